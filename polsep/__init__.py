@@ -1,0 +1,60 @@
+"""polsep: one raw frame of a polarization camera in, a diffuse and a specular image out.
+
+    import polsep
+    out = polsep.separate(raw)        # raw: uint8, uint16 or float32 [H, W] mosaic
+    out.diffuse, out.specular         # float32 [H/2, W/2, 3]
+    out.valid                         # bool [H/2, W/2]
+
+Names are loaded on first use, so ``import polsep`` and ``polsep --help`` cost nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from polsep.camera import Layout, Mosaic
+    from polsep.pipeline import METHODS, PolsepWarning, SeparatedFrame, separate
+    from polsep.separation import Separation
+    from polsep.stokes import Measurements, Stokes
+
+__all__ = [
+    "METHODS",
+    "Layout",
+    "Measurements",
+    "Mosaic",
+    "PolsepWarning",
+    "SeparatedFrame",
+    "Separation",
+    "Stokes",
+    "separate",
+]
+
+_HOME = {
+    "METHODS": "pipeline",
+    "Layout": "camera",
+    "Measurements": "stokes",
+    "Mosaic": "camera",
+    "PolsepWarning": "pipeline",
+    "SeparatedFrame": "pipeline",
+    "Separation": "separation",
+    "Stokes": "stokes",
+    "separate": "pipeline",
+}
+
+try:
+    __version__ = version("polsep")
+except PackageNotFoundError:  # a source tree that was never installed
+    __version__ = "0+unknown"
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'polsep' has no attribute {name!r}")
+    return getattr(import_module(f"polsep.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

@@ -1,0 +1,243 @@
+"""The colour-affine closed form: exact separation of polarized diffuse and white specular light from colour alone.
+
+Let p = s1 + i s2 and a = beta_d exp(2i phi_d), the diffuse polarization, which depends on geometry but not on colour.
+The specular light of a dielectric is white and fully polarized, so in every pixel and every colour c
+
+    p_c = a tau_d,c + tau_s exp(2i phi_s)   and   s0_c = tau_d,c + tau_s   give   p_c = a s0_c + b,
+    b = tau_s (exp(2i phi_s) - a).
+
+The slope a follows from how p varies with s0 over the three colours, b from the mean, and |exp(2i phi_s)| = 1 leaves
+one positive tau_s. No light angle, no calibration, no training. Where there is no colour contrast the slope tends to
+zero and the result to the paper's analytic split.
+
+With the slope known, every unclipped sample is linear in (s0_R, s0_G, s0_B, b): a highlight that clips some analysers
+in some colours is still solved by least squares over the samples that are left (`_solve_clipped`).
+
+Derivation, related work (Nayar, Fang, Boult 1997; Kajiyama et al., WACV 2023) and tests: docs/conventions.md.
+Complex numbers are pairs ``[..., 2, h, w]``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from polsep.separation import Separation, box_mean, separate_analytic_unclipped
+from polsep.stokes import Measurements, Stokes, analyser_residual, fit_stokes_unclipped
+
+#: Largest possible |slope|: DoLP of diffuse light at grazing exit for eta = 1.5 (`optics.diffuse_dolp` at 90 degrees).
+MAX_DIFFUSE_DOLP = 0.3847
+
+#: Windows of the slope, widest first: radius in pixels and how far the slope may stray from the next wider window's
+#: (standard deviation per component). The widest one is held toward zero, the paper's unpolarized diffuse.
+#: Chosen on random scenes outside every test set; see docs/experiments.md.
+SLOPE_SCALES = ((12, 0.1), (6, 0.02), (2, 0.01), (0, 0.01))
+
+#: Colour contrast counts only where it exceeds this many times its expected noise.
+CONTRAST_MARGIN = 2.0
+
+#: Pixels are weighted 1 / (variance + this): below it (0.3 % of white, rms) all are equally good.
+VARIANCE_FLOOR = 1e-5
+
+#: Weight of the neighbourhood's specular direction where clipping leaves b undetermined, against 6 of the samples.
+DIRECTION_WEIGHT = 1e-4
+
+
+def separate_color_affine(measurements: Measurements) -> Separation:
+    """Diffuse and white specular of colour samples ``[..., 4, 3, h, w]`` by the closed form above.
+
+    Falls back to `separation.separate_analytic_unclipped` on mono data and, smoothly, on grey surfaces. Recovers
+    clipped samples from the unclipped analysers and colours of the same pixel; where too few are left, ``valid`` is
+    False, the diffuse is interpolated from around and the specular the least that explains the clipping.
+    """
+    if measurements.data.shape[-3] != 3:
+        return separate_analytic_unclipped(measurements)
+    stokes, determined = fit_stokes_unclipped(measurements)
+    usable = determined.all(dim=-3, keepdim=True)
+    sample = sample_variance(measurements)
+    slope = color_slope(stokes, usable, sample, measurements.variance)
+    offset, residual = _offset(stokes, slope)
+    stokes, offset, valid = _solve_clipped(measurements, stokes, slope, offset)
+    total = stokes.s0.clamp(min=0)
+    specular = torch.minimum(white_specular(offset, slope), total.amin(dim=-3, keepdim=True)).expand_as(total)
+    found = Separation(total - specular, specular, valid, stokes, slope, residual, torch.sqrt(sample))
+    return found if bool(valid.all()) else _fill(found, measurements)
+
+
+def _color_mean(x: Tensor) -> Tensor:
+    return x.mean(dim=-3, keepdim=True)
+
+
+def sample_variance(measurements: Measurements, radius: int = 3) -> Tensor:
+    """Local noise variance of one sample ``[..., 1, h, w]`` from the analysers' contradiction of m0 + m90 = m45 + m135.
+
+    It covers sensor noise and misregistration alike, needs no calibration, and is zero on exact data. Clipped samples
+    are left out of the mean over the window.
+    """
+    squared = _color_mean(analyser_residual(measurements) ** 2)
+    if measurements.clipped is None:
+        return box_mean(squared, radius)
+    weight = (~measurements.clipped.any(dim=-4).any(dim=-3, keepdim=True)).to(squared)
+    return box_mean(squared * weight, radius) / box_mean(weight, radius).clamp(min=1e-6)
+
+
+def color_slope(stokes: Stokes, usable: Tensor, sample: Tensor, interpolation: Tensor | None) -> Tensor:
+    """Slope a ``[..., 2, h, w]`` from how p varies with s0 over colours; |a| at most `MAX_DIFFUSE_DOLP`.
+
+    Fitted to deviations from each pixel's own mean over colours, in which white specular light cancels exactly. Wide
+    windows steady narrow ones, down to the single pixel, each in the proportion of its noise to its colour contrast (a
+    Gaussian prior per scale). Noise in s0 would pull the slope toward p/s0 and so erase the specular of grey surfaces:
+    contrast that noise explains is not counted, and pixels at colour edges, where demosaicking invents contrast, weigh
+    less. ``usable [..., 1, h, w]``: not clipped. ``sample``, ``interpolation``: variances of a sample.
+    """
+    d0, d1, d2 = (s - _color_mean(s) for s in (stokes.s0, stokes.s1, stokes.s2))
+    error = 2 * CONTRAST_MARGIN * sample
+    if interpolation is not None:
+        error = error + interpolation
+    weight = usable.to(error) * VARIANCE_FLOOR / (error + VARIANCE_FLOOR)
+    moments = torch.cat([d.sum(dim=-3, keepdim=True) for d in (d0 * d0, d0 * d1, d0 * d2)] + [error], dim=-3)
+    slope = torch.zeros_like(moments[..., :2, :, :])
+    floor = torch.finfo(error.dtype).eps * 1e-2
+    for radius, spread in SLOPE_SCALES:
+        pooled, samples = _pool(moments, weight, radius) if radius else (moments * usable, 1.0)
+        contrast, moment, noise = pooled[..., :1, :, :], pooled[..., 1:3, :, :], pooled[..., 3:, :, :]
+        counted = ((contrast - noise) / (contrast + floor)).clamp(min=0)
+        held = noise / CONTRAST_MARGIN / (spread**2 * samples) + floor
+        slope = (moment * counted + held * slope) / (contrast + held)
+    size = torch.sqrt((slope * slope).sum(dim=-3, keepdim=True))
+    return slope * (MAX_DIFFUSE_DOLP / size.clamp(min=MAX_DIFFUSE_DOLP))
+
+
+def _pool(moments: Tensor, weight: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """Weighted window means, and the number of independent pixels in each (interpolated neighbours count a quarter)."""
+    means = box_mean(torch.cat([moments * weight, weight, weight * weight], dim=-3), radius)
+    total, squares = means[..., -2:-1, :, :].clamp(min=1e-12), means[..., -1:, :, :].clamp(min=1e-20)
+    pixels = (2 * radius + 1) ** 2 * total * total / squares
+    return means[..., :-2, :, :] / total, (pixels / 4).clamp(min=1)
+
+
+def white_specular(offset: Tensor, slope: Tensor) -> Tensor:
+    """tau_s ``[..., 1, h, w]`` from b = tau_s (exp(2i phi_s) - a).
+
+    The positive root of (|a|^2 - 1) t^2 + 2 Re(b conj a) t + |b|^2 = 0, unique because |a| < 1; |b| where a = 0.
+    """
+    ba = (offset * slope).sum(dim=-3, keepdim=True)
+    bb = (offset * offset).sum(dim=-3, keepdim=True)
+    aa = (slope * slope).sum(dim=-3, keepdim=True)
+    return (ba + torch.sqrt(ba * ba + (1 - aa) * bb)) / (1 - aa)
+
+
+def _offset(stokes: Stokes, slope: Tensor) -> tuple[Tensor, Tensor]:
+    """b of p_c = a s0_c + b as the mean over colours ``[..., 2, h, w]``, and the rms of what it leaves ``[..., 1, h, w]``."""
+    lines = [s - slope[..., k : k + 1, :, :] * stokes.s0 for k, s in enumerate((stokes.s1, stokes.s2))]
+    offset = torch.cat([_color_mean(line) for line in lines], dim=-3)
+    left = sum(((line - _color_mean(line)) ** 2).sum(dim=-3, keepdim=True) for line in lines)
+    return offset, torch.sqrt(torch.as_tensor(left) / 3)
+
+
+def _solve_clipped(
+    measurements: Measurements, stokes: Stokes, slope: Tensor, offset: Tensor
+) -> tuple[Stokes, Tensor, Tensor]:
+    """Stokes and b of pixels with clipped samples by least squares over the others, and where that is determined.
+
+    For given a, twice a sample is g_k s0_c + u_k . b with u_k = (cos 2t_k, sin 2t_k) and g_k = 1 + u_k . a. Each colour's
+    s0 is eliminated, which leaves 2x2 normal equations for b; where they are singular, the direction of b around decides.
+    A colour without any unclipped sample keeps what the clipped ones give until `_fill`.
+    """
+    valid = torch.ones_like(stokes.s0[..., 0, :, :], dtype=torch.bool)
+    if measurements.clipped is None or not bool(measurements.clipped.any()):
+        return stokes, offset, valid
+    clipped = measurements.clipped.movedim((-4, -3), (0, 1))
+    touched = clipped.any(dim=0).any(dim=0)
+    kept = ~clipped[:, :, touched]
+    samples = measurements.data.movedim((-4, -3), (0, 1))[:, :, touched]
+    a = slope.movedim(-3, 0)[:, touched]
+    around = _direction_around(offset, ~touched).movedim(-3, 0)[:, touched]
+    b, s0, determined = _least_squares(2 * samples, kept.to(samples), a, around, measurements.angles)
+    solved = [s.movedim(-3, 0).clone() for s in (stokes.s0, stokes.s1, stokes.s2)]
+    partly = kept.any(dim=0) & ~kept.all(dim=0)
+    for image, values in zip(solved, (s0, a[0] * s0 + b[0], a[1] * s0 + b[1]), strict=True):
+        image[:, touched] = torch.where(partly, values, image[:, touched])
+    offset = offset.movedim(-3, 0).clone()
+    offset[:, touched] = b
+    valid[touched] = determined & kept.any(dim=0).all(dim=0)
+    return Stokes(*(s.movedim(0, -3) for s in solved)), offset.movedim(0, -3), valid
+
+
+def _direction_around(offset: Tensor, unclipped: Tensor, radius: int = 8) -> Tensor:
+    """Unit direction of b averaged over the unclipped pixels around, ``[..., 2, h, w]``; zero where there are none."""
+    mean = box_mean(offset * unclipped[..., None, :, :], radius)
+    return mean / torch.sqrt((mean * mean).sum(dim=-3, keepdim=True)).clamp(min=1e-12)
+
+
+def _least_squares(
+    y: Tensor, kept: Tensor, a: Tensor, around: Tensor, angles: tuple[float, ...]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Solve y = g s0 + u . b over N pixels: b ``[2, N]``, s0 ``[C, N]``, and where both components of b are determined.
+
+    ``y`` and the weights ``kept`` are ``[K, C, N]``; ``a`` and the unit direction ``around`` are ``[2, N]``.
+    """
+    t = 2 * torch.tensor(angles).to(y)
+    u = torch.stack([torch.cos(t), torch.sin(t)])[:, :, None, None]
+    g = 1 + u[0] * a[0] + u[1] * a[1]
+    gg = (kept * g * g).sum(0).clamp(min=1e-6)
+    gy = (kept * g * y).sum(0)
+    gu = [(kept * g * u[i]).sum(0) for i in (0, 1)]
+    projected = [u[i] - g * gu[i] / gg for i in (0, 1)]
+    m00, m01, m11 = ((kept * projected[i] * projected[j]).sum((0, 1)) for i, j in ((0, 0), (0, 1), (1, 1)))
+    r0, r1 = ((kept * projected[i] * y).sum((0, 1)) for i in (0, 1))
+    half_trace, half_gap = (m00 + m11) / 2, torch.hypot((m00 - m11) / 2, m01)
+    m00 = m00 + DIRECTION_WEIGHT * (1 - around[0] ** 2)
+    m11 = m11 + DIRECTION_WEIGHT * (1 - around[1] ** 2)
+    m01 = m01 - DIRECTION_WEIGHT * around[0] * around[1]
+    det = (m00 * m11 - m01 * m01).clamp(min=1e-9)
+    b = torch.stack([m11 * r0 - m01 * r1, m00 * r1 - m01 * r0]) / det
+    s0 = (gy - gu[0] * b[0] - gu[1] * b[1]) / gg
+    return b, s0, half_trace - half_gap > 0.05
+
+
+def _fill(found: Separation, measurements: Measurements) -> Separation:
+    """Complete pixels that clipping left undetermined: diffuse from the valid ones around, specular by the clip's bound."""
+    assert measurements.clipped is not None and found.slope is not None
+    hole = ~found.valid[..., None, :, :]
+    blind = measurements.clipped.all(dim=-4) & hole
+    diffuse = torch.where(blind | (found.diffuse <= 0) & hole, _around(found.diffuse, found.valid), found.diffuse)
+    phase = _phase(found)
+    bound = torch.zeros_like(found.specular[..., :1, :, :])
+    for k, t in enumerate(measurements.angles):
+        u = (math.cos(2 * t), math.sin(2 * t))
+        toward = u[0] * found.slope[..., :1, :, :] + u[1] * found.slope[..., 1:, :, :]
+        passed = 1 + u[0] * phase[..., :1, :, :] + u[1] * phase[..., 1:, :, :]
+        least = (2 * measurements.data[..., k, :, :, :] - diffuse * (1 + toward)) / passed.clamp(min=0.5)
+        sees = measurements.clipped[..., k, :, :, :] & (passed > 0.5)
+        bound = torch.maximum(bound, torch.where(sees, least, 0.0).amax(dim=-3, keepdim=True))
+    specular = torch.where(hole, torch.maximum(found.specular, bound), found.specular)
+    total = diffuse + specular
+    s1, s2 = (
+        found.slope[..., i : i + 1, :, :] * diffuse + phase[..., i : i + 1, :, :] * specular for i in (0, 1)
+    )
+    seen = found.stokes
+    stokes = Stokes(*(torch.where(hole, new, old) for new, old in ((total, seen.s0), (s1, seen.s1), (s2, seen.s2))))
+    return replace(found, diffuse=diffuse, specular=specular, stokes=stokes)
+
+
+def _phase(found: Separation) -> Tensor:
+    """exp(2i phi_s) ``[..., 2, h, w]``: of the valid specular light around each pixel, as a unit vector."""
+    polarization = torch.cat([_color_mean(found.stokes.s1), _color_mean(found.stokes.s2)], dim=-3)
+    mean = box_mean(polarization * found.valid[..., None, :, :], 8)
+    return mean / torch.sqrt((mean * mean).sum(dim=-3, keepdim=True)).clamp(min=1e-12)
+
+
+def _around(image: Tensor, valid: Tensor) -> Tensor:
+    """``image`` averaged over the valid pixels of the smallest window that holds some; 0 where there are none at all."""
+    weight = valid[..., None, :, :].to(image)
+    result = (image * weight).sum(dim=(-2, -1), keepdim=True) / weight.sum(dim=(-2, -1), keepdim=True).clamp(min=1)
+    result = result.expand_as(image)
+    for radius in (64, 32, 16, 8, 4, 2):
+        support = box_mean(weight, radius)
+        near = box_mean(image * weight, radius) / support.clamp(min=1e-9)
+        result = torch.where(support > 0.02, near, result)
+    return result

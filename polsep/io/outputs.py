@@ -1,0 +1,323 @@
+"""Writing one separated frame to files, all of them or none.
+
+Whatever the format, a frame becomes DIR/STEM.<format> (or a set of DIR/STEM_<layer>.<format> images), the preview
+DIR/STEM.png and the sidecar DIR/STEM.json, which holds the polsep version, the report, the units and a sha256 per file.
+
+Conventions: images are linear light with 1.0 = one measurement at the white level, so an unclipped s0 reaches 2;
+aolp is in radians in [0, pi), from image-right toward image-up. Files hold the very float32 values of the frame,
+except the PNG set, whose scales are in `PNG_UNITS` and whose limited samples the sidecar counts.
+
+Every file is encoded in memory, written into a hidden directory inside DIR and then renamed into place. OpenEXR reports
+a full disk, but a short file it reads back only as a warning on the terminal; Python's own writes leave no such doubt.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import io
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import imagecodecs
+import numpy as np
+import OpenEXR  # type: ignore[import-not-found]  # a bare extension module without stubs
+import tifffile
+from numpy.typing import NDArray
+
+from polsep.io.errors import input_error
+from polsep.io.previews import contact_sheet
+
+if TYPE_CHECKING:
+    from polsep.pipeline import SeparatedFrame
+
+FORMATS = ("exr", "npz", "tiff", "png")
+LAYERS = ("diffuse", "specular", "dolp", "aolp", "valid")
+
+_LIGHT = "linear light, 1.0 = one measurement at the white level (an unclipped s0 = diffuse + specular reaches 2)"
+#: What the numbers in EXR, NPZ and TIFF files mean.
+UNITS = {
+    "diffuse": _LIGHT,
+    "specular": f"{_LIGHT}; may exceed 2 where highlights were clipped",
+    "dolp": "degree of linear polarization, 0 to 1; above 1 by noise",
+    "aolp": "angle of linear polarization in radians, in [0, pi), from image-right toward image-up",
+    "valid": "1 (TIFF: 255) where the separation is trustworthy, else 0",
+}
+#: What the codes in the PNG set mean.
+PNG_UNITS = {
+    "diffuse": "16 bit, LINEAR (no gamma): 65535 = 2.0; 1.0 = one measurement at the white level",
+    "specular": "16 bit, LINEAR (no gamma): 65535 = 2.0; 1.0 = one measurement at the white level",
+    "dolp": "16 bit: 65535 = degree of linear polarization 1.0",
+    "aolp": "16 bit: 65536 = pi radians (180 degrees), from image-right toward image-up",
+    "valid": "8 bit: 255 where the separation is trustworthy, else 0",
+}
+#: The value that code 65535 stands for in the PNG set.
+PNG_WHITE = {"diffuse": 2.0, "specular": 2.0, "dolp": 1.0}
+
+
+class OutputError(ValueError):
+    """The outputs could not be written, and nothing was: one line of what was expected and what was found."""
+
+
+def planned_outputs(directory: Path, stem: str, format: str) -> list[Path]:
+    """Every file that `write_separation` would write, images first, then preview and sidecar. Touches no file.
+
+    Raises OutputError when ``format`` is not one of `FORMATS` or ``stem`` is not a plain file name.
+    """
+    if format not in FORMATS:
+        raise OutputError(f"expected a format of {', '.join(FORMATS)}, found {format!r}")
+    if stem in ("", ".", "..") or any(c in stem for c in "/\\\0"):
+        raise OutputError(f"expected a file name without path separators as stem, found {stem!r}")
+    images = [f"{stem}_{layer}.{format}" for layer in LAYERS] if format in ("tiff", "png") else [f"{stem}.{format}"]
+    return [Path(directory) / name for name in (*images, f"{stem}.png", f"{stem}.json")]
+
+
+def write_separation(
+    frame: SeparatedFrame, directory: Path, stem: str, format: str = "exr", overwrite: bool = False
+) -> list[Path]:
+    """Write the images, preview and sidecar of ``frame`` into ``directory`` (made if missing); the paths written.
+
+    All or nothing: after a failure no new file is left and files that were there before are back in place, also with
+    ``overwrite``. Files of an earlier run in another format are left alone. Two writers of one stem at the same time
+    are not guarded against.
+    Raises OutputError when an output exists and ``overwrite`` is False (before any work), when the frame breaks its
+    contract (shapes, dtypes, values that are not finite, a report that is not JSON) or when writing fails.
+    """
+    targets = planned_outputs(directory, stem, format)
+    directory = Path(directory)
+    _check_targets(directory, targets, overwrite)
+    _check_frame(frame)
+    made = [d for d in (directory, *directory.parents) if not os.path.exists(d)]
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        _write_and_move(frame, targets, stem, format)
+    except BaseException as error:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()
+        if isinstance(error, OutputError) or not isinstance(error, Exception):
+            raise
+        reason = " ".join(str(error).split()) or "no reason given"
+        raise OutputError(
+            f"expected to write {stem!r} into {directory}, found {type(error).__name__}: {reason}"
+        ) from error
+    return targets
+
+
+def read_exr_layers(path: Path) -> dict[str, NDArray[np.float32]]:
+    """Every channel of a single-part EXR file by its full name, such as ``diffuse.R``, each ``[H, W]``.
+
+    Raises OSError when it cannot be read, and InputError for anything but a complete single-part EXR (OpenEXR itself
+    returns no part and prints a warning when pixels are missing).
+    """
+    expected = "expected a complete single-part EXR file"
+    try:
+        file = OpenEXR.File(io.BytesIO(Path(path).read_bytes()), separate_channels=True)
+    except RuntimeError as error:
+        raise input_error(path, f"{expected}, found one that OpenEXR cannot open") from error
+    if len(file.parts) != 1:
+        raise input_error(path, f"{expected}, found {len(file.parts)} readable parts")
+    return {name: channel.pixels for name, channel in file.channels().items()}
+
+
+def _check_targets(directory: Path, targets: list[Path], overwrite: bool) -> None:
+    """Refuse to replace files unasked, and ever to replace a directory."""
+    nearest = next((d for d in (directory, *directory.parents) if os.path.lexists(d)), None)
+    if nearest is not None and not os.path.isdir(nearest):
+        raise OutputError(f"expected a directory to write into, found a file: {nearest}")
+    for target in targets:
+        if os.path.isdir(target) and not os.path.islink(target):
+            raise OutputError(f"expected a file or nothing at {target}, found a directory")
+        if not overwrite and os.path.lexists(target):
+            raise OutputError(f"expected no {target}, found one from before; --overwrite replaces it")
+
+
+def _check_frame(frame: SeparatedFrame) -> None:
+    """Hold the frame to its contract, so that no file carries a surprise."""
+    size = frame.valid.shape
+    if len(size) != 2 or 0 in size or frame.valid.dtype != np.bool_:
+        raise OutputError(f"expected valid as bool [H, W], found {frame.valid.dtype} {list(size)}")
+    channels = frame.diffuse.shape[-1]
+    color = (*size, 3 if channels == 3 else 1)
+    for name, shape in {"diffuse": color, "specular": color, "dolp": size, "aolp": size}.items():
+        image = getattr(frame, name)
+        if image.shape != shape or image.dtype != np.float32:
+            raise OutputError(f"expected {name} as float32 {list(shape)}, found {image.dtype} {list(image.shape)}")
+        wrong = int(np.count_nonzero(~np.isfinite(image)))
+        if wrong:
+            raise OutputError(f"expected finite values in {name}, found {wrong} NaN or infinite samples")
+
+
+def _write_and_move(frame: SeparatedFrame, targets: list[Path], stem: str, format: str) -> None:
+    """Write into a hidden directory beside the targets, then rename; that directory is gone afterwards."""
+    staging = Path(tempfile.mkdtemp(prefix=".polsep-", dir=targets[0].parent))
+    try:
+        (staging / "new").mkdir()
+        (staging / "old").mkdir()
+        _stage(frame, staging / "new", stem, format)
+        _move_into_place(staging, targets)
+        shutil.rmtree(staging / "old", ignore_errors=True)
+    finally:
+        shutil.rmtree(staging / "new", ignore_errors=True)
+        for path in (staging / "old", staging):  # not emptied by force: only a failed restore leaves files in old/
+            with suppress(OSError):
+                path.rmdir()
+
+
+def _stage(frame: SeparatedFrame, folder: Path, stem: str, format: str) -> None:
+    """Write every output of ``frame`` into ``folder``, the sidecar last."""
+    files = []
+    for name, data in _encoded_files(frame, stem, format):
+        _write_bytes(folder / name, data)
+        files.append({"name": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()})
+    sidecar: dict[str, Any] = {
+        "polsep": _version(),
+        "source": frame.report.get("source"),
+        "format": format,
+        "shape": list(frame.diffuse.shape),
+        "units": PNG_UNITS if format == "png" else UNITS,
+        "preview": f"{stem}.png is sRGB, 8 bit, for people: do not measure in it",
+        "files": files,
+        "report": frame.report,
+    }
+    if format == "png":
+        sidecar["limited_samples"] = _limited_samples(frame)
+    _write_bytes(folder / f"{stem}.json", (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
+
+
+def _write_bytes(path: Path, data: bytes) -> None:
+    """Write a file and check that all of it arrived; OSError otherwise."""
+    path.write_bytes(data)
+    found = path.stat().st_size
+    if found != len(data):
+        raise OSError(f"expected {len(data)} bytes in {path.name}, found {found}")
+
+
+def _move_into_place(staging: Path, targets: list[Path]) -> None:
+    """Rename staging/new/* to the targets, keeping what they replace in staging/old; undo everything on failure."""
+    begun: list[Path] = []
+    try:
+        for target in targets:
+            begun.append(target)
+            if os.path.lexists(target):
+                os.replace(target, staging / "old" / target.name)
+            os.replace(staging / "new" / target.name, target)
+    except BaseException:
+        for target in reversed(begun):
+            if not (staging / "new" / target.name).exists():
+                target.unlink(missing_ok=True)
+            if os.path.lexists(staging / "old" / target.name):
+                os.replace(staging / "old" / target.name, target)
+        raise
+
+
+def _encoded_files(frame: SeparatedFrame, stem: str, format: str) -> Iterator[tuple[str, bytes]]:
+    """Name and contents of each image file, then of the preview; one in memory at a time."""
+    if format == "exr":
+        yield f"{stem}.exr", _encode_exr(frame)
+    elif format == "npz":
+        yield f"{stem}.npz", _encode_npz(frame)
+    elif format == "tiff":
+        for layer in LAYERS:
+            yield f"{stem}_{layer}.tiff", _encode_tiff(frame, layer)
+    else:
+        for layer in LAYERS:
+            yield f"{stem}_{layer}.png", _encode_png(_png_codes(frame, layer))
+    yield f"{stem}.png", _encode_png(contact_sheet(frame))
+
+
+def _encode_exr(frame: SeparatedFrame) -> bytes:
+    """One part of float32 channels, ZIP compressed, with the units as header attributes."""
+    planes = {"dolp.Y": frame.dolp, "aolp.Y": frame.aolp, "valid.Y": frame.valid}
+    for layer, image in (("diffuse", frame.diffuse), ("specular", frame.specular)):
+        for k, color in enumerate("RGB" if image.shape[-1] == 3 else "Y"):
+            planes[f"{layer}.{color}"] = image[..., k]
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "polsepVersion": _version(),
+        **{f"{layer}Units": text for layer, text in UNITS.items()},
+    }
+    # A fresh dict, because OpenEXR replaces its arrays, and contiguous planes, because it misreads others silently.
+    channels = {name: np.ascontiguousarray(plane, dtype=np.float32) for name, plane in planes.items()}
+    stream = io.BytesIO()
+    OpenEXR.File(header, channels).write(stream)
+    return stream.getvalue()
+
+
+def _encode_npz(frame: SeparatedFrame) -> bytes:
+    """The five arrays as they are, deflated."""
+    stream = io.BytesIO()
+    np.savez_compressed(
+        stream,
+        diffuse=frame.diffuse,
+        specular=frame.specular,
+        dolp=frame.dolp,
+        aolp=frame.aolp,
+        valid=frame.valid,
+    )
+    return stream.getvalue()
+
+
+def _encode_tiff(frame: SeparatedFrame, layer: str) -> bytes:
+    """One layer: float32 deflated after the floating-point predictor where there is one; valid as uint8 0 or 255."""
+    image = np.where(frame.valid, 255, 0).astype(np.uint8) if layer == "valid" else _flat(getattr(frame, layer))
+    predictor = 3 if image.dtype == np.float32 and imagecodecs.FLOATPRED.available else 1  # TIFF: 1 none, 3 float
+    stream = io.BytesIO()
+    tifffile.imwrite(
+        stream,
+        image,
+        photometric="rgb" if image.ndim == 3 else "minisblack",
+        compression="zlib",
+        predictor=predictor,
+        description=f"{layer}: {UNITS[layer]}",
+        software=f"polsep {_version()}",
+        metadata=None,
+    )
+    return stream.getvalue()
+
+
+def _encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    """``[H, W]`` or ``[H, W, 3]`` codes as they are; no colour space is claimed."""
+    return bytes(imagecodecs.png_encode(np.ascontiguousarray(pixels)))
+
+
+def _png_codes(frame: SeparatedFrame, layer: str) -> NDArray[np.uint16] | NDArray[np.uint8]:
+    """One layer in the integer codes of `PNG_UNITS`, values outside the scale limited to its ends."""
+    if layer == "valid":
+        return np.where(frame.valid, 255, 0).astype(np.uint8)
+    if layer == "aolp":
+        steps = np.rint(frame.aolp.astype(np.float64) * (65536 / np.pi)).astype(np.int64)
+        return np.mod(steps, 65536).astype(np.uint16)
+    image: NDArray[np.float64] = _flat(getattr(frame, layer)).astype(np.float64)
+    return np.rint(np.clip(image / PNG_WHITE[layer], 0, 1) * 65535).astype(np.uint16)
+
+
+def _limited_samples(frame: SeparatedFrame) -> dict[str, dict[str, int]]:
+    """How many samples of each layer `_png_codes` limits: below 0 and above the value of code 65535."""
+    return {
+        layer: {
+            "below": int(np.count_nonzero(getattr(frame, layer) < 0)),
+            "above": int(np.count_nonzero(getattr(frame, layer) > white)),
+        }
+        for layer, white in PNG_WHITE.items()
+    }
+
+
+def _flat(image: NDArray[Any]) -> NDArray[Any]:
+    """``[H, W, 1]`` as ``[H, W]``; other shapes unchanged."""
+    return image[..., 0] if image.ndim == 3 and image.shape[-1] == 1 else image
+
+
+def _version() -> str:
+    """The version of the installed polsep."""
+    try:
+        return importlib.metadata.version("polsep")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"

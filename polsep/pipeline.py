@@ -1,0 +1,268 @@
+"""The product on one page: raw frame -> mosaic -> demosaic -> separate -> NumPy images and a report.
+
+A `Method` maps one frame, a `Mosaic` or co-sited `Measurements`, to a `Separation`; everything that is compared has
+this type. The light's colour is divided out before a method runs and multiplied back after, so methods see white light.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polsep.camera import Layout, Mosaic
+from polsep.color_affine import separate_color_affine
+from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
+from polsep.layout_check import check_layout
+from polsep.levels import as_mosaic
+from polsep.separation import Separation, dominant_angle, light_polarizer_angle, separate_analytic
+from polsep.stokes import Measurements, Stokes, aolp, dolp
+
+Capture = Mosaic | Measurements
+LightColor = Sequence[float]
+
+
+class PolsepWarning(UserWarning):
+    """Something about a frame that its owner should know: the layout, the bit depth, the exposure, the light."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A separation method: ``split`` runs on co-registered analysers; ``needs`` and ``source`` are for people to read."""
+
+    name: str
+    split: Callable[[Measurements], Separation]
+    summary: str
+    needs: str
+    source: str
+
+
+METHODS = {
+    method.name: method
+    for method in (
+        Method(
+            "color-affine",
+            separate_color_affine,
+            "closed form for polarized diffuse and white specular light, recovers clipped samples",
+            "colour; on mono and grey it is the analytic split with clipped samples recovered",
+            "this project; after Nayar et al. 1997, Kajiyama et al. 2023",
+        ),
+        Method(
+            "analytic",
+            separate_analytic,
+            "the paper's first estimate: specular = polarized part, diffuse = the rest",
+            "colour or mono; takes the diffuse light for unpolarized and clipped samples at face value",
+            "Dave et al. 2022, Eqs. 15-18",
+        ),
+    )
+}
+
+#: What `auto` means: the best method installed.
+BEST_METHOD = "color-affine"
+
+#: Reflected light of one polarized source: below this concentration of its angle there is no such light.
+MIN_CONCENTRATION = 0.25
+
+
+@dataclass(frozen=True)
+class SeparatedFrame:
+    """A separated frame as NumPy arrays, channels last.
+
+    ``diffuse``, ``specular``: float32 ``[h, w, C]``, C = 3 or 1, linear, 1.0 = one measurement at the white level, so
+    their sum s0 reaches 2 (more where clipped highlights were recovered). ``valid``: bool ``[h, w]``, False where
+    clipping left something to assumption. ``dolp``: float32 ``[h, w]``, of all channels together. ``aolp``: radians in
+    [0, pi), image-right toward image-up. ``report``: JSON-able settings, statistics and warnings.
+    """
+
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    dolp: NDArray[np.float32]
+    aolp: NDArray[np.float32]
+    report: dict[str, Any]
+
+
+def separate(
+    raw: NDArray[Any],
+    method: str = "auto",
+    layout: Layout | None = None,
+    black_level: float = 0,
+    white_level: float | None = None,
+    light_color: LightColor | str = (1, 1, 1),
+    device: str = "auto",
+    full: bool = False,
+) -> SeparatedFrame:
+    """Separate one raw mosaic ``[H, W]`` (uint8, uint16, float32) into diffuse and specular.
+
+    Images are ``[H/2, W/2, C]``, the mean over each 2x2 polarizer cell; ``full=True`` gives ``[H, W, C]``. ``layout``
+    None is Sony's colour order. ``white_level`` None is the dtype's maximum (1.0 for float): 12-bit data in uint16
+    need 4095 or 65520 said. ``light_color``: camera RGB of the light, or "estimate" to take it from the highlights.
+    What the owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises ValueError, with one
+    line of what was expected and what was found, on input that is not a mosaic.
+    """
+    mosaic, notes = as_mosaic(raw, layout, black_level, white_level)
+    frame = separate_capture(mosaic, method, light_color, device, full)
+    frame.report["warnings"] = [*notes, *frame.report["warnings"]]
+    for note in frame.report["warnings"]:
+        warnings.warn(note, PolsepWarning, stacklevel=2)
+    return frame
+
+
+def separate_capture(
+    capture: Capture, method: str = "auto", light_color: LightColor | str = (1, 1, 1), device: str = "auto", full: bool = False
+) -> SeparatedFrame:
+    """`separate` for a frame that is already a `Mosaic`, or co-sited `Measurements` (which keep their resolution)."""
+    chosen = find_method(method)
+    capture = to_device(capture, find_device(device))
+    remarks = []
+    if isinstance(capture, Mosaic):
+        check = check_layout(capture)
+        remarks += [check.warning] if check.warning else []
+    measurements = demosaic(capture, full)
+    light, light_remarks = resolve_light_color(light_color, measurements)
+    found = in_light(chosen.split, measurements, light)
+    report = describe(found, measurements)
+    report |= {"method": chosen.name, "light_color": list(light), "full_resolution": full}
+    report["layout"] = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
+    report["warnings"] = remarks + light_remarks + report["warnings"]
+    return to_numpy(found, report)
+
+
+def find_method(name: str) -> Method:
+    """The method of that name; ValueError, with the names there are, for any other."""
+    if name == "auto":
+        return METHODS[BEST_METHOD]
+    if name not in METHODS:
+        raise ValueError(f"expected a method of {', '.join(['auto', *METHODS])}, found {name!r}")
+    return METHODS[name]
+
+
+def find_device(name: str) -> torch.device:
+    """``auto`` is CUDA where there is one, else the CPU. Raises ValueError on a device that is not there."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"expected a device like auto, cpu or cuda, found {name!r}: {reason}") from None
+    return device
+
+
+def to_device(capture: Capture, device: torch.device) -> Capture:
+    """The capture with its tensors on ``device``."""
+    moved = {name: value.to(device) for name, value in vars(capture).items() if isinstance(value, Tensor)}
+    return replace(capture, **moved)  # type: ignore[arg-type]
+
+
+def demosaic(capture: Capture, full: bool) -> Measurements:
+    """Co-registered analysers at half resolution, or full if asked; co-sited measurements pass."""
+    if isinstance(capture, Measurements):
+        return capture
+    return demosaic_bilinear(capture) if full else demosaic_bilinear_half(capture)
+
+
+def resolve_light_color(light_color: LightColor | str, measurements: Measurements) -> tuple[tuple[float, ...], list[str]]:
+    """One gain per channel, and remarks; "estimate" takes the colour of the highlights. ValueError on anything else."""
+    channels = measurements.data.shape[-3]
+    if isinstance(light_color, str):
+        if light_color != "estimate":
+            raise ValueError(f'expected a light colour of three numbers or "estimate", found {light_color!r}')
+        estimated = estimate_light_color(measurements)
+        if estimated is None:
+            return (1.0,) * channels, ["too few unclipped highlights to estimate the light's colour: white is assumed"]
+        return estimated, []
+    color = tuple(float(c) for c in light_color)
+    if len(color) != 3 or not all(math.isfinite(c) and c > 0 for c in color):
+        raise ValueError(f"expected a light colour of three positive numbers, found {light_color!r}")
+    return (color if channels == 3 else (1.0,)), []
+
+
+def estimate_light_color(measurements: Measurements) -> tuple[float, ...] | None:
+    """Camera RGB of the light, green = 1, from the brightest polarized pixels; None with fewer than 32 of them.
+
+    Highlights off dielectrics have the light's colour, and the polarized part holds little else: the first principal
+    direction of s1, s2 over colours there. Source: the idea is Nayar, Fang, Boult 1997, Sec. 4.
+    """
+    from polsep.stokes import fit_stokes_unclipped, polarized_intensity
+
+    stokes, determined = fit_stokes_unclipped(measurements)
+    if stokes.s0.shape[-3] != 3:
+        return (1.0,)
+    strength = polarized_intensity(stokes).mean(dim=-3) * determined.all(dim=-3)
+    bright = strength.flatten()
+    threshold = torch.topk(bright, max(32, bright.numel() // 500)).values[-1] if bright.numel() >= 32 else bright.max() + 1
+    chosen = (strength >= threshold) & (strength > 0.05)
+    if int(chosen.sum()) < 32:
+        return None
+    samples = torch.cat([s.movedim(-3, 0)[:, chosen] for s in (stokes.s1, stokes.s2)], dim=1).double()
+    color = torch.linalg.eigh(samples @ samples.T).eigenvectors[:, -1].abs()
+    if float(color.min()) < 0.05 * float(color.max()):
+        return None
+    return tuple((color / color[1]).tolist())
+
+
+def in_light(split: Callable[[Measurements], Separation], measurements: Measurements, light: tuple[float, ...]) -> Separation:
+    """Run a method under white light: divide the light's colour out of the samples and multiply it back."""
+    if all(c == 1 for c in light):
+        return split(measurements)
+    gain = torch.tensor(light).to(measurements.data).view(-1, 1, 1)
+    found = split(replace(measurements, data=measurements.data / gain))
+    return replace(found, diffuse=found.diffuse * gain, specular=found.specular * gain, stokes=found.stokes * gain)
+
+
+def describe(found: Separation, measurements: Measurements) -> dict[str, Any]:
+    """Statistics of a separation for its report: exposure, the light's polarizer, how well the model fits."""
+    polarization = torch.stack([found.stokes.s1.mean(dim=-3), found.stokes.s2.mean(dim=-3)], dim=-3)
+    if found.slope is not None:
+        polarization = polarization - found.slope * found.diffuse.mean(dim=-3, keepdim=True)
+    angle, concentration = dominant_angle(polarization)
+    clipped = 0.0 if measurements.clipped is None else float(measurements.clipped.any(dim=-4).any(dim=-3).float().mean())
+    total = found.stokes.s0.clamp(min=0)
+    brightness = float(total.mean())
+    remarks = []
+    if brightness > 1e-3 and concentration < MIN_CONCENTRATION:
+        remarks.append(
+            f"polarized light of one angle was expected, found many (concentration {concentration:.2f}): "
+            "is the light polarized, and the only one?"
+        )
+    statistics: dict[str, Any] = {
+        "clipped_fraction": clipped,
+        "valid_fraction": float(found.valid.float().mean()),
+        "mean_s0": brightness,
+        "specular_fraction": float(found.specular.mean()) / brightness if brightness > 0 else 0.0,
+        "dolp_above_1_fraction": float((dolp(found.stokes) > 1).float().mean()),
+        "specular_aolp_deg": math.degrees(angle),
+        "specular_aolp_concentration": concentration,
+        "light_polarizer_deg": math.degrees(light_polarizer_angle(angle)),
+    }
+    if found.residual is not None:
+        statistics["fit_residual"] = float(found.residual.mean()) / brightness if brightness > 0 else 0.0
+    if found.noise is not None:
+        statistics["sample_noise"] = float(found.noise.mean())
+    return {"statistics": statistics, "warnings": remarks}
+
+
+def to_numpy(found: Separation, report: dict[str, Any]) -> SeparatedFrame:
+    """The public result of one frame: channels last, on the CPU, DoLP and AoLP of all channels together."""
+
+    def image(x: Tensor) -> NDArray[np.float32]:
+        return np.ascontiguousarray(x.detach().float().cpu().movedim(-3, -1).numpy())
+
+    grey = Stokes(*(s.mean(dim=-3, keepdim=True) for s in (found.stokes.s0, found.stokes.s1, found.stokes.s2)))
+    return SeparatedFrame(
+        image(found.diffuse),
+        image(found.specular),
+        found.valid.cpu().numpy(),
+        image(dolp(grey))[..., 0],
+        image(aolp(grey))[..., 0],
+        report,
+    )

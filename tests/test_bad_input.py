@@ -1,0 +1,350 @@
+"""Every damaged or wrong input is refused in one line that names the file and says what was expected or found."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imagecodecs
+import numpy as np
+import pytest
+import tifffile
+
+from polsep.camera import Layout
+from polsep.io.errors import InputError
+from polsep.io.frames import ReadOptions, read_frames
+from polsep.levels import as_measurements, as_mosaic, interleave_planes
+
+CODES = np.random.default_rng(0).integers(0, 65536, (48, 64)).astype(np.uint16)
+
+
+def png_chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def png(width: int = 64, height: int = 48, depth: int = 16, color: int = 0, idat: bytes | None = None) -> bytes:
+    """A PNG of chosen header whose checksums hold; ``idat`` None is the stream that belongs to `CODES`."""
+    stream = zlib.compress(b"".join(b"\0" + row.astype(">u2").tobytes() for row in CODES)) if idat is None else idat
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + png_chunk(b"IDAT", stream) + png_chunk(b"IEND", b"")
+
+
+def encode_png(array: Any) -> bytes:
+    return bytes(imagecodecs.png_encode(array))
+
+
+def flipped(data: bytes, at: int) -> bytes:
+    """``data`` with one byte inverted."""
+    return data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :]
+
+
+def tiff(array: Any = CODES, **options: Any) -> bytes:
+    stream = io.BytesIO()
+    tifffile.imwrite(stream, array, **options)
+    return stream.getvalue()
+
+
+def npy(array: Any, allow_pickle: bool = False) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=allow_pickle)
+    return stream.getvalue()
+
+
+def npy_header(text: str, version: int = 1) -> bytes:
+    """An NPY header of any content, and 64 bytes of data."""
+    body = text.encode() + b"\n"
+    return b"\x93NUMPY" + bytes([version, 0]) + struct.pack("<H", len(body)) + body + bytes(64)
+
+
+def npz(**arrays: Any) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+def zipped(**members: bytes) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(f"{name}.npy", data)
+    return stream.getvalue()
+
+
+def patched_tiff(tag: int, value: int) -> bytes:
+    """The TIFF of `CODES` in uncompressed strips of 16 rows, with the value of one tag overwritten."""
+    data = bytearray(tiff(rowsperstrip=16, metadata=None))
+    with tifffile.TiffFile(io.BytesIO(bytes(data))) as tif:
+        entry = tif.pages.first.tags[tag]
+        offset = entry.valueoffset
+        struct.pack_into({3: "<H", 4: "<I"}[int(entry.dtype)], data, offset, value)
+    return bytes(data)
+
+
+def patched_tiff_count(tag: int, count: int) -> bytes:
+    """The same TIFF with the number of values of one tag overwritten, so that strips lose offsets or sizes."""
+    data = bytearray(tiff(rowsperstrip=16, metadata=None))
+    with tifffile.TiffFile(io.BytesIO(bytes(data))) as tif:
+        struct.pack_into("<I", data, tif.pages.first.tags[tag].offset + 4, count)
+    return bytes(data)
+
+
+RAW = {"size": (64, 48), "pixel_format": "Mono12p"}
+ANGLES = {"pages": "angles"}
+HUGE = 1 << 20
+NAN = np.where(np.arange(16).reshape(4, 4) == 6, np.nan, 0.5)
+TEXT = b"this is no image\n" * 9
+STACK5 = np.zeros((5, 8, 8), np.uint8)
+
+#: Name of the file, its bytes, options, and what the message must contain.
+FILES: list[tuple[str, bytes, dict[str, Any], str]] = [
+    ("empty.png", b"", {}, "found an empty file"),
+    ("empty.tiff", b"", {}, "found an empty file"),
+    ("empty.npy", b"", {}, "found an empty file"),
+    ("empty.npz", b"", {}, "found an empty file"),
+    ("empty.pgm", b"", {}, "found an empty file"),
+    ("empty.raw", b"", RAW, "found 0 bytes"),
+    ("text.png", TEXT, {}, "expected a PNG file, found text"),
+    ("text.tiff", TEXT, {}, "expected a TIFF file, found text"),
+    ("text.npy", TEXT, {}, "expected an NPY file, found text"),
+    ("text.npz", TEXT, {}, "expected an NPZ file, found text"),
+    ("text.pgm", TEXT, {}, "expected a binary PGM (P5) file, found text"),
+    ("photo.tiff", b"\xff\xd8\xff\xe0" + TEXT, {}, "found a JPEG file"),
+    ("swapped.png", tiff(), {}, "expected a PNG file, found a TIFF file"),
+    ("pointer.tiff", b"version https://git-lfs.github.com/spec/v1\n", {}, "found a Git LFS pointer"),
+    ("photo.jpg", b"\xff\xd8\xff\xe0" + TEXT, {}, "found JPEG: lossy"),
+    ("photo.exr", b"\x76\x2f\x31\x01" + TEXT, {}, "found extension '.exr' and an OpenEXR file"),
+    ("photo.bmp", b"BM" + TEXT, {}, "found extension '.bmp' and a BMP file"),
+    ("photo.gif", b"GIF89a" + TEXT, {}, "and a GIF file"),
+    ("noextension", b"\0\1\2\3", {}, "and unknown bytes 00 01 02 03"),
+    # PNG
+    ("header.png", png()[:20], {}, "expected a PNG header of 33 bytes, found 20"),
+    ("half.png", png()[:3000], {}, "it is truncated"),
+    ("noend.png", png()[:-12], {}, "ends with IEND"),
+    ("bitrot.png", flipped(png(), 2000), {}, "checksum of PNG chunk b'IDAT'"),
+    ("ihdr.png", flipped(png(), 20), {}, "expected an intact PNG header"),
+    ("notihdr.png", flipped(png(), 12), {}, "expected an intact PNG header"),
+    ("zlib.png", png(idat=b"\x78\x9c" + bytes(99)), {}, "found damage"),
+    ("short.png", png(idat=zlib.compress(bytes(64))), {}, "found damage"),
+    ("noidat.png", png(idat=b""), {}, "found damage"),
+    ("filter.png", png(idat=zlib.compress(b"\x09" * 48 * 129)), {}, "found damage"),
+    ("huge.png", png(HUGE, HUGE), {}, "found 1048576x1048576"),
+    ("zero.png", png(0, 48), {}, "found 48x0"),
+    ("bits.png", png(depth=1), {}, "expected 8 or 16 bits per sample, found 1"),
+    ("depth9.png", png(depth=9), {}, "expected 8 or 16 bits per sample, found 9"),
+    ("palette.png", png(depth=8, color=3), {}, "found palette"),
+    ("rgba.png", encode_png(np.zeros((8, 8, 4), np.uint8)), {}, "found RGB with alpha"),
+    ("graya.png", encode_png(np.zeros((8, 8, 2), np.uint8)), {}, "found gray with alpha"),
+    ("rgb.png", encode_png(np.arange(192, dtype=np.uint8).reshape(8, 8, 3)), {}, "expected one channel"),
+    ("tiny.png", encode_png(np.zeros((2, 2), np.uint8)), {}, "at least 4x4 pixels, found 2x2"),
+    # TIFF
+    ("magic.tiff", tiff()[:4], {}, "found damage"),
+    ("ifd.tiff", tiff()[:40], {}, "expected"),
+    ("half.tiff", tiff(metadata=None)[:3000], {}, "it is truncated"),
+    ("halfzip.tiff", tiff(compression="zlib")[:3000], {}, "it is truncated"),
+    ("chain.tiff", tiff(STACK5, photometric="minisblack")[:700], {}, "chain of TIFF directories"),
+    ("oneifd.tiff", tiff(STACK5, photometric="minisblack", truncate=True), {}, "one TIFF directory per picture"),
+    ("bitrot.tiff", flipped(tiff(compression="zlib"), 3000), {}, "found damage"),
+    ("lzw.tiff", flipped(tiff(compression="lzw"), 3000)[:-1], {}, "expected"),
+    ("hugewidth.tiff", patched_tiff(256, 65000), {}, "expected"),
+    ("zero.tiff", patched_tiff(257, 0), {}, "found 0x64"),
+    ("strips.tiff", patched_tiff(278, 8), {}, "expected 6 TIFF strips or tiles, found 3"),
+    ("counts.tiff", patched_tiff_count(279, 2), {}, "expected"),
+    ("white0.tiff", tiff(photometric="miniswhite"), {}, "photometric MINISWHITE"),
+    ("palette.tiff", tiff(STACK5[0], photometric="palette", colormap=np.zeros((3, 256), np.uint16)), {}, "PALETTE"),
+    ("jpeg.tiff", tiff(STACK5[0], compression="jpeg"), {}, "expected lossless samples, found TIFF compression JPEG"),
+    ("bilevel.tiff", tiff(STACK5[0] > 0, photometric="minisblack"), {}, "expected samples of 8 bits or more, found 1"),
+    ("signed.tiff", tiff(CODES.astype(np.int16)), {}, "found int16"),
+    ("uint32.tiff", tiff(CODES.astype(np.uint32)), {}, "found uint32"),
+    ("half16.tiff", tiff(CODES[:4].astype(np.float16) / 2), {}, "found float16"),
+    ("nan.tiff", tiff(NAN), {}, "found 1 that are not, the first (nan) at (1, 2)"),
+    ("rgb.tiff", tiff(np.arange(192, dtype=np.uint8).reshape(8, 8, 3), photometric="rgb"), {}, "demosaicked"),
+    # NPY and NPZ
+    ("half.npy", npy(CODES)[:3000], {}, "bytes of samples"),
+    ("longer.npy", npy(CODES) + b"more", {}, "bytes of samples"),
+    ("header.npy", npy(CODES)[:30], {}, "found damage"),
+    ("garbled.npy", npy_header("{'descr': '<u2', 'shape': (4,"), {}, "found damage"),
+    ("version.npy", npy_header("{}", version=9), {}, "expected"),
+    ("huge.npy", npy_header("{'descr': '<u2', 'fortran_order': False, 'shape': (1048576, 1048576)}"), {}, "at most"),
+    (
+        "negative.npy",
+        npy_header("{'descr': '<u2', 'fortran_order': False, 'shape': (-8, 8)}"),
+        {},
+        "at least one pixel",
+    ),
+    ("pickle.npy", pickle.dumps([1, 2]), {}, "expected an NPY file, found unknown bytes"),
+    ("objects.npy", npy(np.array([[None, 1]]), allow_pickle=True), {}, "found Python objects, which need a pickle"),
+    ("fields.npy", npy(np.zeros((8, 8), [("a", "u1"), ("b", "u1")])), {}, "expected samples of uint8"),
+    ("line.npy", npy(np.zeros(8, np.uint8)), {}, "expected an array [H, W], found shape (8,)"),
+    ("none.npy", npy(np.zeros((0, 8), np.uint8)), {}, "at least one pixel, found 0x8"),
+    ("noframes.npy", npy(np.zeros((0, 8, 8), np.uint8)), {}, "expected at least one frame"),
+    ("five.npy", npy(np.zeros((2, 2, 2, 8, 8), np.uint8)), {}, "expected a mosaic [H, W]"),
+    ("bool.npy", npy(CODES > 9), {}, "found bool"),
+    ("int64.npy", npy(CODES.astype(np.int64)), {}, "found int64"),
+    ("complex.npy", npy(CODES.astype(np.complex64)), {}, "found complex64"),
+    ("inf.npy", npy(np.full((4, 4), np.inf)), {}, "found 16 that are not"),
+    ("half.npz", npz(a=CODES)[:3000], {}, "found damage"),
+    ("bitrot.npz", flipped(npz(a=CODES), 3000), {}, "found damage"),
+    ("none.npz", npz(), {}, "found arrays: none"),
+    ("two.npz", npz(a=CODES, b=CODES), {}, "found arrays: a, b"),
+    ("three.npz", npz(i0=CODES, i45=CODES, i90=CODES), {}, "found arrays: i0, i45, i90"),
+    ("sizes.npz", npz(i0=CODES, i45=CODES, i90=CODES, i135=CODES[2:]), {}, "expected angle images of one size"),
+    ("objects.npz", npz(raw=np.array([[None, 1]])), {}, "found Python objects"),
+    ("member.npz", zipped(raw=TEXT), {}, "expected an NPY array in raw.npy, found text"),
+    ("short.npz", zipped(raw=npy(CODES)[:3000]), {}, "bytes of samples"),
+    # PGM
+    ("ascii.pgm", b"P2 4 4 255\n0 0 0 0\n", {}, "expected a binary PGM (P5) file, found text"),
+    ("header.pgm", b"P5 4 four 255\n" + bytes(16), {}, "expected a PGM header"),
+    ("half.pgm", b"P5 4 4 255\n" + bytes(9), {}, "expected 16 bytes for 4x4 of maxval 255, found 9"),
+    ("huge.pgm", b"P5 999999999 999999999 255\n", {}, "expected at most"),
+    ("maxval.pgm", b"P5 4 4 70000\n" + bytes(32), {}, "found 70000"),
+    # headless raw
+    ("nothing.raw", bytes(4608), {}, "expected the size and pixel format of headless raw"),
+    ("nosize.raw", bytes(4608), {"pixel_format": "Mono12p"}, "found only the pixel format"),
+    ("noformat.bin", bytes(4608), {"size": (64, 48)}, "found only the size"),
+    ("half.raw", bytes(4607), RAW, "frames of 4608 bytes (64x48 Mono12p), found 4607 bytes"),
+    (
+        "lucid.raw",
+        bytes(4608),
+        {"size": (64, 48), "pixel_format": "PolarizedAngles_0d_45d_90d_135d_Mono8"},
+        "ONE angle",
+    ),
+    ("format.raw", bytes(4608), {"size": (64, 48), "pixel_format": "Mono12pp"}, "Mono12p"),
+    ("huge.raw", bytes(4608), {"size": (HUGE, HUGE), "pixel_format": "Mono8"}, "expected at most"),
+    # angles and levels
+    ("five.tiff", tiff(STACK5, photometric="minisblack"), ANGLES, "expected four pages for the angles"),
+    ("one.png", png(), ANGLES, "found 1"),
+    (
+        "angles.npy",
+        npy(STACK5[:4]),
+        ANGLES | {"layout": Layout(((0, 30), (60, 90)))},
+        "expected a layout of the angles",
+    ),
+    ("black.png", png(), {"black_level": 70000.0}, "expected a white level above the black level"),
+    ("white.png", png(), {"white_level": float("nan")}, "expected finite black and white levels"),
+]
+
+
+def assert_refused(path: Path | str, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        list(read_frames(path, ReadOptions(**options)))
+    text = str(caught.value)
+    assert text.count("\n") == 0 and text.startswith(f"{path}: ") and text.count(f"{path}: ") == 1, text
+    assert "expected" in text and "found" in text, text
+    assert message in text, text
+
+
+@pytest.mark.parametrize(("name", "data", "options", "message"), FILES, ids=[case[0] for case in FILES])
+def test_bad_files(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, data: bytes, options: dict[str, Any], message: str
+) -> None:
+    (tmp_path / name).write_bytes(data)
+    assert_refused(tmp_path / name, options, message)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".npy", ".npz", ".pgm", ".raw", ".bmp"])
+def test_missing_files_and_directories(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"shot{suffix}"
+    assert_refused(path, RAW if suffix == ".raw" else {}, "found nothing at this path")
+    path.mkdir()
+    assert_refused(path, {}, "expected a file, found a directory")
+
+
+def test_unreadable_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise PermissionError(13, os.strerror(13))
+
+    (tmp_path / "shot.png").write_bytes(png())
+    monkeypatch.setattr(Path, "open", refuse)
+    assert_refused(tmp_path / "shot.png", {}, "found: Permission denied")
+
+
+def write_angles(folder: Path, images: list[Any]) -> str:
+    for angle, image in zip((0, 45, 90, 135), images, strict=False):
+        (folder / f"nir_{angle}.png").write_bytes(encode_png(image))
+    return str(folder / "nir_{angle}.png")
+
+
+@pytest.mark.parametrize(
+    ("images", "named", "message"),
+    [
+        ([CODES] * 3, "nir_135.png", "found nothing at this path"),
+        ([CODES, CODES, CODES, CODES[1:]], "nir_{angle}.png", "135 deg 47x64 uint16"),
+        ([CODES, CODES, CODES, CODES.astype(np.uint8)], "nir_{angle}.png", "135 deg 48x64 uint8"),
+        ([CODES, np.zeros((8, 8, 4), np.uint8)], "nir_45.png", "found RGB with alpha"),
+    ],
+)
+def test_bad_templates(tmp_path: Path, images: list[Any], named: str, message: str) -> None:
+    template = write_angles(tmp_path, images)
+    with pytest.raises(InputError) as caught:
+        list(read_frames(template))
+    text = str(caught.value)
+    assert text.startswith(f"{tmp_path / named}: expected ") and "\n" not in text, text
+    assert message in text and "found" in text, text
+
+
+def test_templates_refuse_files_of_several_pages(tmp_path: Path) -> None:
+    for angle in (0, 45, 90, 135):
+        (tmp_path / f"run_{angle}.npy").write_bytes(npy(STACK5))
+    with pytest.raises(InputError, match=r"run_0\.npy: expected one image of one angle, found 5$"):
+        list(read_frames(tmp_path / "run_{angle}.npy"))
+
+
+@pytest.mark.parametrize("cut", range(1, 12))
+@pytest.mark.parametrize("kind", ["png", "tiff", "npy", "npz", "pgm"])
+def test_no_truncation_passes(tmp_path: Path, kind: str, cut: int) -> None:
+    data = {
+        "png": png(),
+        "tiff": tiff(compression="zlib", rowsperstrip=8),
+        "npy": npy(CODES),
+        "npz": npz(a=CODES),
+        "pgm": b"P5 64 48 65535\n" + CODES.tobytes(),
+    }[kind]
+    path = tmp_path / f"cut.{kind}"
+    path.write_bytes(data[: len(data) * cut // 12])
+    assert_refused(path, {}, "expected")
+    path.write_bytes(data[:-cut])
+    assert_refused(path, {}, "expected")
+
+
+ARRAYS: list[tuple[str, Callable[[], object], str]] = [
+    ("list", lambda: as_mosaic([[1.0] * 4] * 4), "expected a NumPy array, found list"),  # type: ignore[arg-type]
+    ("bool", lambda: as_mosaic(np.ones((8, 8), bool)), "found bool"),
+    ("int16", lambda: as_mosaic(np.ones((8, 8), np.int16)), "found int16"),
+    ("complex", lambda: as_mosaic(np.ones((8, 8), complex)), "found complex128"),
+    ("object", lambda: as_mosaic(np.ones((8, 8), object)), "found object"),
+    ("text", lambda: as_mosaic(np.array([["a", "b"]])), "found <U1"),
+    ("number", lambda: as_mosaic(np.array(3.0)), "found shape a single number"),
+    ("line", lambda: as_mosaic(np.ones(8)), "found shape 8"),
+    ("empty", lambda: as_mosaic(np.ones((0, 8))), "found shape 0x8"),
+    ("frames", lambda: as_mosaic(np.ones((5, 8, 8))), "found shape 5x8x8"),
+    ("rgb", lambda: as_mosaic(np.arange(192.0).reshape(8, 8, 3)), "demosaicked picture is not a raw mosaic"),
+    ("rgba", lambda: as_mosaic(np.ones((8, 8, 4))), "expected one channel, found 4"),
+    ("nan", lambda: as_mosaic(NAN), "found 1 that are not, the first (nan) at (1, 2)"),
+    ("beyond float32", lambda: as_mosaic(np.full((4, 4), 1e39)), "found 16 that are not"),
+    ("small colour", lambda: as_mosaic(np.ones((4, 3))), "at least 4x4 pixels, found 3x4"),
+    ("small mono", lambda: as_mosaic(np.ones((1, 8)), Layout(bayer=None)), "at least 2x2 pixels"),
+    ("levels", lambda: as_mosaic(np.ones((4, 4)), None, 1.0), "expected a white level above"),
+    ("levels reversed", lambda: as_mosaic(np.ones((4, 4)), None, 9.0, 3.0), "found white 3, black 9"),
+    ("infinite", lambda: as_mosaic(np.ones((4, 4)), None, 0.0, np.inf), "expected finite black and white levels"),
+    ("three angles", lambda: as_measurements(np.ones((3, 4, 4))), "expected four gray or RGB images"),
+    ("four channels", lambda: as_measurements(np.ones((4, 4, 4, 4))), "expected four gray or RGB images"),
+    ("five planes", lambda: interleave_planes(np.ones((5, 4, 4)), Layout()), "expected four planes"),
+    ("pages", lambda: ReadOptions(pages="both"), 'expected pages "frames" or "angles", found'),
+    ("size", lambda: ReadOptions(size=(0, 4)), "expected a size of positive width and height, found (0, 4)"),
+]
+
+
+@pytest.mark.parametrize(("name", "call", "message"), ARRAYS, ids=[case[0] for case in ARRAYS])
+def test_bad_arrays(name: str, call: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match="expected") as caught:
+        call()
+    text = str(caught.value)
+    assert "\n" not in text and "found" in text and message in text, text

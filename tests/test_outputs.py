@@ -1,0 +1,398 @@
+"""Outputs: what each format holds, and that a frame is written whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import imagecodecs
+import numpy as np
+import numpy.testing as npt
+import OpenEXR
+import pytest
+import tifffile
+
+from polsep.io import outputs
+from polsep.io.errors import InputError
+from polsep.io.outputs import FORMATS, UNITS, OutputError, planned_outputs, read_exr_layers, write_separation
+
+LAYERS = ("diffuse", "specular", "dolp", "aolp", "valid")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What `write_separation` reads of a separated frame."""
+
+    diffuse: np.ndarray
+    specular: np.ndarray
+    valid: np.ndarray
+    dolp: np.ndarray
+    aolp: np.ndarray
+    report: dict[str, Any] = field(default_factory=lambda: {"source": "shot.raw", "method": "analytic"})
+
+
+def random_frame(channels: int = 3, size: tuple[int, int] = (37, 53)) -> Frame:
+    rng = np.random.default_rng(3)
+    return Frame(
+        rng.random((*size, channels), np.float32),
+        3 * rng.random((*size, channels), np.float32),
+        rng.random(size) > 0.2,
+        1.1 * rng.random(size, np.float32),
+        np.minimum(np.pi * rng.random(size, np.float32), np.float32(3.14159)),
+    )
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    """Every file below a directory, hidden ones too."""
+    return {str(p.relative_to(directory)): p.read_bytes() for p in directory.rglob("*") if p.is_file()}
+
+
+def sidecar(directory: Path, stem: str = "shot") -> dict[str, Any]:
+    return json.loads((directory / f"{stem}.json").read_text())
+
+
+@pytest.mark.parametrize("channels", [3, 1])
+def test_exr_round_trip_is_exact_with_the_promised_layer_names(tmp_path: Path, channels: int) -> None:
+    frame = random_frame(channels)
+    write_separation(frame, tmp_path, "shot")
+    layers = read_exr_layers(tmp_path / "shot.exr")
+    colors = "RGB" if channels == 3 else "Y"
+    expected = {f"diffuse.{c}": frame.diffuse[..., k] for k, c in enumerate(colors)}
+    expected |= {f"specular.{c}": frame.specular[..., k] for k, c in enumerate(colors)}
+    expected |= {"dolp.Y": frame.dolp, "aolp.Y": frame.aolp, "valid.Y": frame.valid.astype(np.float32)}
+    assert set(layers) == set(expected)
+    for name, plane in expected.items():
+        assert layers[name].dtype == np.float32
+        npt.assert_array_equal(layers[name], plane)
+
+
+def test_exr_is_one_zip_part_that_states_units_and_version(tmp_path: Path) -> None:
+    write_separation(random_frame(), tmp_path, "shot")
+    file = OpenEXR.File(str(tmp_path / "shot.exr"), header_only=True)
+    header = file.header()
+    assert len(file.parts) == 1
+    assert header["compression"] == OpenEXR.ZIP_COMPRESSION
+    assert "radians" in header["aolpUnits"]
+    assert {layer: header[f"{layer}Units"] for layer in LAYERS} == UNITS
+    assert header["polsepVersion"] == sidecar(tmp_path)["polsep"]
+
+
+@pytest.mark.parametrize("turn", [lambda a: a.swapaxes(0, 1), lambda a: a[::-1, ::2]])
+def test_exr_of_views_that_are_not_contiguous(tmp_path: Path, turn: Callable[[np.ndarray], np.ndarray]) -> None:
+    whole = random_frame()
+    frame = replace(whole, **{layer: turn(getattr(whole, layer)) for layer in LAYERS})
+    write_separation(frame, tmp_path, "shot")
+    layers = read_exr_layers(tmp_path / "shot.exr")
+    npt.assert_array_equal(layers["specular.G"], frame.specular[..., 1])
+    npt.assert_array_equal(layers["aolp.Y"], frame.aolp)
+
+
+@pytest.mark.parametrize("channels", [3, 1])
+def test_npz_round_trip_is_exact(tmp_path: Path, channels: int) -> None:
+    frame = random_frame(channels)
+    write_separation(frame, tmp_path, "shot", "npz")
+    with np.load(tmp_path / "shot.npz", allow_pickle=False) as arrays:
+        assert sorted(arrays) == sorted(LAYERS)
+        for layer in LAYERS:
+            npt.assert_array_equal(arrays[layer], getattr(frame, layer), strict=True)
+
+
+@pytest.mark.parametrize("channels", [3, 1])
+def test_tiff_round_trip_is_exact(tmp_path: Path, channels: int) -> None:
+    frame = random_frame(channels)
+    write_separation(frame, tmp_path, "shot", "tiff")
+    for layer in ("diffuse", "specular", "dolp", "aolp"):
+        expected = getattr(frame, layer)
+        expected = expected[..., 0] if expected.ndim == 3 and channels == 1 else expected
+        with tifffile.TiffFile(tmp_path / f"shot_{layer}.tiff") as file:
+            assert file.pages[0].description == f"{layer}: {UNITS[layer]}"
+            npt.assert_array_equal(file.asarray(), expected, strict=True)
+    valid = np.where(frame.valid, np.uint8(255), np.uint8(0))
+    npt.assert_array_equal(tifffile.imread(tmp_path / "shot_valid.tiff"), valid, strict=True)
+
+
+def read_png(path: Path, bits: int) -> np.ndarray:
+    codes = imagecodecs.png_decode(path.read_bytes())
+    assert codes.dtype == (np.uint16 if bits == 16 else np.uint8)
+    return codes
+
+
+@pytest.mark.parametrize("channels", [3, 1])
+def test_png_holds_the_values_within_half_a_code_up_to_its_stated_limits(tmp_path: Path, channels: int) -> None:
+    frame = random_frame(channels)
+    write_separation(frame, tmp_path, "shot", "png")
+    for layer, white in (("diffuse", 2.0), ("specular", 2.0), ("dolp", 1.0)):
+        expected = np.clip(getattr(frame, layer), 0, white).astype(np.float64)
+        codes = read_png(tmp_path / f"shot_{layer}.png", 16).reshape(expected.shape)
+        npt.assert_allclose(codes * (white / 65535), expected, rtol=0, atol=0.5001 * white / 65535)
+    aolp = read_png(tmp_path / "shot_aolp.png", 16) * (np.pi / 65536)
+    error = (aolp - frame.aolp + np.pi / 2) % np.pi - np.pi / 2
+    npt.assert_allclose(error, 0, atol=0.5001 * np.pi / 65536)
+    npt.assert_array_equal(read_png(tmp_path / "shot_valid.png", 8), np.where(frame.valid, 255, 0))
+
+
+def test_png_codes_at_the_ends_of_each_scale(tmp_path: Path) -> None:
+    frame = random_frame(1, (1, 4))
+    frame.specular[0, :, 0] = (0, 1, 2, 5)
+    frame.dolp[0] = (0, 1, 0.5, 1.2)
+    frame.aolp[0] = (0, np.pi / 2, np.nextafter(np.float32(np.pi), np.float32(0)), np.pi / 4)
+    write_separation(frame, tmp_path, "shot", "png")
+    npt.assert_array_equal(read_png(tmp_path / "shot_specular.png", 16), [[0, 32768, 65535, 65535]])
+    npt.assert_array_equal(read_png(tmp_path / "shot_dolp.png", 16), [[0, 65535, 32768, 65535]])
+    npt.assert_array_equal(read_png(tmp_path / "shot_aolp.png", 16), [[0, 32768, 0, 16384]])
+    assert sidecar(tmp_path)["limited_samples"]["specular"] == {"below": 0, "above": 1}
+    assert sidecar(tmp_path)["limited_samples"]["dolp"] == {"below": 0, "above": 1}
+
+
+def test_limited_samples_are_counted_in_the_sidecar_and_only_png_limits(tmp_path: Path) -> None:
+    frame = random_frame()
+    frame.diffuse[0, 0] = (-0.25, 0.5, 0.5)
+    write_separation(frame, tmp_path / "png", "shot", "png")
+    limited = sidecar(tmp_path / "png")["limited_samples"]
+    assert limited["diffuse"] == {"below": 1, "above": 0}
+    assert limited["specular"] == {"below": 0, "above": np.count_nonzero(frame.specular > 2)}
+    assert limited["dolp"] == {"below": 0, "above": np.count_nonzero(frame.dolp > 1)}
+    assert limited["specular"]["above"] > 0
+    write_separation(frame, tmp_path / "exr", "shot")
+    assert "limited_samples" not in sidecar(tmp_path / "exr")
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_sidecar_states_version_source_report_units_and_a_sha256_of_every_other_file(
+    tmp_path: Path, format: str
+) -> None:
+    frame = random_frame()
+    written = write_separation(frame, tmp_path, "shot", format)
+    told = sidecar(tmp_path)
+    assert told["source"] == "shot.raw"
+    assert told["report"] == frame.report
+    assert told["format"] == format
+    assert told["shape"] == [37, 53, 3]
+    assert set(told["units"]) == set(LAYERS)
+    assert ("65535 = 2.0" in told["units"]["specular"]) == (format == "png")
+    assert isinstance(told["polsep"], str)
+    assert [f["name"] for f in told["files"]] == [p.name for p in written[:-1]]
+    for entry, path in zip(told["files"], written[:-1], strict=True):
+        data = path.read_bytes()
+        assert entry == {"name": path.name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_exactly_the_planned_files_appear_in_new_directories(tmp_path: Path, format: str) -> None:
+    directory = tmp_path / "a" / "b"
+    planned = planned_outputs(directory, "shot", format)
+    assert write_separation(random_frame(), directory, "shot", format) == planned
+    assert sorted(p for p in tmp_path.rglob("*") if not p.is_dir()) == sorted(planned)
+    assert sorted(p.name for p in directory.iterdir()) == sorted(p.name for p in planned)
+
+
+def test_planned_names_are_the_public_contract() -> None:
+    names = {f: [p.name for p in planned_outputs(Path("d"), "s", f)] for f in FORMATS}
+    assert names["exr"] == ["s.exr", "s.png", "s.json"]
+    assert names["npz"] == ["s.npz", "s.png", "s.json"]
+    for format in ("tiff", "png"):
+        assert names[format] == [f"s_{layer}.{format}" for layer in LAYERS] + ["s.png", "s.json"]
+
+
+def test_writing_twice_gives_the_same_bytes_and_needs_overwrite(tmp_path: Path) -> None:
+    for format in FORMATS:
+        directory = tmp_path / format
+        write_separation(random_frame(), directory, "shot", format)
+        before = contents(directory)
+        with pytest.raises(OutputError, match="--overwrite"):
+            write_separation(random_frame(), directory, "shot", format)
+        write_separation(random_frame(), directory, "shot", format, overwrite=True)
+        assert contents(directory) == before
+
+
+def test_an_existing_output_is_refused_by_name_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "shot.png").write_text("a picture of mine")
+    monkeypatch.setattr(outputs, "_encode_exr", lambda frame: pytest.fail("worked before looking"))
+    with pytest.raises(OutputError, match=r"shot\.png.*--overwrite"):
+        write_separation(random_frame(), tmp_path, "shot")
+    assert contents(tmp_path) == {"shot.png": b"a picture of mine"}
+
+
+def test_files_of_other_stems_and_formats_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "shot.npz").write_text("old")
+    (tmp_path / "other.exr").write_text("other")
+    write_separation(random_frame(), tmp_path, "shot", overwrite=True)
+    assert (tmp_path / "shot.npz").read_text() == "old"
+    assert (tmp_path / "other.exr").read_text() == "other"
+
+
+@pytest.mark.parametrize("stem", ["", ".", "..", "a/b", "../a", "a\\b", "a\0b"])
+def test_stems_that_lead_elsewhere_are_refused(tmp_path: Path, stem: str) -> None:
+    with pytest.raises(OutputError, match="stem"):
+        write_separation(random_frame(), tmp_path, stem)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_format_is_refused_with_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="expected a format of exr, npz, tiff, png, found 'jpg'"):
+        write_separation(random_frame(), tmp_path, "shot", "jpg")
+
+
+@pytest.mark.parametrize("below", [".", "deeper/still"])
+def test_a_directory_that_is_a_file_is_refused_by_name(tmp_path: Path, below: str) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match=r"expected a directory.*found a file.*file"):
+        write_separation(random_frame(), tmp_path / "file" / below, "shot")
+    assert contents(tmp_path) == {"file": b"x"}
+
+
+def test_a_directory_in_the_place_of_an_output_is_refused_even_with_overwrite(tmp_path: Path) -> None:
+    (tmp_path / "shot.exr").mkdir()
+    (tmp_path / "shot.exr" / "precious").write_text("x")
+    with pytest.raises(OutputError, match="found a directory"):
+        write_separation(random_frame(), tmp_path, "shot", overwrite=True)
+    assert contents(tmp_path) == {"shot.exr/precious": b"x"}
+
+
+def test_a_directory_that_cannot_be_written_gives_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: object) -> str:
+        raise PermissionError(13, "Permission denied", str(tmp_path))
+
+    monkeypatch.setattr(tempfile, "mkdtemp", refuse)
+    with pytest.raises(OutputError, match=r"^expected to write 'shot' into .* found PermissionError: .*denied.*$"):
+        write_separation(random_frame(), tmp_path / "new" / "er", "shot")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_too_long_for_the_file_system_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="OSError"):
+        write_separation(random_frame(), tmp_path, "x" * 300)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"valid": np.ones((37, 53), np.uint8)}, "valid as bool"),
+        ({"diffuse": np.zeros((37, 53, 2), np.float32)}, r"diffuse as float32 \[37, 53, 1\], found .*37, 53, 2"),
+        ({"specular": np.zeros((37, 53, 1), np.float32)}, r"specular as float32 \[37, 53, 3\]"),
+        ({"dolp": np.zeros((37, 53))}, "dolp as float32.*float64"),
+        ({"aolp": np.full((37, 53), np.nan, np.float32)}, "finite values in aolp, found 1961"),
+        ({"report": {"x": np.float32(1)}}, "not JSON serializable"),
+        ({"report": {"x": float("nan")}}, "JSON"),
+    ],
+)
+def test_a_frame_that_breaks_its_contract_writes_nothing(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(OutputError, match=message):
+        write_separation(replace(random_frame(), **change), tmp_path / "new", "shot")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_failing_encoder_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str) -> None:
+    def fail(frame: object) -> np.ndarray:
+        raise RuntimeError("out of\npaint")
+
+    monkeypatch.setattr(outputs, "contact_sheet", fail)  # the last image of every format
+    with pytest.raises(OutputError, match="RuntimeError: out of paint") as caught:
+        write_separation(random_frame(), tmp_path / "new", "shot", format)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def fail_at_replace(monkeypatch: pytest.MonkeyPatch, calls: int, error: BaseException) -> None:
+    """Let `os.replace` work ``calls`` times, fail once, then work again."""
+    real, count = os.replace, [0]
+
+    def replace_or_fail(source: Path, target: Path) -> None:
+        count[0] += 1
+        if count[0] == calls + 1:
+            raise error
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", replace_or_fail)
+
+
+@pytest.mark.parametrize("calls", range(3))
+def test_a_failing_rename_takes_back_the_files_already_moved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
+) -> None:
+    fail_at_replace(monkeypatch, calls, OSError(28, "No space left on device"))
+    with pytest.raises(OutputError, match="No space left"):
+        write_separation(random_frame(), tmp_path, "shot")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("calls", range(6))
+def test_a_failing_overwrite_restores_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
+) -> None:
+    old = {"shot.exr": b"old exr", "shot.png": b"old png", "shot.json": b"old json"}
+    for name, data in old.items():
+        (tmp_path / name).write_bytes(data)
+    fail_at_replace(monkeypatch, calls, OSError(5, "Input/output error"))
+    with pytest.raises(OutputError, match="Input/output"):
+        write_separation(random_frame(), tmp_path, "shot", overwrite=True)
+    assert contents(tmp_path) == old
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_an_interrupt_cleans_up_and_stays_an_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fail_at_replace(monkeypatch, 1, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        write_separation(random_frame(), tmp_path / "new", "shot")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_short_write_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = Path.write_bytes
+    monkeypatch.setattr(Path, "write_bytes", lambda path, data: real(path, data[:-1]))
+    with pytest.raises(OutputError, match=r"expected \d+ bytes in shot\.exr, found \d+"):
+        write_separation(random_frame(), tmp_path, "shot")
+    assert list(tmp_path.iterdir()) == []
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from test_outputs import FORMATS, OutputError, random_frame, write_separation
+root, frame = Path(sys.argv[2]), random_frame()
+for format in FORMATS:
+    whole = root / format
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    sizes = sorted({path.stat().st_size for path in write_separation(frame, whole, "shot", format)})
+    for limit in (0, 100, *(size - 1 for size in sizes)):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        try:
+            write_separation(frame, root / "limited", "shot", format)
+        except OutputError as error:
+            print(format, limit, error, (root / "limited").exists())
+        else:
+            print(format, limit, "written")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="file size limits are POSIX")
+def test_files_that_do_not_fit_leave_nothing_in_every_format(tmp_path: Path) -> None:
+    command = [sys.executable, "-W", "error", "-c", LIMITED, str(Path(__file__).parent), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    lines = done.stdout.splitlines()
+    assert done.stderr == ""
+    assert len(lines) == sum(2 + (3 if format in ("exr", "npz") else 7) for format in FORMATS)
+    for line in lines:
+        assert "File too large" in line
+        assert line.endswith("False")
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.01, 0.5, 0.99])
+def test_reading_a_short_exr_is_refused(tmp_path: Path, kept: float, capfd: pytest.CaptureFixture[str]) -> None:
+    write_separation(random_frame(), tmp_path, "shot")
+    data = (tmp_path / "shot.exr").read_bytes()
+    (tmp_path / "short.exr").write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(InputError, match=r"short\.exr: expected a complete single-part EXR"):
+        read_exr_layers(tmp_path / "short.exr")
+    capfd.readouterr()  # OpenEXR warns on the terminal by itself

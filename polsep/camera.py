@@ -57,7 +57,9 @@ class Layout:
         if len(self.polarizer) != 2 or any(len(row) != 2 for row in self.polarizer):
             raise ValueError(f"polarizer must be 2x2 angles in degrees, found {self.polarizer!r}")
         if len({float(a) % 180 for a in flat}) != 4:
-            raise ValueError(f"polarizer must hold four different angles (modulo 180 degrees), found {self.polarizer!r}")
+            raise ValueError(
+                f"polarizer must hold four different angles (modulo 180 degrees), found {self.polarizer!r}"
+            )
         if self.bayer is not None and self.bayer not in BAYER_ORDERS:
             raise ValueError(f"bayer must be one of {', '.join(BAYER_ORDERS)} or None, found {self.bayer!r}")
         if any(o not in (0, 1) for o in self.origin):
@@ -67,7 +69,7 @@ class Layout:
 
     @classmethod
     def parse(cls, spec: str) -> Layout:
-        """A layout from ``color``, ``mono`` or ``"90,45,135,0/RGGB"`` (angles in reading order, then Bayer order or mono)."""
+        """A layout from ``color``, ``mono`` or ``"90,45,135,0/RGGB"``: angles in reading order, Bayer order or mono."""
         if spec in ("color", "colour"):
             return cls()
         if spec == "mono":
@@ -175,12 +177,14 @@ class Mosaic:
     def __post_init__(self) -> None:
         least = self.layout.period
         if self.data.ndim < 2 or min(self.data.shape[-2:]) < least:
-            raise ValueError(f"expected a mosaic [..., H, W] of at least {least}x{least}, found {tuple(self.data.shape)}")
+            raise ValueError(
+                f"expected a mosaic [..., H, W] of at least {least}x{least}, found {tuple(self.data.shape)}"
+            )
         if not self.white_level > self.black_level:
             raise ValueError(f"white_level must be above black_level, found {self.white_level} and {self.black_level}")
 
     def linear(self) -> Tensor:
-        """Samples as float with black at 0 and white at 1 (float32, or float64 for float64 data); not clipped below 0."""
+        """Samples with black at 0 and white at 1, float32 (float64 for float64 data); not clipped below 0."""
         data = self.data if self.data.dtype == torch.float64 else self.data.float()
         return (data - self.black_level) / (self.white_level - self.black_level)
 
@@ -231,7 +235,7 @@ IDEAL = Sensor()
 
 
 def sample_mosaic(measurements: Measurements, layout: Layout) -> Tensor:
-    """Keep of full-resolution angle images ``[..., 4, C, H, W]`` the sample behind each pixel's filter: ``[..., H, W]``.
+    """The mosaic ``[..., H, W]`` of angle images ``[..., 4, C, H, W]``: of each pixel the sample behind its filter.
 
     The twin of every demosaicker. Channels beyond the layout's colours are not looked at.
     """
@@ -242,8 +246,8 @@ def sample_mosaic(measurements: Measurements, layout: Layout) -> Tensor:
         for col in range(layout.period):
             filt = layout.filter_at(row, col)
             k = degrees.index(round(filt.angle_deg, 6))
-            out[..., row::layout.period, col::layout.period] = data[
-                ..., k, filt.channel, row::layout.period, col::layout.period
+            out[..., row :: layout.period, col :: layout.period] = data[
+                ..., k, filt.channel, row :: layout.period, col :: layout.period
             ]
     return out
 

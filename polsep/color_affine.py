@@ -45,6 +45,9 @@ VARIANCE_FLOOR = 1e-5
 #: Weight of the neighbourhood's specular direction where clipping leaves b undetermined, against 6 of the samples.
 DIRECTION_WEIGHT = 1e-4
 
+#: Eigenvalue of the normal equations of b, 6 without clipping, above which a component counts as determined.
+MIN_EIGENVALUE = 0.05
+
 
 def separate_color_affine(measurements: Measurements) -> Separation:
     """Diffuse and white specular of colour samples ``[..., 4, 3, h, w]`` by the closed form above.
@@ -55,16 +58,19 @@ def separate_color_affine(measurements: Measurements) -> Separation:
     """
     if measurements.data.shape[-3] != 3:
         return separate_analytic_unclipped(measurements)
-    stokes, determined = fit_stokes_unclipped(measurements)
-    usable = determined.all(dim=-3, keepdim=True)
+    stokes, exact = fit_stokes_unclipped(measurements)
+    usable = exact.all(dim=-3, keepdim=True)
     sample = sample_variance(measurements)
     slope = color_slope(stokes, usable, sample, measurements.variance)
     offset, residual = _offset(stokes, slope)
-    stokes, offset, valid = _solve_clipped(measurements, stokes, slope, offset)
+    stokes, offset, rank = _solve_clipped(measurements, stokes, slope, offset)
+    valid = rank == 2
+    if measurements.clipped is not None:
+        valid = valid & ~measurements.clipped.all(dim=-4).any(dim=-3)
     total = stokes.s0.clamp(min=0)
     specular = torch.minimum(white_specular(offset, slope), total.amin(dim=-3, keepdim=True)).expand_as(total)
     found = Separation(total - specular, specular, valid, stokes, slope, residual, torch.sqrt(sample))
-    return found if bool(valid.all()) else _fill(found, measurements)
+    return found if bool(valid.all()) else _fill(found, measurements, offset, rank == 0)
 
 
 def _color_mean(x: Tensor) -> Tensor:
@@ -131,7 +137,7 @@ def white_specular(offset: Tensor, slope: Tensor) -> Tensor:
 
 
 def _offset(stokes: Stokes, slope: Tensor) -> tuple[Tensor, Tensor]:
-    """b of p_c = a s0_c + b as the mean over colours ``[..., 2, h, w]``, and the rms of what it leaves ``[..., 1, h, w]``."""
+    """b of p_c = a s0_c + b, the mean over colours ``[..., 2, h, w]``, and the rms of what it leaves ``[..., 1, h, w]``."""
     lines = [s - slope[..., k : k + 1, :, :] * stokes.s0 for k, s in enumerate((stokes.s1, stokes.s2))]
     offset = torch.cat([_color_mean(line) for line in lines], dim=-3)
     left = sum(((line - _color_mean(line)) ** 2).sum(dim=-3, keepdim=True) for line in lines)
@@ -141,42 +147,41 @@ def _offset(stokes: Stokes, slope: Tensor) -> tuple[Tensor, Tensor]:
 def _solve_clipped(
     measurements: Measurements, stokes: Stokes, slope: Tensor, offset: Tensor
 ) -> tuple[Stokes, Tensor, Tensor]:
-    """Stokes and b of pixels with clipped samples by least squares over the others, and where that is determined.
+    """Stokes and b of pixels with clipped samples by least squares over the others, and how much of b is determined (0-2).
 
-    For given a, twice a sample is g_k s0_c + u_k . b with u_k = (cos 2t_k, sin 2t_k) and g_k = 1 + u_k . a. Each colour's
-    s0 is eliminated, which leaves 2x2 normal equations for b; where they are singular, the direction of b around decides.
+    For given a, twice a sample is g_k s0_c + u_k . b with u_k = (cos 2t_k, sin 2t_k) and g_k = 1 + u_k . a. The s0 of
+    each colour is eliminated, which leaves 2x2 normal equations for b; where they are singular, the direction of b
+    around decides.
     A colour without any unclipped sample keeps what the clipped ones give until `_fill`.
     """
-    valid = torch.ones_like(stokes.s0[..., 0, :, :], dtype=torch.bool)
+    rank = torch.full_like(stokes.s0[..., 0, :, :], 2, dtype=torch.long)
     if measurements.clipped is None or not bool(measurements.clipped.any()):
-        return stokes, offset, valid
+        return stokes, offset, rank
     clipped = measurements.clipped.movedim((-4, -3), (0, 1))
     touched = clipped.any(dim=0).any(dim=0)
     kept = ~clipped[:, :, touched]
     samples = measurements.data.movedim((-4, -3), (0, 1))[:, :, touched]
     a = slope.movedim(-3, 0)[:, touched]
-    around = _direction_around(offset, ~touched).movedim(-3, 0)[:, touched]
-    b, s0, determined = _least_squares(2 * samples, kept.to(samples), a, around, measurements.angles)
+    around = _unit(_around(offset, ~touched)).movedim(-3, 0)[:, touched]
+    b, s0, rank[touched] = _least_squares(2 * samples, kept.to(samples), a, around, measurements.angles)
     solved = [s.movedim(-3, 0).clone() for s in (stokes.s0, stokes.s1, stokes.s2)]
     partly = kept.any(dim=0) & ~kept.all(dim=0)
     for image, values in zip(solved, (s0, a[0] * s0 + b[0], a[1] * s0 + b[1]), strict=True):
         image[:, touched] = torch.where(partly, values, image[:, touched])
     offset = offset.movedim(-3, 0).clone()
     offset[:, touched] = b
-    valid[touched] = determined & kept.any(dim=0).all(dim=0)
-    return Stokes(*(s.movedim(0, -3) for s in solved)), offset.movedim(0, -3), valid
+    return Stokes(*(s.movedim(0, -3) for s in solved)), offset.movedim(0, -3), rank
 
 
-def _direction_around(offset: Tensor, unclipped: Tensor, radius: int = 8) -> Tensor:
-    """Unit direction of b averaged over the unclipped pixels around, ``[..., 2, h, w]``; zero where there are none."""
-    mean = box_mean(offset * unclipped[..., None, :, :], radius)
-    return mean / torch.sqrt((mean * mean).sum(dim=-3, keepdim=True)).clamp(min=1e-12)
+def _unit(vectors: Tensor) -> Tensor:
+    """Vectors ``[..., 2, h, w]`` at length 1; zero stays zero."""
+    return vectors / torch.sqrt((vectors * vectors).sum(dim=-3, keepdim=True)).clamp(min=1e-12)
 
 
 def _least_squares(
     y: Tensor, kept: Tensor, a: Tensor, around: Tensor, angles: tuple[float, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Solve y = g s0 + u . b over N pixels: b ``[2, N]``, s0 ``[C, N]``, and where both components of b are determined.
+    """Solve y = g s0 + u . b over N pixels: b ``[2, N]``, s0 ``[C, N]``, and how many components of b are determined.
 
     ``y`` and the weights ``kept`` are ``[K, C, N]``; ``a`` and the unit direction ``around`` are ``[2, N]``.
     """
@@ -196,43 +201,83 @@ def _least_squares(
     det = (m00 * m11 - m01 * m01).clamp(min=1e-9)
     b = torch.stack([m11 * r0 - m01 * r1, m00 * r1 - m01 * r0]) / det
     s0 = (gy - gu[0] * b[0] - gu[1] * b[1]) / gg
-    return b, s0, half_trace - half_gap > 0.05
+    rank = (half_trace + half_gap > MIN_EIGENVALUE).long() + (half_trace - half_gap > MIN_EIGENVALUE).long()
+    return b, s0, rank
 
 
-def _fill(found: Separation, measurements: Measurements) -> Separation:
-    """Complete pixels that clipping left undetermined: diffuse from the valid ones around, specular by the clip's bound."""
-    assert measurements.clipped is not None and found.slope is not None
-    hole = ~found.valid[..., None, :, :]
-    blind = measurements.clipped.all(dim=-4) & hole
-    diffuse = torch.where(blind | (found.diffuse <= 0) & hole, _around(found.diffuse, found.valid), found.diffuse)
-    phase = _phase(found)
-    bound = torch.zeros_like(found.specular[..., :1, :, :])
-    for k, t in enumerate(measurements.angles):
-        u = (math.cos(2 * t), math.sin(2 * t))
-        toward = u[0] * found.slope[..., :1, :, :] + u[1] * found.slope[..., 1:, :, :]
-        passed = 1 + u[0] * phase[..., :1, :, :] + u[1] * phase[..., 1:, :, :]
-        least = (2 * measurements.data[..., k, :, :, :] - diffuse * (1 + toward)) / passed.clamp(min=0.5)
-        sees = measurements.clipped[..., k, :, :, :] & (passed > 0.5)
-        bound = torch.maximum(bound, torch.where(sees, least, 0.0).amax(dim=-3, keepdim=True))
-    specular = torch.where(hole, torch.maximum(found.specular, bound), found.specular)
-    total = diffuse + specular
-    s1, s2 = (
-        found.slope[..., i : i + 1, :, :] * diffuse + phase[..., i : i + 1, :, :] * specular for i in (0, 1)
+def _fill(found: Separation, measurements: Measurements, offset: Tensor, lost: Tensor) -> Separation:
+    """Complete pixels that clipping left undetermined, from bounds and from the valid pixels around.
+
+    Where all of b is ``lost`` the specular has the phase of its surroundings and is the least that explains the clipped
+    samples, but no more than the unclipped ones allow. A colour's diffuse follows from its unclipped samples, or from
+    around where it has none.
+    """
+    assert measurements.clipped is not None
+    assert found.slope is not None
+    hole, phase = ~found.valid[..., None, :, :], _phase(found, offset)
+    blind, gone = measurements.clipped.all(dim=-4), lost[..., None, :, :]
+    around, solved = _around(found.diffuse, found.valid), found.specular[..., :1, :, :]
+    low, high = _specular_bounds(measurements, found.slope, torch.where(blind | gone, around, found.diffuse), phase)
+    specular = torch.where(gone, torch.minimum(torch.maximum(solved, low), high), solved)
+    given = _diffuse_given(measurements, found.slope, specular, phase).clamp(min=0)
+    diffuse = torch.where(hole, torch.where(blind, around, given), found.diffuse)
+    specular = torch.where(hole & ~gone, torch.maximum(solved, low), specular)
+    p1, p2 = (found.slope[..., i : i + 1, :, :] * diffuse + phase[..., i : i + 1, :, :] * specular for i in (0, 1))
+    seen, specular = found.stokes, torch.where(hole, specular, found.specular)
+    values = ((diffuse + specular, seen.s0), (p1, seen.s1), (p2, seen.s2))
+    return replace(
+        found, diffuse=diffuse, specular=specular, stokes=Stokes(*(torch.where(hole, new, old) for new, old in values))
     )
-    seen = found.stokes
-    stokes = Stokes(*(torch.where(hole, new, old) for new, old in ((total, seen.s0), (s1, seen.s1), (s2, seen.s2))))
-    return replace(found, diffuse=diffuse, specular=specular, stokes=stokes)
 
 
-def _phase(found: Separation) -> Tensor:
-    """exp(2i phi_s) ``[..., 2, h, w]``: of the valid specular light around each pixel, as a unit vector."""
-    polarization = torch.cat([_color_mean(found.stokes.s1), _color_mean(found.stokes.s2)], dim=-3)
-    mean = box_mean(polarization * found.valid[..., None, :, :], 8)
-    return mean / torch.sqrt((mean * mean).sum(dim=-3, keepdim=True)).clamp(min=1e-12)
+def _specular_bounds(
+    measurements: Measurements, slope: Tensor, diffuse: Tensor, phase: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Least and largest tau_s ``[..., 1, h, w]``: 2 m = (1 + u.a) tau_d + (1 + u.e) tau_s with e = exp(2i phi_s).
+
+    Every clipped sample gives a lower bound for the given ``diffuse``, every unclipped one an upper bound for none.
+    Analysers nearly crossed with the specular light see too little of it and are left out.
+    """
+    assert measurements.clipped is not None
+    low = torch.zeros_like(phase[..., :1, :, :])
+    high = torch.full_like(low, torch.inf)
+    for k, t in enumerate(measurements.angles):
+        through_d, through_s = _transmitted(slope, t), _transmitted(phase, t)
+        twice, clipped = 2 * measurements.data[..., k, :, :, :], measurements.clipped[..., k, :, :, :]
+        sees, passed = through_s > 0.5, through_s.clamp(min=0.5)
+        needed = torch.where(clipped & sees, (twice - diffuse * through_d) / passed, 0.0)
+        allowed = torch.where(~clipped & sees, twice.clamp(min=0) / passed, torch.inf)
+        low = torch.maximum(low, needed.amax(dim=-3, keepdim=True))
+        high = torch.minimum(high, allowed.amin(dim=-3, keepdim=True))
+    return low, high
+
+
+def _diffuse_given(measurements: Measurements, slope: Tensor, specular: Tensor, phase: Tensor) -> Tensor:
+    """tau_d ``[..., C, h, w]`` by least squares over the unclipped samples, for known specular light."""
+    assert measurements.clipped is not None
+    numerator, denominator = torch.zeros_like(measurements.data[..., 0, :, :, :]), torch.zeros_like(specular)
+    for k, t in enumerate(measurements.angles):
+        through = _transmitted(slope, t) * ~measurements.clipped[..., k, :, :, :]
+        numerator = numerator + through * (2 * measurements.data[..., k, :, :, :] - _transmitted(phase, t) * specular)
+        denominator = denominator + through * through
+    return numerator / denominator.clamp(min=1e-6)
+
+
+def _transmitted(polarization: Tensor, angle: float) -> Tensor:
+    """1 + u.a: twice the share of light of that polarization ``[..., 2, h, w]`` that an analyser passes."""
+    return 1 + math.cos(2 * angle) * polarization[..., :1, :, :] + math.sin(2 * angle) * polarization[..., 1:, :, :]
+
+
+def _phase(found: Separation, offset: Tensor) -> Tensor:
+    """exp(2i phi_s) = b / tau_s + a, unit vectors ``[..., 2, h, w]``; of the valid light around where b is nothing."""
+    assert found.slope is not None
+    own = offset + found.slope * found.specular[..., :1, :, :]
+    known = (offset * offset).sum(dim=-3, keepdim=True) > 1e-4
+    return _unit(torch.where(known, own, _around(own, found.valid)))
 
 
 def _around(image: Tensor, valid: Tensor) -> Tensor:
-    """``image`` averaged over the valid pixels of the smallest window that holds some; 0 where there are none at all."""
+    """``image`` averaged over the valid pixels of the smallest window that holds some; 0 if there are none at all."""
     weight = valid[..., None, :, :].to(image)
     result = (image * weight).sum(dim=(-2, -1), keepdim=True) / weight.sum(dim=(-2, -1), keepdim=True).clamp(min=1)
     result = result.expand_as(image)

@@ -59,7 +59,11 @@ class LayoutCheck:
 def crossed_pairs(layout: Layout) -> str | None:
     """Where a layout's crossed analysers lie in the cell; None when its angles are not 45 degrees apart."""
     (a, b), (c, d) = layout.polarizer
-    for name, (first, second) in {"diagonals": (a - d, b - c), "rows": (a - b, c - d), "columns": (a - c, b - d)}.items():
+    for name, (first, second) in {
+        "diagonals": (a - d, b - c),
+        "rows": (a - b, c - d),
+        "columns": (a - c, b - d),
+    }.items():
         if abs(first % 180 - 90) < 1e-6 and abs(second % 180 - 90) < 1e-6:
             return name
     return None
@@ -110,7 +114,7 @@ def _contradictions(cells: Tensor) -> dict[str, float]:
 
 
 def _color_contrast(cells: Tensor) -> tuple[float, float]:
-    """How much neighbouring cells differ relative to brightness, and +1 / -1 for greens on the anti- / main diagonal."""
+    """How much neighbouring cells differ relative to brightness; +1 for greens on the antidiagonal, -1 on the other."""
     brightness = cells.mean(1)
     diagonal, rows, columns = (signs.to(cells) @ brightness / 4 for signs in _PAIRINGS.values())
     contrast = (diagonal.abs() + rows.abs() + columns.abs()).mean() / brightness.mean().clamp(min=1e-9)
@@ -138,7 +142,7 @@ def check_layout(mosaic: Mosaic) -> LayoutCheck:
 
 
 def _find_color(phases: Tensor, layout: Layout) -> tuple[bool | None, tuple[int, int], float]:
-    """Whether cells differ in colour, the alignment at which they differ most, and the greens' diagonal (0: unknown)."""
+    """Whether cells differ in colour, at which alignment they differ most, and the greens' diagonal (0: unknown)."""
     origins = [(0, 0), (0, 1), (1, 0), (1, 1)]
     found = {origin: _color_contrast(_cells(phases, origin)) for origin in origins}
     best = max(origins, key=lambda origin: found[origin][0])
@@ -204,4 +208,8 @@ def _cropped(layout: Layout) -> list[tuple[Layout, str]]:
 def _mirrored(layout: Layout) -> list[tuple[Layout, str]]:
     """The layout of mirrored and transposed frames whose sides are multiples of 4."""
     left_right, top_bottom = layout.flipped_horizontal(4), layout.flipped_vertical(4)
-    return [(left_right, "mirrored left-right"), (top_bottom, "mirrored top-bottom"), (layout.transposed(), "transposed")]
+    return [
+        (left_right, "mirrored left-right"),
+        (top_bottom, "mirrored top-bottom"),
+        (layout.transposed(), "transposed"),
+    ]

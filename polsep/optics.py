@@ -2,8 +2,8 @@
 
 Conventions:
 
-* Directions are unit vectors ``[..., 3, H, W]`` that point away from the surface: normal n, to the camera (wo = v), to the
-  light (wi = l), half vector h. Axes are right-handed; scalars are ``[..., 1, H, W]``, colours ``[..., C, H, W]``.
+* Directions are unit vectors ``[..., 3, H, W]`` that point away from the surface: normal n, to the camera (wo = v), to
+  the light (wi = l), half vector h. Axes are right-handed; scalars are ``[..., 1, H, W]``, colours ``[..., C, H, W]``.
 * A beam's frame has z along its propagation, y the projection of an "up" vector and x = y cross z. The camera's beam
   travels along v, so x is image-right and y image-up and angles count from x toward y, as in `stokes`. The light's beam
   travels along -l; its polarizer angle is measured in the frame of the light's own up vector.
@@ -12,8 +12,8 @@ Conventions:
 * Roughness r is GGX alpha = r^2. The diffuse lobe is albedo/pi, so both lobes have their physical ratio.
 
 Notes (deviations from the paper; derivation and check in docs/conventions.md): its Eq. 6 needs the INCIDENT azimuth,
-its Eq. 8 has a wrong sign of R^x in the numerator and lacks the 1/2 and the two-argument arctangent. Implemented here is
-the form that an electric-field ray trace confirms to rounding error, and that equals Mitsuba's ``pplastic``.
+its Eq. 8 has a wrong sign of R^x in the numerator and lacks the 1/2 and the two-argument arctangent. Implemented here
+is the form that an electric-field ray trace confirms to rounding error, and that equals Mitsuba's ``pplastic``.
 Source: Baek, Jeon, Tong, Kim 2018, Simultaneous acquisition of polarimetric SVBRDF and normals, TOG 37(6) 268.
 """
 
@@ -67,8 +67,8 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
     """Cross product over the vector axis."""
-    a, b = torch.broadcast_tensors(a, b)
-    return torch.linalg.cross(a, b, dim=-3)
+    product: Tensor = torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=-3)  # type: ignore[no-untyped-call]
+    return product
 
 
 def normalize(v: Tensor) -> Tensor:
@@ -120,7 +120,7 @@ def beam_frame(propagation: Tensor, up: Tensor) -> Beam:
 
 
 def double_angle(vector: Tensor, beam: Beam) -> tuple[Tensor, Tensor]:
-    """cos and sin of twice the azimuth of ``vector`` in the beam's frame, without atan2; (0, 0) if it lies along the beam."""
+    """cos and sin of twice the azimuth of ``vector`` in the beam's frame; (0, 0) if it lies along the beam."""
     a, b = dot(vector, beam.x), dot(vector, beam.y)
     scale = 1 / (a * a + b * b).clamp(min=torch.finfo(a.dtype).tiny * 4)
     return (a * a - b * b) * scale, 2 * a * b * scale
@@ -166,8 +166,8 @@ def _mirror_axis(g: Geometry, camera: Beam) -> Tensor:
 def specular_stokes(g: Geometry, polarizer: Tensor, irradiance: Tensor, roughness: Tensor) -> Stokes:
     """Stokes image of the specular lobe: Fresnel reflection off GGX microfacets, for specular strength 1.
 
-    Arguments as `diffuse_stokes`; ``roughness`` ``[..., 1, H, W]``. Linear light stays fully polarized: s1^2 + s2^2 = s0^2.
-    Multiply the result by a specular strength or colour. Source: Eqs. 7-8 corrected.
+    Arguments as `diffuse_stokes`; ``roughness`` ``[..., 1, H, W]``. Linear light stays fully polarized:
+    s1^2 + s2^2 = s0^2. Multiply the result by a specular strength or colour. Source: Eqs. 7-8 corrected.
     """
     camera, light = _camera_and_light_beams(g)
     cos_i, cos_o, lit = _lit(g)
@@ -195,7 +195,7 @@ def mueller_rotator(angle: Tensor) -> Tensor:
 
 
 def mueller_polarizer(angle: Tensor, diattenuation: float = 1.0) -> Tensor:
-    """Linear polarizer at ``angle`` [rad], transmitting half of unpolarized light; D = (ER-1)/(ER+1). Source: Goldstein 5.3."""
+    """Linear polarizer at ``angle`` [rad] that passes half of unpolarized light; D = (ER-1)/(ER+1). Source: Goldstein 5.3."""
     d = torch.full_like(angle, diattenuation)
     zero, one, root = torch.zeros_like(angle), torch.ones_like(angle), torch.sqrt(1 - d * d)
     straight = 0.5 * _matrix(

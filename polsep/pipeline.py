@@ -35,7 +35,7 @@ class PolsepWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Method:
-    """A separation method: ``split`` runs on co-registered analysers; ``needs`` and ``source`` are for people to read."""
+    """A separation method: ``split`` runs on co-registered analysers, the other fields are for people to read."""
 
     name: str
     split: Callable[[Measurements], Separation]
@@ -116,7 +116,11 @@ def separate(
 
 
 def separate_capture(
-    capture: Capture, method: str = "auto", light_color: LightColor | str = (1, 1, 1), device: str = "auto", full: bool = False
+    capture: Capture,
+    method: str = "auto",
+    light_color: LightColor | str = (1, 1, 1),
+    device: str = "auto",
+    full: bool = False,
 ) -> SeparatedFrame:
     """`separate` for a frame that is already a `Mosaic`, or co-sited `Measurements` (which keep their resolution)."""
     chosen = find_method(method)
@@ -170,7 +174,9 @@ def demosaic(capture: Capture, full: bool) -> Measurements:
     return demosaic_bilinear(capture) if full else demosaic_bilinear_half(capture)
 
 
-def resolve_light_color(light_color: LightColor | str, measurements: Measurements) -> tuple[tuple[float, ...], list[str]]:
+def resolve_light_color(
+    light_color: LightColor | str, measurements: Measurements
+) -> tuple[tuple[float, ...], list[str]]:
     """One gain per channel, and remarks; "estimate" takes the colour of the highlights. ValueError on anything else."""
     channels = measurements.data.shape[-3]
     if isinstance(light_color, str):
@@ -199,7 +205,9 @@ def estimate_light_color(measurements: Measurements) -> tuple[float, ...] | None
         return (1.0,)
     strength = polarized_intensity(stokes).mean(dim=-3) * determined.all(dim=-3)
     bright = strength.flatten()
-    threshold = torch.topk(bright, max(32, bright.numel() // 500)).values[-1] if bright.numel() >= 32 else bright.max() + 1
+    threshold = (
+        torch.topk(bright, max(32, bright.numel() // 500)).values[-1] if bright.numel() >= 32 else bright.max() + 1
+    )
     chosen = (strength >= threshold) & (strength > 0.05)
     if int(chosen.sum()) < 32:
         return None
@@ -210,7 +218,9 @@ def estimate_light_color(measurements: Measurements) -> tuple[float, ...] | None
     return tuple((color / color[1]).tolist())
 
 
-def in_light(split: Callable[[Measurements], Separation], measurements: Measurements, light: tuple[float, ...]) -> Separation:
+def in_light(
+    split: Callable[[Measurements], Separation], measurements: Measurements, light: tuple[float, ...]
+) -> Separation:
     """Run a method under white light: divide the light's colour out of the samples and multiply it back."""
     if all(c == 1 for c in light):
         return split(measurements)
@@ -225,7 +235,9 @@ def describe(found: Separation, measurements: Measurements) -> dict[str, Any]:
     if found.slope is not None:
         polarization = polarization - found.slope * found.diffuse.mean(dim=-3, keepdim=True)
     angle, concentration = dominant_angle(polarization)
-    clipped = 0.0 if measurements.clipped is None else float(measurements.clipped.any(dim=-4).any(dim=-3).float().mean())
+    clipped = (
+        0.0 if measurements.clipped is None else float(measurements.clipped.any(dim=-4).any(dim=-3).float().mean())
+    )
     total = found.stokes.s0.clamp(min=0)
     brightness = float(total.mean())
     remarks = []

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from polsep.optics import Geometry, diffuse_stokes, dot, normalize, specular_stokes
 from polsep.stokes import Stokes
@@ -23,6 +24,8 @@ Vector = tuple[float, float, float]
 MAX_STEPS = 160
 HIT_DISTANCE = 2e-4
 FAR = 30.0
+#: Rays that are traced together, to bound memory.
+RAYS_AT_ONCE = 250_000
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,7 @@ def scene_distance(parts: tuple[Part, ...], points: Tensor) -> Tensor:
 
 
 def trace(parts: tuple[Part, ...], origin: Tensor, direction: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
-    """March rays ``[3, N, 1]`` to the first surface: distance and hit mask, both ``[1, N, 1]``; misses end at ``limit``."""
+    """March rays ``[3, N, 1]`` to the first surface: distance and hit mask ``[1, N, 1]``; misses end at ``limit``."""
     travelled = torch.full_like(direction[:1], 2e-3)
     hit = torch.zeros_like(travelled, dtype=torch.bool)
     active = torch.arange(travelled.numel(), device=travelled.device)
@@ -119,7 +122,7 @@ def surface_normal(parts: tuple[Part, ...], points: Tensor) -> Tensor:
 
 
 def camera_rays(camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Origin ``[3, 1, 1]`` and unit directions ``[3, N, 1]`` through image points (fractional rows, cols) of an H x W image."""
+    """Origin ``[3, 1, 1]`` and unit directions ``[3, N, 1]`` through points (fractional rows, cols) of an H x W image."""
     height, width = size
     eye, target = torch.tensor(camera.position), torch.tensor(camera.target)
     forward = torch.nn.functional.normalize(target - eye, dim=0)
@@ -169,32 +172,21 @@ def render(
 ) -> tuple[Stokes, Stokes]:
     """Diffuse and specular Stokes images ``[3, H, W]``, the mean of ``samples`` x ``samples`` rays per pixel."""
     height, width = size
-    bands = [_render_rows(parts, camera, light, size, samples, row) for row in range(0, height, _band(width, samples))]
-    joined = [
-        Stokes(*(torch.cat([getattr(band[i], name) for band in bands], dim=1) for name in ("s0", "s1", "s2")))
-        for i in (0, 1)
-    ]
-    return joined[0], joined[1]
-
-
-def _band(width: int, samples: int) -> int:
-    """Rows at a time that keep a band of rays within about a quarter of a million."""
-    return max(1, 250_000 // (width * samples**2))
-
-
-def _render_rows(
-    parts: tuple[Part, ...], camera: PinholeCamera, light: PointLight, size: tuple[int, int], samples: int, first: int
-) -> tuple[Stokes, Stokes]:
-    height, width = size
-    last = min(height, first + _band(width, samples))
-    rows = first + (torch.arange((last - first) * samples) + 0.5) / samples
+    rows_at_once = max(1, RAYS_AT_ONCE // (width * samples**2))
     cols = (torch.arange(width * samples) + 0.5) / samples
-    grid_rows, grid_cols = (g.flatten() for g in torch.meshgrid(rows, cols, indexing="ij"))
-    buffer = cast(parts, camera, grid_rows, grid_cols, size)
-    lobes = shade(buffer, parts, camera, light)
+    lobes: tuple[list[Stokes], list[Stokes]] = ([], [])
+    for first in range(0, height, rows_at_once):
+        count = min(rows_at_once, height - first) * samples
+        rows = first + (torch.arange(count) + 0.5) / samples
+        grid_rows, grid_cols = (g.flatten() for g in torch.meshgrid(rows, cols, indexing="ij"))
+        shaded = shade(cast(parts, camera, grid_rows, grid_cols, size), parts, camera, light)
+        for lobe, band in zip(lobes, shaded, strict=True):
+            lobe.append(band.map(lambda s, n=count: avg_pool2d(s.view(1, 3, n, -1), samples)[0]))  # type: ignore[misc]
+    diffuse, specular = (
+        Stokes(*(torch.cat(rows, dim=1) for rows in zip(*map(_parts, lobe), strict=True))) for lobe in lobes
+    )
+    return diffuse, specular
 
-    def to_pixels(values: Tensor) -> Tensor:
-        image = values.view(3, len(rows), len(cols))
-        return torch.nn.functional.avg_pool2d(image[None], samples)[0] if samples > 1 else image
 
-    return lobes[0].map(to_pixels), lobes[1].map(to_pixels)
+def _parts(stokes: Stokes) -> tuple[Tensor, Tensor, Tensor]:
+    return stokes.s0, stokes.s1, stokes.s2

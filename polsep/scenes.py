@@ -116,14 +116,14 @@ def cells(colors: tuple[Vector, ...], size: float, generator: torch.Generator) -
 
 
 def still_life() -> tuple[tuple[Part, ...], PinholeCamera, PointLight]:
-    """The demo's scene: a bumpy red fruit, a marbled ball, a glazed ring, a chequered cube and a grey ball on a table."""
+    """The demo's scene: a bumpy fruit, a marbled ball, a glazed ring, a chequered cube and two small balls on a table."""
     generator = torch.Generator().manual_seed(7)
     parts = (
         Part(floor(-1.0), marble((0.05, 0.05, 0.055), (0.03, 0.028, 0.026), 2.0), roughness=0.6, specular=0.6),
         Part(
             bumpy(ball(0.95), 0.012, 22.0),
             stripes((0.72, 0.05, 0.035), (0.62, 0.03, 0.03), 0.5),
-            (-1.55, -0.05, 0.2),
+            (-1.5, -0.05, 0.2),
             roughness=0.3,
         ),
         Part(ball(0.72), marble((0.75, 0.72, 0.66), (0.08, 0.2, 0.45), 0.55), (0.35, -0.28, 1.0), roughness=0.22),
@@ -135,9 +135,9 @@ def still_life() -> tuple[tuple[Part, ...], PinholeCamera, PointLight]:
             roughness=0.25,
         ),
         Part(
-            rounded_box((0.55, 0.55, 0.55), 0.08),
+            rounded_box((0.75, 0.75, 0.75), 0.1),
             checker((0.8, 0.55, 0.1), (0.15, 0.3, 0.65), 0.27),
-            (0.15, -0.42, -1.35),
+            (0.3, -0.25, -1.6),
             (0.0, 0.6, 0.0),
             roughness=0.4,
         ),
@@ -149,8 +149,8 @@ def still_life() -> tuple[tuple[Part, ...], PinholeCamera, PointLight]:
             roughness=0.28,
         ),
     )
-    camera = PinholeCamera((0.0, 1.6, 9.0), (0.12, -0.22, 0.0), 20.0)
-    return parts, camera, PointLight((-1.6, 3.2, 8.5), 115.0, math.radians(25))
+    camera = PinholeCamera((0.0, 2.1, 9.0), (0.22, -0.12, 0.3), 26.0)
+    return parts, camera, PointLight((-1.6, 3.2, 8.5), 520.0, math.radians(25))
 
 
 def _random_vector(low: float, high: float, generator: torch.Generator) -> Vector:

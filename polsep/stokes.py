@@ -72,11 +72,10 @@ class Measurements:
             )
 
 
-def analyser_matrix(angles: Sequence[float], like: Tensor | None = None) -> Tensor:
-    """Rows ``[1, cos 2t, sin 2t] / 2`` of K ideal analysers: the matrix P of Eqs. 11-12, shape [K, 3], float64 or as ``like``."""
+def analyser_matrix(angles: Sequence[float]) -> Tensor:
+    """Rows ``[1, cos 2t, sin 2t] / 2`` of K ideal analysers: the matrix P of Eqs. 11-12, ``[K, 3]``."""
     t = torch.tensor(angles, dtype=torch.float64)
-    matrix = 0.5 * torch.stack([torch.ones_like(t), torch.cos(2 * t), torch.sin(2 * t)], dim=1)
-    return matrix if like is None else matrix.to(like)
+    return 0.5 * torch.stack([torch.ones_like(t), torch.cos(2 * t), torch.sin(2 * t)], dim=1)
 
 
 def intensity_behind(stokes: Stokes, angle: float | Tensor) -> Tensor:
@@ -111,7 +110,7 @@ def fit_stokes(measurements: Measurements) -> Stokes:
 
 
 def fit_stokes_unclipped(measurements: Measurements) -> tuple[Stokes, Tensor]:
-    """Least squares from the unclipped analysers only, with a mask ``[..., C, H, W]`` of where they determine s0, s1, s2.
+    """Least squares from the unclipped analysers only, and where ``[..., C, H, W]`` they determine s0, s1 and s2.
 
     Any three unclipped analysers are exact: with 0/45/90/135 degrees, m0 = m45 + m135 - m90 and its three siblings
     (the identity m0 + m90 = m45 + m135). With two unclipped analysers that are crossed, s0 and the component along
@@ -130,7 +129,7 @@ def fit_stokes_unclipped(measurements: Measurements) -> tuple[Stokes, Tensor]:
     solution = torch.stack([s[touched] for s in (stokes.s0, stokes.s1, stokes.s2)])
     determined = torch.ones_like(touched)
     determined_touched = torch.zeros_like(codes, dtype=torch.bool)
-    for code in codes.unique().tolist():
+    for code in set(codes.tolist()):
         matrix, exact = _unclipped_inverse(measurements.angles, int(code))
         rows = codes == code
         determined_touched[rows] = exact
@@ -191,7 +190,7 @@ def aolp(stokes: Stokes) -> Tensor:
 
 
 def rotate_frame(stokes: Stokes, angle: float | Tensor) -> Stokes:
-    """The same light in a frame turned by ``+angle`` [rad] (counter-clockwise seen by the viewer): AoLP falls by ``angle``."""
+    """The same light in a frame turned by ``+angle`` [rad], counter-clockwise for the viewer: AoLP falls by ``angle``."""
     t = torch.as_tensor(angle, dtype=stokes.s0.dtype, device=stokes.s0.device)
     c, s = torch.cos(2 * t), torch.sin(2 * t)
     return Stokes(stokes.s0, c * stokes.s1 + s * stokes.s2, c * stokes.s2 - s * stokes.s1)
@@ -218,4 +217,3 @@ def transpose(stokes: Stokes) -> Stokes:
     The diagonal runs along -45 degrees, so an angle t becomes -90 deg - t: cos 2t changes sign, sin 2t does not.
     """
     return Stokes(stokes.s0.mT, -stokes.s1.mT, stokes.s2.mT)
-

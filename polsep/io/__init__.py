@@ -1,1 +1,1 @@
-"""The only room that touches files: raw frames in (`frames`, `genicam`), separations and previews out (`outputs`, `previews`)."""
+"""The only room that touches files: raw frames in (`frames`), separations and their previews out (`outputs`)."""

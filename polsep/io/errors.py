@@ -1,4 +1,4 @@
-"""The one exception of the io room, and how whatever a codec raises becomes it.
+"""`InputError`, and how whatever a codec raises becomes one.
 
 Readers of one format raise ValueError (or InputError, from inside `decoding`) without naming the file; whoever knows
 the path wraps them, once, in `naming`.

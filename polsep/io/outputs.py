@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import imagecodecs
 import numpy as np
-import OpenEXR  # type: ignore[import-not-found]  # a bare extension module without stubs
+import OpenEXR  # a bare extension module without stubs
 import tifffile
 from numpy.typing import NDArray
 

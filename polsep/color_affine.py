@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,11 +43,11 @@ CONTRAST_MARGIN = 2.0
 #: Pixels are weighted 1 / (variance + this): below it (0.3 % of white, rms) all are equally good.
 VARIANCE_FLOOR = 1e-5
 
-#: Weight of the neighbourhood's specular direction where clipping leaves b undetermined, against 6 of the samples.
-DIRECTION_WEIGHT = 1e-4
+#: Weight, against 1 of a sample, of the diffuse light around in pixels where clipping leaves b undetermined.
+PRIOR_WEIGHT = 0.05
 
-#: Eigenvalue of the normal equations of b, 6 without clipping, above which a component counts as determined.
-MIN_EIGENVALUE = 0.05
+#: Least eigenvalue of the normal equations of b, 6 without clipping, above which b counts as determined.
+MIN_EIGENVALUE = 0.3
 
 
 def separate_color_affine(measurements: Measurements) -> Separation:
@@ -63,14 +64,14 @@ def separate_color_affine(measurements: Measurements) -> Separation:
     sample = sample_variance(measurements)
     slope = color_slope(stokes, usable, sample, measurements.variance)
     offset, residual = _offset(stokes, slope)
-    stokes, offset, rank = _solve_clipped(measurements, stokes, slope, offset)
-    valid = rank == 2
+    stokes, offset, determined = _solve_clipped(measurements, stokes, slope, offset)
+    valid = determined
     if measurements.clipped is not None:
         valid = valid & ~measurements.clipped.all(dim=-4).any(dim=-3)
     total = stokes.s0.clamp(min=0)
     specular = torch.minimum(white_specular(offset, slope), total.amin(dim=-3, keepdim=True)).expand_as(total)
     found = Separation(total - specular, specular, valid, stokes, slope, residual, torch.sqrt(sample))
-    return found if bool(valid.all()) else _fill(found, measurements, offset, rank == 0)
+    return found if bool(valid.all()) else _fill(found, measurements, offset, determined)
 
 
 def _color_mean(x: Tensor) -> Tensor:
@@ -137,7 +138,7 @@ def white_specular(offset: Tensor, slope: Tensor) -> Tensor:
 
 
 def _offset(stokes: Stokes, slope: Tensor) -> tuple[Tensor, Tensor]:
-    """b of p_c = a s0_c + b, the mean over colours ``[..., 2, h, w]``, and the rms of what it leaves ``[..., 1, h, w]``."""
+    """b of p_c = a s0_c + b, the mean over colours ``[..., 2, h, w]``, and the rms it leaves ``[..., 1, h, w]``."""
     lines = [s - slope[..., k : k + 1, :, :] * stokes.s0 for k, s in enumerate((stokes.s1, stokes.s2))]
     offset = torch.cat([_color_mean(line) for line in lines], dim=-3)
     left = sum(((line - _color_mean(line)) ** 2).sum(dim=-3, keepdim=True) for line in lines)
@@ -147,43 +148,33 @@ def _offset(stokes: Stokes, slope: Tensor) -> tuple[Tensor, Tensor]:
 def _solve_clipped(
     measurements: Measurements, stokes: Stokes, slope: Tensor, offset: Tensor
 ) -> tuple[Stokes, Tensor, Tensor]:
-    """Stokes and b of pixels with clipped samples by least squares over the others, and how much of b is determined (0-2).
+    """Stokes and b of pixels with clipped samples by least squares over the others, and where those determine b.
 
     For given a, twice a sample is g_k s0_c + u_k . b with u_k = (cos 2t_k, sin 2t_k) and g_k = 1 + u_k . a. The s0 of
-    each colour is eliminated, which leaves 2x2 normal equations for b; where they are singular, the direction of b
-    around decides.
-    A colour without any unclipped sample keeps what the clipped ones give until `_fill`.
+    each colour is eliminated, which leaves 2x2 normal equations for b. What they leave open is for `_fill`.
     """
-    rank = torch.full_like(stokes.s0[..., 0, :, :], 2, dtype=torch.long)
+    determined = torch.ones_like(stokes.s0[..., 0, :, :], dtype=torch.bool)
     if measurements.clipped is None or not bool(measurements.clipped.any()):
-        return stokes, offset, rank
+        return stokes, offset, determined
     clipped = measurements.clipped.movedim((-4, -3), (0, 1))
     touched = clipped.any(dim=0).any(dim=0)
     kept = ~clipped[:, :, touched]
     samples = measurements.data.movedim((-4, -3), (0, 1))[:, :, touched]
     a = slope.movedim(-3, 0)[:, touched]
-    around = _unit(_around(offset, ~touched)).movedim(-3, 0)[:, touched]
-    b, s0, rank[touched] = _least_squares(2 * samples, kept.to(samples), a, around, measurements.angles)
+    b, s0, determined[touched] = _least_squares(2 * samples, kept.to(samples), a, measurements.angles)
     solved = [s.movedim(-3, 0).clone() for s in (stokes.s0, stokes.s1, stokes.s2)]
     partly = kept.any(dim=0) & ~kept.all(dim=0)
     for image, values in zip(solved, (s0, a[0] * s0 + b[0], a[1] * s0 + b[1]), strict=True):
         image[:, touched] = torch.where(partly, values, image[:, touched])
     offset = offset.movedim(-3, 0).clone()
     offset[:, touched] = b
-    return Stokes(*(s.movedim(0, -3) for s in solved)), offset.movedim(0, -3), rank
+    return Stokes(*(s.movedim(0, -3) for s in solved)), offset.movedim(0, -3), determined
 
 
-def _unit(vectors: Tensor) -> Tensor:
-    """Vectors ``[..., 2, h, w]`` at length 1; zero stays zero."""
-    return vectors / torch.sqrt((vectors * vectors).sum(dim=-3, keepdim=True)).clamp(min=1e-12)
+def _least_squares(y: Tensor, kept: Tensor, a: Tensor, angles: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """Solve y = g s0 + u . b over N pixels: b ``[2, N]``, s0 ``[C, N]``, and where b is determined.
 
-
-def _least_squares(
-    y: Tensor, kept: Tensor, a: Tensor, around: Tensor, angles: tuple[float, ...]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Solve y = g s0 + u . b over N pixels: b ``[2, N]``, s0 ``[C, N]``, and how many components of b are determined.
-
-    ``y`` and the weights ``kept`` are ``[K, C, N]``; ``a`` and the unit direction ``around`` are ``[2, N]``.
+    ``y`` and the weights ``kept`` are ``[K, C, N]``, ``a`` is ``[2, N]``.
     """
     t = 2 * torch.tensor(angles).to(y)
     u = torch.stack([torch.cos(t), torch.sin(t)])[:, :, None, None]
@@ -194,73 +185,86 @@ def _least_squares(
     projected = [u[i] - g * gu[i] / gg for i in (0, 1)]
     m00, m01, m11 = ((kept * projected[i] * projected[j]).sum((0, 1)) for i, j in ((0, 0), (0, 1), (1, 1)))
     r0, r1 = ((kept * projected[i] * y).sum((0, 1)) for i in (0, 1))
-    half_trace, half_gap = (m00 + m11) / 2, torch.hypot((m00 - m11) / 2, m01)
-    m00 = m00 + DIRECTION_WEIGHT * (1 - around[0] ** 2)
-    m11 = m11 + DIRECTION_WEIGHT * (1 - around[1] ** 2)
-    m01 = m01 - DIRECTION_WEIGHT * around[0] * around[1]
-    det = (m00 * m11 - m01 * m01).clamp(min=1e-9)
+    smallest = (m00 + m11) / 2 - torch.hypot((m00 - m11) / 2, m01)
+    det = (m00 * m11 - m01 * m01).clamp(min=1e-6)
     b = torch.stack([m11 * r0 - m01 * r1, m00 * r1 - m01 * r0]) / det
     s0 = (gy - gu[0] * b[0] - gu[1] * b[1]) / gg
-    rank = (half_trace + half_gap > MIN_EIGENVALUE).long() + (half_trace - half_gap > MIN_EIGENVALUE).long()
-    return b, s0, rank
+    return b, s0, smallest > MIN_EIGENVALUE
 
 
-def _fill(found: Separation, measurements: Measurements, offset: Tensor, lost: Tensor) -> Separation:
-    """Complete pixels that clipping left undetermined, from bounds and from the valid pixels around.
+def _fill(found: Separation, measurements: Measurements, offset: Tensor, determined: Tensor) -> Separation:
+    """Complete pixels that clipping left undetermined, with the valid pixels around as a weak prior.
 
-    Where all of b is ``lost`` the specular has the phase of its surroundings and is the least that explains the clipped
-    samples, but no more than the unclipped ones allow. A colour's diffuse follows from its unclipped samples, or from
-    around where it has none.
+    Where b is not ``determined`` the specular has the phase of its surroundings and fits the unclipped samples. It is at
+    least what makes the clipped samples clip, and where everything clips at least as bright as around. A colour's
+    diffuse follows from its unclipped samples, or from around where it has none.
     """
     assert measurements.clipped is not None
     assert found.slope is not None
-    hole, phase = ~found.valid[..., None, :, :], _phase(found, offset)
-    blind, gone = measurements.clipped.all(dim=-4), lost[..., None, :, :]
-    around, solved = _around(found.diffuse, found.valid), found.specular[..., :1, :, :]
-    low, high = _specular_bounds(measurements, found.slope, torch.where(blind | gone, around, found.diffuse), phase)
-    specular = torch.where(gone, torch.minimum(torch.maximum(solved, low), high), solved)
-    given = _diffuse_given(measurements, found.slope, specular, phase).clamp(min=0)
-    diffuse = torch.where(hole, torch.where(blind, around, given), found.diffuse)
-    specular = torch.where(hole & ~gone, torch.maximum(solved, low), specular)
+    hole, known = ~found.valid[..., None, :, :], determined[..., None, :, :]
+    own = _unit(offset + found.slope * found.specular[..., :1, :, :])
+    phase = torch.where(known, own, _unit(_around(own * found.specular[..., :1, :, :], found.valid)))
+    around = _around(found.diffuse, found.valid)
+    sums = _sums(measurements, found.slope, phase, around)
+    specular = torch.where(known, found.specular[..., :1, :, :], _fit_specular(sums))
+    diffuse = _fit_diffuse(sums, specular)
+    specular = torch.maximum(specular, _least_specular(measurements, found.slope, diffuse, phase))
+    core = measurements.clipped.all(dim=-4).all(dim=-3)
+    rim = _around(torch.where(hole, specular, found.specular[..., :1, :, :]), ~core)
+    specular = torch.where(core[..., None, :, :], torch.maximum(specular, rim), specular)
     p1, p2 = (found.slope[..., i : i + 1, :, :] * diffuse + phase[..., i : i + 1, :, :] * specular for i in (0, 1))
-    seen, specular = found.stokes, torch.where(hole, specular, found.specular)
-    values = ((diffuse + specular, seen.s0), (p1, seen.s1), (p2, seen.s2))
-    return replace(
-        found, diffuse=diffuse, specular=specular, stokes=Stokes(*(torch.where(hole, new, old) for new, old in values))
-    )
+    seen = found.stokes
+    stokes = [torch.where(hole, new, old) for new, old in ((diffuse + specular, seen.s0), (p1, seen.s1), (p2, seen.s2))]
+    diffuse = torch.where(hole, diffuse, found.diffuse)
+    specular = torch.where(hole, specular, found.specular)
+    return replace(found, diffuse=diffuse, specular=specular, stokes=Stokes(*stokes))
 
 
-def _specular_bounds(
-    measurements: Measurements, slope: Tensor, diffuse: Tensor, phase: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Least and largest tau_s ``[..., 1, h, w]``: 2 m = (1 + u.a) tau_d + (1 + u.e) tau_s with e = exp(2i phi_s).
+class _Sums(NamedTuple):
+    """Sums over unclipped samples of 2 m = g tau_d + p tau_s and the prior tau_d = around, each ``[..., C, h, w]``."""
 
-    Every clipped sample gives a lower bound for the given ``diffuse``, every unclipped one an upper bound for none.
+    gg: Tensor
+    gp: Tensor
+    pp: Tensor
+    gy: Tensor
+    py: Tensor
+
+
+def _sums(measurements: Measurements, slope: Tensor, phase: Tensor, around: Tensor) -> _Sums:
+    assert measurements.clipped is not None
+    gg, gy = torch.full_like(around, PRIOR_WEIGHT), PRIOR_WEIGHT * around
+    gp, pp, py = torch.zeros_like(around), torch.zeros_like(around), torch.zeros_like(around)
+    for k, t in enumerate(measurements.angles):
+        kept = ~measurements.clipped[..., k, :, :, :]
+        g, p, y = _transmitted(slope, t) * kept, _transmitted(phase, t) * kept, 2 * measurements.data[..., k, :, :, :]
+        gg, gp, pp, gy, py = gg + g * g, gp + g * p, pp + p * p, gy + g * y, py + p * y
+    return _Sums(gg, gp, pp, gy, py)
+
+
+def _fit_specular(sums: _Sums) -> Tensor:
+    """tau_s ``[..., 1, h, w]`` by least squares over all colours, each one's tau_d eliminated."""
+    curvature = (sums.pp - sums.gp**2 / sums.gg).sum(dim=-3, keepdim=True)
+    pull = (sums.py - sums.gp * sums.gy / sums.gg).sum(dim=-3, keepdim=True)
+    return (pull / curvature.clamp(min=1e-3)).clamp(min=0)
+
+
+def _fit_diffuse(sums: _Sums, specular: Tensor) -> Tensor:
+    """tau_d ``[..., C, h, w]`` by least squares for given tau_s."""
+    return ((sums.gy - sums.gp * specular) / sums.gg).clamp(min=0)
+
+
+def _least_specular(measurements: Measurements, slope: Tensor, diffuse: Tensor, phase: Tensor) -> Tensor:
+    """The least tau_s ``[..., 1, h, w]`` that makes every clipped sample clip: 2 m = g tau_d + p tau_s >= 2.
+
     Analysers nearly crossed with the specular light see too little of it and are left out.
     """
     assert measurements.clipped is not None
-    low = torch.zeros_like(phase[..., :1, :, :])
-    high = torch.full_like(low, torch.inf)
+    least = torch.zeros_like(phase[..., :1, :, :])
     for k, t in enumerate(measurements.angles):
-        through_d, through_s = _transmitted(slope, t), _transmitted(phase, t)
-        twice, clipped = 2 * measurements.data[..., k, :, :, :], measurements.clipped[..., k, :, :, :]
-        sees, passed = through_s > 0.5, through_s.clamp(min=0.5)
-        needed = torch.where(clipped & sees, (twice - diffuse * through_d) / passed, 0.0)
-        allowed = torch.where(~clipped & sees, twice.clamp(min=0) / passed, torch.inf)
-        low = torch.maximum(low, needed.amax(dim=-3, keepdim=True))
-        high = torch.minimum(high, allowed.amin(dim=-3, keepdim=True))
-    return low, high
-
-
-def _diffuse_given(measurements: Measurements, slope: Tensor, specular: Tensor, phase: Tensor) -> Tensor:
-    """tau_d ``[..., C, h, w]`` by least squares over the unclipped samples, for known specular light."""
-    assert measurements.clipped is not None
-    numerator, denominator = torch.zeros_like(measurements.data[..., 0, :, :, :]), torch.zeros_like(specular)
-    for k, t in enumerate(measurements.angles):
-        through = _transmitted(slope, t) * ~measurements.clipped[..., k, :, :, :]
-        numerator = numerator + through * (2 * measurements.data[..., k, :, :, :] - _transmitted(phase, t) * specular)
-        denominator = denominator + through * through
-    return numerator / denominator.clamp(min=1e-6)
+        p, clipped = _transmitted(phase, t), measurements.clipped[..., k, :, :, :]
+        needed = (2 * measurements.data[..., k, :, :, :] - diffuse * _transmitted(slope, t)) / p.clamp(min=0.5)
+        least = torch.maximum(least, torch.where(clipped & (p > 0.5), needed, 0.0).amax(dim=-3, keepdim=True))
+    return least
 
 
 def _transmitted(polarization: Tensor, angle: float) -> Tensor:
@@ -268,12 +272,9 @@ def _transmitted(polarization: Tensor, angle: float) -> Tensor:
     return 1 + math.cos(2 * angle) * polarization[..., :1, :, :] + math.sin(2 * angle) * polarization[..., 1:, :, :]
 
 
-def _phase(found: Separation, offset: Tensor) -> Tensor:
-    """exp(2i phi_s) = b / tau_s + a, unit vectors ``[..., 2, h, w]``; of the valid light around where b is nothing."""
-    assert found.slope is not None
-    own = offset + found.slope * found.specular[..., :1, :, :]
-    known = (offset * offset).sum(dim=-3, keepdim=True) > 1e-4
-    return _unit(torch.where(known, own, _around(own, found.valid)))
+def _unit(vectors: Tensor) -> Tensor:
+    """Vectors ``[..., 2, h, w]`` at length 1; zero stays zero."""
+    return vectors / torch.sqrt((vectors * vectors).sum(dim=-3, keepdim=True)).clamp(min=1e-12)
 
 
 def _around(image: Tensor, valid: Tensor) -> Tensor:

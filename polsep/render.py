@@ -122,7 +122,7 @@ def surface_normal(parts: tuple[Part, ...], points: Tensor) -> Tensor:
 
 
 def camera_rays(camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Origin ``[3, 1, 1]`` and unit directions ``[3, N, 1]`` through points (fractional rows, cols) of an H x W image."""
+    """Origin ``[3, 1, 1]`` and unit directions ``[3, N, 1]`` through points (rows, cols) of an H x W image."""
     height, width = size
     eye, target = torch.tensor(camera.position), torch.tensor(camera.target)
     forward = torch.nn.functional.normalize(target - eye, dim=0)

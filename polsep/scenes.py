@@ -116,7 +116,7 @@ def cells(colors: tuple[Vector, ...], size: float, generator: torch.Generator) -
 
 
 def still_life() -> tuple[tuple[Part, ...], PinholeCamera, PointLight]:
-    """The demo's scene: a bumpy fruit, a marbled ball, a glazed ring, a chequered cube and two small balls on a table."""
+    """The demo's scene: a bumpy fruit, a marbled ball, a glazed ring, a chequered cube, two small balls, a table."""
     generator = torch.Generator().manual_seed(7)
     parts = (
         Part(floor(-1.0), marble((0.05, 0.05, 0.055), (0.03, 0.028, 0.026), 2.0), roughness=0.6, specular=0.6),

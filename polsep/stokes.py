@@ -190,7 +190,7 @@ def aolp(stokes: Stokes) -> Tensor:
 
 
 def rotate_frame(stokes: Stokes, angle: float | Tensor) -> Stokes:
-    """The same light in a frame turned by ``+angle`` [rad], counter-clockwise for the viewer: AoLP falls by ``angle``."""
+    """The same light in a frame turned counter-clockwise by ``angle`` [rad]: AoLP falls by ``angle``."""
     t = torch.as_tensor(angle, dtype=stokes.s0.dtype, device=stokes.s0.device)
     c, s = torch.cos(2 * t), torch.sin(2 * t)
     return Stokes(stokes.s0, c * stokes.s1 + s * stokes.s2, c * stokes.s2 - s * stokes.s1)

@@ -1,0 +1,27 @@
+"""What every test shares: one hypothesis profile, seeded draws, and the folder of external references."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import settings
+
+settings.register_profile("polsep", derandomize=True, deadline=None, max_examples=40)
+settings.load_profile("polsep")
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    """A generator of random numbers that starts from the same seed in every test."""
+    return torch.Generator().manual_seed(20220930)
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of external reference material beside the repository; tests that need it skip without it."""
+    folder = Path(__file__).resolve().parents[1].parent / "shared"
+    if not folder.is_dir():
+        pytest.skip(f"no reference material at {folder}")
+    return folder

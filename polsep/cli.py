@@ -197,6 +197,38 @@ def _print_demo(name: str, statistics: dict[str, Any]) -> None:
     )
 
 
+@app.command()
+@click.argument("name", metavar="NAME", default="list")
+@click.option("--data", type=DIR, default=Path("../shared/data"), metavar="DIR", help="Real frames for 'real'.")
+@click.option("-o", "--output", type=DIR, default=Path("results"), metavar="DIR", help="Where NAME.jsonl goes.")
+def bench(name: str, data: Path, output: Path) -> None:
+    """Measure NAME, print its rows and write them to DIR/NAME.jsonl; without NAME, list what can be measured.
+
+    'polsep bench readme' makes the tables of README.md anew from DIR.
+    """
+    from polsep.bench import BENCHES, provenance, to_jsonl
+    from polsep.io.results import fill_tables, write_text
+
+    if name == "list":
+        for known, function in BENCHES.items():
+            print(f"{known}: {(function.__doc__ or '').splitlines()[0]}")
+        return
+    if name == "readme":
+        readme = Path("README.md")
+        write_text(readme, fill_tables(readme.read_text(encoding="utf-8"), output))
+        return
+    if name not in BENCHES:
+        raise click.ClickException(f"expected a benchmark of {', '.join([*BENCHES, 'readme'])}, found {name!r}")
+    rows = []
+    try:
+        for row in BENCHES[name](data):
+            print(f"{row.case:48} {row.method:20} {row.metric:28} {row.value:10.4g} {row.unit}", flush=True)
+            rows.append(row)
+    except ValueError as error:
+        raise click.ClickException(str(error)) from None
+    write_text(output / f"{name}.jsonl", to_jsonl(rows, provenance(f"polsep bench {name}")))
+
+
 def main() -> None:
     """Entry point: bad input is one line on stderr and exit status 2."""
     try:

@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
 from polsep.separation import Separation, box_mean, separate_analytic_unclipped
 from polsep.stokes import Measurements, Stokes, analyser_residual, fit_stokes_unclipped
@@ -278,12 +279,18 @@ def _unit(vectors: Tensor) -> Tensor:
 
 
 def _around(image: Tensor, valid: Tensor) -> Tensor:
-    """``image`` averaged over the valid pixels of the smallest window that holds some; 0 if there are none at all."""
-    weight = valid[..., None, :, :].to(image)
-    result = (image * weight).sum(dim=(-2, -1), keepdim=True) / weight.sum(dim=(-2, -1), keepdim=True).clamp(min=1)
-    result = result.expand_as(image)
-    for radius in (64, 32, 16, 8, 4, 2):
-        support = box_mean(weight, radius)
-        near = box_mean(image * weight, radius) / support.clamp(min=1e-9)
-        result = torch.where(support > 0.02, near, result)
-    return result
+    """``image`` where ``valid [..., h, w]``, elsewhere interpolated from the valid pixels around; 0 if there are none.
+
+    Push and pull over a pyramid (after Gortler et al. 1996, The Lumigraph, Sec. 3.3): cost and reach grow with holes.
+    """
+    *batch, height, width = image.shape
+    weight = valid[..., None, :, :].to(image).expand(image.shape).reshape(-1, 1, height, width)
+    levels = [(image.reshape(-1, 1, height, width) * weight, weight)]
+    while max(levels[-1][0].shape[-2:]) > 1:
+        levels.append(tuple(avg_pool2d(x, 2, ceil_mode=True) for x in levels[-1]))  # type: ignore[arg-type]
+    total, weight = levels.pop()
+    result = total / weight.clamp(min=1e-12)
+    for total, weight in reversed(levels):
+        coarse = interpolate(result, size=total.shape[-2:], mode="bilinear")
+        result = torch.where(weight > 0.25, total / weight.clamp(min=1e-12), coarse)
+    return result.reshape(*batch, height, width)

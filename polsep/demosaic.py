@@ -57,9 +57,9 @@ def _bayer_bilinear(planes: Tensor, bayer: str) -> Tensor:
     return functional.conv2d(padded, kernels, groups=3).reshape(*batch, 3, height, width)
 
 
-def _colors(planes: Tensor, layout: Layout) -> Tensor:
-    """Analyser planes ``[..., 4, h, w]`` in all the layout's colours ``[..., 4, C, h, w]``."""
-    return planes[..., None, :, :] if layout.bayer is None else _bayer_bilinear(planes, layout.bayer)
+def _colors(plane: Tensor, layout: Layout) -> Tensor:
+    """An analyser's plane ``[..., h, w]`` in all the layout's colours ``[..., C, h, w]``."""
+    return plane[..., None, :, :] if layout.bayer is None else _bayer_bilinear(plane, layout.bayer)
 
 
 def _neighbour(x: Tensor, place: int, dim: int) -> Tensor:
@@ -92,8 +92,8 @@ def _interpolate(mosaic: Mosaic, register: Callable[[Tensor, tuple[int, int]], T
 
     def run(values: Tensor) -> Tensor:
         planes, places = split_analysers(values, layout)
-        colors = _colors(planes, layout)
-        return torch.stack([register(colors[..., k, :, :, :], place) for k, place in enumerate(places)], dim=-4)
+        each = [register(_colors(planes[..., k, :, :], layout), place) for k, place in enumerate(places)]
+        return torch.stack(each, dim=-4)
 
     clipped = mosaic.clipped()
     mask = run(clipped.float()) > 0 if bool(clipped.any()) else None

@@ -1,0 +1,57 @@
+"""Benchmark rows on disk, and the README tables that are made from them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+#: A table in a Markdown file stands between these two comments.
+_TABLE = re.compile(r"(<!-- table: (?P<name>\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replace a text file as a whole: written beside it, then renamed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.tmp")
+    beside.write_text(text, encoding="utf-8")
+    os.replace(beside, path)
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of a results file in JSON lines."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def fill_tables(markdown: str, results: Path) -> str:
+    """The Markdown text with every table between its comments made anew from ``results``/NAME.jsonl."""
+
+    def table(match: re.Match[str]) -> str:
+        rows = read_rows(results / f"{match['name']}.jsonl")
+        return match[1] + markdown_table(rows) + match[3]
+
+    return _TABLE.sub(table, markdown)
+
+
+def markdown_table(rows: list[dict[str, Any]]) -> str:
+    """One line per case and metric, one column per method, and what made the numbers."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    cells: dict[tuple[str, str, str], dict[str, str]] = {}
+    for row in rows:
+        line = cells.setdefault((row["case"], row["metric"], row["unit"]), {})
+        line[row["method"]] = _number(row["value"])
+    head = ["case", "measured", *methods]
+    body = [
+        [case, f"{metric} [{unit}]", *(line.get(m, "") for m in methods)]
+        for (case, metric, unit), line in cells.items()
+    ]
+    lines = ["| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *body)]
+    first = rows[0]
+    return "\n".join(lines) + f"\n\n`{first['command']}`, commit {first['commit']}, {first['machine']}\n"
+
+
+def _number(value: float) -> str:
+    """Three significant digits, or whole numbers from 100 on."""
+    return f"{value:.0f}" if abs(value) >= 100 or value == int(value) else f"{value:.3g}"

@@ -1,9 +1,10 @@
 """Measurements of polsep on known truth, real frames and this machine, as rows that land in results/*.jsonl.
 
-Every row says what was measured (`bench`, `case`, `method`, `metric`, `value`, `unit`) and by what (`command`, `commit`,
-`machine`). The README's tables are made from these rows by `update_readme`.
+Every row says what was measured (`bench`, `case`, `method`, `metric`, `value`, `unit`) and by what (`command`,
+`commit`, `machine`). The README's tables are made from these rows by `io.results.fill_tables`.
 
-PSNR: linear light, peak 1 = the white level of one measurement, both images limited to [0, 1], inside the object mask.
+PSNR: linear light, peak 1 = the white level of one measurement, both images limited to [0, 1], inside the object mask;
+120 dB at most.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ def bench_separation(_data: Path | None = None) -> Iterator[Row]:
                         scores.setdefault((capture, name, output), []).append(psnr(image, truth, mask))
         for (capture, name, output), values in scores.items():
             yield Row("separation", f"{case}, {capture}", name, f"{output} PSNR", statistics.fmean(values), "dB")
-            if capture.startswith("co-sited exact"):
+            if "unclipped" in capture:
                 yield Row("separation", f"{case}, {capture}", name, f"{output} PSNR, worst scene", min(values), "dB")
 
 
@@ -141,7 +142,7 @@ def bench_exactness(_data: Path | None = None) -> Iterator[Row]:
     yield Row("exactness", "one clipped analyser recovered", "clip-aware Stokes", "largest error", worst, "white")
 
 
-#: The four labelled polarizers of polarizer_IMX250MZR.png: label [deg], centre (row, col) and radius at half resolution.
+#: The labelled polarizers of polarizer_IMX250MZR.png: label [deg], centre (row, col) and radius at half resolution.
 REFERENCE_POLARIZERS = ((0, 544, 189, 88), (45, 544, 502, 88), (90, 544, 778, 88), (135, 553, 1055, 78))
 
 

@@ -196,8 +196,8 @@ def _least_squares(y: Tensor, kept: Tensor, a: Tensor, angles: tuple[float, ...]
 def _fill(found: Separation, measurements: Measurements, offset: Tensor, determined: Tensor) -> Separation:
     """Complete pixels that clipping left undetermined, with the valid pixels around as a weak prior.
 
-    Where b is not ``determined`` the specular has the phase of its surroundings and fits the unclipped samples. It is at
-    least what makes the clipped samples clip, and where everything clips at least as bright as around. A colour's
+    Where b is not ``determined`` the specular has the phase of its surroundings and fits the unclipped samples. It is
+    at least what makes the clipped samples clip, and where everything clips at least as bright as around. A colour's
     diffuse follows from its unclipped samples, or from around where it has none.
     """
     assert measurements.clipped is not None

@@ -195,7 +195,7 @@ def mueller_rotator(angle: Tensor) -> Tensor:
 
 
 def mueller_polarizer(angle: Tensor, diattenuation: float = 1.0) -> Tensor:
-    """Linear polarizer at ``angle`` [rad], half of unpolarized light passes; D = (ER-1)/(ER+1). Source: Goldstein 5.3."""
+    """Linear polarizer at ``angle`` [rad]; half of unpolarized light passes, D = (ER-1)/(ER+1). Goldstein, 5.3."""
     d = torch.full_like(angle, diattenuation)
     zero, one, root = torch.zeros_like(angle), torch.ones_like(angle), torch.sqrt(1 - d * d)
     straight = 0.5 * _matrix(

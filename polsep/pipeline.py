@@ -23,7 +23,7 @@ from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
 from polsep.layout_check import check_layout
 from polsep.levels import as_mosaic
 from polsep.separation import Separation, dominant_angle, light_polarizer_angle, separate_analytic
-from polsep.stokes import Measurements, Stokes, aolp, dolp
+from polsep.stokes import Measurements, Stokes, aolp, dolp, fit_stokes_unclipped, polarized_intensity
 
 Capture = Mosaic | Measurements
 LightColor = Sequence[float]
@@ -198,8 +198,6 @@ def estimate_light_color(measurements: Measurements) -> tuple[float, ...] | None
     Highlights off dielectrics have the light's colour, and the polarized part holds little else: the first principal
     direction of s1, s2 over colours there. Source: the idea is Nayar, Fang, Boult 1997, Sec. 4.
     """
-    from polsep.stokes import fit_stokes_unclipped, polarized_intensity
-
     stokes, determined = fit_stokes_unclipped(measurements)
     if stokes.s0.shape[-3] != 3:
         return (1.0,)

@@ -36,22 +36,25 @@ def fill_tables(markdown: str, results: Path) -> str:
 
 
 def markdown_table(rows: list[dict[str, Any]]) -> str:
-    """One line per case and metric, one column per method, and what made the numbers."""
+    """One line per case and metric, one column per method, and what made the numbers.
+
+    Metrics that differ in "diffuse" and "specular" alone share a line, as "diffuse / specular".
+    """
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    cells: dict[tuple[str, str, str], dict[str, str]] = {}
+    cells: dict[tuple[str, str], dict[str, list[str]]] = {}
     for row in rows:
-        line = cells.setdefault((row["case"], row["metric"], row["unit"]), {})
-        line[row["method"]] = _number(row["value"])
+        metric = re.sub(r"^(diffuse|specular) (?=PSNR)", "diffuse / specular ", row["metric"])
+        line = cells.setdefault((row["case"], f"{metric} [{row['unit']}]"), {})
+        line.setdefault(row["method"], []).append(_number(row["value"]))
     head = ["case", "measured", *methods]
-    body = [
-        [case, f"{metric} [{unit}]", *(line.get(m, "") for m in methods)]
-        for (case, metric, unit), line in cells.items()
-    ]
-    lines = ["| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *body)]
+    body = [[case, metric, *(" / ".join(line.get(m, [])) for m in methods)] for (case, metric), line in cells.items()]
+    lines = ["| " + " | ".join(texts) + " |" for texts in (head, ["---"] * len(head), *body)]
     first = rows[0]
     return "\n".join(lines) + f"\n\n`{first['command']}`, commit {first['commit']}, {first['machine']}\n"
 
 
 def _number(value: float) -> str:
-    """Three significant digits, or whole numbers from 100 on."""
-    return f"{value:.0f}" if abs(value) >= 100 or value == int(value) else f"{value:.3g}"
+    """One decimal from 10 on, else three significant digits; whole numbers as they are."""
+    if value == int(value) or abs(value) >= 200:
+        return f"{value:.0f}"
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3g}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from os.path import realpath
 from pathlib import Path
 from typing import Any
 
@@ -93,8 +94,8 @@ def _refuse_collisions(paths: Sequence[str], write: WriteOptions) -> None:
     if repeated:
         same = ", ".join(path for path in paths if Path(path).stem == repeated[0])
         raise OutputError(f"expected inputs of different names, found {same}: their outputs would be one file")
-    inputs = {Path(path).resolve(): path for path in paths}
+    inputs = {realpath(path) for path in paths}
     for stem in stems:
         for output in planned_outputs(write.directory, stem, write.format):
-            if output.resolve() in inputs:
+            if realpath(output) in inputs:
                 raise OutputError(f"expected an output directory without the inputs, found that {output} is an input")

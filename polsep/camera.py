@@ -53,17 +53,23 @@ class Layout:
     origin: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
-        flat = [angle for row in self.polarizer for angle in row]
-        if len(self.polarizer) != 2 or any(len(row) != 2 for row in self.polarizer):
+        try:
+            (a, b), (c, d) = self.polarizer
+            flat = [float(angle) for angle in (a, b, c, d)]
+        except (TypeError, ValueError):
+            raise ValueError(f"polarizer must be 2x2 angles in degrees, found {self.polarizer!r}") from None
+        if not all(math.isfinite(angle) for angle in flat):
             raise ValueError(f"polarizer must be 2x2 angles in degrees, found {self.polarizer!r}")
-        if len({float(a) % 180 for a in flat}) != 4:
+        object.__setattr__(self, "polarizer", ((a, b), (c, d)))
+        if len({angle % 180 for angle in flat}) != 4:
             raise ValueError(
                 f"polarizer must hold four different angles (modulo 180 degrees), found {self.polarizer!r}"
             )
         if self.bayer is not None and self.bayer not in BAYER_ORDERS:
             raise ValueError(f"bayer must be one of {', '.join(BAYER_ORDERS)} or None, found {self.bayer!r}")
-        if any(o not in (0, 1) for o in self.origin):
+        if self.origin not in ((0, 0), (0, 1), (1, 0), (1, 1)):
             raise ValueError(f"origin must be two of 0 or 1, found {self.origin!r}")
+        object.__setattr__(self, "origin", (int(self.origin[0]), int(self.origin[1])))
         if self.bayer is None and self.origin != (0, 0):
             raise ValueError("a mono layout needs no origin: permute its polarizer cell instead")
 
@@ -89,7 +95,7 @@ class Layout:
     @property
     def spec(self) -> str:
         """The text that `parse` reads back."""
-        angles = ",".join(f"{angle:g}" for row in self.polarizer for angle in row)
+        angles = ",".join(repr(float(angle)).removesuffix(".0") for row in self.polarizer for angle in row)
         offset = f"@{self.origin[0]},{self.origin[1]}" if self.origin != (0, 0) else ""
         return f"{angles}/{self.bayer or 'mono'}{offset}"
 
@@ -208,10 +214,12 @@ class Sensor:
     diattenuation: tuple[float, ...] = (1.0,)
 
     def __post_init__(self) -> None:
-        if not self.full_well > 0 or self.read_noise < 0:
+        if not (self.full_well > 0 and self.read_noise >= 0):
             raise ValueError(f"full_well must be positive and read_noise not negative, found {self}")
-        if not all(0 <= d <= 1 for d in self.diattenuation):
-            raise ValueError(f"diattenuation must lie in [0, 1], found {self.diattenuation}")
+        if self.bits is not None and self.bits < 1:
+            raise ValueError(f"bits must be at least 1, found {self.bits}")
+        if len(self.diattenuation) not in (1, 3) or not all(0 <= d <= 1 for d in self.diattenuation):
+            raise ValueError(f"diattenuation must be one or three numbers in [0, 1], found {self.diattenuation}")
 
     @property
     def white_level(self) -> float:
@@ -237,7 +245,8 @@ IDEAL = Sensor()
 def sample_mosaic(measurements: Measurements, layout: Layout) -> Tensor:
     """The mosaic ``[..., H, W]`` of angle images ``[..., 4, C, H, W]``: of each pixel the sample behind its filter.
 
-    The twin of every demosaicker. Channels beyond the layout's colours are not looked at.
+    The twin of every demosaicker. Channels beyond the layout's colours are not looked at. Raises ValueError when the
+    measurements lack an analyser of the layout.
     """
     data = measurements.data
     out = torch.empty((*data.shape[:-4], *data.shape[-2:]), dtype=data.dtype, device=data.device)
@@ -245,6 +254,8 @@ def sample_mosaic(measurements: Measurements, layout: Layout) -> Tensor:
     for row in range(layout.period):
         for col in range(layout.period):
             filt = layout.filter_at(row, col)
+            if round(filt.angle_deg, 6) not in degrees:
+                raise ValueError(f"expected measurements at {layout.angles_deg} degrees, found {degrees}")
             k = degrees.index(round(filt.angle_deg, 6))
             out[..., row :: layout.period, col :: layout.period] = data[
                 ..., k, filt.channel, row :: layout.period, col :: layout.period
@@ -253,7 +264,12 @@ def sample_mosaic(measurements: Measurements, layout: Layout) -> Tensor:
 
 
 def measure_with_analysers(stokes: Stokes, angles: tuple[float, ...], diattenuation: tuple[float, ...]) -> Measurements:
-    """`stokes.measure` behind real analysers: m = (s0 + D (s1 cos 2t + s2 sin 2t)) / 2 with D per colour."""
+    """`stokes.measure` behind real analysers: m = (s0 + D (s1 cos 2t + s2 sin 2t)) / 2 with D per colour.
+
+    Of three values a mono image takes the middle one, the green's.
+    """
+    if stokes.s0.shape[-3] == 1:
+        diattenuation = diattenuation[len(diattenuation) // 2 :][:1]
     d = torch.tensor(diattenuation, dtype=stokes.s0.dtype, device=stokes.s0.device)[:, None, None]
     data = [0.5 * (stokes.s0 + d * (stokes.s1 * math.cos(2 * t) + stokes.s2 * math.sin(2 * t))) for t in angles]
     return Measurements(torch.stack(data, dim=-4), angles)

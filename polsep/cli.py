@@ -45,7 +45,7 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     width, x, height = text.lower().partition("x")
-    if not x or not (width + height).isdecimal():
+    if not (x and width.isdecimal() and height.isdecimal()):
         raise ValueError(f"expected --size WIDTHxHEIGHT like 2448x2048, found {text!r}")
     return int(width), int(height)
 
@@ -245,3 +245,6 @@ def main() -> None:
     except BrokenPipeError:
         sys.stderr.close()  # the reader of our output has gone: nothing to tell it
         sys.exit(1)
+    except OSError as error:
+        say(f"error: {error}")
+        sys.exit(2)

@@ -93,7 +93,10 @@ def fresnel(cos_theta: Tensor, eta: float = ETA) -> Fresnel:
 
 
 def diffuse_dolp(cos_theta: Tensor, eta: float = ETA) -> Tensor:
-    """beta_d = -T^-/T^+: DoLP of diffuse light that leaves at that zenith angle; 0.044 at 45 degrees, at most 0.385."""
+    """beta_d = -T^-/T^+: DoLP of diffuse light that leaves at that zenith angle; 0.044 at 45 degrees, at most 0.385.
+
+    At exact grazing, where no light leaves, it is 0.
+    """
     f = fresnel(cos_theta, eta)
     return -f.t_minus / f.t_plus.clamp(min=torch.finfo(cos_theta.dtype).eps)
 
@@ -166,12 +169,12 @@ def _mirror_axis(g: Geometry, camera: Beam) -> Tensor:
 def specular_stokes(g: Geometry, polarizer: Tensor, irradiance: Tensor, roughness: Tensor) -> Stokes:
     """Stokes image of the specular lobe: Fresnel reflection off GGX microfacets, for specular strength 1.
 
-    Arguments as `diffuse_stokes`; ``roughness`` ``[..., 1, H, W]``. Linear light stays fully polarized:
+    Arguments as `diffuse_stokes`; ``roughness`` ``[..., 1, H, W]``, above 0. Linear light stays fully polarized:
     s1^2 + s2^2 = s0^2. Multiply the result by a specular strength or colour. Source: Eqs. 7-8 corrected.
     """
     camera, light = _camera_and_light_beams(g)
     cos_i, cos_o, lit = _lit(g)
-    h = normalize(g.to_camera + g.to_light)
+    h = normalize(torch.where(lit > 0, g.to_camera + g.to_light, g.normal))
     alpha = roughness**2
     lobe = ggx_distribution(g.normal, h, alpha) * smith_shadowing(cos_i, alpha) * smith_shadowing(cos_o, alpha)
     shading = lit * irradiance * lobe / (4 * cos_o.clamp(min=1e-4))

@@ -67,8 +67,9 @@ METHODS = {
 #: What `auto` means: the best method installed.
 BEST_METHOD = "color-affine"
 
-#: Reflected light of one polarized source: below this concentration of its angle there is no such light.
-MIN_CONCENTRATION = 0.25
+#: Below this concentration of AoLP there is no single polarized light. Real frames: 0.76 to 0.97 where one light or one
+#: reflecting surface polarizes, 0.31 to 0.50 in the open.
+MIN_CONCENTRATION = 0.6
 
 
 @dataclass(frozen=True)

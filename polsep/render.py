@@ -23,7 +23,8 @@ Vector = tuple[float, float, float]
 #: Sphere tracing (Hart 1996): steps at most, and the distance in scene units that counts as a hit.
 MAX_STEPS = 160
 HIT_DISTANCE = 2e-4
-FAR = 30.0
+#: Rays that go this many times the camera's distance from its target miss.
+FAR = 4.0
 #: Rays that are traced together, to bound memory.
 RAYS_AT_ONCE = 250_000
 
@@ -124,6 +125,8 @@ def surface_normal(parts: tuple[Part, ...], points: Tensor) -> Tensor:
 def camera_rays(camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Origin ``[3, 1, 1]`` and unit directions ``[3, N, 1]`` through points (rows, cols) of an H x W image."""
     height, width = size
+    if math.hypot(camera.position[0] - camera.target[0], camera.position[2] - camera.target[2]) < 1e-6:
+        raise ValueError("expected a camera that does not look straight up or down, its up vector is world +y")
     eye, target = torch.tensor(camera.position), torch.tensor(camera.target)
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0])), dim=0)
@@ -138,7 +141,8 @@ def cast(parts: tuple[Part, ...], camera: PinholeCamera, rows: Tensor, cols: Ten
     """G-buffer ``[*, N, 1]`` of the image points (rows, cols), one ray each."""
     origin, direction = camera_rays(camera, rows, cols, size)
     origin = origin.expand_as(direction)
-    travelled, hit = trace(parts, origin, direction, torch.full_like(direction[:1], FAR))
+    far = FAR * math.dist(camera.position, camera.target)
+    travelled, hit = trace(parts, origin, direction, torch.full_like(direction[:1], far))
     position = origin + travelled * direction
     nearest = torch.stack([part.distance(_local(part, position)) for part in parts]).argmin(dim=0)
     albedo, roughness, specular = torch.zeros_like(position), torch.ones_like(travelled), torch.zeros_like(travelled)

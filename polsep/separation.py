@@ -73,12 +73,14 @@ def box_mean(x: Tensor, radius: int) -> Tensor:
 
 
 def dominant_angle(images: Tensor) -> tuple[float, float]:
-    """Angle [rad, in [0, pi)] of the summed polarization ``[2, h, w]`` (s1, s2) and its concentration in [0, 1].
+    """Dominant angle [rad, in [0, pi)] of polarization images ``[2, h, w]`` (s1, s2) and its concentration in [0, 1].
 
+    Pixels count by the square of their polarized intensity, so that highlights speak and noise does not.
     Concentration 1: one AoLP everywhere, as under one polarized light; near 0: no common direction.
     """
     s1, s2 = images[..., 0, :, :].double(), images[..., 1, :, :].double()
-    total, x, y = float(torch.hypot(s1, s2).sum()), float(s1.sum()), float(s2.sum())
+    weight = torch.hypot(s1, s2)
+    total, x, y = float((weight * weight).sum()), float((weight * s1).sum()), float((weight * s2).sum())
     return (0.5 * math.atan2(y, x)) % math.pi, (math.hypot(x, y) / total if total > 0 else 0.0)
 
 

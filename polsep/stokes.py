@@ -159,19 +159,25 @@ def analyser_residual(measurements: Measurements) -> Tensor:
     """How far four analysers miss being a Stokes vector: the component of m outside the range of P, ``[..., C, H, W]``.
 
     With 0/45/90/135 degrees it is ``(m0 - m45 + m90 - m135) / 2``: zero without noise, clipping or misregistration,
-    and of the same standard deviation as one sample's noise otherwise. Raises ValueError unless K = 4.
+    and of the same standard deviation as one sample's noise otherwise. Raises ValueError unless four analysers
+    determine a Stokes vector.
     """
-    if len(measurements.angles) != 4:
-        raise ValueError(f"the residual needs four analysers, found {len(measurements.angles)}")
     matrix = analyser_matrix(measurements.angles)
+    if len(measurements.angles) != 4 or torch.linalg.matrix_rank(matrix, rtol=1e-6) < 3:
+        degrees = [round(math.degrees(t), 3) for t in measurements.angles]
+        raise ValueError(f"the residual needs four analysers of at least three angles, found {degrees}")
     null = torch.linalg.svd(matrix, full_matrices=True).U[:, 3]
-    null = null * torch.sign(null[0])
+    null = null * torch.sign(null[null.abs() > 0.5 * null.abs().max()][0])
     return torch.einsum("k,...kchw->...chw", null.to(measurements.data), measurements.data)
 
 
 def polarized_intensity(stokes: Stokes) -> Tensor:
-    """sqrt(s1^2 + s2^2), the intensity of the polarized part: tau_s of the analytic split (Eq. 18)."""
-    return torch.hypot(stokes.s1, stokes.s2)
+    """sqrt(s1^2 + s2^2), the intensity of the polarized part: tau_s of the analytic split (Eq. 18).
+
+    Its gradient is taken as 0 where nothing is polarized.
+    """
+    polarized = (stokes.s1 != 0) | (stokes.s2 != 0)
+    return torch.where(polarized, torch.hypot(torch.where(polarized, stokes.s1, 1.0), stokes.s2), 0.0)
 
 
 def dolp(stokes: Stokes) -> Tensor:
@@ -185,7 +191,7 @@ def aolp(stokes: Stokes) -> Tensor:
 
     Eq. 2 with the two-argument arctangent, which the paper's tan^-1 leaves out.
     """
-    angle = torch.remainder(0.5 * torch.atan2(stokes.s2, stokes.s1), math.pi)
+    angle = torch.remainder(0.5 * torch.atan2(stokes.s2 + 0.0, stokes.s1 + 0.0), math.pi)  # + 0.0 turns -0 into 0
     return torch.where(angle >= math.pi, torch.zeros_like(angle), angle)
 
 

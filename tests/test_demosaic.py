@@ -285,6 +285,7 @@ def full_by_scipy(mosaic: np.ndarray, layout: Layout) -> np.ndarray:
     """``[4, 3, H, W]``: each analyser's plane by the function above, interpolated by SciPy at all pixels.
 
     The pixel beyond a plane's outermost sample lies on the mirror between that sample and its image: it takes its
+    value.
     """
     height, width = mosaic.shape
     assert layout.bayer is not None

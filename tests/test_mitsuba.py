@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -25,9 +24,8 @@ Array = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _variant() -> Iterator[None]:
+def _variant() -> None:
     mi.set_variant(VARIANT)
-    yield
 
 
 def plastic(roughness: float, albedo: float, specular: float) -> Any:

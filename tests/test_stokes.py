@@ -221,7 +221,7 @@ def test_residual_of_the_sony_analysers(generator: torch.Generator) -> None:
 def test_residual_needs_four_analysers(count: int) -> None:
     """The residual of another number of analysers is refused."""
     measurements = Measurements(torch.ones(count, 1, 1, 1), tuple(0.3 * k for k in range(count)))
-    with pytest.raises(ValueError, match=f"four analysers, found {count}"):
+    with pytest.raises(ValueError, match="four analysers of at least three angles"):
         analyser_residual(measurements)
 
 
@@ -272,7 +272,6 @@ def test_aolp_just_below_zero(dtype: torch.dtype, s2: float) -> None:
     assert_same_angle(angle, 0.5 * s2, ROUNDING[dtype])
 
 
-@pytest.mark.xfail(reason="aolp of negative zeros is pi/2: half of atan2(0, -0.0) = pi", strict=True)
 @pytest.mark.parametrize("operation", [rotate_quarter, transpose])
 def test_aolp_of_unpolarized_light_after_a_turn(operation: Callable[[Stokes], Stokes]) -> None:
     """Unpolarized light has AoLP 0 also after a turn or a mirror has changed the sign of its zeros."""
@@ -414,7 +413,7 @@ def test_inconsistent_images_are_refused() -> None:
     image = torch.ones(3, 2, 2)
     with pytest.raises(ValueError, match="one shape"):
         Stokes(image, image, image[..., :1])
-    with pytest.raises(TypeError, match="floating point, found torch.int64"):
+    with pytest.raises(TypeError, match=r"floating point, found torch\.int64"):
         Stokes(image.long(), image.long(), image.long())
     with pytest.raises(ValueError, match=r"expected data \[..., 4, C, H, W\]"):
         Measurements(torch.ones(3, 1, 2, 2), SONY)

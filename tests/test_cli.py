@@ -1,0 +1,508 @@
+"""The command line end to end: everything asked for is written, or one line says why not and nothing is left."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import imagecodecs
+import numpy as np
+import pytest
+import tifffile
+import torch
+from numpy.typing import NDArray
+from test_bad_input import FILES
+
+from polsep import cli
+from polsep.camera import IDEAL, Layout, expose
+from polsep.io.genicam import pack_frame
+from polsep.io.outputs import FORMATS, LAYERS, read_exr_layers
+from polsep.pipeline import METHODS
+from polsep.stokes import Stokes
+
+COLOR_LAYERS = {f"{image}.{color}" for image in ("diffuse", "specular") for color in "RGB"}
+MAPS = {"dolp.Y", "aolp.Y", "valid.Y"}
+LINE = re.compile(r"polsep: error: [^\n]+\n")
+
+
+class Run(NamedTuple):
+    """What a command left behind."""
+
+    status: int
+    out: str
+    err: str
+
+
+Cli = Callable[..., Run]
+
+
+@pytest.fixture
+def polsep(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Cli:
+    """Run `polsep ARGS` inside this process."""
+
+    def run(*args: str | Path) -> Run:
+        monkeypatch.setattr(sys, "argv", ["polsep", *map(str, args)])
+        capfd.readouterr()
+        status: Any = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            status = stop.code
+        return Run(status or 0, *capfd.readouterr())
+
+    return run
+
+
+def subprocess_run(*args: str | Path, **options: Any) -> Run:
+    """Run `polsep ARGS` as a shell would."""
+    command = [sys.executable, "-c", "from polsep.cli import main; main()", *map(str, args)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, **options)
+    return Run(done.returncode, done.stdout, done.stderr)
+
+
+def frame(seed: int = 0, layout: Layout | None = None, size: int = 32) -> NDArray[np.uint16]:
+    """A coloured mosaic with white highlights of one angle, in 16-bit codes."""
+    generator = torch.Generator().manual_seed(seed)
+    coarse = torch.rand(1, 4, 4, 4, generator=generator)
+    fine = torch.nn.functional.interpolate(coarse, size=(size, size), mode="bilinear")[0]
+    diffuse, specular = 0.2 + 0.5 * fine[:3], 0.7 * fine[3:]
+    stokes = Stokes(diffuse + specular, (0.8 * specular).expand(3, -1, -1), (0.6 * specular).expand(3, -1, -1))
+    signal = expose(stokes, layout or Layout(), IDEAL).data
+    return torch.round(signal * 65535).to(torch.int32).numpy().astype(np.uint16)
+
+
+def png(path: Path, array: NDArray[Any]) -> Path:
+    path.write_bytes(imagecodecs.png_encode(array))
+    return path
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, hidden ones too."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def assert_refused(run: Run, *words: str) -> None:
+    """Exit status 2, nothing on stdout, one line on stderr that starts with the program's name and says why."""
+    assert run.status == 2, run
+    assert run.out == "", run
+    assert LINE.fullmatch(run.err), run.err
+    for word in words:
+        assert word in run.err
+
+
+def test_help_of_every_command(polsep: Cli) -> None:
+    """--help and -h exit 0 and name every option; no command at all shows the help and exits 2."""
+    assert polsep("--help").out.startswith("Usage: ")
+    for name, command in cli.app.commands.items():
+        for flag in ("--help", "-h"):
+            run = polsep(name, flag)
+            assert run.status == 0 and run.err == ""
+            assert all(option in run.out for p in command.params for option in p.opts if option.startswith("--"))
+        assert name in polsep("--help").out
+    bare = polsep()
+    assert bare.status == 2 and "Usage: " in bare.out
+
+
+def test_version_and_methods(polsep: Cli) -> None:
+    """--version names the version; methods lists every method once and marks the automatic one."""
+    assert re.fullmatch(r"polsep \d+\.\d+\S*\n", polsep("--version").out)
+    listed = polsep("methods")
+    assert listed.status == 0
+    assert [name for name in METHODS if re.search(rf"^{name}( |$)", listed.out, re.MULTILINE)] == list(METHODS)
+    assert listed.out.count("(auto)") == 1
+
+
+def test_separate_writes_the_contract(tmp_path: Path) -> None:
+    """A shell's `polsep separate` writes the layers of the contract, a preview and a sidecar, and says where."""
+    source = png(tmp_path / "shot.png", frame())
+    run = subprocess_run("separate", source, "-o", tmp_path / "out")
+    assert run.status == 0, run
+    assert run.err == ""
+    assert run.out.strip() == f"{source} -> " + ", ".join(
+        str(tmp_path / "out" / f"shot.{s}") for s in ("exr", "png", "json")
+    )
+    layers = read_exr_layers(tmp_path / "out" / "shot.exr")
+    assert set(layers) == COLOR_LAYERS | MAPS
+    assert {image.shape for image in layers.values()} == {(16, 16)}
+    preview = imagecodecs.png_decode((tmp_path / "out" / "shot.png").read_bytes())
+    assert preview.ndim == 3 and preview.dtype == np.uint8
+    sidecar = json.loads((tmp_path / "out" / "shot.json").read_text())
+    assert sidecar["source"] == "shot.png" and sidecar["report"]["method"] == "color-affine"
+    for entry in sidecar["files"]:
+        assert hashlib.sha256((tmp_path / "out" / entry["name"]).read_bytes()).hexdigest() == entry["sha256"]
+
+
+@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("layout", ["color", "mono"])
+def test_every_format_of_both_sensors(tmp_path: Path, polsep: Cli, format: str, layout: str) -> None:
+    """Each --format writes its documented files and nothing else, for colour and mono."""
+    mosaic = frame(layout=Layout.parse(layout))
+    run = polsep(
+        "separate", png(tmp_path / "a.png", mosaic), "-o", tmp_path / "o", "--format", format, "--layout", layout
+    )
+    assert run.status == 0, run
+    images = {f"a_{layer}.{format}" for layer in LAYERS} if format in ("tiff", "png") else {f"a.{format}"}
+    assert set(contents(tmp_path / "o")) == images | {"a.png", "a.json"}
+    if format == "npz":
+        arrays = np.load(tmp_path / "o" / "a.npz")
+        assert set(arrays.files) == set(LAYERS)
+        assert arrays["diffuse"].shape == (16, 16, 3 if layout == "color" else 1)
+    if format == "exr" and layout == "mono":
+        assert set(read_exr_layers(tmp_path / "o" / "a.exr")) == {"diffuse.Y", "specular.Y"} | MAPS
+
+
+@pytest.mark.parametrize("method", ["auto", *METHODS])
+def test_every_method_and_full_resolution(tmp_path: Path, polsep: Cli, method: str) -> None:
+    """--method runs the method it names, and --full gives an image of the raw size."""
+    source = png(tmp_path / "a.png", frame())
+    run = polsep("separate", source, "-o", tmp_path / "o", "--method", method, "--full")
+    assert run.status == 0, run
+    assert read_exr_layers(tmp_path / "o" / "a.exr")["diffuse.G"].shape == (32, 32)
+    report = json.loads((tmp_path / "o" / "a.json").read_text())["report"]
+    assert report["method"] == ("color-affine" if method == "auto" else method) and report["full_resolution"]
+
+
+def test_pages_become_numbered_frames(tmp_path: Path, polsep: Cli) -> None:
+    """A TIFF of three pages gives three results, numbered from 0."""
+    tifffile.imwrite(tmp_path / "run.tiff", np.stack([frame(k) for k in range(3)]), photometric="minisblack")
+    run = polsep("separate", tmp_path / "run.tiff", "-o", tmp_path / "o")
+    assert run.status == 0 and len(run.out.splitlines()) == 3
+    assert set(contents(tmp_path / "o")) == {f"run_000{k}.{s}" for k in range(3) for s in ("exr", "png", "json")}
+
+
+def test_four_angle_images(tmp_path: Path, polsep: Cli) -> None:
+    """A template with {angle} and a stack of four pages are the same capture, and give the same images."""
+    planes = [frame(k % 2)[:24, :20] for k in range(4)]
+    for angle, plane in zip((0, 45, 90, 135), planes, strict=True):
+        png(tmp_path / f"nir_{angle}.png", plane)
+    tifffile.imwrite(tmp_path / "stack.tiff", np.stack(planes), photometric="minisblack")
+    common = ("-o", tmp_path / "o", "--layout", "mono", "--format", "npz")
+    assert polsep("separate", tmp_path / "nir_{angle}.png", *common).status == 0
+    assert polsep("separate", tmp_path / "stack.tiff", "--pages", "angles", *common).status == 0
+    one, other = np.load(tmp_path / "o" / "nir.npz"), np.load(tmp_path / "o" / "stack.npz")
+    assert one["diffuse"].shape == (24, 20, 1)
+    for layer in LAYERS:
+        assert np.abs(one[layer].astype(float) - other[layer]).max() == 0
+
+
+def test_headless_raw_is_the_png(tmp_path: Path, polsep: Cli) -> None:
+    """A packed dump of the codes of a PNG gives the same images."""
+    codes = frame() >> 4
+    png(tmp_path / "a.png", codes)
+    (tmp_path / "b.raw").write_bytes(pack_frame(codes, "BayerRG12p"))
+    common = ("-o", tmp_path / "o", "--format", "npz")
+    assert polsep("separate", tmp_path / "a.png", "--white-level", "4095", *common).status == 0
+    raw = ("--size", "32x32", "--pixel-format", "BayerRG12p")
+    assert polsep("separate", tmp_path / "b.raw", *raw, *common).status == 0
+    one, other = np.load(tmp_path / "o" / "a.npz"), np.load(tmp_path / "o" / "b.npz")
+    for layer in LAYERS:
+        assert np.abs(one[layer].astype(float) - other[layer]).max() == 0
+
+
+def test_same_command_same_bytes(tmp_path: Path, polsep: Cli) -> None:
+    """Outputs depend on the input and the options alone: a second run writes the same bytes."""
+    source = png(tmp_path / "a.png", frame())
+    for folder in ("one", "two"):
+        assert polsep("separate", source, "-o", tmp_path / folder).status == 0
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+
+
+def test_warnings_are_lines_on_stderr(tmp_path: Path, polsep: Cli) -> None:
+    """What the owner should know is said once, on stderr, with the file's name; stdout stays for results."""
+    run = polsep("separate", png(tmp_path / "dim.png", frame() >> 4), "-o", tmp_path / "o")
+    assert run.status == 0
+    assert run.err.startswith(f"polsep: {tmp_path / 'dim.png'}: values never exceed 4095")
+    assert run.err.count("\n") == 1 and run.out.count("\n") == 1
+
+
+def test_good_files_are_written_beside_bad_ones(tmp_path: Path, polsep: Cli) -> None:
+    """One bad file of three: the others are written, one line says what was wrong, and the status is 2."""
+    first, last = png(tmp_path / "a.png", frame()), png(tmp_path / "c.png", frame(1))
+    (tmp_path / "b.png").write_bytes(first.read_bytes()[:99])
+    run = polsep("separate", first, tmp_path / "b.png", last, "-o", tmp_path / "o")
+    assert run.status == 2
+    assert LINE.fullmatch(run.err) and "b.png" in run.err
+    assert len(run.out.splitlines()) == 2
+    assert set(contents(tmp_path / "o")) == {f"{stem}.{s}" for stem in "ac" for s in ("exr", "png", "json")}
+
+
+def test_pages_before_a_damaged_one_are_written(tmp_path: Path, polsep: Cli) -> None:
+    """Frames that were read before the damage are results; the damage is one line and status 2."""
+    array = np.stack([frame(0), frame(1)]).astype(np.float32) / 65535
+    array[1, 3, 5] = np.nan
+    np.save(tmp_path / "run.npy", array)
+    run = polsep("separate", tmp_path / "run.npy", "-o", tmp_path / "o")
+    assert run.status == 2 and LINE.fullmatch(run.err) and "(3, 5)" in run.err
+    assert set(contents(tmp_path / "o")) == {f"run_0000.{s}" for s in ("exr", "png", "json")}
+
+
+@pytest.mark.parametrize("suffix", ["exr", "png", "json"])
+def test_results_are_not_replaced_unasked(tmp_path: Path, polsep: Cli, suffix: str) -> None:
+    """An existing output stops the frame: status 2, one line, every byte as before; --overwrite replaces it."""
+    source = png(tmp_path / "a.png", frame())
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / f"a.{suffix}").write_bytes(b"precious")
+    assert_refused(polsep("separate", source, "-o", tmp_path / "o"), "--overwrite")
+    assert contents(tmp_path / "o") == {f"a.{suffix}": b"precious"}
+    assert polsep("separate", source, "-o", tmp_path / "o", "--overwrite").status == 0
+    assert set(contents(tmp_path / "o")) == {"a.exr", "a.png", "a.json"}
+    assert contents(tmp_path / "o")[f"a.{suffix}"] != b"precious"
+
+
+@pytest.mark.parametrize("spelling", [".", "./", "../{name}", "link"])
+def test_inputs_are_never_overwritten(
+    tmp_path: Path, polsep: Cli, spelling: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Results that would fall on an input are refused before any work, however the directory is spelled."""
+    source = png(tmp_path / "a.png", frame())
+    before = source.read_bytes()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "link").symlink_to(tmp_path, target_is_directory=True)
+    run = polsep("separate", "a.png", "-o", spelling.format(name=tmp_path.name), "--overwrite")
+    assert_refused(run, "is an input")
+    assert source.read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "link"]
+
+
+@pytest.mark.xfail(strict=True, reason="_refuse_collisions knows the stems of paths, not those of pages and templates")
+def test_numbered_pages_do_not_overwrite_an_input(tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Page 0 of run.tiff is run_0000: with --format tiff it must not replace the input run_0000_diffuse.tiff."""
+    monkeypatch.chdir(tmp_path)
+    tifffile.imwrite("run.tiff", np.stack([frame(0), frame(1)]), photometric="minisblack")
+    tifffile.imwrite("run_0000_diffuse.tiff", frame(2))
+    before = Path("run_0000_diffuse.tiff").read_bytes()
+    polsep("separate", "run.tiff", "run_0000_diffuse.tiff", "-o", ".", "--format", "tiff", "--overwrite")
+    assert Path("run_0000_diffuse.tiff").read_bytes() == before
+
+
+@pytest.mark.xfail(
+    strict=True, reason="_refuse_collisions compares shot_{angle} with shot, both of which write shot.exr"
+)
+def test_template_and_file_of_one_name_are_refused(tmp_path: Path, polsep: Cli) -> None:
+    """shot_{angle}.png and shot.png would both write shot.exr: refused, also with --overwrite."""
+    for angle in (0, 45, 90, 135):
+        png(tmp_path / f"shot_{angle}.png", frame())
+    png(tmp_path / "shot.png", frame(1))
+    run = polsep("separate", tmp_path / "shot_{angle}.png", tmp_path / "shot.png", "-o", tmp_path / "o", "--overwrite")
+    assert run.status == 2
+
+
+def test_inputs_of_one_name_are_refused(tmp_path: Path, polsep: Cli) -> None:
+    """Two inputs whose results would be one file are refused before any work."""
+    for folder in ("x", "y"):
+        (tmp_path / folder).mkdir()
+        png(tmp_path / folder / "a.png", frame())
+    run = polsep("separate", tmp_path / "x" / "a.png", tmp_path / "y" / "a.png", "-o", tmp_path / "o")
+    assert_refused(run, "different names")
+    assert not (tmp_path / "o").exists()
+
+
+def cli_options(options: dict[str, Any]) -> list[str]:
+    """Keyword options of `ReadOptions` as they are typed."""
+    typed: list[str] = []
+    for name, value in options.items():
+        text = value.spec if isinstance(value, Layout) else "x".join(map(str, value)) if name == "size" else str(value)
+        typed += [f"--{name.replace('_', '-')}={text}"]
+    return typed
+
+
+@pytest.mark.parametrize(("name", "data", "options"), [case[:3] for case in FILES], ids=[case[0] for case in FILES])
+def test_bad_files(tmp_path: Path, polsep: Cli, name: str, data: bytes, options: dict[str, Any]) -> None:
+    """Every damaged or unfit file: status 2, one line that names it, and no output at all."""
+    (tmp_path / name).write_bytes(data)
+    run = polsep("separate", tmp_path / name, "-o", tmp_path / "o", *cli_options(options))
+    assert_refused(run, name, "expected", "found")
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize("kind", ["missing", "directory", "unreadable", "missing angle", "sizes", "loop", "long name"])
+def test_files_that_are_not_there(tmp_path: Path, polsep: Cli, kind: str) -> None:
+    """Missing, unreadable and unequal files: status 2, one line, no output."""
+    target = tmp_path / "shot.png"
+    if kind == "directory":
+        target.mkdir()
+    elif kind == "loop":
+        target.symlink_to(target)
+    elif kind == "long name":
+        target = tmp_path / f"shot{'a' * 300}.png"
+    elif kind == "unreadable":
+        if os.geteuid() == 0:
+            pytest.skip("root reads everything")
+        png(target, frame()).chmod(0)
+    elif kind in ("missing angle", "sizes"):
+        for angle in (0, 45, 90) if kind == "missing angle" else (0, 45, 90, 135):
+            png(tmp_path / f"shot_{angle}.png", frame()[: 16 if angle == 90 else 32])
+        target = tmp_path / "shot_{angle}.png"
+    assert_refused(polsep("separate", target, "-o", tmp_path / "o"), "shot", "expected", "found")
+    assert not (tmp_path / "o").exists()
+
+
+BAD_OPTIONS: list[tuple[list[str], str]] = [
+    (["--nothing"], "--nothing"),
+    (["--layout"], "--layout"),
+    (["--layout", "sony"], "expected"),
+    (["--layout", ""], "expected"),
+    (["--layout", "90,45,135,0"], "expected"),
+    (["--layout", "90,45,135/RGGB"], "expected"),
+    (["--layout", "90,45,135,0/RGBG"], "bayer"),
+    (["--layout", "90,45,135,0/rggb"], "bayer"),
+    (["--layout", "90,45,135,90/RGGB"], "four different angles"),
+    (["--layout", "90,45,135,270/RGGB"], "four different angles"),
+    (["--layout", "a,b,c,d/RGGB"], "expected"),
+    (["--layout", "90,45,135,0/RGGB@5,5"], "origin"),
+    (["--layout", "90,45,135,0/mono@0,1"], "mono"),
+    (["--layout", "nan,45,135,0/RGGB"], "layout"),
+    (["--layout", "0,1e-9,2e-9,3e-9/RGGB"], "angles"),
+    (["--light-color", "1,2"], "R,G,B"),
+    (["--light-color", "red"], "R,G,B"),
+    (["--light-color", "1,0,1"], "light colour"),
+    (["--light-color", "1,-1,1"], "light colour"),
+    (["--light-color", "nan,1,1"], "light colour"),
+    (["--light-color", "1,inf,1"], "light colour"),
+    (["--light-color", "1e-300,1,1"], "expected"),
+    (["--size", "64"], "--size"),
+    (["--size", "64x"], "--size"),
+    (["--size", "axb"], "--size"),
+    (["--size", "-4x4"], "--size"),
+    (["--size", "0x4"], "size"),
+    (["--size", "1.5x4"], "--size"),
+    (["--method", "magic"], "method"),
+    (["--method", ""], "method"),
+    (["--format", "jpeg"], "jpeg"),
+    (["--pages", "all"], "all"),
+    (["--device", "toaster"], "device"),
+    (["--white-level", "bright"], "bright"),
+    (["--white-level", "0"], "above the black level"),
+    (["--white-level", "-1"], "above the black level"),
+    (["--white-level", "inf"], "finite"),
+    (["--black-level", "65535"], "above the black level"),
+    (["--black-level", "nan"], "finite"),
+    (["--pages", "angles"], "four pages"),
+    pytest.param(  # type: ignore[list-item]
+        ["--device", "meta"],
+        "device",
+        marks=pytest.mark.xfail(strict=True, reason="find_device takes meta, a device without data, for one"),
+    ),
+]
+
+
+@pytest.mark.parametrize(("options", "word"), BAD_OPTIONS)
+def test_bad_options(tmp_path: Path, polsep: Cli, options: list[str], word: str) -> None:
+    """Every wrong option: status 2, one line that names what was wrong, and no output."""
+    source = png(tmp_path / "a.png", frame())
+    assert_refused(polsep("separate", source, "-o", tmp_path / "o", *options), word)
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize("args", [["separate"], ["nothing"], ["--nothing"], ["methods", "more"], ["separate", "-o"]])
+def test_bad_commands(polsep: Cli, args: list[str]) -> None:
+    """Unknown commands and missing arguments: status 2, one line."""
+    assert_refused(polsep(*args))
+
+
+TINY = pytest.mark.xfail(strict=True, reason="the layout check and the Bayer padding need 4 pixels after the origin")
+
+
+@pytest.mark.parametrize(
+    ("shape", "layout"),
+    [
+        ((1, 1), "color"),
+        ((3, 3), "color"),
+        ((1, 1), "mono"),
+        pytest.param((4, 4), "90,45,135,0/RGGB@1,1", marks=TINY),
+        pytest.param((5, 5), "90,45,135,0/RGGB@0,1", marks=TINY),
+    ],
+)
+def test_frames_too_small(tmp_path: Path, polsep: Cli, shape: tuple[int, int], layout: str) -> None:
+    """A frame without one whole period is refused in one line."""
+    source = png(tmp_path / "a.png", np.full(shape, 99, np.uint8))
+    assert_refused(polsep("separate", source, "-o", tmp_path / "o", "--layout", layout), "at least")
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.xfail(strict=True, raises=RuntimeError, reason="the layout check pools blocks of 4 pixels")
+def test_smallest_mono_frame(tmp_path: Path, polsep: Cli) -> None:
+    """2x2 pixels are one whole cell of a mono sensor: separated."""
+    source = png(tmp_path / "a.png", np.array([[90, 80], [70, 60]], np.uint8))
+    assert polsep("separate", source, "-o", tmp_path / "o", "--layout", "mono").status == 0
+
+
+@pytest.mark.parametrize("place", ["file", "under a file", "not writable"])
+def test_bad_output_directories(tmp_path: Path, polsep: Cli, place: str) -> None:
+    """An output path that is a file, or cannot be made: status 2, one line, nothing changed."""
+    source = png(tmp_path / "a.png", frame())
+    (tmp_path / "taken").write_bytes(b"precious")
+    folders = {
+        "file": tmp_path / "taken",
+        "under a file": tmp_path / "taken" / "o",
+        "not writable": Path("/proc/polsep"),
+    }
+    if place == "not writable" and not Path("/proc/self").exists():
+        pytest.skip("no place here that even root cannot write")
+    assert_refused(polsep("separate", source, "-o", folders[place]), "expected", "found")
+    assert (tmp_path / "taken").read_bytes() == b"precious"
+    assert sorted(contents(tmp_path)) == ["a.png", "taken"]
+
+
+def test_commands_without_their_files(tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    """bench refuses in one line what it cannot measure or find."""
+    monkeypatch.chdir(tmp_path)
+    assert_refused(polsep("bench", "nothing"), "expected a benchmark of")
+    assert_refused(polsep("bench", "readme"), "README.md")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_full_disk_leaves_nothing(tmp_path: Path) -> None:
+    """A write that the system stops half way: status 2, one line, no file and no directory left."""
+    source = png(tmp_path / "a.png", frame())
+    limit = 2048
+    run = subprocess_run(
+        "separate",
+        source,
+        "-o",
+        tmp_path / "o",
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+    )
+    assert_refused(run, "expected to write 'a'")
+    assert not (tmp_path / "o").exists()
+
+
+def test_interrupt_leaves_whole_frames_only(tmp_path: Path) -> None:
+    """Ctrl-C in the middle of many frames: status 130, and every frame's files are all there or all absent."""
+    np.save(tmp_path / "run.npy", np.stack([frame(size=64)] * 400))
+    out = tmp_path / "o"
+    command = [sys.executable, "-c", "from polsep.cli import main; main()", "separate", tmp_path / "run.npy", "-o", out]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 60
+        while not (out / "run_0001.json").exists() and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert err.strip() == "polsep: stopped"  # after the line break that a terminal needs behind ^C
+    names = set(contents(out))
+    stems = {name.split(".")[0] for name in names}
+    assert 2 <= len(stems) < 400
+    assert names == {f"{stem}.{suffix}" for stem in stems for suffix in ("exr", "png", "json")}
+    assert [p.name for p in out.iterdir() if p.name.startswith(".")] == []
+
+
+def test_reader_of_our_output_may_leave(tmp_path: Path) -> None:
+    """A closed pipe ends the command without a traceback."""
+    command = [sys.executable, "-c", "from polsep.cli import main; main()", "methods"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert "Traceback" not in process.stderr.read()
+        process.wait(timeout=60)

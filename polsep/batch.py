@@ -13,8 +13,7 @@ from os.path import realpath
 from pathlib import Path
 from typing import Any
 
-from polsep.camera import Layout
-from polsep.io.frames import Frame, ReadOptions, read_frames
+from polsep.io.frames import Frame, ReadOptions, output_stem, read_frames
 from polsep.io.outputs import OutputError, planned_outputs, write_separation
 from polsep.pipeline import LightColor, separate_capture
 
@@ -54,25 +53,32 @@ def separate_files(
 ) -> Iterator[Outcome]:
     """Separate every frame of the files, one outcome per frame; a bad file is one with an error, and the rest go on.
 
-    Raises OutputError before any work when two inputs would write the same files, or one would overwrite an input.
+    Raises OutputError before any work when two inputs have one name. A frame whose outputs would replace an input is
+    refused, also with ``overwrite``.
     """
-    _refuse_collisions(paths, write)
+    _refuse_equal_names(paths)
+    inputs = {realpath(path.replace("{angle}", angle)) for path in paths for angle in ("0", "45", "90", "135")}
     for path in paths:
         try:
             for frame in read_frames(path, read):
+                outputs = {realpath(output) for output in planned_outputs(write.directory, frame.stem, write.format)}
+                if clash := sorted(outputs & inputs):
+                    raise OutputError(f"{path}: expected outputs apart from inputs, found that {clash[0]} is an input")
                 yield _separate_frame(path, frame, read, options, write)
-        except (ValueError, OSError, MemoryError) as error:
+        except (ValueError, OSError, MemoryError, RuntimeError) as error:
             yield Outcome(path, error=_one_line(error))
 
 
 def _separate_frame(
     path: str, frame: Frame, read: ReadOptions, options: SeparateOptions, write: WriteOptions
 ) -> Outcome:
-    found = separate_capture(frame.data, options.method, options.light_color, options.device, options.full)
-    said = read.layout or Layout()
+    try:
+        found = separate_capture(frame.data, options.method, options.light_color, options.device, options.full)
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"{path}: {error}") from error
     found.report["source"] = Path(path).name
     found.report["settings"] = {
-        "layout": said.spec,
+        "layout": read.layout.spec if read.layout else None,
         "black_level": read.black_level,
         "white_level": read.white_level,
         "size": list(read.size) if read.size else None,
@@ -85,17 +91,12 @@ def _separate_frame(
 
 
 def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    return " ".join(str(error).split())[:500] or type(error).__name__
 
 
-def _refuse_collisions(paths: Sequence[str], write: WriteOptions) -> None:
-    stems = Counter(Path(path).stem for path in paths)
+def _refuse_equal_names(paths: Sequence[str]) -> None:
+    stems = Counter(output_stem(path) for path in paths)
     repeated = [stem for stem, count in stems.items() if count > 1]
     if repeated:
-        same = ", ".join(path for path in paths if Path(path).stem == repeated[0])
+        same = ", ".join(path for path in paths if output_stem(path) == repeated[0])
         raise OutputError(f"expected inputs of different names, found {same}: their outputs would be one file")
-    inputs = {realpath(path) for path in paths}
-    for stem in stems:
-        for output in planned_outputs(write.directory, stem, write.format):
-            if realpath(output) in inputs:
-                raise OutputError(f"expected an output directory without the inputs, found that {output} is an input")

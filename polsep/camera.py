@@ -57,9 +57,9 @@ class Layout:
             (a, b), (c, d) = self.polarizer
             flat = [float(angle) for angle in (a, b, c, d)]
         except (TypeError, ValueError):
-            raise ValueError(f"polarizer must be 2x2 angles in degrees, found {self.polarizer!r}") from None
+            raise ValueError(f"a layout's polarizer must be 2x2 angles in degrees, found {self.polarizer!r}") from None
         if not all(math.isfinite(angle) for angle in flat):
-            raise ValueError(f"polarizer must be 2x2 angles in degrees, found {self.polarizer!r}")
+            raise ValueError(f"a layout's polarizer must be 2x2 angles in degrees, found {self.polarizer!r}")
         object.__setattr__(self, "polarizer", ((a, b), (c, d)))
         if len({angle % 180 for angle in flat}) != 4:
             raise ValueError(
@@ -181,11 +181,9 @@ class Mosaic:
     white_level: float
 
     def __post_init__(self) -> None:
-        least = self.layout.period
-        if self.data.ndim < 2 or min(self.data.shape[-2:]) < least:
-            raise ValueError(
-                f"expected a mosaic [..., H, W] of at least {least}x{least}, found {tuple(self.data.shape)}"
-            )
+        rows, cols = (self.layout.period + start for start in self.layout.origin)
+        if self.data.ndim < 2 or self.data.shape[-2] < rows or self.data.shape[-1] < cols:
+            raise ValueError(f"expected a mosaic [..., H, W] of at least {rows}x{cols}, found {tuple(self.data.shape)}")
         if not self.white_level > self.black_level:
             raise ValueError(f"white_level must be above black_level, found {self.white_level} and {self.black_level}")
 

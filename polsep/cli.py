@@ -207,15 +207,14 @@ def bench(name: str, data: Path, output: Path) -> None:
     'polsep bench readme' makes the tables of README.md anew from DIR.
     """
     from polsep.bench import BENCHES, provenance, to_jsonl
-    from polsep.io.results import fill_tables, write_text
+    from polsep.io.results import fill_readme, write_text
 
     if name == "list":
         for known, function in BENCHES.items():
             print(f"{known}: {(function.__doc__ or '').splitlines()[0]}")
         return
     if name == "readme":
-        readme = Path("README.md")
-        write_text(readme, fill_tables(readme.read_text(encoding="utf-8"), output))
+        fill_readme(Path("README.md"), output)
         return
     if name not in BENCHES:
         raise click.ClickException(f"expected a benchmark of {', '.join([*BENCHES, 'readme'])}, found {name!r}")

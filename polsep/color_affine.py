@@ -61,9 +61,8 @@ def separate_color_affine(measurements: Measurements) -> Separation:
     if measurements.data.shape[-3] != 3:
         return separate_analytic_unclipped(measurements)
     stokes, exact = fit_stokes_unclipped(measurements)
-    usable = exact.all(dim=-3, keepdim=True)
     sample = sample_variance(measurements)
-    slope = color_slope(stokes, usable, sample, measurements.variance)
+    slope = color_slope(stokes, exact, sample, measurements.variance)
     offset, residual = _offset(stokes, slope)
     stokes, offset, determined = _solve_clipped(measurements, stokes, slope, offset)
     valid = determined
@@ -92,16 +91,20 @@ def sample_variance(measurements: Measurements, radius: int = 3) -> Tensor:
     return box_mean(squared * weight, radius) / box_mean(weight, radius).clamp(min=1e-6)
 
 
-def color_slope(stokes: Stokes, usable: Tensor, sample: Tensor, interpolation: Tensor | None) -> Tensor:
+def color_slope(stokes: Stokes, exact: Tensor, sample: Tensor, interpolation: Tensor | None) -> Tensor:
     """Slope a ``[..., 2, h, w]`` from how p varies with s0 over colours; |a| at most `MAX_DIFFUSE_DOLP`.
 
     Fitted to deviations from each pixel's own mean over colours, in which white specular light cancels exactly. Wide
     windows steady narrow ones, down to the single pixel, each in the proportion of its noise to its colour contrast (a
     Gaussian prior per scale). Noise in s0 would pull the slope toward p/s0 and so erase the specular of grey surfaces:
     contrast that noise explains is not counted, and pixels at colour edges, where demosaicking invents contrast, weigh
-    less. ``usable [..., 1, h, w]``: not clipped. ``sample``, ``interpolation``: variances of a sample.
+    less. ``exact [..., C, h, w]``: the colours that clipping leaves known, of which a pixel needs two. ``sample``,
+    ``interpolation``: variances of a sample.
     """
-    d0, d1, d2 = (s - _color_mean(s) for s in (stokes.s0, stokes.s1, stokes.s2))
+    colors = exact.sum(dim=-3, keepdim=True)
+    means = ((s * exact).sum(dim=-3, keepdim=True) / colors.clamp(min=1) for s in (stokes.s0, stokes.s1, stokes.s2))
+    d0, d1, d2 = ((s - m) * exact for s, m in zip((stokes.s0, stokes.s1, stokes.s2), means, strict=True))
+    usable = colors > 1
     error = 2 * CONTRAST_MARGIN * sample
     if interpolation is not None:
         error = error + interpolation
@@ -198,7 +201,7 @@ def _fill(found: Separation, measurements: Measurements, offset: Tensor, determi
 
     Where b is not ``determined`` the specular has the phase of its surroundings and fits the unclipped samples. It is
     at least what makes the clipped samples clip, and where everything clips at least as bright as around. A colour's
-    diffuse follows from its unclipped samples, or from around where it has none.
+    diffuse follows from its unclipped samples; where it has none, from around and from what makes it clip.
     """
     assert measurements.clipped is not None
     assert found.slope is not None
@@ -209,7 +212,9 @@ def _fill(found: Separation, measurements: Measurements, offset: Tensor, determi
     sums = _sums(measurements, found.slope, phase, around)
     specular = torch.where(known, found.specular[..., :1, :, :], _fit_specular(sums))
     diffuse = _fit_diffuse(sums, specular)
-    specular = torch.maximum(specular, _least_specular(measurements, found.slope, diffuse, phase))
+    least = torch.maximum(specular, _least_specular(measurements, found.slope, diffuse, phase))
+    specular = torch.where(known, specular, least)
+    diffuse = torch.where(known, torch.maximum(diffuse, _least_diffuse(measurements, found, specular, phase)), diffuse)
     core = measurements.clipped.all(dim=-4).all(dim=-3)
     rim = _around(torch.where(hole, specular, found.specular[..., :1, :, :]), ~core)
     specular = torch.where(core[..., None, :, :], torch.maximum(specular, rim), specular)
@@ -265,6 +270,18 @@ def _least_specular(measurements: Measurements, slope: Tensor, diffuse: Tensor, 
         p, clipped = _transmitted(phase, t), measurements.clipped[..., k, :, :, :]
         needed = (2 * measurements.data[..., k, :, :, :] - diffuse * _transmitted(slope, t)) / p.clamp(min=0.5)
         least = torch.maximum(least, torch.where(clipped & (p > 0.5), needed, 0.0).amax(dim=-3, keepdim=True))
+    return least
+
+
+def _least_diffuse(measurements: Measurements, found: Separation, specular: Tensor, phase: Tensor) -> Tensor:
+    """The least tau_d ``[..., C, h, w]`` that makes every clipped sample clip for given tau_s; 0 where none does."""
+    assert measurements.clipped is not None
+    assert found.slope is not None
+    least = torch.zeros_like(found.diffuse)
+    for k, t in enumerate(measurements.angles):
+        needed = 2 * measurements.data[..., k, :, :, :] - _transmitted(phase, t) * specular
+        needed = torch.where(measurements.clipped[..., k, :, :, :], needed / _transmitted(found.slope, t), 0.0)
+        least = torch.maximum(least, needed)
     return least
 
 

@@ -69,8 +69,11 @@ def crossed_pairs(layout: Layout) -> str | None:
     return None
 
 
-def _phase_means(mosaic: Mosaic) -> Tensor:
-    """Means ``[4, 4, blocks]`` of each pixel of the 4x4 period over 16x16-pixel blocks, gradient removed."""
+def _phase_means(mosaic: Mosaic) -> tuple[Tensor, Tensor]:
+    """Means ``[4, 4, blocks]`` of each pixel of the 4x4 period over 16x16 blocks, gradients removed; `_texture`.
+
+    Blocks with clipped samples are left out.
+    """
     data = mosaic.linear().reshape(-1, *mosaic.data.shape[-2:])[0]
     side = 16 if min(data.shape) >= 64 else 4
     height, width = (n // side * side for n in data.shape)
@@ -85,7 +88,18 @@ def _phase_means(mosaic: Mosaic) -> Tensor:
     place = torch.arange(4, dtype=data.dtype, device=data.device) - 1.5
     shift = place.view(4, 1, 1, 1) * slope_y + place.view(1, 4, 1, 1) * slope_x
     corrected = means - share * shift.flatten(0, 1)
-    return corrected[:, clipped[0, 0] == 0].reshape(4, 4, -1)
+    usable = clipped[0, 0] == 0
+    return corrected[:, usable].reshape(4, 4, -1), _texture(phases, side)[usable]
+
+
+def _texture(phases: Tensor, side: int) -> Tensor:
+    """Per block, `_color_contrast` between whole periods instead of cells: what a scene has without any filters."""
+    periods = phases.mean(1, keepdim=True)
+    if side == 4:
+        return torch.zeros_like(periods[0, 0])
+    means = functional.avg_pool2d(functional.pixel_unshuffle(periods, 2), 2)[0]
+    demodulated = torch.stack(list(_PAIRINGS.values())).to(means) @ means.flatten(1) / 4
+    return (demodulated.abs().sum(0) / means.flatten(1).mean(0).clamp(min=1e-9)).view(means.shape[1:])
 
 
 def _gradient(x: Tensor, dim: int) -> Tensor:
@@ -117,17 +131,19 @@ def _color_contrast(cells: Tensor) -> tuple[float, float]:
     """How much neighbouring cells differ relative to brightness; +1 for greens on the antidiagonal, -1 on the other."""
     brightness = cells.mean(1)
     diagonal, rows, columns = (signs.to(cells) @ brightness / 4 for signs in _PAIRINGS.values())
-    contrast = (diagonal.abs() + rows.abs() + columns.abs()).mean() / brightness.mean().clamp(min=1e-9)
+    contrast = (diagonal.abs() + rows.abs() + columns.abs()) / brightness.mean(0).clamp(min=1e-9)
     power = torch.sqrt((rows**2).sum() * (columns**2).sum())
-    return float(contrast), float((rows * columns).sum() / power.clamp(min=1e-12))
+    return float(contrast.median()), float((rows * columns).sum() / power.clamp(min=1e-12))
 
 
 def check_layout(mosaic: Mosaic) -> LayoutCheck:
     """Compare a frame (the first of a batch) with its own layout; never raises, and stays silent when in doubt."""
-    phases = _phase_means(mosaic)
+    if min(mosaic.data.shape[-2:]) < 16:
+        return LayoutCheck(None, None, None, (mosaic.layout,))
+    phases, texture = _phase_means(mosaic)
     if phases.shape[-1] < 16 or float(phases.mean()) <= 1e-4:
         return LayoutCheck(None, None, None, (mosaic.layout,))
-    color, origin, greens = _find_color(phases, mosaic.layout)
+    color, origin, greens = _find_color(phases, texture, mosaic.layout)
     contradiction = _contradictions(_cells(phases, origin))
     pairs = _find_pairs(contradiction, mosaic.layout)
     fits = _fitting(mosaic.layout, color, origin, greens, pairs)
@@ -141,14 +157,17 @@ def check_layout(mosaic: Mosaic) -> LayoutCheck:
     return LayoutCheck(f"the frame contradicts layout {mosaic.layout.spec}; it fits {likely}", pairs, color, layouts)
 
 
-def _find_color(phases: Tensor, layout: Layout) -> tuple[bool | None, tuple[int, int], float]:
+def _find_color(phases: Tensor, texture: Tensor, layout: Layout) -> tuple[bool | None, tuple[int, int], float]:
     """Whether cells differ in colour, at which alignment they differ most, and the greens' diagonal (0: unknown)."""
+    brightness = phases.mean((0, 1))
+    bright = brightness > 0.1 * brightness.mean()
+    phases, least = phases[..., bright], max(MIN_COLOR, 1.5 * float(texture[bright].median()))
     origins = [(0, 0), (0, 1), (1, 0), (1, 1)]
     found = {origin: _color_contrast(_cells(phases, origin)) for origin in origins}
     best = max(origins, key=lambda origin: found[origin][0])
     contrast, greens = found[best]
     others = max(found[origin][0] for origin in origins if origin != best)
-    if contrast < MIN_COLOR or contrast < 1.15 * others:
+    if contrast < least or contrast < 1.15 * others:
         return (False if contrast < MAX_MONO else None), layout.origin, 0.0
     return True, best, greens
 
@@ -189,13 +208,13 @@ def _fitting(
 def _candidates(layout: Layout) -> list[tuple[Layout, str]]:
     """The layout and what common mistakes make of it; then other orders of the analysers and mono for colour."""
     mistakes = [(layout, "as given"), *_cropped(layout)[:3], *_mirrored(layout), *_cropped(layout)[3:]]
-    bayer, swapped = (None, "mono read as colour") if layout.bayer else ("RGGB", "colour read as mono")
-    for other in (Layout(layout.polarizer, bayer), *(Layout(order, bayer) for order in _ORDERS.values())):
-        mistakes += [(other, swapped), *((crop, f"{swapped}, {reason}") for crop, reason in _cropped(other))]
     for order in _ORDERS.values():
         other = Layout(order, layout.bayer)
         mistakes += [(other, "another order of analysers")]
         mistakes += [(crop, f"another order of analysers, {reason}") for crop, reason in _cropped(other)]
+    bayer, swapped = (None, "mono read as colour") if layout.bayer else ("RGGB", "colour read as mono")
+    for other in (Layout(layout.polarizer, bayer), *(Layout(order, bayer) for order in _ORDERS.values())):
+        mistakes += [(other, swapped), *((crop, f"{swapped}, {reason}") for crop, reason in _cropped(other))]
     return mistakes
 
 

@@ -44,14 +44,17 @@ def as_mosaic(
     ValueError on another dtype or shape, values that are not finite, or white not above black.
     """
     layout = Layout() if layout is None else layout
+    if not isinstance(layout, Layout):
+        raise ValueError(f"expected a Layout or None, found {type(layout).__name__}")
     plane, notes = _one_channel(_checked(array))
     height, width = plane.shape
-    if height % 2 or width % 2:
-        plane = plane[: height - height % 2, : width - width % 2]
+    odd_rows, odd_cols = ((n - start) % 2 for n, start in zip((height, width), layout.origin, strict=True))
+    if odd_rows or odd_cols:
+        plane = plane[: height - odd_rows, : width - odd_cols]
         notes += (f"odd size {width}x{height}: cropped to {plane.shape[1]}x{plane.shape[0]}, whole polarizer cells",)
-    least = layout.period
-    if min(plane.shape) < least:
-        raise ValueError(f"expected a mosaic of at least {least}x{least} pixels, found {width}x{height}")
+    rows, cols = (layout.period + start for start in layout.origin)
+    if plane.shape[0] < rows or plane.shape[1] < cols:
+        raise ValueError(f"expected a mosaic of at least {cols}x{rows} pixels, found {width}x{height}")
     white = _white_level(plane, black_level, white_level)
     data = torch.from_numpy(_as_float32(plane))
     return Mosaic(data, layout, black_level, white), notes + level_notes(plane, black_level, white_level)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from polsep.camera import Layout, Mosaic
 from polsep.color_affine import separate_color_affine
-from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
+from polsep.demosaic import bilinear_variance, demosaic_bilinear, demosaic_bilinear_half
 from polsep.layout_check import check_layout
 from polsep.levels import as_mosaic
 from polsep.separation import Separation, dominant_angle, light_polarizer_angle, separate_analytic
@@ -155,9 +155,9 @@ def find_device(name: str) -> torch.device:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
+        torch.zeros(1, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0][:120]
         raise ValueError(f"expected a device like auto, cpu or cuda, found {name!r}: {reason}") from None
     return device
 
@@ -187,8 +187,11 @@ def resolve_light_color(
         if estimated is None:
             return (1.0,) * channels, ["too few unclipped highlights to estimate the light's colour: white is assumed"]
         return estimated, []
-    color = tuple(float(c) for c in light_color)
-    if len(color) != 3 or not all(math.isfinite(c) and c > 0 for c in color):
+    try:
+        color = tuple(float(c) for c in light_color)
+    except (TypeError, ValueError):
+        color = ()
+    if len(color) != 3 or not all(1e-6 < c < 1e6 for c in color):
         raise ValueError(f"expected a light colour of three positive numbers, found {light_color!r}")
     return (color if channels == 3 else (1.0,)), []
 
@@ -223,8 +226,10 @@ def in_light(
     """Run a method under white light: divide the light's colour out of the samples and multiply it back."""
     if all(c == 1 for c in light):
         return split(measurements)
-    gain = torch.tensor(light).to(measurements.data).view(-1, 1, 1)
-    found = split(replace(measurements, data=measurements.data / gain))
+    gain = torch.tensor(light, dtype=torch.float64).to(measurements.data).view(-1, 1, 1)
+    data = measurements.data / gain
+    variance = None if measurements.variance is None else bilinear_variance(data)
+    found = split(replace(measurements, data=data, variance=variance))
     return replace(found, diffuse=found.diffuse * gain, specular=found.specular * gain, stokes=found.stokes * gain)
 
 

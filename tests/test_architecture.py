@@ -127,14 +127,9 @@ def test_libraries_stay_in_their_room(path: Path) -> None:
     assert optimizers == [] or room(path) == "train"
 
 
-READS_README = pytest.mark.xfail(
-    strict=True, reason="`polsep bench readme` reads README.md in cli instead of io.results"
-)
-
-
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(p, marks=READS_README if p.name == "cli.py" else ()) for p in modules() if room(p) != "io"],
+    [p for p in modules() if room(p) != "io"],
     ids=lambda p: label(p),
 )
 def test_files_are_touched_in_io_only(path: Path) -> None:

@@ -274,7 +274,6 @@ def test_inputs_are_never_overwritten(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "link"]
 
 
-@pytest.mark.xfail(strict=True, reason="_refuse_collisions knows the stems of paths, not those of pages and templates")
 def test_numbered_pages_do_not_overwrite_an_input(tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     """Page 0 of run.tiff is run_0000: with --format tiff it must not replace the input run_0000_diffuse.tiff."""
     monkeypatch.chdir(tmp_path)
@@ -285,9 +284,6 @@ def test_numbered_pages_do_not_overwrite_an_input(tmp_path: Path, polsep: Cli, m
     assert Path("run_0000_diffuse.tiff").read_bytes() == before
 
 
-@pytest.mark.xfail(
-    strict=True, reason="_refuse_collisions compares shot_{angle} with shot, both of which write shot.exr"
-)
 def test_template_and_file_of_one_name_are_refused(tmp_path: Path, polsep: Cli) -> None:
     """shot_{angle}.png and shot.png would both write shot.exr: refused, also with --overwrite."""
     for angle in (0, 45, 90, 135):
@@ -388,11 +384,7 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--black-level", "65535"], "above the black level"),
     (["--black-level", "nan"], "finite"),
     (["--pages", "angles"], "four pages"),
-    pytest.param(  # type: ignore[list-item]
-        ["--device", "meta"],
-        "device",
-        marks=pytest.mark.xfail(strict=True, reason="find_device takes meta, a device without data, for one"),
-    ),
+    (["--device", "meta"], "device"),
 ]
 
 
@@ -410,17 +402,14 @@ def test_bad_commands(polsep: Cli, args: list[str]) -> None:
     assert_refused(polsep(*args))
 
 
-TINY = pytest.mark.xfail(strict=True, reason="the layout check and the Bayer padding need 4 pixels after the origin")
-
-
 @pytest.mark.parametrize(
     ("shape", "layout"),
     [
         ((1, 1), "color"),
         ((3, 3), "color"),
         ((1, 1), "mono"),
-        pytest.param((4, 4), "90,45,135,0/RGGB@1,1", marks=TINY),
-        pytest.param((5, 5), "90,45,135,0/RGGB@0,1", marks=TINY),
+        ((4, 4), "90,45,135,0/RGGB@1,1"),
+        ((4, 4), "90,45,135,0/RGGB@0,1"),
     ],
 )
 def test_frames_too_small(tmp_path: Path, polsep: Cli, shape: tuple[int, int], layout: str) -> None:
@@ -430,7 +419,6 @@ def test_frames_too_small(tmp_path: Path, polsep: Cli, shape: tuple[int, int], l
     assert not (tmp_path / "o").exists()
 
 
-@pytest.mark.xfail(strict=True, raises=RuntimeError, reason="the layout check pools blocks of 4 pixels")
 def test_smallest_mono_frame(tmp_path: Path, polsep: Cli) -> None:
     """2x2 pixels are one whole cell of a mono sensor: separated."""
     source = png(tmp_path / "a.png", np.array([[90, 80], [70, 60]], np.uint8))

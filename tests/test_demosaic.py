@@ -250,7 +250,6 @@ def test_small_and_odd_sizes(height: int, width: int, demosaic: Demosaicker) -> 
         assert torch.equal(found.data, even.data)
 
 
-@pytest.mark.xfail(strict=True, raises=RuntimeError, reason="Mosaic counts rows and columns before the origin")
 @pytest.mark.parametrize("demosaic", DEMOSAICKERS)
 def test_too_few_pixels_after_the_origin_are_refused(demosaic: Demosaicker) -> None:
     """A colour frame that holds less than one Bayer block from its origin on is refused in words."""

@@ -242,7 +242,6 @@ def test_bad_arguments_are_one_line(raw: Any, options: dict[str, Any], message: 
     assert "\n" not in str(caught.value) and "found" in str(caught.value)
 
 
-@pytest.mark.xfail(strict=True, reason="device meta passes the check; a light colour that is no sequence is not caught")
 @pytest.mark.parametrize("options", [{"device": "meta"}, {"light_color": 5}, {"light_color": None}])
 def test_arguments_of_other_kinds_are_one_line(options: dict[str, Any]) -> None:
     """A device without data, or a light colour that is no sequence, is a ValueError of one line too."""
@@ -283,12 +282,7 @@ def test_light_color_needs_highlights() -> None:
     assert any("too few unclipped highlights" in note for note in out.report["warnings"])
 
 
-CARRIED_VARIANCE = pytest.mark.xfail(
-    strict=True, reason="in_light leaves the variance in the units of the coloured light"
-)
-
-
-@pytest.mark.parametrize("method", ["analytic", pytest.param("color-affine", marks=CARRIED_VARIANCE)])
+@pytest.mark.parametrize("method", ["analytic", "color-affine"])
 def test_said_light_color_undoes_the_light(method: str) -> None:
     """With the light's colour said, a scene in coloured light is the scene in white light times that colour."""
     white = quietly(raw_frame("float32", exposure=0.5), method=method)

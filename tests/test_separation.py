@@ -268,7 +268,6 @@ def test_three_analysers_of_one_color_are_enough_for_the_specular() -> None:
     assert bool(found.valid.all())
 
 
-@pytest.mark.xfail(strict=True, reason="the bound of a blind colour raises the specular that the others determine")
 def test_one_blind_color_leaves_the_specular_exact() -> None:
     """Red clips behind all four analysers, green and blue nowhere: the specular is known, the diffuse flagged."""
     truth = random_truth(14, gain=(5.0, 0.7, 0.4))

@@ -26,7 +26,7 @@ from polsep.io.tiff import read_tiff
 from polsep.levels import as_measurements, as_mosaic, interleave_planes
 from polsep.stokes import Measurements
 
-__all__ = ["Frame", "InputError", "ReadOptions", "read_frames"]
+__all__ = ["Frame", "InputError", "ReadOptions", "output_stem", "read_frames"]
 
 _READERS: dict[str, Callable[[Path], Iterator[Page]]] = {
     ".png": read_png,
@@ -92,11 +92,11 @@ def read_frames(path: str | Path, options: ReadOptions | None = None) -> Iterato
     for page in pages:
         with naming(path):
             data, notes = _convert(page, options)
-        stem = _stem(path)
+        stem = output_stem(path)
         yield Frame(stem if page.count == 1 else f"{stem}_{page.index:04d}", data, page.notes + notes)
 
 
-def _stem(path: str | Path) -> str:
+def output_stem(path: str | Path) -> str:
     """File name without extension and placeholder: ``nir_{angle}.png`` gives ``nir``."""
     stem = Path(path).stem
     return stem if _PLACE not in stem else stem.replace(_PLACE, "").strip("_-. ") or "angles"

@@ -35,6 +35,11 @@ def fill_tables(markdown: str, results: Path) -> str:
     return _TABLE.sub(table, markdown)
 
 
+def fill_readme(readme: Path, results: Path) -> None:
+    """`fill_tables` on a file, replaced as a whole."""
+    write_text(readme, fill_tables(readme.read_text(encoding="utf-8"), results))
+
+
 def markdown_table(rows: list[dict[str, Any]]) -> str:
     """One line per case and metric, one column per method, and what made the numbers.
 

@@ -172,13 +172,15 @@ class Mosaic:
     """One raw frame (or a batch): linear sensor values ``data [..., H, W]`` with what is needed to read them.
 
     ``black_level`` and ``white_level`` are in the units of ``data``. Samples within `CLIP_MARGIN` of the white level
-    count as clipped. Raises ValueError when white is not above black or the frame is smaller than one period.
+    count as clipped. ``light_color``: one gain per channel that `linear` divides out, so that what follows sees white
+    light. Raises ValueError when white is not above black or the frame is smaller than one period.
     """
 
     data: Tensor
     layout: Layout
     black_level: float
     white_level: float
+    light_color: tuple[float, ...] = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
         rows, cols = (self.layout.period + start for start in self.layout.origin)
@@ -188,13 +190,24 @@ class Mosaic:
             raise ValueError(f"white_level must be above black_level, found {self.white_level} and {self.black_level}")
 
     def linear(self) -> Tensor:
-        """Samples with black at 0 and white at 1, float32 (float64 for float64 data); not clipped below 0."""
+        """Samples with black at 0 and white at 1, under white light; float32 (float64 for float64 data)."""
+        samples = self._samples()
+        if all(gain == 1 for gain in self.light_color):
+            return samples
+        period = self.layout.period
+        for row in range(period):
+            for col in range(period):
+                channel = self.layout.filter_at(row, col).channel
+                samples[..., row::period, col::period] /= self.light_color[channel]
+        return samples
+
+    def _samples(self) -> Tensor:
         data = self.data if self.data.dtype == torch.float64 else self.data.float()
         return (data - self.black_level) / (self.white_level - self.black_level)
 
     def clipped(self) -> Tensor:
         """Mask ``[..., H, W]`` of samples that only bound the light from below."""
-        return self.linear() >= 1 - CLIP_MARGIN
+        return self._samples() >= 1 - CLIP_MARGIN
 
 
 @dataclass(frozen=True)

@@ -60,9 +60,11 @@ def separate_color_affine(measurements: Measurements) -> Separation:
     """
     if measurements.data.shape[-3] != 3:
         return separate_analytic_unclipped(measurements)
-    stokes, exact = fit_stokes_unclipped(measurements)
-    sample = sample_variance(measurements)
-    slope = color_slope(stokes, exact, sample, measurements.variance)
+    even = measurements.uniform or measurements
+    stokes, exact = fit_stokes_unclipped(even)
+    sample = sample_variance(even)
+    slope = color_slope(stokes, exact, sample, even.variance)
+    stokes = stokes if even is measurements else fit_stokes_unclipped(measurements)[0]
     offset, residual = _offset(stokes, slope)
     stokes, offset, determined = _solve_clipped(measurements, stokes, slope, offset)
     valid = determined

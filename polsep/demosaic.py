@@ -57,7 +57,7 @@ def _bayer_bilinear(planes: Tensor, bayer: str) -> Tensor:
     return functional.conv2d(padded, kernels, groups=3).reshape(*batch, 3, height, width)
 
 
-def _colors(plane: Tensor, layout: Layout) -> Tensor:
+def colors_of(plane: Tensor, layout: Layout) -> Tensor:
     """An analyser's plane ``[..., h, w]`` in all the layout's colours ``[..., C, h, w]``."""
     return plane[..., None, :, :] if layout.bayer is None else _bayer_bilinear(plane, layout.bayer)
 
@@ -70,7 +70,7 @@ def _neighbour(x: Tensor, place: int, dim: int) -> Tensor:
     return torch.cat([x.narrow(dim, 0, 1), x.narrow(dim, 0, n - 1)], dim)
 
 
-def _to_center(x: Tensor, place: tuple[int, int]) -> Tensor:
+def to_center(x: Tensor, place: tuple[int, int]) -> Tensor:
     """Shift a plane by a quarter sample to the cell's centre: weights 3/4 and 1/4 in both directions."""
     for dim in (-2, -1):
         x = 0.75 * x + 0.25 * _neighbour(x, place[dim], dim)
@@ -92,7 +92,7 @@ def _interpolate(mosaic: Mosaic, register: Callable[[Tensor, tuple[int, int]], T
 
     def run(values: Tensor) -> Tensor:
         planes, places = split_analysers(values, layout)
-        each = [register(_colors(planes[..., k, :, :], layout), place) for k, place in enumerate(places)]
+        each = [register(colors_of(planes[..., k, :, :], layout), place) for k, place in enumerate(places)]
         return torch.stack(each, dim=-4)
 
     clipped = mosaic.clipped()
@@ -121,7 +121,7 @@ def demosaic_bilinear(mosaic: Mosaic) -> Measurements:
 
 def demosaic_bilinear_half(mosaic: Mosaic) -> Measurements:
     """`demosaic_bilinear` averaged over each 2x2 cell, ``[..., 4, C, H/2, W/2]``, without making the full images."""
-    return _interpolate(mosaic, _to_center)
+    return _interpolate(mosaic, to_center)
 
 
 def demosaic_dave2022(mosaic: Mosaic) -> Measurements:

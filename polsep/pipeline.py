@@ -19,7 +19,8 @@ from torch import Tensor
 
 from polsep.camera import Layout, Mosaic
 from polsep.color_affine import separate_color_affine
-from polsep.demosaic import bilinear_variance, demosaic_bilinear, demosaic_bilinear_half
+from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
+from polsep.guided import demosaic_guided_half
 from polsep.layout_check import check_layout
 from polsep.levels import as_mosaic
 from polsep.separation import Separation, dominant_angle, light_polarizer_angle, separate_analytic
@@ -35,9 +36,10 @@ class PolsepWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Method:
-    """A separation method: ``split`` runs on co-registered analysers, the other fields are for people to read."""
+    """A separation method: ``demosaic`` a frame to half resolution, then ``split``; the rest is for people to read."""
 
     name: str
+    demosaic: Callable[[Mosaic], Measurements]
     split: Callable[[Measurements], Separation]
     summary: str
     needs: str
@@ -49,6 +51,7 @@ METHODS = {
     for method in (
         Method(
             "color-affine",
+            demosaic_guided_half,
             separate_color_affine,
             "closed form for polarized diffuse and white specular light, recovers clipped samples",
             "colour; on mono and grey it is the analytic split with clipped samples recovered",
@@ -56,6 +59,7 @@ METHODS = {
         ),
         Method(
             "analytic",
+            demosaic_bilinear_half,
             separate_analytic,
             "the paper's first estimate: specular = polarized part, diffuse = the rest",
             "colour or mono; takes the diffuse light for unpolarized and clipped samples at face value",
@@ -130,9 +134,10 @@ def separate_capture(
     if isinstance(capture, Mosaic):
         check = check_layout(capture)
         remarks += [check.warning] if check.warning else []
-    measurements = demosaic(capture, full)
-    light, light_remarks = resolve_light_color(light_color, measurements)
-    found = in_light(chosen.split, measurements, light)
+    light, light_remarks = resolve_light_color(light_color, capture)
+    white = under_white_light(capture, light)
+    measurements = demosaic(white, chosen, full)
+    found = in_light(chosen.split(measurements), light)
     report = describe(found, measurements)
     report |= {"method": chosen.name, "light_color": list(light), "full_resolution": full}
     report["layout"] = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
@@ -168,22 +173,24 @@ def to_device(capture: Capture, device: torch.device) -> Capture:
     return replace(capture, **moved)  # type: ignore[arg-type]
 
 
-def demosaic(capture: Capture, full: bool) -> Measurements:
-    """Co-registered analysers at half resolution, or full if asked; co-sited measurements pass."""
+def demosaic(capture: Capture, method: Method, full: bool) -> Measurements:
+    """Co-registered analysers at half resolution as the method wants them, or bilinear ones at full resolution.
+
+    Co-sited measurements pass.
+    """
     if isinstance(capture, Measurements):
         return capture
-    return demosaic_bilinear(capture) if full else demosaic_bilinear_half(capture)
+    return demosaic_bilinear(capture) if full else method.demosaic(capture)
 
 
-def resolve_light_color(
-    light_color: LightColor | str, measurements: Measurements
-) -> tuple[tuple[float, ...], list[str]]:
+def resolve_light_color(light_color: LightColor | str, capture: Capture) -> tuple[tuple[float, ...], list[str]]:
     """One gain per channel, and remarks; "estimate" takes the colour of the highlights. ValueError on anything else."""
-    channels = measurements.data.shape[-3]
+    channels = capture.layout.channels if isinstance(capture, Mosaic) else capture.data.shape[-3]
     if isinstance(light_color, str):
         if light_color != "estimate":
             raise ValueError(f'expected a light colour of three numbers or "estimate", found {light_color!r}')
-        estimated = estimate_light_color(measurements)
+        samples = demosaic_bilinear_half(capture) if isinstance(capture, Mosaic) else capture
+        estimated = estimate_light_color(samples)
         if estimated is None:
             return (1.0,) * channels, ["too few unclipped highlights to estimate the light's colour: white is assumed"]
         return estimated, []
@@ -220,16 +227,18 @@ def estimate_light_color(measurements: Measurements) -> tuple[float, ...] | None
     return tuple((color / color[1]).tolist())
 
 
-def in_light(
-    split: Callable[[Measurements], Separation], measurements: Measurements, light: tuple[float, ...]
-) -> Separation:
-    """Run a method under white light: divide the light's colour out of the samples and multiply it back."""
-    if all(c == 1 for c in light):
-        return split(measurements)
-    gain = torch.tensor(light, dtype=torch.float64).to(measurements.data).view(-1, 1, 1)
-    data = measurements.data / gain
-    variance = None if measurements.variance is None else bilinear_variance(data)
-    found = split(replace(measurements, data=data, variance=variance))
+def under_white_light(capture: Capture, light: tuple[float, ...]) -> Capture:
+    """The capture as it would be in white light: the light's colour divided out of every sample."""
+    if isinstance(capture, Mosaic):
+        return replace(capture, light_color=light)
+    return replace(
+        capture, data=capture.data / torch.tensor(light, dtype=torch.float64).to(capture.data).view(-1, 1, 1)
+    )
+
+
+def in_light(found: Separation, light: tuple[float, ...]) -> Separation:
+    """The twin of `under_white_light`: the light's colour multiplied back into a separation."""
+    gain = torch.tensor(light, dtype=torch.float64).to(found.diffuse).view(-1, 1, 1)
     return replace(found, diffuse=found.diffuse * gain, specular=found.specular * gain, stokes=found.stokes * gain)
 
 

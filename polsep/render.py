@@ -85,7 +85,7 @@ def rotation_matrix(angles: Vector) -> Tensor:
 
 
 def _local(part: Part, points: Tensor) -> Tensor:
-    center = torch.tensor(part.center).to(points).view(3, 1, 1)
+    center = torch.tensor(part.center, dtype=torch.float32).to(points).view(3, 1, 1)
     return torch.einsum("ji,jnw->inw", rotation_matrix(part.rotation).to(points), points - center)
 
 
@@ -127,7 +127,7 @@ def camera_rays(camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[i
     height, width = size
     if math.hypot(camera.position[0] - camera.target[0], camera.position[2] - camera.target[2]) < 1e-6:
         raise ValueError("expected a camera that does not look straight up or down, its up vector is world +y")
-    eye, target = torch.tensor(camera.position), torch.tensor(camera.target)
+    eye, target = torch.tensor(camera.position, dtype=torch.float32), torch.tensor(camera.target, dtype=torch.float32)
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0])), dim=0)
     up = torch.linalg.cross(right, forward)
@@ -157,14 +157,14 @@ def shade(buffer: GBuffer, parts: tuple[Part, ...], camera: PinholeCamera, light
     """Diffuse and specular Stokes images ``[3, N, 1]`` of a G-buffer under one light, with cast shadows."""
     position, normal = buffer.position, buffer.normal
     up = torch.tensor([0.0, 1.0, 0.0]).to(position).view(3, 1, 1)
-    to_light = torch.tensor(light.position).to(position).view(3, 1, 1) - position
+    to_light = torch.tensor(light.position, dtype=torch.float32).to(position).view(3, 1, 1) - position
     distance = torch.sqrt(dot(to_light, to_light))
-    to_camera = normalize(torch.tensor(camera.position).to(position).view(3, 1, 1) - position)
+    to_camera = normalize(torch.tensor(camera.position, dtype=torch.float32).to(position).view(3, 1, 1) - position)
     to_light = to_light / distance
     lifted = position + 4e-3 * normal
     _, shadowed = trace(parts, lifted, to_light, distance)
     irradiance = light.intensity / distance**2 * (buffer.mask & ~shadowed)
-    polarizer = torch.tensor(light.polarizer).to(position)
+    polarizer = torch.tensor(light.polarizer, dtype=torch.float32).to(position)
     geometry = Geometry(normal, to_camera, to_light, up, up)
     diffuse = diffuse_stokes(geometry, polarizer, irradiance, buffer.albedo)
     specular = specular_stokes(geometry, polarizer, irradiance, buffer.roughness) * buffer.specular

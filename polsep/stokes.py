@@ -55,13 +55,15 @@ class Measurements:
 
     ``angles`` are the K analyser angles in radians. ``clipped`` marks samples that are only known to be at least as
     bright as their value; it may be None when nothing clips. ``variance [..., 1, H, W]`` is the variance of colour
-    differences that a demosaicker expects its own interpolation to have added, None for co-sited samples.
+    differences that a demosaicker expects its own interpolation to have added, None for co-sited samples. ``uniform``:
+    the same samples with one and the same blur in all colours and analysers, where ``data`` lacks that; else None.
     """
 
     data: Tensor
     angles: tuple[float, ...]
     clipped: Tensor | None = None
     variance: Tensor | None = None
+    uniform: Measurements | None = None
 
     def __post_init__(self) -> None:
         if self.data.ndim < 4 or self.data.shape[-4] != len(self.angles):

@@ -20,6 +20,7 @@ RANKS = {
     "separation": 2,
     "color_affine": 2,
     "demosaic": 3,
+    "guided": 3,
     "layout_check": 3,
     "render": 3,
     "scenes": 3,
@@ -32,7 +33,13 @@ RANKS = {
     "cli": 7,
 }
 #: Imports between modules of one rank that belong together.
-WITHIN = {("color_affine", "separation"), ("scenes", "render"), ("pipeline", "levels"), ("io", "io")}
+WITHIN = {
+    ("color_affine", "separation"),
+    ("scenes", "render"),
+    ("pipeline", "levels"),
+    ("guided", "demosaic"),
+    ("io", "io"),
+}
 #: Libraries that only one room may use.
 HOMES = {
     "imagecodecs": "io",

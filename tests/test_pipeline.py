@@ -99,8 +99,11 @@ def test_auto_is_the_closed_form() -> None:
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("uint8", 0.02), ("uint16", 1e-4), ("float64", 1e-6)])
 def test_sample_types_agree(dtype: str, tolerance: float) -> None:
-    """uint8, uint16 and float frames of one scene give the same images up to their quantization."""
-    reference, other = quietly(raw_frame("float32")), quietly(raw_frame(dtype))
+    """uint8, uint16 and float frames of one scene give the same images up to their quantization.
+
+    Nothing clips: whether a sample just below white does is a question that quantization decides.
+    """
+    reference, other = quietly(raw_frame("float32", exposure=0.5)), quietly(raw_frame(dtype, exposure=0.5))
     total = reference.diffuse + reference.specular
     assert float(np.abs(other.diffuse + other.specular - total).max()) < tolerance
     assert float(np.abs(other.specular - reference.specular).mean()) < tolerance
@@ -263,7 +266,7 @@ def test_every_shipped_method_and_device_is_found() -> None:
 def test_light_color_is_estimated_within_3_percent(light: tuple[float, ...]) -> None:
     """The highlights tell the light's colour, relative to green, within 3 %, on a noisy 12-bit frame."""
     mosaic = expose(lit_scene(light), Layout(), IMX250, torch.Generator().manual_seed(4))
-    found = estimate_light_color(demosaic(mosaic, full=False))
+    found = estimate_light_color(demosaic(mosaic, METHODS["analytic"], full=False))
     assert found is not None
     assert found == pytest.approx([c / light[1] for c in light], rel=0.03)
     out = separate_capture(mosaic, light_color="estimate")

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from polsep.color_affine import MAX_DIFFUSE_DOLP, separate_color_affine, white_specular
-from polsep.pipeline import in_light
+from polsep.pipeline import in_light, under_white_light
 from polsep.render import Part, PinholeCamera, PointLight, render
 from polsep.scenes import ball, plain
 from polsep.separation import (
@@ -376,7 +376,9 @@ def test_colored_light_is_divided_out(split: Split, light: tuple[float, ...]) ->
     """A scene lit by colour L, separated in L, is the separation under white light times L."""
     white = measured(random_truth(22))
     color = torch.tensor(light, dtype=torch.float64).view(3, 1, 1)
-    one, other = split(white), in_light(split, Measurements(white.data * color, SONY), light)
+    lit = under_white_light(Measurements(white.data * color, SONY), light)
+    assert isinstance(lit, Measurements)
+    one, other = split(white), in_light(split(lit), light)
     assert_within(other.diffuse, one.diffuse * color, 1e-6)
     assert_within(other.specular, one.specular * color, 1e-6)
     assert_close(other.diffuse + other.specular, other.stokes.s0)

@@ -24,10 +24,6 @@ from polsep.camera import Layout, Mosaic
 from polsep.separation import box_mean
 from polsep.stokes import Measurements
 
-#: Bilinear Bayer kernels on planes with zeros where the colour was not sampled.
-_RED_BLUE = ((0.25, 0.5, 0.25), (0.5, 1.0, 0.5), (0.25, 0.5, 0.25))
-_GREEN = ((0.0, 0.25, 0.0), (0.25, 1.0, 0.25), (0.0, 0.25, 0.0))
-
 
 def aligned(values: Tensor, layout: Layout) -> Tensor:
     """``values [..., H, W]`` from the layout's origin on, cropped to whole 2x2 polarizer cells."""
@@ -44,17 +40,28 @@ def split_analysers(values: Tensor, layout: Layout) -> tuple[Tensor, list[tuple[
     return torch.stack([values[..., row::2, col::2] for row, col in places], dim=-3), places
 
 
+def correlate(x: Tensor, taps: tuple[float, ...], dim: int) -> Tensor:
+    """Correlate images ``[..., h, w]`` with an odd number of taps along -1 or -2; borders mirror, keeping phases."""
+    half, n = len(taps) // 2, x.shape[dim]
+    pads = (half, half, 0, 0) if dim == -1 else (0, 0, half, half)
+    padded = functional.pad(x.reshape(-1, 1, *x.shape[-2:]), pads, mode="reflect")
+    total = torch.zeros(1, dtype=x.dtype, device=x.device)
+    for k, weight in enumerate(taps):
+        if weight:
+            total = total + weight * padded.narrow(dim, k, n)
+    return total.reshape(x.shape)
+
+
 def _bayer_bilinear(planes: Tensor, bayer: str) -> Tensor:
     """RGB ``[..., 3, h, w]`` of Bayer planes ``[..., h, w]``, each colour interpolated on its own."""
-    *batch, height, width = planes.shape
-    flat = planes.reshape(-1, 1, height, width)
-    sampled = flat.new_zeros(flat.shape[0], 3, height, width)
+    sampled = torch.zeros(3, *planes.shape, dtype=planes.dtype, device=planes.device)
     for place, color in enumerate(bayer):
         row, col = divmod(place, 2)
-        sampled[:, "RGB".index(color), row::2, col::2] = flat[:, 0, row::2, col::2]
-    kernels = torch.tensor([_RED_BLUE, _GREEN, _RED_BLUE]).to(planes)[:, None]
-    padded = functional.pad(sampled, (1, 1, 1, 1), mode="reflect")
-    return functional.conv2d(padded, kernels, groups=3).reshape(*batch, 3, height, width)
+        sampled["RGB".index(color), ..., row::2, col::2] = planes[..., row::2, col::2]
+    red, green, blue = sampled
+    red, blue = (correlate(correlate(x, (0.5, 1.0, 0.5), -1), (0.5, 1.0, 0.5), -2) for x in (red, blue))
+    green = correlate(green, (0.25, 0.5, 0.25), -1) + correlate(green, (0.25, 0.5, 0.25), -2)
+    return torch.stack([red, green, blue], dim=-3)
 
 
 def colors_of(plane: Tensor, layout: Layout) -> Tensor:

@@ -24,10 +24,9 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from polsep.camera import Layout, Mosaic
-from polsep.demosaic import colors_of, demosaic_bilinear_half, split_analysers, to_center
+from polsep.demosaic import colors_of, correlate, demosaic_bilinear_half, split_analysers, to_center
 from polsep.separation import box_mean
 from polsep.stokes import Measurements, Stokes, fit_stokes, measure
 
@@ -61,15 +60,6 @@ def demosaic_guided_half(mosaic: Mosaic) -> Measurements:
     return Measurements(data, layout.angles, plain.clipped, plain.variance, plain)
 
 
-def _filter(x: Tensor, taps: tuple[float, ...], dim: int) -> Tensor:
-    """Correlate images ``[..., h, w]`` with an odd number of taps along -1 or -2; borders mirror, keeping phases."""
-    half = len(taps) // 2
-    kernel = torch.tensor(taps).to(x).view((1, 1, 1, -1) if dim == -1 else (1, 1, -1, 1))
-    pads = (half, half, 0, 0) if dim == -1 else (0, 0, half, half)
-    flat = functional.pad(x.reshape(-1, 1, *x.shape[-2:]), pads, mode="reflect")
-    return functional.conv2d(flat, kernel).reshape(x.shape)
-
-
 def _masks(like: Tensor, bayer: str) -> Tensor:
     """Where the cells of ``[..., h, w]`` are red, green, blue: ``[3, h, w]`` of 0 and 1."""
     masks = torch.zeros(3, *like.shape[-2:], dtype=like.dtype, device=like.device)
@@ -91,17 +81,17 @@ def _fill_green(cells: Tensor, is_green: Tensor) -> Tensor:
     """Green everywhere: estimates along both directions, weighed by how smooth green minus the other colour is."""
     total, weights = torch.zeros_like(cells), torch.zeros_like(cells)
     for dim in (-1, -2):
-        around, second = _filter(cells, (0.5, 0.0, 0.5), dim), _filter(cells, (-0.25, 0.0, 0.5, 0.0, -0.25), dim)
+        around, second = correlate(cells, (0.5, 0.0, 0.5), dim), correlate(cells, (-0.25, 0.0, 0.5, 0.0, -0.25), dim)
         other = around + _slope_of_other(cells, is_green, dim) * second
         difference = torch.where(is_green > 0, cells - other, other - cells)
-        weight = 1 / (box_mean(_filter(difference, (-1.0, 0.0, 1.0), dim) ** 2, 1) + 1e-6)
+        weight = 1 / (box_mean(correlate(difference, (-1.0, 0.0, 1.0), dim) ** 2, 1) + 1e-6)
         total, weights = total + weight * difference, weights + weight
     return torch.where(is_green > 0, cells, cells + total / weights)
 
 
 def _slope_of_other(cells: Tensor, is_green: Tensor, dim: int) -> Tensor:
     """The slope at which the other colour of a row (or column) follows the cell's own: regression of differences."""
-    other, own = _filter(cells, (-0.5, 0.0, 0.5), dim), _filter(cells, (-0.25, 0.0, 0.0, 0.0, 0.25), dim)
+    other, own = correlate(cells, (-0.5, 0.0, 0.5), dim), correlate(cells, (-0.25, 0.0, 0.0, 0.0, 0.25), dim)
     slopes = []
     for sites in (is_green, 1 - is_green):
         share = box_mean(sites, 2)
@@ -119,7 +109,7 @@ def _fill_from_green(cells: Tensor, green: Tensor, mask: Tensor) -> Tensor:
     guess = box_mean(slope, 1) * green + box_mean(mean_x - slope * mean_g, 1)
     residual = (cells - guess) * mask
     for dim in (-1, -2):
-        residual = _filter(residual, (0.5, 1.0, 0.5), dim)
+        residual = correlate(residual, (0.5, 1.0, 0.5), dim)
     return guess + residual
 
 
@@ -127,7 +117,7 @@ def _at_sample(image: Tensor, place: tuple[int, int]) -> Tensor:
     """A half-resolution image ``[..., h, w]`` at the places of one analyser's samples, a quarter off the centres."""
     for dim in (-2, -1):
         taps = (*_QUARTER_BEFORE, 0.0) if place[dim] == 0 else (0.0, *_QUARTER_BEFORE[::-1])
-        image = _filter(image, taps, dim)
+        image = correlate(image, taps, dim)
     return image
 
 
@@ -153,7 +143,7 @@ def _polarization(planes: Tensor, s0: Tensor, layout: Layout, places: list[tuple
             left.append(2 * planes[..., k, :, :] - guide[k] - (expected * masks).sum(dim=-3))
         detail = _interleave(left, places)
         for dim in (-1, -2):
-            detail = _filter(detail, (0.25, 0.5, 0.25), dim)
+            detail = correlate(detail, (0.25, 0.5, 0.25), dim)
         sharper = [g + DETAIL_GAIN * detail[..., row::2, col::2] for g, (row, col) in zip(guide, places, strict=True)]
         found = _fit_residual(planes, sharper, layout, places)
     return found

@@ -66,10 +66,16 @@ def separate_analytic_unclipped(measurements: Measurements) -> Separation:
 
 def box_mean(x: Tensor, radius: int) -> Tensor:
     """Mean over (2 radius + 1)^2 windows of ``[..., h, w]``; windows shrink at the border instead of padding."""
-    flat = x.reshape(-1, 1, *x.shape[-2:])
-    for kernel, padding in (((1, 2 * radius + 1), (0, radius)), ((2 * radius + 1, 1), (radius, 0))):
-        flat = functional.avg_pool2d(flat, kernel, 1, padding, count_include_pad=False)
-    return flat.reshape(x.shape)
+    for dim, pads in ((-1, (radius, radius, 0, 0)), (-2, (0, 0, radius, radius))):
+        n = x.shape[dim]
+        padded = functional.pad(x, pads)
+        total = padded.narrow(dim, 0, n).clone()
+        for k in range(1, 2 * radius + 1):
+            total += padded.narrow(dim, k, n)
+        place = torch.arange(n, device=x.device)
+        count = 1 + place.clamp(max=radius) + (n - 1 - place).clamp(max=radius)
+        x = total / (count if dim == -1 else count[:, None]).to(total)
+    return x
 
 
 def dominant_angle(images: Tensor) -> tuple[float, float]:

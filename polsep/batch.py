@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from polsep.io.frames import Frame, ReadOptions, output_stem, read_frames
-from polsep.io.outputs import OutputError, planned_outputs, write_separation
+from polsep.io.outputs import OutputError, planned_outputs, refuse_targets, write_separation
 from polsep.pipeline import LightColor, separate_capture
 
 
@@ -61,9 +61,10 @@ def separate_files(
     for path in paths:
         try:
             for frame in read_frames(path, read):
-                outputs = {realpath(output) for output in planned_outputs(write.directory, frame.stem, write.format)}
-                if clash := sorted(outputs & inputs):
+                outputs = planned_outputs(write.directory, frame.stem, write.format)
+                if clash := sorted({realpath(output) for output in outputs} & inputs):
                     raise OutputError(f"{path}: expected outputs apart from inputs, found that {clash[0]} is an input")
+                refuse_targets(write.directory, outputs, write.overwrite)
                 yield _separate_frame(path, frame, read, options, write)
         except (ValueError, OSError, MemoryError, RuntimeError) as error:
             yield Outcome(path, error=_one_line(error))

@@ -106,11 +106,11 @@ def separate(
 ) -> SeparatedFrame:
     """Separate one raw mosaic ``[H, W]`` (uint8, uint16, float32) into diffuse and specular.
 
-    Images are ``[H/2, W/2, C]``, the mean over each 2x2 polarizer cell; ``full=True`` gives ``[H, W, C]``. ``layout``
-    None is Sony's colour order. ``white_level`` None is the dtype's maximum (1.0 for float): 12-bit data in uint16
-    need 4095 or 65520 said. ``light_color``: camera RGB of the light, or "estimate" to take it from the highlights.
-    What the owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises ValueError, with one
-    line of what was expected and what was found, on input that is not a mosaic.
+    Images are ``[H/2, W/2, C]``, the mean over each 2x2 polarizer cell; ``full=True`` gives ``[H, W, C]`` from bilinear
+    demosaicking. ``layout`` None is Sony's colour order. ``white_level`` None is the dtype's maximum (1.0 for float):
+    12-bit data in uint16 need 4095 or 65520 said. ``light_color``: camera RGB of the light, or "estimate" to take it
+    from the highlights. What the owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises
+    ValueError, with one line of what was expected and what was found, on input that is not a mosaic.
     """
     mosaic, notes = as_mosaic(raw, layout, black_level, white_level)
     frame = separate_capture(mosaic, method, light_color, device, full)

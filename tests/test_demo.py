@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import socket
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import imagecodecs
@@ -23,15 +22,6 @@ from polsep.render import render
 from polsep.scenes import still_life
 
 CAPTURE = Path(polsep.__file__).parent / "data" / "still_life.png"
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Rendering is thousands of small operations: on a busy machine, threads only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def test_demo_works_offline(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import imagecodecs
@@ -40,15 +40,6 @@ def order_layout(order: tuple[int, ...], bayer: str | None = "RGGB") -> Layout:
 
 def read_as(data: Tensor, layout: Layout, white: float = 1.0) -> LayoutCheck:
     return check_layout(Mosaic(data, layout, 0.0, white))
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Rendering is thousands of small operations: on a busy machine, threads only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

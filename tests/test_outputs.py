@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,30 +23,20 @@ import tifffile
 from polsep.io import outputs
 from polsep.io.errors import InputError
 from polsep.io.outputs import FORMATS, UNITS, OutputError, planned_outputs, read_exr_layers, write_separation
+from polsep.pipeline import SeparatedFrame
 
 LAYERS = ("diffuse", "specular", "dolp", "aolp", "valid")
 
 
-@dataclass(frozen=True)
-class Frame:
-    """What `write_separation` reads of a separated frame."""
-
-    diffuse: np.ndarray
-    specular: np.ndarray
-    valid: np.ndarray
-    dolp: np.ndarray
-    aolp: np.ndarray
-    report: dict[str, Any] = field(default_factory=lambda: {"source": "shot.raw", "method": "analytic"})
-
-
-def random_frame(channels: int = 3, size: tuple[int, int] = (37, 53)) -> Frame:
+def random_frame(channels: int = 3, size: tuple[int, int] = (37, 53)) -> SeparatedFrame:
     rng = np.random.default_rng(3)
-    return Frame(
+    return SeparatedFrame(
         rng.random((*size, channels), np.float32),
         3 * rng.random((*size, channels), np.float32),
         rng.random(size) > 0.2,
         1.1 * rng.random(size, np.float32),
         np.minimum(np.pi * rng.random(size, np.float32), np.float32(3.14159)),
+        {"source": "shot.raw", "method": "analytic"},
     )
 
 

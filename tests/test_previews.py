@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import numpy.testing as npt
@@ -11,36 +10,28 @@ import pytest
 from skimage.color import rgb2lab
 
 from polsep.io.previews import NOT_VALID, PANEL, aolp_legend, aolp_wheel, contact_sheet, dolp_map, exposure_of, srgb
+from polsep.pipeline import SeparatedFrame
 
 
-@dataclass(frozen=True)
-class Frame:
-    """What `contact_sheet` reads of a separated frame."""
-
-    diffuse: np.ndarray
-    specular: np.ndarray
-    valid: np.ndarray
-    dolp: np.ndarray
-    aolp: np.ndarray
-    report: dict[str, Any] = field(default_factory=dict)
-
-
-def random_frame(height: int, width: int, channels: int = 3) -> Frame:
+def random_frame(height: int, width: int, channels: int = 3) -> SeparatedFrame:
     rng = np.random.default_rng(7)
     size = (height, width)
-    return Frame(
+    return SeparatedFrame(
         rng.random((*size, channels), np.float32),
         rng.random((*size, channels), np.float32),
         rng.random(size) > 0.1,
         rng.random(size, np.float32),
         np.pi * rng.random(size, np.float32),
+        {},
     )
 
 
-def uniform_frame(height: int, width: int, dolp: float, aolp: float) -> Frame:
+def uniform_frame(height: int, width: int, dolp: float, aolp: float) -> SeparatedFrame:
     size = (height, width)
     half = np.full((*size, 3), 0.5, np.float32)
-    return Frame(half, half, np.ones(size, bool), np.full(size, dolp, np.float32), np.full(size, aolp, np.float32))
+    return SeparatedFrame(
+        half, half, np.ones(size, bool), np.full(size, dolp, np.float32), np.full(size, aolp, np.float32), {}
+    )
 
 
 def test_srgb_at_the_constants_of_the_standard() -> None:
@@ -147,7 +138,7 @@ def test_shrinking_averages_light_before_the_tone_curve() -> None:
     frame = uniform_frame(800, 1000, 0, 0)
     stripes = np.zeros_like(frame.diffuse)
     stripes[:, ::2] = 1
-    sheet = contact_sheet(Frame(stripes, 0 * stripes, frame.valid, frame.dolp, frame.aolp))
+    sheet = contact_sheet(replace(frame, diffuse=stripes, specular=0 * stripes))
     npt.assert_array_equal(panel_of(sheet, 0, 0, 400, 500), round(255 * float(srgb(0.45))))
 
 
@@ -177,7 +168,7 @@ def test_small_frames_show_each_pixel_twice_as_large() -> None:
 
 def test_no_light_gives_black_panels_without_warnings() -> None:
     zero = np.zeros((350, 400, 1), np.float32)
-    frame = Frame(zero, zero, np.zeros((350, 400), bool), zero[..., 0], zero[..., 0])
+    frame = SeparatedFrame(zero, zero, np.zeros((350, 400), bool), zero[..., 0], zero[..., 0], {})
     sheet = contact_sheet(frame)
     for col in range(3):
         npt.assert_array_equal(panel_of(sheet, 0, col, 350, 400), 0)

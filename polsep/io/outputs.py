@@ -91,7 +91,7 @@ def write_separation(
     """
     targets = planned_outputs(directory, stem, format)
     directory = Path(directory)
-    _check_targets(directory, targets, overwrite)
+    refuse_targets(directory, targets, overwrite)
     _check_frame(frame)
     made = [d for d in (directory, *directory.parents) if not os.path.exists(d)]
     try:
@@ -126,8 +126,8 @@ def read_exr_layers(path: Path) -> dict[str, NDArray[np.float32]]:
     return {name: channel.pixels for name, channel in file.channels().items()}
 
 
-def _check_targets(directory: Path, targets: list[Path], overwrite: bool) -> None:
-    """Refuse to replace files unasked, and ever to replace a directory."""
+def refuse_targets(directory: Path, targets: list[Path], overwrite: bool) -> None:
+    """Raise OutputError rather than replace files unasked, or ever replace a directory; to call before any work."""
     nearest = next((d for d in (directory, *directory.parents) if os.path.lexists(d)), None)
     if nearest is not None and not os.path.isdir(nearest):
         raise OutputError(f"expected a directory to write into, found a file: {nearest}")

@@ -69,7 +69,7 @@ DIR = click.Path(path_type=Path)
     default="exr",
     help="A PNG preview always comes along.",
 )
-@click.option("--full", is_flag=True, help="Full resolution, bilinear, instead of one pixel per 2x2 cell.")
+@click.option("--full", is_flag=True, help="Full resolution instead of one pixel per 2x2 cell.")
 @click.option("--size", metavar="WxH", help="Size of headless raw, like 2448x2048.")
 @click.option("--pixel-format", metavar="NAME", help="GenICam pixel format of headless raw, like BayerRG12p.")
 @click.option(

@@ -93,18 +93,28 @@ def _to_full(x: Tensor, place: tuple[int, int]) -> Tensor:
     return x
 
 
-def _interpolate(mosaic: Mosaic, register: Callable[[Tensor, tuple[int, int]], Tensor]) -> Measurements:
-    """Bayer bilinear per analyser, then ``register`` each analyser plane; the clip mask takes the same path."""
-    layout = mosaic.layout
+def interpolate_analysers(values: Tensor, layout: Layout) -> Tensor:
+    """Samples ``[..., H, W]`` as all analysers and colours at every pixel ``[..., 4, C, H, W]``, bilinearly."""
+    return _interpolate(values, layout, _to_full)
 
-    def run(values: Tensor) -> Tensor:
-        planes, places = split_analysers(values, layout)
-        each = [register(colors_of(planes[..., k, :, :], layout), place) for k, place in enumerate(places)]
-        return torch.stack(each, dim=-4)
 
-    clipped = mosaic.clipped()
-    mask = run(clipped.float()) > 0 if bool(clipped.any()) else None
-    data = run(mosaic.linear())
+def interpolate_analysers_half(values: Tensor, layout: Layout) -> Tensor:
+    """Samples ``[..., H, W]`` as all analysers and colours at the cells' centres ``[..., 4, C, H/2, W/2]``."""
+    return _interpolate(values, layout, to_center)
+
+
+def _interpolate(values: Tensor, layout: Layout, register: Callable[[Tensor, tuple[int, int]], Tensor]) -> Tensor:
+    """Bayer bilinear per analyser, then ``register`` each analyser plane."""
+    planes, places = split_analysers(values, layout)
+    each = [register(colors_of(planes[..., k, :, :], layout), place) for k, place in enumerate(places)]
+    return torch.stack(each, dim=-4)
+
+
+def _demosaic_bilinear(mosaic: Mosaic, interpolate: Callable[[Tensor, Layout], Tensor]) -> Measurements:
+    """Samples and their clip mask take the same path."""
+    layout, clipped = mosaic.layout, mosaic.clipped()
+    mask = interpolate(clipped.float(), layout) > 0 if bool(clipped.any()) else None
+    data = interpolate(mosaic.linear(), layout)
     return Measurements(data, layout.angles, mask, bilinear_variance(data))
 
 
@@ -123,12 +133,12 @@ def bilinear_variance(data: Tensor) -> Tensor:
 
 def demosaic_bilinear(mosaic: Mosaic) -> Measurements:
     """Per-analyser bilinear interpolation to full resolution ``[..., 4, C, H, W]``: what common libraries do."""
-    return _interpolate(mosaic, _to_full)
+    return _demosaic_bilinear(mosaic, interpolate_analysers)
 
 
 def demosaic_bilinear_half(mosaic: Mosaic) -> Measurements:
     """`demosaic_bilinear` averaged over each 2x2 cell, ``[..., 4, C, H/2, W/2]``, without making the full images."""
-    return _interpolate(mosaic, to_center)
+    return _demosaic_bilinear(mosaic, interpolate_analysers_half)
 
 
 def demosaic_dave2022(mosaic: Mosaic) -> Measurements:
@@ -136,4 +146,4 @@ def demosaic_dave2022(mosaic: Mosaic) -> Measurements:
 
     Note: for comparison only. The planes lie half a raw pixel from the cell's centre in four different directions.
     """
-    return _interpolate(mosaic, lambda x, place: x)
+    return _demosaic_bilinear(mosaic, lambda values, layout: _interpolate(values, layout, lambda x, place: x))

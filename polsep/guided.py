@@ -1,19 +1,23 @@
-"""Demosaicking with an intensity guide, to half resolution: sharper than interpolating each analyser on its own.
+"""Demosaicking with an intensity guide, to full or half resolution: sharper than interpolating each analyser alone.
 
-A 2x2 cell holds all four analysers of one colour, so s0 of that colour is measured there. What misses is the Bayer
-problem of s0 over cells, and the polarization, which the four places of the samples would falsify wherever s0 varies.
+One sample behind the analyser at angle t says 2 m - (s1 cos 2t + s2 sin 2t) = s0. Polarization is smooth where
+intensity is not, so a smoothed one turns the mosaic of analysers into a mosaic of s0 at the sensor's full resolution,
+whose colours come in 2x2 blocks (`_intensity_mosaic`). Demosaicking has two halves from there. Full resolution takes
+both twice, the second time with polarization as sharp as the first time's found to be reliable (`_reliable`), without
+which thin polarized highlights would keep the pattern of the analysers; in cell means that pattern cancels.
 
-1. s0 of the other colours (`fill_colors`). Green first: along rows and columns, the mean of two neighbours plus the
-   second difference of the cell's own colour, times the slope at which green follows that colour around (1 would be
-   Hamilton and Adams 1997; textures of unlike colours need other slopes). Then red and blue as local linear functions
-   of green with the residual interpolated (residual interpolation, Kiku et al. 2013).
-2. Polarization (`_polarization`). The guide is s0 of each pixel's own colour at that very pixel; what the samples
-   differ from it is interpolated as `demosaic_bilinear_half` would interpolate the samples. The guide is the cubic
-   interpolation of 1 plus the detail that the residuals of all analysers and colours around a pixel have in common.
+1. s0 of all colours (`fill_colors`). Green first: along rows and columns, the interpolation of the other colour plus
+   what the pixel's own colour differs from its interpolation, times the slope at which green follows that colour
+   around (slope 1 is Hamilton and Adams 1997; textures of unlike colours need other slopes). Then red and blue as local
+   linear functions of green, with the residual interpolated (residual interpolation, Kiku et al. 2013).
+2. Polarization (`_residual_mosaic`). The guide is s0 of each pixel's own colour, from pixels around it; what the
+   samples differ from it is interpolated bilinearly per analyser. A 3x3 tent holds all four analysers in balance, so
+   the guide is the tent of s0 plus the detail that the analysers and colours around a pixel have in common.
 
 The idea of an intensity guide for polarization mosaics is Morimatsu et al. 2020 (EARI, doi
 10.1109/ICIP40778.2020.9191062); the steps are this project's, see docs/experiments.md.
 
+Exact on uniform fields to the border, which is continued by mirroring whole cells, and on linear fields inside.
 Estimates of different colours are no longer blurred alike, which invents relations between them. Those who relate
 colours find the bilinear samples in `Measurements.uniform`. Pixels touched by clipping keep the bilinear samples.
 """
@@ -21,137 +25,278 @@ colours find the bilinear samples in `Measurements.uniform`. Pixels touched by c
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from polsep.camera import Layout, Mosaic
-from polsep.demosaic import colors_of, correlate, demosaic_bilinear_half, split_analysers, to_center
+from polsep.demosaic import (
+    aligned,
+    correlate,
+    demosaic_bilinear,
+    demosaic_bilinear_half,
+    interpolate_analysers,
+    interpolate_analysers_half,
+)
 from polsep.separation import box_mean
-from polsep.stokes import Measurements, Stokes, fit_stokes, measure
+from polsep.stokes import Measurements, Stokes, analyser_residual, fit_stokes, measure
 
 #: Smallest number of cells per side for the guided filters; smaller frames stay bilinear.
 LEAST_CELLS = 8
-#: How strongly the common residual sharpens the guide, and how often; chosen on tuning scenes and real pictures.
-DETAIL_GAIN, DETAIL_ROUNDS = 1.6, 2
+#: Cells by which a frame is continued beyond its border: the reach of all filters together.
+MARGIN = 18
+#: How strongly the detail that all analysers share sharpens the guide; chosen on tuning scenes and real pictures.
+DETAIL_GAIN = 1.8
+#: Radius, in cells, over which polarization counts as smooth when it is taken out of the samples.
+SMOOTH_RADIUS = 4
+#: Detail of polarization counts where its variance exceeds this many times the analysers' contradiction (s1 and s2
+#: together have four times its variance), and this variance at least.
+NOISE_MARGIN, NOISE_FLOOR = 16.0, 1e-5
 #: Regularisation of slopes: variances of s0 below these are noise.
 SLOPE_FLOOR, GUIDE_FLOOR = 1e-3, 1e-4
-#: Catmull-Rom weights of the samples at -2, -1, 0, 1 for a point a quarter of a cell before sample 0.
-_QUARTER_BEFORE = (-0.0234375, 0.2265625, 0.8671875, -0.0703125)
+#: s0 of a colour is at least this share of its bilinear interpolation, so that extrapolation never ends at zero.
+LEAST_SHARE = 0.1
+_TENT = (0.25, 0.5, 0.25)
+_GENTLE = (0.125, 0.75, 0.125)
+_BINOMIAL = tuple(math.comb(8, k) / 256 for k in range(9))
+
+
+def demosaic_guided(mosaic: Mosaic) -> Measurements:
+    """Analysers at every pixel ``[..., 4, C, H, W]`` with an intensity guide, as the module says.
+
+    ``clipped`` and ``variance`` are those of `demosaic_bilinear`, whose samples are ``uniform``.
+    """
+    if not _is_large_enough(mosaic):
+        return demosaic_bilinear(mosaic)
+    values, layout = _padded(mosaic)
+    _, residual = _guide(values, _smooth_polarization(values, layout), layout)
+    first = Measurements(interpolate_analysers_half(residual, layout), layout.angles)
+    s0, residual = _guide(values, _reliable(first), layout)
+    polarization = _blur_stokes(fit_stokes(Measurements(interpolate_analysers(residual, layout), layout.angles)), _TENT)
+    found = Stokes(s0, polarization.s1, polarization.s2).map(lambda x: _crop(x, 2 * MARGIN))
+    return _complete(found, demosaic_bilinear(mosaic))
 
 
 def demosaic_guided_half(mosaic: Mosaic) -> Measurements:
-    """Co-registered analysers ``[..., 4, C, H/2, W/2]`` with an intensity guide, as the module says.
+    """Co-registered analysers ``[..., 4, C, H/2, W/2]`` with an intensity guide: means over 2x2 cells, in one round.
 
-    Exact on uniform fields to the border. ``clipped`` and ``variance`` are those of `demosaic_bilinear_half`.
+    ``clipped`` and ``variance`` are those of `demosaic_bilinear_half`, whose samples are ``uniform``.
     """
-    plain = demosaic_bilinear_half(mosaic)
-    if min(plain.data.shape[-2:]) < LEAST_CELLS:
-        return plain
-    layout = mosaic.layout
-    planes, places = split_analysers(mosaic.linear(), layout)
-    own = fit_stokes(Measurements(planes[..., None, :, :], layout.angles)).s0
-    s0 = fill_colors(own[..., 0, :, :], layout) if layout.bayer else own
-    polarization = _polarization(planes, s0, layout, places)
-    data = measure(Stokes(s0, polarization.s1, polarization.s2), layout.angles).data
+    if not _is_large_enough(mosaic):
+        return demosaic_bilinear_half(mosaic)
+    values, layout = _padded(mosaic)
+    s0, residual = _guide(values, _smooth_polarization(values, layout), layout)
+    samples = Measurements(interpolate_analysers_half(residual, layout), layout.angles)
+    polarization = _blur_stokes(fit_stokes(samples), _GENTLE)
+    found = Stokes(_cell_mean(s0), polarization.s1, polarization.s2).map(lambda x: _crop(x, MARGIN))
+    del s0, residual, values, samples
+    return _complete(found, demosaic_bilinear_half(mosaic))
+
+
+def _is_large_enough(mosaic: Mosaic) -> bool:
+    return min(aligned(mosaic.data, mosaic.layout).shape[-2:]) >= 2 * LEAST_CELLS
+
+
+def _padded(mosaic: Mosaic) -> tuple[Tensor, Layout]:
+    """Linear samples from the first whole cell on with `MARGIN` more cells around, and the layout they have."""
+    values = _mirror_cells(aligned(mosaic.linear(), mosaic.layout), MARGIN)
+    return values, replace(mosaic.layout, origin=(0, 0))
+
+
+def _complete(stokes: Stokes, plain: Measurements) -> Measurements:
+    """The analysers that see ``stokes``, with the bilinear samples of ``plain`` wherever clipping touches a pixel."""
+    data = measure(stokes, plain.angles).data
     if plain.clipped is not None:
         touched = plain.clipped.any(dim=-4, keepdim=True).any(dim=-3, keepdim=True)
         data = torch.where(touched, plain.data, data)
-    return Measurements(data, layout.angles, plain.clipped, plain.variance, plain)
+    return Measurements(data, plain.angles, plain.clipped, plain.variance, plain)
 
 
-def _masks(like: Tensor, bayer: str) -> Tensor:
-    """Where the cells of ``[..., h, w]`` are red, green, blue: ``[3, h, w]`` of 0 and 1."""
-    masks = torch.zeros(3, *like.shape[-2:], dtype=like.dtype, device=like.device)
-    for place, color in enumerate(bayer):
-        masks["RGB".index(color), place // 2 :: 2, place % 2 :: 2] = 1
-    return masks
+def _guide(values: Tensor, polarization: Stokes, layout: Layout) -> tuple[Tensor, Tensor]:
+    """s0 ``[..., C, H, W]`` of aligned samples ``[..., H, W]``, and the samples minus half their guide.
+
+    ``polarization [..., C, H/2, W/2]`` is what is taken for known.
+    """
+    intensity = _intensity_mosaic(values, polarization, layout)
+    s0 = fill_colors(intensity, layout) if layout.bayer else intensity[..., None, :, :]
+    return s0, _residual_mosaic(values, intensity, s0, layout)
 
 
-def fill_colors(cells: Tensor, layout: Layout) -> Tensor:
-    """All colours ``[..., 3, h, w]`` of cells ``[..., h, w]`` that hold one each, in the layout's Bayer order."""
-    assert layout.bayer is not None
-    masks = _masks(cells, layout.bayer)
-    green = _fill_green(cells, masks[1])
-    red, blue = (_fill_from_green(cells, green, masks[c]) for c in (0, 2))
+def _smooth_polarization(values: Tensor, layout: Layout) -> Stokes:
+    """Stokes images at half resolution, bilinear and then smoothed by `SMOOTH_RADIUS`."""
+    found = fit_stokes(Measurements(interpolate_analysers_half(values, layout), layout.angles))
+    return found.map(lambda image: box_mean(image, SMOOTH_RADIUS))
+
+
+def _reliable(found: Measurements) -> Stokes:
+    """Stokes images at half resolution, smoothed as far as the analysers contradict each other.
+
+    A Wiener filter: detail counts by the share of its variance that exceeds `NOISE_MARGIN` times what noise and
+    misregistration explain, which shows in `analyser_residual`.
+    """
+    stokes = fit_stokes(found)
+    smooth = stokes.map(lambda image: box_mean(image, SMOOTH_RADIUS))
+    d1, d2 = stokes.s1 - smooth.s1, stokes.s2 - smooth.s2
+    detail = box_mean((d1 * d1 + d2 * d2).mean(dim=-3, keepdim=True), 1)
+    noise = NOISE_MARGIN * box_mean((analyser_residual(found) ** 2).mean(dim=-3, keepdim=True), 1) + NOISE_FLOOR
+    share = ((detail - noise) / (detail + NOISE_FLOOR)).clamp(min=0)
+    return Stokes(smooth.s0, smooth.s1 + share * d1, smooth.s2 + share * d2)
+
+
+def _intensity_mosaic(values: Tensor, polarization: Stokes, layout: Layout) -> Tensor:
+    """s0 of its own colour at every pixel ``[..., H, W]``: twice the sample minus the polarization that it passed."""
+    intensity = 2 * values
+    for weight, image in ((math.cos, polarization.s1), (math.sin, polarization.s2)):
+        passed = _own(_enlarge(image), layout)
+        for row in (0, 1):
+            for col in (0, 1):
+                t = math.radians(layout.polarizer[row][col])
+                intensity[..., row::2, col::2] -= weight(2 * t) * passed[..., row::2, col::2]
+    return intensity
+
+
+def _residual_mosaic(values: Tensor, intensity: Tensor, s0: Tensor, layout: Layout) -> Tensor:
+    """Samples minus half the guide ``[..., H, W]``: polarization, the smoother the better the guide."""
+    tent = _own(_blur(s0, _TENT), layout)
+    guide = tent + DETAIL_GAIN * _blur(intensity - tent, _TENT)
+    return values - 0.5 * guide
+
+
+def fill_colors(mosaic: Tensor, layout: Layout) -> Tensor:
+    """All colours ``[..., 3, H, W]`` of a mosaic ``[..., H, W]`` of 2x2 blocks of one colour each (a quad Bayer one).
+
+    The pixels' own values stay.
+    """
+    masks, cells = color_masks(mosaic, layout, 2), color_masks(mosaic, layout, 1)
+    green = _fill_green(mosaic, masks[1], cells[1])
+    red, blue = (_fill_from_green(mosaic, green, masks[c], cells[c]) for c in (0, 2))
     return torch.stack([red, green, blue], dim=-3)
 
 
-def _fill_green(cells: Tensor, is_green: Tensor) -> Tensor:
+def color_masks(mosaic: Tensor, layout: Layout, block: int) -> Tensor:
+    """Where each colour is: ``[C, n, m]`` of 0 and 1 per pixel of a mosaic (``block`` 2) or per cell (``block`` 1)."""
+    height, width = (n // 2 * block for n in mosaic.shape[-2:])
+    masks = torch.zeros(layout.channels, height, width, dtype=mosaic.dtype, device=mosaic.device)
+    for place, color in enumerate(layout.bayer or "RRRR"):
+        row, col = divmod(place, 2)
+        for i in range(block):
+            for j in range(block):
+                masks["RGB".index(color), row * block + i :: 2 * block, col * block + j :: 2 * block] = 1
+    return masks
+
+
+def _fill_green(mosaic: Tensor, is_green: Tensor, green_cells: Tensor) -> Tensor:
     """Green everywhere: estimates along both directions, weighed by how smooth green minus the other colour is."""
-    total, weights = torch.zeros_like(cells), torch.zeros_like(cells)
+    total, weights = torch.zeros_like(mosaic), torch.zeros_like(mosaic)
+    cells = _cell_mean(mosaic)
     for dim in (-1, -2):
-        around, second = correlate(cells, (0.5, 0.0, 0.5), dim), correlate(cells, (-0.25, 0.0, 0.5, 0.0, -0.25), dim)
-        other = around + _slope_of_other(cells, is_green, dim) * second
-        difference = torch.where(is_green > 0, cells - other, other - cells)
-        weight = 1 / (box_mean(correlate(difference, (-1.0, 0.0, 1.0), dim) ** 2, 1) + 1e-6)
+        around, second = _across_pairs(mosaic, dim)
+        other = around + _repeat(_slope_of_other(cells, green_cells, dim)) * second
+        difference = correlate(torch.where(is_green > 0, mosaic - other, other - mosaic), _GENTLE, dim)
+        rough = box_mean(_cell_mean(correlate(difference, (-1.0, 0.0, 1.0), dim) ** 2), 1)
+        weight = _repeat(1 / (rough + 1e-6))
         total, weights = total + weight * difference, weights + weight
-    return torch.where(is_green > 0, cells, cells + total / weights)
+    return torch.where(is_green > 0, mosaic, mosaic + total / weights)
 
 
-def _slope_of_other(cells: Tensor, is_green: Tensor, dim: int) -> Tensor:
-    """The slope at which the other colour of a row (or column) follows the cell's own: regression of differences."""
+def _across_pairs(mosaic: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """Along rows or columns A A B B: the other colour interpolated, and what the own one differs from the same of it.
+
+    At the first of a pair the nearest samples of the other colour are 1 before and 2 after, so they weigh 2/3 and 1/3;
+    the own colour is interpolated at those two places, and from there at the pixel. At the second it is mirrored.
+    """
+    around = ((0, 0, 0, 0, 6, 0, 0, 3, 0, 0, 0), (0, 0, 0, 3, 0, 0, 6, 0, 0, 0, 0))
+    second = ((0, 0, -2, 0, 0, 5, -2, 0, 0, -1, 0), (0, -1, 0, 0, -2, 5, 0, 0, -2, 0, 0))
+    place = torch.arange(mosaic.shape[dim], device=mosaic.device) % 2 == 0
+    is_first = place if dim == -1 else place[:, None]
+    found = []
+    for first, last in (around, second):
+        ninths = [tuple(weight / 9 for weight in taps) for taps in (first, last)]
+        found.append(torch.where(is_first, correlate(mosaic, ninths[0], dim), correlate(mosaic, ninths[1], dim)))
+    return found[0], found[1]
+
+
+def _slope_of_other(cells: Tensor, green_cells: Tensor, dim: int) -> Tensor:
+    """The slope ``[..., h, w]`` at which the other colour of a row (or column) follows a cell's own: a regression.
+
+    Regressed are central differences over 5x5 cells, green and other cells apart.
+    """
     other, own = correlate(cells, (-0.5, 0.0, 0.5), dim), correlate(cells, (-0.25, 0.0, 0.0, 0.0, 0.25), dim)
     slopes = []
-    for sites in (is_green, 1 - is_green):
+    for sites in (green_cells, 1 - green_cells):
         share = box_mean(sites, 2)
         slopes.append(box_mean(other * own * sites, 2) / (box_mean(own * own * sites, 2) + SLOPE_FLOOR * share))
-    return torch.where(is_green > 0, slopes[0], slopes[1]).clamp(-0.5, 4)
+    return torch.where(green_cells > 0, slopes[0], slopes[1]).clamp(-0.5, 4)
 
 
-def _fill_from_green(cells: Tensor, green: Tensor, mask: Tensor) -> Tensor:
-    """Red or blue everywhere: a local linear function of green (guided filter), plus its interpolated residual."""
-    share = box_mean(mask, 2)
-    mean_g, mean_x = box_mean(green * mask, 2) / share, box_mean(cells * mask, 2) / share
-    covariance = box_mean(green * cells * mask, 2) / share - mean_g * mean_x
-    variance = box_mean(green * green * mask, 2) / share - mean_g * mean_g
+def _fill_from_green(mosaic: Tensor, green: Tensor, mask: Tensor, mask_cells: Tensor) -> Tensor:
+    """Red or blue everywhere: a local linear function of green, plus its interpolated residual.
+
+    Note: a binomial window, because it gives every phase of the Bayer pattern the same second moments; a box does not,
+    which would make linear fields inexact.
+    """
+    share = _blur(mask_cells, _BINOMIAL)
+
+    def mean(image: Tensor) -> Tensor:
+        return _blur(_cell_mean(image) * mask_cells, _BINOMIAL) / share
+
+    mean_g, mean_x = mean(green), mean(mosaic)
+    covariance, variance = mean(green * mosaic) - mean_g * mean_x, mean(green * green) - mean_g * mean_g
     slope = covariance / (variance.clamp(min=0) + GUIDE_FLOOR)
-    guess = box_mean(slope, 1) * green + box_mean(mean_x - slope * mean_g, 1)
-    residual = (cells - guess) * mask
-    for dim in (-1, -2):
-        residual = correlate(residual, (0.5, 1.0, 0.5), dim)
-    return guess + residual
+    offset = mean_x - slope * mean_g
+    guess = _enlarge(box_mean(slope, 1)) * green + _enlarge(box_mean(offset, 1))
+    tent = (0.125, 0.25, 0.375, 0.5, 0.375, 0.25, 0.125)
+    plain, residual = (_blur(image * mask, tent) for image in (mosaic, mosaic - guess))
+    filled = guess + residual
+    filled = torch.where(filled < LEAST_SHARE * plain, LEAST_SHARE * plain, filled)
+    return torch.where(mask > 0, mosaic, filled)
 
 
-def _at_sample(image: Tensor, place: tuple[int, int]) -> Tensor:
-    """A half-resolution image ``[..., h, w]`` at the places of one analyser's samples, a quarter off the centres."""
+def _own(image: Tensor, layout: Layout) -> Tensor:
+    """Of an image ``[..., C, H, W]`` the colour of each pixel's own filter ``[..., H, W]``."""
+    return (image * color_masks(image, layout, 2)).sum(dim=-3)
+
+
+def _blur(image: Tensor, taps: tuple[float, ...]) -> Tensor:
+    return correlate(correlate(image, taps, -1), taps, -2)
+
+
+def _blur_stokes(stokes: Stokes, taps: tuple[float, ...]) -> Stokes:
+    return stokes.map(lambda image: _blur(image, taps))
+
+
+def _cell_mean(image: Tensor) -> Tensor:
+    """Means over 2x2 cells, ``[..., H, W]`` to ``[..., H/2, W/2]``."""
+    rows = image[..., 0::2, :] + image[..., 1::2, :]
+    return 0.25 * (rows[..., 0::2] + rows[..., 1::2])
+
+
+def _repeat(cells: Tensor) -> Tensor:
+    """Every cell's value at its four pixels."""
+    return cells.repeat_interleave(2, -1).repeat_interleave(2, -2)
+
+
+def _enlarge(image: Tensor) -> Tensor:
+    """From cells ``[..., h, w]`` to pixels ``[..., 2h, 2w]``, linearly between the cells' centres."""
     for dim in (-2, -1):
-        taps = (*_QUARTER_BEFORE, 0.0) if place[dim] == 0 else (0.0, *_QUARTER_BEFORE[::-1])
-        image = correlate(image, taps, dim)
+        before, after = correlate(image, (0.25, 0.75, 0.0), dim), correlate(image, (0.0, 0.75, 0.25), dim)
+        image = torch.stack((before, after), dim=dim).flatten(dim - 1, dim)
     return image
 
 
-def _interleave(samples: list[Tensor], places: list[tuple[int, int]]) -> Tensor:
-    """Full-resolution ``[..., H, W]`` of one plane ``[..., h, w]`` per analyser."""
-    first = samples[0]
-    full = first.new_empty(*first.shape[:-2], 2 * first.shape[-2], 2 * first.shape[-1])
-    for plane, (row, col) in zip(samples, places, strict=True):
-        full[..., row::2, col::2] = plane
-    return full
+def _mirror_cells(values: Tensor, margin: int) -> Tensor:
+    """Samples continued by ``margin`` cells on all sides: whole cells mirror about the outermost one.
+
+    Colours and analysers keep their phase, and so uniform fields stay uniform.
+    """
+    for dim in (-2, -1):
+        cells = values.shape[dim] // 2
+        place = torch.arange(-margin, cells + margin, device=values.device)
+        place = cells - 1 - (place.remainder(2 * cells - 2) - (cells - 1)).abs()
+        values = values.index_select(dim, (2 * place[:, None] + torch.arange(2, device=values.device)).flatten())
+    return values
 
 
-def _polarization(planes: Tensor, s0: Tensor, layout: Layout, places: list[tuple[int, int]]) -> Stokes:
-    """s1 and s2 ``[..., C, h, w]`` of analyser planes ``[..., 4, h, w]``, given s0; its s0 is what s0 leaves over."""
-    masks = _masks(planes, layout.bayer) if layout.bayer else torch.ones_like(planes[..., :1, :, :])
-    guide = [(_at_sample(s0, place) * masks).sum(dim=-3) for place in places]
-    found = _fit_residual(planes, guide, layout, places)
-    for _ in range(DETAIL_ROUNDS):
-        s1, s2 = box_mean(found.s1, 2), box_mean(found.s2, 2)
-        left = []
-        for k, (place, t) in enumerate(zip(places, layout.angles, strict=True)):
-            expected = _at_sample(s1 * math.cos(2 * t) + s2 * math.sin(2 * t), place)
-            left.append(2 * planes[..., k, :, :] - guide[k] - (expected * masks).sum(dim=-3))
-        detail = _interleave(left, places)
-        for dim in (-1, -2):
-            detail = correlate(detail, (0.25, 0.5, 0.25), dim)
-        sharper = [g + DETAIL_GAIN * detail[..., row::2, col::2] for g, (row, col) in zip(guide, places, strict=True)]
-        found = _fit_residual(planes, sharper, layout, places)
-    return found
-
-
-def _fit_residual(planes: Tensor, guide: list[Tensor], layout: Layout, places: list[tuple[int, int]]) -> Stokes:
-    """Stokes images ``[..., C, h, w]`` of what the samples differ from half the guide, interpolated bilinearly."""
-    residual = [
-        to_center(colors_of(planes[..., k, :, :] - 0.5 * guide[k], layout), place) for k, place in enumerate(places)
-    ]
-    return fit_stokes(Measurements(torch.stack(residual, dim=-4), layout.angles))
+def _crop(image: Tensor, margin: int) -> Tensor:
+    return image[..., margin:-margin, margin:-margin]

@@ -20,7 +20,7 @@ from torch import Tensor
 from polsep.camera import Layout, Mosaic
 from polsep.color_affine import separate_color_affine
 from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
-from polsep.guided import demosaic_guided_half
+from polsep.guided import demosaic_guided, demosaic_guided_half
 from polsep.layout_check import check_layout
 from polsep.levels import as_mosaic
 from polsep.separation import Separation, dominant_angle, light_polarizer_angle, separate_analytic
@@ -36,10 +36,11 @@ class PolsepWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Method:
-    """A separation method: ``demosaic`` a frame to half resolution, then ``split``; the rest is for people to read."""
+    """A separation method: ``demosaic`` a frame, to half or full resolution, then ``split``; the rest is to be read."""
 
     name: str
-    demosaic: Callable[[Mosaic], Measurements]
+    demosaic_half: Callable[[Mosaic], Measurements]
+    demosaic_full: Callable[[Mosaic], Measurements]
     split: Callable[[Measurements], Separation]
     summary: str
     needs: str
@@ -52,6 +53,7 @@ METHODS = {
         Method(
             "color-affine",
             demosaic_guided_half,
+            demosaic_guided,
             separate_color_affine,
             "closed form for polarized diffuse and white specular light, recovers clipped samples",
             "colour; on mono and grey it is the analytic split with clipped samples recovered",
@@ -60,6 +62,7 @@ METHODS = {
         Method(
             "analytic",
             demosaic_bilinear_half,
+            demosaic_bilinear,
             separate_analytic,
             "the paper's first estimate: specular = polarized part, diffuse = the rest",
             "colour or mono; takes the diffuse light for unpolarized and clipped samples at face value",
@@ -106,11 +109,11 @@ def separate(
 ) -> SeparatedFrame:
     """Separate one raw mosaic ``[H, W]`` (uint8, uint16, float32) into diffuse and specular.
 
-    Images are ``[H/2, W/2, C]``, the mean over each 2x2 polarizer cell; ``full=True`` gives ``[H, W, C]`` from bilinear
-    demosaicking. ``layout`` None is Sony's colour order. ``white_level`` None is the dtype's maximum (1.0 for float):
-    12-bit data in uint16 need 4095 or 65520 said. ``light_color``: camera RGB of the light, or "estimate" to take it
-    from the highlights. What the owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises
-    ValueError, with one line of what was expected and what was found, on input that is not a mosaic.
+    Images are ``[H/2, W/2, C]``, the mean over each 2x2 polarizer cell; ``full=True`` gives ``[H, W, C]``. ``layout``
+    None is Sony's colour order. ``white_level`` None is the dtype's maximum (1.0 for float): 12-bit data in uint16 need
+    4095 or 65520 said. ``light_color``: camera RGB of the light, or "estimate" to take it from the highlights. What the
+    owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises ValueError, with one line of
+    what was expected and what was found, on input that is not a mosaic.
     """
     mosaic, notes = as_mosaic(raw, layout, black_level, white_level)
     frame = separate_capture(mosaic, method, light_color, device, full)
@@ -174,13 +177,10 @@ def to_device(capture: Capture, device: torch.device) -> Capture:
 
 
 def demosaic(capture: Capture, method: Method, full: bool) -> Measurements:
-    """Co-registered analysers at half resolution as the method wants them, or bilinear ones at full resolution.
-
-    Co-sited measurements pass.
-    """
+    """Co-registered analysers at half or full resolution as the method wants them. Co-sited measurements pass."""
     if isinstance(capture, Measurements):
         return capture
-    return demosaic_bilinear(capture) if full else method.demosaic(capture)
+    return method.demosaic_full(capture) if full else method.demosaic_half(capture)
 
 
 def resolve_light_color(light_color: LightColor | str, capture: Capture) -> tuple[tuple[float, ...], list[str]]:

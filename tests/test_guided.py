@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor
@@ -9,11 +11,11 @@ from torch.nn.functional import avg_pool2d
 
 from polsep.camera import IDEAL, IMX250, Layout, Mosaic, expose
 from polsep.demosaic import demosaic_bilinear_half
-from polsep.guided import demosaic_guided_half, fill_colors
+from polsep.guided import demosaic_guided, demosaic_guided_half, fill_colors
 from polsep.render import PinholeCamera, render
 from polsep.scenes import random_light, random_parts
 from polsep.separation import separate_analytic
-from polsep.stokes import Stokes, fit_stokes, flip_horizontal, flip_vertical, transpose
+from polsep.stokes import Measurements, Stokes, fit_stokes, flip_horizontal, flip_vertical, transpose
 
 LAYOUTS = [
     Layout(),
@@ -22,6 +24,15 @@ LAYOUTS = [
     Layout(bayer=None),
     Layout(origin=(1, 1)),
 ]
+
+
+#: Both resolutions, each with what it makes of an image of the scene.
+DEMOSAICKERS = [
+    pytest.param(demosaic_guided_half, lambda x: avg_pool2d(x, 2), id="half"),
+    pytest.param(demosaic_guided, lambda x: x, id="full"),
+]
+Demosaicker = Callable[[Mosaic], Measurements]
+Reduced = Callable[[Tensor], Tensor]
 
 
 def textured(channels: int, seed: int = 0, size: int = 64) -> Stokes:
@@ -36,27 +47,31 @@ def textured(channels: int, seed: int = 0, size: int = 64) -> Stokes:
     return Stokes(smooth(0.5, 1.4), smooth(-0.2, 0.2), smooth(-0.2, 0.2))
 
 
+@pytest.mark.parametrize(("demosaic", "reduced"), DEMOSAICKERS)
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.spec)
-def test_uniform_field_is_exact_to_the_border(layout: Layout) -> None:
+def test_uniform_field_is_exact_to_the_border(layout: Layout, demosaic: Demosaicker, reduced: Reduced) -> None:
     """One polarized state everywhere comes out exactly, in every pixel and colour."""
     level = torch.tensor([1.0, 0.7, 0.5])[: layout.channels, None, None]
     truth = Stokes(*((level * k).expand(-1, 34, 38) for k in (1.0, 0.3, -0.2)))
-    found = fit_stokes(demosaic_guided_half(expose(truth, layout, IDEAL)))
+    found = fit_stokes(demosaic(expose(truth, layout, IDEAL)))
     for name in ("s0", "s1", "s2"):
         expected = getattr(truth, name)[:, :1, :1].expand_as(getattr(found, name))
         torch.testing.assert_close(getattr(found, name), expected, rtol=0, atol=2e-6)
 
 
+@pytest.mark.parametrize(("demosaic", "reduced"), DEMOSAICKERS)
 @pytest.mark.parametrize("layout", [Layout(), Layout(bayer=None)], ids=lambda layout: layout.spec)
-def test_unpolarized_ramp_stays_unpolarized_inside(layout: Layout) -> None:
-    """A linear ramp of grey light: s0 exact and no false polarization away from the border."""
-    rows, cols = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
-    s0 = (0.4 + 0.006 * rows + 0.004 * cols).expand(layout.channels, -1, -1)
-    found = fit_stokes(demosaic_guided_half(expose(Stokes(s0, 0 * s0, 0 * s0), layout, IDEAL)))
-    inside = (slice(None), slice(6, -6), slice(6, -6))
-    torch.testing.assert_close(found.s0[inside], avg_pool2d(s0, 2)[inside], rtol=0, atol=5e-4)
-    for s in (found.s1, found.s2):
-        torch.testing.assert_close(s[inside], torch.zeros_like(s[inside]), rtol=0, atol=5e-4)
+def test_linear_fields_are_exact_inside(layout: Layout, demosaic: Demosaicker, reduced: Reduced) -> None:
+    """s0, s1 and s2 that grow linearly, each colour with its own slope, come out exactly away from the border."""
+    rows, cols = torch.meshgrid(torch.arange(160.0), torch.arange(160.0), indexing="ij")
+    level = torch.tensor([1.0, 0.8, 0.6])[: layout.channels, None, None]
+    ramp = (rows + 0.5 * cols).double() * level.double()
+    truth = Stokes(0.3 + 0.004 * ramp, 0.1 + 0.0005 * ramp, -0.05 + 0.0003 * ramp)
+    found = fit_stokes(demosaic(expose(truth, layout, IDEAL)))
+    inside = (slice(None), slice(40, -40), slice(40, -40))
+    for name in ("s0", "s1", "s2"):
+        expected = reduced(getattr(truth, name))
+        torch.testing.assert_close(getattr(found, name)[inside], expected[inside], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -67,31 +82,42 @@ def test_unpolarized_ramp_stays_unpolarized_inside(layout: Layout) -> None:
         (transpose, lambda layout: layout.transposed()),
     ],
 )
+@pytest.mark.parametrize(("demosaic", "reduced"), DEMOSAICKERS)
 @pytest.mark.parametrize("layout", [Layout(), Layout(bayer=None)], ids=lambda layout: layout.spec)
-def test_mirrored_scenes_give_mirrored_images(flip, turned, layout: Layout) -> None:  # type: ignore[no-untyped-def]
+def test_mirrored_scenes_give_mirrored_images(flip, turned, layout: Layout, demosaic, reduced) -> None:  # type: ignore[no-untyped-def]
     """Mirroring the scene and the layout mirrors the result, with the sign rules of s1 and s2."""
     scene = textured(layout.channels).map(Tensor.double)
-    straight = flip(fit_stokes(demosaic_guided_half(expose(scene, layout, IDEAL))))
-    mirrored = fit_stokes(demosaic_guided_half(expose(flip(scene), turned(layout), IDEAL)))
+    straight = flip(fit_stokes(demosaic(expose(scene, layout, IDEAL))))
+    mirrored = fit_stokes(demosaic(expose(flip(scene), turned(layout), IDEAL)))
     for name in ("s0", "s1", "s2"):
         torch.testing.assert_close(getattr(mirrored, name), getattr(straight, name), rtol=0, atol=1e-9)
 
 
-def test_own_colour_of_a_cell_is_its_measurement() -> None:
-    """The s0 that a cell measures is never changed, whatever its neighbours say."""
-    cells = torch.rand(32, 32, generator=torch.Generator().manual_seed(1))
-    filled = fill_colors(cells, Layout())
+def test_samples_of_a_colour_stay() -> None:
+    """s0 of its own colour is never changed at a pixel, whatever its neighbours say."""
+    mosaic = torch.rand(32, 32, generator=torch.Generator().manual_seed(1))
+    filled = fill_colors(mosaic, Layout())
     for place, color in enumerate((0, 1, 1, 2)):
-        row, col = divmod(place, 2)
-        torch.testing.assert_close(filled[color, row::2, col::2], cells[row::2, col::2], rtol=0, atol=1e-5)
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            at = (slice(place // 2 * 2 + i, None, 4), slice(place % 2 * 2 + j, None, 4))
+            torch.testing.assert_close(filled[color][at], mosaic[at], rtol=0, atol=0)
 
 
-def test_grey_texture_is_filled_from_every_cell() -> None:
-    """Where all colours are equal, each one is known at every cell: far closer to the truth than bilinear."""
-    truth = textured(1, seed=3).s0.expand(3, -1, -1) + 0.1 * torch.sin(torch.arange(64) * 1.3)
-    bayer = torch.tensor([[0, 1], [1, 2]]).repeat(32, 32)
-    filled = fill_colors(torch.gather(truth, 0, bayer[None])[0], Layout())
-    assert float((filled - truth)[:, 4:-4, 4:-4].abs().mean()) < 0.01
+def test_grey_texture_is_filled_from_every_pixel() -> None:
+    """Where all colours are equal, each one is known at every pixel: far closer to the truth than bilinear."""
+    truth = textured(1, seed=3).s0.expand(3, -1, -1) + 0.1 * torch.sin(torch.arange(64) * 0.65)
+    colors = torch.tensor([[0, 0, 1, 1], [0, 0, 1, 1], [1, 1, 2, 2], [1, 1, 2, 2]]).repeat(16, 16)
+    filled = fill_colors(torch.gather(truth, 0, colors[None])[0], Layout())
+    assert float((filled - truth)[:, 8:-8, 8:-8].abs().mean()) < 0.01
+
+
+def test_a_colour_never_ends_at_zero() -> None:
+    """Beside a black edge the linear function of green would leave red at or below zero; it keeps a share instead."""
+    step = torch.zeros(64, 64)
+    step[:, 32:] = 1
+    truth = torch.stack([0.02 + 0.9 * step, 0.3 + 0.6 * step, 0.02 + 0.1 * (1 - step)])
+    colors = torch.tensor([[0, 0, 1, 1], [0, 0, 1, 1], [1, 1, 2, 2], [1, 1, 2, 2]]).repeat(16, 16)
+    assert float(fill_colors(torch.gather(truth, 0, colors[None])[0], Layout())[[0, 2]].min()) > 0
 
 
 def test_colors_of_any_order_are_permuted_alike() -> None:

@@ -1,0 +1,31 @@
+"""PSNR of the separation methods on rendered scenes of known truth."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator
+from pathlib import Path
+
+from polsep.bench.rows import Row
+from polsep.bench.truth import SCENE_SEEDS, captures, psnr, render_scene
+from polsep.pipeline import METHODS, demosaic
+
+
+def bench_separation(_data: Path | None = None) -> Iterator[Row]:
+    """PSNR of every method on co-sited, noisy and mosaicked captures of coloured and of grey scenes."""
+    for case, saturation in (("colour", 1.0), ("desaturated", 0.3), ("grey", 0.0)):
+        scores: dict[tuple[str, str, str], list[float]] = {}
+        for seed in SCENE_SEEDS:
+            scene = render_scene(seed, saturation)
+            for capture, frame, mask, (diffuse, specular) in captures(scene, seed):
+                for name, method in METHODS.items():
+                    found = method.split(demosaic(frame, method, full=False))
+                    for output, image, truth in (
+                        ("diffuse", found.diffuse, diffuse),
+                        ("specular", found.specular, specular),
+                    ):
+                        scores.setdefault((capture, name, output), []).append(psnr(image, truth, mask))
+        for (capture, name, output), values in scores.items():
+            yield Row("separation", f"{case}, {capture}", name, f"{output} PSNR", statistics.fmean(values), "dB")
+            if "unclipped" in capture:
+                yield Row("separation", f"{case}, {capture}", name, f"{output} PSNR, worst scene", min(values), "dB")

@@ -1,0 +1,72 @@
+"""Scenes of known truth as every benchmark takes them: rendered, exposed, and compared by PSNR.
+
+PSNR: linear light, peak 1 = the white level of one measurement, both images limited to [0, 1], inside the object mask;
+120 dB at most.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from polsep.camera import IMX250, Layout, Mosaic, add_noise, expose
+from polsep.render import PinholeCamera, render
+from polsep.scenes import random_light, random_parts
+from polsep.stokes import Measurements, Stokes, measure
+
+#: Seeds of the benchmark's scenes; nothing is ever tuned or trained on seeds from 2000 to 2999.
+SCENE_SEEDS = tuple(range(2000, 2008))
+SCENE_SIZE = (384, 384)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A rendered scene: exact lobes and the object mask, exposed so that 1 % of the diffuse light exceeds s0 = 1.4."""
+
+    diffuse: Stokes
+    specular: Stokes
+    mask: Tensor
+
+
+def render_scene(seed: int, saturation: float, size: tuple[int, int] = SCENE_SIZE) -> Scene:
+    """A random scene of four objects under one random polarized light; ``saturation`` 0 makes every albedo grey."""
+    generator = torch.Generator().manual_seed(seed)
+    parts = random_parts(generator, 4, saturation)
+    light = random_light(generator)
+    diffuse, specular = render(parts, PinholeCamera((0.0, 0.0, 8.0), (0.0, 0.0, 0.0), 24.0), light, size)
+    mask = (diffuse + specular).s0.amax(dim=0) > 1e-3
+    gain = 1.4 / float(torch.quantile(diffuse.s0.amax(dim=0)[mask], 0.99))
+    return Scene(diffuse * gain, specular * gain, mask)
+
+
+def psnr(found: Tensor, truth: Tensor, mask: Tensor) -> float:
+    """PSNR in dB of images ``[C, h, w]`` inside ``mask [h, w]``, as the module says; at most 120."""
+    error = ((found.clamp(0, 1) - truth.clamp(0, 1)) ** 2).mean(dim=0)[mask].mean()
+    return min(120.0, -10 * math.log10(max(float(error), 1e-30)))
+
+
+Captures = Iterator[tuple[str, Measurements | Mosaic, Tensor, tuple[Tensor, Tensor]]]
+
+
+def captures(scene: Scene, seed: int) -> Captures:
+    """A scene as co-sited exact, co-sited noisy and mosaicked noisy samples, each with its mask and truth."""
+    light, angles = scene.diffuse + scene.specular, Layout().angles
+    exact = measure(light, angles)
+    truth = (scene.diffuse.s0, scene.specular.s0)
+    clipped = exact.data >= 1
+    limited = Measurements(exact.data.clamp(max=1), angles, clipped)
+    unclipped = scene.mask & ~clipped.any(dim=0).any(dim=0)
+    yield "co-sited exact, unclipped pixels", limited, unclipped, truth
+    yield "co-sited exact, with clipping", limited, scene.mask, truth
+    generator = torch.Generator().manual_seed(seed)
+    noisy = add_noise(exact.data, IMX250, generator).clamp(0, 1)
+    yield "co-sited, sensor noise", Measurements(noisy, angles, noisy >= 1), scene.mask, truth
+    mosaic = expose(light, Layout(), IMX250, generator)
+    half = (avg_pool2d(truth[0], 2), avg_pool2d(truth[1], 2))
+    mask = avg_pool2d(scene.mask[None].float(), 2)[0] == 1
+    yield "mosaic, sensor noise", mosaic, mask, half

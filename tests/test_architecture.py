@@ -25,6 +25,7 @@ RANKS = {
     "render": 3,
     "scenes": 3,
     "levels": 4,
+    "kernels": 4,
     "pipeline": 4,
     "io": 5,
     "batch": 6,
@@ -39,6 +40,8 @@ WITHIN = {
     ("pipeline", "levels"),
     ("guided", "demosaic"),
     ("io", "io"),
+    ("kernels", "kernels"),
+    ("bench", "bench"),
 }
 #: Libraries that only one room may use.
 HOMES = {

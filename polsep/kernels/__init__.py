@@ -1,0 +1,29 @@
+"""The fused CPU twins of the hot path, compiled by numba, and nothing else.
+
+Every kernel computes what a readable torch function computes, which its docstring names and a test compares. Importing
+this room imports numba; ``import polsep`` does not.
+"""
+
+from __future__ import annotations
+
+from polsep.kernels import analytic, color_affine
+from polsep.kernels.analytic import AnalyticImages, AnalyticOptions, separate_analytic_half
+from polsep.kernels.color_affine import ColorAffineImages, ColorAffineOptions, separate_color_affine_half
+from polsep.kernels.unpack import PackedFrame
+
+__all__ = [
+    "AnalyticImages",
+    "AnalyticOptions",
+    "ColorAffineImages",
+    "ColorAffineOptions",
+    "PackedFrame",
+    "separate_analytic_half",
+    "separate_color_affine_half",
+    "warm_up",
+]
+
+
+def warm_up() -> None:
+    """Compile every kernel, or load it from numba's cache: minutes the first time on a machine, then about a second."""
+    analytic.warm_up()
+    color_affine.warm_up()

@@ -297,7 +297,7 @@ def test_bad_images_are_refused() -> None:
 
 
 def test_one_compilation_serves_all_frames() -> None:
-    """Dtypes, packings, layouts and read-only buffers share one specialisation, so `analytic.warm_up` warms all of them."""
+    """Dtypes, packings, layouts and read-only buffers share one specialisation: `analytic.warm_up` warms them all."""
     analytic.warm_up()
     separate_analytic_half(PackedFrame(np.frombuffer(bytes(24), np.uint8), 4, 4, "lsb"), Layout(), 0, 4095)
     assert len(analytic._separate.signatures) == 1

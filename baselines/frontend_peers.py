@@ -155,7 +155,7 @@ def time_chain(name: str, path: Path) -> dict[str, float]:
     before = peak_mebibytes()
     function(raw)
     times: list[float] = []
-    while len(times) < 2 or (len(times) < MOST_RUNS and sum(times) < MOST_SECONDS):
+    while not times or (len(times) < MOST_RUNS and sum(times) < MOST_SECONDS):
         start = time.perf_counter()
         function(raw)
         times.append(time.perf_counter() - start)

@@ -8,8 +8,10 @@ which thin polarized highlights would keep the pattern of the analysers; in cell
 
 1. s0 of all colours (`fill_colors`). Green first: along rows and columns, the interpolation of the other colour plus
    what the pixel's own colour differs from its interpolation, times the slope at which green follows that colour
-   around (slope 1 is Hamilton and Adams 1997; textures of unlike colours need other slopes). Then red and blue as local
-   linear functions of green, with the residual interpolated (residual interpolation, Kiku et al. 2013).
+   around (slope 1 is Hamilton and Adams 1997; textures of unlike colours need other slopes). What green then differs
+   from the pixel's colour is smoothed where it is no larger than the error of such an interpolation: on grey things,
+   that is everywhere. Then red and blue as local linear functions of green, with the residual interpolated (residual
+   interpolation, Kiku et al. 2013).
 2. Polarization (`_residual_mosaic`). The guide is s0 of each pixel's own colour, from pixels around it; what the
    samples differ from it is interpolated bilinearly per analyser. A 3x3 tent holds all four analysers in balance, so
    the guide is the tent of s0 plus the detail that the analysers and colours around a pixel have in common.
@@ -45,7 +47,7 @@ from polsep.stokes import Measurements, Stokes, analyser_residual, fit_stokes, m
 #: Smallest number of cells per side for the guided filters; smaller frames stay bilinear.
 LEAST_CELLS = 8
 #: Cells by which a frame is continued beyond its border: the reach of all filters together.
-MARGIN = 18
+MARGIN = 24
 #: How strongly the detail that all analysers share sharpens the guide; chosen on tuning scenes and real pictures.
 DETAIL_GAIN = 1.8
 #: Radius, in cells, over which polarization counts as smooth when it is taken out of the samples.
@@ -53,13 +55,19 @@ SMOOTH_RADIUS = 4
 #: Detail of polarization counts where its variance exceeds this many times the analysers' contradiction (s1 and s2
 #: together have four times its variance), and this variance at least.
 NOISE_MARGIN, NOISE_FLOOR = 16.0, 1e-5
-#: Regularisation of slopes: variances of s0 below these are noise.
-SLOPE_FLOOR, GUIDE_FLOOR = 1e-3, 1e-4
+#: Regularisation of slopes: where the variance of s0 is below these, a slope falls back to `PRIOR_SHARE` of the ratio of
+#: the colours, the slope of a uniform albedo under varying light. The whole ratio would double noise, none would blur.
+SLOPE_FLOOR, GUIDE_FLOOR, PRIOR_SHARE = 2e-4, 2e-5, 0.5
+#: Radius in cells, and how many times the squared detail along the better direction counts as error, where the
+#: difference of green from red and blue is smoothed.
+DIFFERENCE_RADIUS, DIFFERENCE_MARGIN = 4, 0.7
 #: s0 of a colour is at least this share of its bilinear interpolation, so that extrapolation never ends at zero.
-LEAST_SHARE = 0.1
+LEAST_SHARE = 0.25
 _TENT = (0.25, 0.5, 0.25)
 _GENTLE = (0.125, 0.75, 0.125)
 _BINOMIAL = tuple(math.comb(8, k) / 256 for k in range(9))
+#: Bilinear interpolation of samples that come in pairs, every fourth pixel; green comes twice as dense.
+_PAIRS = (0.125, 0.25, 0.375, 0.5, 0.375, 0.25, 0.125)
 
 
 def demosaic_guided(mosaic: Mosaic) -> Measurements:
@@ -169,7 +177,7 @@ def fill_colors(mosaic: Tensor, layout: Layout) -> Tensor:
     The pixels' own values stay.
     """
     masks, cells = color_masks(mosaic, layout, 2), color_masks(mosaic, layout, 1)
-    green = _fill_green(mosaic, masks[1], cells[1])
+    green = _fill_green(mosaic, masks, cells)
     red, blue = (_fill_from_green(mosaic, green, masks[c], cells[c]) for c in (0, 2))
     return torch.stack([red, green, blue], dim=-3)
 
@@ -186,18 +194,35 @@ def color_masks(mosaic: Tensor, layout: Layout, block: int) -> Tensor:
     return masks
 
 
-def _fill_green(mosaic: Tensor, is_green: Tensor, green_cells: Tensor) -> Tensor:
+def _fill_green(mosaic: Tensor, masks: Tensor, mask_cells: Tensor) -> Tensor:
     """Green everywhere: estimates along both directions, weighed by how smooth green minus the other colour is."""
-    total, weights = torch.zeros_like(mosaic), torch.zeros_like(mosaic)
-    cells = _cell_mean(mosaic)
+    is_green, cells = masks[1] > 0, _cell_mean(mosaic)
+    total, weights, precision = (torch.zeros_like(image) for image in (mosaic, cells, cells))
     for dim in (-1, -2):
         around, second = _across_pairs(mosaic, dim)
-        other = around + _repeat(_slope_of_other(cells, green_cells, dim)) * second
-        difference = correlate(torch.where(is_green > 0, mosaic - other, other - mosaic), _GENTLE, dim)
-        rough = box_mean(_cell_mean(correlate(difference, (-1.0, 0.0, 1.0), dim) ** 2), 1)
-        weight = _repeat(1 / (rough + 1e-6))
-        total, weights = total + weight * difference, weights + weight
-    return torch.where(is_green > 0, mosaic, mosaic + total / weights)
+        other = around + _repeat(_slope_of_other(cells, mask_cells[1], dim)) * second
+        difference = correlate(torch.where(is_green, mosaic - other, other - mosaic), _GENTLE, dim)
+        weight = 1 / (box_mean(_cell_mean(correlate(difference, (-1.0, 0.0, 1.0), dim) ** 2), 1) + 1e-6)
+        total, weights = total + _repeat(weight) * difference, weights + weight
+        precision = precision + 1 / (box_mean(_cell_mean(second) ** 2, 1) + 1e-12)
+    difference = _without_error(total / _repeat(weights), 1 / precision, mask_cells)
+    green = _at_least(mosaic + difference, 0.5 * _blur(mosaic * masks[1], _PAIRS))
+    return torch.where(is_green, mosaic, green)
+
+
+def _without_error(difference: Tensor, error: Tensor, mask_cells: Tensor) -> Tensor:
+    """The ``difference [..., H, W]`` of green at red and at blue cells, smoothed where the ``error [..., h, w]``
+    explains it: the variance within a window counts by the share that exceeds `DIFFERENCE_MARGIN` times the error.
+    """
+    found = torch.zeros_like(difference)
+    for mask in (mask_cells[0], mask_cells[2]):
+        share = box_mean(mask, DIFFERENCE_RADIUS)
+        smooth = _repeat(box_mean(_cell_mean(difference) * mask, DIFFERENCE_RADIUS) / share)
+        detail = difference - smooth
+        variance, noise = (box_mean(x * mask, DIFFERENCE_RADIUS) / share for x in (_cell_mean(detail**2), error))
+        kept = ((variance - DIFFERENCE_MARGIN * noise) / (variance + 1e-12)).clamp(min=0)
+        found = found + _repeat(mask) * (smooth + _repeat(kept) * detail)
+    return found
 
 
 def _across_pairs(mosaic: Tensor, dim: int) -> tuple[Tensor, Tensor]:
@@ -223,11 +248,23 @@ def _slope_of_other(cells: Tensor, green_cells: Tensor, dim: int) -> Tensor:
     Regressed are central differences over 5x5 cells, green and other cells apart.
     """
     other, own = correlate(cells, (-0.5, 0.0, 0.5), dim), correlate(cells, (-0.25, 0.0, 0.0, 0.0, 0.25), dim)
+    means = [box_mean(cells * sites, 2) / box_mean(sites, 2) for sites in (green_cells, 1 - green_cells)]
     slopes = []
-    for sites in (green_cells, 1 - green_cells):
-        share = box_mean(sites, 2)
-        slopes.append(box_mean(other * own * sites, 2) / (box_mean(own * own * sites, 2) + SLOPE_FLOOR * share))
+    for sites, mean_own, mean_other in ((green_cells, *means), (1 - green_cells, *means[::-1])):
+        floor = SLOPE_FLOOR * box_mean(sites, 2)
+        follows = box_mean(other * own * sites, 2) + floor * _prior_slope(mean_other, mean_own)
+        slopes.append(follows / (box_mean(own * own * sites, 2) + floor))
     return torch.where(green_cells > 0, slopes[0], slopes[1]).clamp(-0.5, 4)
+
+
+def _prior_slope(mean: Tensor, mean_guide: Tensor) -> Tensor:
+    """The slope where nothing can be regressed, from the means of both colours."""
+    return PRIOR_SHARE * ((mean + 1e-3) / (mean_guide.clamp(min=0) + 1e-3)).clamp(0.2, 5)
+
+
+def _at_least(image: Tensor, plain: Tensor) -> Tensor:
+    """At least `LEAST_SHARE` of its interpolation, which may be negative."""
+    return torch.where(image < LEAST_SHARE * plain, LEAST_SHARE * plain, image)
 
 
 def _fill_from_green(mosaic: Tensor, green: Tensor, mask: Tensor, mask_cells: Tensor) -> Tensor:
@@ -243,14 +280,11 @@ def _fill_from_green(mosaic: Tensor, green: Tensor, mask: Tensor, mask_cells: Te
 
     mean_g, mean_x = mean(green), mean(mosaic)
     covariance, variance = mean(green * mosaic) - mean_g * mean_x, mean(green * green) - mean_g * mean_g
-    slope = covariance / (variance.clamp(min=0) + GUIDE_FLOOR)
+    slope = (covariance + GUIDE_FLOOR * _prior_slope(mean_x, mean_g)) / (variance.clamp(min=0) + GUIDE_FLOOR)
     offset = mean_x - slope * mean_g
     guess = _enlarge(box_mean(slope, 1)) * green + _enlarge(box_mean(offset, 1))
-    tent = (0.125, 0.25, 0.375, 0.5, 0.375, 0.25, 0.125)
-    plain, residual = (_blur(image * mask, tent) for image in (mosaic, mosaic - guess))
-    filled = guess + residual
-    filled = torch.where(filled < LEAST_SHARE * plain, LEAST_SHARE * plain, filled)
-    return torch.where(mask > 0, mosaic, filled)
+    plain, residual = (_blur(image * mask, _PAIRS) for image in (mosaic, mosaic - guess))
+    return torch.where(mask > 0, mosaic, _at_least(guess + residual, plain))
 
 
 def _own(image: Tensor, layout: Layout) -> Tensor:

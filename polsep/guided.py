@@ -47,7 +47,7 @@ from polsep.stokes import Measurements, Stokes, analyser_residual, fit_stokes, m
 #: Smallest number of cells per side for the guided filters; smaller frames stay bilinear.
 LEAST_CELLS = 8
 #: Cells by which a frame is continued beyond its border: the reach of all filters together.
-MARGIN = 24
+MARGIN = 36
 #: How strongly the detail that all analysers share sharpens the guide; chosen on tuning scenes and real pictures.
 DETAIL_GAIN = 1.8
 #: Radius, in cells, over which polarization counts as smooth when it is taken out of the samples.
@@ -55,8 +55,8 @@ SMOOTH_RADIUS = 4
 #: Detail of polarization counts where its variance exceeds this many times the analysers' contradiction (s1 and s2
 #: together have four times its variance), and this variance at least.
 NOISE_MARGIN, NOISE_FLOOR = 16.0, 1e-5
-#: Regularisation of slopes: where the variance of s0 is below these, a slope falls back to `PRIOR_SHARE` of the ratio of
-#: the colours, the slope of a uniform albedo under varying light. The whole ratio would double noise, none would blur.
+#: Regularisation of slopes: where the variance of s0 is below these, a slope falls back to `PRIOR_SHARE` of the ratio
+#: of the colours, the slope of a uniform albedo under varying light. The whole ratio would double noise, none would blur.
 SLOPE_FLOOR, GUIDE_FLOOR, PRIOR_SHARE = 2e-4, 2e-5, 0.5
 #: Radius in cells, and how many times the squared detail along the better direction counts as error, where the
 #: difference of green from red and blue is smoothed.
@@ -66,7 +66,7 @@ LEAST_SHARE = 0.25
 _TENT = (0.25, 0.5, 0.25)
 _GENTLE = (0.125, 0.75, 0.125)
 _BINOMIAL = tuple(math.comb(8, k) / 256 for k in range(9))
-#: Bilinear interpolation of samples that come in pairs, every fourth pixel; green comes twice as dense.
+#: Bilinear interpolation of samples that come in pairs, every fourth pixel.
 _PAIRS = (0.125, 0.25, 0.375, 0.5, 0.375, 0.25, 0.125)
 
 
@@ -206,8 +206,8 @@ def _fill_green(mosaic: Tensor, masks: Tensor, mask_cells: Tensor) -> Tensor:
         total, weights = total + _repeat(weight) * difference, weights + weight
         precision = precision + 1 / (box_mean(_cell_mean(second) ** 2, 1) + 1e-12)
     difference = _without_error(total / _repeat(weights), 1 / precision, mask_cells)
-    green = _at_least(mosaic + difference, 0.5 * _blur(mosaic * masks[1], _PAIRS))
-    return torch.where(is_green, mosaic, green)
+    beside = 0.5 * (correlate(cells, (0.5, 0.0, 0.5), -1) + correlate(cells, (0.5, 0.0, 0.5), -2))
+    return torch.where(is_green, mosaic, _at_least(mosaic + difference, _repeat(beside)))
 
 
 def _without_error(difference: Tensor, error: Tensor, mask_cells: Tensor) -> Tensor:

@@ -104,11 +104,20 @@ def fit_stokes(measurements: Measurements) -> Stokes:
     This is the paper's Eq. 15, s = P^+ m, for any set of angles. Clipping biases it; see `fit_stokes_unclipped`.
     Raises ValueError when the angles do not determine a Stokes vector.
     """
-    matrix = analyser_matrix(measurements.angles)
+    return _combine(stokes_inverse(measurements.angles), measurements.data)
+
+
+def stokes_inverse(angles: Sequence[float]) -> Tensor:
+    """The pseudo-inverse ``[3, K]`` of `analyser_matrix`, float64: Stokes vectors from the samples of K analysers.
+
+    Raises ValueError when the angles do not determine a Stokes vector.
+    """
+    matrix = analyser_matrix(angles)
     if torch.linalg.matrix_rank(matrix, rtol=1e-6) < 3:
-        degrees = [round(math.degrees(t), 3) for t in measurements.angles]
+        degrees = [round(math.degrees(t), 3) for t in angles]
         raise ValueError(f"need three analysers of different angles (modulo 180 degrees), found {degrees}")
-    return _combine(torch.linalg.pinv(matrix), measurements.data)
+    inverse: Tensor = torch.linalg.pinv(matrix)
+    return inverse
 
 
 def fit_stokes_unclipped(measurements: Measurements) -> tuple[Stokes, Tensor]:
@@ -132,7 +141,7 @@ def fit_stokes_unclipped(measurements: Measurements) -> tuple[Stokes, Tensor]:
     determined = torch.ones_like(touched)
     determined_touched = torch.zeros_like(codes, dtype=torch.bool)
     for code in set(codes.tolist()):
-        matrix, exact = _unclipped_inverse(measurements.angles, int(code))
+        matrix, exact = unclipped_inverse(measurements.angles, int(code))
         rows = codes == code
         determined_touched[rows] = exact
         if matrix is not None:
@@ -144,8 +153,11 @@ def fit_stokes_unclipped(measurements: Measurements) -> tuple[Stokes, Tensor]:
     return Stokes(s0, s1, s2), determined
 
 
-def _unclipped_inverse(angles: tuple[float, ...], code: int) -> tuple[Tensor | None, bool]:
-    """[3, K] inverse that ignores the analysers in the bit mask ``code``; None where only bounds are left."""
+def unclipped_inverse(angles: tuple[float, ...], code: int) -> tuple[Tensor | None, bool]:
+    """`stokes_inverse` without the analysers whose bits in ``code`` are set, and whether it determines s0, s1 and s2.
+
+    ``[3, K]`` with zeros for those analysers. Two crossed ones leave the third component 0; fewer or others give None.
+    """
     kept = [k for k in range(len(angles)) if not code >> k & 1]
     matrix = analyser_matrix(angles)
     rank = int(torch.linalg.matrix_rank(matrix[kept], rtol=1e-6)) if kept else 0

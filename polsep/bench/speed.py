@@ -39,6 +39,8 @@ CASE = "2448x2048 colour frame"
 WHITE_LEVEL = 4095.0
 #: Every chain is timed in so many processes, in turns, each time so often or so long; the best time counts.
 ROUNDS, MOST_RUNS, MOST_SECONDS = 2, 10, 4.0
+#: Threads of every chain.
+THREADS = 2
 
 Raw = NDArray[Any]
 Chain = Callable[[Raw], Any]
@@ -123,9 +125,11 @@ def print_time(name: str, path: str) -> None:
 
     Printed as JSON.
     """
-    torch.set_num_threads(2)
+    torch.set_num_threads(THREADS)
     raw, chain = read_array(Path(path)), find_chain(name)
     assert chain is not None
+    if name in KERNELS:
+        import_module("polsep.kernels").set_threads(THREADS)
     before = read_peak_memory()
     chain(raw)
     times: list[float] = []
@@ -140,7 +144,7 @@ def print_time(name: str, path: str) -> None:
 def measure_copy_bandwidth(mebibytes: int = 512) -> float:
     """Bytes/s, read and written, at which two threads of torch copy that much: best of 5."""
     threads = torch.get_num_threads()
-    torch.set_num_threads(2)
+    torch.set_num_threads(THREADS)
     source = torch.ones(mebibytes * 2**18)
     target = torch.zeros_like(source)
     times = []

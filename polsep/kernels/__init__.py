@@ -9,6 +9,7 @@ from __future__ import annotations
 from polsep.kernels import analytic, color_affine
 from polsep.kernels.analytic import AnalyticImages, AnalyticOptions, separate_analytic_half
 from polsep.kernels.color_affine import ColorAffineImages, ColorAffineOptions, separate_color_affine_half
+from polsep.kernels.threads import get_threads, set_threads
 from polsep.kernels.unpack import PackedFrame
 
 __all__ = [
@@ -17,13 +18,15 @@ __all__ = [
     "ColorAffineImages",
     "ColorAffineOptions",
     "PackedFrame",
+    "get_threads",
     "separate_analytic_half",
     "separate_color_affine_half",
+    "set_threads",
     "warm_up",
 ]
 
 
 def warm_up() -> None:
-    """Compile every kernel, or load it from numba's cache: minutes the first time on a machine, then about a second."""
+    """Compile every kernel, or load it from numba's cache: half a minute the first time on a machine, then a second."""
     analytic.warm_up()
     color_affine.warm_up()

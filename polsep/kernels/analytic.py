@@ -2,23 +2,17 @@
 
 Conventions are those of the twins: linear light, 1.0 = one measurement at the white level, AoLP in [0, pi) from
 image-right toward image-up. Values agree to rounding (2e-6 of white), ``valid`` exactly. Rows are computed
-independently of each other, so the number of threads (`numba.set_num_threads`) does not change a bit.
-
-Compiled code is kept on disk by numba: in ``__pycache__`` beside this file or, where that cannot be written, in the
-user's cache folder (``NUMBA_CACHE_DIR`` overrides both). Note: numba renews it when this file changes, not when the
-modules that it imports do; after editing those, remove ``polsep/kernels/__pycache__``.
+independently of each other, so the number of threads (`set_threads`) does not change a bit.
 """
 
 from __future__ import annotations
 
 import math
-import threading
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from polsep.camera import Layout
@@ -32,15 +26,14 @@ from polsep.kernels.bilinear import (
     open_window,
     read_pattern,
 )
-from polsep.kernels.unpack import RawFrame, Samples, as_samples, compiled
-from polsep.stokes import Measurements, fit_stokes
+from polsep.kernels.compiling import HALF, ONE, THIRD, ZERO, compiled, entry
+from polsep.kernels.images import check_images, interleave_colors
+from polsep.kernels.threads import Piece, share
+from polsep.kernels.unpack import RawFrame, Samples, as_samples
+from polsep.stokes import stokes_inverse
 
-#: Cell rows that one thread computes at a time: few enough to share the work, many enough to reuse loaded rows.
+#: Least cell rows that a thread computes at a time: few enough to share the work, many enough to reuse loaded rows.
 STRIP = 32
-
-# numba's plain thread pool, its last resort where neither TBB nor OpenMP is there, ends the process when two threads
-# start a parallel kernel at once. A kernel uses all threads anyway, so callers wait for each other.
-_LAUNCH = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -109,7 +102,7 @@ def separate_analytic_half(
 
     ``raw``: ``[H, W]`` uint8, uint16, float32, or a `PackedFrame`; levels in its units. Images are ``[h, w, C]`` with
     h and w the whole 2x2 cells from the layout's origin on, in white light unless ``options`` say otherwise. A frame
-    whose rows are not contiguous is copied first. Uses numba's threads; the first call ever compiles (see `warm_up`).
+    whose rows are not contiguous is copied first. The first call ever compiles (see `warm_up`).
     Raises ValueError on another dtype or shape, levels out of order, or images in ``options.out`` that do not fit.
     Source: Dave et al. 2022, Eqs. 15-18.
     """
@@ -121,38 +114,26 @@ def separate_analytic_half(
         out = AnalyticImages.empty((raw.shape[0], raw.shape[1]), layout, options.polarization)
     targets = _as_targets(out, (pattern.h, pattern.w, pattern.channels))
     gains = options.light_color[: pattern.channels] if options.in_light else (1.0,) * pattern.channels
-    conversion = _Conversion(_stokes_inverse(layout), np.array(gains, np.float32))
-    with _LAUNCH:
-        _separate(samples, pattern, conversion, targets)
+    conversion = _Conversion(_inverse(layout), np.array(gains, np.float32))
+    share(partial(_separate_rows, samples, pattern, conversion, targets), pattern.h, STRIP)
     return out
 
 
-def _stokes_inverse(layout: Layout) -> NDArray[np.float32]:
-    """The ``[3, 4]`` matrix that `fit_stokes` applies; its errors are `fit_stokes`' own."""
-    unit = torch.eye(4, dtype=torch.float64).reshape(4, 1, 1, 4)
-    stokes = fit_stokes(Measurements(unit, layout.angles))
-    return np.stack([s.reshape(4).float().numpy() for s in (stokes.s0, stokes.s1, stokes.s2)])
+@lru_cache(maxsize=8)
+def _inverse(layout: Layout) -> NDArray[np.float32]:
+    """The matrix ``[3, 4]`` of `fit_stokes`."""
+    return stokes_inverse(layout.angles).float().numpy()
 
 
 def _as_targets(out: AnalyticImages, shape: tuple[int, int, int]) -> _Targets:
     """The images of ``out``, checked. Raises ValueError on a wrong shape or dtype, or on arrays with gaps."""
     if (out.dolp is None) != (out.aolp is None):
         raise ValueError("expected both dolp and aolp or neither, found one of them")
+    check_images({name: image for name, image in vars(out).items() if image is not None}, shape)
     none = np.empty((0, 0), np.float32)
     dolp, aolp = (none, none) if out.dolp is None or out.aolp is None else (out.dolp, out.aolp)
-    targets = _Targets(out.diffuse, out.specular, out.valid, dolp, aolp)
-    for name, image in targets._asdict().items():
-        if image is none:
-            continue
-        wanted = shape if name in ("diffuse", "specular") else shape[:2]
-        dtype = "bool" if name == "valid" else "float32"
-        if image.shape != wanted or image.dtype != dtype or not image.flags.c_contiguous or not image.flags.writeable:
-            raise ValueError(
-                f"expected {name} to be a writable C-contiguous {dtype} array {list(wanted)}, "
-                f"found {image.dtype} {list(image.shape)}"
-            )
     rows = (shape[0], shape[1] * shape[2])
-    return targets._replace(diffuse=out.diffuse.reshape(rows), specular=out.specular.reshape(rows))
+    return _Targets(out.diffuse.reshape(rows), out.specular.reshape(rows), out.valid, dolp, aolp)
 
 
 def warm_up() -> None:
@@ -161,8 +142,7 @@ def warm_up() -> None:
         separate_analytic_half(np.zeros((4, 4), np.uint8), layout, 0, 255, AnalyticOptions(polarization=True))
 
 
-_ZERO, _ONE = np.float32(0), np.float32(1)
-_HALF, _PI, _HALF_PI = np.float32(0.5), np.float32(math.pi), np.float32(math.pi / 2)
+_PI, _HALF_PI = np.float32(math.pi), np.float32(math.pi / 2)
 
 # atan(x) / x on [0, 1] as a polynomial in x^2: own minimax fit (iteratively reweighted least squares), 2.5e-7 rad.
 _A0, _A1, _A2, _A3, _A4, _A5, _A6 = (
@@ -172,20 +152,20 @@ _A0, _A1, _A2, _A3, _A4, _A5, _A6 = (
 
 
 @compiled
-def _split_row(m: Any, c: int, gain: Any, inverse: Any) -> None:
-    """Eqs. 15-18 for colour ``c`` of a row ``m [4, C, n]``: it becomes (specular, diffuse, -, -), times ``gain``.
+def _split_row(m: Any, c: int, inverse: Any) -> None:
+    """Eqs. 15-18 for colour ``c`` of a row ``m [4, C, n]``: it becomes (specular, diffuse, -, -).
 
     In place, because LLVM gives up on loops over so many arrays of which each might overlap each.
     """
-    i00, i01, i02, i03 = gain * inverse[0, 0], gain * inverse[0, 1], gain * inverse[0, 2], gain * inverse[0, 3]
-    i10, i11, i12, i13 = gain * inverse[1, 0], gain * inverse[1, 1], gain * inverse[1, 2], gain * inverse[1, 3]
-    i20, i21, i22, i23 = gain * inverse[2, 0], gain * inverse[2, 1], gain * inverse[2, 2], gain * inverse[2, 3]
+    i00, i01, i02, i03 = inverse[0, 0], inverse[0, 1], inverse[0, 2], inverse[0, 3]
+    i10, i11, i12, i13 = inverse[1, 0], inverse[1, 1], inverse[1, 2], inverse[1, 3]
+    i20, i21, i22, i23 = inverse[2, 0], inverse[2, 1], inverse[2, 2], inverse[2, 3]
     m0, m1, m2, m3 = m[0, c], m[1, c], m[2, c], m[3, c]
     for j in range(m0.size):
         s0 = i00 * m0[j] + i01 * m1[j] + i02 * m2[j] + i03 * m3[j]
         s1 = i10 * m0[j] + i11 * m1[j] + i12 * m2[j] + i13 * m3[j]
         s2 = i20 * m0[j] + i21 * m1[j] + i22 * m2[j] + i23 * m3[j]
-        total = s0 if s0 > _ZERO else _ZERO
+        total = s0 if s0 > ZERO else ZERO
         polarized = math.sqrt(s1 * s1 + s2 * s2)
         specular = polarized if polarized < total else total
         m0[j] = specular
@@ -198,13 +178,13 @@ def _half_angle(s1: Any, s2: Any) -> Any:
     x, y = abs(s1), abs(s2)
     steep = y > x
     long, short = (y, x) if steep else (x, y)
-    ratio = short / (long if long > _ZERO else _ONE)
+    ratio = short / (long if long > ZERO else ONE)
     z = ratio * ratio
     angle = ratio * (_A0 + z * (_A1 + z * (_A2 + z * (_A3 + z * (_A4 + z * (_A5 + z * _A6))))))
     angle = _HALF_PI - angle if steep else angle
-    angle = _HALF * (_PI - angle if s1 < _ZERO else angle)
-    angle = _PI - angle if s2 < _ZERO else angle
-    return angle if angle < _PI else _ZERO
+    angle = HALF * (_PI - angle if s1 < ZERO else angle)
+    angle = _PI - angle if s2 < ZERO else angle
+    return angle if angle < _PI else ZERO
 
 
 @compiled
@@ -218,8 +198,8 @@ def _polarize_row(m: Any, inverse: Any) -> None:
         s0 = i00 * m0[j] + i01 * m1[j] + i02 * m2[j] + i03 * m3[j]
         s1 = i10 * m0[j] + i11 * m1[j] + i12 * m2[j] + i13 * m3[j]
         s2 = i20 * m0[j] + i21 * m1[j] + i22 * m2[j] + i23 * m3[j]
-        degree = math.sqrt(s1 * s1 + s2 * s2) / (s0 if s0 > _ZERO else _ONE)
-        m0[j] = degree if s0 > _ZERO else _ZERO
+        degree = math.sqrt(s1 * s1 + s2 * s2) / (s0 if s0 > ZERO else ONE)
+        m0[j] = degree if s0 > ZERO else ZERO
         m1[j] = _half_angle(s1, s2)
 
 
@@ -228,10 +208,9 @@ def _mean_color(m: Any, gains: Any, mean: Any) -> None:
     """Mean over colours of ``m [4, C, n]``, in the light's colour, to ``mean [4, n]``."""
     if m.shape[1] == 1:
         for k in range(4):
-            _copy(m[k, 0], mean[k])
+            _scale(m[k, 0], ONE, mean[k])
         return
-    third = _ONE / np.float32(3)
-    g0, g1, g2 = third * gains[0], third * gains[1], third * gains[2]
+    g0, g1, g2 = THIRD * gains[0], THIRD * gains[1], THIRD * gains[2]
     for k in range(4):
         red, green, blue, out = m[k, 0], m[k, 1], m[k, 2], mean[k]
         for j in range(out.size):
@@ -239,23 +218,19 @@ def _mean_color(m: Any, gains: Any, mean: Any) -> None:
 
 
 @compiled
-def _interleave(planes: Any, image: Any) -> None:
-    """Channels last: ``planes [C, n]`` to a row ``image [w C]``."""
-    if planes.shape[0] == 1:
-        _copy(planes[0], image)
-        return
-    red, green, blue = planes[0], planes[1], planes[2]
-    for j in range(image.size // 3):
-        image[3 * j] = red[j]
-        image[3 * j + 1] = green[j]
-        image[3 * j + 2] = blue[j]
+def _scale(row: Any, gain: Any, image: Any) -> None:
+    """The first values of ``row`` times ``gain``."""
+    for j in range(image.size):
+        image[j] = gain * row[j]
 
 
 @compiled
-def _copy(row: Any, image: Any) -> None:
-    """The first values of ``row``; a loop, because numba compiles far longer for an assignment of slices."""
-    for j in range(image.size):
-        image[j] = row[j]
+def _interleave(planes: Any, gains: Any, image: Any) -> None:
+    """Channels last, in the light's colour: ``planes [C, n]`` to a row ``image [w C]``."""
+    if planes.shape[0] == 1:
+        _scale(planes[0], gains[0], image)
+    else:
+        interleave_colors((planes[0], planes[1], planes[2]), gains, image)
 
 
 @compiled
@@ -265,17 +240,20 @@ def _clear_flagged(flags: Any, valid: Any) -> None:
         for c in range(flags.shape[1]):
             row = flags[k, c]
             for j in range(valid.size):
-                valid[j] &= row[j] == _ZERO
+                valid[j] &= row[j] == ZERO
 
 
-@compiled
-def _separate_strip(samples: Samples, pattern: Pattern, conversion: _Conversion, targets: _Targets, start: int) -> None:
-    """One strip of cell rows, from ``start`` on."""
+@entry
+def _separate_rows(
+    samples: Samples, pattern: Pattern, conversion: _Conversion, targets: _Targets, piece: Piece
+) -> None:
+    """A piece of the frame's cell rows."""
     inverse, gains = conversion.inverse, conversion.gains
+    first, stop = piece
     window, m = make_window(pattern), make_analysers(pattern)
     mean = np.empty((4, m.shape[2]), np.float32)
-    open_window(samples, pattern, window, start)
-    for r in range(start, start + STRIP if start + STRIP < pattern.h else pattern.h):
+    open_window(samples, pattern, window, first)
+    for r in range(first, stop):
         flagged = advance_window(samples, pattern, window, r)
         valid = targets.valid[r]
         for j in range(valid.size):
@@ -287,16 +265,9 @@ def _separate_strip(samples: Samples, pattern: Pattern, conversion: _Conversion,
         if targets.dolp.size:
             _mean_color(m, gains, mean)
             _polarize_row(mean, inverse)
-            _copy(mean[0], targets.dolp[r])
-            _copy(mean[1], targets.aolp[r])
+            _scale(mean[0], ONE, targets.dolp[r])
+            _scale(mean[1], ONE, targets.aolp[r])
         for c in range(pattern.channels):
-            _split_row(m, c, gains[c], inverse)
-        _interleave(m[0], targets.specular[r])
-        _interleave(m[1], targets.diffuse[r])
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _separate(samples: Samples, pattern: Pattern, conversion: _Conversion, targets: _Targets) -> None:
-    """All strips, shared among numba's threads."""
-    for strip in prange((pattern.h + STRIP - 1) // STRIP):
-        _separate_strip(samples, pattern, conversion, targets, strip * STRIP)
+            _split_row(m, c, inverse)
+        _interleave(m[0], gains, targets.specular[r])
+        _interleave(m[1], gains, targets.diffuse[r])

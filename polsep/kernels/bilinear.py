@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.camera import CLIP_MARGIN, Layout
-from polsep.kernels.unpack import Samples, compiled, read_row
+from polsep.kernels.compiling import HALF, ONE, QUARTER, ZERO, compiled
+from polsep.kernels.unpack import Samples, read_row
 
 #: Room on each side of a phase for its repeated border sample; a cache line, so that phases stay aligned.
 PAD = 16
@@ -28,7 +29,6 @@ PAD = 16
 #: Slots of a window: the rows that one cell row needs of each half, by row number modulo 4.
 SLOTS = 4
 
-_ZERO, _ONE, _QUARTER, _HALF = np.float32(0), np.float32(1), np.float32(0.25), np.float32(0.5)
 _OWN, _FAR = np.float32(0.875), np.float32(0.125)
 _BACK, _NEAR = np.float32(0.375), np.float32(0.625)
 _THREE_QUARTERS = np.float32(0.75)
@@ -192,7 +192,8 @@ def _spread(pattern: Pattern, row: Any, black: Any, gains: tuple[Any, Any], phas
 
 
 @compiled
-def _any_clipped(row: Any, clip_at: Any) -> bool:
+def any_clipped(row: Any, clip_at: Any) -> bool:
+    """Whether a row of codes has a clipped one."""
     clipped = False
     for x in range(row.size):
         clipped |= row[x] >= clip_at
@@ -205,11 +206,11 @@ def _load(samples: Samples, pattern: Pattern, window: Window, r: int, half: int)
     slot, row = r % SLOTS, window.row
     read_row(samples, pattern.top + 2 * r + half, pattern.left, row)
     _spread(pattern, row, pattern.black, (pattern.gains[r % 2, 0], pattern.gains[r % 2, 1]), window.values[half, slot])
-    clipped = _any_clipped(row, pattern.clip_at)
+    clipped = any_clipped(row, pattern.clip_at)
     if clipped or window.flagged[half, slot]:
         for x in range(row.size):
-            row[x] = _ONE if row[x] >= pattern.clip_at else _ZERO
-        _spread(pattern, row, _ZERO, (_ONE, _ONE), window.flags[half, slot])
+            row[x] = ONE if row[x] >= pattern.clip_at else ZERO
+        _spread(pattern, row, ZERO, (ONE, ONE), window.flags[half, slot])
     window.flagged[half, slot] = clipped
 
 
@@ -265,8 +266,8 @@ def _interpolate_green(a: tuple[Any, Any], q: Any, weights: tuple[Any, Any], ste
     a1_back, a1_near = a[1][PAD - (step > 0) :], a[1][PAD - (step < 0) :]
     a0_back, a0_near = a[0][PAD + (step < 0) :], a[0][PAD + (step > 0) :]
     q0, q0_near, q1, q1_near = q[0, PAD:], q[0, PAD + (step > 0) :], q[1, PAD:], q[1, PAD - (step < 0) :]
-    w_own, w_far, w_back, w_near = w * _HALF * _OWN, w * _HALF * _FAR, w * _HALF * _BACK, w * _HALF * _NEAR
-    v_own, v_far, v_back, v_near = v * _HALF * _OWN, v * _HALF * _FAR, v * _HALF * _BACK, v * _HALF * _NEAR
+    w_own, w_far, w_back, w_near = w * HALF * _OWN, w * HALF * _FAR, w * HALF * _BACK, w * HALF * _NEAR
+    v_own, v_far, v_back, v_near = v * HALF * _OWN, v * HALF * _FAR, v * HALF * _BACK, v * HALF * _NEAR
     for t in range(out.size // 2):
         even = w_own * a0[t] + w_far * a0_far[t] + v_back * a1_back[t] + v_near * a1_near[t]
         odd = v_own * a1[t] + v_far * a1_far[t] + w_back * a0_back[t] + w_near * a0_near[t]
@@ -279,7 +280,7 @@ def _green_at_edge(a: tuple[Any, Any], q: Any, weights: tuple[Any, Any], j: int,
     """Green of column ``j`` where the quarter step repeats the edge; ``inside`` is the column next to it."""
     here = weights[j % 2] * a[j % 2][PAD + j // 2]
     there = weights[inside % 2] * a[inside % 2][PAD + inside // 2]
-    return _HALF * (here + there + q[j % 2, PAD + j // 2])
+    return HALF * (here + there + q[j % 2, PAD + j // 2])
 
 
 @compiled
@@ -295,7 +296,7 @@ def _interpolate_colors(pattern: Pattern, rows: Any, q: Any, r: int, out: Any) -
         near = (r - d if edge else r + d) % SLOTS
         back = (r - d if 0 <= r - d < rows_of_cells else r + d) % SLOTS
         far = (r + 2 * d if 0 <= r + 2 * d < rows_of_cells else r) % SLOTS
-        w_own, w_near = (_ONE, _ZERO) if edge else (_THREE_QUARTERS, _QUARTER)
+        w_own, w_near = (ONE, ZERO) if edge else (_THREE_QUARTERS, QUARTER)
         for p in range(2):
             phase = 2 * p + place
             in_own_row = (p == 0) == green_first
@@ -315,12 +316,12 @@ def _interpolate_colors(pattern: Pattern, rows: Any, q: Any, r: int, out: Any) -
 @compiled
 def _center(upper: Any, lower: Any, w: Any, step: int, out: Any) -> None:
     """The quarter step in both directions."""
-    v, n = _ONE - w, out.size
+    v, n = ONE - w, out.size
     own, own_next = upper[PAD : PAD + n], upper[PAD + step : PAD + step + n]
     near, near_next = lower[PAD : PAD + n], lower[PAD + step : PAD + step + n]
     for j in range(n):
         here, there = w * own[j] + v * near[j], w * own_next[j] + v * near_next[j]
-        out[j] = _THREE_QUARTERS * here + _QUARTER * there
+        out[j] = _THREE_QUARTERS * here + QUARTER * there
 
 
 @compiled

@@ -4,29 +4,31 @@ A strip of cell rows runs through a line of rings (`kernels.moments`): demosaick
 of the colours three rows later, window sums and the slope (`kernels.slope`) another twelve rows later.
 
 Pixels with clipped samples are few: the kernel leaves them out of the slope as the twin does, and the twin's own torch
-functions solve and fill them afterwards. Strips are computed independently of each other and their height is fixed, so
-the number of threads (`numba.set_num_threads`) does not change a bit.
+functions solve and fill them afterwards. Note: in a forked child, torch needs ``torch.set_num_threads(1)`` first if it
+has used several threads in the parent; only clipped frames need torch.
+
+Strips are computed independently of each other and their height is fixed, so the number of threads (`set_threads`)
+does not change a bit.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import njit, prange
 from numpy.typing import NDArray
 from torch import Tensor
 
 from polsep import color_affine as twin
 from polsep.camera import Layout
-from polsep.kernels.analytic import _LAUNCH, _stokes_inverse
 from polsep.kernels.bilinear import (
     PAD,
     Pattern,
     advance_window,
+    any_clipped,
     flag_row,
     interpolate_row,
     make_analysers,
@@ -34,12 +36,12 @@ from polsep.kernels.bilinear import (
     open_window,
     read_pattern,
 )
+from polsep.kernels.compiling import ONE, THIRD, ZERO, compiled, entry
+from polsep.kernels.images import check_images, interleave_colors
 from polsep.kernels.moments import (
-    FASTMATH,
     NOISE,
     REACH,
     WIDEST,
-    ZERO,
     Conversion,
     Rings,
     Rows,
@@ -50,15 +52,13 @@ from polsep.kernels.moments import (
     weigh_row,
 )
 from polsep.kernels.slope import find_slope
+from polsep.kernels.threads import Piece, share
 from polsep.kernels.unpack import RawFrame, Samples, as_samples, read_row
 from polsep.separation import Separation
-from polsep.stokes import Measurements, _unclipped_inverse, analyser_residual, fit_stokes_unclipped
+from polsep.stokes import Measurements, analyser_residual, fit_stokes_unclipped, stokes_inverse, unclipped_inverse
 
 #: Cell rows of a strip; each also computes the moments of `REACH` rows above and below.
 STRIP = 128
-
-_ONE = np.float32(1)
-_THIRD = np.float32(1 / 3)
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class ColorAffineOptions:
 
 
 class _Targets(NamedTuple):
-    """What the kernel fills. On frames without clipped samples the last two are ``[0, 0, 0]`` and ``[0, 0]``.
+    """What the kernel fills: colours ``[h, 3 w]``. On frames without clipped samples the last two are empty.
 
     ``lines [4, h, w]``: slope and offset. ``clipped [h, w]``: one bit per analyser and colour, 1 << (3 k + c).
     """
@@ -128,15 +128,20 @@ def separate_color_affine_half(
     out = options.out
     if out is None:
         out = ColorAffineImages.empty((raw.shape[0], raw.shape[1]), layout)
-    _check_images(out, shape)
+    check_images(vars(out), (*shape, 3))
     gains = np.array(options.light_color[:3] if options.in_light else (1, 1, 1), np.float32)
-    with _LAUNCH:
-        clips = bool(_any_clipped(samples, pattern))
-        # Filling compares colours with each other, so with clipped samples the light waits until it is done.
-        conversion = Conversion(*_matrices(layout), np.ones(3, np.float32) if clips else gains)
-        room = shape if clips else (0, 0)
-        targets = _Targets(out.diffuse, out.specular, np.empty((4, *room), np.float32), np.zeros(room, np.uint16))
-        _separate(samples, pattern, conversion, targets)
+    clips = any(share(partial(_rows_clip, samples, pattern), pattern.h, STRIP))
+    # Filling compares colours with each other, so with clipped samples the light waits until it is done.
+    conversion = Conversion(*_matrices(layout), np.ones(3, np.float32) if clips else gains)
+    room = shape if clips else (0, 0)
+    rows = (pattern.h, 3 * pattern.w)
+    targets = _Targets(
+        out.diffuse.reshape(rows),
+        out.specular.reshape(rows),
+        np.empty((4, *room), np.float32),
+        np.zeros(room, np.uint16),
+    )
+    share(partial(_separate_rows, samples, pattern, conversion, targets), pattern.h, STRIP)
     out.valid[:] = True
     if clips:
         places = np.flatnonzero(targets.clipped)
@@ -153,25 +158,14 @@ def warm_up() -> None:
     separate_color_affine_half(np.full((4, 4), 255, np.uint8), Layout(), 0, 255)
 
 
-def _check_images(out: ColorAffineImages, shape: tuple[int, int]) -> None:
-    """Raises ValueError on images of a wrong shape or dtype, or with gaps."""
-    for name, image in vars(out).items():
-        wanted, dtype = (shape, "bool") if name == "valid" else ((*shape, 3), "float32")
-        if image.shape != wanted or image.dtype != dtype or not image.flags.c_contiguous or not image.flags.writeable:
-            raise ValueError(
-                f"expected {name} to be a writable C-contiguous {dtype} array {list(wanted)}, "
-                f"found {image.dtype} {list(image.shape)}"
-            )
-
-
 @lru_cache(maxsize=8)
 def _matrices(layout: Layout) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
     """The matrices of `fit_stokes_unclipped`, which of them are exact, and the vector of `analyser_residual`."""
-    full = _stokes_inverse(layout)
+    full = stokes_inverse(layout.angles).float().numpy()
     inverses, exact = np.stack([full] * 16), np.zeros(16, np.bool_)
     exact[0] = True
     for code in range(1, 16):
-        matrix, exact[code] = _unclipped_inverse(layout.angles, code)
+        matrix, exact[code] = unclipped_inverse(layout.angles, code)
         if matrix is not None:
             inverses[code] = matrix.float().numpy()
     unit = torch.eye(4, dtype=torch.float64).reshape(4, 1, 1, 4)
@@ -184,8 +178,7 @@ def _gather(
 ) -> Measurements:
     """The analysers of the N pixels with clipped samples, as an image ``[4, 3, 1, N]``."""
     data = np.empty((4, 3, places.size), np.float32)
-    with _LAUNCH:
-        _collect(samples, pattern, places, data)
+    _collect(samples, pattern, places, data)
     bits = targets.clipped.reshape(-1)[places]
     clipped = (bits >> np.arange(12, dtype=np.uint16).reshape(4, 3, 1)) & 1 > 0
     return Measurements(torch.from_numpy(data)[:, :, None], layout.angles, torch.from_numpy(clipped)[:, :, None])
@@ -198,7 +191,7 @@ def _complete(measurements: Measurements, targets: _Targets, places: NDArray[np.
     lines, at = torch.from_numpy(targets.lines).flatten(1), torch.from_numpy(places)
     slope = lines[:2, at][:, None]
     stokes = fit_stokes_unclipped(measurements)[0]
-    stokes, offset, determined = twin._solve_clipped(measurements, stokes, slope, lines[2:, at][:, None])
+    stokes, offset, determined = twin.solve_clipped(measurements, stokes, slope, lines[2:, at][:, None])
     lines[2:, at] = offset[:, 0]
     total = stokes.s0.clamp(min=0)
     tau = torch.minimum(twin.white_specular(offset, slope), total.amin(dim=-3, keepdim=True)).expand_as(total)
@@ -228,24 +221,25 @@ def _fill(found: Separation, holes: Measurements, frame: tuple[Tensor, ...], at:
         return image.flatten(1)[:, at][:, None]
 
     tau = specular[None, ..., 0]
-    own = twin._unit(lines[2:] + lines[:2] * tau)
-    phase = twin._unit(at_holes(twin._around(own * tau, valid)))
+    own = twin.unit_vectors(lines[2:] + lines[:2] * tau)
+    phase = twin.unit_vectors(at_holes(twin.interpolate_around(own * tau, valid)))
     phase = torch.where(known, at_holes(own), phase)
-    sums = twin._sums(holes, found.slope, phase, at_holes(twin._around(diffuse.movedim(-1, 0), valid)))
-    s = torch.where(known, before, twin._fit_specular(sums))
-    d = twin._fit_diffuse(sums, s)
-    s = torch.where(known, s, torch.maximum(s, twin._least_specular(holes, found.slope, d, phase)))
-    d = torch.where(known, torch.maximum(d, twin._least_diffuse(holes, found, s, phase)), d)
+    around = at_holes(twin.interpolate_around(diffuse.movedim(-1, 0), valid))
+    sums = twin.sum_unclipped(holes, found.slope, phase, around)
+    s = torch.where(known, before, twin.fit_specular(sums))
+    d = twin.fit_diffuse(sums, s)
+    s = torch.where(known, s, torch.maximum(s, twin.least_specular(holes, found.slope, d, phase)))
+    d = torch.where(known, torch.maximum(d, twin.least_diffuse(holes, found, s, phase)), d)
     core = holes.clipped.all(dim=-4).all(dim=-3)
     if bool(core.any()):
         image, outside = tau.clone(), torch.ones_like(valid)
         image.view(-1)[at], outside.view(-1)[at] = s.reshape(-1), ~core[0]
-        s = torch.where(core[None], torch.maximum(s, at_holes(twin._around(image, outside))), s)
+        s = torch.where(core[None], torch.maximum(s, at_holes(twin.interpolate_around(image, outside))), s)
     diffuse.view(-1, 3)[at] = d[:, 0].T
     specular.view(-1, 3)[at] = s[:, 0].T.expand(-1, 3)
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@compiled
 def _split(stokes: Any, slope: Any, planes: Any) -> None:
     """Specular and diffuse of a row, ``planes [4, n]``."""
     r, g, b, m1, m2 = stokes[0, PAD:], stokes[1, PAD:], stokes[2, PAD:], stokes[3, PAD:], stokes[4, PAD:]
@@ -253,10 +247,10 @@ def _split(stokes: Any, slope: Any, planes: Any) -> None:
     tau, d0, d1, d2 = planes[0], planes[1], planes[2], planes[3]
     for j in range(tau.size):
         x, y, z = r[j] if r[j] > ZERO else ZERO, g[j] if g[j] > ZERO else ZERO, b[j] if b[j] > ZERO else ZERO
-        mean = _THIRD * (r[j] + g[j] + b[j])
+        mean = THIRD * (r[j] + g[j] + b[j])
         b1, b2 = m1[j] - a1[j] * mean, m2[j] - a2[j] * mean
         ba, bb = b1 * a1[j] + b2 * a2[j], b1 * b1 + b2 * b2
-        rest = _ONE - (a1[j] * a1[j] + a2[j] * a2[j])
+        rest = ONE - (a1[j] * a1[j] + a2[j] * a2[j])
         specular = (ba + np.sqrt(ba * ba + rest * bb)) / rest
         specular = specular if specular < x else x
         specular = specular if specular < y else y
@@ -267,44 +261,31 @@ def _split(stokes: Any, slope: Any, planes: Any) -> None:
         d2[j] = z - specular
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _leave(pattern: Pattern, gains: Any, t: int, scratch: tuple[Rows, Rings], targets: _Targets) -> None:
     """Specular and diffuse of row ``t``, whose slope is found, to the images."""
     rows, rings = scratch
     stokes = rings.stokes[t % 16]
     _split(stokes, rows.slope, rows.planes)
-    _interleave_scaled(rows.planes, gains, targets.specular[t], targets.diffuse[t])
+    tau, d0, d1, d2 = rows.planes[0], rows.planes[1], rows.planes[2], rows.planes[3]
+    interleave_colors((tau, tau, tau), gains, targets.specular[t])
+    interleave_colors((d0, d1, d2), gains, targets.diffuse[t])
     if targets.clipped.size:
         _keep_lines(stokes, rows.slope, targets.lines[:, t])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _keep_lines(stokes: Any, slope: Any, lines: Any) -> None:
     """Slope and offset of a row, ``lines [4, w]``."""
     for j in range(lines.shape[1]):
         x = PAD + j
-        mean = _THIRD * (stokes[0, x] + stokes[1, x] + stokes[2, x])
+        mean = THIRD * (stokes[0, x] + stokes[1, x] + stokes[2, x])
         for i in range(2):
             lines[i, j] = slope[i, x]
             lines[2 + i, j] = stokes[3 + i, x] - slope[i, x] * mean
 
 
-@njit(cache=True, nogil=True)
-def _interleave_scaled(planes: Any, gains: Any, specular: Any, diffuse: Any) -> None:
-    """Channels last, in the light's colour."""
-    tau, d0, d1, d2 = planes[0], planes[1], planes[2], planes[3]
-    s, d = specular.reshape(-1), diffuse.reshape(-1)
-    g0, g1, g2 = gains[0], gains[1], gains[2]
-    for j in range(tau.size):
-        s[3 * j] = g0 * tau[j]
-        s[3 * j + 1] = g1 * tau[j]
-        s[3 * j + 2] = g2 * tau[j]
-        d[3 * j] = g0 * d0[j]
-        d[3 * j + 1] = g1 * d1[j]
-        d[3 * j + 2] = g2 * d2[j]
-
-
-@njit(cache=True, nogil=True)
+@compiled
 def _separate_strip(samples: Samples, pattern: Pattern, conversion: Conversion, targets: _Targets, start: int) -> None:
     """One strip of cell rows, from ``start`` on."""
     stop = min(start + STRIP, pattern.h)
@@ -320,7 +301,8 @@ def _separate_strip(samples: Samples, pattern: Pattern, conversion: Conversion, 
                 flag_row(pattern, window, t, rows.flags)
             enter_row(pattern, conversion, flagged, t, scratch)
             if flagged and start <= t < stop:
-                targets.clipped[t] = rows.clipped
+                for j in range(pattern.w):
+                    targets.clipped[t, j] = rows.clipped[j]
         elif t >= pattern.h:
             rings.noise[t % 7] = ZERO
         if t - 2 > first or t - 2 == 0:
@@ -332,33 +314,25 @@ def _separate_strip(samples: Samples, pattern: Pattern, conversion: Conversion, 
             _leave(pattern, conversion.gains, t - REACH, scratch, targets)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _separate(samples: Samples, pattern: Pattern, conversion: Conversion, targets: _Targets) -> None:
-    """All strips, shared among numba's threads."""
-    for strip in prange((pattern.h + STRIP - 1) // STRIP):
-        _separate_strip(samples, pattern, conversion, targets, strip * STRIP)
+@entry
+def _separate_rows(samples: Samples, pattern: Pattern, conversion: Conversion, targets: _Targets, piece: Piece) -> None:
+    """A piece of the frame's cell rows, strip by strip."""
+    for start in range(piece[0], piece[1], STRIP):
+        _separate_strip(samples, pattern, conversion, targets, start)
 
 
-@njit(cache=True, nogil=True)
-def _row_clips(samples: Samples, pattern: Pattern, y: int) -> bool:
+@entry
+def _rows_clip(samples: Samples, pattern: Pattern, piece: Piece) -> bool:
+    """Whether any sample of a piece of the frame's cell rows is clipped."""
     row = np.empty(2 * pattern.w, np.float32)
-    read_row(samples, pattern.top + y, pattern.left, row)
-    clipped = False
-    for x in range(row.size):
-        clipped |= row[x] >= pattern.clip_at
-    return clipped
+    for y in range(2 * piece[0], 2 * piece[1]):
+        read_row(samples, pattern.top + y, pattern.left, row)
+        if any_clipped(row, pattern.clip_at):
+            return True
+    return False
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _any_clipped(samples: Samples, pattern: Pattern) -> bool:
-    """Whether any sample of the frame is clipped."""
-    clipped = 0
-    for y in prange(2 * pattern.h):
-        clipped += _row_clips(samples, pattern, y)
-    return clipped > 0
-
-
-@njit(cache=True, nogil=True)
+@entry
 def _collect(samples: Samples, pattern: Pattern, places: Any, data: Any) -> None:
     """Analysers of the pixels ``places``, flat and in order, into ``data [4, 3, N]``."""
     window, m = make_window(pattern), make_analysers(pattern)
@@ -371,4 +345,6 @@ def _collect(samples: Samples, pattern: Pattern, places: Any, data: Any) -> None
             advance_window(samples, pattern, window, r)
             interpolate_row(pattern, window, r, m)
             last = r
-        data[:, :, i] = m[:, :, j]
+        for k in range(4):
+            for c in range(3):
+                data[k, c, i] = m[k, c, j]

@@ -10,21 +10,19 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from polsep import color_affine as twin
 from polsep.kernels.bilinear import PAD, Pattern, make_analysers
+from polsep.kernels.compiling import ONE, QUARTER, THIRD, TWO, ZERO, compiled
 
+#: Radii of the slope's windows, `color_affine.SLOPE_SCALES` without the pixel itself, and of `sample_variance`'s.
+WIDEST, MIDDLE, NARROW, NOISE = 12, 6, 2, 3
 #: Rows that a pixel's slope looks up and down: the widest window and `sample_variance` of its moments.
-WIDEST, NOISE = 12, 3
 REACH = WIDEST + NOISE
 
-ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
-_QUARTER, _THIRD, _TWELFTH = np.float32(0.25), np.float32(1 / 3), np.float32(1 / 12)
+_TWELFTH = np.float32(1 / 12)
 _MARGIN, _VARIANCE_FLOOR = np.float32(twin.CONTRAST_MARGIN), np.float32(twin.VARIANCE_FLOOR)
-MIDDLE, NARROW = 6, 2
-FASTMATH = {"contract", "nsz"}
 
 
 class Conversion(NamedTuple):
@@ -76,7 +74,7 @@ class Rows(NamedTuple):
     counts: NDArray[np.float32]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def make_rings(w: int) -> Rings:
     """Empty rings for rows of ``w`` cells."""
     n = w + 2 * PAD
@@ -94,7 +92,7 @@ def make_rings(w: int) -> Rings:
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def make_rows(pattern: Pattern) -> Rows:
     """Empty rows, and how many columns each window counts."""
     w = pattern.w
@@ -118,7 +116,7 @@ def make_rows(pattern: Pattern) -> Rows:
     )
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _stokes_of(m: Any, inverse: Any, c: int, w: int, s: Any) -> None:
     """Stokes vectors of colour ``c`` of a row, ``m [4, 3, w]``, to ``s [9, n]``."""
     i00, i01, i02, i03 = inverse[0, 0], inverse[0, 1], inverse[0, 2], inverse[0, 3]
@@ -132,7 +130,7 @@ def _stokes_of(m: Any, inverse: Any, c: int, w: int, s: Any) -> None:
         s2[j] = i20 * m0[j] + i21 * m1[j] + i22 * m2[j] + i23 * m3[j]
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _residual_of(m: Any, null: Any, squared: Any, bright: Any) -> None:
     """Mean squared residual of a row and mean brightness, ``m [4, 3, w]``."""
     n0, n1, n2, n3 = null[0], null[1], null[2], null[3]
@@ -143,12 +141,12 @@ def _residual_of(m: Any, null: Any, squared: Any, bright: Any) -> None:
         r = n0 * r0[j] + n1 * r1[j] + n2 * r2[j] + n3 * r3[j]
         g = n0 * g0[j] + n1 * g1[j] + n2 * g2[j] + n3 * g3[j]
         b = n0 * b0[j] + n1 * b1[j] + n2 * b2[j] + n3 * b3[j]
-        squared[j] = _THIRD * (r * r + g * g + b * b)
+        squared[j] = THIRD * (r * r + g * g + b * b)
         red, green, blue = r0[j] + r1[j] + r2[j] + r3[j], g0[j] + g1[j] + g2[j] + g3[j], b0[j] + b1[j] + b2[j] + b3[j]
-        bright[j] = _TWO * _TWELFTH * (red + green + blue)
+        bright[j] = TWO * _TWELFTH * (red + green + blue)
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _contrast(s: Any, w: int, moments: Any, stokes: Any) -> None:
     """Moments of the colours' deviations from their mean: s0 s0, s0 s1, s0 s2; and the means of s1 and s2."""
     r0, g0, b0 = s[0, PAD:], s[1, PAD:], s[2, PAD:]
@@ -157,9 +155,9 @@ def _contrast(s: Any, w: int, moments: Any, stokes: Any) -> None:
     contrast, first, second = moments[0, PAD:], moments[1, PAD:], moments[2, PAD:]
     red, green, blue, mean1, mean2 = stokes[0, PAD:], stokes[1, PAD:], stokes[2, PAD:], stokes[3, PAD:], stokes[4, PAD:]
     for j in range(w):
-        a0 = _THIRD * (r0[j] + g0[j] + b0[j])
-        a1 = _THIRD * (r1[j] + g1[j] + b1[j])
-        a2 = _THIRD * (r2[j] + g2[j] + b2[j])
+        a0 = THIRD * (r0[j] + g0[j] + b0[j])
+        a1 = THIRD * (r1[j] + g1[j] + b1[j])
+        a2 = THIRD * (r2[j] + g2[j] + b2[j])
         red[j], green[j], blue[j] = r0[j], g0[j], b0[j]
         dr, dg, db = r0[j] - a0, g0[j] - a0, b0[j] - a0
         contrast[j] = dr * dr + dg * dg + db * db
@@ -169,7 +167,7 @@ def _contrast(s: Any, w: int, moments: Any, stokes: Any) -> None:
         mean2[j] = a2
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _clip_bits(flags: Any, clipped: Any) -> None:
     """Bits 1 << (3 k + c) of the clipped analysers k and colours c of every pixel of a row."""
     clipped[:] = 0
@@ -180,7 +178,7 @@ def _clip_bits(flags: Any, clipped: Any) -> None:
                 clipped[j] |= bit if row[j] > ZERO else np.uint16(0)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _leave_out_clipped(rows: Rows, conversion: Conversion, moments: Any) -> None:
     """Residuals and moments of a row's pixels with clipped samples, from what the unclipped ones determine."""
     _clip_bits(rows.flags, rows.clipped)
@@ -203,14 +201,14 @@ def _leave_out_clipped(rows: Rows, conversion: Conversion, moments: Any) -> None
         _moments_of_exact(rows.s[:, PAD + j], exact, moments[:, PAD + j])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _moments_of_exact(s: Any, exact: Any, moments: Any) -> None:
     """`_contrast` of one pixel over the colours that are ``exact``; all zero unless there are two."""
     moments[:] = ZERO
     colors = np.float32(exact.sum())
-    if colors < _TWO:
+    if colors < TWO:
         return
-    moments[3] = _ONE
+    moments[3] = ONE
     for i in range(3):
         mean0, mean = ZERO, ZERO
         for c in range(3):
@@ -220,7 +218,7 @@ def _moments_of_exact(s: Any, exact: Any, moments: Any) -> None:
             moments[i] += exact[c] * (s[c] - mean0) * (s[3 * i + c] - mean)
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _sum_seven(x: Any, out: Any) -> None:
     """Sums of seven neighbours along a row."""
     a, b, c, d, e, f, g = x[0:], x[1:], x[2:], x[3:], x[4:], x[5:], x[6:]
@@ -228,23 +226,23 @@ def _sum_seven(x: Any, out: Any) -> None:
         out[j] = ((a[j] + b[j]) + (c[j] + d[j])) + ((e[j] + f[j]) + g[j])
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _missed_brightness(above: Any, here: Any, below: Any, out: Any) -> None:
     """Squared differences of a row's samples from the mean of their four neighbours."""
     left, middle, right = here[0:], here[1:], here[2:]
     for j in range(out.size):
-        missed = middle[j] - _QUARTER * (left[j] + right[j] + above[j] + below[j])
+        missed = middle[j] - QUARTER * (left[j] + right[j] + above[j] + below[j])
         out[j] = missed * missed
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _sum_three(x: Any, out: Any) -> None:
     a, b, c = x[0:], x[1:], x[2:]
     for j in range(out.size):
         out[j] = a[j] + b[j] + c[j]
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@compiled
 def _errors(noise: Any, missed: Any, per_column: Any, counts: Any, error: Any) -> None:
     """Expected error of the contrast from rings of noise and missed brightness."""
     q0, q1, q2, q3 = noise[0, 0, PAD:], noise[1, 0, PAD:], noise[2, 0, PAD:], noise[3, 0, PAD:]
@@ -257,10 +255,10 @@ def _errors(noise: Any, missed: Any, per_column: Any, counts: Any, error: Any) -
         total = ((q0[j] + q1[j]) + (q2[j] + q3[j])) + ((q4[j] + q5[j]) + q6[j])
         weight = ((w0[j] + w1[j]) + (w2[j] + w3[j])) + ((w4[j] + w5[j]) + w6[j])
         weight = weight if weight > least else least
-        error[j] = _TWO * _MARGIN * total / weight + (v0[j] + v1[j] + v2[j]) / (per_column * columns[j])
+        error[j] = TWO * _MARGIN * total / weight + (v0[j] + v1[j] + v2[j]) / (per_column * columns[j])
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@compiled
 def _weigh(moments: Any, w: int, weighted: Any) -> None:
     """Weighted moments, error, weight and its square; the error waits in ``weighted[3]``."""
     c, m1, m2, usable = moments[0, PAD:], moments[1, PAD:], moments[2, PAD:], moments[3, PAD:]
@@ -277,7 +275,7 @@ def _weigh(moments: Any, w: int, weighted: Any) -> None:
         x5[j] = weight * weight
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def enter_row(pattern: Pattern, conversion: Conversion, flagged: bool, t: int, scratch: tuple[Rows, Rings]) -> None:
     """Stokes vectors, moments, residuals and brightness of row ``t``, whose analysers are in ``rows.m``."""
     rows, rings = scratch
@@ -289,15 +287,15 @@ def enter_row(pattern: Pattern, conversion: Conversion, flagged: bool, t: int, s
     _residual_of(m, conversion.null, rows.squared[0, inside], bright[inside])
     bright[PAD - 1], bright[PAD + w] = bright[PAD], bright[PAD + w - 1]
     _contrast(s, w, moments, stokes)
-    moments[3, inside] = _ONE
-    rows.squared[1, inside] = _ONE
+    moments[3, inside] = ONE
+    rows.squared[1, inside] = ONE
     if flagged:
         _leave_out_clipped(rows, conversion, moments)
     for i in range(2):
         _sum_seven(rows.squared[i, PAD - NOISE :], rings.noise[t % 7, i, inside])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def measure_misses(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
     """What the mean of its four neighbours misses of row ``t``'s brightness; nothing outside the frame."""
     rows, rings = scratch
@@ -310,13 +308,13 @@ def measure_misses(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> Non
     _sum_three(rows.missed[PAD - 1 :], rings.missed[t % 3, inside])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def rows_around(t: int, radius: int, h: int) -> Any:
     """Rows of a window about row ``t`` that lie inside a frame of ``h`` rows, float32."""
     return np.float32(min(t + radius, h - 1) - max(t - radius, 0) + 1)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def weigh_row(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
     """Weighted moments of row ``t``, zero outside the frame."""
     rows, rings = scratch

@@ -9,29 +9,27 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from polsep import color_affine as twin
 from polsep.kernels.bilinear import PAD, Pattern
-from polsep.kernels.moments import FASTMATH, WIDEST, ZERO, Rings, Rows, rows_around
+from polsep.kernels.compiling import ONE, ZERO, compiled
+from polsep.kernels.moments import MIDDLE, NARROW, WIDEST, Rings, Rows, rows_around
 
-_ONE = np.float32(1)
 _FLOOR = np.float32(np.finfo(np.float32).eps * 1e-2)
 _MARGIN = np.float32(twin.CONTRAST_MARGIN)
 _MAX_SLOPE = np.float32(twin.MAX_DIFFUSE_DOLP)
 _SPREAD_WIDEST, _SPREAD_MIDDLE, _SPREAD_NARROW, _SPREAD_PIXEL = (np.float32(s) for _, s in twin.SLOPE_SCALES)
 _LEAST_WEIGHT, _LEAST_SQUARE = np.float32(1e-12), np.float32(1e-20)
-MIDDLE, NARROW = 6, 2
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _sum_fours(x: Any, out: Any) -> None:
     a, b, c, d = x[0:], x[1:], x[2:], x[3:]
     for j in range(x.size - 3):
         out[j] = (a[j] + b[j]) + (c[j] + d[j])
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _sum_window(x: Any, fours: Any, radius: int, sums: tuple[Any, Any]) -> None:
     """Sums along rows over windows, from sums of four; into a block's row and onto the sum of the block."""
     out, total = sums[0][PAD:], sums[1][PAD:]
@@ -56,13 +54,13 @@ def _sum_window(x: Any, fours: Any, radius: int, sums: tuple[Any, Any]) -> None:
             total[j] += s
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _add_to(x: Any, y: Any) -> None:
     for j in range(x.size):
         x[j] += y[j]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _push(weighted: Any, radius: int, pushed: int, fours: Any, block: Any) -> int:
     """Put a row of weighted moments, the strip's ``pushed``-th, into a block of window sums.
 
@@ -81,7 +79,7 @@ def _push(weighted: Any, radius: int, pushed: int, fours: Any, block: Any) -> in
     return 0
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@compiled
 def _steady(part: tuple[Any, Any], counts: tuple[Any, Any], spread: Any, w: int, slope: Any) -> None:
     """One scale of `color_slope` from sums over windows in two parts; ``counts``: 4 / pixels per window, by column."""
     u, v = part
@@ -89,7 +87,7 @@ def _steady(part: tuple[Any, Any], counts: tuple[Any, Any], spread: Any, w: int,
     v0, v1, v2, v3, v4, v5 = v[0, PAD:], v[1, PAD:], v[2, PAD:], v[3, PAD:], v[4, PAD:], v[5, PAD:]
     columns, per_window = counts[0][PAD:], counts[1]
     a1, a2 = slope[0, PAD:], slope[1, PAD:]
-    scale = _ONE / (_MARGIN * spread * spread)
+    scale = ONE / (_MARGIN * spread * spread)
     for j in range(w):
         contrast, noise = u0[j] + v0[j], u3[j] + v3[j]
         total, squares = u4[j] + v4[j], u5[j] + v5[j]
@@ -97,27 +95,27 @@ def _steady(part: tuple[Any, Any], counts: tuple[Any, Any], spread: Any, w: int,
         squares = squares if squares > _LEAST_SQUARE else _LEAST_SQUARE
         floor = _FLOOR * total
         share = per_window * columns[j] * squares / (total * total)
-        share = share if share < _ONE else _ONE
+        share = share if share < ONE else ONE
         held = noise * scale * share + floor
         surplus = contrast - noise if contrast > noise else ZERO
         counted = surplus / (contrast + floor)
-        below = _ONE / (contrast + held)
+        below = ONE / (contrast + held)
         a1[j] = ((u1[j] + v1[j]) * counted + held * a1[j]) * below
         a2[j] = ((u2[j] + v2[j]) * counted + held * a2[j]) * below
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@compiled
 def _own_pixel(x: Any, w: int, slope: Any) -> None:
     """The last scale, the pixel itself, and the limit of the slope."""
     x0, x1, x2, x3, x4 = x[0, PAD:], x[1, PAD:], x[2, PAD:], x[3, PAD:], x[4, PAD:]
     a1, a2 = slope[0, PAD:], slope[1, PAD:]
-    scale = _ONE / (_MARGIN * _SPREAD_PIXEL * _SPREAD_PIXEL)
+    scale = ONE / (_MARGIN * _SPREAD_PIXEL * _SPREAD_PIXEL)
     for j in range(w):
         floor = _FLOOR * (x4[j] if x4[j] > _LEAST_WEIGHT else _LEAST_WEIGHT)
         held = x3[j] * scale + floor
         surplus = x0[j] - x3[j] if x0[j] > x3[j] else ZERO
         counted = surplus / (x0[j] + floor)
-        below = _ONE / (x0[j] + held)
+        below = ONE / (x0[j] + held)
         first, second = (x1[j] * counted + held * a1[j]) * below, (x2[j] * counted + held * a2[j]) * below
         size = np.sqrt(first * first + second * second)
         limit = _MAX_SLOPE / (size if size > _MAX_SLOPE else _MAX_SLOPE)
@@ -125,7 +123,7 @@ def _own_pixel(x: Any, w: int, slope: Any) -> None:
         a2[j] = second * limit
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def find_slope(pattern: Pattern, t: int, start: int, scratch: tuple[Rows, Rings]) -> None:
     """The slope of row ``t``, into ``rows.slope``; before ``start`` it only fills blocks."""
     rows, rings = scratch

@@ -10,13 +10,13 @@ names them and `polsep.io.genicam` defines them:
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from polsep.kernels.compiling import compiled
 
 UINT8, UINT16, FLOAT32, GIGE, LSB = range(5)
 
@@ -68,8 +68,6 @@ class PackedFrame:
 
 RawFrame = NDArray[Any] | PackedFrame
 
-Compilable = TypeVar("Compilable", bound=Callable[..., Any])
-
 
 class Samples(NamedTuple):
     """A frame as kernels take it: all its samples in the one array of their type, the other two arrays being empty.
@@ -116,22 +114,6 @@ def _check_mosaic(raw: object) -> None:
         raise ValueError(f"expected samples of uint8, uint16 or float32, found {raw.dtype}")
     if raw.ndim != 2:
         raise ValueError(f"expected a mosaic [H, W], found shape {raw.shape}")
-
-
-def compiled(function: Compilable) -> Compilable:
-    """Decorator of everything that kernels call: compiled into them, not callable from Python, not cached on its own.
-
-    No reassociation and no assumption of finite values, so that the bits do not depend on how loops are cut. Wrappers
-    for Python would take longer to compile than the functions themselves.
-    """
-    decorated: Compilable = njit(  # type: ignore[call-overload]  # numba's stubs lack its two options for wrappers
-        nogil=True,
-        fastmath={"contract", "nsz"},
-        error_model="numpy",
-        no_cpython_wrapper=True,
-        no_cfunc_wrapper=True,
-    )(function)
-    return decorated
 
 
 @compiled

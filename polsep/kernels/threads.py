@@ -1,0 +1,120 @@
+"""Threads that share the strips of a frame.
+
+Kernels run without the interpreter's lock, so Python's own threads are enough: each takes more strips when it is done
+with some, and the calling thread works too. Unlike numba's parallel loops this keeps a busy core from holding up the
+others, works in forked children and from several threads at once, and takes less time to compile.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import TypeVar
+
+Result = TypeVar("Result")
+
+#: First row and the row behind the last one.
+Piece = tuple[int, int]
+
+
+def _default_threads() -> int:
+    """The cores that this process may use, or fewer if one of two environment variables says so."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
+        limit = os.environ.get(name, "").split(",")[0].strip()  # OpenMP takes a list, one number per nesting level
+        if limit.isdecimal() and int(limit) > 0:
+            count = min(count, int(limit))
+    return count
+
+
+class _State:
+    """What changes: the number of threads, and a pool of ``helpers`` beside the callers, made when first needed."""
+
+    threads: int = _default_threads()
+    lock = threading.Lock()
+    pool: ThreadPoolExecutor | None = None
+    helpers: int = 0
+
+
+def _forget_pool() -> None:
+    """In a forked child: the pool's threads have stayed behind, and the lock may have been held by one of them."""
+    _State.lock, _State.pool, _State.helpers = threading.Lock(), None, 0
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_pool)
+
+
+def get_threads() -> int:
+    """How many threads a kernel uses, the calling one among them.
+
+    At first the number of cores that this process may use (its affinity mask, not the machine), but no more than
+    ``NUMBA_NUM_THREADS`` and ``OMP_NUM_THREADS`` where these are set when kernels are imported. Quotas of CPU time, as
+    containers have them, are not seen.
+    """
+    return _State.threads
+
+
+def set_threads(count: int) -> None:
+    """Let every kernel called from now on use ``count`` threads, in the whole process; results do not depend on it.
+
+    Raises ValueError below 1.
+    """
+    if count < 1:
+        raise ValueError(f"expected at least one thread, found {count}")
+    _State.threads = int(count)
+
+
+def _start_helpers(work: Callable[[], None], count: int) -> list[Future[None]]:
+    """Let ``count`` threads of the pool call ``work``; a pool that is too small is replaced and ends when idle."""
+    if count < 1:
+        return []
+    with _State.lock:
+        if _State.pool is None or _State.helpers < count:
+            if _State.pool is not None:
+                _State.pool.shutdown(wait=False)
+            _State.pool, _State.helpers = ThreadPoolExecutor(count, "polsep-kernel"), count
+        return [_State.pool.submit(work) for _ in range(count)]
+
+
+def share(work: Callable[[Piece], Result], rows: int, step: int) -> list[Result]:
+    """Call ``work`` on `Piece` after piece of ``range(rows)``, in `get_threads` threads; its results in no fixed order.
+
+    A piece starts at a multiple of ``step``, the rows of a strip. Returns when all is done. Several threads may call
+    this at once, and ``work`` may too: a caller never waits for helpers that have not begun. The first exception ends
+    the handing out and is raised here.
+    """
+    strips = -(-rows // step)
+    threads = max(1, min(get_threads(), strips))
+    lock, taken = threading.Lock(), 0
+    results: list[Result] = []
+
+    def take() -> Piece:
+        """The next strips: a share of those left, so that calls are few and all threads end together."""
+        nonlocal taken
+        with lock:
+            first, left = taken, strips - taken
+            taken += left if threads == 1 else -(-left // (2 * threads))
+            return first, taken
+
+    def work_off() -> None:
+        nonlocal taken
+        try:
+            while (taking := take())[0] < strips:
+                results.append(work((taking[0] * step, min(taking[1] * step, rows))))
+        except BaseException:
+            with lock:
+                taken = strips
+            raise
+
+    helpers = _start_helpers(work_off, threads - 1)
+    try:
+        work_off()
+    finally:
+        begun = [helper for helper in helpers if not helper.cancel()]
+        wait(begun)
+    for helper in begun:
+        helper.result()
+    return results

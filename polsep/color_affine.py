@@ -11,7 +11,7 @@ one positive tau_s. No light angle, no calibration, no training. Where there is 
 zero and the result to the paper's analytic split.
 
 With the slope known, every unclipped sample is linear in (s0_R, s0_G, s0_B, b): a highlight that clips some analysers
-in some colours is still solved by least squares over the samples that are left (`solve_clipped`).
+in some colours is still solved by least squares over the samples that are left (`_solve_clipped`).
 
 Derivation, related work (Nayar, Fang, Boult 1997; Kajiyama et al., WACV 2023) and tests: docs/conventions.md.
 Complex numbers are pairs ``[..., 2, h, w]``.
@@ -64,9 +64,11 @@ def separate_color_affine(measurements: Measurements) -> Separation:
     stokes, exact = fit_stokes_unclipped(even)
     sample = sample_variance(even)
     slope = color_slope(stokes, exact, sample, even.variance)
-    stokes = stokes if even is measurements else fit_stokes_unclipped(measurements)[0]
     offset, residual = _offset(stokes, slope)
-    stokes, offset, determined = solve_clipped(measurements, stokes, slope, offset)
+    if even is not measurements:
+        stokes = fit_stokes_unclipped(measurements)[0]
+        offset, _ = _offset(stokes, slope)
+    stokes, offset, determined = _solve_clipped(measurements, stokes, slope, offset)
     valid = determined
     if measurements.clipped is not None:
         valid = valid & ~measurements.clipped.all(dim=-4).any(dim=-3)
@@ -151,7 +153,7 @@ def _offset(stokes: Stokes, slope: Tensor) -> tuple[Tensor, Tensor]:
     return offset, torch.sqrt(torch.as_tensor(left) / 3)
 
 
-def solve_clipped(
+def _solve_clipped(
     measurements: Measurements, stokes: Stokes, slope: Tensor, offset: Tensor
 ) -> tuple[Stokes, Tensor, Tensor]:
     """Stokes and b of pixels with clipped samples by least squares over the others, and where those determine b.
@@ -208,18 +210,19 @@ def _fill(found: Separation, measurements: Measurements, offset: Tensor, determi
     assert measurements.clipped is not None
     assert found.slope is not None
     hole, known = ~found.valid[..., None, :, :], determined[..., None, :, :]
-    own = unit_vectors(offset + found.slope * found.specular[..., :1, :, :])
-    phase = torch.where(known, own, unit_vectors(interpolate_around(own * found.specular[..., :1, :, :], found.valid)))
+    own = _unit(offset + found.slope * found.specular[..., :1, :, :])
+    phase = torch.where(known, own, _unit(interpolate_around(own * found.specular[..., :1, :, :], found.valid)))
     around = interpolate_around(found.diffuse, found.valid)
-    sums = sum_unclipped(measurements, found.slope, phase, around)
-    specular = torch.where(known, found.specular[..., :1, :, :], fit_specular(sums))
-    diffuse = fit_diffuse(sums, specular)
-    least = torch.maximum(specular, least_specular(measurements, found.slope, diffuse, phase))
+    sums = _sum_unclipped(measurements, found.slope, phase, around)
+    specular = torch.where(known, found.specular[..., :1, :, :], _fit_specular(sums))
+    diffuse = _fit_diffuse(sums, specular)
+    least = torch.maximum(specular, _least_specular(measurements, found.slope, diffuse, phase))
     specular = torch.where(known, specular, least)
-    diffuse = torch.where(known, torch.maximum(diffuse, least_diffuse(measurements, found, specular, phase)), diffuse)
+    diffuse = torch.where(known, torch.maximum(diffuse, _least_diffuse(measurements, found, specular, phase)), diffuse)
     core = measurements.clipped.all(dim=-4).all(dim=-3)
-    rim = interpolate_around(torch.where(hole, specular, found.specular[..., :1, :, :]), ~core)
-    specular = torch.where(core[..., None, :, :], torch.maximum(specular, rim), specular)
+    if bool(core.any()):
+        rim = interpolate_around(torch.where(hole, specular, found.specular[..., :1, :, :]), ~core)
+        specular = torch.where(core[..., None, :, :], torch.maximum(specular, rim), specular)
     p1, p2 = (found.slope[..., i : i + 1, :, :] * diffuse + phase[..., i : i + 1, :, :] * specular for i in (0, 1))
     seen = found.stokes
     stokes = [torch.where(hole, new, old) for new, old in ((diffuse + specular, seen.s0), (p1, seen.s1), (p2, seen.s2))]
@@ -228,8 +231,8 @@ def _fill(found: Separation, measurements: Measurements, offset: Tensor, determi
     return replace(found, diffuse=diffuse, specular=specular, stokes=Stokes(*stokes))
 
 
-class Sums(NamedTuple):
-    """Sums over unclipped samples of 2 m = g tau_d + p tau_s and the prior tau_d = around, each ``[..., C, h, w]``."""
+class _Sums(NamedTuple):
+    """_Sums over unclipped samples of 2 m = g tau_d + p tau_s and the prior tau_d = around, each ``[..., C, h, w]``."""
 
     gg: Tensor
     gp: Tensor
@@ -238,8 +241,8 @@ class Sums(NamedTuple):
     py: Tensor
 
 
-def sum_unclipped(measurements: Measurements, slope: Tensor, phase: Tensor, around: Tensor) -> Sums:
-    """`Sums` for a given slope and phase of the specular light ``[..., 2, h, w]`` and the diffuse light ``around``."""
+def _sum_unclipped(measurements: Measurements, slope: Tensor, phase: Tensor, around: Tensor) -> _Sums:
+    """`_Sums` for a given slope and phase of the specular light ``[..., 2, h, w]`` and the diffuse light ``around``."""
     assert measurements.clipped is not None
     gg, gy = torch.full_like(around, PRIOR_WEIGHT), PRIOR_WEIGHT * around
     gp, pp, py = torch.zeros_like(around), torch.zeros_like(around), torch.zeros_like(around)
@@ -247,22 +250,22 @@ def sum_unclipped(measurements: Measurements, slope: Tensor, phase: Tensor, arou
         kept = ~measurements.clipped[..., k, :, :, :]
         g, p, y = _transmitted(slope, t) * kept, _transmitted(phase, t) * kept, 2 * measurements.data[..., k, :, :, :]
         gg, gp, pp, gy, py = gg + g * g, gp + g * p, pp + p * p, gy + g * y, py + p * y
-    return Sums(gg, gp, pp, gy, py)
+    return _Sums(gg, gp, pp, gy, py)
 
 
-def fit_specular(sums: Sums) -> Tensor:
+def _fit_specular(sums: _Sums) -> Tensor:
     """tau_s ``[..., 1, h, w]`` by least squares over all colours, each one's tau_d eliminated."""
     curvature = (sums.pp - sums.gp**2 / sums.gg).sum(dim=-3, keepdim=True)
     pull = (sums.py - sums.gp * sums.gy / sums.gg).sum(dim=-3, keepdim=True)
     return (pull / curvature.clamp(min=1e-3)).clamp(min=0)
 
 
-def fit_diffuse(sums: Sums, specular: Tensor) -> Tensor:
+def _fit_diffuse(sums: _Sums, specular: Tensor) -> Tensor:
     """tau_d ``[..., C, h, w]`` by least squares for given tau_s."""
     return ((sums.gy - sums.gp * specular) / sums.gg).clamp(min=0)
 
 
-def least_specular(measurements: Measurements, slope: Tensor, diffuse: Tensor, phase: Tensor) -> Tensor:
+def _least_specular(measurements: Measurements, slope: Tensor, diffuse: Tensor, phase: Tensor) -> Tensor:
     """The least tau_s ``[..., 1, h, w]`` that makes every clipped sample clip: 2 m = g tau_d + p tau_s >= 2.
 
     Analysers nearly crossed with the specular light see too little of it and are left out.
@@ -276,7 +279,7 @@ def least_specular(measurements: Measurements, slope: Tensor, diffuse: Tensor, p
     return least
 
 
-def least_diffuse(measurements: Measurements, found: Separation, specular: Tensor, phase: Tensor) -> Tensor:
+def _least_diffuse(measurements: Measurements, found: Separation, specular: Tensor, phase: Tensor) -> Tensor:
     """The least tau_d ``[..., C, h, w]`` that makes every clipped sample clip for given tau_s; 0 where none does."""
     assert measurements.clipped is not None
     assert found.slope is not None
@@ -293,7 +296,7 @@ def _transmitted(polarization: Tensor, angle: float) -> Tensor:
     return 1 + math.cos(2 * angle) * polarization[..., :1, :, :] + math.sin(2 * angle) * polarization[..., 1:, :, :]
 
 
-def unit_vectors(vectors: Tensor) -> Tensor:
+def _unit(vectors: Tensor) -> Tensor:
     """Vectors ``[..., 2, h, w]`` at length 1; zero stays zero."""
     return vectors / torch.sqrt((vectors * vectors).sum(dim=-3, keepdim=True)).clamp(min=1e-12)
 

@@ -56,7 +56,7 @@ SMOOTH_RADIUS = 4
 #: together have four times its variance), and this variance at least.
 NOISE_MARGIN, NOISE_FLOOR = 16.0, 1e-5
 #: Regularisation of slopes: where the variance of s0 is below these, a slope falls back to `PRIOR_SHARE` of the ratio
-#: of the colours, the slope of a uniform albedo under varying light. The whole ratio would double noise, none would blur.
+#: of the colours, the slope of a uniform albedo under varying light. All of the ratio doubles noise, none of it blurs.
 SLOPE_FLOOR, GUIDE_FLOOR, PRIOR_SHARE = 2e-4, 2e-5, 0.5
 #: Radius in cells, and how many times the squared detail along the better direction counts as error, where the
 #: difference of green from red and blue is smoothed.

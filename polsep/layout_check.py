@@ -9,18 +9,20 @@ What no frame can tell: 0 and 90 swapped, 45 and 135 swapped, or the two pairs s
 red and blue. A mirrored, rotated or transposed MONO frame therefore looks in order. The check never warns of those.
 
 All statistics are means over blocks of 16x16 pixels, first-order corrected for the brightness gradient, without blocks
-that hold a clipped sample, in units of the mean brightness.
+that hold a clipped sample, in units of the mean brightness. The light's colour is left in: what is compared are the
+filters, whatever the light.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from polsep.camera import Layout, Mosaic
+from polsep.camera import CLIP_MARGIN, Layout, Mosaic
 
 #: Mean contradiction of a layout, relative to brightness, above which it is doubted at all.
 MIN_CONTRADICTION = 0.006
@@ -72,32 +74,37 @@ def crossed_pairs(layout: Layout) -> str | None:
 def _phase_means(mosaic: Mosaic) -> tuple[Tensor, Tensor]:
     """Means ``[4, 4, blocks]`` of each pixel of the 4x4 period over 16x16 blocks, gradients removed; `_texture`.
 
-    Blocks with clipped samples are left out.
+    Blocks with clipped samples are left out. Codes are pooled and their means made linear: no copy of the frame.
     """
-    data = mosaic.linear().reshape(-1, *mosaic.data.shape[-2:])[0]
+    data = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0]
+    data = data if data.is_floating_point() else data.float()
     side = 16 if min(data.shape) >= 64 else 4
-    height, width = (n // side * side for n in data.shape)
-    data = data[:height, :width]
-    phases = functional.pixel_unshuffle(data[None, None], 4)
-    mask = mosaic.clipped().reshape(-1, *mosaic.data.shape[-2:])[0, :height, :width]
-    clipped = functional.max_pool2d(mask.float()[None, None], side)
-    means = functional.avg_pool2d(phases, side // 4)[0]
+    rows, cols = (n // side for n in data.shape)
+    data = data[: rows * side, : cols * side]
+    sums = data.reshape(rows, side // 4, 4, -1).sum(1).reshape(rows, 4, cols, side // 4, 4).sum(3)
+    means = _linear(mosaic, sums / (side // 4) ** 2).permute(1, 3, 0, 2).flatten(0, 1)
+    brightest = data.reshape(rows, side, -1).amax(1).reshape(rows, cols, side).amax(2)
     brightness = means.mean(0, keepdim=True)
     slope_y, slope_x = _gradient(brightness, 1) / side, _gradient(brightness, 2) / side
     share = means.mean((1, 2), keepdim=True) / brightness.mean().clamp(min=1e-9)
     place = torch.arange(4, dtype=data.dtype, device=data.device) - 1.5
     shift = place.view(4, 1, 1, 1) * slope_y + place.view(1, 4, 1, 1) * slope_x
     corrected = means - share * shift.flatten(0, 1)
-    usable = clipped[0, 0] == 0
-    return corrected[:, usable].reshape(4, 4, -1), _texture(phases, side)[usable]
+    usable = _linear(mosaic, brightest) < 1 - CLIP_MARGIN
+    return corrected[:, usable].reshape(4, 4, -1), _texture(mosaic, data, side)[usable]
 
 
-def _texture(phases: Tensor, side: int) -> Tensor:
+def _linear(mosaic: Mosaic, codes: Tensor) -> Tensor:
+    """Means of codes with black at 0 and white at 1, in the light they are in."""
+    return (codes - mosaic.black_level) / (mosaic.white_level - mosaic.black_level)
+
+
+def _texture(mosaic: Mosaic, data: Tensor, side: int) -> Tensor:
     """Per block, `_color_contrast` between whole periods instead of cells: what a scene has without any filters."""
-    periods = phases.mean(1, keepdim=True)
+    periods = functional.avg_pool2d(data[None, None], 4)
     if side == 4:
         return torch.zeros_like(periods[0, 0])
-    means = functional.avg_pool2d(functional.pixel_unshuffle(periods, 2), 2)[0]
+    means = functional.avg_pool2d(functional.pixel_unshuffle(_linear(mosaic, periods), 2), 2)[0]
     demodulated = torch.stack(list(_PAIRINGS.values())).to(means) @ means.flatten(1) / 4
     return (demodulated.abs().sum(0) / means.flatten(1).mean(0).clamp(min=1e-9)).view(means.shape[1:])
 
@@ -205,7 +212,8 @@ def _fitting(
     return found or {layout: "as given"}
 
 
-def _candidates(layout: Layout) -> list[tuple[Layout, str]]:
+@lru_cache(maxsize=8)
+def _candidates(layout: Layout) -> tuple[tuple[Layout, str], ...]:
     """The layout and what common mistakes make of it; then other orders of the analysers and mono for colour."""
     mistakes = [(layout, "as given"), *_cropped(layout)[:3], *_mirrored(layout), *_cropped(layout)[3:]]
     for order in _ORDERS.values():
@@ -215,7 +223,7 @@ def _candidates(layout: Layout) -> list[tuple[Layout, str]]:
     bayer, swapped = (None, "mono read as colour") if layout.bayer else ("RGGB", "colour read as mono")
     for other in (Layout(layout.polarizer, bayer), *(Layout(order, bayer) for order in _ORDERS.values())):
         mistakes += [(other, swapped), *((crop, f"{swapped}, {reason}") for crop, reason in _cropped(other))]
-    return mistakes
+    return tuple(mistakes)
 
 
 def _cropped(layout: Layout) -> list[tuple[Layout, str]]:

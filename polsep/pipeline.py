@@ -1,16 +1,17 @@
 """The product on one page: raw frame -> mosaic -> demosaic -> separate -> NumPy images and a report.
 
 A `Method` maps one frame, a `Mosaic` or co-sited `Measurements`, to a `Separation`; everything that is compared has
-this type. The light's colour is divided out before a method runs and multiplied back after, so methods see white light.
+this type. The light's colour is divided out before a method runs and multiplied back into its diffuse and specular
+image, so methods see white light, and DoLP, AoLP and statistics are of white light. On the CPU at half resolution a
+method's compiled twin runs in its place (`engine`).
 """
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,11 +21,16 @@ from torch import Tensor
 from polsep.camera import Layout, Mosaic
 from polsep.color_affine import separate_color_affine
 from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
+from polsep.engine import run_analytic, run_color_affine
 from polsep.guided import demosaic_guided, demosaic_guided_half
 from polsep.layout_check import check_layout
 from polsep.levels import as_mosaic
-from polsep.separation import Separation, dominant_angle, light_polarizer_angle, separate_analytic
-from polsep.stokes import Measurements, Stokes, aolp, dolp, fit_stokes_unclipped, polarized_intensity
+from polsep.report import describe, grey, tally
+from polsep.separation import Separation, separate_analytic
+from polsep.stokes import Measurements, aolp, dolp, fit_stokes_unclipped, polarized_intensity
+
+if TYPE_CHECKING:
+    from polsep.kernels import AnalyticImages, ColorAffineImages
 
 Capture = Mosaic | Measurements
 LightColor = Sequence[float]
@@ -36,12 +42,16 @@ class PolsepWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Method:
-    """A separation method: ``demosaic`` a frame, to half or full resolution, then ``split``; the rest is to be read."""
+    """A separation method: ``demosaic`` a frame, to half or full resolution, then ``split``; the rest is to be read.
+
+    ``engine``: the compiled twin of both at half resolution, which gives None for frames that it does not take.
+    """
 
     name: str
     demosaic_half: Callable[[Mosaic], Measurements]
     demosaic_full: Callable[[Mosaic], Measurements]
     split: Callable[[Measurements], Separation]
+    engine: Callable[[Mosaic], AnalyticImages | ColorAffineImages | None]
     summary: str
     needs: str
     source: str
@@ -55,6 +65,7 @@ METHODS = {
             demosaic_guided_half,
             demosaic_guided,
             separate_color_affine,
+            run_color_affine,
             "closed form for polarized diffuse and white specular light, recovers clipped samples",
             "colour; on mono and grey it is the analytic split with clipped samples recovered",
             "this project; after Nayar et al. 1997, Kajiyama et al. 2023",
@@ -64,6 +75,7 @@ METHODS = {
             demosaic_bilinear_half,
             demosaic_bilinear,
             separate_analytic,
+            run_analytic,
             "the paper's first estimate: specular = polarized part, diffuse = the rest",
             "colour or mono; takes the diffuse light for unpolarized and clipped samples at face value",
             "Dave et al. 2022, Eqs. 15-18",
@@ -74,10 +86,6 @@ METHODS = {
 #: What `auto` means: the best method installed.
 BEST_METHOD = "color-affine"
 
-#: Below this concentration of AoLP there is no single polarized light. Real frames: 0.76 to 0.97 where one light or one
-#: reflecting surface polarizes, 0.31 to 0.50 in the open.
-MIN_CONCENTRATION = 0.6
-
 
 @dataclass(frozen=True)
 class SeparatedFrame:
@@ -85,8 +93,8 @@ class SeparatedFrame:
 
     ``diffuse``, ``specular``: float32 ``[h, w, C]``, C = 3 or 1, linear, 1.0 = one measurement at the white level, so
     their sum s0 reaches 2 (more where clipped highlights were recovered). ``valid``: bool ``[h, w]``, False where
-    clipping left something to assumption. ``dolp``: float32 ``[h, w]``, of all channels together. ``aolp``: radians in
-    [0, pi), image-right toward image-up. ``report``: JSON-able settings, statistics and warnings.
+    clipping left something to assumption. ``dolp``: float32 ``[h, w]``, of all channels together in white light, and
+    ``aolp``: radians in [0, pi), image-right toward image-up. ``report``: JSON-able settings, statistics and warnings.
     """
 
     diffuse: NDArray[np.float32]
@@ -138,14 +146,31 @@ def separate_capture(
         check = check_layout(capture)
         remarks += [check.warning] if check.warning else []
     light, light_remarks = resolve_light_color(light_color, capture)
-    white = under_white_light(capture, light)
-    measurements = demosaic(white, chosen, full)
-    found = in_light(chosen.split(measurements), light)
-    report = describe(found, measurements)
+    frame = None if full else separate_in_engine(capture, chosen, light)
+    if frame is None:
+        frame = separate_in_torch(capture, chosen, light, full)
+    report = frame.report
     report |= {"method": chosen.name, "light_color": list(light), "full_resolution": full}
     report["layout"] = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
     report["warnings"] = remarks + light_remarks + report["warnings"]
-    return to_numpy(found, report)
+    return frame
+
+
+def separate_in_engine(capture: Capture, method: Method, light: tuple[float, ...]) -> SeparatedFrame | None:
+    """A capture through the method's compiled twin, at half resolution, or None where that does not take it."""
+    images = method.engine(replace(capture, light_color=light)) if isinstance(capture, Mosaic) else None
+    if images is None:
+        return None
+    assert images.dolp is not None and images.aolp is not None and images.tally is not None
+    report = describe(images.tally)
+    return SeparatedFrame(images.diffuse, images.specular, images.valid, images.dolp, images.aolp, report)
+
+
+def separate_in_torch(capture: Capture, method: Method, light: tuple[float, ...], full: bool) -> SeparatedFrame:
+    """Any capture through the method's own functions, on the capture's device."""
+    measurements = demosaic(under_white_light(capture, light), method, full)
+    found = method.split(measurements)
+    return to_numpy(in_light(found, light), describe(tally(found, measurements)))
 
 
 def find_method(name: str) -> Method:
@@ -237,43 +262,9 @@ def under_white_light(capture: Capture, light: tuple[float, ...]) -> Capture:
 
 
 def in_light(found: Separation, light: tuple[float, ...]) -> Separation:
-    """The twin of `under_white_light`: the light's colour multiplied back into a separation."""
+    """The twin of `under_white_light`: the light's colour multiplied back into diffuse and specular, not Stokes."""
     gain = torch.tensor(light, dtype=torch.float64).to(found.diffuse).view(-1, 1, 1)
-    return replace(found, diffuse=found.diffuse * gain, specular=found.specular * gain, stokes=found.stokes * gain)
-
-
-def describe(found: Separation, measurements: Measurements) -> dict[str, Any]:
-    """Statistics of a separation for its report: exposure, the light's polarizer, how well the model fits."""
-    polarization = torch.stack([found.stokes.s1.mean(dim=-3), found.stokes.s2.mean(dim=-3)], dim=-3)
-    if found.slope is not None:
-        polarization = polarization - found.slope * found.diffuse.mean(dim=-3, keepdim=True)
-    angle, concentration = dominant_angle(polarization)
-    clipped = (
-        0.0 if measurements.clipped is None else float(measurements.clipped.any(dim=-4).any(dim=-3).float().mean())
-    )
-    total = found.stokes.s0.clamp(min=0)
-    brightness = float(total.mean())
-    remarks = []
-    if brightness > 1e-3 and concentration < MIN_CONCENTRATION:
-        remarks.append(
-            f"polarized light of one angle was expected, found many (concentration {concentration:.2f}): "
-            "is the light polarized, and the only one?"
-        )
-    statistics: dict[str, Any] = {
-        "clipped_fraction": clipped,
-        "valid_fraction": float(found.valid.float().mean()),
-        "mean_s0": brightness,
-        "specular_fraction": float(found.specular.mean()) / brightness if brightness > 0 else 0.0,
-        "dolp_above_1_fraction": float((dolp(found.stokes) > 1).float().mean()),
-        "specular_aolp_deg": math.degrees(angle),
-        "specular_aolp_concentration": concentration,
-        "light_polarizer_deg": math.degrees(light_polarizer_angle(angle)),
-    }
-    if found.residual is not None:
-        statistics["fit_residual"] = float(found.residual.mean()) / brightness if brightness > 0 else 0.0
-    if found.noise is not None:
-        statistics["sample_noise"] = float(found.noise.mean())
-    return {"statistics": statistics, "warnings": remarks}
+    return replace(found, diffuse=found.diffuse * gain, specular=found.specular * gain)
 
 
 def to_numpy(found: Separation, report: dict[str, Any]) -> SeparatedFrame:
@@ -282,12 +273,12 @@ def to_numpy(found: Separation, report: dict[str, Any]) -> SeparatedFrame:
     def image(x: Tensor) -> NDArray[np.float32]:
         return np.ascontiguousarray(x.detach().float().cpu().movedim(-3, -1).numpy())
 
-    grey = Stokes(*(s.mean(dim=-3, keepdim=True) for s in (found.stokes.s0, found.stokes.s1, found.stokes.s2)))
+    mean = grey(found.stokes)
     return SeparatedFrame(
         image(found.diffuse),
         image(found.specular),
         found.valid.cpu().numpy(),
-        image(dolp(grey))[..., 0],
-        image(aolp(grey))[..., 0],
+        image(dolp(mean))[..., 0],
+        image(aolp(mean))[..., 0],
         report,
     )

@@ -8,6 +8,9 @@ import pytest
 import torch
 from hypothesis import settings
 
+from polsep.camera import Layout, Mosaic
+from polsep.pipeline import METHODS
+
 settings.register_profile("polsep", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("polsep")
 
@@ -28,3 +31,10 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no reference material at {folder}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def compiled() -> None:
+    """Every engine's kernels are compiled on disk: programs that tests start then never stop to compile, nor say so."""
+    for method in METHODS.values():
+        method.engine(Mosaic(torch.eye(32), Layout(), 0.0, 1.0))

@@ -34,6 +34,8 @@ COLOR_LAYERS = {f"{image}.{color}" for image in ("diffuse", "specular") for colo
 MAPS = {"dolp.Y", "aolp.Y", "valid.Y"}
 LINE = re.compile(r"polsep: error: [^\n]+\n")
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 
 class Run(NamedTuple):
     """What a command left behind."""

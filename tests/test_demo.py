@@ -25,6 +25,7 @@ from polsep.scenes import still_life
 CAPTURE = Path(polsep.__file__).parent / "data" / "still_life.png"
 
 
+@pytest.mark.usefixtures("compiled")
 def test_demo_works_offline(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -21,6 +21,7 @@ from polsep.kernels import AnalyticImages, AnalyticOptions, PackedFrame, analyti
 from polsep.kernels.bilinear import clip_code
 from polsep.kernels.threads import get_threads, set_threads
 from polsep.pipeline import in_light, to_numpy
+from polsep.report import tally
 from polsep.separation import Separation, separate_analytic
 from polsep.stokes import Stokes
 
@@ -144,15 +145,32 @@ def test_light_color_is_divided_out_and_multiplied_back(layout: Layout, light: t
 
 @pytest.mark.parametrize("layout", [LAYOUTS[0], LAYOUTS[8], Layout(SONY, None)], ids=spec)
 def test_dolp_and_aolp_agree_with_the_pipeline(layout: Layout) -> None:
-    """DoLP and AoLP of the mean over colours in the light's colour; AoLP where it is defined to more than rounding."""
+    """DoLP and AoLP of the mean over colours in white light; AoLP where it is defined to more than rounding."""
     light, raw = (0.8, 1.0, 1.3), random_codes((40, 60))
-    images = separate_analytic_half(raw, layout, 0, 65535, AnalyticOptions(light, in_light=True, polarization=True))
-    expected = to_numpy(in_light(twin(raw, layout, 0.0, 65535.0, light), light[: layout.channels]), {})
+    images = separate_analytic_half(raw, layout, 0, 65535, AnalyticOptions(light, in_light=True, report=True))
+    expected = to_numpy(twin(raw, layout, 0.0, 65535.0, light), {})
     assert images.dolp is not None and images.aolp is not None
     assert_within(torch.from_numpy(images.dolp), torch.from_numpy(expected.dolp), 1e-5)
     assert images.aolp.min() >= 0 and images.aolp.max() < np.float32(math.pi)
     away = np.abs((images.aolp - expected.aolp + math.pi / 2) % math.pi - math.pi / 2)
     assert float((away * np.minimum(expected.dolp, 1)).max()) < ANGLE
+
+
+@pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), (0.8, 1.0, 1.3)])
+@pytest.mark.parametrize("layout", [LAYOUTS[0], LAYOUTS[6], LAYOUTS[8], Layout(SONY, None)], ids=spec)
+def test_tally_is_the_twins(layout: Layout, light: tuple[float, ...]) -> None:
+    """Every sum over the frame, of white light whatever the images are in; the counts exactly."""
+    raw = random_codes((71, 60), clipped=0.01)
+    mosaic = Mosaic(torch.from_numpy(raw.astype(np.float32)), layout, 25_000.0, 65535.0, light)
+    measurements = demosaic_bilinear_half(mosaic)
+    expected = tally(separate_analytic(measurements), measurements)
+    options = AnalyticOptions(light, in_light=True, report=True)
+    found = separate_analytic_half(raw, layout, 25_000, 65535, options).tally
+    assert found is not None and found.clipped > 0 and found.above_one > 0
+    for name in ("pixels", "clipped", "valid", "above_one", "residual", "noise"):
+        assert getattr(found, name) == getattr(expected, name)
+    for name in ("s0", "specular", "power", "along", "across"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-5, abs=1e-5 * expected.power)
 
 
 def test_aolp_is_exact_around_the_circle() -> None:
@@ -161,7 +179,7 @@ def test_aolp_is_exact_around_the_circle() -> None:
     analysers = np.radians([[90, 45], [135, 0]])
     for degrees in range(0, 180, 3):
         cell = 0.25 * (1 + np.cos(2 * (math.radians(degrees) - analysers)))
-        options = AnalyticOptions(polarization=True)
+        options = AnalyticOptions(report=True)
         images = separate_analytic_half(np.tile(cell, (2, 2)).astype(np.float32), layout, 0, 1, options)
         assert images.dolp is not None and images.aolp is not None
         away = (images.aolp - math.radians(degrees) + math.pi / 2) % math.pi - math.pi / 2
@@ -169,7 +187,7 @@ def test_aolp_is_exact_around_the_circle() -> None:
         assert_within(torch.from_numpy(images.dolp), 1.0, ROUNDING)
     for level in (0, 100):
         frame = np.full((4, 4), level, np.uint8)
-        images = separate_analytic_half(frame, layout, 0, 255, AnalyticOptions(polarization=True))
+        images = separate_analytic_half(frame, layout, 0, 255, AnalyticOptions(report=True))
         assert images.dolp is not None and images.aolp is not None
         assert max(images.dolp.max(), images.aolp.max(), images.specular.max()) <= ROUNDING * level
 
@@ -207,14 +225,15 @@ def test_clip_threshold_is_the_twins(black: int, span: int) -> None:
 def test_threads_do_not_change_a_bit() -> None:
     """With one thread and with more than there are strips, into fresh and into given images."""
     raw = random_codes((150, 90), clipped=0.002)
-    expected = separate_analytic_half(raw, Layout(), 0, 65535, AnalyticOptions(polarization=True))
-    out = AnalyticImages.empty((150, 90), Layout(), polarization=True)
+    expected = separate_analytic_half(raw, Layout(), 0, 65535, AnalyticOptions(report=True))
+    out = AnalyticImages.empty((150, 90), Layout(), report=True)
     for count in (1, 2, 3, 7):
         set_threads(count)
-        found = separate_analytic_half(raw, Layout(), 0, 65535, AnalyticOptions(out=out))
-        assert found is out
-        for name, image in vars(expected).items():
-            np.testing.assert_array_equal(getattr(found, name), image)
+        found = separate_analytic_half(raw, Layout(), 0, 65535, AnalyticOptions(report=True, out=out))
+        assert found.diffuse is out.diffuse and found.dolp is out.dolp
+        assert found.tally == expected.tally
+        for name in ("diffuse", "specular", "valid", "dolp", "aolp"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
 def test_frames_with_gaps_and_read_only_frames_are_taken() -> None:
@@ -279,8 +298,8 @@ def test_bad_light_colors_are_refused(light: tuple[float, ...]) -> None:
 
 
 def test_bad_images_are_refused() -> None:
-    """Given images must fit: shape, dtype, contiguous; DoLP and AoLP come together."""
-    good = AnalyticImages.empty((8, 8), Layout(), polarization=True)
+    """Given images must fit: shape, dtype, contiguous; a report needs DoLP and AoLP."""
+    good = AnalyticImages.empty((8, 8), Layout(), report=True)
     changes: list[dict[str, Any]] = [
         {"diffuse": np.empty((4, 4, 1), np.float32)},
         {"specular": np.empty((4, 4, 3), np.float64)},
@@ -290,7 +309,11 @@ def test_bad_images_are_refused() -> None:
     for change in changes:
         with pytest.raises(ValueError, match="expected"):
             separate_analytic_half(
-                np.zeros((8, 8), np.uint8), Layout(), 0, 255, AnalyticOptions(out=AnalyticImages(**vars(good) | change))
+                np.zeros((8, 8), np.uint8),
+                Layout(),
+                0,
+                255,
+                AnalyticOptions(report=True, out=AnalyticImages(**vars(good) | change)),
             )
 
 

@@ -2,8 +2,9 @@
 
 Real captures are the four-angle pictures of ``data``/four_angle, taken at full resolution behind a turning polarizer:
 they are mosaicked by Sony's layout without noise. Rendered ones are 12-bit mosaics with noise and clipping; their truth
-is limited to the white level, as demosaicking restores nothing that clipped. All are compared at half resolution, the
-mean over each 2x2 cell; real ones also at full resolution by the methods that have it.
+is limited to the white level, as demosaicking restores nothing that clipped. For demosaicking every sample counts at
+face value, in all methods (`at_face_value`); the separation knows which ones clipped. All are compared at half
+resolution, the mean over each 2x2 cell; real ones also at full resolution by the methods that have it.
 
 Metrics, over all colours, without a border of 8 (half) or 16 (full) pixels and inside the object mask of renders:
 
@@ -101,7 +102,14 @@ def read_cases(data: Path) -> Iterator[Case]:
         truth = found.data[..., :height, :width]
         raw = sample_mosaic(Measurements(truth, found.angles), Layout())
         everywhere = torch.ones(height // 2, width // 2, dtype=torch.bool)
-        yield Case(folder.name, Mosaic(raw, Layout(), 0.0, 1.0), truth, everywhere)
+        yield at_face_value(Case(folder.name, Mosaic(raw, Layout(), 0.0, 1.0), truth, everywhere))
+
+
+def at_face_value(case: Case) -> Case:
+    """The case exposed 1 % darker, so that no sample counts as clipped."""
+    black = case.mosaic.black_level
+    mosaic = replace(case.mosaic, white_level=black + 1.01 * (case.mosaic.white_level - black))
+    return replace(case, mosaic=mosaic, truth=case.truth / 1.01)
 
 
 def inside(mask: Tensor, border: int) -> Tensor:
@@ -207,11 +215,12 @@ def _bench_rendered(title: str, saturation: float, peers: str | None) -> Iterato
         exact = measure(scene.diffuse + scene.specular, Layout().angles).data.clamp(0, 1)
         cases.append(Case(f"scene {seed} {title}", mosaic, exact, mask))
         truths.append(truth)
-    theirs = ask_peers(cases, peers)
     if saturation in (0.0, 1.0):
-        scored = cases[: len(SCORED_SEEDS)]
+        scored = [at_face_value(case) for case in cases[: len(SCORED_SEEDS)]]
+        theirs = ask_peers(scored, peers)
         found = ({key: x for key, x in demosaic_case(c, theirs).items() if key[0] == "half"} for c in scored)
         yield from score_cases("rendered", f"{title} renders", zip(scored, found, strict=True))
+    theirs = ask_peers(cases, peers)
     eari = next((images for name, images in theirs.items() if name.startswith("eari")), {})
     yield from _score_splits(title, cases, truths, eari)
 

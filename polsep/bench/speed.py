@@ -1,6 +1,7 @@
 """Time and memory of whole chains, raw frame to diffuse and specular, each in its own process with two threads.
 
-All see the demo capture: 2448x2048, 12 bits in uint16, colour. polsep's chains end at half resolution in float32.
+All see the demo capture: 2448x2048, 12 bits in uint16, colour; fused ones also at half its brightness, where nothing
+clips (solving clipped pixels takes time). polsep's chains end at half resolution in float32.
 
 A chain must at least read the raw and write both images. ``roofline`` is that traffic at the bandwidth at which two
 threads copy 512 MiB (bytes read plus bytes written), the floor for any chain that leaves the cache; its share says how
@@ -14,7 +15,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -51,27 +51,28 @@ def _compose(demosaic: Callable[[Mosaic], Measurements], separate: Callable[[Mea
     return lambda raw: separate(demosaic(Mosaic(torch.from_numpy(raw), Layout(), 0.0, WHITE_LEVEL)))
 
 
-#: polsep's chains in torch, and by name of the function in `polsep.kernels`; kernels that are not there are left out.
+#: polsep's chains in torch, and fused ones by the names of the function and its options in `polsep.kernels`.
 CHAINS: dict[str, Chain] = {
     "polsep analytic, bilinear": _compose(demosaic_bilinear_half, separate_analytic),
     "polsep analytic, guided": _compose(demosaic_guided_half, separate_analytic),
     "polsep color-affine, bilinear": _compose(demosaic_bilinear_half, separate_color_affine),
     "polsep color-affine, guided": _compose(demosaic_guided_half, separate_color_affine),
 }
-KERNELS = {
-    "polsep analytic, bilinear, kernel": "separate_analytic_half",
-    "polsep color-affine, bilinear, kernel": "separate_color_affine_half",
+KERNELS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "polsep analytic, bilinear, kernel": ("separate_analytic_half", "AnalyticOptions", {}),
+    "polsep color-affine, bilinear, kernel": ("separate_color_affine_half", "ColorAffineOptions", {}),
+    "polsep color-affine, guided, kernel": ("separate_color_affine_half", "ColorAffineOptions", {"guided": True}),
 }
 
 
-def find_chain(name: str) -> Chain | None:
-    """polsep's chain of that name, None for a kernel that is not there; only kernels import numba."""
+def find_chain(name: str) -> Chain:
+    """polsep's chain of that name; only kernels import numba."""
     if name in CHAINS:
         return CHAINS[name]
-    if find_spec("polsep.kernels") is None:
-        return None
-    function = getattr(import_module("polsep.kernels"), KERNELS[name], None)
-    return None if function is None else lambda raw: function(raw, Layout(), 0.0, WHITE_LEVEL)
+    kernels = import_module("polsep.kernels")
+    function, options, fields = KERNELS[name]
+    separate, chosen = getattr(kernels, function), getattr(kernels, options)(**fields)
+    return lambda raw: separate(raw, Layout(), 0.0, WHITE_LEVEL, chosen)
 
 
 def bench_speed(peers: str | None) -> Iterator[Row]:
@@ -80,11 +81,12 @@ def bench_speed(peers: str | None) -> Iterator[Row]:
     frame = next(read_frames(capture, ReadOptions(white_level=WHITE_LEVEL))).data
     raw = frame.data.numpy().astype(np.uint16)
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "raw.npy"
+        path, unclipped = Path(folder) / "raw.npy", Path(folder) / "unclipped.npy"
         write_array(path, raw)
+        write_array(unclipped, raw // 2)
         found: dict[str, dict[str, float]] = {}
         for _ in range(ROUNDS):
-            for name, times in (*_time_own(path), *(time_peers(peers, path) if peers else ())):
+            for name, times in (*_time_own(path, unclipped), *(time_peers(peers, path) if peers else ())):
                 found[name] = times if times["best"] < found.get(name, times)["best"] else found.get(name, times)
     bandwidth = measure_copy_bandwidth()
     least = 1000 * (raw.nbytes + 2 * 3 * 4 * raw.size // 4) / bandwidth
@@ -96,7 +98,7 @@ def bench_speed(peers: str | None) -> Iterator[Row]:
         for label, milliseconds in references.items():
             if milliseconds is not None:
                 yield Row("frontend/speed", CASE, name, f"times as fast as {label}", milliseconds / times["best"], "x")
-        if name in CHAINS or name in KERNELS:
+        if name.startswith("polsep"):
             yield Row("frontend/speed", CASE, name, "roofline reached", 100 * least / times["best"], "%")
         yield Row("frontend/speed", CASE, name, "peak memory", times["peak"], "MiB")
         yield Row("frontend/speed", CASE, name, "of it by the chain", times["working"], "MiB")
@@ -112,12 +114,13 @@ def _time_of(found: dict[str, dict[str, float]], start: str) -> float | None:
     return next((times["best"] for name, times in found.items() if name.startswith(start)), None)
 
 
-def _time_own(path: Path) -> Iterator[tuple[str, dict[str, float]]]:
+def _time_own(path: Path, unclipped: Path) -> Iterator[tuple[str, dict[str, float]]]:
     """`print_time` of every chain that there is, each in its own process."""
     script = "import sys; from polsep.bench.speed import print_time; print_time(*sys.argv[1:])"
     for name in (*CHAINS, *KERNELS):
-        if find_chain(name) is not None:
-            yield name, run_json(sys.executable, "-c", script, name, str(path))
+        yield name, run_json(sys.executable, "-c", script, name, str(path))
+    for name in KERNELS:
+        yield f"{name}, nothing clipped", run_json(sys.executable, "-c", script, name, str(unclipped))
 
 
 def print_time(name: str, path: str) -> None:
@@ -127,7 +130,6 @@ def print_time(name: str, path: str) -> None:
     """
     torch.set_num_threads(THREADS)
     raw, chain = read_array(Path(path)), find_chain(name)
-    assert chain is not None
     if name in KERNELS:
         import_module("polsep.kernels").set_threads(THREADS)
     before = read_peak_memory()

@@ -8,7 +8,7 @@ independently of each other, so the number of threads (`set_threads`) does not c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -26,10 +26,12 @@ from polsep.kernels.bilinear import (
     open_window,
     read_pattern,
 )
-from polsep.kernels.compiling import HALF, ONE, THIRD, ZERO, compiled, entry
+from polsep.kernels.compiling import ONE, THIRD, ZERO, compiled, entry
 from polsep.kernels.images import check_images, interleave_colors
+from polsep.kernels.polarization import polarize
 from polsep.kernels.threads import Piece, share
 from polsep.kernels.unpack import RawFrame, Samples, as_samples
+from polsep.report import Tally
 from polsep.stokes import stokes_inverse
 
 #: Least cell rows that a thread computes at a time: few enough to share the work, many enough to reuse loaded rows.
@@ -40,8 +42,9 @@ STRIP = 32
 class AnalyticImages:
     """The separated frame, channels last; also the room that a stream gives to be filled again and again.
 
-    ``diffuse``, ``specular``: float32 ``[h, w, C]``, ``valid``: bool ``[h, w]``, as in `Separation`. ``dolp`` and
-    ``aolp`` [rad]: float32 ``[h, w]``, of the mean over colours, or both None when nobody wants them.
+    ``diffuse``, ``specular``: float32 ``[h, w, C]``, ``valid``: bool ``[h, w]``, as in `Separation`. For a report,
+    else None: ``dolp`` and ``aolp`` [rad], float32 ``[h, w]``, and ``tally``, all of white light and the mean over
+    colours.
     """
 
     diffuse: NDArray[np.float32]
@@ -49,13 +52,14 @@ class AnalyticImages:
     valid: NDArray[np.bool_]
     dolp: NDArray[np.float32] | None = None
     aolp: NDArray[np.float32] | None = None
+    tally: Tally | None = None
 
     @classmethod
-    def empty(cls, shape: tuple[int, int], layout: Layout, polarization: bool = False) -> AnalyticImages:
-        """Room for mosaics of that ``shape`` (H, W); with ``polarization`` also for DoLP and AoLP."""
+    def empty(cls, shape: tuple[int, int], layout: Layout, report: bool = False) -> AnalyticImages:
+        """Room for mosaics of that ``shape`` (H, W); for a ``report`` also for DoLP and AoLP."""
         h, w = ((n - start) // 2 for n, start in zip(shape, layout.origin, strict=True))
         images = [np.empty((h, w, layout.channels), np.float32) for _ in range(2)]
-        angles = [np.empty((h, w), np.float32) for _ in range(2)] if polarization else [None, None]
+        angles = [np.empty((h, w), np.float32) for _ in range(2)] if report else [None, None]
         return cls(images[0], images[1], np.empty((h, w), np.bool_), angles[0], angles[1])
 
 
@@ -64,24 +68,28 @@ class AnalyticOptions:
     """What a stream of frames has in common beside its layout and levels.
 
     ``light_color``: one gain per channel, divided out of every sample, as in `Mosaic`. ``in_light``: multiply it back
-    into the results, as the pipeline does. ``polarization``: also make DoLP and AoLP. ``out``: images to fill, which
-    then say whether DoLP and AoLP are made.
+    into diffuse and specular, as the pipeline does. ``report``: also make DoLP, AoLP and the frame's tally. ``out``:
+    images to fill.
     """
 
     light_color: tuple[float, ...] = (1.0, 1.0, 1.0)
     in_light: bool = False
-    polarization: bool = False
+    report: bool = False
     out: AnalyticImages | None = None
 
 
 class _Targets(NamedTuple):
-    """Images as the kernel takes them: colours ``[h, w C]``; ``dolp`` and ``aolp`` are ``[0, 0]`` when not wanted."""
+    """Images as the kernel takes them: colours ``[h, w C]``; the last three are empty when no report is wanted.
+
+    ``sums [h, 6]``: over every row, of s0, specular, DoLP above 1, power, power along and across, as in `Tally`.
+    """
 
     diffuse: NDArray[np.float32]
     specular: NDArray[np.float32]
     valid: NDArray[np.bool_]
     dolp: NDArray[np.float32]
     aolp: NDArray[np.float32]
+    sums: NDArray[np.float64]
 
 
 class _Conversion(NamedTuple):
@@ -111,12 +119,12 @@ def separate_analytic_half(
     pattern = read_pattern((raw.shape[0], raw.shape[1]), layout, black_level, white_level, options.light_color)
     out = options.out
     if out is None:
-        out = AnalyticImages.empty((raw.shape[0], raw.shape[1]), layout, options.polarization)
-    targets = _as_targets(out, (pattern.h, pattern.w, pattern.channels))
+        out = AnalyticImages.empty((raw.shape[0], raw.shape[1]), layout, options.report)
+    targets = _as_targets(out, (pattern.h, pattern.w, pattern.channels), options.report)
     gains = options.light_color[: pattern.channels] if options.in_light else (1.0,) * pattern.channels
     conversion = _Conversion(_inverse(layout), np.array(gains, np.float32))
     share(partial(_separate_rows, samples, pattern, conversion, targets), pattern.h, STRIP)
-    return out
+    return replace(out, tally=_tally(out, targets.sums)) if options.report else out
 
 
 @lru_cache(maxsize=8)
@@ -125,30 +133,29 @@ def _inverse(layout: Layout) -> NDArray[np.float32]:
     return stokes_inverse(layout.angles).float().numpy()
 
 
-def _as_targets(out: AnalyticImages, shape: tuple[int, int, int]) -> _Targets:
-    """The images of ``out``, checked. Raises ValueError on a wrong shape or dtype, or on arrays with gaps."""
-    if (out.dolp is None) != (out.aolp is None):
-        raise ValueError("expected both dolp and aolp or neither, found one of them")
-    check_images({name: image for name, image in vars(out).items() if image is not None}, shape)
-    none = np.empty((0, 0), np.float32)
-    dolp, aolp = (none, none) if out.dolp is None or out.aolp is None else (out.dolp, out.aolp)
-    rows = (shape[0], shape[1] * shape[2])
-    return _Targets(out.diffuse.reshape(rows), out.specular.reshape(rows), out.valid, dolp, aolp)
+def _as_targets(out: AnalyticImages, shape: tuple[int, int, int], report: bool) -> _Targets:
+    """The images of ``out``, checked. Raises ValueError on a wrong shape or dtype, gaps, or no room for a report."""
+    check_images({name: image for name, image in vars(out).items() if isinstance(image, np.ndarray)}, shape)
+    dolp = aolp = np.empty((0, 0), np.float32)
+    if report:
+        if out.dolp is None or out.aolp is None:
+            raise ValueError("expected room for dolp and aolp, which a report needs, found none")
+        dolp, aolp = out.dolp, out.aolp
+    rows, sums = (shape[0], shape[1] * shape[2]), np.zeros((dolp.shape[0], 6))
+    return _Targets(out.diffuse.reshape(rows), out.specular.reshape(rows), out.valid, dolp, aolp, sums)
+
+
+def _tally(out: AnalyticImages, sums: NDArray[np.float64]) -> Tally:
+    """The frame's tally from its rows' sums, in one order whatever the threads."""
+    s0, specular, above_one, power, along, across = (float(x) for x in sums.sum(axis=0))
+    valid = int(np.count_nonzero(out.valid))
+    return Tally(out.valid.size, out.valid.size - valid, valid, int(above_one), s0, specular, power, along, across)
 
 
 def warm_up() -> None:
     """Compile the kernel, or load it from numba's cache on disk. One compilation serves all dtypes and layouts."""
     for layout in (Layout(), Layout(bayer=None)):
-        separate_analytic_half(np.zeros((4, 4), np.uint8), layout, 0, 255, AnalyticOptions(polarization=True))
-
-
-_PI, _HALF_PI = np.float32(math.pi), np.float32(math.pi / 2)
-
-# atan(x) / x on [0, 1] as a polynomial in x^2: own minimax fit (iteratively reweighted least squares), 2.5e-7 rad.
-_A0, _A1, _A2, _A3, _A4, _A5, _A6 = (
-    np.float32(c)
-    for c in (0.999996112, -0.333173682, 0.198078157, -0.132333405, 0.079623623, -0.0336041677, 0.00681177381)
-)
+        separate_analytic_half(np.zeros((4, 4), np.uint8), layout, 0, 255, AnalyticOptions(report=True))
 
 
 @compiled
@@ -173,23 +180,8 @@ def _split_row(m: Any, c: int, inverse: Any) -> None:
 
 
 @compiled
-def _half_angle(s1: Any, s2: Any) -> Any:
-    """AoLP in [0, pi) without branches: atan2(s2, s1) / 2."""
-    x, y = abs(s1), abs(s2)
-    steep = y > x
-    long, short = (y, x) if steep else (x, y)
-    ratio = short / (long if long > ZERO else ONE)
-    z = ratio * ratio
-    angle = ratio * (_A0 + z * (_A1 + z * (_A2 + z * (_A3 + z * (_A4 + z * (_A5 + z * _A6))))))
-    angle = _HALF_PI - angle if steep else angle
-    angle = HALF * (_PI - angle if s1 < ZERO else angle)
-    angle = _PI - angle if s2 < ZERO else angle
-    return angle if angle < _PI else ZERO
-
-
-@compiled
-def _polarize_row(m: Any, inverse: Any) -> None:
-    """DoLP and AoLP of a row: ``m [4, n]`` becomes (DoLP, AoLP, -, -)."""
+def _fit_row(m: Any, inverse: Any) -> None:
+    """Stokes vectors of a row, in place: ``m [4, n]`` becomes (s0, s1, s2, -)."""
     i00, i01, i02, i03 = inverse[0, 0], inverse[0, 1], inverse[0, 2], inverse[0, 3]
     i10, i11, i12, i13 = inverse[1, 0], inverse[1, 1], inverse[1, 2], inverse[1, 3]
     i20, i21, i22, i23 = inverse[2, 0], inverse[2, 1], inverse[2, 2], inverse[2, 3]
@@ -198,23 +190,49 @@ def _polarize_row(m: Any, inverse: Any) -> None:
         s0 = i00 * m0[j] + i01 * m1[j] + i02 * m2[j] + i03 * m3[j]
         s1 = i10 * m0[j] + i11 * m1[j] + i12 * m2[j] + i13 * m3[j]
         s2 = i20 * m0[j] + i21 * m1[j] + i22 * m2[j] + i23 * m3[j]
-        degree = math.sqrt(s1 * s1 + s2 * s2) / (s0 if s0 > ZERO else ONE)
-        m0[j] = degree if s0 > ZERO else ZERO
-        m1[j] = _half_angle(s1, s2)
+        m0[j] = s0
+        m1[j] = s1
+        m2[j] = s2
 
 
 @compiled
-def _mean_color(m: Any, gains: Any, mean: Any) -> None:
-    """Mean over colours of ``m [4, C, n]``, in the light's colour, to ``mean [4, n]``."""
-    if m.shape[1] == 1:
-        for k in range(4):
-            _scale(m[k, 0], ONE, mean[k])
-        return
-    g0, g1, g2 = THIRD * gains[0], THIRD * gains[1], THIRD * gains[2]
+def _mean_color(planes: Any, mean: Any) -> None:
+    """Mean over colours of ``planes [C, n]``, to ``mean [n]``."""
+    if planes.shape[0] == 1:
+        _scale(planes[0], ONE, mean)
+    else:
+        red, green, blue = planes[0], planes[1], planes[2]
+        for j in range(mean.size):
+            mean[j] = THIRD * (red[j] + green[j] + blue[j])
+
+
+@compiled
+def _polarize_row(m: Any, mean: Any, inverse: Any, r: int, targets: _Targets) -> None:
+    """DoLP and AoLP of row ``r`` of analysers ``m [4, C, n]``; ``mean [4, n]`` becomes (s0, s1, s2, -)."""
     for k in range(4):
-        red, green, blue, out = m[k, 0], m[k, 1], m[k, 2], mean[k]
-        for j in range(out.size):
-            out[j] = g0 * red[j] + g1 * green[j] + g2 * blue[j]
+        _mean_color(m[k], mean[k])
+    _fit_row(mean, inverse)
+    polarize(mean[0], mean[1], mean[2], targets.dolp[r], targets.aolp[r])
+
+
+@compiled
+def _sum_row(m: Any, mean: Any, dolp: Any, sums: Any) -> None:
+    """Sums over a row in double precision; ``m [4, C, n]`` is (specular, diffuse, -, -), ``mean`` from the above."""
+    _mean_color(m[0], mean[0])
+    _mean_color(m[1], mean[3])
+    s, s1, s2, d = mean[0], mean[1], mean[2], mean[3]
+    specular, diffuse, above_one, power, along, across = 0.0, 0.0, 0, 0.0, 0.0, 0.0
+    for j in range(dolp.size):
+        specular += s[j]
+        diffuse += d[j]
+        above_one += dolp[j] > ONE
+        square = s1[j] * s1[j] + s2[j] * s2[j]
+        weight = math.sqrt(square)
+        power += square
+        along += weight * s1[j]
+        across += weight * s2[j]
+    sums[0], sums[1], sums[2] = specular + diffuse, specular, above_one
+    sums[3], sums[4], sums[5] = power, along, across
 
 
 @compiled
@@ -263,11 +281,10 @@ def _separate_rows(
             _clear_flagged(m, valid)
         interpolate_row(pattern, window, r, m)
         if targets.dolp.size:
-            _mean_color(m, gains, mean)
-            _polarize_row(mean, inverse)
-            _scale(mean[0], ONE, targets.dolp[r])
-            _scale(mean[1], ONE, targets.aolp[r])
+            _polarize_row(m, mean, inverse, r, targets)
         for c in range(pattern.channels):
             _split_row(m, c, inverse)
+        if targets.dolp.size:
+            _sum_row(m, mean, targets.dolp[r], targets.sums[r])
         _interleave(m[0], gains, targets.specular[r])
         _interleave(m[1], gains, targets.diffuse[r])

@@ -49,6 +49,14 @@ class Grid(NamedTuple):
     inverse: NDArray[np.float32]
 
 
+class Source(NamedTuple):
+    """A frame of samples, how its filters lie, and what all its rows share."""
+
+    samples: Samples
+    pattern: Pattern
+    grid: Grid
+
+
 def read_grid(pattern: Pattern, angles: tuple[float, ...], inverse: NDArray[np.float32]) -> Grid:
     """The grid of frames of a colour ``pattern`` whose analysers have ``angles`` [rad] and that ``inverse [3, 4]``."""
     columns = np.arange(-EDGE, pattern.w + EDGE)
@@ -69,15 +77,17 @@ def read_grid(pattern: Pattern, angles: tuple[float, ...], inverse: NDArray[np.f
 
 def reflect(places: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     """Places of ``count`` cells mirrored about the outermost one, as often as needed."""
-    return count - 1 - np.abs(np.mod(places, 2 * count - 2) - (count - 1))
+    mirrored: NDArray[np.int64] = count - 1 - np.abs(np.mod(places, 2 * count - 2) - (count - 1))
+    return mirrored
 
 
 @compiled
-def load_cells(samples: Samples, pattern: Pattern, grid: Grid, source: int, row: Any, planes: Any) -> None:
-    """The samples of the frame's cell row ``source`` to ``planes [4, n]``, linear; ``row``: room for a sensor row."""
-    gains = grid.gains[source % 2, EDGE:]
+def load_cells(source: Source, r: int, row: Any, planes: Any) -> None:
+    """The samples of the frame's cell row ``r`` to ``planes [4, n]``, linear; ``row``: room for a sensor row."""
+    samples, pattern, grid = source
+    gains = grid.gains[r % 2, EDGE:]
     for i in range(2):
-        read_row(samples, pattern.top + 2 * source + i, pattern.left, row)
+        read_row(samples, pattern.top + 2 * r + i, pattern.left, row)
         left, right = planes[2 * i, EDGE:], planes[2 * i + 1, EDGE:]
         for j in range(row.size // 2):
             left[j] = (row[2 * j] - pattern.black) * gains[j]
@@ -139,12 +149,12 @@ def _add_green(q: Any, step: int, weights: tuple[Any, Any], sums: tuple[Any, Any
 
 
 @compiled
-def polarize_row(ring: Any, r: int, parity: int, grid: Grid, room: Any, sums: Any) -> None:
+def polarize_row(ring: Any, r: int, grid: Grid, room: Any, sums: Any) -> None:
     """s1 and s2 of row ``r`` to ``sums [2, 3, n]``, bilinear, from a ring of planes with rows r - 2 to r + 2.
 
-    ``parity``: of the frame's row. Twin: `fit_stokes` of `interpolate_analysers_half`.
+    ``room [3, n]``: for rows. Twin: `fit_stokes` of `interpolate_analysers_half`.
     """
-    length = ring.shape[0]
+    length, parity = ring.shape[0], r % 2
     other, green = grid.others[parity], grid.others[1 - parity]
     for i in range(2):
         for c in range(3):

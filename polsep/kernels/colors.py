@@ -1,7 +1,7 @@
 """Red and blue at every pixel from green, rows of cells in and out: twin of `guided._fill_from_green`.
 
-The rows, counted back from the newest one of green: linear functions 4 (`LINES`), smoothed over 3x3 cells 5, guesses and
-their residual 6 (`GUESS`), red and blue 8 (`FILLED`). Index 0 is red and 1 is blue wherever there are two.
+The rows, counted back from the newest one of green: linear functions 4 (`LINES`), smoothed over 3x3 cells 5, guesses
+and their residual 6 (`GUESS`), red and blue 8 (`FILLED`). Index 0 is red and 1 is blue wherever there are two.
 """
 
 from __future__ import annotations
@@ -44,7 +44,6 @@ class Colors(NamedTuple):
     rows: NDArray[np.float32]
 
 
-@compiled
 def make_colors(n: int) -> Colors:
     """Empty rings for rows of length ``n``."""
     return Colors(
@@ -165,19 +164,15 @@ def _fill(mosaic: Any, guess: Any, rows: tuple[Any, Any], present: Any, out: Any
 
 
 @compiled
-def fill_colors_row(mosaic: Any, green: Any, r: int, grid: Grid, state: Colors, filled: Any) -> None:
-    """Take row ``r`` of the rings ``green`` and ``mosaic [length, 4, n]``; fill row ``r - FILLED`` of ``filled``.
+def _subtract(x: Any, y: Any, out: Any) -> None:
+    for j in range(out.size):
+        out[j] = x[j] - y[j]
 
-    ``filled [length, 8, n]``: four planes of red, four of blue.
-    """
+
+@compiled
+def _find_lines(p: int, grid: Grid, state: Colors) -> None:
+    """Linear functions of row ``p``, and their means over 3x3 cells of the row above."""
     rows = state.rows
-    here = mosaic[r % mosaic.shape[0]]
-    _products(green[r % green.shape[0]], here, rows)
-    mean_cells(here, rows[1])
-    for k in range(4):
-        _mean_along(rows[k], grid.others[r % 2], state.moments[r % 9, k])
-
-    p = r - LINES
     for color in range(2):
         own = grid.colors[p % 2] == 2 * color
         for k in range(4):
@@ -185,14 +180,15 @@ def fill_colors_row(mosaic: Any, green: Any, r: int, grid: Grid, state: Colors, 
         _find_line(rows)
         for k in range(2):
             sum_three(rows[k], state.lines[p % 3, 2 * color + k])
-
-    p = r - LINES - 1
-    above, middle, below = state.lines[(p - 1) % 3], state.lines[p % 3], state.lines[(p + 1) % 3]
+    above, middle, below = state.lines[(p - 2) % 3], state.lines[(p - 1) % 3], state.lines[p % 3]
     for k in range(4):
-        add_rows(above[k], middle[k], below[k], _NINTH, state.smooth[p % 3, k])
+        add_rows(above[k], middle[k], below[k], _NINTH, state.smooth[(p - 1) % 3, k])
 
-    p = r - GUESS
-    here, here_green, guess = mosaic[p % mosaic.shape[0]], green[p % green.shape[0]], state.guess[p % 3]
+
+@compiled
+def _guess_row(here: Any, green: Any, p: int, grid: Grid, state: Colors) -> None:
+    """Guesses of row ``p`` from its green, and what they miss of its mosaic, ``here``, interpolated along the row."""
+    rows, guess = state.rows, state.guess[p % 3]
     above, middle, below = state.smooth[(p - 1) % 3], state.smooth[p % 3], state.smooth[(p + 1) % 3]
     for color in range(2):
         for k in range(2):
@@ -200,7 +196,7 @@ def fill_colors_row(mosaic: Any, green: Any, r: int, grid: Grid, state: Colors, 
             enlarge_down(above[line], middle[line], below[line], rows[2 * k : 2 * k + 2])
         for i in range(2):
             first = 4 * color + 2 * i
-            _guess(rows[i], rows[2 + i], here_green[2 * i : 2 * i + 2], guess[first : first + 2])
+            _guess(rows[i], rows[2 + i], green[2 * i : 2 * i + 2], guess[first : first + 2])
     first = 4 * (grid.colors[p % 2] // 2)
     for k in range(4):
         _subtract(here[k], guess[first + k], rows[4 + k])
@@ -209,20 +205,37 @@ def fill_colors_row(mosaic: Any, green: Any, r: int, grid: Grid, state: Colors, 
         _interpolate_along(rows[4 + 2 * i : 6 + 2 * i], other, residual[2 * i : 2 * i + 2])
         _interpolate_along(here[2 * i : 2 * i + 2], other, residual[4 + 2 * i : 6 + 2 * i])
 
-    p = r - FILLED
-    here, out = mosaic[p % mosaic.shape[0]], filled[p % filled.shape[0]]
+
+@compiled
+def _fill_row(here: Any, p: int, grid: Grid, state: Colors, out: Any) -> None:
+    """Red and blue of row ``p``, to ``out [8, n]``."""
+    rows = state.rows
     for color in range(2):
         own = grid.colors[p % 2] == 2 * color
+        present = grid.others[p % 2] if own else rows[8]
         for j in range(2):
             _interpolate_down(state.residual, p, j, own, rows[0:2])
             _interpolate_down(state.residual, p, 4 + j, own, rows[2:4])
             for i in range(2):
                 k = 2 * i + j
-                present = grid.others[p % 2] if own else rows[8]
                 _fill(here[k], state.guess[p % 3, 4 * color + k], (rows[i], rows[2 + i]), present, out[4 * color + k])
 
 
 @compiled
-def _subtract(x: Any, y: Any, out: Any) -> None:
-    for j in range(out.size):
-        out[j] = x[j] - y[j]
+def fill_colors_row(rings: tuple[Any, Any, Any], r: int, grid: Grid, state: Colors) -> None:
+    """Take row ``r`` of green and of the mosaic; fill row ``r - FILLED`` of red and blue.
+
+    ``rings``: mosaic and green ``[length, 4, n]``, and ``[length, 8, n]`` for four planes of red and four of blue.
+    """
+    mosaic, green, filled = rings
+    rows, length = state.rows, mosaic.shape[0]
+    here = mosaic[r % length]
+    _products(green[r % green.shape[0]], here, rows)
+    mean_cells(here, rows[1])
+    for k in range(4):
+        _mean_along(rows[k], grid.others[r % 2], state.moments[r % 9, k])
+    _find_lines(r - LINES, grid, state)
+    p = r - GUESS
+    _guess_row(mosaic[p % length], green[p % green.shape[0]], p, grid, state)
+    p = r - FILLED
+    _fill_row(mosaic[p % length], p, grid, state, filled[p % filled.shape[0]])

@@ -47,7 +47,6 @@ class Green(NamedTuple):
     rows: NDArray[np.float32]
 
 
-@compiled
 def make_green(n: int) -> Green:
     """Empty rings for rows of length ``n``."""
     return Green(
@@ -283,8 +282,9 @@ def _beside(cells: tuple[Any, Any, Any], out: Any) -> None:
 
 
 @compiled
-def _add_difference(mosaic: Any, found: Any, smooth: Any, kept: Any, row: tuple[Any, Any], green: Any) -> None:
-    """One plane of green."""
+def _add_difference(mosaic: Any, difference: tuple[Any, Any, Any], row: tuple[Any, Any], green: Any) -> None:
+    """One plane of green. ``difference``: found, smooth, and the share of detail that is kept."""
+    found, smooth, kept = difference
     other, least = row
     for j in range(green.size):
         value = mosaic[j] + (smooth[j] + kept[j] * (found[j] - smooth[j]))
@@ -320,10 +320,12 @@ def _compare(mosaic: Any, r: int, other: Any, state: Green) -> None:
 
 
 @compiled
-def fill_green_row(mosaic: Any, cells: Any, r: int, grid: Grid, state: Green, green: Any) -> None:
-    """Take row ``r`` of the rings ``mosaic [length, 4, n]`` and ``cells [length, n]``, its cells' means; fill row
-    ``r - GREEN`` of the ring ``green``.
+def fill_green_row(rings: tuple[Any, Any, Any], r: int, grid: Grid, state: Green) -> None:
+    """Take row ``r`` of a mosaic and of its cells' means; fill row ``r - GREEN`` of green.
+
+    ``rings``: mosaic ``[length, 4, n]``, means ``[length, n]``, green ``[length, 4, n]``.
     """
+    mosaic, cells, green = rings
     rows, length = state.rows, cells.shape[0]
     p = r - GRADIENTS
     above2, above, middle = cells[(p - 2) % length], cells[(p - 1) % length], cells[p % length]
@@ -358,6 +360,7 @@ def fill_green_row(mosaic: Any, cells: Any, r: int, grid: Grid, state: Green, gr
     _mean_of_window(state.means, p, 1, rows[1])
     _kept_share(rows[0], rows[1])
     _beside((cells[(p - 1) % length], cells[p % length], cells[(p + 1) % length]), rows[2])
-    mine, found, smooth = mosaic[p % mosaic.shape[0]], state.found[p % 9], state.smooth[p % 5, 0]
+    here, out = mosaic[p % mosaic.shape[0]], green[p % green.shape[0]]
     for k in range(4):
-        _add_difference(mine[k], found[k], smooth, rows[0], (grid.others[p % 2], rows[2]), green[p % green.shape[0], k])
+        difference = (state.found[p % 9, k], state.smooth[p % 5, 0], rows[0])
+        _add_difference(here[k], difference, (grid.others[p % 2], rows[2]), out[k])

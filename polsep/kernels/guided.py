@@ -1,8 +1,9 @@
 """Twin of `guided.demosaic_guided_half` as a stream of cell rows, on the CPU: raw rows in, Stokes rows out.
 
-A row passes through a line of rings: bilinear polarization and its smoothing, the mosaic of s0, green (`kernels.green`),
-red and blue (`kernels.colors`), the guide, the residual and its polarization. The result of a row is ready `REACH` rows
-after it was loaded. Every step is a filter of finite reach, so rows do not depend on where a stream began.
+A row passes through a line of rings: bilinear polarization and its smoothing, the mosaic of s0, green
+(`kernels.green`), red and blue (`kernels.colors`), the guide, the residual and its polarization. The result of a row is
+ready `REACH` rows after it was loaded. Every step is a filter of finite reach, so rows do not depend on where a stream
+began.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep import guided as twin
-from polsep.kernels.bilinear import Pattern
 from polsep.kernels.cells import (
     EDGE,
     GUARD,
     Grid,
+    Source,
     blur_gently,
     blur_gently_down,
     blur_pixels_along,
@@ -29,12 +30,12 @@ from polsep.kernels.cells import (
     reciprocal,
 )
 from polsep.kernels.colors import FILLED, Colors, fill_colors_row, make_colors
-from polsep.kernels.compiling import HALF, ONE, QUARTER, THIRD, TWO, ZERO, compiled
+from polsep.kernels.compiling import HALF, ONE, QUARTER, THIRD, TWO, ZERO, compiled, entry
 from polsep.kernels.green import GREEN, Green, fill_green_row, make_green
-from polsep.kernels.unpack import Samples
+from polsep.kernels.threads import Piece
 
-#: Rows back from the newest one: bilinear polarization, its smoothing, the mosaic of s0, green, all colours, the guide's
-#: tent, the residual, its polarization, and the result.
+#: Rows back from the newest one: bilinear polarization, its smoothing, the mosaic of s0, green, all colours, the
+#: guide's tent, the residual, its polarization, and the result.
 _POLARIZED = 2
 _SMOOTHED = _POLARIZED + twin.SMOOTH_RADIUS
 _INTENSITY = _SMOOTHED + 1
@@ -56,7 +57,8 @@ class Stream(NamedTuple):
     ``raw``: samples. ``sums``: s1 and s2 of three colours, over the cells of a row's window; ``smooth``: over all.
     ``mosaic``: s0 of each pixel's colour. ``means [length, n]``: its cells'. ``green``, ``filled``: s0. ``total``: cell
     means of red, green, blue. ``tent``, ``detail``: of the guide. ``residual``: samples minus half the guide.
-    ``found``: mean s1 and s2. ``sensor_row``: room for one. ``rows``: for others.
+    ``found``: mean s1 and s2. ``sensor_row``: room for one. ``rows``: for others. ``first``: row of the frame that the
+    stream begins with, an even one. ``pushed [1]``: rows so far.
     """
 
     raw: NDArray[np.float32]
@@ -75,12 +77,13 @@ class Stream(NamedTuple):
     rows: NDArray[np.float32]
     for_green: Green
     for_colors: Colors
+    first: int
+    pushed: NDArray[np.int64]
 
 
-@compiled
-def make_stream(pattern: Pattern, grid: Grid) -> Stream:
-    """An empty stream; its results count from the `REACH`-th row on that is put in before the one they are for."""
-    n = grid.n
+def open_stream(source: Source, start: int) -> Stream:
+    """A stream whose results begin with the frame's row ``start``, an even one."""
+    n = source.grid.n
     return Stream(
         np.zeros((_RESIDUAL + 1, 4, n), np.float32),
         np.zeros((9, 6, n), np.float32),
@@ -94,10 +97,12 @@ def make_stream(pattern: Pattern, grid: Grid) -> Stream:
         np.zeros((3, 4, n), np.float32),
         np.zeros((5, 4, n), np.float32),
         np.zeros((3, 2, n), np.float32),
-        np.empty(2 * pattern.w, np.float32),
+        np.empty(2 * source.pattern.w, np.float32),
         np.zeros((16, n), np.float32),
         make_green(n),
         make_colors(n),
+        start - REACH - REACH % 2,
+        np.zeros(1, np.int64),
     )
 
 
@@ -112,10 +117,11 @@ def _sum_nine(x: Any, out: Any) -> None:
 
 
 @compiled
-def _mean_nine(ring: Any, k: int, out: Any) -> None:
-    """The mean over nine rows of sums, all that a ring holds."""
-    a, b, c, d, e = ring[0, k], ring[1, k], ring[2, k], ring[3, k], ring[4, k]
-    f, g, h, i = ring[5, k], ring[6, k], ring[7, k], ring[8, k]
+def _mean_nine(ring: Any, r: int, k: int, out: Any) -> None:
+    """The mean over the nine rows of sums about row ``r``, always added in the same order."""
+    a, b, c, d = ring[(r - 4) % 9, k], ring[(r - 3) % 9, k], ring[(r - 2) % 9, k], ring[(r - 1) % 9, k]
+    e, f, g = ring[r % 9, k], ring[(r + 1) % 9, k], ring[(r + 2) % 9, k]
+    h, i = ring[(r + 3) % 9, k], ring[(r + 4) % 9, k]
     for j in range(out.size):
         total = (((a[j] + b[j]) + (c[j] + d[j])) + ((e[j] + f[j]) + (g[j] + h[j]))) + i[j]
         out[j] = _WINDOW * total
@@ -215,7 +221,7 @@ def _repolarize_row(stream: Stream, r: int, grid: Grid) -> None:
     """Polarization of the residual, mean over colours, of row ``r``."""
     rows = stream.rows
     sums = rows[0:6].reshape(2, 3, grid.n)
-    polarize_row(stream.residual, r, r % 2, grid, rows[6:9], sums)
+    polarize_row(stream.residual, r, grid, rows[6:9], sums)
     for s in range(2):
         _average_colors(sums[s], rows[9])
         blur_gently(rows[9], stream.found[r % 3, s])
@@ -229,30 +235,26 @@ def _copy_inside(x: Any, out: Any) -> None:
 
 
 @compiled
-def push_row(
-    samples: Samples, pattern: Pattern, grid: Grid, source: int, u: int, stream: Stream, out: Any
-) -> None:
-    """Put the frame's cell row ``source`` in as the stream's ``u``-th, and take row ``u - REACH`` out.
-
-    ``out [5, w]``: s0 of three colours and the means over colours of s1 and s2. Rows of an even number ``u`` have the
-    colours of the frame's even ones.
-    """
-    rows = stream.rows
-    load_cells(samples, pattern, grid, source, stream.sensor_row, stream.raw[u % stream.raw.shape[0]])
+def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
+    """Put a row in as the stream's ``u``-th, mirrored into the frame, and take the row `REACH` above it out."""
+    rows, grid, last = stream.rows, source.grid, source.pattern.h - 1
+    mirrored = last - abs((stream.first + u) % (2 * last) - last)
+    load_cells(source, mirrored, stream.sensor_row, stream.raw[u % stream.raw.shape[0]])
 
     r = u - _POLARIZED
-    polarize_row(stream.raw, r, r % 2, grid, rows[6:9], rows[0:6].reshape(2, 3, grid.n))
+    polarize_row(stream.raw, r, grid, rows[6:9], rows[0:6].reshape(2, 3, grid.n))
     for k in range(6):
         _sum_nine(rows[k], stream.sums[r % 9, k])
+    r = u - _SMOOTHED
     for k in range(6):
-        _mean_nine(stream.sums, k, stream.smooth[(u - _SMOOTHED) % 3, k])
+        _mean_nine(stream.sums, r, k, stream.smooth[r % 3, k])
 
     r = u - _INTENSITY
     _intensity_row(stream, r, grid)
-    fill_green_row(stream.mosaic, stream.means, r, grid, stream.for_green, stream.green)
+    fill_green_row((stream.mosaic, stream.means, stream.green), r, grid, stream.for_green)
 
     r = u - _GREEN
-    fill_colors_row(stream.mosaic, stream.green, r, grid, stream.for_colors, stream.filled)
+    fill_colors_row((stream.mosaic, stream.green, stream.filled), r, grid, stream.for_colors)
 
     r = u - _FILLED
     total = stream.total[r % stream.total.shape[0]]
@@ -272,3 +274,15 @@ def push_row(
     for s in range(2):
         blur_gently_down(above[s], here[s], below[s], rows[0])
         _copy_inside(rows[0], out[3 + s])
+
+
+@entry
+def demosaic_rows(source: Source, stream: Stream, piece: Piece, out: Any) -> None:
+    """The frame's cell rows of a piece, which continues the one before, to ``out [rows, 5, w]``.
+
+    A row is s0 of three colours and the means over colours of s1 and s2.
+    """
+    for t in range(piece[0], piece[1]):
+        while stream.first + stream.pushed[0] <= t + REACH:
+            _push_row(source, stream.pushed[0], stream, out[t - piece[0]])
+            stream.pushed[0] += 1

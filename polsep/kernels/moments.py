@@ -44,8 +44,9 @@ class Rings(NamedTuple):
     ``stokes [16, 5, n]``: s0 of three colours, s1, s2. ``moments [4, 4, n]``: of `_contrast`, and 1 where usable.
     ``noise [7, 2, n]``: squared residuals and their weights, summed along rows. ``bright [4, n]``. ``missed [3, n]``:
     squared second differences, summed along rows. ``weighted [16, 6, n]``: weighted moments, error, weight and its
-    square. ``wide``, ``middle``, ``narrow`` ``[L + 1, 6, n]``: rows of one block of window sums of length L, behind
-    it the sum of the block so far.
+    square. ``spread [16, 4, n]``: moments of `_contrast` and the spread of s1 and s2, for a report. ``wide``,
+    ``middle``, ``narrow`` ``[L + 1, 6, n]``: rows of one block of window sums of length L, behind it the sum of the
+    block so far.
     """
 
     stokes: NDArray[np.float32]
@@ -54,6 +55,7 @@ class Rings(NamedTuple):
     bright: NDArray[np.float32]
     missed: NDArray[np.float32]
     weighted: NDArray[np.float32]
+    spread: NDArray[np.float32]
     wide: NDArray[np.float32]
     middle: NDArray[np.float32]
     narrow: NDArray[np.float32]
@@ -71,6 +73,7 @@ class Rows(NamedTuple):
     fours: NDArray[np.float32]
     slope: NDArray[np.float32]
     planes: NDArray[np.float32]
+    spare: NDArray[np.float32]
     counts: NDArray[np.float32]
 
 
@@ -86,6 +89,7 @@ def make_rings(w: int) -> Rings:
         np.zeros((4, n), np.float32),
         np.zeros((3, n), np.float32),
         np.zeros((16, 6, n), np.float32),
+        np.zeros((16, 4, n), np.float32),
         np.zeros((2 * WIDEST + 2, 6, n), np.float32),
         np.zeros((2 * MIDDLE + 2, 6, n), np.float32),
         np.zeros((2 * NARROW + 2, 6, n), np.float32),
@@ -112,6 +116,7 @@ def make_rows(pattern: Pattern) -> Rows:
         np.zeros(6 * n, np.float32),
         np.zeros((2, n), np.float32),
         np.zeros((4, w), np.float32),
+        np.zeros((3, w), np.float32),
         counts,
     )
 
@@ -293,6 +298,45 @@ def enter_row(pattern: Pattern, conversion: Conversion, flagged: bool, t: int, s
         _leave_out_clipped(rows, conversion, moments)
     for i in range(2):
         _sum_seven(rows.squared[i, PAD - NOISE :], rings.noise[t % 7, i, inside])
+
+
+@compiled
+def _spread(s: Any, w: int, out: Any) -> None:
+    """Moments of the colours' deviations from their means: s0 s0, s0 s1, s0 s2, and s1 s1 + s2 s2."""
+    r0, g0, b0 = s[0, PAD:], s[1, PAD:], s[2, PAD:]
+    r1, g1, b1 = s[3, PAD:], s[4, PAD:], s[5, PAD:]
+    r2, g2, b2 = s[6, PAD:], s[7, PAD:], s[8, PAD:]
+    contrast, first, second, total = out[0, PAD:], out[1, PAD:], out[2, PAD:], out[3, PAD:]
+    for j in range(w):
+        a0 = THIRD * (r0[j] + g0[j] + b0[j])
+        a1 = THIRD * (r1[j] + g1[j] + b1[j])
+        a2 = THIRD * (r2[j] + g2[j] + b2[j])
+        x, y, z = r0[j] - a0, g0[j] - a0, b0[j] - a0
+        dr1, dg1, db1, dr2, dg2, db2 = r1[j] - a1, g1[j] - a1, b1[j] - a1, r2[j] - a2, g2[j] - a2, b2[j] - a2
+        contrast[j] = x * x + y * y + z * z
+        first[j] = x * dr1 + y * dg1 + z * db1
+        second[j] = x * dr2 + y * dg2 + z * db2
+        total[j] = (dr1 * dr1 + dg1 * dg1 + db1 * db1) + (dr2 * dr2 + dg2 * dg2 + db2 * db2)
+
+
+@compiled
+def measure_spread(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
+    """What a report takes of row ``t``, which has just been entered: how far its colours miss the model."""
+    rows, rings = scratch
+    _spread(rows.s, pattern.w, rings.spread[t % 16])
+
+
+@compiled
+def sum_noise(pattern: Pattern, noise: Any) -> float:
+    """The sum over a row of the standard deviation of a sample, from a full ring of noise. Twin: `sample_variance`."""
+    total = 0.0
+    for j in range(PAD, PAD + pattern.w):
+        squares, weight = 0.0, 0.0
+        for i in range(7):
+            squares += noise[i, 0, j]
+            weight += noise[i, 1, j]
+        total += np.sqrt(squares / (weight if weight > 1e-6 else 1e-6))
+    return total
 
 
 @compiled

@@ -1,0 +1,177 @@
+"""Twin of `color_affine.interpolate_around` for few holes in a large frame: push and pull over a pyramid.
+
+Only the pyramid, a third of the frame, is ever made; of the frame itself nothing but the holes is interpolated.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.kernels.compiling import HALF, ONE, QUARTER, ZERO, compiled, entry
+from polsep.kernels.threads import Piece, share
+
+#: Means and, in the last plane, weights of one level of a pyramid: ``[K + 1, h, w]``.
+Level = NDArray[np.float32]
+
+_LEAST_WEIGHT = np.float32(1e-12)
+#: Rows of a frame that one thread halves, an even number.
+_PIECE = 64
+
+
+def interpolate_holes(finest: Level, shape: tuple[int, int], places: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Values ``[K, N]`` at the flat ``places [N]``, holes all, of a frame of that ``shape (h, w)``.
+
+    ``finest``: the first level above the frame, from `halve_specular` or `halve_separation`.
+    """
+    levels = [finest]
+    while max(levels[-1].shape[1:]) > 1:
+        levels.append(_halve(levels[-1]))
+    result = _divide(levels.pop())
+    while levels:
+        result = _push(levels.pop(), result)
+    values: NDArray[np.float32] = _push_at(result, shape[0], shape[1], places)
+    return values
+
+
+def _room(planes: int, h: int, w: int) -> Level:
+    return np.zeros((planes + 1, (h + 1) // 2, (w + 1) // 2), np.float32)
+
+
+def halve_separation(
+    diffuse: NDArray[np.float32], specular: NDArray[np.float32], lines: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> Level:
+    """The first level of the specular polarization (two planes) and of the diffuse light (three), where ``valid``.
+
+    ``diffuse``, ``specular [h, w, 3]``, ``lines [4, h, w]``: slope and offset.
+    """
+    level = _room(5, *valid.shape)
+    share(partial(_halve_separation, (diffuse, specular, lines), valid, level), valid.shape[0], _PIECE)
+    return level
+
+
+def halve_specular(specular: NDArray[np.float32], outside: NDArray[np.bool_]) -> Level:
+    """The first level of a white specular image ``[h, w, 3]``, ``outside`` of its holes."""
+    level = _room(1, *outside.shape)
+    share(partial(_halve_specular, specular, outside, level), outside.shape[0], _PIECE)
+    return level
+
+
+def _halve(level: Level) -> Level:
+    """The next level: means over 2x2 of totals and weights."""
+    coarse = _room(level.shape[0] - 1, *level.shape[1:])
+    _halve_planes(level, coarse)
+    return coarse
+
+
+@compiled
+def _share(y: int, x: int, h: int, w: int) -> Any:
+    """1 / the number of pixels of a 2x2 block, at an odd border fewer than 4."""
+    count = (2 if 2 * y + 1 < h else 1) * (2 if 2 * x + 1 < w else 1)
+    return ONE / np.float32(count)
+
+
+@entry
+def _halve_separation(images: tuple[Any, Any, Any], valid: Any, level: Any, piece: Piece) -> None:
+    diffuse, specular, lines = images
+    h, w = valid.shape
+    for i in range(piece[0], piece[1]):
+        for j in range(w):
+            if not valid[i, j]:
+                continue
+            y, x = i // 2, j // 2
+            share, tau = _share(y, x, h, w), specular[i, j, 0]
+            p1, p2 = lines[2, i, j] + lines[0, i, j] * tau, lines[3, i, j] + lines[1, i, j] * tau
+            size = np.sqrt(p1 * p1 + p2 * p2)
+            scale = share * tau / (size if size > _LEAST_WEIGHT else _LEAST_WEIGHT)
+            level[0, y, x] += scale * p1
+            level[1, y, x] += scale * p2
+            for c in range(3):
+                level[2 + c, y, x] += share * diffuse[i, j, c]
+            level[5, y, x] += share
+
+
+@entry
+def _halve_specular(specular: Any, outside: Any, level: Any, piece: Piece) -> None:
+    h, w = outside.shape
+    for i in range(piece[0], piece[1]):
+        for j in range(w):
+            if outside[i, j]:
+                share = _share(i // 2, j // 2, h, w)
+                level[0, i // 2, j // 2] += share * specular[i, j, 0]
+                level[1, i // 2, j // 2] += share
+
+
+@entry
+def _halve_planes(level: Any, coarse: Any) -> None:
+    planes, h, w = level.shape
+    for k in range(planes):
+        for i in range(h):
+            for j in range(w):
+                coarse[k, i // 2, j // 2] += _share(i // 2, j // 2, h, w) * level[k, i, j]
+
+
+@entry
+def _divide(level: Any) -> Any:
+    """Totals over weights, whatever the weights are."""
+    planes, h, w = level.shape
+    result = np.empty((planes - 1, h, w), np.float32)
+    for k in range(planes - 1):
+        for i in range(h):
+            for j in range(w):
+                weight = level[planes - 1, i, j]
+                result[k, i, j] = level[k, i, j] / (weight if weight > _LEAST_WEIGHT else _LEAST_WEIGHT)
+    return result
+
+
+@compiled
+def _between(place: int, size: int, coarse: int) -> tuple[int, int, Any]:
+    """The two samples of ``coarse`` that interpolation to ``place`` of ``size`` mixes, and the second one's share."""
+    source = (np.float32(place) + HALF) * (np.float32(coarse) / np.float32(size)) - HALF
+    source = source if source > ZERO else ZERO
+    first = min(int(source), coarse - 1)
+    return first, min(first + 1, coarse - 1), source - np.float32(first)
+
+
+@compiled
+def _sample(coarse: Any, k: int, rows: Any, cols: Any) -> Any:
+    """One plane, linearly between four samples."""
+    r0, r1, v = rows
+    c0, c1, u = cols
+    above = (ONE - u) * coarse[k, r0, c0] + u * coarse[k, r0, c1]
+    below = (ONE - u) * coarse[k, r1, c0] + u * coarse[k, r1, c1]
+    return (ONE - v) * above + v * below
+
+
+@entry
+def _push(level: Any, coarse: Any) -> Any:
+    """A level completed from the one above it: its own means where more than a quarter of it is known."""
+    planes, h, w = level.shape
+    result = np.empty((planes - 1, h, w), np.float32)
+    for i in range(h):
+        rows = _between(i, h, coarse.shape[1])
+        for j in range(w):
+            weight = level[planes - 1, i, j]
+            if weight > QUARTER:
+                for k in range(planes - 1):
+                    result[k, i, j] = level[k, i, j] / weight
+            else:
+                cols = _between(j, w, coarse.shape[2])
+                for k in range(planes - 1):
+                    result[k, i, j] = _sample(coarse, k, rows, cols)
+    return result
+
+
+@entry
+def _push_at(coarse: Any, h: int, w: int, places: Any) -> Any:
+    """A level above the frame, interpolated to some of the frame's pixels."""
+    result = np.empty((coarse.shape[0], places.size), np.float32)
+    for n in range(places.size):
+        rows = _between(places[n] // w, h, coarse.shape[1])
+        cols = _between(places[n] % w, w, coarse.shape[2])
+        for k in range(coarse.shape[0]):
+            result[k, n] = _sample(coarse, k, rows, cols)
+    return result

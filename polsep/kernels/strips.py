@@ -1,0 +1,291 @@
+"""The strips of `kernels.color_affine`: compiled code from raw rows to separated rows.
+
+A strip of cell rows runs through a line of rings (`kernels.moments`): demosaicking, Stokes vectors and noise, moments
+of the colours three rows later, window sums and the slope (`kernels.slope`) another twelve rows later. Guided Stokes
+rows (`kernels.guided`), where asked for, take the place of the bilinear ones at the end, except in pixels with clipped
+samples.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.kernels import guided
+from polsep.kernels.bilinear import (
+    PAD,
+    Pattern,
+    Window,
+    advance_window,
+    any_clipped,
+    flag_row,
+    interpolate_row,
+    make_analysers,
+    make_window,
+    open_window,
+)
+from polsep.kernels.cells import Source
+from polsep.kernels.compiling import ONE, THIRD, ZERO, compiled, entry
+from polsep.kernels.images import interleave_colors
+from polsep.kernels.moments import (
+    NOISE,
+    REACH,
+    WIDEST,
+    Conversion,
+    Rings,
+    Rows,
+    enter_row,
+    make_rings,
+    make_rows,
+    measure_misses,
+    measure_spread,
+    sum_noise,
+    weigh_row,
+)
+from polsep.kernels.polarization import add_polarization, polarize, sum_row
+from polsep.kernels.slope import find_slope
+from polsep.kernels.threads import Piece
+from polsep.kernels.unpack import Samples, read_row
+
+#: Cell rows of a strip; each also computes the moments of `REACH` rows above and below.
+STRIP = 128
+#: Cell rows of a piece that is guided: every piece starts with twice the reach of the guided rows.
+GUIDED_PIECE = 256
+
+#: Columns of ``sums``: s0, specular, DoLP above 1, power, power along and across, residual, noise.
+SUMS = 8
+
+
+class Targets(NamedTuple):
+    """What the kernel fills: colours ``[h, 3 w]``. What is not asked for is empty.
+
+    ``lines [4, h, w]``, slope and offset, and ``clipped [h, w]``, one bit per analyser and colour, 1 << (3 k + c), on
+    frames with clipped samples. ``dolp``, ``aolp [h, w]`` and ``sums [h, 8]``, of unclipped pixels, for a report.
+    """
+
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+    lines: NDArray[np.float32]
+    clipped: NDArray[np.uint16]
+    dolp: NDArray[np.float32]
+    aolp: NDArray[np.float32]
+    sums: NDArray[np.float64]
+
+
+class Frame(NamedTuple):
+    """A frame and how it is converted."""
+
+    source: Source
+    conversion: Conversion
+
+
+class Strip(NamedTuple):
+    """Room of one strip. ``better [STRIP, 5, w]``: guided Stokes rows, or empty."""
+
+    rows: Rows
+    rings: Rings
+    better: NDArray[np.float32]
+
+
+@compiled
+def _split(stokes: Any, slope: Any, planes: Any) -> None:
+    """Specular and diffuse of a row, ``planes [4, n]``."""
+    r, g, b, m1, m2 = stokes[0, PAD:], stokes[1, PAD:], stokes[2, PAD:], stokes[3, PAD:], stokes[4, PAD:]
+    a1, a2 = slope[0, PAD:], slope[1, PAD:]
+    tau, d0, d1, d2 = planes[0], planes[1], planes[2], planes[3]
+    for j in range(tau.size):
+        x, y, z = r[j] if r[j] > ZERO else ZERO, g[j] if g[j] > ZERO else ZERO, b[j] if b[j] > ZERO else ZERO
+        mean = THIRD * (r[j] + g[j] + b[j])
+        b1, b2 = m1[j] - a1[j] * mean, m2[j] - a2[j] * mean
+        ba, bb = b1 * a1[j] + b2 * a2[j], b1 * b1 + b2 * b2
+        rest = ONE - (a1[j] * a1[j] + a2[j] * a2[j])
+        specular = (ba + np.sqrt(ba * ba + rest * bb)) / rest
+        specular = specular if specular < x else x
+        specular = specular if specular < y else y
+        specular = specular if specular < z else z
+        tau[j] = specular
+        d0[j] = x - specular
+        d1[j] = y - specular
+        d2[j] = z - specular
+
+
+@compiled
+def _take_better(better: Any, clipped: Any, stokes: Any) -> None:
+    """Guided Stokes values in place of a row's bilinear ones, except in ``clipped`` pixels."""
+    for k in range(5):
+        x, out = better[k], stokes[k, PAD:]
+        if clipped.size:
+            for j in range(x.size):
+                out[j] = x[j] if clipped[j] == 0 else out[j]
+        else:
+            for j in range(x.size):
+                out[j] = x[j]
+
+
+@compiled
+def _keep_lines(stokes: Any, slope: Any, lines: Any) -> None:
+    """Slope and offset of a row, ``lines [4, w]``."""
+    for j in range(lines.shape[1]):
+        x = PAD + j
+        mean = THIRD * (stokes[0, x] + stokes[1, x] + stokes[2, x])
+        for i in range(2):
+            lines[i, j] = slope[i, x]
+            lines[2 + i, j] = stokes[3 + i, x] - slope[i, x] * mean
+
+
+@compiled
+def _average(planes: Any, first: int, start: int, out: Any) -> None:
+    """Mean of three rows from ``first`` on, each from ``start``."""
+    r, g, b = planes[first, start:], planes[first + 1, start:], planes[first + 2, start:]
+    for j in range(out.size):
+        out[j] = THIRD * (r[j] + g[j] + b[j])
+
+
+@compiled
+def _report(strip: Strip, t: int, clipped: Any, targets: Targets) -> None:
+    """DoLP and AoLP of row ``t``, and what its unclipped pixels add to the sums."""
+    rows, stokes = strip.rows, strip.rings.stokes[t % 16]
+    mean, p1, p2 = rows.spare[0], rows.spare[1], rows.spare[2]
+    dolp, sums = targets.dolp[t], targets.sums[t]
+    _average(stokes, 0, PAD, mean)
+    s1, s2 = stokes[3, PAD:], stokes[4, PAD:]
+    polarize(mean, s1, s2, dolp, targets.aolp[t])
+    for j in range(dolp.size):
+        p1[j] = ONE if dolp[j] > ONE else ZERO
+    sums[2] = sum_row(p1, clipped)
+    _average(rows.planes, 1, 0, mean)
+    a1, a2 = rows.slope[0, PAD:], rows.slope[1, PAD:]
+    for j in range(mean.size):
+        p1[j] = s1[j] - a1[j] * mean[j]
+        p2[j] = s2[j] - a2[j] * mean[j]
+    add_polarization(p1, p2, clipped, sums[3:6])
+    sums[1] = sum_row(rows.planes[0], clipped)
+    sums[0] = sums[1] + sum_row(mean, clipped)
+    spread = strip.rings.spread[t % 16]
+    contrast, first, second, total = spread[0, PAD:], spread[1, PAD:], spread[2, PAD:], spread[3, PAD:]
+    for j in range(mean.size):
+        explained = (a1[j] * a1[j] + a2[j] * a2[j]) * contrast[j]
+        left = total[j] - (a1[j] * first[j] + a2[j] * second[j]) * np.float32(2) + explained
+        p1[j] = np.sqrt(THIRD * left) if left > ZERO else ZERO
+    sums[6] = sum_row(p1, clipped)
+
+
+@compiled
+def _leave(gains: Any, place: tuple[int, int], strip: Strip, targets: Targets) -> None:
+    """Specular and diffuse of row ``t``, whose slope is found, to the images; ``place``: t and the strip's start."""
+    t, start = place
+    rows, rings, better = strip.rows, strip.rings, strip.better
+    stokes = rings.stokes[t % 16]
+    clipped = targets.clipped[t] if targets.clipped.size else targets.clipped[0:0].reshape(-1)
+    if better.size:
+        _take_better(better[t - start], clipped, stokes)
+    _split(stokes, rows.slope, rows.planes)
+    tau, d0, d1, d2 = rows.planes[0], rows.planes[1], rows.planes[2], rows.planes[3]
+    interleave_colors((tau, tau, tau), gains, targets.specular[t])
+    interleave_colors((d0, d1, d2), gains, targets.diffuse[t])
+    if targets.lines.size:
+        _keep_lines(stokes, rows.slope, targets.lines[:, t])
+    if targets.sums.size:
+        _report(strip, t, clipped, targets)
+
+
+@compiled
+def _enter(frame: Frame, t: int, window: Window, scratch: tuple[Rows, Rings]) -> bool:
+    """Demosaic row ``t`` and put it into the rings; True if a sample that it is made of is clipped."""
+    rows, pattern = scratch[0], frame.source.pattern
+    flagged = advance_window(frame.source.samples, pattern, window, t)
+    interpolate_row(pattern, window, t, rows.m)
+    if flagged:
+        flag_row(pattern, window, t, rows.flags)
+    enter_row(pattern, frame.conversion, flagged, t, scratch)
+    return flagged
+
+
+@compiled
+def _sum_noise(pattern: Pattern, t: int, rings: Rings, targets: Targets) -> None:
+    """The noise of row ``t``, whose window the rings hold, to the sums; neighbouring strips find the same."""
+    if targets.sums.size and 0 <= t < pattern.h:
+        targets.sums[t, 7] = sum_noise(pattern, rings.noise)
+
+
+@compiled
+def _separate_strip(frame: Frame, targets: Targets, start: int, better: Any) -> None:
+    """One strip of cell rows, from ``start`` on."""
+    samples, pattern, _ = frame.source
+    stop = min(start + STRIP, pattern.h)
+    first = max(start - REACH, 0)
+    window, scratch = make_window(pattern), (make_rows(pattern), make_rings(pattern.w))
+    rows, rings = scratch
+    strip = Strip(rows, rings, better)
+    open_window(samples, pattern, window, first)
+    for t in range(start - REACH, stop + REACH):
+        if first <= t < pattern.h:
+            flagged = _enter(frame, t, window, scratch)
+            if targets.sums.size:
+                measure_spread(pattern, t, scratch)
+            if flagged and start <= t < stop:
+                for j in range(pattern.w):
+                    targets.clipped[t, j] = rows.clipped[j]
+        elif t >= pattern.h:
+            rings.noise[t % 7] = ZERO
+        if t - 2 > first or t - 2 == 0:
+            measure_misses(pattern, t - 2, scratch)
+        if t - NOISE >= start - WIDEST:
+            weigh_row(pattern, t - NOISE, scratch)
+            _sum_noise(pattern, t - NOISE, rings, targets)
+            find_slope(pattern, t - REACH, start, scratch)
+        if t - REACH >= start:
+            _leave(frame.conversion.gains, (t - REACH, start), strip, targets)
+
+
+@entry
+def separate_rows(frame: Frame, targets: Targets, piece: Piece, better: Any) -> None:
+    """A piece of the frame's cell rows, strip by strip; ``better``: guided Stokes rows of its only strip, or empty."""
+    for start in range(piece[0], piece[1], STRIP):
+        _separate_strip(frame, targets, start, better)
+
+
+def separate_piece(frame: Frame, targets: Targets, piece: Piece) -> None:
+    """A piece of the frame's cell rows from bilinear samples."""
+    separate_rows(frame, targets, piece, np.empty((0, 5, frame.source.pattern.w), np.float32))
+
+
+def separate_guided_piece(frame: Frame, targets: Targets, piece: Piece) -> None:
+    """`separate_piece` from guided Stokes rows, which stream through all strips of the piece."""
+    stream = guided.open_stream(frame.source, piece[0])
+    better = np.empty((STRIP, 5, frame.source.pattern.w), np.float32)
+    for start in range(piece[0], piece[1], STRIP):
+        stop = min(start + STRIP, piece[1])
+        guided.demosaic_rows(frame.source, stream, (start, stop), better)
+        separate_rows(frame, targets, (start, stop), better)
+
+
+@entry
+def rows_clip(samples: Samples, pattern: Pattern, piece: Piece) -> bool:
+    """Whether any sample of a piece of the frame's cell rows is clipped."""
+    row = np.empty(2 * pattern.w, np.float32)
+    for y in range(2 * piece[0], 2 * piece[1]):
+        read_row(samples, pattern.top + y, pattern.left, row)
+        if any_clipped(row, pattern.clip_at):
+            return True
+    return False
+
+
+@entry
+def collect(samples: Samples, pattern: Pattern, places: Any, data: Any) -> None:
+    """The bilinear analysers of the pixels ``places [N]``, flat and ascending, into ``data [4, 3, N]``."""
+    window, m = make_window(pattern), make_analysers(pattern)
+    last = -2
+    for i in range(places.size):
+        r, j = places[i] // pattern.w, places[i] % pattern.w
+        if r != last:
+            if r != last + 1:
+                open_window(samples, pattern, window, r)
+            advance_window(samples, pattern, window, r)
+            interpolate_row(pattern, window, r, m)
+            last = r
+        for k in range(4):
+            for c in range(3):
+                data[k, c, i] = m[k, c, j]

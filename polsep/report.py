@@ -1,0 +1,106 @@
+"""What a separation says of its frame: exposure, the light's polarizer, how well the model fits.
+
+Statistics come from sums over pixels (`Tally`), so that a frame may be tallied in parts. All are of white light, that
+is before the light's colour is multiplied back, and polarization is that of all colours together.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from polsep.separation import Separation, light_polarizer_angle
+from polsep.stokes import Measurements, Stokes, dolp
+
+#: Below this concentration of AoLP there is no single polarized light. Real frames: 0.76 to 0.97 where one light or one
+#: reflecting surface polarizes, 0.31 to 0.50 in the open.
+MIN_CONCENTRATION = 0.6
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Sums over the ``pixels`` of a frame or of a part of it; parts add.
+
+    ``clipped``, ``valid``, ``above_one``: pixels with a clipped sample, without an assumption, with DoLP above 1.
+    ``s0``, ``specular``: of the means over colours; s0 is diffuse + specular. ``power``, ``along``, ``across``: of w^2,
+    w p1 and w p2 for the specular light's polarization (p1, p2) and w = |p|, as `separation.dominant_angle` has them.
+    ``residual``, ``noise``: of `Separation`'s, None where it has none.
+    """
+
+    pixels: int = 0
+    clipped: int = 0
+    valid: int = 0
+    above_one: int = 0
+    s0: float = 0.0
+    specular: float = 0.0
+    power: float = 0.0
+    along: float = 0.0
+    across: float = 0.0
+    residual: float | None = None
+    noise: float | None = None
+
+    def __add__(self, other: Tally) -> Tally:
+        """Sums over the pixels of both; a sum that one of them has not is the other's."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Tally(*(theirs if mine is None else mine if theirs is None else mine + theirs for mine, theirs in pairs))
+
+
+def grey(stokes: Stokes) -> Stokes:
+    """Stokes images ``[..., 1, h, w]`` of all colours together."""
+    return stokes.map(lambda image: image.mean(dim=-3, keepdim=True))
+
+
+def tally(found: Separation, measurements: Measurements) -> Tally:
+    """Sums over all pixels of a separation and the samples it was made of."""
+    mean = grey(found.stokes)
+    p1, p2 = (image.double() for image in (mean.s1[..., 0, :, :], mean.s2[..., 0, :, :]))
+    diffuse, specular = (image.mean(dim=-3).double() for image in (found.diffuse, found.specular))
+    if found.slope is not None:
+        p1, p2 = (p - found.slope[..., i, :, :] * diffuse for i, p in enumerate((p1, p2)))
+    weight = torch.hypot(p1, p2)
+    clipped = measurements.clipped
+    return Tally(
+        found.valid.numel(),
+        0 if clipped is None else int(clipped.any(dim=-4).any(dim=-3).sum()),
+        int(found.valid.sum()),
+        int((dolp(mean) > 1).sum()),
+        float((diffuse + specular).sum()),
+        float(specular.sum()),
+        float((weight * weight).sum()),
+        float((weight * p1).sum()),
+        float((weight * p2).sum()),
+        None if found.residual is None else float(found.residual.double().sum()),
+        None if found.noise is None else float(found.noise.double().sum()),
+    )
+
+
+def describe(sums: Tally) -> dict[str, Any]:
+    """Statistics and warnings of a frame for its report, without what its method does not measure."""
+    pixels = max(sums.pixels, 1)
+    angle = (0.5 * math.atan2(sums.across, sums.along)) % math.pi
+    concentration = math.hypot(sums.along, sums.across) / sums.power if sums.power > 0 else 0.0
+    brightness = sums.s0 / pixels
+    remarks = []
+    if brightness > 1e-3 and concentration < MIN_CONCENTRATION:
+        remarks.append(
+            f"polarized light of one angle was expected, found many (concentration {concentration:.2f}): "
+            "is the light polarized, and the only one?"
+        )
+    statistics = {
+        "clipped_fraction": sums.clipped / pixels,
+        "valid_fraction": sums.valid / pixels,
+        "mean_s0": brightness,
+        "specular_fraction": sums.specular / sums.s0 if sums.s0 > 0 else 0.0,
+        "dolp_above_1_fraction": sums.above_one / pixels,
+        "specular_aolp_deg": math.degrees(angle),
+        "specular_aolp_concentration": concentration,
+        "light_polarizer_deg": math.degrees(light_polarizer_angle(angle)),
+    }
+    if sums.residual is not None:
+        statistics["fit_residual"] = sums.residual / sums.s0 if sums.s0 > 0 else 0.0
+    if sums.noise is not None:
+        statistics["sample_noise"] = sums.noise / pixels
+    return {"statistics": statistics, "warnings": remarks}

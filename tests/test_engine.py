@@ -1,0 +1,161 @@
+"""A method's compiled twin gives the frame and the report that the method's own functions in torch give."""
+
+from __future__ import annotations
+
+import logging
+import math
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from polsep import engine
+from polsep.camera import Layout, Mosaic
+from polsep.pipeline import (
+    METHODS,
+    SeparatedFrame,
+    resolve_light_color,
+    separate_capture,
+    separate_in_engine,
+    separate_in_torch,
+)
+from polsep.stokes import Measurements
+
+SONY = ((90, 45), (135, 0))
+COLOR, MONO = Layout(), Layout(bayer=None)
+CROPPED = Layout(SONY, "GRBG", (1, 1))
+WHITE, ODD_LIGHT = (1.0, 1.0, 1.0), (1.0, 0.8, 0.6)
+IMAGES = {"analytic": 2e-6, "color-affine": 2e-5}  # of white; guided demosaicking weighs by what rounding changes
+ANGLE = 2e-5  # [rad], where DoLP is 1
+STATISTICS = 1e-4
+
+
+def capture(layout: Layout, shape: tuple[int, int] = (96, 120), light: tuple[float, ...] = WHITE) -> Mosaic:
+    """A 12-bit frame of smooth light with highlights of which some clip, in the colour of ``light``."""
+    y, x = torch.meshgrid(torch.linspace(0, 6, shape[0]), torch.linspace(0, 7, shape[1]), indexing="ij")
+    highlight = 5 * torch.exp(-((x - 3) ** 2 + (y - 3) ** 2) / 0.3)
+    data = torch.empty(shape)
+    for row in range(4):
+        for col in range(4):
+            at = (slice(row, None, 4), slice(col, None, 4))
+            filt = layout.filter_at(row, col)
+            turn = math.cos(2 * (filt.angle_deg * math.pi / 180 - 0.5))
+            albedo = 0.3 + 0.1 * torch.sin((2 + filt.channel) * x[at] + y[at]) * torch.cos(1.3 * y[at])
+            data[at] = light[filt.channel] * (albedo * (1 + 0.1 * turn) + highlight[at] * (0.5 + 0.4 * turn))
+    noise = 0.003 * torch.randn(shape, generator=torch.Generator().manual_seed(6))
+    return Mosaic(((data + noise).clamp(0, 1) * 4095).round(), layout, 20.0, 4095.0)
+
+
+def both(mosaic: Mosaic, method: str, light: tuple[float, ...]) -> tuple[SeparatedFrame, SeparatedFrame]:
+    """The frame by the engine and by torch."""
+    chosen, (light, _) = METHODS[method], resolve_light_color(light, mosaic)
+    found = separate_in_engine(mosaic, chosen, light)
+    assert found is not None
+    return found, separate_in_torch(mosaic, chosen, light, full=False)
+
+
+@pytest.mark.parametrize(
+    ("method", "layout", "shape", "light"),
+    [
+        ("analytic", COLOR, (96, 120), WHITE),
+        ("analytic", COLOR, (96, 120), ODD_LIGHT),
+        ("analytic", COLOR, (90, 70), WHITE),
+        ("analytic", CROPPED, (97, 121), ODD_LIGHT),
+        ("analytic", MONO, (96, 120), ODD_LIGHT),
+        ("color-affine", COLOR, (96, 120), WHITE),
+        ("color-affine", COLOR, (96, 120), ODD_LIGHT),
+        ("color-affine", COLOR, (90, 70), WHITE),
+        ("color-affine", CROPPED, (97, 121), ODD_LIGHT),
+    ],
+)
+def test_engine_and_torch_agree(method: str, layout: Layout, shape: tuple[int, int], light: tuple[float, ...]) -> None:
+    """Images, mask, DoLP, AoLP where it is defined, and every statistic, with clipped samples in the frame."""
+    found, expected = both(capture(layout, shape, light if layout.bayer else WHITE), method, light)
+    np.testing.assert_array_equal(found.valid, expected.valid)
+    assert not bool(found.valid.all())
+    assert float(found.valid.mean()) > 0.9
+    for name in ("diffuse", "specular", "dolp"):
+        image, twin = getattr(found, name), getattr(expected, name)
+        assert image.dtype == twin.dtype and image.shape == twin.shape
+        np.testing.assert_allclose(image, twin, rtol=IMAGES[method], atol=IMAGES[method] / min(light))
+    away = np.abs((found.aolp - expected.aolp + math.pi / 2) % math.pi - math.pi / 2)
+    assert float((away * expected.dolp).max()) < ANGLE
+    assert found.report["statistics"] == pytest.approx(expected.report["statistics"], rel=STATISTICS)
+    assert found.report["warnings"] == expected.report["warnings"]
+
+
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("method", METHODS)
+def test_dolp_aolp_and_statistics_are_of_white_light(method: str, full: bool) -> None:
+    """A scene in coloured light, with that colour said, has those of the scene in white light, by engine and torch."""
+    white = Mosaic(0.5 * capture(COLOR).linear(), COLOR, 0.0, 1.0)
+    colored = replace(white, data=replace(white, light_color=tuple(1 / gain for gain in ODD_LIGHT)).linear())
+    one, other = separate_capture(white, method, full=full), separate_capture(colored, method, ODD_LIGHT, full=full)
+    np.testing.assert_allclose(other.dolp, one.dolp, rtol=0, atol=1e-4)
+    assert other.report["statistics"] == pytest.approx(one.report["statistics"], rel=STATISTICS)
+    np.testing.assert_allclose(other.specular, one.specular * np.float32(ODD_LIGHT), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "data", [torch.zeros(2, 32, 32), torch.zeros(32, 32).double(), torch.zeros(32, 32, device="meta")], ids=str
+)
+def test_engines_leave_what_they_cannot_take(method: str, data: torch.Tensor) -> None:
+    """Batches, double precision and other devices are left to torch."""
+    assert METHODS[method].engine(Mosaic(data, COLOR, 0.0, 1.0)) is None
+
+
+def test_small_and_mono_frames_of_color_affine_are_left_to_torch() -> None:
+    """Where guided demosaicking falls back to bilinear, and mono frames, which the kernel does not take."""
+    assert engine.run_color_affine(Mosaic(torch.zeros(14, 64), COLOR, 0.0, 1.0)) is None
+    assert engine.run_color_affine(Mosaic(torch.zeros(64, 64), MONO, 0.0, 1.0)) is None
+    for layout, shape in ((COLOR, (14, 64)), (MONO, (64, 64)), (COLOR, (4, 4))):
+        out = separate_capture(Mosaic(torch.full(shape, 0.5), layout, 0.0, 1.0), "color-affine", device="cpu")
+        assert out.diffuse.shape == (shape[0] // 2, shape[1] // 2, layout.channels)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_full_resolution_and_measurements_are_torchs(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No kernel runs for them."""
+    calls: list[Mosaic] = []
+    monkeypatch.setitem(METHODS, method, replace(METHODS[method], engine=calls.append))
+    mosaic = capture(COLOR, (32, 32))
+    separate_capture(mosaic, method, full=True, device="cpu")
+    separate_capture(Measurements(torch.rand(4, 3, 16, 16), COLOR.angles), method, device="cpu")
+    assert calls == []
+    separate_capture(mosaic, method, device="cpu")
+    assert len(calls) == 1
+
+
+def test_slow_compilation_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """What is ready soon says nothing; what takes longer says so in one line, and not again."""
+    monkeypatch.setattr(engine, "PATIENCE", 0.05)
+
+    def quick(mosaic: Mosaic) -> None:
+        assert mosaic.data.ndim == 2
+
+    def slow(mosaic: Mosaic) -> None:
+        time.sleep(0.3)
+
+    with caplog.at_level(logging.WARNING, "polsep"):
+        engine._make_ready(quick)
+        assert caplog.messages == []
+        engine._make_ready(slow)
+        engine._make_ready(slow)
+    assert len(caplog.messages) == 1 and "compiling kernels" in caplog.messages[0]
+
+
+def test_kernels_are_loaded_with_the_first_frame() -> None:
+    """``polsep.separate`` can be named, and frames at full resolution separated, without numba."""
+    code = (
+        "import sys, numpy as np, polsep;"
+        "raw = np.full((32, 32), 0.5, np.float32);"
+        "polsep.separate(raw, layout=polsep.Layout(bayer=None), full=True, device='cpu');"
+        "print('numba' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
+    assert done.stdout.strip() == "False"

@@ -26,7 +26,7 @@ class Tally:
 
     ``clipped``, ``valid``, ``above_one``: pixels with a clipped sample, without an assumption, with DoLP above 1.
     ``s0``, ``specular``: of the means over colours; s0 is diffuse + specular. ``power``, ``along``, ``across``: of w^2,
-    w p1 and w p2 for the specular light's polarization (p1, p2) and w = |p|, as `separation.dominant_angle` has them.
+    w p1 and w p2 for the specular light's polarization (p1, p2) and w = |p|: highlights speak and noise does not.
     ``residual``, ``noise``: of `Separation`'s, None where it has none.
     """
 
@@ -77,11 +77,19 @@ def tally(found: Separation, measurements: Measurements) -> Tally:
     )
 
 
+def dominant_angle(sums: Tally) -> tuple[float, float]:
+    """Dominant angle [rad, in [0, pi)] of the specular light's polarization, and its concentration in [0, 1].
+
+    Concentration 1: one AoLP everywhere, as under one polarized light; near 0: no common direction.
+    """
+    angle = (0.5 * math.atan2(sums.across, sums.along)) % math.pi
+    return angle, math.hypot(sums.along, sums.across) / sums.power if sums.power > 0 else 0.0
+
+
 def describe(sums: Tally) -> dict[str, Any]:
     """Statistics and warnings of a frame for its report, without what its method does not measure."""
     pixels = max(sums.pixels, 1)
-    angle = (0.5 * math.atan2(sums.across, sums.along)) % math.pi
-    concentration = math.hypot(sums.along, sums.across) / sums.power if sums.power > 0 else 0.0
+    angle, concentration = dominant_angle(sums)
     brightness = sums.s0 / pixels
     remarks = []
     if brightness > 1e-3 and concentration < MIN_CONCENTRATION:

@@ -78,18 +78,6 @@ def box_mean(x: Tensor, radius: int) -> Tensor:
     return x
 
 
-def dominant_angle(images: Tensor) -> tuple[float, float]:
-    """Dominant angle [rad, in [0, pi)] of polarization images ``[2, h, w]`` (s1, s2) and its concentration in [0, 1].
-
-    Pixels count by the square of their polarized intensity, so that highlights speak and noise does not.
-    Concentration 1: one AoLP everywhere, as under one polarized light; near 0: no common direction.
-    """
-    s1, s2 = images[..., 0, :, :].double(), images[..., 1, :, :].double()
-    weight = torch.hypot(s1, s2)
-    total, x, y = float((weight * weight).sum()), float((weight * s1).sum()), float((weight * s2).sum())
-    return (0.5 * math.atan2(y, x)) % math.pi, (math.hypot(x, y) / total if total > 0 else 0.0)
-
-
 def light_polarizer_angle(specular_angle: float) -> float:
     """Polarizer angle of a light near the camera's axis, in its own beam's frame: a mirror turns nu into -nu [rad].
 

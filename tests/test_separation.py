@@ -17,11 +17,11 @@ from torch.nn.functional import interpolate
 from polsep.color_affine import MAX_DIFFUSE_DOLP, separate_color_affine, white_specular
 from polsep.pipeline import in_light, under_white_light
 from polsep.render import Part, PinholeCamera, PointLight, render
+from polsep.report import dominant_angle, tally
 from polsep.scenes import ball, plain
 from polsep.separation import (
     Separation,
     box_mean,
-    dominant_angle,
     light_polarizer_angle,
     separate_analytic,
     separate_analytic_unclipped,
@@ -401,9 +401,8 @@ def test_light_polarizer_angle_on_a_rendered_ball(degrees: float) -> None:
     light = PointLight(camera.position, 60.0, math.radians(degrees))
     ball_part = (Part(ball(1.2), plain((0.3, 0.3, 0.3)), roughness=0.35),)
     diffuse, specular = render(ball_part, camera, light, (64, 64))
-    found = separate_color_affine(measure(diffuse + specular, SONY))
-    s1, s2 = found.stokes.s1.mean(dim=0), found.stokes.s2.mean(dim=0)
-    angle, concentration = dominant_angle(torch.stack([s1, s2]))
+    samples = measure(diffuse + specular, SONY)
+    angle, concentration = dominant_angle(tally(separate_color_affine(samples), samples))
     error = math.degrees(light_polarizer_angle(angle)) - degrees
     assert abs((error + 90) % 180 - 90) < 1
     assert concentration > 0.5
@@ -411,11 +410,14 @@ def test_light_polarizer_angle_on_a_rendered_ball(degrees: float) -> None:
 
 def test_dominant_angle_at_special_points() -> None:
     """One angle everywhere has concentration 1; opposite ones, and no light at all, have 0."""
-    one = torch.tensor([math.cos(2.0), math.sin(2.0)]).view(2, 1, 1).expand(2, 5, 5)
-    angle, concentration = dominant_angle(one)
-    assert angle == pytest.approx(1.0, abs=1e-6) and concentration == pytest.approx(1, abs=1e-6)
-    assert dominant_angle(torch.cat([one, -one], dim=1))[1] == pytest.approx(0, abs=1e-6)
-    assert dominant_angle(torch.zeros(2, 5, 5))[1] == 0
+    shape = torch.tensor([1.0, -1.0, 0.0])
+    for signs, expected in ((shape[:1], 1), (shape[:2], 0), (shape[2:], 0)):
+        light = Stokes(*(k * signs.expand(1, 3, -1) for k in (2.0, math.cos(2.0), math.sin(2.0))))
+        samples = measure(light, SONY)
+        angle, concentration = dominant_angle(tally(separate_analytic(samples), samples))
+        assert concentration == pytest.approx(expected, abs=1e-6)
+        if expected:
+            assert angle == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("radius", [0, 1, 3, 40])

@@ -31,7 +31,7 @@ warnings.simplefilter("ignore")
 #: Row and column of the analysers 0, 45, 90, 135 in a cell.
 PLACES = ((1, 1), (0, 1), (0, 0), (1, 0))
 WHITE, WHITE_12_BIT = 65535.0, 4095.0
-MOST_RUNS, MOST_SECONDS = 10, 4.0
+MOST_RUNS, MOST_SECONDS = 40, 4.0
 
 Array = np.ndarray[Any, Any]
 

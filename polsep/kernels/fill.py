@@ -31,9 +31,9 @@ def interpolate_holes(finest: Level, shape: tuple[int, int], places: NDArray[np.
     while max(levels[-1].shape[1:]) > 1:
         levels.append(_halve(levels[-1]))
     result = _divide(levels.pop())
-    while levels:
+    while len(levels) > 1:
         result = _push(levels.pop(), result)
-    values: NDArray[np.float32] = _push_at(result, shape[0], shape[1], places)
+    values: NDArray[np.float32] = _push_at(finest, result, shape, places)
     return values
 
 
@@ -146,32 +146,45 @@ def _sample(coarse: Any, k: int, rows: Any, cols: Any) -> Any:
     return (ONE - v) * above + v * below
 
 
+@compiled
+def _add_pushed(level: Any, coarse: Any, place: tuple[int, int], share: Any, values: Any) -> None:
+    """Add ``share`` of one completed pixel of a level to ``values [K]``.
+
+    A level is completed from the one above it: its own means count where more than a quarter of a pixel is known.
+    """
+    planes, h, w = level.shape
+    i, j = place
+    weight = level[planes - 1, i, j]
+    if weight > QUARTER:
+        for k in range(planes - 1):
+            values[k] += share * level[k, i, j] / weight
+    else:
+        rows, cols = _between(i, h, coarse.shape[1]), _between(j, w, coarse.shape[2])
+        for k in range(planes - 1):
+            values[k] += share * _sample(coarse, k, rows, cols)
+
+
 @entry
 def _push(level: Any, coarse: Any) -> Any:
-    """A level completed from the one above it: its own means where more than a quarter of it is known."""
+    """A completed level."""
     planes, h, w = level.shape
-    result = np.empty((planes - 1, h, w), np.float32)
+    result = np.zeros((planes - 1, h, w), np.float32)
     for i in range(h):
-        rows = _between(i, h, coarse.shape[1])
         for j in range(w):
-            weight = level[planes - 1, i, j]
-            if weight > QUARTER:
-                for k in range(planes - 1):
-                    result[k, i, j] = level[k, i, j] / weight
-            else:
-                cols = _between(j, w, coarse.shape[2])
-                for k in range(planes - 1):
-                    result[k, i, j] = _sample(coarse, k, rows, cols)
+            _add_pushed(level, coarse, (i, j), ONE, result[:, i, j])
     return result
 
 
 @entry
-def _push_at(coarse: Any, h: int, w: int, places: Any) -> Any:
-    """A level above the frame, interpolated to some of the frame's pixels."""
-    result = np.empty((coarse.shape[0], places.size), np.float32)
+def _push_at(level: Any, coarse: Any, shape: tuple[int, int], places: Any) -> Any:
+    """The first level above a frame, completed and interpolated to some of the frame's pixels."""
+    planes, h, w = level.shape
+    result = np.zeros((planes - 1, places.size), np.float32)
     for n in range(places.size):
-        rows = _between(places[n] // w, h, coarse.shape[1])
-        cols = _between(places[n] % w, w, coarse.shape[2])
-        for k in range(coarse.shape[0]):
-            result[k, n] = _sample(coarse, k, rows, cols)
+        r0, r1, v = _between(places[n] // shape[1], shape[0], h)
+        c0, c1, u = _between(places[n] % shape[1], shape[1], w)
+        _add_pushed(level, coarse, (r0, c0), (ONE - v) * (ONE - u), result[:, n])
+        _add_pushed(level, coarse, (r0, c1), (ONE - v) * u, result[:, n])
+        _add_pushed(level, coarse, (r1, c0), v * (ONE - u), result[:, n])
+        _add_pushed(level, coarse, (r1, c1), v * u, result[:, n])
     return result

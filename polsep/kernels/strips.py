@@ -50,7 +50,7 @@ from polsep.kernels.threads import Piece
 from polsep.kernels.unpack import Samples, read_row
 
 #: Cell rows of a strip; each also computes the moments of `REACH` rows above and below.
-STRIP = 128
+STRIP = 256
 #: Cell rows of a piece that is guided: every piece starts with twice the reach of the guided rows.
 GUIDED_PIECE = 256
 

@@ -11,7 +11,7 @@ from polsep.camera import BAYER_ORDERS, IDEAL, IMX250, Layout, Mosaic, Sensor
 from polsep.color_affine import separate_color_affine
 from polsep.guided import demosaic_guided_half
 from polsep.kernels import ColorAffineOptions, get_threads, separate_color_affine_half, set_threads
-from polsep.kernels.strips import GUIDED_PIECE, STRIP
+from polsep.kernels.strips import CHUNK
 from polsep.report import describe, grey, tally
 from polsep.separation import Separation
 from polsep.stokes import Measurements, aolp, dolp
@@ -45,7 +45,7 @@ def test_agrees_on_analysers_of_any_angle(generator: torch.Generator) -> None:
     assert_twins(separate_color_affine_half(as_raw(mosaic), layout, 0, 4095, GUIDED), twins_of(mosaic)[0])
 
 
-@pytest.mark.parametrize("shape", [(16, 16), (17, 51), (2 * GUIDED_PIECE + 40, 20), (20, 301), (4 * STRIP + 6, 18)])
+@pytest.mark.parametrize("shape", [(16, 16), (17, 51), (8 * CHUNK + 40, 20), (20, 301), (4 * CHUNK + 6, 18)])
 @pytest.mark.parametrize("sensor", [IDEAL, IMX250], ids=["exact", "noisy"])
 def test_agrees_on_every_size(shape: tuple[int, int], sensor: Sensor, generator: torch.Generator) -> None:
     """Frames smaller than the filters' reach, mirrored again and again, and frames of several pieces."""
@@ -64,7 +64,7 @@ def test_agrees_where_samples_clip(brightness: float, generator: torch.Generator
 
 def test_threads_change_nothing(generator: torch.Generator) -> None:
     """The same bits from one thread and from several."""
-    raw = as_raw(random_frame((5 * GUIDED_PIECE, 40), Layout(), IMX250, 1.3, generator))
+    raw = as_raw(random_frame((20 * CHUNK, 40), Layout(), IMX250, 1.3, generator))
     before, found = get_threads(), []
     try:
         for threads in (1, 2, 5):

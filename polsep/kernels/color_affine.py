@@ -33,8 +33,6 @@ from polsep.kernels.images import check_images
 from polsep.kernels.moments import Conversion
 from polsep.kernels.polarization import polarize_pixels
 from polsep.kernels.strips import (
-    GUIDED_PIECE,
-    STRIP,
     SUMS,
     Frame,
     Targets,
@@ -43,10 +41,13 @@ from polsep.kernels.strips import (
     separate_guided_piece,
     separate_piece,
 )
-from polsep.kernels.threads import share
+from polsep.kernels.threads import get_threads, share
 from polsep.kernels.unpack import RawFrame, as_samples
 from polsep.report import Tally
 from polsep.stokes import Measurements, analyser_residual, stokes_inverse, unclipped_inverse
+
+#: Fewest cell rows of a strip that is worth a thread.
+LEAST_ROWS = 64
 
 
 @dataclass(frozen=True)
@@ -111,17 +112,15 @@ def separate_color_affine_half(
     out = options.out
     if out is None:
         out = ColorAffineImages.empty((raw.shape[0], raw.shape[1]), layout, options.report)
-    clips = any(share(partial(rows_clip, samples, pattern), pattern.h, STRIP))
+    height = strip_height(pattern.h)
+    clips = any(share(partial(rows_clip, samples, pattern), pattern.h, height))
     targets = _as_targets(out, pattern, clips, options.report)
     gains = np.array(options.light_color[:3] if options.in_light else (1, 1, 1), np.float32)
     # Filling compares colours with each other, so with clipped samples the light waits until it is done.
     conversion = Conversion(*_matrices(layout), np.ones(3, np.float32) if clips else gains)
     grid = read_grid(pattern, layout.angles, conversion.inverses[0])
     frame = Frame(Source(samples, pattern, grid), conversion)
-    if options.guided:
-        share(partial(separate_guided_piece, frame, targets), pattern.h, GUIDED_PIECE)
-    else:
-        share(partial(separate_piece, frame, targets), pattern.h, STRIP)
+    share(partial(separate_guided_piece if options.guided else separate_piece, frame, targets), pattern.h, height)
     out.valid[:] = True
     places = np.flatnonzero(targets.clipped)
     tally = _sum_rows(targets, pattern.h * pattern.w - places.size)
@@ -139,6 +138,11 @@ def warm_up() -> None:
     """Compile the kernels, or load them from numba's cache on disk. One compilation serves all dtypes and layouts."""
     for guided in (False, True):
         separate_color_affine_half(np.eye(8, dtype=np.uint8), Layout(), 0, 1, ColorAffineOptions(guided=guided))
+
+
+def strip_height(rows: int) -> int:
+    """Cell rows of a strip, an even number: a share of all for each thread, as every strip starts with rows twice."""
+    return max(LEAST_ROWS, (-(-rows // get_threads()) + 1) // 2 * 2)
 
 
 def _as_targets(out: ColorAffineImages, pattern: Pattern, clips: bool, report: bool) -> Targets:

@@ -61,13 +61,14 @@ def _add_to(x: Any, y: Any) -> None:
 
 
 @compiled
-def _push(weighted: Any, radius: int, pushed: int, fours: Any, block: Any) -> int:
-    """Put a row of weighted moments, the strip's ``pushed``-th, into a block of window sums.
+def _push(weighted: Any, radius: int, r: int, fours: Any, block: Any) -> int:
+    """Put row ``r`` of weighted moments into a block of window sums.
 
     Returns the row of the block which, with the sum behind the block, makes the sums of the window that ends here.
+    Blocks begin at multiples of their length, so that sums do not depend on where a strip starts.
     """
     length = 2 * radius + 1
-    place = pushed % length
+    place = r % length
     x, total = weighted.reshape(-1), block[length].reshape(-1)
     _sum_fours(x, fours)
     _sum_window(x, fours, radius, (block[place].reshape(-1), total))
@@ -124,6 +125,19 @@ def _own_pixel(x: Any, w: int, slope: Any) -> None:
 
 
 @compiled
+def _first_of_block(start: int, radius: int) -> int:
+    """The first row of the block that holds the first row of the window about row ``start``."""
+    length = 2 * radius + 1
+    return (start - radius) // length * length
+
+
+@compiled
+def first_weighed(start: int) -> int:
+    """The first row whose weighted moments `find_slope` takes on the way to the slope of row ``start``."""
+    return min(_first_of_block(start, WIDEST), _first_of_block(start, MIDDLE), _first_of_block(start, NARROW))
+
+
+@compiled
 def find_slope(pattern: Pattern, t: int, start: int, scratch: tuple[Rows, Rings]) -> None:
     """The slope of row ``t``, into ``rows.slope``; before ``start`` it only fills blocks."""
     rows, rings = scratch
@@ -133,10 +147,9 @@ def find_slope(pattern: Pattern, t: int, start: int, scratch: tuple[Rows, Rings]
     radii = (WIDEST, MIDDLE, NARROW)
     for i in range(3):
         radius, block = radii[i], blocks[i]
-        pushed = t - start + 2 * radius
-        if pushed < 0:
+        if t + radius < _first_of_block(start, radius):
             continue
-        row = _push(rings.weighted[(t + radius) % 16], radius, pushed, rows.fours, block)
+        row = _push(rings.weighted[(t + radius) % 16], radius, t + radius, rows.fours, block)
         if t >= start:
             per_window = 4 * rows_around(t, radius, pattern.h) / np.float32((2 * radius + 1) ** 2)
             part = (block[row], block[2 * radius + 1])

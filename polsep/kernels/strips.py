@@ -32,7 +32,6 @@ from polsep.kernels.images import interleave_colors
 from polsep.kernels.moments import (
     NOISE,
     REACH,
-    WIDEST,
     Conversion,
     Rings,
     Rows,
@@ -45,14 +44,12 @@ from polsep.kernels.moments import (
     weigh_row,
 )
 from polsep.kernels.polarization import add_polarization, polarize, sum_row
-from polsep.kernels.slope import find_slope
+from polsep.kernels.slope import find_slope, first_weighed
 from polsep.kernels.threads import Piece
 from polsep.kernels.unpack import Samples, read_row
 
-#: Cell rows of a strip; each also computes the moments of `REACH` rows above and below.
-STRIP = 256
-#: Cell rows of a piece that is guided: every piece starts with twice the reach of the guided rows.
-GUIDED_PIECE = 256
+#: Guided rows that are made at a time, before they are split.
+CHUNK = 64
 
 #: Columns of ``sums``: s0, specular, DoLP above 1, power, power along and across, residual, noise.
 SUMS = 8
@@ -82,11 +79,14 @@ class Frame(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """Room of one strip. ``better [STRIP, 5, w]``: guided Stokes rows, or empty."""
+    """A strip on its way: rows of results ``start`` to ``stop``, from weighted moments from row ``begin`` on."""
 
+    start: int
+    stop: int
+    begin: int
+    window: Window
     rows: Rows
     rings: Rings
-    better: NDArray[np.float32]
 
 
 @compiled
@@ -173,14 +173,12 @@ def _report(strip: Strip, t: int, clipped: Any, targets: Targets) -> None:
 
 
 @compiled
-def _leave(gains: Any, place: tuple[int, int], strip: Strip, targets: Targets) -> None:
-    """Specular and diffuse of row ``t``, whose slope is found, to the images; ``place``: t and the strip's start."""
-    t, start = place
-    rows, rings, better = strip.rows, strip.rings, strip.better
-    stokes = rings.stokes[t % 16]
+def _leave(gains: Any, t: int, strip: Strip, better: Any, targets: Targets) -> None:
+    """Specular and diffuse of row ``t``, whose slope is found, to the images; ``better``: its guided Stokes row."""
+    rows, stokes = strip.rows, strip.rings.stokes[t % 16]
     clipped = targets.clipped[t] if targets.clipped.size else targets.clipped[0:0].reshape(-1)
     if better.size:
-        _take_better(better[t - start], clipped, stokes)
+        _take_better(better, clipped, stokes)
     _split(stokes, rows.slope, rows.planes)
     tau, d0, d1, d2 = rows.planes[0], rows.planes[1], rows.planes[2], rows.planes[3]
     interleave_colors((tau, tau, tau), gains, targets.specular[t])
@@ -192,74 +190,73 @@ def _leave(gains: Any, place: tuple[int, int], strip: Strip, targets: Targets) -
 
 
 @compiled
-def _enter(frame: Frame, t: int, window: Window, scratch: tuple[Rows, Rings]) -> bool:
-    """Demosaic row ``t`` and put it into the rings; True if a sample that it is made of is clipped."""
-    rows, pattern = scratch[0], frame.source.pattern
-    flagged = advance_window(frame.source.samples, pattern, window, t)
-    interpolate_row(pattern, window, t, rows.m)
+def _enter(frame: Frame, t: int, strip: Strip, targets: Targets) -> None:
+    """Demosaic row ``t`` of the frame, put it into the rings, and note what is clipped."""
+    rows, pattern, scratch = strip.rows, frame.source.pattern, (strip.rows, strip.rings)
+    flagged = advance_window(frame.source.samples, pattern, strip.window, t)
+    interpolate_row(pattern, strip.window, t, rows.m)
     if flagged:
-        flag_row(pattern, window, t, rows.flags)
+        flag_row(pattern, strip.window, t, rows.flags)
     enter_row(pattern, frame.conversion, flagged, t, scratch)
-    return flagged
+    if targets.sums.size:
+        measure_spread(pattern, t, scratch)
+    if flagged and strip.start <= t < strip.stop:
+        for j in range(pattern.w):
+            targets.clipped[t, j] = rows.clipped[j]
 
 
 @compiled
-def _sum_noise(pattern: Pattern, t: int, rings: Rings, targets: Targets) -> None:
-    """The noise of row ``t``, whose window the rings hold, to the sums; neighbouring strips find the same."""
+def _weigh(frame: Frame, t: int, strip: Strip, targets: Targets) -> None:
+    """Weighted moments of row ``t``, and its noise to the sums, for which neighbouring strips find the same."""
+    pattern = frame.source.pattern
+    weigh_row(pattern, t, (strip.rows, strip.rings))
     if targets.sums.size and 0 <= t < pattern.h:
-        targets.sums[t, 7] = sum_noise(pattern, rings.noise)
-
-
-@compiled
-def _separate_strip(frame: Frame, targets: Targets, start: int, better: Any) -> None:
-    """One strip of cell rows, from ``start`` on."""
-    samples, pattern, _ = frame.source
-    stop = min(start + STRIP, pattern.h)
-    first = max(start - REACH, 0)
-    window, scratch = make_window(pattern), (make_rows(pattern), make_rings(pattern.w))
-    rows, rings = scratch
-    strip = Strip(rows, rings, better)
-    open_window(samples, pattern, window, first)
-    for t in range(start - REACH, stop + REACH):
-        if first <= t < pattern.h:
-            flagged = _enter(frame, t, window, scratch)
-            if targets.sums.size:
-                measure_spread(pattern, t, scratch)
-            if flagged and start <= t < stop:
-                for j in range(pattern.w):
-                    targets.clipped[t, j] = rows.clipped[j]
-        elif t >= pattern.h:
-            rings.noise[t % 7] = ZERO
-        if t - 2 > first or t - 2 == 0:
-            measure_misses(pattern, t - 2, scratch)
-        if t - NOISE >= start - WIDEST:
-            weigh_row(pattern, t - NOISE, scratch)
-            _sum_noise(pattern, t - NOISE, rings, targets)
-            find_slope(pattern, t - REACH, start, scratch)
-        if t - REACH >= start:
-            _leave(frame.conversion.gains, (t - REACH, start), strip, targets)
+        targets.sums[t, 7] = sum_noise(pattern, strip.rings.noise)
 
 
 @entry
-def separate_rows(frame: Frame, targets: Targets, piece: Piece, better: Any) -> None:
-    """A piece of the frame's cell rows, strip by strip; ``better``: guided Stokes rows of its only strip, or empty."""
-    for start in range(piece[0], piece[1], STRIP):
-        _separate_strip(frame, targets, start, better)
+def open_strip(frame: Frame, piece: Piece) -> Strip:
+    """A strip that is to separate a piece of the frame's cell rows."""
+    pattern, begin = frame.source.pattern, first_weighed(piece[0])
+    window = make_window(pattern)
+    open_window(frame.source.samples, pattern, window, max(begin - NOISE, 0))
+    return Strip(piece[0], piece[1], begin, window, make_rows(pattern), make_rings(pattern.w))
+
+
+@entry
+def separate_rows(frame: Frame, targets: Targets, strip: Strip, piece: Piece, better: Any) -> None:
+    """The next rows of a strip; ``better [rows, 5, w]``: their guided Stokes rows, or empty."""
+    pattern, scratch = frame.source.pattern, (strip.rows, strip.rings)
+    first = max(strip.begin - NOISE, 0)
+    for t in range(piece[0] + REACH if piece[0] > strip.start else strip.begin - NOISE, piece[1] + REACH):
+        if first <= t < pattern.h:
+            _enter(frame, t, strip, targets)
+        elif t >= pattern.h:
+            strip.rings.noise[t % 7] = ZERO
+        if t - 2 > first or t - 2 == 0:
+            measure_misses(pattern, t - 2, scratch)
+        if t - NOISE >= strip.begin:
+            _weigh(frame, t - NOISE, strip, targets)
+            find_slope(pattern, t - REACH, strip.start, scratch)
+        if t - REACH >= strip.start:
+            r = t - REACH
+            _leave(frame.conversion.gains, r, strip, better[r - piece[0]] if better.size else better[:0, 0], targets)
 
 
 def separate_piece(frame: Frame, targets: Targets, piece: Piece) -> None:
-    """A piece of the frame's cell rows from bilinear samples."""
-    separate_rows(frame, targets, piece, np.empty((0, 5, frame.source.pattern.w), np.float32))
+    """A strip of the frame from bilinear samples."""
+    nothing = np.empty((0, 5, frame.source.pattern.w), np.float32)
+    separate_rows(frame, targets, open_strip(frame, piece), piece, nothing)
 
 
 def separate_guided_piece(frame: Frame, targets: Targets, piece: Piece) -> None:
-    """`separate_piece` from guided Stokes rows, which stream through all strips of the piece."""
-    stream = guided.open_stream(frame.source, piece[0])
-    better = np.empty((STRIP, 5, frame.source.pattern.w), np.float32)
-    for start in range(piece[0], piece[1], STRIP):
-        stop = min(start + STRIP, piece[1])
-        guided.demosaic_rows(frame.source, stream, (start, stop), better)
-        separate_rows(frame, targets, (start, stop), better)
+    """A strip of the frame from guided Stokes rows, a few at a time."""
+    stream, strip = guided.open_stream(frame.source, piece[0]), open_strip(frame, piece)
+    better = np.empty((CHUNK, 5, frame.source.pattern.w), np.float32)
+    for start in range(piece[0], piece[1], CHUNK):
+        chunk = (start, min(start + CHUNK, piece[1]))
+        guided.demosaic_rows(frame.source, stream, chunk, better)
+        separate_rows(frame, targets, strip, chunk, better)
 
 
 @entry

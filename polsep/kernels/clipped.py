@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from polsep import color_affine as twin
 from polsep.kernels.compiling import HALF, ONE, THIRD, TWO, ZERO, compiled, entry
 from polsep.kernels.moments import Conversion
+from polsep.kernels.threads import Piece
 
 _LEAST_EIGENVALUE, _PRIOR = np.float32(twin.MIN_EIGENVALUE), np.float32(twin.PRIOR_WEIGHT)
 _SINGULAR, _FLAT, _SHORT = np.float32(1e-6), np.float32(1e-3), np.float32(1e-12)
@@ -134,10 +135,10 @@ def _white_specular(b1: Any, b2: Any, a1: Any, a2: Any) -> Any:
 
 
 @entry
-def solve_pixels(pixels: Pixels, analysers: Analysers) -> None:
-    """Diffuse, specular and offset of every pixel from its unclipped samples, and which of them are determined."""
+def solve_pixels(pixels: Pixels, analysers: Analysers, piece: Piece) -> None:
+    """Diffuse, specular and offset of pixels from their unclipped samples, and which of them are determined."""
     s, s0, kept = np.empty((3, 3), np.float32), np.empty(3, np.float32), np.empty(3, np.int64)
-    for n in range(pixels.clipped.size):
+    for n in range(piece[0], piece[1]):
         a1, a2 = pixels.lines[0, n], pixels.lines[1, n]
         _fit_unclipped(pixels, n, analysers.conversion, s, kept)
         pixels.residual[n] = _left_over(s, a1, a2)

@@ -37,6 +37,7 @@ from polsep.kernels.strips import (
     Frame,
     Targets,
     collect,
+    find_clipped,
     rows_clip,
     separate_guided_piece,
     separate_piece,
@@ -48,6 +49,8 @@ from polsep.stokes import Measurements, analyser_residual, stokes_inverse, uncli
 
 #: Fewest cell rows of a strip that is worth a thread.
 LEAST_ROWS = 64
+#: Pixels with clipped samples that one thread takes at a time.
+PIXELS = 1024
 
 
 @dataclass(frozen=True)
@@ -122,7 +125,7 @@ def separate_color_affine_half(
     frame = Frame(Source(samples, pattern, grid), conversion)
     share(partial(separate_guided_piece if options.guided else separate_piece, frame, targets), pattern.h, height)
     out.valid[:] = True
-    places = np.flatnonzero(targets.clipped)
+    places = find_clipped(targets.clipped)
     tally = _sum_rows(targets, pattern.h * pattern.w - places.size)
     if places.size:
         doubled = 2 * np.array(layout.angles)
@@ -187,8 +190,8 @@ def _complete(
     """Solve and fill the N pixels ``places`` with clipped samples, into ``out``; their sums."""
     (frame, analysers), lines = given, targets.lines.reshape(4, -1)
     pixels = make_pixels(targets.clipped.reshape(-1)[places], np.ascontiguousarray(lines[:, places]))
-    collect(frame.source.samples, frame.source.pattern, places, pixels.samples)
-    solve_pixels(pixels, analysers)
+    share(partial(collect, frame.source, places, pixels.samples), places.size, PIXELS)
+    share(partial(solve_pixels, pixels, analysers), places.size, PIXELS)
     lines[2:, places] = pixels.lines[2:]
     out.valid.reshape(-1)[places] = pixels.valid
     _write(pixels, places, out)

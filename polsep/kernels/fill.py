@@ -25,15 +25,14 @@ _PIECE = 64
 def interpolate_holes(finest: Level, shape: tuple[int, int], places: NDArray[np.int64]) -> NDArray[np.float32]:
     """Values ``[K, N]`` at the flat ``places [N]``, holes all, of a frame of that ``shape (h, w)``.
 
-    ``finest``: the first level above the frame, from `halve_specular` or `halve_separation`.
+    ``finest``: the first level above the frame, from `halve_specular` or `halve_separation`, which is completed.
     """
     levels = [finest]
     while max(levels[-1].shape[1:]) > 1:
         levels.append(_halve(levels[-1]))
-    result = _divide(levels.pop())
-    while len(levels) > 1:
-        result = _push(levels.pop(), result)
-    values: NDArray[np.float32] = _push_at(finest, result, shape, places)
+    for level, coarse in zip(levels[-2::-1], levels[:0:-1], strict=True):
+        _push(level, coarse)
+    values: NDArray[np.float32] = _push_at(finest, shape, places)
     return values
 
 
@@ -114,19 +113,6 @@ def _halve_planes(level: Any, coarse: Any) -> None:
                 coarse[k, i // 2, j // 2] += _share(i // 2, j // 2, h, w) * level[k, i, j]
 
 
-@entry
-def _divide(level: Any) -> Any:
-    """Totals over weights, whatever the weights are."""
-    planes, h, w = level.shape
-    result = np.empty((planes - 1, h, w), np.float32)
-    for k in range(planes - 1):
-        for i in range(h):
-            for j in range(w):
-                weight = level[planes - 1, i, j]
-                result[k, i, j] = level[k, i, j] / (weight if weight > _LEAST_WEIGHT else _LEAST_WEIGHT)
-    return result
-
-
 @compiled
 def _between(place: int, size: int, coarse: int) -> tuple[int, int, Any]:
     """The two samples of ``coarse`` that interpolation to ``place`` of ``size`` mixes, and the second one's share."""
@@ -137,54 +123,44 @@ def _between(place: int, size: int, coarse: int) -> tuple[int, int, Any]:
 
 
 @compiled
-def _sample(coarse: Any, k: int, rows: Any, cols: Any) -> Any:
-    """One plane, linearly between four samples."""
-    r0, r1, v = rows
-    c0, c1, u = cols
-    above = (ONE - u) * coarse[k, r0, c0] + u * coarse[k, r0, c1]
-    below = (ONE - u) * coarse[k, r1, c0] + u * coarse[k, r1, c1]
-    return (ONE - v) * above + v * below
+def _value(level: Any, k: int, i: int, j: int) -> Any:
+    """The mean of what is known of a pixel of a level."""
+    weight = level[-1, i, j]
+    return level[k, i, j] / (weight if weight > _LEAST_WEIGHT else _LEAST_WEIGHT)
 
 
 @compiled
-def _add_pushed(level: Any, coarse: Any, place: tuple[int, int], share: Any, values: Any) -> None:
-    """Add ``share`` of one completed pixel of a level to ``values [K]``.
-
-    A level is completed from the one above it: its own means count where more than a quarter of a pixel is known.
-    """
-    planes, h, w = level.shape
-    i, j = place
-    weight = level[planes - 1, i, j]
-    if weight > QUARTER:
-        for k in range(planes - 1):
-            values[k] += share * level[k, i, j] / weight
-    else:
-        rows, cols = _between(i, h, coarse.shape[1]), _between(j, w, coarse.shape[2])
-        for k in range(planes - 1):
-            values[k] += share * _sample(coarse, k, rows, cols)
+def _sample(level: Any, k: int, rows: Any, cols: Any) -> Any:
+    """One plane, linearly between four pixels."""
+    r0, r1, v = rows
+    c0, c1, u = cols
+    above = (ONE - u) * _value(level, k, r0, c0) + u * _value(level, k, r0, c1)
+    below = (ONE - u) * _value(level, k, r1, c0) + u * _value(level, k, r1, c1)
+    return (ONE - v) * above + v * below
 
 
 @entry
-def _push(level: Any, coarse: Any) -> Any:
-    """A completed level."""
+def _push(level: Any, coarse: Any) -> None:
+    """Complete a level from the one above it, wherever a quarter of a pixel or less is known."""
     planes, h, w = level.shape
-    result = np.zeros((planes - 1, h, w), np.float32)
     for i in range(h):
+        rows = _between(i, h, coarse.shape[1])
         for j in range(w):
-            _add_pushed(level, coarse, (i, j), ONE, result[:, i, j])
-    return result
+            if level[planes - 1, i, j] <= QUARTER:
+                cols = _between(j, w, coarse.shape[2])
+                for k in range(planes - 1):
+                    level[k, i, j] = _sample(coarse, k, rows, cols)
+                level[planes - 1, i, j] = ONE
 
 
 @entry
-def _push_at(level: Any, coarse: Any, shape: tuple[int, int], places: Any) -> Any:
-    """The first level above a frame, completed and interpolated to some of the frame's pixels."""
+def _push_at(level: Any, shape: tuple[int, int], places: Any) -> Any:
+    """The completed level above a frame, interpolated to some of the frame's pixels."""
     planes, h, w = level.shape
-    result = np.zeros((planes - 1, places.size), np.float32)
+    result = np.empty((planes - 1, places.size), np.float32)
     for n in range(places.size):
-        r0, r1, v = _between(places[n] // shape[1], shape[0], h)
-        c0, c1, u = _between(places[n] % shape[1], shape[1], w)
-        _add_pushed(level, coarse, (r0, c0), (ONE - v) * (ONE - u), result[:, n])
-        _add_pushed(level, coarse, (r0, c1), (ONE - v) * u, result[:, n])
-        _add_pushed(level, coarse, (r1, c0), v * (ONE - u), result[:, n])
-        _add_pushed(level, coarse, (r1, c1), v * u, result[:, n])
+        rows = _between(places[n] // shape[1], shape[0], h)
+        cols = _between(places[n] % shape[1], shape[1], w)
+        for k in range(planes - 1):
+            result[k, n] = _sample(level, k, rows, cols)
     return result

@@ -271,11 +271,12 @@ def rows_clip(samples: Samples, pattern: Pattern, piece: Piece) -> bool:
 
 
 @entry
-def collect(samples: Samples, pattern: Pattern, places: Any, data: Any) -> None:
-    """The bilinear analysers of the pixels ``places [N]``, flat and ascending, into ``data [4, 3, N]``."""
+def collect(source: Source, places: Any, data: Any, piece: Piece) -> None:
+    """The bilinear analysers of some pixels of ``places [N]``, flat and ascending, into ``data [4, 3, N]``."""
+    samples, pattern, _ = source
     window, m = make_window(pattern), make_analysers(pattern)
     last = -2
-    for i in range(places.size):
+    for i in range(piece[0], piece[1]):
         r, j = places[i] // pattern.w, places[i] % pattern.w
         if r != last:
             if r != last + 1:
@@ -286,3 +287,19 @@ def collect(samples: Samples, pattern: Pattern, places: Any, data: Any) -> None:
         for k in range(4):
             for c in range(3):
                 data[k, c, i] = m[k, c, j]
+
+
+@entry
+def find_clipped(clipped: Any) -> Any:
+    """The flat places of the pixels of ``clipped [h, w]`` that are not 0, ascending."""
+    flat = clipped.reshape(-1)
+    count = 0
+    for n in range(flat.size):
+        count += flat[n] != 0
+    places = np.empty(count, np.int64)
+    count = 0
+    for n in range(flat.size):
+        if flat[n] != 0:
+            places[count] = n
+            count += 1
+    return places

@@ -79,7 +79,7 @@ def _make_ready(run: Callable[[Mosaic], object]) -> None:
     notice = threading.Timer(
         PATIENCE,
         logging.getLogger("polsep").warning,
-        ("compiling kernels for this machine, once: up to a minute or two",),
+        ("compiling this method for this machine, once: up to a minute or two",),
     )
     notice.daemon = True
     notice.start()

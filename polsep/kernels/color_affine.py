@@ -197,7 +197,7 @@ def _complete(
     _write(pixels, places, out)
     if not pixels.valid.all():
         _fill(pixels, analysers, targets, places, out)
-    if out.dolp is None or out.aolp is None:
+    if out.dolp is None or out.aolp is None or not targets.sums.size:
         return Tally()
     degree, angle = np.empty(places.size, np.float32), np.empty(places.size, np.float32)
     polarize_pixels(pixels.stokes, degree, angle)

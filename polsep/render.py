@@ -153,19 +153,24 @@ def cast(parts: tuple[Part, ...], camera: PinholeCamera, rows: Tensor, cols: Ten
     return GBuffer(position, surface_normal(parts, position), albedo, roughness, specular, hit)
 
 
-def shade(buffer: GBuffer, parts: tuple[Part, ...], camera: PinholeCamera, light: PointLight) -> tuple[Stokes, Stokes]:
-    """Diffuse and specular Stokes images ``[3, N, 1]`` of a G-buffer under one light, with cast shadows."""
+def is_lit(parts: tuple[Part, ...], buffer: GBuffer, light: PointLight) -> Tensor:
+    """Whether the points of a G-buffer see the light, ``[1, N, 1]``; False where nothing was hit."""
+    to_light = torch.tensor(light.position, dtype=torch.float32).to(buffer.position).view(3, 1, 1) - buffer.position
+    distance = torch.sqrt(dot(to_light, to_light))
+    _, shadowed = trace(parts, buffer.position + 4e-3 * buffer.normal, to_light / distance, distance)
+    return buffer.mask & ~shadowed
+
+
+def shade(buffer: GBuffer, camera: PinholeCamera, light: PointLight, lit: Tensor) -> tuple[Stokes, Stokes]:
+    """Diffuse and specular Stokes images ``[3, N, 1]`` of a G-buffer under one light, black where not ``lit``."""
     position, normal = buffer.position, buffer.normal
     up = torch.tensor([0.0, 1.0, 0.0]).to(position).view(3, 1, 1)
     to_light = torch.tensor(light.position, dtype=torch.float32).to(position).view(3, 1, 1) - position
     distance = torch.sqrt(dot(to_light, to_light))
     to_camera = normalize(torch.tensor(camera.position, dtype=torch.float32).to(position).view(3, 1, 1) - position)
-    to_light = to_light / distance
-    lifted = position + 4e-3 * normal
-    _, shadowed = trace(parts, lifted, to_light, distance)
-    irradiance = light.intensity / distance**2 * (buffer.mask & ~shadowed)
+    irradiance = light.intensity / distance**2 * lit
     polarizer = torch.tensor(light.polarizer, dtype=torch.float32).to(position)
-    geometry = Geometry(normal, to_camera, to_light, up, up)
+    geometry = Geometry(normal, to_camera, to_light / distance, up, up)
     diffuse = diffuse_stokes(geometry, polarizer, irradiance, buffer.albedo)
     specular = specular_stokes(geometry, polarizer, irradiance, buffer.roughness) * buffer.specular
     return diffuse, specular.map(lambda s: s.expand_as(diffuse.s0))
@@ -175,6 +180,21 @@ def render(
     parts: tuple[Part, ...], camera: PinholeCamera, light: PointLight, size: tuple[int, int], samples: int = 1
 ) -> tuple[Stokes, Stokes]:
     """Diffuse and specular Stokes images ``[3, H, W]``, the mean of ``samples`` x ``samples`` rays per pixel."""
+
+    def shade_points(rows: Tensor, cols: Tensor) -> tuple[Stokes, Stokes]:
+        buffer = cast(parts, camera, rows, cols, size)
+        return shade(buffer, camera, light, is_lit(parts, buffer, light))
+
+    return render_points(shade_points, size, samples)
+
+
+def render_points(
+    shade_points: Callable[[Tensor, Tensor], tuple[Stokes, Stokes]], size: tuple[int, int], samples: int
+) -> tuple[Stokes, Stokes]:
+    """Images ``[3, H, W]`` from what shades image points (rows, cols) ``[N]`` to ``[3, N, 1]``, band by band.
+
+    A pixel is the mean over ``samples`` x ``samples`` points.
+    """
     height, width = size
     rows_at_once = max(1, RAYS_AT_ONCE // (width * samples**2))
     cols = (torch.arange(width * samples) + 0.5) / samples
@@ -183,8 +203,7 @@ def render(
         count = min(rows_at_once, height - first) * samples
         rows = first + (torch.arange(count) + 0.5) / samples
         grid_rows, grid_cols = (g.flatten() for g in torch.meshgrid(rows, cols, indexing="ij"))
-        shaded = shade(cast(parts, camera, grid_rows, grid_cols, size), parts, camera, light)
-        for lobe, band in zip(lobes, shaded, strict=True):
+        for lobe, band in zip(lobes, shade_points(grid_rows, grid_cols), strict=True):
             lobe.append(band.map(lambda s, n=count: avg_pool2d(s.view(1, 3, n, -1), samples)[0]))  # type: ignore[misc]
     diffuse, specular = (
         Stokes(*(torch.cat(rows, dim=1) for rows in zip(*map(_parts, lobe), strict=True))) for lobe in lobes

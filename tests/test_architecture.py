@@ -23,6 +23,8 @@ RANKS = {
     "guided": 3,
     "layout_check": 3,
     "render": 3,
+    "shapes": 3,
+    "raycast": 3,
     "report": 3,
     "scenes": 3,
     "levels": 4,
@@ -39,6 +41,8 @@ RANKS = {
 WITHIN = {
     ("color_affine", "separation"),
     ("scenes", "render"),
+    ("raycast", "render"),
+    ("raycast", "shapes"),
     ("engine", "kernels"),
     ("pipeline", "engine"),
     ("pipeline", "kernels"),
@@ -60,6 +64,7 @@ HOMES = {
     "argparse": "cli",
     "click": "cli",
     "torch.optim": "train",
+    "embreex": "raycast",
 }
 #: Calls that touch files, by name of the function or method.
 FILE_CALLS = {"open", "read_bytes", "write_bytes", "read_text", "write_text", "imread", "imwrite", "fromfile", "tofile"}

@@ -19,7 +19,7 @@ from polsep.camera import IMX250, Layout, Sensor, expose
 from polsep.layout_check import check_layout
 from polsep.levels import as_mosaic
 from polsep.pipeline import METHODS
-from polsep.render import cast, render, shade
+from polsep.render import cast, is_lit, render, shade
 from polsep.scenes import still_life
 
 CAPTURE = Path(polsep.__file__).parent / "data" / "still_life.png"
@@ -76,7 +76,8 @@ def test_the_still_life_is_the_capture(first: int) -> None:
     parts, camera, light = still_life()
     rows, cols = first + (torch.arange(8) + 0.5) / 2, (torch.arange(2 * 2448) + 0.5) / 2
     points = [g.flatten() for g in torch.meshgrid(rows, cols, indexing="ij")]
-    diffuse, specular = shade(cast(parts, camera, *points, (2048, 2448)), parts, camera, light)
+    buffer = cast(parts, camera, *points, (2048, 2448))
+    diffuse, specular = shade(buffer, camera, light, is_lit(parts, buffer, light))
     stokes = (diffuse + specular).map(lambda s: avg_pool2d(s.view(1, 3, 8, -1), 2)[0])
     expected = expose(stokes, Layout(), Sensor(diattenuation=IMX250.diattenuation)).data
     deviation = (codes / 4095 - expected) / IMX250.noise_variance(expected).sqrt()

@@ -1,0 +1,142 @@
+"""Rays against triangle meshes by Embree: what each ray of a camera hits, and whether a light reaches it.
+
+`Hits` hold geometry alone, so that many materials (`dress`) and lights (`is_lit`) share one cast. Conventions are those
+of `polsep.render`; normals are interpolated from the mesh's vertices and face the camera. Needs the extra ``render``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polsep.optics import dot, normalize
+from polsep.render import GBuffer, PinholeCamera, PointLight, camera_rays, render_points, shade
+from polsep.shapes import Mesh
+from polsep.stokes import Stokes
+
+#: Cosine to the camera that a visible interpolated normal has at least: triangles at a silhouette are seen, though the
+#: smooth surface they stand for would be turned away.
+LEAST_COSINE = 1e-3
+#: How far above its triangle a shadow ray starts, relative to the mesh's size.
+LIFT = 1e-3
+
+
+@dataclass(frozen=True)
+class MeshScene:
+    """A mesh that rays can be cast against; building it takes longer than a cast."""
+
+    mesh: Mesh
+    tracer: Any = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        tracer = EmbreeScene()
+        TriangleMesh(tracer, self.mesh.vertices.astype(np.float32), self.mesh.faces.astype(np.int32))
+        object.__setattr__(self, "tracer", tracer)
+
+    @property
+    def size(self) -> float:
+        """The largest extent along an axis, in scene units."""
+        return float(np.ptp(self.mesh.vertices, axis=0).max())
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What rays hit: ``position``, unit ``normal`` and ``face_normal`` of the triangle itself, both toward the camera,
+    all ``[3, N, 1]``; ``uv [2, N, 1]``; and the material ``slot [1, N, 1]``, -1 where they hit nothing.
+    """
+
+    position: Tensor
+    normal: Tensor
+    face_normal: Tensor
+    uv: Tensor
+    slot: Tensor
+
+
+@dataclass(frozen=True)
+class Materials:
+    """A material per slot: linear RGB ``albedo [S, 3]``, ``roughness`` and ``specular [S]`` as in `render.Part`."""
+
+    albedo: Tensor
+    roughness: Tensor
+    specular: Tensor
+
+
+def find_hits(scene: MeshScene, camera: PinholeCamera, points: tuple[Tensor, Tensor], size: tuple[int, int]) -> Hits:
+    """The first triangles behind image points (rows, cols) ``[N]`` of an H x W image."""
+    origin, direction = camera_rays(camera, *points, size)
+    found = _run(scene, origin.expand_as(direction), direction, output=1)
+    triangle = torch.from_numpy(found["primID"]).long()
+    hit, triangle = triangle >= 0, triangle.clamp(min=0)
+    weights = torch.from_numpy(np.stack([1 - found["u"] - found["v"], found["u"], found["v"]]))
+    corners = torch.from_numpy(scene.mesh.faces)[triangle]
+    distance = torch.where(hit, torch.from_numpy(found["tfar"]), 0.0)
+    facing = -normalize(torch.from_numpy(found["Ng"]).T[..., None].double()).float()
+    facing = torch.where(dot(facing, direction) > 0, -facing, facing)
+    return Hits(
+        origin + distance[None, :, None] * direction,
+        _toward(_interpolate(scene.mesh.normals, corners, weights), -direction),
+        facing,
+        _interpolate(scene.mesh.uv, corners, weights),
+        torch.where(hit, torch.from_numpy(scene.mesh.slots)[triangle], -1)[None, :, None],
+    )
+
+
+def dress(hits: Hits, materials: Materials) -> GBuffer:
+    """The G-buffer of hits with materials; black where nothing was hit."""
+    slot = hits.slot[0, :, 0].clamp(min=0)
+    mask = hits.slot >= 0
+    albedo = materials.albedo[slot].T[..., None] * mask
+    roughness, specular = (x[slot][None, :, None] for x in (materials.roughness, materials.specular))
+    return GBuffer(hits.position, hits.normal, albedo, roughness, specular * mask, mask)
+
+
+def is_lit(scene: MeshScene, hits: Hits, light: PointLight) -> Tensor:
+    """Whether hits see the light, ``[1, N, 1]``; False where nothing was hit."""
+    lifted = hits.position + LIFT * scene.size * hits.face_normal
+    way = torch.tensor(light.position, dtype=torch.float32).view(3, 1, 1) - lifted
+    distance = torch.sqrt(dot(way, way))
+    blocker = _run(scene, lifted, way / distance, query="OCCLUDED", dists=distance.flatten().numpy())
+    return (torch.from_numpy(blocker) < 0)[None, :, None] & (hits.slot >= 0)
+
+
+def render_mesh(
+    model: tuple[MeshScene, Materials],
+    camera: PinholeCamera,
+    light: PointLight,
+    size: tuple[int, int],
+    samples: int = 1,
+) -> tuple[Stokes, Stokes]:
+    """`render.render` of a mesh: diffuse and specular Stokes images ``[3, H, W]``."""
+    scene, materials = model
+
+    def shade_points(rows: Tensor, cols: Tensor) -> tuple[Stokes, Stokes]:
+        hits = find_hits(scene, camera, (rows, cols), size)
+        return shade(dress(hits, materials), camera, light, is_lit(scene, hits, light))
+
+    return render_points(shade_points, size, samples)
+
+
+def _run(scene: MeshScene, origin: Tensor, direction: Tensor, **options: Any) -> Any:
+    """Embree's answer for rays ``[3, N, 1]``."""
+    origins, directions = (np.ascontiguousarray(x[..., 0].T.numpy(), np.float32) for x in (origin, direction))
+    return scene.tracer.run(origins, directions, **options)
+
+
+def _interpolate(values: NDArray[np.float64], corners: Tensor, weights: Tensor) -> Tensor:
+    """Vertex values ``[V, K]`` at points of triangles, ``[K, N, 1]``."""
+    at_corners = torch.from_numpy(values).float()[corners]
+    return torch.einsum("nck,cn->kn", at_corners, weights)[..., None]
+
+
+def _toward(normal: Tensor, viewer: Tensor) -> Tensor:
+    """Unit normals, turned just toward the viewer where they look away."""
+    normal = normalize(normal)
+    missing = (LEAST_COSINE - dot(normal, viewer)).clamp(min=0)
+    return normalize(normal + missing * viewer)

@@ -1,0 +1,102 @@
+"""Meshes rendered through Embree: the same light as the same solid traced as a signed distance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from polsep.raycast import Materials, MeshScene, dress, find_hits, is_lit, render_mesh
+from polsep.render import Part, PinholeCamera, PointLight, render
+from polsep.scenes import ball, plain
+from polsep.shapes import FINE, Floats, box, ellipsoid, join, moved, random_mesh
+
+FLAT: list[Floats] = [np.zeros((FINE, FINE))] * 6
+SIZE = (96, 112)
+#: What a mesh of 10000 triangles leaves of a smooth ball's light: everywhere but at the rim, and at it, where a polygon
+#: covers less of a pixel and light grazes.
+INSIDE, RIM = 5e-4, 2e-2
+COLOR = (0.3, 0.5, 0.2)
+
+
+def one_material(slots: int = 1, color: tuple[float, float, float] = COLOR) -> Materials:
+    return Materials(torch.tensor([color] * slots), torch.full((slots,), 0.35), torch.full((slots,), 0.8))
+
+
+def unit_ball() -> MeshScene:
+    return MeshScene(ellipsoid(np.ones(3), FLAT))
+
+
+def every_point(size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+    rows, cols = torch.meshgrid(torch.arange(size[0]) + 0.5, torch.arange(size[1]) + 0.5, indexing="ij")
+    return rows.flatten(), cols.flatten()
+
+
+@pytest.mark.parametrize("light", [PointLight((1.0, 2.0, 8.0), 60.0, 0.4), PointLight((-6.0, 1.0, 3.0), 60.0, 2.0)])
+def test_a_ball_is_the_ball(light: PointLight) -> None:
+    """Diffuse and specular Stokes images of the mesh agree with those of the signed distance."""
+    camera = PinholeCamera((0.5, 1.0, 6.0))
+    found = render_mesh((unit_ball(), one_material()), camera, light, SIZE, 3)
+    expected = render((Part(ball(1.0), plain(COLOR), roughness=0.35, specular=0.8),), camera, light, SIZE, 3)
+    for lobe, exact in zip(found, expected, strict=True):
+        for name in ("s0", "s1", "s2"):
+            wrong = (getattr(lobe, name) - getattr(exact, name)).abs()
+            assert float(wrong.max()) < RIM
+            assert float(torch.quantile(wrong, 0.995)) < INSIDE
+
+
+def test_what_misses_is_black() -> None:
+    """No hit: no slot, no material, no light."""
+    hits = find_hits(unit_ball(), PinholeCamera((0.0, 0.0, 6.0), (0.0, 5.0, 0.0)), every_point(SIZE), SIZE)
+    assert bool((hits.slot == -1).all())
+    buffer = dress(hits, one_material())
+    assert not bool(buffer.mask.any())
+    assert float(buffer.albedo.abs().max()) == 0
+    assert not bool(is_lit(unit_ball(), hits, PointLight()).any())
+
+
+def test_a_wall_casts_its_shadow() -> None:
+    """A box between light and ball takes the light from the ball, and from nothing that it does not hide."""
+    wall = moved(box(np.array([3.0, 3.0, 0.1]), FLAT), np.eye(3), np.array([0.0, 0.0, 3.0]))
+    camera, light = PinholeCamera((8.0, 0.0, 0.0)), PointLight((0.0, 0.0, 8.0), 60.0)
+    alone = unit_ball()
+    behind = MeshScene(join(alone.mesh, wall))
+    hits = find_hits(alone, camera, every_point(SIZE), SIZE)
+    lit = is_lit(alone, hits, light)
+    toward_light = hits.position[2:] > 0.2
+    assert bool(lit[toward_light & (hits.slot == 0)].all())
+    assert not bool(is_lit(behind, hits, light).any())
+    assert not bool(lit[hits.position[2:] < -0.05].any())
+
+
+def test_slots_choose_materials() -> None:
+    """Every face of a box shows its own albedo, seen straight on."""
+    scene = MeshScene(box(np.ones(3), FLAT))
+    colors = torch.rand(6, 3, generator=torch.Generator().manual_seed(1))
+    materials = Materials(colors, torch.full((6,), 0.3), torch.ones(6))
+    for face, eye in ((0, (9.0, 0.0, 0.0)), (1, (-9.0, 0.0, 0.0)), (4, (0.0, 0.0, 9.0)), (5, (0.0, 0.0, -9.0))):
+        hits = find_hits(scene, PinholeCamera(eye), (torch.tensor([48.0]), torch.tensor([56.0])), SIZE)
+        assert int(hits.slot) == face
+        torch.testing.assert_close(dress(hits, materials).albedo[:, 0, 0], colors[face])
+        direction = torch.tensor(eye) / math.hypot(*eye)
+        torch.testing.assert_close(hits.normal[:, 0, 0], direction, rtol=0, atol=1e-5)
+
+
+def test_random_shapes_obey_physics() -> None:
+    """All finite, DoLP of the diffuse below the Fresnel limit, the specular fully polarized, normals seen."""
+    for seed in range(3):
+        generator = torch.Generator().manual_seed(seed)
+        scene = MeshScene(random_mesh(generator))
+        slots = scene.mesh.slot_count
+        camera = PinholeCamera((0.0, 0.6 * scene.size, 2.4 * scene.size))
+        light = PointLight((scene.size, 2 * scene.size, 2 * scene.size), 5 * scene.size**2, 1.0)
+        diffuse, specular = render_mesh((scene, one_material(slots)), camera, light, (64, 64))
+        assert float(diffuse.s0.max()) > 0.01
+        for stokes in (diffuse, specular):
+            assert all(bool(torch.isfinite(s).all()) for s in (stokes.s0, stokes.s1, stokes.s2))
+            assert float(stokes.s0.min()) >= 0
+        polarized = torch.hypot(diffuse.s1, diffuse.s2)
+        assert bool((polarized <= 0.39 * diffuse.s0 + 1e-6).all())
+        torch.testing.assert_close(torch.hypot(specular.s1, specular.s2), specular.s0, rtol=1e-3, atol=1e-5)

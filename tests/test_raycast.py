@@ -16,9 +16,9 @@ from polsep.shapes import FINE, Floats, box, ellipsoid, join, moved, random_mesh
 
 FLAT: list[Floats] = [np.zeros((FINE, FINE))] * 6
 SIZE = (96, 112)
-#: What a mesh of 10000 triangles leaves of a smooth ball's light: where it faces the camera, and at the rim, where a polygon
+#: What a mesh of 10000 triangles leaves of a smooth ball's light (1 % in highlights), and of its rim, where it
 #: covers less of a pixel and light grazes.
-INSIDE, RIM = 1e-3, 2e-2
+INSIDE, RIM = 5e-3, 2e-2
 COLOR = (0.3, 0.5, 0.2)
 
 

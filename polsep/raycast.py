@@ -48,11 +48,14 @@ class MeshScene:
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays hit: ``position`` and unit ``normal``, toward the camera; ``above``, where shadow rays start, just out
-    of the smooth surface that the triangles stand for; all ``[3, N, 1]``. ``uv [2, N, 1]``, and the material
-    ``slot [1, N, 1]``, -1 where rays hit nothing.
+    """What those M of N rays hit that hit anything: ``ray [M]``, which of the N they are, and ``rays``, N.
+
+    ``position`` and unit ``normal``, toward the camera; ``above``, where shadow rays start, just out of the smooth
+    surface that the triangles stand for; all ``[3, M, 1]``. ``uv [2, M, 1]``; the material ``slot [M]``.
     """
 
+    rays: int
+    ray: Tensor
     position: Tensor
     normal: Tensor
     above: Tensor
@@ -69,42 +72,48 @@ class Materials:
     specular: Tensor
 
 
+#: What `render_mesh` renders: a mesh, and a material for each of its slots.
+Model = tuple[MeshScene, Materials]
+
+
 def find_hits(scene: MeshScene, camera: PinholeCamera, points: tuple[Tensor, Tensor], size: tuple[int, int]) -> Hits:
     """The first triangles behind image points (rows, cols) ``[N]`` of an H x W image."""
     origin, direction = camera_rays(camera, *points, size)
     found = _run(scene, origin.expand_as(direction), direction, output=1)
-    triangle = torch.from_numpy(found["primID"]).long()
-    hit, triangle = triangle >= 0, triangle.clamp(min=0)
-    weights = torch.from_numpy(np.stack([1 - found["u"] - found["v"], found["u"], found["v"]]))
-    corners = torch.from_numpy(scene.mesh.faces)[triangle]
-    distance = torch.where(hit, torch.from_numpy(found["tfar"]), 0.0)
-    facing = -normalize(torch.from_numpy(found["Ng"]).T[..., None].double()).float()
-    facing = torch.where(dot(facing, direction) > 0, -facing, facing)
+    ray = torch.from_numpy(np.flatnonzero(found["primID"] >= 0))
+    triangle, u, v, distance = (torch.from_numpy(found[name])[ray] for name in ("primID", "u", "v", "tfar"))
+    triangle = triangle.long()
+    weights, corners = torch.stack([1 - u - v, u, v]), torch.from_numpy(scene.mesh.faces)[triangle]
+    direction = direction[:, ray]
     position = origin + distance[None, :, None] * direction
+    facing = normalize(torch.from_numpy(found["Ng"])[ray].T[..., None])
+    facing = torch.where(dot(facing, direction) > 0, -facing, facing)
     return Hits(
+        points[0].numel(),
+        ray,
         position,
         _toward(_interpolate(scene.mesh.normals, corners, weights), -direction),
         _above(scene.mesh, position, corners, weights) + LIFT * scene.size * facing,
         _interpolate(scene.mesh.uv, corners, weights),
-        torch.where(hit, torch.from_numpy(scene.mesh.slots)[triangle], -1)[None, :, None],
+        torch.from_numpy(scene.mesh.slots)[triangle],
     )
 
 
 def dress(hits: Hits, materials: Materials) -> GBuffer:
-    """The G-buffer of hits with materials; black where nothing was hit."""
-    slot = hits.slot[0, :, 0].clamp(min=0)
-    mask = hits.slot >= 0
-    albedo = materials.albedo[slot].T[..., None] * mask
-    roughness, specular = (x[slot][None, :, None] for x in (materials.roughness, materials.specular))
-    return GBuffer(hits.position, hits.normal, albedo, roughness, specular * mask, mask)
+    """The G-buffer ``[*, M, 1]`` of hits with materials."""
+    albedo = materials.albedo[hits.slot].T[..., None]
+    roughness, specular = (x[hits.slot][None, :, None] for x in (materials.roughness, materials.specular))
+    return GBuffer(
+        hits.position, hits.normal, albedo, roughness, specular, torch.ones_like(roughness, dtype=torch.bool)
+    )
 
 
 def is_lit(scene: MeshScene, hits: Hits, light: PointLight) -> Tensor:
-    """Whether hits see the light, ``[1, N, 1]``; False where nothing was hit."""
+    """Whether hits see the light, ``[1, M, 1]``."""
     way = torch.tensor(light.position, dtype=torch.float32).view(3, 1, 1) - hits.above
     distance = torch.sqrt(dot(way, way))
     blocker = _run(scene, hits.above, way / distance, query="OCCLUDED", dists=distance.flatten().numpy())
-    return (torch.from_numpy(blocker) < 0)[None, :, None] & (hits.slot >= 0)
+    return (torch.from_numpy(blocker) < 0)[None, :, None]
 
 
 def render_mesh(
@@ -114,14 +123,22 @@ def render_mesh(
     size: tuple[int, int],
     samples: int = 1,
 ) -> tuple[Stokes, Stokes]:
-    """`render.render` of a mesh: diffuse and specular Stokes images ``[3, H, W]``."""
+    """`render.render` of a mesh: diffuse and specular Stokes images ``[3, H, W]``, black where rays hit nothing."""
     scene, materials = model
 
     def shade_points(rows: Tensor, cols: Tensor) -> tuple[Stokes, Stokes]:
         hits = find_hits(scene, camera, (rows, cols), size)
-        return shade(dress(hits, materials), camera, light, is_lit(scene, hits, light))
+        diffuse, specular = shade(dress(hits, materials), camera, light, is_lit(scene, hits, light))
+        return diffuse.map(lambda s: _scatter(s, hits)), specular.map(lambda s: _scatter(s, hits))
 
     return render_points(shade_points, size, samples)
+
+
+def _scatter(values: Tensor, hits: Hits) -> Tensor:
+    """Values ``[3, M, 1]`` of hits at their rays ``[3, N, 1]``, 0 elsewhere."""
+    image = torch.zeros(3, hits.rays, 1)
+    image[:, hits.ray] = values
+    return image
 
 
 def _run(scene: MeshScene, origin: Tensor, direction: Tensor, **options: Any) -> Any:

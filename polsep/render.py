@@ -134,7 +134,7 @@ def camera_rays(camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[i
     scale = 2 * math.tan(math.radians(camera.fov_deg) / 2) / height
     x, y = (cols - width / 2) * scale, (height / 2 - rows) * scale
     rays = forward[:, None] + right[:, None] * x + up[:, None] * y
-    return eye.view(3, 1, 1), torch.nn.functional.normalize(rays, dim=0)[..., None]
+    return eye.view(3, 1, 1), normalize(rays[..., None])
 
 
 def cast(parts: tuple[Part, ...], camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> GBuffer:

@@ -44,7 +44,8 @@ def test_a_ball_is_the_ball(light: PointLight) -> None:
     hits = find_hits(unit_ball(), camera, every_point(SIZE), SIZE)
     to_camera = torch.tensor(camera.position).view(3, 1, 1) - hits.position
     steep = dot(hits.normal, to_camera) / torch.sqrt(dot(to_camera, to_camera)) > 0.3
-    inside = (steep & (hits.slot == 0)).view(SIZE)
+    inside = torch.zeros(SIZE, dtype=torch.bool)
+    inside.view(-1)[hits.ray] = steep[0, :, 0]
     assert float(inside.float().mean()) > 0.2
     for lobe, exact in zip(found, expected, strict=True):
         for name in ("s0", "s1", "s2"):
@@ -54,13 +55,13 @@ def test_a_ball_is_the_ball(light: PointLight) -> None:
 
 
 def test_what_misses_is_black() -> None:
-    """No hit: no slot, no material, no light."""
-    hits = find_hits(unit_ball(), PinholeCamera((0.0, 0.0, 6.0), (0.0, 5.0, 0.0)), every_point(SIZE), SIZE)
-    assert bool((hits.slot == -1).all())
-    buffer = dress(hits, one_material())
-    assert not bool(buffer.mask.any())
-    assert float(buffer.albedo.abs().max()) == 0
-    assert not bool(is_lit(unit_ball(), hits, PointLight()).any())
+    """Rays that hit nothing are left out, and their pixels are black."""
+    camera = PinholeCamera((0.0, 0.0, 6.0), (0.0, 5.0, 0.0))
+    hits = find_hits(unit_ball(), camera, every_point(SIZE), SIZE)
+    assert hits.ray.numel() == 0
+    assert hits.rays == SIZE[0] * SIZE[1]
+    for lobe in render_mesh((unit_ball(), one_material()), camera, PointLight(), SIZE):
+        assert float(lobe.s0.abs().max()) == 0
 
 
 def test_a_wall_casts_its_shadow() -> None:
@@ -72,7 +73,7 @@ def test_a_wall_casts_its_shadow() -> None:
     hits = find_hits(alone, camera, every_point(SIZE), SIZE)
     lit = is_lit(alone, hits, light)
     toward_light = hits.position[2:] > 0.2
-    assert bool(lit[toward_light & (hits.slot == 0)].all())
+    assert bool(lit[toward_light].all())
     assert not bool(is_lit(behind, hits, light).any())
     assert not bool(lit[hits.position[2:] < -0.05].any())
 

@@ -16,6 +16,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 from torch import Tensor
 
+from polsep.materials import Materials
 from polsep.optics import dot, normalize
 from polsep.render import GBuffer, PinholeCamera, PointLight, camera_rays, render_points, shade
 from polsep.shapes import Mesh
@@ -61,15 +62,6 @@ class Hits:
     above: Tensor
     uv: Tensor
     slot: Tensor
-
-
-@dataclass(frozen=True)
-class Materials:
-    """A material per slot: linear RGB ``albedo [S, 3]``, ``roughness`` and ``specular [S]`` as in `render.Part`."""
-
-    albedo: Tensor
-    roughness: Tensor
-    specular: Tensor
 
 
 #: What `render_mesh` renders: a mesh, and a material for each of its slots.

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from polsep.materials import Materials
 from polsep.optics import dot
-from polsep.raycast import Materials, MeshScene, dress, find_hits, is_lit, render_mesh
+from polsep.raycast import MeshScene, dress, find_hits, is_lit, render_mesh
 from polsep.render import Part, PinholeCamera, PointLight, render
 from polsep.scenes import ball, plain
 from polsep.shapes import FINE, Floats, box, ellipsoid, join, moved, random_mesh

@@ -52,6 +52,12 @@ def correlate(x: Tensor, taps: tuple[float, ...], dim: int) -> Tensor:
     return total.reshape(x.shape)
 
 
+def mean_cells(image: Tensor) -> Tensor:
+    """Means over 2x2 cells, ``[..., H, W]`` to ``[..., H/2, W/2]``."""
+    rows = image[..., 0::2, :] + image[..., 1::2, :]
+    return 0.25 * (rows[..., 0::2] + rows[..., 1::2])
+
+
 def _bayer_bilinear(planes: Tensor, bayer: str) -> Tensor:
     """RGB ``[..., 3, h, w]`` of Bayer planes ``[..., h, w]``, each colour interpolated on its own."""
     sampled = torch.zeros(3, *planes.shape, dtype=planes.dtype, device=planes.device)

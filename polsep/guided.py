@@ -40,6 +40,7 @@ from polsep.demosaic import (
     demosaic_bilinear_half,
     interpolate_analysers,
     interpolate_analysers_half,
+    mean_cells,
 )
 from polsep.separation import box_mean
 from polsep.stokes import Measurements, Stokes, analyser_residual, fit_stokes, measure
@@ -97,7 +98,7 @@ def demosaic_guided_half(mosaic: Mosaic) -> Measurements:
     s0, residual = _guide(values, _smooth_polarization(values, layout), layout)
     samples = Measurements(interpolate_analysers_half(residual, layout), layout.angles)
     polarization = _blur_stokes(fit_stokes(samples), _GENTLE)
-    found = Stokes(_cell_mean(s0), polarization.s1, polarization.s2).map(lambda x: _crop(x, MARGIN))
+    found = Stokes(mean_cells(s0), polarization.s1, polarization.s2).map(lambda x: _crop(x, MARGIN))
     del s0, residual, values, samples
     return _complete(found, demosaic_bilinear_half(mosaic))
 
@@ -196,15 +197,15 @@ def color_masks(mosaic: Tensor, layout: Layout, block: int) -> Tensor:
 
 def _fill_green(mosaic: Tensor, masks: Tensor, mask_cells: Tensor) -> Tensor:
     """Green everywhere: estimates along both directions, weighed by how smooth green minus the other colour is."""
-    is_green, cells = masks[1] > 0, _cell_mean(mosaic)
+    is_green, cells = masks[1] > 0, mean_cells(mosaic)
     total, weights, precision = (torch.zeros_like(image) for image in (mosaic, cells, cells))
     for dim in (-1, -2):
         around, second = _across_pairs(mosaic, dim)
         other = around + _repeat(_slope_of_other(cells, mask_cells[1], dim)) * second
         difference = correlate(torch.where(is_green, mosaic - other, other - mosaic), _GENTLE, dim)
-        weight = 1 / (box_mean(_cell_mean(correlate(difference, (-1.0, 0.0, 1.0), dim) ** 2), 1) + 1e-6)
+        weight = 1 / (box_mean(mean_cells(correlate(difference, (-1.0, 0.0, 1.0), dim) ** 2), 1) + 1e-6)
         total, weights = total + _repeat(weight) * difference, weights + weight
-        precision = precision + 1 / (box_mean(_cell_mean(second) ** 2, 1) + 1e-12)
+        precision = precision + 1 / (box_mean(mean_cells(second) ** 2, 1) + 1e-12)
     difference = _without_error(total / _repeat(weights), 1 / precision, mask_cells)
     beside = 0.5 * (correlate(cells, (0.5, 0.0, 0.5), -1) + correlate(cells, (0.5, 0.0, 0.5), -2))
     return torch.where(is_green, mosaic, _at_least(mosaic + difference, _repeat(beside)))
@@ -217,9 +218,9 @@ def _without_error(difference: Tensor, error: Tensor, mask_cells: Tensor) -> Ten
     found = torch.zeros_like(difference)
     for mask in (mask_cells[0], mask_cells[2]):
         share = box_mean(mask, DIFFERENCE_RADIUS)
-        smooth = _repeat(box_mean(_cell_mean(difference) * mask, DIFFERENCE_RADIUS) / share)
+        smooth = _repeat(box_mean(mean_cells(difference) * mask, DIFFERENCE_RADIUS) / share)
         detail = difference - smooth
-        variance, noise = (box_mean(x * mask, DIFFERENCE_RADIUS) / share for x in (_cell_mean(detail**2), error))
+        variance, noise = (box_mean(x * mask, DIFFERENCE_RADIUS) / share for x in (mean_cells(detail**2), error))
         kept = ((variance - DIFFERENCE_MARGIN * noise) / (variance + 1e-12)).clamp(min=0)
         found = found + _repeat(mask) * (smooth + _repeat(kept) * detail)
     return found
@@ -276,7 +277,7 @@ def _fill_from_green(mosaic: Tensor, green: Tensor, mask: Tensor, mask_cells: Te
     share = _blur(mask_cells, _BINOMIAL)
 
     def mean(image: Tensor) -> Tensor:
-        return _blur(_cell_mean(image) * mask_cells, _BINOMIAL) / share
+        return _blur(mean_cells(image) * mask_cells, _BINOMIAL) / share
 
     mean_g, mean_x = mean(green), mean(mosaic)
     covariance, variance = mean(green * mosaic) - mean_g * mean_x, mean(green * green) - mean_g * mean_g
@@ -298,12 +299,6 @@ def _blur(image: Tensor, taps: tuple[float, ...]) -> Tensor:
 
 def _blur_stokes(stokes: Stokes, taps: tuple[float, ...]) -> Stokes:
     return stokes.map(lambda image: _blur(image, taps))
-
-
-def _cell_mean(image: Tensor) -> Tensor:
-    """Means over 2x2 cells, ``[..., H, W]`` to ``[..., H/2, W/2]``."""
-    rows = image[..., 0::2, :] + image[..., 1::2, :]
-    return 0.25 * (rows[..., 0::2] + rows[..., 1::2])
 
 
 def _repeat(cells: Tensor) -> Tensor:

@@ -14,7 +14,6 @@ import torch
 from polsep.bench import frontend, speed
 from polsep.bench.frontend import (
     Case,
-    average_cells,
     demosaic_case,
     read_cases,
     score_cases,
@@ -24,6 +23,7 @@ from polsep.bench.frontend import (
 from polsep.bench.peers import PEERS_VARIABLE, find_peers, run_json
 from polsep.bench.rows import Row, to_jsonl
 from polsep.camera import Layout, Mosaic, sample_mosaic
+from polsep.demosaic import mean_cells
 from polsep.io.results import fill_tables
 from polsep.stokes import Measurements, Stokes, measure
 
@@ -88,7 +88,7 @@ def test_unpolarized_light_has_no_angle() -> None:
 def test_half_resolution_is_the_mean_of_cells(generator: torch.Generator) -> None:
     """A full result at half resolution is the mean over each 2x2 cell."""
     full = random_truth(generator)
-    half = average_cells(full)
+    half = mean_cells(full)
     assert half.shape == (4, 3, 24, 32)
     assert torch.allclose(half[1, 2, 5, 7], full[1, 2, 10:12, 14:16].mean())
 
@@ -98,7 +98,7 @@ def test_peers_images_are_scored_at_both_resolutions(generator: torch.Generator)
     truth = random_truth(generator)
     mosaic = Mosaic(sample_mosaic(Measurements(truth, Layout().angles), Layout()), Layout(), 0.0, 1.0)
     case = Case("a", mosaic, truth, EVERYWHERE[::2, ::2])
-    found = demosaic_case(case, {"full": {"a": truth}, "small": {"a": average_cells(truth)}})
+    found = demosaic_case(case, {"full": {"a": truth}, "small": {"a": mean_cells(truth)}})
     rows = [row for row in score_cases("real", "mean", [(case, found)]) if row.metric == "s0 PSNR"]
     perfect = {(row.bench, row.case, row.method) for row in rows if row.value == 120}
     assert {(m, c) for b, c, m in perfect if b == "frontend/real"} == {

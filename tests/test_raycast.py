@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from polsep import shapes
 from polsep.materials import Materials
-from polsep.optics import dot
+from polsep.optics import dot, normalize
 from polsep.raycast import MeshScene, dress, find_hits, is_lit, render_mesh
 from polsep.render import Part, PinholeCamera, PointLight, render
 from polsep.scenes import ball, plain
@@ -53,6 +54,30 @@ def test_a_ball_is_the_ball(light: PointLight) -> None:
             wrong = (getattr(lobe, name) - getattr(exact, name)).abs()
             assert float(wrong[:, inside].max()) < INSIDE
             assert float(wrong.max()) < RIM
+
+
+def test_finer_meshes_come_closer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is left of the difference to the ball is the triangles': twice as fine, less than half of it."""
+    camera, light = PinholeCamera((0.5, 1.0, 6.0)), PointLight((-6.0, 1.0, 3.0), 60.0, 2.0)
+    exact = render((Part(ball(1.0), plain(COLOR), roughness=0.35, specular=0.8),), camera, light, SIZE, 2)
+    wrong = []
+    for grid in ((25, 50), (50, 100), (100, 200)):
+        monkeypatch.setattr(shapes, "ELLIPSOID_GRID", grid)
+        found = render_mesh((unit_ball(), one_material()), camera, light, SIZE, 2)
+        wrong.append(max(float((a.s0 - b.s0).abs().mean()) for a, b in zip(found, exact, strict=True)))
+    assert wrong[1] < wrong[0] / 2
+    assert wrong[2] < wrong[1] / 2
+
+
+def test_triangles_do_not_shade_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a coarse ball every point whose smooth normal faces the light sees it, up to the terminator."""
+    monkeypatch.setattr(shapes, "ELLIPSOID_GRID", (12, 24))
+    scene, light = unit_ball(), PointLight((-6.0, 1.0, 3.0))
+    hits = find_hits(scene, PinholeCamera((0.5, 1.0, 6.0)), every_point(SIZE), SIZE)
+    to_light = normalize(torch.tensor(light.position).view(3, 1, 1) - hits.position)
+    facing = dot(hits.normal, to_light) > 0.02
+    assert int(facing.sum()) > 1000
+    assert bool(is_lit(scene, hits, light)[facing].all())
 
 
 def test_what_misses_is_black() -> None:

@@ -31,7 +31,7 @@ from polsep.bench.speed import bench_speed
 from polsep.bench.truth import SCENE_SEEDS, captures, psnr, render_scene
 from polsep.camera import Layout, Mosaic, sample_mosaic
 from polsep.color_affine import separate_color_affine
-from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
+from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half, mean_cells
 from polsep.guided import demosaic_guided, demosaic_guided_half
 from polsep.io.frames import read_frames
 from polsep.separation import separate_analytic
@@ -119,12 +119,6 @@ def inside(mask: Tensor, border: int) -> Tensor:
     return kept
 
 
-def average_cells(full: Tensor) -> Tensor:
-    """Half resolution ``[..., h, w]`` of images ``[..., 2h, 2w]``: the mean over each 2x2 cell."""
-    rows = full[..., ::2, :] + full[..., 1::2, :]
-    return 0.25 * (rows[..., ::2] + rows[..., 1::2])
-
-
 def score_images(found: Tensor, truth: Tensor, mask: Tensor) -> dict[str, float]:
     """Every metric of `UNITS` of analyser images ``[4, C, h, w]`` inside ``mask [h, w]``, as the module says."""
     found, truth = (images[..., mask][..., None, :] for images in (found, truth))
@@ -175,7 +169,7 @@ def demosaic_case(case: Case, theirs: dict[str, dict[str, Tensor]]) -> Found:
         if image.shape[-2:] == case.mask.shape:
             found["half", name] = image
         else:
-            found["half", name], found["full", name] = average_cells(image), image
+            found["half", name], found["full", name] = mean_cells(image), image
     return found
 
 
@@ -200,7 +194,7 @@ def score_cases(bench: str, title: str, cases: Iterable[tuple[Case, Found]]) -> 
 def _score_at(images: Tensor, case: Case) -> dict[str, float]:
     """`score_images` at the images' own resolution."""
     if images.shape[-2:] == case.mask.shape:
-        return score_images(images, average_cells(case.truth), inside(case.mask, BORDER))
+        return score_images(images, mean_cells(case.truth), inside(case.mask, BORDER))
     mask = case.mask.repeat_interleave(2, 0).repeat_interleave(2, 1)
     return score_images(images, case.truth, inside(mask, 2 * BORDER))
 
@@ -233,7 +227,7 @@ def _score_splits(
     for case, truth in zip(cases, truths, strict=True):
         samples = {name.removeprefix("polsep "): half(case.mosaic) for name, (half, _) in DEMOSAICKERS.items()}
         if eari:
-            samples["EARI"] = with_samples(demosaic_bilinear_half(case.mosaic), average_cells(eari[case.name]))
+            samples["EARI"] = with_samples(demosaic_bilinear_half(case.mosaic), mean_cells(eari[case.name]))
         for split, separate in SPLITS.items():
             for name, measurements in samples.items():
                 found = separate(measurements)

@@ -225,6 +225,13 @@ def add_rows(a: Any, b: Any, c: Any, scale: Any, out: Any) -> None:
 
 
 @compiled
+def subtract(x: Any, y: Any, out: Any) -> None:
+    """``x - y``."""
+    for j in range(out.size):
+        out[j] = x[j] - y[j]
+
+
+@compiled
 def blur_gently(x: Any, out: Any) -> None:
     """(1/8, 3/4, 1/8) along a row of cells."""
     a, b, c, found = x[GUARD - 1 :], x[GUARD:], x[GUARD + 1 :], out[GUARD:]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep import guided as twin
-from polsep.kernels.cells import GUARD, Grid, add_rows, enlarge_down, mean_cells, reciprocal, sum_three
+from polsep.kernels.cells import GUARD, Grid, add_rows, enlarge_down, mean_cells, reciprocal, subtract, sum_three
 from polsep.kernels.compiling import ONE, QUARTER, ZERO, compiled
 from polsep.kernels.green import prior_slope
 
@@ -164,12 +164,6 @@ def _fill(mosaic: Any, guess: Any, rows: tuple[Any, Any], present: Any, out: Any
 
 
 @compiled
-def _subtract(x: Any, y: Any, out: Any) -> None:
-    for j in range(out.size):
-        out[j] = x[j] - y[j]
-
-
-@compiled
 def _find_lines(p: int, grid: Grid, state: Colors) -> None:
     """Linear functions of row ``p``, and their means over 3x3 cells of the row above."""
     rows = state.rows
@@ -199,7 +193,7 @@ def _guess_row(here: Any, green: Any, p: int, grid: Grid, state: Colors) -> None
             _guess(rows[i], rows[2 + i], green[2 * i : 2 * i + 2], guess[first : first + 2])
     first = 4 * (grid.colors[p % 2] // 2)
     for k in range(4):
-        _subtract(here[k], guess[first + k], rows[4 + k])
+        subtract(here[k], guess[first + k], rows[4 + k])
     other, residual = grid.others[p % 2], state.residual[p % 5]
     for i in range(2):
         _interpolate_along(rows[4 + 2 * i : 6 + 2 * i], other, residual[2 * i : 2 * i + 2])

@@ -19,6 +19,7 @@ from polsep.kernels.cells import (
     GUARD,
     Grid,
     Source,
+    add_rows,
     blur_gently,
     blur_gently_down,
     blur_pixels_along,
@@ -28,6 +29,7 @@ from polsep.kernels.cells import (
     mean_cells,
     polarize_row,
     reciprocal,
+    subtract,
 )
 from polsep.kernels.colors import FILLED, Colors, fill_colors_row, make_colors
 from polsep.kernels.compiling import HALF, ONE, QUARTER, THIRD, TWO, ZERO, compiled, entry
@@ -185,13 +187,7 @@ def _tent_row(stream: Stream, r: int, grid: Grid) -> None:
     mosaic = stream.mosaic[r % stream.mosaic.shape[0]]
     for k in range(4):
         choose(grid.others[r % 2], rows[12 + k], rows[8 + k], tent[k])
-        _subtract(mosaic[k], tent[k], detail[k])
-
-
-@compiled
-def _subtract(x: Any, y: Any, out: Any) -> None:
-    for j in range(out.size):
-        out[j] = x[j] - y[j]
+        subtract(mosaic[k], tent[k], detail[k])
 
 
 @compiled
@@ -209,21 +205,13 @@ def _residual_row(stream: Stream, r: int) -> None:
 
 
 @compiled
-def _average_colors(x: Any, out: Any) -> None:
-    """Mean of three rows."""
-    a, b, c = x[0], x[1], x[2]
-    for j in range(out.size):
-        out[j] = THIRD * (a[j] + b[j] + c[j])
-
-
-@compiled
 def _repolarize_row(stream: Stream, r: int, grid: Grid) -> None:
     """Polarization of the residual, mean over colours, of row ``r``."""
     rows = stream.rows
     sums = rows[0:6].reshape(2, 3, grid.n)
     polarize_row(stream.residual, r, grid, rows[6:9], sums)
     for s in range(2):
-        _average_colors(sums[s], rows[9])
+        add_rows(sums[s, 0], sums[s, 1], sums[s, 2], THIRD, rows[9])
         blur_gently(rows[9], stream.found[r % 3, s])
 
 

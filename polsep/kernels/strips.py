@@ -26,7 +26,7 @@ from polsep.kernels.bilinear import (
     make_window,
     open_window,
 )
-from polsep.kernels.cells import Source
+from polsep.kernels.cells import Source, add_rows
 from polsep.kernels.compiling import ONE, THIRD, ZERO, compiled, entry
 from polsep.kernels.images import interleave_colors
 from polsep.kernels.moments import (
@@ -136,26 +136,18 @@ def _keep_lines(stokes: Any, slope: Any, lines: Any) -> None:
 
 
 @compiled
-def _average(planes: Any, first: int, start: int, out: Any) -> None:
-    """Mean of three rows from ``first`` on, each from ``start``."""
-    r, g, b = planes[first, start:], planes[first + 1, start:], planes[first + 2, start:]
-    for j in range(out.size):
-        out[j] = THIRD * (r[j] + g[j] + b[j])
-
-
-@compiled
 def _report(strip: Strip, t: int, clipped: Any, targets: Targets) -> None:
     """DoLP and AoLP of row ``t``, and what its unclipped pixels add to the sums."""
     rows, stokes = strip.rows, strip.rings.stokes[t % 16]
     mean, p1, p2 = rows.spare[0], rows.spare[1], rows.spare[2]
     dolp, sums = targets.dolp[t], targets.sums[t]
-    _average(stokes, 0, PAD, mean)
+    add_rows(stokes[0, PAD:], stokes[1, PAD:], stokes[2, PAD:], THIRD, mean)
     s1, s2 = stokes[3, PAD:], stokes[4, PAD:]
     polarize(mean, s1, s2, dolp, targets.aolp[t])
     for j in range(dolp.size):
         p1[j] = ONE if dolp[j] > ONE else ZERO
     sums[2] = sum_row(p1, clipped)
-    _average(rows.planes, 1, 0, mean)
+    add_rows(rows.planes[1], rows.planes[2], rows.planes[3], THIRD, mean)
     a1, a2 = rows.slope[0, PAD:], rows.slope[1, PAD:]
     for j in range(mean.size):
         p1[j] = s1[j] - a1[j] * mean[j]

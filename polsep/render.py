@@ -75,6 +75,19 @@ class GBuffer:
     mask: Tensor
 
 
+@dataclass(frozen=True)
+class Scene:
+    """Exact lobes on the sensor: ``diffuse``, ``specular`` ``[C, H, W]`` and the object ``mask [H, W]``.
+
+    The mask holds the pixels that objects cover wholly. Lobes are in the light's units until an exposure scales them so
+    that 1 is the white level of one measurement; then their s0 are what a separation is to find.
+    """
+
+    diffuse: Stokes
+    specular: Stokes
+    mask: Tensor
+
+
 def rotation_matrix(angles: Vector) -> Tensor:
     """Rz Ry Rx for angles about x, y, z [rad], [3, 3]."""
     (sx, cx), (sy, cy), (sz, cz) = ((math.sin(a), math.cos(a)) for a in angles)

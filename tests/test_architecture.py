@@ -32,6 +32,7 @@ RANKS = {
     "kernels": 4,
     "engine": 4,
     "pipeline": 4,
+    "simulate": 4,
     "io": 5,
     "batch": 6,
     "bench": 6,
@@ -45,6 +46,7 @@ WITHIN = {
     ("raycast", "render"),
     ("raycast", "shapes"),
     ("raycast", "materials"),
+    ("simulate", "kernels"),
     ("engine", "kernels"),
     ("pipeline", "engine"),
     ("pipeline", "kernels"),
@@ -67,6 +69,11 @@ HOMES = {
     "click": "cli",
     "torch.optim": "train",
     "embreex": "raycast",
+    "mitsuba": "pathtrace",
+    "drjit": "pathtrace",
+    "trimesh": "io",
+    "scipy.io": "io",
+    "ray": "dataset",
 }
 #: Calls that touch files, by name of the function or method.
 FILE_CALLS = {"open", "read_bytes", "write_bytes", "read_text", "write_text", "imread", "imwrite", "fromfile", "tofile"}

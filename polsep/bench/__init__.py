@@ -15,9 +15,9 @@ from polsep.bench.real import bench_real
 from polsep.bench.resources import bench_resources
 from polsep.bench.rows import Row, provenance, to_jsonl
 from polsep.bench.separation import bench_separation
-from polsep.bench.truth import SCENE_SEEDS, SCENE_SIZE, Scene, psnr, render_scene
+from polsep.bench.truth import SCENE_SEEDS, SCENE_SIZE, psnr, render_scene
 
-__all__ = ["BENCHES", "SCENE_SEEDS", "SCENE_SIZE", "Row", "Scene", "provenance", "psnr", "render_scene", "to_jsonl"]
+__all__ = ["BENCHES", "SCENE_SEEDS", "SCENE_SIZE", "Row", "provenance", "psnr", "render_scene", "to_jsonl"]
 
 BENCHES: dict[str, Callable[[Path], Iterator[Row]]] = {
     "separation": bench_separation,

@@ -8,33 +8,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from polsep.camera import IMX250, Layout, Mosaic, add_noise, expose
-from polsep.render import PinholeCamera, render
+from polsep.render import PinholeCamera, Scene, render
 from polsep.scenes import random_light, random_parts
-from polsep.stokes import Measurements, Stokes, measure
+from polsep.stokes import Measurements, measure
 
 #: Seeds of the benchmark's scenes; nothing is ever tuned or trained on seeds from 2000 to 2999.
 SCENE_SEEDS = tuple(range(2000, 2008))
 SCENE_SIZE = (384, 384)
 
 
-@dataclass(frozen=True)
-class Scene:
-    """A rendered scene: exact lobes and the object mask, exposed so that 1 % of the diffuse light exceeds s0 = 1.4."""
-
-    diffuse: Stokes
-    specular: Stokes
-    mask: Tensor
-
-
 def render_scene(seed: int, saturation: float, size: tuple[int, int] = SCENE_SIZE) -> Scene:
-    """A random scene of four objects under one random polarized light; ``saturation`` 0 makes every albedo grey."""
+    """A random scene of four objects under one random polarized light; ``saturation`` 0 makes every albedo grey.
+
+    Exposed so that 1 % of the diffuse light exceeds s0 = 1.4.
+    """
     generator = torch.Generator().manual_seed(seed)
     parts = random_parts(generator, 4, saturation)
     light = random_light(generator)

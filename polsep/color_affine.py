@@ -36,7 +36,14 @@ MAX_DIFFUSE_DOLP = 0.3847
 #: Windows of the slope, widest first: radius in pixels and how far the slope may stray from the next wider window's
 #: (standard deviation per component). The widest one is held toward zero, the paper's unpolarized diffuse.
 #: Chosen on random scenes outside every test set; see docs/experiments.md.
-SLOPE_SCALES = ((12, 0.1), (6, 0.02), (2, 0.01), (0, 0.01))
+SLOPE_SCALES = ((12, 0.1), (6, 0.04), (2, 0.01), (0, 0.005))
+
+#: The window that ends at edges, where they are known: every third pixel of the one of this radius.
+EDGE_RADIUS, EDGE_STEP = 6, 3
+#: Difference of mean s1 / s0 or s2 / s0 beyond which a pixel lies on another surface: twice a Gaussian's 0.05.
+EDGE_REACH = 0.1
+#: Light below which polarization says nothing about edges.
+EDGE_FLOOR = 1e-3
 
 #: Colour contrast counts only where it exceeds this many times its expected noise.
 CONTRAST_MARGIN = 2.0
@@ -63,7 +70,8 @@ def separate_color_affine(measurements: Measurements) -> Separation:
     even = measurements.uniform or measurements
     stokes, exact = fit_stokes_unclipped(even)
     sample = sample_variance(even)
-    slope = color_slope(stokes, exact, sample, even.variance)
+    edges = None if even is measurements else polarization_edges(even, stokes)
+    slope = color_slope((stokes, exact), sample, even.variance, edges)
     offset, residual = _offset(stokes, slope)
     if even is not measurements:
         stokes = fit_stokes_unclipped(measurements)[0]
@@ -95,16 +103,31 @@ def sample_variance(measurements: Measurements, radius: int = 3) -> Tensor:
     return box_mean(squared * weight, radius) / box_mean(weight, radius).clamp(min=1e-6)
 
 
-def color_slope(stokes: Stokes, exact: Tensor, sample: Tensor, interpolation: Tensor | None) -> Tensor:
+def polarization_edges(measurements: Measurements, stokes: Stokes) -> Tensor:
+    """s1 / s0 and s2 / s0 ``[..., 2, h, w]`` of all colours in 3x3 pixels, clipped ones left out.
+
+    They change where the surface does, and at the rim of a highlight, but hardly with texture.
+    """
+    light = torch.cat([_color_mean(s) for s in (stokes.s0, stokes.s1, stokes.s2)], dim=-3)
+    if measurements.clipped is not None:
+        light = light * ~measurements.clipped.any(dim=-4).any(dim=-3, keepdim=True)
+    light = box_mean(light, 1)
+    return light[..., 1:, :, :] / (light[..., :1, :, :] + EDGE_FLOOR)
+
+
+def color_slope(
+    known: tuple[Stokes, Tensor], sample: Tensor, interpolation: Tensor | None, edges: Tensor | None = None
+) -> Tensor:
     """Slope a ``[..., 2, h, w]`` from how p varies with s0 over colours; |a| at most `MAX_DIFFUSE_DOLP`.
 
     Fitted to deviations from each pixel's own mean over colours, in which white specular light cancels exactly. Wide
     windows steady narrow ones, down to the single pixel, each in the proportion of its noise to its colour contrast (a
     Gaussian prior per scale). Noise in s0 would pull the slope toward p/s0 and so erase the specular of grey surfaces:
     contrast that noise explains is not counted, and pixels at colour edges, where demosaicking invents contrast, weigh
-    less. ``exact [..., C, h, w]``: the colours that clipping leaves known, of which a pixel needs two. ``sample``,
-    ``interpolation``: variances of a sample.
+    less. ``known``: Stokes images and ``exact [..., C, h, w]``, the colours that clipping leaves known, of which a
+    pixel needs two. ``sample``, ``interpolation``: variances of a sample. ``edges``: `polarization_edges`, if any.
     """
+    stokes, exact = known
     colors = exact.sum(dim=-3, keepdim=True)
     means = ((s * exact).sum(dim=-3, keepdim=True) / colors.clamp(min=1) for s in (stokes.s0, stokes.s1, stokes.s2))
     d0, d1, d2 = ((s - m) * exact for s, m in zip((stokes.s0, stokes.s1, stokes.s2), means, strict=True))
@@ -117,7 +140,10 @@ def color_slope(stokes: Stokes, exact: Tensor, sample: Tensor, interpolation: Te
     slope = torch.zeros_like(moments[..., :2, :, :])
     floor = torch.finfo(error.dtype).eps * 1e-2
     for radius, spread in SLOPE_SCALES:
-        pooled, samples = _pool(moments, weight, radius) if radius else (moments * usable, 1.0)
+        if radius == EDGE_RADIUS and edges is not None:
+            pooled, samples = _pool_to_edges(moments, weight, edges)
+        else:
+            pooled, samples = _pool(moments, weight, radius) if radius else (moments * usable, torch.ones_like(weight))
         contrast, moment, noise = pooled[..., :1, :, :], pooled[..., 1:3, :, :], pooled[..., 3:, :, :]
         counted = ((contrast - noise) / (contrast + floor)).clamp(min=0)
         held = noise / CONTRAST_MARGIN / (spread**2 * samples) + floor
@@ -132,6 +158,27 @@ def _pool(moments: Tensor, weight: Tensor, radius: int) -> tuple[Tensor, Tensor]
     total, squares = means[..., -2:-1, :, :].clamp(min=1e-12), means[..., -1:, :, :].clamp(min=1e-20)
     pixels = (2 * radius + 1) ** 2 * total * total / squares
     return means[..., :-2, :, :] / total, (pixels / 4).clamp(min=1)
+
+
+def _pool_to_edges(moments: Tensor, weight: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
+    """`_pool` over the window of `EDGE_RADIUS`, whose pixels count less the more their polarization differs.
+
+    A bilateral window (Tomasi and Manduchi 1998) with Tukey's biweight for a kernel, which is zero beyond `EDGE_REACH`.
+    Every third pixel is independent of the others.
+    """
+    height, width = weight.shape[-2:]
+    weighted = torch.cat([moments * weight, weight, weight * weight], dim=-3)
+    sums = torch.zeros_like(weighted)
+    steps = range(-EDGE_RADIUS, EDGE_RADIUS + 1, EDGE_STEP)
+    for down, right in ((down, right) for down in steps for right in steps):
+        here = (..., slice(max(-down, 0), height - max(down, 0)), slice(max(-right, 0), width - max(right, 0)))
+        there = (..., slice(max(down, 0), height - max(-down, 0)), slice(max(right, 0), width - max(-right, 0)))
+        if abs(down) < height and abs(right) < width:
+            apart = edges[there] - edges[here]
+            near = (1 - (apart * apart).sum(dim=-3, keepdim=True) / EDGE_REACH**2).clamp(min=0) ** 2
+            sums[here] += weighted[there] * torch.cat([near.expand_as(weighted[there][..., 1:, :, :]), near * near], -3)
+    total, squares = sums[..., -2:-1, :, :].clamp(min=1e-12), sums[..., -1:, :, :].clamp(min=1e-20)
+    return sums[..., :-2, :, :] / total, (total * total / squares).clamp(min=1)
 
 
 def white_specular(offset: Tensor, slope: Tensor) -> Tensor:

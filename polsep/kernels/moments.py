@@ -20,6 +20,8 @@ from polsep.kernels.compiling import ONE, QUARTER, THIRD, TWO, ZERO, compiled
 WIDEST, MIDDLE, NARROW, NOISE = 12, 6, 2, 3
 #: Rows that a pixel's slope looks up and down: the widest window and `sample_variance` of its moments.
 REACH = WIDEST + NOISE
+#: Rows of weighted moments and of edges that are kept: as far down as the widest window looks, as far up as the middle.
+KEPT = 20
 
 _TWELFTH = np.float32(1 / 12)
 _MARGIN, _VARIANCE_FLOOR = np.float32(twin.CONTRAST_MARGIN), np.float32(twin.VARIANCE_FLOOR)
@@ -43,10 +45,11 @@ class Rings(NamedTuple):
 
     ``stokes [16, 5, n]``: s0 of three colours, s1, s2. ``moments [4, 4, n]``: of `_contrast`, and 1 where usable.
     ``noise [7, 2, n]``: squared residuals and their weights, summed along rows. ``bright [4, n]``. ``missed [3, n]``:
-    squared second differences, summed along rows. ``weighted [16, 6, n]``: weighted moments, error, weight and its
+    squared second differences, summed along rows. ``weighted [20, 6, n]``: weighted moments, error, weight and its
     square. ``spread [16, 4, n]``: moments of `_contrast` and the spread of s1 and s2, for a report. ``wide``,
     ``middle``, ``narrow`` ``[L + 1, 6, n]``: rows of one block of window sums of length L, behind it the sum of the
-    block so far.
+    block so far. ``light [4, 3, n]``: mean s0, s1, s2 of pixels without clipped samples, ``edges [20, 2, n]``: their
+    ratios in 3x3 pixels; both empty where windows do not end at edges.
     """
 
     stokes: NDArray[np.float32]
@@ -59,10 +62,15 @@ class Rings(NamedTuple):
     wide: NDArray[np.float32]
     middle: NDArray[np.float32]
     narrow: NDArray[np.float32]
+    light: NDArray[np.float32]
+    edges: NDArray[np.float32]
 
 
 class Rows(NamedTuple):
-    """Single rows: ``m [4, 3, w]`` analysers, ``flags`` like it, ``s [9, n]`` s0, s1, s2 of each colour, and others."""
+    """Single rows: ``m [4, 3, w]`` analysers, ``flags`` like it, ``s [9, n]`` s0, s1, s2 of each colour,
+    ``sums [6, n]``, ``nothing`` like it but zero, ``ones [n]``,
+    ``near [5, w]`` weights of the window that ends at edges, and others.
+    """
 
     m: NDArray[np.float32]
     flags: NDArray[np.float32]
@@ -75,11 +83,15 @@ class Rows(NamedTuple):
     planes: NDArray[np.float32]
     spare: NDArray[np.float32]
     counts: NDArray[np.float32]
+    sums: NDArray[np.float32]
+    nothing: NDArray[np.float32]
+    ones: NDArray[np.float32]
+    near: NDArray[np.float32]
 
 
 @compiled
-def make_rings(w: int) -> Rings:
-    """Empty rings for rows of ``w`` cells."""
+def make_rings(w: int, edges: int) -> Rings:
+    """Empty rings for rows of ``w`` cells; with rows of edges, `KEPT` or 0."""
     n = w + 2 * PAD
     n += -n % PAD
     return Rings(
@@ -88,11 +100,13 @@ def make_rings(w: int) -> Rings:
         np.zeros((7, 2, n), np.float32),
         np.zeros((4, n), np.float32),
         np.zeros((3, n), np.float32),
-        np.zeros((16, 6, n), np.float32),
+        np.zeros((KEPT, 6, n), np.float32),
         np.zeros((16, 4, n), np.float32),
         np.zeros((2 * WIDEST + 2, 6, n), np.float32),
         np.zeros((2 * MIDDLE + 2, 6, n), np.float32),
         np.zeros((2 * NARROW + 2, 6, n), np.float32),
+        np.zeros((4 if edges else 0, 3, n), np.float32),
+        np.zeros((edges, 2, n), np.float32),
     )
 
 
@@ -118,6 +132,10 @@ def make_rows(pattern: Pattern) -> Rows:
         np.zeros((4, w), np.float32),
         np.zeros((3, w), np.float32),
         counts,
+        np.zeros((6, n), np.float32),
+        np.zeros((6, n), np.float32),
+        np.ones(n, np.float32),
+        np.zeros((5, w), np.float32),
     )
 
 
@@ -362,7 +380,7 @@ def rows_around(t: int, radius: int, h: int) -> Any:
 def weigh_row(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
     """Weighted moments of row ``t``, zero outside the frame."""
     rows, rings = scratch
-    weighted = rings.weighted[t % 16]
+    weighted = rings.weighted[t % KEPT]
     if not 0 <= t < pattern.h:
         weighted[:] = ZERO
         return

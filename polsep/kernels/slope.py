@@ -2,6 +2,7 @@
 
 Windows are summed first along the row, then down it by suffix and prefix sums of blocks (van Herk 1992, Gil and Werman
 1993): they only ever add, so that a bright edge leaves no rounding behind in the dark beside it, as running sums would.
+Where edges are kept, the middle window is that of `kernels.edges`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import numpy as np
 from polsep import color_affine as twin
 from polsep.kernels.bilinear import PAD, Pattern
 from polsep.kernels.compiling import ONE, ZERO, compiled
-from polsep.kernels.moments import MIDDLE, NARROW, WIDEST, Rings, Rows, rows_around
+from polsep.kernels.edges import sum_alike
+from polsep.kernels.moments import KEPT, MIDDLE, NARROW, WIDEST, Rings, Rows, rows_around
 
 _FLOOR = np.float32(np.finfo(np.float32).eps * 1e-2)
 _MARGIN = np.float32(twin.CONTRAST_MARGIN)
@@ -82,7 +84,8 @@ def _push(weighted: Any, radius: int, r: int, fours: Any, block: Any) -> int:
 
 @compiled
 def _steady(part: tuple[Any, Any], counts: tuple[Any, Any], spread: Any, w: int, slope: Any) -> None:
-    """One scale of `color_slope` from sums over windows in two parts; ``counts``: 4 / pixels per window, by column."""
+    """One scale of `color_slope` from sums over windows in two parts; ``counts``: share
+    of a window's inverse number of independent pixels by column, and by row."""
     u, v = part
     u0, u1, u2, u3, u4, u5 = u[0, PAD:], u[1, PAD:], u[2, PAD:], u[3, PAD:], u[4, PAD:], u[5, PAD:]
     v0, v1, v2, v3, v4, v5 = v[0, PAD:], v[1, PAD:], v[2, PAD:], v[3, PAD:], v[4, PAD:], v[5, PAD:]
@@ -149,10 +152,15 @@ def find_slope(pattern: Pattern, t: int, start: int, scratch: tuple[Rows, Rings]
         radius, block = radii[i], blocks[i]
         if t + radius < _first_of_block(start, radius):
             continue
-        row = _push(rings.weighted[(t + radius) % 16], radius, t + radius, rows.fours, block)
+        if radius == MIDDLE and rings.edges.size:
+            if t >= start:
+                sum_alike(pattern, t, scratch)
+                _steady((rows.sums, rows.nothing), (rows.ones, ONE), spreads[i], pattern.w, rows.slope)
+            continue
+        row = _push(rings.weighted[(t + radius) % KEPT], radius, t + radius, rows.fours, block)
         if t >= start:
             per_window = 4 * rows_around(t, radius, pattern.h) / np.float32((2 * radius + 1) ** 2)
             part = (block[row], block[2 * radius + 1])
             _steady(part, (rows.counts[i], np.float32(per_window)), spreads[i], pattern.w, rows.slope)
     if t >= start:
-        _own_pixel(rings.weighted[t % 16], pattern.w, rows.slope)
+        _own_pixel(rings.weighted[t % KEPT], pattern.w, rows.slope)

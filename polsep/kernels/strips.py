@@ -28,8 +28,10 @@ from polsep.kernels.bilinear import (
 )
 from polsep.kernels.cells import Source, add_rows
 from polsep.kernels.compiling import ONE, THIRD, ZERO, compiled, entry
+from polsep.kernels.edges import enter_light, measure_edges
 from polsep.kernels.images import interleave_colors
 from polsep.kernels.moments import (
+    KEPT,
     NOISE,
     REACH,
     Conversion,
@@ -190,6 +192,8 @@ def _enter(frame: Frame, t: int, strip: Strip, targets: Targets) -> None:
     if flagged:
         flag_row(pattern, strip.window, t, rows.flags)
     enter_row(pattern, frame.conversion, flagged, t, scratch)
+    if strip.rings.edges.size:
+        enter_light(pattern, flagged, t, scratch)
     if targets.sums.size:
         measure_spread(pattern, t, scratch)
     if flagged and strip.start <= t < strip.stop:
@@ -207,12 +211,12 @@ def _weigh(frame: Frame, t: int, strip: Strip, targets: Targets) -> None:
 
 
 @entry
-def open_strip(frame: Frame, piece: Piece) -> Strip:
-    """A strip that is to separate a piece of the frame's cell rows."""
+def open_strip(frame: Frame, piece: Piece, edges: int) -> Strip:
+    """A strip that is to separate a piece of the frame's cell rows; ``edges``: rows of edges to keep, `KEPT` or 0."""
     pattern, begin = frame.source.pattern, first_weighed(piece[0])
     window = make_window(pattern)
     open_window(frame.source.samples, pattern, window, max(begin - NOISE, 0))
-    return Strip(piece[0], piece[1], begin, window, make_rows(pattern), make_rings(pattern.w))
+    return Strip(piece[0], piece[1], begin, window, make_rows(pattern), make_rings(pattern.w, edges))
 
 
 @entry
@@ -227,6 +231,8 @@ def separate_rows(frame: Frame, targets: Targets, strip: Strip, piece: Piece, be
             strip.rings.noise[t % 7] = ZERO
         if t - 2 > first or t - 2 == 0:
             measure_misses(pattern, t - 2, scratch)
+            if strip.rings.edges.size:
+                measure_edges(pattern, t - 2, scratch)
         if t - NOISE >= strip.begin:
             _weigh(frame, t - NOISE, strip, targets)
             find_slope(pattern, t - REACH, strip.start, scratch)
@@ -238,12 +244,12 @@ def separate_rows(frame: Frame, targets: Targets, strip: Strip, piece: Piece, be
 def separate_piece(frame: Frame, targets: Targets, piece: Piece) -> None:
     """A strip of the frame from bilinear samples."""
     nothing = np.empty((0, 5, frame.source.pattern.w), np.float32)
-    separate_rows(frame, targets, open_strip(frame, piece), piece, nothing)
+    separate_rows(frame, targets, open_strip(frame, piece, 0), piece, nothing)
 
 
 def separate_guided_piece(frame: Frame, targets: Targets, piece: Piece) -> None:
     """A strip of the frame from guided Stokes rows, a few at a time."""
-    stream, strip = guided.open_stream(frame.source, piece[0]), open_strip(frame, piece)
+    stream, strip = guided.open_stream(frame.source, piece[0]), open_strip(frame, piece, KEPT)
     better = np.empty((CHUNK, 5, frame.source.pattern.w), np.float32)
     for start in range(piece[0], piece[1], CHUNK):
         chunk = (start, min(start + CHUNK, piece[1]))

@@ -54,6 +54,12 @@ VARIANCE_FLOOR = 1e-5
 #: Weight, against 1 of a sample, of the diffuse light around in pixels where clipping leaves b undetermined.
 PRIOR_WEIGHT = 0.05
 
+#: Where light must be added for samples to clip: how much more freely than the diffuse light, relative to each one's
+#: brightness around, the specular varies; to the fourth power it decides who takes how much.
+SPECULAR_FREEDOM = 12.0
+#: Brightness squared below which freedom is not told apart.
+FREEDOM_FLOOR = 1e-6
+
 #: Least eigenvalue of the normal equations of b, 6 without clipping, above which b counts as determined.
 MIN_EIGENVALUE = 0.3
 
@@ -250,22 +256,23 @@ def _least_squares(y: Tensor, kept: Tensor, a: Tensor, angles: tuple[float, ...]
 def _fill(found: Separation, measurements: Measurements, offset: Tensor, determined: Tensor) -> Separation:
     """Complete pixels that clipping left undetermined, with the valid pixels around as a weak prior.
 
-    Where b is not ``determined`` the specular has the phase of its surroundings and fits the unclipped samples. It is
-    at least what makes the clipped samples clip, and where everything clips at least as bright as around. A colour's
-    diffuse follows from its unclipped samples; where it has none, from around and from what makes it clip.
+    Where b is not ``determined`` the specular has the phase of its surroundings and fits the unclipped samples. What
+    clipped samples lack to clip is light of the lobe that varies more freely: specular beside a highlight, diffuse on a
+    bright matte surface. Where everything clips the specular is at least as bright as around. Of a colour without
+    unclipped samples the diffuse follows from around and from what makes it clip.
     """
     assert measurements.clipped is not None
     assert found.slope is not None
     hole, known = ~found.valid[..., None, :, :], determined[..., None, :, :]
     own = _unit(offset + found.slope * found.specular[..., :1, :, :])
-    phase = torch.where(known, own, _unit(interpolate_around(own * found.specular[..., :1, :, :], found.valid)))
+    nearby = interpolate_around(own * found.specular[..., :1, :, :], found.valid)
     around = interpolate_around(found.diffuse, found.valid)
+    phase, freedom = torch.where(known, own, _unit(nearby)), specular_freedom(nearby, around)
     sums = _sum_unclipped(measurements, found.slope, phase, around)
-    specular = torch.where(known, found.specular[..., :1, :, :], _fit_specular(sums))
-    diffuse = _fit_diffuse(sums, specular)
-    least = torch.maximum(specular, _least_specular(measurements, found.slope, diffuse, phase))
-    specular = torch.where(known, specular, least)
-    diffuse = torch.where(known, torch.maximum(diffuse, _least_diffuse(measurements, found, specular, phase)), diffuse)
+    fitted = _fit_specular(sums, nearby, freedom)
+    lit = (found.slope, phase, _fit_diffuse(sums, fitted), fitted)
+    specular = torch.where(known, found.specular[..., :1, :, :], _raise_specular(measurements, lit, freedom))
+    diffuse = torch.maximum(_fit_diffuse(sums, specular), _least_diffuse(measurements, found, specular, phase))
     core = measurements.clipped.all(dim=-4).all(dim=-3)
     if bool(core.any()):
         rim = interpolate_around(torch.where(hole, specular, found.specular[..., :1, :, :]), ~core)
@@ -276,6 +283,16 @@ def _fill(found: Separation, measurements: Measurements, offset: Tensor, determi
     diffuse = torch.where(hole, diffuse, found.diffuse)
     specular = torch.where(hole, specular, found.specular)
     return replace(found, diffuse=diffuse, specular=specular, stokes=Stokes(*stokes))
+
+
+def specular_freedom(nearby: Tensor, around: Tensor) -> Tensor:
+    """Variance of the specular light over the diffuse light's ``[..., 1, h, w]``, see `SPECULAR_FREEDOM`.
+
+    ``nearby [..., 2, h, w]``: the specular polarization around, ``around [..., C, h, w]``: the diffuse light.
+    """
+    specular = SPECULAR_FREEDOM**2 * (nearby * nearby).sum(dim=-3, keepdim=True)
+    ratio = (specular + FREEDOM_FLOOR) / (_color_mean(around) ** 2 + FREEDOM_FLOOR)
+    return ratio * ratio
 
 
 class _Sums(NamedTuple):
@@ -300,11 +317,12 @@ def _sum_unclipped(measurements: Measurements, slope: Tensor, phase: Tensor, aro
     return _Sums(gg, gp, pp, gy, py)
 
 
-def _fit_specular(sums: _Sums) -> Tensor:
-    """tau_s ``[..., 1, h, w]`` by least squares over all colours, each one's tau_d eliminated."""
-    curvature = (sums.pp - sums.gp**2 / sums.gg).sum(dim=-3, keepdim=True)
-    pull = (sums.py - sums.gp * sums.gy / sums.gg).sum(dim=-3, keepdim=True)
-    return (pull / curvature.clamp(min=1e-3)).clamp(min=0)
+def _fit_specular(sums: _Sums, nearby: Tensor, freedom: Tensor) -> Tensor:
+    """tau_s ``[..., 1, h, w]`` by least squares over all colours, tau_d eliminated; ``nearby`` is its prior."""
+    likely, weight = torch.sqrt((nearby * nearby).sum(dim=-3, keepdim=True)), PRIOR_WEIGHT / freedom
+    curvature = (sums.pp - sums.gp**2 / sums.gg).sum(dim=-3, keepdim=True) + weight
+    pull = (sums.py - sums.gp * sums.gy / sums.gg).sum(dim=-3, keepdim=True) + weight * likely
+    return (pull / curvature.clamp(min=1e-6)).clamp(min=0)
 
 
 def _fit_diffuse(sums: _Sums, specular: Tensor) -> Tensor:
@@ -312,18 +330,23 @@ def _fit_diffuse(sums: _Sums, specular: Tensor) -> Tensor:
     return ((sums.gy - sums.gp * specular) / sums.gg).clamp(min=0)
 
 
-def _least_specular(measurements: Measurements, slope: Tensor, diffuse: Tensor, phase: Tensor) -> Tensor:
-    """The least tau_s ``[..., 1, h, w]`` that makes every clipped sample clip: 2 m = g tau_d + p tau_s >= 2.
+def _raise_specular(measurements: Measurements, lit: tuple[Tensor, ...], freedom: Tensor) -> Tensor:
+    """tau_s ``[..., 1, h, w]`` with its share of what every clipped sample lacks: 2 m = g tau_d + p tau_s >= 2.
 
-    Analysers nearly crossed with the specular light see too little of it and are left out.
+    Never more than the unclipped samples allow, except those nearly crossed with it. ``lit``: slope and phase, tau_d
+    and tau_s so far.
     """
     assert measurements.clipped is not None
-    least = torch.zeros_like(phase[..., :1, :, :])
+    slope, phase, diffuse, specular = lit
+    raised, most = specular, torch.full_like(specular, torch.inf)
     for k, t in enumerate(measurements.angles):
-        p, clipped = _transmitted(phase, t), measurements.clipped[..., k, :, :, :]
-        needed = (2 * measurements.data[..., k, :, :, :] - diffuse * _transmitted(slope, t)) / p.clamp(min=0.5)
-        least = torch.maximum(least, torch.where(clipped & (p > 0.5), needed, 0.0).amax(dim=-3, keepdim=True))
-    return least
+        g, p, clipped = _transmitted(slope, t), _transmitted(phase, t), measurements.clipped[..., k, :, :, :]
+        y = 2 * measurements.data[..., k, :, :, :]
+        lack = torch.where(clipped, (y - g * diffuse - p * specular).clamp(min=0), 0.0).amax(dim=-3, keepdim=True)
+        raised = torch.maximum(raised, specular + lack * p * freedom / (p * p * freedom + g * g))
+        allowed = torch.where(clipped | (p <= 0.5), torch.inf, y / p.clamp(min=0.5)).amin(dim=-3, keepdim=True)
+        most = torch.minimum(most, allowed)
+    return torch.minimum(raised, most.clamp(min=0))
 
 
 def _least_diffuse(measurements: Measurements, found: Separation, specular: Tensor, phase: Tensor) -> Tensor:

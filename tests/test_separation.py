@@ -317,6 +317,26 @@ def test_clipped_highlight_is_not_a_hole() -> None:
     assert_within(found.specular[:, rim], truth.specular[:, rim], 0.05)
 
 
+@pytest.mark.parametrize("gloss", [0.0, 0.02])
+@pytest.mark.parametrize("color", [(2.4, 2.4, 2.4), (2.5, 2.4, 0.4)])
+def test_clipped_matte_surface_is_no_highlight(gloss: float, color: tuple[float, ...]) -> None:
+    """Bright diffuse light that clips, with little specular around it, is not explained by a highlight."""
+    axis = torch.linspace(-1, 1, SIZE, dtype=torch.float64)
+    shading = 1 - 0.4 * (axis[:, None] ** 2 + axis**2)
+    diffuse = torch.tensor(color, dtype=torch.float64).view(3, 1, 1) * shading
+    specular = torch.full_like(diffuse, gloss)
+    truth = Truth(diffuse, specular, Stokes(diffuse + specular, 0.03 * diffuse + gloss, 0.02 * diffuse))
+    seen = saturated(measured(truth))
+    assert seen.clipped is not None
+    gone = seen.clipped.all(dim=0).any(dim=0)
+    assert int(gone.sum()) > 20
+    found = separate_color_affine(seen)
+    assert not bool(found.valid[gone].any())
+    taken_for_specular = math.hypot(0.03, 0.02) * max(color)  # on grey its polarization passes for specular light
+    assert float(found.specular[:, gone].max()) < gloss + 1.5 * taken_for_specular
+    assert float((found.diffuse - diffuse)[:, gone].abs().max()) < 0.25 * max(color)
+
+
 @pytest.mark.parametrize("split", METHODS)
 @pytest.mark.parametrize("scale", [0.25, 4.0])
 def test_exposure_scales_the_parts(split: Split, scale: float) -> None:

@@ -13,7 +13,8 @@ from polsep.kernels.moments import Conversion
 from polsep.kernels.threads import Piece
 
 _LEAST_EIGENVALUE, _PRIOR = np.float32(twin.MIN_EIGENVALUE), np.float32(twin.PRIOR_WEIGHT)
-_SINGULAR, _FLAT, _SHORT = np.float32(1e-6), np.float32(1e-3), np.float32(1e-12)
+_FREEDOM, _FREEDOM_FLOOR = np.float32(twin.SPECULAR_FREEDOM), np.float32(twin.FREEDOM_FLOOR)
+_SINGULAR, _SHORT, _ENDLESS = np.float32(1e-6), np.float32(1e-12), np.float32(np.inf)
 ALL_CLIPPED = np.uint16(0xFFF)
 
 
@@ -169,13 +170,22 @@ def _unit(x: Any, y: Any) -> Any:
 
 
 @compiled
-def _fit_specular(pixels: Pixels, n: int, passed: tuple[Any, Any], sums: Any) -> Any:
+def _freedom(likely: Any, bright: Any) -> Any:
+    """Twin of `color_affine.specular_freedom` for the specular light around and the mean diffuse light."""
+    ratio = (_FREEDOM * _FREEDOM * likely * likely + _FREEDOM_FLOOR) / (bright * bright + _FREEDOM_FLOOR)
+    return ratio * ratio
+
+
+@compiled
+def _fit_specular(pixels: Pixels, n: int, passed: tuple[Any, Any], prior: tuple[Any, Any], sums: Any) -> Any:
     """`color_affine._fit_specular`; ``passed``: twice the share of diffuse and specular light behind each analyser.
 
-    ``sums [3, 3]``, by colour: of g g, g p and g y, with ``sums[c, 2]`` holding the prior's share at first.
+    ``prior``: the likely specular light and the weight of that. ``sums [3, 3]``, by colour: of g g, g p and g y, with
+    ``sums[c, 2]`` holding the prior's share at first.
     """
     g, p = passed
-    curvature, pull = ZERO, ZERO
+    likely, weight = prior
+    curvature, pull = weight, weight * likely
     for c in range(3):
         gg, gp, pp, gy, py = _PRIOR, ZERO, ZERO, sums[c, 2], ZERO
         for k in range(4):
@@ -189,22 +199,35 @@ def _fit_specular(pixels: Pixels, n: int, passed: tuple[Any, Any], sums: Any) ->
         sums[c, 0], sums[c, 1], sums[c, 2] = gg, gp, gy
         curvature += pp - gp * gp / gg
         pull += py - gp * gy / gg
-    value = pull / (curvature if curvature > _FLAT else _FLAT)
+    value = pull / (curvature if curvature > _SINGULAR else _SINGULAR)
     return value if value > ZERO else ZERO
 
 
 @compiled
-def _least_specular(pixels: Pixels, n: int, passed: tuple[Any, Any], diffuse: Any) -> Any:
-    """The least specular light that makes every clipped sample clip. Twin: `color_affine._least_specular`."""
+def _fit_diffuse(sums: Any, specular: Any, diffuse: Any) -> None:
+    """Twin of `color_affine._fit_diffuse`."""
+    for c in range(3):
+        value = (sums[c, 2] - sums[c, 1] * specular) / sums[c, 0]
+        diffuse[c] = value if value > ZERO else ZERO
+
+
+@compiled
+def _raise_specular(pixels: Pixels, n: int, passed: tuple[Any, Any], lit: tuple[Any, Any], freedom: Any) -> Any:
+    """`color_affine._raise_specular`; ``lit``: diffuse and specular light so far."""
     g, p = passed
-    least = ZERO
+    diffuse, specular = lit
+    raised, most = specular, _ENDLESS
     for k in range(4):
-        if p[k] > HALF:
-            for c in range(3):
-                needed = (TWO * pixels.samples[k, c, n] - diffuse[c] * g[k]) / p[k]
-                if _is_clipped(pixels.clipped[n], k, c) and needed > least:
-                    least = needed
-    return least
+        taken = p[k] * freedom / (p[k] * p[k] * freedom + g[k] * g[k])
+        for c in range(3):
+            y = TWO * pixels.samples[k, c, n]
+            if _is_clipped(pixels.clipped[n], k, c):
+                lack = y - g[k] * diffuse[c] - p[k] * specular
+                enough = specular + lack * taken
+                raised = enough if enough > raised else raised
+            elif p[k] > HALF and y / p[k] < most:
+                most = y / p[k] if y > ZERO else ZERO
+    return raised if raised < most else most
 
 
 @compiled
@@ -231,6 +254,8 @@ def fill_pixels(pixels: Pixels, analysers: Analysers, holes: Any, around: Any) -
         n = holes[i]
         a1, a2, known, specular = pixels.lines[0, n], pixels.lines[1, n], pixels.determined[n], pixels.specular[n]
         p1, p2 = around[0, i], around[1, i]
+        likely = np.sqrt(p1 * p1 + p2 * p2)
+        freedom = _freedom(likely, THIRD * (around[2, i] + around[3, i] + around[4, i]))
         if known:
             p1, p2 = pixels.lines[2, n] + a1 * specular, pixels.lines[3, n] + a2 * specular
         p1, p2 = _unit(p1, p2)
@@ -239,16 +264,12 @@ def fill_pixels(pixels: Pixels, analysers: Analysers, holes: Any, around: Any) -
             p[k] = ONE + analysers.cosines[k] * p1 + analysers.sines[k] * p2
         for c in range(3):
             sums[c, 2] = _PRIOR * around[2 + c, i]
-        fitted = _fit_specular(pixels, n, (g, p), sums)
-        specular = specular if known else fitted
-        for c in range(3):
-            value = (sums[c, 2] - sums[c, 1] * specular) / sums[c, 0]
-            diffuse[c] = value if value > ZERO else ZERO
-        if known:
-            _raise_diffuse(pixels, n, (g, p), specular, diffuse)
-        else:
-            least = _least_specular(pixels, n, (g, p), diffuse)
-            specular = least if least > specular else specular
+        fitted = _fit_specular(pixels, n, (g, p), (likely, _PRIOR / freedom), sums)
+        if not known:
+            _fit_diffuse(sums, fitted, diffuse)
+            specular = _raise_specular(pixels, n, (g, p), (diffuse, fitted), freedom)
+        _fit_diffuse(sums, specular, diffuse)
+        _raise_diffuse(pixels, n, (g, p), specular, diffuse)
         mean = THIRD * (diffuse[0] + diffuse[1] + diffuse[2])
         pixels.stokes[0, n] = mean + specular
         pixels.stokes[1, n], pixels.stokes[2, n] = a1 * mean + p1 * specular, a2 * mean + p2 * specular

@@ -135,19 +135,29 @@ def surface_normal(parts: tuple[Part, ...], points: Tensor) -> Tensor:
     return normalize(torch.cat(gradient))
 
 
-def camera_rays(camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Origin ``[3, 1, 1]`` and unit directions ``[3, N, 1]`` through points (rows, cols) of an H x W image."""
-    height, width = size
+def camera_axes(camera: PinholeCamera) -> Tensor:
+    """Unit vectors right, up and forward ``[3, 3]``. Raises ValueError for a camera that looks straight up or down."""
     if math.hypot(camera.position[0] - camera.target[0], camera.position[2] - camera.target[2]) < 1e-6:
         raise ValueError("expected a camera that does not look straight up or down, its up vector is world +y")
     eye, target = torch.tensor(camera.position, dtype=torch.float32), torch.tensor(camera.target, dtype=torch.float32)
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0])), dim=0)
-    up = torch.linalg.cross(right, forward)
-    scale = 2 * math.tan(math.radians(camera.fov_deg) / 2) / height
+    return torch.stack([right, torch.linalg.cross(right, forward), forward])
+
+
+def pixel_side(camera: PinholeCamera, height: int) -> float:
+    """The side of a pixel of an image of that height, at distance 1 from the camera."""
+    return 2 * math.tan(math.radians(camera.fov_deg) / 2) / height
+
+
+def camera_rays(camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Origin ``[3, 1, 1]`` and unit directions ``[3, N, 1]`` through points (rows, cols) of an H x W image."""
+    height, width = size
+    right, up, forward = camera_axes(camera)
+    scale = pixel_side(camera, height)
     x, y = (cols - width / 2) * scale, (height / 2 - rows) * scale
     rays = forward[:, None] + right[:, None] * x + up[:, None] * y
-    return eye.view(3, 1, 1), normalize(rays[..., None])
+    return torch.tensor(camera.position, dtype=torch.float32).view(3, 1, 1), normalize(rays[..., None])
 
 
 def cast(parts: tuple[Part, ...], camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> GBuffer:

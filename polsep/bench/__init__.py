@@ -12,6 +12,7 @@ from pathlib import Path
 from polsep.bench.exactness import bench_exactness
 from polsep.bench.frontend import bench_frontend
 from polsep.bench.real import bench_real
+from polsep.bench.rendering import bench_rendering
 from polsep.bench.resources import bench_resources
 from polsep.bench.rows import Row, provenance, to_jsonl
 from polsep.bench.separation import bench_separation
@@ -25,4 +26,5 @@ BENCHES: dict[str, Callable[[Path], Iterator[Row]]] = {
     "real": bench_real,
     "resources": bench_resources,
     "frontend": bench_frontend,
+    "rendering": bench_rendering,
 }

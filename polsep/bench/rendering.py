@@ -1,0 +1,84 @@
+"""Time of one rendered image, direct light only, beside Mitsuba's compiled polarized variant doing the same.
+
+The same random shapes with one material per slot, the same cameras, lights and points of pixels: 1024x1024 pixels of 4
+rays each, to diffuse and specular Stokes images in three colours. Both have built their scenes before and run on all
+cores. Mitsuba is driven by `pathtrace` with depth 1: per sample one ray, one shadow ray and both lobes of its polarized
+plastic, compiled into one kernel. They take turns and the best time of each counts; the images are compared too.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from polsep.bench.rows import Row
+from polsep.stokes import Stokes
+
+CASE = "1024x1024, 4 rays per pixel, direct light"
+SIZE, SAMPLES = (1024, 1024), 2
+#: Seeds of the random shapes, and how often each is rendered.
+SEEDS, ROUNDS = (0, 1, 2, 3), 6
+OURS, THEIRS = "polsep", "Mitsuba llvm polarized"
+
+
+def bench_rendering(_data: Path | None = None) -> Iterator[Row]:
+    """Seconds per rendered image of 1 MP, and how many times as fast as Mitsuba 3. Needs embreex, mitsuba and LLVM."""
+    try:
+        from polsep.pathtrace import FAST_VARIANT, find_variant
+    except ImportError as error:
+        raise ValueError(f"expected the extras render and mitsuba, found no {error.name}") from None
+    if find_variant() != FAST_VARIANT:
+        raise ValueError("expected an LLVM that Mitsuba works with (libllvm19), found none: nothing to compare with")
+    totals, agreeing = {OURS: 0.0, THEIRS: 0.0}, 1.0
+    for seed in SEEDS:
+        renderers = _build_renderers(seed)
+        images = {name: torch.stack([_stacked(lobe) for lobe in render()]) for name, render in renderers.items()}
+        wrong = (images[OURS] - images[THEIRS]).abs().amax(dim=(0, 1, 2)) / images[OURS].max()
+        agreeing = min(agreeing, float((wrong < 1e-3).float().mean()))
+        best = dict.fromkeys(renderers, float("inf"))
+        for _ in range(ROUNDS):
+            for name, render in renderers.items():
+                start = time.perf_counter()
+                render()
+                best[name] = min(best[name], time.perf_counter() - start)
+        for name, seconds in best.items():
+            totals[name] += seconds / len(SEEDS)
+    for name, seconds in totals.items():
+        yield Row("rendering", CASE, name, "time per image", seconds, "s")
+        yield Row("rendering", CASE, name, "rate", 60 / seconds, "images/min")
+    yield Row("rendering", CASE, OURS, f"times as fast as {THEIRS}", totals[THEIRS] / totals[OURS], "x")
+    yield Row("rendering", CASE, OURS, "pixels that agree to 0.1 %, least", 100 * agreeing, "%")
+
+
+def _stacked(stokes: Stokes) -> Tensor:
+    return torch.stack([stokes.s0, stokes.s1, stokes.s2])
+
+
+def _build_renderers(seed: int) -> dict[str, Callable[[], tuple[Stokes, Stokes]]]:
+    """What renders the diffuse and specular images of a random shape, by name."""
+    from polsep.materials import random_materials
+    from polsep.pathtrace import FAST_VARIANT, PathOptions, build_path_model, trace_paths
+    from polsep.raycast import MeshScene, render_mesh
+    from polsep.render import PinholeCamera, PointLight
+    from polsep.shapes import random_mesh
+
+    generator = torch.Generator().manual_seed(seed)
+    scene = MeshScene(random_mesh(generator))
+    materials = replace(random_materials(scene.mesh.slot_count, generator), textures=None)
+    camera = PinholeCamera((0.3 * scene.size, 0.6 * scene.size, 2.4 * scene.size))
+    light = PointLight((scene.size, 2 * scene.size, 2 * scene.size), 5 * scene.size**2, 1.0)
+    model = build_path_model((scene, materials), FAST_VARIANT)
+
+    def ours() -> tuple[Stokes, Stokes]:
+        return render_mesh((scene, materials), camera, light, SIZE, SAMPLES)
+
+    def theirs() -> tuple[Stokes, Stokes]:
+        traced = trace_paths(model, camera, light, SIZE, PathOptions(SAMPLES, 1, 1))
+        return traced.diffuse, traced.specular
+
+    return {OURS: ours, THEIRS: theirs}

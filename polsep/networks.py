@@ -1,0 +1,74 @@
+"""The learned parts as plain modules: no files, no optimizer, no statistics of whole images, so crop and frame agree.
+
+Conventions: images ``[N, C, H, W]``, linear light; any H and W (padded by mirror inside to what the levels need).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+
+class DoubleConv(nn.Sequential):
+    """Two 3x3 convolutions with ReLU, the size kept by zero padding (Ronneberger et al. 2015 crop instead)."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(
+            nn.Conv2d(inputs, outputs, 3, padding=1),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(outputs, outputs, 3, padding=1),
+            nn.ReLU(inplace=True),
+        )
+        for layer in self:
+            if isinstance(layer, nn.Conv2d):
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+                nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+
+
+class UNet(nn.Module):
+    """The U-Net of Ronneberger et al. 2015 without normalization: ``[N, inputs, H, W]`` to ``[N, outputs, H, W]``.
+
+    ``width`` channels at full size, twice as many at each of ``levels`` halvings (max pooling down, 2x2 transposed
+    convolutions up, skips concatenated). 64 and 4 are the classic one. The last 1x1 convolution starts at zero.
+    """
+
+    def __init__(self, inputs: int, outputs: int, width: int = 64, levels: int = 4) -> None:
+        super().__init__()
+        widths = [width * 2**level for level in range(levels + 1)]
+        self.levels = levels
+        self.encoders = nn.ModuleList(DoubleConv(a, b) for a, b in zip([inputs, *widths], widths, strict=False))
+        self.ups = nn.ModuleList(nn.ConvTranspose2d(2 * w, w, 2, stride=2) for w in widths[:-1])
+        self.decoders = nn.ModuleList(DoubleConv(2 * w, w) for w in widths[:-1])
+        self.last = nn.Conv2d(width, outputs, 1)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Images of any size; what pads them to a multiple of 2^levels is cut off again."""
+        height, width = x.shape[-2:]
+        x = pad_to_multiple(x, 2**self.levels)
+        skips = []
+        for encoder in self.encoders[:-1]:
+            x = encoder(x)
+            skips.append(x)
+            x = nn.functional.max_pool2d(x, 2)
+        x = self.encoders[-1](x)
+        for up, decoder, skip in zip(reversed(self.ups), reversed(self.decoders), reversed(skips), strict=True):
+            x = decoder(torch.cat([skip, up(x)], dim=1))
+        out: Tensor = self.last(x)[..., :height, :width]
+        return out
+
+
+def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:
+    """``[N, C, H, W]`` mirrored at its lower and right border to multiples; repeated where too small for that."""
+    rows, cols = (-x.shape[-2]) % multiple, (-x.shape[-1]) % multiple
+    if not rows and not cols:
+        return x
+    mirrors = rows < x.shape[-2] and cols < x.shape[-1]
+    return pad(x, (0, cols, 0, rows), mode="reflect" if mirrors else "replicate")
+
+
+def count_parameters(module: nn.Module) -> int:
+    """How many numbers training sets."""
+    return sum(p.numel() for p in module.parameters() if p.requires_grad)

@@ -1,0 +1,117 @@
+"""The paper's second stage: U-Nets that refine an analytic split, and the rungs of the ladder it is compared with.
+
+A rung says what its networks see of a frame's co-registered analysers; all rungs have the same two networks, DiffUNet
+for tau_d and SpecUNet for log(1 + tau_s), but for one with both in a single net. Conventions: linear white light;
+analysers ``[N, 4, C, h, w]``, inputs ``[N, K, h, w]``. Source: Dave et al. 2022, Sec. 4.3 and Table 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from polsep.networks import UNet
+from polsep.separation import Separation, separate_analytic
+from polsep.stokes import Measurements, Stokes, fit_stokes, polarized_intensity
+
+Inputs = Callable[[Measurements], Tensor]
+
+#: Polarized light below this share of the white level has no angle: its cosine tends to 0.
+LEAST_POLARIZED = 1e-6
+
+
+def analytic_inputs(measurements: Measurements) -> Tensor:
+    """tau_d and log(1 + tau_s) of the analytic split and cos(2 phi), of every colour (Sec. 4.3, inputs 1 to 3)."""
+    return torch.cat([split_inputs(measurements), _cosine(fit_stokes(measurements))], dim=-3)
+
+
+def split_inputs(measurements: Measurements) -> Tensor:
+    """`analytic_inputs` without the angle (Table 2, ablation 2)."""
+    found = separate_analytic(measurements)
+    return torch.cat([found.diffuse, torch.log1p(found.specular)], dim=-3)
+
+
+def stokes_inputs(measurements: Measurements) -> Tensor:
+    """s0, s1, s2 of every colour (Table 2, ablation 3)."""
+    stokes = fit_stokes(measurements)
+    return torch.cat([stokes.s0, stokes.s1, stokes.s2], dim=-3)
+
+
+def polarized_inputs(measurements: Measurements) -> Tensor:
+    """The four polarized images (baseline 3)."""
+    return measurements.data.flatten(-4, -3)
+
+
+def unpolarized_inputs(measurements: Measurements) -> Tensor:
+    """s0 of every colour, what a camera without polarizers sees (baseline 2)."""
+    return fit_stokes(measurements).s0
+
+
+def _cosine(stokes: Stokes) -> Tensor:
+    return stokes.s1 / polarized_intensity(stokes).clamp(min=LEAST_POLARIZED)
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One rung: its ``inputs`` and their number per colour, and whether diffuse and specular ``share`` one network."""
+
+    name: str
+    inputs: Inputs
+    per_color: int
+    share: bool
+    summary: str
+
+
+RUNGS = {
+    rung.name: rung
+    for rung in (
+        Rung("paper", analytic_inputs, 3, False, "analytic split and angle, two networks"),
+        Rung("unpolarized", unpolarized_inputs, 1, False, "CNN on the unpolarized image"),
+        Rung("polarized", polarized_inputs, 4, False, "CNN on the four polarized images"),
+        Rung("shared", analytic_inputs, 3, True, "one network for both outputs"),
+        Rung("no-angle", split_inputs, 2, False, "analytic split without the angle"),
+        Rung("stokes", stokes_inputs, 3, False, "Stokes maps instead of the analytic split"),
+    )
+}
+
+
+class Refinement(nn.Module):
+    """The networks of a rung: inputs ``[N, K, h, w]`` to tau_d and log(1 + tau_s), ``[N, C, h, w]`` each.
+
+    ``colors``: C, 3 or 1; ``width`` and ``levels`` as in `UNet`.
+    """
+
+    def __init__(self, rung: Rung, colors: int = 3, width: int = 64, levels: int = 4) -> None:
+        super().__init__()
+        self.colors = colors
+        inputs = rung.per_color * colors
+        self.nets = nn.ModuleList(
+            [UNet(inputs, 2 * colors, width, levels)]
+            if rung.share
+            else [UNet(inputs, colors, width, levels), UNet(inputs, colors, width, levels)]
+        )
+
+    def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """DiffUNet's and SpecUNet's images."""
+        images = torch.cat([net(inputs) for net in self.nets], dim=1)
+        return images[:, : self.colors], images[:, self.colors :]
+
+
+def separate_refined(measurements: Measurements, rung: Rung, networks: Refinement) -> Separation:
+    """Diffuse and specular of ``[..., 4, C, h, w]`` as the networks see them; negative values are cut to 0.
+
+    The networks demosaick nothing and hold nothing together: ``stokes.s0`` is the sum of both outputs.
+    """
+    batch = measurements.data.shape[:-4]
+    inputs = rung.inputs(measurements)
+    inputs = inputs.reshape(-1, *inputs.shape[-3:])
+    with torch.no_grad():
+        diffuse, logarithm = networks(inputs)
+    images = [x.float().reshape(*batch, *x.shape[-3:]) for x in (diffuse, torch.expm1(logarithm.float()))]
+    diffuse, specular = (x.clamp(min=0) for x in images)
+    seen = separate_analytic(measurements)
+    stokes = Stokes(diffuse + specular, seen.stokes.s1, seen.stokes.s2)
+    return Separation(diffuse, specular, seen.valid, stokes)

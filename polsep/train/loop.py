@@ -1,0 +1,184 @@
+"""The one training loop: AdamW, warm-up and cosine, clipped gradients, a moving average of the weights, checkpoints.
+
+A training that is killed goes on from its last checkpoint and ends with the same bits as one that was not: the state
+holds all that a step depends on, and the stream starts at any batch.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from polsep.bench.truth import psnr
+from polsep.io.checkpoints import append_line, read_checkpoint, write_checkpoint
+from polsep.kernels.threads import set_threads
+from polsep.train.stream import Examples, ExampleStream, StreamOptions
+from polsep.train.tasks import Task
+
+#: The learning rate ends at this share of its peak.
+LAST_SHARE = 0.01
+WEIGHT_DECAY, BETAS = 1e-4, (0.9, 0.99)
+#: Norm of a network's gradient at most.
+MOST_GRADIENT = 1.0
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long and how: ``steps``, peak learning ``rate``, steps of ``warm_up``, decay of the moving ``average``.
+
+    ``checkpoint_every`` and ``validate_every`` count steps. ``precision``: as lightning-fabric names it.
+    """
+
+    steps: int = 20_000
+    rate: float = 1e-3
+    warm_up: int = 500
+    average: float = 0.999
+    checkpoint_every: int = 500
+    validate_every: int = 1000
+    precision: str = "bf16-mixed"
+
+    def rate_at(self, step: int) -> float:
+        """Linear warm-up, then half a cosine down to `LAST_SHARE` of the peak."""
+        if step < self.warm_up:
+            return self.rate * (step + 1) / self.warm_up
+        done = (step - self.warm_up) / max(1, self.steps - self.warm_up)
+        return self.rate * (LAST_SHARE + (1 - LAST_SHARE) * (1 + math.cos(math.pi * min(done, 1))) / 2)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Where a training writes, what it trains on, and on what: ``workers`` render, ``devices`` train."""
+
+    out: Path
+    stream: StreamOptions
+    schedule: Schedule
+    workers: int = 1
+    devices: int = 1
+
+
+Report = Callable[[dict[str, Any]], None]
+
+
+def train(task: Task, run: Run, report: Report) -> dict[str, Tensor]:
+    """Train to the end of the schedule, from the last checkpoint if there is one; returns the averaged weights.
+
+    ``report`` is called with every line of the log. Raises ValueError when the checkpoint is of another training.
+    """
+    fabric = Fabric(accelerator="auto", devices=run.devices, precision=run.schedule.precision)  # type: ignore[arg-type]
+    fabric.launch()
+    network = task.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, betas=BETAS, weight_decay=WEIGHT_DECAY)
+    average = {name: value.detach().clone() for name, value in network.state_dict().items()}
+    path = run.out / "checkpoint.pt"
+    step = _restore(read_checkpoint(path), run, (network, optimizer, average))
+    wrapped, wrapped_optimizer = fabric.setup(network, optimizer)
+    average = {name: value.to(fabric.device) for name, value in average.items()}
+    validation = validation_batches(run.stream)
+    batches = _batches(run, fabric, step)
+    started, first, losses = time.monotonic(), step, []
+    while step < run.schedule.steps:
+        for group in optimizer.param_groups:
+            group["lr"] = run.schedule.rate_at(step)
+        examples = Examples(*(x.to(fabric.device) for x in next(batches)))
+        loss = task.loss(wrapped, task.prepare(examples))
+        optimizer.zero_grad(set_to_none=True)
+        fabric.backward(loss)
+        for net in _parts(network):
+            nn.utils.clip_grad_norm_(net.parameters(), MOST_GRADIENT)
+        wrapped_optimizer.step()
+        step += 1
+        losses.append(float(loss.detach()))
+        follow(average, network, min(run.schedule.average, (1 + step) / (10 + step)))
+        if step % run.schedule.validate_every == 0 or step == run.schedule.steps:
+            line = {"step": step, "loss": statistics.fmean(losses), "rate": run.schedule.rate_at(step)}
+            line |= validate(task, average, [Examples(*(x.to(fabric.device) for x in b)) for b in validation])
+            line["steps_per_second"] = (step - first) / (time.monotonic() - started)
+            losses = []
+            if fabric.is_global_zero:
+                append_line(run.out / "log.jsonl", json.dumps(line))
+                report(line)
+        if step % run.schedule.checkpoint_every == 0 or step == run.schedule.steps:
+            state = {"step": step, "run": _describe(run), "network": network.state_dict()}
+            if fabric.is_global_zero:
+                write_checkpoint(path, state | {"optimizer": optimizer.state_dict(), "average": average})
+    return average
+
+
+def _describe(run: Run) -> str:
+    """What must be the same for a checkpoint to go on: data and schedule, not where or by how many processes."""
+    return json.dumps({"stream": asdict(run.stream), "schedule": asdict(run.schedule), "lanes": _lanes(run)})
+
+
+def _lanes(run: Run) -> int:
+    return max(run.workers, 1) * run.devices
+
+
+def _restore(state: dict[str, Any] | None, run: Run, into: tuple[nn.Module, Any, dict[str, Tensor]]) -> int:
+    """Fill network, optimizer and average from a checkpoint; the step it was made at, 0 without one."""
+    if state is None:
+        return 0
+    if state["run"] != _describe(run):
+        raise ValueError(f"expected the checkpoint of {_describe(run)}, found one of {state['run']}")
+    network, optimizer, average = into
+    network.load_state_dict(state["network"])
+    optimizer.load_state_dict(state["optimizer"])
+    average.update(state["average"])
+    return int(state["step"])
+
+
+def _parts(network: nn.Module) -> list[nn.Module]:
+    """Networks that are trained independently have their gradients clipped so."""
+    nets = getattr(network, "nets", None)
+    return list(nets) if nets is not None else [network]
+
+
+def _batches(run: Run, fabric: Fabric, step: int) -> Iterator[Examples]:
+    """Batches from ``step`` on; every device has lanes of its own."""
+    stream = ExampleStream(run.stream, step, (fabric.global_rank, fabric.world_size))
+    return iter(DataLoader(stream, batch_size=None, num_workers=run.workers, worker_init_fn=_take_one_core))
+
+
+def _take_one_core(worker: int) -> None:
+    """Rendering workers are as many as there are cores to give."""
+    del worker
+    set_threads(1)
+
+
+def follow(average: dict[str, Tensor], network: nn.Module, decay: float) -> None:
+    """Move the average of the weights a step toward the network's."""
+    with torch.no_grad():
+        for name, value in network.state_dict().items():
+            average[name].lerp_(value.detach(), 1 - decay)
+
+
+def validation_batches(stream: StreamOptions, count: int = 4) -> list[Examples]:
+    """The first batches of the validation split, of which every example is of a scene of its own."""
+    options = StreamOptions("validation", 0, 8, stream.crop, stream.size, stream.samples, pool=1, reuse=1)
+    batches = iter(ExampleStream(options))
+    return [next(batches) for _ in range(count)]
+
+
+def validate(task: Task, average: dict[str, Tensor], batches: list[Examples]) -> dict[str, float]:
+    """Mean PSNR [dB] of diffuse and specular over the examples' masks, by the averaged weights."""
+    network = task.network
+    own = {name: value.detach().clone() for name, value in network.state_dict().items()}
+    network.load_state_dict(average)
+    scores: dict[str, list[float]] = {"diffuse": [], "specular": []}
+    for examples in batches:
+        seen = task.prepare(examples)
+        found = task.separate(seen)
+        for name, images, truth in (("diffuse", found.diffuse, seen[1]), ("specular", found.specular, seen[2])):
+            scores[name] += [psnr(x, t, m) for x, t, m in zip(images, truth, seen[3], strict=True) if bool(m.any())]
+    network.load_state_dict(own)
+    return {f"{name} PSNR": statistics.fmean(values) for name, values in scores.items()}

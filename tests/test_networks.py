@@ -1,0 +1,60 @@
+"""Networks as functions: sizes, borders, batches, gradients, and that they can learn a picture by heart."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tolerances import assert_close, assert_finite
+
+from polsep.networks import UNet, count_parameters, pad_to_multiple
+
+
+def random_net(inputs: int = 3, outputs: int = 2, width: int = 4, levels: int = 2) -> UNet:
+    """A net whose last layer is not zero, as after training."""
+    torch.manual_seed(0)
+    net = UNet(inputs, outputs, width, levels)
+    torch.nn.init.normal_(net.last.weight, std=0.3)
+    return net.eval()
+
+
+def test_classic_unet_has_the_size_of_ronneberger() -> None:
+    """31.0 million parameters, as the architecture of Fig. 1 in Ronneberger et al. 2015 has with one input channel."""
+    assert 31.0e6 < count_parameters(UNet(1, 2)) < 31.1e6
+
+
+@pytest.mark.parametrize("size", [(16, 16), (13, 18), (5, 7), (3, 3)])
+def test_any_size_goes_in_and_out(size: tuple[int, int]) -> None:
+    x = torch.rand(1, 3, *size)
+    assert random_net()(x).shape == (1, 2, *size)
+
+
+def test_starts_at_zero() -> None:
+    assert not bool(UNet(3, 2, 4, 2)(torch.rand(1, 3, 8, 8)).any())
+
+
+def test_padding_mirrors_and_repeats() -> None:
+    row = torch.arange(5.0).view(1, 1, 1, 5).expand(1, 1, 4, 5)
+    assert pad_to_multiple(row, 4)[0, 0, 0].tolist() == [0, 1, 2, 3, 4, 3, 2, 1]
+    assert pad_to_multiple(torch.ones(1, 1, 1, 1), 4).shape == (1, 1, 4, 4)
+
+
+def test_images_of_a_batch_are_independent() -> None:
+    net, x = random_net(), torch.rand(3, 3, 16, 16)
+    assert_close(net(x)[1:2], net(x[1:2]))
+
+
+def test_crop_and_frame_agree_away_from_the_border() -> None:
+    """No statistics of the image: beyond the reach of a level's convolutions a crop gives what the frame gives."""
+    net, x = random_net(), torch.rand(1, 3, 96, 96)
+    reach = 32
+    crop = net(x[..., 16:96, 16:96])[..., reach:-reach, reach:-reach]
+    assert_close(crop, net(x)[..., 16 + reach : 96 - reach, 16 + reach : 96 - reach])
+
+
+def test_gradients_are_finite_and_reach_every_layer() -> None:
+    net = random_net()
+    net(torch.rand(2, 3, 16, 16)).square().mean().backward()
+    gradients = [p.grad for p in net.parameters()]
+    assert all(g is not None for g in gradients)
+    assert_finite(*(g for g in gradients if g is not None))
+    assert all(float(g.abs().max()) > 0 for g in gradients if g is not None and g.ndim == 4)

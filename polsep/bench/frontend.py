@@ -50,6 +50,8 @@ SPLITS = {"analytic": separate_analytic, "color-affine": separate_color_affine}
 BORDER = 8
 #: Below this true DoLP an angle of polarization says nothing.
 LEAST_DOLP = 0.05
+#: Rendered materials: the saturation of their colours, and their share of mixed ones, of which a quarter is grey.
+MATERIALS = {"colour": (1.0, 0.375), "desaturated": (0.3, 0.375), "grey": (0.0, 0.25)}
 #: Scenes whose demosaicking is scored; the separation takes all of `SCENE_SEEDS`.
 SCORED_SEEDS = SCENE_SEEDS[:4]
 
@@ -84,8 +86,15 @@ def bench_frontend(data: Path) -> Iterator[Row]:
     peers = find_peers()
     theirs = ask_peers(cases, peers)
     yield from score_cases("real", "real captures", ((case, demosaic_case(case, theirs)) for case in cases))
-    for case, saturation in (("colour", 1.0), ("desaturated", 0.3), ("grey", 0.0)):
-        yield from _bench_rendered(case, saturation, peers)
+    mixed: dict[tuple[str, str], float] = {}
+    for case, (saturation, share) in MATERIALS.items():
+        for row in _bench_rendered(case, saturation, peers):
+            yield row
+            if row.metric.endswith("gain"):
+                key = (row.method, row.metric)
+                mixed[key] = mixed.get(key, 0.0) + share * row.value
+    for (method, metric), value in mixed.items():
+        yield Row("frontend/split", "mixed renders, half", method, metric, value, "dB")
     yield from bench_speed(peers)
 
 

@@ -1,0 +1,121 @@
+"""Streamed training examples: the same wherever a stream starts, true to the camera model, never of the test split."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tolerances import SIGMAS, assert_close
+from torch.utils.data import DataLoader
+
+pytest.importorskip("embreex")
+
+from polsep.camera import CLIP_MARGIN, IMX250, Layout
+from polsep.simulate import filter_light
+from polsep.stokes import Stokes
+from polsep.train.stream import (
+    HEADROOM,
+    LOOKS,
+    VIEWS,
+    Examples,
+    ExampleStream,
+    StreamOptions,
+    add_gaussian_noise,
+    pool_scenes,
+    random_gain,
+    stream_lane,
+)
+
+SMALL = StreamOptions(batch=3, crop=32, size=64, pool=3, reuse=2)
+
+
+def take(options: StreamOptions, lane: int, first: int, count: int) -> list[Examples]:
+    return list(itertools.islice(stream_lane(options, lane, first), count))
+
+
+def same(a: Examples, b: Examples) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+@pytest.fixture(scope="module")
+def batches() -> list[Examples]:
+    return take(SMALL, 0, 0, 8)
+
+
+@pytest.mark.parametrize("first", [1, 5, 7])
+def test_a_stream_that_starts_later_goes_on_alike(batches: list[Examples], first: int) -> None:
+    assert same(take(SMALL, 0, first, 1)[0], batches[first])
+
+
+def test_seeds_lanes_and_splits_differ(batches: list[Examples]) -> None:
+    others = [take(replace(SMALL, seed=1), 0, 0, 1), take(SMALL, 1, 0, 1), take(replace(SMALL, split="test"), 0, 0, 1)]
+    assert not any(same(other[0], batches[0]) for other in others)
+
+
+@pytest.mark.parametrize("start", [0, 3])
+def test_workers_are_lanes_in_turn(start: int) -> None:
+    """Batch k is of lane k modulo their number, whichever batch is the first."""
+    loader = DataLoader(ExampleStream(SMALL, start), batch_size=None, num_workers=2)
+    found = list(itertools.islice(loader, 3))
+    for k, batch in enumerate(found, start):
+        assert same(Examples(*batch), take(SMALL, k % 2, k // 2, 1)[0])
+
+
+def test_scenes_follow_their_number() -> None:
+    whole = list(itertools.islice(pool_scenes(SMALL, 0, 0), VIEWS * LOOKS + 2))
+    later = next(pool_scenes(SMALL, 0, VIEWS * LOOKS + 1))
+    assert torch.equal(whole[-1].diffuse, later.diffuse)
+
+
+def test_raw_is_the_truth_behind_its_filters(batches: list[Examples]) -> None:
+    """Where nothing clips, raw minus the filtered truth is noise of the sensor's size."""
+    deviations = []
+    for b in batches:
+        for k in range(SMALL.batch):
+            diffuse, specular, polarized = (x[k].float() for x in (b.diffuse, b.specular, b.polarized))
+            signal = filter_light(Stokes(diffuse + specular, polarized[:3], polarized[3:]), Layout(), IMX250)
+            kept = (signal > 0.01) & (signal < 0.9)
+            deviations.append(((b.raw[k] - signal) / IMX250.noise_variance(signal).sqrt())[kept])
+    z = torch.cat(deviations)
+    assert abs(float(z.mean())) < SIGMAS / math.sqrt(z.numel()) + 0.02  # halves round the truth by up to 2^-12
+    assert abs(float(z.std()) - 1) < 0.05
+
+
+def test_truth_is_physical(batches: list[Examples]) -> None:
+    for b in batches:
+        assert float(b.diffuse.min()) >= 0
+        assert float(b.specular.min()) >= 0
+        total = b.diffuse.float() + b.specular.float()
+        polarized = torch.hypot(b.polarized[:, :3].float(), b.polarized[:, 3:].float())
+        assert float((polarized - total).max()) < 2e-3 * float(total.max())
+        assert float(b.raw.min()) >= 0
+        assert float(b.raw.max()) <= 1
+        assert float(total.permute(0, 2, 3, 1)[~b.mask].max()) <= float(total.max())
+
+
+def test_exposures_clip_what_was_drawn() -> None:
+    brightness = torch.linspace(0.94, 1, 121)
+    gains = [random_gain(brightness, torch.Generator().manual_seed(k)) for k in range(300)]
+    assert min(gains) > 0
+    assert max(gains) <= 1 / 0.95 + 1e-6
+    unclipped = sum(gain <= HEADROOM for gain in gains)
+    assert 70 < unclipped < 130
+
+
+def test_fast_noise_has_the_sensors_statistics() -> None:
+    signal = torch.full((200, 200), 0.3)
+    raw = add_gaussian_noise(signal, IMX250, torch.Generator().manual_seed(3))
+    assert abs(float(raw.mean()) - 0.3) < SIGMAS * math.sqrt(float(IMX250.noise_variance(signal)[0, 0]) / signal.numel())
+    assert abs(float(raw.var()) / float(IMX250.noise_variance(signal)[0, 0]) - 1) < 0.05
+    codes = raw * IMX250.white_level
+    assert_close(codes, codes.round(), scale=IMX250.white_level)
+    assert float(add_gaussian_noise(torch.full((8, 8), 3.0), IMX250, torch.Generator()).min()) >= 1 - CLIP_MARGIN
+
+
+@pytest.mark.parametrize("wrong", [{"crop": 30}, {"crop": 128, "size": 64}, {"pool": 0}, {"batch": 0}])
+def test_bad_options_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        replace(SMALL, **wrong)

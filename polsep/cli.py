@@ -218,6 +218,54 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 
 
 @app.command()
+@click.argument("rung")
+@click.option("-o", "--output", type=DIR, required=True, metavar="DIR", help="A new directory, or one to go on with.")
+@click.option("--data", default="mosaic", metavar="NAME", help="mosaic: noisy raw frames; co-sited: as in the paper.")
+@click.option("--width", type=int, default=32, metavar="N", help="Channels of the network's first level.")
+@click.option("--levels", type=int, default=3, metavar="N", help="Halvings of the network.")
+@click.option("--fold", type=int, default=2, metavar="N", help="N x N pixels are folded into channels; 1: none.")
+@click.option("--steps", type=int, default=20_000, metavar="N", help="Batches of 8 crops.")
+@click.option("--rate", type=float, default=1e-3, metavar="X", help="Peak learning rate.")
+@click.option("--seed", type=int, default=0, metavar="N", help="Of the weights and of the data.")
+@click.option("--workers", type=int, default=1, metavar="N", help="Processes that render, per device.")
+@click.option("--devices", type=int, default=1, metavar="N", help="GPUs, where there are any.")
+@click.option("--precision", default="bf16-mixed", metavar="NAME", help="bf16-mixed or 32-true.")
+def train(rung: str, output: Path, data: str, **options: Any) -> None:
+    """Train a rung of the paper's ladder on rendered examples: paper, unpolarized, polarized, shared, no-angle, stokes.
+
+    Data are rendered while training, from seeds that no test has. A run that was stopped or killed goes on when the
+    same command is given again. Needs the extra train.
+
+    \b
+    polsep train paper -o runs/paper
+    polsep train paper --width 64 --levels 4 --fold 1 -o runs/unet64      the classic U-Net
+    """
+    try:
+        from polsep.networks import Size
+        from polsep.train.command import TrainOptions, plan_run, train_rung
+        from polsep.train.loop import Schedule
+    except ModuleNotFoundError as error:
+        raise click.ClickException(
+            f"expected the extra 'train' (pip install 'polsep[train]'), found no {error.name}"
+        ) from None
+    try:
+        size = Size(options["width"], options["levels"], options["fold"])
+        asked = TrainOptions(rung, data, size, options["seed"])
+        schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])
+        run = plan_run(output, asked, schedule, options["workers"], options["devices"])
+        path = train_rung(asked, run, _show_training)
+    except ValueError as error:
+        raise click.ClickException(str(error)) from None
+    print(path)
+
+
+def _show_training(line: dict[str, Any]) -> None:
+    """One line of a training's log."""
+    values = (f"{name} {value:.4g}" for name, value in line.items())
+    print(", ".join(values), file=sys.stderr, flush=True)
+
+
+@app.command()
 def methods() -> None:
     """List the separation methods that this installation has."""
     from polsep.pipeline import BEST_METHOD, METHODS

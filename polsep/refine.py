@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from polsep.networks import UNet
+from polsep.networks import UNET64, Size, UNet
 from polsep.separation import Separation, separate_analytic
 from polsep.stokes import Measurements, Stokes, fit_stokes, polarized_intensity
 
@@ -81,18 +81,14 @@ RUNGS = {
 class Refinement(nn.Module):
     """The networks of a rung: inputs ``[N, K, h, w]`` to tau_d and log(1 + tau_s), ``[N, C, h, w]`` each.
 
-    ``colors``: C, 3 or 1; ``width`` and ``levels`` as in `UNet`.
+    ``colors``: C, 3 or 1; ``size``: of each network.
     """
 
-    def __init__(self, rung: Rung, colors: int = 3, width: int = 64, levels: int = 4) -> None:
+    def __init__(self, rung: Rung, colors: int = 3, size: Size = UNET64) -> None:
         super().__init__()
         self.colors = colors
-        inputs = rung.per_color * colors
-        self.nets = nn.ModuleList(
-            [UNet(inputs, 2 * colors, width, levels)]
-            if rung.share
-            else [UNet(inputs, colors, width, levels), UNet(inputs, colors, width, levels)]
-        )
+        outputs = [2 * colors] if rung.share else [colors, colors]
+        self.nets = nn.ModuleList(UNet(rung.per_color * colors, count, size) for count in outputs)
 
     def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """DiffUNet's and SpecUNet's images."""

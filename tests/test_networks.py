@@ -6,13 +6,15 @@ import pytest
 import torch
 from tolerances import assert_close, assert_finite
 
-from polsep.networks import UNet, count_parameters, pad_to_multiple
+from polsep.networks import Size, UNet, count_parameters, pad_to_multiple
+
+SIZES = [Size(4, 2, 1), Size(4, 1, 2)]
 
 
-def random_net(inputs: int = 3, outputs: int = 2, width: int = 4, levels: int = 2) -> UNet:
-    """A net whose last layer is not zero, as after training."""
+def random_net(size: Size = SIZES[0]) -> UNet:
+    """A net of 3 channels in and 2 out whose last layer is not zero, as after training."""
     torch.manual_seed(0)
-    net = UNet(inputs, outputs, width, levels)
+    net = UNet(3, 2, size)
     torch.nn.init.normal_(net.last.weight, std=0.3)
     return net.eval()
 
@@ -22,14 +24,19 @@ def test_classic_unet_has_the_size_of_ronneberger() -> None:
     assert 31.0e6 < count_parameters(UNet(1, 2)) < 31.1e6
 
 
-@pytest.mark.parametrize("size", [(16, 16), (13, 18), (5, 7), (3, 3)])
-def test_any_size_goes_in_and_out(size: tuple[int, int]) -> None:
-    x = torch.rand(1, 3, *size)
-    assert random_net()(x).shape == (1, 2, *size)
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("shape", [(16, 16), (13, 18), (5, 7), (3, 3)])
+def test_any_size_goes_in_and_out(size: Size, shape: tuple[int, int]) -> None:
+    assert random_net(size)(torch.rand(1, 3, *shape)).shape == (1, 2, *shape)
 
 
 def test_starts_at_zero() -> None:
-    assert not bool(UNet(3, 2, 4, 2)(torch.rand(1, 3, 8, 8)).any())
+    assert not bool(UNet(3, 2, SIZES[0])(torch.rand(1, 3, 8, 8)).any())
+
+
+def test_sizes_below_one_are_refused() -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        Size(0, 1, 1)
 
 
 def test_padding_mirrors_and_repeats() -> None:
@@ -38,14 +45,16 @@ def test_padding_mirrors_and_repeats() -> None:
     assert pad_to_multiple(torch.ones(1, 1, 1, 1), 4).shape == (1, 1, 4, 4)
 
 
-def test_images_of_a_batch_are_independent() -> None:
-    net, x = random_net(), torch.rand(3, 3, 16, 16)
+@pytest.mark.parametrize("size", SIZES)
+def test_images_of_a_batch_are_independent(size: Size) -> None:
+    net, x = random_net(size), torch.rand(3, 3, 16, 16)
     assert_close(net(x)[1:2], net(x[1:2]))
 
 
-def test_crop_and_frame_agree_away_from_the_border() -> None:
+@pytest.mark.parametrize("size", SIZES)
+def test_crop_and_frame_agree_away_from_the_border(size: Size) -> None:
     """No statistics of the image: beyond the reach of a level's convolutions a crop gives what the frame gives."""
-    net, x = random_net(), torch.rand(1, 3, 96, 96)
+    net, x = random_net(size), torch.rand(1, 3, 96, 96)
     reach = 32
     crop = net(x[..., 16:96, 16:96])[..., reach:-reach, reach:-reach]
     assert_close(crop, net(x)[..., 16 + reach : 96 - reach, 16 + reach : 96 - reach])

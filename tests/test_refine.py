@@ -8,6 +8,7 @@ import pytest
 import torch
 from tolerances import assert_close
 
+from polsep.networks import Size
 from polsep.refine import RUNGS, Refinement, Rung, analytic_inputs, separate_refined
 from polsep.stokes import Measurements, Stokes, measure
 from polsep.train.losses import diffuse_loss, gradient_loss, proxy_diffuse, specular_loss
@@ -35,7 +36,7 @@ def test_unpolarized_light_has_no_angle() -> None:
 
 @pytest.mark.parametrize("rung", RUNGS.values(), ids=lambda r: r.name)
 def test_every_rung_sees_and_separates(rung: Rung) -> None:
-    network = Refinement(rung, 3, 4, 1)
+    network = Refinement(rung, 3, Size(4, 1, 1))
     assert len(network.nets) == (1 if rung.share else 2)
     assert rung.inputs(seen()).shape == (1, 3 * rung.per_color, 12, 12)
     for net in network.nets:
@@ -48,7 +49,7 @@ def test_every_rung_sees_and_separates(rung: Rung) -> None:
 
 def test_mono_has_one_colour() -> None:
     mono = Measurements(seen().data[:, :, :1], ANGLES)
-    found = separate_refined(mono, RUNGS["paper"], Refinement(RUNGS["paper"], 1, 4, 1))
+    found = separate_refined(mono, RUNGS["paper"], Refinement(RUNGS["paper"], 1, Size(4, 1, 1)))
     assert found.diffuse.shape == (1, 1, 12, 12)
 
 

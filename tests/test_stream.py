@@ -108,7 +108,9 @@ def test_exposures_clip_what_was_drawn() -> None:
 def test_fast_noise_has_the_sensors_statistics() -> None:
     signal = torch.full((200, 200), 0.3)
     raw = add_gaussian_noise(signal, IMX250, torch.Generator().manual_seed(3))
-    assert abs(float(raw.mean()) - 0.3) < SIGMAS * math.sqrt(float(IMX250.noise_variance(signal)[0, 0]) / signal.numel())
+    assert abs(float(raw.mean()) - 0.3) < SIGMAS * math.sqrt(
+        float(IMX250.noise_variance(signal)[0, 0]) / signal.numel()
+    )
     assert abs(float(raw.var()) / float(IMX250.noise_variance(signal)[0, 0]) - 1) < 0.05
     codes = raw * IMX250.white_level
     assert_close(codes, codes.round(), scale=IMX250.white_level)

@@ -1,4 +1,4 @@
-"""The training loop: learns a picture by heart, goes on after a kill with the same bits, refuses another's checkpoint."""
+"""The training loop: learns a picture by heart, goes on after a kill with the same bits, refuses foreign files."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ pytest.importorskip("lightning_fabric")
 
 from polsep.bench.truth import psnr
 from polsep.io.checkpoints import read_checkpoint, write_checkpoint
+from polsep.networks import Size
 from polsep.train.loop import Run, Schedule, train, validate
 from polsep.train.stream import Examples, StreamOptions, stream_lane
 from polsep.train.tasks import Task, find_rung, ladder_task, see_co_sited, see_mosaic
@@ -26,7 +27,7 @@ SCHEDULE = Schedule(steps=6, warm_up=2, checkpoint_every=3, validate_every=100, 
 
 def small_task() -> Task:
     torch.manual_seed(1)
-    return ladder_task(find_rung("paper"), "mosaic", 4, 1)
+    return ladder_task(find_rung("paper"), "mosaic", Size(4, 1, 1))
 
 
 def run_in(folder: Path, schedule: Schedule = SCHEDULE) -> Run:
@@ -87,7 +88,7 @@ def test_a_net_learns_a_picture_by_heart(see: object) -> None:
     """One 32 x 32 example, 200 steps: both outputs gain over a zero network by 15 dB and more."""
     examples = next(itertools.islice(stream_lane(replace(STREAM, batch=1), 0, 0), 1, None))
     torch.manual_seed(0)
-    task = ladder_task(find_rung("paper"), "mosaic", 12, 2)
+    task = ladder_task(find_rung("paper"), "mosaic", Size(12, 2, 1))
     seen = see(examples)  # type: ignore[operator]
     before = task.separate(seen)
     optimizer = torch.optim.Adam(task.network.parameters(), 3e-3)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from polsep.demosaic import demosaic_bilinear_half
+from polsep.networks import Size
 from polsep.refine import RUNGS, Refinement, Rung, separate_refined
 from polsep.separation import Separation
 from polsep.stokes import Measurements, Stokes, measure
@@ -49,9 +50,9 @@ def see_co_sited(examples: Examples) -> Seen:
 VARIANTS: dict[str, Callable[[Examples], Seen]] = {"mosaic": see_mosaic, "co-sited": see_co_sited}
 
 
-def ladder_task(rung: Rung, variant: str, width: int, levels: int) -> Task:
+def ladder_task(rung: Rung, variant: str, size: Size) -> Task:
     """A rung of the paper's ladder; its two networks are trained side by side and share nothing but the data."""
-    network = Refinement(rung, 3, width, levels)
+    network = Refinement(rung, 3, size)
 
     def loss(network: nn.Module, seen: Seen) -> Tensor:
         measurements, diffuse, specular, _ = seen

@@ -1,0 +1,71 @@
+"""`polsep train`: a rung of the ladder from options to a file of weights."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from polsep.io.weights import write_weights
+from polsep.networks import Size, count_parameters
+from polsep.train.loop import Run, Schedule, train, validate, validation_batches
+from polsep.train.stream import StreamOptions
+from polsep.train.tasks import VARIANTS, find_rung, ladder_task
+
+#: What a laptop trains in an hour or two.
+SMALL = Size()
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """What is trained: a ``rung`` of `refine.RUNGS` on a ``variant`` of the data, of which size, from which seed.
+
+    Raises ValueError on a rung or variant that there is not.
+    """
+
+    rung: str
+    variant: str = "mosaic"
+    size: Size = SMALL
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        find_rung(self.rung)
+        if self.variant not in VARIANTS:
+            raise ValueError(f"expected a variant of {', '.join(VARIANTS)}, found {self.variant!r}")
+
+
+def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]], None]) -> Path:
+    """Train to the end, going on where a run in ``run.out`` stopped; returns the file of the averaged weights.
+
+    The weights are in half precision; the scores in their metadata are of these on the validation views.
+    """
+    torch.manual_seed(options.seed)
+    task = ladder_task(find_rung(options.rung), options.variant, options.size)
+    average = train(task, run, report)
+    halves = {name: value.half().float() for name, value in average.items()}
+    scores = validate(task, halves, validation_batches(run.stream))
+    metadata = {
+        "method": "paper",
+        "rung": options.rung,
+        "variant": options.variant,
+        "size": json.dumps(asdict(options.size)),
+        "colors": "3",
+        "seed": str(options.seed),
+        "parameters": str(count_parameters(task.network)),
+        "schedule": json.dumps(asdict(run.schedule)),
+        "stream": json.dumps(asdict(run.stream)),
+        "validation": json.dumps(scores),
+    }
+    path = run.out / f"{options.rung}-{options.variant}.safetensors"
+    write_weights(path, halves, metadata)
+    return path
+
+
+def plan_run(out: Path, options: TrainOptions, schedule: Schedule, workers: int, devices: int) -> Run:
+    """Where and how: crops of 256 raw pixels for mosaics, of 128 for co-sited images, which have as many in the end."""
+    crop = 256 if options.variant == "mosaic" else 128
+    return Run(out, StreamOptions(seed=options.seed, crop=crop), schedule, workers, devices)

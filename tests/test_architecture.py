@@ -18,6 +18,7 @@ RANKS = {
     "optics": 1,
     "camera": 2,
     "networks": 2,
+    "metrics": 2,
     "separation": 2,
     "color_affine": 2,
     "demosaic": 3,
@@ -65,8 +66,9 @@ WITHIN = {
     ("kernels", "kernels"),
     ("bench", "bench"),
     ("bench", "testsets"),
+    ("bench", "dataset"),
+    ("bench", "train"),
     ("testsets", "testsets"),
-    ("train", "bench"),
     ("train", "train"),
 }
 #: Libraries that only one room may use.

@@ -14,8 +14,8 @@ from torch import Tensor
 pytest.importorskip("embreex")
 pytest.importorskip("lightning_fabric")
 
-from polsep.bench.truth import psnr
 from polsep.io.checkpoints import read_checkpoint, write_checkpoint
+from polsep.metrics import psnr
 from polsep.networks import Size
 from polsep.train.loop import Run, Schedule, train, validate
 from polsep.train.stream import Examples, StreamOptions, stream_lane

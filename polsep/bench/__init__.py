@@ -16,7 +16,8 @@ from polsep.bench.rendering import bench_rendering
 from polsep.bench.resources import bench_resources
 from polsep.bench.rows import Row, provenance, to_jsonl
 from polsep.bench.separation import bench_separation
-from polsep.bench.truth import SCENE_SEEDS, SCENE_SIZE, psnr, render_scene
+from polsep.bench.truth import SCENE_SEEDS, SCENE_SIZE, render_scene
+from polsep.metrics import psnr
 
 __all__ = ["BENCHES", "SCENE_SEEDS", "SCENE_SIZE", "Row", "provenance", "psnr", "render_scene", "to_jsonl"]
 

@@ -28,12 +28,13 @@ from torch import Tensor
 from polsep.bench.peers import demosaic_by_peers, find_peers
 from polsep.bench.rows import Row
 from polsep.bench.speed import bench_speed
-from polsep.bench.truth import SCENE_SEEDS, captures, psnr, render_scene
+from polsep.bench.truth import SCENE_SEEDS, captures, render_scene
 from polsep.camera import Layout, Mosaic, sample_mosaic
 from polsep.color_affine import separate_color_affine
 from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half, mean_cells
 from polsep.guided import demosaic_guided, demosaic_guided_half
 from polsep.io.frames import read_frames
+from polsep.metrics import psnr
 from polsep.separation import separate_analytic
 from polsep.stokes import Measurements, Stokes, aolp, dolp, fit_stokes, measure
 

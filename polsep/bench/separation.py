@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from polsep.bench.rows import Row
-from polsep.bench.truth import SCENE_SEEDS, captures, psnr, render_scene
+from polsep.bench.truth import SCENE_SEEDS, captures, render_scene
+from polsep.metrics import psnr
 from polsep.pipeline import METHODS, demosaic
 
 

@@ -1,12 +1,7 @@
-"""Scenes of known truth as every benchmark takes them: rendered, exposed, and compared by PSNR.
-
-PSNR: linear light, peak 1 = the white level of one measurement, both images limited to [0, 1], inside the object mask;
-120 dB at most.
-"""
+"""Scenes of known truth as every benchmark takes them: rendered and exposed."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import torch
@@ -35,12 +30,6 @@ def render_scene(seed: int, saturation: float, size: tuple[int, int] = SCENE_SIZ
     mask = (diffuse + specular).s0.amax(dim=0) > 1e-3
     gain = 1.4 / float(torch.quantile(diffuse.s0.amax(dim=0)[mask], 0.99))
     return Scene(diffuse * gain, specular * gain, mask)
-
-
-def psnr(found: Tensor, truth: Tensor, mask: Tensor) -> float:
-    """PSNR in dB of images ``[C, h, w]`` inside ``mask [h, w]``, as the module says; at most 120."""
-    error = ((found.clamp(0, 1) - truth.clamp(0, 1)) ** 2).mean(dim=0)[mask].mean()
-    return min(120.0, -10 * math.log10(max(float(error), 1e-30)))
 
 
 Captures = Iterator[tuple[str, Measurements | Mosaic, Tensor, tuple[Tensor, Tensor]]]

@@ -20,9 +20,9 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from polsep.bench.truth import psnr
 from polsep.io.checkpoints import append_line, read_checkpoint, write_checkpoint
 from polsep.kernels.threads import set_threads
+from polsep.metrics import psnr
 from polsep.train.stream import Examples, ExampleStream, StreamOptions
 from polsep.train.tasks import Task
 
@@ -146,10 +146,10 @@ def _parts(network: nn.Module) -> list[nn.Module]:
 def _batches(run: Run, fabric: Fabric, step: int) -> Iterator[Examples]:
     """Batches from ``step`` on; every device has lanes of its own."""
     stream = ExampleStream(run.stream, step, (fabric.global_rank, fabric.world_size))
-    return iter(DataLoader(stream, batch_size=None, num_workers=run.workers, worker_init_fn=_take_one_core))
+    return iter(DataLoader(stream, batch_size=None, num_workers=run.workers, worker_init_fn=take_one_core))
 
 
-def _take_one_core(worker: int) -> None:
+def take_one_core(worker: int) -> None:
     """Rendering workers are as many as there are cores to give."""
     del worker
     set_threads(1)

@@ -109,20 +109,20 @@ def capture(scene: Scene, layout: Layout, sensor: Sensor, generator: torch.Gener
 
 
 def filter_light(light: Stokes, layout: Layout, sensor: Sensor) -> Tensor:
-    """What the filters of a layout let through of ``light [C, H, W]``, noise-free ``[H, W]``, white at 1.
+    """What the filters of a layout let through of ``light [..., C, H, W]``, noise-free ``[..., H, W]``, white at 1.
 
     The samples that `camera.sample_mosaic` takes of `camera.measure_with_analysers`, without those it does not take.
     """
-    out, period = torch.empty_like(light.s0[0]), layout.period
+    out, period = torch.empty_like(light.s0[..., 0, :, :]), layout.period
     losses = sensor.diattenuation
-    if light.s0.shape[0] == 1:
+    if light.s0.shape[-3] == 1:
         losses = losses[len(losses) // 2 :][:1]
     for row in range(period):
         for col in range(period):
             covered = layout.filter_at(row, col)
-            at = (slice(covered.channel, covered.channel + 1), slice(row, None, period), slice(col, None, period))
+            at = (..., slice(covered.channel, covered.channel + 1), slice(row, None, period), slice(col, None, period))
             part = light.map(lambda s, at=at: s[at])  # type: ignore[misc]
             loss = losses[covered.channel % len(losses)]
             behind = measure_with_analysers(part, (math.radians(covered.angle_deg),), (loss,))
-            out[at[1:]] = behind.data[0, 0]
+            out[(..., *at[2:])] = behind.data[..., 0, 0, :, :]
     return out

@@ -1,9 +1,9 @@
 """Training examples without end: random views rendered in the background, cut, exposed and measured anew every time.
 
 A lane is one worker's stream. It keeps a pool of rendered scenes; example number n is a random crop of one of them,
-mirrored and turned at random, with its colours permuted, its own exposure and noise. After every few examples the
-oldest scene gives way to a new one. Everything follows from the options, the lane and n, so a stream that starts at
-any batch gives what one from the beginning would.
+mirrored and turned at random, with its colours permuted and its own exposure; noise is drawn per batch. After every few
+examples the oldest scene gives way to a new one. Everything follows from the options, the lane and n, so a stream that
+starts at any batch gives what one from the beginning would.
 
 Conventions: images at raw resolution, linear, 1 = the white level of one measurement.
 """
@@ -26,7 +26,7 @@ from polsep.materials import random_materials
 from polsep.raycast import MeshScene, find_view, light_view, shade_view
 from polsep.render import PointLight, Scene
 from polsep.simulate import HEADROOM, blur, filter_light
-from polsep.stokes import Stokes, flip_horizontal, flip_vertical, transpose
+from polsep.stokes import Stokes
 from polsep.views import random_clip, random_light, random_shot, scene_seed, seeded_shape
 
 #: Views of a shape, and lights with materials of their own under which each is seen.
@@ -122,20 +122,19 @@ def stream_lane(options: StreamOptions, lane: int, first: int) -> Iterator[Examp
         pool.append(next(scenes))
         newest += 1
     oldest = newest - options.pool + 1
-    number = first * options.batch
     while True:
-        examples = []
-        for _ in range(options.batch):
-            if number // options.reuse > oldest:
+        crops, number = [], first * options.batch
+        for k in range(options.batch):
+            if (number + k) // options.reuse > oldest:
                 pool.append(next(scenes))
                 oldest += 1
-            examples.append(random_example(pool, options, _generator(options, lane, number)))
-            number += 1
-        yield Examples(*(torch.stack(images) for images in zip(*examples, strict=True)))
+            crops.append(random_crop(pool, options.crop, _generator(options, lane, number + k)))
+        yield expose_crops(crops, _generator(options, lane, number, "noise"))
+        first += 1
 
 
-def _generator(options: StreamOptions, lane: int, number: int) -> torch.Generator:
-    label = f"example/{options.split}/{options.seed}/{lane}/{number}"
+def _generator(options: StreamOptions, lane: int, number: int, use: str = "crop") -> torch.Generator:
+    label = f"{use}/{options.split}/{options.seed}/{lane}/{number}"
     return torch.Generator().manual_seed(int.from_bytes(hashlib.sha256(label.encode()).digest()[:8]) >> 1)
 
 
@@ -181,23 +180,46 @@ def _as_pooled(scene: Scene) -> Pooled:
     return Pooled(diffuse, specular, scene.mask, scene.mask.nonzero(), brightness * gain)
 
 
-def random_example(pool: deque[Pooled], options: StreamOptions, generator: torch.Generator) -> Examples:
-    """One crop of one of the scenes, without the batch's dimension; see the module."""
+class Crop(NamedTuple):
+    """A crop before its exposure: ``light [12, h, w]``, half precision, the scene's diffuse and specular planes.
+
+    ``factors [12]`` bring them to the white level, with the signs that mirroring gives s1 and s2. ``mask [h, w]``.
+    """
+
+    light: Tensor
+    factors: Tensor
+    mask: Tensor
+
+
+def random_crop(pool: deque[Pooled], crop: int, generator: torch.Generator) -> Crop:
+    """A random crop of one of the scenes, mirrored, turned, its colours permuted; see the module.
+
+    Mirroring turns the sign of s2, transposing that of s1 (`stokes.flip_horizontal`, `stokes.transpose`).
+    """
     scene = pool[_integer(len(pool), generator)]
-    rows, cols = _random_place(scene, options.crop, generator)
-    lobes = (scene.diffuse, scene.specular)
-    light = [Stokes(*x[:, rows, cols].float().view(3, -1, options.crop, options.crop)) for x in lobes]
-    mask = scene.mask[None, rows, cols].float()
-    for mirror in (flip_horizontal, flip_vertical, transpose):
-        if _integer(2, generator):
-            light = [mirror(stokes) for stokes in light]
-            mask = mirror(Stokes(mask, mask, mask)).s0
-    gain, colors = random_gain(scene.brightness, generator), torch.randperm(3, generator=generator)
-    diffuse, specular = light[0].map(lambda s: gain * s[colors]), light[1].map(lambda s: gain * s)
-    total = diffuse + specular
-    raw = add_gaussian_noise(filter_light(total, Layout(), IMX250), IMX250, generator)
-    polarized = torch.cat([total.s1.half(), total.s2.half()])
-    return Examples(raw, diffuse.s0.half(), specular.s0.half().expand(3, -1, -1), polarized, mask[0] == 1)
+    rows, cols = _random_place(scene, crop, generator)
+    across, down, transposed = (_integer(2, generator) for _ in range(3))
+    colors = torch.randperm(3, generator=generator)
+    planes = torch.cat([colors, colors + 3, colors + 6])
+    light = torch.cat([scene.diffuse[:, rows, cols][planes], scene.specular[:, rows, cols]])
+    turned = [axis for axis, wanted in ((-1, across), (-2, down)) if wanted]
+    light, mask = light.flip(turned), scene.mask[rows, cols].flip(turned)
+    if transposed:
+        light, mask = light.transpose(-1, -2), mask.T
+    s1, s2 = 1 - 2 * transposed, (1 - 2 * across) * (1 - 2 * down)
+    signs = torch.tensor([1.0] * 3 + [s1] * 3 + [s2] * 3 + [1.0, s1, s2])
+    return Crop(light, random_gain(scene.brightness, generator) * signs, mask)
+
+
+def expose_crops(crops: list[Crop], generator: torch.Generator) -> Examples:
+    """A batch of crops as the sensor records them, and the truth."""
+    factors = torch.stack([crop.factors for crop in crops])[..., None, None]
+    light = torch.stack([crop.light for crop in crops]).float() * factors
+    diffuse, specular = light[:, :3], light[:, 9:10].expand(-1, 3, -1, -1)
+    s1, s2 = light[:, 3:6] + light[:, 10:11], light[:, 6:9] + light[:, 11:12]
+    signal = filter_light(Stokes(diffuse + specular, s1, s2), Layout(), IMX250)
+    raw, polarized = add_gaussian_noise(signal, IMX250, generator), torch.cat([s1.half(), s2.half()], dim=1)
+    return Examples(raw, diffuse.half(), specular.half(), polarized, torch.stack([crop.mask for crop in crops]))
 
 
 def _integer(limit: int, generator: torch.Generator) -> int:

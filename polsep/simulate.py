@@ -47,6 +47,8 @@ def blur(scene: Scene, sigma: float) -> Scene:
     taps = [weight / total for weight in weights]
 
     def smooth(image: Tensor) -> Tensor:
+        if image.stride(0) == 0:  # white light, whose colours share memory
+            return _smooth_plane(image[0], taps).expand_as(image)
         return torch.stack([_smooth_plane(plane, taps) for plane in image])
 
     return Scene(scene.diffuse.map(smooth), scene.specular.map(smooth), scene.mask)

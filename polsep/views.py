@@ -16,12 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from polsep.camera import IMX250, Layout
 from polsep.materials import random_materials
-from polsep.optics import dot
-from polsep.raycast import MeshScene, find_hits, is_lit, render_scene
+from polsep.raycast import MeshScene, find_view, light_view, render_scene
 from polsep.render import PinholeCamera, PointLight, Vector
 from polsep.shapes import Floats, random_mesh
 from polsep.simulate import Capture, blur, capture, expose_to_clip, expose_to_level
@@ -138,9 +136,8 @@ def random_shot(shape: MeshScene, generator: torch.Generator) -> Shot:
 
 def lit_share(shape: MeshScene, shot: Shot) -> float:
     """The share of a shape's pixels that the light reaches, in a picture of `PREVIEW_SIZE`."""
-    hits = find_hits(shape, shot.camera, _pixel_centres(PREVIEW_SIZE), PREVIEW_SIZE)
-    to_light = torch.tensor(shot.light.position).view(3, 1, 1) - hits.position
-    lit = is_lit(shape, hits, shot.light) & (dot(hits.normal, to_light) > 0)
+    view = find_view(shape, shot.camera, PREVIEW_SIZE)
+    lit = torch.cat([found[0, :, 0] for found in light_view(shape, view, shot.light)])
     return float(lit.float().mean()) if lit.numel() else 0.0
 
 
@@ -150,12 +147,6 @@ def capture_shot(shape: MeshScene, shot: Shot, size: int, samples: int, generato
     scene = render_scene((shape, materials), shot.camera, shot.light, (size, size), samples)
     exposed = expose_to_clip(blur(scene, shot.blur), shot.clip, Layout(), IMX250)
     return capture(expose_to_level(exposed, LEAST_LEVEL, Layout(), IMX250), Layout(), IMX250, generator)
-
-
-def _pixel_centres(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Rows and columns ``[H W]`` of the centres of an image's pixels."""
-    rows, cols = torch.meshgrid(torch.arange(size[0]) + 0.5, torch.arange(size[1]) + 0.5, indexing="ij")
-    return rows.flatten(), cols.flatten()
 
 
 def _radius(vertices: Floats) -> float:

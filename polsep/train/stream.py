@@ -30,7 +30,7 @@ from polsep.stokes import Stokes
 from polsep.views import random_clip, random_light, random_shot, scene_seed, seeded_shape
 
 #: Views of a shape, and lights with materials of their own under which each is seen.
-VIEWS, LOOKS = 4, 2
+VIEWS, LOOKS = 4, 3
 #: Brightness of object samples is kept at so many quantiles above this share, for exposures that clip the rest.
 LOWEST_QUANTILE, QUANTILES = 0.94, 121
 #: Where nothing is to clip, the brightest sample may lie this much lower than `HEADROOM`.
@@ -68,8 +68,8 @@ class StreamOptions:
 class Examples(NamedTuple):
     """A batch: noisy ``raw [B, H, W]``, clipped at 1, and the truth behind it.
 
-    ``diffuse``, ``specular``: s0 ``[B, 3, H, W]``. ``polarized``: s1 and s2 of their sum ``[B, 6, H, W]``. ``mask``:
-    bool ``[B, H, W]``, on objects. Truth in half precision.
+    ``diffuse [B, 3, H, W]``, white ``specular [B, 1, H, W]``: s0. ``polarized``: s1 and s2 of their sum
+    ``[B, 6, H, W]``. ``mask``: bool ``[B, H, W]``, on objects. Truth in half precision.
     """
 
     raw: Tensor
@@ -171,9 +171,10 @@ def _look_at(shape: MeshScene, options: StreamOptions, generator: torch.Generato
 def _as_pooled(scene: Scene) -> Pooled:
     """A scene for the pool, scaled so that its brightest object sample is 1."""
     samples = filter_light(scene.diffuse + scene.specular, Layout(), IMX250)[scene.mask]
-    shares = torch.linspace(LOWEST_QUANTILE, 1, QUANTILES)
-    ranks = (shares * (samples.numel() - 1)).round().long()
-    brightness = samples.sort().values[ranks]
+    lowest = int(LOWEST_QUANTILE * (samples.numel() - 1))
+    brightest = np.sort(np.partition(samples.numpy(), lowest)[lowest:])
+    ranks = np.linspace(0, brightest.size - 1, QUANTILES).round().astype(np.int64)
+    brightness = torch.from_numpy(brightest[ranks])
     gain = 1 / max(float(brightness[-1]), 1e-12)
     white = scene.specular.map(lambda s: s[:1])
     diffuse, specular = (torch.cat([s.s0, s.s1, s.s2]).mul_(gain).half() for s in (scene.diffuse, white))
@@ -215,7 +216,7 @@ def expose_crops(crops: list[Crop], generator: torch.Generator) -> Examples:
     """A batch of crops as the sensor records them, and the truth."""
     factors = torch.stack([crop.factors for crop in crops])[..., None, None]
     light = torch.stack([crop.light for crop in crops]).float() * factors
-    diffuse, specular = light[:, :3], light[:, 9:10].expand(-1, 3, -1, -1)
+    diffuse, specular = light[:, :3], light[:, 9:10]
     s1, s2 = light[:, 3:6] + light[:, 10:11], light[:, 6:9] + light[:, 11:12]
     signal = filter_light(Stokes(diffuse + specular, s1, s2), Layout(), IMX250)
     raw, polarized = add_gaussian_noise(signal, IMX250, generator), torch.cat([s1.half(), s2.half()], dim=1)

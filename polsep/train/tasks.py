@@ -33,7 +33,7 @@ class Task:
 
 def see_mosaic(examples: Examples) -> Seen:
     """Noisy mosaics, demosaicked bilinearly to half resolution, and the mean truth of every cell."""
-    diffuse, specular = (avg_pool2d(x.float(), 2) for x in (examples.diffuse, examples.specular))
+    diffuse, specular = (avg_pool2d(x.float(), 2).expand(-1, 3, -1, -1) for x in (examples.diffuse, examples.specular))
     mask = avg_pool2d(examples.mask[:, None].float(), 2)[:, 0] == 1
     return demosaic_bilinear_half(as_mosaic(examples.raw)), diffuse, specular, mask
 
@@ -41,6 +41,7 @@ def see_mosaic(examples: Examples) -> Seen:
 def see_co_sited(examples: Examples) -> Seen:
     """The paper's protocol: every analyser and colour at every pixel, clipped at 1, no noise (Eqs. 12, 13)."""
     diffuse, specular, polarized = (x.float() for x in (examples.diffuse, examples.specular, examples.polarized))
+    specular = specular.expand(-1, 3, -1, -1)
     light = Stokes(diffuse + specular, polarized[:, :3], polarized[:, 3:])
     exact = measure(light, ANGLES).data
     return Measurements(exact.clamp(max=1), ANGLES, exact >= 1), diffuse, specular, examples.mask

@@ -1,17 +1,20 @@
 """Make the pictures of README.md: python examples/make_readme_pictures.py docs/images
 
-Separates the embedded capture with every method and draws them in rows, all panels at one exposure in sRGB.
+Separates the embedded capture with every method and draws them in rows, all panels at one exposure in sRGB; renders 16
+random views (extra render).
 """
 
 import sys
 import warnings
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import imagecodecs
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import polsep
+from polsep.dataset import RenderOptions, default_workers, render_dataset
 from polsep.io.previews import contact_sheet, exposure_of, srgb
 
 WIDTH, TITLE, GAP = 470, 30, 6
@@ -30,7 +33,7 @@ def panel(image: np.ndarray, gain: float, title: str) -> Image.Image:
 
 
 def main(directory: str) -> None:
-    """Write still_life.jpg (rows of methods) and contact_sheet.jpg (what polsep writes for every frame)."""
+    """Write still_life.jpg (rows of methods), contact_sheet.jpg (what every frame gets) and rendered.jpg."""
     warnings.simplefilter("ignore")
     raw = imagecodecs.imread(Path(polsep.__file__).parent / "data" / "still_life.png")
     rows = []
@@ -53,6 +56,10 @@ def main(directory: str) -> None:
     sheet.save(out / "still_life.jpg", quality=90)
     preview = Image.fromarray(contact_sheet(found)).resize((1420, 949), Image.Resampling.LANCZOS)
     preview.save(out / "contact_sheet.jpg", quality=85)
+    with TemporaryDirectory() as folder:
+        for _ in render_dataset(RenderOptions(8, 2, 512, 3, "validation"), Path(folder) / "set", default_workers()):
+            pass
+        Image.open(Path(folder) / "set" / "contact.png").save(out / "rendered.jpg", quality=88)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from polsep.camera import Layout, Mosaic
-    from polsep.pipeline import METHODS, PolsepWarning, SeparatedFrame, separate
+    from polsep.pipeline import METHODS, PolsepWarning, separate
+    from polsep.report import SeparatedFrame
     from polsep.separation import Separation
     from polsep.stokes import Measurements, Stokes
 
@@ -38,7 +39,7 @@ _HOME = {
     "Measurements": "stokes",
     "Mosaic": "camera",
     "PolsepWarning": "pipeline",
-    "SeparatedFrame": "pipeline",
+    "SeparatedFrame": "report",
     "Separation": "separation",
     "Stokes": "stokes",
     "separate": "pipeline",

@@ -25,7 +25,7 @@ from polsep.engine import run_analytic, run_color_affine
 from polsep.guided import demosaic_guided, demosaic_guided_half
 from polsep.layout_check import check_layout
 from polsep.levels import as_mosaic
-from polsep.report import describe, grey, tally
+from polsep.report import SeparatedFrame, describe, grey, tally
 from polsep.separation import Separation, separate_analytic
 from polsep.stokes import Measurements, aolp, dolp, fit_stokes_unclipped, polarized_intensity
 
@@ -85,24 +85,6 @@ METHODS = {
 
 #: What `auto` means: the best method installed.
 BEST_METHOD = "color-affine"
-
-
-@dataclass(frozen=True)
-class SeparatedFrame:
-    """A separated frame as NumPy arrays, channels last.
-
-    ``diffuse``, ``specular``: float32 ``[h, w, C]``, C = 3 or 1, linear, 1.0 = one measurement at the white level, so
-    their sum s0 reaches 2 (more where clipped highlights were recovered). ``valid``: bool ``[h, w]``, False where
-    clipping left something to assumption. ``dolp``: float32 ``[h, w]``, of all channels together in white light, and
-    ``aolp``: radians in [0, pi), image-right toward image-up. ``report``: JSON-able settings, statistics and warnings.
-    """
-
-    diffuse: NDArray[np.float32]
-    specular: NDArray[np.float32]
-    valid: NDArray[np.bool_]
-    dolp: NDArray[np.float32]
-    aolp: NDArray[np.float32]
-    report: dict[str, Any]
 
 
 def separate(

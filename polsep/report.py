@@ -1,4 +1,4 @@
-"""What a separation says of its frame: exposure, the light's polarizer, how well the model fits.
+"""What a separation says of its frame: images, exposure, the light's polarizer, how well the model fits.
 
 Statistics come from sums over pixels (`Tally`), so that a frame may be tallied in parts. All are of white light, that
 is before the light's colour is multiplied back, and polarization is that of all colours together.
@@ -10,7 +10,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from polsep.separation import Separation, light_polarizer_angle
 from polsep.stokes import Measurements, Stokes, dolp
@@ -18,6 +20,24 @@ from polsep.stokes import Measurements, Stokes, dolp
 #: Below this concentration of AoLP there is no single polarized light. Real frames: 0.76 to 0.97 where one light or one
 #: reflecting surface polarizes, 0.31 to 0.50 in the open.
 MIN_CONCENTRATION = 0.6
+
+
+@dataclass(frozen=True)
+class SeparatedFrame:
+    """A separated frame as NumPy arrays, channels last.
+
+    ``diffuse``, ``specular``: float32 ``[h, w, C]``, C = 3 or 1, linear, 1.0 = one measurement at the white level, so
+    their sum s0 reaches 2 (more where clipped highlights were recovered). ``valid``: bool ``[h, w]``, False where
+    clipping left something to assumption. ``dolp``: float32 ``[h, w]``, of all channels together in white light, and
+    ``aolp``: radians in [0, pi), image-right toward image-up. ``report``: JSON-able settings, statistics and warnings.
+    """
+
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    dolp: NDArray[np.float32]
+    aolp: NDArray[np.float32]
+    report: dict[str, Any]
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ import tifffile
 from polsep.io import outputs
 from polsep.io.errors import InputError
 from polsep.io.outputs import FORMATS, UNITS, OutputError, planned_outputs, read_exr_layers, write_separation
-from polsep.pipeline import SeparatedFrame
+from polsep.report import SeparatedFrame
 
 LAYERS = ("diffuse", "specular", "dolp", "aolp", "valid")
 

@@ -10,7 +10,7 @@ import pytest
 from skimage.color import rgb2lab
 
 from polsep.io.previews import NOT_VALID, PANEL, aolp_legend, aolp_wheel, contact_sheet, dolp_map, exposure_of, srgb
-from polsep.pipeline import SeparatedFrame
+from polsep.report import SeparatedFrame
 
 
 def random_frame(height: int, width: int, channels: int = 3) -> SeparatedFrame:

@@ -35,7 +35,7 @@ from polsep.io.errors import input_error
 from polsep.io.previews import contact_sheet
 
 if TYPE_CHECKING:
-    from polsep.pipeline import SeparatedFrame
+    from polsep.report import SeparatedFrame
 
 FORMATS = ("exr", "npz", "tiff", "png")
 LAYERS = ("diffuse", "specular", "dolp", "aolp", "valid")

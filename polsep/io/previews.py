@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 if TYPE_CHECKING:
-    from polsep.pipeline import SeparatedFrame
+    from polsep.report import SeparatedFrame
 
 Values = NDArray[np.floating[Any]]
 Pixels = NDArray[np.uint8]

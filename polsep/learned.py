@@ -1,0 +1,65 @@
+"""Methods with learned weights: the networks that come with polsep, loaded once, applied to any frame.
+
+Weights are those of `polsep/weights`, read by `io.weights`; their metadata says which network they belong to.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+
+from polsep.io.weights import read_weights, shipped_weights
+from polsep.networks import Size
+from polsep.refine import RUNGS, Refinement, Rung, separate_refined
+from polsep.separation import Separation
+from polsep.stokes import Measurements
+
+#: The paper's networks, trained on noisy mosaics.
+PAPER = "paper-mosaic"
+
+
+def load_refinement(path: Path, device: torch.device) -> tuple[Rung, Refinement]:
+    """The rung and its networks from a file of weights.
+
+    Raises ValueError when the file is damaged or of another network.
+    """
+    tensors, metadata = read_weights(path)
+    try:
+        rung = RUNGS[metadata["rung"]]
+        network = Refinement(rung, int(metadata["colors"]), Size(**json.loads(metadata["size"])))
+        network.load_state_dict(tensors)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"expected weights of a refinement in {path}, found {type(error).__name__}") from None
+    return rung, network.to(device).eval()
+
+
+@lru_cache(maxsize=4)
+def _shipped_refinement(name: str, device: torch.device) -> tuple[Rung, Refinement]:
+    return load_refinement(shipped_weights(name), device)
+
+
+def is_shipped(name: str) -> bool:
+    """Whether weights of that name are installed."""
+    try:
+        shipped_weights(name)
+    except ValueError:
+        return False
+    return True
+
+
+def separate_paper(measurements: Measurements) -> Separation:
+    """The paper's method: an analytic split refined by two U-Nets. Mono frames go through as grey ones.
+
+    ``[..., 4, C, h, w]``, C = 3 or 1. Source: Dave et al. 2022, Sec. 4.
+    """
+    rung, network = _shipped_refinement(PAPER, measurements.data.device)
+    if measurements.data.shape[-3] == network.colors:
+        return separate_refined(measurements, rung, network)
+    data = measurements.data
+    copies = Measurements(data.expand(*data.shape[:-3], network.colors, *data.shape[-2:]), measurements.angles)
+    found = separate_refined(copies, rung, network)
+    diffuse, specular = (x.mean(dim=-3, keepdim=True) for x in (found.diffuse, found.specular))
+    return Separation(diffuse, specular, found.valid, found.stokes.map(lambda s: s.mean(dim=-3, keepdim=True)))

@@ -16,10 +16,10 @@ from polsep.bench.rendering import bench_rendering
 from polsep.bench.resources import bench_resources
 from polsep.bench.rows import Row, provenance, to_jsonl
 from polsep.bench.separation import bench_separation
+from polsep.bench.sets import bench_sets
 from polsep.bench.truth import SCENE_SEEDS, SCENE_SIZE, render_scene
-from polsep.metrics import psnr
 
-__all__ = ["BENCHES", "SCENE_SEEDS", "SCENE_SIZE", "Row", "provenance", "psnr", "render_scene", "to_jsonl"]
+__all__ = ["BENCHES", "SCENE_SEEDS", "SCENE_SIZE", "Row", "provenance", "render_scene", "to_jsonl"]
 
 BENCHES: dict[str, Callable[[Path], Iterator[Row]]] = {
     "separation": bench_separation,
@@ -28,4 +28,5 @@ BENCHES: dict[str, Callable[[Path], Iterator[Row]]] = {
     "resources": bench_resources,
     "frontend": bench_frontend,
     "rendering": bench_rendering,
+    "sets": bench_sets,
 }

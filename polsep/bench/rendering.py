@@ -32,7 +32,7 @@ OURS, THEIRS = "polsep", "Mitsuba llvm polarized"
 #: The set that is rendered: shapes, views of each; and the paper's number of images.
 SHAPES, VIEWS, PAPER_IMAGES = 10, 20, 10_000
 #: Sides in raw pixels of streamed crops, and batches that are counted, after those that fill the pools.
-CROPS, BATCHES, FIRST_BATCHES = (128, 256), 150, 10
+CROPS, BATCHES, FIRST_BATCHES = (128, 256), 500, 20
 
 
 def bench_rendering(_data: Path | None = None) -> Iterator[Row]:

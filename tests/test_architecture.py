@@ -21,6 +21,7 @@ RANKS = {
     "metrics": 2,
     "separation": 2,
     "color_affine": 2,
+    "multi_capture": 2,
     "demosaic": 3,
     "guided": 3,
     "refine": 3,
@@ -51,6 +52,7 @@ RANKS = {
 #: Imports between modules of one rank that belong together.
 WITHIN = {
     ("color_affine", "separation"),
+    ("multi_capture", "separation"),
     ("scenes", "render"),
     ("raycast", "kernels"),
     ("simulate", "kernels"),

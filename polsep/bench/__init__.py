@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from polsep.bench.calibration import bench_calibration
 from polsep.bench.exactness import bench_exactness
 from polsep.bench.frontend import bench_frontend
 from polsep.bench.real import bench_real
@@ -29,4 +30,5 @@ BENCHES: dict[str, Callable[[Path], Iterator[Row]]] = {
     "frontend": bench_frontend,
     "rendering": bench_rendering,
     "sets": bench_sets,
+    "calibration": bench_calibration,
 }

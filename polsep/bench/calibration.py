@@ -75,10 +75,8 @@ def see_with_errors(shape: MeshScene, generator: torch.Generator) -> Iterator[tu
     from polsep.views import random_shot
 
     shot = random_shot(shape, generator)
-    view, materials = (
-        find_view(shape, shot.camera, SIZE, 2),
-        random_materials(shape.mesh.slot_count, generator, shape.size),
-    )
+    view = find_view(shape, shot.camera, SIZE, 2)
+    materials = random_materials(shape.mesh.slot_count, generator, shape.size)
     lit = light_view(shape, view, shot.light)
     deviates = torch.randn(2, generator=generator, dtype=torch.float64).tolist()
 

@@ -308,7 +308,7 @@ def _print_demo(name: str, statistics: dict[str, Any]) -> None:
 
 @app.command()
 @click.argument("name", metavar="NAME", default="list")
-@click.option("--data", type=DIR, default=Path("../shared/data"), metavar="DIR", help="For 'real' and 'frontend'.")
+@click.option("--data", type=DIR, default=Path("../shared/data"), metavar="DIR", help="For real, frontend and sets.")
 @click.option("-o", "--output", type=DIR, default=Path("results"), metavar="DIR", help="Where NAME.jsonl goes.")
 def bench(name: str, data: Path, output: Path) -> None:
     """Measure NAME, print its rows and write them to DIR/NAME.jsonl; without NAME, list what can be measured.

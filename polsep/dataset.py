@@ -51,7 +51,7 @@ VIEWS_AT_ONCE = 4
 #: How often Ray gives the work of a worker that died to another one.
 RETRIES = 5
 #: Packages whose versions decide about the last bit of what is rendered.
-MAKERS = ("polsep", "torch", "numpy", "embreex", "imagecodecs", "OpenEXR")
+MAKERS = ("polsep", "torch", "numpy", "numba", "llvmlite", "embreex", "imagecodecs", "OpenEXR")
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,9 @@ def separate_paper(measurements: Measurements) -> Separation:
     rung, network = _shipped_refinement(PAPER, measurements.data.device)
     if measurements.data.shape[-3] == network.colors:
         return separate_refined(measurements, rung, network)
-    data = measurements.data
-    copies = Measurements(data.expand(*data.shape[:-3], network.colors, *data.shape[-2:]), measurements.angles)
+    data, clipped = measurements.data, measurements.clipped
+    shape = (*data.shape[:-3], network.colors, *data.shape[-2:])
+    copies = Measurements(data.expand(shape), measurements.angles, None if clipped is None else clipped.expand(shape))
     found = separate_refined(copies, rung, network)
     diffuse, specular = (x.mean(dim=-3, keepdim=True) for x in (found.diffuse, found.specular))
     return Separation(diffuse, specular, found.valid, found.stokes.map(lambda s: s.mean(dim=-3, keepdim=True)))

@@ -21,14 +21,19 @@ WORST_SHARE = 0.1
 
 
 def psnr(found: Tensor, truth: Tensor, mask: Tensor) -> float:
-    """PSNR in dB of images ``[C, h, w]`` inside ``mask [h, w]``, as the module says; at most 120."""
+    """PSNR in dB of images ``[C, h, w]`` inside ``mask [h, w]``, as the module says; at most 120.
+
+    Raises ValueError where the mask is empty or the error is not a number.
+    """
     return psnr_unlimited(found.clamp(0, 1), truth.clamp(0, 1), mask)
 
 
 def psnr_unlimited(found: Tensor, truth: Tensor, mask: Tensor) -> float:
     """`psnr` of the values as they are."""
-    error = ((found - truth) ** 2).mean(dim=0)[mask].mean()
-    return min(120.0, -10 * math.log10(max(float(error), 1e-30)))
+    error = float(((found - truth) ** 2).mean(dim=0)[mask].mean())
+    if math.isnan(error):
+        raise ValueError(f"expected numbers inside a mask, found NaN in {int(mask.sum())} pixels")
+    return min(120.0, -10 * math.log10(max(error, 1e-30)))
 
 
 def ssim(found: Tensor, truth: Tensor, mask: Tensor) -> float:

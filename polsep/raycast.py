@@ -12,6 +12,7 @@ Needs the extra ``render``.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -40,6 +41,8 @@ Floats = NDArray[np.float32]
 LIFT = 2e-4
 #: Rays that are cast together: enough to be worth a call, few enough to stay in a processor's cache.
 RAYS_AT_ONCE = 131_072
+#: Held while Embree builds.
+_BUILDING = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -63,11 +66,15 @@ class MeshScene:
     @cached_property
     def tracer(self) -> Any:
         """Embree's hierarchy of the mesh, built when first needed: that takes longer than a cast of a small image."""
-        tracer = EmbreeScene()
-        TriangleMesh(tracer, self.triangles.vertices, self.triangles.faces)
-        # Embree builds at the first ray, which must not happen in two threads at once.
-        tracer.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
-        return tracer
+        with _BUILDING:
+            if "tracer" in vars(self):  # built by another thread in the meantime: since Python 3.12 nothing else waits
+                return vars(self)["tracer"]
+            tracer = EmbreeScene()
+            TriangleMesh(tracer, self.triangles.vertices, self.triangles.faces)
+            # Embree builds at the first ray, which must not happen in two threads at once.
+            tracer.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+            vars(self)["tracer"] = tracer
+            return tracer
 
 
 @dataclass(frozen=True)

@@ -142,7 +142,10 @@ def lit_share(shape: MeshScene, shot: Shot) -> float:
 
 
 def capture_shot(shape: MeshScene, shot: Shot, size: int, samples: int, generator: torch.Generator) -> Capture:
-    """A ``size`` x ``size`` frame of a shape with random materials by the camera `camera.IMX250`, and its truth."""
+    """A ``size`` x ``size`` frame of a shape with random materials by the camera `camera.IMX250`, and its truth.
+
+    Raises ValueError when the light reaches no pixel that the shape covers wholly.
+    """
     materials = random_materials(shape.mesh.slot_count, generator, shape.size)
     scene = render_scene((shape, materials), shot.camera, shot.light, (size, size), samples)
     exposed = expose_to_clip(blur(scene, shot.blur), shot.clip, Layout(), IMX250)

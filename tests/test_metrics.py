@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from tolerances import assert_within
+from torch import Tensor
 
 from polsep.metrics import chroma, highlights, psnr, psnr_unlimited, ssim, worst_mean
 
@@ -53,6 +56,17 @@ def test_masks_without_windows_are_refused() -> None:
     mask[:3] = True
     with pytest.raises(ValueError, match="reaches 5 pixels inside"):
         ssim(*pair(), mask)
+
+
+@pytest.mark.parametrize("score", [psnr, psnr_unlimited])
+def test_nothing_and_no_numbers_have_no_score(score: Callable[[Tensor, Tensor, Tensor], float]) -> None:
+    """Neither an empty mask nor NaN may pass for a perfect image."""
+    found, truth = pair()
+    with pytest.raises(ValueError, match="found NaN in 0 pixels"):
+        score(found, truth, torch.zeros_like(EVERYWHERE))
+    found[0, 3, 3] = torch.nan
+    with pytest.raises(ValueError, match="found NaN in 2000 pixels"):
+        score(found, truth, EVERYWHERE)
 
 
 def test_highlights_and_their_chroma() -> None:

@@ -287,7 +287,7 @@ def test_wrong_options_are_refused(wrong: dict[str, int]) -> None:
 
 def test_wrong_lights_are_refused() -> None:
     """A disk has a radius and a side."""
-    with pytest.raises(ValueError, match="radius must be positive, found 0"):
+    with pytest.raises(ValueError, match="expected an area light of a positive radius, found 0"):
         AreaLight(radius=0.0)
-    with pytest.raises(ValueError, match="must face a target"):
+    with pytest.raises(ValueError, match="expected an area light away from its target, found both"):
         AreaLight(target=AreaLight().position)

@@ -1,8 +1,9 @@
-"""Meshes rendered through Embree: the same light as the same solid traced as a signed distance."""
+"""Meshes rendered by filled triangles and by Embree: the same light as the same solid traced as a signed distance."""
 
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterator
 
 import numpy as np
@@ -305,6 +306,18 @@ def test_the_light_behind_a_mesh_in_part(monkeypatch: pytest.MonkeyPatch) -> Non
     is_lit(scene, hits, PointLight((0.0, 0.0, 0.5)))
     is_lit(scene, hits, PointLight((0.0, 0.0, 0.0)))
     assert asked == [True, True]
+
+
+def test_threads_share_one_hierarchy() -> None:
+    """Embree builds once, however many threads ask for it first."""
+    scene, found = unit_ball(), []
+    threads = [threading.Thread(target=lambda: found.append(scene.tracer)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 4
+    assert all(tracer is scene.tracer for tracer in found)
 
 
 @pytest.mark.parametrize("samples", [0, -1, 33])

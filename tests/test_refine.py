@@ -6,10 +6,10 @@ import math
 
 import pytest
 import torch
-from tolerances import assert_close
+from tolerances import assert_close, assert_within
 
 from polsep.networks import Size
-from polsep.refine import RUNGS, Refinement, Rung, analytic_inputs, separate_refined
+from polsep.refine import RUNGS, Refinement, Rung, analytic_inputs, fit_linear, separate_refined
 from polsep.stokes import Measurements, Stokes, measure
 from polsep.train.losses import diffuse_loss, gradient_loss, proxy_diffuse, specular_loss
 
@@ -41,10 +41,22 @@ def test_every_rung_sees_and_separates(rung: Rung) -> None:
     assert rung.inputs(seen()).shape == (1, 3 * rung.per_color, 12, 12)
     for net in network.nets:
         torch.nn.init.constant_(net.last.bias, 0.25)  # type: ignore[union-attr, arg-type]
+    torch.nn.init.zeros_(network.linear.weight)
+    torch.nn.init.zeros_(network.linear.bias)  # type: ignore[arg-type]
     found = separate_refined(seen(), rung, network)
     assert_close(found.diffuse, torch.full((1, 3, 12, 12), 0.25))
     assert_close(found.specular, torch.full((1, 3, 12, 12), math.expm1(0.25)))
     assert_close(found.stokes.s0, found.diffuse + found.specular)
+
+
+def test_linear_map_starts_at_the_best_fit() -> None:
+    """Truth that is a linear map of the inputs is met at once; the networks start at zero."""
+    generator = torch.Generator().manual_seed(4)
+    network = Refinement(RUNGS["paper"], 3, Size(4, 1, 1))
+    inputs, mixing = torch.rand(2, 9, 8, 8, generator=generator), torch.rand(6, 9, generator=generator)
+    truth = torch.einsum("ok,nkhw->nohw", mixing, inputs) + 0.3
+    fit_linear(network, inputs, truth)
+    assert_within(torch.cat(network(inputs), dim=1).detach(), truth, 1e-3)
 
 
 def test_mono_has_one_colour() -> None:

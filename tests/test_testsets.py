@@ -14,6 +14,8 @@ pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
 pytest.importorskip("scipy", reason="depth maps need the extra 'render'")
 
+from tolerances import SIGMAS, assert_close, assert_same_angle, assert_within
+
 from polsep.camera import IMX250, Layout, measure_with_analysers, sample_mosaic
 from polsep.io.objects import hash_files, read_depth, read_mask, read_mesh, read_normal_map, read_photograph
 from polsep.optics import Geometry, diffuse_dolp, diffuse_stokes
@@ -40,7 +42,6 @@ from polsep.testsets.expected import EXPECTED
 from polsep.testsets.photographs import normals_from_depth, polarize_diffuse
 from polsep.testsets.sheet import TILE
 from polsep.testsets.statues import DILIGENT_FILES, random_albedo, span_surface, unproject
-from tests.tolerances import SIGMAS, assert_close, assert_same_angle, assert_within
 
 ROOT = Path(__file__).resolve().parents[1]
 SIDE = 48
@@ -378,6 +379,12 @@ def test_unreadable_objects_are_refused(tmp_path: Path) -> None:
     empty.write_text("v 0 0 0\n")
     with pytest.raises(ValueError, match=r"expected triangles in .*empty\.obj, found none"):
         read_mesh(empty)
+    dust = tmp_path / "dust.obj"
+    dust.write_text(
+        "".join(f"v {k} 0 0\nv {k} 1 0\nv {k} 0 1\nf {3 * k + 1} {3 * k + 2} {3 * k + 3}\n" for k in range(101))
+    )
+    with pytest.raises(ValueError, match=r"expected connected triangles in .*dust\.obj, found loose fragments only"):
+        read_mesh(dust)
     with pytest.raises(ValueError, match="expected the files of a test scene"):
         hash_files([tmp_path / "absent.png"])
     np.savez(tmp_path / "two.npz", a=np.zeros((2, 2)), b=np.zeros((2, 2)))

@@ -36,7 +36,17 @@ CROPS, BATCHES, FIRST_BATCHES = (128, 256), 500, 20
 
 
 def bench_rendering(_data: Path | None = None) -> Iterator[Row]:
-    """Rendering beside Mitsuba 3, a whole set, and streamed crops. Needs the extras train and mitsuba, and LLVM."""
+    """Rendering beside Mitsuba 3, a whole set, and streamed crops. Needs the extras train and mitsuba, and LLVM.
+
+    Raises ValueError, before anything is measured, where one of them is missing.
+    """
+    try:
+        import polsep.train.loop  # noqa: F401  # needed only after minutes, missed now
+        from polsep.pathtrace import FAST_VARIANT, find_variant
+    except ImportError as error:
+        raise ValueError(f"expected the extras train and mitsuba, found no {error.name}") from None
+    if find_variant() != FAST_VARIANT:
+        raise ValueError("expected an LLVM that Mitsuba works with (libllvm19), found none: nothing to compare with")
     yield from _bench_images()
     yield from _bench_set()
     for crop in CROPS:
@@ -84,12 +94,6 @@ def _bench_stream(crop: int) -> Iterator[Row]:
 
 def _bench_images() -> Iterator[Row]:
     """Seconds per rendered image of 1 MP, and how many times as fast as Mitsuba 3."""
-    try:
-        from polsep.pathtrace import FAST_VARIANT, find_variant
-    except ImportError as error:
-        raise ValueError(f"expected the extras render and mitsuba, found no {error.name}") from None
-    if find_variant() != FAST_VARIANT:
-        raise ValueError("expected an LLVM that Mitsuba works with (libllvm19), found none: nothing to compare with")
     totals, agreeing = {OURS: 0.0, THEIRS: 0.0}, 1.0
     for seed in SEEDS:
         renderers = _build_renderers(seed)

@@ -53,6 +53,8 @@ def read_mesh(path: Path) -> Mesh:
     vertices, faces = vertices[first], same.reshape(-1)[faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     faces = _without_fragments(faces)
+    if not len(faces):
+        raise ValueError(f"expected connected triangles in {path}, found loose fragments only")
     normals = smooth_normals(vertices, faces)
     return Mesh(vertices, normals, np.zeros((len(vertices), 2)), faces, np.zeros(len(faces), np.int64))
 

@@ -36,9 +36,9 @@ class AreaLight:
 
     def __post_init__(self) -> None:
         if not self.radius > 0:
-            raise ValueError(f"an area light's radius must be positive, found {self.radius}")
+            raise ValueError(f"expected an area light of a positive radius, found {self.radius}")
         if math.dist(self.position, self.target) == 0:
-            raise ValueError(f"an area light must face a target away from it, found both at {self.position}")
+            raise ValueError(f"expected an area light away from its target, found both at {self.position}")
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ class PathOptions:
     def __post_init__(self) -> None:
         if min(self.samples, self.paths, self.depth) < 1:
             found = f"{self.samples}, {self.paths} and {self.depth}"
-            raise ValueError(f"samples, paths and depth must be at least 1, found {found}")
+            raise ValueError(f"expected samples, paths and depth of at least 1, found {found}")
 
 
 @dataclass(frozen=True)

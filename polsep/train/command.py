@@ -18,6 +18,8 @@ from polsep.train.tasks import VARIANTS, find_rung, ladder_task
 
 #: What a laptop trains in an hour or two.
 SMALL = Size()
+#: Those without a scale of the loss, which checkpoints would have to hold.
+PRECISIONS = ("bf16-mixed", "32-true")
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,8 @@ def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]
     torch.manual_seed(options.seed)
     task = ladder_task(find_rung(options.rung), options.variant, options.size)
     average = train(task, run, report)
-    halves = {name: value.half().float() for name, value in average.items()}
+    task.network.cpu()  # where the validation views are
+    halves = {name: value.cpu().half().float() for name, value in average.items()}
     scores = validate(task, halves, validation_batches(run.stream))
     metadata = {
         "method": "paper",
@@ -66,6 +69,16 @@ def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]
 
 
 def plan_run(out: Path, options: TrainOptions, schedule: Schedule, workers: int, devices: int) -> Run:
-    """Where and how: crops of 256 raw pixels for mosaics, of 128 for co-sited images, which have as many in the end."""
+    """Where and how: crops of 256 raw pixels for mosaics, of 128 for co-sited images, which have as many in the end.
+
+    Raises ValueError on what would only fail later, or train nothing.
+    """
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"expected a directory to write into, found a file: {out}")
+    if min(schedule.steps, devices, workers + 1) < 1:
+        found = f"steps {schedule.steps}, devices {devices}, workers {workers}"
+        raise ValueError(f"expected at least 1 step, 1 device and 0 workers, found {found}")
+    if schedule.precision not in PRECISIONS:
+        raise ValueError(f"expected a precision of {', '.join(PRECISIONS)}, found {schedule.precision!r}")
     crop = 256 if options.variant == "mosaic" else 128
     return Run(out, StreamOptions(seed=options.seed, crop=crop), schedule, workers, devices)

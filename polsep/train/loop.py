@@ -29,6 +29,8 @@ from polsep.train.tasks import Task
 #: The learning rate ends at this share of its peak.
 LAST_SHARE = 0.01
 WEIGHT_DECAY, BETAS = 1e-4, (0.9, 0.99)
+#: Batches from which a network is set up.
+FIRST_BATCHES = 2
 #: Norm of a network's gradient at most.
 MOST_GRADIENT = 1.0
 
@@ -79,12 +81,13 @@ def train(task: Task, run: Run, report: Report) -> dict[str, Tensor]:
     fabric.launch()
     network = task.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, betas=BETAS, weight_decay=WEIGHT_DECAY)
+    validation = validation_batches(run.stream)
+    task.begin([task.prepare(batch) for batch in validation_batches(run.stream, FIRST_BATCHES, run.stream.split)])
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
     path = run.out / "checkpoint.pt"
     step = _restore(read_checkpoint(path), run, (network, optimizer, average))
     wrapped, wrapped_optimizer = fabric.setup(network, optimizer)
     average = {name: value.to(fabric.device) for name, value in average.items()}
-    validation = validation_batches(run.stream)
     batches = _batches(run, fabric, step)
     started, first, losses = time.monotonic(), step, []
     while step < run.schedule.steps:
@@ -140,7 +143,7 @@ def _restore(state: dict[str, Any] | None, run: Run, into: tuple[nn.Module, Any,
 def _parts(network: nn.Module) -> list[nn.Module]:
     """Networks that are trained independently have their gradients clipped so."""
     nets = getattr(network, "nets", None)
-    return list(nets) if nets is not None else [network]
+    return [*nets, network.linear] if nets is not None else [network]  # type: ignore[list-item]
 
 
 def _batches(run: Run, fabric: Fabric, step: int) -> Iterator[Examples]:
@@ -162,9 +165,9 @@ def follow(average: dict[str, Tensor], network: nn.Module, decay: float) -> None
             average[name].lerp_(value.detach(), 1 - decay)
 
 
-def validation_batches(stream: StreamOptions, count: int = 4) -> list[Examples]:
-    """The first batches of the validation split, of which every example is of a scene of its own."""
-    options = StreamOptions("validation", 0, 8, stream.crop, stream.size, stream.samples, pool=1, reuse=1)
+def validation_batches(stream: StreamOptions, count: int = 4, split: str = "validation") -> list[Examples]:
+    """The first batches of a split, of which every example is of a scene of its own."""
+    options = StreamOptions(split, 0, 8, stream.crop, stream.size, stream.samples, pool=1, reuse=1)
     batches = iter(ExampleStream(options))
     return [next(batches) for _ in range(count)]
 

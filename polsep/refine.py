@@ -56,24 +56,33 @@ def _cosine(stokes: Stokes) -> Tensor:
 
 @dataclass(frozen=True)
 class Rung:
-    """One rung: its ``inputs`` and their number per colour, and whether diffuse and specular ``share`` one network."""
+    """One rung: its ``inputs``, and whether diffuse and specular ``share`` one network.
+
+    ``start``: weights of the inputs of a colour, of which there are so many, that make the first guess of its tau_d and
+    of its log(1 + tau_s): the analytic split where a rung sees it, else all light as diffuse.
+    """
 
     name: str
     inputs: Inputs
-    per_color: int
+    start: tuple[tuple[float, ...], tuple[float, ...]]
     share: bool
     summary: str
+
+    @property
+    def per_color(self) -> int:
+        """Inputs per colour."""
+        return len(self.start[0])
 
 
 RUNGS = {
     rung.name: rung
     for rung in (
-        Rung("paper", analytic_inputs, 3, False, "analytic split and angle, two networks"),
-        Rung("unpolarized", unpolarized_inputs, 1, False, "CNN on the unpolarized image"),
-        Rung("polarized", polarized_inputs, 4, False, "CNN on the four polarized images"),
-        Rung("shared", analytic_inputs, 3, True, "one network for both outputs"),
-        Rung("no-angle", split_inputs, 2, False, "analytic split without the angle"),
-        Rung("stokes", stokes_inputs, 3, False, "Stokes maps instead of the analytic split"),
+        Rung("paper", analytic_inputs, ((1, 0, 0), (0, 1, 0)), False, "analytic split and angle, two networks"),
+        Rung("unpolarized", unpolarized_inputs, ((1,), (0,)), False, "CNN on the unpolarized image"),
+        Rung("polarized", polarized_inputs, ((0.5,) * 4, (0,) * 4), False, "CNN on the four polarized images"),
+        Rung("shared", analytic_inputs, ((1, 0, 0), (0, 1, 0)), True, "one network for both outputs"),
+        Rung("no-angle", split_inputs, ((1, 0), (0, 1)), False, "analytic split without the angle"),
+        Rung("stokes", stokes_inputs, ((1, 0, 0), (0, 0, 0)), False, "Stokes maps instead of the analytic split"),
     )
 }
 
@@ -82,7 +91,8 @@ class Refinement(nn.Module):
     """The networks of a rung: inputs ``[N, K, h, w]`` to tau_d and log(1 + tau_s), ``[N, C, h, w]`` each.
 
     ``colors``: C, 3 or 1; ``size``: of each network. Note: the paper's networks write their images alone; here they add
-    to a learned linear map of each pixel's inputs, on all rungs alike, which saves them most of the training.
+    to a learned linear map of each pixel's inputs that starts at the rung's first guess. Without it a training of an
+    hour on two cores stays behind the analytic split (docs/experiments.md).
     """
 
     def __init__(self, rung: Rung, colors: int = 3, size: Size = UNET64) -> None:
@@ -91,6 +101,12 @@ class Refinement(nn.Module):
         inputs = rung.per_color * colors
         self.nets = nn.ModuleList(UNet(inputs, n, size) for n in ([2 * colors] if rung.share else [colors, colors]))
         self.linear = nn.Conv2d(inputs, 2 * colors, 1)
+        weight = torch.zeros(2, colors, rung.per_color, colors)
+        for color in range(colors):
+            weight[:, color, :, color] = torch.tensor(rung.start)
+        with torch.no_grad():
+            self.linear.weight.copy_(weight.view(2 * colors, inputs, 1, 1))
+        nn.init.zeros_(self.linear.bias)  # type: ignore[arg-type]
 
     def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """DiffUNet's and SpecUNet's images."""
@@ -98,18 +114,6 @@ class Refinement(nn.Module):
         with torch.autocast(inputs.device.type, enabled=False):
             images = images.float() + self.linear(inputs.float())
         return images[:, : self.colors], images[:, self.colors :]
-
-
-def fit_linear(refinement: Refinement, inputs: Tensor, truth: Tensor) -> None:
-    """Start the linear map at the least-squares fit of ``truth [N, 2 C, h, w]`` to ``inputs [N, K, h, w]``."""
-    x, y = (image.movedim(1, -1).reshape(-1, image.shape[1]).double() for image in (inputs, truth))
-    x = torch.cat([x, torch.ones_like(x[:, :1])], dim=1)
-    ridge = 1e-6 * len(x) * torch.eye(x.shape[1], dtype=x.dtype, device=x.device)
-    fit = torch.linalg.solve(x.T @ x + ridge, x.T @ y)
-    with torch.no_grad():
-        refinement.linear.weight.copy_(fit[:-1].T[..., None, None])
-        assert refinement.linear.bias is not None
-        refinement.linear.bias.copy_(fit[-1])
 
 
 def separate_refined(measurements: Measurements, rung: Rung, networks: Refinement) -> Separation:

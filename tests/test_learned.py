@@ -27,6 +27,8 @@ def write_constant(path: Path, **changed: str) -> Path:
     network = Refinement(RUNGS["paper"], 3, SIZE)
     for net in network.nets:
         torch.nn.init.constant_(net.last.bias, 0.25)  # type: ignore[union-attr, arg-type]
+    torch.nn.init.zeros_(network.linear.weight)
+    torch.nn.init.zeros_(network.linear.bias)  # type: ignore[arg-type]
     metadata = {"method": "paper", "rung": "paper", "colors": "3", "size": json.dumps(asdict(SIZE))}
     write_weights(path, network.state_dict(), metadata | changed)
     return path

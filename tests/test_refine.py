@@ -6,10 +6,11 @@ import math
 
 import pytest
 import torch
-from tolerances import assert_close, assert_within
+from tolerances import assert_close
 
 from polsep.networks import Size
-from polsep.refine import RUNGS, Refinement, Rung, analytic_inputs, fit_linear, separate_refined
+from polsep.refine import RUNGS, Refinement, Rung, analytic_inputs, separate_refined
+from polsep.separation import separate_analytic
 from polsep.stokes import Measurements, Stokes, measure
 from polsep.train.losses import diffuse_loss, gradient_loss, proxy_diffuse, specular_loss
 
@@ -49,14 +50,19 @@ def test_every_rung_sees_and_separates(rung: Rung) -> None:
     assert_close(found.stokes.s0, found.diffuse + found.specular)
 
 
-def test_linear_map_starts_at_the_best_fit() -> None:
-    """Truth that is a linear map of the inputs is met at once; the networks start at zero."""
-    generator = torch.Generator().manual_seed(4)
-    network = Refinement(RUNGS["paper"], 3, Size(4, 1, 1))
-    inputs, mixing = torch.rand(2, 9, 8, 8, generator=generator), torch.rand(6, 9, generator=generator)
-    truth = torch.einsum("ok,nkhw->nohw", mixing, inputs) + 0.3
-    fit_linear(network, inputs, truth)
-    assert_within(torch.cat(network(inputs), dim=1).detach(), truth, 1e-3)
+@pytest.mark.parametrize("name", ["paper", "shared", "no-angle"])
+def test_networks_that_see_the_analytic_split_start_at_it(name: str) -> None:
+    rung, expected = RUNGS[name], separate_analytic(seen())
+    found = separate_refined(seen(), rung, Refinement(rung, 3, Size(4, 1, 1)))
+    assert_close(found.diffuse, expected.diffuse)
+    assert_close(found.specular, expected.specular)
+
+
+@pytest.mark.parametrize("name", ["unpolarized", "polarized", "stokes"])
+def test_other_networks_start_with_all_light_diffuse(name: str) -> None:
+    found = separate_refined(seen(), RUNGS[name], Refinement(RUNGS[name], 3, Size(4, 1, 1)))
+    assert_close(found.diffuse, torch.full((1, 3, 12, 12), 0.8))
+    assert float(found.specular.max()) == 0
 
 
 def test_mono_has_one_colour() -> None:

@@ -18,11 +18,16 @@ from polsep.camera import CLIP_MARGIN, IMX250, Layout
 from polsep.simulate import filter_light
 from polsep.stokes import Stokes
 from polsep.train.stream import (
-    HEADROOM,
+    BRIGHTEST,
+    CLIPPED,
+    LEAST_LEVEL,
     LOOKS,
+    LOWEST_QUANTILE,
+    QUANTILES,
     VIEWS,
     Examples,
     ExampleStream,
+    Pooled,
     StreamOptions,
     add_gaussian_noise,
     pool_scenes,
@@ -33,7 +38,7 @@ from polsep.views import BLURS
 
 #: Light spreads this many pixels beyond the mask: the lens's three standard deviations, and a pixel half covered.
 FRINGE = math.ceil(3 * max(BLURS)) + 1
-SMALL = StreamOptions(batch=3, crop=32, size=64, pool=3, reuse=2)
+SMALL = StreamOptions(batch=3, crop=32, size=64, pool=3, uses=1)
 
 
 def take(options: StreamOptions, lane: int, first: int, count: int) -> list[Examples]:
@@ -102,12 +107,19 @@ def test_truth_is_physical(batches: list[Examples]) -> None:
 
 
 def test_exposures_clip_what_was_drawn() -> None:
-    brightness = torch.linspace(0.94, 1, 121)
-    gains = [random_gain(brightness, torch.Generator().manual_seed(k)) for k in range(300)]
-    assert min(gains) > 0
-    assert max(gains) <= 1 / 0.95 + 1e-6
-    unclipped = sum(gain <= HEADROOM for gain in gains)
-    assert 70 < unclipped < 130
+    """A fifth clips nothing, the others 0.05 to 5 % of evenly spread samples; none is darker than the floor."""
+    ranks = torch.linspace(LOWEST_QUANTILE, 1, QUANTILES)
+    nothing = torch.zeros(0)
+    scene = Pooled(nothing, nothing, nothing, nothing, ranks, 0.5)
+    gains = [random_gain(scene, torch.Generator().manual_seed(k)) for k in range(500)]
+    unclipped = [gain for gain in gains if gain < 1]
+    assert 70 < len(unclipped) < 130
+    assert BRIGHTEST[0] <= min(unclipped) <= max(unclipped) <= BRIGHTEST[1]
+    shares = [1 - 1 / gain for gain in gains if gain >= 1]
+    assert min(shares) >= CLIPPED[0] - 1e-4
+    assert max(shares) <= CLIPPED[1] + 1e-4
+    dark = replace(scene, level=1e-4)
+    assert all(random_gain(dark, torch.Generator().manual_seed(k)) >= LEAST_LEVEL / 1e-4 for k in range(20))
 
 
 def test_fast_noise_has_the_sensors_statistics() -> None:

@@ -23,7 +23,7 @@ from polsep.train.loop import Run, Schedule, train, validate
 from polsep.train.stream import Examples, StreamOptions, stream_lane
 from polsep.train.tasks import Task, find_rung, ladder_task, see_co_sited, see_mosaic
 
-STREAM = StreamOptions(batch=2, crop=32, size=64, pool=2, reuse=4)
+STREAM = StreamOptions(batch=2, crop=32, size=64, pool=2, uses=1)
 SCHEDULE = Schedule(steps=6, warm_up=2, checkpoint_every=3, validate_every=100, precision="32-true")
 
 
@@ -33,7 +33,7 @@ def small_task() -> Task:
 
 
 def run_in(folder: Path, schedule: Schedule = SCHEDULE) -> Run:
-    return Run(folder, STREAM, schedule, workers=1)
+    return Run(folder, "a test", STREAM, schedule, workers=1)
 
 
 def equal(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:

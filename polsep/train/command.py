@@ -81,4 +81,5 @@ def plan_run(out: Path, options: TrainOptions, schedule: Schedule, workers: int,
     if schedule.precision not in PRECISIONS:
         raise ValueError(f"expected a precision of {', '.join(PRECISIONS)}, found {schedule.precision!r}")
     crop = 256 if options.variant == "mosaic" else 128
-    return Run(out, StreamOptions(seed=options.seed, crop=crop), schedule, workers, devices)
+    stream = StreamOptions(seed=options.seed, crop=crop)
+    return Run(out, json.dumps(asdict(options)), stream, schedule, workers, devices)

@@ -29,10 +29,8 @@ from polsep.train.tasks import Task
 #: The learning rate ends at this share of its peak.
 LAST_SHARE = 0.01
 WEIGHT_DECAY, BETAS = 1e-4, (0.9, 0.99)
-#: Batches from which a network is set up.
-FIRST_BATCHES = 2
-#: Norm of a network's gradient at most.
-MOST_GRADIENT = 1.0
+#: Norm of a network's gradient at most. Usual ones are 13 to 42, so only outliers are cut.
+MOST_GRADIENT = 100.0
 
 
 @dataclass(frozen=True)
@@ -60,9 +58,10 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Run:
-    """Where a training writes, what it trains on, and on what: ``workers`` render, ``devices`` train."""
+    """Where a training writes, ``what`` it trains, on which data; ``workers`` render, ``devices`` train."""
 
     out: Path
+    what: str
     stream: StreamOptions
     schedule: Schedule
     workers: int = 1
@@ -82,7 +81,6 @@ def train(task: Task, run: Run, report: Report) -> dict[str, Tensor]:
     network = task.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, betas=BETAS, weight_decay=WEIGHT_DECAY)
     validation = validation_batches(run.stream)
-    task.begin([task.prepare(batch) for batch in validation_batches(run.stream, FIRST_BATCHES, run.stream.split)])
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
     path = run.out / "checkpoint.pt"
     step = _restore(read_checkpoint(path), run, (network, optimizer, average))
@@ -119,12 +117,9 @@ def train(task: Task, run: Run, report: Report) -> dict[str, Tensor]:
 
 
 def _describe(run: Run) -> str:
-    """What must be the same for a checkpoint to go on: data and schedule, not where or by how many processes."""
-    return json.dumps({"stream": asdict(run.stream), "schedule": asdict(run.schedule), "lanes": _lanes(run)})
-
-
-def _lanes(run: Run) -> int:
-    return max(run.workers, 1) * run.devices
+    """What must be the same for a checkpoint to go on."""
+    described = {"what": run.what, "stream": asdict(run.stream), "schedule": asdict(run.schedule)}
+    return json.dumps(described | {"workers": run.workers, "devices": run.devices})
 
 
 def _restore(state: dict[str, Any] | None, run: Run, into: tuple[nn.Module, Any, dict[str, Tensor]]) -> int:
@@ -165,9 +160,9 @@ def follow(average: dict[str, Tensor], network: nn.Module, decay: float) -> None
             average[name].lerp_(value.detach(), 1 - decay)
 
 
-def validation_batches(stream: StreamOptions, count: int = 4, split: str = "validation") -> list[Examples]:
-    """The first batches of a split, of which every example is of a scene of its own."""
-    options = StreamOptions(split, 0, 8, stream.crop, stream.size, stream.samples, pool=1, reuse=1)
+def validation_batches(stream: StreamOptions, count: int = 8) -> list[Examples]:
+    """The first batches of the validation split, of which every example is of a scene of its own."""
+    options = StreamOptions("validation", 0, 8, stream.crop, stream.size, stream.samples, pool=1, uses=0)
     batches = iter(ExampleStream(options))
     return [next(batches) for _ in range(count)]
 

@@ -27,14 +27,18 @@ from polsep.raycast import MeshScene, find_view, light_view, shade_view
 from polsep.render import PointLight, Scene
 from polsep.simulate import HEADROOM, blur, filter_light
 from polsep.stokes import Stokes
-from polsep.views import random_clip, random_light, random_shot, scene_seed, seeded_shape
+from polsep.views import LEAST_LEVEL, random_light, random_shot, scene_seed, seeded_shape
 
 #: Views of a shape, and lights with materials of their own under which each is seen.
-VIEWS, LOOKS = 4, 3
+VIEWS, LOOKS = 2, 3
 #: Brightness of object samples is kept at so many quantiles above this share, for exposures that clip the rest.
-LOWEST_QUANTILE, QUANTILES = 0.94, 121
-#: Where nothing is to clip, the brightest sample may lie this much lower than `HEADROOM`.
-DIMMEST = 0.4
+LOWEST_QUANTILE, QUANTILES = 0.94, 601
+#: Share of the examples in which nothing is to clip; there the brightest sample lies between these shares of white.
+UNCLIPPED_SHARE, BRIGHTEST = 0.2, (0.4, HEADROOM)
+#: Shares of the object's samples that clip in the others, log-uniform.
+CLIPPED = (0.0005, 0.05)
+#: A crop is drawn anew, at most so many times, while less than this share of it is on objects.
+LEAST_COVERED, MOST_DRAWS = 0.6, 4
 
 
 #: Analysers of the examples [rad].
@@ -45,8 +49,9 @@ ANGLES = Layout().angles
 class StreamOptions:
     """What a stream gives: ``batch`` crops of ``crop`` x ``crop`` raw pixels from views of ``size`` x ``size``.
 
-    ``pool``: scenes to draw from, per lane; ``reuse``: examples before one of them is replaced. ``samples``: rays along
-    a pixel's side. Raises ValueError when crops do not fit or are no multiples of the mosaic's period.
+    ``pool``: scenes to draw from, per lane; ``uses``: how often a scene's pixels are taken, on average, before it is
+    replaced; 0 for one crop of each. ``samples``: rays along a pixel's side. Raises ValueError when crops do not fit or
+    are no multiples of the mosaic's period.
     """
 
     split: str = "train"
@@ -54,15 +59,20 @@ class StreamOptions:
     batch: int = 8
     crop: int = 256
     size: int = 512
-    samples: int = 1
+    samples: int = 2
     pool: int = 48
-    reuse: int = 32
+    uses: int = 6
 
     def __post_init__(self) -> None:
         if self.crop % 4 or not 4 <= self.crop <= self.size:
             raise ValueError(f"expected crops of a multiple of 4 up to {self.size} pixels, found {self.crop}")
-        if min(self.batch, self.samples, self.pool, self.reuse) < 1:
-            raise ValueError(f"expected batch, samples, pool and reuse of at least 1, found {self}")
+        if min(self.batch, self.samples, self.pool, self.uses + 1) < 1:
+            raise ValueError(f"expected batch, samples and pool of at least 1 and uses of at least 0, found {self}")
+
+    @property
+    def reuse(self) -> int:
+        """Examples before a scene is replaced."""
+        return max(1, self.uses * self.size**2 // self.crop**2)
 
 
 class Examples(NamedTuple):
@@ -83,6 +93,8 @@ class Examples(NamedTuple):
 class Pooled:
     """A scene in half precision, with the ``places [N, 2]`` and the ``brightness`` quantiles of its object's pixels.
 
+    ``level``: the median of the lit ones.
+
     ``diffuse [9, H, W]``: s0, s1, s2 of three colours each; ``specular [3, H, W]``: of white light.
     """
 
@@ -91,6 +103,7 @@ class Pooled:
     mask: Tensor
     places: Tensor
     brightness: Tensor
+    level: float
 
 
 class ExampleStream(IterableDataset[Examples]):
@@ -175,10 +188,11 @@ def _as_pooled(scene: Scene) -> Pooled:
     brightest = np.sort(np.partition(samples.numpy(), lowest)[lowest:])
     ranks = np.linspace(0, brightest.size - 1, QUANTILES).round().astype(np.int64)
     brightness = torch.from_numpy(brightest[ranks])
-    gain = 1 / max(float(brightness[-1]), 1e-12)
+    gain, lit = 1 / max(float(brightness[-1]), 1e-12), samples[samples > 0]
+    level = gain * float(lit.median()) if lit.numel() else 1.0
     white = scene.specular.map(lambda s: s[:1])
     diffuse, specular = (torch.cat([s.s0, s.s1, s.s2]).mul_(gain).half() for s in (scene.diffuse, white))
-    return Pooled(diffuse, specular, scene.mask, scene.mask.nonzero(), brightness * gain)
+    return Pooled(diffuse, specular, scene.mask, scene.mask.nonzero(), brightness * gain, level)
 
 
 class Crop(NamedTuple):
@@ -209,7 +223,7 @@ def random_crop(pool: deque[Pooled], crop: int, generator: torch.Generator) -> C
         light, mask = light.transpose(-1, -2), mask.T
     s1, s2 = 1 - 2 * transposed, (1 - 2 * across) * (1 - 2 * down)
     signs = torch.tensor([1.0] * 3 + [s1] * 3 + [s2] * 3 + [1.0, s1, s2])
-    return Crop(light, random_gain(scene.brightness, generator) * signs, mask)
+    return Crop(light, random_gain(scene, generator) * signs, mask)
 
 
 def expose_crops(crops: list[Crop], generator: torch.Generator) -> Examples:
@@ -228,20 +242,29 @@ def _integer(limit: int, generator: torch.Generator) -> int:
 
 
 def _random_place(scene: Pooled, crop: int, generator: torch.Generator) -> tuple[slice, slice]:
-    """A crop about a random pixel of the object, as far as the frame allows."""
-    center = scene.places[_integer(len(scene.places), generator)].tolist()
-    starts = [min(max(c - crop // 2, 0), n - crop) for c, n in zip(center, scene.mask.shape, strict=True)]
-    rows, cols = (slice(start, start + crop) for start in starts)
+    """A crop about a random pixel of the object, as far as the frame allows, with much of the object in it."""
+    for _ in range(MOST_DRAWS):
+        center = scene.places[_integer(len(scene.places), generator)].tolist()
+        starts = [min(max(c - crop // 2, 0), n - crop) for c, n in zip(center, scene.mask.shape, strict=True)]
+        rows, cols = (slice(start, start + crop) for start in starts)
+        if float(scene.mask[rows, cols].float().mean()) >= LEAST_COVERED:
+            break
     return rows, cols
 
 
-def random_gain(brightness: Tensor, generator: torch.Generator) -> float:
-    """A gain at which a share of the samples clips as `views.random_clip` draws it, or none."""
-    share, dim = random_clip(generator), float(torch.rand(1, generator=generator))
-    if not share:
-        return HEADROOM * (1 - (1 - DIMMEST) * dim)
-    place = (1 - share - LOWEST_QUANTILE) / (1 - LOWEST_QUANTILE) * (QUANTILES - 1)
-    return 1 / max(float(brightness[round(place)]), 1e-6)
+def random_gain(scene: Pooled, generator: torch.Generator) -> float:
+    """A gain at which a random share of the samples clips, or none; more clip where the rest would be black.
+
+    The floor is that of `views.capture_shot`.
+    """
+    none, place = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+    if none < UNCLIPPED_SHARE:
+        gain = BRIGHTEST[0] + (BRIGHTEST[1] - BRIGHTEST[0]) * place
+    else:
+        share = CLIPPED[0] * (CLIPPED[1] / CLIPPED[0]) ** place
+        rank = (1 - share - LOWEST_QUANTILE) / (1 - LOWEST_QUANTILE) * (QUANTILES - 1)
+        gain = 1 / max(float(scene.brightness[round(rank)]), 1e-6)
+    return float(max(gain, LEAST_LEVEL / scene.level))
 
 
 def add_gaussian_noise(signal: Tensor, sensor: Sensor, generator: torch.Generator) -> Tensor:

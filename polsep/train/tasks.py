@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool2d
 
 from polsep.demosaic import demosaic_bilinear_half
 from polsep.networks import Size
-from polsep.refine import RUNGS, Refinement, Rung, fit_linear, separate_refined
+from polsep.refine import RUNGS, Refinement, Rung, separate_refined
 from polsep.separation import Separation
 from polsep.stokes import Measurements, Stokes, measure
 from polsep.train.losses import diffuse_loss, specular_loss
@@ -23,16 +23,12 @@ Seen = tuple[Measurements, Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Task:
-    """A ``network``, its ``loss`` on what ``prepare`` makes of examples, and how it ``separate``s.
-
-    ``begin`` sets up the network from a few batches, before the first step.
-    """
+    """A ``network``, its ``loss`` on what ``prepare`` makes of examples, and how it ``separate``s."""
 
     network: nn.Module
     prepare: Callable[[Examples], Seen]
     loss: Callable[[nn.Module, Seen], Tensor]
     separate: Callable[[Seen], Separation]
-    begin: Callable[[list[Seen]], None]
 
 
 def see_mosaic(examples: Examples) -> Seen:
@@ -67,12 +63,7 @@ def ladder_task(rung: Rung, variant: str, size: Size) -> Task:
     def separate(seen: Seen) -> Separation:
         return separate_refined(seen[0], rung, network)
 
-    def begin(batches: list[Seen]) -> None:
-        inputs = torch.cat([rung.inputs(seen[0]) for seen in batches])
-        truth = torch.cat([torch.cat([diffuse, torch.log1p(specular)], dim=1) for _, diffuse, specular, _ in batches])
-        fit_linear(network, inputs, truth)
-
-    return Task(network, VARIANTS[variant], loss, separate, begin)
+    return Task(network, VARIANTS[variant], loss, separate)
 
 
 def find_rung(name: str) -> Rung:

@@ -60,6 +60,9 @@ SPECULAR_FREEDOM = 12.0
 #: Brightness squared below which freedom is not told apart.
 FREEDOM_FLOOR = 1e-6
 
+#: Least weight of the specular light around as a prior, far below that of any sample and above rounding.
+LEAST_PRIOR = 1e-6
+
 #: Least eigenvalue of the normal equations of b, 6 without clipping, above which b counts as determined.
 MIN_EIGENVALUE = 0.3
 
@@ -319,10 +322,11 @@ def _sum_unclipped(measurements: Measurements, slope: Tensor, phase: Tensor, aro
 
 def _fit_specular(sums: _Sums, nearby: Tensor, freedom: Tensor) -> Tensor:
     """tau_s ``[..., 1, h, w]`` by least squares over all colours, tau_d eliminated; ``nearby`` is its prior."""
-    likely, weight = torch.sqrt((nearby * nearby).sum(dim=-3, keepdim=True)), PRIOR_WEIGHT / freedom
+    likely = torch.sqrt((nearby * nearby).sum(dim=-3, keepdim=True))
+    weight = (PRIOR_WEIGHT / freedom).clamp(min=LEAST_PRIOR)
     curvature = (sums.pp - sums.gp**2 / sums.gg).sum(dim=-3, keepdim=True) + weight
     pull = (sums.py - sums.gp * sums.gy / sums.gg).sum(dim=-3, keepdim=True) + weight * likely
-    return (pull / curvature.clamp(min=1e-6)).clamp(min=0)
+    return (pull / curvature.clamp(min=LEAST_PRIOR / 2)).clamp(min=0)
 
 
 def _fit_diffuse(sums: _Sums, specular: Tensor) -> Tensor:

@@ -57,6 +57,8 @@ def test_resumed_training_ends_with_the_same_bits(tmp_path: Path) -> None:
     assert state is not None
     assert state["step"] == 3
     resumed = train(small_task(), killed, lines.append)
+    assert whole is not None
+    assert resumed is not None
     assert equal(whole, resumed)
 
 

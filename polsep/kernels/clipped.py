@@ -14,6 +14,7 @@ from polsep.kernels.threads import Piece
 
 _LEAST_EIGENVALUE, _PRIOR = np.float32(twin.MIN_EIGENVALUE), np.float32(twin.PRIOR_WEIGHT)
 _FREEDOM, _FREEDOM_FLOOR = np.float32(twin.SPECULAR_FREEDOM), np.float32(twin.FREEDOM_FLOOR)
+_LEAST_PRIOR = np.float32(twin.LEAST_PRIOR)
 _SINGULAR, _SHORT, _ENDLESS = np.float32(1e-6), np.float32(1e-12), np.float32(np.inf)
 ALL_CLIPPED = np.uint16(0xFFF)
 
@@ -199,7 +200,7 @@ def _fit_specular(pixels: Pixels, n: int, passed: tuple[Any, Any], prior: tuple[
         sums[c, 0], sums[c, 1], sums[c, 2] = gg, gp, gy
         curvature += pp - gp * gp / gg
         pull += py - gp * gy / gg
-    value = pull / (curvature if curvature > _SINGULAR else _SINGULAR)
+    value = pull / (curvature if curvature > HALF * _LEAST_PRIOR else HALF * _LEAST_PRIOR)
     return value if value > ZERO else ZERO
 
 
@@ -264,7 +265,8 @@ def fill_pixels(pixels: Pixels, analysers: Analysers, holes: Any, around: Any) -
             p[k] = ONE + analysers.cosines[k] * p1 + analysers.sines[k] * p2
         for c in range(3):
             sums[c, 2] = _PRIOR * around[2 + c, i]
-        fitted = _fit_specular(pixels, n, (g, p), (likely, _PRIOR / freedom), sums)
+        weight = _PRIOR / freedom
+        fitted = _fit_specular(pixels, n, (g, p), (likely, weight if weight > _LEAST_PRIOR else _LEAST_PRIOR), sums)
         if not known:
             _fit_diffuse(sums, fitted, diffuse)
             specular = _raise_specular(pixels, n, (g, p), (diffuse, fitted), freedom)

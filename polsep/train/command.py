@@ -47,7 +47,10 @@ def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]
     """
     torch.manual_seed(options.seed)
     task = ladder_task(find_rung(options.rung), options.variant, options.size)
+    path = run.out / f"{options.rung}-{options.variant}.safetensors"
     average = train(task, run, report)
+    if average is None:
+        return path
     task.network.cpu()  # where the validation views are
     halves = {name: value.cpu().half().float() for name, value in average.items()}
     scores = validate(task, halves, validation_batches(run.stream))
@@ -63,7 +66,6 @@ def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]
         "stream": json.dumps(asdict(run.stream)),
         "validation": json.dumps(scores),
     }
-    path = run.out / f"{options.rung}-{options.variant}.safetensors"
     write_weights(path, halves, metadata)
     return path
 

@@ -71,10 +71,11 @@ class Run:
 Report = Callable[[dict[str, Any]], None]
 
 
-def train(task: Task, run: Run, report: Report) -> dict[str, Tensor]:
+def train(task: Task, run: Run, report: Report) -> dict[str, Tensor] | None:
     """Train to the end of the schedule, from the last checkpoint if there is one; returns the averaged weights.
 
-    ``report`` is called with every line of the log. Raises ValueError when the checkpoint is of another training.
+    ``report`` is called with every line of the log. Of several processes only the first one writes and reports, and
+    the others return None. Raises ValueError when the checkpoint is of another training.
     """
     fabric = Fabric(accelerator="auto", devices=run.devices, precision=run.schedule.precision)  # type: ignore[arg-type]
     fabric.launch()
@@ -113,7 +114,7 @@ def train(task: Task, run: Run, report: Report) -> dict[str, Tensor]:
             state = {"step": step, "run": _describe(run), "network": network.state_dict()}
             if fabric.is_global_zero:
                 write_checkpoint(path, state | {"optimizer": optimizer.state_dict(), "average": average})
-    return average
+    return average if fabric.is_global_zero else None
 
 
 def _describe(run: Run) -> str:

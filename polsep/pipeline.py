@@ -21,9 +21,10 @@ from torch import Tensor
 from polsep.camera import Layout, Mosaic
 from polsep.color_affine import separate_color_affine
 from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
-from polsep.engine import run_analytic, run_color_affine
+from polsep.engine import run_analytic, run_color_affine, run_nothing
 from polsep.guided import demosaic_guided, demosaic_guided_half
 from polsep.layout_check import check_layout
+from polsep.learned import separate_paper
 from polsep.levels import as_mosaic
 from polsep.report import SeparatedFrame, describe, grey, tally
 from polsep.separation import Separation, separate_analytic
@@ -79,6 +80,16 @@ METHODS = {
             "the paper's first estimate: specular = polarized part, diffuse = the rest",
             "colour or mono; takes the diffuse light for unpolarized and clipped samples at face value",
             "Dave et al. 2022, Eqs. 15-18",
+        ),
+        Method(
+            "paper",
+            demosaic_bilinear_half,
+            demosaic_bilinear,
+            separate_paper,
+            run_nothing,
+            "the paper's two U-Nets, which refine the analytic split",
+            "colour; mono frames go through as grey ones; trained on noisy mosaics under white light",
+            "Dave et al. 2022, Sec. 4; weights are this project's",
         ),
     )
 }

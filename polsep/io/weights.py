@@ -33,6 +33,7 @@ def write_weights(path: Path, tensors: Tensors, metadata: dict[str, str]) -> Non
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(path.name + ".part")
     save_file(halves, beside, metadata | {"sha256": digest_tensors(halves)})
+    beside.chmod(0o644)  # safetensors makes files that only their owner can read
     beside.replace(path)
 
 

@@ -119,7 +119,8 @@ class Refinement(nn.Module):
 def separate_refined(measurements: Measurements, rung: Rung, networks: Refinement) -> Separation:
     """Diffuse and specular of ``[..., 4, C, h, w]`` as the networks see them; negative values are cut to 0.
 
-    The networks demosaick nothing and hold nothing together: ``stokes.s0`` is the sum of both outputs.
+    ``stokes`` and ``valid`` are those of the analytic split: the networks say nothing of polarization, and nothing
+    makes their outputs sum to s0.
     """
     batch = measurements.data.shape[:-4]
     inputs = rung.inputs(measurements)
@@ -129,5 +130,4 @@ def separate_refined(measurements: Measurements, rung: Rung, networks: Refinemen
     images = [x.reshape(*batch, *x.shape[-3:]) for x in (diffuse, torch.expm1(logarithm))]
     diffuse, specular = (x.clamp(min=0) for x in images)
     seen = separate_analytic(measurements)
-    stokes = Stokes(diffuse + specular, seen.stokes.s1, seen.stokes.s2)
-    return Separation(diffuse, specular, seen.valid, stokes)
+    return Separation(diffuse, specular, seen.valid, seen.stokes)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,24 @@ from polsep.train.tasks import VARIANTS, find_rung, ladder_task
 SMALL = Size()
 #: Those without a scale of the loss, which checkpoints would have to hold.
 PRECISIONS = ("bf16-mixed", "32-true")
+#: The code that examples depend on.
+DATA_MODULES = (
+    "camera.py",
+    "kernels/patterns.py",
+    "kernels/raster.py",
+    "kernels/rays.py",
+    "kernels/shading.py",
+    "kernels/shadows.py",
+    "materials.py",
+    "raycast.py",
+    "render.py",
+    "shapes.py",
+    "simulate.py",
+    "textures.py",
+    "train/stream.py",
+    "train/variety.py",
+    "views.py",
+)
 
 
 @dataclass(frozen=True)
@@ -46,6 +66,7 @@ def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]
     The weights are in half precision; the scores in their metadata are of these on the validation views.
     """
     torch.manual_seed(options.seed)
+    data = digest_data(run.stream)
     task = ladder_task(find_rung(options.rung), options.variant, options.size)
     path = run.out / f"{options.rung}-{options.variant}.safetensors"
     average = train(task, run, report)
@@ -64,10 +85,32 @@ def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]
         "parameters": str(count_parameters(task.network)),
         "schedule": json.dumps(asdict(run.schedule)),
         "stream": json.dumps(asdict(run.stream)),
+        "data": data,
+        "command": describe_command(options, run),
         "validation": json.dumps(scores),
     }
     write_weights(path, halves, metadata)
     return path
+
+
+def digest_data(stream: StreamOptions) -> str:
+    """sha256 of what makes the examples: the options, and the code of every module that draws, renders or exposes."""
+    digest = hashlib.sha256(json.dumps(asdict(stream)).encode())
+    for name in DATA_MODULES:
+        digest.update(files("polsep").joinpath(name).read_bytes())
+    return digest.hexdigest()
+
+
+def describe_command(options: TrainOptions, run: Run) -> str:
+    """The command line that trains this again."""
+    size, schedule = options.size, run.schedule
+    words = (
+        f"polsep train {options.rung} --data {options.variant}",
+        f"--width {size.width} --levels {size.levels} --fold {size.fold}",
+        f"--steps {schedule.steps} --rate {schedule.rate:g} --seed {options.seed} --precision {schedule.precision}",
+        f"--workers {run.workers} --devices {run.devices} -o {run.out.name}",
+    )
+    return " ".join(words)
 
 
 def plan_run(out: Path, options: TrainOptions, schedule: Schedule, workers: int, devices: int) -> Run:

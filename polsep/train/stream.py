@@ -1,7 +1,7 @@
 """Training examples without end: random views rendered in the background, cut, exposed and measured anew every time.
 
 A lane is one worker's stream. It keeps a pool of rendered scenes; example number n is a random crop of one of them,
-mirrored and turned at random, with its colours permuted and its own exposure; noise is drawn per batch. After every few
+mirrored and turned at random, with its colours permuted and its own exposure, camera and noise. After every few
 examples the oldest scene gives way to a new one. Everything follows from the options, the lane and n, so a stream that
 starts at any batch gives what one from the beginning would.
 
@@ -24,19 +24,20 @@ from torch.utils.data import IterableDataset, get_worker_info
 from polsep.camera import IMX250, Layout, Mosaic, Sensor
 from polsep.materials import random_materials
 from polsep.raycast import MeshScene, find_view, light_view, shade_view
-from polsep.render import PointLight, Scene
+from polsep.render import Scene
 from polsep.simulate import HEADROOM, blur, filter_light
 from polsep.stokes import Stokes
-from polsep.views import LEAST_LEVEL, random_light, random_shot, scene_seed, seeded_shape
+from polsep.train.variety import random_sensor, relight, vary_materials, vary_shot
+from polsep.views import LEAST_LEVEL, random_shot, scene_seed, seeded_shape
 
 #: Views of a shape, and lights with materials of their own under which each is seen.
 VIEWS, LOOKS = 2, 3
 #: Brightness of object samples is kept at so many quantiles above this share, for exposures that clip the rest.
 LOWEST_QUANTILE, QUANTILES = 0.94, 601
 #: Share of the examples in which nothing is to clip; there the brightest sample lies between these shares of white.
-UNCLIPPED_SHARE, BRIGHTEST = 0.2, (0.4, HEADROOM)
-#: Shares of the object's samples that clip in the others, log-uniform.
-CLIPPED = (0.0005, 0.05)
+UNCLIPPED_SHARE, BRIGHTEST = 0.25, (0.4, HEADROOM)
+#: Shares of the object's samples that clip in the others: least and most, small ones more often (a square's law).
+CLIPPED = (0.0005, 0.06)
 #: A crop is drawn anew, at most so many times, while less than this share of it is on objects.
 LEAST_COVERED, MOST_DRAWS = 0.6, 4
 
@@ -169,15 +170,15 @@ def pool_scenes(options: StreamOptions, lane: int, first: int) -> Iterator[Poole
 
 def _look_at(shape: MeshScene, options: StreamOptions, generator: torch.Generator) -> list[Pooled]:
     """One view of a shape under several lights, with other materials under each."""
-    shot = random_shot(shape, generator)
+    shot = vary_shot(shape, random_shot(shape, generator), generator)
     view = find_view(shape, shot.camera, (options.size, options.size), options.samples)
-    light: PointLight = shot.light
+    light = shot.light
     looks = []
     for _ in range(LOOKS):
-        materials = random_materials(shape.mesh.slot_count, generator, shape.size)
+        materials = vary_materials(random_materials(shape.mesh.slot_count, generator, shape.size), generator)
         scene = blur(shade_view(view, materials, light, light_view(shape, view, light)), shot.blur)
         looks.append(_as_pooled(scene))
-        light = random_light(shot.camera, shape.size / 2, generator)
+        light = relight(shape, shot, generator)
     return looks
 
 
@@ -233,7 +234,8 @@ def expose_crops(crops: list[Crop], generator: torch.Generator) -> Examples:
     diffuse, specular = light[:, :3], light[:, 9:10]
     s1, s2 = light[:, 3:6] + light[:, 10:11], light[:, 6:9] + light[:, 11:12]
     signal = filter_light(Stokes(diffuse + specular, s1, s2), Layout(), IMX250)
-    raw, polarized = add_gaussian_noise(signal, IMX250, generator), torch.cat([s1.half(), s2.half()], dim=1)
+    raw = torch.stack([add_gaussian_noise(x, random_sensor(generator), generator) for x in signal])
+    polarized = torch.cat([s1.half(), s2.half()], dim=1)
     return Examples(raw, diffuse.half(), specular.half(), polarized, torch.stack([crop.mask for crop in crops]))
 
 
@@ -261,7 +263,7 @@ def random_gain(scene: Pooled, generator: torch.Generator) -> float:
     if none < UNCLIPPED_SHARE:
         gain = BRIGHTEST[0] + (BRIGHTEST[1] - BRIGHTEST[0]) * place
     else:
-        share = CLIPPED[0] * (CLIPPED[1] / CLIPPED[0]) ** place
+        share = CLIPPED[0] + (CLIPPED[1] - CLIPPED[0]) * place**2
         rank = (1 - share - LOWEST_QUANTILE) / (1 - LOWEST_QUANTILE) * (QUANTILES - 1)
         gain = 1 / max(float(scene.brightness[round(rank)]), 1e-6)
     return float(max(gain, LEAST_LEVEL / scene.level))

@@ -1,0 +1,86 @@
+"""What training examples have beyond `polsep.views`: close-ups, grey and plain objects, softer lenses, other cameras.
+
+Whoever uses a trained network photographs more than objects that fill the frame, by one camera. Draws take a generator.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from polsep.camera import IMX250, Sensor
+from polsep.materials import Materials
+from polsep.raycast import MeshScene, find_view, light_view
+from polsep.render import PointLight
+from polsep.views import LEAST_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
+
+#: Share of the views that show a part of the object, and how many times larger than the whole, log-uniform.
+CLOSE_SHARE, MAGNIFICATIONS = 0.5, (1.0, 5.0)
+#: Shares of the looks of which all is near-grey, and of those without textures.
+GREY_SHARE, PLAIN_SHARE = 0.2, 0.2
+#: Saturation that near-grey looks keep, at most.
+GREY_SATURATION = 0.15
+#: Standard deviation of the lens's point spread in raw pixels: that of `views.BLURS` and, slightly defocused, more.
+BLURS = (0.3, 1.2)
+#: Electrons at the white level, log-uniform: a gain of 12 to 0 dB on cameras like the IMX250, and larger pixels.
+FULL_WELLS = (2_600.0, 21_000.0)
+#: Bits of the converter, and their shares.
+BITS, BITS_SHARES = (8, 10, 12), (0.15, 0.15, 0.7)
+#: Lights are drawn anew, at most so many times, while they leave most of a view dark.
+MOST_DRAWS = 10
+
+
+def vary_shot(shape: MeshScene, shot: Shot, generator: torch.Generator) -> Shot:
+    """A shot of the whole object, or of the surroundings of a lit point of it, through another lens."""
+    close, magnification, softness = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
+    shot = replace(shot, blur=BLURS[0] * (BLURS[1] / BLURS[0]) ** softness)
+    if close >= CLOSE_SHARE:
+        return shot
+    view = find_view(shape, shot.camera, PREVIEW_SIZE)
+    lit = light_view(shape, view, shot.light)
+    points = [band.hits.position[:, seen[0, :, 0], 0] for band, seen in zip(view.bands, lit, strict=True)]
+    places = torch.cat(points, dim=1)
+    target = places[:, int(torch.randint(places.shape[1], (1,), generator=generator))]
+    larger = MAGNIFICATIONS[0] * (MAGNIFICATIONS[1] / MAGNIFICATIONS[0]) ** magnification
+    fov = 2 * math.degrees(math.atan(math.tan(math.radians(shot.camera.fov_deg) / 2) / larger))
+    x, y, z = (round(c, 6) for c in target.tolist())
+    return replace(shot, camera=replace(shot.camera, target=(x, y, z), fov_deg=round(fov, 6)))
+
+
+def relight(shape: MeshScene, shot: Shot, generator: torch.Generator) -> PointLight:
+    """Another light for a shot, one that reaches much of what is seen."""
+    for _ in range(MOST_DRAWS):
+        light = random_light(shot.camera, shape.size / 2, generator)
+        if lit_share(shape, replace(shot, light=light)) >= LEAST_LIT:
+            break
+    return light
+
+
+def vary_materials(materials: Materials, generator: torch.Generator) -> Materials:
+    """The same, near-grey or without textures at random."""
+    grey, plain, saturation = torch.rand(3, generator=generator).tolist()
+    if plain < PLAIN_SHARE:
+        materials = replace(materials, textures=None)
+    if grey >= GREY_SHARE:
+        return materials
+    saturation *= GREY_SATURATION
+    textures = materials.textures
+    if textures is not None:
+        textures = replace(textures, albedo=_desaturate(textures.albedo, saturation))
+    return replace(materials, albedo=_desaturate(materials.albedo, saturation), textures=textures)
+
+
+def _desaturate(albedo: Tensor, saturation: float) -> Tensor:
+    """Albedos ``[S, 3]`` with this share of their own saturation, as bright as before."""
+    value = albedo.amax(dim=1, keepdim=True)
+    return value + saturation * (albedo - value)
+
+
+def random_sensor(generator: torch.Generator) -> Sensor:
+    """The IMX250's filters and read noise with another full well and converter."""
+    place = float(torch.rand(1, generator=generator, dtype=torch.float64))
+    bits = BITS[int(torch.multinomial(torch.tensor(BITS_SHARES), 1, generator=generator))]
+    return replace(IMX250, full_well=FULL_WELLS[0] * (FULL_WELLS[1] / FULL_WELLS[0]) ** place, bits=bits)

@@ -220,7 +220,12 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 @app.command()
 @click.argument("rung")
 @click.option("-o", "--output", type=DIR, required=True, metavar="DIR", help="A new directory, or one to go on with.")
-@click.option("--data", default="mosaic", metavar="NAME", help="mosaic: noisy raw frames; co-sited: as in the paper.")
+@click.option(
+    "--data",
+    default="mosaic",
+    metavar="NAME",
+    help="mosaic: noisy frames; mono: without colours; co-sited: as the paper.",
+)
 @click.option("--width", type=int, default=32, metavar="N", help="Channels of the network's first level.")
 @click.option("--levels", type=int, default=3, metavar="N", help="Halvings of the network.")
 @click.option("--fold", type=int, default=2, metavar="N", help="N x N pixels are folded into channels; 1: none.")
@@ -234,10 +239,11 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     """Train a rung of the paper's ladder on rendered examples: paper, unpolarized, polarized, shared, no-angle, stokes.
 
     Data are rendered while training, from seeds that no test has. A run that was stopped or killed goes on when the
-    same command is given again. Needs the extra train.
+    same command is given again. 'tensorboard --logdir DIR' shows its curves. Needs the extra train.
 
     \b
     polsep train paper -o runs/paper
+    polsep train paper --data mono -o runs/mono                           for cameras without colour filters
     polsep train paper --width 64 --levels 4 --fold 1 -o runs/unet64      the classic U-Net
     """
     try:
@@ -308,33 +314,52 @@ def _print_demo(name: str, statistics: dict[str, Any]) -> None:
 
 @app.command()
 @click.argument("name", metavar="NAME", default="list")
-@click.option("--data", type=DIR, default=Path("../shared/data"), metavar="DIR", help="For real, frontend and sets.")
+@click.option(
+    "--data", type=DIR, default=Path("../shared/data"), metavar="DIR", help="For real, frontend, sets, paper."
+)
 @click.option("-o", "--output", type=DIR, default=Path("results"), metavar="DIR", help="Where NAME.jsonl goes.")
-def bench(name: str, data: Path, output: Path) -> None:
+@click.option("--quick", is_flag=True, help="A part of it in minutes, to DIR/NAME-quick.jsonl.")
+@click.option(
+    "--images",
+    type=DIR,
+    metavar="DIR",
+    help="Where NAME's pictures go.  [default: docs/images/NAME; beside the rows with --quick]",
+)
+def bench(name: str, data: Path, output: Path, quick: bool, images: Path | None) -> None:
     """Measure NAME, print its rows and write them to DIR/NAME.jsonl; without NAME, list what can be measured.
 
-    'polsep bench readme' makes the tables of README.md anew from DIR.
+    'polsep bench readme' makes the tables of README.md and docs/paper.md anew from DIR.
     """
     from polsep.bench import BENCHES, provenance, to_jsonl
     from polsep.io.results import fill_readme, write_text
 
     if name == "list":
-        for known, function in BENCHES.items():
-            print(f"{known}: {(function.__doc__ or '').splitlines()[0]}")
+        for known, entry in BENCHES.items():
+            print(f"{known}: {(entry.run.__doc__ or '').splitlines()[0]}")
         return
     if name == "readme":
-        fill_readme(Path("README.md"), output)
+        for page in ("README.md", "docs/paper.md"):
+            fill_readme(Path(page), output)
         return
     if name not in BENCHES:
         raise click.ClickException(f"expected a benchmark of {', '.join([*BENCHES, 'readme'])}, found {name!r}")
+    chosen = BENCHES[name]
+    measure = chosen.quick if quick else chosen.run
+    if measure is None:
+        known = ", ".join(n for n, entry in BENCHES.items() if entry.quick)
+        raise click.ClickException(f"expected a benchmark with a quick version for --quick ({known}), found {name!r}")
+    stem, command = (f"{name}-quick", f"polsep bench {name} --quick") if quick else (name, f"polsep bench {name}")
+    folder = images or (output / stem if quick else Path("docs/images") / name)
     rows = []
     try:
-        for row in BENCHES[name](data):
+        for row in measure(data):
             print(f"{row.case:48} {row.method:20} {row.metric:28} {row.value:10.4g} {row.unit}", flush=True)
             rows.append(row)
+        write_text(output / f"{stem}.jsonl", to_jsonl(rows, provenance(command)))
+        for path in chosen.draw(rows, data, folder) if chosen.draw else ():
+            print(path, flush=True)
     except ValueError as error:
         raise click.ClickException(str(error)) from None
-    write_text(output / f"{name}.jsonl", to_jsonl(rows, provenance(f"polsep bench {name}")))
 
 
 def main() -> None:

@@ -17,8 +17,8 @@ from polsep.refine import RUNGS, Refinement, Rung, separate_refined
 from polsep.separation import Separation
 from polsep.stokes import Measurements
 
-#: The paper's networks, trained on noisy mosaics.
-PAPER = "paper-mosaic"
+#: The paper's networks, trained on noisy mosaics of colour cameras, and of those without colour filters.
+PAPER, PAPER_MONO = "paper-mosaic", "paper-mono"
 
 
 def load_refinement(path: Path, device: torch.device) -> tuple[Rung, Refinement]:
@@ -51,11 +51,13 @@ def is_shipped(name: str) -> bool:
 
 
 def separate_paper(measurements: Measurements) -> Separation:
-    """The paper's method: an analytic split refined by two U-Nets. Mono frames go through as grey ones.
+    """The paper's method: an analytic split refined by two U-Nets. ``[..., 4, C, h, w]``, C = 3 or 1.
 
-    ``[..., 4, C, h, w]``, C = 3 or 1. Source: Dave et al. 2022, Sec. 4.
+    Mono frames have networks of their own where those are shipped, else they go through as grey ones.
+    Source: Dave et al. 2022, Sec. 4.
     """
-    rung, network = _shipped_refinement(PAPER, measurements.data.device)
+    name = PAPER_MONO if measurements.data.shape[-3] == 1 and is_shipped(PAPER_MONO) else PAPER
+    rung, network = _shipped_refinement(name, measurements.data.device)
     if measurements.data.shape[-3] == network.colors:
         return separate_refined(measurements, rung, network)
     data, clipped = measurements.data, measurements.clipped

@@ -17,6 +17,7 @@ pytest.importorskip("embreex")
 from polsep.camera import CLIP_MARGIN, IMX250, Layout
 from polsep.simulate import filter_light
 from polsep.stokes import Stokes
+from polsep.train import stream
 from polsep.train.stream import (
     BRIGHTEST,
     CLIPPED,
@@ -24,6 +25,7 @@ from polsep.train.stream import (
     LOOKS,
     LOWEST_QUANTILE,
     QUANTILES,
+    UNCLIPPED_SHARE,
     VIEWS,
     Examples,
     ExampleStream,
@@ -34,7 +36,7 @@ from polsep.train.stream import (
     random_gain,
     stream_lane,
 )
-from polsep.views import BLURS
+from polsep.train.variety import BLURS
 
 #: Light spreads this many pixels beyond the mask: the lens's three standard deviations, and a pixel half covered.
 FRINGE = math.ceil(3 * max(BLURS)) + 1
@@ -79,10 +81,11 @@ def test_scenes_follow_their_number() -> None:
     assert torch.equal(whole[-1].diffuse, later.diffuse)
 
 
-def test_raw_is_the_truth_behind_its_filters(batches: list[Examples]) -> None:
-    """Where nothing clips, raw minus the filtered truth is noise of the sensor's size."""
+def test_raw_is_the_truth_behind_its_filters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing clips, raw minus the filtered truth is noise of the sensor's size; here all have one sensor."""
+    monkeypatch.setattr(stream, "random_sensor", lambda _: IMX250)
     deviations = []
-    for b in batches:
+    for b in take(SMALL, 0, 0, 8):
         for k in range(SMALL.batch):
             diffuse, specular, polarized = (x[k].float() for x in (b.diffuse, b.specular, b.polarized))
             signal = filter_light(Stokes(diffuse + specular, polarized[:3], polarized[3:]), Layout(), IMX250)
@@ -107,18 +110,27 @@ def test_truth_is_physical(batches: list[Examples]) -> None:
 
 
 def test_exposures_clip_what_was_drawn() -> None:
-    """A fifth clips nothing, the others 0.05 to 5 % of evenly spread samples; none is darker than the floor."""
+    """Some clip nothing, the others a share of evenly spread samples whose square law's place is uniform in [0, 1]."""
     ranks = torch.linspace(LOWEST_QUANTILE, 1, QUANTILES)
     nothing = torch.zeros(0)
     scene = Pooled(nothing, nothing, nothing, nothing, ranks, 0.5)
     gains = [random_gain(scene, torch.Generator().manual_seed(k)) for k in range(500)]
     unclipped = [gain for gain in gains if gain < 1]
-    assert 70 < len(unclipped) < 130
+    spread = math.sqrt(500 * UNCLIPPED_SHARE * (1 - UNCLIPPED_SHARE))
+    assert abs(len(unclipped) - 500 * UNCLIPPED_SHARE) < SIGMAS * spread
     assert BRIGHTEST[0] <= min(unclipped) <= max(unclipped) <= BRIGHTEST[1]
-    shares = [1 - 1 / gain for gain in gains if gain >= 1]
-    assert min(shares) >= CLIPPED[0] - 1e-4
-    assert max(shares) <= CLIPPED[1] + 1e-4
-    dark = replace(scene, level=1e-4)
+    step = (1 - LOWEST_QUANTILE) / QUANTILES
+    shares = torch.tensor([1 - 1 / gain for gain in gains if gain >= 1], dtype=torch.float64)
+    assert float(shares.min()) >= CLIPPED[0] - step
+    assert float(shares.max()) <= CLIPPED[1] + step
+    places = ((shares - CLIPPED[0]).clamp(min=0) / (CLIPPED[1] - CLIPPED[0])).sqrt().sort().values
+    # Kolmogorov and Smirnov's distance, which exceeds 1.95 / sqrt(n) once in a thousand times.
+    assert float((places - torch.linspace(0, 1, len(places))).abs().max()) < 1.95 / math.sqrt(len(places)) + 0.02
+
+
+def test_dark_scenes_are_exposed_to_the_floor() -> None:
+    nothing = torch.zeros(0)
+    dark = Pooled(nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 1e-4)
     assert all(random_gain(dark, torch.Generator().manual_seed(k)) >= LEAST_LEVEL / 1e-4 for k in range(20))
 
 

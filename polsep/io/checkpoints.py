@@ -1,8 +1,9 @@
-"""Training states on disk: written beside and renamed, so that a kill leaves the last whole one."""
+"""What a training keeps on disk: its state and its log, replaced by renaming, so a kill leaves the last whole one."""
 
 from __future__ import annotations
 
 import os
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -38,3 +39,23 @@ def append_line(path: Path, line: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as file:
         file.write(line + "\n")
+
+
+def read_lines(path: Path) -> list[str]:
+    """The lines of a log; none without a file. A last one that a kill cut short does not count."""
+    if not path.exists():
+        return []
+    return path.read_bytes().decode("utf-8", errors="replace").split("\n")[:-1]
+
+
+def write_lines(path: Path, lines: list[str]) -> None:
+    """Replace a log as a whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(path.name + ".part")
+    beside.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
+    beside.replace(path)
+
+
+def read_module(name: str) -> bytes:
+    """The source of a module of the installed package, by its path there: part of what a training depends on."""
+    return files("polsep").joinpath(name).read_bytes()

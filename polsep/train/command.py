@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from polsep.io.checkpoints import read_module
 from polsep.io.weights import write_weights
 from polsep.networks import Size, count_parameters
-from polsep.train.loop import Run, Schedule, train, validate, validation_batches
+from polsep.train.log import curve_of, read_log, references_of
+from polsep.train.loop import Run, Schedule, train
 from polsep.train.stream import StreamOptions
 from polsep.train.tasks import VARIANTS, find_rung, ladder_task
+from polsep.train.validation import validate, validation_batches
 
 #: What a laptop trains in an hour or two.
 SMALL = Size()
@@ -63,7 +66,9 @@ class TrainOptions:
 def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]], None]) -> Path:
     """Train to the end, going on where a run in ``run.out`` stopped; returns the file of the averaged weights.
 
-    The weights are in half precision; the scores in their metadata are of these on the validation views.
+    The weights are in half precision; the scores in their metadata are of these on the validation views, beside the
+    log's: ``curve``, a list of [step, diffuse PSNR, specular PSNR], and ``reference``, both PSNRs of methods without
+    training.
     """
     torch.manual_seed(options.seed)
     data = digest_data(run.stream)
@@ -74,13 +79,14 @@ def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]
         return path
     task.network.cpu()  # where the validation views are
     halves = {name: value.cpu().half().float() for name, value in average.items()}
-    scores = validate(task, halves, validation_batches(run.stream))
+    scores = validate(task, halves, [task.prepare(batch) for batch in validation_batches(run.stream)])
+    lines = read_log(run.out)
     metadata = {
         "method": "paper",
         "rung": options.rung,
         "variant": options.variant,
         "size": json.dumps(asdict(options.size)),
-        "colors": "3",
+        "colors": str(VARIANTS[options.variant].colors),
         "seed": str(options.seed),
         "parameters": str(count_parameters(task.network)),
         "schedule": json.dumps(asdict(run.schedule)),
@@ -88,6 +94,8 @@ def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]
         "data": data,
         "command": describe_command(options, run),
         "validation": json.dumps(scores),
+        "curve": json.dumps(curve_of(lines)),
+        "reference": json.dumps(references_of(lines)),
     }
     write_weights(path, halves, metadata)
     return path
@@ -97,24 +105,32 @@ def digest_data(stream: StreamOptions) -> str:
     """sha256 of what makes the examples: the options, and the code of every module that draws, renders or exposes."""
     digest = hashlib.sha256(json.dumps(asdict(stream)).encode())
     for name in DATA_MODULES:
-        digest.update(files("polsep").joinpath(name).read_bytes())
+        digest.update(read_module(name))
     return digest.hexdigest()
 
 
 def describe_command(options: TrainOptions, run: Run) -> str:
     """The command line that trains this again."""
     size, schedule = options.size, run.schedule
-    words = (
-        f"polsep train {options.rung} --data {options.variant}",
-        f"--width {size.width} --levels {size.levels} --fold {size.fold}",
-        f"--steps {schedule.steps} --rate {schedule.rate:g} --seed {options.seed} --precision {schedule.precision}",
-        f"--workers {run.workers} --devices {run.devices} -o {run.out.name}",
-    )
-    return " ".join(words)
+    asked = {
+        "data": options.variant,
+        "width": size.width,
+        "levels": size.levels,
+        "fold": size.fold,
+        "steps": schedule.steps,
+        "rate": schedule.rate,
+        "seed": options.seed,
+        "workers": run.workers,
+        "devices": run.devices,
+        "precision": schedule.precision,
+        "output": run.out.name,
+    }
+    words = [word for name, value in asked.items() for word in (f"--{name}", str(value))]
+    return shlex.join(["polsep", "train", options.rung, *words])
 
 
 def plan_run(out: Path, options: TrainOptions, schedule: Schedule, workers: int, devices: int) -> Run:
-    """Where and how: crops of 256 raw pixels for mosaics, of 128 for co-sited images, which have as many in the end.
+    """Where and how: a training of ``options`` that writes into ``out``.
 
     Raises ValueError on what would only fail later, or train nothing.
     """
@@ -125,6 +141,5 @@ def plan_run(out: Path, options: TrainOptions, schedule: Schedule, workers: int,
         raise ValueError(f"expected at least 1 step, 1 device and 0 workers, found {found}")
     if schedule.precision not in PRECISIONS:
         raise ValueError(f"expected a precision of {', '.join(PRECISIONS)}, found {schedule.precision!r}")
-    crop = 256 if options.variant == "mosaic" else 128
-    stream = StreamOptions(seed=options.seed, crop=crop)
+    stream = StreamOptions(seed=options.seed, crop=VARIANTS[options.variant].crop)
     return Run(out, json.dumps(asdict(options)), stream, schedule, workers, devices)

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-import statistics
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +19,12 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from polsep.io.checkpoints import append_line, read_checkpoint, write_checkpoint
+from polsep.io.checkpoints import read_checkpoint, write_checkpoint
 from polsep.kernels.threads import set_threads
-from polsep.metrics import psnr
+from polsep.train.log import Report, open_log
 from polsep.train.stream import Examples, ExampleStream, StreamOptions
-from polsep.train.tasks import Task
+from polsep.train.tasks import Seen, Task
+from polsep.train.validation import score_references, validate, validation_batches
 
 #: The learning rate ends at this share of its peak.
 LAST_SHARE = 0.01
@@ -55,6 +55,10 @@ class Schedule:
         done = (step - self.warm_up) / max(1, self.steps - self.warm_up)
         return self.rate * (LAST_SHARE + (1 - LAST_SHARE) * (1 + math.cos(math.pi * min(done, 1))) / 2)
 
+    def is_due(self, step: int, every: int) -> bool:
+        """Whether what is done ``every`` so many steps, and after the last one, is to be done now."""
+        return step % every == 0 or step == self.steps
+
 
 @dataclass(frozen=True)
 class Run:
@@ -68,9 +72,6 @@ class Run:
     devices: int = 1
 
 
-Report = Callable[[dict[str, Any]], None]
-
-
 def train(task: Task, run: Run, report: Report) -> dict[str, Tensor] | None:
     """Train to the end of the schedule, from the last checkpoint if there is one; returns the averaged weights.
 
@@ -81,40 +82,41 @@ def train(task: Task, run: Run, report: Report) -> dict[str, Tensor] | None:
     fabric.launch()
     network = task.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, betas=BETAS, weight_decay=WEIGHT_DECAY)
-    validation = validation_batches(run.stream)
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
-    path = run.out / "checkpoint.pt"
-    step = _restore(read_checkpoint(path), run, (network, optimizer, average))
+    step = _restore(read_checkpoint(run.out / "checkpoint.pt"), run, (network, optimizer, average))
     wrapped, wrapped_optimizer = fabric.setup(network, optimizer)
     average = {name: value.to(fabric.device) for name, value in average.items()}
     batches = _batches(run, fabric, step)
-    started, first, losses = time.monotonic(), step, []
-    while step < run.schedule.steps:
-        for group in optimizer.param_groups:
-            group["lr"] = run.schedule.rate_at(step)
-        examples = Examples(*(x.to(fabric.device) for x in next(batches)))
-        loss = task.loss(wrapped, task.prepare(examples))
-        optimizer.zero_grad(set_to_none=True)
-        fabric.backward(loss)
-        for net in _parts(network):
-            nn.utils.clip_grad_norm_(net.parameters(), MOST_GRADIENT)
-        wrapped_optimizer.step()
-        step += 1
-        losses.append(float(loss.detach()))
-        follow(average, network, min(run.schedule.average, (1 + step) / (10 + step)))
-        if step % run.schedule.validate_every == 0 or step == run.schedule.steps:
-            line = {"step": step, "loss": statistics.fmean(losses), "rate": run.schedule.rate_at(step)}
-            line |= validate(task, average, [Examples(*(x.to(fabric.device) for x in b)) for b in validation])
-            line["steps_per_second"] = (step - first) / (time.monotonic() - started)
-            losses = []
-            if fabric.is_global_zero:
-                append_line(run.out / "log.jsonl", json.dumps(line))
-                report(line)
-        if step % run.schedule.checkpoint_every == 0 or step == run.schedule.steps:
-            state = {"step": step, "run": _describe(run), "network": network.state_dict()}
-            if fabric.is_global_zero:
-                write_checkpoint(path, state | {"optimizer": optimizer.state_dict(), "average": average})
+    with ExitStack() as stack:
+        log, views = None, list[Seen]()
+        if fabric.is_global_zero:
+            views = [task.prepare(_to(fabric.device, batch)) for batch in validation_batches(run.stream)]
+            log = stack.enter_context(open_log(run.out, step, report, lambda: score_references(views)))
+        while step < run.schedule.steps:
+            for group in optimizer.param_groups:
+                group["lr"] = run.schedule.rate_at(step)
+            loss = task.loss(wrapped, task.prepare(_to(fabric.device, next(batches))))
+            optimizer.zero_grad(set_to_none=True)
+            fabric.backward(loss)
+            for net in _parts(network):
+                nn.utils.clip_grad_norm_(net.parameters(), MOST_GRADIENT)
+            wrapped_optimizer.step()
+            step += 1
+            follow(average, network, min(run.schedule.average, (1 + step) / (10 + step)))
+            if log is None:
+                continue
+            log.note(step, float(loss.detach()), run.schedule.rate_at(step))
+            if run.schedule.is_due(step, run.schedule.validate_every):
+                log.add_scores(step, run.schedule.rate_at(step), validate(task, average, views))
+            if run.schedule.is_due(step, run.schedule.checkpoint_every):
+                state = {"step": step, "run": _describe(run), "network": network.state_dict()}
+                state |= {"optimizer": optimizer.state_dict(), "average": average}
+                write_checkpoint(run.out / "checkpoint.pt", state)
     return average if fabric.is_global_zero else None
+
+
+def _to(device: torch.device, examples: Examples) -> Examples:
+    return Examples(*(x.to(device) for x in examples))
 
 
 def _describe(run: Run) -> str:
@@ -159,25 +161,3 @@ def follow(average: dict[str, Tensor], network: nn.Module, decay: float) -> None
     with torch.no_grad():
         for name, value in network.state_dict().items():
             average[name].lerp_(value.detach(), 1 - decay)
-
-
-def validation_batches(stream: StreamOptions, count: int = 8) -> list[Examples]:
-    """The first batches of the validation split, of which every example is of a scene of its own."""
-    options = StreamOptions("validation", 0, 8, stream.crop, stream.size, stream.samples, pool=1, uses=0)
-    batches = iter(ExampleStream(options))
-    return [next(batches) for _ in range(count)]
-
-
-def validate(task: Task, average: dict[str, Tensor], batches: list[Examples]) -> dict[str, float]:
-    """Mean PSNR [dB] of diffuse and specular over the examples' masks, by the averaged weights."""
-    network = task.network
-    own = {name: value.detach().clone() for name, value in network.state_dict().items()}
-    network.load_state_dict(average)
-    scores: dict[str, list[float]] = {"diffuse": [], "specular": []}
-    for examples in batches:
-        seen = task.prepare(examples)
-        found = task.separate(seen)
-        for name, images, truth in (("diffuse", found.diffuse, seen[1]), ("specular", found.specular, seen[2])):
-            scores[name] += [psnr(x, t, m) for x, t, m in zip(images, truth, seen[3], strict=True) if bool(m.any())]
-    network.load_state_dict(own)
-    return {f"{name} PSNR": statistics.fmean(values) for name, values in scores.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -9,15 +10,21 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
+from polsep.camera import IMX250, Layout, Mosaic
 from polsep.demosaic import demosaic_bilinear_half
 from polsep.networks import Size
 from polsep.refine import RUNGS, Refinement, Rung, separate_refined
 from polsep.separation import Separation
+from polsep.simulate import filter_light
 from polsep.stokes import Measurements, Stokes, measure
 from polsep.train.losses import diffuse_loss, specular_loss
-from polsep.train.stream import ANGLES, Examples, as_mosaic
+from polsep.train.stream import ANGLES, Examples, add_gaussian_noise, as_mosaic
+from polsep.train.variety import random_sensor
 
-#: Co-registered analysers, true diffuse and specular ``[B, 3, h, w]`` and the mask ``[B, h, w]`` of a batch.
+#: Sony's order without colours.
+MONO = Layout(bayer=None)
+
+#: Co-registered analysers, true diffuse and specular ``[B, C, h, w]`` and the mask ``[B, h, w]`` of a batch.
 Seen = tuple[Measurements, Tensor, Tensor, Tensor]
 
 
@@ -34,8 +41,7 @@ class Task:
 def see_mosaic(examples: Examples) -> Seen:
     """Noisy mosaics, demosaicked bilinearly to half resolution, and the mean truth of every cell."""
     diffuse, specular = (avg_pool2d(x.float(), 2).expand(-1, 3, -1, -1) for x in (examples.diffuse, examples.specular))
-    mask = avg_pool2d(examples.mask[:, None].float(), 2)[:, 0] == 1
-    return demosaic_bilinear_half(as_mosaic(examples.raw)), diffuse, specular, mask
+    return demosaic_bilinear_half(as_mosaic(examples.raw)), diffuse, specular, _whole_cells(examples.mask)
 
 
 def see_co_sited(examples: Examples) -> Seen:
@@ -47,13 +53,48 @@ def see_co_sited(examples: Examples) -> Seen:
     return Measurements(exact.clamp(max=1), ANGLES, exact >= 1), diffuse, specular, examples.mask
 
 
-#: How a training sees its examples.
-VARIANTS: dict[str, Callable[[Examples], Seen]] = {"mosaic": see_mosaic, "co-sited": see_co_sited}
+def see_mono(examples: Examples) -> Seen:
+    """Noisy mosaics of a camera without colour filters, on which the green light of the examples falls.
+
+    Their noise and sensors are drawn from a seed that the colour frames give, so a batch is always seen alike.
+    """
+    diffuse, specular, polarized, mask = (x.cpu() for x in examples[1:])
+    diffuse, specular, s1, s2 = (x.float() for x in (diffuse[:, 1:2], specular, polarized[:, 1:2], polarized[:, 4:5]))
+    signal = filter_light(Stokes(diffuse + specular, s1, s2), MONO, IMX250)
+    generator = torch.Generator().manual_seed(zlib.crc32(examples.raw.cpu().numpy().tobytes()))
+    raw = torch.stack([add_gaussian_noise(x, random_sensor(generator), generator) for x in signal])
+    device = examples.raw.device
+    diffuse, specular = (avg_pool2d(x, 2).to(device) for x in (diffuse, specular))
+    seen = demosaic_bilinear_half(Mosaic(raw.to(device), MONO, 0.0, 1.0))
+    return seen, diffuse, specular, _whole_cells(mask).to(device)
+
+
+def _whole_cells(mask: Tensor) -> Tensor:
+    """The cells of 2x2 pixels ``[B, h, w]`` of which all are in the mask ``[B, H, W]``."""
+    return avg_pool2d(mask[:, None].float(), 2)[:, 0] == 1
+
+
+@dataclass(frozen=True)
+class Variant:
+    """How a training ``see``s its examples, in how many ``colors``, from crops of so many raw pixels along a side."""
+
+    see: Callable[[Examples], Seen]
+    colors: int
+    crop: int
+
+
+#: Crops of 256 raw pixels for mosaics, of 128 for co-sited images, which have as many in the end.
+VARIANTS = {
+    "mosaic": Variant(see_mosaic, 3, 256),
+    "mono": Variant(see_mono, 1, 256),
+    "co-sited": Variant(see_co_sited, 3, 128),
+}
 
 
 def ladder_task(rung: Rung, variant: str, size: Size) -> Task:
     """A rung of the paper's ladder; its two networks are trained side by side and share nothing but the data."""
-    network = Refinement(rung, 3, size)
+    seen_as = VARIANTS[variant]
+    network = Refinement(rung, seen_as.colors, size)
 
     def loss(network: nn.Module, seen: Seen) -> Tensor:
         measurements, diffuse, specular, _ = seen
@@ -63,7 +104,7 @@ def ladder_task(rung: Rung, variant: str, size: Size) -> Task:
     def separate(seen: Seen) -> Separation:
         return separate_refined(seen[0], rung, network)
 
-    return Task(network, VARIANTS[variant], loss, separate)
+    return Task(network, seen_as.see, loss, separate)
 
 
 def find_rung(name: str) -> Rung:

@@ -1,0 +1,144 @@
+"""What training examples have beyond the views of data sets: every draw keeps what it must and stays in its bounds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tolerances import SIGMAS, assert_close
+from torch import Tensor
+
+pytest.importorskip("embreex")
+
+from polsep.camera import IMX250
+from polsep.materials import Materials, random_materials
+from polsep.raycast import MeshScene
+from polsep.train.variety import (
+    BITS,
+    BITS_SHARES,
+    BLURS,
+    CLOSE_SHARE,
+    FULL_WELLS,
+    GREY_SATURATION,
+    GREY_SHARE,
+    MAGNIFICATIONS,
+    PLAIN_SHARE,
+    random_sensor,
+    relight,
+    vary_materials,
+    vary_shot,
+)
+from polsep.views import LEAST_LIT, Shot, lit_share, random_shot, seeded_shape
+
+#: A field of view that shows one point.
+NARROW_DEG = 0.01
+
+
+def seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def expect_share(count: int, draws: int, share: float) -> None:
+    """So many of the draws are within the statistics of ``share``."""
+    assert abs(count - draws * share) < SIGMAS * math.sqrt(draws * share * (1 - share))
+
+
+@pytest.fixture(scope="module")
+def shape() -> MeshScene:
+    return seeded_shape("train", 0, 0)
+
+
+@pytest.fixture(scope="module")
+def shots(shape: MeshScene) -> list[Shot]:
+    return [random_shot(shape, seeded(k)) for k in range(12)]
+
+
+@pytest.fixture(scope="module")
+def varied(shape: MeshScene, shots: list[Shot]) -> list[Shot]:
+    return [vary_shot(shape, shot, seeded(100 + k)) for k, shot in enumerate(shots)]
+
+
+def test_shots_keep_place_light_and_exposure(shots: list[Shot], varied: list[Shot]) -> None:
+    """The lens differs; camera and light stay where they are, so the light still reaches what it did."""
+    for before, after in zip(shots, varied, strict=True):
+        assert after.light == before.light
+        assert after.clip == before.clip
+        assert after.camera.position == before.camera.position
+        assert BLURS[0] <= after.blur <= BLURS[1]
+
+
+def test_shots_keep_the_size_or_enlarge(shots: list[Shot], varied: list[Shot]) -> None:
+    def extent(shot: Shot) -> float:
+        return math.tan(math.radians(shot.camera.fov_deg) / 2)
+
+    magnifications = [extent(a) / extent(b) for a, b in zip(shots, varied, strict=True)]
+    assert all(MAGNIFICATIONS[0] - 1e-6 <= m <= MAGNIFICATIONS[1] + 1e-6 for m in magnifications)
+    for before, after, magnification in zip(shots, varied, magnifications, strict=True):
+        assert (magnification == 1) == (after.camera == before.camera)
+    expect_share(sum(m > 1 for m in magnifications), len(shots), CLOSE_SHARE)
+
+
+def test_close_ups_look_at_a_lit_point(shape: MeshScene, shots: list[Shot], varied: list[Shot]) -> None:
+    """All that a field of view of a hundredth of a degree shows lies on the object and in the light."""
+    close = [after for before, after in zip(shots, varied, strict=True) if after.camera != before.camera]
+    assert close
+    for shot in close:
+        assert lit_share(shape, replace(shot, camera=replace(shot.camera, fov_deg=NARROW_DEG))) > 0.9
+
+
+def test_new_lights_reach_much_of_the_view(shape: MeshScene, varied: list[Shot]) -> None:
+    for k, shot in enumerate(varied):
+        light = relight(shape, shot, seeded(k))
+        assert light != shot.light
+        assert lit_share(shape, replace(shot, light=light)) >= LEAST_LIT
+
+
+def saturation(albedo: Tensor) -> Tensor:
+    return 1 - albedo.amin(dim=1) / albedo.amax(dim=1)
+
+
+def albedos(materials: Materials) -> list[Tensor]:
+    """Of the first materials, and of the second ones of textures."""
+    return [materials.albedo] + ([materials.textures.albedo] if materials.textures is not None else [])
+
+
+def test_grey_looks_keep_brightness_and_lose_saturation() -> None:
+    """A look is as it was, or all of it has at most `GREY_SATURATION` of its own saturation."""
+    draws, grey, plain = 200, 0, 0
+    for seed in range(draws):
+        before = random_materials(5, seeded(seed))
+        after = vary_materials(before, seeded(1000 + seed))
+        assert torch.equal(after.roughness, before.roughness)
+        assert torch.equal(after.specular, before.specular)
+        same = torch.equal(after.albedo, before.albedo)
+        for old, new in zip(albedos(before), albedos(after), strict=False):
+            assert_close(new.amax(dim=1), old.amax(dim=1))
+            assert torch.equal(new, old) == same
+            assert same or bool((saturation(new) <= GREY_SATURATION * saturation(old) + 1e-6).all())
+        grey += not same
+        plain += before.textures is not None and after.textures is None
+    expect_share(grey, draws, GREY_SHARE)
+    expect_share(plain, draws, PLAIN_SHARE)
+
+
+def test_sensors_stay_in_their_bounds() -> None:
+    draws = 400
+    sensors = [random_sensor(seeded(k)) for k in range(draws)]
+    assert all(FULL_WELLS[0] <= sensor.full_well <= FULL_WELLS[1] for sensor in sensors)
+    assert all(replace(s, full_well=IMX250.full_well, bits=IMX250.bits) == IMX250 for s in sensors)
+    for bits, share in zip(BITS, BITS_SHARES, strict=True):
+        expect_share(sum(sensor.bits == bits for sensor in sensors), draws, share)
+    middle = math.sqrt(FULL_WELLS[0] * FULL_WELLS[1])  # the median of a log-uniform law
+    expect_share(sum(sensor.full_well < middle for sensor in sensors), draws, 0.5)
+
+
+def test_a_seed_draws_the_same_again(shape: MeshScene, shots: list[Shot]) -> None:
+    for seed, shot in enumerate(shots[:4]):
+        assert vary_shot(shape, shot, seeded(seed)) == vary_shot(shape, shot, seeded(seed))
+        assert relight(shape, shot, seeded(seed)) == relight(shape, shot, seeded(seed))
+        assert random_sensor(seeded(seed)) == random_sensor(seeded(seed))
+        materials = random_materials(3, seeded(seed))
+        once, again = (vary_materials(materials, seeded(seed)) for _ in range(2))
+        assert all(torch.equal(a, b) for a, b in zip(albedos(once), albedos(again), strict=True))

@@ -226,9 +226,11 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
     metavar="NAME",
     help="mosaic: noisy frames; mono: without colours; co-sited: as the paper.",
 )
-@click.option("--width", type=int, default=32, metavar="N", help="Channels of the network's first level.")
-@click.option("--levels", type=int, default=3, metavar="N", help="Halvings of the network.")
+@click.option("--width", type=int, metavar="N", help="Channels of the network's first level; 32 on the ladder.")
+@click.option("--levels", type=int, default=3, metavar="N", help="Halvings of a rung's networks.")
 @click.option("--fold", type=int, default=2, metavar="N", help="N x N pixels are folded into channels; 1: none.")
+@click.option("--blocks", metavar="N,N,...", help="Residual blocks per level of a joint network.")
+@click.option("--ablation", default="none", metavar="NAME", help="What a joint network goes without.")
 @click.option("--steps", type=int, default=20_000, metavar="N", help="Batches of 8 crops.")
 @click.option("--rate", type=float, default=1e-3, metavar="X", help="Peak learning rate.")
 @click.option("--seed", type=int, default=0, metavar="N", help="Of the weights and of the data.")
@@ -236,30 +238,28 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 @click.option("--devices", type=int, default=1, metavar="N", help="GPUs, where there are any.")
 @click.option("--precision", default="bf16-mixed", metavar="NAME", help="bf16-mixed or 32-true.")
 def train(rung: str, output: Path, data: str, **options: Any) -> None:
-    """Train a rung of the paper's ladder on rendered examples: paper, unpolarized, polarized, shared, no-angle, stokes.
+    """Train joint, joint-fast or a rung of the paper's ladder: paper, unpolarized, polarized, shared, no-angle, stokes.
 
     Data are rendered while training, from seeds that no test has. A run that was stopped or killed goes on when the
     same command is given again. 'tensorboard --logdir DIR' shows its curves. Needs the extra train.
 
     \b
-    polsep train paper -o runs/paper
+    polsep train joint -o runs/joint
     polsep train paper --data mono -o runs/mono                           for cameras without colour filters
     polsep train paper --width 64 --levels 4 --fold 1 -o runs/unet64      the classic U-Net
     """
     try:
-        from polsep.networks import Size
-        from polsep.train.command import TrainOptions, plan_run, train_rung
+        from polsep.train.command import choose_options, plan_run, train_weights
         from polsep.train.loop import Schedule
     except ModuleNotFoundError as error:
         raise click.ClickException(
             f"expected the extra 'train' (pip install 'polsep[train]'), found no {error.name}"
         ) from None
     try:
-        size = Size(options["width"], options["levels"], options["fold"])
-        asked = TrainOptions(rung, data, size, options["seed"])
+        asked = choose_options(rung, data, options)
         schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])
         run = plan_run(output, asked, schedule, options["workers"], options["devices"])
-        path = train_rung(asked, run, _show_training)
+        path = train_weights(asked, run, _show_training)
     except ValueError as error:
         raise click.ClickException(str(error)) from None
     print(path)

@@ -6,10 +6,11 @@ Conventions: images ``[N, C, H, W]``, linear light; any H and W (padded by mirro
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import max_pool2d, pad, pixel_shuffle, pixel_unshuffle
+from torch.nn.functional import max_pool2d, pad, pixel_shuffle, pixel_unshuffle, relu
 
 
 class DoubleConv(nn.Sequential):
@@ -80,6 +81,80 @@ class UNet(nn.Module):
         for up, decoder, skip in zip(reversed(self.ups), reversed(self.decoders), reversed(skips), strict=True):
             x = decoder(torch.cat([skip, up(x)], dim=1))
         return pixel_shuffle(self.last(x), self.size.fold)[..., :height, :width]
+
+
+@dataclass(frozen=True)
+class ResidualSize:
+    """Size of a `ResidualUNet`: ``width`` channels at the top, doubled at every further level; ``blocks`` per level.
+
+    Raises ValueError on what cannot be built.
+    """
+
+    width: int = 32
+    blocks: tuple[int, ...] = (1, 1, 1)
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or not self.blocks or min(self.blocks) < 0:
+            raise ValueError(f"expected a width of at least 1 and blocks per level of at least 0, found {self}")
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Channels of every level."""
+        return tuple(self.width * 2**level for level in range(len(self.blocks)))
+
+
+class Block(nn.Module):
+    """Two 3x3 convolutions that add to their input; the second one starts at zero."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+        nn.init.kaiming_normal_(self.first.weight, nonlinearity="relu")
+        nn.init.zeros_(self.first.bias)  # type: ignore[arg-type]
+        nn.init.zeros_(self.second.weight)
+        nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``[N, C, h, w]`` of any size."""
+        change: Tensor = self.second(relu(self.first(x)))
+        return x + change
+
+
+class ResidualUNet(nn.Module):
+    """Residual blocks at every level, strided convolutions down, nearest neighbours and 1x1 convolutions up.
+
+    Skips are added. Any height and width. ``[N, inputs, h, w]`` to ``[N, width, h, w]``.
+    """
+
+    def __init__(self, inputs: int, size: ResidualSize) -> None:
+        super().__init__()
+        widths = size.widths
+        self.enter = nn.Conv2d(inputs, widths[0], 3, padding=1)
+        self.encoders = nn.ModuleList(_chain(w, n) for w, n in zip(widths, size.blocks, strict=True))
+        pairs = list(pairwise(widths))
+        self.downs = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairs)
+        self.ups = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
+        self.decoders = nn.ModuleList(_chain(w, n) for w, n in zip(widths[:-1], size.blocks, strict=False))
+        self.out = _chain(widths[0], 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Features at the input's resolution."""
+        x = self.enter(x)
+        skips = []
+        for encoder, down in zip(self.encoders, self.downs, strict=False):
+            x = encoder(x)
+            skips.append(x)
+            x = down(relu(x))
+        x = self.encoders[-1](x)
+        for up, decoder, skip in zip(reversed(self.ups), reversed(self.decoders), reversed(skips), strict=True):
+            x = up(relu(x)).repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)
+            x = decoder(skip + x[..., : skip.shape[-2], : skip.shape[-1]])
+        return relu(self.out(x))
+
+
+def _chain(width: int, count: int) -> nn.Sequential:
+    return nn.Sequential(*(Block(width) for _ in range(count)))
 
 
 def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:

@@ -25,6 +25,8 @@ RANKS = {
     "demosaic": 3,
     "guided": 3,
     "refine": 3,
+    "orient": 3,
+    "joint": 4,
     "layout_check": 3,
     "render": 3,
     "shapes": 3,
@@ -87,11 +89,15 @@ HOMES = {
     "embreex": "raycast",
     "safetensors": "io",
     "lightning_fabric": "train",
+    "tensorboard": "io",
+    "torch.utils.tensorboard": "io",
     "mitsuba": "pathtrace",
     "drjit": "pathtrace",
     "trimesh": "io",
     "scipy.io": "io",
     "ray": "dataset",
+    "flip_evaluator": "metrics",
+    "matplotlib": "bench",
 }
 #: Calls that touch files, by name of the function or method.
 FILE_CALLS = {"open", "read_bytes", "write_bytes", "read_text", "write_text", "imread", "imwrite", "fromfile", "tofile"}

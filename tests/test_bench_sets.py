@@ -1,4 +1,4 @@
-"""Benchmarks on rendered data: they refuse what they cannot measure, before they measure anything."""
+"""Benchmarks on test sets: one scoring path, sets that are not there, refusals before anything is measured."""
 
 from __future__ import annotations
 
@@ -10,13 +10,18 @@ import torch
 
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
+pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 
 from polsep import testsets
 from polsep.bench.rendering import bench_rendering
+from polsep.bench.scoring import Entry, Protocol, score_case, score_sets, see_clean, see_co_sited, see_noisy
 from polsep.bench.sets import bench_sets
+from polsep.demosaic import demosaic_bilinear_half
+from polsep.metrics import psnr
 from polsep.render import Scene
-from polsep.stokes import Stokes
-from polsep.testsets import Recipe
+from polsep.separation import Separation, separate_analytic
+from polsep.stokes import Measurements, Stokes
+from polsep.testsets import Recipe, build_case
 
 
 def make_grey(_paths: list[Path], _generator: torch.Generator) -> Scene:
@@ -25,10 +30,25 @@ def make_grey(_paths: list[Path], _generator: torch.Generator) -> Scene:
     return Scene(Stokes(grey, 0 * grey, 0 * grey), Stokes(grey, grey, 0 * grey), grey[0] > 0)
 
 
+GREY = Recipe("grey", 1, (), make_grey)
+ANALYTIC = Entry("analytic", demosaic_bilinear_half, separate_analytic)
+PROTOCOLS = [
+    Protocol(n, s, (ANALYTIC,)) for n, s in (("noisy", see_noisy), ("clean", see_clean), ("all", see_co_sited))
+]
+
+
 def test_scenes_that_nobody_recorded_get_no_score(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A test set that changed unknowingly stops the benchmark."""
-    monkeypatch.setattr(testsets, "SETS", {"grey": (Recipe("grey", 1, (), make_grey),)})
+    monkeypatch.setattr(testsets, "SETS", {"grey": (GREY,)})
     with pytest.raises(ValueError, match="expected a recorded test scene, found grey"):
+        next(bench_sets(tmp_path))
+
+
+def test_the_extra_of_scores_is_named_before_anything_is_measured(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    with pytest.raises(ValueError, match=r"expected the extra bench .* found no flip_evaluator"):
         next(bench_sets(tmp_path))
 
 
@@ -38,3 +58,43 @@ def test_missing_extras_are_named_before_anything_is_measured(monkeypatch: pytes
     monkeypatch.delitem(sys.modules, "polsep.train.loop", raising=False)
     with pytest.raises(ValueError, match="expected the extras train and mitsuba, found no lightning_fabric"):
         next(bench_rendering())
+
+
+def test_every_protocol_has_every_metric_of_its_own_view() -> None:
+    """The analytic split is exact on grey light with an unpolarized diffuse, but for noise and clipping."""
+    scores = list(score_case(build_case(GREY), PROTOCOLS))
+    metrics = {p.name: [score.metric for score in scores if score.protocol == p.name] for p in PROTOCOLS}
+    assert metrics["noisy"] == metrics["clean"] == metrics["all"]
+    assert {"diffuse PSNR", "specular SSIM", "specular FLIP", "chroma of highlights"} <= set(metrics["all"])
+    value = {(score.protocol, score.metric): score.value for score in scores}
+    assert value["clean", "diffuse PSNR"] > value["noisy", "diffuse PSNR"]
+
+
+def test_scores_are_those_of_the_metrics() -> None:
+    case = build_case(GREY)
+    (diffuse, _, mask), found = case.half_truth(), ANALYTIC.separate(case.noisy)
+    scores = {s.metric: s.value for s in score_case(case, PROTOCOLS[:1])}
+    assert scores["diffuse PSNR"] == psnr(found.diffuse, diffuse, mask)
+
+
+def test_an_entry_demosaicks_mosaics_alone() -> None:
+    case, seen = build_case(GREY), []
+
+    def split(measurements: Measurements) -> Separation:
+        seen.append(tuple(measurements.data.shape))
+        return separate_analytic(measurements)
+
+    entry = Entry("x", demosaic_bilinear_half, split)
+    for capture in (case.noisy, case.co_sited):
+        entry.separate(capture)
+    assert seen == [(4, 3, 16, 16), (4, 3, 32, 32)]
+
+
+def test_sets_without_their_data_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line says so, and the others are scored all the same."""
+    absent = Recipe("absent", 2, ("nowhere/a.png",), make_grey)
+    with pytest.raises(ValueError, match="expected a recorded test scene, found grey"):
+        list(score_sets("x", {"first": (absent,), "second": (GREY,)}, tmp_path, PROTOCOLS))
+    assert capsys.readouterr().err == (
+        f"polsep: the set first is left out: expected {tmp_path}/nowhere/a.png, found none\n"
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -11,7 +12,8 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from tolerances import assert_within
 from torch import Tensor
 
-from polsep.metrics import chroma, highlights, psnr, psnr_unlimited, ssim, worst_mean
+from polsep.io.previews import srgb
+from polsep.metrics import chroma, flip, highlights, psnr, psnr_unlimited, require_flip, ssim, worst_mean
 
 EVERYWHERE = torch.ones(40, 50, dtype=torch.bool)
 
@@ -82,3 +84,56 @@ def test_highlights_and_their_chroma() -> None:
 def test_the_worst_are_a_tenth_and_at_least_one() -> None:
     assert worst_mean([3.0, 1.0, 2.0]) == 1
     assert worst_mean([float(k) for k in range(20)]) == 0.5
+
+
+def test_flip_is_zero_for_equal_images_and_grows() -> None:
+    pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
+    _, truth = pair(3)
+    noise = torch.randn(truth.shape, generator=torch.Generator().manual_seed(4))
+    assert flip(truth, truth, EVERYWHERE) == 0
+    scores = [flip(truth + size * noise, truth, EVERYWHERE) for size in (0.01, 0.05, 0.2)]
+    assert 0 < scores[0] < scores[1] < scores[2] < 1
+
+
+def test_flip_is_that_of_images_shown_in_srgb() -> None:
+    """The library's own value for the encoded images, which count as limited, inside the mask alone."""
+    pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
+    found, truth = pair(5)
+    shown = [srgb(x.permute(1, 2, 0).numpy()).astype(np.float32) for x in (truth, found)]
+    errors, _, _ = require_flip().evaluate(*shown, "LDR", applyMagma=False, computeMeanError=False)
+    mask = torch.zeros_like(EVERYWHERE)
+    mask[4:30, 7:33] = True
+    assert flip(torch.where(found == 1, 1.5, found), truth, mask) == pytest.approx(errors[4:30, 7:33].mean(), abs=1e-5)
+
+
+def test_scores_in_a_mask_are_those_of_the_whole_frame() -> None:
+    """What lies farther away than windows and filters reach is not looked at, and makes no difference."""
+    pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
+    truth = torch.rand(3, 120, 130, generator=torch.Generator().manual_seed(7))
+    found = truth + 0.2 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(8))
+    mask = torch.zeros(120, 130, dtype=torch.bool)
+    mask[50:70, 60:66] = True
+    corner = mask.clone()
+    corner[0, 0] = corner[-1, -1] = True
+    images = (x.clamp(0, 1).permute(1, 2, 0).contiguous().numpy() for x in (truth, found))
+    errors, _, _ = require_flip().evaluate(*images, "LDR", inputsRGB=False, applyMagma=False, computeMeanError=False)
+    assert flip(found, truth, mask) == pytest.approx(errors[50:70, 60:66].mean(), abs=1e-6)
+    assert flip(found, truth, corner) == pytest.approx(errors[..., 0][corner.numpy()].mean(), abs=1e-6)
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0, "full": True}
+    limited = [x.clamp(0, 1).double().numpy() for x in (truth, found)]
+    maps = [structural_similarity(t, f, **options)[1] for t, f in zip(*limited, strict=True)]
+    assert ssim(found, truth, mask) == pytest.approx(np.mean(maps, axis=0)[mask.numpy()].mean(), abs=1e-6)
+
+
+def test_flip_sees_grey_images_too() -> None:
+    pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
+    found, truth = (x[:1] for x in pair(6))
+    assert flip(found, truth, EVERYWHERE) == flip(found.expand(3, -1, -1), truth.expand(3, -1, -1), EVERYWHERE)
+    with pytest.raises(ValueError, match="found an empty one"):
+        flip(found, truth, torch.zeros_like(EVERYWHERE))
+
+
+def test_flip_names_the_extra_that_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    with pytest.raises(ValueError, match=r"expected the extra bench .*, found no flip_evaluator"):
+        flip(*pair(), EVERYWHERE)

@@ -34,7 +34,15 @@ from polsep.networks import Size
 from polsep.pipeline import METHODS
 from polsep.refine import RUNGS
 from polsep.stokes import Stokes, measure
-from polsep.train.command import TrainOptions, describe_command, digest_data, plan_run, train_rung
+from polsep.train.command import (
+    Options,
+    TrainOptions,
+    choose_options,
+    describe_command,
+    digest_data,
+    plan_run,
+    train_weights,
+)
 from polsep.train.log import open_log, read_log
 from polsep.train.loop import Run, Schedule, train
 from polsep.train.stream import Examples, StreamOptions, stream_lane
@@ -45,7 +53,7 @@ STREAM = StreamOptions(batch=2, crop=32, size=64, pool=2, uses=1)
 SCHEDULE = Schedule(steps=6, warm_up=2, checkpoint_every=3, validate_every=100, precision="32-true")
 
 
-def small_task() -> Task:
+def small_task() -> Task[Seen]:
     torch.manual_seed(1)
     return ladder_task(find_rung("paper"), "mosaic", Size(4, 1, 1))
 
@@ -130,7 +138,7 @@ def test_a_log_begins_with_methods_without_training(
     """Also one that another version began without them; its other lines stay."""
     lines = killed[2]
     views = [see_mosaic(batch) for batch in validation_batches(STREAM)]
-    assert lines[0] == {"step": 0} | score_references(views)
+    assert lines[0] == {"step": 0} | score_references(small_task(), views)
     analytic = score(lambda seen: METHODS["analytic"].split(seen[0]), views)
     assert {f"analytic {name}": value for name, value in analytic.items()}.items() <= lines[0].items()
     with open_log(tmp_path, 0, lambda _: None, lambda: {"x": 1.0}) as log:
@@ -156,7 +164,7 @@ def test_weights_say_how_they_came_about(variant: str, tmp_path: Path) -> None:
     options = TrainOptions("paper", variant, Size(4, 1, 1))
     run = replace(run_in(tmp_path, replace(SCHEDULE, steps=2)), workers=0)
     lines: list[dict[str, Any]] = []
-    path = train_rung(options, run, lines.append)
+    path = train_weights(options, run, lines.append)
     assert path.name == f"paper-{variant}.safetensors"
     metadata = read_weights(path)[1]
     assert metadata["colors"] == ("1" if variant == "mono" else "3")
@@ -171,7 +179,7 @@ def test_weights_say_how_they_came_about(variant: str, tmp_path: Path) -> None:
     _, network = load_refinement(path, torch.device("cpu"))
     assert network.colors == VARIANTS[variant].colors
     # Given again, the command of a training that is done writes the same again.
-    train_rung(options, run, lines.append)
+    train_weights(options, run, lines.append)
     assert read_weights(path)[1] == metadata
     assert len(lines) == 2
 
@@ -190,17 +198,28 @@ def test_data_have_a_digest_of_their_options() -> None:
         ["paper", "--data", "co-sited", "--rate", "0.000123456789", "--steps", "7", "-o", "x y"],
         ["stokes", "--width", "8", "--levels", "2", "--fold", "1", "--seed", "3", "--precision", "32-true", "-o", "x"],
         ["paper", "--data", "mono", "--workers", "2", "--devices", "2", "-o", "x"],
+        ["joint", "--data", "mono", "-o", "x"],
+        ["joint-fast", "--blocks", "0,1", "--width", "8", "--ablation", "cosine", "-o", "x"],
     ],
 )
 def test_commands_are_described_as_click_reads_them(asked: list[str]) -> None:
+    """What is left to defaults is written out."""
     given = cli.train.make_context("train", list(asked)).params
-    size = Size(given["width"], given["levels"], given["fold"])
-    options = TrainOptions(given["rung"], given["data"], size, given["seed"])
-    schedule = Schedule(given["steps"], given["rate"], precision=given["precision"])
-    run = plan_run(Path("runs") / given["output"], options, schedule, given["workers"], given["devices"])
+    options, run = plan(given)
     words = shlex.split(describe_command(options, run))
     assert words[:2] == ["polsep", "train"]
-    assert cli.train.make_context("train", words[2:]).params == given
+    read = cli.train.make_context("train", words[2:]).params
+    assert {name: value for name, value in read.items() if given[name] is not None} == {
+        name: value for name, value in given.items() if value is not None
+    }
+    assert plan(read) == (options, run)
+
+
+def plan(given: dict[str, Any]) -> tuple[Options, Run]:
+    """As `polsep train` plans."""
+    options = choose_options(given["rung"], given["data"], given)
+    schedule = Schedule(given["steps"], given["rate"], precision=given["precision"])
+    return options, plan_run(Path("runs") / given["output"], options, schedule, given["workers"], given["devices"])
 
 
 def test_mono_sees_the_green_light_behind_every_pixel() -> None:

@@ -7,11 +7,14 @@ Every row says what was measured (`bench`, `case`, `method`, `metric`, `value`, 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from polsep.bench.calibration import bench_calibration
 from polsep.bench.exactness import bench_exactness
 from polsep.bench.frontend import bench_frontend
+from polsep.bench.gallery import draw_paper
+from polsep.bench.paper import bench_paper, bench_paper_quick
 from polsep.bench.real import bench_real
 from polsep.bench.rendering import bench_rendering
 from polsep.bench.resources import bench_resources
@@ -20,15 +23,31 @@ from polsep.bench.separation import bench_separation
 from polsep.bench.sets import bench_sets
 from polsep.bench.truth import SCENE_SEEDS, SCENE_SIZE, render_scene
 
-__all__ = ["BENCHES", "SCENE_SEEDS", "SCENE_SIZE", "Row", "provenance", "render_scene", "to_jsonl"]
+__all__ = ["BENCHES", "SCENE_SEEDS", "SCENE_SIZE", "Bench", "Row", "provenance", "render_scene", "to_jsonl"]
 
-BENCHES: dict[str, Callable[[Path], Iterator[Row]]] = {
-    "separation": bench_separation,
-    "exactness": bench_exactness,
-    "real": bench_real,
-    "resources": bench_resources,
-    "frontend": bench_frontend,
-    "rendering": bench_rendering,
-    "sets": bench_sets,
-    "calibration": bench_calibration,
+Measure = Callable[[Path], Iterator[Row]]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What can be measured: ``run`` gives rows from a data folder, ``quick`` those of a part of it, in minutes.
+
+    ``draw`` writes pictures, from rows and the data folder into a folder, and gives their paths. None: there are none.
+    """
+
+    run: Measure
+    quick: Measure | None = None
+    draw: Callable[[list[Row], Path, Path], Iterator[Path]] | None = None
+
+
+BENCHES: dict[str, Bench] = {
+    "separation": Bench(bench_separation),
+    "exactness": Bench(bench_exactness),
+    "real": Bench(bench_real),
+    "resources": Bench(bench_resources),
+    "frontend": Bench(bench_frontend),
+    "rendering": Bench(bench_rendering),
+    "sets": Bench(bench_sets),
+    "calibration": Bench(bench_calibration),
+    "paper": Bench(bench_paper, bench_paper_quick, draw_paper),
 }

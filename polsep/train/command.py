@@ -1,25 +1,30 @@
-"""`polsep train`: a rung of the ladder from options to a file of weights."""
+"""`polsep train`: a rung of the ladder, or the joint network, from options to a file of weights."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
+from torch import Tensor
 
 from polsep.io.checkpoints import read_module
 from polsep.io.weights import write_weights
-from polsep.networks import Size, count_parameters
+from polsep.networks import ResidualSize, Size, count_parameters
+from polsep.train.joint_task import ABLATIONS, SIZES, VIEWS, joint_task
+from polsep.train.joint_views import JointSeen
 from polsep.train.log import curve_of, read_log, references_of
 from polsep.train.loop import Run, Schedule, train
 from polsep.train.stream import StreamOptions
-from polsep.train.tasks import VARIANTS, find_rung, ladder_task
+from polsep.train.tasks import VARIANTS, Seen, Task, find_rung, ladder_task
 from polsep.train.validation import validate, validation_batches
+
+Item = TypeVar("Item")
 
 #: What a laptop trains in an hour or two.
 SMALL = Size()
@@ -59,11 +64,67 @@ class TrainOptions:
 
     def __post_init__(self) -> None:
         find_rung(self.rung)
-        if self.variant not in VARIANTS:
-            raise ValueError(f"expected a variant of {', '.join(VARIANTS)}, found {self.variant!r}")
+        find(VARIANTS, "variant", self.variant)
+
+    def task(self) -> Task[Seen]:
+        """The rung's."""
+        return ladder_task(find_rung(self.rung), self.variant, self.size)
+
+    def metadata(self) -> dict[str, str]:
+        """What whoever loads the weights needs."""
+        return {"method": "paper", "rung": self.rung, "colors": str(VARIANTS[self.variant].colors)}
+
+    @property
+    def name(self) -> str:
+        """The rung's."""
+        return self.rung
+
+    @property
+    def crop(self) -> int:
+        """Raw pixels along a crop's side."""
+        return VARIANTS[self.variant].crop
 
 
-def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]], None]) -> Path:
+@dataclass(frozen=True)
+class JointOptions:
+    """The joint network to train, by ``name`` of `joint_task.SIZES`; ``variant``: for colour (mosaic) or mono frames.
+
+    ``ablation``: what of `joint_task.ABLATIONS` differs. Raises ValueError on names that there are not.
+    """
+
+    name: str
+    variant: str = "mosaic"
+    size: ResidualSize | None = None
+    ablation: str = "none"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        find(SIZES, "joint network", self.name)
+        find(VIEWS, "variant", self.variant)
+        find(ABLATIONS, "ablation", self.ablation)
+        if self.size is None:
+            object.__setattr__(self, "size", SIZES[self.name])
+
+    def task(self) -> Task[JointSeen]:
+        """That of the network and its ablation."""
+        return joint_task(self.variant, self.size or SIZES[self.name], ABLATIONS[self.ablation])
+
+    def metadata(self) -> dict[str, str]:
+        """What whoever loads the weights needs."""
+        inputs = json.dumps(ABLATIONS[self.ablation].inputs)
+        return {"method": self.name, "ablation": self.ablation, "inputs": inputs, "colors": str(VIEWS[self.variant][1])}
+
+    @property
+    def crop(self) -> int:
+        """Raw pixels along a crop's side."""
+        return 256
+
+
+#: What can be trained.
+Options = TrainOptions | JointOptions
+
+
+def train_weights(options: Options, run: Run, report: Callable[[dict[str, Any]], None]) -> Path:
     """Train to the end, going on where a run in ``run.out`` stopped; returns the file of the averaged weights.
 
     The weights are in half precision; the scores in their metadata are of these on the validation views, beside the
@@ -72,23 +133,17 @@ def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]
     """
     torch.manual_seed(options.seed)
     data = digest_data(run.stream)
-    task = ladder_task(find_rung(options.rung), options.variant, options.size)
-    path = run.out / f"{options.rung}-{options.variant}.safetensors"
-    average = train(task, run, report)
-    if average is None:
+    path = run.out / f"{options.name}-{options.variant}.safetensors"
+    trained = _train(options.task(), run, report)
+    if trained is None:
         return path
-    task.network.cpu()  # where the validation views are
-    halves = {name: value.cpu().half().float() for name, value in average.items()}
-    scores = validate(task, halves, [task.prepare(batch) for batch in validation_batches(run.stream)])
+    weights, scores, parameters = trained
     lines = read_log(run.out)
-    metadata = {
-        "method": "paper",
-        "rung": options.rung,
+    metadata = options.metadata() | {
         "variant": options.variant,
-        "size": json.dumps(asdict(options.size)),
-        "colors": str(VARIANTS[options.variant].colors),
+        "size": json.dumps(asdict(options.size)),  # type: ignore[arg-type]
         "seed": str(options.seed),
-        "parameters": str(count_parameters(task.network)),
+        "parameters": str(parameters),
         "schedule": json.dumps(asdict(run.schedule)),
         "stream": json.dumps(asdict(run.stream)),
         "data": data,
@@ -97,8 +152,29 @@ def train_rung(options: TrainOptions, run: Run, report: Callable[[dict[str, Any]
         "curve": json.dumps(curve_of(lines)),
         "reference": json.dumps(references_of(lines)),
     }
-    write_weights(path, halves, metadata)
+    write_weights(path, weights, metadata)
     return path
+
+
+def _train(
+    task: Task[Seen] | Task[JointSeen], run: Run, report: Callable[[dict[str, Any]], None]
+) -> tuple[dict[str, Tensor], dict[str, float], int] | None:
+    """Averaged weights as they will be read again, their scores, and how many there are; None but in one process."""
+    anything: Task[Any] = task
+    average = train(anything, run, report)
+    if average is None:
+        return None
+    task.network.cpu()  # where the validation views are
+    halves = {name: value.cpu().half().float() for name, value in average.items()}
+    scores = validate(anything, halves, [task.prepare(batch) for batch in validation_batches(run.stream)])
+    return halves, scores, count_parameters(task.network)
+
+
+def find(known: Mapping[str, Item], kind: str, name: str) -> Item:
+    """The item of that name; ValueError, with the names there are, for any other."""
+    if name not in known:
+        raise ValueError(f"expected a {kind} of {', '.join(known)}, found {name!r}")
+    return known[name]
 
 
 def digest_data(stream: StreamOptions) -> str:
@@ -109,14 +185,16 @@ def digest_data(stream: StreamOptions) -> str:
     return digest.hexdigest()
 
 
-def describe_command(options: TrainOptions, run: Run) -> str:
+def describe_command(options: Options, run: Run) -> str:
     """The command line that trains this again."""
-    size, schedule = options.size, run.schedule
-    asked = {
-        "data": options.variant,
-        "width": size.width,
-        "levels": size.levels,
-        "fold": size.fold,
+    schedule = run.schedule
+    asked: dict[str, object] = {"data": options.variant}
+    if isinstance(options, TrainOptions):
+        asked |= {"width": options.size.width, "levels": options.size.levels, "fold": options.size.fold}
+    else:
+        size = options.size or SIZES[options.name]
+        asked |= {"width": size.width, "blocks": ",".join(map(str, size.blocks)), "ablation": options.ablation}
+    asked |= {
         "steps": schedule.steps,
         "rate": schedule.rate,
         "seed": options.seed,
@@ -126,10 +204,29 @@ def describe_command(options: TrainOptions, run: Run) -> str:
         "output": run.out.name,
     }
     words = [word for name, value in asked.items() for word in (f"--{name}", str(value))]
-    return shlex.join(["polsep", "train", options.rung, *words])
+    return shlex.join(["polsep", "train", options.name, *words])
 
 
-def plan_run(out: Path, options: TrainOptions, schedule: Schedule, workers: int, devices: int) -> Run:
+def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:
+    """Options of a rung or of a joint network from those of the command line; see `polsep train`.
+
+    Raises ValueError on names and sizes that there are not.
+    """
+    if name not in SIZES:
+        return TrainOptions(
+            name, data, Size(asked["width"] or SMALL.width, asked["levels"], asked["fold"]), asked["seed"]
+        )
+    size = SIZES[name]
+    try:
+        blocks = size.blocks if asked["blocks"] is None else tuple(int(n) for n in asked["blocks"].split(","))
+    except ValueError:
+        raise ValueError(f"expected blocks per level like 1,1,2, found {asked['blocks']!r}") from None
+    return JointOptions(
+        name, data, ResidualSize(asked["width"] or size.width, blocks), asked["ablation"], asked["seed"]
+    )
+
+
+def plan_run(out: Path, options: Options, schedule: Schedule, workers: int, devices: int) -> Run:
     """Where and how: a training of ``options`` that writes into ``out``.
 
     Raises ValueError on what would only fail later, or train nothing.
@@ -141,5 +238,5 @@ def plan_run(out: Path, options: TrainOptions, schedule: Schedule, workers: int,
         raise ValueError(f"expected at least 1 step, 1 device and 0 workers, found {found}")
     if schedule.precision not in PRECISIONS:
         raise ValueError(f"expected a precision of {', '.join(PRECISIONS)}, found {schedule.precision!r}")
-    stream = StreamOptions(seed=options.seed, crop=VARIANTS[options.variant].crop)
+    stream = StreamOptions(seed=options.seed, crop=options.crop)
     return Run(out, json.dumps(asdict(options)), stream, schedule, workers, devices)

@@ -23,7 +23,7 @@ from polsep.io.checkpoints import read_checkpoint, write_checkpoint
 from polsep.kernels.threads import set_threads
 from polsep.train.log import Report, open_log
 from polsep.train.stream import Examples, ExampleStream, StreamOptions
-from polsep.train.tasks import Seen, Task
+from polsep.train.tasks import Task, View
 from polsep.train.validation import score_references, validate, validation_batches
 
 #: The learning rate ends at this share of its peak.
@@ -72,7 +72,7 @@ class Run:
     devices: int = 1
 
 
-def train(task: Task, run: Run, report: Report) -> dict[str, Tensor] | None:
+def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | None:
     """Train to the end of the schedule, from the last checkpoint if there is one; returns the averaged weights.
 
     ``report`` is called with every line of the log. Of several processes only the first one writes and reports, and
@@ -82,16 +82,19 @@ def train(task: Task, run: Run, report: Report) -> dict[str, Tensor] | None:
     fabric.launch()
     network = task.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, betas=BETAS, weight_decay=WEIGHT_DECAY)
+    state = read_checkpoint(run.out / "checkpoint.pt")
+    if state is None:
+        task.begin(run.stream)
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
-    step = _restore(read_checkpoint(run.out / "checkpoint.pt"), run, (network, optimizer, average))
+    step = _restore(state, run, (network, optimizer, average))
     wrapped, wrapped_optimizer = fabric.setup(network, optimizer)
     average = {name: value.to(fabric.device) for name, value in average.items()}
     batches = _batches(run, fabric, step)
     with ExitStack() as stack:
-        log, views = None, list[Seen]()
+        log, views = None, list[View]()
         if fabric.is_global_zero:
             views = [task.prepare(_to(fabric.device, batch)) for batch in validation_batches(run.stream)]
-            log = stack.enter_context(open_log(run.out, step, report, lambda: score_references(views)))
+            log = stack.enter_context(open_log(run.out, step, report, lambda: score_references(task, views)))
         while step < run.schedule.steps:
             for group in optimizer.param_groups:
                 group["lr"] = run.schedule.rate_at(step)

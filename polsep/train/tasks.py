@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +19,7 @@ from polsep.separation import Separation
 from polsep.simulate import filter_light
 from polsep.stokes import Measurements, Stokes, measure
 from polsep.train.losses import diffuse_loss, specular_loss
-from polsep.train.stream import ANGLES, Examples, add_gaussian_noise, as_mosaic
+from polsep.train.stream import ANGLES, Examples, StreamOptions, add_gaussian_noise, as_mosaic
 from polsep.train.variety import random_sensor
 
 #: Sony's order without colours.
@@ -26,22 +27,40 @@ MONO = Layout(bayer=None)
 
 #: Co-registered analysers, true diffuse and specular ``[B, C, h, w]`` and the mask ``[B, h, w]`` of a batch.
 Seen = tuple[Measurements, Tensor, Tensor, Tensor]
+#: What a network sees of a batch: whatever comes first, then truth and mask as those of `Seen`.
+View = TypeVar("View", bound=tuple[Any, ...])
+
+
+def begin_at_random(stream: StreamOptions) -> None:
+    """Networks that start from nothing but their own random weights."""
+    del stream
+
+
+def first_of(seen: Seen) -> Measurements:
+    """What networks that see analysers see."""
+    return seen[0]
 
 
 @dataclass(frozen=True)
-class Task:
-    """A ``network``, its ``loss`` on what ``prepare`` makes of examples, and how it ``separate``s."""
+class Task(Generic[View]):
+    """A ``network``, its ``loss`` on what ``prepare`` makes of examples, and how it ``separate``s.
+
+    ``measure``: co-registered analysers of the same views, for methods without training. ``begin``: called with the
+    stream's options before the first step.
+    """
 
     network: nn.Module
-    prepare: Callable[[Examples], Seen]
-    loss: Callable[[nn.Module, Seen], Tensor]
-    separate: Callable[[Seen], Separation]
+    prepare: Callable[[Examples], View]
+    loss: Callable[[nn.Module, View], Tensor]
+    separate: Callable[[View], Separation]
+    measure: Callable[[View], Measurements]
+    begin: Callable[[StreamOptions], None]
 
 
 def see_mosaic(examples: Examples) -> Seen:
     """Noisy mosaics, demosaicked bilinearly to half resolution, and the mean truth of every cell."""
     diffuse, specular = (avg_pool2d(x.float(), 2).expand(-1, 3, -1, -1) for x in (examples.diffuse, examples.specular))
-    return demosaic_bilinear_half(as_mosaic(examples.raw)), diffuse, specular, _whole_cells(examples.mask)
+    return demosaic_bilinear_half(as_mosaic(examples.raw)), diffuse, specular, whole_cells(examples.mask)
 
 
 def see_co_sited(examples: Examples) -> Seen:
@@ -54,22 +73,28 @@ def see_co_sited(examples: Examples) -> Seen:
 
 
 def see_mono(examples: Examples) -> Seen:
-    """Noisy mosaics of a camera without colour filters, on which the green light of the examples falls.
+    """Noisy mosaics of a camera without colour filters, as `see_mosaic` sees those of colour."""
+    view = expose_mono(examples)
+    diffuse, specular = (avg_pool2d(x, 2) for x in (view.diffuse, view.specular))
+    return demosaic_bilinear_half(Mosaic(view.raw, MONO, 0.0, 1.0)), diffuse, specular, whole_cells(view.mask)
+
+
+def expose_mono(examples: Examples) -> Examples:
+    """Examples as a camera without colour filters records their green light; one colour, single precision.
 
     Their noise and sensors are drawn from a seed that the colour frames give, so a batch is always seen alike.
     """
-    diffuse, specular, polarized, mask = (x.cpu() for x in examples[1:])
-    diffuse, specular, s1, s2 = (x.float() for x in (diffuse[:, 1:2], specular, polarized[:, 1:2], polarized[:, 4:5]))
-    signal = filter_light(Stokes(diffuse + specular, s1, s2), MONO, IMX250)
+    diffuse, specular, polarized = (x.float().cpu() for x in examples[1:4])
+    diffuse, polarized = diffuse[:, 1:2], polarized[:, 1::3]
+    signal = filter_light(Stokes(diffuse + specular, polarized[:, :1], polarized[:, 1:]), MONO, IMX250)
     generator = torch.Generator().manual_seed(zlib.crc32(examples.raw.cpu().numpy().tobytes()))
     raw = torch.stack([add_gaussian_noise(x, random_sensor(generator), generator) for x in signal])
     device = examples.raw.device
-    diffuse, specular = (avg_pool2d(x, 2).to(device) for x in (diffuse, specular))
-    seen = demosaic_bilinear_half(Mosaic(raw.to(device), MONO, 0.0, 1.0))
-    return seen, diffuse, specular, _whole_cells(mask).to(device)
+    raw, diffuse, specular, polarized = (x.to(device) for x in (raw, diffuse, specular, polarized))
+    return Examples(raw, diffuse, specular, polarized, examples.mask)
 
 
-def _whole_cells(mask: Tensor) -> Tensor:
+def whole_cells(mask: Tensor) -> Tensor:
     """The cells of 2x2 pixels ``[B, h, w]`` of which all are in the mask ``[B, H, W]``."""
     return avg_pool2d(mask[:, None].float(), 2)[:, 0] == 1
 
@@ -91,7 +116,7 @@ VARIANTS = {
 }
 
 
-def ladder_task(rung: Rung, variant: str, size: Size) -> Task:
+def ladder_task(rung: Rung, variant: str, size: Size) -> Task[Seen]:
     """A rung of the paper's ladder; its two networks are trained side by side and share nothing but the data."""
     seen_as = VARIANTS[variant]
     network = Refinement(rung, seen_as.colors, size)
@@ -104,7 +129,7 @@ def ladder_task(rung: Rung, variant: str, size: Size) -> Task:
     def separate(seen: Seen) -> Separation:
         return separate_refined(seen[0], rung, network)
 
-    return Task(network, seen_as.see, loss, separate)
+    return Task(network, seen_as.see, loss, separate, first_of, begin_at_random)
 
 
 def find_rung(name: str) -> Rung:

@@ -18,7 +18,7 @@ from polsep.metrics import psnr
 from polsep.separation import Separation, separate_analytic
 from polsep.stokes import Measurements
 from polsep.train.stream import Examples, ExampleStream, StreamOptions
-from polsep.train.tasks import Seen, Task
+from polsep.train.tasks import Task, View
 
 #: Methods without training that every log begins with, on the measurements that the networks get.
 REFERENCES: dict[str, Callable[[Measurements], Separation]] = {
@@ -35,7 +35,7 @@ def validation_batches(stream: StreamOptions, count: int = 8) -> tuple[Examples,
     return tuple(next(batches) for _ in range(count))
 
 
-def score(separate: Callable[[Seen], Separation], views: list[Seen]) -> dict[str, float]:
+def score(separate: Callable[[View], Separation], views: list[View]) -> dict[str, float]:
     """Scores of whatever separates ``views``: "diffuse PSNR" and "specular PSNR"."""
     scores: dict[str, list[float]] = {"diffuse": [], "specular": []}
     for seen in views:
@@ -45,7 +45,7 @@ def score(separate: Callable[[Seen], Separation], views: list[Seen]) -> dict[str
     return {f"{name} PSNR": statistics.fmean(values) for name, values in scores.items()}
 
 
-def validate(task: Task, average: dict[str, Tensor], views: list[Seen]) -> dict[str, float]:
+def validate(task: Task[View], average: dict[str, Tensor], views: list[View]) -> dict[str, float]:
     """Scores of the task's network with the averaged weights; it has its own again afterwards."""
     network = task.network
     own = {name: value.detach().clone() for name, value in network.state_dict().items()}
@@ -55,11 +55,11 @@ def validate(task: Task, average: dict[str, Tensor], views: list[Seen]) -> dict[
     return scores
 
 
-def score_references(views: list[Seen]) -> dict[str, float]:
+def score_references(task: Task[View], views: list[View]) -> dict[str, float]:
     """Scores of `REFERENCES` under names like "analytic diffuse PSNR"."""
     found: dict[str, float] = {}
     for method, separate in REFERENCES.items():
         with torch.no_grad():
-            scores = score(lambda seen, separate=separate: separate(seen[0]), views)  # type: ignore[misc]
+            scores = score(lambda seen, separate=separate: separate(task.measure(seen)), views)  # type: ignore[misc]
         found |= {f"{method} {name}": value for name, value in scores.items()}
     return found

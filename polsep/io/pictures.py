@@ -1,0 +1,29 @@
+"""Pictures for documents, as JPEG: the same pixels make the same bytes, and a file is whole or not there."""
+
+from __future__ import annotations
+
+import os
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+#: Quality of the JPEG, 1 to 95. Colours are not subsampled, which thin coloured lines would not survive.
+QUALITY = 90
+
+
+def write_picture(path: Path, pixels: NDArray[np.uint8]) -> None:
+    """Write ``pixels`` (uint8, sRGB, ``[h, w, 3]``) as a JPEG file without metadata; makes its folder.
+
+    Raises ValueError on another shape or type.
+    """
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise ValueError(f"expected pixels uint8 [h, w, 3], found {pixels.dtype} {pixels.shape}")
+    stream = BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "JPEG", quality=QUALITY, subsampling=0, optimize=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.tmp")
+    beside.write_bytes(stream.getvalue())
+    os.replace(beside, path)

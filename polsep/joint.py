@@ -1,0 +1,267 @@
+"""The joint network: a raw mosaic in, diffuse and specular out; demosaicking, closed form and refinement in one graph.
+
+A mosaic is packed to quarter resolution: the 16 samples of a period become channels, so every pixel of the network
+sees the same filters. A learned linear filter, which starts at bilinear interpolation, makes Stokes images of them;
+the colour-affine closed form (`color_affine`) with windows of two sizes makes a first separation of these; a U-Net of
+residual blocks, which sees samples, clip masks and the closed form, adds what they lack. The specular light is white by
+construction. Diffuse and specular sum to the network's own s0.
+
+Inputs and corrections are relative to the brightness around, so that a darker exposure of a scene gives a darker image
+of the same separation, as far as noise and clipping allow. There are no statistics of whole images: crop and frame
+agree away from the border.
+
+Conventions: quarter resolution [h, w] is [H/4, W/4] of the mosaic. "Packed" images ``[N, C k^2, h, w]`` hold k x k
+pixels per period, in the order of `torch.nn.functional.pixel_unshuffle`; k = 4 at full, 2 at half resolution.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, pad, pixel_shuffle, pixel_unshuffle
+
+from polsep.camera import Layout, Mosaic
+from polsep.color_affine import MAX_DIFFUSE_DOLP
+from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
+from polsep.networks import ResidualSize, ResidualUNet
+from polsep.stokes import fit_stokes
+
+#: Raw pixels along the side of a packed pixel.
+PERIOD = 4
+#: What the network sees besides the logarithm of the brightness; ablations leave some out.
+INPUTS = ("samples", "clipping", "cosine", "sine", "split")
+#: Brightness around that counts as black: below it inputs and corrections fade.
+LEAST_LIGHT = 0.01
+#: Windows of the slope in packed pixels, and the contrast of colours, relative to the brightness and squared, below
+#: which they fall back to the wider window and to zero. Chosen on validation views (docs/experiments.md).
+WINDOWS, TRUST = (9, 3), (3e-3, 3e-3)
+
+
+class Guess(NamedTuple):
+    """What the closed form says at half resolution: ``diffuse [N, 4 C, h, w]``, ``specular [N, 4, h, w]``, packed.
+
+    ``polarized [N, 8 C, h, w]``: s1 and s2. ``light [N, 1, h, w]``: the brightness around; ``pose [N, 4, h, w]``: slope
+    and direction as in `Pose`; ``maps``: what the network sees, relative to the light.
+    """
+
+    diffuse: Tensor
+    specular: Tensor
+    polarized: Tensor
+    light: Tensor
+    pose: Tensor
+    maps: Tensor
+
+
+class Pose(NamedTuple):
+    """Diffuse polarization ``slope`` and the specular one's ``direction``, a unit vector, ``[N, 2, H/4, W/4]`` each.
+
+    Both as (cos 2 phi, sin 2 phi), the slope times its degree.
+    """
+
+    slope: Tensor
+    direction: Tensor
+
+
+class Images(NamedTuple):
+    """``diffuse [N, C, ...]`` and ``specular [N, 1, ...]``, not limited to be positive, and what goes with them.
+
+    At half resolution: ``s1``, ``s2 [N, C, H/2, W/2]`` as linearly demosaicked; ``doubt [N, 2, H/2, W/2]``, the log
+    variance of the error of diffuse and specular, relative to the square of the brightness around,
+    ``light [N, 1, H/4, W/4]``.
+    """
+
+    diffuse: Tensor
+    specular: Tensor
+    s1: Tensor
+    s2: Tensor
+    doubt: Tensor
+    light: Tensor
+
+
+class Joint(nn.Module):
+    """Samples ``[N, 1, H, W]`` (black 0, white 1, Sony's order) to diffuse and specular images.
+
+    ``inputs``: those of `INPUTS` that it sees. ``demosaic``: the linear filter, no subject of gradients; see
+    `bilinear_filter`.
+    """
+
+    demosaic: Tensor
+
+    def __init__(self, colors: int, size: ResidualSize, inputs: tuple[str, ...] = INPUTS) -> None:
+        super().__init__()
+        self.colors, self.size, self.inputs = colors, size, inputs
+        self.register_buffer("demosaic", bilinear_filter(Layout(bayer="RGGB" if colors == 3 else None)))
+        counts = {"samples": 16, "clipping": 17, "cosine": 4, "sine": 4, "split": 4 * colors + 10}
+        self.net = ResidualUNet(1 + sum(counts[name] for name in inputs), size)
+        self.last = nn.Conv2d(size.widths[0], 16 * (colors + 1), 1)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
+        self.pose = nn.Conv2d(size.widths[0], 4, 1)
+        nn.init.zeros_(self.pose.weight)
+        nn.init.zeros_(self.pose.bias)  # type: ignore[arg-type]
+        self.doubt = nn.Sequential(nn.Conv2d(size.widths[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 8, 1))
+
+    def forward(self, raw: Tensor, clipped: Tensor) -> tuple[Images, Pose]:
+        """Images at full resolution, ``[N, C, H, W]``.
+
+        ``raw``, ``clipped [N, 1, H, W]``: samples and which of them clipped, H and W multiples of 4.
+        """
+        planes, guess, features, doubt = self._see(raw, clipped)
+        change, turn = self.last(features), self.pose(features)
+        with torch.autocast(raw.device.type, enabled=False):
+            total = _filter(planes, self.demosaic[: 16 * self.colors])
+            specular = _spread(guess.specular)
+            diffuse = total - torch.cat([specular] * self.colors, dim=1)
+            images = torch.cat([diffuse, specular], dim=1) + change.float() * guess.light
+            slope, direction = (guess.pose + turn.float()).chunk(2, dim=1)
+            length = torch.sqrt((direction**2).sum(dim=1, keepdim=True) + 1e-6)
+            return self._unpack(images, guess, doubt), Pose(slope, direction / length)
+
+    def half_resolution(self, raw: Tensor, clipped: Tensor) -> Images:
+        """The means over 2x2 cells of what `forward` gives, ``[N, C, H/2, W/2]``, in less time."""
+        _, guess, features, doubt = self._see(raw, clipped)
+        weight, bias = pool_outputs(self.last.weight), pool_outputs(self.last.bias)  # type: ignore[arg-type]
+        change = conv2d(features, weight, bias)
+        with torch.autocast(raw.device.type, enabled=False):
+            images = torch.cat([guess.diffuse, guess.specular], dim=1) + change.float() * guess.light
+            return self._unpack(images, guess, doubt)
+
+    def _unpack(self, packed: Tensor, guess: Guess, doubt: Tensor) -> Images:
+        images = pixel_shuffle(packed, math.isqrt(packed.shape[1] // (self.colors + 1)))
+        s1, s2 = (pixel_shuffle(s, 2) for s in guess.polarized.chunk(2, dim=1))
+        return Images(images[:, : self.colors], images[:, self.colors :], s1, s2, doubt, guess.light)
+
+    def _see(self, raw: Tensor, clipped: Tensor) -> tuple[Tensor, Guess, Tensor, Tensor]:
+        """Packed samples, the closed form, the network's features and doubt."""
+        planes, masks = pixel_unshuffle(raw, PERIOD), pixel_unshuffle(clipped.to(raw), PERIOD)
+        with torch.autocast(raw.device.type, enabled=False), torch.no_grad():
+            guess = self.guess(planes, masks)
+        features = self.net(guess.maps)
+        return planes, guess, features, pixel_shuffle(self.doubt(features.detach()).float(), 2)
+
+    def guess(self, planes: Tensor, masks: Tensor) -> Guess:
+        """The closed form on linearly demosaicked samples; ``planes``, ``masks [N, 16, h, w]``."""
+        colors, s0_full = self.colors, 16 * self.colors
+        found = _filter(planes, torch.cat([pool_outputs(self.demosaic[:s0_full]), self.demosaic[s0_full:]]))
+        s0, s1, s2 = (x.chunk(colors, dim=1) for x in torch.split(found, 4 * colors, dim=1))
+        mean = _mean(s0)
+        light = avg_pool2d(_mean(mean.chunk(4, dim=1)), 3, 1, 1, count_include_pad=False).clamp(min=0) + LEAST_LIGHT
+        free = 1 - max_pool2d(masks, 3, 1, 1).amax(dim=1, keepdim=True)
+        slopes, contrast = find_slopes((s0, s1, s2), free / light**2)
+        a1, a2 = slopes[-1].chunk(2, dim=1)
+        offsets = [[s - a * x for s, x in zip(values, s0, strict=True)] for values, a in ((s1, a1), (s2, a2))]
+        b1, b2 = (_mean(values) for values in offsets)
+        misfit = _mean([(o - b) ** 2 for values, b in zip(offsets, (b1, b2), strict=True) for o in values])
+        specular = white_specular((b1, b2), (a1, a2)).clamp(min=0)
+        least = s0[0]
+        for color in s0[1:]:
+            least = torch.minimum(least, color)
+        specular = torch.minimum(specular, least.clamp(min=0))
+        diffuse = torch.cat([color - specular for color in s0], dim=1)
+        # p - a d = b + a s is the specular polarization.
+        direction = [_mean((b + a * specular).chunk(4, dim=1)) for b, a in ((b1, a1), (b2, a2))]
+        length = torch.sqrt(direction[0] ** 2 + direction[1] ** 2 + 1e-12)
+        pose = torch.cat([a1, a2, direction[0] / length, direction[1] / length], dim=1)
+        misfit = torch.sqrt(_mean(misfit.chunk(4, dim=1)) + 1e-12) / light
+        seen = {
+            "samples": [planes / light],
+            "clipping": [masks, free],
+            "cosine": [_mean(s1) / light],
+            "sine": [_mean(s2) / light],
+            "split": [diffuse / light, specular / light, *slopes, contrast, misfit],
+        }
+        maps = torch.cat([image for name in self.inputs for image in seen[name]] + [torch.log(light)], dim=1)
+        return Guess(diffuse, specular, found[:, 4 * colors :], light, pose, maps)
+
+
+def find_slopes(stokes: tuple[tuple[Tensor, ...], ...], weight: Tensor) -> tuple[list[Tensor], Tensor]:
+    """The diffuse polarization ``[N, 2, h, w]`` in `WINDOWS`, widest first, and the contrast ``[N, 1, h, w]``.
+
+    ``stokes``: s0, s1, s2, of every colour ``[N, 4, h, w]``; ``weight [N, 1, h, w]`` of packed pixels.
+    """
+    s0, s1, s2 = stokes
+    mean = _mean(s0)
+    deviations = [x - mean for x in s0]
+    moments = [
+        _mean(_mean([d * x for d, x in zip(deviations, values, strict=True)]).chunk(4, dim=1))
+        for values in (s1, s2, deviations)
+    ]
+    sums = torch.cat(moments, dim=1) * weight
+    slope, slopes, pooled = torch.zeros_like(sums[:, :2]), [], sums
+    for window, trust in zip(WINDOWS, TRUST, strict=True):
+        pooled = avg_pool2d(sums, window, 1, window // 2, count_include_pad=False)
+        slope = (pooled[:, :2] + trust * slope) / (pooled[:, 2:] + trust)
+        size = torch.sqrt(slope[:, :1] ** 2 + slope[:, 1:] ** 2 + 1e-12)
+        slope = slope * (MAX_DIFFUSE_DOLP / size.clamp(min=MAX_DIFFUSE_DOLP))
+        slopes.append(slope)
+    return slopes, torch.sqrt(pooled[:, 2:] + 1e-12)
+
+
+def _mean(images: Sequence[Tensor]) -> Tensor:
+    """The mean of images; sums of slices, because engines reduce over channels slowly."""
+    total = images[0]
+    for image in images[1:]:
+        total = total + image
+    return total / len(images)
+
+
+def _filter(planes: Tensor, weight: Tensor) -> Tensor:
+    """Correlate packed samples, repeated beyond the border."""
+    reach = weight.shape[-1] // 2
+    return conv2d(pad(planes, (reach, reach, reach, reach), mode="replicate"), weight)
+
+
+def pool_outputs(weight: Tensor) -> Tensor:
+    """Weights of packed full-resolution outputs ``[16 k, ...]``, as those of their means over cells ``[4 k, ...]``."""
+    return weight.view(-1, 2, 2, 2, 2, *weight.shape[1:]).mean(dim=(2, 4)).flatten(0, 2)
+
+
+def _spread(half: Tensor) -> Tensor:
+    """Packed images at half resolution ``[N, 4, h, w]``, repeated to full resolution ``[N, 16, h, w]``."""
+    places = [2 * (row // 2) + col // 2 for row in range(4) for col in range(4)]
+    return half[:, places]
+
+
+def white_specular(offset: tuple[Tensor, Tensor], slope: tuple[Tensor, Tensor]) -> Tensor:
+    """The positive root of (|a|^2 - 1) tau^2 + 2 Re(b a*) tau + |b|^2 = 0 for slope a and offset b."""
+    real = offset[0] * slope[0] + offset[1] * slope[1]
+    free = 1 - slope[0] ** 2 - slope[1] ** 2
+    return (real + torch.sqrt(real**2 + free * (offset[0] ** 2 + offset[1] ** 2) + 1e-12)) / free
+
+
+def bilinear_filter(layout: Layout) -> Tensor:
+    """Packed filter ``[24 C, 16, 3, 3]``: full-resolution s0 and half-resolution s1, s2, bilinearly.
+
+    Found by showing `demosaic` one bright sample after the other.
+    """
+    middle, size = PERIOD * 4, 9 * PERIOD
+    frames = torch.zeros(16, size, size)
+    for k in range(16):
+        frames[k, middle + k // 4, middle + k % 4] = 1
+    mosaic = Mosaic(frames, layout, 0.0, 2.0)
+    full, half = (fit_stokes(demosaic(mosaic)) for demosaic in (demosaic_bilinear, demosaic_bilinear_half))
+    images = torch.cat([pixel_unshuffle(2 * full.s0, 4)] + [pixel_unshuffle(2 * s, 2) for s in (half.s1, half.s2)], 1)
+    # The response at packed place 4 + i to a sample at packed place 4 is the weight of a neighbour at -i.
+    return images[:, :, 3:6, 3:6].flip(-1, -2).transpose(0, 1).contiguous()
+
+
+def predict_samples(images: Images, pose: Pose, layout: Layout) -> Tensor:
+    """The samples ``[N, 1, H, W]`` that full-resolution images explain: what lies behind each pixel's filter.
+
+    m = (d_c + s + Re((a d_c + s e) exp(-2 i t))) / 2 for the analyser t and colour c of the pixel, with slope a and
+    specular direction e. Not limited at the white level.
+    """
+    colors = images.diffuse.shape[1]
+    diffuse, specular = (pixel_unshuffle(x, PERIOD) for x in (images.diffuse, images.specular))
+    samples = []
+    for place in range(16):
+        angle_deg, channel = layout.filter_at(place // 4, place % 4)
+        turn = torch.tensor([math.cos(2 * math.radians(angle_deg)), math.sin(2 * math.radians(angle_deg))])
+        a, e = ((x * turn.to(x).view(1, 2, 1, 1)).sum(dim=1) for x in pose)
+        own = diffuse[:, 16 * min(channel, colors - 1) + place]
+        samples.append((own * (1 + a) + specular[:, place] * (1 + e)) / 2)
+    return pixel_shuffle(torch.stack(samples, dim=1), PERIOD)

@@ -1,0 +1,95 @@
+"""What the joint network minimizes.
+
+The score that counts is the mean PSNR over scenes, so that is what is minimized: the logarithm of each crop's mean
+squared error, limited to the white level as the score is, at half and at full resolution. Beside it stand the light
+beyond white on a logarithmic scale, the samples that the images explain against those that did not clip, and the
+likelihood of the errors under the variances that the network itself predicts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from polsep.joint import Images, Pose, predict_samples
+from polsep.train.joint_views import JointSeen, find_clipped
+from polsep.train.losses import diffuse_loss
+
+#: Mean squared error below which a crop counts as done: 50 dB.
+LEAST_ERROR = 1e-5
+#: Weight of pixels off the object, against 1 on it.
+BACKGROUND = 0.05
+#: Weights, against dB at half resolution, of dB at full resolution, of log(1 + light) and of the samples' misfit.
+FULL_WEIGHT, BEYOND_WEIGHT, DATA_WEIGHT = 0.5, 10.0, 1.0
+#: Misfit of a sample, in white levels, that counts as large: twice the noise of a bright one.
+DATA_SCALE = 0.02
+#: The sum, in dB, times this gives gradients of about the size of the other networks' (`loop.MOST_GRADIENT`).
+LOSS_SCALE = 0.1
+
+#: How far images are from the truth ``[B, C, h, w]``, under weights ``[B, 1, h, w]``.
+Difference = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+def mean_decibels(found: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
+    """Minus the mean PSNR over crops, limited to white and by `LEAST_ERROR`."""
+    squared = (found.clamp(max=1) - truth.clamp(max=1)) ** 2
+    mean = (squared * weight).mean(dim=(1, 2, 3)) / weight.mean(dim=(1, 2, 3))
+    return 10 / math.log(10) * torch.log(mean + LEAST_ERROR).mean()
+
+
+def paper_difference(found: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
+    """Mean absolute error and five times that of the gradient, in percent of white (Dave et al. 2022, Eq. 19)."""
+    del weight
+    return 100 * diffuse_loss(found, truth)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """How images are compared with the truth, and the weight of the samples' misfit."""
+
+    difference: Difference = mean_decibels
+    data: float = DATA_WEIGHT
+
+
+def joint_loss(found: tuple[Images, Pose], seen: JointSeen, goal: Goal) -> Tensor:
+    """The loss of the module's text; ``found`` at full resolution."""
+    images, pose = found
+    weight = seen.weight * (1 - BACKGROUND) + BACKGROUND
+    half_weight = avg_pool2d(weight, 2)
+    diffuse, specular = avg_pool2d(images.diffuse, 2), avg_pool2d(images.specular, 2)
+    differ = goal.difference
+    half = differ(diffuse, seen.diffuse, half_weight) + differ(specular, seen.specular, half_weight)
+    full = differ(images.diffuse, seen.full_diffuse, weight) + differ(images.specular, seen.full_specular, weight)
+    beyond = beyond_white(diffuse, seen.diffuse) + beyond_white(specular, seen.specular)
+    loss = half + FULL_WEIGHT * full + BEYOND_WEIGHT * beyond
+    if goal.data:
+        loss = loss + goal.data * sample_misfit(images, pose, seen)
+    errors = (diffuse - seen.diffuse, specular - seen.specular)
+    return LOSS_SCALE * (loss + doubt_loss(images, errors, half_weight))
+
+
+def beyond_white(found: Tensor, truth: Tensor) -> Tensor:
+    """Mean difference of log(1 + light), which goes on where the score is blind."""
+    return (torch.log1p(found.clamp(min=0)) - torch.log1p(truth)).abs().mean()
+
+
+def sample_misfit(images: Images, pose: Pose, seen: JointSeen) -> Tensor:
+    """How far the samples that images explain lie from those that did not clip: a mean of Huber's over `DATA_SCALE`."""
+    misfit = (predict_samples(images, pose, seen.layout) - seen.raw) / DATA_SCALE
+    size = misfit.abs()
+    robust = torch.where(size < 1, 0.5 * misfit**2, size - 0.5)
+    kept = ~find_clipped(seen.raw)
+    return (robust * kept).sum() / kept.sum().clamp(min=1)
+
+
+def doubt_loss(images: Images, errors: tuple[Tensor, Tensor], weight: Tensor) -> Tensor:
+    """Minus the Gaussian log likelihood of the errors, relative to the light around; moves nothing but the doubt."""
+    light = interpolate(images.light, scale_factor=2.0)
+    squared = [(error.detach() ** 2).mean(dim=1, keepdim=True) / light**2 for error in errors]
+    unlikely = images.doubt + (torch.cat(squared, dim=1).clamp(max=100) + 1e-7) * torch.exp(-images.doubt)
+    return (0.5 * unlikely * weight).mean()

@@ -1,0 +1,119 @@
+"""The joint network's training: the linear demosaicking filter that it starts from, its task and its ablations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import islice
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, max_pool2d, pad, pixel_unshuffle, unfold
+
+from polsep.camera import Mosaic
+from polsep.demosaic import demosaic_bilinear_half
+from polsep.joint import INPUTS, Joint, bilinear_filter
+from polsep.networks import ResidualSize
+from polsep.separation import Separation
+from polsep.stokes import Measurements, Stokes
+from polsep.train.joint_losses import Goal, joint_loss, paper_difference
+from polsep.train.joint_views import JointSeen, find_clipped, see_raw, see_raw_mono
+from polsep.train.stream import StreamOptions, stream_lane
+from polsep.train.tasks import Task
+
+#: The shipped networks: the best one at two frames a second on two cores, and the real-time one.
+SIZES = {"joint": ResidualSize(48, (1, 1, 2)), "joint-fast": ResidualSize(16, (0, 1, 1))}
+#: Batches that the filter is fitted to, from a pool of so many scenes, of a lane that no worker has.
+FIT_BATCHES, FIT_POOL, FIT_LANE = 60, 24, 120
+#: Light around below which a pixel says nothing about the filter, and what is added to that light.
+LEAST_FIT, FIT_FLOOR = 0.01, 0.02
+#: How firmly weights that the examples leave open are held at bilinear ones, against the samples' own power.
+RIDGE = 1e-4
+
+
+class Ablation(NamedTuple):
+    """What differs from the shipped networks: which maps they see, and what they minimize."""
+
+    inputs: tuple[str, ...] = INPUTS
+    goal: Goal = Goal()
+
+
+def _without(name: str) -> tuple[str, ...]:
+    return tuple(other for other in INPUTS if other != name)
+
+
+#: By name; "none" is what is shipped.
+ABLATIONS = {
+    "none": Ablation(),
+    "no-closed-form": Ablation(("samples", "clipping")),
+    "no-clip-masks": Ablation(_without("clipping")),
+    "demosaicked": Ablation(_without("samples")),
+    "cosine": Ablation(_without("sine")),
+    "no-data-term": Ablation(goal=Goal(data=0.0)),
+    "paper-loss": Ablation(goal=Goal(paper_difference)),
+}
+#: How examples are seen, and in how many colours.
+VIEWS = {"mosaic": (see_raw, 3), "mono": (see_raw_mono, 1)}
+
+
+def joint_task(variant: str, size: ResidualSize, ablation: Ablation) -> Task[JointSeen]:
+    """The joint network for colour (``mosaic``) or ``mono`` frames."""
+    see, colors = VIEWS[variant]
+    network = Joint(colors, size, ablation.inputs)
+
+    def loss(net: nn.Module, seen: JointSeen) -> Tensor:
+        return joint_loss(net(seen.raw, find_clipped(seen.raw)), seen, ablation.goal)
+
+    def separate(seen: JointSeen) -> Separation:
+        with torch.no_grad():
+            images = network.half_resolution(seen.raw, find_clipped(seen.raw))
+        diffuse, specular = images.diffuse.clamp(min=0), images.specular.clamp(min=0).expand_as(images.diffuse)
+        return Separation(diffuse, specular, seen.mask, Stokes(diffuse + specular, images.s1, images.s2))
+
+    def begin(stream: StreamOptions) -> None:
+        batches = islice(stream_lane(replace(stream, pool=FIT_POOL), FIT_LANE, 0), FIT_BATCHES)
+        network.demosaic.copy_(fit_filter(see(batch) for batch in batches))
+
+    return Task(network, see, loss, separate, measure_bilinearly, begin)
+
+
+def measure_bilinearly(seen: JointSeen) -> Measurements:
+    """What methods without training are given of the same frames."""
+    return demosaic_bilinear_half(Mosaic(seen.raw[:, 0], seen.layout, 0.0, 1.0))
+
+
+def fit_filter(views: Iterable[JointSeen]) -> Tensor:
+    """The packed filter, as `joint.bilinear_filter`, that is off least on examples in the mean square.
+
+    Errors count relative to the light around, and only where nothing clips: it is a Wiener filter for scenes like
+    these, colours and polarization included. Raises ValueError without examples.
+    """
+    start, power, goal = torch.zeros(0), torch.zeros(0), torch.zeros(0)
+    for view in views:
+        seen, wanted = _fit_samples(view)
+        if not start.numel():
+            start = bilinear_filter(view.layout).flatten(1).double().T
+            power, goal = start.new_zeros(len(start), len(start)), torch.zeros_like(start)
+        power += seen.T @ seen
+        goal += seen.T @ wanted
+    if not start.numel():
+        raise ValueError("expected examples to fit a filter to, found none")
+    hold = RIDGE * power.diagonal().mean() * torch.eye(len(start), dtype=torch.float64)
+    weights: Tensor = torch.linalg.solve(power + hold, goal + hold @ start)
+    return weights.T.float().reshape(-1, 16, 3, 3)
+
+
+def _fit_samples(view: JointSeen) -> tuple[Tensor, Tensor]:
+    """Neighbourhoods ``[M, 144]`` and what is wanted of them ``[M, 24 C]``, over the light around."""
+    planes = pixel_unshuffle(view.raw, 4)
+    half = [pixel_unshuffle(avg_pool2d(x, 2), 2) for x in view.polarized.chunk(2, dim=1)]
+    wanted = torch.cat([pixel_unshuffle(view.full_diffuse + view.full_specular, 4), *half], dim=1)
+    light = 2 * avg_pool2d(planes.mean(dim=1, keepdim=True), 3, 1, 1, count_include_pad=False)
+    clipped = max_pool2d(pixel_unshuffle(find_clipped(view.raw).float(), 4).amax(dim=1, keepdim=True), 3, 1, 1) > 0
+    inside = pixel_unshuffle(view.weight, 4).amin(dim=1, keepdim=True) > 0
+    kept = (inside & ~clipped & (light > LEAST_FIT)).flatten()
+    size = (light.flatten()[kept] + FIT_FLOOR)[:, None]
+    around = unfold(pad(planes, (1, 1, 1, 1), mode="replicate"), 3).transpose(1, 2).flatten(0, 1)
+    wanted = wanted.flatten(2).transpose(1, 2).flatten(0, 1)
+    return (around[kept] / size).double(), (wanted[kept] / size).double()

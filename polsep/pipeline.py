@@ -43,19 +43,32 @@ class PolsepWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Method:
-    """A separation method: ``demosaic`` a frame, to half or full resolution, then ``split``; the rest is to be read.
+    """A separation method: what it makes of a frame at ``half`` and at ``full`` resolution; the rest is to be read.
 
-    ``engine``: the compiled twin of both at half resolution, which gives None for frames that it does not take.
+    Co-sited measurements keep their resolution. ``engine``: the compiled twin of ``half``, which gives None for frames
+    that it does not take.
     """
 
     name: str
-    demosaic_half: Callable[[Mosaic], Measurements]
-    demosaic_full: Callable[[Mosaic], Measurements]
-    split: Callable[[Measurements], Separation]
+    half: Callable[[Capture], Separation]
+    full: Callable[[Capture], Separation]
     engine: Callable[[Mosaic], AnalyticImages | ColorAffineImages | None]
     summary: str
     needs: str
     source: str
+
+
+def compose(
+    demosaic: Callable[[Mosaic], Measurements], split: Callable[[Measurements], Separation]
+) -> Callable[[Capture], Separation]:
+    """A demosaicker and what separates its samples; co-sited measurements are separated as they are."""
+
+    def separate_samples(capture: Capture) -> Separation:
+        samples = capture if isinstance(capture, Measurements) else demosaic(capture)
+        clipped = None if samples.clipped is None else samples.clipped.any(dim=-4).any(dim=-3)
+        return replace(split(samples), clipped=clipped)
+
+    return separate_samples
 
 
 METHODS = {
@@ -63,9 +76,8 @@ METHODS = {
     for method in (
         Method(
             "color-affine",
-            demosaic_guided_half,
-            demosaic_guided,
-            separate_color_affine,
+            compose(demosaic_guided_half, separate_color_affine),
+            compose(demosaic_guided, separate_color_affine),
             run_color_affine,
             "closed form for polarized diffuse and white specular light, recovers clipped samples",
             "colour; on mono and grey it is the analytic split with clipped samples recovered",
@@ -73,9 +85,8 @@ METHODS = {
         ),
         Method(
             "analytic",
-            demosaic_bilinear_half,
-            demosaic_bilinear,
-            separate_analytic,
+            compose(demosaic_bilinear_half, separate_analytic),
+            compose(demosaic_bilinear, separate_analytic),
             run_analytic,
             "the paper's first estimate: specular = polarized part, diffuse = the rest",
             "colour or mono; takes the diffuse light for unpolarized and clipped samples at face value",
@@ -83,9 +94,8 @@ METHODS = {
         ),
         Method(
             "paper",
-            demosaic_bilinear_half,
-            demosaic_bilinear,
-            separate_paper,
+            compose(demosaic_bilinear_half, separate_paper),
+            compose(demosaic_bilinear, separate_paper),
             run_nothing,
             "the paper's two U-Nets, which refine the analytic split",
             "colour; mono frames go through as grey ones; trained on noisy mosaics under white light",
@@ -161,9 +171,8 @@ def separate_in_engine(capture: Capture, method: Method, light: tuple[float, ...
 
 def separate_in_torch(capture: Capture, method: Method, light: tuple[float, ...], full: bool) -> SeparatedFrame:
     """Any capture through the method's own functions, on the capture's device."""
-    measurements = demosaic(under_white_light(capture, light), method, full)
-    found = method.split(measurements)
-    return to_numpy(in_light(found, light), describe(tally(found, measurements)))
+    found = (method.full if full else method.half)(under_white_light(capture, light))
+    return to_numpy(in_light(found, light), describe(tally(found)))
 
 
 def find_method(name: str) -> Method:
@@ -192,13 +201,6 @@ def to_device(capture: Capture, device: torch.device) -> Capture:
     """The capture with its tensors on ``device``."""
     moved = {name: value.to(device) for name, value in vars(capture).items() if isinstance(value, Tensor)}
     return replace(capture, **moved)  # type: ignore[arg-type]
-
-
-def demosaic(capture: Capture, method: Method, full: bool) -> Measurements:
-    """Co-registered analysers at half or full resolution as the method wants them. Co-sited measurements pass."""
-    if isinstance(capture, Measurements):
-        return capture
-    return method.demosaic_full(capture) if full else method.demosaic_half(capture)
 
 
 def resolve_light_color(light_color: LightColor | str, capture: Capture) -> tuple[tuple[float, ...], list[str]]:

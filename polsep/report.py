@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from polsep.separation import Separation, light_polarizer_angle
-from polsep.stokes import Measurements, Stokes, dolp
+from polsep.stokes import Stokes, dolp
 
 #: Below this concentration of AoLP there is no single polarized light. Real frames: 0.76 to 0.97 where one light or one
 #: reflecting surface polarizes, 0.31 to 0.50 in the open.
@@ -73,18 +73,17 @@ def grey(stokes: Stokes) -> Stokes:
     return stokes.map(lambda image: image.mean(dim=-3, keepdim=True))
 
 
-def tally(found: Separation, measurements: Measurements) -> Tally:
-    """Sums over all pixels of a separation and the samples it was made of."""
+def tally(found: Separation) -> Tally:
+    """Sums over all pixels of a separation."""
     mean = grey(found.stokes)
     p1, p2 = (image.double() for image in (mean.s1[..., 0, :, :], mean.s2[..., 0, :, :]))
     diffuse, specular = (image.mean(dim=-3).double() for image in (found.diffuse, found.specular))
     if found.slope is not None:
         p1, p2 = (p - found.slope[..., i, :, :] * diffuse for i, p in enumerate((p1, p2)))
     weight = torch.hypot(p1, p2)
-    clipped = measurements.clipped
     return Tally(
         found.valid.numel(),
-        0 if clipped is None else int(clipped.any(dim=-4).any(dim=-3).sum()),
+        0 if found.clipped is None else int(found.clipped.sum()),
         int(found.valid.sum()),
         int((dolp(mean) > 1).sum()),
         float((diffuse + specular).sum()),

@@ -27,6 +27,7 @@ class Separation:
     ``slope``, ``[..., 2, h, w]``: the diffuse polarization (beta_d cos 2 phi_d, beta_d sin 2 phi_d) that the method
     found, or None. ``residual``, ``[..., 1, h, w]``: rms distance of the polarization over colours from its model, or
     None. ``noise``, ``[..., 1, h, w]``: standard deviation of one sample as the analysers' own contradiction shows it.
+    ``clipped [..., h, w]``: pixels to which a clipped sample contributed, None where nobody looked.
     """
 
     diffuse: Tensor
@@ -36,6 +37,7 @@ class Separation:
     slope: Tensor | None = None
     residual: Tensor | None = None
     noise: Tensor | None = None
+    clipped: Tensor | None = None
 
 
 def _split(stokes: Stokes, specular: Tensor, valid: Tensor) -> Separation:

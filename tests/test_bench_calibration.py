@@ -30,13 +30,14 @@ from polsep.bench.calibration import (
 from polsep.bench.scoring import Entry
 from polsep.demosaic import demosaic_bilinear_half
 from polsep.materials import random_materials
+from polsep.pipeline import compose
 from polsep.raycast import find_view, light_view, shade_view
 from polsep.separation import separate_analytic
 from polsep.stokes import intensity_behind
 from polsep.views import random_shot, seeded_shape
 
 SIZE = (96, 96)
-ANALYTIC = Entry("analytic", demosaic_bilinear_half, separate_analytic)
+ANALYTIC = Entry("analytic", compose(demosaic_bilinear_half, separate_analytic))
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,7 @@ from polsep.bench.scoring import Entry, Protocol, score_case, score_sets, see_cl
 from polsep.bench.sets import bench_sets
 from polsep.demosaic import demosaic_bilinear_half
 from polsep.metrics import psnr
+from polsep.pipeline import compose
 from polsep.render import Scene
 from polsep.separation import Separation, separate_analytic
 from polsep.stokes import Measurements, Stokes
@@ -31,7 +32,7 @@ def make_grey(_paths: list[Path], _generator: torch.Generator) -> Scene:
 
 
 GREY = Recipe("grey", 1, (), make_grey)
-ANALYTIC = Entry("analytic", demosaic_bilinear_half, separate_analytic)
+ANALYTIC = Entry("analytic", compose(demosaic_bilinear_half, separate_analytic))
 PROTOCOLS = [
     Protocol(n, s, (ANALYTIC,)) for n, s in (("noisy", see_noisy), ("clean", see_clean), ("all", see_co_sited))
 ]
@@ -84,7 +85,7 @@ def test_an_entry_demosaicks_mosaics_alone() -> None:
         seen.append(tuple(measurements.data.shape))
         return separate_analytic(measurements)
 
-    entry = Entry("x", demosaic_bilinear_half, split)
+    entry = Entry("x", compose(demosaic_bilinear_half, split))
     for capture in (case.noisy, case.co_sited):
         entry.separate(capture)
     assert seen == [(4, 3, 16, 16), (4, 3, 32, 32)]

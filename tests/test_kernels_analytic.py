@@ -20,7 +20,7 @@ from polsep.io.genicam import pack_frame
 from polsep.kernels import AnalyticImages, AnalyticOptions, PackedFrame, analytic, separate_analytic_half
 from polsep.kernels.bilinear import clip_code
 from polsep.kernels.threads import get_threads, set_threads
-from polsep.pipeline import in_light, to_numpy
+from polsep.pipeline import compose, in_light, to_numpy
 from polsep.report import tally
 from polsep.separation import Separation, separate_analytic
 from polsep.stokes import Stokes
@@ -162,8 +162,7 @@ def test_tally_is_the_twins(layout: Layout, light: tuple[float, ...]) -> None:
     """Every sum over the frame, of white light whatever the images are in; the counts exactly."""
     raw = random_codes((71, 60), clipped=0.01)
     mosaic = Mosaic(torch.from_numpy(raw.astype(np.float32)), layout, 25_000.0, 65535.0, light)
-    measurements = demosaic_bilinear_half(mosaic)
-    expected = tally(separate_analytic(measurements), measurements)
+    expected = tally(compose(demosaic_bilinear_half, separate_analytic)(mosaic))
     options = AnalyticOptions(light, in_light=True, report=True)
     found = separate_analytic_half(raw, layout, 25_000, 65535, options).tally
     assert found is not None and found.clipped > 0 and found.above_one > 0

@@ -12,19 +12,18 @@ from polsep.color_affine import separate_color_affine
 from polsep.guided import demosaic_guided_half
 from polsep.kernels import ColorAffineOptions, get_threads, separate_color_affine_half, set_threads
 from polsep.kernels.strips import CHUNK
+from polsep.pipeline import compose
 from polsep.report import describe, grey, tally
 from polsep.separation import Separation
-from polsep.stokes import Measurements, aolp, dolp
+from polsep.stokes import aolp, dolp
 
 GUIDED = ColorAffineOptions(guided=True)
 #: What float32 sums leave of a frame's statistics, relative.
 SUMMED = 1e-4
 
 
-def twins_of(mosaic: Mosaic) -> tuple[Separation, Measurements]:
-    """The separation in torch, and the samples it was made of."""
-    measurements = demosaic_guided_half(mosaic)
-    return separate_color_affine(measurements), measurements
+def twins_of(mosaic: Mosaic) -> Separation:
+    return compose(demosaic_guided_half, separate_color_affine)(mosaic)
 
 
 @pytest.mark.parametrize("bayer", BAYER_ORDERS)
@@ -35,14 +34,14 @@ def test_agrees_on_every_layout(bayer: str, origin: tuple[int, int], generator: 
     mosaic = random_frame((75, 94), layout, IMX250, 0.5, generator)
     mosaic = Mosaic(mosaic.data, layout, 20, mosaic.white_level, LIGHT)
     options = ColorAffineOptions(LIGHT, guided=True)
-    assert_twins(separate_color_affine_half(as_raw(mosaic), layout, 20, 4095, options), twins_of(mosaic)[0])
+    assert_twins(separate_color_affine_half(as_raw(mosaic), layout, 20, 4095, options), twins_of(mosaic))
 
 
 def test_agrees_on_analysers_of_any_angle(generator: torch.Generator) -> None:
     """Angles between those of Sony's cell, where every analyser sees s1 and s2."""
     layout = Layout(((10, 60), (110, 160)))
     mosaic = random_frame((64, 80), layout, IMX250, 0.5, generator)
-    assert_twins(separate_color_affine_half(as_raw(mosaic), layout, 0, 4095, GUIDED), twins_of(mosaic)[0])
+    assert_twins(separate_color_affine_half(as_raw(mosaic), layout, 0, 4095, GUIDED), twins_of(mosaic))
 
 
 @pytest.mark.parametrize("shape", [(16, 16), (17, 51), (8 * CHUNK + 40, 20), (20, 301), (4 * CHUNK + 6, 18)])
@@ -51,7 +50,7 @@ def test_agrees_on_every_size(shape: tuple[int, int], sensor: Sensor, generator:
     """Frames smaller than the filters' reach, mirrored again and again, and frames of several pieces."""
     mosaic = random_frame(shape, Layout(), sensor, 0.5, generator)
     found = separate_color_affine_half(as_raw(mosaic), Layout(), 0, mosaic.white_level, GUIDED)
-    assert_twins(found, twins_of(mosaic)[0])
+    assert_twins(found, twins_of(mosaic))
 
 
 @pytest.mark.parametrize("brightness", [1.2, 5.0])
@@ -59,7 +58,7 @@ def test_agrees_where_samples_clip(brightness: float, generator: torch.Generator
     """A few clipped samples, and a frame that is mostly clipped."""
     mosaic = random_frame((310, 220), Layout(), IMX250, brightness, generator)
     assert bool(mosaic.clipped().any())
-    assert_twins(separate_color_affine_half(as_raw(mosaic), Layout(), 0, 4095, GUIDED), twins_of(mosaic)[0], SOLVED)
+    assert_twins(separate_color_affine_half(as_raw(mosaic), Layout(), 0, 4095, GUIDED), twins_of(mosaic), SOLVED)
 
 
 def test_threads_change_nothing(generator: torch.Generator) -> None:
@@ -86,9 +85,9 @@ def test_reports_as_the_twins_do(brightness: float, generator: torch.Generator) 
     mosaic = random_frame((310, 220), Layout(), IMX250, brightness, generator)
     options = ColorAffineOptions(guided=True, report=True)
     images = separate_color_affine_half(as_raw(mosaic), Layout(), 0, 4095, options)
-    found, measurements = twins_of(mosaic)
+    found = twins_of(mosaic)
     assert images.tally is not None
-    expected = describe(tally(found, measurements))
+    expected = describe(tally(found))
     assert describe(images.tally)["statistics"] == pytest.approx(expected["statistics"], rel=SUMMED, abs=1e-7)
     mean = grey(found.stokes)
     bright = mean.s0[0].numpy() > 0.05

@@ -422,7 +422,7 @@ def test_light_polarizer_angle_on_a_rendered_ball(degrees: float) -> None:
     ball_part = (Part(ball(1.2), plain((0.3, 0.3, 0.3)), roughness=0.35),)
     diffuse, specular = render(ball_part, camera, light, (64, 64))
     samples = measure(diffuse + specular, SONY)
-    angle, concentration = dominant_angle(tally(separate_color_affine(samples), samples))
+    angle, concentration = dominant_angle(tally(separate_color_affine(samples)))
     error = math.degrees(light_polarizer_angle(angle)) - degrees
     assert abs((error + 90) % 180 - 90) < 1
     assert concentration > 0.5
@@ -434,7 +434,7 @@ def test_dominant_angle_at_special_points() -> None:
     for signs, expected in ((shape[:1], 1), (shape[:2], 0), (shape[2:], 0)):
         light = Stokes(*(k * signs.expand(1, 3, -1) for k in (2.0, math.cos(2.0), math.sin(2.0))))
         samples = measure(light, SONY)
-        angle, concentration = dominant_angle(tally(separate_analytic(samples), samples))
+        angle, concentration = dominant_angle(tally(separate_analytic(samples)))
         assert concentration == pytest.approx(expected, abs=1e-6)
         if expected:
             assert angle == pytest.approx(1.0, abs=1e-6)

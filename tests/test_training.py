@@ -139,7 +139,7 @@ def test_a_log_begins_with_methods_without_training(
     lines = killed[2]
     views = [see_mosaic(batch) for batch in validation_batches(STREAM)]
     assert lines[0] == {"step": 0} | score_references(small_task(), views)
-    analytic = score(lambda seen: METHODS["analytic"].split(seen[0]), views)
+    analytic = score(lambda seen: METHODS["analytic"].half(seen[0]), views)
     assert {f"analytic {name}": value for name, value in analytic.items()}.items() <= lines[0].items()
     with open_log(tmp_path, 0, lambda _: None, lambda: {"x": 1.0}) as log:
         log.note(2, 0.5, 0.1)

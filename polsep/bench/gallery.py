@@ -197,7 +197,7 @@ def draw_fig6(data: Path) -> Pixels | None:
         capture = read_grey(data / name, white)
         total = fit_stokes(capture).s0
         gain = _gain(total)
-        found = [(t, entry.split(capture)) for t, entry in columns_of(ladder_entries(MOSAIC))]
+        found = [(t, entry.separate(capture)) for t, entry in columns_of(ladder_entries(MOSAIC))]
         diffuse = [Panel(f"diffuse, {t}", _halved(tone(f.diffuse, gain))) for t, f in found]
         specular = [Panel(f"specular, {t}", _halved(tone(2 * f.specular, gain))) for t, f in found]
         rows += [

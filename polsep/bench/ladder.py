@@ -26,7 +26,7 @@ from polsep.io.weights import read_weights, shipped_weights
 from polsep.learned import PAPER, load_refinement
 from polsep.multi_capture import separate_extremes
 from polsep.networks import count_parameters
-from polsep.pipeline import METHODS
+from polsep.pipeline import METHODS, compose
 from polsep.refine import RUNGS, Refinement, separate_refined
 from polsep.separation import separate_analytic
 
@@ -74,8 +74,8 @@ def ladder_entries(variant: str, rungs: tuple[str, ...] = tuple(RUNGS)) -> tuple
     All see the same bilinear data; `color-affine` itself, with the demosaicker of its own, is there for mosaics only.
     """
     entries = [
-        Entry("analytic", demosaic_bilinear_half, separate_analytic),
-        Entry("min and max", demosaic_bilinear_half, separate_extremes),
+        Entry("analytic", compose(demosaic_bilinear_half, separate_analytic)),
+        Entry("min and max", compose(demosaic_bilinear_half, separate_extremes)),
         *(network_entry(weights) for weights in find_ladder(variant, rungs)),
     ]
     shipped = find_weights(PAPER)
@@ -83,8 +83,8 @@ def ladder_entries(variant: str, rungs: tuple[str, ...] = tuple(RUNGS)) -> tuple
         entries.append(network_entry(Weights("paper", SHIPPED, shipped)))
     own = METHODS["color-affine"]
     if variant == MOSAIC:
-        entries.append(Entry("color-affine, bilinear", demosaic_bilinear_half, separate_color_affine))
-    return (*entries, Entry(own.name, own.demosaic_half, own.split))
+        entries.append(Entry("color-affine, bilinear", compose(demosaic_bilinear_half, separate_color_affine)))
+    return (*entries, Entry(own.name, own.half))
 
 
 def rung_of(method: str) -> str:
@@ -99,7 +99,7 @@ def network_entry(weights: Weights) -> Entry:
     if rung.name != weights.rung:
         raise ValueError(f"expected weights of the rung {weights.rung} in {weights.path}, found {rung.name}")
     split = partial(separate_refined, rung=rung, networks=network)
-    return Entry(weights.name, demosaic_bilinear_half, split, network)
+    return Entry(weights.name, compose(demosaic_bilinear_half, split), network)
 
 
 Curve = list[tuple[float, float, float]]

@@ -17,12 +17,10 @@ import torch
 from torch import Tensor
 
 from polsep.bench.rows import Row
-from polsep.camera import Mosaic
 from polsep.metrics import chroma, flip, highlights, psnr, psnr_unlimited, ssim, worst_mean
 from polsep.pipeline import METHODS, Capture
 from polsep.refine import Refinement
 from polsep.separation import Separation
-from polsep.stokes import Measurements
 
 if TYPE_CHECKING:
     from polsep.testsets import Case, Recipe
@@ -36,16 +34,14 @@ Truth = tuple[Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Entry:
-    """A method as it is compared: its demosaicker, its split of the result, and its networks if it has some."""
+    """A method as it is compared: what separates a capture at half resolution, and its networks if it has some.
+
+    Co-sited measurements are separated at their own resolution.
+    """
 
     name: str
-    demosaic: Callable[[Mosaic], Measurements]
-    split: Callable[[Measurements], Separation]
+    separate: Callable[[Capture], Separation]
     network: Refinement | None = None
-
-    def separate(self, capture: Capture) -> Separation:
-        """A mosaic at half resolution, or co-sited measurements at their own."""
-        return self.split(capture if isinstance(capture, Measurements) else self.demosaic(capture))
 
 
 @dataclass(frozen=True)
@@ -69,7 +65,7 @@ class Score(NamedTuple):
 
 def own_entries() -> tuple[Entry, ...]:
     """`pipeline.METHODS` as entries."""
-    return tuple(Entry(m.name, m.demosaic_half, m.split) for m in METHODS.values())
+    return tuple(Entry(m.name, m.half) for m in METHODS.values())
 
 
 def see_noisy(case: Case) -> tuple[Capture, Truth]:

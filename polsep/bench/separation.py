@@ -9,7 +9,7 @@ from pathlib import Path
 from polsep.bench.rows import Row
 from polsep.bench.truth import SCENE_SEEDS, captures, render_scene
 from polsep.metrics import psnr
-from polsep.pipeline import METHODS, demosaic
+from polsep.pipeline import METHODS
 
 
 def bench_separation(_data: Path | None = None) -> Iterator[Row]:
@@ -20,7 +20,7 @@ def bench_separation(_data: Path | None = None) -> Iterator[Row]:
             scene = render_scene(seed, saturation)
             for capture, frame, mask, (diffuse, specular) in captures(scene, seed):
                 for name, method in METHODS.items():
-                    found = method.split(demosaic(frame, method, full=False))
+                    found = method.half(frame)
                     for output, image, truth in (
                         ("diffuse", found.diffuse, diffuse),
                         ("specular", found.specular, specular),

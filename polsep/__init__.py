@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from polsep.camera import Layout, Mosaic
-    from polsep.pipeline import METHODS, PolsepWarning, separate
+    from polsep.methods import METHODS
+    from polsep.pipeline import PolsepWarning, separate
     from polsep.report import SeparatedFrame
     from polsep.separation import Separation
     from polsep.stokes import Measurements, Stokes
@@ -34,7 +35,7 @@ __all__ = [
 ]
 
 _HOME = {
-    "METHODS": "pipeline",
+    "METHODS": "methods",
     "Layout": "camera",
     "Measurements": "stokes",
     "Mosaic": "camera",

@@ -102,7 +102,8 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
     from polsep.camera import Layout
     from polsep.io.frames import ReadOptions
-    from polsep.pipeline import find_device, find_method
+    from polsep.methods import check_method
+    from polsep.pipeline import find_device
 
     try:
         given = click.get_current_context().get_parameter_source("layout") == click.core.ParameterSource.COMMANDLINE
@@ -114,7 +115,7 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
             options["pixel_format"],
             options["pages"],
         )
-        find_method(options["method"])
+        check_method(options["method"])
         find_device(options["device"])
         light = parse_light_color(options["light_color"])
         run = SeparateOptions(options["method"], light, options["device"], options["full"])
@@ -274,10 +275,10 @@ def _show_training(line: dict[str, Any]) -> None:
 @app.command()
 def methods() -> None:
     """List the separation methods that this installation has."""
-    from polsep.pipeline import BEST_METHOD, METHODS
+    from polsep.methods import BEST, METHODS
 
     for method in METHODS.values():
-        best = "  (auto)" if method.name == BEST_METHOD else ""
+        best = "  (auto)" if method is BEST[0] else ""
         print(f"{method.name}{best}\n    {method.summary}\n    needs:  {method.needs}\n    source: {method.source}")
 
 
@@ -291,7 +292,7 @@ def demo(output: Path) -> None:
     """
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
     from polsep.io.frames import ReadOptions
-    from polsep.pipeline import METHODS
+    from polsep.methods import METHODS
 
     capture = Path(__file__).parent / "data" / "still_life.png"
     for name in METHODS:

@@ -21,8 +21,8 @@ from polsep.guided import LEAST_CELLS
 if TYPE_CHECKING:
     from polsep.kernels import AnalyticImages, ColorAffineImages
 
-#: Loading compiled code takes less than this many seconds, compiling it takes more.
-PATIENCE = 2.0
+#: Loading compiled code takes less than this many seconds, also on a busy machine; compiling it takes more.
+PATIENCE = 6.0
 
 #: Samples that kernels read.
 _DTYPES = (torch.uint8, torch.uint16, torch.float32)

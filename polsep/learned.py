@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from polsep.io.weights import read_weights, shipped_weights
+from polsep.io.weights import is_shipped, read_weights, shipped_weights
 from polsep.networks import Size
 from polsep.refine import RUNGS, Refinement, Rung, separate_refined
 from polsep.separation import Separation
@@ -39,15 +39,6 @@ def load_refinement(path: Path, device: torch.device) -> tuple[Rung, Refinement]
 @lru_cache(maxsize=4)
 def _shipped_refinement(name: str, device: torch.device) -> tuple[Rung, Refinement]:
     return load_refinement(shipped_weights(name), device)
-
-
-def is_shipped(name: str) -> bool:
-    """Whether weights of that name are installed."""
-    try:
-        shipped_weights(name)
-    except ValueError:
-        return False
-    return True
 
 
 def separate_paper(measurements: Measurements) -> Separation:

@@ -138,6 +138,11 @@ class ResidualUNet(nn.Module):
         self.decoders = nn.ModuleList(_chain(w, n) for w, n in zip(widths[:-1], size.blocks, strict=False))
         self.out = _chain(widths[0], 1)
 
+    @property
+    def grid(self) -> int:
+        """Pixels after which the strided convolutions repeat."""
+        return 1 << len(self.downs)
+
     def forward(self, x: Tensor) -> Tensor:
         """Features at the input's resolution."""
         x = self.enter(x)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -25,7 +26,7 @@ class Orientation:
     """How a frame of ``height`` x ``width`` becomes a wanted one: transposed, mirrored, then continued.
 
     ``top``, ``left``: samples added there, of the turned frame; below and at the right it is continued to multiples of
-    `PERIOD`.
+    `PERIOD`. ``origin``: first whole cell of the frame as it is, as in `Layout`.
     """
 
     height: int
@@ -35,6 +36,23 @@ class Orientation:
     across: bool = False
     top: int = 0
     left: int = 0
+    origin: tuple[int, int] = (0, 0)
+
+    @property
+    def spans(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Rows and columns of the turned frame that the frame's whole cells take: the first and how many, each."""
+        sides = [(self.height, self.origin[0]), (self.width, self.origin[1])]
+        down, across = sides[::-1] if self.transposed else sides
+        return _span(*down, self.top, self.down), _span(*across, self.left, self.across)
+
+    @property
+    def keeps_cells(self) -> bool:
+        """Whether cells of the turned frame are those of the frame.
+
+        Always in colour. Mono frames cropped at an odd offset have cells of their own, half a cell apart: there
+        images of half resolution are best made of full ones that were turned back.
+        """
+        return all(first % 2 == 0 for first, _ in self.spans)
 
     def turn(self, frames: Tensor) -> Tensor:
         """Frames ``[..., H, W]`` in the wanted order."""
@@ -45,13 +63,18 @@ class Orientation:
         return frames[..., places[0][:, None].to(frames.device), places[1].to(frames.device)]
 
     def turn_back(self, images: Tensor, scale: int) -> Tensor:
-        """Images of a turned frame as those of the frame's whole cells; ``scale``: 2 pixels per cell and side, or 1."""
-        rows, cols = (self.width, self.height) if self.transposed else (self.height, self.width)
-        spans = [
-            ((before + before % 2) // 2, (n - before % 2) // 2) for before, n in ((self.top, rows), (self.left, cols))
-        ]
-        for axis, (first, count) in zip((-2, -1), spans, strict=True):
-            images = images.narrow(axis, scale * first, scale * count)
+        """Images of a turned frame as those of the frame's whole cells; ``scale``: 2 pixels per cell and side, or 1.
+
+        One pixel per cell, where the frame has cells of its own (`keeps_cells`), is the mean of those it lies between;
+        of masks, True where one of them is.
+        """
+        for axis, (first, count) in zip((-2, -1), self.spans, strict=True):
+            start, length = first * scale // 2, count * scale // 2
+            cells = images.narrow(axis, start, length)
+            if first * scale % 2:
+                others = images.narrow(axis, start + 1, length)
+                cells = cells | others if images.dtype == torch.bool else 0.5 * (cells + others)
+            images = cells
         images = images.flip([axis for axis, wanted in ((-2, self.down), (-1, self.across)) if wanted])
         return images.mT if self.transposed else images
 
@@ -61,27 +84,45 @@ class Orientation:
         return Stokes(s0, -s1 if self.transposed else s1, -s2 if self.down != self.across else s2)
 
 
+def _span(count: int, origin: int, before: int, mirrored: bool) -> tuple[int, int]:
+    """Where whole cells of a side of ``count`` samples lie behind ``before`` more, mirrored or not, and how many."""
+    whole = (count - origin) // 2 * 2
+    return before + (count - origin - whole if mirrored else origin), whole
+
+
 def _continued(count: int, before: int) -> Tensor:
     """Places of a side of ``count`` samples with ``before`` more, and as many behind as make a multiple of `PERIOD`."""
     places = torch.arange(-before, count + (-count - before) % PERIOD)
-    places = torch.where(places < 0, places + PERIOD, places)
-    return torch.where(places >= count, places - PERIOD, places)
+    # Frames of less than a period are mono ones, which repeat after every cell.
+    period = min(PERIOD, count // 2 * 2)
+    behind = count - period + (places - count) % period
+    return torch.where(places < 0, places % period, torch.where(places >= count, behind, places))
 
 
 def orient(mosaic: Mosaic, wanted: Layout) -> Orientation:
-    """The orientation that brings a mosaic's filters into the ``wanted`` order.
+    """The orientation that brings a mosaic's filters into the ``wanted`` order; one that keeps the cells if possible.
 
     Raises ValueError when none does, as for other analyser angles.
     """
     height, width = mosaic.data.shape[-2:]
-    for candidate, layout in _orientations(height, width, mosaic.layout):
-        if layout.table() == wanted.table():
-            return candidate
-    raise ValueError(f"expected filters {wanted.spec}, mirrored, turned or cropped, found {mosaic.layout.spec}")
+    return _orient(height, width, mosaic.layout, wanted)
+
+
+@lru_cache(maxsize=64)  # frames of a stream are alike, and all orientations take 20 ms
+def _orient(height: int, width: int, layout: Layout, wanted: Layout) -> Orientation:
+    shifted = None
+    for candidate, turned in _orientations(height, width, layout):
+        if turned.table() == wanted.table():
+            if candidate.keeps_cells:
+                return candidate
+            shifted = shifted or candidate
+    if shifted is None:
+        raise ValueError(f"expected filters {wanted.spec}, mirrored, turned or cropped, found {layout.spec}")
+    return shifted
 
 
 def _orientations(height: int, width: int, layout: Layout) -> Iterator[tuple[Orientation, Layout]]:
-    """Every orientation and what it makes of a layout, the simplest first; crops by even cells before odd ones."""
+    """Every orientation and what it makes of a layout, the simplest first."""
     for transposed in (False, True):
         rows, cols = (width, height) if transposed else (height, width)
         for down, across in ((False, False), (False, True), (True, False), (True, True)):
@@ -90,4 +131,5 @@ def _orientations(height: int, width: int, layout: Layout) -> Iterator[tuple[Ori
             turned = turned.flipped_horizontal(cols) if across else turned
             for top in range(PERIOD):
                 for left in range(PERIOD):
-                    yield Orientation(height, width, transposed, down, across, top, left), turned.rolled(top, left)
+                    made = Orientation(height, width, transposed, down, across, top, left, layout.origin)
+                    yield made, turned.rolled(top, left)

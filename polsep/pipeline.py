@@ -1,17 +1,17 @@
 """The product on one page: raw frame -> mosaic -> demosaic -> separate -> NumPy images and a report.
 
-A `Method` maps one frame, a `Mosaic` or co-sited `Measurements`, to a `Separation`; everything that is compared has
-this type. The light's colour is divided out before a method runs and multiplied back into its diffuse and specular
-image, so methods see white light, and DoLP, AoLP and statistics are of white light. On the CPU at half resolution a
-method's compiled twin runs in its place (`engine`).
+A `Method` (`methods`) maps one frame, a `Mosaic` or co-sited `Measurements`, to a `Separation`. The light's colour is
+divided out before a method runs and multiplied back into its diffuse and specular image, so methods see white light,
+and DoLP, AoLP and statistics are of white light. On the CPU at half resolution a method's compiled twin runs in its
+place (`engine`).
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,93 +19,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polsep.camera import Layout, Mosaic
-from polsep.color_affine import separate_color_affine
-from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
-from polsep.engine import run_analytic, run_color_affine, run_nothing
-from polsep.guided import demosaic_guided, demosaic_guided_half
+from polsep.demosaic import demosaic_bilinear_half
 from polsep.layout_check import check_layout
-from polsep.learned import separate_paper
 from polsep.levels import as_mosaic
+from polsep.methods import Capture, Method, find_method
 from polsep.report import SeparatedFrame, describe, grey, tally
-from polsep.separation import Separation, separate_analytic
+from polsep.separation import Separation
 from polsep.stokes import Measurements, aolp, dolp, fit_stokes_unclipped, polarized_intensity
 
-if TYPE_CHECKING:
-    from polsep.kernels import AnalyticImages, ColorAffineImages
-
-Capture = Mosaic | Measurements
 LightColor = Sequence[float]
 
 
 class PolsepWarning(UserWarning):
     """Something about a frame that its owner should know: the layout, the bit depth, the exposure, the light."""
-
-
-@dataclass(frozen=True)
-class Method:
-    """A separation method: what it makes of a frame at ``half`` and at ``full`` resolution; the rest is to be read.
-
-    Co-sited measurements keep their resolution. ``engine``: the compiled twin of ``half``, which gives None for frames
-    that it does not take.
-    """
-
-    name: str
-    half: Callable[[Capture], Separation]
-    full: Callable[[Capture], Separation]
-    engine: Callable[[Mosaic], AnalyticImages | ColorAffineImages | None]
-    summary: str
-    needs: str
-    source: str
-
-
-def compose(
-    demosaic: Callable[[Mosaic], Measurements], split: Callable[[Measurements], Separation]
-) -> Callable[[Capture], Separation]:
-    """A demosaicker and what separates its samples; co-sited measurements are separated as they are."""
-
-    def separate_samples(capture: Capture) -> Separation:
-        samples = capture if isinstance(capture, Measurements) else demosaic(capture)
-        clipped = None if samples.clipped is None else samples.clipped.any(dim=-4).any(dim=-3)
-        return replace(split(samples), clipped=clipped)
-
-    return separate_samples
-
-
-METHODS = {
-    method.name: method
-    for method in (
-        Method(
-            "color-affine",
-            compose(demosaic_guided_half, separate_color_affine),
-            compose(demosaic_guided, separate_color_affine),
-            run_color_affine,
-            "closed form for polarized diffuse and white specular light, recovers clipped samples",
-            "colour; on mono and grey it is the analytic split with clipped samples recovered",
-            "this project; after Nayar et al. 1997, Kajiyama et al. 2023",
-        ),
-        Method(
-            "analytic",
-            compose(demosaic_bilinear_half, separate_analytic),
-            compose(demosaic_bilinear, separate_analytic),
-            run_analytic,
-            "the paper's first estimate: specular = polarized part, diffuse = the rest",
-            "colour or mono; takes the diffuse light for unpolarized and clipped samples at face value",
-            "Dave et al. 2022, Eqs. 15-18",
-        ),
-        Method(
-            "paper",
-            compose(demosaic_bilinear_half, separate_paper),
-            compose(demosaic_bilinear, separate_paper),
-            run_nothing,
-            "the paper's two U-Nets, which refine the analytic split",
-            "colour; mono frames go through as grey ones; trained on noisy mosaics under white light",
-            "Dave et al. 2022, Sec. 4; weights are this project's",
-        ),
-    )
-}
-
-#: What `auto` means: the best method installed.
-BEST_METHOD = "color-affine"
 
 
 def separate(
@@ -142,7 +68,7 @@ def separate_capture(
     full: bool = False,
 ) -> SeparatedFrame:
     """`separate` for a frame that is already a `Mosaic`, or co-sited `Measurements` (which keep their resolution)."""
-    chosen = find_method(method)
+    chosen = find_method(method, capture)
     capture = to_device(capture, find_device(device))
     remarks = []
     if isinstance(capture, Mosaic):
@@ -173,15 +99,6 @@ def separate_in_torch(capture: Capture, method: Method, light: tuple[float, ...]
     """Any capture through the method's own functions, on the capture's device."""
     found = (method.full if full else method.half)(under_white_light(capture, light))
     return to_numpy(in_light(found, light), describe(tally(found)))
-
-
-def find_method(name: str) -> Method:
-    """The method of that name; ValueError, with the names there are, for any other."""
-    if name == "auto":
-        return METHODS[BEST_METHOD]
-    if name not in METHODS:
-        raise ValueError(f"expected a method of {', '.join(['auto', *METHODS])}, found {name!r}")
-    return METHODS[name]
 
 
 def find_device(name: str) -> torch.device:

@@ -27,7 +27,8 @@ class Separation:
     ``slope``, ``[..., 2, h, w]``: the diffuse polarization (beta_d cos 2 phi_d, beta_d sin 2 phi_d) that the method
     found, or None. ``residual``, ``[..., 1, h, w]``: rms distance of the polarization over colours from its model, or
     None. ``noise``, ``[..., 1, h, w]``: standard deviation of one sample as the analysers' own contradiction shows it.
-    ``clipped [..., h, w]``: pixels to which a clipped sample contributed, None where nobody looked.
+    ``clipped [..., h, w]``: pixels to which a clipped sample contributed, None where nobody looked. ``doubt``,
+    ``[..., 2, h, w]``: standard deviation of the error of diffuse and specular as the method expects it, or None.
     """
 
     diffuse: Tensor
@@ -38,6 +39,7 @@ class Separation:
     residual: Tensor | None = None
     noise: Tensor | None = None
     clipped: Tensor | None = None
+    doubt: Tensor | None = None
 
 
 def _split(stokes: Stokes, specular: Tensor, valid: Tensor) -> Separation:

@@ -9,7 +9,7 @@ import torch
 from hypothesis import settings
 
 from polsep.camera import Layout, Mosaic
-from polsep.pipeline import METHODS
+from polsep.methods import METHODS
 
 settings.register_profile("polsep", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("polsep")

@@ -30,7 +30,7 @@ from polsep.bench.calibration import (
 from polsep.bench.scoring import Entry
 from polsep.demosaic import demosaic_bilinear_half
 from polsep.materials import random_materials
-from polsep.pipeline import compose
+from polsep.methods import compose
 from polsep.raycast import find_view, light_view, shade_view
 from polsep.separation import separate_analytic
 from polsep.stokes import intensity_behind

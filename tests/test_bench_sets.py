@@ -17,8 +17,8 @@ from polsep.bench.rendering import bench_rendering
 from polsep.bench.scoring import Entry, Protocol, score_case, score_sets, see_clean, see_co_sited, see_noisy
 from polsep.bench.sets import bench_sets
 from polsep.demosaic import demosaic_bilinear_half
+from polsep.methods import compose
 from polsep.metrics import psnr
-from polsep.pipeline import compose
 from polsep.render import Scene
 from polsep.separation import Separation, separate_analytic
 from polsep.stokes import Measurements, Stokes

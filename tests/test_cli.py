@@ -27,7 +27,7 @@ from polsep import cli
 from polsep.camera import IDEAL, Layout, expose
 from polsep.io.genicam import pack_frame
 from polsep.io.outputs import FORMATS, LAYERS, read_exr_layers
-from polsep.pipeline import METHODS
+from polsep.methods import METHODS
 from polsep.stokes import Stokes
 
 COLOR_LAYERS = {f"{image}.{color}" for image in ("diffuse", "specular") for color in "RGB"}

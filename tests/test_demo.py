@@ -18,7 +18,7 @@ from polsep import cli
 from polsep.camera import IMX250, Layout, Sensor, expose
 from polsep.layout_check import check_layout
 from polsep.levels import as_mosaic
-from polsep.pipeline import METHODS
+from polsep.methods import METHODS
 from polsep.render import cast, is_lit, render, shade
 from polsep.scenes import still_life
 

@@ -15,14 +15,8 @@ import torch
 
 from polsep import engine
 from polsep.camera import Layout, Mosaic
-from polsep.pipeline import (
-    METHODS,
-    SeparatedFrame,
-    resolve_light_color,
-    separate_capture,
-    separate_in_engine,
-    separate_in_torch,
-)
+from polsep.methods import METHODS
+from polsep.pipeline import SeparatedFrame, resolve_light_color, separate_capture, separate_in_engine, separate_in_torch
 from polsep.stokes import Measurements
 
 SONY = ((90, 45), (135, 0))

@@ -20,7 +20,8 @@ from polsep.io.genicam import pack_frame
 from polsep.kernels import AnalyticImages, AnalyticOptions, PackedFrame, analytic, separate_analytic_half
 from polsep.kernels.bilinear import clip_code
 from polsep.kernels.threads import get_threads, set_threads
-from polsep.pipeline import compose, in_light, to_numpy
+from polsep.methods import compose
+from polsep.pipeline import in_light, to_numpy
 from polsep.report import tally
 from polsep.separation import Separation, separate_analytic
 from polsep.stokes import Stokes

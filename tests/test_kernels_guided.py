@@ -12,7 +12,7 @@ from polsep.color_affine import separate_color_affine
 from polsep.guided import demosaic_guided_half
 from polsep.kernels import ColorAffineOptions, get_threads, separate_color_affine_half, set_threads
 from polsep.kernels.strips import CHUNK
-from polsep.pipeline import compose
+from polsep.methods import compose
 from polsep.report import describe, grey, tally
 from polsep.separation import Separation
 from polsep.stokes import aolp, dolp

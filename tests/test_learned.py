@@ -20,6 +20,7 @@ from torch import Tensor
 from polsep import learned
 from polsep.camera import Mosaic
 from polsep.demosaic import demosaic_bilinear_half
+from polsep.io import weights
 from polsep.io.frames import ReadOptions, read_frames
 from polsep.io.weights import shipped_weights, write_weights
 from polsep.learned import PAPER, PAPER_MONO, is_shipped, load_refinement, separate_paper
@@ -55,6 +56,7 @@ def ship(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         return path
 
     monkeypatch.setattr(learned, "shipped_weights", find)
+    monkeypatch.setattr(weights, "shipped_weights", find)
     learned._shipped_refinement.cache_clear()
     yield tmp_path
     learned._shipped_refinement.cache_clear()

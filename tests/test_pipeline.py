@@ -18,7 +18,8 @@ from torch.nn.functional import interpolate
 import polsep
 from polsep.camera import IDEAL, IMX250, Layout, Mosaic, expose
 from polsep.demosaic import demosaic_bilinear_half
-from polsep.pipeline import METHODS, estimate_light_color, find_device, find_method, separate_capture
+from polsep.methods import METHODS, find_method
+from polsep.pipeline import estimate_light_color, find_device, separate_capture
 from polsep.stokes import Measurements, Stokes, measure
 
 SIZE = 96
@@ -264,7 +265,7 @@ def test_arguments_of_other_kinds_are_one_line(options: dict[str, Any]) -> None:
 def test_every_shipped_method_and_device_is_found() -> None:
     """Method names find themselves; auto devices exist; the table of methods describes each."""
     for name, method in METHODS.items():
-        assert find_method(name) is method and method.name == name
+        assert find_method(name, Mosaic(torch.zeros(8, 8), Layout(), 0, 1)) is method and method.name == name
         assert method.summary and method.needs and method.source
     assert find_device("cpu") == torch.device("cpu")
     assert find_device("auto").type in ("cpu", "cuda")

@@ -30,8 +30,8 @@ from polsep import cli
 from polsep.io.checkpoints import read_checkpoint, read_lines, write_checkpoint, write_lines
 from polsep.io.weights import read_weights
 from polsep.learned import load_refinement
+from polsep.methods import METHODS
 from polsep.networks import Size
-from polsep.pipeline import METHODS
 from polsep.refine import RUNGS
 from polsep.stokes import Stokes, measure
 from polsep.train.command import (

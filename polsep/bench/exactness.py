@@ -10,7 +10,7 @@ import torch
 
 from polsep.bench.rows import Row
 from polsep.camera import Layout
-from polsep.pipeline import METHODS
+from polsep.methods import METHODS
 from polsep.stokes import Measurements, Stokes, fit_stokes_unclipped, measure
 
 

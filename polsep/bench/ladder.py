@@ -24,9 +24,9 @@ from polsep.color_affine import separate_color_affine
 from polsep.demosaic import demosaic_bilinear_half
 from polsep.io.weights import read_weights, shipped_weights
 from polsep.learned import PAPER, load_refinement
+from polsep.methods import METHODS, compose
 from polsep.multi_capture import separate_extremes
 from polsep.networks import count_parameters
-from polsep.pipeline import METHODS, compose
 from polsep.refine import RUNGS, Refinement, separate_refined
 from polsep.separation import separate_analytic
 

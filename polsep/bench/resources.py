@@ -16,7 +16,7 @@ from polsep.bench.rows import Row
 from polsep.io.frames import ReadOptions, read_frames
 from polsep.io.results import write_array
 from polsep.kernels import warm_up
-from polsep.pipeline import METHODS
+from polsep.methods import METHODS
 
 CASE = "2448x2048 colour frame"
 

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from polsep.bench.rows import Row
+from polsep.methods import METHODS, Capture
 from polsep.metrics import chroma, flip, highlights, psnr, psnr_unlimited, ssim, worst_mean
-from polsep.pipeline import METHODS, Capture
 from polsep.refine import Refinement
 from polsep.separation import Separation
 

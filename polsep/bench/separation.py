@@ -8,8 +8,8 @@ from pathlib import Path
 
 from polsep.bench.rows import Row
 from polsep.bench.truth import SCENE_SEEDS, captures, render_scene
+from polsep.methods import METHODS
 from polsep.metrics import psnr
-from polsep.pipeline import METHODS
 
 
 def bench_separation(_data: Path | None = None) -> Iterator[Row]:

@@ -58,3 +58,12 @@ def shipped_weights(name: str) -> Path:
     if not path.exists():
         raise ValueError(f"expected the weights {name!r} in {path.parent}, found none of that name")
     return path
+
+
+def is_shipped(name: str) -> bool:
+    """Whether weights of that name are installed."""
+    try:
+        shipped_weights(name)
+    except ValueError:
+        return False
+    return True

@@ -66,9 +66,8 @@ def joint_loss(found: tuple[Images, Pose], seen: JointSeen, goal: Goal) -> Tenso
     half = differ(diffuse, seen.diffuse, half_weight) + differ(specular, seen.specular, half_weight)
     full = differ(images.diffuse, seen.full_diffuse, weight) + differ(images.specular, seen.full_specular, weight)
     beyond = beyond_white(diffuse, seen.diffuse) + beyond_white(specular, seen.specular)
-    loss = half + FULL_WEIGHT * full + BEYOND_WEIGHT * beyond
-    if goal.data:
-        loss = loss + goal.data * sample_misfit(images, pose, seen)
+    # Also when it weighs nothing: the budget stays the same, and every parameter has a gradient.
+    loss = half + FULL_WEIGHT * full + BEYOND_WEIGHT * beyond + goal.data * sample_misfit(images, pose, seen)
     errors = (diffuse - seen.diffuse, specular - seen.specular)
     return LOSS_SCALE * (loss + doubt_loss(images, errors, half_weight))
 

@@ -87,7 +87,7 @@ def fit_filter(views: Iterable[JointSeen]) -> Tensor:
     """The packed filter, as `joint.bilinear_filter`, that is off least on examples in the mean square.
 
     Errors count relative to the light around, and only where nothing clips: it is a Wiener filter for scenes like
-    these, colours and polarization included. Raises ValueError without examples.
+    these, colours and polarization included. Raises ValueError without examples, or without light on objects in them.
     """
     start, power, goal = torch.zeros(0), torch.zeros(0), torch.zeros(0)
     for view in views:
@@ -97,7 +97,7 @@ def fit_filter(views: Iterable[JointSeen]) -> Tensor:
             power, goal = start.new_zeros(len(start), len(start)), torch.zeros_like(start)
         power += seen.T @ seen
         goal += seen.T @ wanted
-    if not start.numel():
+    if not bool(power.any()):
         raise ValueError("expected examples to fit a filter to, found none")
     hold = RIDGE * power.diagonal().mean() * torch.eye(len(start), dtype=torch.float64)
     weights: Tensor = torch.linalg.solve(power + hold, goal + hold @ start)

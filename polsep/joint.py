@@ -226,6 +226,13 @@ def _spread(half: Tensor) -> Tensor:
     return half[:, places]
 
 
+def limit(images: Images) -> tuple[Tensor, Tensor, Tensor]:
+    """Diffuse and specular without negative light, and the standard deviation of their errors ``[N, 2, H/2, W/2]``."""
+    light = images.light.repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)
+    error = light * torch.exp(0.5 * images.doubt)
+    return images.diffuse.clamp(min=0), images.specular.clamp(min=0), error
+
+
 def white_specular(offset: tuple[Tensor, Tensor], slope: tuple[Tensor, Tensor]) -> Tensor:
     """The positive root of (|a|^2 - 1) tau^2 + 2 Re(b a*) tau + |b|^2 = 0 for slope a and offset b."""
     real = offset[0] * slope[0] + offset[1] * slope[1]

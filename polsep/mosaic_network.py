@@ -19,7 +19,7 @@ from torch.nn.functional import max_pool2d
 
 from polsep.camera import Layout, Mosaic
 from polsep.io.weights import is_shipped, read_weights, shipped_weights
-from polsep.joint import PERIOD, Images, Joint
+from polsep.joint import PERIOD, Images, Joint, limit
 from polsep.networks import ResidualSize
 from polsep.orient import Orientation, orient
 from polsep.separation import Separation
@@ -131,9 +131,8 @@ def _look_full(network: Joint, raw: Tensor, clipped: Tensor) -> list[Tensor]:
 
 
 def _as_list(images: Images) -> list[Tensor]:
-    light = images.light.repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)
-    error = light * torch.exp(0.5 * images.doubt)
-    return [images.diffuse.clamp(min=0), images.specular.clamp(min=0), images.s1, images.s2, error]
+    diffuse, specular, error = limit(images)
+    return [diffuse, specular, images.s1, images.s2, error]
 
 
 def _rows(image: Tensor, rows: tuple[int, int], height: int) -> Tensor:

@@ -1,0 +1,446 @@
+"""What the joint network learns from: its loss piece by piece, its linear filter, its ablations; whole trainings."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tolerances import assert_close, assert_finite
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, conv2d, interpolate, pad, pixel_shuffle, pixel_unshuffle
+
+pytest.importorskip("embreex")
+pytest.importorskip("lightning_fabric")
+pytest.importorskip("tensorboard")
+
+from polsep.camera import CLIP_MARGIN, IDEAL, IMX250, Layout, expose
+from polsep.io.weights import read_weights
+from polsep.joint import INPUTS, Images, Joint, Pose, bilinear_filter
+from polsep.metrics import psnr
+from polsep.networks import ResidualSize, count_parameters
+from polsep.simulate import filter_light
+from polsep.stokes import Stokes
+from polsep.train import command, loop
+from polsep.train import joint_task as module
+from polsep.train.command import JointOptions, digest_data, train_weights
+from polsep.train.joint_losses import (
+    DATA_SCALE,
+    LEAST_ERROR,
+    Goal,
+    beyond_white,
+    doubt_loss,
+    joint_loss,
+    mean_decibels,
+    paper_difference,
+    sample_misfit,
+)
+from polsep.train.joint_task import ABLATIONS, FIT_LANE, SIZES, VIEWS, fit_filter, joint_task
+from polsep.train.joint_views import JointSeen, find_clipped, see_raw, see_raw_mono
+from polsep.train.loop import Run, Schedule, train
+from polsep.train.losses import diffuse_loss
+from polsep.train.stream import Examples, StreamOptions, stream_lane
+from polsep.train.tasks import Task
+from polsep.train.validation import score, validation_batches
+
+STREAM = StreamOptions(batch=2, crop=32, size=64, pool=2, uses=1)
+SCHEDULE = Schedule(steps=2, warm_up=1, checkpoint_every=2, validate_every=100, precision="32-true")
+TINY = ResidualSize(4, (0, 1))
+COLOR, MONO = Layout(), Layout(bayer=None)
+
+
+@pytest.fixture
+def shortened(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The linear filter from a few examples instead of hundreds, and a batch of validation views instead of eight."""
+    monkeypatch.setattr(module, "FIT_BATCHES", 4)
+    monkeypatch.setattr(module, "FIT_POOL", 2)
+    for user in (loop, command):
+        monkeypatch.setattr(user, "validation_batches", lambda stream: validation_batches(stream, 1))
+
+
+@pytest.fixture(scope="module")
+def batches() -> list[Examples]:
+    """Examples of another lane than the one the filter is fitted to."""
+    return list(itertools.islice(stream_lane(replace(STREAM, batch=4, pool=4), 0, 0), 4))
+
+
+def small_task(ablation: str = "none", variant: str = "mosaic") -> Task[JointSeen]:
+    torch.manual_seed(1)
+    return joint_task(variant, TINY, ABLATIONS[ablation])
+
+
+def truth_of(seen: JointSeen) -> Images:
+    """True light as the network would give it, with doubts about nothing."""
+    s1, s2 = avg_pool2d(seen.polarized, 2).chunk(2, dim=1)
+    count, _, height, width = seen.raw.shape
+    doubt, light = torch.zeros(count, 2, height // 2, width // 2), torch.ones(count, 1, height // 4, width // 4)
+    return Images(seen.full_diffuse, seen.full_specular, s1, s2, doubt, light)
+
+
+def explained(layout: Layout) -> tuple[Images, Pose, JointSeen]:
+    """Images, the pose that polarizes them, and an example without noise that they explain, part of it clipped."""
+    generator, c = torch.Generator().manual_seed(5), layout.channels
+    diffuse, specular = (3 * torch.rand(2, n, 16, 16, generator=generator) ** 2 for n in (c, 1))
+    a, e = torch.tensor([0.1, -0.2]), torch.tensor([0.6, 0.8])
+    light = Stokes(diffuse + specular, *(a[k] * diffuse + e[k] * specular for k in (0, 1)))
+    raw = expose(light, layout, IDEAL).data[:, None]
+    half = [avg_pool2d(x, 2) for x in (diffuse, specular)]
+    polarized = torch.cat([light.s1, light.s2], dim=1)
+    ones = torch.ones(2, 1, 16, 16)
+    seen = JointSeen(raw, *half, ones[:, 0, ::2, ::2] > 0, layout, diffuse, specular, ones, polarized)
+    pose = Pose(*(x.view(1, 2, 1, 1).expand(2, 2, 4, 4) for x in (a, e)))
+    return truth_of(seen), pose, seen
+
+
+def as_variable(images: Images) -> Images:
+    return Images(*(x.detach().clone().requires_grad_() for x in images))
+
+
+@pytest.mark.parametrize("see", [see_raw, see_raw_mono])
+def test_examples_hold_raw_samples_and_the_truth_behind_them(
+    batches: list[Examples], see: Callable[[Examples], JointSeen]
+) -> None:
+    """The truth, through the camera, is the samples up to noise; half resolution is the mean of full."""
+    seen = see(batches[0])
+    c = seen.layout.channels
+    assert_close(seen.diffuse, avg_pool2d(seen.full_diffuse, 2))
+    assert_close(seen.specular, avg_pool2d(seen.full_specular, 2))
+    light = Stokes(seen.full_diffuse + seen.full_specular, seen.polarized[:, :c], seen.polarized[:, c:])
+    error = (filter_light(light, seen.layout, IMX250) - seen.raw[:, 0])[~find_clipped(seen.raw)[:, 0]]
+    assert abs(float(error.mean())) < 2e-3
+    assert float(error.abs().median()) < 1e-2
+    assert torch.equal(seen.mask, avg_pool2d(seen.weight, 2)[:, 0] == 1)
+    assert torch.equal(find_clipped(seen.raw), seen.raw >= 1 - CLIP_MARGIN)
+
+
+def test_decibels_are_minus_the_score() -> None:
+    """Of `metrics.psnr` under a mask of ones, the floor of the error apart."""
+    generator = torch.Generator().manual_seed(0)
+    found, truth = (1.5 * torch.rand(3, 3, 8, 8, generator=generator) for _ in range(2))
+    everywhere = torch.ones(8, 8, dtype=torch.bool)
+    scores = [psnr(x, t, everywhere) for x, t in zip(found, truth, strict=True)]
+    expected = sum(10 * math.log10(10 ** (-s / 10) + LEAST_ERROR) for s in scores) / 3
+    assert float(mean_decibels(found, truth, torch.ones(3, 1, 8, 8))) == pytest.approx(expected, abs=1e-4)
+    assert expected == pytest.approx(-sum(scores) / 3, abs=0.01)
+
+
+def test_decibels_are_taken_under_the_weight() -> None:
+    """Pixels without weight count nothing, also where the score is blind; crops count alike, whatever their weight."""
+    generator = torch.Generator().manual_seed(1)
+    found, truth = (torch.rand(2, 3, 8, 8, generator=generator) for _ in range(2))
+    weight = (torch.rand(2, 1, 8, 8, generator=generator) > 0.5).float()
+    spoilt = torch.where(weight > 0, found, 5.0)
+    assert_close(mean_decibels(spoilt, truth, weight), mean_decibels(found, truth, weight))
+    assert_close(mean_decibels(found, truth, 0.1 * weight), mean_decibels(found, truth, weight), scale=10)
+    each = [-psnr(x, t, w[0] > 0) for x, t, w in zip(found, truth, weight, strict=True)]
+    assert float(mean_decibels(found, truth, weight)) == pytest.approx(sum(each) / 2, abs=0.01)
+    assert float(mean_decibels(truth + 2, truth * 0 + 1, weight)) == pytest.approx(10 * math.log10(LEAST_ERROR))
+
+
+def test_the_loss_of_the_paper_is_that_of_its_network() -> None:
+    found, truth = torch.rand(2, 1, 3, 8, 8).unbind(0)
+    assert_close(paper_difference(found, truth, torch.zeros(1, 1, 8, 8)), 100 * diffuse_loss(found, truth), scale=100)
+
+
+def test_light_beyond_white_counts() -> None:
+    """Where the score is blind; the darker of two highlights of a true 3 is the worse one."""
+    truth = torch.full((1, 1, 4, 4), 3.0)
+    losses = [float(beyond_white(torch.full_like(truth, level), truth)) for level in (1.0, 2.0, 3.0)]
+    assert losses[0] > losses[1] > losses[2] == 0
+
+
+@pytest.mark.parametrize("share", [1e-4, 0.01, 0.3])
+def test_doubt_is_least_where_it_is_the_squared_error(share: float) -> None:
+    """Relative to the light around: the log variance that the likelihood wants, for each of both images."""
+    light = torch.full((1, 1, 2, 2), 0.4)
+    errors = (torch.full((1, 3, 4, 4), 0.4 * share), torch.full((1, 1, 4, 4), -0.8 * share))
+    best = torch.log(torch.tensor([share**2, 4 * share**2]) + 1e-7).view(1, 2, 1, 1).expand(1, 2, 4, 4)
+
+    def loss(doubt: Tensor) -> Tensor:
+        nothing = torch.zeros(1)
+        return doubt_loss(Images(nothing, nothing, nothing, nothing, doubt, light), errors, torch.ones(1, 1, 4, 4))
+
+    doubt = best.clone().requires_grad_()
+    loss(doubt).backward()
+    assert_close(doubt.grad, torch.zeros_like(best))
+    for step in (-0.5, 0.5):
+        assert float(loss(best + step)) > float(loss(best))
+
+
+def test_doubt_moves_nothing_but_itself() -> None:
+    images = as_variable(explained(COLOR)[0])
+    diffuse, specular = avg_pool2d(images.diffuse, 2), avg_pool2d(images.specular, 2)
+    doubt_loss(images, (diffuse - 0.3, specular - 0.1), torch.ones(2, 1, 8, 8)).backward()
+    assert images.diffuse.grad is None and images.specular.grad is None
+    assert images.doubt.grad is not None and bool(images.doubt.grad.any())
+
+
+@pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
+def test_the_truth_explains_all_samples_that_did_not_clip(layout: Layout) -> None:
+    """The misfit is 0 although a part of the frame clips, and not where anything else is claimed."""
+    images, pose, seen = explained(layout)
+    assert 0.02 < float(find_clipped(seen.raw).float().mean()) < 0.5
+    assert float(sample_misfit(images, pose, seen)) < 1e-8
+    darker = images._replace(diffuse=0.9 * images.diffuse)
+    turned = pose._replace(direction=pose.direction.flip(1))
+    assert float(sample_misfit(darker, pose, seen)) > 0.1
+    assert float(sample_misfit(images, turned, seen)) > 0.1
+
+
+def test_clipped_samples_have_no_misfit() -> None:
+    """Their values and the light behind them change nothing and get no gradient; nor do wholly clipped frames."""
+    images, pose, seen = explained(MONO)
+    clipped = find_clipped(seen.raw)
+    variable = as_variable(images._replace(diffuse=images.diffuse + 0.5))
+    sample_misfit(variable, pose, seen).backward()
+    gradient = variable.diffuse.grad
+    assert gradient is not None
+    assert not bool(gradient[clipped].any())
+    assert bool((gradient[~clipped] != 0).all())
+    assert float(sample_misfit(images, pose, seen._replace(raw=torch.ones_like(seen.raw)))) == 0
+
+
+def test_misfit_is_quadratic_for_noise_and_linear_beyond() -> None:
+    images, pose, seen = explained(MONO)
+    nothing = seen._replace(raw=torch.zeros_like(seen.raw))
+    flat = Pose(torch.zeros_like(pose.slope), pose.direction)
+
+    def misfit(sample: float) -> float:
+        level = torch.full_like(images.diffuse, 2 * sample * DATA_SCALE)
+        return float(sample_misfit(images._replace(diffuse=level, specular=0 * level), flat, nothing))
+
+    assert misfit(0.5) == pytest.approx(0.125)
+    assert misfit(1.0) == pytest.approx(0.5)
+    assert misfit(3.0) == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
+def test_nothing_is_better_than_the_truth(layout: Layout) -> None:
+    """The whole loss, with the doubts that go with each."""
+    images, pose, seen = explained(layout)
+    floor = math.log(1e-7)
+    best = joint_loss((images._replace(doubt=torch.full_like(images.doubt, floor)), pose), seen, Goal())
+    for change in (-0.05, 0.05):
+        for other in (
+            images._replace(diffuse=images.diffuse + change),
+            images._replace(specular=images.specular + change),
+        ):
+            doubt = torch.full_like(images.doubt, 2 * math.log(abs(change)))
+            assert float(joint_loss((other._replace(doubt=doubt), pose), seen, Goal())) > float(best) + 1
+
+
+def known_views(layout: Layout, weight: Tensor) -> list[JointSeen]:
+    """Random samples, whose truth is what a packed filter makes of them."""
+    generator, c = torch.Generator().manual_seed(2), layout.channels
+    views = []
+    for _ in range(2):
+        raw = 0.1 + 0.8 * torch.rand(2, 1, 64, 64, generator=generator)
+        found = conv2d(pad(pixel_unshuffle(raw, 4), (1, 1, 1, 1), mode="replicate"), weight)
+        s0, s1, s2 = found.split((16 * c, 4 * c, 4 * c), dim=1)
+        polarized = interpolate(torch.cat([pixel_shuffle(s, 2) for s in (s1, s2)], dim=1), scale_factor=2.0)
+        diffuse, specular = pixel_shuffle(s0, 4), torch.zeros_like(raw)
+        mask = torch.ones(2, 32, 32, dtype=torch.bool)
+        views.append(
+            JointSeen(
+                raw,
+                avg_pool2d(diffuse, 2),
+                specular[..., ::2, ::2],
+                mask,
+                layout,
+                diffuse,
+                specular,
+                torch.ones_like(raw),
+                polarized,
+            )
+        )
+    return views
+
+
+@pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
+def test_the_fit_recovers_a_known_filter(layout: Layout) -> None:
+    weight = bilinear_filter(layout)
+    weight = weight + 0.1 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(4))
+    found = fit_filter(known_views(layout, weight))
+    assert found.shape == weight.shape and found.dtype == torch.float32
+    assert float((found - weight).abs().max()) < 0.01
+    assert float((found - weight).square().mean()) < 1e-4 * float((weight - bilinear_filter(layout)).square().mean())
+
+
+def test_samples_near_clipped_ones_say_nothing_about_the_filter() -> None:
+    """Samples raised to white, whose truth does not follow them, leave what the others say."""
+    weight = bilinear_filter(COLOR)
+    weight = weight + 0.1 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(4))
+    views = known_views(COLOR, weight)
+    clipped = torch.rand(views[0].raw.shape, generator=torch.Generator().manual_seed(6)) < 0.002
+    spoilt = [view._replace(raw=torch.where(clipped, 1.0, view.raw)) for view in views]
+    assert float((fit_filter(spoilt) - weight).abs().max()) < 0.01
+
+
+def test_what_examples_leave_open_stays_bilinear() -> None:
+    """A single packed pixel without any light behind it hardly moves it; without one there is nothing to fit."""
+    views = known_views(COLOR, torch.zeros(72, 16, 3, 3))
+    corner = [view._replace(weight=pad(torch.ones(2, 1, 4, 4), (0, 60, 0, 60))) for view in views]
+    bilinear = bilinear_filter(COLOR)
+    assert_finite(fit_filter(corner))
+    assert float((fit_filter(corner) - bilinear).square().mean()) < 0.5 * float(bilinear.square().mean())
+    outside = [view._replace(weight=torch.zeros_like(view.weight)) for view in views]
+    with pytest.raises(ValueError, match="expected examples to fit a filter to, found none"):
+        fit_filter(outside)
+    with pytest.raises(ValueError, match="expected examples to fit a filter to, found none"):
+        fit_filter([])
+
+
+@pytest.mark.parametrize("variant", VIEWS)
+def test_the_fitted_filter_beats_bilinear_on_other_examples(variant: str, batches: list[Examples]) -> None:
+    """s0 where nothing clips, relative to its brightness, of scenes that it was not fitted to."""
+    see, colors = VIEWS[variant]
+    stream = stream_lane(replace(STREAM, batch=4, pool=4), FIT_LANE, 0)
+    fitted = fit_filter(see(batch) for batch in itertools.islice(stream, 10))
+    net = Joint(colors, TINY)
+    views = [see(batch) for batch in batches]
+    before = relative_error(net, views)
+    net.demosaic.copy_(fitted)
+    assert relative_error(net, views) < 0.9 * before
+
+
+def relative_error(net: Joint, views: list[JointSeen]) -> float:
+    """Mean squared error of s0 over the squared light around, where nothing near clips."""
+    total, count = 0.0, 0
+    for seen in views:
+        with torch.no_grad():
+            images = net(seen.raw, find_clipped(seen.raw))[0]
+        light = interpolate(images.light, scale_factor=4.0)
+        near = interpolate(avg_pool2d(find_clipped(seen.raw).float(), 8, 4, 2), scale_factor=4.0)[..., :32, :32]
+        kept = ((seen.weight > 0) & (near == 0)).expand_as(images.diffuse)
+        error = (images.diffuse + images.specular - seen.full_diffuse - seen.full_specular) / light
+        total, count = total + float(error[kept].square().sum()), count + int(kept.sum())
+    return total / count
+
+
+def test_sizes_and_ablations_are_told_apart() -> None:
+    assert set(SIZES) == {"joint", "joint-fast"}
+    assert {name for name, ablation in ABLATIONS.items() if ablation == ABLATIONS["none"]} == {"none"}
+    parameters = {name: count_parameters(Joint(3, size)) for name, size in SIZES.items()}
+    assert parameters["joint"] > 4 * parameters["joint-fast"]
+
+
+@pytest.mark.parametrize("variant", VIEWS)
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_every_ablation_learns(ablation: str, variant: str, batches: list[Examples]) -> None:
+    """It sees what it says, a step has finite gradients of every parameter, and changes what it separates."""
+    task = small_task(ablation, variant)
+    seen = task.prepare(batches[0])
+    before = task.separate(seen)
+    optimizer = torch.optim.Adam(task.network.parameters(), 1e-2)
+    for _ in range(2):
+        optimizer.zero_grad()
+        task.loss(task.network, seen).backward()
+        assert_finite(*(p.grad for p in task.network.parameters()))
+        optimizer.step()
+    after = task.separate(seen)
+    for one, other in ((before.diffuse, after.diffuse), (before.specular, after.specular)):
+        assert one.shape == other.shape == (4, VIEWS[variant][1], 16, 16)
+        assert float(other.min()) >= 0
+        assert float((one - other).abs().mean()) > 1e-4
+
+
+@pytest.mark.parametrize("ablation", ["none", "no-closed-form", "paper-loss"])
+def test_gradients_are_finite_on_black_and_clipped_frames(ablation: str) -> None:
+    task = small_task(ablation)
+    for level in (0.0, 0.5, 3.0):
+        light, nothing = torch.full((1, 3, 16, 16), level), torch.zeros(1, 1, 16, 16)
+        raw, mask = torch.full((1, 16, 16), min(level / 2, 1.0)), torch.full((1, 16, 16), level > 0)
+        seen = task.prepare(Examples(raw, light, nothing, torch.zeros(1, 6, 16, 16), mask))
+        task.network.zero_grad()
+        task.loss(task.network, seen).backward()
+        assert_finite(*(p.grad for p in task.network.parameters()))
+
+
+@pytest.mark.parametrize("variant", VIEWS)
+def test_ablations_differ_in_what_they_see_or_in_what_they_minimize(variant: str, batches: list[Examples]) -> None:
+    """Never in both, and in nothing else: at the beginning all separate alike."""
+    seen = VIEWS[variant][0](batches[0])
+    whole = small_task("none", variant)
+    for ablation, (inputs, goal) in ABLATIONS.items():
+        assert (inputs != INPUTS) + (goal != Goal()) == (ablation != "none")
+        task = small_task(ablation, variant)
+        assert isinstance(task.network, Joint)
+        assert task.network.inputs == inputs
+        assert count_parameters(task.network) <= count_parameters(whole.network)
+        assert torch.equal(task.separate(seen).specular, whole.separate(seen).specular)
+
+
+@pytest.mark.parametrize("variant", VIEWS)
+def test_training_ends_in_weights_that_say_all(variant: str, tmp_path: Path, shortened: None) -> None:
+    options = JointOptions("joint-fast", variant, TINY)
+    run = Run(tmp_path, "a test", STREAM, SCHEDULE, workers=0)
+    lines: list[dict[str, Any]] = []
+    path = train_weights(options, run, lines.append)
+    assert path.name == f"joint-fast-{variant}.safetensors"
+    weights, metadata = read_weights(path)
+    known = {"method": "joint-fast", "ablation": "none", "variant": variant, "seed": "0", "data": digest_data(STREAM)}
+    assert known.items() <= metadata.items()
+    colors = int(metadata["colors"])
+    assert colors == VIEWS[variant][1]
+    assert json.loads(metadata["inputs"]) == list(INPUTS)
+    assert json.loads(metadata["size"]) == {"width": 4, "blocks": [0, 1]}
+    last = [round(lines[-1][f"{image} PSNR"], 3) for image in ("diffuse", "specular")]
+    assert json.loads(metadata["curve"]) == [[2, *last]]
+    halves = json.loads(metadata["validation"])
+    assert [halves[f"{image} PSNR"] for image in ("diffuse", "specular")] == pytest.approx(last, abs=0.1)
+    assert set(json.loads(metadata["reference"])) == {"analytic", "color-affine"}
+    assert metadata["command"].startswith("polsep train joint-fast ")
+    network = Joint(colors, ResidualSize(**json.loads(metadata["size"])), tuple(json.loads(metadata["inputs"])))
+    network.load_state_dict({name: value.float() for name, value in weights.items()})
+    assert metadata["parameters"] == str(count_parameters(network))
+    examples = itertools.islice(stream_lane(STREAM, FIT_LANE, 0), 4)
+    fitted = fit_filter(VIEWS[variant][0](batch) for batch in examples)
+    assert torch.equal(network.demosaic, fitted.half().float())
+
+
+def die_at(step: int) -> Callable[[dict[str, Any]], None]:
+    def stop(line: dict[str, Any]) -> None:
+        if line["step"] == step:
+            raise KeyboardInterrupt
+
+    return stop
+
+
+def test_resumed_training_ends_with_the_same_bits(tmp_path: Path, shortened: None, monkeypatch: Any) -> None:
+    """The filter is fitted once, before the first step, and kept."""
+    schedule = replace(SCHEDULE, steps=5, checkpoint_every=2, validate_every=3)
+    run = Run(tmp_path / "killed", "a test", STREAM, schedule, workers=0)
+    whole = train(small_task(), replace(run, out=tmp_path / "whole"), lambda _: None)
+    with pytest.raises(KeyboardInterrupt):
+        train(small_task(), run, die_at(3))
+    monkeypatch.setattr(module, "fit_filter", None)
+    resumed = train(small_task(), run, lambda _: None)
+    assert whole is not None and resumed is not None
+    assert set(whole) == set(resumed)
+    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+
+
+def test_it_learns_a_picture_by_heart() -> None:
+    """One 32 x 32 example, 160 steps: both outputs reach 40 dB, 15 dB above the closed form that they start at."""
+    examples = next(itertools.islice(stream_lane(replace(STREAM, batch=1), 0, 0), 2, None))
+    torch.manual_seed(0)
+    task = joint_task("mosaic", ResidualSize(16, (1, 1)), ABLATIONS["none"])
+    seen = task.prepare(examples)
+    everywhere = [seen._replace(mask=torch.ones_like(seen.mask))]
+    before = score(task.separate, everywhere)
+    optimizer = torch.optim.Adam(task.network.parameters(), 3e-3)
+    falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 160)
+    for _ in range(160):
+        optimizer.zero_grad()
+        task.loss(task.network, seen).backward()
+        optimizer.step()
+        falling.step()
+    for name, end in score(task.separate, everywhere).items():
+        assert end > 40
+        assert end > before[name] + 15

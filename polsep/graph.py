@@ -7,7 +7,6 @@ It knows no file format; `io.onnx` writes it.
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
 
 from polsep.camera import CLIP_MARGIN

@@ -340,7 +340,7 @@ def test_every_ablation_learns(ablation: str, variant: str, batches: list[Exampl
     optimizer = torch.optim.Adam(task.network.parameters(), 1e-2)
     for _ in range(2):
         optimizer.zero_grad()
-        task.loss(task.network, seen).backward()
+        task.loss(task.network, seen, 1.0).backward()
         assert_finite(*(p.grad for p in task.network.parameters()))
         optimizer.step()
     after = task.separate(seen)
@@ -358,7 +358,7 @@ def test_gradients_are_finite_on_black_and_clipped_frames(ablation: str) -> None
         raw, mask = torch.full((1, 16, 16), min(level / 2, 1.0)), torch.full((1, 16, 16), level > 0)
         seen = task.prepare(Examples(raw, light, nothing, torch.zeros(1, 6, 16, 16), mask))
         task.network.zero_grad()
-        task.loss(task.network, seen).backward()
+        task.loss(task.network, seen, 1.0).backward()
         assert_finite(*(p.grad for p in task.network.parameters()))
 
 
@@ -438,7 +438,7 @@ def test_it_learns_a_picture_by_heart() -> None:
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 160)
     for _ in range(160):
         optimizer.zero_grad()
-        task.loss(task.network, seen).backward()
+        task.loss(task.network, seen, 1.0).backward()
         optimizer.step()
         falling.step()
     for name, end in score(task.separate, everywhere).items():

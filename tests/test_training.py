@@ -45,8 +45,19 @@ from polsep.train.command import (
 )
 from polsep.train.log import open_log, read_log
 from polsep.train.loop import Run, Schedule, train
+from polsep.train.losses import SQUARED_SPECULAR, squared_loss
 from polsep.train.stream import Examples, StreamOptions, stream_lane
-from polsep.train.tasks import VARIANTS, Seen, Task, find_rung, ladder_task, see_co_sited, see_mono, see_mosaic
+from polsep.train.tasks import (
+    SQUARED_SHARE,
+    VARIANTS,
+    Seen,
+    Task,
+    find_rung,
+    ladder_task,
+    see_co_sited,
+    see_mono,
+    see_mosaic,
+)
 from polsep.train.validation import score, score_references, validate, validation_batches
 
 STREAM = StreamOptions(batch=2, crop=32, size=64, pool=2, uses=1)
@@ -276,7 +287,7 @@ def test_a_net_learns_a_picture_by_heart(see: Callable[[Examples], Seen]) -> Non
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 200)
     for _ in range(200):
         optimizer.zero_grad()
-        task.loss(task.network, seen).backward()
+        task.loss(task.network, seen, 1.0).backward()
         optimizer.step()
         falling.step()
     for name, end in score(task.separate, everywhere).items():
@@ -293,7 +304,7 @@ def test_gradients_are_finite(rung: str) -> None:
         mask = torch.ones(1, 8, 8, dtype=torch.bool)
         seen = task.prepare(Examples(torch.zeros(1, 8, 8), light, nothing, torch.zeros(1, 6, 8, 8), mask))
         task.network.zero_grad()
-        task.loss(task.network, seen).backward()
+        task.loss(task.network, seen, 1.0).backward()
         assert_finite(*(p.grad for p in task.network.parameters()))
 
 
@@ -336,6 +347,10 @@ def test_without_tensorboard_the_extra_is_named(
         (["none"], "expected a rung of paper"),
         (["paper", "--data", "none"], "expected a variant of mosaic"),
         (["paper", "--width", "0"], "expected a width"),
+        (["joint", "--width", "0"], "expected a width"),
+        (["joint", "--blocks", "1,x"], "expected blocks per level like 1,1,2, found '1,x'"),
+        (["joint", "--ablation", "x"], "expected an ablation of none"),
+        (["joint-fast", "--data", "co-sited"], "expected a variant of mosaic, mono"),
         (["paper", "--steps", "0"], "expected at least 1 step"),
         (["paper", "--workers", "-1"], "expected at least 1 step"),
         (["paper", "--devices", "0"], "expected at least 1 step"),
@@ -360,3 +375,18 @@ def test_bad_options_are_one_line_and_leave_nothing(
     assert said in line
     assert line.count("\n") == 1
     assert [p.name for p in tmp_path.iterdir()] == ["a-file"]
+
+
+def test_the_first_eighth_minimizes_squared_errors() -> None:
+    """The paper's losses come after it; both are zero at the truth only."""
+    task = small_task()
+    seen = task.prepare(next(stream_lane(STREAM, 0, 0)))
+    _, diffuse, specular, _ = seen
+    truth = (diffuse, specular)
+    exact = (diffuse, torch.log1p(specular))
+    assert float(squared_loss(exact, truth)) == 0
+    found = (diffuse + 0.1, exact[1] - 0.2)
+    assert float(squared_loss(found, truth)) == pytest.approx(0.1**2 + SQUARED_SPECULAR * 0.2**2, rel=1e-4)
+    with torch.no_grad():
+        first, last = (float(task.loss(task.network, seen, done)) for done in (0.0, SQUARED_SHARE - 1e-9))
+        assert first == last != float(task.loss(task.network, seen, SQUARED_SHARE))

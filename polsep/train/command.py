@@ -64,7 +64,7 @@ class TrainOptions:
 
     def __post_init__(self) -> None:
         find_rung(self.rung)
-        find(VARIANTS, "variant", self.variant)
+        find(VARIANTS, "a variant", self.variant)
 
     def task(self) -> Task[Seen]:
         """The rung's."""
@@ -99,9 +99,9 @@ class JointOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        find(SIZES, "joint network", self.name)
-        find(VIEWS, "variant", self.variant)
-        find(ABLATIONS, "ablation", self.ablation)
+        find(SIZES, "a joint network", self.name)
+        find(VIEWS, "a variant", self.variant)
+        find(ABLATIONS, "an ablation", self.ablation)
         if self.size is None:
             object.__setattr__(self, "size", SIZES[self.name])
 
@@ -173,7 +173,7 @@ def _train(
 def find(known: Mapping[str, Item], kind: str, name: str) -> Item:
     """The item of that name; ValueError, with the names there are, for any other."""
     if name not in known:
-        raise ValueError(f"expected a {kind} of {', '.join(known)}, found {name!r}")
+        raise ValueError(f"expected {kind} of {', '.join(known)}, found {name!r}")
     return known[name]
 
 
@@ -212,18 +212,17 @@ def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:
 
     Raises ValueError on names and sizes that there are not.
     """
+    width = asked["width"]
     if name not in SIZES:
-        return TrainOptions(
-            name, data, Size(asked["width"] or SMALL.width, asked["levels"], asked["fold"]), asked["seed"]
-        )
-    size = SIZES[name]
+        size = Size(SMALL.width if width is None else width, asked["levels"], asked["fold"])
+        return TrainOptions(name, data, size, asked["seed"])
+    usual = SIZES[name]
     try:
-        blocks = size.blocks if asked["blocks"] is None else tuple(int(n) for n in asked["blocks"].split(","))
+        blocks = usual.blocks if asked["blocks"] is None else tuple(int(n) for n in asked["blocks"].split(","))
     except ValueError:
         raise ValueError(f"expected blocks per level like 1,1,2, found {asked['blocks']!r}") from None
-    return JointOptions(
-        name, data, ResidualSize(asked["width"] or size.width, blocks), asked["ablation"], asked["seed"]
-    )
+    larger = ResidualSize(usual.width if width is None else width, blocks)
+    return JointOptions(name, data, larger, asked["ablation"], asked["seed"])
 
 
 def plan_run(out: Path, options: Options, schedule: Schedule, workers: int, devices: int) -> Run:

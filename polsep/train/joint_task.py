@@ -62,7 +62,8 @@ def joint_task(variant: str, size: ResidualSize, ablation: Ablation) -> Task[Joi
     see, colors = VIEWS[variant]
     network = Joint(colors, size, ablation.inputs)
 
-    def loss(net: nn.Module, seen: JointSeen) -> Tensor:
+    def loss(net: nn.Module, seen: JointSeen, done: float) -> Tensor:
+        del done
         return joint_loss(net(seen.raw, find_clipped(seen.raw)), seen, ablation.goal)
 
     def separate(seen: JointSeen) -> Separation:

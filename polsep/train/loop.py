@@ -98,7 +98,7 @@ def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | Non
         while step < run.schedule.steps:
             for group in optimizer.param_groups:
                 group["lr"] = run.schedule.rate_at(step)
-            loss = task.loss(wrapped, task.prepare(_to(fabric.device, next(batches))))
+            loss = task.loss(wrapped, task.prepare(_to(fabric.device, next(batches))), step / run.schedule.steps)
             optimizer.zero_grad(set_to_none=True)
             fabric.backward(loss)
             for net in _parts(network):

@@ -10,6 +10,8 @@ from torch import Tensor
 
 #: Weights of the gradient terms of Eqs. 19 and 21.
 DIFFUSE_GRADIENT, SPECULAR_GRADIENT = 5.0, 50.0
+#: Weight of SpecUNet's squared error against DiffUNet's; of no account to networks that share nothing.
+SQUARED_SPECULAR = 10.0
 
 
 def gradient_loss(found: Tensor, truth: Tensor) -> Tensor:
@@ -27,6 +29,16 @@ def diffuse_loss(found: Tensor, diffuse: Tensor) -> Tensor:
 def proxy_diffuse(logarithm: Tensor, mixed: Tensor) -> Tensor:
     """The diffuse image that SpecUNet's log(1 + tau_s) leaves of the unseparated image ``mixed`` (Eq. 20)."""
     return mixed - torch.expm1(logarithm)
+
+
+def squared_loss(found: tuple[Tensor, Tensor], truth: tuple[Tensor, Tensor]) -> Tensor:
+    """Mean squared errors of both networks' images, tau_d and log(1 + tau_s), for the first part of a training.
+
+    Note: not in the paper. Specular light is sparse, so the losses of Eqs. 19 and 21, whose best constant is the
+    median, hold a network that starts without a first guess at no specular light at all, for 6000 steps and more.
+    """
+    diffuse, specular = truth
+    return (found[0] - diffuse).square().mean() + SQUARED_SPECULAR * (found[1] - torch.log1p(specular)).square().mean()
 
 
 def specular_loss(logarithm: Tensor, truth: tuple[Tensor, Tensor]) -> Tensor:

@@ -18,10 +18,12 @@ from polsep.refine import RUNGS, Refinement, Rung, separate_refined
 from polsep.separation import Separation
 from polsep.simulate import filter_light
 from polsep.stokes import Measurements, Stokes, measure
-from polsep.train.losses import diffuse_loss, specular_loss
+from polsep.train.losses import diffuse_loss, specular_loss, squared_loss
 from polsep.train.stream import ANGLES, Examples, StreamOptions, add_gaussian_noise, as_mosaic
 from polsep.train.variety import random_sensor
 
+#: The share of a ladder training that minimizes squared errors, `losses.squared_loss`, before the paper's losses.
+SQUARED_SHARE = 1 / 8
 #: Sony's order without colours.
 MONO = Layout(bayer=None)
 
@@ -45,13 +47,13 @@ def first_of(seen: Seen) -> Measurements:
 class Task(Generic[View]):
     """A ``network``, its ``loss`` on what ``prepare`` makes of examples, and how it ``separate``s.
 
-    ``measure``: co-registered analysers of the same views, for methods without training. ``begin``: called with the
-    stream's options before the first step.
+    The loss is told which share of the training is done. ``measure``: co-registered analysers of the same views, for
+    methods without training. ``begin``: called with the stream's options before the first step.
     """
 
     network: nn.Module
     prepare: Callable[[Examples], View]
-    loss: Callable[[nn.Module, View], Tensor]
+    loss: Callable[[nn.Module, View, float], Tensor]
     separate: Callable[[View], Separation]
     measure: Callable[[View], Measurements]
     begin: Callable[[StreamOptions], None]
@@ -121,9 +123,11 @@ def ladder_task(rung: Rung, variant: str, size: Size) -> Task[Seen]:
     seen_as = VARIANTS[variant]
     network = Refinement(rung, seen_as.colors, size)
 
-    def loss(network: nn.Module, seen: Seen) -> Tensor:
+    def loss(network: nn.Module, seen: Seen, done: float) -> Tensor:
         measurements, diffuse, specular, _ = seen
         found, logarithm = network(rung.inputs(measurements).contiguous(memory_format=torch.channels_last))
+        if done < SQUARED_SHARE:
+            return squared_loss((found, logarithm), (diffuse, specular))
         return diffuse_loss(found, diffuse) + specular_loss(logarithm, (diffuse, specular))
 
     def separate(seen: Seen) -> Separation:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import conv2d
 
 from polsep.networks import UNET64, Size, UNet
 from polsep.separation import Separation, separate_analytic
@@ -59,7 +60,9 @@ class Rung:
     """One rung: its ``inputs``, and whether diffuse and specular ``share`` one network.
 
     ``start``: weights of the inputs of a colour, of which there are so many, that make the first guess of its tau_d and
-    of its log(1 + tau_s): the analytic split where a rung sees it, else all light as diffuse.
+    of its log(1 + tau_s): the analytic split where a rung sees it, else all light as diffuse. ``basis``: an invertible
+    matrix that its networks see the inputs of a colour through, so that small differences are not lost beside what all
+    inputs share; None for the inputs as they are.
     """
 
     name: str
@@ -67,6 +70,7 @@ class Rung:
     start: tuple[tuple[float, ...], tuple[float, ...]]
     share: bool
     summary: str
+    basis: tuple[tuple[float, ...], ...] | None = None
 
     @property
     def per_color(self) -> int:
@@ -79,10 +83,24 @@ RUNGS = {
     for rung in (
         Rung("paper", analytic_inputs, ((1, 0, 0), (0, 1, 0)), False, "analytic split and angle, two networks"),
         Rung("unpolarized", unpolarized_inputs, ((1,), (0,)), False, "CNN on the unpolarized image"),
-        Rung("polarized", polarized_inputs, ((0.5,) * 4, (0,) * 4), False, "CNN on the four polarized images"),
+        Rung(
+            "polarized",
+            polarized_inputs,
+            ((0.5,) * 4, (0,) * 4),
+            False,
+            "CNN on the four polarized images",
+            ((0.25, 0.25, 0.25, 0.25), (2, 0, -2, 0), (0, 2, 0, -2), (2, -2, 2, -2)),
+        ),
         Rung("shared", analytic_inputs, ((1, 0, 0), (0, 1, 0)), True, "one network for both outputs"),
         Rung("no-angle", split_inputs, ((1, 0), (0, 1)), False, "analytic split without the angle"),
-        Rung("stokes", stokes_inputs, ((1, 0, 0), (0, 0, 0)), False, "Stokes maps instead of the analytic split"),
+        Rung(
+            "stokes",
+            stokes_inputs,
+            ((1, 0, 0), (0, 0, 0)),
+            False,
+            "Stokes maps instead of the analytic split",
+            ((0.5, 0, 0), (0, 2, 0), (0, 0, 2)),
+        ),
     )
 }
 
@@ -94,6 +112,8 @@ class Refinement(nn.Module):
     to a learned linear map of each pixel's inputs that starts at the rung's first guess. Without it a training of an
     hour on two cores stays behind the analytic split (docs/experiments.md).
     """
+
+    basis: Tensor | None
 
     def __init__(self, rung: Rung, colors: int = 3, size: Size = UNET64) -> None:
         super().__init__()
@@ -107,10 +127,15 @@ class Refinement(nn.Module):
         with torch.no_grad():
             self.linear.weight.copy_(weight.view(2 * colors, inputs, 1, 1))
         nn.init.zeros_(self.linear.bias)  # type: ignore[arg-type]
+        basis = torch.eye(rung.per_color) if rung.basis is None else torch.tensor(rung.basis)
+        basis = torch.kron(basis, torch.eye(colors))[..., None, None]
+        self.register_buffer("basis", basis if rung.basis else None, persistent=False)
 
     def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """DiffUNet's and SpecUNet's images."""
-        images = torch.cat([net(inputs) for net in self.nets], dim=1)
+        with torch.autocast(inputs.device.type, enabled=False):  # half precision would round small differences away
+            seen = inputs if self.basis is None else conv2d(inputs.float(), self.basis)
+        images = torch.cat([net(seen) for net in self.nets], dim=1)
         with torch.autocast(inputs.device.type, enabled=False):
             images = images.float() + self.linear(inputs.float())
         return images[:, : self.colors], images[:, self.colors :]

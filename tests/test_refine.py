@@ -93,3 +93,15 @@ def test_losses_vanish_at_the_truth_only() -> None:
     assert_close(diffuse_loss(diffuse, diffuse), 0.0)
     assert float(specular_loss(torch.log1p(specular), (diffuse, specular))) < 1e-4
     assert float(specular_loss(torch.log1p(specular) + 0.1, (diffuse, specular))) > 0.1
+
+
+@pytest.mark.parametrize("rung", [rung for rung in RUNGS.values() if rung.basis], ids=lambda rung: rung.name)
+def test_networks_see_inputs_through_an_invertible_basis(rung: Rung) -> None:
+    """Nothing is lost: brightness in the first map, unpolarized light in no other, colours apart."""
+    network = Refinement(rung, 3, Size(4, 1, 1))
+    assert network.basis is not None
+    matrix = network.basis[..., 0, 0]
+    assert float(torch.linalg.cond(matrix)) < 20
+    stokes = Stokes(torch.full((3, 1, 1), 0.8), torch.zeros(3, 1, 1), torch.zeros(3, 1, 1))
+    seen = matrix @ rung.inputs(measure(stokes, ANGLES)).flatten()
+    assert_close(seen, torch.cat([torch.full((3,), 0.4), torch.zeros(3 * rung.per_color - 3)]))

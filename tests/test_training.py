@@ -45,10 +45,10 @@ from polsep.train.command import (
 )
 from polsep.train.log import open_log, read_log
 from polsep.train.loop import Run, Schedule, train
-from polsep.train.losses import SQUARED_SPECULAR, squared_loss
+from polsep.train.losses import FIRST_WEIGHT, first_specular_loss
 from polsep.train.stream import Examples, StreamOptions, stream_lane
 from polsep.train.tasks import (
-    SQUARED_SHARE,
+    FIRST_SHARE,
     VARIANTS,
     Seen,
     Task,
@@ -377,16 +377,15 @@ def test_bad_options_are_one_line_and_leave_nothing(
     assert [p.name for p in tmp_path.iterdir()] == ["a-file"]
 
 
-def test_the_first_eighth_minimizes_squared_errors() -> None:
-    """The paper's losses come after it; both are zero at the truth only."""
-    task = small_task()
+@pytest.mark.parametrize("rung", RUNGS)
+def test_rungs_without_a_first_guess_begin_with_squared_errors(rung: str) -> None:
+    """For an eighth of the training, and of the specular light only; the others have the paper's losses throughout."""
+    specular = torch.rand(1, 3, 4, 4)
+    assert float(first_specular_loss(torch.log1p(specular), specular)) == 0
+    assert float(first_specular_loss(torch.log1p(specular) - 0.2, specular)) == pytest.approx(FIRST_WEIGHT * 0.04)
+    task = ladder_task(find_rung(rung), "mosaic", Size(4, 1, 1))
     seen = task.prepare(next(stream_lane(STREAM, 0, 0)))
-    _, diffuse, specular, _ = seen
-    truth = (diffuse, specular)
-    exact = (diffuse, torch.log1p(specular))
-    assert float(squared_loss(exact, truth)) == 0
-    found = (diffuse + 0.1, exact[1] - 0.2)
-    assert float(squared_loss(found, truth)) == pytest.approx(0.1**2 + SQUARED_SPECULAR * 0.2**2, rel=1e-4)
     with torch.no_grad():
-        first, last = (float(task.loss(task.network, seen, done)) for done in (0.0, SQUARED_SHARE - 1e-9))
-        assert first == last != float(task.loss(task.network, seen, SQUARED_SHARE))
+        early, late, last = (float(task.loss(task.network, seen, done)) for done in (0.0, FIRST_SHARE, 1.0))
+    assert late == last
+    assert (early == late) == (rung in ("paper", "shared", "no-angle"))

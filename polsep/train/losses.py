@@ -10,8 +10,8 @@ from torch import Tensor
 
 #: Weights of the gradient terms of Eqs. 19 and 21.
 DIFFUSE_GRADIENT, SPECULAR_GRADIENT = 5.0, 50.0
-#: Weight of SpecUNet's squared error against DiffUNet's; of no account to networks that share nothing.
-SQUARED_SPECULAR = 10.0
+#: Makes gradients of the squared error about as large as those of Eq. 21.
+FIRST_WEIGHT = 100.0
 
 
 def gradient_loss(found: Tensor, truth: Tensor) -> Tensor:
@@ -31,14 +31,13 @@ def proxy_diffuse(logarithm: Tensor, mixed: Tensor) -> Tensor:
     return mixed - torch.expm1(logarithm)
 
 
-def squared_loss(found: tuple[Tensor, Tensor], truth: tuple[Tensor, Tensor]) -> Tensor:
-    """Mean squared errors of both networks' images, tau_d and log(1 + tau_s), for the first part of a training.
+def first_specular_loss(logarithm: Tensor, specular: Tensor) -> Tensor:
+    """Mean squared error of log(1 + tau_s), for the first part of a training that has no first guess of tau_s.
 
-    Note: not in the paper. Specular light is sparse, so the losses of Eqs. 19 and 21, whose best constant is the
-    median, hold a network that starts without a first guess at no specular light at all, for 6000 steps and more.
+    Note: not in the paper. Specular light is sparse, so Eq. 21, whose best constant is the median, holds such a network
+    at no specular light at all, for 6000 steps and more.
     """
-    diffuse, specular = truth
-    return (found[0] - diffuse).square().mean() + SQUARED_SPECULAR * (found[1] - torch.log1p(specular)).square().mean()
+    return FIRST_WEIGHT * (logarithm - torch.log1p(specular)).square().mean()
 
 
 def specular_loss(logarithm: Tensor, truth: tuple[Tensor, Tensor]) -> Tensor:

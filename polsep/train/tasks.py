@@ -18,12 +18,12 @@ from polsep.refine import RUNGS, Refinement, Rung, separate_refined
 from polsep.separation import Separation
 from polsep.simulate import filter_light
 from polsep.stokes import Measurements, Stokes, measure
-from polsep.train.losses import diffuse_loss, specular_loss, squared_loss
+from polsep.train.losses import diffuse_loss, first_specular_loss, specular_loss
 from polsep.train.stream import ANGLES, Examples, StreamOptions, add_gaussian_noise, as_mosaic
 from polsep.train.variety import random_sensor
 
-#: The share of a ladder training that minimizes squared errors, `losses.squared_loss`, before the paper's losses.
-SQUARED_SHARE = 1 / 8
+#: The share of a training for which `losses.first_specular_loss` stands in for Eq. 21 on rungs without a first guess.
+FIRST_SHARE = 1 / 8
 #: Sony's order without colours.
 MONO = Layout(bayer=None)
 
@@ -126,8 +126,8 @@ def ladder_task(rung: Rung, variant: str, size: Size) -> Task[Seen]:
     def loss(network: nn.Module, seen: Seen, done: float) -> Tensor:
         measurements, diffuse, specular, _ = seen
         found, logarithm = network(rung.inputs(measurements).contiguous(memory_format=torch.channels_last))
-        if done < SQUARED_SHARE:
-            return squared_loss((found, logarithm), (diffuse, specular))
+        if done < FIRST_SHARE and not any(rung.start[1]):
+            return diffuse_loss(found, diffuse) + first_specular_loss(logarithm, specular)
         return diffuse_loss(found, diffuse) + specular_loss(logarithm, (diffuse, specular))
 
     def separate(seen: Seen) -> Separation:

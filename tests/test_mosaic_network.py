@@ -1,0 +1,157 @@
+"""Mosaics through the joint network: any orientation, strips like the whole, nothing but mosaics, foreign weights."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import torch
+from tolerances import assert_close, assert_within
+
+from polsep import mosaic_network
+from polsep.camera import Layout, Mosaic
+from polsep.demosaic import mean_cells
+from polsep.io import weights
+from polsep.io.weights import write_weights
+from polsep.joint import INPUTS, Joint
+from polsep.methods import METHODS, find_method
+from polsep.mosaic_network import cut_rows, load_joint, run_joint, separate_mosaic, takes, weights_name
+from polsep.networks import ResidualSize
+from polsep.stokes import Measurements
+
+SIZE = ResidualSize(4, (0, 1, 1))
+COLOR, MONO = Layout(), Layout(bayer=None)
+CPU = torch.device("cpu")
+
+
+def random_network(layout: Layout) -> Joint:
+    """A network whose every layer matters."""
+    torch.manual_seed(3)
+    network = Joint(layout.channels, SIZE)
+    for weight in network.parameters():
+        if weight.dim() > 1:
+            torch.nn.init.normal_(weight, std=weight[0].numel() ** -0.5)
+    return network.eval()
+
+
+def random_mosaic(layout: Layout, height: int, width: int) -> Mosaic:
+    """Light that varies slowly, with some clipped samples."""
+    generator = torch.Generator().manual_seed(5)
+    light = torch.rand(1, 1, 6, 6, generator=generator)
+    light = torch.nn.functional.interpolate(light, (height, width), mode="bicubic")[0, 0]
+    return Mosaic((light * 1.2 + 0.05 * torch.rand(height, width, generator=generator)).clamp(0, 1), layout, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
+def test_half_resolution_is_the_mean_over_cells(layout: Layout) -> None:
+    network, mosaic = random_network(layout), random_mosaic(layout, 48, 64)
+    images = [network(*(x[None, None] for x in (mosaic.linear(), mosaic.clipped())))[0]]
+    half, full = run_joint(network, mosaic, "half"), run_joint(network, mosaic, "full")
+    assert half.diffuse.shape == half.specular.shape == (layout.channels, 24, 32)
+    assert full.diffuse.shape == full.specular.shape == full.stokes.s1.shape == (layout.channels, 48, 64)
+    assert_close(half.diffuse, mean_cells(images[0].diffuse[0]).clamp(min=0))
+    assert half.doubt is not None and full.doubt is not None
+    assert half.doubt.shape == (2, 24, 32) and full.doubt.shape == (2, 48, 64)
+    assert float(half.doubt.min()) > 0
+    assert half.clipped is not None and bool(half.clipped.any()) and not bool(half.clipped.all())
+    assert bool((half.clipped | half.valid).all())
+
+
+@pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
+def test_mirrored_frames_give_mirrored_images(layout: Layout) -> None:
+    network, mosaic = random_network(layout), random_mosaic(layout, 48, 64)
+    mirrored = Mosaic(mosaic.data.flip(-1), layout.flipped_horizontal(64), 0.0, 1.0)
+    found, other = run_joint(network, mosaic, "half"), run_joint(network, mirrored, "half")
+    assert_close(other.diffuse.flip(-1), found.diffuse)
+    assert_close(other.stokes.s1.flip(-1), found.stokes.s1)
+    assert_close(-other.stokes.s2.flip(-1), found.stokes.s2)
+
+
+@pytest.mark.parametrize("resolution", ["half", "full"])
+@pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
+def test_strips_are_the_whole_frame(
+    layout: Layout, resolution: mosaic_network.Resolution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network, mosaic = random_network(layout), random_mosaic(layout, 720, 36)
+    whole = run_joint(network, mosaic, resolution)
+    monkeypatch.setattr(mosaic_network, "MOST_PIXELS", 36 * 600)
+    assert len(list(cut_rows((720, 36), 16))) > 5
+    parts = run_joint(network, mosaic, resolution)
+    assert torch.equal(parts.valid, whole.valid)
+    for name in ("diffuse", "specular", "doubt"):
+        assert_close(getattr(parts, name), getattr(whole, name), 4.0)
+
+
+def test_frames_of_a_batch_are_separated_alike() -> None:
+    network, mosaic = random_network(COLOR), random_mosaic(COLOR, 32, 40)
+    two = Mosaic(torch.stack([mosaic.data, 0.5 * mosaic.data]), COLOR, 0.0, 1.0)
+    assert_close(run_joint(network, two, "half").diffuse[0], run_joint(network, mosaic, "half").diffuse)
+
+
+def test_reach_is_within_the_margin() -> None:
+    """The shipped sizes, too, see no farther than strips overlap."""
+    network = Joint(1, ResidualSize(2, (1, 1, 2)))
+    for weight in network.parameters():
+        torch.nn.init.normal_(weight, std=0.3)
+    raw = random_mosaic(MONO, 1024, 8).data[None, None]
+    other = raw.clone()
+    other[..., 512, :] += 0.2
+    nothing = torch.zeros_like(raw, dtype=torch.bool)
+    changed = (network.half_resolution(other, nothing).diffuse - network.half_resolution(raw, nothing).diffuse).abs()
+    rows = 2 * changed.amax(dim=(0, 1, 3)).nonzero()[:, 0]
+    assert int(rows.min()) > 512 - mosaic_network.MARGIN
+    assert int(rows.max()) < 512 + mosaic_network.MARGIN
+
+
+@pytest.fixture
+def ship(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder whose files are the shipped weights."""
+
+    def find(name: str) -> Path:
+        path = tmp_path / f"{name}.safetensors"
+        if not path.exists():
+            raise ValueError("not shipped")
+        return path
+
+    monkeypatch.setattr(mosaic_network, "shipped_weights", find)
+    monkeypatch.setattr(weights, "shipped_weights", find)
+    mosaic_network._shipped_joint.cache_clear()
+    yield tmp_path
+    mosaic_network._shipped_joint.cache_clear()
+
+
+def write_network(path: Path, layout: Layout, changed: dict[str, str] | None = None) -> Joint:
+    network = random_network(layout)
+    metadata = {"method": "joint", "colors": str(layout.channels), "inputs": json.dumps(INPUTS)}
+    write_weights(path, network.state_dict(), metadata | {"size": json.dumps(asdict(SIZE))} | (changed or {}))
+    return network
+
+
+def test_methods_take_what_they_have_weights_for(ship: Path) -> None:
+    mosaic = random_mosaic(COLOR, 32, 40)
+    assert not takes("joint")(mosaic)
+    network = write_network(ship / f"{weights_name('joint', COLOR)}.safetensors", COLOR)
+    assert takes("joint")(mosaic)
+    assert not takes("joint")(random_mosaic(MONO, 32, 40))
+    assert not takes("joint")(random_mosaic(Layout(((0, 60), (120, 30))), 32, 40))
+    found = separate_mosaic("joint", "half")(mosaic)
+    assert_within(found.diffuse, run_joint(network, mosaic, "half").diffuse, 0.01)  # weights in half precision
+    co_sited = Measurements(torch.rand(4, 3, 8, 8), COLOR.angles)
+    assert not takes("joint")(co_sited)
+    with pytest.raises(ValueError, match="expected a mosaic for the method joint, found four co-sited angle images"):
+        separate_mosaic("joint", "half")(co_sited)
+
+
+def test_auto_takes_the_closed_form_where_no_network_does() -> None:
+    co_sited = Measurements(torch.rand(4, 3, 8, 8), COLOR.angles)
+    assert find_method("auto", co_sited) is METHODS["color-affine"]
+
+
+@pytest.mark.parametrize("changed", [{"colors": "1"}, {"size": "[]"}, {"size": "{}"}, {"inputs": "3"}])
+def test_weights_of_another_network_are_refused(changed: dict[str, str], tmp_path: Path) -> None:
+    write_network(tmp_path / "x.safetensors", COLOR, changed)
+    with pytest.raises(ValueError, match="expected weights of a joint network in"):
+        load_joint(tmp_path / "x.safetensors", CPU)

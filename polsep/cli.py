@@ -266,6 +266,31 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     print(path)
 
 
+@app.command()
+@click.argument("method")
+@click.option("-o", "--output", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="FILE.onnx")
+@click.option("--mono", is_flag=True, help="For cameras without colour filters.")
+@click.option("--full", is_flag=True, help="Images of the mosaic's own resolution.")
+@click.option("--weights", type=click.Path(path_type=Path), metavar="FILE", help="Of polsep train; default: shipped.")
+def export(method: str, output: Path, mono: bool, full: bool, weights: Path | None) -> None:
+    """Write joint or joint-fast as one ONNX file: raw uint16 frames in, diffuse, specular and expected error out.
+
+    It runs in onnxruntime and its like without polsep. Frames [N, H, W] are in Sony's order with sides that are
+    multiples of 4; black_level and white_level are in their units. Needs the extra export.
+    """
+    from polsep.camera import Layout
+    from polsep.graph import OUTPUT_NAMES, Graph
+    from polsep.io.onnx import write_onnx
+    from polsep.mosaic_network import find_joint
+
+    try:
+        network, metadata = find_joint(method, Layout(bayer=None) if mono else Layout(), weights)
+        write_onnx(output, Graph(network, full), OUTPUT_NAMES, metadata)
+    except ValueError as error:
+        raise click.ClickException(str(error)) from None
+    print(output)
+
+
 def _show_training(line: dict[str, Any]) -> None:
     """One line of a training's log."""
     values = (f"{name} {value:.4g}" for name, value in line.items())

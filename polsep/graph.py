@@ -2,7 +2,7 @@
 
 A graph takes a batch of raw frames ``[N, H, W]`` in Sony's order, H and W multiples of 4, with their black and white
 level, and gives ``[N, h, w, ...]`` images: what `mosaic_network.run_joint` makes of such frames, without turning them.
-It knows no file format; `io.onnx` writes it.
+It knows no file format: `io.onnx` writes it.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from polsep.camera import CLIP_MARGIN
 from polsep.joint import Joint, limit
 
-#: Names of a graph's inputs and outputs, in order.
-INPUT_NAMES = ("raw", "black_level", "white_level")
+#: Names of a graph's outputs, in order.
 OUTPUT_NAMES = ("diffuse", "specular", "error")
 
 

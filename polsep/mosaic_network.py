@@ -27,6 +27,8 @@ from polsep.stokes import Measurements, Stokes
 
 #: Raw pixels of a frame, or of a strip with its margins, that are seen at once: some 250 bytes of memory each.
 MOST_PIXELS = 6_000_000
+#: Methods of the joint network.
+NAMES = ("joint", "joint-fast")
 #: Raw rows that a strip sees beyond its own, farther than the network does (a test measures that).
 MARGIN = 256
 
@@ -49,6 +51,20 @@ def load_joint(path: Path, device: torch.device) -> Joint:
 @lru_cache(maxsize=4)
 def _shipped_joint(name: str, device: torch.device) -> Joint:
     return load_joint(shipped_weights(name), device)
+
+
+def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[Joint, dict[str, str]]:
+    """A method's network for frames of a layout, shipped or from a file of weights, and the weights' metadata.
+
+    Raises ValueError on methods without such a network, and on weights for other frames.
+    """
+    if method not in NAMES:
+        raise ValueError(f"expected a method of {', '.join(NAMES)}, found {method!r}")
+    path = path or shipped_weights(weights_name(method, layout))
+    network, metadata = load_joint(path, torch.device("cpu")), read_weights(path)[1]
+    if network.colors != layout.channels:
+        raise ValueError(f"expected weights for {layout.channels} colours in {path}, found {network.colors}")
+    return network, metadata
 
 
 def weights_name(method: str, layout: Layout) -> str:

@@ -27,6 +27,7 @@ RANKS = {
     "refine": 3,
     "orient": 3,
     "joint": 4,
+    "graph": 5,
     "layout_check": 3,
     "render": 3,
     "shapes": 3,
@@ -100,6 +101,8 @@ HOMES = {
     "trimesh": "io",
     "scipy.io": "io",
     "ray": "dataset",
+    "onnxscript": "io",
+    "onnx": "io",
     "flip_evaluator": "metrics",
     "matplotlib": "bench",
 }

@@ -1,0 +1,83 @@
+"""The joint network as an ONNX file gives what it gives in torch, for any size, without polsep."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tolerances import assert_within
+
+pytest.importorskip("onnxruntime")
+pytest.importorskip("onnxscript", reason="exporting needs the extra 'export'")
+
+import onnxruntime
+
+from polsep import cli
+from polsep.camera import Layout, Mosaic
+from polsep.io.weights import write_weights
+from polsep.joint import INPUTS, Joint
+from polsep.mosaic_network import load_joint, run_joint
+from polsep.networks import ResidualSize
+
+SIZE = ResidualSize(4, (0, 1))
+#: Rounding through two dozen layers, in white levels.
+ROUNDED = 1e-4
+
+
+def write_random(path: Path) -> Path:
+    torch.manual_seed(2)
+    network = Joint(3, SIZE)
+    for weight in network.parameters():
+        if weight.dim() > 1:
+            torch.nn.init.normal_(weight, std=weight[0].numel() ** -0.5)
+    metadata = {"method": "joint", "colors": "3", "inputs": json.dumps(INPUTS), "size": json.dumps(asdict(SIZE))}
+    write_weights(path, network.state_dict(), metadata)
+    return path
+
+
+@pytest.mark.parametrize("resolution", ["half", "full"])
+def test_exported_graphs_agree(resolution: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    weights, target = write_random(tmp_path / "w.safetensors"), tmp_path / "new" / "joint.onnx"
+    words = ["polsep", "export", "joint", "--weights", str(weights), "-o", str(target)]
+    monkeypatch.setattr(sys, "argv", words + ["--full"] * (resolution == "full"))
+    cli.main()
+    assert [path.name for path in target.parent.iterdir()] == ["joint.onnx"]
+    session = onnxruntime.InferenceSession(target, providers=["CPUExecutionProvider"])
+    network = load_joint(weights, torch.device("cpu"))
+    generator = np.random.default_rng(4)
+    for shape in ((1, 40, 64), (2, 36, 20)):
+        raw = generator.integers(100, 5000, shape).clip(max=4095).astype(np.uint16)
+        given = {"raw": raw, "black_level": np.float32([64]), "white_level": np.float32([4095])}
+        diffuse, specular, error = session.run(["diffuse", "specular", "error"], given)
+        found = run_joint(network, Mosaic(torch.from_numpy(raw), Layout(), 64.0, 4095.0), resolution)  # type: ignore[arg-type]
+        assert found.doubt is not None
+        assert_within(torch.from_numpy(diffuse).movedim(-1, -3), found.diffuse, ROUNDED)
+        assert_within(torch.from_numpy(specular).movedim(-1, -3).expand_as(found.specular), found.specular, ROUNDED)
+        step = 2 if resolution == "full" else 1
+        assert_within(torch.from_numpy(error).movedim(-1, -3), found.doubt[..., ::step, ::step], ROUNDED)
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        (["paper"], "expected a method of joint, joint-fast, found 'paper'"),
+        (["joint", "--weights", "nowhere"], "expected weights in nowhere"),
+        (["joint", "--weights", "w.safetensors", "--mono"], "expected weights for 1 colours"),
+    ],
+)
+def test_bad_requests_are_one_line_and_leave_nothing(
+    asked: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_random(Path("w.safetensors"))
+    monkeypatch.setattr(sys, "argv", ["polsep", "export", *asked, "-o", "x.onnx"])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert stopped.value.code == 2
+    assert said in capsys.readouterr().err
+    assert not Path("x.onnx").exists()

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import settings
 
+from polsep import learned, mosaic_network
 from polsep.camera import Layout, Mosaic
+from polsep.io import weights
 from polsep.methods import METHODS
 
 settings.register_profile("polsep", derandomize=True, deadline=None, max_examples=40)
@@ -38,3 +41,23 @@ def compiled() -> None:
     """Every engine's kernels are compiled on disk: programs that tests start then never stop to compile, nor say so."""
     for method in METHODS.values():
         method.engine(Mosaic(torch.eye(32), Layout(), 0.0, 1.0))
+
+
+@pytest.fixture
+def ship(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder whose files are the shipped weights."""
+
+    def find(name: str) -> Path:
+        path = tmp_path / f"{name}.safetensors"
+        if not path.exists():
+            raise ValueError("not shipped")
+        return path
+
+    for room in (weights, learned, mosaic_network):
+        monkeypatch.setattr(room, "shipped_weights", find)
+    caches = (learned._shipped_refinement, mosaic_network._shipped_joint)
+    for cache in caches:
+        cache.cache_clear()
+    yield tmp_path
+    for cache in caches:
+        cache.cache_clear()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
@@ -17,10 +17,8 @@ import torch
 from tolerances import assert_close
 from torch import Tensor
 
-from polsep import learned
 from polsep.camera import Mosaic
 from polsep.demosaic import demosaic_bilinear_half
-from polsep.io import weights
 from polsep.io.frames import ReadOptions, read_frames
 from polsep.io.weights import shipped_weights, write_weights
 from polsep.learned import PAPER, PAPER_MONO, is_shipped, load_refinement, separate_paper
@@ -43,23 +41,6 @@ def write_constant(path: Path, colors: int = 3, value: float = 0.25, changed: di
     metadata = {"method": "paper", "rung": "paper", "colors": str(colors), "size": json.dumps(asdict(SIZE))}
     write_weights(path, network.state_dict(), metadata | (changed or {}))
     return path
-
-
-@pytest.fixture
-def ship(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder whose files are the shipped weights."""
-
-    def find(name: str) -> Path:
-        path = tmp_path / f"{name}.safetensors"
-        if not path.exists():
-            raise ValueError("not shipped")
-        return path
-
-    monkeypatch.setattr(learned, "shipped_weights", find)
-    monkeypatch.setattr(weights, "shipped_weights", find)
-    learned._shipped_refinement.cache_clear()
-    yield tmp_path
-    learned._shipped_refinement.cache_clear()
 
 
 @pytest.mark.parametrize("colors", [1, 3])

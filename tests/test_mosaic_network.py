@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from tolerances import assert_close, assert_within
 from polsep import mosaic_network
 from polsep.camera import Layout, Mosaic
 from polsep.demosaic import mean_cells
-from polsep.io import weights
 from polsep.io.weights import write_weights
 from polsep.joint import INPUTS, Joint
 from polsep.methods import METHODS, find_method
@@ -104,23 +102,6 @@ def test_reach_is_within_the_margin() -> None:
     rows = 2 * changed.amax(dim=(0, 1, 3)).nonzero()[:, 0]
     assert int(rows.min()) > 512 - mosaic_network.MARGIN
     assert int(rows.max()) < 512 + mosaic_network.MARGIN
-
-
-@pytest.fixture
-def ship(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder whose files are the shipped weights."""
-
-    def find(name: str) -> Path:
-        path = tmp_path / f"{name}.safetensors"
-        if not path.exists():
-            raise ValueError("not shipped")
-        return path
-
-    monkeypatch.setattr(mosaic_network, "shipped_weights", find)
-    monkeypatch.setattr(weights, "shipped_weights", find)
-    mosaic_network._shipped_joint.cache_clear()
-    yield tmp_path
-    mosaic_network._shipped_joint.cache_clear()
 
 
 def write_network(path: Path, layout: Layout, changed: dict[str, str] | None = None) -> Joint:

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from polsep.camera import Layout, Mosaic
+from polsep.demosaic import mean_cells
 from polsep.io.weights import is_shipped, read_weights, shipped_weights
 from polsep.joint import PERIOD, Images, Joint, limit
 from polsep.networks import ResidualSize
@@ -114,6 +115,8 @@ def run_joint(network: Joint, mosaic: Mosaic, resolution: Resolution) -> Separat
     a cell clip. ``doubt``: see `Separation`. Raises ValueError on layouts that are not Sony's in any orientation.
     """
     orientation = orient(mosaic, own_order(mosaic.layout))
+    if resolution == "half" and not orientation.keeps_cells:  # then the network's cells are not the frame's
+        return _halve(run_joint(network, mosaic, "full"))
     raw, clipped = (orientation.turn(x) for x in (mosaic.linear().float(), mosaic.clipped()))
     batch, (height, width) = raw.shape[:-2], raw.shape[-2:]
     raw, clipped = (x.reshape(-1, 1, height, width) for x in (raw, clipped))
@@ -127,6 +130,18 @@ def run_joint(network: Joint, mosaic: Mosaic, resolution: Resolution) -> Separat
     joined = (torch.cat(strips, dim=-2) for strips in zip(*parts, strict=True))
     images = [image.reshape(*batch, *image.shape[1:]) for image in joined]
     return _as_separation(images, _cells(clipped).reshape(*batch, 2, height // 2, width // 2), orientation)
+
+
+def _halve(found: Separation) -> Separation:
+    """Means over 2x2 cells of a separation at full resolution; masks hold where one of the four does not."""
+    diffuse, specular, valid = (
+        mean_cells(found.diffuse),
+        mean_cells(found.specular),
+        mean_cells(found.valid.float()) == 1,
+    )
+    clipped = None if found.clipped is None else mean_cells(found.clipped.float()) > 0
+    doubt = None if found.doubt is None else mean_cells(found.doubt)
+    return Separation(diffuse, specular, valid, found.stokes.map(mean_cells), clipped=clipped, doubt=doubt)
 
 
 def cut_rows(size: tuple[int, int], grid: int) -> Iterator[tuple[int, int]]:

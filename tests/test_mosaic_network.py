@@ -18,6 +18,7 @@ from polsep.joint import INPUTS, Joint
 from polsep.methods import METHODS, find_method
 from polsep.mosaic_network import cut_rows, load_joint, run_joint, separate_mosaic, takes, weights_name
 from polsep.networks import ResidualSize
+from polsep.orient import orient
 from polsep.stokes import Measurements
 
 SIZE = ResidualSize(4, (0, 1, 1))
@@ -66,6 +67,17 @@ def test_mirrored_frames_give_mirrored_images(layout: Layout) -> None:
     assert_close(other.diffuse.flip(-1), found.diffuse)
     assert_close(other.stokes.s1.flip(-1), found.stokes.s1)
     assert_close(-other.stokes.s2.flip(-1), found.stokes.s2)
+
+
+def test_mono_cells_of_other_frames_are_their_own() -> None:
+    """A mono frame cropped by a column has its cells half a cell on: half resolution follows them."""
+    layout = MONO.rolled(0, 1)
+    network, mosaic = random_network(MONO), random_mosaic(layout, 48, 64)
+    assert not orient(mosaic, MONO).keeps_cells
+    half, full = run_joint(network, mosaic, "half"), run_joint(network, mosaic, "full")
+    assert half.diffuse.shape == (1, 24, 32)
+    assert_close(half.diffuse, mean_cells(full.diffuse))
+    assert half.clipped is not None and half.clipped.shape == half.valid.shape == (24, 32)
 
 
 @pytest.mark.parametrize("resolution", ["half", "full"])

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,10 +21,8 @@ from polsep.train.joint_views import JointSeen
 from polsep.train.log import curve_of, read_log, references_of
 from polsep.train.loop import Run, Schedule, train
 from polsep.train.stream import StreamOptions
-from polsep.train.tasks import VARIANTS, Seen, Task, find_rung, ladder_task
+from polsep.train.tasks import VARIANTS, Seen, Task, find, find_rung, ladder_task
 from polsep.train.validation import validate, validation_batches
-
-Item = TypeVar("Item")
 
 #: What a laptop trains in an hour or two.
 SMALL = Size()
@@ -168,13 +166,6 @@ def _train(
     halves = {name: value.cpu().half().float() for name, value in average.items()}
     scores = validate(anything, halves, [task.prepare(batch) for batch in validation_batches(run.stream)])
     return halves, scores, count_parameters(task.network)
-
-
-def find(known: Mapping[str, Item], kind: str, name: str) -> Item:
-    """The item of that name; ValueError, with the names there are, for any other."""
-    if name not in known:
-        raise ValueError(f"expected {kind} of {', '.join(known)}, found {name!r}")
-    return known[name]
 
 
 def digest_data(stream: StreamOptions) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -30,6 +30,7 @@ MONO = Layout(bayer=None)
 #: Co-registered analysers, true diffuse and specular ``[B, C, h, w]`` and the mask ``[B, h, w]`` of a batch.
 Seen = tuple[Measurements, Tensor, Tensor, Tensor]
 #: What a network sees of a batch: whatever comes first, then truth and mask as those of `Seen`.
+Item = TypeVar("Item")
 View = TypeVar("View", bound=tuple[Any, ...])
 
 
@@ -138,6 +139,11 @@ def ladder_task(rung: Rung, variant: str, size: Size) -> Task[Seen]:
 
 def find_rung(name: str) -> Rung:
     """The rung of that name; ValueError, with the names there are, for any other."""
-    if name not in RUNGS:
-        raise ValueError(f"expected a rung of {', '.join(RUNGS)}, found {name!r}")
-    return RUNGS[name]
+    return find(RUNGS, "a rung", name)
+
+
+def find(known: Mapping[str, Item], kind: str, name: str) -> Item:
+    """The item of that name; ValueError, with the names there are, for any other."""
+    if name not in known:
+        raise ValueError(f"expected {kind} of {', '.join(known)}, found {name!r}")
+    return known[name]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -329,10 +330,10 @@ def test_readme_fills_both_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_tables_of_the_page_are_the_results() -> None:
-    """docs/paper.md is what the committed results make of it, and every picture on it is there."""
+    """docs/paper.md is what the committed results make of it, and every picture that it shows is there."""
     page = (ROOT / "docs/paper.md").read_text(encoding="utf-8")
     assert page.count("<!-- table: paper/") >= 6
     assert fill_tables(page, ROOT / "results") == page
-    for name in ("fig3a", "fig3b", "fig4", "fig5", "fig5-light", "fig6"):
-        assert f"images/paper/{name}.jpg" in page
-        assert (ROOT / f"docs/images/paper/{name}.jpg").is_file()
+    shown = re.findall(r"!\[[^]]*\]\(([^)]+)\)", page)
+    assert len(shown) >= 6
+    assert all((ROOT / "docs" / name).is_file() for name in shown)

@@ -29,8 +29,8 @@ MONO = Layout(bayer=None)
 
 #: Co-registered analysers, true diffuse and specular ``[B, C, h, w]`` and the mask ``[B, h, w]`` of a batch.
 Seen = tuple[Measurements, Tensor, Tensor, Tensor]
-#: What a network sees of a batch: whatever comes first, then truth and mask as those of `Seen`.
 Item = TypeVar("Item")
+#: What a network sees of a batch: whatever comes first, then truth and mask as those of `Seen`.
 View = TypeVar("View", bound=tuple[Any, ...])
 
 

@@ -14,7 +14,7 @@ pytest.importorskip("embreex")
 
 from polsep.camera import IMX250
 from polsep.materials import Materials, random_materials
-from polsep.raycast import MeshScene
+from polsep.raycast import MeshScene, View, find_view
 from polsep.train.variety import (
     BITS,
     BITS_SHARES,
@@ -25,9 +25,12 @@ from polsep.train.variety import (
     GREY_SHARE,
     MAGNIFICATIONS,
     PLAIN_SHARE,
+    RELIEF_SHARE,
+    RELIEF_TILTS,
     random_sensor,
     relight,
     vary_materials,
+    vary_normals,
     vary_shot,
 )
 from polsep.views import LEAST_LIT, Shot, lit_share, random_shot, seeded_shape
@@ -67,6 +70,32 @@ def test_shots_keep_place_light_and_exposure(shots: list[Shot], varied: list[Sho
         assert after.clip == before.clip
         assert after.camera.position == before.camera.position
         assert BLURS[0] <= after.blur <= BLURS[1]
+
+
+def normals_of(view: View) -> Tensor:
+    return torch.cat([band.hits.normal[..., 0] for band in view.bands], dim=1)
+
+
+def test_relief_tilts_normals_and_moves_nothing(shape: MeshScene, shots: list[Shot]) -> None:
+    """Half of the views keep their very normals; in the others they stay of length 1, tilt, and still face the eye."""
+    view = find_view(shape, shots[0].camera, (48, 48))
+    smooth = normals_of(view).clone()
+    eye = torch.tensor(view.camera.position, dtype=torch.float32)[:, None]
+    rough = [vary_normals(view, seeded(k)) for k in range(40)]
+    expect_share(sum(other is not view for other in rough), 40, RELIEF_SHARE)
+    assert torch.equal(normals_of(view), smooth)
+    for other in rough:
+        found = normals_of(other)
+        assert_close(found.norm(dim=0), torch.ones(found.shape[1]))
+        for before, after in zip(view.bands, other.bands, strict=True):
+            assert after.hits.position is before.hits.position
+            assert after.hits.above is before.hits.above
+        toward = eye - torch.cat([band.hits.position[..., 0] for band in other.bands], dim=1)
+        turned = (found - smooth).abs().amax(dim=0) > 0
+        assert bool(((found * toward).sum(dim=0) > 0)[turned].all())
+        if other is not view:
+            tilt = torch.tan(torch.acos((found * smooth).sum(dim=0).clamp(-1, 1)))[turned].median()
+            assert RELIEF_TILTS[0] / 4 < float(tilt) < RELIEF_TILTS[1] * 2
 
 
 def test_shots_keep_the_size_or_enlarge(shots: list[Shot], varied: list[Shot]) -> None:

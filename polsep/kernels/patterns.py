@@ -152,7 +152,7 @@ def _fade(t: Any) -> Any:
 
 
 @_strict
-def _gradient_noise(x: Any, y: Any, z: Any, seed: Any) -> Any:
+def gradient_noise(x: Any, y: Any, z: Any, seed: Any) -> Any:
     """`textures.gradient_noise` at one point."""
     i, j, k = _floor(x), _floor(y), _floor(z)
     x, y, z = x - np.float32(i), y - np.float32(j), z - np.float32(k)
@@ -185,7 +185,7 @@ def _octave_noise(f: Any, count: int, seed: Any, octaves: int) -> None:
     scale, gain = ONE, _NOISE_GAIN
     for _ in range(octaves):
         for n in range(count):
-            noise = _gradient_noise(f[_X + n] * scale, f[_Y + n] * scale, f[_Z + n] * scale, seed)
+            noise = gradient_noise(f[_X + n] * scale, f[_Y + n] * scale, f[_Z + n] * scale, seed)
             f[_NOISE + n] = f[_NOISE + n] + gain * noise
         scale, gain, seed = scale * _LACUNARITY, gain * _GAIN, np.uint32(seed + _STEP)
 

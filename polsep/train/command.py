@@ -34,6 +34,7 @@ DATA_MODULES = (
     "kernels/patterns.py",
     "kernels/raster.py",
     "kernels/rays.py",
+    "kernels/relief.py",
     "kernels/shading.py",
     "kernels/shadows.py",
     "materials.py",

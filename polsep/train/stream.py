@@ -27,7 +27,7 @@ from polsep.raycast import MeshScene, find_view, light_view, shade_view
 from polsep.render import Scene
 from polsep.simulate import HEADROOM, blur, filter_light
 from polsep.stokes import Stokes
-from polsep.train.variety import random_sensor, relight, vary_materials, vary_shot
+from polsep.train.variety import random_sensor, relight, vary_materials, vary_normals, vary_shot
 from polsep.views import LEAST_LEVEL, random_shot, scene_seed, seeded_shape
 
 #: Views of a shape, and lights with materials of their own under which each is seen.
@@ -171,7 +171,7 @@ def pool_scenes(options: StreamOptions, lane: int, first: int) -> Iterator[Poole
 def _look_at(shape: MeshScene, options: StreamOptions, generator: torch.Generator) -> list[Pooled]:
     """One view of a shape under several lights, with other materials under each."""
     shot = vary_shot(shape, random_shot(shape, generator), generator)
-    view = find_view(shape, shot.camera, (options.size, options.size), options.samples)
+    view = vary_normals(find_view(shape, shot.camera, (options.size, options.size), options.samples), generator)
     light = shot.light
     looks = []
     for _ in range(LOOKS):

@@ -1,4 +1,4 @@
-"""What training examples have beyond `polsep.views`: close-ups, grey and plain objects, softer lenses, other cameras.
+"""What training examples have beyond `polsep.views`: close-ups, relief, grey and plain objects, lenses, other cameras.
 
 Whoever uses a trained network photographs more than objects that fill the frame, by one camera. Draws take a generator.
 """
@@ -8,13 +8,15 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from polsep.camera import IMX250, Sensor
+from polsep.kernels.relief import Relief, roughen_normals
 from polsep.materials import Materials
-from polsep.raycast import MeshScene, find_view, light_view
-from polsep.render import PointLight
+from polsep.raycast import MeshScene, View, find_view, light_view
+from polsep.render import PointLight, pixel_side
 from polsep.views import LEAST_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
 
 #: Share of the views that show a part of the object, and how many times larger than the whole, log-uniform.
@@ -29,6 +31,10 @@ BLURS = (0.3, 1.2)
 FULL_WELLS = (2_600.0, 21_000.0)
 #: Bits of the converter, and their shares.
 BITS, BITS_SHARES = (8, 10, 12), (0.15, 0.15, 0.7)
+#: Share of the views with fine relief. Pixels along its largest cells and tangent of its tilt, log-uniform; octaves at
+#: most, while the finest cells are no smaller than the limit.
+RELIEF_SHARE, RELIEF_PIXELS, RELIEF_TILTS = 0.5, (3.0, 60.0), (0.05, 0.6)
+MOST_OCTAVES, LEAST_CELL = 3, 2.5
 #: Lights are drawn anew, at most so many times, while they leave most of a view dark.
 MOST_DRAWS = 10
 
@@ -57,6 +63,32 @@ def relight(shape: MeshScene, shot: Shot, generator: torch.Generator) -> PointLi
         if lit_share(shape, replace(shot, light=light)) >= LEAST_LIT:
             break
     return light
+
+
+def vary_normals(view: View, generator: torch.Generator) -> View:
+    """The same view, or one of a surface with fine relief: its normals are tilted, nothing else differs."""
+    wanted, width, tilt, octaves = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
+    seed = int(torch.randint(2**31, (1,), generator=generator))
+    positions = [band.hits.position[..., 0] for band in view.bands]
+    if wanted >= RELIEF_SHARE or not any(p.shape[1] for p in positions):
+        return view
+    eye = torch.tensor(view.camera.position, dtype=torch.float32)
+    distance = float((torch.cat(positions, dim=1) - eye[:, None]).norm(dim=0).median())
+    pixels = RELIEF_PIXELS[0] * (RELIEF_PIXELS[1] / RELIEF_PIXELS[0]) ** width
+    most = 1 + int(math.log2(pixels / LEAST_CELL))
+    relief = Relief(
+        frequency=1 / (pixels * distance * pixel_side(view.camera, view.size[0])),
+        strength=RELIEF_TILTS[0] * (RELIEF_TILTS[1] / RELIEF_TILTS[0]) ** tilt,
+        octaves=min(most, 1 + int(MOST_OCTAVES * octaves)),
+        seed=seed,
+    )
+    bands = []
+    for band in view.bands:
+        normals = np.array(band.hits.normal[..., 0].numpy(), order="C")
+        roughen_normals(band.hits.position[..., 0].numpy(), normals, eye.numpy(), relief)
+        hits = replace(band.hits, normal=torch.from_numpy(normals)[..., None])
+        bands.append(replace(band, hits=hits))
+    return replace(view, bands=tuple(bands))
 
 
 def vary_materials(materials: Materials, generator: torch.Generator) -> Materials:

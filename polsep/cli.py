@@ -237,6 +237,7 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 @click.option("--seed", type=int, default=0, metavar="N", help="Of the weights and of the data.")
 @click.option("--workers", type=int, default=1, metavar="N", help="Processes that render, per device.")
 @click.option("--devices", type=int, default=1, metavar="N", help="GPUs, where there are any.")
+@click.option("--start", type=click.Path(path_type=Path), metavar="FILE", help="Weights to begin with.")
 @click.option("--precision", default="bf16-mixed", metavar="NAME", help="bf16-mixed or 32-true.")
 def train(rung: str, output: Path, data: str, **options: Any) -> None:
     """Train joint, joint-fast or a rung of the paper's ladder: paper, unpolarized, polarized, shared, no-angle, stokes.
@@ -251,7 +252,8 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     """
     try:
         from polsep.train.command import choose_options, plan_run, train_weights
-        from polsep.train.loop import Schedule
+        from polsep.train.loop import Run, Schedule
+        from polsep.train.stream import StreamOptions
     except ModuleNotFoundError as error:
         raise click.ClickException(
             f"expected the extra 'train' (pip install 'polsep[train]'), found no {error.name}"
@@ -259,7 +261,8 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     try:
         asked = choose_options(rung, data, options)
         schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])
-        run = plan_run(output, asked, schedule, options["workers"], options["devices"])
+        run = Run(output, "", StreamOptions(), schedule, options["workers"], options["devices"], options["start"])
+        run = plan_run(run, asked)
         path = train_weights(asked, run, _show_training)
     except ValueError as error:
         raise click.ClickException(str(error)) from None

@@ -230,7 +230,9 @@ def plan(given: dict[str, Any]) -> tuple[Options, Run]:
     """As `polsep train` plans."""
     options = choose_options(given["rung"], given["data"], given)
     schedule = Schedule(given["steps"], given["rate"], precision=given["precision"])
-    return options, plan_run(Path("runs") / given["output"], options, schedule, given["workers"], given["devices"])
+    out = Path("runs") / given["output"]
+    run = Run(out, "", StreamOptions(), schedule, given["workers"], given["devices"], given["start"])
+    return options, plan_run(run, options)
 
 
 def test_mono_sees_the_green_light_behind_every_pixel() -> None:
@@ -266,6 +268,31 @@ def test_foreign_checkpoint_is_refused(tmp_path: Path) -> None:
         read_checkpoint(path)
 
 
+def test_networks_are_shown_samples_as_they_are(tmp_path: Path) -> None:
+    """bfloat16 has 8 bits, a sample has 12: what layers round, the data must not have lost before."""
+    task, shown = small_task(), list[Tensor]()
+    task.network.register_forward_pre_hook(lambda _, given: shown.append(given[0].clone()))
+    expected = task.prepare(next(stream_lane(STREAM, 0, 0)))
+    train(task, run_in(tmp_path, replace(SCHEDULE, steps=1, precision="bf16-mixed")), lambda _: None)
+    maps = find_rung("paper").inputs(expected[0])
+    assert any(torch.equal(x, maps) for x in shown)
+
+
+def test_a_training_begins_with_given_weights(tmp_path: Path) -> None:
+    """Without a step's worth of learning rate, what comes out is what went in; others are refused by name."""
+    options = TrainOptions("paper", "co-sited", Size(4, 1, 1), seed=5)
+    run = replace(run_in(tmp_path / "first"), workers=0)
+    first = train_weights(options, run, lambda _: None)
+    after = replace(run, out=tmp_path / "second", start=first, schedule=replace(SCHEDULE, steps=1, rate=1e-12))
+    second = train_weights(replace(options, seed=6), after, lambda _: None)
+    before, found = read_weights(first)[0], read_weights(second)[0]
+    assert all(torch.allclose(before[name], found[name], rtol=1e-3, atol=1e-6) for name in before)
+    assert read_weights(second)[1]["command"].endswith("--start paper-co-sited.safetensors")
+    other = replace(run, out=tmp_path / "third", start=first)
+    with pytest.raises(ValueError, match="expected weights of the network to be trained in .*, found those of another"):
+        train_weights(replace(options, size=Size(8, 1, 1)), other, lambda _: None)
+
+
 def test_rate_warms_up_and_falls_as_a_cosine() -> None:
     schedule = Schedule(steps=1000, rate=2.0, warm_up=100)
     assert schedule.rate_at(0) == pytest.approx(0.02)
@@ -277,7 +304,7 @@ def test_rate_warms_up_and_falls_as_a_cosine() -> None:
 @pytest.mark.parametrize("see", [see_mosaic, see_co_sited])
 def test_a_net_learns_a_picture_by_heart(see: Callable[[Examples], Seen]) -> None:
     """One 32 x 32 example, 200 steps: both outputs reach 40 dB, 15 dB above the analytic split they start at."""
-    examples = next(itertools.islice(stream_lane(replace(STREAM, batch=1), 0, 0), 2, None))
+    examples = next(itertools.islice(stream_lane(replace(STREAM, batch=1), 0, 0), 3, None))
     torch.manual_seed(0)
     task = ladder_task(find_rung("paper"), "mosaic", Size(12, 2, 1))
     seen = see(examples)

@@ -6,7 +6,7 @@ import hashlib
 import json
 import shlex
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -195,6 +195,7 @@ def describe_command(options: Options, run: Run) -> str:
         "precision": schedule.precision,
         "output": run.out.name,
     }
+    asked |= {"start": run.start.name} if run.start else {}
     words = [word for name, value in asked.items() for word in (f"--{name}", str(value))]
     return shlex.join(["polsep", "train", options.name, *words])
 
@@ -217,17 +218,18 @@ def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:
     return JointOptions(name, data, larger, asked["ablation"], asked["seed"])
 
 
-def plan_run(out: Path, options: Options, schedule: Schedule, workers: int, devices: int) -> Run:
-    """Where and how: a training of ``options`` that writes into ``out``.
+def plan_run(run: Run, options: Options) -> Run:
+    """The same with what is trained and the stream that it needs.
 
     Raises ValueError on what would only fail later, or train nothing.
     """
+    out, schedule = run.out, run.schedule
     if out.exists() and not out.is_dir():
         raise ValueError(f"expected a directory to write into, found a file: {out}")
-    if min(schedule.steps, devices, workers + 1) < 1:
-        found = f"steps {schedule.steps}, devices {devices}, workers {workers}"
+    if min(schedule.steps, run.devices, run.workers + 1) < 1:
+        found = f"steps {schedule.steps}, devices {run.devices}, workers {run.workers}"
         raise ValueError(f"expected at least 1 step, 1 device and 0 workers, found {found}")
     if schedule.precision not in PRECISIONS:
         raise ValueError(f"expected a precision of {', '.join(PRECISIONS)}, found {schedule.precision!r}")
     stream = StreamOptions(seed=options.seed, crop=options.crop)
-    return Run(out, json.dumps(asdict(options)), stream, schedule, workers, devices)
+    return replace(run, what=json.dumps(asdict(options)), stream=stream)

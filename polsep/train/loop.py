@@ -16,10 +16,12 @@ from typing import Any
 
 import torch
 from lightning_fabric import Fabric
+from lightning_fabric.plugins import MixedPrecision
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from polsep.io.checkpoints import read_checkpoint, write_checkpoint
+from polsep.io.weights import read_weights
 from polsep.kernels.threads import set_threads
 from polsep.train.log import Report, open_log
 from polsep.train.stream import Examples, ExampleStream, StreamOptions
@@ -62,7 +64,10 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Run:
-    """Where a training writes, ``what`` it trains, on which data; ``workers`` render, ``devices`` train."""
+    """Where a training writes, ``what`` it trains, on which data; ``workers`` render, ``devices`` train.
+
+    ``start``: a file of weights to begin with, instead of random ones.
+    """
 
     out: Path
     what: str
@@ -70,6 +75,18 @@ class Run:
     schedule: Schedule
     workers: int = 1
     devices: int = 1
+    start: Path | None = None
+
+
+class ExactInputs(MixedPrecision):
+    """Mixed precision in which what a network is given stays as it is.
+
+    Lightning rounds it to bfloat16, whose steps at white are 16 of a 12-bit camera's.
+    """
+
+    def convert_input(self, data: Any) -> Any:
+        """The data themselves; autocast rounds where a layer computes in bfloat16."""
+        return data
 
 
 def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | None:
@@ -78,13 +95,13 @@ def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | Non
     ``report`` is called with every line of the log. Of several processes only the first one writes and reports, and
     the others return None. Raises ValueError when the checkpoint is of another training.
     """
-    fabric = Fabric(accelerator="auto", devices=run.devices, precision=run.schedule.precision)  # type: ignore[arg-type]
+    fabric = _fabric(run)
     fabric.launch()
     network = task.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, betas=BETAS, weight_decay=WEIGHT_DECAY)
     state = read_checkpoint(run.out / "checkpoint.pt")
     if state is None:
-        task.begin(run.stream)
+        task.begin(run.stream) if run.start is None else begin_at(run.start, network)
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
     step = _restore(state, run, (network, optimizer, average))
     wrapped, wrapped_optimizer = fabric.setup(network, optimizer)
@@ -118,13 +135,31 @@ def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | Non
     return average if fabric.is_global_zero else None
 
 
+def _fabric(run: Run) -> Fabric:
+    """Where it trains, and how precisely."""
+    if run.schedule.precision != "bf16-mixed":
+        return Fabric(devices=run.devices, precision=run.schedule.precision)  # type: ignore[arg-type]
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    return Fabric(accelerator=device, devices=run.devices, plugins=[ExactInputs("bf16-mixed", device)])
+
+
+def begin_at(path: Path, network: nn.Module) -> None:
+    """Fill in a network's weights from a file. Raises ValueError when they are of another one."""
+    tensors, _ = read_weights(path)
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError:
+        raise ValueError(f"expected weights of the network to be trained in {path}, found those of another") from None
+
+
 def _to(device: torch.device, examples: Examples) -> Examples:
     return Examples(*(x.to(device) for x in examples))
 
 
 def _describe(run: Run) -> str:
     """What must be the same for a checkpoint to go on."""
-    described = {"what": run.what, "stream": asdict(run.stream), "schedule": asdict(run.schedule)}
+    described: dict[str, Any] = {"what": run.what, "stream": asdict(run.stream), "schedule": asdict(run.schedule)}
+    described |= {"start": run.start.name} if run.start else {}
     return json.dumps(described | {"workers": run.workers, "devices": run.devices})
 
 

@@ -19,7 +19,7 @@ from polsep.networks import ResidualSize, Size, count_parameters
 from polsep.train.joint_task import ABLATIONS, SIZES, VIEWS, joint_task
 from polsep.train.joint_views import JointSeen
 from polsep.train.log import curve_of, read_log, references_of
-from polsep.train.loop import Run, Schedule, train
+from polsep.train.loop import Run, train
 from polsep.train.stream import StreamOptions
 from polsep.train.tasks import VARIANTS, Seen, Task, find, find_rung, ladder_task
 from polsep.train.validation import validate, validation_batches

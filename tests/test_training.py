@@ -289,9 +289,7 @@ def test_a_training_begins_with_given_weights(tmp_path: Path) -> None:
     assert all(torch.allclose(before[name], found[name], rtol=1e-3, atol=1e-6) for name in before)
     assert read_weights(second)[1]["command"].endswith("--start paper-co-sited.safetensors")
     other = replace(run, out=tmp_path / "third", start=first)
-    with pytest.raises(
-        ValueError, match=r"expected weights of the network to be trained in .*, found those of another"
-    ):
+    with pytest.raises(ValueError, match=r"expected weights of the network .*, found those of another"):
         train_weights(replace(options, size=Size(8, 1, 1)), other, lambda _: None)
 
 

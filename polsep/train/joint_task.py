@@ -23,7 +23,7 @@ from polsep.train.stream import StreamOptions, stream_lane
 from polsep.train.tasks import Task
 
 #: The shipped networks: the best one at two frames a second on two cores, and the real-time one.
-SIZES = {"joint": ResidualSize(48, (1, 1, 2)), "joint-fast": ResidualSize(16, (0, 1, 1))}
+SIZES = {"joint": ResidualSize(48, (0, 1, 1)), "joint-fast": ResidualSize(16, (0, 1, 1))}
 #: Batches that the filter is fitted to, from a pool of so many scenes, of a lane that no worker has.
 FIT_BATCHES, FIT_POOL, FIT_LANE = 60, 24, 120
 #: Light around below which a pixel says nothing about the filter, and what is added to that light.

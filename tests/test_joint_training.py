@@ -41,7 +41,16 @@ from polsep.train.joint_losses import (
     paper_difference,
     sample_misfit,
 )
-from polsep.train.joint_task import ABLATIONS, FIT_LANE, SIZES, VIEWS, fit_filter, joint_task
+from polsep.train.joint_task import (
+    ABLATIONS,
+    FIT_LANE,
+    FIT_REACH,
+    SIZES,
+    VIEWS,
+    fit_filter,
+    joint_task,
+    reach_of_filter,
+)
 from polsep.train.joint_views import JointSeen, find_clipped, see_raw, see_raw_mono
 from polsep.train.loop import Run, Schedule, train
 from polsep.train.losses import diffuse_loss
@@ -262,10 +271,34 @@ def known_views(layout: Layout, weight: Tensor) -> list[JointSeen]:
     return views
 
 
-@pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
-def test_the_fit_recovers_a_known_filter(layout: Layout) -> None:
+def known_filter(layout: Layout) -> Tensor:
+    """Not the bilinear one; it sees what a fitted one does."""
     weight = bilinear_filter(layout)
     weight = weight + 0.1 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(4))
+    return weight * reach_of_filter(layout.channels).view_as(weight)
+
+
+@pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
+def test_the_filter_sees_raw_samples_within_its_reach(layout: Layout) -> None:
+    """Sample by sample: one bright sample changes the pixels and cells no farther than `FIT_REACH` from it."""
+    weight = reach_of_filter(layout.channels).float().view(-1, 16, 3, 3)
+    c = layout.channels
+    for row, col in ((12, 12), (13, 14), (15, 15)):
+        raw = torch.zeros(1, 1, 28, 28)
+        raw[..., row, col] = 1
+        s0, s1, s2 = conv2d(pad(pixel_unshuffle(raw, 4), (1,) * 4), weight).split((16 * c, 4 * c, 4 * c), dim=1)
+        for image, size in ((pixel_shuffle(s0, 4), 1), (pixel_shuffle(s1, 2), 2), (pixel_shuffle(s2, 2), 2)):
+            reached = image[0].repeat_interleave(size, -1).repeat_interleave(size, -2) > 0
+            rows, cols = (torch.arange(28) // size * size for _ in range(2))
+            near = [
+                (place - FIT_REACH <= x) & (x < place + size + FIT_REACH) for place, x in ((rows, row), (cols, col))
+            ]
+            assert torch.equal(reached, (near[0][:, None] & near[1]).expand(c, -1, -1))
+
+
+@pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
+def test_the_fit_recovers_a_known_filter(layout: Layout) -> None:
+    weight = known_filter(layout)
     found = fit_filter(known_views(layout, weight))
     assert found.shape == weight.shape and found.dtype == torch.float32
     assert float((found - weight).abs().max()) < 0.01
@@ -274,8 +307,7 @@ def test_the_fit_recovers_a_known_filter(layout: Layout) -> None:
 
 def test_samples_near_clipped_ones_say_nothing_about_the_filter() -> None:
     """Samples raised to white, whose truth does not follow them, leave what the others say."""
-    weight = bilinear_filter(COLOR)
-    weight = weight + 0.1 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(4))
+    weight = known_filter(COLOR)
     views = known_views(COLOR, weight)
     clipped = torch.rand(views[0].raw.shape, generator=torch.Generator().manual_seed(6)) < 0.002
     spoilt = [view._replace(raw=torch.where(clipped, 1.0, view.raw)) for view in views]

@@ -28,6 +28,9 @@ SIZES = {"joint": ResidualSize(48, (0, 1, 1)), "joint-fast": ResidualSize(16, (0
 FIT_BATCHES, FIT_POOL, FIT_LANE = 60, 24, 120
 #: Light around below which a pixel says nothing about the filter, and what is added to that light.
 LEAST_FIT, FIT_FLOOR = 0.01, 0.02
+#: Raw pixels that the filter reaches beyond a pixel or cell: what lies farther would improve s0 by 2 %, polarization
+#: by 1 %, at more than twice the cost (docs/experiments.md).
+FIT_REACH = 3
 #: How firmly weights that the examples leave open are held at bilinear ones, against the samples' own power.
 RIDGE = 1e-4
 
@@ -88,7 +91,8 @@ def fit_filter(views: Iterable[JointSeen]) -> Tensor:
     """The packed filter, as `joint.bilinear_filter`, that is off least on examples in the mean square.
 
     Errors count relative to the light around, and only where nothing clips: it is a Wiener filter for scenes like
-    these, colours and polarization included. Raises ValueError without examples, or without light on objects in them.
+    these, colours and polarization included, of samples within `FIT_REACH`. Raises ValueError without examples, or
+    without light on objects in them.
     """
     start, power, goal = torch.zeros(0), torch.zeros(0), torch.zeros(0)
     for view in views:
@@ -100,9 +104,28 @@ def fit_filter(views: Iterable[JointSeen]) -> Tensor:
         goal += seen.T @ wanted
     if not bool(power.any()):
         raise ValueError("expected examples to fit a filter to, found none")
-    hold = RIDGE * power.diagonal().mean() * torch.eye(len(start), dtype=torch.float64)
-    weights: Tensor = torch.linalg.solve(power + hold, goal + hold @ start)
+    hold = RIDGE * power.diagonal().mean()
+    weights, near = torch.zeros_like(start), reach_of_filter(start.shape[1] // 24).T
+    # Outputs that see the same samples share a system.
+    for sees in torch.unique(near, dim=1).unbind(dim=1):
+        inputs, outputs = sees.nonzero()[:, 0], (near == sees[:, None]).all(dim=0).nonzero()[:, 0]
+        own = torch.meshgrid(inputs, outputs, indexing="ij")
+        system = power[inputs][:, inputs] + hold * torch.eye(len(inputs), dtype=torch.float64)
+        weights[own] = torch.linalg.solve(system, goal[own] + hold * start[own])
     return weights.T.float().reshape(-1, 16, 3, 3)
+
+
+def reach_of_filter(colors: int) -> Tensor:
+    """Which of the packed samples a packed filter uses: bool ``[24 C, 144]``, within `FIT_REACH` of what it makes."""
+    offsets = torch.arange(-4, 8)  # raw rows, or columns, of the 3 x 3 packed pixels around
+    places = []
+    for count in (4, 2):  # full-resolution pixels, half-resolution cells
+        first = torch.arange(count) * (4 // count)
+        near = (offsets >= first[:, None] - FIT_REACH) & (offsets < first[:, None] + 4 // count + FIT_REACH)
+        both = near[:, None, :, None] & near[None, :, None, :]  # row and column of output and of sample
+        packed = both.view(count**2, 3, 4, 3, 4).permute(0, 2, 4, 1, 3).flatten(1)
+        places.append(packed.repeat(colors if count == 4 else 2 * colors, 1))
+    return torch.cat(places)
 
 
 def _fit_samples(view: JointSeen) -> tuple[Tensor, Tensor]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from polsep.camera import Layout, Mosaic
@@ -16,6 +17,7 @@ from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
 from polsep.engine import run_analytic, run_color_affine, run_nothing
 from polsep.guided import demosaic_guided, demosaic_guided_half
 from polsep.io.weights import is_shipped
+from polsep.joint_engine import JointImages, run_engine
 from polsep.learned import separate_paper
 from polsep.mosaic_network import separate_mosaic, takes, weights_name
 from polsep.separation import Separation, separate_analytic
@@ -40,7 +42,7 @@ class Method:
     half: Callable[[Capture], Separation]
     full: Callable[[Capture], Separation]
     takes: Callable[[Capture], bool]
-    engine: Callable[[Mosaic], AnalyticImages | ColorAffineImages | None]
+    engine: Callable[[Mosaic], AnalyticImages | ColorAffineImages | JointImages | None]
     summary: str
     needs: str
     source: str
@@ -71,7 +73,7 @@ def _joint(name: str, summary: str) -> Method:
         separate_mosaic(name, "half"),
         separate_mosaic(name, "full"),
         takes(name),
-        run_nothing,
+        partial(run_engine, name),
         summary,
         "a raw mosaic with Sony's filters in any orientation, colour or mono; trained under white light",
         "this project; after Dave et al. 2022 and the colour-affine closed form",

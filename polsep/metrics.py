@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from types import ModuleType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,6 +23,20 @@ FLIP_REACH = 20
 HIGHLIGHT = 0.2
 #: Share of scenes that count as the worst.
 WORST_SHARE = 0.1
+#: Errors below this, a PSNR of 120 dB, count as this where ratios are taken.
+LEAST_DEVIATION = 1e-6
+
+
+class Reliability(NamedTuple):
+    """Which errors were ``expected`` and ``found`` ``[bins]``, rms, by rising expectation; and by how much they differ.
+
+    ``miss`` is the rms over bins of log2(found / expected): 0 for a calibrated expectation, 1 for one that is wrong by
+    a factor of two everywhere, in either direction.
+    """
+
+    expected: Tensor
+    found: Tensor
+    miss: float
 
 
 def psnr(found: Tensor, truth: Tensor, mask: Tensor) -> float:
@@ -118,6 +133,28 @@ def chroma(specular: Tensor, mask: Tensor) -> float:
     inside = specular[:, mask]
     mean = inside.mean(dim=0)
     return float(((inside.amax(dim=0) - inside.amin(dim=0)) / mean.clamp(min=1e-6)).mean()) if inside.numel() else 0.0
+
+
+def reliability(error: Tensor, expected: Tensor, mask: Tensor, bins: int) -> Reliability:
+    """The reliability curve of expected errors: whether they are as large as the true ones.
+
+    ``error [C, h, w]``: found - truth; ``expected [h, w]``: its standard deviation over all colours. The pixels of
+    ``mask [h, w]`` are sorted into ``bins`` of equal count by what was expected. Means are of squares on both sides, so
+    that bins may be wide. What n independent errors per bin leave of ``miss`` when calibrated is 1 / sqrt(n), not 0.
+    Raises ValueError on fewer pixels than bins, on errors that are no numbers and on deviations below 0.
+    Source: Levi, Gispan, Giladi, Fetaya 2022, doi:10.3390/s22155540 (their ENCE takes differences, not logarithms).
+    """
+    squared, sigma = (error.double() ** 2).mean(dim=0)[mask], expected.double()[mask]
+    if not 0 < bins <= sigma.numel():
+        raise ValueError(f"expected at least {max(bins, 1)} pixels for {bins} bins, found {sigma.numel()}")
+    wrong = int((~torch.isfinite(squared) | ~torch.isfinite(sigma) | (sigma < 0)).sum())
+    if wrong:
+        raise ValueError(f"expected finite errors and deviations of 0 or more, found others in {wrong} pixels")
+    groups = torch.argsort(sigma, stable=True).tensor_split(bins)
+    curves = (torch.stack([x[group].mean().sqrt() for group in groups]) for x in (sigma**2, squared))
+    said, found = curves
+    octaves = torch.log2(found.clamp(min=LEAST_DEVIATION) / said.clamp(min=LEAST_DEVIATION))
+    return Reliability(said, found, float(octaves.square().mean().sqrt()))
 
 
 def worst_mean(values: list[float]) -> float:

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import max_pool2d, pad, pixel_shuffle, pixel_unshuffle, relu
+from torch.nn.functional import interpolate, max_pool2d, pad, pixel_shuffle, pixel_unshuffle, relu
 
 
 class DoubleConv(nn.Sequential):
@@ -153,7 +153,7 @@ class ResidualUNet(nn.Module):
             x = down(relu(x))
         x = self.encoders[-1](x)
         for up, decoder, skip in zip(reversed(self.ups), reversed(self.decoders), reversed(skips), strict=True):
-            x = up(relu(x)).repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)
+            x = interpolate(up(relu(x)), scale_factor=2.0)  # by nearest neighbours
             x = decoder(skip + x[..., : skip.shape[-2], : skip.shape[-1]])
         return relu(self.out(x))
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from polsep.camera import Layout, Mosaic
 from polsep.demosaic import demosaic_bilinear_half
+from polsep.joint_engine import JointImages
 from polsep.layout_check import check_layout
 from polsep.levels import as_mosaic
 from polsep.methods import Capture, Method, find_method
@@ -92,7 +93,8 @@ def separate_in_engine(capture: Capture, method: Method, light: tuple[float, ...
         return None
     assert images.dolp is not None and images.aolp is not None and images.tally is not None
     report = describe(images.tally)
-    return SeparatedFrame(images.diffuse, images.specular, images.valid, images.dolp, images.aolp, report)
+    error = images.error if isinstance(images, JointImages) else None
+    return SeparatedFrame(images.diffuse, images.specular, images.valid, images.dolp, images.aolp, report, error)
 
 
 def separate_in_torch(capture: Capture, method: Method, light: tuple[float, ...], full: bool) -> SeparatedFrame:
@@ -174,9 +176,13 @@ def under_white_light(capture: Capture, light: tuple[float, ...]) -> Capture:
 
 
 def in_light(found: Separation, light: tuple[float, ...]) -> Separation:
-    """The twin of `under_white_light`: the light's colour multiplied back into diffuse and specular, not Stokes."""
+    """The twin of `under_white_light`: the light's colour multiplied back into diffuse and specular, not Stokes.
+
+    The expected errors are over all colours, so the mean of the colour multiplies them.
+    """
     gain = torch.tensor(light, dtype=torch.float64).to(found.diffuse).view(-1, 1, 1)
-    return replace(found, diffuse=found.diffuse * gain, specular=found.specular * gain)
+    doubt = None if found.doubt is None else found.doubt * gain.mean()
+    return replace(found, diffuse=found.diffuse * gain, specular=found.specular * gain, doubt=doubt)
 
 
 def to_numpy(found: Separation, report: dict[str, Any]) -> SeparatedFrame:
@@ -193,4 +199,5 @@ def to_numpy(found: Separation, report: dict[str, Any]) -> SeparatedFrame:
         image(dolp(mean))[..., 0],
         image(aolp(mean))[..., 0],
         report,
+        None if found.doubt is None else image(found.doubt),
     )

@@ -30,6 +30,8 @@ class SeparatedFrame:
     their sum s0 reaches 2 (more where clipped highlights were recovered). ``valid``: bool ``[h, w]``, False where
     clipping left something to assumption. ``dolp``: float32 ``[h, w]``, of all channels together in white light, and
     ``aolp``: radians in [0, pi), image-right toward image-up. ``report``: JSON-able settings, statistics and warnings.
+    ``error``: float32 ``[h, w, 2]``, the standard deviation that the method expects of the errors of diffuse and
+    specular, over all colours, in the images' unit; None where a method expects none.
     """
 
     diffuse: NDArray[np.float32]
@@ -38,6 +40,7 @@ class SeparatedFrame:
     dolp: NDArray[np.float32]
     aolp: NDArray[np.float32]
     report: dict[str, Any]
+    error: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,8 @@ class Tally:
     ``clipped``, ``valid``, ``above_one``: pixels with a clipped sample, without an assumption, with DoLP above 1.
     ``s0``, ``specular``: of the means over colours; s0 is diffuse + specular. ``power``, ``along``, ``across``: of w^2,
     w p1 and w p2 for the specular light's polarization (p1, p2) and w = |p|: highlights speak and noise does not.
-    ``residual``, ``noise``: of `Separation`'s, None where it has none.
+    ``residual``, ``noise``: of `Separation`'s, None where it has none. ``diffuse_variance``, ``specular_variance``: of
+    the squares of its ``doubt``, None likewise.
     """
 
     pixels: int = 0
@@ -61,6 +65,8 @@ class Tally:
     across: float = 0.0
     residual: float | None = None
     noise: float | None = None
+    diffuse_variance: float | None = None
+    specular_variance: float | None = None
 
     def __add__(self, other: Tally) -> Tally:
         """Sums over the pixels of both; a sum that one of them has not is the other's."""
@@ -81,6 +87,8 @@ def tally(found: Separation) -> Tally:
     if found.slope is not None:
         p1, p2 = (p - found.slope[..., i, :, :] * diffuse for i, p in enumerate((p1, p2)))
     weight = torch.hypot(p1, p2)
+    doubt = (None, None) if found.doubt is None else found.doubt.double().unbind(dim=-3)
+    variances = (None if deviation is None else float((deviation**2).sum()) for deviation in doubt)
     return Tally(
         found.valid.numel(),
         0 if found.clipped is None else int(found.clipped.sum()),
@@ -93,6 +101,7 @@ def tally(found: Separation) -> Tally:
         float((weight * p2).sum()),
         None if found.residual is None else float(found.residual.double().sum()),
         None if found.noise is None else float(found.noise.double().sum()),
+        *variances,
     )
 
 
@@ -106,7 +115,10 @@ def dominant_angle(sums: Tally) -> tuple[float, float]:
 
 
 def describe(sums: Tally) -> dict[str, Any]:
-    """Statistics and warnings of a frame for its report, without what its method does not measure."""
+    """Statistics and warnings of a frame for its report, without what its method does not measure.
+
+    docs/conventions.md lists them all.
+    """
     pixels = max(sums.pixels, 1)
     angle, concentration = dominant_angle(sums)
     brightness = sums.s0 / pixels
@@ -116,7 +128,7 @@ def describe(sums: Tally) -> dict[str, Any]:
             f"polarized light of one angle was expected, found many (concentration {concentration:.2f}): "
             "is the light polarized, and the only one?"
         )
-    statistics = {
+    statistics: dict[str, Any] = {
         "clipped_fraction": sums.clipped / pixels,
         "valid_fraction": sums.valid / pixels,
         "mean_s0": brightness,
@@ -130,4 +142,7 @@ def describe(sums: Tally) -> dict[str, Any]:
         statistics["fit_residual"] = sums.residual / sums.s0 if sums.s0 > 0 else 0.0
     if sums.noise is not None:
         statistics["sample_noise"] = sums.noise / pixels
+    if sums.diffuse_variance is not None and sums.specular_variance is not None:
+        variances = (sums.diffuse_variance, sums.specular_variance)
+        statistics["expected_error"] = [math.sqrt(variance / pixels) for variance in variances]
     return {"statistics": statistics, "warnings": remarks}

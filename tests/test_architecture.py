@@ -41,6 +41,7 @@ RANKS = {
     "engine": 4,
     "learned": 5,
     "mosaic_network": 5,
+    "joint_engine": 5,
     "methods": 5,
     "pipeline": 5,
     "simulate": 4,
@@ -59,6 +60,7 @@ WITHIN = {
     ("color_affine", "separation"),
     ("multi_capture", "separation"),
     ("scenes", "render"),
+    ("kernels", "joint"),
     ("raycast", "kernels"),
     ("simulate", "kernels"),
     ("views", "simulate"),
@@ -68,6 +70,9 @@ WITHIN = {
     ("engine", "kernels"),
     ("methods", "learned"),
     ("methods", "mosaic_network"),
+    ("methods", "joint_engine"),
+    ("joint_engine", "mosaic_network"),
+    ("pipeline", "joint_engine"),
     ("pipeline", "methods"),
     ("guided", "demosaic"),
     ("io", "io"),
@@ -105,6 +110,7 @@ HOMES = {
     "onnx": "io",
     "flip_evaluator": "metrics",
     "matplotlib": "bench",
+    "openvino": "joint_engine",
 }
 #: Calls that touch files, by name of the function or method.
 FILE_CALLS = {"open", "read_bytes", "write_bytes", "read_text", "write_text", "imread", "imwrite", "fromfile", "tofile"}

@@ -33,6 +33,7 @@ from polsep.train.command import JointOptions, digest_data, train_weights
 from polsep.train.joint_losses import (
     DATA_SCALE,
     LEAST_ERROR,
+    SURPRISE,
     Goal,
     beyond_white,
     doubt_loss,
@@ -180,6 +181,22 @@ def test_doubt_is_least_where_it_is_the_squared_error(share: float) -> None:
     assert_close(doubt.grad, torch.zeros_like(best))
     for step in (-0.5, 0.5):
         assert float(loss(best + step)) > float(loss(best))
+
+
+def test_a_pixel_that_is_far_off_does_not_outweigh_the_others() -> None:
+    """Its pull on the doubt ends at that of an error of `SURPRISE` variances, however sure the network was."""
+    light, nothing = torch.ones(1, 1, 2, 2), torch.zeros(1)
+    errors = torch.ones(1, 3, 4, 4), torch.ones(1, 1, 4, 4)
+    pulls = []
+    for sure in (0.0, -math.log(2 * SURPRISE), -200.0):
+        doubt = torch.full((1, 2, 4, 4), sure, requires_grad=True)
+        loss = doubt_loss(Images(nothing, nothing, nothing, nothing, doubt, light), errors, torch.ones(1, 1, 4, 4))
+        loss.backward()
+        assert doubt.grad is not None
+        assert_finite(loss, doubt.grad)
+        pulls.append(float(doubt.grad.sum()))
+    assert abs(pulls[0]) < 1e-6
+    assert pulls[1:] == pytest.approx([0.5 * (1 - SURPRISE)] * 2, rel=1e-5)
 
 
 def test_doubt_moves_nothing_but_itself() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 
@@ -9,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
-from tolerances import assert_within
+from tolerances import SIGMAS, assert_close, assert_within
 from torch import Tensor
 
 from polsep.io.previews import srgb
-from polsep.metrics import chroma, flip, highlights, psnr, psnr_unlimited, require_flip, ssim, worst_mean
+from polsep.metrics import chroma, flip, highlights, psnr, psnr_unlimited, reliability, require_flip, ssim, worst_mean
 
 EVERYWHERE = torch.ones(40, 50, dtype=torch.bool)
 
@@ -137,3 +138,72 @@ def test_flip_names_the_extra_that_it_needs(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     with pytest.raises(ValueError, match=r"expected the extra bench .*, found no flip_evaluator"):
         flip(*pair(), EVERYWHERE)
+
+
+def drawn_errors(colors: int = 3) -> tuple[Tensor, Tensor]:
+    """Gaussian errors ``[C, 160, 200]`` and their true standard deviations ``[160, 200]``, over two decades."""
+    generator = torch.Generator().manual_seed(9)
+    sigma = 10 ** (-3 + 2 * torch.rand(160, 200, generator=generator))
+    return sigma * torch.randn(colors, 160, 200, generator=generator), sigma
+
+
+@pytest.mark.parametrize("colors", [1, 3])
+@pytest.mark.parametrize("bins", [1, 16])
+def test_expected_errors_that_are_the_true_ones_are_reliable(colors: int, bins: int) -> None:
+    """Bin by bin within the statistics of that many samples, however wide the bins are."""
+    error, sigma = drawn_errors(colors)
+    everywhere = torch.ones_like(sigma, dtype=torch.bool)
+    curve = reliability(error, sigma, everywhere, bins)
+    assert curve.expected.shape == curve.found.shape == (bins,)
+    assert bool((curve.expected.diff() > 0).all())
+    groups = sigma.flatten().sort().values.double().view(bins, -1)
+    assert_close(curve.expected, groups.square().mean(dim=1).sqrt())
+    # The variance of a mean of squares of normal errors: twice the sum of fourth powers of their deviations.
+    spread = (2 * (groups**4).sum(dim=1) / colors).sqrt() / (groups**2).sum(dim=1)
+    assert bool(((curve.found / curve.expected).square() - 1 < SIGMAS * spread).all())
+    assert bool((1 - (curve.found / curve.expected).square() < SIGMAS * spread).all())
+    assert 0 <= curve.miss < SIGMAS * float(spread.max()) / (2 * math.log(2))
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 4.0])
+def test_expected_errors_miss_by_octaves(factor: float) -> None:
+    """An expectation that is wrong by a factor everywhere misses by its logarithm, in either direction."""
+    error, sigma = drawn_errors()
+    everywhere = torch.ones_like(sigma, dtype=torch.bool)
+    right, wrong = (reliability(error, k * sigma, everywhere, 8) for k in (1.0, factor))
+    assert_close(wrong.found, right.found)
+    assert_close(wrong.expected, factor * right.expected)
+    assert_within(wrong.miss, abs(math.log2(factor)), right.miss + 1e-6)
+
+
+def test_expectations_that_know_nothing_are_not_reliable() -> None:
+    """Right on average, large where errors are small: one bin is content with that, many find out."""
+    error, sigma = drawn_errors()
+    everywhere = torch.ones_like(sigma, dtype=torch.bool)
+    upside_down = 1e-4 / sigma
+    assert reliability(error, upside_down, everywhere, 1).miss < 0.1
+    assert reliability(error, upside_down, everywhere, 16).miss > 2
+
+
+def test_reliability_counts_the_mask_alone_and_needs_numbers() -> None:
+    error, sigma = drawn_errors()
+    mask = torch.zeros_like(sigma, dtype=torch.bool)
+    mask[10:20, 30:51] = True
+    spoilt = [torch.where(mask, x, torch.nan) for x in (error, sigma)]
+    one = reliability(error[:, 10:20, 30:51], sigma[10:20, 30:51], mask[10:20, 30:51], 4)
+    other = reliability(*spoilt, mask, 4)
+    assert torch.equal(one.found, other.found) and one.miss == other.miss
+    with pytest.raises(ValueError, match="expected finite errors and deviations of 0 or more, found others in 31790"):
+        reliability(*spoilt, torch.ones_like(mask), 4)
+    with pytest.raises(ValueError, match="found others in 210 pixels"):
+        reliability(error, -sigma, mask, 4)
+    for bins, expected in ((0, "at least 1 pixels for 0 bins"), (211, "at least 211 pixels for 211 bins, found 210")):
+        with pytest.raises(ValueError, match=expected):
+            reliability(error, sigma, mask, bins)
+
+
+def test_errors_of_zero_are_finite() -> None:
+    """Nothing expected and nothing found is no miss, and a bin without error misses by a number."""
+    nothing, mask = torch.zeros(3, 4, 4), torch.ones(4, 4, dtype=torch.bool)
+    assert reliability(nothing, nothing[0], mask, 2).miss == 0
+    assert reliability(nothing, torch.full((4, 4), 2e-6), mask, 2).miss == pytest.approx(1)

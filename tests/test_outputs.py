@@ -40,6 +40,12 @@ def random_frame(channels: int = 3, size: tuple[int, int] = (37, 53)) -> Separat
     )
 
 
+def doubtful_frame(channels: int = 3) -> SeparatedFrame:
+    """`random_frame` with an expected error of two channels."""
+    error = np.random.default_rng(4).random((37, 53, 2), np.float32)
+    return replace(random_frame(channels), error=0.1 * error)
+
+
 def contents(directory: Path) -> dict[str, bytes]:
     """Every file below a directory, hidden ones too."""
     return {str(p.relative_to(directory)): p.read_bytes() for p in directory.rglob("*") if p.is_file()}
@@ -71,7 +77,8 @@ def test_exr_is_one_zip_part_that_states_units_and_version(tmp_path: Path) -> No
     assert len(file.parts) == 1
     assert header["compression"] == OpenEXR.ZIP_COMPRESSION
     assert "radians" in header["aolpUnits"]
-    assert {layer: header[f"{layer}Units"] for layer in LAYERS} == UNITS
+    assert {layer: header[f"{layer}Units"] for layer in LAYERS} == {layer: UNITS[layer] for layer in LAYERS}
+    assert "errorUnits" not in header
     assert header["polsepVersion"] == sidecar(tmp_path)["polsep"]
 
 
@@ -179,9 +186,68 @@ def test_sidecar_states_version_source_report_units_and_a_sha256_of_every_other_
 def test_exactly_the_planned_files_appear_in_new_directories(tmp_path: Path, format: str) -> None:
     directory = tmp_path / "a" / "b"
     planned = planned_outputs(directory, "shot", format)
-    assert write_separation(random_frame(), directory, "shot", format) == planned
+    assert write_separation(doubtful_frame(), directory, "shot", format) == planned
     assert sorted(p for p in tmp_path.rglob("*") if not p.is_dir()) == sorted(planned)
     assert sorted(p.name for p in directory.iterdir()) == sorted(p.name for p in planned)
+    without = [path for path in planned if path.name != f"shot_error.{format}"]
+    assert len(planned) - len(without) == (1 if format in ("tiff", "png") else 0)
+    assert write_separation(random_frame(), directory, "shot", format, overwrite=True) == without
+    assert sorted(p for p in tmp_path.rglob("*") if not p.is_dir()) == sorted(without)
+
+
+@pytest.mark.parametrize("format", ["tiff", "png"])
+@pytest.mark.parametrize("frame", [random_frame(), doubtful_frame()], ids=["without", "with"])
+def test_an_error_image_from_before_is_refused_and_never_stays_beside_other_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str, frame: SeparatedFrame
+) -> None:
+    """Also where the frame has no error; and it is back when anything fails, at whichever step."""
+    directory = tmp_path / "out"
+    write_separation(doubtful_frame(1), directory, "shot", format)
+    before = contents(directory)
+    alone = tmp_path / "alone" / f"shot_error.{format}"
+    alone.parent.mkdir()
+    alone.write_bytes(b"mine")
+    with pytest.raises(OutputError, match=rf"shot_error\.{format}, found one from before; --overwrite"):
+        write_separation(frame, alone.parent, "shot", format)
+    assert contents(alone.parent) == {alone.name: b"mine"}
+    steps = 2 * len(before) - (1 if frame.error is None else 0)  # taken away, and put in place
+    for calls in range(steps):
+        with monkeypatch.context() as failing:
+            fail_at_replace(failing, calls, OSError(5, "Input/output error"))
+            with pytest.raises(OutputError, match="Input/output"):
+                write_separation(frame, directory, "shot", format, overwrite=True)
+        assert contents(directory) == before
+    write_separation(frame, directory, "shot", format, overwrite=True)
+    write_separation(frame, tmp_path / "fresh", "shot", format)
+    assert contents(directory) == contents(tmp_path / "fresh")
+
+
+@pytest.mark.parametrize("channels", [3, 1])
+def test_expected_errors_survive_every_format(tmp_path: Path, channels: int) -> None:
+    """Exactly, two channels, diffuse first, and in PNG within half a code; the sidecar says so."""
+    frame = doubtful_frame(channels)
+    assert frame.error is not None
+    frame.error[0, 0] = (3, 2)
+    for format in FORMATS:
+        write_separation(frame, tmp_path, "shot", format, overwrite=True)
+        told = sidecar(tmp_path)
+        assert set(told["units"]) == {*LAYERS, "error"}
+        limited = told.get("limited_samples", {"error": None})
+        assert limited["error"] == ({"below": 0, "above": 1} if format == "png" else None)
+    layers = read_exr_layers(tmp_path / "shot.exr")
+    assert OpenEXR.File(str(tmp_path / "shot.exr"), header_only=True).header()["errorUnits"] == UNITS["error"]
+    npt.assert_array_equal(layers["error.diffuse"], frame.error[..., 0])
+    npt.assert_array_equal(layers["error.specular"], frame.error[..., 1])
+    with np.load(tmp_path / "shot.npz", allow_pickle=False) as arrays:
+        assert sorted(arrays) == sorted([*LAYERS, "error"])
+        npt.assert_array_equal(arrays["error"], frame.error, strict=True)
+    with tifffile.TiffFile(tmp_path / "shot_error.tiff") as file:
+        assert file.pages[0].description == f"error: {UNITS['error']}"
+        npt.assert_array_equal(file.asarray(), frame.error, strict=True)
+    codes = read_png(tmp_path / "shot_error.png", 16)
+    expected = np.minimum(frame.error, 2).astype(np.float64)
+    npt.assert_allclose(codes[..., :2] * (2 / 65535), expected, rtol=0, atol=0.5001 * 2 / 65535)
+    assert codes.shape == (37, 53, 3) and int(codes[..., 2].max()) == 0
 
 
 def test_planned_names_are_the_public_contract() -> None:
@@ -189,7 +255,7 @@ def test_planned_names_are_the_public_contract() -> None:
     assert names["exr"] == ["s.exr", "s.png", "s.json"]
     assert names["npz"] == ["s.npz", "s.png", "s.json"]
     for format in ("tiff", "png"):
-        assert names[format] == [f"s_{layer}.{format}" for layer in LAYERS] + ["s.png", "s.json"]
+        assert names[format] == [f"s_{layer}.{format}" for layer in (*LAYERS, "error")] + ["s.png", "s.json"]
 
 
 def test_writing_twice_gives_the_same_bytes_and_needs_overwrite(tmp_path: Path) -> None:
@@ -271,6 +337,9 @@ def test_a_name_too_long_for_the_file_system_leaves_nothing(tmp_path: Path) -> N
         ({"specular": np.zeros((37, 53, 1), np.float32)}, r"specular as float32 \[37, 53, 3\]"),
         ({"dolp": np.zeros((37, 53))}, "dolp as float32.*float64"),
         ({"aolp": np.full((37, 53), np.nan, np.float32)}, "finite values in aolp, found 1961"),
+        ({"error": np.zeros((37, 53), np.float32)}, r"error as float32 \[37, 53, 2\], found float32 \[37, 53\]"),
+        ({"error": np.full((37, 53, 2), np.inf, np.float32)}, "finite values in error, found 3922"),
+        ({"error": np.full((37, 53, 2), -0.5, np.float32)}, "deviations of 0 or more in error, found -0.5"),
         ({"report": {"x": np.float32(1)}}, "not JSON serializable"),
         ({"report": {"x": float("nan")}}, "JSON"),
     ],

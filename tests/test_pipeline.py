@@ -7,19 +7,26 @@ import json
 import subprocess
 import sys
 import warnings
-from typing import Any
+from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from tolerances import assert_close
 from torch.nn.functional import interpolate
 
 import polsep
 from polsep.camera import IDEAL, IMX250, Layout, Mosaic, expose
 from polsep.demosaic import demosaic_bilinear_half
+from polsep.engine import run_nothing
+from polsep.joint import Joint
 from polsep.methods import METHODS, find_method
+from polsep.mosaic_network import run_joint
+from polsep.networks import ResidualSize
 from polsep.pipeline import estimate_light_color, find_device, separate_capture
+from polsep.separation import Separation
 from polsep.stokes import Measurements, Stokes, measure
 
 SIZE = 96
@@ -177,6 +184,55 @@ def test_statistics_are_what_a_method_measures() -> None:
     ours, theirs = (set(quietly(raw_frame(), name).report["statistics"]) for name in ("color-affine", "analytic"))
     assert ours - theirs == {"fit_residual", "sample_noise"}
     assert theirs < ours
+
+
+@pytest.fixture
+def doubting(monkeypatch: pytest.MonkeyPatch) -> Joint:
+    """A random network that expects errors, installed as the method ``joint``."""
+    torch.manual_seed(3)
+    network = Joint(3, ResidualSize(4, (0, 1, 1))).eval()
+    for weight in network.doubt.parameters():
+        torch.nn.init.normal_(weight, std=0.5)
+
+    def half(mosaic: Mosaic) -> Separation:
+        return run_joint(network, mosaic, "half")
+
+    def full(mosaic: Mosaic) -> Separation:
+        return run_joint(network, mosaic, "full")
+
+    method = replace(METHODS["analytic"], name="joint", half=half, full=full, engine=run_nothing)
+    monkeypatch.setitem(METHODS, "joint", method)
+    return network
+
+
+@pytest.mark.parametrize("resolution", ["half", "full"])
+def test_expected_errors_reach_their_owner(doubting: Joint, resolution: Literal["half", "full"]) -> None:
+    """The frame holds what the method expects, and the report their rms; other methods have neither."""
+    raw, full = raw_frame("float32"), resolution == "full"
+    out = quietly(raw, method="joint", full=full)
+    expected = run_joint(doubting, Mosaic(torch.from_numpy(raw), Layout(), 0.0, 1.0), resolution).doubt
+    assert expected is not None and out.error is not None
+    assert out.error.shape == (*out.valid.shape, 2) and out.error.dtype == np.float32
+    assert out.error.flags.c_contiguous and float(out.error.min()) > 0 and float(np.ptp(out.error)) > 0
+    assert_close(torch.from_numpy(out.error).movedim(-1, 0), expected)
+    typical = np.sqrt(np.square(out.error, dtype=np.float64).mean(axis=(0, 1))).tolist()
+    assert out.report["statistics"]["expected_error"] == pytest.approx(typical, rel=1e-6)
+    assert json.loads(json.dumps(out.report, allow_nan=False)) == out.report
+    other = quietly(raw, full=full)
+    assert other.error is None and "expected_error" not in other.report["statistics"]
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_expected_errors_are_in_the_light(doubting: Joint, full: bool) -> None:
+    """Under a said light, errors grow by the mean over its colours as images do; statistics stay of white light."""
+    del doubting
+    white = quietly(raw_frame("float32", exposure=0.5), method="joint", full=full)
+    light = {"light": ODD_LIGHT, "exposure": 0.5}
+    colored = quietly(raw_frame("float32", **light), method="joint", light_color=ODD_LIGHT, full=full)
+    assert white.error is not None and colored.error is not None
+    assert_close(torch.from_numpy(colored.error), torch.from_numpy(white.error * np.float32(np.mean(ODD_LIGHT))))
+    statistics = (frame.report["statistics"]["expected_error"] for frame in (white, colored))
+    assert next(statistics) == pytest.approx(next(statistics), rel=1e-4)
 
 
 @pytest.mark.parametrize("frame", ["plain", "black", "clipped", "random"])

@@ -54,14 +54,14 @@ def bench_paper_quick(data: Path) -> Iterator[Row]:
 
 
 def measure_paper(data: Path, extent: Extent) -> Iterator[Row]:
-    """Rows of tables, costs and sweep, in this order, to the ``extent`` asked for."""
+    """Rows of costs, tables and sweep, in this order, to the ``extent`` asked for."""
     require_matplotlib()
     sets = {name: recipes[: extent.scenes.get(name)] for name, recipes in load_sets().items()}
     mosaic, co_sited = ladder_entries(MOSAIC), ladder_entries(CO_SITED)
     protocols = [Protocol(MOSAIC, see_noisy, mosaic), Protocol(CO_SITED, see_co_sited, co_sited)]
+    yield from measure_costs(mosaic, read_demo_capture(), extent.runs)
     for row in score_sets("paper", sets, data, protocols):
         yield from table_rows(row)
-    yield from measure_costs(mosaic, read_demo_capture(), extent.runs)
     yield from measure_sweep("paper/calibration", extent.sweep, snapshot_entries(co_sited))
 
 

@@ -2,6 +2,8 @@
 
 Whatever the format, a frame becomes DIR/STEM.<format> (or a set of DIR/STEM_<layer>.<format> images), the preview
 DIR/STEM.png and the sidecar DIR/STEM.json, which holds the polsep version, the report, the units and a sha256 per file.
+The layer `ERROR` exists only where a frame has one. Its image belongs to STEM all the same: an older one is refused or
+replaced like the others, and does not stay beside images that it says nothing of.
 
 Conventions: images are linear light with 1.0 = one measurement at the white level, so an unclipped s0 reaches 2;
 aolp is in radians in [0, pi), from image-right toward image-up. Files hold the very float32 values of the frame,
@@ -38,7 +40,10 @@ if TYPE_CHECKING:
     from polsep.report import SeparatedFrame
 
 FORMATS = ("exr", "npz", "tiff", "png")
+#: Layers of every frame.
 LAYERS = ("diffuse", "specular", "dolp", "aolp", "valid")
+#: The layer of frames whose method expects an error: two channels, for diffuse and specular.
+ERROR = "error"
 
 _LIGHT = "linear light, 1.0 = one measurement at the white level (an unclipped s0 = diffuse + specular reaches 2)"
 #: What the numbers in EXR, NPZ and TIFF files mean.
@@ -48,6 +53,7 @@ UNITS = {
     "dolp": "degree of linear polarization, 0 to 1; above 1 by noise",
     "aolp": "angle of linear polarization in radians, in [0, pi), from image-right toward image-up",
     "valid": "1 (TIFF: 255) where the separation is trustworthy, else 0",
+    ERROR: "expected standard deviation of the error of diffuse and of specular, over all colours, in their unit",
 }
 #: What the codes in the PNG set mean.
 PNG_UNITS = {
@@ -56,9 +62,10 @@ PNG_UNITS = {
     "dolp": "16 bit: 65535 = degree of linear polarization 1.0",
     "aolp": "16 bit: 65536 = pi radians (180 degrees), from image-right toward image-up",
     "valid": "8 bit: 255 where the separation is trustworthy, else 0",
+    ERROR: "16 bit, LINEAR: 65535 = 2.0; expected standard deviation of the error, red: of diffuse, green: of specular",
 }
 #: The value that code 65535 stands for in the PNG set.
-PNG_WHITE = {"diffuse": 2.0, "specular": 2.0, "dolp": 1.0}
+PNG_WHITE = {"diffuse": 2.0, "specular": 2.0, "dolp": 1.0, ERROR: 2.0}
 
 
 class OutputError(ValueError):
@@ -66,16 +73,27 @@ class OutputError(ValueError):
 
 
 def planned_outputs(directory: Path, stem: str, format: str) -> list[Path]:
-    """Every file that `write_separation` would write, images first, then preview and sidecar. Touches no file.
+    """Every file that `write_separation` may write, images first, then preview and sidecar. Touches no file.
 
+    All are written, but for the image of `ERROR` (TIFF and PNG) where a frame has none.
     Raises OutputError when ``format`` is not one of `FORMATS` or ``stem`` is not a plain file name.
     """
     if format not in FORMATS:
         raise OutputError(f"expected a format of {', '.join(FORMATS)}, found {format!r}")
     if stem in ("", ".", "..") or any(c in stem for c in "/\\\0"):
         raise OutputError(f"expected a file name without path separators as stem, found {stem!r}")
-    images = [f"{stem}_{layer}.{format}" for layer in LAYERS] if format in ("tiff", "png") else [f"{stem}.{format}"]
-    return [Path(directory) / name for name in (*images, f"{stem}.png", f"{stem}.json")]
+    return [Path(directory) / name for name in _file_names(stem, format, (*LAYERS, ERROR))]
+
+
+def _file_names(stem: str, format: str, layers: tuple[str, ...]) -> list[str]:
+    """The files of one frame with these layers."""
+    images = [f"{stem}_{layer}.{format}" for layer in layers] if format in ("tiff", "png") else [f"{stem}.{format}"]
+    return [*images, f"{stem}.png", f"{stem}.json"]
+
+
+def _layers(frame: SeparatedFrame) -> tuple[str, ...]:
+    """The layers that a frame has."""
+    return LAYERS if frame.error is None else (*LAYERS, ERROR)
 
 
 def write_separation(
@@ -84,10 +102,10 @@ def write_separation(
     """Write the images, preview and sidecar of ``frame`` into ``directory`` (made if missing); the paths written.
 
     All or nothing: after a failure no new file is left and files that were there before are back in place, also with
-    ``overwrite``. Files of an earlier run in another format are left alone. Two writers of one stem at the same time
-    are not guarded against.
-    Raises OutputError when an output exists and ``overwrite`` is False (before any work), when the frame breaks its
-    contract (shapes, dtypes, values that are not finite, a report that is not JSON) or when writing fails.
+    ``overwrite``, which also removes an older error image where ``frame`` has none. Files of an earlier run in another
+    format are left alone. Two writers of one stem at the same time are not guarded against.
+    Raises OutputError when one of `planned_outputs` exists and ``overwrite`` is False (before any work), when the frame
+    breaks its contract (shapes, dtypes, values that are not finite, a report that is not JSON) or when writing fails.
     """
     targets = planned_outputs(directory, stem, format)
     directory = Path(directory)
@@ -107,7 +125,7 @@ def write_separation(
         raise OutputError(
             f"expected to write {stem!r} into {directory}, found {type(error).__name__}: {reason}"
         ) from error
-    return targets
+    return [directory / name for name in _file_names(stem, format, _layers(frame))]
 
 
 def read_exr_layers(path: Path) -> dict[str, NDArray[np.float32]]:
@@ -145,13 +163,18 @@ def _check_frame(frame: SeparatedFrame) -> None:
         raise OutputError(f"expected valid as bool [H, W], found {frame.valid.dtype} {list(size)}")
     channels = frame.diffuse.shape[-1]
     color = (*size, 3 if channels == 3 else 1)
-    for name, shape in {"diffuse": color, "specular": color, "dolp": size, "aolp": size}.items():
+    shapes = {"diffuse": color, "specular": color, "dolp": size, "aolp": size}
+    if frame.error is not None:
+        shapes[ERROR] = (*size, 2)
+    for name, shape in shapes.items():
         image = getattr(frame, name)
         if image.shape != shape or image.dtype != np.float32:
             raise OutputError(f"expected {name} as float32 {list(shape)}, found {image.dtype} {list(image.shape)}")
         wrong = int(np.count_nonzero(~np.isfinite(image)))
         if wrong:
             raise OutputError(f"expected finite values in {name}, found {wrong} NaN or infinite samples")
+    if frame.error is not None and float(frame.error.min()) < 0:
+        raise OutputError(f"expected deviations of 0 or more in {ERROR}, found {float(frame.error.min()):.3g}")
 
 
 def _write_and_move(frame: SeparatedFrame, targets: list[Path], stem: str, format: str) -> None:
@@ -181,7 +204,7 @@ def _stage(frame: SeparatedFrame, folder: Path, stem: str, format: str) -> None:
         "source": frame.report.get("source"),
         "format": format,
         "shape": list(frame.diffuse.shape),
-        "units": PNG_UNITS if format == "png" else UNITS,
+        "units": {layer: (PNG_UNITS if format == "png" else UNITS)[layer] for layer in _layers(frame)},
         "preview": f"{stem}.png is sRGB, 8 bit, for people: do not measure in it",
         "files": files,
         "report": frame.report,
@@ -200,17 +223,22 @@ def _write_bytes(path: Path, data: bytes) -> None:
 
 
 def _move_into_place(staging: Path, targets: list[Path]) -> None:
-    """Rename staging/new/* to the targets, keeping what they replace in staging/old; undo everything on failure."""
+    """Rename staging/new/* to the targets, keeping what was there in staging/old; undo everything on failure.
+
+    A target that was not staged, an error image that the frame lacks, is only taken away.
+    """
     begun: list[Path] = []
+    staged = {path.name for path in (staging / "new").iterdir()}
     try:
         for target in targets:
             begun.append(target)
             if os.path.lexists(target):
                 os.replace(target, staging / "old" / target.name)
-            os.replace(staging / "new" / target.name, target)
+            if target.name in staged:
+                os.replace(staging / "new" / target.name, target)
     except BaseException:
         for target in reversed(begun):
-            if not (staging / "new" / target.name).exists():
+            if target.name in staged and not (staging / "new" / target.name).exists():
                 target.unlink(missing_ok=True)
             if os.path.lexists(staging / "old" / target.name):
                 os.replace(staging / "old" / target.name, target)
@@ -224,10 +252,10 @@ def _encoded_files(frame: SeparatedFrame, stem: str, format: str) -> Iterator[tu
     elif format == "npz":
         yield f"{stem}.npz", _encode_npz(frame)
     elif format == "tiff":
-        for layer in LAYERS:
+        for layer in _layers(frame):
             yield f"{stem}_{layer}.tiff", _encode_tiff(frame, layer)
     else:
-        for layer in LAYERS:
+        for layer in _layers(frame):
             yield f"{stem}_{layer}.png", _encode_png(_png_codes(frame, layer))
     yield f"{stem}.png", _encode_png(contact_sheet(frame))
 
@@ -238,11 +266,13 @@ def _encode_exr(frame: SeparatedFrame) -> bytes:
     for layer, image in (("diffuse", frame.diffuse), ("specular", frame.specular)):
         for k, color in enumerate("RGB" if image.shape[-1] == 3 else "Y"):
             planes[f"{layer}.{color}"] = image[..., k]
+    if frame.error is not None:
+        planes |= {f"{ERROR}.{image}": frame.error[..., k] for k, image in enumerate(("diffuse", "specular"))}
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "polsepVersion": _version(),
-        **{f"{layer}Units": text for layer, text in UNITS.items()},
+        **{f"{layer}Units": UNITS[layer] for layer in _layers(frame)},
     }
     # A fresh dict, because OpenEXR replaces its arrays, and contiguous planes, because it misreads others silently.
     channels = {name: np.ascontiguousarray(plane, dtype=np.float32) for name, plane in planes.items()}
@@ -252,28 +282,26 @@ def _encode_exr(frame: SeparatedFrame) -> bytes:
 
 
 def _encode_npz(frame: SeparatedFrame) -> bytes:
-    """The five arrays as they are, deflated."""
+    """The layers as they are, deflated."""
     stream = io.BytesIO()
-    np.savez_compressed(
-        stream,
-        diffuse=frame.diffuse,
-        specular=frame.specular,
-        dolp=frame.dolp,
-        aolp=frame.aolp,
-        valid=frame.valid,
-    )
+    np.savez_compressed(stream, **{layer: getattr(frame, layer) for layer in _layers(frame)})
     return stream.getvalue()
 
 
 def _encode_tiff(frame: SeparatedFrame, layer: str) -> bytes:
-    """One layer: float32 deflated after the floating-point predictor where there is one; valid as uint8 0 or 255."""
+    """One layer: float32 deflated after the floating-point predictor where there is one; valid as uint8 0 or 255.
+
+    The error is one page of two samples per pixel.
+    """
     image = np.where(frame.valid, 255, 0).astype(np.uint8) if layer == "valid" else _flat(getattr(frame, layer))
     predictor = 3 if image.dtype == np.float32 and imagecodecs.FLOATPRED.available else 1  # TIFF: 1 none, 3 float
     stream = io.BytesIO()
     tifffile.imwrite(
         stream,
         image,
-        photometric="rgb" if image.ndim == 3 else "minisblack",
+        photometric="rgb" if image.shape[2:] == (3,) else "minisblack",
+        planarconfig="contig" if image.ndim == 3 else None,
+        extrasamples=("unspecified",) if layer == ERROR else None,
         compression="zlib",
         predictor=predictor,
         description=f"{layer}: {UNITS[layer]}",
@@ -289,13 +317,18 @@ def _encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
 
 
 def _png_codes(frame: SeparatedFrame, layer: str) -> NDArray[np.uint16] | NDArray[np.uint8]:
-    """One layer in the integer codes of `PNG_UNITS`, values outside the scale limited to its ends."""
+    """One layer in the integer codes of `PNG_UNITS`, values outside the scale limited to its ends.
+
+    The error gets a third colour of zeros: PNG would take the second of two channels for opacity.
+    """
     if layer == "valid":
         return np.where(frame.valid, 255, 0).astype(np.uint8)
     if layer == "aolp":
         steps = np.rint(frame.aolp.astype(np.float64) * (65536 / np.pi)).astype(np.int64)
         return np.mod(steps, 65536).astype(np.uint16)
     image: NDArray[np.float64] = _flat(getattr(frame, layer)).astype(np.float64)
+    if layer == ERROR:
+        image = np.concatenate([image, np.zeros_like(image[..., :1])], axis=-1)
     return np.rint(np.clip(image / PNG_WHITE[layer], 0, 1) * 65535).astype(np.uint16)
 
 
@@ -307,6 +340,7 @@ def _limited_samples(frame: SeparatedFrame) -> dict[str, dict[str, int]]:
             "above": int(np.count_nonzero(getattr(frame, layer) > white)),
         }
         for layer, white in PNG_WHITE.items()
+        if layer in _layers(frame)
     }
 
 

@@ -28,6 +28,8 @@ BACKGROUND = 0.05
 FULL_WEIGHT, BEYOND_WEIGHT, DATA_WEIGHT = 0.5, 10.0, 1.0
 #: Misfit of a sample, in white levels, that counts as large: twice the noise of a bright one.
 DATA_SCALE = 0.02
+#: Squared error, in variances expected of it, from which on the likelihood grows as a logarithm.
+SURPRISE = 50.0
 #: The sum, in dB, times this gives gradients of about the size of the other networks' (`loop.MOST_GRADIENT`).
 LOSS_SCALE = 0.1
 
@@ -90,5 +92,8 @@ def doubt_loss(images: Images, errors: tuple[Tensor, Tensor], weight: Tensor) ->
     """Minus the Gaussian log likelihood of the errors, relative to the light around; moves nothing but the doubt."""
     light = interpolate(images.light, scale_factor=2.0)
     squared = [(error.detach() ** 2).mean(dim=1, keepdim=True) / light**2 for error in errors]
-    unlikely = images.doubt + (torch.cat(squared, dim=1).clamp(max=100) + 1e-7) * torch.exp(-images.doubt)
-    return (0.5 * unlikely * weight).mean()
+    # The logarithm of the squared error in variances; beyond `SURPRISE` it counts itself, so that one pixel cannot
+    # outweigh a batch: it once did, by a factor of 1e13.
+    excess = torch.log(torch.cat(squared, dim=1) + 1e-7) - images.doubt - math.log(SURPRISE)
+    surprise = SURPRISE * (torch.exp(excess.clamp(max=0)) + excess.clamp(min=0))
+    return (0.5 * (images.doubt + surprise) * weight).mean()

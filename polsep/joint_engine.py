@@ -1,0 +1,234 @@
+"""The joint network on CPUs: kernels make its maps, OpenVINO runs its layers, kernels make images of what it says.
+
+The same as `mosaic_network.run_joint` at half resolution, several times faster. Layers run in bfloat16 where the
+processor has it, in float32 elsewhere; the closed form and the images are float32 always. Without OpenVINO, and for
+frames that it does not take, torch does the work.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import warnings
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import conv2d
+
+from polsep.camera import Layout, Mosaic
+from polsep.joint import INPUTS, PERIOD, Joint, pool_outputs
+from polsep.mosaic_network import MOST_PIXELS, find_joint, own_order
+from polsep.orient import Orientation, orient
+from polsep.report import Tally
+
+if TYPE_CHECKING:
+    from polsep.kernels.joint import Taps
+    from polsep.kernels.unpack import RawFrame
+
+Floats = NDArray[np.float32]
+
+#: Channels of the maps of each of `joint.INPUTS`, beside 4 per colour of the split.
+_CHANNELS = {"samples": 16, "clipping": 17, "cosine": 4, "sine": 4, "split": 10}
+#: Packed rows that a thread takes at a time.
+_ROWS = 16
+#: Of layers, "bf16" or "f32"; None: what suits the processor.
+PRECISION: str | None = None
+#: Engines that are kept, each with some 50 bytes of memory per raw pixel.
+KEPT = 2
+
+
+@dataclass(frozen=True)
+class JointImages:
+    """A separated frame, channels last, in its light; fields as in `report.SeparatedFrame`, and its ``tally``."""
+
+    diffuse: Floats
+    specular: Floats
+    valid: NDArray[np.bool_]
+    dolp: Floats
+    aolp: Floats
+    error: Floats
+    tally: Tally
+
+
+class Layers(nn.Module):
+    """A network's layers: maps ``[1, n, h, w]`` to corrections ``[1, 4 C + 4, h, w]``, deviations ``[1, 8, h, w]``."""
+
+    def __init__(self, network: Joint) -> None:
+        super().__init__()
+        self.net, self.doubt = network.net, network.doubt
+        assert network.last.bias is not None
+        self.weight, self.bias = (nn.Parameter(pool_outputs(x)) for x in (network.last.weight, network.last.bias))
+
+    def forward(self, maps: Tensor) -> tuple[Tensor, Tensor]:
+        """Relative to the light, at half resolution; see `kernels.joint_images.Found`."""
+        features = self.net(maps)
+        return conv2d(features, self.weight, self.bias), torch.exp(0.5 * self.doubt(features))
+
+
+class OpenVinoEngine:
+    """A network for frames of one shape in its own order of filters, H and W multiples of 4.
+
+    State: compiled layers and the room for everything between raw samples and images, one frame at a time.
+    ``precision``: "bf16", "f32", or None for what suits the processor.
+    """
+
+    def __init__(self, network: Joint, shape: tuple[int, int], precision: str | None = None) -> None:
+        import openvino  # type: ignore[import-untyped]  # no stubs
+
+        from polsep.kernels import get_threads
+        from polsep.kernels.joint import Maps
+
+        self._lock, self._colors = threading.Lock(), network.colors
+        self._layout = Layout() if network.colors == 3 else Layout(bayer=None)
+        h, w = shape[0] // PERIOD, shape[1] // PERIOD
+        first, count = _first_channels(network)
+        model = _as_model(Layers(network).eval(), torch.zeros(1, count, 32, 32))
+        options: dict[str, Any] = {"INFERENCE_NUM_THREADS": get_threads(), "PERFORMANCE_HINT": "LATENCY"}
+        options |= {} if precision is None else {"INFERENCE_PRECISION_HINT": precision}
+        core = openvino.Core()
+        if precision is None:
+            precision = core.get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name()
+        halves = precision == "bf16"
+        kind = openvino.Type.bf16 if halves else openvino.Type.f32
+        steps = openvino.preprocess.PrePostProcessor(model)
+        steps.input().tensor().set_element_type(kind).set_layout(openvino.Layout("NHWC"))
+        steps.input().model().set_layout(openvino.Layout("NCHW"))
+        for k in range(2):
+            steps.output(k).tensor().set_layout(openvino.Layout("NHWC"))
+            steps.output(k).model().set_layout(openvino.Layout("NCHW"))
+        model = steps.build()
+        model.reshape([1, h, w, count])
+        self._request = core.compile_model(model, "CPU", options).create_infer_request()
+        nothing, room = (0, 0, 0), (h, w, count)
+        self._maps = Maps(
+            np.empty(nothing if halves else room, np.float32),
+            np.empty(room if halves else nothing, np.uint16),
+            first,
+            np.empty((h, 4 * network.colors + 13, w), np.float32),
+            np.empty((h, w), np.uint16),
+        )
+        self._taps = make_taps(network, w)
+        self._found = [np.empty((h, w, n), np.float32) for n in (4 * network.colors + 4, 8)]
+        seen = self._maps.halves if halves else self._maps.floats
+        self._request.set_input_tensor(openvino.Tensor(seen, [1, *room], kind))
+        for k, image in enumerate(self._found):
+            self._request.set_output_tensor(k, openvino.Tensor(image[None], shared_memory=True))
+
+    def run(self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...]) -> JointImages:
+        """Images of a frame ``[H, W]`` with black and white ``levels`` and a ``light`` of one gain per colour."""
+        from polsep.kernels.bilinear import read_pattern
+        from polsep.kernels.joint import map_rows
+        from polsep.kernels.joint_images import SUMS, Found, Targets, write_rows
+        from polsep.kernels.threads import share
+        from polsep.kernels.unpack import as_samples
+
+        samples, shape = as_samples(raw), (raw.shape[0], raw.shape[1])
+        pattern = read_pattern(shape, self._layout, *levels, light)
+        h, w = shape[0] // 2, shape[1] // 2
+        images = [np.empty((h, w * n), np.float32) for n in (self._colors, self._colors, 2)]
+        valid, angles = np.empty((h, w), np.bool_), [np.empty((h, w), np.float32) for _ in range(2)]
+        targets = Targets(images[0], images[1], images[2], valid, angles[0], angles[1], np.zeros((h, SUMS)))
+        gains = np.array(light[: self._colors], np.float32)
+        with self._lock:
+            share(lambda rows: map_rows(samples, pattern, self._taps, self._maps, rows), h // 2, _ROWS)
+            self._request.infer()
+            found = Found(self._maps.base, self._maps.clipped, self._found[0], self._found[1])
+            share(lambda rows: write_rows(found, gains, targets, rows), h // 2, _ROWS)
+        diffuse, specular, error = (image.reshape(h, w, -1) for image in images)
+        return JointImages(diffuse, specular, valid, angles[0], angles[1], error, _tally(targets))
+
+
+def _as_model(layers: nn.Module, example: Tensor) -> Any:
+    """Layers for OpenVINO: by its reader of traced modules, as its `convert_model`, which calls home, does."""
+    from openvino.frontend import FrontEndManager  # type: ignore[import-untyped]  # no stubs
+    from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder  # type: ignore[import-untyped]
+
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # of torch about tracing: sizes do not decide anything here
+        reader = FrontEndManager().load_by_framework("pytorch")
+        traced = TorchScriptPythonDecoder(layers, example_input=example)  # must live until it is converted
+        return reader.convert(reader.load(traced))
+
+
+def _first_channels(network: Joint) -> tuple[NDArray[np.int64], int]:
+    """Where each of the network's maps begins, -1 for those it does not see, and how many channels there are."""
+    first, count = dict.fromkeys(INPUTS, -1), 0
+    for name in network.inputs:
+        first[name] = count
+        count += _CHANNELS[name] + (4 * network.colors if name == "split" else 0)
+    return np.array([*first.values(), count], np.int64), count + 1
+
+
+def make_taps(network: Joint, width: int) -> Taps:
+    """The linear filter at half resolution for ``width`` packed pixels, without samples that an output does not see."""
+    from polsep.kernels.joint import Taps
+    from polsep.kernels.rows import AT_ONCE
+
+    s0 = 16 * network.colors
+    whole = torch.cat([pool_outputs(network.demosaic[:s0]), network.demosaic[s0:]]).flatten(1).numpy()
+    most = max(int(np.count_nonzero(row)) for row in whole)
+    shape = (len(whole), most + -most % AT_ONCE)
+    weight, rows, places = np.zeros(shape, np.float32), np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+    for output, row in enumerate(whole):
+        seen = np.flatnonzero(row)  # plane, row, column
+        weight[output, : seen.size], rows[output, : seen.size] = row[seen], seen % 9 // 3
+        places[output, : seen.size] = seen // 9 * (width + 2) + seen % 3
+    return Taps(weight, rows, places, network.colors)
+
+
+def _tally(targets: Any) -> Tally:
+    """The frame's tally from its rows' sums, in one order whatever the threads."""
+    *sums, clipped = (float(x) for x in targets.sums.sum(axis=0))
+    s0, specular, above_one, power, along, across, *variances = sums
+    counts = (targets.valid.size, int(clipped), int(np.count_nonzero(targets.valid)), int(above_one))
+    return Tally(*counts, s0, specular, power, along, across, None, None, variances[0], variances[1])
+
+
+@lru_cache(maxsize=KEPT)
+def _engine(method: str, colors: int, shape: tuple[int, int]) -> OpenVinoEngine:
+    network, _ = find_joint(method, Layout() if colors == 3 else Layout(bayer=None), None)
+    logging.getLogger("polsep").debug("compiling %s for frames of %dx%d", method, *shape)
+    return OpenVinoEngine(network, shape, PRECISION)
+
+
+def run_engine(method: str, mosaic: Mosaic) -> JointImages | None:
+    """A method's images of one frame in its light, or None: batches, other devices, huge frames, no OpenVINO.
+
+    Frames in other orientations than the network's are turned before and after, as `mosaic_network.run_joint` does.
+    """
+    data = mosaic.data
+    if find_spec("openvino") is None or data.ndim != 2 or data.device.type != "cpu" or data.numel() > MOST_PIXELS:
+        return None
+    orientation = orient(mosaic, own_order(mosaic.layout))
+    if not orientation.keeps_cells or data.dtype not in (torch.uint8, torch.uint16, torch.float32):
+        return None
+    levels, light = (mosaic.black_level, mosaic.white_level), mosaic.light_color
+    if orientation == Orientation(*data.shape) and not any(n % PERIOD for n in data.shape):
+        return _engine(method, mosaic.layout.channels, (data.shape[0], data.shape[1])).run(data.numpy(), levels, light)
+    turned = orientation.turn(data.float()).contiguous()
+    shape = (turned.shape[0], turned.shape[1])
+    return _turn_back(_engine(method, mosaic.layout.channels, shape).run(turned.numpy(), levels, light), orientation)
+
+
+def _turn_back(images: JointImages, orientation: Orientation) -> JointImages:
+    """Images of a turned frame as those of the frame itself; the tally is of all that was seen."""
+
+    def turn(image: NDArray[Any]) -> NDArray[Any]:
+        planes = torch.from_numpy(image)
+        planes = planes.movedim(-1, 0) if planes.ndim == 3 else planes
+        planes = orientation.turn_back(planes, 1)
+        return np.ascontiguousarray((planes.movedim(0, -1) if planes.ndim == 3 else planes).numpy())
+
+    aolp, tally, mirrored = turn(images.aolp), images.tally, orientation.down != orientation.across
+    if orientation.transposed:
+        aolp, tally = np.mod(np.float32(np.pi / 2) - aolp, np.float32(np.pi)), replace(tally, along=-tally.along)
+    if mirrored:
+        aolp, tally = np.mod(-aolp, np.float32(np.pi)), replace(tally, across=-tally.across)
+    diffuse, specular, error = (turn(image) for image in (images.diffuse, images.specular, images.error))
+    return JointImages(diffuse, specular, turn(images.valid), turn(images.dolp), aolp, error, tally)

@@ -1,0 +1,387 @@
+"""Twin of what surrounds the network in `joint.Joint.half_resolution`: from raw rows to its maps, and on to images.
+
+One pass makes the network's input, the closed form of its module, row after row of packed pixels: rings hold the rows
+that windows look back on. Another adds the network's corrections and writes images and what a report takes. Words are
+those of `polsep.joint`; rows are planar, ``[..., w]``, w packed pixels. Rows depend on nothing but the frame, so the
+number of threads changes no bit.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.color_affine import MAX_DIFFUSE_DOLP
+from polsep.joint import LEAST_LIGHT, PERIOD, TRUST, WINDOWS
+from polsep.kernels.bilinear import Pattern
+from polsep.kernels.compiling import HALF, ONE, QUARTER, TWO, ZERO, compiled, entry
+from polsep.kernels.rows import (
+    add_product,
+    average,
+    copy,
+    emit,
+    emit_bits,
+    emit_product,
+    fill,
+    filter_row,
+    multiply,
+    subtract,
+    sum_three,
+)
+from polsep.kernels.threads import Piece
+from polsep.kernels.unpack import Samples, read_row
+
+Floats = NDArray[np.float32]
+
+#: Rows that rings keep: those from a row to the last one it waits for, and twice the widest window.
+KEPT, SUMMED = 8, 16
+#: How many rows behind the newest one a row is left: the light around, and half of the widest window.
+REACH = 1 + WINDOWS[0] // 2
+_WIDE, _NARROW = (window // 2 for window in WINDOWS)
+_TRUST_WIDE, _TRUST_NARROW = (np.float32(trust) for trust in TRUST)
+_MOST, _LEAST_LIGHT, _TINY = np.float32(MAX_DIFFUSE_DOLP), np.float32(LEAST_LIGHT), np.float32(1e-12)
+#: Rows of scratch.
+_ROWS = 24
+
+
+class Taps(NamedTuple):
+    """The linear filter at half resolution, and its ``colors``; outputs are s0, s1, s2 of C colours times 4 cells.
+
+    ``weight``, ``row``, ``place [12 C, K]``: of the samples that each output sees, their packed row, 0 to 2, and their
+    place in rows ``[16, w + 2]``; K is a multiple of `rows.AT_ONCE`.
+    """
+
+    weight: Floats
+    row: NDArray[np.int64]
+    place: NDArray[np.int64]
+    colors: int
+
+
+class Maps(NamedTuple):
+    """What the first pass fills. ``floats`` or ``halves [h, w, channels]``, bfloat16 as its bits; the other is empty.
+
+    ``first [6]``: the first channel of samples, clipping, cosine, sine, split, logarithm; -1 for what is not wanted.
+    ``base [h, 4 C + 13, w]``: diffuse, specular, means over colours of s1 and s2, light. ``clipped [h, w]``: a bit per
+    sample of a packed pixel.
+    """
+
+    floats: Floats
+    halves: NDArray[np.uint16]
+    first: NDArray[np.int64]
+    base: Floats
+    clipped: NDArray[np.uint16]
+
+
+class _Rings(NamedTuple):
+    """Rows on their way, by row number modulo `KEPT` or `SUMMED`; ``planes`` have a column more on both sides.
+
+    ``s0 [8, 4 C, w]``, ``cosine``, ``sine [8, 4, w]``: means over colours; ``moments [8, 4, w]``: of the colours'
+    deviations, s0 with s0, s1, s2 and what s1, s2 have. ``luminance``, ``light``, ``free [8, w]``; ``sums [16, 3, w]``.
+    """
+
+    planes: Floats
+    s0: Floats
+    cosine: Floats
+    sine: Floats
+    moments: Floats
+    luminance: Floats
+    light: Floats
+    free: Floats
+    sums: Floats
+
+
+@compiled
+def _make_rings(colors: int, w: int) -> _Rings:
+    return _Rings(
+        np.zeros((KEPT, 16, w + 2), np.float32),
+        np.zeros((KEPT, 4 * colors, w), np.float32),
+        np.zeros((KEPT, 4, w), np.float32),
+        np.zeros((KEPT, 4, w), np.float32),
+        np.zeros((KEPT, 4, w), np.float32),
+        np.zeros((KEPT, w + 2), np.float32),
+        np.zeros((KEPT, w), np.float32),
+        np.zeros((KEPT, w), np.float32),
+        np.zeros((SUMMED, 3, w), np.float32),
+    )
+
+
+@compiled
+def _enter(samples: Samples, pattern: Pattern, u: int, planes: Any, clipped: Any) -> None:
+    """Samples of packed row ``u`` as planes ``[16, w + 2]``, and which of them clip."""
+    w = clipped.size
+    codes = np.empty(PERIOD * w, np.float32)
+    for j in range(w):
+        clipped[j] = 0
+    for row in range(PERIOD):
+        read_row(samples, PERIOD * u + row, 0, codes)
+        some = False
+        for x in range(codes.size):
+            some |= codes[x] >= pattern.clip_at
+        for col in range(PERIOD):
+            plane, gain = planes[PERIOD * row + col], pattern.gains[row // 2, col // 2]
+            inner, own = plane[1:], codes[col:]
+            for j in range(w):
+                inner[j] = (own[PERIOD * j] - pattern.black) * gain
+            plane[0], plane[w + 1] = plane[1], plane[w]
+            if some:
+                for j in range(w):
+                    if own[PERIOD * j] >= pattern.clip_at:
+                        clipped[j] |= np.uint16(1 << (PERIOD * row + col))
+
+
+@compiled
+def _starts(u: int, h: int, size: int) -> Any:
+    """Where the rows around packed row ``u`` begin in a ring of rows of ``size``; the border's are repeated."""
+    starts = np.empty(3, np.int64)
+    for k in range(3):
+        starts[k] = min(max(u - 1 + k, 0), h - 1) % KEPT * size
+    return starts
+
+
+@compiled
+def _demosaic(taps: Taps, u: int, h: int, rings: _Rings, spare: Any) -> None:
+    """Stokes images of row ``u``, the colours' moments, and its brightness."""
+    colors, slot = taps.colors, u % KEPT
+    near = (rings.planes.reshape(-1), _starts(u, h, rings.planes[0].size))
+    moments = rings.moments[slot]
+    for k in range(4):
+        fill(ZERO, moments[k])
+    luminance = rings.luminance[slot]
+    fill(ZERO, luminance)
+    mean, x, y, z = spare[0], spare[1], spare[2], spare[3:]
+    share, count = np.float32(1 / colors), np.float32(1 / (4 * colors))
+    for cell in range(4):
+        s0 = rings.s0[slot]
+        fill(ZERO, mean)
+        for c in range(colors):
+            output = 4 * c + cell
+            filter_row(taps.weight[output], (taps.row[output], taps.place[output]), near, s0[output])
+            add_product(s0[output], share, mean)
+        add_product(mean, QUARTER, luminance[1:-1])
+        for k, means in ((1, rings.cosine[slot, cell]), (2, rings.sine[slot, cell])):
+            fill(ZERO, means)
+            for c in range(colors):
+                output = 4 * (colors * k + c) + cell
+                filter_row(taps.weight[output], (taps.row[output], taps.place[output]), near, z[3 * k + c])
+                add_product(z[3 * k + c], share, means)
+        if colors == 1:
+            continue
+        for c in range(colors):
+            subtract(s0[4 * c + cell], mean, x)
+            for j in range(x.size):
+                moments[0, j] += x[j] * x[j] * count
+            for k, means in ((1, rings.cosine[slot, cell]), (2, rings.sine[slot, cell])):
+                subtract(z[3 * k + c], means, y)
+                multiply(x, y, count, moments[k])
+                multiply(y, y, count, moments[3])
+
+
+@compiled
+def _look_around(v: int, h: int, rings: _Rings, clipped: Any, spare: Any) -> None:
+    """The light around row ``v``, whether anything there clips, and the weighted moments."""
+    w, slot = rings.light.shape[1], v % KEPT
+    total, light, free = spare[0], rings.light[slot], rings.free[slot]
+    fill(ZERO, light)
+    fill(ONE, free)
+    first, last = max(v - 1, 0), min(v + 1, h - 1)
+    for row in range(first, last + 1):
+        around = rings.luminance[row % KEPT]
+        sum_three(around, around[1:], around[2:], total)
+        add_product(total, ONE, light)
+        bits, some = clipped[row], False
+        for j in range(w):
+            some |= bits[j] != 0
+        if some:
+            for j in range(w):
+                if bits[j] != 0:
+                    for i in range(max(j - 1, 0), min(j + 2, w)):
+                        free[i] = ZERO
+    rows = np.float32(last - first + 1)
+    average(light, 1, rows)
+    weight = spare[1]
+    for j in range(w):
+        light[j] = (light[j] if light[j] > ZERO else ZERO) + _LEAST_LIGHT
+    for j in range(w):
+        weight[j] = free[j] / (light[j] * light[j])
+    sums, moments = rings.sums[v % SUMMED], rings.moments[slot]
+    for k, moment in ((0, 1), (1, 2), (2, 0)):
+        fill(ZERO, sums[k])
+        multiply(moments[moment], weight, ONE, sums[k])
+
+
+@compiled
+def _pool(t: int, h: int, window: int, sums: Any, spare: Any) -> None:
+    """Means of the three moments over (2 ``window`` + 1)^2 around row ``t``, to ``spare [3, w]``."""
+    w = spare.shape[1]
+    padded, threes = np.zeros(w + 8, np.float32), np.zeros(w + 8, np.float32)
+    first, last = max(t - window, 0), min(t + window, h - 1)
+    for k in range(3):
+        inner, found = padded[4 : w + 4], spare[k]
+        fill(ZERO, inner)
+        for row in range(first, last + 1):
+            add_product(sums[row % SUMMED, k], ONE, inner)
+        sum_three(padded, padded[1:], padded[2:], threes[: w + 6])
+        if window == 1:
+            copy(threes[3:], found)
+        else:
+            sum_three(threes, threes[3:], threes[6:], found)
+        average(found, window, np.float32(last - first + 1))
+
+
+@compiled
+def _find_slope(pooled: Any, trust: Any, a1: Any, a2: Any) -> None:
+    """The slope from pooled moments ``[3, w]``, drawn toward the one before, to ``a1``, ``a2``."""
+    p1, p2, p0 = pooled[0], pooled[1], pooled[2]
+    for j in range(a1.size):
+        a1[j] = (p1[j] + trust * a1[j]) / (p0[j] + trust)
+    for j in range(a2.size):
+        a2[j] = (p2[j] + trust * a2[j]) / (p0[j] + trust)
+    for j in range(a1.size):
+        size = np.sqrt(a1[j] * a1[j] + a2[j] * a2[j] + _TINY)
+        limit = _MOST / (size if size > _MOST else _MOST)
+        a1[j] *= limit
+        a2[j] *= limit
+
+
+@compiled
+def _white_specular(b1: Any, b2: Any, a1: Any, a2: Any, tau: Any) -> None:
+    """`joint.white_specular` of a row, not below 0; ``tau`` is ``b1``'s place as well as its own."""
+    for j in range(tau.size):
+        real = b1[j] * a1[j] + b2[j] * a2[j]
+        free = ONE - a1[j] * a1[j] - a2[j] * a2[j]
+        root = (real + np.sqrt(real * real + free * (b1[j] * b1[j] + b2[j] * b2[j]) + _TINY)) / free
+        tau[j] = root if root > ZERO else ZERO
+
+
+@compiled
+def _offset(means: Any, a: Any, mean: Any, b: Any) -> None:
+    for j in range(b.size):
+        b[j] = means[j] - a[j] * mean[j]
+
+
+@compiled
+def _limit(s0: Any, tau: Any) -> None:
+    """No more specular light than a colour has."""
+    for j in range(tau.size):
+        most = s0[j] if s0[j] > ZERO else ZERO
+        tau[j] = tau[j] if tau[j] < most else most
+
+
+@compiled
+def _misfit(moments: Any, a: tuple[Any, Any], misfit: Any) -> None:
+    """Distance of the polarization from the line; ``moments [4, w]``."""
+    a1, a2 = a
+    own, first, second, total = moments[0], moments[1], moments[2], moments[3]
+    for j in range(misfit.size):
+        misfit[j] = total[j] - TWO * (a1[j] * first[j] + a2[j] * second[j])
+    for j in range(misfit.size):
+        left = misfit[j] + (a1[j] * a1[j] + a2[j] * a2[j]) * own[j]
+        misfit[j] = np.sqrt((HALF * left if left > ZERO else ZERO) + _TINY)
+
+
+@compiled
+def _find_slopes(t: int, h: int, sums: Any, spare: Any) -> None:
+    """Slopes of row ``t``, wide and narrow, to ``spare[4:8]``; the moments of the narrow window stay in ``[1:4]``."""
+    pooled, wide, narrow = spare[1:4], spare[4:6], spare[6:8]
+    fill(ZERO, wide[0])
+    fill(ZERO, wide[1])
+    _pool(t, h, _WIDE, sums, pooled)
+    _find_slope(pooled, _TRUST_WIDE, wide[0], wide[1])
+    copy(wide[0], narrow[0])
+    copy(wide[1], narrow[1])
+    _pool(t, h, _NARROW, sums, pooled)
+    _find_slope(pooled, _TRUST_NARROW, narrow[0], narrow[1])
+
+
+@compiled
+def _split(colors: int, slot: int, rings: _Rings, base: Any, spare: Any) -> None:
+    """Diffuse, specular and polarization of a row to its base; ``spare[6:8]``: its slope."""
+    a1, a2, mean, b1, b2, share = spare[6], spare[7], spare[8], spare[9], spare[10], np.float32(1 / colors)
+    for cell in range(4):
+        tau, cosine, sine = base[4 * colors + cell], rings.cosine[slot, cell], rings.sine[slot, cell]
+        fill(ZERO, mean)
+        for c in range(colors):
+            add_product(rings.s0[slot, 4 * c + cell], share, mean)
+        _offset(cosine, a1, mean, b1)
+        _offset(sine, a2, mean, b2)
+        _white_specular(b1, b2, a1, a2, tau)
+        for c in range(colors):
+            _limit(rings.s0[slot, 4 * c + cell], tau)
+        for c in range(colors):
+            subtract(rings.s0[slot, 4 * c + cell], tau, base[4 * c + cell])
+        copy(cosine, base[4 * colors + 4 + cell])
+        copy(sine, base[4 * colors + 8 + cell])
+
+
+@compiled
+def _show_samples(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> None:
+    """Samples of row ``t``, relative to the light, and which of them clip, to their maps."""
+    samples, clipping, inverse, row = maps.first[0], maps.first[1], spare[0], spare[11]
+    if samples >= 0:
+        for k in range(16):
+            emit_product(rings.planes[slot, k, 1:], inverse, (maps.floats, maps.halves, samples + k, t), row)
+    if clipping >= 0:
+        for k in range(16):
+            emit_bits(maps.clipped[t], k, (maps.floats, maps.halves, clipping + k, t), row)
+        emit(rings.free[slot], (maps.floats, maps.halves, clipping + 16, t))
+
+
+@compiled
+def _show_split(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> None:
+    """The closed form of row ``t`` to its maps."""
+    base, inverse, row, misfit, images = maps.base[t], spare[0], spare[11], spare[12], maps.base.shape[1] - 9
+    split, contrast = maps.first[4], spare[3]
+    for k in range(images):
+        emit_product(base[k], inverse, (maps.floats, maps.halves, split + k, t), row)
+    for k in range(4):
+        emit(spare[4 + k], (maps.floats, maps.halves, split + images + k, t))
+    for j in range(row.size):
+        row[j] = np.sqrt(contrast[j] + _TINY)
+    emit(row, (maps.floats, maps.halves, split + images + 4, t))
+    _misfit(rings.moments[slot], (spare[6], spare[7]), misfit)
+    emit_product(misfit, inverse, (maps.floats, maps.halves, split + images + 5, t), row)
+
+
+@compiled
+def _leave(t: int, taps: Taps, rings: _Rings, maps: Maps, spare: Any) -> None:
+    """The closed form of row ``t``, and the network's maps of it."""
+    slot = t % KEPT
+    light, inverse, row = rings.light[slot], spare[0], spare[11]
+    for j in range(light.size):
+        inverse[j] = ONE / light[j]
+    _find_slopes(t, maps.base.shape[0], rings.sums, spare)
+    _split(taps.colors, slot, rings, maps.base[t], spare)
+    copy(light, maps.base[t, 4 * taps.colors + 12])
+    _show_samples(t, slot, rings, maps, spare)
+    for first, rows in ((maps.first[2], rings.cosine[slot]), (maps.first[3], rings.sine[slot])):
+        if first >= 0:
+            for cell in range(4):
+                emit_product(rows[cell], inverse, (maps.floats, maps.halves, first + cell, t), row)
+    if maps.first[4] >= 0:
+        _show_split(t, slot, rings, maps, spare)
+    for j in range(row.size):
+        row[j] = np.log(light[j])
+    emit(row, (maps.floats, maps.halves, maps.first[5], t))
+
+
+@entry
+def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, piece: Piece) -> None:
+    """The maps and the closed form of a piece of the packed rows."""
+    h, w = maps.clipped.shape
+    rings, spare = _make_rings(taps.colors, w), np.zeros((_ROWS, w), np.float32)
+    # Rows that two pieces need are entered by both; what they write of them is the same.
+    begin = max(piece[0] - REACH, 0)
+    for u in range(max(begin - 1, 0), begin + 1):
+        _enter(samples, pattern, u, rings.planes[u % KEPT], maps.clipped[u])
+    for u in range(begin, piece[1] + REACH):
+        if u + 1 < h:
+            _enter(samples, pattern, u + 1, rings.planes[(u + 1) % KEPT], maps.clipped[u + 1])
+        if u < h:
+            _demosaic(taps, u, h, rings, spare)
+        v = u - 1
+        if (v > begin or v == 0) and v < h:
+            _look_around(v, h, rings, maps.clipped, spare)
+        if u - REACH >= piece[0]:
+            _leave(u - REACH, taps, rings, maps, spare)

@@ -1,0 +1,144 @@
+"""Twin of what follows the network in `joint.Joint.half_resolution`: corrections and closed form become images.
+
+Row after row of packed pixels, of which each makes two rows of images; see `kernels.joint`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.kernels.compiling import ONE, ZERO, compiled, entry
+from polsep.kernels.polarization import add_polarization, polarize, sum_row
+from polsep.kernels.rows import add_product, copy, fill
+from polsep.kernels.threads import Piece
+
+Floats = NDArray[np.float32]
+
+#: Columns of ``sums``: s0, specular, DoLP above 1, power, power along and across, variance of diffuse and of specular
+#: that is expected, pixels near clipped ones.
+SUMS = 9
+#: Bits of the samples of a packed pixel's first cell.
+_CELL = 0b110011
+
+
+class Found(NamedTuple):
+    """What is known of every packed pixel: ``base [h, 4 C + 13, w]`` and ``clipped [h, w]`` as in `joint.Maps`.
+
+    ``change [h, w, 4 C + 4]``: the network's corrections, relative to the light. ``doubt [h, w, 8]``: standard
+    deviations of the errors of four cells' diffuse, then specular, relative to it too.
+    """
+
+    base: Floats
+    clipped: NDArray[np.uint16]
+    change: Floats
+    doubt: Floats
+
+
+class Targets(NamedTuple):
+    """What is filled: colours ``[2 h, 2 w C]``, ``error [2 h, 2 w 2]``, others ``[2 h, 2 w]``; ``sums [2 h, 9]``."""
+
+    diffuse: Floats
+    specular: Floats
+    error: Floats
+    valid: NDArray[np.bool_]
+    dolp: Floats
+    aolp: Floats
+    sums: NDArray[np.float64]
+
+
+@compiled
+def _correct(closed: Any, change: Any, light: Any, image: Any) -> None:
+    """The closed form with its correction, not below 0."""
+    for j in range(image.size):
+        value = closed[j] + change[j] * light[j]
+        image[j] = value if value > ZERO else ZERO
+
+
+@compiled
+def _spread(row: Any, gain: Any, place: int, image: Any) -> None:
+    """A row to every so many numbers of an image row, from ``place`` on; as many as make its size."""
+    step = image.size // row.size
+    for j in range(row.size):
+        image[step * j + place] = gain * row[j]
+
+
+@compiled
+def _write_cells(found: Found, t: int, cell: int, gains: Any, work: tuple[Targets, Any]) -> None:
+    """One of the four cells of every packed pixel of row ``t``."""
+    targets, spare = work
+    y, side, colors = 2 * t + cell // 2, cell % 2, gains.size
+    base, light = found.base[t], found.base[t, 4 * colors + 12]
+    image, tau, s0, dolp, aolp = spare[0], spare[1], spare[2], spare[3], spare[4]
+    _correct(base[4 * colors + cell], found.change[t, :, 4 * colors + cell], light, tau)
+    copy(tau, s0)
+    for c in range(colors):
+        _correct(base[4 * c + cell], found.change[t, :, 4 * c + cell], light, image)
+        add_product(image, np.float32(1 / colors), s0)
+        _spread(image, gains[c], colors * side + c, targets.diffuse[y])
+        _spread(tau, gains[c], colors * side + c, targets.specular[y])
+    s1, s2 = base[4 * colors + 4 + cell], base[4 * colors + 8 + cell]
+    polarize(s0, s1, s2, dolp, aolp)
+    _spread(dolp, ONE, side, targets.dolp[y])
+    _spread(aolp, ONE, side, targets.aolp[y])
+    mean_gain = ZERO
+    for c in range(colors):
+        mean_gain += gains[c] / np.float32(colors)
+    for kind in range(2):
+        fill(ZERO, image)
+        doubt = found.doubt[t, :, 4 * kind + cell]
+        variance = 0.0
+        for j in range(image.size):
+            image[j] = doubt[j] * light[j]
+            variance += image[j] * image[j]
+        targets.sums[y, 6 + kind] += variance
+        _spread(image, mean_gain, 2 * side + kind, targets.error[y])
+    sums, nothing = targets.sums[y], found.clipped[0, :0]
+    sums[0] += sum_row(s0, nothing)
+    sums[1] += sum_row(tau, nothing)
+    for j in range(dolp.size):
+        sums[2] += dolp[j] > ONE
+    add_polarization(s1, s2, nothing, sums[3:6])
+
+
+@compiled
+def _clipped_of(clipped: Any, y: int, x: int) -> Any:
+    """A bit for each sample of the cell at ``y``, ``x`` that clips, of those of `_CELL`."""
+    return (clipped[y // 2, x // 2] >> (8 * (y % 2) + 2 * (x % 2))) & _CELL
+
+
+@compiled
+def _mark_clipped(clipped: Any, y: int, valid: Any) -> int:
+    """False in ``valid [2 w]`` where all of a cell clips; how many cells of the row are near a clipped sample."""
+    h, w = clipped.shape
+    first, last, some = max(y - 1, 0), min(y + 1, 2 * h - 1), False
+    for row in range(first // 2, last // 2 + 1):
+        bits = clipped[row]
+        for j in range(w):
+            some |= bits[j] != 0
+    count = 0
+    for x in range(2 * w):
+        valid[x] = True
+    if not some:
+        return count
+    for x in range(2 * w):
+        near = False
+        for row in range(first, last + 1):
+            for col in range(max(x - 1, 0), min(x + 2, 2 * w)):
+                near |= _clipped_of(clipped, row, col) != 0
+        count += near
+        valid[x] = _clipped_of(clipped, y, x) != _CELL
+    return count
+
+
+@entry
+def write_rows(found: Found, gains: Floats, targets: Targets, piece: Piece) -> None:
+    """Images of a piece of the packed rows; ``gains [C]``: the light's colour."""
+    spare = np.zeros((5, found.base.shape[2]), np.float32)
+    for t in range(piece[0], piece[1]):
+        for cell in range(4):
+            _write_cells(found, t, cell, gains, (targets, spare))
+        for y in range(2 * t, 2 * t + 2):
+            targets.sums[y, 8] = _mark_clipped(found.clipped, y, targets.valid[y])

@@ -1,0 +1,185 @@
+"""The joint network by kernels and OpenVINO: the same as in torch, for every frame that it takes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import torch
+from tolerances import assert_close, assert_same_angle, assert_within
+
+from polsep import joint_engine
+from polsep.camera import Layout, Mosaic
+from polsep.joint import INPUTS, Joint
+from polsep.joint_engine import JointImages, OpenVinoEngine, run_engine
+from polsep.kernels import get_threads, set_threads
+from polsep.mosaic_network import own_order, run_joint
+from polsep.networks import ResidualSize
+from polsep.pipeline import in_light
+from polsep.report import tally
+from polsep.separation import Separation
+from polsep.stokes import aolp, dolp
+
+COLOR, MONO = Layout(), Layout(bayer=None)
+LAYOUTS = [COLOR, MONO]
+LIGHT = (1.2, 1.0, 0.8)
+BLACK, WHITE = 100.0, 4000.0
+#: DoLP and AoLP of pixels that are hardly polarized, and sums over a frame of these tests, in float32.
+NOISE, SUMMED = 1e-4, 1e-4
+#: What bfloat16 changes in corrections of a few percent, rms: 8 bits, a few times over.
+ROUNDED = 1e-3
+
+
+def random_net(layout: Layout, inputs: tuple[str, ...] = INPUTS) -> Joint:
+    """A net whose every layer does something, with corrections of a few percent, and a filter that is not bilinear."""
+    torch.manual_seed(0)
+    net = Joint(layout.channels, ResidualSize(16, (0, 1, 1)), inputs)
+    for name, weight in net.named_parameters():
+        if name.endswith("weight"):
+            torch.nn.init.normal_(weight, std=0.5 / weight[0].numel() ** 0.5)
+    torch.nn.init.normal_(net.last.weight, std=0.02 / 16**0.5)
+    net.demosaic += 0.002 * torch.randn(net.demosaic.shape)
+    return net.eval()
+
+
+def random_frame(height: int, width: int, layout: Layout, most: int = 4095) -> Mosaic:
+    """12-bit samples, some clipped unless ``most`` is below `WHITE`, under a coloured light."""
+    generator = np.random.default_rng(height * width)
+    raw = generator.integers(int(BLACK), 3500, (height, width), np.uint16)
+    raw[height // 2 :, : width // 3][generator.random((height - height // 2, width // 3)) < 0.05] = 4095
+    raw[: height // 4, : width // 4] = 4095
+    return Mosaic(
+        torch.from_numpy(np.minimum(raw, np.uint16(most))), layout, BLACK, WHITE, light_color=LIGHT[: layout.channels]
+    )
+
+
+def in_torch(net: Joint, mosaic: Mosaic) -> Separation:
+    return in_light(run_joint(net, mosaic, "half"), mosaic.light_color)
+
+
+def in_engine(net: Joint, mosaic: Mosaic, precision: str = "f32") -> JointImages:
+    height, width = mosaic.data.shape
+    engine = OpenVinoEngine(net, (height, width), precision)
+    return engine.run(mosaic.data.numpy(), (mosaic.black_level, mosaic.white_level), mosaic.light_color)
+
+
+def assert_same(found: JointImages, expected: Separation, white: Separation) -> None:
+    """Images in the light, and polarization and tally in white light."""
+    for image, wanted in ((found.diffuse, expected.diffuse), (found.specular, expected.specular)):
+        assert_close(torch.from_numpy(image).movedim(-1, 0), wanted)
+    assert expected.doubt is not None
+    assert_close(torch.from_numpy(found.error).movedim(-1, 0), expected.doubt)
+    assert torch.equal(torch.from_numpy(found.valid), white.valid)
+    grey = white.stokes.map(lambda s: s.mean(dim=-3))
+    assert_within(torch.from_numpy(found.dolp), dolp(grey), NOISE)
+    polarized = dolp(grey) > 0.05
+    assert_same_angle(torch.from_numpy(found.aolp)[polarized], aolp(grey)[polarized], NOISE)
+    sums = tally(white)
+    for field in fields(sums):
+        mine, theirs = (getattr(x, field.name) for x in (found.tally, sums))
+        assert mine is theirs or mine == pytest.approx(theirs, rel=SUMMED, abs=SUMMED * sums.pixels), field.name
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.spec)
+@pytest.mark.parametrize("size", [(64, 96), (4, 4), (8, 60), (60, 8)])
+def test_it_is_what_torch_makes_of_a_frame(layout: Layout, size: tuple[int, int]) -> None:
+    net, mosaic = random_net(layout), random_frame(*size, layout)
+    assert_same(in_engine(net, mosaic), in_torch(net, mosaic), run_joint(net, mosaic, "half"))
+
+
+@pytest.mark.parametrize("left_out", INPUTS)
+def test_networks_that_see_less_are_shown_less(left_out: str) -> None:
+    net = random_net(COLOR, tuple(name for name in INPUTS if name != left_out))
+    mosaic = random_frame(32, 48, COLOR)
+    assert_same(in_engine(net, mosaic), in_torch(net, mosaic), run_joint(net, mosaic, "half"))
+
+
+def test_a_frame_without_clipped_samples_is_valid_everywhere() -> None:
+    net, mosaic = random_net(COLOR), random_frame(32, 48, COLOR, most=3000)
+    found = in_engine(net, mosaic)
+    assert found.valid.all() and found.tally.clipped == 0
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.spec)
+def test_bfloat16_rounds_corrections_only(layout: Layout) -> None:
+    net, mosaic = random_net(layout), random_frame(64, 96, layout)
+    found, expected = in_engine(net, mosaic, "bf16"), in_torch(net, mosaic)
+    for image, wanted in ((found.diffuse, expected.diffuse), (found.specular, expected.specular)):
+        error = torch.from_numpy(image).movedim(-1, 0) - wanted
+        assert 0 < float(error.square().mean().sqrt()) < ROUNDED
+    assert_within(torch.from_numpy(found.aolp), torch.from_numpy(in_engine(net, mosaic).aolp), 0.0)
+
+
+def test_threads_and_frames_before_change_no_bit() -> None:
+    """The room for what lies between is used again and again; strips of rows overlap."""
+    net, threads = random_net(COLOR), get_threads()
+    frames = [random_frame(320, 48, COLOR, most) for most in (4095, 2000)]
+    engine = OpenVinoEngine(net, (320, 48), "f32")
+    runs = []
+    try:
+        for count in (1, 3):
+            set_threads(count)
+            for frame in (*frames, frames[0]):
+                runs.append(engine.run(frame.data.numpy(), (BLACK, WHITE), LIGHT))
+    finally:
+        set_threads(threads)
+    for first, second in ((0, 2), (0, 3), (1, 4), (2, 5)):
+        for field in fields(JointImages):
+            one, other = (getattr(runs[k], field.name) for k in (first, second))
+            assert one == other if field.name == "tally" else np.array_equal(one, other)
+    assert not np.array_equal(runs[0].diffuse, runs[1].diffuse)
+
+
+@pytest.fixture
+def shipped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random networks stand for the shipped ones."""
+
+    def find(method: str, layout: Layout, path: None) -> tuple[Joint, dict[str, str]]:
+        return random_net(own_order(layout)), {}
+
+    joint_engine._engine.cache_clear()
+    monkeypatch.setattr(joint_engine, "find_joint", find)
+    monkeypatch.setattr(joint_engine, "PRECISION", "f32")
+
+
+TURNS: dict[str, Callable[[Layout], Layout]] = {
+    "as it is": lambda layout: layout,
+    "mirrored": lambda layout: layout.flipped_horizontal(62),
+    "upside down": lambda layout: layout.flipped_vertical(50),
+    "transposed": lambda layout: layout.transposed(),
+    "cropped": lambda layout: layout.rolled(2, 2),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.spec)
+@pytest.mark.parametrize("turn", TURNS)
+def test_frames_of_any_orientation_and_side(layout: Layout, turn: str, shipped: None) -> None:
+    """Sides that are no multiples of the period, filters mirrored, transposed or cropped."""
+    mosaic = random_frame(50, 62, TURNS[turn](layout))
+    found = run_engine("joint", mosaic)
+    assert found is not None
+    white = run_joint(random_net(layout), mosaic, "half")
+    for image, wanted in ((found.diffuse, in_light(white, mosaic.light_color).diffuse), (found.valid, white.valid)):
+        turned = torch.from_numpy(image)
+        assert_close((turned.movedim(-1, 0) if turned.ndim == 3 else turned).float(), wanted.float())
+    grey = white.stokes.map(lambda s: s.mean(dim=-3))
+    polarized = dolp(grey) > 0.05
+    assert_same_angle(torch.from_numpy(found.aolp)[polarized], aolp(grey)[polarized], NOISE)
+
+
+def test_what_it_does_not_take_is_left_to_torch(shipped: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Batches, other dtypes, cells half a cell off, frames beyond `MOST_PIXELS`, and machines without OpenVINO."""
+    mosaic = random_frame(32, 48, COLOR)
+    assert run_engine("joint", mosaic) is not None
+    batch = Mosaic(mosaic.data.float()[None], COLOR, BLACK, WHITE)
+    double = Mosaic(mosaic.data.double(), COLOR, BLACK, WHITE)
+    half_off = random_frame(32, 48, MONO.rolled(1, 0))
+    assert [run_engine("joint", frame) for frame in (batch, double, half_off)] == [None] * 3
+    monkeypatch.setattr(joint_engine, "MOST_PIXELS", 32 * 48 - 1)
+    assert run_engine("joint", mosaic) is None
+    monkeypatch.setattr(joint_engine, "MOST_PIXELS", math.inf)
+    monkeypatch.setattr(joint_engine, "find_spec", lambda name: None)
+    assert run_engine("joint", mosaic) is None

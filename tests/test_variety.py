@@ -24,6 +24,8 @@ from polsep.train.variety import (
     GREY_SATURATION,
     GREY_SHARE,
     MAGNIFICATIONS,
+    MATTE_SHARE,
+    MATTE_STRENGTH,
     PLAIN_SHARE,
     RELIEF_SHARE,
     RELIEF_TILTS,
@@ -133,14 +135,16 @@ def albedos(materials: Materials) -> list[Tensor]:
     return [materials.albedo] + ([materials.textures.albedo] if materials.textures is not None else [])
 
 
-def test_grey_looks_keep_brightness_and_lose_saturation() -> None:
-    """A look is as it was, or all of it has at most `GREY_SATURATION` of its own saturation."""
-    draws, grey, plain = 200, 0, 0
+def test_looks_keep_what_they_must() -> None:
+    """Grey ones keep brightness and at most `GREY_SATURATION` of their saturation, matte ones some specular light."""
+    draws, grey, plain, matte = 200, 0, 0, 0
     for seed in range(draws):
         before = random_materials(5, seeded(seed))
         after = vary_materials(before, seeded(1000 + seed))
         assert torch.equal(after.roughness, before.roughness)
-        assert torch.equal(after.specular, before.specular)
+        left = after.specular / before.specular
+        matte += not torch.equal(after.specular, before.specular)
+        assert torch.equal(left, torch.ones(5)) or bool((left > MATTE_STRENGTH[0]).all() and (left < 1).all())
         same = torch.equal(after.albedo, before.albedo)
         for old, new in zip(albedos(before), albedos(after), strict=False):
             assert_close(new.amax(dim=1), old.amax(dim=1))
@@ -150,6 +154,7 @@ def test_grey_looks_keep_brightness_and_lose_saturation() -> None:
         plain += before.textures is not None and after.textures is None
     expect_share(grey, draws, GREY_SHARE)
     expect_share(plain, draws, PLAIN_SHARE)
+    expect_share(matte, draws, MATTE_SHARE)
 
 
 def test_sensors_stay_in_their_bounds() -> None:

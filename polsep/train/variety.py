@@ -1,4 +1,4 @@
-"""What training examples have beyond `polsep.views`: close-ups, relief, grey and plain objects, lenses, other cameras.
+"""What training examples have beyond `polsep.views`: close-ups, relief, grey, plain and matte objects, cameras.
 
 Whoever uses a trained network photographs more than objects that fill the frame, by one camera. Draws take a generator.
 """
@@ -23,6 +23,9 @@ from polsep.views import LEAST_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
 CLOSE_SHARE, MAGNIFICATIONS = 0.5, (1.0, 5.0)
 #: Shares of the looks of which all is near-grey, and of those without textures.
 GREY_SHARE, PLAIN_SHARE = 0.2, 0.2
+#: Share of the looks that are matte: what is left of their specular light, log-uniform for every material. Photographs of
+#: painted, dusty or paper things have half a percent of it, which random materials rarely have.
+MATTE_SHARE, MATTE_STRENGTH = 0.3, (0.02, 1.0)
 #: Saturation that near-grey looks keep, at most.
 GREY_SATURATION = 0.15
 #: Standard deviation of the lens's point spread in raw pixels: that of `views.BLURS` and, slightly defocused, more.
@@ -92,8 +95,12 @@ def vary_normals(view: View, generator: torch.Generator) -> View:
 
 
 def vary_materials(materials: Materials, generator: torch.Generator) -> Materials:
-    """The same, near-grey or without textures at random."""
-    grey, plain, saturation = torch.rand(3, generator=generator).tolist()
+    """The same, near-grey, without textures or matte at random."""
+    grey, plain, saturation, matte = torch.rand(4, generator=generator).tolist()
+    places = torch.rand(materials.specular.shape, generator=generator)
+    if matte < MATTE_SHARE:
+        left = MATTE_STRENGTH[0] * (MATTE_STRENGTH[1] / MATTE_STRENGTH[0]) ** places
+        materials = replace(materials, specular=materials.specular * left)
     if plain < PLAIN_SHARE:
         materials = replace(materials, textures=None)
     if grey >= GREY_SHARE:

@@ -23,8 +23,8 @@ from polsep.views import LEAST_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
 CLOSE_SHARE, MAGNIFICATIONS = 0.5, (1.0, 5.0)
 #: Shares of the looks of which all is near-grey, and of those without textures.
 GREY_SHARE, PLAIN_SHARE = 0.2, 0.2
-#: Share of the looks that are matte: what is left of their specular light, log-uniform for every material. Photographs of
-#: painted, dusty or paper things have half a percent of it, which random materials rarely have.
+#: Share of the looks that are matte: what is left of their specular light, log-uniform for every material. Photographs
+#: of painted, dusty or paper things have half a percent of it, which random materials rarely have.
 MATTE_SHARE, MATTE_STRENGTH = 0.3, (0.02, 1.0)
 #: Saturation that near-grey looks keep, at most.
 GREY_SATURATION = 0.15

@@ -143,6 +143,6 @@ def describe(sums: Tally) -> dict[str, Any]:
     if sums.noise is not None:
         statistics["sample_noise"] = sums.noise / pixels
     if sums.diffuse_variance is not None and sums.specular_variance is not None:
-        variances = (sums.diffuse_variance, sums.specular_variance)
-        statistics["expected_error"] = [math.sqrt(variance / pixels) for variance in variances]
+        statistics["expected_diffuse_error"] = math.sqrt(sums.diffuse_variance / pixels)
+        statistics["expected_specular_error"] = math.sqrt(sums.specular_variance / pixels)
     return {"statistics": statistics, "warnings": remarks}

@@ -27,7 +27,8 @@ from polsep import cli
 from polsep.camera import IDEAL, Layout, expose
 from polsep.io.genicam import pack_frame
 from polsep.io.outputs import FORMATS, LAYERS, read_exr_layers
-from polsep.methods import METHODS
+from polsep.methods import BEST, METHODS
+from polsep.mosaic_network import NAMES
 from polsep.stokes import Stokes
 
 COLOR_LAYERS = {f"{image}.{color}" for image in ("diffuse", "specular") for color in "RGB"}
@@ -134,12 +135,13 @@ def test_separate_writes_the_contract(tmp_path: Path) -> None:
         str(tmp_path / "out" / f"shot.{s}") for s in ("exr", "png", "json")
     )
     layers = read_exr_layers(tmp_path / "out" / "shot.exr")
-    assert set(layers) == COLOR_LAYERS | MAPS
+    errors = {"error.diffuse", "error.specular"} if BEST[0].name in NAMES else set()
+    assert set(layers) == COLOR_LAYERS | MAPS | errors
     assert {image.shape for image in layers.values()} == {(16, 16)}
     preview = imagecodecs.png_decode((tmp_path / "out" / "shot.png").read_bytes())
     assert preview.ndim == 3 and preview.dtype == np.uint8
     sidecar = json.loads((tmp_path / "out" / "shot.json").read_text())
-    assert sidecar["source"] == "shot.png" and sidecar["report"]["method"] == "color-affine"
+    assert sidecar["source"] == "shot.png" and sidecar["report"]["method"] == BEST[0].name
     for entry in sidecar["files"]:
         assert hashlib.sha256((tmp_path / "out" / entry["name"]).read_bytes()).hexdigest() == entry["sha256"]
 
@@ -153,11 +155,12 @@ def test_every_format_of_both_sensors(tmp_path: Path, polsep: Cli, format: str, 
         "separate", png(tmp_path / "a.png", mosaic), "-o", tmp_path / "o", "--format", format, "--layout", layout
     )
     assert run.status == 0, run
-    images = {f"a_{layer}.{format}" for layer in LAYERS} if format in ("tiff", "png") else {f"a.{format}"}
+    layers = {*LAYERS, "error"} if layout == "color" and BEST[0].name in NAMES else set(LAYERS)
+    images = {f"a_{layer}.{format}" for layer in layers} if format in ("tiff", "png") else {f"a.{format}"}
     assert set(contents(tmp_path / "o")) == images | {"a.png", "a.json"}
     if format == "npz":
         arrays = np.load(tmp_path / "o" / "a.npz")
-        assert set(arrays.files) == set(LAYERS)
+        assert set(arrays.files) == layers
         assert arrays["diffuse"].shape == (16, 16, 3 if layout == "color" else 1)
     if format == "exr" and layout == "mono":
         assert set(read_exr_layers(tmp_path / "o" / "a.exr")) == {"diffuse.Y", "specular.Y"} | MAPS
@@ -171,7 +174,7 @@ def test_every_method_and_full_resolution(tmp_path: Path, polsep: Cli, method: s
     assert run.status == 0, run
     assert read_exr_layers(tmp_path / "o" / "a.exr")["diffuse.G"].shape == (32, 32)
     report = json.loads((tmp_path / "o" / "a.json").read_text())["report"]
-    assert report["method"] == ("color-affine" if method == "auto" else method) and report["full_resolution"]
+    assert report["method"] == (BEST[0].name if method == "auto" else method) and report["full_resolution"]
 
 
 def test_pages_become_numbered_frames(tmp_path: Path, polsep: Cli) -> None:

@@ -16,6 +16,7 @@ import torch
 from polsep import engine
 from polsep.camera import Layout, Mosaic
 from polsep.methods import METHODS
+from polsep.mosaic_network import NAMES
 from polsep.pipeline import SeparatedFrame, resolve_light_color, separate_capture, separate_in_engine, separate_in_torch
 from polsep.stokes import Measurements
 
@@ -89,9 +90,13 @@ def test_dolp_aolp_and_statistics_are_of_white_light(method: str, full: bool) ->
     white = Mosaic(0.5 * capture(COLOR).linear(), COLOR, 0.0, 1.0)
     colored = replace(white, data=replace(white, light_color=tuple(1 / gain for gain in ODD_LIGHT)).linear())
     one, other = separate_capture(white, method, full=full), separate_capture(colored, method, ODD_LIGHT, full=full)
-    np.testing.assert_allclose(other.dolp, one.dolp, rtol=0, atol=1e-4)
-    assert other.report["statistics"] == pytest.approx(one.report["statistics"], rel=STATISTICS)
-    np.testing.assert_allclose(other.specular, one.specular * np.float32(ODD_LIGHT), rtol=0, atol=1e-5)
+    rounded = method in NAMES and not full  # layers may run in bfloat16
+    np.testing.assert_allclose(other.dolp, one.dolp, rtol=0, atol=1e-2 if rounded else 1e-4)
+    loose = {"rel": 1e-2, "abs": 1e-2} if rounded else {"rel": STATISTICS}
+    assert other.report["statistics"] == pytest.approx(one.report["statistics"], **loose)
+    np.testing.assert_allclose(
+        other.specular, one.specular * np.float32(ODD_LIGHT), rtol=0, atol=3e-3 if rounded else 1e-5
+    )
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -119,7 +124,9 @@ def test_full_resolution_and_measurements_are_torchs(method: str, monkeypatch: p
     monkeypatch.setitem(METHODS, method, replace(METHODS[method], engine=calls.append))
     mosaic = capture(COLOR, (32, 32))
     separate_capture(mosaic, method, full=True, device="cpu")
-    separate_capture(Measurements(torch.rand(4, 3, 16, 16), COLOR.angles), method, device="cpu")
+    co_sited = Measurements(torch.rand(4, 3, 16, 16), COLOR.angles)
+    if METHODS[method].takes(co_sited):
+        separate_capture(co_sited, method, device="cpu")
     assert calls == []
     separate_capture(mosaic, method, device="cpu")
     assert len(calls) == 1

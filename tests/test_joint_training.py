@@ -159,10 +159,11 @@ def test_the_loss_of_the_paper_is_that_of_its_network() -> None:
 
 
 def test_light_beyond_white_counts() -> None:
-    """Where the score is blind; the darker of two highlights of a true 3 is the worse one."""
-    truth = torch.full((1, 1, 4, 4), 3.0)
-    losses = [float(beyond_white(torch.full_like(truth, level), truth)) for level in (1.0, 2.0, 3.0)]
-    assert losses[0] > losses[1] > losses[2] == 0
+    """Where the score is blind; the darker of two highlights of a true 3 is the worse one, none is -50 dB."""
+    truth, weight = torch.full((1, 1, 4, 4), 3.0), torch.ones(1, 1, 4, 4)
+    losses = [float(beyond_white(torch.full_like(truth, level), truth, weight)) for level in (1.0, 2.0, 3.0)]
+    assert losses[0] > losses[1] > losses[2] == pytest.approx(10 * math.log10(LEAST_ERROR))
+    assert losses[1] == pytest.approx(20 * math.log10(math.log(4 / 3)), abs=0.01)
 
 
 @pytest.mark.parametrize("share", [1e-4, 0.01, 0.3])

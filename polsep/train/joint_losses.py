@@ -1,9 +1,9 @@
 """What the joint network minimizes.
 
 The score that counts is the mean PSNR over scenes, so that is what is minimized: the logarithm of each crop's mean
-squared error, limited to the white level as the score is, at half and at full resolution. Beside it stand the light
-beyond white on a logarithmic scale, the samples that the images explain against those that did not clip, and the
-likelihood of the errors under the variances that the network itself predicts.
+squared error, limited to the white level as the score is, at half and at full resolution. Beside it stand the same of
+light on a logarithmic scale, which goes on beyond white, the samples that the images explain against those that did not
+clip, and the likelihood of the errors under the variances that the network itself predicts.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from polsep.train.losses import diffuse_loss
 LEAST_ERROR = 1e-5
 #: Weight of pixels off the object, against 1 on it.
 BACKGROUND = 0.05
-#: Weights, against dB at half resolution, of dB at full resolution, of log(1 + light) and of the samples' misfit.
-FULL_WEIGHT, BEYOND_WEIGHT, DATA_WEIGHT = 0.5, 10.0, 1.0
+#: Weights, against dB at half resolution, of dB at full resolution, of dB of log(1 + light) and of the samples' misfit.
+FULL_WEIGHT, BEYOND_WEIGHT, DATA_WEIGHT = 0.5, 0.3, 1.0
 #: Misfit of a sample, in white levels, that counts as large: twice the noise of a bright one.
 DATA_SCALE = 0.02
 #: Squared error, in variances expected of it, from which on the likelihood grows as a logarithm.
@@ -39,7 +39,11 @@ Difference = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 def mean_decibels(found: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
     """Minus the mean PSNR over crops, limited to white and by `LEAST_ERROR`."""
-    squared = (found.clamp(max=1) - truth.clamp(max=1)) ** 2
+    return _mean_logarithm((found.clamp(max=1) - truth.clamp(max=1)) ** 2, weight)
+
+
+def _mean_logarithm(squared: Tensor, weight: Tensor) -> Tensor:
+    """Of the mean of each crop, in dB."""
     mean = (squared * weight).mean(dim=(1, 2, 3)) / weight.mean(dim=(1, 2, 3))
     return 10 / math.log(10) * torch.log(mean + LEAST_ERROR).mean()
 
@@ -67,16 +71,17 @@ def joint_loss(found: tuple[Images, Pose], seen: JointSeen, goal: Goal) -> Tenso
     differ = goal.difference
     half = differ(diffuse, seen.diffuse, half_weight) + differ(specular, seen.specular, half_weight)
     full = differ(images.diffuse, seen.full_diffuse, weight) + differ(images.specular, seen.full_specular, weight)
-    beyond = beyond_white(diffuse, seen.diffuse) + beyond_white(specular, seen.specular)
+    beyond = beyond_white(diffuse, seen.diffuse, half_weight) + beyond_white(specular, seen.specular, half_weight)
     # Also when it weighs nothing: the budget stays the same, and every parameter has a gradient.
     loss = half + FULL_WEIGHT * full + BEYOND_WEIGHT * beyond + goal.data * sample_misfit(images, pose, seen)
     errors = (diffuse - seen.diffuse, specular - seen.specular)
     return LOSS_SCALE * (loss + doubt_loss(images, errors, half_weight))
 
 
-def beyond_white(found: Tensor, truth: Tensor) -> Tensor:
-    """Mean difference of log(1 + light), which goes on where the score is blind."""
-    return (torch.log1p(found.clamp(min=0)) - torch.log1p(truth)).abs().mean()
+def beyond_white(found: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
+    """`mean_decibels` of log(1 + light), not limited: where the score is blind, highlights that clip are recovered."""
+    squared = (torch.log1p(found.clamp(min=0)) - torch.log1p(truth)) ** 2
+    return _mean_logarithm(squared, weight)
 
 
 def sample_misfit(images: Images, pose: Pose, seen: JointSeen) -> Tensor:

@@ -240,7 +240,8 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 @click.option("--start", type=click.Path(path_type=Path), metavar="FILE", help="Weights to begin with.")
 @click.option("--precision", default="bf16-mixed", metavar="NAME", help="bf16-mixed or 32-true.")
 def train(rung: str, output: Path, data: str, **options: Any) -> None:
-    """Train joint, joint-fast or a rung of the paper's ladder: paper, unpolarized, polarized, shared, no-angle, stokes.
+    """Train joint, joint-fast or a rung of the paper's ladder: paper, unpolarized, polarized, shared, signed,
+    no-angle, stokes.
 
     Data are rendered while training, from seeds that no test has. A run that was stopped or killed goes on when the
     same command is given again. 'tensorboard --logdir DIR' shows its curves. Needs the extra train.

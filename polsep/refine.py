@@ -35,6 +35,13 @@ def split_inputs(measurements: Measurements) -> Tensor:
     return torch.cat([found.diffuse, torch.log1p(found.specular)], dim=-3)
 
 
+def signed_inputs(measurements: Measurements) -> Tensor:
+    """`analytic_inputs` and sin(2 phi), which tells phi from -phi; not in the paper."""
+    stokes = fit_stokes(measurements)
+    sine = stokes.s2 / polarized_intensity(stokes).clamp(min=LEAST_POLARIZED)
+    return torch.cat([split_inputs(measurements), _cosine(stokes), sine], dim=-3)
+
+
 def stokes_inputs(measurements: Measurements) -> Tensor:
     """s0, s1, s2 of every colour (Table 2, ablation 3)."""
     stokes = fit_stokes(measurements)
@@ -92,6 +99,7 @@ RUNGS = {
             ((0.25, 0.25, 0.25, 0.25), (2, 0, -2, 0), (0, 2, 0, -2), (2, -2, 2, -2)),
         ),
         Rung("shared", analytic_inputs, ((1, 0, 0), (0, 1, 0)), True, "one network for both outputs"),
+        Rung("signed", signed_inputs, ((1, 0, 0, 0), (0, 1, 0, 0)), False, "as paper, with the angle's sine too"),
         Rung("no-angle", split_inputs, ((1, 0), (0, 1)), False, "analytic split without the angle"),
         Rung(
             "stokes",

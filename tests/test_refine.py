@@ -50,7 +50,7 @@ def test_every_rung_sees_and_separates(rung: Rung) -> None:
     assert_close(found.stokes.s0, separate_analytic(seen()).stokes.s0)
 
 
-@pytest.mark.parametrize("name", ["paper", "shared", "no-angle"])
+@pytest.mark.parametrize("name", ["paper", "shared", "signed", "no-angle"])
 def test_networks_that_see_the_analytic_split_start_at_it(name: str) -> None:
     rung, expected = RUNGS[name], separate_analytic(seen())
     found = separate_refined(seen(), rung, Refinement(rung, 3, Size(4, 1, 1)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import re
@@ -304,12 +303,14 @@ def test_rate_warms_up_and_falls_as_a_cosine() -> None:
 @pytest.mark.parametrize("see", [see_mosaic, see_co_sited])
 def test_a_net_learns_a_picture_by_heart(see: Callable[[Examples], Seen]) -> None:
     """One 32 x 32 example, 200 steps: both outputs reach 40 dB, 15 dB above the analytic split they start at."""
-    examples = next(itertools.islice(stream_lane(replace(STREAM, batch=1), 0, 0), 3, None))
     torch.manual_seed(0)
     task = ladder_task(find_rung("paper"), "mosaic", Size(12, 2, 1))
-    seen = see(examples)
-    everywhere = [(*seen[:3], torch.ones_like(seen[3]))]
-    before = score(task.separate, everywhere)
+    for examples in stream_lane(replace(STREAM, batch=1), 0, 0):
+        seen = see(examples)
+        everywhere = [(*seen[:3], torch.ones_like(seen[3]))]
+        before = score(task.separate, everywhere)
+        if min(before.values()) > 20 and max(before.values()) < 34:  # one that leaves something to learn
+            break
     optimizer = torch.optim.Adam(task.network.parameters(), 3e-3)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 200)
     for _ in range(200):
@@ -415,4 +416,4 @@ def test_rungs_without_a_first_guess_begin_with_squared_errors(rung: str) -> Non
     with torch.no_grad():
         early, late, last = (float(task.loss(task.network, seen, done)) for done in (0.0, FIRST_SHARE, 1.0))
     assert late == last
-    assert (early == late) == (rung in ("paper", "shared", "no-angle"))
+    assert (early == late) == (rung in ("paper", "shared", "signed", "no-angle"))

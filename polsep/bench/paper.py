@@ -22,7 +22,7 @@ from polsep.camera import Mosaic
 from polsep.io.frames import ReadOptions, read_frames
 
 #: Rungs that leave something out of the paper's method (Table 2); all others are baselines (Table 3).
-ABLATIONS = ("shared", "no-angle", "stokes")
+ABLATIONS = ("shared", "signed", "no-angle", "stokes")
 #: Metrics of Tables 2 and 3.
 TABLED = ("diffuse PSNR", "specular PSNR")
 

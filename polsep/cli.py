@@ -84,8 +84,9 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     """Separate raw frames of a polarization camera into diffuse and specular images.
 
     FILE is PNG, TIFF, NPY, NPZ, PGM or headless raw; 'shot_{angle}.png' names four images at 0, 45, 90 and 135 degrees.
-    For every frame, DIR/STEM.exr gets the layers diffuse.R/G/B, specular.R/G/B, dolp.Y, aolp.Y [radians] and valid.Y,
-    DIR/STEM.png is a preview, and DIR/STEM.json tells settings and statistics.
+    For every frame, DIR/STEM.exr gets the layers diffuse.R/G/B, specular.R/G/B, dolp.Y, aolp.Y [radians] and valid.Y
+    (networks also write error.diffuse and error.specular, how far off they expect to be), DIR/STEM.png is a preview,
+    and DIR/STEM.json tells settings and statistics.
 
     \b
     polsep separate shot.png -o out                   Sony colour mosaic, 8 or 16 bit

@@ -36,6 +36,8 @@ PERIOD = 4
 INPUTS = ("samples", "clipping", "cosine", "sine", "split")
 #: Brightness around that counts as black: below it inputs and corrections fade.
 LEAST_LIGHT = 0.01
+#: Expected log variances at most, so that their exponentials are finite: an error of 150 times the light around.
+MOST_DOUBT = 10.0
 #: Windows of the slope in packed pixels, and the contrast of colours, relative to the brightness and squared, below
 #: which they fall back to the wider window and to zero. Chosen on validation views (docs/experiments.md).
 WINDOWS, TRUST = (9, 3), (3e-3, 3e-3)
@@ -141,7 +143,7 @@ class Joint(nn.Module):
         with torch.autocast(raw.device.type, enabled=False), torch.no_grad():
             guess = self.guess(planes, masks)
         features = self.net(guess.maps)
-        return planes, guess, features, pixel_shuffle(self.doubt(features.detach()).float(), 2)
+        return planes, guess, features, pixel_shuffle(self.doubt(features.detach()).float().clamp(max=MOST_DOUBT), 2)
 
     def guess(self, planes: Tensor, masks: Tensor) -> Guess:
         """The closed form on linearly demosaicked samples; ``planes``, ``masks [N, 16, h, w]``."""

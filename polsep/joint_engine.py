@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d
 
 from polsep.camera import Layout, Mosaic
-from polsep.joint import INPUTS, PERIOD, Joint, pool_outputs
+from polsep.joint import INPUTS, MOST_DOUBT, PERIOD, Joint, pool_outputs
 from polsep.mosaic_network import MOST_PIXELS, find_joint, own_order
 from polsep.orient import Orientation, orient
 from polsep.report import Tally
@@ -68,7 +68,7 @@ class Layers(nn.Module):
     def forward(self, maps: Tensor) -> tuple[Tensor, Tensor]:
         """Relative to the light, at half resolution; see `kernels.joint_images.Found`."""
         features = self.net(maps)
-        return conv2d(features, self.weight, self.bias), torch.exp(0.5 * self.doubt(features))
+        return conv2d(features, self.weight, self.bias), torch.exp(0.5 * self.doubt(features).clamp(max=MOST_DOUBT))
 
 
 class OpenVinoEngine:

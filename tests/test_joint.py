@@ -17,12 +17,14 @@ from polsep.color_affine import MAX_DIFFUSE_DOLP
 from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
 from polsep.joint import (
     INPUTS,
+    MOST_DOUBT,
     PERIOD,
     Images,
     Joint,
     Pose,
     bilinear_filter,
     find_slopes,
+    limit,
     pool_outputs,
     predict_samples,
     white_specular,
@@ -364,3 +366,12 @@ def test_samples_beyond_the_border_are_repeated_by_periods(layout: Layout) -> No
     net = untrained(layout)
     one, two = (net(x, nothing_clipped(x))[0] for x in (raw, wide))
     assert_close(one.diffuse + one.specular, crop(two.diffuse + two.specular, 4))
+
+
+def test_expected_errors_stay_finite() -> None:
+    """However far off a network expects to be, files can hold it."""
+    net, raw = untrained(COLOR), random_raw(1, 16, 16)
+    torch.nn.init.constant_(net.doubt[2].bias, 1e6)  # type: ignore[arg-type]
+    images = net.half_resolution(raw, nothing_clipped(raw))
+    assert float(images.doubt.min()) == MOST_DOUBT
+    assert_finite(*limit(images))

@@ -372,6 +372,7 @@ def test_expected_errors_stay_finite() -> None:
     """However far off a network expects to be, files can hold it."""
     net, raw = untrained(COLOR), random_raw(1, 16, 16)
     torch.nn.init.constant_(net.doubt[2].bias, 1e6)  # type: ignore[arg-type]
-    images = net.half_resolution(raw, nothing_clipped(raw))
+    with torch.no_grad():
+        images = net.half_resolution(raw, nothing_clipped(raw))
     assert float(images.doubt.min()) == MOST_DOUBT
     assert_finite(*limit(images))

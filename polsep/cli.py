@@ -322,7 +322,7 @@ def demo(output: Path) -> None:
     """
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
     from polsep.io.frames import ReadOptions
-    from polsep.methods import BEST, METHODS
+    from polsep.methods import METHODS
 
     capture = Path(__file__).parent / "data" / "still_life.png"
     for name in METHODS:
@@ -331,10 +331,9 @@ def demo(output: Path) -> None:
             if _report(outcome):
                 sys.exit(2)
             _print_demo(name, outcome.report["statistics"])
-    best = BEST[0].name
-    print(f"Look at {output / best / 'still_life.png'} beside {output / 'analytic' / 'still_life.png'}:")
+    print(f"Look at {output / 'color-affine' / 'still_life.png'} beside {output / 'analytic' / 'still_life.png'}:")
     print("  in 'specular', the analytic split leaves coloured rims of the objects, and holes where highlights clip;")
-    print(f"  {best} removes both. The EXR files hold the linear images for Blender, Nuke or Python.")
+    print("  the closed form removes both. The EXR files hold the linear images for Blender, Nuke or Python.")
 
 
 def _print_demo(name: str, statistics: dict[str, Any]) -> None:

@@ -255,7 +255,6 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     try:
         from polsep.train.command import choose_options, plan_run, train_weights
         from polsep.train.loop import Run, Schedule
-        from polsep.train.stream import StreamOptions
     except ModuleNotFoundError as error:
         raise click.ClickException(
             f"expected the extra 'train' (pip install 'polsep[train]'), found no {error.name}"
@@ -263,8 +262,8 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     try:
         asked = choose_options(rung, data, options)
         schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])
-        run = Run(output, "", StreamOptions(), schedule, options["workers"], options["devices"], options["start"])
-        run = plan_run(run, asked)
+        given = {name: options[name] for name in ("workers", "devices", "start")}
+        run = plan_run(Run(output, schedule=schedule, **given), asked)
         path = train_weights(asked, run, _show_training)
     except ValueError as error:
         raise click.ClickException(str(error)) from None

@@ -32,7 +32,7 @@ def run_analytic(mosaic: Mosaic) -> AnalyticImages | None:
     """`kernels.separate_analytic_half` of one frame, in its light, for a report; None for batches and other devices."""
     if not _is_plain(mosaic):
         return None
-    _make_ready(_run_analytic)
+    make_ready(_try_analytic)
     return _run_analytic(mosaic)
 
 
@@ -40,7 +40,7 @@ def run_color_affine(mosaic: Mosaic) -> ColorAffineImages | None:
     """`kernels.separate_color_affine_half`, guided, as `run_analytic`; None also for mono and very small frames."""
     if not _is_plain(mosaic) or mosaic.layout.channels != 3 or min(_cells(mosaic)) < LEAST_CELLS:
         return None
-    _make_ready(_run_color_affine)
+    make_ready(_try_color_affine)
     return _run_color_affine(mosaic)
 
 
@@ -71,9 +71,22 @@ def _cells(mosaic: Mosaic) -> tuple[int, ...]:
     return tuple((n - start) // 2 for n, start in zip(mosaic.data.shape, mosaic.layout.origin, strict=True))
 
 
+def _try_analytic() -> None:
+    _run_analytic(_tiny_frame())
+
+
+def _try_color_affine() -> None:
+    _run_color_affine(_tiny_frame())
+
+
+def _tiny_frame() -> Mosaic:
+    """With clipped samples."""
+    return Mosaic(torch.eye(2 * LEAST_CELLS), Layout(), 0.0, 1.0)
+
+
 @lru_cache
-def _make_ready(run: Callable[[Mosaic], object]) -> None:
-    """Load or compile what ``run`` needs, on a tiny frame with clipped samples; says so once it takes long."""
+def make_ready(warm_up: Callable[[], object]) -> None:
+    """Load or compile what a method needs by ``warm_up``, the first time only; says so once it takes long."""
     import polsep.kernels  # noqa: F401  # its import is not what takes long
 
     notice = threading.Timer(
@@ -84,7 +97,7 @@ def _make_ready(run: Callable[[Mosaic], object]) -> None:
     notice.daemon = True
     notice.start()
     try:
-        run(Mosaic(torch.eye(2 * LEAST_CELLS), Layout(), 0.0, 1.0))
+        warm_up()
     finally:
         notice.cancel()
 

@@ -41,6 +41,7 @@ from polsep.demosaic import (
     interpolate_analysers,
     interpolate_analysers_half,
     mean_cells,
+    repeat_tile,
 )
 from polsep.separation import box_mean
 from polsep.stokes import Measurements, Stokes, analyser_residual, fit_stokes, measure
@@ -94,22 +95,31 @@ def demosaic_guided_half(mosaic: Mosaic) -> Measurements:
     """
     if not _is_large_enough(mosaic):
         return demosaic_bilinear_half(mosaic)
-    values, layout = _padded(mosaic)
+    found, _ = guide_once(mosaic)
+    return _complete(found, demosaic_bilinear_half(mosaic))
+
+
+def guide_once(mosaic: Mosaic, margin: int = MARGIN) -> tuple[Stokes, Tensor]:
+    """Stokes images ``[..., C, H/2, W/2]`` with an intensity guide in one round, and s0 at every pixel.
+
+    Clipped samples count as they are. ``mosaic``: of at least 2x2 cells. ``margin``: cells by which it is continued;
+    with fewer than `MARGIN` its border changes a little, and crops take half as long.
+    """
+    values, layout = _padded(mosaic, margin)
     s0, residual = _guide(values, _smooth_polarization(values, layout), layout)
     samples = Measurements(interpolate_analysers_half(residual, layout), layout.angles)
-    polarization = _blur_stokes(fit_stokes(samples), _GENTLE)
-    found = Stokes(mean_cells(s0), polarization.s1, polarization.s2).map(lambda x: _crop(x, MARGIN))
-    del s0, residual, values, samples
-    return _complete(found, demosaic_bilinear_half(mosaic))
+    polarization = _blur_stokes(fit_stokes(samples), _GENTLE).map(lambda x: _crop(x, margin))
+    s0 = _crop(s0, 2 * margin)
+    return Stokes(mean_cells(s0), polarization.s1, polarization.s2), s0
 
 
 def _is_large_enough(mosaic: Mosaic) -> bool:
     return min(aligned(mosaic.data, mosaic.layout).shape[-2:]) >= 2 * LEAST_CELLS
 
 
-def _padded(mosaic: Mosaic) -> tuple[Tensor, Layout]:
-    """Linear samples from the first whole cell on with `MARGIN` more cells around, and the layout they have."""
-    values = _mirror_cells(aligned(mosaic.linear(), mosaic.layout), MARGIN)
+def _padded(mosaic: Mosaic, margin: int = MARGIN) -> tuple[Tensor, Layout]:
+    """Linear samples from the first whole cell on with ``margin`` more cells around, and the layout they have."""
+    values = _mirror_cells(aligned(mosaic.linear(), mosaic.layout), margin)
     return values, replace(mosaic.layout, origin=(0, 0))
 
 
@@ -155,13 +165,11 @@ def _reliable(found: Measurements) -> Stokes:
 
 def _intensity_mosaic(values: Tensor, polarization: Stokes, layout: Layout) -> Tensor:
     """s0 of its own colour at every pixel ``[..., H, W]``: twice the sample minus the polarization that it passed."""
+    doubled = torch.deg2rad(2 * torch.tensor(layout.polarizer, dtype=torch.float64))
     intensity = 2 * values
-    for weight, image in ((math.cos, polarization.s1), (math.sin, polarization.s2)):
-        passed = _own(_enlarge(image), layout)
-        for row in (0, 1):
-            for col in (0, 1):
-                t = math.radians(layout.polarizer[row][col])
-                intensity[..., row::2, col::2] -= weight(2 * t) * passed[..., row::2, col::2]
+    for weights, image in ((doubled.cos(), polarization.s1), (doubled.sin(), polarization.s2)):
+        weights = torch.where(weights.abs() < 1e-9, 0.0, weights).to(values)
+        intensity = intensity - repeat_tile(weights, values, 1) * _own(_enlarge(image), layout)
     return intensity
 
 
@@ -185,14 +193,9 @@ def fill_colors(mosaic: Tensor, layout: Layout) -> Tensor:
 
 def color_masks(mosaic: Tensor, layout: Layout, block: int) -> Tensor:
     """Where each colour is: ``[C, n, m]`` of 0 and 1 per pixel of a mosaic (``block`` 2) or per cell (``block`` 1)."""
-    height, width = (n // 2 * block for n in mosaic.shape[-2:])
-    masks = torch.zeros(layout.channels, height, width, dtype=mosaic.dtype, device=mosaic.device)
-    for place, color in enumerate(layout.bayer or "RRRR"):
-        row, col = divmod(place, 2)
-        for i in range(block):
-            for j in range(block):
-                masks["RGB".index(color), row * block + i :: 2 * block, col * block + j :: 2 * block] = 1
-    return masks
+    colors = torch.tensor(["RGB".index(color) for color in layout.bayer or "RRRR"], device=mosaic.device).view(2, 2)
+    own = (colors == torch.arange(layout.channels, device=mosaic.device)[:, None, None]).to(mosaic.dtype)
+    return repeat_tile(own, mosaic if block == 2 else mosaic[..., ::2, ::2], block)
 
 
 def _fill_green(mosaic: Tensor, masks: Tensor, mask_cells: Tensor) -> Tensor:
@@ -255,12 +258,12 @@ def _slope_of_other(cells: Tensor, green_cells: Tensor, dim: int) -> Tensor:
         floor = SLOPE_FLOOR * box_mean(sites, 2)
         follows = box_mean(other * own * sites, 2) + floor * _prior_slope(mean_other, mean_own)
         slopes.append(follows / (box_mean(own * own * sites, 2) + floor))
-    return torch.where(green_cells > 0, slopes[0], slopes[1]).clamp(-0.5, 4)
+    return torch.where(green_cells > 0, slopes[0], slopes[1]).clamp(-0.5, 4.0)
 
 
 def _prior_slope(mean: Tensor, mean_guide: Tensor) -> Tensor:
     """The slope where nothing can be regressed, from the means of both colours."""
-    return PRIOR_SHARE * ((mean + 1e-3) / (mean_guide.clamp(min=0) + 1e-3)).clamp(0.2, 5)
+    return PRIOR_SHARE * ((mean + 1e-3) / (mean_guide.clamp(min=0) + 1e-3)).clamp(0.2, 5.0)
 
 
 def _at_least(image: Tensor, plain: Tensor) -> Tensor:
@@ -322,7 +325,8 @@ def _mirror_cells(values: Tensor, margin: int) -> Tensor:
     for dim in (-2, -1):
         cells = values.shape[dim] // 2
         place = torch.arange(-margin, cells + margin, device=values.device)
-        place = cells - 1 - (place.remainder(2 * cells - 2) - (cells - 1)).abs()
+        period = torch.full_like(place[:1], 2 * cells - 2)  # a tensor: a graph's sizes are no numbers
+        place = cells - 1 - (place.remainder(period) - (cells - 1)).abs()
         values = values.index_select(dim, (2 * place[:, None] + torch.arange(2, device=values.device)).flatten())
     return values
 

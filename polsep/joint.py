@@ -1,10 +1,10 @@
 """The joint network: a raw mosaic in, diffuse and specular out; demosaicking, closed form and refinement in one graph.
 
 A mosaic is packed to quarter resolution: the 16 samples of a period become channels, so every pixel of the network
-sees the same filters. A learned linear filter, which starts at bilinear interpolation, makes Stokes images of them;
-the colour-affine closed form (`color_affine`) with windows of two sizes makes a first separation of these; a U-Net of
-residual blocks, which sees samples, clip masks and the closed form, adds what they lack. The specular light is white by
-construction. Diffuse and specular sum to the network's own s0.
+sees the same filters. Stokes images come from the intensity guide (`guided.guide_once`) or, in less time, from a linear
+filter fitted to examples. The colour-affine closed form (`color_affine`) with windows of two sizes makes a first
+separation of these. A U-Net of residual blocks, which sees samples, clip masks and the closed form, adds what that
+lacks. The specular light is white by construction. Diffuse and specular sum to the network's own s0.
 
 Inputs and corrections are relative to the brightness around, so that a darker exposure of a scene gives a darker image
 of the same separation, as far as noise and clipping allow. There are no statistics of whole images: crop and frame
@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -27,6 +27,7 @@ from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, pad, pixel_shuff
 from polsep.camera import Layout, Mosaic
 from polsep.color_affine import MAX_DIFFUSE_DOLP
 from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
+from polsep.guided import MARGIN, guide_once
 from polsep.networks import ResidualSize, ResidualUNet
 from polsep.stokes import fit_stokes
 
@@ -41,6 +42,10 @@ MOST_DOUBT = 10.0
 #: Windows of the slope in packed pixels, and the contrast of colours, relative to the brightness and squared, below
 #: which they fall back to the wider window and to zero. Chosen on validation views (docs/experiments.md).
 WINDOWS, TRUST = (9, 3), (3e-3, 3e-3)
+
+
+#: Where Stokes images come from.
+Demosaicker = Literal["linear", "guided"]
 
 
 class Guess(NamedTuple):
@@ -87,16 +92,19 @@ class Images(NamedTuple):
 class Joint(nn.Module):
     """Samples ``[N, 1, H, W]`` (black 0, white 1, Sony's order) to diffuse and specular images.
 
-    ``inputs``: those of `INPUTS` that it sees. ``demosaic``: the linear filter, no subject of gradients; see
-    `bilinear_filter`.
+    ``inputs``: those of `INPUTS` that it sees. ``demosaicker``: "guided" with frames continued by ``margin`` cells, or
+    "linear" by the filter ``demosaic``, no subject of gradients; see `bilinear_filter`.
     """
 
-    demosaic: Tensor
+    demosaic: Tensor | None
 
-    def __init__(self, colors: int, size: ResidualSize, inputs: tuple[str, ...] = INPUTS) -> None:
+    def __init__(
+        self, colors: int, size: ResidualSize, inputs: tuple[str, ...] = INPUTS, demosaicker: Demosaicker = "linear"
+    ) -> None:
         super().__init__()
-        self.colors, self.size, self.inputs = colors, size, inputs
-        self.register_buffer("demosaic", bilinear_filter(Layout(bayer="RGGB" if colors == 3 else None)))
+        self.colors, self.size, self.inputs, self.margin = colors, size, inputs, MARGIN
+        self.layout = Layout(bayer="RGGB" if colors == 3 else None)
+        self.register_buffer("demosaic", bilinear_filter(self.layout) if demosaicker == "linear" else None)
         counts = {"samples": 16, "clipping": 17, "cosine": 4, "sine": 4, "split": 4 * colors + 10}
         self.net = ResidualUNet(1 + sum(counts[name] for name in inputs), size)
         self.last = nn.Conv2d(size.widths[0], 16 * (colors + 1), 1)
@@ -112,10 +120,9 @@ class Joint(nn.Module):
 
         ``raw``, ``clipped [N, 1, H, W]``: samples and which of them clipped, H and W multiples of 4.
         """
-        planes, guess, features, doubt = self._see(raw, clipped)
+        total, guess, features, doubt = self._see(raw, clipped, full=True)
         change, turn = self.last(features), self.pose(features)
         with torch.autocast(raw.device.type, enabled=False):
-            total = _filter(planes, self.demosaic[: 16 * self.colors])
             specular = _spread(guess.specular)
             diffuse = total - torch.cat([specular] * self.colors, dim=1)
             images = torch.cat([diffuse, specular], dim=1) + change.float() * guess.light
@@ -125,7 +132,7 @@ class Joint(nn.Module):
 
     def half_resolution(self, raw: Tensor, clipped: Tensor) -> Images:
         """The means over 2x2 cells of what `forward` gives, ``[N, C, H/2, W/2]``, in less time."""
-        _, guess, features, doubt = self._see(raw, clipped)
+        _, guess, features, doubt = self._see(raw, clipped, full=False)
         weight, bias = pool_outputs(self.last.weight), pool_outputs(self.last.bias)  # type: ignore[arg-type]
         change = conv2d(features, weight, bias)
         with torch.autocast(raw.device.type, enabled=False):
@@ -137,18 +144,28 @@ class Joint(nn.Module):
         s1, s2 = (pixel_shuffle(s, 2) for s in guess.polarized.chunk(2, dim=1))
         return Images(images[:, : self.colors], images[:, self.colors :], s1, s2, doubt, guess.light)
 
-    def _see(self, raw: Tensor, clipped: Tensor) -> tuple[Tensor, Guess, Tensor, Tensor]:
-        """Packed samples, the closed form, the network's features and doubt."""
+    def _see(self, raw: Tensor, clipped: Tensor, full: bool) -> tuple[Tensor, Guess, Tensor, Tensor]:
+        """Packed s0 at full resolution, the closed form, the network's features and doubt."""
         planes, masks = pixel_unshuffle(raw, PERIOD), pixel_unshuffle(clipped.to(raw), PERIOD)
         with torch.autocast(raw.device.type, enabled=False), torch.no_grad():
-            guess = self.guess(planes, masks)
+            half, total = self.demosaicked(planes, full)
+            guess = self.guess(half, planes, masks)
         features = self.net(guess.maps)
-        return planes, guess, features, pixel_shuffle(self.doubt(features.detach()).float().clamp(max=MOST_DOUBT), 2)
+        return total, guess, features, pixel_shuffle(self.doubt(features.detach()).float().clamp(max=MOST_DOUBT), 2)
 
-    def guess(self, planes: Tensor, masks: Tensor) -> Guess:
-        """The closed form on linearly demosaicked samples; ``planes``, ``masks [N, 16, h, w]``."""
-        colors, s0_full = self.colors, 16 * self.colors
-        found = _filter(planes, torch.cat([pool_outputs(self.demosaic[:s0_full]), self.demosaic[s0_full:]]))
+    def demosaicked(self, planes: Tensor, full: bool) -> tuple[Tensor, Tensor]:
+        """Of packed samples s0, s1, s2 at half resolution ``[N, 12 C, h, w]``, and s0 at full resolution or nothing."""
+        if self.demosaic is None:
+            stokes, s0 = guide_once(Mosaic(pixel_shuffle(planes, PERIOD)[:, 0], self.layout, 0.0, 1.0), self.margin)
+            half = torch.cat([pixel_unshuffle(s, 2) for s in (stokes.s0, stokes.s1, stokes.s2)], dim=1)
+            return half, pixel_unshuffle(s0, PERIOD) if full else half[:, :0]
+        s0_full = 16 * self.colors
+        half = torch.cat([pool_outputs(self.demosaic[:s0_full]), self.demosaic[s0_full:]])
+        return _filter(planes, half), _filter(planes, self.demosaic[:s0_full]) if full else planes[:, :0]
+
+    def guess(self, found: Tensor, planes: Tensor, masks: Tensor) -> Guess:
+        """The closed form on Stokes images at half resolution ``found``; ``planes``, ``masks [N, 16, h, w]``."""
+        colors = self.colors
         s0, s1, s2 = (x.chunk(colors, dim=1) for x in torch.split(found, 4 * colors, dim=1))
         mean = _mean(s0)
         light = avg_pool2d(_mean(mean.chunk(4, dim=1)), 3, 1, 1, count_include_pad=False).clamp(min=0) + LEAST_LIGHT

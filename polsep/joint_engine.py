@@ -1,6 +1,6 @@
 """The joint network on CPUs: kernels make its maps, OpenVINO runs its layers, kernels make images of what it says.
 
-The same as `mosaic_network.run_joint` at half resolution, several times faster. Layers run in bfloat16 where the
+The same as `mosaic_network.run_joint` at half resolution, in less time. Layers run in bfloat16 where the
 processor has it, in float32 elsewhere; the closed form and the images are float32 always. Without OpenVINO, and for
 frames that it does not take, torch does the work.
 """
@@ -22,14 +22,17 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d
 
 from polsep.camera import Layout, Mosaic
+from polsep.engine import make_ready
 from polsep.joint import INPUTS, MOST_DOUBT, PERIOD, Joint, pool_outputs
 from polsep.mosaic_network import MOST_PIXELS, find_joint, own_order
 from polsep.orient import Orientation, orient
 from polsep.report import Tally
+from polsep.stokes import stokes_inverse
 
 if TYPE_CHECKING:
+    from polsep.kernels.bilinear import Pattern
     from polsep.kernels.joint import Taps
-    from polsep.kernels.unpack import RawFrame
+    from polsep.kernels.unpack import RawFrame, Samples
 
 Floats = NDArray[np.float32]
 
@@ -37,9 +40,7 @@ Floats = NDArray[np.float32]
 _CHANNELS = {"samples": 16, "clipping": 17, "cosine": 4, "sine": 4, "split": 10}
 #: Packed rows that a thread takes at a time.
 _ROWS = 16
-#: Of layers, "bf16" or "f32"; None: what suits the processor.
-PRECISION: str | None = None
-#: Engines that are kept, each with some 50 bytes of memory per raw pixel.
+#: Engines that are kept, each with the memory that its frames need.
 KEPT = 2
 
 
@@ -113,7 +114,7 @@ class OpenVinoEngine:
             np.empty((h, 4 * network.colors + 13, w), np.float32),
             np.empty((h, w), np.uint16),
         )
-        self._taps = make_taps(network, w)
+        self._taps = make_taps(network, w) if network.demosaic is not None else None
         self._found = [np.empty((h, w, n), np.float32) for n in (4 * network.colors + 4, 8)]
         seen = self._maps.halves if halves else self._maps.floats
         self._request.set_input_tensor(openvino.Tensor(seen, [1, *room], kind))
@@ -123,7 +124,6 @@ class OpenVinoEngine:
     def run(self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...]) -> JointImages:
         """Images of a frame ``[H, W]`` with black and white ``levels`` and a ``light`` of one gain per colour."""
         from polsep.kernels.bilinear import read_pattern
-        from polsep.kernels.joint import map_rows
         from polsep.kernels.joint_images import SUMS, Found, Targets, write_rows
         from polsep.kernels.threads import share
         from polsep.kernels.unpack import as_samples
@@ -136,12 +136,28 @@ class OpenVinoEngine:
         targets = Targets(images[0], images[1], images[2], valid, angles[0], angles[1], np.zeros((h, SUMS)))
         gains = np.array(light[: self._colors], np.float32)
         with self._lock:
-            share(lambda rows: map_rows(samples, pattern, self._taps, self._maps, rows), h // 2, _ROWS)
+            self._fill_maps(samples, pattern)
             self._request.infer()
             found = Found(self._maps.base, self._maps.clipped, self._found[0], self._found[1])
             share(lambda rows: write_rows(found, gains, targets, rows), h // 2, _ROWS)
         diffuse, specular, error = (image.reshape(h, w, -1) for image in images)
         return JointImages(diffuse, specular, valid, angles[0], angles[1], error, _tally(targets))
+
+    def _fill_maps(self, samples: Samples, pattern: Pattern) -> None:
+        """What the layers see, and the closed form, of a frame."""
+        from polsep.kernels import get_threads
+        from polsep.kernels.cells import Source, read_grid
+        from polsep.kernels.joint import map_guided_rows, map_rows
+        from polsep.kernels.threads import share
+
+        h, taps = pattern.h // 2, self._taps
+        if taps is not None:
+            share(lambda rows: map_rows(samples, pattern, taps, self._maps, rows), h, _ROWS)
+            return
+        angles = self._layout.angles
+        source = Source(samples, pattern, read_grid(pattern, angles, stokes_inverse(angles).float().numpy()))
+        # A strip begins with rows that the one before has too, many of them: one for each thread.
+        share(lambda rows: map_guided_rows(source, self._maps, rows), h, -(-h // get_threads()))
 
 
 def _as_model(layers: nn.Module, example: Tensor) -> Any:
@@ -170,6 +186,7 @@ def make_taps(network: Joint, width: int) -> Taps:
     from polsep.kernels.joint import Taps
     from polsep.kernels.rows import AT_ONCE
 
+    assert network.demosaic is not None
     s0 = 16 * network.colors
     whole = torch.cat([pool_outputs(network.demosaic[:s0]), network.demosaic[s0:]]).flatten(1).numpy()
     most = max(int(np.count_nonzero(row)) for row in whole)
@@ -194,7 +211,13 @@ def _tally(targets: Any) -> Tally:
 def _engine(method: str, colors: int, shape: tuple[int, int]) -> OpenVinoEngine:
     network, _ = find_joint(method, Layout() if colors == 3 else Layout(bayer=None), None)
     logging.getLogger("polsep").debug("compiling %s for frames of %dx%d", method, *shape)
-    return OpenVinoEngine(network, shape, PRECISION)
+    return OpenVinoEngine(network, shape)
+
+
+def _warm_up() -> None:
+    from polsep.kernels import joint_images
+
+    joint_images.warm_up()
 
 
 def run_engine(method: str, mosaic: Mosaic) -> JointImages | None:
@@ -208,6 +231,7 @@ def run_engine(method: str, mosaic: Mosaic) -> JointImages | None:
     orientation = orient(mosaic, own_order(mosaic.layout))
     if not orientation.keeps_cells or data.dtype not in (torch.uint8, torch.uint16, torch.float32):
         return None
+    make_ready(_warm_up)
     levels, light = (mosaic.black_level, mosaic.white_level), mosaic.light_color
     if orientation == Orientation(*data.shape) and not any(n % PERIOD for n in data.shape):
         return _engine(method, mosaic.layout.channels, (data.shape[0], data.shape[1])).run(data.numpy(), levels, light)

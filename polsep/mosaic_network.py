@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -42,7 +42,8 @@ def load_joint(path: Path, device: torch.device) -> Joint:
     try:
         size = json.loads(metadata["size"])
         size = ResidualSize(size["width"], tuple(size["blocks"]))
-        network = Joint(int(metadata["colors"]), size, tuple(json.loads(metadata["inputs"])))
+        demosaicker: Any = metadata.get("demosaicker", "linear")  # what weights without a word on it were trained with
+        network = Joint(int(metadata["colors"]), size, tuple(json.loads(metadata["inputs"])), demosaicker)
         network.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"expected weights of a joint network in {path}, found {type(error).__name__}") from None

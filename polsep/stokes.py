@@ -16,7 +16,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,9 +32,9 @@ class Stokes:
     s2: Tensor
 
     def __post_init__(self) -> None:
-        shapes = {tuple(s.shape) for s in (self.s0, self.s1, self.s2)}
-        if len(shapes) != 1:
-            raise ValueError(f"s0, s1, s2 must have one shape, found {sorted(shapes)}")
+        if self.s1.shape != self.s0.shape or self.s2.shape != self.s0.shape:
+            shapes = sorted({tuple(s.shape) for s in (self.s0, self.s1, self.s2)})
+            raise ValueError(f"s0, s1, s2 must have one shape, found {shapes}")
         if not self.s0.is_floating_point():
             raise TypeError(f"Stokes images must be floating point, found {self.s0.dtype}")
 
@@ -112,11 +114,17 @@ def stokes_inverse(angles: Sequence[float]) -> Tensor:
 
     Raises ValueError when the angles do not determine a Stokes vector.
     """
-    matrix = analyser_matrix(angles)
-    if torch.linalg.matrix_rank(matrix, rtol=1e-6) < 3:
+    return torch.tensor(_pseudo_inverse(tuple(angles)), dtype=torch.float64)
+
+
+@lru_cache(maxsize=32)
+def _pseudo_inverse(angles: tuple[float, ...]) -> list[list[float]]:
+    """As numbers, which whoever traces a computation takes for constants."""
+    matrix = np.array([[0.5, 0.5 * math.cos(2 * t), 0.5 * math.sin(2 * t)] for t in angles])
+    if np.linalg.matrix_rank(matrix, tol=1e-6 * np.linalg.norm(matrix, 2)) < 3:
         degrees = [round(math.degrees(t), 3) for t in angles]
         raise ValueError(f"need three analysers of different angles (modulo 180 degrees), found {degrees}")
-    inverse: Tensor = torch.linalg.pinv(matrix)
+    inverse: list[list[float]] = np.linalg.pinv(matrix).tolist()
     return inverse
 
 

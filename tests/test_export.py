@@ -19,6 +19,7 @@ import onnxruntime
 
 from polsep import cli
 from polsep.camera import Layout, Mosaic
+from polsep.graph import Graph
 from polsep.io.weights import write_weights
 from polsep.joint import INPUTS, Joint
 from polsep.mosaic_network import load_joint, run_joint
@@ -60,6 +61,20 @@ def test_exported_graphs_agree(resolution: str, tmp_path: Path, monkeypatch: pyt
         assert_within(torch.from_numpy(specular).movedim(-1, -3).expand_as(found.specular), found.specular, ROUNDED)
         step = 2 if resolution == "full" else 1
         assert_within(torch.from_numpy(error).movedim(-1, -3), found.doubt[..., ::step, ::step], ROUNDED)
+
+
+def test_what_graphs_do_otherwise_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A guided network's filters are written as convolutions; whole graphs of that kind take minutes to write."""
+    graph = Graph(Joint(3, SIZE, INPUTS, "guided"), full=True)
+    raw = torch.randint(100, 4095, (1, 40, 56), generator=torch.Generator().manual_seed(4)).to(torch.uint16)
+    levels = torch.tensor([64.0]), torch.tensor([4095.0])
+    with torch.no_grad():
+        expected = graph(raw, *levels)
+        monkeypatch.setattr(torch.compiler, "is_exporting", lambda: True)
+        found = graph(raw, *levels)
+    for one, other in zip(found, expected, strict=True):
+        assert_within(one, other, ROUNDED)
+    assert not torch.equal(found[0], expected[0])
 
 
 @pytest.mark.parametrize(

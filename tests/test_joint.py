@@ -15,6 +15,7 @@ from polsep import color_affine
 from polsep.camera import CLIP_MARGIN, IDEAL, Layout, Mosaic, expose, sample_mosaic
 from polsep.color_affine import MAX_DIFFUSE_DOLP
 from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
+from polsep.guided import demosaic_guided_half
 from polsep.joint import (
     INPUTS,
     MOST_DOUBT,
@@ -31,6 +32,7 @@ from polsep.joint import (
 )
 from polsep.networks import ResidualSize
 from polsep.stokes import Stokes, fit_stokes, measure
+from polsep.train.joint_task import MARGIN
 
 COLOR, MONO = Layout(), Layout(bayer=None)
 LAYOUTS = [COLOR, MONO]
@@ -125,6 +127,29 @@ def test_the_linear_filter_keeps_uniform_fields(layout: Layout) -> None:
         s0, s1, s2 = sums.split((16 * c, 4 * c, 4 * c))
         for found, level, count in ((s0, 1.0, 16), (s1, 0.3, 4), (s2, -0.2, 4)):
             assert_close(found.view(c, count), level * light[:, :, 0].expand(c, count))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
+def test_a_guided_network_starts_at_guided_demosaicking(layout: Layout) -> None:
+    """s0, s1 and s2 at half resolution; at full resolution diffuse and specular sum to what has these means."""
+    raw = random_raw(2, 40, 48)
+    net = Joint(layout.channels, SIZE, INPUTS, "guided")
+    wanted = fit_stokes(demosaic_guided_half(as_mosaic(raw, layout)))
+    found, full = net.half_resolution(raw, nothing_clipped(raw)), net(raw, nothing_clipped(raw))[0]
+    for total in (found.diffuse + found.specular, avg_pool2d(full.diffuse + full.specular, 2)):
+        assert_close(total, wanted.s0)
+    assert_close(found.s1, wanted.s1)
+    assert_close(found.s2, wanted.s2)
+
+
+def test_crops_continued_by_less_differ_near_their_border_only() -> None:
+    """What training saves: `Joint.margin` cells instead of all that filters reach."""
+    raw = random_raw(1, 96, 96)
+    net, brief = Joint(3, SIZE, INPUTS, "guided"), Joint(3, SIZE, INPUTS, "guided")
+    brief.margin = MARGIN
+    one, other = (n.demosaicked(pixel_unshuffle(raw, 4), full=False)[0] for n in (net, brief))
+    assert_close(one[..., 10:-10, 10:-10], other[..., 10:-10, 10:-10])
+    assert float((one - other).abs().max()) > 0
 
 
 def test_pooled_weights_give_the_means_of_cells() -> None:
@@ -305,14 +330,15 @@ def test_networks_see_the_maps_they_were_asked_to_see(layout: Layout) -> None:
     """Those of all inputs, in their order, and the logarithm of the brightness; what is left out, is not there."""
     planes = pixel_unshuffle(random_raw(1, 16, 16), 4)
     masks = (planes > 0.85).float()
-    single = [Joint(layout.channels, SIZE, (name,)).guess(planes, masks) for name in INPUTS]
-    whole = Joint(layout.channels, SIZE).guess(planes, masks)
+    half = untrained(layout).demosaicked(planes, full=False)[0]
+    single = [Joint(layout.channels, SIZE, (name,)).guess(half, planes, masks) for name in INPUTS]
+    whole = Joint(layout.channels, SIZE).guess(half, planes, masks)
     assert torch.equal(
         whole.maps, torch.cat([*(guess.maps[:, :-1] for guess in single), torch.log(whole.light)], dim=1)
     )
     for name, guess in zip(INPUTS, single, strict=True):
         net = random_net(layout, tuple(other for other in INPUTS if other != name))
-        assert net.guess(planes, masks).maps.shape[1] == whole.maps.shape[1] - guess.maps.shape[1] + 1
+        assert net.guess(half, planes, masks).maps.shape[1] == whole.maps.shape[1] - guess.maps.shape[1] + 1
         assert bool(net(pixel_shuffle(planes, 4), pixel_shuffle(masks, 4))[0].diffuse.any())
 
 

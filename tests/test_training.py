@@ -230,8 +230,8 @@ def plan(given: dict[str, Any]) -> tuple[Options, Run]:
     options = choose_options(given["rung"], given["data"], given)
     schedule = Schedule(given["steps"], given["rate"], precision=given["precision"])
     out = Path("runs") / given["output"]
-    run = Run(out, "", StreamOptions(), schedule, given["workers"], given["devices"], given["start"])
-    return options, plan_run(run, options)
+    kept = {name: given[name] for name in ("workers", "devices", "start")}
+    return options, plan_run(Run(out, schedule=schedule, **kept), options)
 
 
 def test_mono_sees_the_green_light_behind_every_pixel() -> None:

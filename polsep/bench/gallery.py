@@ -61,7 +61,7 @@ COLUMNS = {
     "color-affine": "color-affine",
 }
 #: Scenes of Fig. 3; where the data of one are absent, a random object stands in.
-SCENES, STAND_IN = ("object-05", "statue-buddha"), "object-03"
+SCENES, STAND_IN = ("object-05", "scan-spot"), "object-03"
 #: Of which view of the sweep Fig. 4 is, and its size.
 VIEW, VIEW_SIZE = 7, (384, 384)
 #: Frames of Fig. 6 below the data folder, what they hold, and their white level; all are mono. No lamp is

@@ -6,7 +6,7 @@ this room imports numba; ``import polsep`` does not.
 
 from __future__ import annotations
 
-from polsep.kernels import analytic, color_affine
+from polsep.kernels import analytic, color_affine, joint_images
 from polsep.kernels.analytic import AnalyticImages, AnalyticOptions, separate_analytic_half
 from polsep.kernels.color_affine import ColorAffineImages, ColorAffineOptions, separate_color_affine_half
 from polsep.kernels.threads import get_threads, set_threads
@@ -30,3 +30,4 @@ def warm_up() -> None:
     """Compile every kernel, or load it from numba's cache: half a minute the first time on a machine, then a second."""
     analytic.warm_up()
     color_affine.warm_up()
+    joint_images.warm_up()

@@ -59,8 +59,8 @@ class Stream(NamedTuple):
     ``raw``: samples. ``sums``: s1 and s2 of three colours, over the cells of a row's window; ``smooth``: over all.
     ``mosaic``: s0 of each pixel's colour. ``means [length, n]``: its cells'. ``green``, ``filled``: s0. ``total``: cell
     means of red, green, blue. ``tent``, ``detail``: of the guide. ``residual``: samples minus half the guide.
-    ``found``: mean s1 and s2. ``sensor_row``: room for one. ``rows``: for others. ``first``: row of the frame that the
-    stream begins with, an even one. ``pushed [1]``: rows so far.
+    ``found``: s1 and s2, means over colours or of each. ``sensor_row``: room for one. ``rows``: for others. ``first``:
+    row of the frame that the stream begins with, an even one. ``pushed [1]``: rows so far.
     """
 
     raw: NDArray[np.float32]
@@ -83,8 +83,8 @@ class Stream(NamedTuple):
     pushed: NDArray[np.int64]
 
 
-def open_stream(source: Source, start: int) -> Stream:
-    """A stream whose results begin with the frame's row ``start``, an even one."""
+def open_stream(source: Source, start: int, apart: bool = False) -> Stream:
+    """A stream whose results begin with the frame's row ``start``, an even one; ``apart``: s1, s2 of every colour."""
     n = source.grid.n
     return Stream(
         np.zeros((_RESIDUAL + 1, 4, n), np.float32),
@@ -98,7 +98,7 @@ def open_stream(source: Source, start: int) -> Stream:
         np.zeros((2, 4, n), np.float32),
         np.zeros((3, 4, n), np.float32),
         np.zeros((5, 4, n), np.float32),
-        np.zeros((3, 2, n), np.float32),
+        np.zeros((3, 6 if apart else 2, n), np.float32),
         np.empty(2 * source.pattern.w, np.float32),
         np.zeros((16, n), np.float32),
         make_green(n),
@@ -206,10 +206,14 @@ def _residual_row(stream: Stream, r: int) -> None:
 
 @compiled
 def _repolarize_row(stream: Stream, r: int, grid: Grid) -> None:
-    """Polarization of the residual, mean over colours, of row ``r``."""
+    """Polarization of the residual of row ``r``, mean over colours or of each."""
     rows = stream.rows
     sums = rows[0:6].reshape(2, 3, grid.n)
     polarize_row(stream.residual, r, grid, rows[6:9], sums)
+    if stream.found.shape[1] == 6:
+        for k in range(6):
+            blur_gently(rows[k], stream.found[r % 3, k])
+        return
     for s in range(2):
         add_rows(sums[s, 0], sums[s, 1], sums[s, 2], THIRD, rows[9])
         blur_gently(rows[9], stream.found[r % 3, s])
@@ -259,7 +263,7 @@ def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
     for c in range(3):
         _copy_inside(total[c], out[c])
     above, here, below = stream.found[(r - 1) % 3], stream.found[r % 3], stream.found[(r + 1) % 3]
-    for s in range(2):
+    for s in range(above.shape[0]):
         blur_gently_down(above[s], here[s], below[s], rows[0])
         _copy_inside(rows[0], out[3 + s])
 
@@ -268,7 +272,8 @@ def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
 def demosaic_rows(source: Source, stream: Stream, piece: Piece, out: Any) -> None:
     """The frame's cell rows of a piece, which continues the one before, to ``out [rows, 5, w]``.
 
-    A row is s0 of three colours and the means over colours of s1 and s2.
+    A row is s0 of three colours and the means over colours of s1 and s2; of a stream ``apart``, each colour's s1, then
+    s2, ``[rows, 9, w]``.
     """
     for t in range(piece[0], piece[1]):
         while stream.first + stream.pushed[0] <= t + REACH:

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from polsep.color_affine import MAX_DIFFUSE_DOLP
 from polsep.joint import LEAST_LIGHT, PERIOD, TRUST, WINDOWS
 from polsep.kernels.bilinear import Pattern
+from polsep.kernels.cells import Source
 from polsep.kernels.compiling import HALF, ONE, QUARTER, TWO, ZERO, compiled, entry
+from polsep.kernels.guided import Stream, demosaic_rows, open_stream
 from polsep.kernels.rows import (
     add_product,
     average,
@@ -43,7 +45,7 @@ _WIDE, _NARROW = (window // 2 for window in WINDOWS)
 _TRUST_WIDE, _TRUST_NARROW = (np.float32(trust) for trust in TRUST)
 _MOST, _LEAST_LIGHT, _TINY = np.float32(MAX_DIFFUSE_DOLP), np.float32(LEAST_LIGHT), np.float32(1e-12)
 #: Rows of scratch.
-_ROWS = 24
+_ROWS = 13
 
 
 class Taps(NamedTuple):
@@ -141,40 +143,56 @@ def _starts(u: int, h: int, size: int) -> Any:
 
 
 @compiled
-def _demosaic(taps: Taps, u: int, h: int, rings: _Rings, spare: Any) -> None:
-    """Stokes images of row ``u``, the colours' moments, and its brightness."""
-    colors, slot = taps.colors, u % KEPT
+def _filter_samples(taps: Taps, u: int, h: int, rings: _Rings, polarized: Any) -> None:
+    """Stokes images of row ``u`` by the linear filter: s0 to its ring, s1 and s2 to ``polarized [8 C, w]``."""
     near = (rings.planes.reshape(-1), _starts(u, h, rings.planes[0].size))
+    s0 = rings.s0[u % KEPT]
+    for k in range(s0.shape[0]):
+        filter_row(taps.weight[k], (taps.row[k], taps.place[k]), near, s0[k])
+    for k in range(polarized.shape[0]):
+        output = s0.shape[0] + k
+        filter_row(taps.weight[output], (taps.row[output], taps.place[output]), near, polarized[k])
+
+
+@compiled
+def _take_apart(rows: Any, s0: Any, polarized: Any) -> None:
+    """Stokes rows ``[2, 9, 2 w]`` of two rows of cells as packed ones, ``[12, w]`` and ``[24, w]``."""
+    for cell in range(4):
+        for k in range(9):
+            row, packed = rows[cell // 2, k, cell % 2 :], s0[4 * k + cell] if k < 3 else polarized[4 * (k - 3) + cell]
+            for j in range(packed.size):
+                packed[j] = row[2 * j]
+
+
+@compiled
+def _describe(colors: int, u: int, rings: _Rings, polarized: Any, spare: Any) -> None:
+    """What is kept of row ``u``: means over colours, the colours' moments, and the brightness."""
+    slot = u % KEPT
     moments = rings.moments[slot]
     for k in range(4):
         fill(ZERO, moments[k])
     luminance = rings.luminance[slot]
     fill(ZERO, luminance)
-    mean, x, y, z = spare[0], spare[1], spare[2], spare[3:]
+    mean, x, y, s0 = spare[0], spare[1], spare[2], rings.s0[slot]
     share, count = np.float32(1 / colors), np.float32(1 / (4 * colors))
     for cell in range(4):
-        s0 = rings.s0[slot]
         fill(ZERO, mean)
         for c in range(colors):
-            output = 4 * c + cell
-            filter_row(taps.weight[output], (taps.row[output], taps.place[output]), near, s0[output])
-            add_product(s0[output], share, mean)
+            add_product(s0[4 * c + cell], share, mean)
         add_product(mean, QUARTER, luminance[1:-1])
-        for k, means in ((1, rings.cosine[slot, cell]), (2, rings.sine[slot, cell])):
+        for k, means in ((0, rings.cosine[slot, cell]), (1, rings.sine[slot, cell])):
             fill(ZERO, means)
             for c in range(colors):
-                output = 4 * (colors * k + c) + cell
-                filter_row(taps.weight[output], (taps.row[output], taps.place[output]), near, z[3 * k + c])
-                add_product(z[3 * k + c], share, means)
+                add_product(polarized[4 * (colors * k + c) + cell], share, means)
         if colors == 1:
             continue
         for c in range(colors):
             subtract(s0[4 * c + cell], mean, x)
             for j in range(x.size):
                 moments[0, j] += x[j] * x[j] * count
-            for k, means in ((1, rings.cosine[slot, cell]), (2, rings.sine[slot, cell])):
-                subtract(z[3 * k + c], means, y)
-                multiply(x, y, count, moments[k])
+            for k, means in ((0, rings.cosine[slot, cell]), (1, rings.sine[slot, cell])):
+                subtract(polarized[4 * (colors * k + c) + cell], means, y)
+                multiply(x, y, count, moments[k + 1])
                 multiply(y, y, count, moments[3])
 
 
@@ -345,15 +363,15 @@ def _show_split(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> Non
 
 
 @compiled
-def _leave(t: int, taps: Taps, rings: _Rings, maps: Maps, spare: Any) -> None:
+def _leave(t: int, rings: _Rings, maps: Maps, spare: Any) -> None:
     """The closed form of row ``t``, and the network's maps of it."""
-    slot = t % KEPT
+    slot, colors = t % KEPT, rings.s0.shape[1] // 4
     light, inverse, row = rings.light[slot], spare[0], spare[11]
     for j in range(light.size):
         inverse[j] = ONE / light[j]
     _find_slopes(t, maps.base.shape[0], rings.sums, spare)
-    _split(taps.colors, slot, rings, maps.base[t], spare)
-    copy(light, maps.base[t, 4 * taps.colors + 12])
+    _split(colors, slot, rings, maps.base[t], spare)
+    copy(light, maps.base[t, 4 * colors + 12])
     _show_samples(t, slot, rings, maps, spare)
     for first, rows in ((maps.first[2], rings.cosine[slot]), (maps.first[3], rings.sine[slot])):
         if first >= 0:
@@ -366,11 +384,22 @@ def _leave(t: int, taps: Taps, rings: _Rings, maps: Maps, spare: Any) -> None:
     emit(row, (maps.floats, maps.halves, maps.first[5], t))
 
 
+@compiled
+def _go_on(u: int, piece: Piece, rings: _Rings, maps: Maps, spare: Any) -> None:
+    """What can be done of earlier rows once row ``u`` is described."""
+    v, h = u - 1, maps.clipped.shape[0]
+    if (v > max(piece[0] - REACH, 0) or v == 0) and v < h:
+        _look_around(v, h, rings, maps.clipped, spare)
+    if u - REACH >= piece[0]:
+        _leave(u - REACH, rings, maps, spare)
+
+
 @entry
 def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, piece: Piece) -> None:
-    """The maps and the closed form of a piece of the packed rows."""
+    """The maps and the closed form of a piece of the packed rows, by the linear filter."""
     h, w = maps.clipped.shape
     rings, spare = _make_rings(taps.colors, w), np.zeros((_ROWS, w), np.float32)
+    polarized = np.empty((8 * taps.colors, w), np.float32)
     # Rows that two pieces need are entered by both; what they write of them is the same.
     begin = max(piece[0] - REACH, 0)
     for u in range(max(begin - 1, 0), begin + 1):
@@ -379,9 +408,26 @@ def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, piece: 
         if u + 1 < h:
             _enter(samples, pattern, u + 1, rings.planes[(u + 1) % KEPT], maps.clipped[u + 1])
         if u < h:
-            _demosaic(taps, u, h, rings, spare)
-        v = u - 1
-        if (v > begin or v == 0) and v < h:
-            _look_around(v, h, rings, maps.clipped, spare)
-        if u - REACH >= piece[0]:
-            _leave(u - REACH, taps, rings, maps, spare)
+            _filter_samples(taps, u, h, rings, polarized)
+            _describe(taps.colors, u, rings, polarized, spare)
+        _go_on(u, piece, rings, maps, spare)
+
+
+@entry
+def _map_guided_rows(source: Source, stream: Stream, maps: Maps, piece: Piece) -> None:
+    h, w = maps.clipped.shape
+    rings, spare, polarized = _make_rings(3, w), np.zeros((_ROWS, w), np.float32), np.empty((24, w), np.float32)
+    rows = np.empty((2, 9, 2 * w), np.float32)
+    for u in range(max(piece[0] - REACH, 0), piece[1] + REACH):
+        if u < h:
+            _enter(source.samples, source.pattern, u, rings.planes[u % KEPT], maps.clipped[u])
+            demosaic_rows(source, stream, (2 * u, 2 * u + 2), rows)
+            _take_apart(rows, rings.s0[u % KEPT], polarized)
+            _describe(3, u, rings, polarized, spare)
+        _go_on(u, piece, rings, maps, spare)
+
+
+def map_guided_rows(source: Source, maps: Maps, piece: Piece) -> None:
+    """The maps and the closed form of a piece of the packed rows of a colour frame, by the intensity guide."""
+    stream = open_stream(source, 2 * max(piece[0] - REACH, 0), apart=True)
+    _map_guided_rows(source, stream, maps, piece)

@@ -10,10 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.camera import Layout
+from polsep.joint import PERIOD
+from polsep.kernels.bilinear import read_pattern
+from polsep.kernels.cells import Source, read_grid
 from polsep.kernels.compiling import ONE, ZERO, compiled, entry
+from polsep.kernels.joint import Maps, Taps, map_guided_rows, map_rows
 from polsep.kernels.polarization import add_polarization, polarize, sum_row
-from polsep.kernels.rows import add_product, copy, fill
+from polsep.kernels.rows import AT_ONCE, add_product, copy, fill
 from polsep.kernels.threads import Piece
+from polsep.kernels.unpack import as_samples
+from polsep.stokes import stokes_inverse
 
 Floats = NDArray[np.float32]
 
@@ -142,3 +149,22 @@ def write_rows(found: Found, gains: Floats, targets: Targets, piece: Piece) -> N
             _write_cells(found, t, cell, gains, (targets, spare))
         for y in range(2 * t, 2 * t + 2):
             targets.sums[y, 8] = _mark_clipped(found.clipped, y, targets.valid[y])
+
+
+def warm_up() -> None:
+    """Compile both ways to the maps and what writes the images, or load them from numba's cache on disk."""
+    layout, size = Layout(), 4
+    samples = as_samples(np.eye(PERIOD * size, dtype=np.uint8))
+    pattern = read_pattern((PERIOD * size, PERIOD * size), layout, 0, 1, (1.0, 1.0, 1.0))
+    base, clipped = np.zeros((size, 25, size), np.float32), np.zeros((size, size), np.uint16)
+    first = np.array([-1, -1, -1, -1, -1, 0], np.int64)
+    maps = Maps(np.zeros((size, size, 1), np.float32), np.zeros((0, 0, 0), np.uint16), first, base, clipped)
+    nothing = np.zeros((36, AT_ONCE), np.int64)
+    map_rows(samples, pattern, Taps(nothing.astype(np.float32), nothing, nothing, 3), maps, (0, size))
+    grid = read_grid(pattern, layout.angles, stokes_inverse(layout.angles).float().numpy())
+    map_guided_rows(Source(samples, pattern, grid), maps, (0, size))
+    found = Found(base, clipped, *(np.zeros((size, size, n), np.float32) for n in (16, 8)))
+    colors, pairs, grey = (np.zeros((2 * size, 2 * size * n), np.float32) for n in (3, 2, 1))
+    sums = np.zeros((2 * size, SUMS))
+    targets = Targets(colors, colors, pairs, np.zeros((2 * size, 2 * size), np.bool_), grey, grey, sums)
+    write_rows(found, np.ones(3, np.float32), targets, (0, size))

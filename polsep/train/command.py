@@ -15,8 +15,9 @@ from torch import Tensor
 
 from polsep.io.checkpoints import read_module
 from polsep.io.weights import write_weights
+from polsep.joint import Demosaicker
 from polsep.networks import ResidualSize, Size, count_parameters
-from polsep.train.joint_task import ABLATIONS, SIZES, VIEWS, joint_task
+from polsep.train.joint_task import ABLATIONS, DEMOSAICKERS, SIZES, VIEWS, joint_task
 from polsep.train.joint_views import JointSeen
 from polsep.train.log import curve_of, read_log, references_of
 from polsep.train.loop import Run, train
@@ -106,12 +107,18 @@ class JointOptions:
 
     def task(self) -> Task[JointSeen]:
         """That of the network and its ablation."""
-        return joint_task(self.variant, self.size or SIZES[self.name], ABLATIONS[self.ablation])
+        return joint_task(self.variant, self.size or SIZES[self.name], ABLATIONS[self.ablation], self.demosaicker)
+
+    @property
+    def demosaicker(self) -> Demosaicker:
+        """Where the network's Stokes images come from."""
+        return DEMOSAICKERS[self.name] if self.variant == "mosaic" else "linear"
 
     def metadata(self) -> dict[str, str]:
         """What whoever loads the weights needs."""
-        inputs = json.dumps(ABLATIONS[self.ablation].inputs)
-        return {"method": self.name, "ablation": self.ablation, "inputs": inputs, "colors": str(VIEWS[self.variant][1])}
+        inputs, colors = json.dumps(ABLATIONS[self.ablation].inputs), str(VIEWS[self.variant][1])
+        named = {"method": self.name, "ablation": self.ablation, "demosaicker": self.demosaicker}
+        return named | {"inputs": inputs, "colors": colors}
 
     @property
     def crop(self) -> int:

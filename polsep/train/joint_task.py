@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d, pad, pixel_unshuffle, un
 
 from polsep.camera import Mosaic
 from polsep.demosaic import demosaic_bilinear_half
-from polsep.joint import INPUTS, Joint, bilinear_filter
+from polsep.joint import INPUTS, Demosaicker, Joint, bilinear_filter
 from polsep.networks import ResidualSize
 from polsep.separation import Separation
 from polsep.stokes import Measurements, Stokes
@@ -24,6 +24,10 @@ from polsep.train.tasks import Task
 
 #: The shipped networks: the best one at two frames a second on two cores, and the real-time one.
 SIZES = {"joint": ResidualSize(48, (0, 1, 1)), "joint-fast": ResidualSize(16, (0, 1, 1))}
+#: Where their Stokes images come from, for colour frames; for mono ones, from a linear filter.
+DEMOSAICKERS: dict[str, Demosaicker] = {"joint": "guided", "joint-fast": "linear"}
+#: Cells by which the guide continues crops.
+MARGIN = 8
 #: Batches that the filter is fitted to, from a pool of so many scenes, of a lane that no worker has.
 FIT_BATCHES, FIT_POOL, FIT_LANE = 60, 24, 120
 #: Light around below which a pixel says nothing about the filter, and what is added to that light.
@@ -60,10 +64,13 @@ ABLATIONS = {
 VIEWS = {"mosaic": (see_raw, 3), "mono": (see_raw_mono, 1)}
 
 
-def joint_task(variant: str, size: ResidualSize, ablation: Ablation) -> Task[JointSeen]:
+def joint_task(
+    variant: str, size: ResidualSize, ablation: Ablation, demosaicker: Demosaicker = "linear"
+) -> Task[JointSeen]:
     """The joint network for colour (``mosaic``) or ``mono`` frames."""
     see, colors = VIEWS[variant]
-    network = Joint(colors, size, ablation.inputs)
+    network = Joint(colors, size, ablation.inputs, demosaicker)
+    network.margin = MARGIN
 
     def loss(net: nn.Module, seen: JointSeen, done: float) -> Tensor:
         del done
@@ -76,6 +83,8 @@ def joint_task(variant: str, size: ResidualSize, ablation: Ablation) -> Task[Joi
         return Separation(diffuse, specular, seen.mask, Stokes(diffuse + specular, images.s1, images.s2))
 
     def begin(stream: StreamOptions) -> None:
+        if network.demosaic is None:
+            return
         batches = islice(stream_lane(replace(stream, pool=FIT_POOL), FIT_LANE, 0), FIT_BATCHES)
         network.demosaic.copy_(fit_filter(see(batch) for batch in batches))
 

@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -70,9 +70,9 @@ class Run:
     """
 
     out: Path
-    what: str
-    stream: StreamOptions
-    schedule: Schedule
+    what: str = ""
+    stream: StreamOptions = field(default_factory=StreamOptions)
+    schedule: Schedule = field(default_factory=Schedule)
     workers: int = 1
     devices: int = 1
     start: Path | None = None

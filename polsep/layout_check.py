@@ -15,7 +15,7 @@ filters, whatever the light.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
@@ -34,6 +34,9 @@ MIN_RATIO = 2.0
 #: Mean difference between neighbouring cells, relative to brightness: above the first a sensor shows colour, below the
 #: second it is mono or sees grey. Real mono frames show up to 0.012, real colour frames 0.10 and 0.19.
 MIN_COLOR, MAX_MONO = 0.04, 0.02
+
+#: Rows of a strip, and from one strip to the next; multiples of the blocks' 16.
+STRIP, STEP = 64, 256
 
 _PAIRINGS = {
     "diagonals": torch.tensor([1.0, -1.0, -1.0, 1.0]),
@@ -69,6 +72,15 @@ def crossed_pairs(layout: Layout) -> str | None:
         if abs(first % 180 - 90) < 1e-6 and abs(second % 180 - 90) < 1e-6:
             return name
     return None
+
+
+def _strips(mosaic: Mosaic) -> list[Mosaic]:
+    """The frame, or of a large one `STRIP` rows out of every `STEP`: as sure, in a quarter of the time."""
+    height = mosaic.data.shape[-2]
+    if height < 4 * STEP:
+        return [mosaic]
+    tops = range(0, height - STRIP + 1, STEP)
+    return [replace(mosaic, data=mosaic.data[..., top : top + STRIP, :]) for top in tops]
 
 
 def _phase_means(mosaic: Mosaic) -> tuple[Tensor, Tensor]:
@@ -147,7 +159,8 @@ def check_layout(mosaic: Mosaic) -> LayoutCheck:
     """Compare a frame (the first of a batch) with its own layout; never raises, and stays silent when in doubt."""
     if min(mosaic.data.shape[-2:]) < 16:
         return LayoutCheck(None, None, None, (mosaic.layout,))
-    phases, texture = _phase_means(mosaic)
+    seen = [_phase_means(strip) for strip in _strips(mosaic)]
+    phases, texture = torch.cat([means for means, _ in seen], dim=-1), torch.cat([each for _, each in seen])
     if phases.shape[-1] < 16 or float(phases.mean()) <= 1e-4:
         return LayoutCheck(None, None, None, (mosaic.layout,))
     color, origin, greens = _find_color(phases, texture, mosaic.layout)

@@ -7,18 +7,21 @@ from pathlib import Path
 
 import pytest
 import torch
+from tolerances import assert_close
 
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
 pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 
 from polsep import testsets
+from polsep.bench.joint import BINS, enlarge, full_entries, measure_reliability, see_full
 from polsep.bench.rendering import bench_rendering
 from polsep.bench.scoring import Entry, Protocol, score_case, score_sets, see_clean, see_co_sited, see_noisy
 from polsep.bench.sets import bench_sets
-from polsep.demosaic import demosaic_bilinear_half
-from polsep.methods import compose
-from polsep.metrics import psnr
+from polsep.demosaic import demosaic_bilinear_half, mean_cells
+from polsep.methods import METHODS, compose
+from polsep.metrics import psnr, reliability
+from polsep.mosaic_network import NAMES
 from polsep.render import Scene
 from polsep.separation import Separation, separate_analytic
 from polsep.stokes import Measurements, Stokes
@@ -89,6 +92,38 @@ def test_an_entry_demosaicks_mosaics_alone() -> None:
     for capture in (case.noisy, case.co_sited):
         entry.separate(capture)
     assert seen == [(4, 3, 16, 16), (4, 3, 32, 32)]
+
+
+def test_half_resolution_is_enlarged_about_the_centres_of_cells() -> None:
+    """A linear field of cell means becomes the field of the pixels, but for the border."""
+    y, x = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
+    field = (0.1 + 0.01 * y - 0.002 * x).expand(3, -1, -1)
+    assert_close(enlarge(mean_cells(field))[:, 1:-1, 1:-1], field[:, 1:-1, 1:-1])
+
+
+def test_full_resolution_is_scored_at_full_resolution() -> None:
+    """Every method, the ones that give half-resolution images enlarged."""
+    case = build_case(GREY)
+    capture, (diffuse, _, mask) = see_full(case)
+    found = {entry.name: entry.separate(capture) for entry in full_entries()}
+    assert set(found) == {"joint", "joint-fast", "color-affine", "analytic", "paper, enlarged"}
+    assert all(images.diffuse.shape == diffuse.shape for images in found.values())
+    scores = list(score_case(case, [Protocol("full", see_full, full_entries())]))
+    value = {score.method: score.value for score in scores if score.metric == "diffuse PSNR"}
+    assert value["analytic"] == psnr(found["analytic"].diffuse, diffuse, mask)
+
+
+def test_reliability_is_that_of_all_pixels_of_a_set(tmp_path: Path) -> None:
+    rows = list(measure_reliability("grey", (GREY,), tmp_path))
+    assert {(row.method, row.metric) for row in rows if row.unit == "octaves"} == {
+        (method, f"{output}, miss") for method in NAMES for output in ("diffuse", "specular")
+    }
+    case = build_case(GREY)
+    (diffuse, _, mask), found = case.half_truth(), METHODS["joint"].half(case.noisy)
+    assert found.doubt is not None
+    curve = reliability(found.diffuse - diffuse, found.doubt[0], mask, BINS)
+    said = [row.value for row in rows if row.method == "joint" and row.metric == "diffuse error, expected"]
+    assert said == pytest.approx(curve.expected.tolist())
 
 
 def test_sets_without_their_data_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,6 +14,7 @@ from polsep.bench.calibration import bench_calibration
 from polsep.bench.exactness import bench_exactness
 from polsep.bench.frontend import bench_frontend
 from polsep.bench.gallery import draw_paper
+from polsep.bench.joint import bench_joint
 from polsep.bench.paper import bench_paper, bench_paper_quick
 from polsep.bench.real import bench_real
 from polsep.bench.rendering import bench_rendering
@@ -48,6 +49,7 @@ BENCHES: dict[str, Bench] = {
     "frontend": Bench(bench_frontend),
     "rendering": Bench(bench_rendering),
     "sets": Bench(bench_sets),
+    "joint": Bench(bench_joint),
     "calibration": Bench(bench_calibration),
     "paper": Bench(bench_paper, bench_paper_quick, draw_paper),
 }

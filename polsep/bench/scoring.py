@@ -19,6 +19,7 @@ from torch import Tensor
 from polsep.bench.rows import Row
 from polsep.methods import METHODS, Capture
 from polsep.metrics import chroma, flip, highlights, psnr, psnr_unlimited, ssim, worst_mean
+from polsep.mosaic_network import NAMES
 from polsep.refine import Refinement
 from polsep.separation import Separation
 
@@ -63,9 +64,9 @@ class Score(NamedTuple):
     value: float
 
 
-def own_entries() -> tuple[Entry, ...]:
-    """`pipeline.METHODS` as entries."""
-    return tuple(Entry(m.name, m.half) for m in METHODS.values())
+def own_entries(mosaics: bool) -> tuple[Entry, ...]:
+    """`pipeline.METHODS` as entries: all for ``mosaics``, those that take them for co-sited samples."""
+    return tuple(Entry(m.name, m.half) for m in METHODS.values() if mosaics or m.name not in NAMES)
 
 
 def see_noisy(case: Case) -> tuple[Capture, Truth]:

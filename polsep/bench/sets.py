@@ -23,9 +23,9 @@ def bench_sets(data: Path) -> Iterator[Row]:
     Raises ValueError without the extras render and bench, and on a scene that does not come out as recorded.
     """
     sets = load_sets()
-    entries = own_entries()
-    seen = {"noisy": see_noisy, "clean": see_clean, "co-sited": see_co_sited}
-    yield from score_sets("sets", sets, data, [Protocol(name, see, entries) for name, see in seen.items()])
+    protocols = [Protocol(name, see, own_entries(True)) for name, see in (("noisy", see_noisy), ("clean", see_clean))]
+    protocols.append(Protocol("co-sited", see_co_sited, own_entries(False)))
+    yield from score_sets("sets", sets, data, protocols)
 
 
 def load_sets() -> dict[str, tuple[Recipe, ...]]:

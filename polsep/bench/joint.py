@@ -1,0 +1,96 @@
+"""The joint networks on the fixed test sets: images at full resolution, and whether they know their own errors.
+
+Full resolution is scored against the truth of every pixel of the noisy mosaic. Methods that give half-resolution images
+only have theirs enlarged, linearly between the cells' centres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from polsep.bench.rows import Row
+from polsep.bench.scoring import Entry, Protocol, Truth, find_absent, score_sets, see_noisy
+from polsep.bench.sets import load_sets
+from polsep.methods import METHODS, Capture
+from polsep.metrics import reliability
+from polsep.mosaic_network import NAMES
+from polsep.separation import Separation
+
+if TYPE_CHECKING:
+    from polsep.testsets import Case, Recipe
+
+#: Methods whose images at full resolution would be of bilinear samples, as their networks' are at half.
+ENLARGED = ("paper",)
+#: Groups of pixels in a reliability curve.
+BINS = 10
+
+
+def bench_joint(data: Path) -> Iterator[Row]:
+    """Full-resolution scores of all methods, and reliability curves of expected errors, on the test sets.
+
+    Raises ValueError without the extras render and bench, and on a scene that does not come out as recorded.
+    """
+    sets = load_sets()
+    yield from score_sets("joint", sets, data, [Protocol("full", see_full, full_entries())])
+    for name, recipes in sets.items():
+        if find_absent(recipes, data) is None:
+            yield from measure_reliability(name, recipes, data)
+
+
+def see_full(case: Case) -> tuple[Capture, Truth]:
+    """A 12-bit mosaic with noise, and the truth at its own resolution."""
+    return case.noisy, (case.scene.diffuse.s0, case.scene.specular.s0, case.scene.mask)
+
+
+def full_entries() -> tuple[Entry, ...]:
+    """Every method at full resolution; those of `ENLARGED` from half."""
+    return tuple(
+        Entry(f"{m.name}, enlarged", enlarged(m.half)) if m.name in ENLARGED else Entry(m.name, m.full)
+        for m in METHODS.values()
+    )
+
+
+def enlarged(separate: Callable[[Capture], Separation]) -> Callable[[Capture], Separation]:
+    """A method at half resolution, with its images enlarged to full; its masks and what else it says are not."""
+
+    def separate_and_enlarge(capture: Capture) -> Separation:
+        found = separate(capture)
+        diffuse, specular = (enlarge(image) for image in (found.diffuse, found.specular))
+        return replace(found, diffuse=diffuse, specular=specular)
+
+    return separate_and_enlarge
+
+
+def enlarge(image: Tensor) -> Tensor:
+    """Cells ``[C, h, w]`` as pixels ``[C, 2 h, 2 w]``, linearly between their centres."""
+    return interpolate(image[None], scale_factor=2.0, mode="bilinear", align_corners=False)[0]
+
+
+def measure_reliability(name: str, recipes: Sequence[Recipe], data: Path) -> Iterator[Row]:
+    """Of both outputs of the joint networks, over all pixels on objects of a set: a curve, and how far it is off."""
+    from polsep.testsets import build_cases
+
+    seen: dict[tuple[str, str], list[tuple[Tensor, Tensor]]] = {}
+    for case in build_cases(recipes, data):
+        capture, (diffuse, specular, mask) = see_noisy(case)
+        for method in NAMES:
+            found = METHODS[method].half(capture)
+            assert found.doubt is not None
+            outputs = (("diffuse", found.diffuse - diffuse), ("specular", found.specular - specular))
+            for (output, error), expected in zip(outputs, found.doubt, strict=True):
+                seen.setdefault((method, output), []).append((error[:, mask], expected[mask]))
+    for (method, output), parts in seen.items():
+        errors, expected = (torch.cat(x, dim=-1) for x in zip(*parts, strict=True))
+        everywhere = torch.ones(1, expected.numel(), dtype=torch.bool)
+        curve = reliability(errors[:, None], expected[None], everywhere, BINS)
+        yield Row("joint/reliability", name, method, f"{output}, miss", curve.miss, "octaves")
+        for k, (said, true) in enumerate(zip(curve.expected.tolist(), curve.found.tolist(), strict=True)):
+            yield Row("joint/curve", f"{name}, tenth {k + 1}", method, f"{output} error, expected", said, "white")
+            yield Row("joint/curve", f"{name}, tenth {k + 1}", method, f"{output} error, found", true, "white")

@@ -358,7 +358,7 @@ def _print_demo(name: str, statistics: dict[str, Any]) -> None:
 def bench(name: str, data: Path, output: Path, quick: bool, images: Path | None) -> None:
     """Measure NAME, print its rows and write them to DIR/NAME.jsonl; without NAME, list what can be measured.
 
-    'polsep bench readme' makes the tables of README.md and docs/paper.md anew from DIR.
+    'polsep bench readme' makes the tables of README.md and docs anew from DIR.
     """
     from polsep.bench import BENCHES, provenance, to_jsonl
     from polsep.io.results import fill_readme, write_text
@@ -368,7 +368,7 @@ def bench(name: str, data: Path, output: Path, quick: bool, images: Path | None)
             print(f"{known}: {(entry.run.__doc__ or '').splitlines()[0]}")
         return
     if name == "readme":
-        for page in ("README.md", "docs/paper.md"):
+        for page in ("README.md", "docs/joint.md", "docs/paper.md"):
             fill_readme(Path(page), output)
         return
     if name not in BENCHES:

@@ -51,14 +51,16 @@ Demosaicker = Literal["linear", "guided"]
 class Guess(NamedTuple):
     """What the closed form says at half resolution: ``diffuse [N, 4 C, h, w]``, ``specular [N, 4, h, w]``, packed.
 
-    ``polarized [N, 8 C, h, w]``: s1 and s2. ``light [N, 1, h, w]``: the brightness around; ``pose [N, 4, h, w]``: slope
-    and direction as in `Pose`; ``maps``: what the network sees, relative to the light.
+    ``polarized [N, 8 C, h, w]``: s1 and s2. ``light``, ``misfit [N, 1, h, w]``: the brightness around, and the rms
+    distance of s1 and s2 from the model; ``pose [N, 4, h, w]``: slope and direction as in `Pose`; ``maps``: what the
+    network sees, relative to the light.
     """
 
     diffuse: Tensor
     specular: Tensor
     polarized: Tensor
     light: Tensor
+    misfit: Tensor
     pose: Tensor
     maps: Tensor
 
@@ -78,7 +80,7 @@ class Images(NamedTuple):
 
     At half resolution: ``s1``, ``s2 [N, C, H/2, W/2]`` as linearly demosaicked; ``doubt [N, 2, H/2, W/2]``, the log
     variance of the error of diffuse and specular, relative to the square of the brightness around,
-    ``light [N, 1, H/4, W/4]``.
+    ``light [N, 1, H/4, W/4]``; ``misfit [N, 1, H/4, W/4]`` as in `Guess`.
     """
 
     diffuse: Tensor
@@ -87,6 +89,7 @@ class Images(NamedTuple):
     s2: Tensor
     doubt: Tensor
     light: Tensor
+    misfit: Tensor
 
 
 class Joint(nn.Module):
@@ -142,7 +145,7 @@ class Joint(nn.Module):
     def _unpack(self, packed: Tensor, guess: Guess, doubt: Tensor) -> Images:
         images = pixel_shuffle(packed, math.isqrt(packed.shape[1] // (self.colors + 1)))
         s1, s2 = (pixel_shuffle(s, 2) for s in guess.polarized.chunk(2, dim=1))
-        return Images(images[:, : self.colors], images[:, self.colors :], s1, s2, doubt, guess.light)
+        return Images(images[:, : self.colors], images[:, self.colors :], s1, s2, doubt, guess.light, guess.misfit)
 
     def _see(self, raw: Tensor, clipped: Tensor, full: bool) -> tuple[Tensor, Guess, Tensor, Tensor]:
         """Packed s0 at full resolution, the closed form, the network's features and doubt."""
@@ -185,16 +188,16 @@ class Joint(nn.Module):
         direction = [_mean((b + a * specular).chunk(4, dim=1)) for b, a in ((b1, a1), (b2, a2))]
         length = torch.sqrt(direction[0] ** 2 + direction[1] ** 2 + 1e-12)
         pose = torch.cat([a1, a2, direction[0] / length, direction[1] / length], dim=1)
-        misfit = torch.sqrt(_mean(misfit.chunk(4, dim=1)) + 1e-12) / light
+        misfit = torch.sqrt(_mean(misfit.chunk(4, dim=1)) + 1e-12)
         seen = {
             "samples": [planes / light],
             "clipping": [masks, free],
             "cosine": [_mean(s1) / light],
             "sine": [_mean(s2) / light],
-            "split": [diffuse / light, specular / light, *slopes, contrast, misfit],
+            "split": [diffuse / light, specular / light, *slopes, contrast, misfit / light],
         }
         maps = torch.cat([image for name in self.inputs for image in seen[name]] + [torch.log(light)], dim=1)
-        return Guess(diffuse, specular, found[:, 4 * colors :], light, pose, maps)
+        return Guess(diffuse, specular, found[:, 4 * colors :], light, misfit, pose, maps)
 
 
 def find_slopes(stokes: tuple[tuple[Tensor, ...], ...], weight: Tensor) -> tuple[list[Tensor], Tensor]:

@@ -111,7 +111,7 @@ class OpenVinoEngine:
             np.empty(nothing if halves else room, np.float32),
             np.empty(room if halves else nothing, np.uint16),
             first,
-            np.empty((h, 4 * network.colors + 13, w), np.float32),
+            np.empty((h, 4 * network.colors + 14, w), np.float32),
             np.empty((h, w), np.uint16),
         )
         self._taps = make_taps(network, w) if network.demosaic is not None else None
@@ -201,10 +201,11 @@ def make_taps(network: Joint, width: int) -> Taps:
 
 def _tally(targets: Any) -> Tally:
     """The frame's tally from its rows' sums, in one order whatever the threads."""
-    *sums, clipped = (float(x) for x in targets.sums.sum(axis=0))
+    *sums, clipped, misfit = (float(x) for x in targets.sums.sum(axis=0))
     s0, specular, above_one, power, along, across, *variances = sums
+    residual = misfit if targets.diffuse.shape[1] > targets.dolp.shape[1] else None  # one colour fits any line
     counts = (targets.valid.size, int(clipped), int(np.count_nonzero(targets.valid)), int(above_one))
-    return Tally(*counts, s0, specular, power, along, across, None, None, variances[0], variances[1])
+    return Tally(*counts, s0, specular, power, along, across, residual, None, variances[0], variances[1])
 
 
 @lru_cache(maxsize=KEPT)

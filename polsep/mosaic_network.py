@@ -8,6 +8,7 @@ so that they agree with the whole frame.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -141,8 +142,9 @@ def _halve(found: Separation) -> Separation:
         mean_cells(found.valid.float()) == 1,
     )
     clipped = None if found.clipped is None else mean_cells(found.clipped.float()) > 0
-    doubt = None if found.doubt is None else mean_cells(found.doubt)
-    return Separation(diffuse, specular, valid, found.stokes.map(mean_cells), clipped=clipped, doubt=doubt)
+    residual, doubt = (None if x is None else mean_cells(x) for x in (found.residual, found.doubt))
+    stokes = found.stokes.map(mean_cells)
+    return Separation(diffuse, specular, valid, stokes, residual=residual, clipped=clipped, doubt=doubt)
 
 
 def cut_rows(size: tuple[int, int], grid: int) -> Iterator[tuple[int, int]]:
@@ -154,7 +156,7 @@ def cut_rows(size: tuple[int, int], grid: int) -> Iterator[tuple[int, int]]:
 
 
 def _look_half(network: Joint, raw: Tensor, clipped: Tensor) -> list[Tensor]:
-    """Diffuse, specular, s1, s2, and the standard deviations of the errors of both, of a strip."""
+    """Diffuse, specular, s1, s2, the standard deviations of the errors of both, and the misfit, of a strip."""
     return _as_list(network.half_resolution(raw, clipped))
 
 
@@ -164,7 +166,12 @@ def _look_full(network: Joint, raw: Tensor, clipped: Tensor) -> list[Tensor]:
 
 def _as_list(images: Images) -> list[Tensor]:
     diffuse, specular, error = limit(images)
-    return [diffuse, specular, images.s1, images.s2, error]
+    return [diffuse, specular, images.s1, images.s2, error, _repeat(images.misfit, 2)]
+
+
+def _repeat(image: Tensor, times: int) -> Tensor:
+    """Every pixel's value ``times`` in both directions."""
+    return image.repeat_interleave(times, dim=-1).repeat_interleave(times, dim=-2) if times > 1 else image
 
 
 def _rows(image: Tensor, rows: tuple[int, int], height: int) -> Tensor:
@@ -182,16 +189,13 @@ def _cells(clipped: Tensor) -> Tensor:
 
 def _as_separation(images: list[Tensor], cells: Tensor, orientation: Orientation) -> Separation:
     """Turn everything back to the frame's own orientation, and the masks and Stokes images to the images' size."""
-    diffuse, specular, s1, s2, error = images
-    scale = 2 if diffuse.shape[-1] > s1.shape[-1] else 1
-
-    def enlarge(image: Tensor) -> Tensor:
-        return image.repeat_interleave(scale, dim=-1).repeat_interleave(scale, dim=-2) if scale > 1 else image
-
-    specular = specular.expand_as(diffuse)
-    stokes = Stokes(diffuse + specular, enlarge(s1), enlarge(s2))
-    turned = [orientation.turn_back(x, scale) for x in (diffuse, specular, enlarge(cells), enlarge(error))]
-    diffuse, specular, cells, error = turned
+    diffuse, specular = images[0], images[1].expand_as(images[0])
+    scale = 2 if diffuse.shape[-1] > cells.shape[-1] else 1
+    s1, s2, error, misfit, cells = (_repeat(x, scale) for x in (*images[2:], cells))
+    stokes = Stokes(diffuse + specular, s1, s2)
+    turned = [orientation.turn_back(x, scale) for x in (diffuse, specular, cells, error, math.sqrt(2) * misfit)]
+    diffuse, specular, cells, error, residual = turned
     valid, clipped = ~cells[..., 1, :, :], cells[..., 0, :, :]
     stokes = orientation.turn_back_stokes(stokes, scale)
-    return Separation(diffuse, specular, valid, stokes, clipped=clipped, doubt=error)
+    model = {"residual": residual} if diffuse.shape[-3] > 1 else {}  # one colour fits any line
+    return Separation(diffuse, specular, valid, stokes, clipped=clipped, doubt=error, **model)

@@ -322,10 +322,10 @@ def test_benches_without_a_quick_version_say_so() -> None:
 def test_readme_fills_both_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "docs").mkdir()
-    for page in ("README.md", "docs/paper.md"):
+    for page in ("README.md", "docs/joint.md", "docs/paper.md"):
         (tmp_path / page).write_text("<!-- table: paper/costs -->\n<!-- end -->\n", encoding="utf-8")
     app(["bench", "readme"], standalone_mode=False)
-    for page in ("README.md", "docs/paper.md"):
+    for page in ("README.md", "docs/joint.md", "docs/paper.md"):
         assert "Not measured yet: `polsep bench paper`." in (tmp_path / page).read_text(encoding="utf-8")
 
 

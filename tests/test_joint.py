@@ -94,7 +94,7 @@ def scene(layout: Layout, height: int, width: int) -> tuple[Images, Pose, Stokes
     a, e = (x.repeat_interleave(PERIOD, dim=-1).repeat_interleave(PERIOD, dim=-2) for x in (slope, direction))
     light = Stokes(diffuse + specular, *(a[:, k : k + 1] * diffuse + e[:, k : k + 1] * specular for k in (0, 1)))
     nothing = torch.zeros(2, 1, 1, 1)
-    return Images(diffuse, specular, nothing, nothing, nothing, nothing), Pose(slope, direction), light
+    return Images(diffuse, specular, *[nothing] * 5), Pose(slope, direction), light
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)

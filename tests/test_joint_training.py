@@ -90,7 +90,7 @@ def truth_of(seen: JointSeen) -> Images:
     s1, s2 = avg_pool2d(seen.polarized, 2).chunk(2, dim=1)
     count, _, height, width = seen.raw.shape
     doubt, light = torch.zeros(count, 2, height // 2, width // 2), torch.ones(count, 1, height // 4, width // 4)
-    return Images(seen.full_diffuse, seen.full_specular, s1, s2, doubt, light)
+    return Images(seen.full_diffuse, seen.full_specular, s1, s2, doubt, light, torch.zeros_like(light))
 
 
 def explained(layout: Layout) -> tuple[Images, Pose, JointSeen]:
@@ -175,7 +175,7 @@ def test_doubt_is_least_where_it_is_the_squared_error(share: float) -> None:
 
     def loss(doubt: Tensor) -> Tensor:
         nothing = torch.zeros(1)
-        return doubt_loss(Images(nothing, nothing, nothing, nothing, doubt, light), errors, torch.ones(1, 1, 4, 4))
+        return doubt_loss(Images(*[nothing] * 4, doubt, light, nothing), errors, torch.ones(1, 1, 4, 4))
 
     doubt = best.clone().requires_grad_()
     loss(doubt).backward()
@@ -191,7 +191,7 @@ def test_a_pixel_that_is_far_off_does_not_outweigh_the_others() -> None:
     pulls = []
     for sure in (0.0, -math.log(2 * SURPRISE), -200.0):
         doubt = torch.full((1, 2, 4, 4), sure, requires_grad=True)
-        loss = doubt_loss(Images(nothing, nothing, nothing, nothing, doubt, light), errors, torch.ones(1, 1, 4, 4))
+        loss = doubt_loss(Images(*[nothing] * 4, doubt, light, nothing), errors, torch.ones(1, 1, 4, 4))
         loss.backward()
         assert doubt.grad is not None
         assert_finite(loss, doubt.grad)

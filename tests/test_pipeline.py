@@ -194,6 +194,17 @@ def test_unpolarized_light_is_reported() -> None:
         polsep.separate(expose(mixed, Layout(bayer=None), IDEAL).data.numpy(), layout=Layout(bayer=None))
 
 
+@pytest.mark.parametrize("method", ["joint", "color-affine"])
+def test_metals_are_reported(method: str) -> None:
+    """Highlights in the metal's own colour, and nothing else, are no white light on a coloured thing."""
+    generator = torch.Generator().manual_seed(2)
+    light = interpolate(torch.rand(1, 1, 12, 12, generator=generator), size=(SIZE, SIZE))[0]
+    gold = 0.1 + 0.9 * light * torch.tensor([1.0, 0.78, 0.34]).view(3, 1, 1)
+    frame = expose(Stokes(gold, 0.6 * gold, 0.7 * gold), Layout(), IDEAL).data.numpy()
+    with pytest.warns(polsep.PolsepWarning, match="white highlights on coloured things were expected"):
+        polsep.separate(frame, method=method)
+
+
 def test_statistics_are_what_a_method_measures() -> None:
     """The closed form tells how well its model fits and the noise; the analytic split has neither, so says neither."""
     ours, theirs = (set(quietly(raw_frame(), name).report["statistics"]) for name in ("color-affine", "analytic"))

@@ -45,7 +45,7 @@ _WIDE, _NARROW = (window // 2 for window in WINDOWS)
 _TRUST_WIDE, _TRUST_NARROW = (np.float32(trust) for trust in TRUST)
 _MOST, _LEAST_LIGHT, _TINY = np.float32(MAX_DIFFUSE_DOLP), np.float32(LEAST_LIGHT), np.float32(1e-12)
 #: Rows of scratch.
-_ROWS = 13
+_ROWS = 12
 
 
 class Taps(NamedTuple):
@@ -65,8 +65,8 @@ class Maps(NamedTuple):
     """What the first pass fills. ``floats`` or ``halves [h, w, channels]``, bfloat16 as its bits; the other is empty.
 
     ``first [6]``: the first channel of samples, clipping, cosine, sine, split, logarithm; -1 for what is not wanted.
-    ``base [h, 4 C + 13, w]``: diffuse, specular, means over colours of s1 and s2, light. ``clipped [h, w]``: a bit per
-    sample of a packed pixel.
+    ``base [h, 4 C + 14, w]``: diffuse, specular, means over colours of s1 and s2, light, misfit. ``clipped [h, w]``: a
+    bit per sample of a packed pixel.
     """
 
     floats: Floats
@@ -349,7 +349,7 @@ def _show_samples(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> N
 @compiled
 def _show_split(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> None:
     """The closed form of row ``t`` to its maps."""
-    base, inverse, row, misfit, images = maps.base[t], spare[0], spare[11], spare[12], maps.base.shape[1] - 9
+    base, inverse, row, images = maps.base[t], spare[0], spare[11], maps.base.shape[1] - 10
     split, contrast = maps.first[4], spare[3]
     for k in range(images):
         emit_product(base[k], inverse, (maps.floats, maps.halves, split + k, t), row)
@@ -358,8 +358,7 @@ def _show_split(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> Non
     for j in range(row.size):
         row[j] = np.sqrt(contrast[j] + _TINY)
     emit(row, (maps.floats, maps.halves, split + images + 4, t))
-    _misfit(rings.moments[slot], (spare[6], spare[7]), misfit)
-    emit_product(misfit, inverse, (maps.floats, maps.halves, split + images + 5, t), row)
+    emit_product(base[images + 9], inverse, (maps.floats, maps.halves, split + images + 5, t), row)
 
 
 @compiled
@@ -372,6 +371,7 @@ def _leave(t: int, rings: _Rings, maps: Maps, spare: Any) -> None:
     _find_slopes(t, maps.base.shape[0], rings.sums, spare)
     _split(colors, slot, rings, maps.base[t], spare)
     copy(light, maps.base[t, 4 * colors + 12])
+    _misfit(rings.moments[slot], (spare[6], spare[7]), maps.base[t, 4 * colors + 13])
     _show_samples(t, slot, rings, maps, spare)
     for first, rows in ((maps.first[2], rings.cosine[slot]), (maps.first[3], rings.sine[slot])):
         if first >= 0:

@@ -5,6 +5,7 @@ Row after row of packed pixels, of which each makes two rows of images; see `ker
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from polsep.kernels.bilinear import read_pattern
 from polsep.kernels.cells import Source, read_grid
 from polsep.kernels.compiling import ONE, ZERO, compiled, entry
 from polsep.kernels.joint import Maps, Taps, map_guided_rows, map_rows
-from polsep.kernels.polarization import add_polarization, polarize, sum_row
+from polsep.kernels.polarization import polarize, sum_row
 from polsep.kernels.rows import AT_ONCE, add_product, copy, fill
 from polsep.kernels.threads import Piece
 from polsep.kernels.unpack import as_samples
@@ -25,14 +26,16 @@ from polsep.stokes import stokes_inverse
 Floats = NDArray[np.float32]
 
 #: Columns of ``sums``: s0, specular, DoLP above 1, power, power along and across, variance of diffuse and of specular
-#: that is expected, pixels near clipped ones.
-SUMS = 9
+#: that is expected, pixels near clipped ones, misfit.
+SUMS = 10
 #: Bits of the samples of a packed pixel's first cell.
 _CELL = 0b110011
+#: Cells of a packed pixel in one row, times what makes a distance of the rms of its two components.
+_CELLS = 2 * math.sqrt(2)
 
 
 class Found(NamedTuple):
-    """What is known of every packed pixel: ``base [h, 4 C + 13, w]`` and ``clipped [h, w]`` as in `joint.Maps`.
+    """What is known of every packed pixel: ``base [h, 4 C + 14, w]`` and ``clipped [h, w]`` as in `joint.Maps`.
 
     ``change [h, w, 4 C + 4]``: the network's corrections, relative to the light. ``doubt [h, w, 8]``: standard
     deviations of the errors of four cells' diffuse, then specular, relative to it too.
@@ -45,7 +48,7 @@ class Found(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """What is filled: colours ``[2 h, 2 w C]``, ``error [2 h, 2 w 2]``, others ``[2 h, 2 w]``; ``sums [2 h, 9]``."""
+    """What is filled: colours ``[2 h, 2 w C]``, ``error [2 h, 2 w 2]``, others ``[2 h, 2 w]``; ``sums [2 h, 10]``."""
 
     diffuse: Floats
     specular: Floats
@@ -107,7 +110,20 @@ def _write_cells(found: Found, t: int, cell: int, gains: Any, work: tuple[Target
     sums[1] += sum_row(tau, nothing)
     for j in range(dolp.size):
         sums[2] += dolp[j] > ONE
-    add_polarization(s1, s2, nothing, sums[3:6])
+    _add_polarization(tau, s1, s2, sums[3:6])
+
+
+@compiled
+def _add_polarization(tau: Any, p1: Any, p2: Any, sums: Any) -> None:
+    """Add power, and power along and across, of the polarization where there is specular light ``tau``."""
+    power, along, across = 0.0, 0.0, 0.0
+    for j in range(tau.size):
+        power += tau[j] * np.sqrt(p1[j] * p1[j] + p2[j] * p2[j])
+        along += tau[j] * p1[j]
+        across += tau[j] * p2[j]
+    sums[0] += power
+    sums[1] += along
+    sums[2] += across
 
 
 @compiled
@@ -149,6 +165,7 @@ def write_rows(found: Found, gains: Floats, targets: Targets, piece: Piece) -> N
             _write_cells(found, t, cell, gains, (targets, spare))
         for y in range(2 * t, 2 * t + 2):
             targets.sums[y, 8] = _mark_clipped(found.clipped, y, targets.valid[y])
+            targets.sums[y, 9] = _CELLS * sum_row(found.base[t, found.base.shape[1] - 1], found.clipped[0, :0])
 
 
 def warm_up() -> None:
@@ -156,7 +173,7 @@ def warm_up() -> None:
     layout, size = Layout(), 4
     samples = as_samples(np.eye(PERIOD * size, dtype=np.uint8))
     pattern = read_pattern((PERIOD * size, PERIOD * size), layout, 0, 1, (1.0, 1.0, 1.0))
-    base, clipped = np.zeros((size, 25, size), np.float32), np.zeros((size, size), np.uint16)
+    base, clipped = np.zeros((size, 26, size), np.float32), np.zeros((size, size), np.uint16)
     first = np.array([-1, -1, -1, -1, -1, 0], np.int64)
     maps = Maps(np.zeros((size, size, 1), np.float32), np.zeros((0, 0, 0), np.uint16), first, base, clipped)
     nothing = np.zeros((36, AT_ONCE), np.int64)

@@ -20,8 +20,8 @@ from polsep.stokes import Stokes, dolp
 #: Below this concentration of AoLP there is no single polarized light. Real frames: 0.76 to 0.97 where one light or one
 #: reflecting surface polarizes, 0.31 to 0.50 in the open; test sets under one light, by `joint`: 0.57 to 0.99.
 MIN_CONCENTRATION = 0.53
-#: Above this distance of the polarization from its model, relative to s0, highlights are coloured as metals' are. Test sets
-#: down to 1 % of full exposure: up to 0.04; objects with golden highlights and no diffuse: 0.11 and more. Linear
+#: Above this distance of the polarization from its model, relative to s0, highlights are coloured as metals' are. Test
+#: sets down to 3 % of full exposure: up to 0.04; objects with golden highlights and no diffuse: 0.11 and more. Linear
 #: demosaicking (`joint-fast`) hides a part of the distance.
 MOST_RESIDUAL = 0.07
 

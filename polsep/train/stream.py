@@ -38,9 +38,16 @@ LOWEST_QUANTILE, QUANTILES = 0.94, 601
 UNCLIPPED_SHARE, BRIGHTEST = 0.25, (0.4, HEADROOM)
 #: Shares of the object's samples that clip in the others: least and most, small ones more often (a square's law).
 CLIPPED = (0.0005, 0.06)
+#: Share of the examples that are exposed for what they show instead, whatever clips, and of those with glaring highlights:
+#: the brightest 0.3 % of the object exceed the median of the lit samples so many times. That median lies between these
+#: shares of white then.
+LEVEL_SHARE, GLARING_SHARE, GLARING, LEVELS = 0.2, 0.8, (0.003, 10.0), (0.05, 0.4)
 #: A crop is drawn anew, at most so many times, while less than this share of it is on objects.
 LEAST_COVERED, MOST_DRAWS = 0.6, 4
 
+
+#: Light at most, in white levels, so that half precision holds it.
+MOST_LIGHT = 2.0**14
 
 #: Analysers of the examples [rad].
 ANGLES = Layout().angles
@@ -230,7 +237,7 @@ def random_crop(pool: deque[Pooled], crop: int, generator: torch.Generator) -> C
 def expose_crops(crops: list[Crop], generator: torch.Generator) -> Examples:
     """A batch of crops as the sensor records them, and the truth."""
     factors = torch.stack([crop.factors for crop in crops])[..., None, None]
-    light = torch.stack([crop.light for crop in crops]).float() * factors
+    light = (torch.stack([crop.light for crop in crops]).float() * factors).clamp(-MOST_LIGHT, MOST_LIGHT)
     diffuse, specular = light[:, :3], light[:, 9:10]
     s1, s2 = light[:, 3:6] + light[:, 10:11], light[:, 6:9] + light[:, 11:12]
     signal = filter_light(Stokes(diffuse + specular, s1, s2), Layout(), IMX250)
@@ -255,18 +262,25 @@ def _random_place(scene: Pooled, crop: int, generator: torch.Generator) -> tuple
 
 
 def random_gain(scene: Pooled, generator: torch.Generator) -> float:
-    """A gain at which a random share of the samples clips, or none; more clip where the rest would be black.
+    """A gain at which a random share of the samples clips, or none, or that exposes the median; see the constants.
 
     The floor is that of `views.capture_shot`.
     """
-    none, place = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
-    if none < UNCLIPPED_SHARE:
+    none, place, level = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
+    glaring = float(scene.brightness[_rank(GLARING[0])]) > GLARING[1] * scene.level
+    if level < (GLARING_SHARE if glaring else LEVEL_SHARE):
+        gain = (LEVELS[0] + (LEVELS[1] - LEVELS[0]) * place) / max(scene.level, 1e-6)
+    elif none < UNCLIPPED_SHARE:
         gain = BRIGHTEST[0] + (BRIGHTEST[1] - BRIGHTEST[0]) * place
     else:
         share = CLIPPED[0] + (CLIPPED[1] - CLIPPED[0]) * place**2
-        rank = (1 - share - LOWEST_QUANTILE) / (1 - LOWEST_QUANTILE) * (QUANTILES - 1)
-        gain = 1 / max(float(scene.brightness[round(rank)]), 1e-6)
+        gain = 1 / max(float(scene.brightness[_rank(share)]), 1e-6)
     return float(max(gain, LEAST_LEVEL / scene.level))
+
+
+def _rank(share: float) -> int:
+    """Which of a scene's quantiles this share of its object's samples exceeds."""
+    return round((1 - share - LOWEST_QUANTILE) / (1 - LOWEST_QUANTILE) * (QUANTILES - 1))
 
 
 def add_gaussian_noise(signal: Tensor, sensor: Sensor, generator: torch.Generator) -> Tensor:

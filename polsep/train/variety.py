@@ -26,6 +26,9 @@ GREY_SHARE, PLAIN_SHARE = 0.2, 0.2
 #: Share of the looks that are matte: what is left of their specular light, log-uniform for every material. Photographs
 #: of painted, dusty or paper things have half a percent of it, which random materials rarely have.
 MATTE_SHARE, MATTE_STRENGTH = 0.3, (0.02, 1.0)
+#: Share of the looks whose highlights clip all analysers over an area, as mirror images of lamps do, which points of light
+#: do not make. How bright their middle is against the diffuse light, log-uniform; roughness from which on it is less.
+GLARE_SHARE, GLARES, GLARE_ROUGHNESS = 0.25, (30.0, 3000.0), 0.4
 #: Saturation that near-grey looks keep, at most.
 GREY_SATURATION = 0.15
 #: Standard deviation of the lens's point spread in raw pixels: that of `views.BLURS` and, slightly defocused, more.
@@ -95,12 +98,17 @@ def vary_normals(view: View, generator: torch.Generator) -> View:
 
 
 def vary_materials(materials: Materials, generator: torch.Generator) -> Materials:
-    """The same, near-grey, without textures or matte at random."""
-    grey, plain, saturation, matte = torch.rand(4, generator=generator).tolist()
+    """The same, near-grey, without textures, matte or glaring at random."""
+    grey, plain, saturation, matte, glare = torch.rand(5, generator=generator).tolist()
     places = torch.rand(materials.specular.shape, generator=generator)
     if matte < MATTE_SHARE:
         left = MATTE_STRENGTH[0] * (MATTE_STRENGTH[1] / MATTE_STRENGTH[0]) ** places
         materials = replace(materials, specular=materials.specular * left)
+    elif matte < MATTE_SHARE + GLARE_SHARE:
+        # The lobe's peak over an albedo of a half: F / (4 pi r^4) over 0.5 / pi, for F = 0.04.
+        narrow = materials.roughness.clamp(max=GLARE_ROUGHNESS) ** 4
+        stronger = GLARES[0] * (GLARES[1] / GLARES[0]) ** glare * narrow / 0.02
+        materials = replace(materials, specular=materials.specular * stronger.clamp(min=1))
     if plain < PLAIN_SHARE:
         materials = replace(materials, textures=None)
     if grey >= GREY_SHARE:

@@ -21,7 +21,10 @@ from polsep.train import stream
 from polsep.train.stream import (
     BRIGHTEST,
     CLIPPED,
+    GLARING_SHARE,
     LEAST_LEVEL,
+    LEVEL_SHARE,
+    LEVELS,
     LOOKS,
     LOWEST_QUANTILE,
     QUANTILES,
@@ -110,14 +113,20 @@ def test_truth_is_physical(batches: list[Examples]) -> None:
 
 
 def test_exposures_clip_what_was_drawn() -> None:
-    """Some clip nothing, the others a share of evenly spread samples whose square law's place is uniform in [0, 1]."""
+    """Some clip nothing, others a share of evenly spread samples whose square law's place is uniform in [0, 1].
+
+    The rest is exposed for the median, far below here.
+    """
     ranks = torch.linspace(LOWEST_QUANTILE, 1, QUANTILES)
     nothing = torch.zeros(0)
-    scene = Pooled(nothing, nothing, nothing, nothing, ranks, 0.5)
+    scene = Pooled(nothing, nothing, nothing, nothing, ranks, 2.0)
     gains = [random_gain(scene, torch.Generator().manual_seed(k)) for k in range(500)]
-    unclipped = [gain for gain in gains if gain < 1]
-    spread = math.sqrt(500 * UNCLIPPED_SHARE * (1 - UNCLIPPED_SHARE))
-    assert abs(len(unclipped) - 500 * UNCLIPPED_SHARE) < SIGMAS * spread
+    leveled = [gain for gain in gains if gain < BRIGHTEST[0]]
+    assert LEVELS[0] / 2 <= min(leveled) <= max(leveled) <= LEVELS[1] / 2
+    assert abs(len(leveled) - 500 * LEVEL_SHARE) < SIGMAS * math.sqrt(500 * LEVEL_SHARE * (1 - LEVEL_SHARE))
+    unclipped = [gain for gain in gains if BRIGHTEST[0] <= gain < 1]
+    share = UNCLIPPED_SHARE * (1 - LEVEL_SHARE)
+    assert abs(len(unclipped) - 500 * share) < SIGMAS * math.sqrt(500 * share * (1 - share))
     assert BRIGHTEST[0] <= min(unclipped) <= max(unclipped) <= BRIGHTEST[1]
     step = (1 - LOWEST_QUANTILE) / QUANTILES
     shares = torch.tensor([1 - 1 / gain for gain in gains if gain >= 1], dtype=torch.float64)
@@ -126,6 +135,16 @@ def test_exposures_clip_what_was_drawn() -> None:
     places = ((shares - CLIPPED[0]).clamp(min=0) / (CLIPPED[1] - CLIPPED[0])).sqrt().sort().values
     # Kolmogorov and Smirnov's distance, which exceeds 1.95 / sqrt(n) once in a thousand times.
     assert float((places - torch.linspace(0, 1, len(places))).abs().max()) < 1.95 / math.sqrt(len(places)) + 0.02
+
+
+def test_glaring_scenes_are_mostly_exposed_for_the_rest() -> None:
+    """Where the brightest are far above the median, most exposures let them clip."""
+    nothing = torch.zeros(0)
+    glaring = Pooled(nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 0.01)
+    gains = [random_gain(glaring, torch.Generator().manual_seed(k)) for k in range(300)]
+    leveled = [gain for gain in gains if gain > 2 * LEAST_LEVEL / 0.01]
+    assert LEVELS[0] / 0.01 <= min(leveled) <= max(leveled) <= LEVELS[1] / 0.01
+    assert abs(len(leveled) - 300 * GLARING_SHARE) < SIGMAS * math.sqrt(300 * GLARING_SHARE * (1 - GLARING_SHARE))
 
 
 def test_dark_scenes_are_exposed_to_the_floor() -> None:

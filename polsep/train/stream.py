@@ -38,9 +38,9 @@ LOWEST_QUANTILE, QUANTILES = 0.94, 601
 UNCLIPPED_SHARE, BRIGHTEST = 0.25, (0.4, HEADROOM)
 #: Shares of the object's samples that clip in the others: least and most, small ones more often (a square's law).
 CLIPPED = (0.0005, 0.06)
-#: Share of the examples that are exposed for what they show instead, whatever clips, and of those with glaring highlights:
-#: the brightest 0.3 % of the object exceed the median of the lit samples so many times. That median lies between these
-#: shares of white then.
+#: Share of the examples that are exposed for what they show instead, whatever clips, and of those with glaring
+#: highlights: the brightest 0.3 % of the object exceed the median of the lit samples so many times. That median lies
+#: between these shares of white then.
 LEVEL_SHARE, GLARING_SHARE, GLARING, LEVELS = 0.2, 0.8, (0.003, 10.0), (0.05, 0.4)
 #: A crop is drawn anew, at most so many times, while less than this share of it is on objects.
 LEAST_COVERED, MOST_DRAWS = 0.6, 4

@@ -26,8 +26,9 @@ GREY_SHARE, PLAIN_SHARE = 0.2, 0.2
 #: Share of the looks that are matte: what is left of their specular light, log-uniform for every material. Photographs
 #: of painted, dusty or paper things have half a percent of it, which random materials rarely have.
 MATTE_SHARE, MATTE_STRENGTH = 0.3, (0.02, 1.0)
-#: Share of the looks whose highlights clip all analysers over an area, as mirror images of lamps do, which points of light
-#: do not make. How bright their middle is against the diffuse light, log-uniform; roughness from which on it is less.
+#: Share of the looks whose highlights clip all analysers over an area, as mirror images of lamps do, which points of
+#: light do not make. How bright their middle is against the diffuse light, log-uniform; roughness from which on it is
+#: less.
 GLARE_SHARE, GLARES, GLARE_ROUGHNESS = 0.25, (30.0, 3000.0), 0.4
 #: Saturation that near-grey looks keep, at most.
 GREY_SATURATION = 0.15

@@ -124,7 +124,8 @@ def _pseudo_inverse(angles: tuple[float, ...]) -> list[list[float]]:
     if np.linalg.matrix_rank(matrix, tol=1e-6 * np.linalg.norm(matrix, 2)) < 3:
         degrees = [round(math.degrees(t), 3) for t in angles]
         raise ValueError(f"need three analysers of different angles (modulo 180 degrees), found {degrees}")
-    inverse: list[list[float]] = np.linalg.pinv(matrix).tolist()
+    found = np.linalg.pinv(matrix)
+    inverse: list[list[float]] = np.where(np.abs(found) < 1e-12, 0, found).tolist()  # rounding would polarize
     return inverse
 
 

@@ -155,7 +155,7 @@ def test_every_format_of_both_sensors(tmp_path: Path, polsep: Cli, format: str, 
         "separate", png(tmp_path / "a.png", mosaic), "-o", tmp_path / "o", "--format", format, "--layout", layout
     )
     assert run.status == 0, run
-    layers = {*LAYERS, "error"} if layout == "color" and BEST[0].name in NAMES else set(LAYERS)
+    layers = {*LAYERS, "error"} if BEST[0].name in NAMES else set(LAYERS)
     images = {f"a_{layer}.{format}" for layer in layers} if format in ("tiff", "png") else {f"a.{format}"}
     assert set(contents(tmp_path / "o")) == images | {"a.png", "a.json"}
     if format == "npz":

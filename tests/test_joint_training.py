@@ -478,7 +478,7 @@ def test_resumed_training_ends_with_the_same_bits(tmp_path: Path, shortened: Non
 
 def test_it_learns_a_picture_by_heart() -> None:
     """One 32 x 32 example, 160 steps: both outputs reach 40 dB, 15 dB above the closed form that they start at."""
-    examples = next(itertools.islice(stream_lane(replace(STREAM, batch=1), 0, 0), 2, None))
+    examples = next(itertools.islice(stream_lane(replace(STREAM, batch=1), 0, 0), 1, None))
     torch.manual_seed(0)
     task = joint_task("mosaic", ResidualSize(16, (1, 1)), ABLATIONS["none"])
     seen = task.prepare(examples)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -404,6 +405,22 @@ def test_an_interrupt_cleans_up_and_stays_an_interrupt(tmp_path: Path, monkeypat
     with pytest.raises(KeyboardInterrupt):
         write_separation(random_frame(), tmp_path / "new", "shot")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_waits_until_a_frame_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C while files are moved: they are all there, nothing else is, and then it interrupts."""
+    move = outputs._move_into_place
+
+    def interrupted(*arguments: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        move(*arguments)
+
+    monkeypatch.setattr(outputs, "_move_into_place", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        write_separation(random_frame(), tmp_path, "shot")
+    assert {path.name for path in tmp_path.iterdir()} == {"shot.exr", "shot.png", "shot.json"}
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_short_write_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,10 +21,13 @@ import io
 import json
 import os
 import shutil
+import signal
 import tempfile
+import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import imagecodecs
@@ -114,7 +117,8 @@ def write_separation(
     made = [d for d in (directory, *directory.parents) if not os.path.exists(d)]
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        _write_and_move(frame, targets, stem, format)
+        with _unbroken():
+            _write_and_move(frame, targets, stem, format)
     except BaseException as error:
         for path in made:
             with suppress(OSError):
@@ -175,6 +179,23 @@ def _check_frame(frame: SeparatedFrame) -> None:
             raise OutputError(f"expected finite values in {name}, found {wrong} NaN or infinite samples")
     if frame.error is not None and float(frame.error.min()) < 0:
         raise OutputError(f"expected deviations of 0 or more in {ERROR}, found {float(frame.error.min()):.3g}")
+
+
+@contextmanager
+def _unbroken() -> Iterator[None]:
+    """Ctrl-C waits until the block is done: otherwise it may come while the block cleans up, and leave a part of it."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is None:  # no signal comes here
+        yield
+        return
+    caught: list[tuple[int, FrameType | None]] = []
+    signal.signal(signal.SIGINT, lambda number, place: caught.append((number, place)))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if caught and callable(before):
+        before(*caught[0])
 
 
 def _write_and_move(frame: SeparatedFrame, targets: list[Path], stem: str, format: str) -> None:

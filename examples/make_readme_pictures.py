@@ -37,7 +37,7 @@ def main(directory: str) -> None:
     warnings.simplefilter("ignore")
     raw = imagecodecs.imread(Path(polsep.__file__).parent / "data" / "still_life.png")
     rows = []
-    for method, name in (("analytic", "paper's analytic split"), ("color-affine", "polsep, color-affine")):
+    for method, name in (("analytic", "paper's analytic split"), ("joint", "polsep")):
         found = polsep.separate(raw, method=method, white_level=4095)
         if not rows:
             gain = exposure_of(found.diffuse + found.specular)

@@ -78,8 +78,12 @@ class Measurements:
 
 def analyser_matrix(angles: Sequence[float]) -> Tensor:
     """Rows ``[1, cos 2t, sin 2t] / 2`` of K ideal analysers: the matrix P of Eqs. 11-12, ``[K, 3]``."""
-    t = torch.tensor(angles, dtype=torch.float64)
-    return 0.5 * torch.stack([torch.ones_like(t), torch.cos(2 * t), torch.sin(2 * t)], dim=1)
+    return torch.tensor(_analyser_rows(angles), dtype=torch.float64)
+
+
+def _analyser_rows(angles: Sequence[float]) -> list[list[float]]:
+    """`analyser_matrix` as numbers, which whoever traces a computation takes for constants."""
+    return [[0.5, 0.5 * math.cos(2 * t), 0.5 * math.sin(2 * t)] for t in angles]
 
 
 def intensity_behind(stokes: Stokes, angle: float | Tensor) -> Tensor:
@@ -119,8 +123,8 @@ def stokes_inverse(angles: Sequence[float]) -> Tensor:
 
 @lru_cache(maxsize=32)
 def _pseudo_inverse(angles: tuple[float, ...]) -> list[list[float]]:
-    """As numbers, which whoever traces a computation takes for constants."""
-    matrix = np.array([[0.5, 0.5 * math.cos(2 * t), 0.5 * math.sin(2 * t)] for t in angles])
+    """As numbers, like `_analyser_rows`."""
+    matrix = np.array(_analyser_rows(angles))
     if np.linalg.matrix_rank(matrix, tol=1e-6 * np.linalg.norm(matrix, 2)) < 3:
         degrees = [round(math.degrees(t), 3) for t in angles]
         raise ValueError(f"need three analysers of different angles (modulo 180 degrees), found {degrees}")

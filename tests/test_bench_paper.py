@@ -319,7 +319,7 @@ def test_benches_without_a_quick_version_say_so() -> None:
         app(["bench", "sets", "--quick"], standalone_mode=False)
 
 
-def test_readme_fills_both_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readme_fills_all_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "docs").mkdir()
     for page in ("README.md", "docs/joint.md", "docs/paper.md"):

@@ -31,7 +31,7 @@ from polsep.stokes import Measurements, Stokes, measure
 
 SIZE = 96
 #: What layers in bfloat16 make of other inputs by rounding.
-ROUNDED = 3e-3
+ROUNDED = 2e-3
 ODD_LIGHT = (1.0, 0.8, 0.6)
 
 

@@ -14,9 +14,11 @@ from tolerances import assert_close, assert_same_angle, assert_within
 
 from polsep import joint_engine
 from polsep.camera import Layout, Mosaic
-from polsep.joint import INPUTS, Demosaicker, Joint
+from polsep.joint import INPUTS, PERIOD, Demosaicker, Joint
 from polsep.joint_engine import JointImages, OpenVinoEngine, run_engine
 from polsep.kernels import get_threads, set_threads
+from polsep.kernels.bilinear import read_pattern
+from polsep.kernels.unpack import as_samples
 from polsep.mosaic_network import own_order, run_joint
 from polsep.networks import ResidualSize
 from polsep.pipeline import in_light
@@ -135,6 +137,24 @@ def test_threads_and_frames_before_change_no_bit() -> None:
             one, other = (getattr(runs[k], field.name) for k in (first, second))
             assert one == other if field.name == "tally" else np.array_equal(one, other)
     assert not np.array_equal(runs[0].diffuse, runs[1].diffuse)
+
+
+@pytest.mark.parametrize(("layout", "demosaicker"), KINDS)
+def test_a_thread_writes_no_row_of_another(
+    layout: Layout, demosaicker: Demosaicker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not even the same numbers: who reads them in between would see half of them."""
+    height, piece = 48, (3, 6)
+    net, mosaic = random_net(layout, INPUTS, demosaicker), random_frame(height, 64, layout)
+    engine = OpenVinoEngine(net, (height, 64), "f32")
+    engine._maps.base.fill(math.nan)
+    engine._maps.clipped.fill(12345)
+    monkeypatch.setattr("polsep.kernels.threads.share", lambda work, rows, step: work(piece))
+    engine._fill_maps(as_samples(mosaic.data.numpy()), read_pattern((height, 64), layout, BLACK, WHITE, LIGHT))
+    others = np.ones(height // PERIOD, np.bool_)
+    others[slice(*piece)] = False
+    assert np.isnan(engine._maps.base[others]).all() and np.isfinite(engine._maps.base[~others]).all()
+    assert (engine._maps.clipped[others] == 12345).all() and (engine._maps.clipped[~others] != 12345).all()
 
 
 @pytest.fixture

@@ -81,6 +81,7 @@ class _Rings(NamedTuple):
 
     ``s0 [8, 4 C, w]``, ``cosine``, ``sine [8, 4, w]``: means over colours; ``moments [8, 4, w]``: of the colours'
     deviations, s0 with s0, s1, s2 and what s1, s2 have. ``luminance``, ``light``, ``free [8, w]``; ``sums [16, 3, w]``.
+    ``clipped [8, w]``: as in `Maps`, of rows beyond the piece as well, which another thread may be writing there.
     """
 
     planes: Floats
@@ -92,6 +93,7 @@ class _Rings(NamedTuple):
     light: Floats
     free: Floats
     sums: Floats
+    clipped: NDArray[np.uint16]
 
 
 @compiled
@@ -106,12 +108,15 @@ def _make_rings(colors: int, w: int) -> _Rings:
         np.zeros((KEPT, w), np.float32),
         np.zeros((KEPT, w), np.float32),
         np.zeros((SUMMED, 3, w), np.float32),
+        np.zeros((KEPT, w), np.uint16),
     )
 
 
 @compiled
-def _enter(samples: Samples, pattern: Pattern, u: int, planes: Any, clipped: Any) -> None:
-    """Samples of packed row ``u`` as planes ``[16, w + 2]``, and which of them clip."""
+def _enter(source: tuple[Samples, Pattern], u: int, piece: Piece, rings: _Rings, found: Any) -> None:
+    """Samples of packed row ``u``, and which of them clip, to their rings; the latter to ``found`` too in the piece."""
+    samples, pattern = source
+    planes, clipped = rings.planes[u % KEPT], rings.clipped[u % KEPT]
     w = clipped.size
     codes = np.empty(PERIOD * w, np.float32)
     for j in range(w):
@@ -131,6 +136,8 @@ def _enter(samples: Samples, pattern: Pattern, u: int, planes: Any, clipped: Any
                 for j in range(w):
                     if own[PERIOD * j] >= pattern.clip_at:
                         clipped[j] |= np.uint16(1 << (PERIOD * row + col))
+    if piece[0] <= u < piece[1]:
+        copy(clipped, found[u])
 
 
 @compiled
@@ -197,7 +204,7 @@ def _describe(colors: int, u: int, rings: _Rings, polarized: Any, spare: Any) ->
 
 
 @compiled
-def _look_around(v: int, h: int, rings: _Rings, clipped: Any, spare: Any) -> None:
+def _look_around(v: int, h: int, rings: _Rings, spare: Any) -> None:
     """The light around row ``v``, whether anything there clips, and the weighted moments."""
     w, slot = rings.light.shape[1], v % KEPT
     total, light, free = spare[0], rings.light[slot], rings.free[slot]
@@ -208,7 +215,7 @@ def _look_around(v: int, h: int, rings: _Rings, clipped: Any, spare: Any) -> Non
         around = rings.luminance[row % KEPT]
         sum_three(around, around[1:], around[2:], total)
         add_product(total, ONE, light)
-        bits, some = clipped[row], False
+        bits, some = rings.clipped[row % KEPT], False
         for j in range(w):
             some |= bits[j] != 0
         if some:
@@ -389,7 +396,7 @@ def _go_on(u: int, piece: Piece, rings: _Rings, maps: Maps, spare: Any) -> None:
     """What can be done of earlier rows once row ``u`` is described."""
     v, h = u - 1, maps.clipped.shape[0]
     if (v > max(piece[0] - REACH, 0) or v == 0) and v < h:
-        _look_around(v, h, rings, maps.clipped, spare)
+        _look_around(v, h, rings, spare)
     if u - REACH >= piece[0]:
         _leave(u - REACH, rings, maps, spare)
 
@@ -400,13 +407,12 @@ def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, piece: 
     h, w = maps.clipped.shape
     rings, spare = _make_rings(taps.colors, w), np.zeros((_ROWS, w), np.float32)
     polarized = np.empty((8 * taps.colors, w), np.float32)
-    # Rows that two pieces need are entered by both; what they write of them is the same.
     begin = max(piece[0] - REACH, 0)
     for u in range(max(begin - 1, 0), begin + 1):
-        _enter(samples, pattern, u, rings.planes[u % KEPT], maps.clipped[u])
+        _enter((samples, pattern), u, piece, rings, maps.clipped)
     for u in range(begin, piece[1] + REACH):
         if u + 1 < h:
-            _enter(samples, pattern, u + 1, rings.planes[(u + 1) % KEPT], maps.clipped[u + 1])
+            _enter((samples, pattern), u + 1, piece, rings, maps.clipped)
         if u < h:
             _filter_samples(taps, u, h, rings, polarized)
             _describe(taps.colors, u, rings, polarized, spare)
@@ -420,7 +426,7 @@ def _map_guided_rows(source: Source, stream: Stream, maps: Maps, piece: Piece) -
     rows = np.empty((2, 9, 2 * w), np.float32)
     for u in range(max(piece[0] - REACH, 0), piece[1] + REACH):
         if u < h:
-            _enter(source.samples, source.pattern, u, rings.planes[u % KEPT], maps.clipped[u])
+            _enter((source.samples, source.pattern), u, piece, rings, maps.clipped)
             demosaic_rows(source, stream, (2 * u, 2 * u + 2), rows)
             _take_apart(rows, rings.s0[u % KEPT], polarized)
             _describe(3, u, rings, polarized, spare)

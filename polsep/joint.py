@@ -3,8 +3,9 @@
 A mosaic is packed to quarter resolution: the 16 samples of a period become channels, so every pixel of the network
 sees the same filters. Stokes images come from the intensity guide (`guided.guide_once`) or, in less time, from a linear
 filter fitted to examples. The colour-affine closed form (`color_affine`) with windows of two sizes makes a first
-separation of these. A U-Net of residual blocks, which sees samples, clip masks and the closed form, adds what that
-lacks. The specular light is white by construction. Diffuse and specular sum to the network's own s0.
+separation of these. A U-Net of residual blocks, which sees samples, clip masks and the closed form, says how much of
+that one's specular light to believe and adds what is missing. The specular light is white by construction. Diffuse and
+specular sum to the network's own s0.
 
 Inputs and corrections are relative to the brightness around, so that a darker exposure of a scene gives a darker image
 of the same separation, as far as noise and clipping allow. There are no statistics of whole images: crop and frame
@@ -113,6 +114,11 @@ class Joint(nn.Module):
         self.last = nn.Conv2d(size.widths[0], 16 * (colors + 1), 1)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
+        # Without the closed form among its maps the network does not know what it would believe.
+        self.trust = nn.Conv2d(size.widths[0], 4, 1) if "split" in inputs else None
+        if self.trust is not None:
+            nn.init.zeros_(self.trust.weight)
+            nn.init.zeros_(self.trust.bias)  # type: ignore[arg-type]
         self.pose = nn.Conv2d(size.widths[0], 4, 1)
         nn.init.zeros_(self.pose.weight)
         nn.init.zeros_(self.pose.bias)  # type: ignore[arg-type]
@@ -124,9 +130,9 @@ class Joint(nn.Module):
         ``raw``, ``clipped [N, 1, H, W]``: samples and which of them clipped, H and W multiples of 4.
         """
         total, guess, features, doubt = self._see(raw, clipped, full=True)
-        change, turn = self.last(features), self.pose(features)
+        change, turn, trust = self.last(features), self.pose(features), self._trust(features)
         with torch.autocast(raw.device.type, enabled=False):
-            specular = _spread(guess.specular)
+            specular = _spread(guess.specular * (1 + trust))
             diffuse = total - torch.cat([specular] * self.colors, dim=1)
             images = torch.cat([diffuse, specular], dim=1) + change.float() * guess.light
             slope, direction = (guess.pose + turn.float()).chunk(2, dim=1)
@@ -137,10 +143,16 @@ class Joint(nn.Module):
         """The means over 2x2 cells of what `forward` gives, ``[N, C, H/2, W/2]``, in less time."""
         _, guess, features, doubt = self._see(raw, clipped, full=False)
         weight, bias = pool_outputs(self.last.weight), pool_outputs(self.last.bias)  # type: ignore[arg-type]
-        change = conv2d(features, weight, bias)
+        change, trust = conv2d(features, weight, bias), self._trust(features)
         with torch.autocast(raw.device.type, enabled=False):
-            images = torch.cat([guess.diffuse, guess.specular], dim=1) + change.float() * guess.light
-            return self._unpack(images, guess, doubt)
+            moved = guess.specular * trust
+            closed = torch.cat([guess.diffuse - torch.cat([moved] * self.colors, dim=1), guess.specular + moved], dim=1)
+            return self._unpack(closed + change.float() * guess.light, guess, doubt)
+
+    def _trust(self, features: Tensor) -> Tensor:
+        """How much more specular light there is than in the closed form, relative to that ``[N, 4 or 1, h, w]``."""
+        trust = torch.zeros_like(features[:, :1]) if self.trust is None else self.trust(features)
+        return trust.float()
 
     def _unpack(self, packed: Tensor, guess: Guess, doubt: Tensor) -> Images:
         images = pixel_shuffle(packed, math.isqrt(packed.shape[1] // (self.colors + 1)))

@@ -58,16 +58,22 @@ class JointImages:
 
 
 class Layers(nn.Module):
-    """A network's layers: maps ``[1, n, h, w]`` to corrections ``[1, 4 C + 4, h, w]``, deviations ``[1, 8, h, w]``."""
+    """A network's layers: maps ``[1, n, h, w]`` to corrections ``[1, 4 C + 8, h, w]``, deviations ``[1, 8, h, w]``."""
 
     def __init__(self, network: Joint) -> None:
         super().__init__()
         self.net, self.doubt = network.net, network.doubt
         assert network.last.bias is not None
-        self.weight, self.bias = (nn.Parameter(pool_outputs(x)) for x in (network.last.weight, network.last.bias))
+        weight, bias = (pool_outputs(x) for x in (network.last.weight, network.last.bias))
+        if network.trust is None:
+            trust = [torch.zeros_like(weight[:4]), torch.zeros_like(bias[:4])]
+        else:
+            assert network.trust.bias is not None
+            trust = [network.trust.weight, network.trust.bias]
+        self.weight, self.bias = nn.Parameter(torch.cat([weight, trust[0]])), nn.Parameter(torch.cat([bias, trust[1]]))
 
     def forward(self, maps: Tensor) -> tuple[Tensor, Tensor]:
-        """Relative to the light, at half resolution; see `kernels.joint_images.Found`."""
+        """Relative to the light and to the closed form, at half resolution; see `kernels.joint_images.Found`."""
         features = self.net(maps)
         return conv2d(features, self.weight, self.bias), torch.exp(0.5 * self.doubt(features).clamp(max=MOST_DOUBT))
 
@@ -115,7 +121,7 @@ class OpenVinoEngine:
             np.empty((h, w), np.uint16),
         )
         self._taps = make_taps(network, w) if network.demosaic is not None else None
-        self._found = [np.empty((h, w, n), np.float32) for n in (4 * network.colors + 4, 8)]
+        self._found = [np.empty((h, w, n), np.float32) for n in (4 * network.colors + 8, 8)]
         seen = self._maps.halves if halves else self._maps.floats
         self._request.set_input_tensor(openvino.Tensor(seen, [1, *room], kind))
         for k, image in enumerate(self._found):

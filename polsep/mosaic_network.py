@@ -42,7 +42,7 @@ def load_joint(path: Path, device: torch.device) -> Joint:
     tensors, metadata = read_weights(path)
     try:
         size = json.loads(metadata["size"])
-        size = ResidualSize(size["width"], tuple(size["blocks"]))
+        size = ResidualSize(size["width"], tuple(size["blocks"]), size.get("entry", 0))
         demosaicker: Any = metadata.get("demosaicker", "linear")  # what weights without a word on it were trained with
         network = Joint(int(metadata["colors"]), size, tuple(json.loads(metadata["inputs"])), demosaicker)
         network.load_state_dict(tensors)

@@ -87,15 +87,17 @@ class UNet(nn.Module):
 class ResidualSize:
     """Size of a `ResidualUNet`: ``width`` channels at the top, doubled at every further level; ``blocks`` per level.
 
-    Raises ValueError on what cannot be built.
+    ``entry``: channels to which a 1x1 convolution brings the inputs first, 0 for none; where there are many inputs and
+    few channels, most of the time goes into the first 3x3 convolution. Raises ValueError on what cannot be built.
     """
 
     width: int = 32
     blocks: tuple[int, ...] = (1, 1, 1)
+    entry: int = 0
 
     def __post_init__(self) -> None:
-        if self.width < 1 or not self.blocks or min(self.blocks) < 0:
-            raise ValueError(f"expected a width of at least 1 and blocks per level of at least 0, found {self}")
+        if self.width < 1 or not self.blocks or min(*self.blocks, self.entry) < 0:
+            raise ValueError(f"expected a width of at least 1, blocks per level and entry of at least 0, found {self}")
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -130,7 +132,7 @@ class ResidualUNet(nn.Module):
     def __init__(self, inputs: int, size: ResidualSize) -> None:
         super().__init__()
         widths = size.widths
-        self.enter = nn.Conv2d(inputs, widths[0], 3, padding=1)
+        self.enter = _entrance(inputs, size)
         self.encoders = nn.ModuleList(_chain(w, n) for w, n in zip(widths, size.blocks, strict=True))
         pairs = list(pairwise(widths))
         self.downs = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairs)
@@ -156,6 +158,13 @@ class ResidualUNet(nn.Module):
             x = interpolate(up(relu(x)), scale_factor=2.0)  # by nearest neighbours
             x = decoder(skip + x[..., : skip.shape[-2], : skip.shape[-1]])
         return relu(self.out(x))
+
+
+def _entrance(inputs: int, size: ResidualSize) -> nn.Module:
+    """A 3x3 convolution, of fewer channels where the size says so."""
+    if not size.entry:
+        return nn.Conv2d(inputs, size.width, 3, padding=1)
+    return nn.Sequential(nn.Conv2d(inputs, size.entry, 1), nn.Conv2d(size.entry, size.width, 3, padding=1))
 
 
 def _chain(width: int, count: int) -> nn.Sequential:

@@ -314,7 +314,7 @@ def test_the_command_measures_and_draws(weights: Path, tiny_sets: None, tmp_path
 
 
 def test_benches_without_a_quick_version_say_so() -> None:
-    expected = r"expected a benchmark with a quick version for --quick \(paper\), found 'sets'"
+    expected = r"expected a benchmark with a quick version for --quick \(dynamic, video, paper\), found 'sets'"
     with pytest.raises(ClickException, match=expected):
         app(["bench", "sets", "--quick"], standalone_mode=False)
 

@@ -402,3 +402,17 @@ def test_expected_errors_stay_finite() -> None:
         images = net.half_resolution(raw, nothing_clipped(raw))
     assert float(images.doubt.min()) == MOST_DOUBT
     assert_finite(*limit(images))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
+def test_distrust_moves_the_closed_form_s_specular_light_to_the_diffuse(layout: Layout) -> None:
+    net, raw = untrained(layout), random_raw(1, 16, 16)
+    clipped = nothing_clipped(raw)
+    assert net.trust is not None
+    believed = net.half_resolution(raw, clipped), net(raw, clipped)[0]
+    torch.nn.init.constant_(net.trust.bias, -1.0)  # type: ignore[arg-type]
+    refused = net.half_resolution(raw, clipped), net(raw, clipped)[0]
+    for before, after in zip(believed, refused, strict=True):
+        assert bool((before.specular > 0).any())
+        assert_within(after.specular, torch.zeros_like(after.specular), 1e-6)
+        assert_close(after.diffuse, before.diffuse + before.specular)

@@ -150,8 +150,9 @@ def test_turned_scenes_separate_alike(capture: Measurements, name: str) -> None:
 
     The networks' inputs turn with the scene exactly. The networks themselves do not: convolutions are not symmetric,
     they only learnt from examples of all eight turns, and folding and pooling pair other pixels. The bound is what a
-    network well above the analytic split's 30 to 35 dB needs so that turning changes less than it still errs; weights
-    trained for 3600 steps keep 42 to 52 dB here.
+    network well above the analytic split's 30 to 35 dB needs so that turning changes less than it still errs; the
+    shipped weights keep 42 to 56 dB here. Where clipping leaves a core to be guessed, turned guesses may differ (27 dB
+    over all pixels): those are not compared.
     """
     turn, back, turn_stokes, order = TURNS[name]
     whole = stacked([cut(capture, row, col, (320, 320)) for row, col in ((300, 400), (500, 100))])
@@ -166,7 +167,7 @@ def test_turned_scenes_separate_alike(capture: Measurements, name: str) -> None:
     sign = -1 if turn_stokes in (transpose, rotate_quarter) else 1
     assert float((inputs[:, angle] - sign * own[:, angle]).abs().median()) < 1e-5
     found, straight = separate_paper(turned), separate_paper(whole)
-    everywhere = torch.ones_like(straight.valid[0])
+    assert float(straight.valid.float().mean()) > 0.95
     for a, b in ((found.diffuse, straight.diffuse), (found.specular, straight.specular)):
-        scores = [psnr(back(x), y, everywhere) for x, y in zip(a, b, strict=True)]
-        assert sum(scores) / len(scores) > 35
+        scores = [psnr(back(x), y, seen) for x, y, seen in zip(a, b, straight.valid, strict=True)]
+        assert min(scores) > 35

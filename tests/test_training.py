@@ -214,11 +214,11 @@ def test_data_have_a_digest_of_their_options() -> None:
 )
 def test_commands_are_described_as_click_reads_them(asked: list[str]) -> None:
     """What is left to defaults is written out."""
-    given = cli.train.make_context("train", list(asked)).params
+    given = cli.data.train.make_context("train", list(asked)).params
     options, run = plan(given)
     words = shlex.split(describe_command(options, run))
     assert words[:2] == ["polsep", "train"]
-    read = cli.train.make_context("train", words[2:]).params
+    read = cli.data.train.make_context("train", words[2:]).params
     assert {name: value for name, value in read.items() if given[name] is not None} == {
         name: value for name, value in given.items() if value is not None
     }
@@ -309,7 +309,7 @@ def test_a_net_learns_a_picture_by_heart(see: Callable[[Examples], Seen]) -> Non
         seen = see(examples)
         everywhere = [(*seen[:3], torch.ones_like(seen[3]))]
         before = score(task.separate, everywhere)
-        if min(before.values()) > 20 and max(before.values()) < 34:  # one that leaves something to learn
+        if min(before.values()) > 20 and max(before.values()) < 30:  # one that leaves 15 dB to learn
             break
     optimizer = torch.optim.Adam(task.network.parameters(), 3e-3)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 200)

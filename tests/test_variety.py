@@ -15,11 +15,14 @@ pytest.importorskip("embreex")
 from polsep.camera import IMX250
 from polsep.materials import Materials, random_materials
 from polsep.raycast import MeshScene, View, find_view
+from polsep.render import Scene
+from polsep.stokes import Stokes
 from polsep.train.variety import (
     BITS,
     BITS_SHARES,
     BLURS,
     CLOSE_SHARE,
+    DEPOLARIZED_SHARE,
     FULL_WELLS,
     GLARE_SHARE,
     GREY_SATURATION,
@@ -30,10 +33,15 @@ from polsep.train.variety import (
     PLAIN_SHARE,
     RELIEF_SHARE,
     RELIEF_TILTS,
+    RETAINED,
+    RETAINING_SHARE,
+    UNPOLARIZED_SHARE,
     random_sensor,
     relight,
     vary_materials,
     vary_normals,
+    vary_polarization,
+    vary_retention,
     vary_shot,
 )
 from polsep.views import LEAST_LIT, Shot, lit_share, random_shot, seeded_shape
@@ -182,3 +190,42 @@ def test_a_seed_draws_the_same_again(shape: MeshScene, shots: list[Shot]) -> Non
         materials = random_materials(3, seeded(seed))
         once, again = (vary_materials(materials, seeded(seed)) for _ in range(2))
         assert all(torch.equal(a, b) for a, b in zip(albedos(once), albedos(again), strict=True))
+
+
+def test_some_diffuse_light_is_less_polarized_and_nothing_else_differs() -> None:
+    draws, generator = 2000, seeded(5)
+    lobes = [Stokes(*(x * torch.ones(1, 1, 1) for x in values)) for values in ((1.0, 0.2, -0.1), (0.5, 0.3, 0.4))]
+    scene = Scene(*lobes, torch.ones(1, 1, dtype=torch.bool))
+    kept = []
+    for _ in range(draws):
+        found = vary_polarization(scene, generator)
+        assert found.specular is scene.specular
+        assert found.mask is scene.mask
+        assert torch.equal(found.diffuse.s0, scene.diffuse.s0)
+        kept.append(float(found.diffuse.s1 / scene.diffuse.s1))
+        assert_close(found.diffuse.s2, kept[-1] * scene.diffuse.s2)
+    assert min(kept) == 0
+    assert max(kept) == 1
+    expect_share(sum(k < 1 for k in kept), draws, DEPOLARIZED_SHARE)
+    expect_share(sum(k == 0 for k in kept), draws, DEPOLARIZED_SHARE * UNPOLARIZED_SHARE)
+
+
+def test_some_diffuse_light_keeps_its_polarization() -> None:
+    """What is added is white, fully polarized at the angle of the highlights, and a share of the diffuse light."""
+    draws, generator = 2000, seeded(6)
+    diffuse = Stokes(torch.tensor([0.9, 0.6, 0.3])[:, None, None], *torch.zeros(2, 3, 1, 1))
+    specular = Stokes(torch.full((3, 1, 1), 0.5), torch.full((3, 1, 1), 0.3), torch.full((3, 1, 1), 0.4))
+    scene = Scene(diffuse, specular, torch.ones(1, 1, dtype=torch.bool))
+    shares = []
+    for _ in range(draws):
+        found = vary_retention(scene, generator)
+        assert found.diffuse is diffuse
+        more = found.specular.s0 - specular.s0
+        shares.append(float(more[0]) / 0.6)
+        assert_close(found.specular.s1 - specular.s1, 0.6 * more)
+        assert_close(found.specular.s2 - specular.s2, 0.8 * more)
+        assert_close(more, more[:1].expand(3, 1, 1))
+    kept = [share for share in shares if share > 0]
+    expect_share(len(kept), draws, RETAINING_SHARE)
+    assert min(kept) >= RETAINED[0] - 1e-6
+    assert max(kept) <= RETAINED[1] + 1e-6

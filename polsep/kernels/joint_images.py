@@ -37,8 +37,9 @@ _CELLS = 2 * math.sqrt(2)
 class Found(NamedTuple):
     """What is known of every packed pixel: ``base [h, 4 C + 14, w]`` and ``clipped [h, w]`` as in `joint.Maps`.
 
-    ``change [h, w, 4 C + 4]``: the network's corrections, relative to the light. ``doubt [h, w, 8]``: standard
-    deviations of the errors of four cells' diffuse, then specular, relative to it too.
+    ``change [h, w, 4 C + 8]``: the network's corrections, relative to the light, and for the closed form's specular
+    light relative to that. ``doubt [h, w, 8]``: standard deviations of the errors of four cells' diffuse, then
+    specular, relative to the light.
     """
 
     base: Floats
@@ -60,10 +61,10 @@ class Targets(NamedTuple):
 
 
 @compiled
-def _correct(closed: Any, change: Any, light: Any, image: Any) -> None:
-    """The closed form with its correction, not below 0."""
+def _correct(closed: Any, change: Any, light: Any, moved: Any, image: Any) -> None:
+    """The closed form, more by ``moved``, with its correction, not below 0."""
     for j in range(image.size):
-        value = closed[j] + change[j] * light[j]
+        value = closed[j] + moved[j] + change[j] * light[j]
         image[j] = value if value > ZERO else ZERO
 
 
@@ -81,11 +82,16 @@ def _write_cells(found: Found, t: int, cell: int, gains: Any, work: tuple[Target
     targets, spare = work
     y, side, colors = 2 * t + cell // 2, cell % 2, gains.size
     base, light = found.base[t], found.base[t, 4 * colors + 12]
-    image, tau, s0, dolp, aolp = spare[0], spare[1], spare[2], spare[3], spare[4]
-    _correct(base[4 * colors + cell], found.change[t, :, 4 * colors + cell], light, tau)
+    image, tau, s0, dolp, aolp, moved = spare[0], spare[1], spare[2], spare[3], spare[4], spare[5]
+    specular, trust = base[4 * colors + cell], found.change[t, :, 4 * colors + 4 + cell]
+    for j in range(moved.size):
+        moved[j] = specular[j] * trust[j]
+    _correct(specular, found.change[t, :, 4 * colors + cell], light, moved, tau)
     copy(tau, s0)
+    for j in range(moved.size):
+        moved[j] = -moved[j]
     for c in range(colors):
-        _correct(base[4 * c + cell], found.change[t, :, 4 * c + cell], light, image)
+        _correct(base[4 * c + cell], found.change[t, :, 4 * c + cell], light, moved, image)
         add_product(image, np.float32(1 / colors), s0)
         _spread(image, gains[c], colors * side + c, targets.diffuse[y])
         _spread(tau, gains[c], colors * side + c, targets.specular[y])
@@ -159,7 +165,7 @@ def _mark_clipped(clipped: Any, y: int, valid: Any) -> int:
 @entry
 def write_rows(found: Found, gains: Floats, targets: Targets, piece: Piece) -> None:
     """Images of a piece of the packed rows; ``gains [C]``: the light's colour."""
-    spare = np.zeros((5, found.base.shape[2]), np.float32)
+    spare = np.zeros((6, found.base.shape[2]), np.float32)
     for t in range(piece[0], piece[1]):
         for cell in range(4):
             _write_cells(found, t, cell, gains, (targets, spare))
@@ -180,7 +186,7 @@ def warm_up() -> None:
     map_rows(samples, pattern, Taps(nothing.astype(np.float32), nothing, nothing, 3), maps, (0, size))
     grid = read_grid(pattern, layout.angles, stokes_inverse(layout.angles).float().numpy())
     map_guided_rows(Source(samples, pattern, grid), maps, (0, size))
-    found = Found(base, clipped, *(np.zeros((size, size, n), np.float32) for n in (16, 8)))
+    found = Found(base, clipped, *(np.zeros((size, size, n), np.float32) for n in (20, 8)))
     colors, pairs, grey = (np.zeros((2 * size, 2 * size * n), np.float32) for n in (3, 2, 1))
     sums = np.zeros((2 * size, SUMS))
     targets = Targets(colors, colors, pairs, np.zeros((2 * size, 2 * size), np.bool_), grey, grey, sums)

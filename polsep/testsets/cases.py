@@ -107,9 +107,13 @@ def fingerprint(case: Case) -> tuple[int, ...]:
 
     Weights differ between colours and over the image, so that no flip, shift or swap goes unnoticed.
     """
-    lobes = [image for lobe in (case.scene.diffuse, case.scene.specular) for image in _components(lobe)]
-    mosaics = [case.clean.linear()[None], case.noisy.linear()[None]]
-    return tuple(round(_weighted_mean(image) / UNIT) for image in (*lobes, *mosaics))
+    return tuple(round(mean / UNIT) for mean in weigh_scene(case.scene, (case.clean, case.noisy)))
+
+
+def weigh_scene(scene: Scene, mosaics: tuple[Mosaic, ...]) -> tuple[float, ...]:
+    """The weighted means behind `fingerprint`: s0, s1, s2 of the diffuse and of the specular, then the samples."""
+    lobes = [image for lobe in (scene.diffuse, scene.specular) for image in _components(lobe)]
+    return tuple(_weighted_mean(image) for image in (*lobes, *(mosaic.linear()[None] for mosaic in mosaics)))
 
 
 def record_of(recipe: Recipe, data: Path | None = None) -> Expected:

@@ -192,7 +192,8 @@ def describe_command(options: Options, run: Run) -> str:
         asked |= {"width": options.size.width, "levels": options.size.levels, "fold": options.size.fold}
     else:
         size = options.size or SIZES[options.name]
-        asked |= {"width": size.width, "blocks": ",".join(map(str, size.blocks)), "ablation": options.ablation}
+        asked |= {"width": size.width, "blocks": ",".join(map(str, size.blocks)), "entry": size.entry}
+        asked |= {"ablation": options.ablation}
     asked |= {
         "steps": schedule.steps,
         "rate": schedule.rate,
@@ -221,7 +222,8 @@ def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:
         blocks = usual.blocks if asked["blocks"] is None else tuple(int(n) for n in asked["blocks"].split(","))
     except ValueError:
         raise ValueError(f"expected blocks per level like 1,1,2, found {asked['blocks']!r}") from None
-    larger = ResidualSize(usual.width if width is None else width, blocks)
+    entry = usual.entry if asked["entry"] is None else asked["entry"]
+    larger = ResidualSize(usual.width if width is None else width, blocks, entry)
     return JointOptions(name, data, larger, asked["ablation"], asked["seed"])
 
 

@@ -23,7 +23,7 @@ from polsep.train.stream import StreamOptions, stream_lane
 from polsep.train.tasks import Task
 
 #: The shipped networks: the best one at two frames a second on two cores, and the real-time one.
-SIZES = {"joint": ResidualSize(48, (0, 1, 1)), "joint-fast": ResidualSize(16, (0, 1, 1))}
+SIZES = {"joint": ResidualSize(48, (0, 1, 1)), "joint-fast": ResidualSize(16, (0, 1, 1), 16)}
 #: Where their Stokes images come from, for colour frames; for mono ones, from a linear filter.
 DEMOSAICKERS: dict[str, Demosaicker] = {"joint": "guided", "joint-fast": "linear"}
 #: Cells by which the guide continues crops.

@@ -27,7 +27,15 @@ from polsep.raycast import MeshScene, find_view, light_view, shade_view
 from polsep.render import Scene
 from polsep.simulate import HEADROOM, blur, filter_light
 from polsep.stokes import Stokes
-from polsep.train.variety import random_sensor, relight, vary_materials, vary_normals, vary_shot
+from polsep.train.variety import (
+    random_sensor,
+    relight,
+    vary_materials,
+    vary_normals,
+    vary_polarization,
+    vary_retention,
+    vary_shot,
+)
 from polsep.views import LEAST_LEVEL, random_shot, scene_seed, seeded_shape
 
 #: Views of a shape, and lights with materials of their own under which each is seen.
@@ -184,6 +192,7 @@ def _look_at(shape: MeshScene, options: StreamOptions, generator: torch.Generato
     for _ in range(LOOKS):
         materials = vary_materials(random_materials(shape.mesh.slot_count, generator, shape.size), generator)
         scene = blur(shade_view(view, materials, light, light_view(shape, view, light)), shot.blur)
+        scene = vary_retention(vary_polarization(scene, generator), generator)
         looks.append(_as_pooled(scene))
         light = relight(shape, shot, generator)
     return looks

@@ -1,4 +1,4 @@
-"""What training examples have beyond `polsep.views`: close-ups, relief, grey, plain and matte objects, cameras.
+"""What training examples have beyond `polsep.views`: close-ups, relief, grey, plain, matte and rough objects, cameras.
 
 Whoever uses a trained network photographs more than objects that fill the frame, by one camera. Draws take a generator.
 """
@@ -16,7 +16,8 @@ from polsep.camera import IMX250, Sensor
 from polsep.kernels.relief import Relief, roughen_normals
 from polsep.materials import Materials
 from polsep.raycast import MeshScene, View, find_view, light_view
-from polsep.render import PointLight, pixel_side
+from polsep.render import PointLight, Scene, pixel_side
+from polsep.stokes import Stokes
 from polsep.views import LEAST_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
 
 #: Share of the views that show a part of the object, and how many times larger than the whole, log-uniform.
@@ -30,6 +31,13 @@ MATTE_SHARE, MATTE_STRENGTH = 0.3, (0.02, 1.0)
 #: light do not make. How bright their middle is against the diffuse light, log-uniform; roughness from which on it is
 #: less.
 GLARE_SHARE, GLARES, GLARE_ROUGHNESS = 0.25, (30.0, 3000.0), 0.4
+#: Share of the looks whose diffuse light is less polarized than Fresnel's transmission says, as behind rough surfaces,
+#: and the share of those whose diffuse light is not polarized at all; the others keep a uniform share of it.
+DEPOLARIZED_SHARE, UNPOLARIZED_SHARE = 0.4, 0.3
+#: Share of the looks in which a part of the diffuse light keeps the polarization of the lamp, as light that was
+#: scattered once does (Ma et al. 2007), and how much of it, log-uniform. Crossed polarizers count it as specular; on
+#: matte photographs it is most of what they measure.
+RETAINING_SHARE, RETAINED = 0.5, (0.002, 0.03)
 #: Saturation that near-grey looks keep, at most.
 GREY_SATURATION = 0.15
 #: Standard deviation of the lens's point spread in raw pixels: that of `views.BLURS` and, slightly defocused, more.
@@ -119,6 +127,29 @@ def vary_materials(materials: Materials, generator: torch.Generator) -> Material
     if textures is not None:
         textures = replace(textures, albedo=_desaturate(textures.albedo, saturation))
     return replace(materials, albedo=_desaturate(materials.albedo, saturation), textures=textures)
+
+
+def vary_polarization(scene: Scene, generator: torch.Generator) -> Scene:
+    """The same, or with less polarized diffuse light."""
+    wanted, none, kept = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
+    if wanted >= DEPOLARIZED_SHARE:
+        return scene
+    kept = 0.0 if none < UNPOLARIZED_SHARE else kept
+    s0, s1, s2 = scene.diffuse.s0, scene.diffuse.s1, scene.diffuse.s2
+    return replace(scene, diffuse=Stokes(s0, kept * s1, kept * s2))
+
+
+def vary_retention(scene: Scene, generator: torch.Generator) -> Scene:
+    """The same, or with a share of the diffuse light added as white light at the AoLP of all highlights together."""
+    wanted, place = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+    if wanted >= RETAINING_SHARE:
+        return scene
+    share = RETAINED[0] * (RETAINED[1] / RETAINED[0]) ** place
+    specular = scene.specular
+    angle = math.atan2(float(specular.s2.double().sum()), float(specular.s1.double().sum()))
+    kept = share * scene.diffuse.s0.mean(dim=0, keepdim=True)
+    more = Stokes(specular.s0 + kept, specular.s1 + kept * math.cos(angle), specular.s2 + kept * math.sin(angle))
+    return replace(scene, specular=more)
 
 
 def _desaturate(albedo: Tensor, saturation: float) -> Tensor:

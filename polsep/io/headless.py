@@ -20,8 +20,11 @@ _GAP = rb"(?:\s|#[^\n]*\n)+"
 _PGM_HEADER = re.compile(rb"P5" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})\s")
 
 
-def read_headless(path: Path, size: tuple[int, int], pixel_format: str) -> Iterator[Page]:
-    """The frames of a dump of (width, height) pixels; of ONE angle image for LUCID's angles. Raises ValueError."""
+def read_headless(path: Path, size: tuple[int, int], pixel_format: str, first: int = 0) -> Iterator[Page]:
+    """The frames of a dump of (width, height) pixels, from ``first`` on; of ONE angle image for LUCID's angles.
+
+    Raises ValueError.
+    """
     fmt = find_pixel_format(pixel_format)
     width, height = size
     require_size((fmt.planes, height, width) if fmt.planes > 1 else (height, width))
@@ -31,18 +34,26 @@ def read_headless(path: Path, size: tuple[int, int], pixel_format: str) -> Itera
         kind = f"{width}x{height} {fmt.name}" + ("; the size of ONE angle image" if fmt.planes > 1 else "")
         raise ValueError(f"expected a whole number of frames of {frame} bytes ({kind}), found {total} bytes")
     with path.open("rb") as stream:
-        for index in range(total // frame):
-            codes = unpack_frame(stream.read(frame), width, height, pixel_format)
-            yield Page(
-                codes,
-                index,
-                total // frame,
-                white_level=fmt.white_level if 8 < fmt.bits < 16 else None,  # 8 and 16 bits: that of the dtype
-                layout=Layout(bayer=fmt.bayer),
-                angles=fmt.planes > 1,
-                sampled=fmt.planes > 1,
-                notes=_mirror_notes(fmt),
-            )
+        stream.seek(first * frame)
+        for index in range(first, total // frame):
+            yield headless_page(stream.read(frame), size, pixel_format, (index, total // frame))
+
+
+def headless_page(payload: bytes, size: tuple[int, int], pixel_format: str, place: tuple[int, int] = (0, 1)) -> Page:
+    """One frame of (width, height) pixels from the bytes a camera sent; ``place``: its index, of how many.
+
+    Raises ValueError as `genicam.unpack_frame` does.
+    """
+    fmt = find_pixel_format(pixel_format)
+    return Page(
+        unpack_frame(payload, *size, pixel_format),
+        *place,
+        white_level=fmt.white_level if 8 < fmt.bits < 16 else None,  # 8 and 16 bits: that of the dtype
+        layout=Layout(bayer=fmt.bayer),
+        angles=fmt.planes > 1,
+        sampled=fmt.planes > 1,
+        notes=_mirror_notes(fmt),
+    )
 
 
 def _mirror_notes(fmt: PixelFormat) -> tuple[str, ...]:

@@ -1,0 +1,133 @@
+"""Files as a camera: raw frames of a folder, a file or a recording, once or in a loop, at a rate."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import repeat
+from pathlib import Path
+
+import numpy as np
+
+from polsep.capture.sources import CameraError, CameraInfo, CameraSettings, EndOfFrames
+from polsep.io.errors import input_error, naming
+from polsep.io.footage import natural_order
+from polsep.io.frames import read_pages
+from polsep.io.genicam import find_pixel_format, pack_frame
+from polsep.io.pages import Page
+from polsep.io.recording import RECORD, RawImage, read_header, read_images
+
+#: Kinds of files that describe themselves, so that their codes can be sent without being told anything.
+KINDS = (".png", ".tif", ".tiff", ".npy", ".pgm")
+#: Frames per second where no rate is said.
+RATE_HZ = 10.0
+
+
+class FolderSource:
+    """Frames of files as `read_pages` finds them, in natural order (2 before 10), or of a recording, byte for byte.
+
+    Codes of 8 bits become BayerRG8, wider ones BayerRG10, 12 or 16 by the file's white level; the settings' pixel
+    format, which may be a packed one, goes before. All frames must have one size. Files have no exposure to set.
+    """
+
+    def __init__(self, path: Path, settings: CameraSettings, loop: bool = False) -> None:
+        """Look at what is there. Raises CameraError when it holds no frames or a setting is a camera's own."""
+        asked = {
+            "exposure": settings.exposure_us,
+            "gain": settings.gain_db,
+            "trigger": settings.trigger,
+            "features": settings.features or None,
+        }
+        for name, value in asked.items():
+            if value is not None:
+                raise CameraError(f"{path}: expected a camera to set its {name}, found files")
+        self._path, self._settings, self._loop = path, settings, loop
+        self._files = _files_of(path)
+
+    @contextmanager
+    def connect(self) -> Iterator[_Files]:
+        """A camera that starts at the first frame."""
+        yield _Files(self._path.name or str(self._path), self._frames(), self._settings.frame_rate_hz or RATE_HZ)
+
+    def _frames(self) -> Iterator[tuple[bytes, CameraInfo]]:
+        for _ in repeat(None) if self._loop else (None,):
+            for path in self._files:
+                with naming(path):
+                    yield from _recorded(path) if path.name == RECORD else self._packed(path)
+
+    def _packed(self, path: Path) -> Iterator[tuple[bytes, CameraInfo]]:
+        for page in read_pages(path):
+            name = self._settings.pixel_format or _pixel_format(page)
+            fmt = find_pixel_format(name)
+            codes = page.array[..., 0] if page.array.shape[2:] == (1,) else page.array
+            if page.angles or codes.ndim != 2 or codes.dtype not in (np.uint8, np.uint16) or fmt.planes > 1:
+                found = f"{codes.dtype} {codes.shape} for {name}"
+                raise ValueError(f"expected a raw mosaic [H, W] of uint8 or uint16 codes, found {found}")
+            height, width = codes.shape
+            yield pack_frame(codes, name), CameraInfo(str(path), width, height, name)
+
+
+class _Files:
+    """The `Camera` of a folder: frames when they are due, counted from 0."""
+
+    def __init__(self, name: str, frames: Iterator[tuple[bytes, CameraInfo]], rate_hz: float) -> None:
+        self._frames, self._period = frames, 1 / rate_hz
+        self._next = next(self._frames, None)
+        if self._next is None:
+            raise CameraError(f"{name}: expected at least one frame, found none")
+        first = self._next[1]
+        settings = {"frame_rate_hz": rate_hz}
+        self.info = CameraInfo(name, first.width, first.height, first.pixel_format, settings)
+        self._count, self._due = 0, 0.0
+
+    def start(self) -> None:
+        """The first frame is due now."""
+        self._due = time.monotonic()
+
+    def read(self, timeout_s: float) -> RawImage | None:
+        """The next frame, no sooner than it is due. Files that are slower than the rate just come later."""
+        wait = self._due - time.monotonic()
+        if wait > timeout_s:
+            time.sleep(timeout_s)
+            return None
+        time.sleep(max(wait, 0))
+        if self._next is None:
+            raise EndOfFrames
+        (payload, info), self._next = self._next, None
+        found, expected = (f"{i.width}x{i.height} {i.pixel_format}" for i in (info, self.info))
+        if found != expected:
+            raise input_error(info.name, f"expected {expected} as in the frames before, found {found}")
+        image = RawImage(payload, self._count, time.time_ns())
+        self._count += 1
+        self._due = max(self._due + self._period, time.monotonic())
+        self._next = next(self._frames, None)
+        return image
+
+
+def _files_of(path: Path) -> list[Path]:
+    """The recording, the files of a folder, or the file itself."""
+    if (path / RECORD).is_file():
+        return [path / RECORD]
+    if not path.is_dir():
+        if not path.exists():
+            raise CameraError(f"{path}: expected a folder or file of raw frames, found nothing at this path")
+        return [path]
+    files = sorted((file for file in path.iterdir() if file.suffix.lower() in KINDS), key=natural_order)
+    if not files:
+        raise CameraError(f"{path}: expected files of {', '.join(KINDS)} or a {RECORD}, found none")
+    return files
+
+
+def _recorded(path: Path) -> Iterator[tuple[bytes, CameraInfo]]:
+    """The payloads of a recording."""
+    header = read_header(path)
+    for image in read_images(path):
+        yield image.payload, CameraInfo(str(path), header.width, header.height, header.pixel_format)
+
+
+def _pixel_format(page: Page) -> str:
+    """The colour format that holds a page's codes."""
+    if page.array.dtype == np.uint8:
+        return "BayerRG8"
+    return {1023.0: "BayerRG10", 4095.0: "BayerRG12"}.get(page.white_level or 0.0, "BayerRG16")

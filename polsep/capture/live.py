@@ -1,0 +1,74 @@
+"""The newest frame, separated and shown as a picture, as fast as the machine has time for it.
+
+What is shown comes from the same functions as `polsep separate` uses on the recording, so both agree sample by sample.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+from polsep.camera import Layout
+from polsep.capture.sources import CameraInfo
+from polsep.io.frames import ReadOptions, decode_frame
+from polsep.io.genicam import find_pixel_format
+from polsep.io.pictures import encode_picture, replace_bytes
+from polsep.io.previews import live_sheet
+from polsep.io.recording import RawImage
+from polsep.pipeline import separate_capture
+from polsep.report import SeparatedFrame
+
+#: Added to the live view's nice value on Linux: receiving and recording go before it.
+NICENESS = 5
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The latest picture: a JPEG file's bytes, the frame's id, the light's polarizer [degrees], what is remarkable."""
+
+    jpeg: bytes
+    frame_id: int
+    light_deg: float
+    remarks: tuple[str, ...]
+
+
+class LiveView:
+    """Separates frames one at a time and keeps the latest picture, in memory and, where there is one, in a file."""
+
+    def __init__(self, method: str, layout: Layout | None = None, picture: Path | None = None) -> None:
+        self._method, self._layout, self._picture = method, layout, picture
+        self._options = ReadOptions()
+        self.latest: Shown | None = None
+
+    def warm_up(self, info: CameraInfo) -> None:
+        """Do what the first frame would wait for, on a black one. Raises ValueError when the method cannot take it."""
+        lower_priority()
+        self._options = ReadOptions(self._layout, size=(info.width, info.height), pixel_format=info.pixel_format)
+        self.separate(bytes(find_pixel_format(info.pixel_format).frame_bytes(info.width, info.height)))
+
+    def separate(self, payload: bytes) -> tuple[SeparatedFrame, tuple[str, ...]]:
+        """One frame, and what is remarkable about it."""
+        data, notes = decode_frame(payload, self._options)
+        frame = separate_capture(data, self._method)
+        return frame, (*notes, *frame.report["warnings"])
+
+    def show(self, image: RawImage) -> Shown:
+        """Separate a frame and replace the picture, as a whole."""
+        frame, remarks = self.separate(image.payload)
+        light = float(frame.report["statistics"]["light_polarizer_deg"])
+        shown = Shown(encode_picture(live_sheet(frame)), image.frame_id, light, remarks)
+        if self._picture is not None:
+            replace_bytes(self._picture, shown.jpeg)
+        self.latest = shown
+        return shown
+
+
+def lower_priority() -> None:
+    """Let other threads go before this one and those it starts, where the system can do that for one thread."""
+    if sys.platform == "linux":
+        thread = threading.get_native_id()
+        nice = os.getpriority(os.PRIO_PROCESS, thread)
+        os.setpriority(os.PRIO_PROCESS, thread, min(nice + NICENESS, 19))

@@ -27,7 +27,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev,render,mitsuba,train,bench,export]"
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev,render,mitsuba,train,bench,export,video]"
 	touch $@
 
 clean:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-import logging
 import math
 import multiprocessing
 import multiprocessing.connection
@@ -31,6 +30,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from polsep.cluster import map_unordered
 from polsep.io.dataset import (
     FORMATS,
     LARGEST_HALF,
@@ -48,8 +48,6 @@ from polsep.views import SPLITS, Shot, capture_shot, random_shot, scene_seed, se
 
 #: Views of one shape that a worker renders before it says so.
 VIEWS_AT_ONCE = 4
-#: How often Ray gives the work of a worker that died to another one.
-RETRIES = 5
 #: Packages whose versions decide about the last bit of what is rendered.
 MAKERS = ("polsep", "torch", "numpy", "numba", "llvmlite", "embreex", "imagecodecs", "OpenEXR")
 
@@ -253,32 +251,8 @@ def _follow_parent() -> None:
 
 
 def run_on_ray(jobs: Sequence[Job], workers: int) -> Generator[int, None, None]:
-    """Jobs as tasks of the Ray cluster that RAY_ADDRESS names, or else of one that is started on this machine.
-
-    Every node must see the directory of the set under one path. The work of a worker that dies goes to another one.
-    """
-    import ray
-
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    started = not ray.is_initialized()
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
-    if started and os.environ.get("RAY_ADDRESS"):
-        ray.init(**quiet)
-    elif started:
-        ray.init(num_cpus=workers, include_dashboard=False, _node_ip_address="127.0.0.1", **quiet)
-    task = ray.remote(num_cpus=1, max_retries=RETRIES)(render_job)
-    pending = [task.remote(job) for job in jobs]
-    try:
-        while pending:
-            ready, pending = ray.wait(pending)
-            yield from ray.get(ready)
-    except ray.exceptions.RayTaskError as error:
-        raise error.cause from None
-    except ray.exceptions.RayError as error:
-        raise RuntimeError(f"expected Ray to finish the work, found {type(error).__name__}") from error
-    finally:
-        if started:
-            ray.shutdown()
+    """Jobs as tasks of a Ray cluster (`cluster`); every node must see the directory of the set under one path."""
+    yield from map_unordered(render_job, jobs, workers)
 
 
 #: Engines by the name that the command line has for them.

@@ -76,13 +76,18 @@ def separate_capture(
         check = check_layout(capture)
         remarks += [check.warning] if check.warning else []
     light, light_remarks = resolve_light_color(light_color, capture)
-    frame = None if full else separate_in_engine(capture, chosen, light)
+    frame = separate_known(capture, chosen, light, full)
+    frame.report["warnings"] = remarks + light_remarks + frame.report["warnings"]
+    return frame
+
+
+def separate_known(capture: Capture, method: Method, light: tuple[float, ...], full: bool = False) -> SeparatedFrame:
+    """`separate_capture` where method, light and layout are settled, as from the second frame of a video on."""
+    frame = None if full else separate_in_engine(capture, method, light)
     if frame is None:
-        frame = separate_in_torch(capture, chosen, light, full)
-    report = frame.report
-    report |= {"method": chosen.name, "light_color": list(light), "full_resolution": full}
-    report["layout"] = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
-    report["warnings"] = remarks + light_remarks + report["warnings"]
+        frame = separate_in_torch(capture, method, light, full)
+    frame.report.update(method=method.name, light_color=list(light), full_resolution=full)
+    frame.report["layout"] = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
     return frame
 
 

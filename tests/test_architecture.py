@@ -39,6 +39,8 @@ RANKS = {
     "levels": 3,
     "kernels": 4,
     "engine": 4,
+    "noise": 3,
+    "temporal": 4,
     "learned": 5,
     "mosaic_network": 5,
     "joint_engine": 5,
@@ -49,10 +51,13 @@ RANKS = {
     "pathtrace": 4,
     "io": 4,
     "batch": 6,
+    "cluster": 1,
+    "video": 6,
     "dataset": 6,
     "bench": 6,
     "testsets": 6,
     "train": 6,
+    "capture": 6,
     "cli": 7,
 }
 #: Imports between modules of one rank that belong together.
@@ -68,6 +73,7 @@ WITHIN = {
     ("pathtrace", "raycast"),
     ("views", "raycast"),
     ("engine", "kernels"),
+    ("temporal", "kernels"),
     ("methods", "learned"),
     ("methods", "mosaic_network"),
     ("methods", "joint_engine"),
@@ -81,8 +87,11 @@ WITHIN = {
     ("bench", "testsets"),
     ("bench", "dataset"),
     ("bench", "train"),
+    ("bench", "video"),
     ("testsets", "testsets"),
     ("train", "train"),
+    ("capture", "capture"),
+    ("cli", "cli"),
 }
 #: Libraries that only one room may use.
 HOMES = {
@@ -105,12 +114,15 @@ HOMES = {
     "drjit": "pathtrace",
     "trimesh": "io",
     "scipy.io": "io",
-    "ray": "dataset",
+    "ray": "cluster",
     "onnxscript": "io",
     "onnx": "io",
     "flip_evaluator": "metrics",
     "matplotlib": "bench",
     "openvino": "joint_engine",
+    "av": "io",
+    "gi": "capture",
+    "pypylon": "capture",
 }
 #: Calls that touch files, by name of the function or method.
 FILE_CALLS = {"open", "read_bytes", "write_bytes", "read_text", "write_text", "imread", "imwrite", "fromfile", "tofile"}
@@ -129,7 +141,7 @@ def suites() -> list[Path]:
 
 
 def room(path: Path) -> str:
-    """``polsep/io/png.py`` is in the room ``io``, ``polsep/cli.py`` in ``cli``."""
+    """``polsep/io/png.py`` is in the room ``io``, ``polsep/stokes.py`` in ``stokes``."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return parts[0]
 

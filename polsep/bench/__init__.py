@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polsep.bench.calibration import bench_calibration
+from polsep.bench.dynamic import bench_dynamic, bench_dynamic_quick
 from polsep.bench.exactness import bench_exactness
 from polsep.bench.frontend import bench_frontend
 from polsep.bench.gallery import draw_paper
@@ -23,6 +24,7 @@ from polsep.bench.rows import Row, provenance, to_jsonl
 from polsep.bench.separation import bench_separation
 from polsep.bench.sets import bench_sets
 from polsep.bench.truth import SCENE_SEEDS, SCENE_SIZE, render_scene
+from polsep.bench.video import bench_video, bench_video_quick
 
 __all__ = ["BENCHES", "SCENE_SEEDS", "SCENE_SIZE", "Bench", "Row", "provenance", "render_scene", "to_jsonl"]
 
@@ -50,6 +52,8 @@ BENCHES: dict[str, Bench] = {
     "rendering": Bench(bench_rendering),
     "sets": Bench(bench_sets),
     "joint": Bench(bench_joint),
+    "dynamic": Bench(bench_dynamic, bench_dynamic_quick),
     "calibration": Bench(bench_calibration),
+    "video": Bench(bench_video, bench_video_quick),
     "paper": Bench(bench_paper, bench_paper_quick, draw_paper),
 }

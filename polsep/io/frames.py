@@ -1,7 +1,8 @@
 """Raw frames from files of any supported kind, lazily, as `Mosaic` or `Measurements`.
 
-Supported: PNG, TIFF, NPY, NPZ, binary PGM, headless dumps of a named size and pixel format, and four angle images
-through a path with ``{angle}`` in it. The extension decides which is expected, the content must agree.
+Supported: PNG, TIFF, NPY, NPZ, binary PGM, lossless grey video, headless dumps of a named size and pixel format,
+recordings of a camera by their ``recording.json``, and four angle images through a path with ``{angle}`` in it. The
+extension decides which is expected, the content must agree.
 
 Four angle images are co-sited `Measurements` when they are RGB, or gray without a colour layout;
 LUCID's four planes, and gray ones under a colour layout, are samples of one mosaic and go back to it.
@@ -18,30 +19,45 @@ from pathlib import Path
 
 from polsep.camera import Layout, Mosaic
 from polsep.io.errors import InputError, input_error, naming
-from polsep.io.headless import read_headless, read_pgm
+from polsep.io.headless import headless_page, read_headless, read_pgm
 from polsep.io.npy import read_npy, read_npz, stack_angles
 from polsep.io.pages import Page, describe
 from polsep.io.png import read_png
+from polsep.io.recording import RECORD, read_recording
 from polsep.io.tiff import read_tiff
+from polsep.io.videos import read_video
 from polsep.levels import as_measurements, as_mosaic, interleave_planes
 from polsep.stokes import Measurements
 
-__all__ = ["Frame", "InputError", "ReadOptions", "output_stem", "read_frames"]
+__all__ = ["Frame", "InputError", "ReadOptions", "decode_frame", "output_stem", "read_frames", "read_pages"]
 
 _READERS: dict[str, Callable[[Path], Iterator[Page]]] = {
     ".png": read_png,
-    ".tif": read_tiff,
-    ".tiff": read_tiff,
     ".npy": read_npy,
     ".npz": read_npz,
     ".pgm": read_pgm,
 }
+#: Readers that begin at any picture.
+_SEEKING: dict[str, Callable[[Path, int], Iterator[Page]]] = {
+    ".tif": read_tiff,
+    ".tiff": read_tiff,
+    ".mkv": read_video,
+    ".avi": read_video,
+    ".mov": read_video,
+    ".nut": read_video,
+    ".json": read_recording,
+}
 _HEADLESS = (".raw", ".bin")
-_LOSSY = {".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".heic": "HEIC", ".mp4": "video", ".avi": "video"}
+#: Files of single frames, as folders of recordings hold them.
+FRAME_FILES = (*_READERS, ".tif", ".tiff", *_HEADLESS)
+_LOSSY = {".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".heic": "HEIC", ".mp4": "video"}
 _ANGLES = (0, 45, 90, 135)
 _PLACE = "{angle}"
 
-SUPPORTED = "PNG, TIFF, NPY, NPZ or PGM, or headless raw (.raw, .bin) with a size and pixel format"
+SUPPORTED = (
+    "PNG, TIFF, NPY, NPZ, PGM, a lossless video, a recording.json, "
+    "or headless raw (.raw, .bin) with a size and pixel format"
+)
 
 
 @dataclass(frozen=True)
@@ -68,15 +84,20 @@ class ReadOptions:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame of a file: ``stem`` names its outputs, ``notes`` are one-line remarks for the user."""
+    """One frame of a file: ``stem`` names its outputs, ``notes`` are one-line remarks for the user.
+
+    It is number ``index`` of ``count`` (about, where a film does not say).
+    """
 
     stem: str
     data: Mosaic | Measurements
     notes: tuple[str, ...]
+    index: int = 0
+    count: int = 1
 
 
-def read_frames(path: str | Path, options: ReadOptions | None = None) -> Iterator[Frame]:
-    """The frames of a file, or of the four files of a template with ``{angle}``, one page at a time.
+def read_frames(path: str | Path, options: ReadOptions | None = None, first: int = 0) -> Iterator[Frame]:
+    """The frames of a file, or of the four files of a template with ``{angle}``, one page at a time, from ``first`` on.
 
     A single frame has the stem of the file; of several, frame k is ``stem_000k``, counted from 0. Nothing is opened
     before the first frame is asked for. Raises InputError, in one line that names the file, on whatever can't be
@@ -88,16 +109,38 @@ def read_frames(path: str | Path, options: ReadOptions | None = None) -> Iterato
     elif options.pages == "angles":
         pages = _group_angles(Path(path), options)
     else:
-        pages = _read_pages(Path(path), options)
+        pages = _read_pages(Path(path), options, first)
     for page in pages:
+        if page.index < first:
+            continue
         with naming(path):
             data, notes = _convert(page, options)
         stem = output_stem(path)
-        yield Frame(stem if page.count == 1 else f"{stem}_{page.index:04d}", data, page.notes + notes)
+        name = stem if page.count == 1 else f"{stem}_{page.index:04d}"
+        yield Frame(name, data, page.notes + notes, page.index, page.count)
+
+
+def read_pages(path: Path) -> Iterator[Page]:
+    """The pictures of one file that describes itself, as codes: not yet light. Raises InputError as `read_frames`."""
+    return _read_pages(path, ReadOptions())
+
+
+def decode_frame(payload: bytes, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
+    """One frame from the bytes a camera sent, and notes, exactly as `read_frames` takes it from a file of them.
+
+    ``options`` say size and pixel format. Raises ValueError when they do not or the bytes do not fit them.
+    """
+    if options.size is None or options.pixel_format is None:
+        raise ValueError(_missing_notes(options))
+    page = next(_noting_layout(iter([headless_page(payload, options.size, options.pixel_format)]), options))
+    data, notes = _convert(page, options)
+    return data, page.notes + notes
 
 
 def output_stem(path: str | Path) -> str:
-    """File name without extension and placeholder: ``nir_{angle}.png`` gives ``nir``."""
+    """File name without extension and placeholder: ``nir_{angle}.png`` gives ``nir``; a recording has its folder's."""
+    if Path(path).name == RECORD:
+        return Path(path).absolute().parent.name or "recording"
     stem = Path(path).stem
     return stem if _PLACE not in stem else stem.replace(_PLACE, "").strip("_-. ") or "angles"
 
@@ -117,20 +160,21 @@ def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, t
     return as_measurements(array, options.black_level, white)
 
 
-def _read_pages(path: Path, options: ReadOptions) -> Iterator[Page]:
-    """The pictures of one file, by its extension."""
+def _read_pages(path: Path, options: ReadOptions, first: int = 0) -> Iterator[Page]:
+    """The pictures of one file, by its extension; where that saves time, those before ``first`` are left out."""
     with naming(path):
         if path.is_dir():
             raise ValueError("expected a file, found a directory")
         suffix = path.suffix.lower()
-        if suffix in _READERS:
+        if suffix in _READERS or suffix in _SEEKING:
             notes = _ignored_notes(options)
-            for page in _READERS[suffix](path):
+            reader = _SEEKING[suffix](path, first) if suffix in _SEEKING else _READERS[suffix](path)
+            for page in reader:
                 yield replace(page, notes=page.notes + notes)
         elif suffix in _HEADLESS or (options.pixel_format is not None and suffix not in _LOSSY):
             if options.size is None or options.pixel_format is None:
                 raise ValueError(_missing_notes(options))
-            yield from _noting_layout(read_headless(path, options.size, options.pixel_format), options)
+            yield from _noting_layout(read_headless(path, options.size, options.pixel_format, first), options)
         elif suffix in _LOSSY:
             raise ValueError(f"expected {SUPPORTED}, found {_LOSSY[suffix]}: lossy compression and gamma spoil samples")
         else:

@@ -19,11 +19,21 @@ def write_picture(path: Path, pixels: NDArray[np.uint8]) -> None:
 
     Raises ValueError on another shape or type.
     """
+    replace_bytes(path, encode_picture(pixels))
+
+
+def encode_picture(pixels: NDArray[np.uint8]) -> bytes:
+    """The JPEG file of ``pixels`` (uint8, sRGB, ``[h, w, 3]``). Raises ValueError on another shape or type."""
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
         raise ValueError(f"expected pixels uint8 [h, w, 3], found {pixels.dtype} {pixels.shape}")
     stream = BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "JPEG", quality=QUALITY, subsampling=0, optimize=True)
+    return stream.getvalue()
+
+
+def replace_bytes(path: Path, data: bytes) -> None:
+    """Replace a file as a whole, written beside it, then renamed; makes its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f".{path.name}.tmp")
-    beside.write_bytes(stream.getvalue())
+    beside.write_bytes(data)
     os.replace(beside, path)

@@ -132,6 +132,15 @@ def contact_sheet(frame: SeparatedFrame) -> Pixels:
     return np.array(sheet, dtype=np.uint8)
 
 
+def live_sheet(frame: SeparatedFrame) -> Pixels:
+    """Input, diffuse and specular side by side, ``uint8 [h, w, 3]``, with one gain: what is quick enough to be live."""
+    diffuse, specular = (_shrunk(np.maximum(image, 0)) for image in (frame.diffuse, frame.specular))
+    total = diffuse + specular
+    gain = exposure_of(total)
+    gap = np.full((total.shape[0], GUTTER, 3), BACKGROUND, np.uint8)
+    return np.concatenate([_toned(total, gain), gap, _toned(diffuse, gain), gap, _toned(specular, gain)], axis=1)
+
+
 def _panels(frame: SeparatedFrame, total: Values, flags: list[Flag]) -> list[Panel]:
     """The six pictures of the contact sheet in reading order, all of one size; ``total`` is the linear input."""
     gain = exposure_of(total)

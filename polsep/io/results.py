@@ -6,6 +6,7 @@ import json
 import os
 import re
 import resource
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,19 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
 def read_array(path: Path) -> NDArray[Any]:
     """The array of an NPY file from another program."""
     return np.asarray(np.load(path, allow_pickle=False))
+
+
+def read_memory() -> float:
+    """Resident memory of this process now [MiB]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def write_chunks(path: Path, chunks: Iterable[bytes]) -> None:
+    """One file of many chunks."""
+    with path.open("wb") as stream:
+        for chunk in chunks:
+            stream.write(chunk)
 
 
 def read_peak_memory() -> float:

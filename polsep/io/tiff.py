@@ -29,8 +29,8 @@ _LOSSY = {6: "old JPEG", 7: "JPEG", 34892: "lossy JPEG", 50001: "WebP"}
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
-def read_tiff(path: Path) -> Iterator[Page]:
-    """Every picture of a TIFF file in order: ``[H, W]`` or ``[H, W, C]``. Raises ValueError."""
+def read_tiff(path: Path, first: int = 0) -> Iterator[Page]:
+    """Every picture of a TIFF file in order, from ``first`` on: ``[H, W]`` or ``[H, W, C]``. Raises ValueError."""
     with path.open("rb") as stream:
         require_signature(stream, (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "a TIFF")
         size = path.stat().st_size
@@ -38,7 +38,7 @@ def read_tiff(path: Path) -> Iterator[Page]:
             tif = tifffile.TiffFile(stream)
         with tif:
             count = _count_pages(tif, stream)
-            for index in range(count):
+            for index in range(first, count):
                 with decoding("TIFF"):
                     page = _read_page(tif.pages[index], size, index, count)
                 yield page

@@ -1,0 +1,480 @@
+"""Recordings: every kind gives the same files, kills and damage do no harm, and threads end when they are to."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import imagecodecs
+import numpy as np
+import pytest
+import tifffile
+import torch
+from numpy.typing import NDArray
+from torch.nn.functional import interpolate
+
+from polsep import cli, video
+from polsep.camera import IDEAL, Layout, expose
+from polsep.io.footage import Damaged, natural_order, open_footage
+from polsep.io.frames import Frame, ReadOptions
+from polsep.io.outputs import OutputError, read_exr_layers
+from polsep.io.sequences import FILM_WHITE, PART, Picture, SequenceKind, write_exr
+from polsep.levels import as_mosaic
+from polsep.pipeline import separate_capture
+from polsep.report import SeparatedFrame
+from polsep.stokes import Stokes
+from polsep.video import ahead
+
+av = pytest.importorskip("av", reason="needs the extra 'video'")
+
+FRAMES, SIDE, WHITE = 2 * PART + 7, 32, 4095
+#: How often a run is killed at a random moment; 20 by hand.
+KILLS = int(os.environ.get("POLSEP_KILLS", "1"))
+#: Seconds that a thread may take to notice that it is to end.
+PATIENCE_S = 5.0
+
+
+def frames(count: int = FRAMES) -> NDArray[np.uint16]:
+    """A coloured scene with highlights of one angle, 12 bits ``[N, H, W]``.
+
+    Its lower half moves by the period of the filters, the upper half is still but for noise.
+    """
+    generator = torch.Generator().manual_seed(7)
+    coarse = torch.rand(1, 4, 4, SIDE, generator=generator)
+    fine = interpolate(coarse, size=(SIDE, SIDE + 4 * count), mode="bilinear")[0]
+    diffuse, specular = 0.2 + 0.5 * fine[:3], 0.7 * fine[3:]
+    light = Stokes(diffuse + specular, (0.8 * specular).expand(3, -1, -1), (0.6 * specular).expand(3, -1, -1))
+    codes = torch.round(expose(light, Layout(), IDEAL).data * WHITE).to(torch.int32).numpy().astype(np.uint16)
+    images = np.stack([codes[:, 4 * k : 4 * k + SIDE] for k in range(count)])
+    noise = np.random.default_rng(1).integers(0, 60, (count, SIDE // 2, SIDE), np.uint16)
+    images[:, : SIDE // 2] = np.minimum(codes[: SIDE // 2, :SIDE] + noise, WHITE)
+    return images
+
+
+def write_film(path: Path, images: NDArray[np.uint16], codec: str = "ffv1", pixels: str = "gray12le") -> Path:
+    """The images as a film."""
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream(codec, rate=50)
+        stream.height, stream.width, stream.pix_fmt = images.shape[1], images.shape[2], pixels
+        stream.options = {"level": "3", "slicecrc": "1", "g": "1"} if codec == "ffv1" else {}
+        for image in images:
+            given = image if pixels.startswith("gray1") else np.repeat((image >> 4).astype(np.uint8)[..., None], 3, 2)
+            shown = av.VideoFrame.from_ndarray(given, format=pixels if given is image else "rgb24")
+            container.mux(stream.encode(shown.reformat(format=pixels)))
+        container.mux(stream.encode())
+    return path
+
+
+def write_folder(path: Path, images: NDArray[np.uint16]) -> Path:
+    path.mkdir()
+    for k, image in enumerate(images):
+        (path / f"shot{k}.png").write_bytes(imagecodecs.png_encode(image))
+    return path
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording as one NPY file."""
+    path = tmp_path_factory.mktemp("recording") / "run.npy"
+    np.save(path, frames())
+    return path
+
+
+def command(recording: Path, output: Path, *more: str) -> list[str]:
+    """Each frame for itself, so that it can be compared with itself alone."""
+    given = ["--method", "analytic", "--white-level", str(WHITE), "--filter", "none"]
+    return ["video", str(recording), "-o", str(output), *given, *more]
+
+
+#: Frames that depend on the ones before.
+STEADY = ("--filter", "temporal")
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *args: str) -> int:
+    """What `polsep ARGS` exits with, in this process."""
+    monkeypatch.setattr(sys, "argv", ["polsep", *args])
+    try:
+        cli.main()
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+def separated_alone(image: NDArray[np.uint16]) -> SeparatedFrame:
+    """A frame of the recording, without what the command line would warn of."""
+    return separate_capture(as_mosaic(image, white_level=WHITE)[0], "analytic")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, hidden ones too."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What one run makes of it."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    with pytest.MonkeyPatch.context() as patch:
+        assert run(patch, *command(recording, folder)) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def steady(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What one run with the temporal filter makes of it."""
+    folder = tmp_path_factory.mktemp("steady")
+    with pytest.MonkeyPatch.context() as patch:
+        assert run(patch, *command(recording, folder, *STEADY)) == 0
+    return folder
+
+
+def test_every_frame_is_what_it_is_alone(recording: Path, undisturbed: Path) -> None:
+    for index in (0, PART, FRAMES - 1):
+        alone = separated_alone(np.load(recording)[index])
+        layers = read_exr_layers(undisturbed / f"run_{index:06d}.exr")
+        for name in ("diffuse", "specular"):
+            for k, color in enumerate("RGB"):
+                np.testing.assert_array_equal(
+                    layers[f"{name}.{color}"], getattr(alone, name)[..., k].astype(np.float16)
+                )
+    log = [json.loads(line) for line in (undisturbed / "run.jsonl").read_text().splitlines()]
+    assert [line["frame"] for line in log] == list(range(FRAMES))
+    assert log[-1]["mean_s0"] == alone.report["statistics"]["mean_s0"]
+    report = json.loads((undisturbed / "run.json").read_text())
+    assert (report["frames"], report["damaged"]) == (FRAMES, [])
+    assert not [p for p in undisturbed.iterdir() if p.name.startswith(".")]
+
+
+@pytest.mark.parametrize("colors", [1, 3])
+@pytest.mark.parametrize("compression", ["none", "zip", "piz"])
+def test_files_hold_half_floats(colors: int, compression: str, tmp_path: Path) -> None:
+    """Our own files are what the library reads, and the same as its own; light beyond half floats is their largest."""
+    generator = np.random.default_rng(3)
+    diffuse, specular = generator.normal(1, 0.5, (2, 7, 5, colors)).astype(np.float32)
+    specular[2, 3] = 1e6
+    specular.setflags(write=False)
+    write_exr(tmp_path / "a.exr", Picture(diffuse, specular, None, {}), compression)
+    layers = read_exr_layers(tmp_path / "a.exr")
+    expected = {
+        f"{name}.{color}": np.minimum(image[..., k], 65504).astype(np.float16)
+        for name, image in (("diffuse", diffuse), ("specular", specular))
+        for k, color in enumerate("RGB" if colors == 3 else "Y")
+    }
+    assert set(layers) == set(expected)
+    for name, plane in expected.items():
+        assert layers[name].dtype == np.float16
+        np.testing.assert_array_equal(layers[name], plane)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_the_film_to_watch_has_every_frame_at_its_time(undisturbed: Path) -> None:
+    with av.open(str(undisturbed / "run_preview.mp4")) as container:
+        times = [float(frame.pts * frame.time_base) for frame in container.decode(video=0)]
+    np.testing.assert_allclose(times, np.arange(FRAMES) / 25, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["folder", "tiff", "mkv", "raw"])
+def test_every_kind_of_recording_gives_the_same_images(
+    kind: str, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images, more = frames(), []
+    path = tmp_path / f"run.{kind}"
+    if kind == "folder":
+        write_folder(path := tmp_path / "run", images)
+    elif kind == "tiff":
+        tifffile.imwrite(path, images, photometric="minisblack")
+    elif kind == "mkv":
+        write_film(path, images)
+    else:
+        path.write_bytes((images << 4).astype("<u2").tobytes())  # 12 bits, left-justified
+        more = ["--size", f"{SIDE}x{SIDE}", "--pixel-format", "BayerRG16", "--white-level", str(WHITE * 16)]
+    assert run(monkeypatch, *command(path, tmp_path / "out", "--no-preview", *more)) == 0
+    exr = {name: data for name, data in contents(tmp_path / "out").items() if name.endswith("exr")}
+    assert exr == {name: data for name, data in contents(undisturbed).items() if name.endswith("exr")}
+
+
+def test_lossless_films_hold_the_images_in_sixteen_bits(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    more = ("--format", "ffv1", "--frames", str(PART + 2), "--no-preview", "--rate", "30")
+    assert run(monkeypatch, *command(recording, tmp_path, *more)) == 0
+    assert set(contents(tmp_path)) == {"run_diffuse.mkv", "run_specular.mkv", "run.json", "run.jsonl"}
+    for name, white in FILM_WHITE.items():
+        with av.open(str(tmp_path / f"run_{name}.mkv")) as container:
+            shown = [frame.to_ndarray() for frame in container.decode(video=0)]
+        assert len(shown) == PART + 2
+        alone = separated_alone(np.load(recording)[PART + 1])
+        expected = np.clip(getattr(alone, name) / white, 0, 1) * 65535
+        assert float(np.abs(shown[-1] - expected).max()) <= 0.5 + 1e-2  # rounding of the codes, and of float32
+
+
+def test_a_recording_goes_on_from_any_frame(recording: Path, tmp_path: Path) -> None:
+    """Seeking gives what reading on gives, in every kind of file."""
+    images = frames()
+    np.save(tmp_path / "a.npy", images)
+    tifffile.imwrite(tmp_path / "a.tiff", images, photometric="minisblack")
+    write_film(tmp_path / "a.mkv", images)
+    write_folder(tmp_path / "a", images)
+    for path in (tmp_path / "a.npy", tmp_path / "a.tiff", tmp_path / "a.mkv", tmp_path / "a"):
+        footage = open_footage(path, ReadOptions(white_level=WHITE))
+        for first in (0, 1, PART, FRAMES - 1, FRAMES):
+            seen = list(footage.begin(first))
+            assert [frame.index for frame in seen] == list(range(first, FRAMES))
+            for frame in seen:
+                assert isinstance(frame, Frame)
+                np.testing.assert_array_equal(frame.data.data.numpy(), images[frame.index])
+
+
+def test_numbers_in_names_count_as_numbers() -> None:
+    names = ["b1.png", "a10.png", "a9.png", "a9b.png", "a010.png"]
+    assert [p.name for p in sorted(map(Path, names), key=natural_order)] == [
+        "a9.png",
+        "a9b.png",
+        "a010.png",
+        "a10.png",
+        "b1.png",
+    ]
+
+
+@pytest.mark.usefixtures("compiled")
+def test_a_killed_run_goes_on_to_the_same_files(recording: Path, steady: Path, tmp_path: Path) -> None:
+    generator = random.Random(5)
+    program = [sys.executable, "-c", "from polsep.cli import main; main()"]
+    for kill in range(KILLS):
+        output = tmp_path / str(kill)
+        process = subprocess.Popen([*program, *command(recording, output, *STEADY)], stdout=subprocess.DEVNULL)
+        wanted = generator.randrange(1, FRAMES)
+        while process.poll() is None and len(list(output.glob("*.exr"))) < wanted:
+            time.sleep(0.002)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert not (output / "run.json").exists()
+        again = [*program, *command(recording, output, *STEADY)]
+        subprocess.run(again, check=True, stdout=subprocess.DEVNULL, timeout=120)
+        assert contents(output) == contents(steady)
+
+
+def test_a_damaged_frame_stops_the_run_until_it_is_repaired(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_folder(tmp_path / "run", frames())
+    broken = folder / f"shot{PART + 3}.png"
+    whole = broken.read_bytes()
+    broken.write_bytes(whole[:100])
+    assert run(monkeypatch, *command(folder, tmp_path / "out")) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and broken.name in error
+    assert not (tmp_path / "out" / "run.json").exists()
+    broken.write_bytes(whole)
+    assert run(monkeypatch, *command(folder, tmp_path / "out")) == 0
+    found, expected = contents(tmp_path / "out"), contents(undisturbed)
+    assert {k: v for k, v in found.items() if k != "run.json"} == {k: v for k, v in expected.items() if k != "run.json"}
+
+
+def test_damaged_frames_are_left_out_when_that_is_asked(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_folder(tmp_path / "run", frames())
+    (folder / "shot4.png").write_bytes(b"no picture")
+    other = imagecodecs.png_encode(np.zeros((SIDE, SIDE + 4), np.uint16))
+    (folder / f"shot{PART}.png").write_bytes(other)
+    assert run(monkeypatch, *command(folder, tmp_path / "out", "--damaged", "skip")) == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 2 and "shot4.png" in errors[0]
+    assert f"frame {PART}: expected {SIDE}x{SIDE} samples as in the first one, found {SIDE + 4}x{SIDE}" in errors[1]
+    report = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert [line["frame"] for line in report["damaged"]] == [4, PART]
+    found, expected = contents(tmp_path / "out"), contents(undisturbed)
+    assert set(expected) - set(found) == {"run_000004.exr", f"run_{PART:06d}.exr"}
+    assert all(expected[name] == data for name, data in found.items() if name.endswith("exr"))
+    with av.open(str(tmp_path / "out" / "run_preview.mp4")) as container:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(pictures) == FRAMES
+    assert pictures[4].max() < 16 < pictures[5].max()
+
+
+def test_damage_in_the_middle_of_a_film_costs_its_frame_only(tmp_path: Path) -> None:
+    path = write_film(tmp_path / "run.mkv", frames())
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 8] = bytes(255 - b for b in data[middle : middle + 8])
+    path.write_bytes(data)
+    seen = list(open_footage(path, ReadOptions()).begin(0))
+    damaged = [frame for frame in seen if isinstance(frame, Damaged)]
+    assert len(damaged) == 1 and "run.mkv" in damaged[0].reason
+    for frame in seen:
+        if isinstance(frame, Frame):
+            np.testing.assert_array_equal(frame.data.data.numpy(), frames()[frame.index])
+    assert [frame.index for frame in seen] == list(range(FRAMES))
+
+
+def test_what_is_there_is_not_replaced_unasked(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = ("--frames", "3", "--format", "none")
+    assert run(monkeypatch, *command(recording, tmp_path, *short)) == 0
+    before = contents(tmp_path)
+    assert run(monkeypatch, *command(recording, tmp_path, *short)) == 2
+    assert "--overwrite replaces it" in capsys.readouterr().err
+    assert contents(tmp_path) == before
+    assert run(monkeypatch, *command(recording, tmp_path, *short, "--overwrite")) == 0
+    assert contents(tmp_path) == before
+
+
+def test_a_run_does_not_go_on_with_other_settings(recording: Path, tmp_path: Path) -> None:
+    def steps(method: str) -> Iterator[video.Progress]:
+        options = video.VideoOptions(method)
+        return video.separate_video(recording, ReadOptions(white_level=WHITE), options, video.Target(tmp_path))
+
+    begun = steps("analytic")
+    while next(begun).done < PART + 1:
+        pass
+    begun.close()  # type: ignore[attr-defined]  # a generator
+    with pytest.raises(OutputError, match=r"expected the settings with which .* was begun, found others"):
+        next(steps("color-affine"))
+    *_, end = steps("analytic")
+    assert end.done == FRAMES and end.written
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda p: (p / "run").mkdir(), "expected a folder of frames"),
+        (lambda p: [(p / "run").mkdir(), (p / "run/a.png").touch(), (p / "run/b.tiff").touch()], "1 .png, 1 .tiff"),
+        (lambda p: None, "found nothing at this path"),
+        (lambda p: [(p / "run").mkdir(), (p / "run/a.png").touch()], "expected a frame that can be read, found"),
+    ],
+    ids=["empty", "mixed", "missing", "unreadable"],
+)
+def test_what_is_no_recording_is_said_in_a_line(
+    make: Any, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make(tmp_path)
+    assert (
+        run(monkeypatch, *command(tmp_path / "run" if words[0] != "f" else tmp_path / "run.npy", tmp_path / "o")) == 2
+    )
+    said = capsys.readouterr()
+    assert said.err.count("\n") == 1 and words in said.err
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(("codec", "pixels"), [("libx264", "yuv420p"), ("mjpeg", "yuvj420p"), ("ffv1", "bgr0")])
+def test_films_that_hold_no_mosaic_are_refused(codec: str, pixels: str, tmp_path: Path) -> None:
+    path = write_film(tmp_path / "run.mkv", frames(2), codec, pixels)
+    with pytest.raises(ValueError, match=r"run.mkv: expected a mosaic as grey samples, found pixels"):
+        open_footage(path, ReadOptions())
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ({"format": "gif"}, "expected a format of exr, ffv1, none, found 'gif'"),
+        ({"compression": "rar"}, "expected a compression of none, zip, piz, found 'rar'"),
+        ({"rate": 0.0}, "expected a rate of 0.001 to 100000 frames per second, found 0"),
+        ({"format": "none", "preview": False}, "expected something to write"),
+    ],
+)
+def test_kinds_that_are_not_are_refused(kind: dict[str, Any], words: str) -> None:
+    with pytest.raises(OutputError, match=words):
+        SequenceKind(**kind)
+
+
+def test_without_the_library_films_are_refused_before_any_work(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert run(monkeypatch, *command(recording, tmp_path / "o")) == 2
+    assert "expected the extra 'video'" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+    assert run(monkeypatch, *command(recording, tmp_path / "o", "--no-preview", "--frames", "1")) == 0
+
+
+def threads() -> int:
+    return sum(thread.name == "polsep-ahead" for thread in threading.enumerate())
+
+
+def test_items_come_in_order_and_no_more_than_asked_are_made() -> None:
+    made: list[int] = []
+
+    def make() -> Iterator[int]:
+        for k in range(20):
+            made.append(k)
+            yield k
+
+    items = ahead(make(), 2)
+    for k, item in enumerate(items):
+        assert item == k
+        assert len(made) <= k + 2 + 2  # the one given, those that wait, and one in hand
+    assert threads() == 0
+
+
+def test_closing_ends_the_threads_behind_it() -> None:
+    closed = threading.Event()
+
+    def make() -> Iterator[int]:
+        try:
+            yield from range(1000)
+        finally:
+            closed.set()
+
+    items = ahead(ahead(make()))
+    assert next(items) == 0
+    items.close()
+    assert closed.wait(PATIENCE_S)
+    deadline = time.monotonic() + PATIENCE_S
+    while threads() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert threads() == 0
+
+
+def test_what_is_raised_in_a_thread_is_raised_here() -> None:
+    def make() -> Iterator[int]:
+        yield 1
+        raise ValueError("expected")
+
+    items = ahead(make())
+    assert next(items) == 1
+    with pytest.raises(ValueError, match="expected"):
+        next(items)
+    assert threads() == 0
+
+
+@pytest.mark.usefixtures("compiled")
+def test_ray_makes_the_same_bytes_with_a_worker_killed(recording: Path, steady: Path, tmp_path: Path) -> None:
+    """The cluster of one machine loses a worker in the middle of its work."""
+    pytest.importorskip("ray", reason="needs the extra 'ray'")
+    psutil = pytest.importorskip("psutil")
+    program = [sys.executable, "-c", "from polsep.cli import main; main()"]
+    run = subprocess.Popen(
+        [*program, *command(recording, tmp_path, *STEADY, "--engine", "ray")], stdout=subprocess.DEVNULL
+    )
+    while run.poll() is None and not list(tmp_path.glob("*.exr")):
+        time.sleep(0.01)
+    workers = [p for p in psutil.Process(run.pid).children(recursive=True) if "separate_one" in " ".join(p.cmdline())]
+    if workers:
+        workers[0].kill()
+    assert run.wait(300) == 0
+    assert contents(tmp_path) == contents(steady)
+
+
+def test_what_stands_still_is_steady(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noise of a still scene falls as frames are averaged, by both filters; across parts too."""
+    still = frames(1)[0].astype(np.float64)
+    noise = np.random.default_rng(2).normal(0, 20, (FRAMES, SIDE, SIDE))
+    np.save(tmp_path / "run.npy", np.clip(still + noise, 0, 4000).round().astype(np.uint16))
+    spread = {}
+    for name in ("none", "temporal"):
+        more = ("--filter", name, "--no-preview")
+        assert run(monkeypatch, *command(tmp_path / "run.npy", tmp_path / name, *more)) == 0
+        late = [read_exr_layers(tmp_path / name / f"run_{k:06d}.exr")["diffuse.G"] for k in range(PART - 3, PART + 9)]
+        spread[name] = float(np.std(np.stack(late).astype(np.float64), axis=0).mean())
+    assert spread["temporal"] < 0.2 * spread["none"]

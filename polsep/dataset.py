@@ -33,7 +33,6 @@ from torch import Tensor
 from polsep.cluster import map_unordered
 from polsep.io.dataset import (
     FORMATS,
-    LARGEST_HALF,
     begin_dataset,
     find_finished,
     finish_dataset,
@@ -41,6 +40,7 @@ from polsep.io.dataset import (
     view_stem,
     write_view,
 )
+from polsep.io.exr import LARGEST_HALF
 from polsep.kernels.threads import set_threads
 from polsep.raycast import MeshScene
 from polsep.simulate import Capture

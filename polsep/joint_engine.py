@@ -10,10 +10,11 @@ from __future__ import annotations
 import logging
 import threading
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -40,7 +41,7 @@ Floats = NDArray[np.float32]
 _CHANNELS = {"samples": 16, "clipping": 17, "cosine": 4, "sine": 4, "split": 10}
 #: Packed rows that a thread takes at a time.
 _ROWS = 16
-#: Engines that are kept, each with the memory that its frames need.
+#: Engines that are kept at least, each with the memory that its frames need.
 KEPT = 2
 
 
@@ -96,7 +97,9 @@ class OpenVinoEngine:
         h, w = shape[0] // PERIOD, shape[1] // PERIOD
         first, count = _first_channels(network)
         model = _as_model(Layers(network).eval(), torch.zeros(1, count, 32, 32))
+        # Pinned threads of two engines would share a core, and wait there for whoever else works on it.
         options: dict[str, Any] = {"INFERENCE_NUM_THREADS": get_threads(), "PERFORMANCE_HINT": "LATENCY"}
+        options |= {"ENABLE_CPU_PINNING": False}
         options |= {} if precision is None else {"INFERENCE_PRECISION_HINT": precision}
         core = openvino.Core()
         if precision is None:
@@ -106,9 +109,6 @@ class OpenVinoEngine:
         steps = openvino.preprocess.PrePostProcessor(model)
         steps.input().tensor().set_element_type(kind).set_layout(openvino.Layout("NHWC"))
         steps.input().model().set_layout(openvino.Layout("NCHW"))
-        for k in range(2):
-            steps.output(k).tensor().set_layout(openvino.Layout("NHWC"))
-            steps.output(k).model().set_layout(openvino.Layout("NCHW"))
         model = steps.build()
         model.reshape([1, h, w, count])
         self._request = core.compile_model(model, "CPU", options).create_infer_request()
@@ -121,7 +121,7 @@ class OpenVinoEngine:
             np.empty((h, w), np.uint16),
         )
         self._taps = make_taps(network, w) if network.demosaic is not None else None
-        self._found = [np.empty((h, w, n), np.float32) for n in (4 * network.colors + 8, 8)]
+        self._found = [np.empty((n, h, w), np.float32) for n in (4 * network.colors + 8, 8)]
         seen = self._maps.halves if halves else self._maps.floats
         self._request.set_input_tensor(openvino.Tensor(seen, [1, *room], kind))
         for k, image in enumerate(self._found):
@@ -195,13 +195,15 @@ def make_taps(network: Joint, width: int) -> Taps:
     assert network.demosaic is not None
     s0 = 16 * network.colors
     whole = torch.cat([pool_outputs(network.demosaic[:s0]), network.demosaic[s0:]]).flatten(1).numpy()
-    most = max(int(np.count_nonzero(row)) for row in whole)
-    shape = (len(whole), most + -most % AT_ONCE)
-    weight, rows, places = np.zeros(shape, np.float32), np.zeros(shape, np.int64), np.zeros(shape, np.int64)
-    for output, row in enumerate(whole):
-        seen = np.flatnonzero(row)  # plane, row, column
-        weight[output, : seen.size], rows[output, : seen.size] = row[seen], seen % 9 // 3
-        places[output, : seen.size] = seen // 9 * (width + 2) + seen % 3
+    cells = whole.reshape(-1, 4, whole.shape[1]).swapaxes(0, 1)
+    most = max(int(np.count_nonzero(cell.any(axis=0))) for cell in cells)
+    shape = (4, most + -most % AT_ONCE)
+    weight = np.zeros((4, cells.shape[1], shape[1]), np.float32)
+    rows, places = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+    for k, cell in enumerate(cells):
+        seen = np.flatnonzero(cell.any(axis=0))  # plane, row, column
+        weight[k, :, : seen.size], rows[k, : seen.size] = cell[:, seen], seen % 9 // 3
+        places[k, : seen.size] = seen // 9 * (width + 2) + seen % 3
     return Taps(weight, rows, places, network.colors)
 
 
@@ -214,11 +216,59 @@ def _tally(targets: Any) -> Tally:
     return Tally(*counts, s0, specular, power, along, across, residual, None, variances[0], variances[1])
 
 
-@lru_cache(maxsize=KEPT)
-def _engine(method: str, colors: int, shape: tuple[int, int]) -> OpenVinoEngine:
-    network, _ = find_joint(method, Layout() if colors == 3 else Layout(bayer=None), None)
-    logging.getLogger("polsep").debug("compiling %s for frames of %dx%d", method, *shape)
-    return OpenVinoEngine(network, shape)
+class _Job(NamedTuple):
+    """What an engine is for."""
+
+    method: str
+    colors: int
+    shape: tuple[int, int]
+    threads: int
+
+
+class _Engines:
+    """Engines, each for one frame at a time. State: those that wait, the last used at the end, and how many are busy.
+
+    As many are kept as were ever busy at once.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._idle, self._busy, self._kept = threading.Lock(), list[tuple[_Job, OpenVinoEngine]](), 0, KEPT
+
+    @contextmanager
+    def borrow(self, job: _Job) -> Iterator[OpenVinoEngine]:
+        """An engine that waits, or a new one."""
+        with self._lock:
+            found = next((pair for pair in reversed(self._idle) if pair[0] == job), None)
+            if found is not None:
+                self._idle.remove(found)
+            self._busy += 1
+            self._kept = max(self._kept, self._busy)
+        engine = None
+        try:
+            engine = found[1] if found is not None else _make_engine(job)
+            yield engine
+        finally:
+            with self._lock:
+                self._busy -= 1
+                self._idle += [] if engine is None else [(job, engine)]
+                del self._idle[: -self._kept]
+
+    def clear(self) -> None:
+        """Forget those that wait."""
+        with self._lock:
+            self._idle = []
+
+
+ENGINES = _Engines()
+_MAKING = threading.Lock()
+
+
+def _make_engine(job: _Job) -> OpenVinoEngine:
+    """One at a time: torch cannot trace two modules at once."""
+    network, _ = find_joint(job.method, Layout() if job.colors == 3 else Layout(bayer=None), None)
+    logging.getLogger("polsep").debug("compiling %s for frames of %dx%d", job.method, *job.shape)
+    with _MAKING:
+        return OpenVinoEngine(network, job.shape)
 
 
 def _warm_up() -> None:
@@ -239,12 +289,15 @@ def run_engine(method: str, mosaic: Mosaic) -> JointImages | None:
     if not orientation.keeps_cells or data.dtype not in (torch.uint8, torch.uint16, torch.float32):
         return None
     make_ready(_warm_up)
+    from polsep.kernels import get_threads
+
     levels, light = (mosaic.black_level, mosaic.white_level), mosaic.light_color
-    if orientation == Orientation(*data.shape) and not any(n % PERIOD for n in data.shape):
-        return _engine(method, mosaic.layout.channels, (data.shape[0], data.shape[1])).run(data.numpy(), levels, light)
-    turned = orientation.turn(data.float()).contiguous()
-    shape = (turned.shape[0], turned.shape[1])
-    return _turn_back(_engine(method, mosaic.layout.channels, shape).run(turned.numpy(), levels, light), orientation)
+    as_it_is = orientation == Orientation(*data.shape) and not any(n % PERIOD for n in data.shape)
+    turned = data if as_it_is else orientation.turn(data.float()).contiguous()
+    job = _Job(method, mosaic.layout.channels, (turned.shape[0], turned.shape[1]), get_threads())
+    with ENGINES.borrow(job) as engine:
+        images = engine.run(turned.numpy(), levels, light)
+    return images if as_it_is else _turn_back(images, orientation)
 
 
 def _turn_back(images: JointImages, orientation: Orientation) -> JointImages:

@@ -11,39 +11,41 @@ then fixed: pictures do not flicker because of it.
 
 from __future__ import annotations
 
-import queue
-import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import closing, suppress
+from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from polsep.camera import Mosaic
 from polsep.cluster import map_ordered
 from polsep.io.footage import Damaged, Footage, open_footage
 from polsep.io.frames import Frame, ReadOptions
-from polsep.io.previews import exposure_of
+from polsep.io.previews import exposure_of, srgb
 from polsep.io.sequences import PART, Part, Picture, Sequence, SequenceKind, State
-from polsep.kernels.panels import make_panels
-from polsep.kernels.threads import get_threads
+from polsep.kernels.panels import STEPS, make_panels
+from polsep.kernels.threads import get_threads, own_threads
 from polsep.methods import Capture, find_method
 from polsep.pipeline import LightColor, find_device, separate_capture, separate_known, to_device
-from polsep.report import SeparatedFrame
 from polsep.temporal import Images, TemporalState, filter_frame, steady_images
+from polsep.workers import DEPTH, ahead, map_ahead
 
+Floats = NDArray[np.float32]
 Item = TypeVar("Item")
 
-#: Frames that wait between two threads, and that a cluster has at once for each of its workers.
-DEPTH = 2
+#: Frames that are separated at once by this process, at most: each takes the memory of its method.
+AT_ONCE = 4
 #: Names under which steady images are kept for the next part.
 IMAGES = ("diffuse", "specular")
 #: Widest panel of the film to watch.
 PANEL = 640
+#: The tone curve by equal steps of the root of linear light.
+_TONES = np.rint(255 * srgb((np.arange(STEPS + 1) / STEPS) ** 2)).astype(np.uint8)
 #: What is done against flicker.
 FILTERS = ("temporal", "none")
 #: What becomes of a run with a damaged frame.
@@ -102,11 +104,19 @@ class Look:
 
 
 @dataclass(frozen=True)
+class Found:
+    """What is kept of a separated frame: diffuse and specular images, and its ``report``."""
+
+    images: Images
+    report: dict[str, Any]
+
+
+@dataclass(frozen=True)
 class Separated:
     """A frame that was separated, or is damaged, and the state of the filter behind it, if there is one."""
 
     index: int
-    found: SeparatedFrame | Damaged
+    found: Found | Damaged
     state: TemporalState | None
 
 
@@ -189,7 +199,7 @@ def _run(footage: Footage, options: VideoOptions, look: Look, sequence: Sequence
                     part.show(_missing(frame.found, look, sequence.kind.preview))
                     warning = f"frame {frame.index} is left out: {frame.found.reason}"
                 else:
-                    images = _steady(frame.found, images, frame.state)
+                    images = _steady(frame.found.images, images, frame.state)
                     part.write(frame.index, as_picture(frame, images, look, sequence.kind.preview))
                 yield Progress(frame.index + 1, 0, warning, damaged=warning is not None)
                 if len(part) == PART:
@@ -203,9 +213,8 @@ def _run(footage: Footage, options: VideoOptions, look: Look, sequence: Sequence
                 part.close()
 
 
-def _steady(found: SeparatedFrame, before: Images | None, state: TemporalState | None) -> Images:
+def _steady(images: Images, before: Images | None, state: TemporalState | None) -> Images:
     """A frame's images, steadier where nothing has moved, if there is a filter."""
-    images = found.diffuse, found.specular
     return images if state is None else steady_images(images, before, state)
 
 
@@ -219,18 +228,22 @@ def _as_arrays(state: TemporalState | None, images: Images | None) -> State:
 def separate_here(
     footage: Footage, options: VideoOptions, look: Look, start: tuple[int, TemporalState | None]
 ) -> Generator[Separated, None, None]:
-    """Frames from number ``start[0]`` on, separated in order by threads of this process."""
-    device = find_device(options.device)
+    """Frames from number ``start[0]`` on, in order, by threads of this process: each separates a frame by itself.
 
-    def separate() -> Iterator[Separated]:
-        with closing(ahead(_prepared(footage, options, look, start))) as frames:
-            for frame, state in frames:
-                if isinstance(frame, Damaged):
-                    yield Separated(frame.index, frame, state)
-                else:
-                    yield Separated(frame.index, separate_one((frame.data, look, device)), state)
+    That keeps all cores busy whatever else runs; threads that share a frame would wait for the slowest one.
+    """
+    device, cores = find_device(options.device), get_threads()
+    workers = min(cores, AT_ONCE)
 
-    return ahead(separate())
+    def separate(ready: tuple[Frame | Damaged, TemporalState | None]) -> Separated:
+        frame, state = ready
+        if isinstance(frame, Damaged):
+            return Separated(frame.index, frame, state)
+        with own_threads(cores // workers):
+            return Separated(frame.index, separate_one((frame.data, look, device)), state)
+
+    with closing(ahead(_prepared(footage, options, look, start), 1)) as frames:
+        yield from map_ahead(separate, frames, workers)
 
 
 def separate_on_ray(
@@ -238,11 +251,11 @@ def separate_on_ray(
 ) -> Generator[Separated, None, None]:
     """The same by a Ray cluster; this process reads and writes."""
     workers, device = get_threads(), find_device(options.device)
-    asked: deque[tuple[Frame | Damaged, TemporalState | None]] = deque()
+    asked: deque[tuple[int | Damaged, TemporalState | None]] = deque()
 
     def whole_frames() -> Iterator[tuple[Capture, Look, torch.device]]:
         for frame, state in frames:
-            asked.append((frame, state))
+            asked.append((frame if isinstance(frame, Damaged) else frame.index, state))
             if not isinstance(frame, Damaged):
                 yield frame.data, look, device
 
@@ -255,8 +268,9 @@ def separate_on_ray(
     with closing(ahead(_prepared(footage, options, look, start))) as frames:
         for found in map_ordered(separate_one, whole_frames(), workers, DEPTH * workers):
             yield from waiting()
-            frame, state = asked.popleft()
-            yield Separated(frame.index, found, state)
+            index, state = asked.popleft()
+            assert isinstance(index, int)
+            yield Separated(index, found, state)
         yield from waiting()
 
 
@@ -264,11 +278,12 @@ def separate_on_ray(
 ENGINES = {"local": separate_here, "ray": separate_on_ray}
 
 
-def separate_one(job: tuple[Capture, Look, torch.device]) -> SeparatedFrame:
+def separate_one(job: tuple[Capture, Look, torch.device]) -> Found:
     """One frame by the method, and under the light, that the first one settled."""
     data, look, device = job
     data = to_device(data, device)
-    return separate_known(data, find_method(look.method, data), look.light)
+    frame = separate_known(data, find_method(look.method, data), look.light)
+    return Found((frame.diffuse, frame.specular), frame.report)
 
 
 def _prepared(
@@ -302,18 +317,23 @@ def limited(frames: Iterator[Item], first: int, count: int | None) -> Iterator[I
 
 def as_picture(frame: Separated, images: Images, look: Look, preview: bool) -> Picture:
     """What is kept of a separated frame and its steady ``images``."""
-    assert isinstance(frame.found, SeparatedFrame)
+    assert isinstance(frame.found, Found)
     report, (diffuse, specular) = frame.found.report, images
     line = {"frame": frame.index, **report["statistics"]}
     if report["warnings"]:
         line["warnings"] = report["warnings"]
-    return Picture(diffuse, specular, make_panels(diffuse, specular, look.gain, PANEL) if preview else None, line)
+    return Picture(diffuse, specular, _panels(diffuse, specular, look.gain) if preview else None, line)
+
+
+def _panels(diffuse: Floats, specular: Floats, gain: float) -> NDArray[np.uint8]:
+    """Input, diffuse and specular to watch."""
+    return make_panels((diffuse, specular), gain, _TONES, PANEL)
 
 
 def _missing(damaged: Damaged, look: Look, preview: bool) -> Picture:
     """A black picture."""
     black = np.zeros(look.size, np.float32)
-    panels = make_panels(black, black, 1.0, PANEL) if preview else None
+    panels = _panels(black, black, 1.0) if preview else None
     return Picture(black, black, panels, {"frame": damaged.index, "damaged": damaged.reason})
 
 
@@ -326,51 +346,3 @@ def _report(settings: dict[str, Any], look: Look, lines: list[dict[str, Any]]) -
     damaged = [line for line in lines if "damaged" in line]
     counts = {"frames": len(lines), "damaged": damaged}
     return {**counts, "settings": settings, "first_frame_warnings": list(look.warnings), "warnings": warnings}
-
-
-class _Ahead:
-    """What `ahead` shares between its two threads. State: items that wait, and whether anyone still wants them."""
-
-    def __init__(self, items: Iterable[Any], depth: int) -> None:
-        self.items, self.ready, self.gone = items, queue.Queue[tuple[bool, Any]](depth), threading.Event()
-
-    def put(self, more: bool, item: Any) -> bool:
-        """Wait for room; False when nobody waits for the item any more."""
-        while not self.gone.is_set():
-            with suppress(queue.Full):
-                self.ready.put((more, item), timeout=0.1)
-                return True
-        return False
-
-    def work(self) -> None:
-        """The making thread."""
-        try:
-            if all(self.put(True, item) for item in self.items):
-                self.put(False, None)
-        except BaseException as error:
-            self.put(False, error)
-        finally:
-            close: Callable[[], None] = getattr(self.items, "close", lambda: None)
-            close()
-
-
-def ahead(items: Iterable[Item], depth: int = DEPTH) -> Generator[Item, None, None]:
-    """The items, made by a thread of their own, up to ``depth`` in advance; what is raised there is raised here.
-
-    Closing this generator ends the thread, and closes ``items`` where that can be closed.
-    """
-    shared = _Ahead(items, depth)
-    thread = threading.Thread(target=shared.work, name="polsep-ahead", daemon=True)
-    thread.start()
-    try:
-        while True:
-            more, item = shared.ready.get()
-            if more:
-                yield item
-            elif item is None:
-                return
-            else:
-                raise item
-    finally:
-        shared.gone.set()
-        thread.join()

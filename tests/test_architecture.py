@@ -52,6 +52,7 @@ RANKS = {
     "io": 4,
     "batch": 6,
     "cluster": 1,
+    "workers": 1,
     "video": 6,
     "dataset": 6,
     "bench": 6,

@@ -25,8 +25,9 @@ from test_bad_input import FILES
 
 from polsep import cli
 from polsep.camera import IDEAL, Layout, expose
+from polsep.io.exr import read_exr_layers
 from polsep.io.genicam import pack_frame
-from polsep.io.outputs import FORMATS, LAYERS, read_exr_layers
+from polsep.io.outputs import FORMATS, LAYERS
 from polsep.methods import BEST, METHODS
 from polsep.mosaic_network import NAMES
 from polsep.stokes import Stokes

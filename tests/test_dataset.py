@@ -299,7 +299,7 @@ def test_torn_and_missing_files_are_rendered_again(tmp_path: Path) -> None:
 def test_a_full_disk_leaves_what_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The error comes out as it is, no view is torn, and the run goes on once there is room."""
     finish(SMALL, tmp_path / "expected")
-    write, room = files._write_bytes, [9]
+    write, room = files.write_checked, [9]
 
     def write_until_full(path: Path, data: bytes) -> None:
         room[0] -= 1
@@ -308,7 +308,7 @@ def test_a_full_disk_leaves_what_is_whole(tmp_path: Path, monkeypatch: pytest.Mo
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
         write(path, data)
 
-    monkeypatch.setattr(files, "_write_bytes", write_until_full)
+    monkeypatch.setattr(files, "write_checked", write_until_full)
     with pytest.raises(OSError, match="No space left on device"):
         finish(SMALL, tmp_path / "set")
     assert len(find_finished(tmp_path / "set", SMALL.stems)) == 2

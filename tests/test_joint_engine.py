@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from functools import partial
 
@@ -158,15 +158,17 @@ def test_a_thread_writes_no_row_of_another(
 
 
 @pytest.fixture
-def shipped(monkeypatch: pytest.MonkeyPatch) -> None:
+def shipped(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Random networks stand for the shipped ones."""
 
     def find(method: str, layout: Layout, path: None) -> tuple[Joint, dict[str, str]]:
         return random_net(own_order(layout)), {}
 
-    joint_engine._engine.cache_clear()
+    joint_engine.ENGINES.clear()
     monkeypatch.setattr(joint_engine, "find_joint", find)
     monkeypatch.setattr(joint_engine, "OpenVinoEngine", partial(OpenVinoEngine, precision="f32"))
+    yield
+    joint_engine.ENGINES.clear()
 
 
 TURNS: dict[str, Callable[[Layout], Layout]] = {

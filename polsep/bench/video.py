@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Iterator
 from itertools import cycle, islice
@@ -14,12 +15,14 @@ from numpy.typing import NDArray
 import polsep
 from polsep.bench.rows import Row
 from polsep.io.frames import ReadOptions, read_frames
+from polsep.io.genicam import pack_frame
 from polsep.io.results import read_memory, write_chunks
 from polsep.io.sequences import SequenceKind
 from polsep.levels import as_mosaic
 from polsep.methods import METHODS
 from polsep.pipeline import separate_known
 from polsep.video import Target, VideoOptions, separate_video
+from polsep.workers import keep_memory
 
 #: Frames of the long recording, and of those that compare formats.
 LONG, SHORT = 1000, 60
@@ -27,11 +30,15 @@ LONG, SHORT = 1000, 60
 DISTINCT = 12
 #: Frames after which memory is to stay as it is, and those that the method alone is timed on.
 SETTLED, ALONE = 50, 40
+#: Frames that do not count for rates: engines are made meanwhile.
+BEGINNING = 10
 SIZE, PIXELS = (2448, 2048), "BayerRG12p"
-FORMATS = {
-    "half-float EXR and a film to watch": SequenceKind(),
-    "half-float EXR, ZIP": SequenceKind(compression="zip", preview=False),
-    "FFV1, 16 bits": SequenceKind("ffv1", preview=False),
+#: What is written, behind which filter. The first costs reading and writing alone, the second is the default.
+KINDS = {
+    "EXR, no filter": (SequenceKind(preview=False), "none"),
+    "EXR and a film to watch, temporal filter": (SequenceKind(), "temporal"),
+    "EXR with ZIP, temporal filter": (SequenceKind(compression="zip", preview=False), "temporal"),
+    "FFV1 with 16 bits, temporal filter": (SequenceKind("ffv1", preview=False), "temporal"),
 }
 
 
@@ -50,31 +57,34 @@ def bench_video_quick(_data: Path | None = None) -> Iterator[Row]:
 
 def measure_recordings(long: int, short: int) -> Iterator[Row]:
     """Rows of a recording of ``long`` frames, and of its first ``short`` ones."""
+    keep_memory()
     with TemporaryDirectory() as folder:
         path = Path(folder) / "run.raw"
         frames = _frames()
-        write_chunks(path, (pack_12p(image) for image in islice(cycle(frames), long)))
-        for method, count in (("joint-fast", long), ("joint", short)):
+        write_chunks(path, (pack_frame(image, PIXELS) for image in islice(cycle(frames), long)))
+        bare, usual, *others = KINDS
+        runs = [("joint-fast", bare, long), ("joint-fast", usual, long), ("joint", bare, short)]
+        runs += [("joint", usual, short), *(("joint-fast", kind, short) for kind in others)]
+        for method, kind, count in runs:
             alone = _rate_alone(method, frames)
-            yield Row("video", f"{count} frames", method, "the method alone", alone, "frames/s")
-            kind = "half-float EXR and a film to watch"
-            yield from _measure(path, Path(folder) / method, (method, kind, count), alone)
-        for kind in list(FORMATS)[1:]:
-            yield from _measure(
-                path, Path(folder) / kind, ("joint-fast", kind, short), _rate_alone("joint-fast", frames)
-            )
+            yield Row("video", f"{count} frames, {kind}", method, "the method alone", alone, "frames/s")
+            yield from _measure(path, Path(folder), (method, kind, count), alone)
 
 
-def _measure(path: Path, output: Path, run: tuple[str, str, int], alone: float) -> Iterator[Row]:
-    """The rate from the first frame written to the last, its ratio to the method's ``alone``, and memory's spread."""
+def _measure(path: Path, folder: Path, run: tuple[str, str, int], alone: float) -> Iterator[Row]:
+    """The rate behind the first frames, its ratio to the method's ``alone``, and memory's spread."""
     method, kind, count = run
     times, memory = [], []
-    options, read = VideoOptions(method, frames=count), ReadOptions(size=SIZE, pixel_format=PIXELS)
-    for step in separate_video(path, read, options, Target(output, FORMATS[kind])):
+    written, filter = KINDS[kind]
+    options, read = VideoOptions(method, frames=count, filter=filter), ReadOptions(size=SIZE, pixel_format=PIXELS)
+    output = folder / "out"
+    for step in separate_video(path, read, options, Target(output, written)):
         times.append(time.perf_counter())
         if step.done > SETTLED:
             memory.append(read_memory())
-    rate = (count - 1) / (times[-2] - times[-2 - (count - 1)])
+    shutil.rmtree(output)
+    counted = count - BEGINNING
+    rate = counted / (times[-2] - times[-2 - counted])
     case = f"{count} frames, {kind}"
     yield Row("video", case, method, "polsep video", rate, "frames/s")
     yield Row("video", case, method, "of the method alone", 100 * rate / alone, "%")
@@ -100,10 +110,3 @@ def _frames() -> list[NDArray[np.uint16]]:
     capture = Path(polsep.__file__).parent / "data" / "still_life.png"
     raw = next(read_frames(capture, ReadOptions(white_level=4095.0))).data.data.numpy().astype(np.uint16)
     return [np.roll(raw, (8 * k, 16 * k), (0, 1)) for k in range(DISTINCT)]
-
-
-def pack_12p(image: NDArray[np.uint16]) -> bytes:
-    """12-bit samples of a frame as GenICam's 12p: two in three bytes, least significant bits first."""
-    first, second = image.reshape(-1, 2).astype(np.uint16).T
-    packed = np.stack([first & 255, (first >> 8) | ((second & 15) << 4), second >> 4], axis=1)
-    return packed.astype(np.uint8).tobytes()

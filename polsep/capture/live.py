@@ -15,9 +15,10 @@ from polsep.camera import Layout
 from polsep.capture.sources import CameraInfo
 from polsep.io.frames import ReadOptions, decode_frame
 from polsep.io.genicam import find_pixel_format
-from polsep.io.pictures import encode_picture, replace_bytes
+from polsep.io.pictures import encode_picture
 from polsep.io.previews import live_sheet
 from polsep.io.recording import RawImage
+from polsep.io.whole import replace_bytes
 from polsep.pipeline import separate_capture
 from polsep.report import SeparatedFrame
 

@@ -150,7 +150,8 @@ def bench(name: str, data: Path, output: Path, quick: bool, images: Path | None)
     'polsep bench readme' makes the tables of README.md and docs anew from DIR.
     """
     from polsep.bench import BENCHES, provenance, to_jsonl
-    from polsep.io.results import fill_readme, write_text
+    from polsep.io.results import fill_readme
+    from polsep.io.whole import replace_text
 
     if name == "list":
         for known, entry in BENCHES.items():
@@ -174,7 +175,7 @@ def bench(name: str, data: Path, output: Path, quick: bool, images: Path | None)
         for row in measure(data):
             print(f"{row.case:48} {row.method:20} {row.metric:28} {row.value:10.4g} {row.unit}", flush=True)
             rows.append(row)
-        write_text(output / f"{stem}.jsonl", to_jsonl(rows, provenance(command)))
+        replace_text(output / f"{stem}.jsonl", to_jsonl(rows, provenance(command)))
         for path in chosen.draw(rows, data, folder) if chosen.draw else ():
             print(path, flush=True)
     except ValueError as error:

@@ -56,7 +56,9 @@ def video(recording: Path, output: Path, **options: Any) -> None:
     from polsep.io.sequences import SequenceKind
     from polsep.methods import check_method
     from polsep.video import Target, VideoOptions, separate_video
+    from polsep.workers import keep_memory
 
+    keep_memory()
     try:
         read = ReadOptions(
             Layout.parse(options["layout"]) if options["layout"] else None,

@@ -9,16 +9,15 @@ from typing import Any
 
 import torch
 
+from polsep.io.whole import beside, replace_text
+
 
 def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """Write a state of tensors, numbers and strings, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(path.name + ".part")
-    with beside.open("wb") as file:
+    with beside(path) as part, part.open("wb") as file:
         torch.save(state, file)
         file.flush()
         os.fsync(file.fileno())
-    beside.replace(path)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any] | None:
@@ -50,10 +49,7 @@ def read_lines(path: Path) -> list[str]:
 
 def write_lines(path: Path, lines: list[str]) -> None:
     """Replace a log as a whole."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(path.name + ".part")
-    beside.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
-    beside.replace(path)
+    replace_text(path, "".join(line + "\n" for line in lines))
 
 
 def read_module(name: str) -> bytes:

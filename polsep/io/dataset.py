@@ -14,7 +14,6 @@ killed. Nothing in a file depends on the time, the machine's name or who wrote i
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
@@ -27,11 +26,12 @@ from typing import Any
 
 import imagecodecs
 import numpy as np
-import OpenEXR  # a bare extension module without stubs
 from numpy.typing import NDArray
 
-from polsep.io.outputs import OutputError, read_exr_layers
+from polsep.io.exr import encode_exr, read_exr_layers
+from polsep.io.outputs import OutputError, require_same
 from polsep.io.previews import srgb
+from polsep.io.whole import write_checked
 
 FORMATS = ("exr", "npz")
 #: RGB images of the truth; s1 and s2 are of the light on the sensor, whose s0 is diffuse + specular.
@@ -39,8 +39,6 @@ LAYERS = ("diffuse", "specular", "s1", "s2")
 OPTIONS, MANIFEST, SHEET, UNFINISHED = "options.json", "manifest.jsonl", "contact.png", ".unfinished"
 #: zlib level of the mosaic: noise does not shrink, and level 6 takes twice as long for 4 % less.
 PNG_LEVEL = 2
-#: The largest finite half float; brighter highlights stop there.
-LARGEST_HALF = 65504.0
 #: Rows and columns of views on the contact sheet, and the side of each of their pictures in pixels.
 SHEET_ROWS, SHEET_COLS, THUMBNAIL = 5, 8, 160
 #: Width and grey level of the gaps between them.
@@ -63,24 +61,12 @@ def begin_dataset(directory: Path, options: Mapping[str, Any]) -> None:
     if os.path.lexists(directory) and not directory.is_dir():
         raise OutputError(f"expected a directory to write into, found a file: {directory}")
     if path.is_file():
-        _require_equal(path, options)
+        require_same(path, options, f"the set in {directory}")
         return
     if directory.is_dir() and (others := sorted(set(os.listdir(directory)) - {UNFINISHED})):
         raise OutputError(f"expected {directory} empty, new, or a set begun before, found {others[0]!r} in it")
     directory.mkdir(parents=True, exist_ok=True)
     _write_whole(path, _as_json(options))
-
-
-def _require_equal(path: Path, options: Mapping[str, Any]) -> None:
-    try:
-        before = json.loads(path.read_text(encoding="utf-8"))
-        different = [key for key in {**before, **options} if before.get(key) != options.get(key)]
-    except (ValueError, TypeError) as error:
-        raise OutputError(f"expected the options of a set in {path}, found {error}") from error
-    if different:
-        found = ", ".join(f"{key} {options.get(key)}" for key in different)
-        was = ", ".join(f"{key} {before.get(key)}" for key in different)
-        raise OutputError(f"expected {was}, with which the set in {path.parent} was begun, found {found}")
 
 
 def find_finished(directory: Path, stems: Sequence[str]) -> set[str]:
@@ -109,7 +95,7 @@ def write_view(directory: Path, stem: str, images: Images, record: Mapping[str, 
     staging = Path(tempfile.mkdtemp(dir=hidden))
     try:
         for name, data in contents.items():
-            _write_bytes(staging / name, data)
+            write_checked(staging / name, data)
         for name in contents:  # the record is the last
             os.replace(staging / name, directory / name)
     finally:
@@ -195,16 +181,8 @@ def _encode_exr(images: Images) -> bytes:
     """One part of half floats, ZIP compressed, as every reader of EXR knows it."""
     planes = {f"{layer}.{c}": images[layer][..., k] for layer in LAYERS for k, c in enumerate("RGB")}
     planes["mask.Y"] = images["mask"]
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "units": "linear light, 1.0 = one measurement at the white level: s0 = diffuse + specular = 2",
-    }
-    # A fresh dict, because OpenEXR replaces its arrays, and contiguous planes, because it misreads others silently.
-    channels = {name: np.ascontiguousarray(plane, dtype=np.float16) for name, plane in planes.items()}
-    stream = io.BytesIO()
-    OpenEXR.File(header, channels).write(stream)
-    return stream.getvalue()
+    notes = {"units": "linear light, 1.0 = one measurement at the white level: s0 = diffuse + specular = 2"}
+    return bytes(encode_exr({name: plane.astype(np.float16) for name, plane in planes.items()}, notes))
 
 
 def _encode_npz(images: Images) -> bytes:
@@ -228,16 +206,5 @@ def _write_whole(path: Path, data: bytes) -> None:
     hidden = path.parent / UNFINISHED
     hidden.mkdir(exist_ok=True)
     beside = hidden / f"{path.name}.{os.getpid()}"
-    _write_bytes(beside, data)
+    write_checked(beside, data)
     os.replace(beside, path)
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    """Write a file and check that all of it arrived; OSError that names it otherwise."""
-    try:
-        path.write_bytes(data)
-    except OSError as error:  # names the file where it cannot be opened, but not where the disk is full
-        raise OSError(error.errno, error.strerror, str(path)) from error
-    found = path.stat().st_size
-    if found != len(data):
-        raise OSError(errno.EIO, f"expected {len(data)} bytes, found {found}", str(path))

@@ -164,14 +164,12 @@ def _groups(data: NDArray[Any], size: int) -> NDArray[Any]:
 def _unpack_lsb(data: NDArray[np.uint8], count: int, bits: int) -> NDArray[np.uint16]:
     """Codes of a little-endian bit stream of 10 or 12 bits, where no code touches more than two bytes."""
     pixels, size = (4, 5) if bits == 10 else (2, 3)
-    groups = _groups(data, size)
-    out = np.empty((len(groups), pixels), np.uint16)
-    for start in range(0, len(groups), BLOCK // pixels):
-        block = groups[start : start + BLOCK // pixels].astype(np.uint16)
-        for k in range(pixels):
-            byte, shift = divmod(k * bits, 8)
-            word = block[:, byte] | (block[:, byte + 1] << 8)
-            out[start : start + BLOCK // pixels, k] = (word >> shift) & (2**bits - 1)
+    groups = _groups(data, size).reshape(-1)
+    out = np.empty((groups.size // size, pixels), np.uint16)
+    for k in range(pixels):
+        byte, shift = divmod(k * bits, 8)
+        words: NDArray[np.uint16] = np.ndarray((len(out),), "<u2", groups, byte, (size,))
+        np.bitwise_and(words >> shift, 2**bits - 1, out=out[:, k])
     return out.reshape(-1)[:count]
 
 

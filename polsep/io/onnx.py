@@ -8,6 +8,8 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from polsep.io.whole import beside
+
 #: What a graph is given, in order.
 INPUTS = ("raw", "black_level", "white_level")
 #: The oldest set of operators that torch's exporter writes.
@@ -42,7 +44,5 @@ def write_onnx(path: Path, graph: nn.Module, outputs: tuple[str, ...], metadata:
         )
     assert program is not None
     program.model.metadata_props.update(metadata)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.part")
-    program.save(beside)
-    beside.replace(path)
+    with beside(path) as part:
+        program.save(part)

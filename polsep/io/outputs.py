@@ -24,7 +24,7 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -32,12 +32,12 @@ from typing import TYPE_CHECKING, Any
 
 import imagecodecs
 import numpy as np
-import OpenEXR  # a bare extension module without stubs
 import tifffile
 from numpy.typing import NDArray
 
-from polsep.io.errors import input_error
+from polsep.io.exr import encode_exr
 from polsep.io.previews import contact_sheet
+from polsep.io.whole import write_checked
 
 if TYPE_CHECKING:
     from polsep.report import SeparatedFrame
@@ -132,22 +132,6 @@ def write_separation(
     return [directory / name for name in _file_names(stem, format, _layers(frame))]
 
 
-def read_exr_layers(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Every channel of a single-part EXR file by its full name, such as ``diffuse.R``, each ``[H, W]``.
-
-    Raises OSError when it cannot be read, and InputError for anything but a complete single-part EXR (OpenEXR itself
-    returns no part and prints a warning when pixels are missing).
-    """
-    expected = "expected a complete single-part EXR file"
-    try:
-        file = OpenEXR.File(io.BytesIO(Path(path).read_bytes()), separate_channels=True)
-    except RuntimeError as error:
-        raise input_error(path, f"{expected}, found one that OpenEXR cannot open") from error
-    if len(file.parts) != 1:
-        raise input_error(path, f"{expected}, found {len(file.parts)} readable parts")
-    return {name: channel.pixels for name, channel in file.channels().items()}
-
-
 def refuse_targets(directory: Path, targets: list[Path], overwrite: bool) -> None:
     """Raise OutputError rather than replace files unasked, or ever replace a directory; to call before any work."""
     nearest = next((d for d in (directory, *directory.parents) if os.path.lexists(d)), None)
@@ -198,6 +182,26 @@ def _unbroken() -> Iterator[None]:
         before(*caught[0])
 
 
+def require_same(path: Path, settings: Mapping[str, Any], begun: str, advice: str = "") -> None:
+    """Raise OutputError, naming what differs, unless ``path`` holds these settings; ``begun``: what they belong to."""
+    try:
+        before, now = (_flat_names(json.loads(text)) for text in (path.read_text("utf-8"), json.dumps(settings)))
+    except (ValueError, AttributeError) as error:
+        raise OutputError(f"expected the settings of {begun} in {path}, found {error}") from error
+    different = [name for name in before | now if before.get(name) != now.get(name)]
+    if different:
+        was, found = (", ".join(f"{name} {kept.get(name)}" for name in different) for kept in (before, now))
+        raise OutputError(f"expected {was}, with which {begun} was begun, found {found}{advice}")
+
+
+def _flat_names(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Settings within settings as those with both names."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= _flat_names(value, f"{before}{name} ") if isinstance(value, Mapping) else {f"{before}{name}": value}
+    return flat
+
+
 def _write_and_move(frame: SeparatedFrame, targets: list[Path], stem: str, format: str) -> None:
     """Write into a hidden directory beside the targets, then rename; that directory is gone afterwards."""
     staging = Path(tempfile.mkdtemp(prefix=".polsep-", dir=targets[0].parent))
@@ -218,7 +222,7 @@ def _stage(frame: SeparatedFrame, folder: Path, stem: str, format: str) -> None:
     """Write every output of ``frame`` into ``folder``, the sidecar last."""
     files = []
     for name, data in _encoded_files(frame, stem, format):
-        _write_bytes(folder / name, data)
+        write_checked(folder / name, data)
         files.append({"name": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()})
     sidecar: dict[str, Any] = {
         "polsep": _version(),
@@ -232,15 +236,7 @@ def _stage(frame: SeparatedFrame, folder: Path, stem: str, format: str) -> None:
     }
     if format == "png":
         sidecar["limited_samples"] = _limited_samples(frame)
-    _write_bytes(folder / f"{stem}.json", (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    """Write a file and check that all of it arrived; OSError otherwise."""
-    path.write_bytes(data)
-    found = path.stat().st_size
-    if found != len(data):
-        raise OSError(f"expected {len(data)} bytes in {path.name}, found {found}")
+    write_checked(folder / f"{stem}.json", (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
 
 
 def _move_into_place(staging: Path, targets: list[Path]) -> None:
@@ -266,7 +262,7 @@ def _move_into_place(staging: Path, targets: list[Path]) -> None:
         raise
 
 
-def _encoded_files(frame: SeparatedFrame, stem: str, format: str) -> Iterator[tuple[str, bytes]]:
+def _encoded_files(frame: SeparatedFrame, stem: str, format: str) -> Iterator[tuple[str, bytes | memoryview]]:
     """Name and contents of each image file, then of the preview; one in memory at a time."""
     if format == "exr":
         yield f"{stem}.exr", _encode_exr(frame)
@@ -281,7 +277,7 @@ def _encoded_files(frame: SeparatedFrame, stem: str, format: str) -> Iterator[tu
     yield f"{stem}.png", _encode_png(contact_sheet(frame))
 
 
-def _encode_exr(frame: SeparatedFrame) -> bytes:
+def _encode_exr(frame: SeparatedFrame) -> memoryview:
     """One part of float32 channels, ZIP compressed, with the units as header attributes."""
     planes = {"dolp.Y": frame.dolp, "aolp.Y": frame.aolp, "valid.Y": frame.valid}
     for layer, image in (("diffuse", frame.diffuse), ("specular", frame.specular)):
@@ -289,17 +285,8 @@ def _encode_exr(frame: SeparatedFrame) -> bytes:
             planes[f"{layer}.{color}"] = image[..., k]
     if frame.error is not None:
         planes |= {f"{ERROR}.{image}": frame.error[..., k] for k, image in enumerate(("diffuse", "specular"))}
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "polsepVersion": _version(),
-        **{f"{layer}Units": UNITS[layer] for layer in _layers(frame)},
-    }
-    # A fresh dict, because OpenEXR replaces its arrays, and contiguous planes, because it misreads others silently.
-    channels = {name: np.ascontiguousarray(plane, dtype=np.float32) for name, plane in planes.items()}
-    stream = io.BytesIO()
-    OpenEXR.File(header, channels).write(stream)
-    return stream.getvalue()
+    notes = {"polsepVersion": _version(), **{f"{layer}Units": UNITS[layer] for layer in _layers(frame)}}
+    return encode_exr({name: plane.astype(np.float32) for name, plane in planes.items()}, notes)
 
 
 def _encode_npz(frame: SeparatedFrame) -> bytes:

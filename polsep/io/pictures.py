@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+
+from polsep.io.whole import replace_bytes
 
 #: Quality of the JPEG, 1 to 95. Colours are not subsampled, which thin coloured lines would not survive.
 QUALITY = 90
@@ -29,11 +30,3 @@ def encode_picture(pixels: NDArray[np.uint8]) -> bytes:
     stream = BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "JPEG", quality=QUALITY, subsampling=0, optimize=True)
     return stream.getvalue()
-
-
-def replace_bytes(path: Path, data: bytes) -> None:
-    """Replace a file as a whole, written beside it, then renamed; makes its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.tmp")
-    beside.write_bytes(data)
-    os.replace(beside, path)

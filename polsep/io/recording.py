@@ -27,7 +27,7 @@ from polsep.io.genicam import find_pixel_format
 from polsep.io.headless import headless_page
 from polsep.io.outputs import refuse_targets
 from polsep.io.pages import Page, require_size
-from polsep.io.results import write_text
+from polsep.io.whole import replace_text
 
 FORMAT = "polsep recording 1"
 RAW, INDEX, RECORD, PICTURE = "frames.raw", "frames.jsonl", "recording.json", "live.jpg"
@@ -124,7 +124,7 @@ class RecordingWriter:
             "frames": self.frames,
             **remarks,
         }
-        write_text(self.directory / RECORD, json.dumps(record, indent=2, allow_nan=False) + "\n")
+        replace_text(self.directory / RECORD, json.dumps(record, indent=2, allow_nan=False) + "\n")
 
     def close(self) -> None:
         """Close the files; what they hold is on its way to the disk."""

@@ -13,18 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.io.whole import replace_text
+
 #: A table in a Markdown file stands between these two comments.
 _TABLE = re.compile(
     r"(<!-- table: (?P<name>\w+)(?P<part>/\w+)?(?P<turned> by method)? -->\n).*?(<!-- end -->)", re.DOTALL
 )
-
-
-def write_text(path: Path, text: str) -> None:
-    """Replace a text file as a whole: written beside it, then renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.tmp")
-    beside.write_text(text, encoding="utf-8")
-    os.replace(beside, path)
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
@@ -83,7 +77,7 @@ def fill_tables(markdown: str, results: Path) -> str:
 
 def fill_readme(readme: Path, results: Path) -> None:
     """`fill_tables` on a file, replaced as a whole."""
-    write_text(readme, fill_tables(readme.read_text(encoding="utf-8"), results))
+    replace_text(readme, fill_tables(readme.read_text(encoding="utf-8"), results))
 
 
 def markdown_table(rows: list[dict[str, Any]]) -> str:

@@ -13,32 +13,23 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import OpenEXR  # a bare extension module without stubs
-import torch
 from numpy.typing import NDArray
 
-from polsep.io.halves import LARGEST_HALF, write_exr_halves
-from polsep.io.outputs import UNITS, OutputError
+from polsep.io.exr import COMPRESSIONS, as_half_planes, encode_exr, write_exr_halves
+from polsep.io.outputs import UNITS, OutputError, require_same
 from polsep.io.videos import LOSSLESS, LOSSLESS_GREY, WATCHABLE, Film, FilmKind, as_codes, join_films, load_library
+from polsep.io.whole import beside, replace_bytes, replace_text, write_checked
 
 #: Frames after which a run can go on: a second, about. Films have a key frame at least as often.
 PART = 25
 #: What images become: an EXR file per frame, a lossless film each, or nothing but the film to watch.
 FORMATS = ("exr", "ffv1", "none")
-COMPRESSIONS = {
-    "none": OpenEXR.NO_COMPRESSION,
-    "zip": OpenEXR.ZIP_COMPRESSION,
-    "piz": OpenEXR.PIZ_COMPRESSION,
-}
 #: The value of code 65535 in lossless films.
 FILM_WHITE = {"diffuse": 2.0, "specular": 8.0}
 
@@ -95,12 +86,10 @@ class Sequence:
             load_library()  # or else the first part would miss it
         self._parts.mkdir(parents=True, exist_ok=True)
         kept = self._parts / "run.json"
-        text = json.dumps(settings, sort_keys=True)
-        if kept.exists() and kept.read_text() != text:
-            raise OutputError(
-                f"expected the settings with which {directory / stem} was begun, found others; --overwrite begins anew"
-            )
-        _write_whole(kept, text.encode())
+        if kept.exists():
+            require_same(kept, settings, f"{directory / stem}", "; --overwrite begins anew")
+        else:
+            replace_text(kept, json.dumps(settings, sort_keys=True))
         self.done = 0
         while self._record(self.done).exists():
             self.done += 1
@@ -147,8 +136,8 @@ class Sequence:
         if state:
             stream = io.BytesIO()
             np.savez(stream, **state)  # type: ignore[arg-type]  # names are not parameters of savez
-            _write_whole(self._parts / f"{part.number:06d}.npz", stream.getvalue())
-        _write_whole(self._record(part.number), "".join(json.dumps(line) + "\n" for line in part.lines).encode())
+            replace_bytes(self._parts / f"{part.number:06d}.npz", stream.getvalue())
+        replace_text(self._record(part.number), "".join(json.dumps(line) + "\n" for line in part.lines))
         with_state = self._parts / f"{part.number - 1:06d}.npz"
         with_state.unlink(missing_ok=True)
         self.done = part.number + 1
@@ -159,16 +148,15 @@ class Sequence:
         for image, kind in self.films().items():
             target = self.directory / f"{self.stem}_{image}{kind.suffix}"
             parts = [path for k in range(self.done) if (path := self._film(k, image, kind)).exists()]
-            beside = target.with_name(f".{target.name}")
-            join_films(parts, beside, self.kind.rate)
-            os.replace(beside, target)
+            with beside(target) as joined:
+                join_films(parts, joined, kind, self.kind.rate)
             written.append(target)
         log = self.directory / f"{self.stem}.jsonl"
-        _write_whole(log, b"".join(self._record(k).read_bytes() for k in range(self.done)))
+        replace_bytes(log, b"".join(self._record(k).read_bytes() for k in range(self.done)))
         units = {name: UNITS[name] for name in ("diffuse", "specular")}
         if self.kind.format == "ffv1":
             units = {name: f"{units[name]}; code 65535 is {white:g}" for name, white in FILM_WHITE.items()}
-        _write_whole(self.report, json.dumps({**report, "units": units}, indent=2).encode() + b"\n")
+        replace_text(self.report, json.dumps({**report, "units": units}, indent=2) + "\n")
         shutil.rmtree(self._parts)
         return [*written, log, self.report]
 
@@ -217,40 +205,10 @@ class Part:
 
 def write_exr(path: Path, picture: Picture, compression: str) -> None:
     """One part of half floats, layers diffuse and specular, beside its place and then renamed."""
-    images = {"diffuse": picture.diffuse, "specular": picture.specular}
-    notes = {f"{layer}Units": UNITS[layer] for layer in images}
-    with _beside(path) as beside:
+    planes = as_half_planes({"diffuse": picture.diffuse, "specular": picture.specular})
+    notes = {f"{layer}Units": UNITS[layer] for layer in ("diffuse", "specular")}
+    with beside(path) as part:
         if compression == "none":
-            write_exr_halves(beside, images, notes)
+            write_exr_halves(part, planes, notes)
         else:
-            _write_compressed(beside, images, {**notes, "compression": COMPRESSIONS[compression]})
-
-
-def _write_compressed(path: Path, images: Mapping[str, NDArray[np.float32]], header: dict[str, Any]) -> None:
-    channels = {}
-    for layer, image in images.items():
-        # PyTorch converts to half floats ten times as fast as NumPy.
-        writable = np.require(image, requirements="W")  # what comes from a cluster is not
-        planes = torch.from_numpy(writable).clamp(max=LARGEST_HALF).movedim(-1, 0).half().contiguous().numpy()
-        for color, plane in zip("RGB" if len(planes) == 3 else "Y", planes, strict=True):
-            channels[f"{layer}.{color}"] = plane
-    stream = io.BytesIO()
-    OpenEXR.File({**header, "type": OpenEXR.scanlineimage}, channels).write(stream)
-    path.write_bytes(stream.getbuffer())
-
-
-@contextmanager
-def _beside(path: Path) -> Iterator[Path]:
-    """A place to write to, which then becomes ``path``: a reader sees all of a file or the one from before."""
-    beside = path.with_name(f".{path.name}.part")
-    try:
-        yield beside
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise OutputError(f"expected to write {path}, found {error.strerror or error}") from error
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    with _beside(path) as beside:
-        beside.write_bytes(data)
+            write_checked(part, encode_exr(planes, notes, compression))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import count as count_from
@@ -27,6 +27,8 @@ from polsep.io.pages import Page, require_size
 
 #: Containers by suffix.
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska"}
+#: No dates and random numbers in them.
+_EXACTLY = {"fflags": "+bitexact"}
 #: Pixel formats that hold a mosaic: gray, gray10le, ...
 _GREY = re.compile(r"gray(\d*)(?:le|be)?")
 
@@ -157,7 +159,7 @@ class Film:
     def __init__(self, path: Path, kind: FilmKind, size: tuple[int, int], rate: float) -> None:
         av = load_library()
         self._kind, self._count = kind, 0
-        self._container: Any = av.open(str(path), "w", format=_FORMATS[kind.suffix], options={"fflags": "+bitexact"})
+        self._container: Any = av.open(str(path), "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
         fraction = Fraction(rate).limit_denominator(1001)
         self._stream: Any = self._container.add_stream(kind.codec, rate=fraction, options=dict(kind.options))
         self._stream.height, self._stream.width = size
@@ -187,11 +189,11 @@ class Film:
         self._container.close()
 
 
-def join_films(parts: Sequence[Path], path: Path, rate: float) -> None:
-    """One film of several that one `FilmKind` made at one ``rate``, in their order, by copying what is encoded."""
+def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -> None:
+    """One film of several of one ``kind`` and ``rate``, in their order, by copying what is encoded."""
     av = load_library()
     stream, shown = None, 0
-    with _writing(av, path) as output:
+    with closing(av.open(str(path), "w", format=_FORMATS[kind.suffix], options=_EXACTLY)) as output:
         for part in parts:
             with av.open(str(part)) as source:
                 given = source.streams.video[0]
@@ -203,15 +205,6 @@ def join_films(parts: Sequence[Path], path: Path, rate: float) -> None:
                     packet.pts, packet.dts, packet.stream = packet.pts + later, packet.dts + later, stream
                     output.mux(packet)
                 shown += len(packets)
-
-
-@contextmanager
-def _writing(av: Any, path: Path) -> Iterator[Any]:
-    container = av.open(str(path), "w", format=_FORMATS[path.suffix], options={"fflags": "+bitexact"})
-    try:
-        yield container
-    finally:
-        container.close()
 
 
 def as_codes(image: NDArray[np.float32], white: float) -> NDArray[np.uint16]:

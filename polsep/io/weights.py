@@ -15,6 +15,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from polsep.io.whole import beside
+
 Tensors = dict[str, Tensor]
 
 
@@ -30,11 +32,9 @@ def digest_tensors(tensors: Tensors) -> str:
 def write_weights(path: Path, tensors: Tensors, metadata: dict[str, str]) -> None:
     """Write tensors in half precision, whole or not at all."""
     halves = {name: tensor.detach().cpu().half().contiguous() for name, tensor in tensors.items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(path.name + ".part")
-    save_file(halves, beside, metadata | {"sha256": digest_tensors(halves)})
-    beside.chmod(0o644)  # safetensors makes files that only their owner can read
-    beside.replace(path)
+    with beside(path) as part:
+        save_file(halves, part, metadata | {"sha256": digest_tensors(halves)})
+        part.chmod(0o644)  # safetensors makes files that only their owner can read
 
 
 def read_weights(path: Path) -> tuple[Tensors, dict[str, str]]:

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.color_affine import MAX_DIFFUSE_DOLP
 from polsep.joint import LEAST_LIGHT, PERIOD, TRUST, WINDOWS
 from polsep.kernels.bilinear import Pattern
 from polsep.kernels.cells import Source
-from polsep.kernels.compiling import HALF, ONE, QUARTER, TWO, ZERO, compiled, entry
+from polsep.kernels.closed_form import SUMMED, find_slope, limit, misfit, offset, pool, white_specular
+from polsep.kernels.compiling import ONE, QUARTER, ZERO, compiled, entry
 from polsep.kernels.guided import Stream, demosaic_rows, open_stream
 from polsep.kernels.rows import (
     add_product,
@@ -27,32 +27,33 @@ from polsep.kernels.rows import (
     emit_bits,
     emit_product,
     fill,
-    filter_row,
+    filter_rows,
     multiply,
     subtract,
     sum_three,
+    weave,
 )
 from polsep.kernels.threads import Piece
 from polsep.kernels.unpack import Samples, read_row
 
 Floats = NDArray[np.float32]
 
-#: Rows that rings keep: those from a row to the last one it waits for, and twice the widest window.
-KEPT, SUMMED = 8, 16
+#: Rows that rings keep: those from a row to the last one it waits for.
+KEPT = 8
 #: How many rows behind the newest one a row is left: the light around, and half of the widest window.
 REACH = 1 + WINDOWS[0] // 2
 _WIDE, _NARROW = (window // 2 for window in WINDOWS)
 _TRUST_WIDE, _TRUST_NARROW = (np.float32(trust) for trust in TRUST)
-_MOST, _LEAST_LIGHT, _TINY = np.float32(MAX_DIFFUSE_DOLP), np.float32(LEAST_LIGHT), np.float32(1e-12)
+_LEAST_LIGHT, _TINY = np.float32(LEAST_LIGHT), np.float32(1e-12)
 #: Rows of scratch.
 _ROWS = 12
 
 
 class Taps(NamedTuple):
-    """The linear filter at half resolution, and its ``colors``; outputs are s0, s1, s2 of C colours times 4 cells.
+    """The linear filter at half resolution, and its ``colors``.
 
-    ``weight``, ``row``, ``place [12 C, K]``: of the samples that each output sees, their packed row, 0 to 2, and their
-    place in rows ``[16, w + 2]``; K is a multiple of `rows.AT_ONCE`.
+    ``weight [4, 3 C, K]``: of 4 cells, s0, s1, s2 of C colours; ``row``, ``place [4, K]``: of the samples that a cell's
+    outputs see, their packed row, 0 to 2, and their place in rows ``[16, w + 2]``; K is a multiple of `rows.AT_ONCE`.
     """
 
     weight: Floats
@@ -81,7 +82,8 @@ class _Rings(NamedTuple):
 
     ``s0 [8, 4 C, w]``, ``cosine``, ``sine [8, 4, w]``: means over colours; ``moments [8, 4, w]``: of the colours'
     deviations, s0 with s0, s1, s2 and what s1, s2 have. ``luminance``, ``light``, ``free [8, w]``; ``sums [16, 3, w]``.
-    ``clipped [8, w]``: as in `Maps`, of rows beyond the piece as well, which another thread may be writing there.
+    ``room [channels, w]``: a row of the maps as bfloat16. ``clipped [8, w]``: as in `Maps`, of rows beyond the piece as
+    well, which another thread may be writing there.
     """
 
     planes: Floats
@@ -93,11 +95,13 @@ class _Rings(NamedTuple):
     light: Floats
     free: Floats
     sums: Floats
+    room: NDArray[np.uint16]
     clipped: NDArray[np.uint16]
 
 
 @compiled
-def _make_rings(colors: int, w: int) -> _Rings:
+def _make_rings(colors: int, maps: Maps) -> _Rings:
+    w = maps.clipped.shape[1]
     return _Rings(
         np.zeros((KEPT, 16, w + 2), np.float32),
         np.zeros((KEPT, 4 * colors, w), np.float32),
@@ -108,6 +112,7 @@ def _make_rings(colors: int, w: int) -> _Rings:
         np.zeros((KEPT, w), np.float32),
         np.zeros((KEPT, w), np.float32),
         np.zeros((SUMMED, 3, w), np.float32),
+        np.zeros((maps.halves.shape[2], w), np.uint16),
         np.zeros((KEPT, w), np.uint16),
     )
 
@@ -153,12 +158,22 @@ def _starts(u: int, h: int, size: int) -> Any:
 def _filter_samples(taps: Taps, u: int, h: int, rings: _Rings, polarized: Any) -> None:
     """Stokes images of row ``u`` by the linear filter: s0 to its ring, s1 and s2 to ``polarized [8 C, w]``."""
     near = (rings.planes.reshape(-1), _starts(u, h, rings.planes[0].size))
-    s0 = rings.s0[u % KEPT]
-    for k in range(s0.shape[0]):
-        filter_row(taps.weight[k], (taps.row[k], taps.place[k]), near, s0[k])
-    for k in range(polarized.shape[0]):
-        output = s0.shape[0] + k
-        filter_row(taps.weight[output], (taps.row[output], taps.place[output]), near, polarized[k])
+    s0, colors = rings.s0[u % KEPT], taps.colors
+    for cell in range(4):
+        for k in range(0, 3 * colors, 3):
+            first, second, third = (
+                _stokes_row(4 * k + cell, s0, polarized),
+                _stokes_row(4 * k + 4 + cell, s0, polarized),
+                _stokes_row(4 * k + 8 + cell, s0, polarized),
+            )
+            weight = taps.weight[cell, k : k + 3]
+            filter_rows(weight, (taps.row[cell], taps.place[cell]), near, (first, second, third))
+
+
+@compiled
+def _stokes_row(k: int, s0: Any, polarized: Any) -> Any:
+    """One of the rows of s0, s1 and s2."""
+    return s0[k] if k < s0.shape[0] else polarized[k - s0.shape[0]]
 
 
 @compiled
@@ -237,87 +252,17 @@ def _look_around(v: int, h: int, rings: _Rings, spare: Any) -> None:
 
 
 @compiled
-def _pool(t: int, h: int, window: int, sums: Any, spare: Any) -> None:
-    """Means of the three moments over (2 ``window`` + 1)^2 around row ``t``, to ``spare [3, w]``."""
-    w = spare.shape[1]
-    padded, threes = np.zeros(w + 8, np.float32), np.zeros(w + 8, np.float32)
-    first, last = max(t - window, 0), min(t + window, h - 1)
-    for k in range(3):
-        inner, found = padded[4 : w + 4], spare[k]
-        fill(ZERO, inner)
-        for row in range(first, last + 1):
-            add_product(sums[row % SUMMED, k], ONE, inner)
-        sum_three(padded, padded[1:], padded[2:], threes[: w + 6])
-        if window == 1:
-            copy(threes[3:], found)
-        else:
-            sum_three(threes, threes[3:], threes[6:], found)
-        average(found, window, np.float32(last - first + 1))
-
-
-@compiled
-def _find_slope(pooled: Any, trust: Any, a1: Any, a2: Any) -> None:
-    """The slope from pooled moments ``[3, w]``, drawn toward the one before, to ``a1``, ``a2``."""
-    p1, p2, p0 = pooled[0], pooled[1], pooled[2]
-    for j in range(a1.size):
-        a1[j] = (p1[j] + trust * a1[j]) / (p0[j] + trust)
-    for j in range(a2.size):
-        a2[j] = (p2[j] + trust * a2[j]) / (p0[j] + trust)
-    for j in range(a1.size):
-        size = np.sqrt(a1[j] * a1[j] + a2[j] * a2[j] + _TINY)
-        limit = _MOST / (size if size > _MOST else _MOST)
-        a1[j] *= limit
-        a2[j] *= limit
-
-
-@compiled
-def _white_specular(b1: Any, b2: Any, a1: Any, a2: Any, tau: Any) -> None:
-    """`joint.white_specular` of a row, not below 0; ``tau`` is ``b1``'s place as well as its own."""
-    for j in range(tau.size):
-        real = b1[j] * a1[j] + b2[j] * a2[j]
-        free = ONE - a1[j] * a1[j] - a2[j] * a2[j]
-        root = (real + np.sqrt(real * real + free * (b1[j] * b1[j] + b2[j] * b2[j]) + _TINY)) / free
-        tau[j] = root if root > ZERO else ZERO
-
-
-@compiled
-def _offset(means: Any, a: Any, mean: Any, b: Any) -> None:
-    for j in range(b.size):
-        b[j] = means[j] - a[j] * mean[j]
-
-
-@compiled
-def _limit(s0: Any, tau: Any) -> None:
-    """No more specular light than a colour has."""
-    for j in range(tau.size):
-        most = s0[j] if s0[j] > ZERO else ZERO
-        tau[j] = tau[j] if tau[j] < most else most
-
-
-@compiled
-def _misfit(moments: Any, a: tuple[Any, Any], misfit: Any) -> None:
-    """Distance of the polarization from the line; ``moments [4, w]``."""
-    a1, a2 = a
-    own, first, second, total = moments[0], moments[1], moments[2], moments[3]
-    for j in range(misfit.size):
-        misfit[j] = total[j] - TWO * (a1[j] * first[j] + a2[j] * second[j])
-    for j in range(misfit.size):
-        left = misfit[j] + (a1[j] * a1[j] + a2[j] * a2[j]) * own[j]
-        misfit[j] = np.sqrt((HALF * left if left > ZERO else ZERO) + _TINY)
-
-
-@compiled
 def _find_slopes(t: int, h: int, sums: Any, spare: Any) -> None:
     """Slopes of row ``t``, wide and narrow, to ``spare[4:8]``; the moments of the narrow window stay in ``[1:4]``."""
     pooled, wide, narrow = spare[1:4], spare[4:6], spare[6:8]
     fill(ZERO, wide[0])
     fill(ZERO, wide[1])
-    _pool(t, h, _WIDE, sums, pooled)
-    _find_slope(pooled, _TRUST_WIDE, wide[0], wide[1])
+    pool(t, h, _WIDE, sums, pooled)
+    find_slope(pooled, _TRUST_WIDE, wide[0], wide[1])
     copy(wide[0], narrow[0])
     copy(wide[1], narrow[1])
-    _pool(t, h, _NARROW, sums, pooled)
-    _find_slope(pooled, _TRUST_NARROW, narrow[0], narrow[1])
+    pool(t, h, _NARROW, sums, pooled)
+    find_slope(pooled, _TRUST_NARROW, narrow[0], narrow[1])
 
 
 @compiled
@@ -329,11 +274,11 @@ def _split(colors: int, slot: int, rings: _Rings, base: Any, spare: Any) -> None
         fill(ZERO, mean)
         for c in range(colors):
             add_product(rings.s0[slot, 4 * c + cell], share, mean)
-        _offset(cosine, a1, mean, b1)
-        _offset(sine, a2, mean, b2)
-        _white_specular(b1, b2, a1, a2, tau)
+        offset(cosine, a1, mean, b1)
+        offset(sine, a2, mean, b2)
+        white_specular(b1, b2, a1, a2, tau)
         for c in range(colors):
-            _limit(rings.s0[slot, 4 * c + cell], tau)
+            limit(rings.s0[slot, 4 * c + cell], tau)
         for c in range(colors):
             subtract(rings.s0[slot, 4 * c + cell], tau, base[4 * c + cell])
         copy(cosine, base[4 * colors + 4 + cell])
@@ -346,11 +291,11 @@ def _show_samples(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> N
     samples, clipping, inverse, row = maps.first[0], maps.first[1], spare[0], spare[11]
     if samples >= 0:
         for k in range(16):
-            emit_product(rings.planes[slot, k, 1:], inverse, (maps.floats, maps.halves, samples + k, t), row)
+            emit_product(rings.planes[slot, k, 1:], inverse, (maps.floats, rings.room, samples + k, t), row)
     if clipping >= 0:
         for k in range(16):
-            emit_bits(maps.clipped[t], k, (maps.floats, maps.halves, clipping + k, t), row)
-        emit(rings.free[slot], (maps.floats, maps.halves, clipping + 16, t))
+            emit_bits(maps.clipped[t], k, (maps.floats, rings.room, clipping + k, t), row)
+        emit(rings.free[slot], (maps.floats, rings.room, clipping + 16, t))
 
 
 @compiled
@@ -359,13 +304,13 @@ def _show_split(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> Non
     base, inverse, row, images = maps.base[t], spare[0], spare[11], maps.base.shape[1] - 10
     split, contrast = maps.first[4], spare[3]
     for k in range(images):
-        emit_product(base[k], inverse, (maps.floats, maps.halves, split + k, t), row)
+        emit_product(base[k], inverse, (maps.floats, rings.room, split + k, t), row)
     for k in range(4):
-        emit(spare[4 + k], (maps.floats, maps.halves, split + images + k, t))
+        emit(spare[4 + k], (maps.floats, rings.room, split + images + k, t))
     for j in range(row.size):
         row[j] = np.sqrt(contrast[j] + _TINY)
-    emit(row, (maps.floats, maps.halves, split + images + 4, t))
-    emit_product(base[images + 9], inverse, (maps.floats, maps.halves, split + images + 5, t), row)
+    emit(row, (maps.floats, rings.room, split + images + 4, t))
+    emit_product(base[images + 9], inverse, (maps.floats, rings.room, split + images + 5, t), row)
 
 
 @compiled
@@ -378,17 +323,19 @@ def _leave(t: int, rings: _Rings, maps: Maps, spare: Any) -> None:
     _find_slopes(t, maps.base.shape[0], rings.sums, spare)
     _split(colors, slot, rings, maps.base[t], spare)
     copy(light, maps.base[t, 4 * colors + 12])
-    _misfit(rings.moments[slot], (spare[6], spare[7]), maps.base[t, 4 * colors + 13])
+    misfit(rings.moments[slot], (spare[6], spare[7]), maps.base[t, 4 * colors + 13])
     _show_samples(t, slot, rings, maps, spare)
     for first, rows in ((maps.first[2], rings.cosine[slot]), (maps.first[3], rings.sine[slot])):
         if first >= 0:
             for cell in range(4):
-                emit_product(rows[cell], inverse, (maps.floats, maps.halves, first + cell, t), row)
+                emit_product(rows[cell], inverse, (maps.floats, rings.room, first + cell, t), row)
     if maps.first[4] >= 0:
         _show_split(t, slot, rings, maps, spare)
     for j in range(row.size):
         row[j] = np.log(light[j])
-    emit(row, (maps.floats, maps.halves, maps.first[5], t))
+    emit(row, (maps.floats, rings.room, maps.first[5], t))
+    if maps.halves.size:
+        weave(rings.room, maps.halves[t])
 
 
 @compiled
@@ -405,7 +352,7 @@ def _go_on(u: int, piece: Piece, rings: _Rings, maps: Maps, spare: Any) -> None:
 def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, piece: Piece) -> None:
     """The maps and the closed form of a piece of the packed rows, by the linear filter."""
     h, w = maps.clipped.shape
-    rings, spare = _make_rings(taps.colors, w), np.zeros((_ROWS, w), np.float32)
+    rings, spare = _make_rings(taps.colors, maps), np.zeros((_ROWS, w), np.float32)
     polarized = np.empty((8 * taps.colors, w), np.float32)
     begin = max(piece[0] - REACH, 0)
     for u in range(max(begin - 1, 0), begin + 1):
@@ -422,7 +369,7 @@ def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, piece: 
 @entry
 def _map_guided_rows(source: Source, stream: Stream, maps: Maps, piece: Piece) -> None:
     h, w = maps.clipped.shape
-    rings, spare, polarized = _make_rings(3, w), np.zeros((_ROWS, w), np.float32), np.empty((24, w), np.float32)
+    rings, spare, polarized = _make_rings(3, maps), np.zeros((_ROWS, w), np.float32), np.empty((24, w), np.float32)
     rows = np.empty((2, 9, 2 * w), np.float32)
     for u in range(max(piece[0] - REACH, 0), piece[1] + REACH):
         if u < h:

@@ -17,8 +17,8 @@ from polsep.kernels.bilinear import read_pattern
 from polsep.kernels.cells import Source, read_grid
 from polsep.kernels.compiling import ONE, ZERO, compiled, entry
 from polsep.kernels.joint import Maps, Taps, map_guided_rows, map_rows
-from polsep.kernels.polarization import polarize, sum_row
-from polsep.kernels.rows import AT_ONCE, add_product, copy, fill
+from polsep.kernels.polarization import polarize
+from polsep.kernels.rows import AT_ONCE, add_product, add_up, copy
 from polsep.kernels.threads import Piece
 from polsep.kernels.unpack import as_samples
 from polsep.stokes import stokes_inverse
@@ -37,8 +37,8 @@ _CELLS = 2 * math.sqrt(2)
 class Found(NamedTuple):
     """What is known of every packed pixel: ``base [h, 4 C + 14, w]`` and ``clipped [h, w]`` as in `joint.Maps`.
 
-    ``change [h, w, 4 C + 8]``: the network's corrections, relative to the light, and for the closed form's specular
-    light relative to that. ``doubt [h, w, 8]``: standard deviations of the errors of four cells' diffuse, then
+    ``change [4 C + 8, h, w]``: the network's corrections, relative to the light, and for the closed form's specular
+    light relative to that. ``doubt [8, h, w]``: standard deviations of the errors of four cells' diffuse, then
     specular, relative to the light.
     """
 
@@ -83,15 +83,15 @@ def _write_cells(found: Found, t: int, cell: int, gains: Any, work: tuple[Target
     y, side, colors = 2 * t + cell // 2, cell % 2, gains.size
     base, light = found.base[t], found.base[t, 4 * colors + 12]
     image, tau, s0, dolp, aolp, moved = spare[0], spare[1], spare[2], spare[3], spare[4], spare[5]
-    specular, trust = base[4 * colors + cell], found.change[t, :, 4 * colors + 4 + cell]
+    specular, trust = base[4 * colors + cell], found.change[4 * colors + 4 + cell, t]
     for j in range(moved.size):
         moved[j] = specular[j] * trust[j]
-    _correct(specular, found.change[t, :, 4 * colors + cell], light, moved, tau)
+    _correct(specular, found.change[4 * colors + cell, t], light, moved, tau)
     copy(tau, s0)
     for j in range(moved.size):
         moved[j] = -moved[j]
     for c in range(colors):
-        _correct(base[4 * c + cell], found.change[t, :, 4 * c + cell], light, moved, image)
+        _correct(base[4 * c + cell], found.change[4 * c + cell, t], light, moved, image)
         add_product(image, np.float32(1 / colors), s0)
         _spread(image, gains[c], colors * side + c, targets.diffuse[y])
         _spread(tau, gains[c], colors * side + c, targets.specular[y])
@@ -102,76 +102,83 @@ def _write_cells(found: Found, t: int, cell: int, gains: Any, work: tuple[Target
     mean_gain = ZERO
     for c in range(colors):
         mean_gain += gains[c] / np.float32(colors)
+    sums = targets.sums[y]
     for kind in range(2):
-        fill(ZERO, image)
-        doubt = found.doubt[t, :, 4 * kind + cell]
-        variance = 0.0
+        doubt = found.doubt[4 * kind + cell, t]
         for j in range(image.size):
             image[j] = doubt[j] * light[j]
-            variance += image[j] * image[j]
-        targets.sums[y, 6 + kind] += variance
         _spread(image, mean_gain, 2 * side + kind, targets.error[y])
-    sums, nothing = targets.sums[y], found.clipped[0, :0]
-    sums[0] += sum_row(s0, nothing)
-    sums[1] += sum_row(tau, nothing)
+        for j in range(image.size):
+            image[j] *= image[j]
+        sums[6 + kind] += add_up(image)
+    sums[0] += add_up(s0)
+    sums[1] += add_up(tau)
     for j in range(dolp.size):
-        sums[2] += dolp[j] > ONE
-    _add_polarization(tau, s1, s2, sums[3:6])
+        moved[j] = ONE if dolp[j] > ONE else ZERO
+    sums[2] += add_up(moved)
+    _add_polarization((tau, s1, s2), image, sums[3:6])
 
 
 @compiled
-def _add_polarization(tau: Any, p1: Any, p2: Any, sums: Any) -> None:
-    """Add power, and power along and across, of the polarization where there is specular light ``tau``."""
-    power, along, across = 0.0, 0.0, 0.0
-    for j in range(tau.size):
-        power += tau[j] * np.sqrt(p1[j] * p1[j] + p2[j] * p2[j])
-        along += tau[j] * p1[j]
-        across += tau[j] * p2[j]
-    sums[0] += power
-    sums[1] += along
-    sums[2] += across
+def _add_polarization(rows: tuple[Any, Any, Any], room: Any, sums: Any) -> None:
+    """Add power, and power along and across, of the polarization ``rows[1:]`` where there is specular light."""
+    tau, p1, p2 = rows
+    for j in range(room.size):
+        room[j] = tau[j] * np.sqrt(p1[j] * p1[j] + p2[j] * p2[j])
+    sums[0] += add_up(room)
+    for j in range(room.size):
+        room[j] = tau[j] * p1[j]
+    sums[1] += add_up(room)
+    for j in range(room.size):
+        room[j] = tau[j] * p2[j]
+    sums[2] += add_up(room)
 
 
 @compiled
-def _clipped_of(clipped: Any, y: int, x: int) -> Any:
-    """A bit for each sample of the cell at ``y``, ``x`` that clips, of those of `_CELL`."""
-    return (clipped[y // 2, x // 2] >> (8 * (y % 2) + 2 * (x % 2))) & _CELL
+def _mark_clipped(clipped: Any, y: int, valid: Any, near: Any) -> int:
+    """False in ``valid [2 w]`` where all of a cell clips; how many cells of the row are near a clipped sample.
 
-
-@compiled
-def _mark_clipped(clipped: Any, y: int, valid: Any) -> int:
-    """False in ``valid [2 w]`` where all of a cell clips; how many cells of the row are near a clipped sample."""
+    ``near [2 w + 2]``, uint8: for the cells of a row and one more on both sides.
+    """
     h, w = clipped.shape
-    first, last, some = max(y - 1, 0), min(y + 1, 2 * h - 1), False
+    first, last, some = max(y - 1, 0), min(y + 1, 2 * h - 1), np.uint16(0)
     for row in range(first // 2, last // 2 + 1):
         bits = clipped[row]
         for j in range(w):
-            some |= bits[j] != 0
-    count = 0
+            some |= bits[j]
     for x in range(2 * w):
         valid[x] = True
-    if not some:
-        return count
+    if some == 0:
+        return 0
+    for x in range(near.size):
+        near[x] = 0
+    for row in range(first, last + 1):
+        bits, shift = clipped[row // 2], np.uint16(8 * (row % 2))
+        for j in range(w):
+            own = bits[j] >> shift
+            near[2 * j + 1] |= own & _CELL != 0
+            near[2 * j + 2] |= own >> 2 & _CELL != 0
+    bits, shift, count = clipped[y // 2], np.uint16(8 * (y % 2)), 0
+    for j in range(w):
+        own = bits[j] >> shift
+        valid[2 * j] = own & _CELL != _CELL
+        valid[2 * j + 1] = own >> 2 & _CELL != _CELL
     for x in range(2 * w):
-        near = False
-        for row in range(first, last + 1):
-            for col in range(max(x - 1, 0), min(x + 2, 2 * w)):
-                near |= _clipped_of(clipped, row, col) != 0
-        count += near
-        valid[x] = _clipped_of(clipped, y, x) != _CELL
+        count += near[x] | near[x + 1] | near[x + 2]
     return count
 
 
 @entry
 def write_rows(found: Found, gains: Floats, targets: Targets, piece: Piece) -> None:
     """Images of a piece of the packed rows; ``gains [C]``: the light's colour."""
-    spare = np.zeros((6, found.base.shape[2]), np.float32)
+    w = found.base.shape[2]
+    spare, near = np.zeros((6, w), np.float32), np.zeros(2 * w + 2, np.uint8)
     for t in range(piece[0], piece[1]):
         for cell in range(4):
             _write_cells(found, t, cell, gains, (targets, spare))
         for y in range(2 * t, 2 * t + 2):
-            targets.sums[y, 8] = _mark_clipped(found.clipped, y, targets.valid[y])
-            targets.sums[y, 9] = _CELLS * sum_row(found.base[t, found.base.shape[1] - 1], found.clipped[0, :0])
+            targets.sums[y, 8] = _mark_clipped(found.clipped, y, targets.valid[y], near)
+            targets.sums[y, 9] = _CELLS * add_up(found.base[t, found.base.shape[1] - 1])
 
 
 def warm_up() -> None:
@@ -182,11 +189,11 @@ def warm_up() -> None:
     base, clipped = np.zeros((size, 26, size), np.float32), np.zeros((size, size), np.uint16)
     first = np.array([-1, -1, -1, -1, -1, 0], np.int64)
     maps = Maps(np.zeros((size, size, 1), np.float32), np.zeros((0, 0, 0), np.uint16), first, base, clipped)
-    nothing = np.zeros((36, AT_ONCE), np.int64)
-    map_rows(samples, pattern, Taps(nothing.astype(np.float32), nothing, nothing, 3), maps, (0, size))
+    nothing = np.zeros((4, AT_ONCE), np.int64)
+    map_rows(samples, pattern, Taps(np.zeros((4, 9, AT_ONCE), np.float32), nothing, nothing, 3), maps, (0, size))
     grid = read_grid(pattern, layout.angles, stokes_inverse(layout.angles).float().numpy())
     map_guided_rows(Source(samples, pattern, grid), maps, (0, size))
-    found = Found(base, clipped, *(np.zeros((size, size, n), np.float32) for n in (20, 8)))
+    found = Found(base, clipped, *(np.zeros((n, size, size), np.float32) for n in (20, 8)))
     colors, pairs, grey = (np.zeros((2 * size, 2 * size * n), np.float32) for n in (3, 2, 1))
     sums = np.zeros((2 * size, SUMS))
     targets = Targets(colors, colors, pairs, np.zeros((2 * size, 2 * size), np.bool_), grey, grey, sums)

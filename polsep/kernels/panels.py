@@ -20,18 +20,34 @@ STEPS = 4096
 _ROWS = 16
 
 
-def tone_table() -> NDArray[np.uint8]:
-    """sRGB codes of `STEPS` + 1 equal steps of the square root of linear light from 0 to 1 (IEC 61966-2-1:1999)."""
-    x = (np.arange(STEPS + 1) / STEPS) ** 2
-    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
-    codes: NDArray[np.uint8] = np.rint(255 * encoded).astype(np.uint8)
-    return codes
+@compiled
+def _shrink(image: Any, y: int, factor: int, rows: Any, row: Any) -> None:
+    """Sums over squares of an image ``[H, W C]`` to ``row [w C]``; ``rows``: room for a row of the image."""
+    colors, n = row.shape[1], row.shape[0]
+    for x in range(rows.size):
+        rows[x] = ZERO
+    for k in range(factor * y, factor * y + factor):
+        line = image[k]
+        for x in range(rows.size):
+            rows[x] += line[x]
+    for c in range(colors):
+        own = rows[c:]
+        for x in range(n):
+            total = ZERO
+            for k in range(factor):
+                total += own[(factor * x + k) * colors]
+            row[x, c] = total
 
 
 @compiled
-def _code(light: Any, table: Any) -> Any:
-    limited = ONE if light > ONE else light
-    return table[int(np.sqrt(limited) * np.float32(STEPS) + np.float32(0.5))] if limited > ZERO else table[0]
+def _encode(light: Any, scale: Any, table: Any, codes: Any) -> None:
+    """Codes ``[w, 3]`` of a row of light ``[w, C]``."""
+    colors = light.shape[1]
+    for x in range(codes.shape[0]):
+        for c in range(3):
+            value = light[x, c if colors == 3 else 0] * scale
+            value = (value if value < ONE else ONE) if value > ZERO else ZERO
+            codes[x, c] = table[np.int32(np.sqrt(value) * np.float32(STEPS) + np.float32(0.5))]
 
 
 @entry
@@ -43,31 +59,34 @@ def fill_panels(
     piece: Piece,
 ) -> None:
     """Rows of ``out [h, 3 w, 3]``: the sum of both ``images [H, W, C]``, the first and the second."""
-    first, second = images
-    colors, width = first.shape[2], out.shape[1] // 3
-    factor = first.shape[0] // out.shape[0]
+    height, full, colors = images[0].shape
+    width = out.shape[1] // 3
+    factor = height // out.shape[0]
     scale = np.float32(gain / (factor * factor))
+    rows = np.empty(full * colors, np.float32)
+    one, two = np.empty((width, colors), np.float32), np.empty((width, colors), np.float32)
+    both = np.empty((width, colors), np.float32)
+    first, second = images[0].reshape(height, -1), images[1].reshape(height, -1)
     for y in range(piece[0], piece[1]):
+        _shrink(first, y, factor, rows, one)
+        _shrink(second, y, factor, rows, two)
         for x in range(width):
-            for c in range(3):
-                one, two = ZERO, ZERO
-                own = c if colors == 3 else 0
-                for row in range(factor * y, factor * y + factor):
-                    for col in range(factor * x, factor * x + factor):
-                        one += first[row, col, own]
-                        two += second[row, col, own]
-                out[y, x, c] = _code((one + two) * scale, table)
-                out[y, width + x, c] = _code(one * scale, table)
-                out[y, 2 * width + x, c] = _code(two * scale, table)
+            for c in range(colors):
+                both[x, c] = one[x, c] + two[x, c]
+        _encode(both, scale, table, out[y, :width])
+        _encode(one, scale, table, out[y, width : 2 * width])
+        _encode(two, scale, table, out[y, 2 * width :])
 
 
 def make_panels(
-    diffuse: NDArray[np.float32], specular: NDArray[np.float32], gain: float, widest: int
+    images: tuple[NDArray[np.float32], NDArray[np.float32]], gain: float, table: NDArray[np.uint8], widest: int
 ) -> NDArray[np.uint8]:
-    """Input, diffuse and specular ``[h, 3 w, 3]`` beside one another, even sides, each at most ``widest`` wide."""
-    height, width = diffuse.shape[:2]
+    """Sum, first and second of ``images [H, W, C]`` side by side, ``[h, 3 w, 3]``; sides even, at most ``widest``.
+
+    ``table``: codes of `STEPS` + 1 equal steps of the square root of linear light from 0 to 1.
+    """
+    height, width = images[0].shape[:2]
     factor = -(-max(height, width) // widest)
     out = np.empty((max(height // factor // 2 * 2, 2), 3 * max(width // factor // 2 * 2, 2), 3), np.uint8)
-    table = tone_table()
-    share(lambda rows: fill_panels((diffuse, specular), gain, table, out, rows), out.shape[0], _ROWS)
+    share(lambda rows: fill_panels(images, gain, table, out, rows), out.shape[0], _ROWS)
     return out

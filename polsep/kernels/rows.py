@@ -12,6 +12,7 @@ from polsep.kernels.compiling import ONE, ZERO, compiled
 AT_ONCE = 6
 
 _ROUND, _ODD, _SIXTEEN = np.uint32(0x7FFF), np.uint32(1), np.uint32(16)
+_SHIFTS = (np.uint64(16), np.uint64(32), np.uint64(48))
 
 
 @compiled
@@ -57,6 +58,25 @@ def sum_three(x: Any, y: Any, z: Any, total: Any) -> None:
 
 
 @compiled
+def add_up(row: Any) -> float:
+    """The sum of a row in double precision, by eight sums that a processor can make at once."""
+    a, b, c, d, e, f, g, h = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    whole = row.size - row.size % 8
+    for j in range(0, whole, 8):
+        a += row[j]
+        b += row[j + 1]
+        c += row[j + 2]
+        d += row[j + 3]
+        e += row[j + 4]
+        f += row[j + 5]
+        g += row[j + 6]
+        h += row[j + 7]
+    for j in range(whole, row.size):
+        a += row[j]
+    return ((a + b) + (c + d)) + ((e + f) + (g + h))
+
+
+@compiled
 def average(row: Any, window: int, rows: Any) -> None:
     """Divide sums over 2 ``window`` + 1 columns, fewer at the borders, and ``rows`` rows by their number."""
     w = row.size
@@ -71,36 +91,63 @@ def average(row: Any, window: int, rows: Any) -> None:
 
 
 @compiled
-def filter_row(weight: Any, taps: tuple[Any, Any], near: tuple[Any, Any], found: Any) -> None:
-    """A correlation with samples around: ``taps``: the row, 0 to 2, and the place in it, of what ``weight [K]`` weighs.
+def filter_rows(weight: Any, taps: tuple[Any, Any], near: tuple[Any, Any], found: tuple[Any, Any, Any]) -> None:
+    """Three correlations with the same samples around, each of which is read once for all three.
 
-    ``near``: all samples, and where each of the three rows begins.
+    ``weight [3, K]``; ``taps``: the row, 0 to 2, and the place in it, of what is weighed. ``near``: all samples, and
+    where each of the three rows begins.
     """
-    w, (rows, places), (x, start) = found.size, taps, near
-    for j in range(w):
-        found[j] = ZERO
-    for k in range(0, weight.size, AT_ONCE):
+    (rows, places), (x, start), (first, second, third) = taps, near, found
+    u, v, w, n = weight[0], weight[1], weight[2], first.size
+    fill(ZERO, first)
+    fill(ZERO, second)
+    fill(ZERO, third)
+    for k in range(0, places.size, AT_ONCE):
         p0, p1 = start[rows[k]] + places[k], start[rows[k + 1]] + places[k + 1]
         p2, p3 = start[rows[k + 2]] + places[k + 2], start[rows[k + 3]] + places[k + 3]
         p4, p5 = start[rows[k + 4]] + places[k + 4], start[rows[k + 5]] + places[k + 5]
         x0, x1, x2, x3, x4, x5 = x[p0:], x[p1:], x[p2:], x[p3:], x[p4:], x[p5:]
-        w0, w1, w2, w3, w4, w5 = weight[k], weight[k + 1], weight[k + 2], weight[k + 3], weight[k + 4], weight[k + 5]
-        for j in range(w):
-            found[j] += w0 * x0[j] + w1 * x1[j] + w2 * x2[j] + w3 * x3[j] + w4 * x4[j] + w5 * x5[j]
+        u0, u1, u2, u3, u4, u5 = u[k], u[k + 1], u[k + 2], u[k + 3], u[k + 4], u[k + 5]
+        v0, v1, v2, v3, v4, v5 = v[k], v[k + 1], v[k + 2], v[k + 3], v[k + 4], v[k + 5]
+        w0, w1, w2, w3, w4, w5 = w[k], w[k + 1], w[k + 2], w[k + 3], w[k + 4], w[k + 5]
+        for j in range(n):
+            a, b, c, d, e, f = x0[j], x1[j], x2[j], x3[j], x4[j], x5[j]
+            first[j] += u0 * a + u1 * b + u2 * c + u3 * d + u4 * e + u5 * f
+            second[j] += v0 * a + v1 * b + v2 * c + v3 * d + v4 * e + v5 * f
+            third[j] += w0 * a + w1 * b + w2 * c + w3 * d + w4 * e + w5 * f
 
 
 @compiled
 def emit(row: Any, target: tuple[Any, Any, int, int]) -> None:
-    """A row to a channel of float32 or bfloat16 maps, ``(floats, halves, channel, row)``; see `joint.Maps`."""
-    floats, halves, channel, t = target
+    """A row to a channel of maps, ``(floats, room, channel, row)``: to ``floats [h, w, channels]`` or, where these are
+    empty, as bfloat16 to ``room [channels, w]``, which `weave` takes on."""
+    floats, room, channel, t = target
     if floats.size:
         out = floats[t, :, channel]
         for j in range(row.size):
             out[j] = row[j]
     else:
-        bits, half = row.view(np.uint32), halves[t, :, channel]
+        bits, half = row.view(np.uint32), room[channel]
         for j in range(row.size):
             half[j] = np.uint16((bits[j] + _ROUND + ((bits[j] >> _SIXTEEN) & _ODD)) >> _SIXTEEN)
+
+
+@compiled
+def weave(planes: Any, row: Any) -> None:
+    """Channels ``planes [n, w]`` of 16 bits to a row with channels last, ``[w, n]``; four at a time where they fit."""
+    n, w = planes.shape
+    if n % 4:
+        for k in range(n):
+            plane, out = planes[k], row[:, k]
+            for j in range(w):
+                out[j] = plane[j]
+        return
+    fours = row.reshape(-1).view(np.uint64)
+    for k in range(0, n, 4):
+        a, b, c, d, out = planes[k], planes[k + 1], planes[k + 2], planes[k + 3], fours[k // 4 :: n // 4]
+        for j in range(w):
+            low = np.uint64(a[j]) | np.uint64(b[j]) << _SHIFTS[0]
+            out[j] = low | np.uint64(c[j]) << _SHIFTS[1] | np.uint64(d[j]) << _SHIFTS[2]
 
 
 @compiled

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from typing import TypeVar
 
 Result = TypeVar("Result")
@@ -38,6 +39,15 @@ class _State:
     helpers: int = 0
 
 
+class _Own(threading.local):
+    """What one thread was told about its ``threads``."""
+
+    threads: int | None = None
+
+
+_OWN = _Own()
+
+
 def _forget_pool() -> None:
     """In a forked child: the pool's threads have stayed behind, and the lock may have been held by one of them."""
     _State.lock, _State.pool, _State.helpers = threading.Lock(), None, 0
@@ -54,7 +64,7 @@ def get_threads() -> int:
     ``NUMBA_NUM_THREADS`` and ``OMP_NUM_THREADS`` where these are set when kernels are imported. Quotas of CPU time, as
     containers have them, are not seen.
     """
-    return _State.threads
+    return _OWN.threads or _State.threads
 
 
 def set_threads(count: int) -> None:
@@ -65,6 +75,16 @@ def set_threads(count: int) -> None:
     if count < 1:
         raise ValueError(f"expected at least one thread, found {count}")
     _State.threads = int(count)
+
+
+@contextmanager
+def own_threads(count: int) -> Iterator[None]:
+    """Inside, kernels that this thread calls use ``count`` threads, whatever `set_threads` says; not nested."""
+    _OWN.threads = count
+    try:
+        yield
+    finally:
+        _OWN.threads = None
 
 
 def _start_helpers(work: Callable[[], None], count: int) -> list[Future[None]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from functools import partial
 
@@ -18,6 +19,7 @@ from polsep.joint import INPUTS, PERIOD, Demosaicker, Joint
 from polsep.joint_engine import JointImages, OpenVinoEngine, run_engine
 from polsep.kernels import get_threads, set_threads
 from polsep.kernels.bilinear import read_pattern
+from polsep.kernels.threads import own_threads
 from polsep.kernels.unpack import as_samples
 from polsep.mosaic_network import own_order, run_joint
 from polsep.networks import ResidualSize
@@ -194,6 +196,26 @@ def test_frames_of_any_orientation_and_side(layout: Layout, turn: str, shipped: 
     grey = white.stokes.map(lambda s: s.mean(dim=-3))
     polarized = dolp(grey) > 0.05
     assert_same_angle(torch.from_numpy(found.aolp)[polarized], aolp(grey)[polarized], NOISE)
+
+
+def test_threads_with_engines_of_their_own_find_the_same(shipped: None) -> None:
+    """Frames of two sizes by two threads at once, one engine each, are those of one thread after another."""
+    sizes = [(32, 48), (48, 32), (32, 48), (32, 48)]
+    frames = [random_frame(*size, COLOR, most) for size, most in zip(sizes, (4095, 4095, 2000, 1000), strict=True)]
+
+    def separate(frame: Mosaic) -> JointImages:
+        with own_threads(1):
+            found = run_engine("joint", frame)
+        assert found is not None
+        return found
+
+    alone = [run_engine("joint", frame) for frame in frames]
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(separate, frames * 3))
+    for found, expected in zip(together, alone * 3, strict=True):
+        for field in fields(JointImages):
+            one, other = (getattr(images, field.name) for images in (found, expected))
+            assert one == other if field.name == "tally" else np.array_equal(one, other)
 
 
 def test_what_it_does_not_take_is_left_to_torch(shipped: None, monkeypatch: pytest.MonkeyPatch) -> None:

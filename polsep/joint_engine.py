@@ -265,9 +265,9 @@ _MAKING = threading.Lock()
 
 def _make_engine(job: _Job) -> OpenVinoEngine:
     """One at a time: torch cannot trace two modules at once."""
-    network, _ = find_joint(job.method, Layout() if job.colors == 3 else Layout(bayer=None), None)
-    logging.getLogger("polsep").debug("compiling %s for frames of %dx%d", job.method, *job.shape)
     with _MAKING:
+        network, _ = find_joint(job.method, Layout() if job.colors == 3 else Layout(bayer=None), None)
+        logging.getLogger("polsep").debug("compiling %s for frames of %dx%d", job.method, *job.shape)
         return OpenVinoEngine(network, job.shape)
 
 

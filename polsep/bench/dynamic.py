@@ -39,6 +39,8 @@ COMPARED = ("color-affine", "joint-fast", "joint")
 QUICK = range(15, 25)
 #: Cells between what is ``apart`` and any change: the reach of the closed form's largest window.
 APART = 12
+#: Regions and metrics whose change is shown.
+SHOWN = (("still", "flicker"), ("apart", "flicker"), ("still", "PSNR"), ("moving", "PSNR"))
 #: Fewest cells of a region that are worth a score.
 LEAST_CELLS = 100
 #: Size of a frame of the camera, and how often the filter is timed on it.
@@ -145,10 +147,9 @@ def _compare(film: str, method: str, alone: Tally, variants: dict[str, Tally]) -
         for region, metric, unit, value in tally.scores():
             yield Row("dynamic", f"{film}, {region}", f"{method}, {variant}", metric, value, unit)
             old, ratio = before[region, metric][1], metric.endswith("flicker")
-            change = value / old if ratio else value - old
-            yield Row(
-                "dynamic/change", f"{film}, {region}", f"{method}, {variant}", metric, change, "1" if ratio else unit
-            )
+            change, unit = (value / old, "1") if ratio else (value - old, unit)
+            if (region, metric.split()[-1]) in SHOWN:
+                yield Row("dynamic/change", film, f"{method}, {variant}", f"{metric}, {region}", change, unit)
 
 
 def find_regions(mask: Tensor, still: Tensor) -> dict[str, Tensor]:

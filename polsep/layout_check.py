@@ -36,8 +36,8 @@ MIN_RATIO = 2.0
 #: second it is mono or sees grey. Real mono frames show up to 0.012, real colour frames 0.10 and 0.19.
 MIN_COLOR, MAX_MONO = 0.04, 0.02
 
-#: Rows of a strip, and from one strip to the next; multiples of the blocks' 16.
-STRIP, STEP = 64, 256
+#: Strips of a large frame, rows of one, a multiple of the blocks' 16, and how many times that a frame has to have.
+STRIPS, STRIP, LARGE = 4, 64, 16
 
 _PAIRINGS = {
     "diagonals": np.array([1.0, -1.0, -1.0, 1.0], np.float32),
@@ -76,14 +76,14 @@ def crossed_pairs(layout: Layout) -> str | None:
 
 
 def _strips(mosaic: Mosaic) -> list[Floats]:
-    """The first frame's samples; of a large one `STRIP` rows out of every `STEP`: as sure, in a quarter of the time.
+    """The first frame's samples; of a large one `STRIPS` of them: as sure, in an eighth of the time.
 
     All that follows is NumPy's, in this thread: torch would wake its others for every step, which takes less than that.
     """
     frame = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0]
     height = frame.shape[0]
-    tops = range(0, height - STRIP + 1, STEP) if height >= 4 * STEP else [0]
-    size = STRIP if height >= 4 * STEP else height
+    step = height // STRIPS // STRIP * STRIP
+    tops, size = (range(0, STRIPS * step, step), STRIP) if height >= LARGE * STRIP else (range(1), height)
     return [frame[top : top + size].detach().cpu().numpy().astype(np.float32, copy=False) for top in tops]
 
 

@@ -14,11 +14,13 @@ pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
 pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 
 from polsep import testsets
+from polsep.bench.ablations import ablation_entry, find_ablations
 from polsep.bench.joint import BINS, enlarge, full_entries, measure_reliability, see_full
 from polsep.bench.rendering import bench_rendering
 from polsep.bench.scoring import Entry, Protocol, score_case, score_sets, see_clean, see_co_sited, see_noisy
 from polsep.bench.sets import bench_sets
 from polsep.demosaic import demosaic_bilinear_half, mean_cells
+from polsep.io.weights import read_weights
 from polsep.methods import METHODS, compose
 from polsep.metrics import psnr, reliability
 from polsep.mosaic_network import NAMES
@@ -134,3 +136,18 @@ def test_sets_without_their_data_are_left_out(tmp_path: Path, capsys: pytest.Cap
     assert capsys.readouterr().err == (
         f"polsep: the set first is left out: expected {tmp_path}/nowhere/a.png, found none\n"
     )
+
+
+def test_ablations_differ_in_what_they_go_without_alone() -> None:
+    """One size, one seed, one schedule, the same examples; each runs and scores something of its own."""
+    joint_task = pytest.importorskip("polsep.train.joint_task", reason="training needs the extra 'train'")
+    found = find_ablations()
+    assert next(iter(found)) == "none" and set(found) == set(joint_task.ABLATIONS)
+    records = [read_weights(path)[1] for path in found.values()]
+    for key in ("method", "variant", "seed", "schedule", "stream", "data", "size"):
+        assert len({record[key] for record in records}) == 1, key
+    case = build_case(GREY)
+    entries = tuple(ablation_entry(name, path) for name, path in found.items())
+    scores = list(score_case(case, [Protocol("noisy", see_noisy, entries)]))
+    psnrs = [score.value for score in scores if score.metric == "specular PSNR"]
+    assert len(set(psnrs)) == len(found)

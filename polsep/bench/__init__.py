@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from polsep.bench.ablations import bench_ablations
 from polsep.bench.calibration import bench_calibration
 from polsep.bench.dynamic import bench_dynamic, bench_dynamic_quick
 from polsep.bench.exactness import bench_exactness
@@ -52,6 +53,7 @@ BENCHES: dict[str, Bench] = {
     "rendering": Bench(bench_rendering),
     "sets": Bench(bench_sets),
     "joint": Bench(bench_joint),
+    "ablations": Bench(bench_ablations),
     "dynamic": Bench(bench_dynamic, bench_dynamic_quick),
     "calibration": Bench(bench_calibration),
     "video": Bench(bench_video, bench_video_quick),

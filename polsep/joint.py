@@ -38,8 +38,9 @@ PERIOD = 4
 INPUTS = ("samples", "clipping", "cosine", "sine", "split")
 #: Brightness around that counts as black: below it inputs and corrections fade.
 LEAST_LIGHT = 0.01
-#: Expected log variances at most, so that their exponentials are finite: an error of 150 times the light around.
-MOST_DOUBT = 10.0
+#: Log variances of diffuse and specular that are expected at most: errors of 2 and 26 times the light around, which are
+#: those of the hundredth of the validation views where they are largest (docs/experiments.md).
+MOST_DOUBT = (1.5, 6.5)
 #: Windows of the slope in packed pixels, and the contrast of colours, relative to the brightness and squared, below
 #: which they fall back to the wider window and to zero. Chosen on validation views (docs/experiments.md).
 WINDOWS, TRUST = (9, 3), (3e-3, 3e-3)
@@ -101,6 +102,7 @@ class Joint(nn.Module):
     """
 
     demosaic: Tensor | None
+    most_doubt: Tensor
 
     def __init__(
         self, colors: int, size: ResidualSize, inputs: tuple[str, ...] = INPUTS, demosaicker: Demosaicker = "linear"
@@ -122,6 +124,8 @@ class Joint(nn.Module):
         self.pose = nn.Conv2d(size.widths[0], 4, 1)
         nn.init.zeros_(self.pose.weight)
         nn.init.zeros_(self.pose.bias)  # type: ignore[arg-type]
+        most = torch.tensor(MOST_DOUBT).repeat_interleave(4).view(1, 8, 1, 1)
+        self.register_buffer("most_doubt", most, persistent=False)
         self.doubt = nn.Sequential(nn.Conv2d(size.widths[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 8, 1))
 
     def forward(self, raw: Tensor, clipped: Tensor) -> tuple[Images, Pose]:
@@ -166,7 +170,8 @@ class Joint(nn.Module):
             half, total = self.demosaicked(planes, full)
             guess = self.guess(half, planes, masks)
         features = self.net(guess.maps)
-        return total, guess, features, pixel_shuffle(self.doubt(features.detach()).float().clamp(max=MOST_DOUBT), 2)
+        doubt = self.doubt(features.detach()).float()
+        return total, guess, features, pixel_shuffle(torch.minimum(doubt, self.most_doubt), 2)
 
     def demosaicked(self, planes: Tensor, full: bool) -> tuple[Tensor, Tensor]:
         """Of packed samples s0, s1, s2 at half resolution ``[N, 12 C, h, w]``, and s0 at full resolution or nothing."""

@@ -24,7 +24,7 @@ from torch.nn.functional import conv2d
 
 from polsep.camera import Layout, Mosaic
 from polsep.engine import make_ready
-from polsep.joint import INPUTS, MOST_DOUBT, PERIOD, Joint, pool_outputs
+from polsep.joint import INPUTS, PERIOD, Joint, pool_outputs
 from polsep.mosaic_network import MOST_PIXELS, find_joint, own_order
 from polsep.orient import Orientation, orient
 from polsep.report import Tally
@@ -63,7 +63,7 @@ class Layers(nn.Module):
 
     def __init__(self, network: Joint) -> None:
         super().__init__()
-        self.net, self.doubt = network.net, network.doubt
+        self.net, self.doubt, self.most_doubt = network.net, network.doubt, network.most_doubt
         assert network.last.bias is not None
         weight, bias = (pool_outputs(x) for x in (network.last.weight, network.last.bias))
         if network.trust is None:
@@ -76,7 +76,8 @@ class Layers(nn.Module):
     def forward(self, maps: Tensor) -> tuple[Tensor, Tensor]:
         """Relative to the light and to the closed form, at half resolution; see `kernels.joint_images.Found`."""
         features = self.net(maps)
-        return conv2d(features, self.weight, self.bias), torch.exp(0.5 * self.doubt(features).clamp(max=MOST_DOUBT))
+        doubt = torch.minimum(self.doubt(features), self.most_doubt)
+        return conv2d(features, self.weight, self.bias), torch.exp(0.5 * doubt)
 
 
 class OpenVinoEngine:

@@ -13,6 +13,7 @@ Images are linear light ``[h, w, C]``, float32; masks ``[h, w]`` in [0, 1]; sigm
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,10 @@ Floats = NDArray[np.float32]
 
 #: Where g ends, in sigmas.
 REACH = 6.0
-#: Rows of the image that one product makes.
-_ROWS = 128
+#: Rows, or columns, that one product makes: fewest and most.
+_ROWS = (32, 128)
+#: Less light than this is none.
+_DARK = np.float32(1e-30)
 #: Steps of Richardson and Lucy. Each halves errors of broad shapes, about, and adds noise.
 STEPS = 4
 
@@ -32,11 +35,12 @@ def blur(image: Floats, sigma: float, mask: Floats | None = None) -> Floats:
 
     Stays non-negative. At sigma 0 the values are the image's own.
     """
+    weights = _weights(sigma)
+    light = _as_planes(image)
     if mask is None:
-        return _gaussian(image, sigma)
-    inside = mask[..., None]
-    spread = inside * _gaussian(inside * image / _reached(mask, sigma), sigma)
-    return (1 - inside) * image + spread
+        return _as_image(_gaussian(light, weights))
+    spread = mask * _gaussian(mask * light / _reached(mask, weights), weights)
+    return _as_image((1 - mask) * light + spread)
 
 
 def deblur(image: Floats, sigma: float, mask: Floats | None = None) -> Floats:
@@ -46,37 +50,51 @@ def deblur(image: Floats, sigma: float, mask: Floats | None = None) -> Floats:
     columns of A sum to 1. Detail that a blur took below the noise does not return; the noise grows.
     Source: Richardson 1972, doi 10.1364/JOSA.62.000055; Lucy 1974, doi 10.1086/111605.
     """
-    inside = np.float32(1) if mask is None else mask[..., None]
-    reached = np.float32(1) if mask is None else _reached(mask, sigma)
-    measured = inside * image
+    weights = _weights(sigma)
+    light = _as_planes(image)
+    if mask is None:
+        return _as_image(_richardson_lucy(light, lambda x: _gaussian(x, weights), lambda x: _gaussian(x, weights)))
+    inside, reached = mask, _reached(mask, weights)
+
+    def blurred(x: Floats) -> Floats:
+        return inside * _gaussian(x / reached, weights)
+
+    def transposed(x: Floats) -> Floats:
+        return _gaussian(inside * x, weights) / reached
+
+    return _as_image((1 - mask) * light + _richardson_lucy(mask * light, blurred, transposed))
+
+
+def _richardson_lucy(
+    measured: Floats, blurred: Callable[[Floats], Floats], transposed: Callable[[Floats], Floats]
+) -> Floats:
+    """The image that ``blurred`` maps to ``measured``, about; ``transposed``: its adjoint."""
     found = measured
     for _ in range(STEPS):
-        seen = inside * _gaussian(found / reached, sigma)
-        ratio = np.divide(measured, seen, out=np.zeros_like(measured), where=seen > 0)
-        found = found * (_gaussian(inside * ratio, sigma) / reached)
-    return found if mask is None else (1 - inside) * image + found
+        found = found * transposed(measured / np.maximum(blurred(found), _DARK))
+    return found
 
 
-def _reached(mask: Floats, sigma: float) -> Floats:
-    """G m ``[h, w, 1]``, and 1 where that is 0, so that one may divide by it."""
-    share = _gaussian(mask[..., None], sigma)
+def _reached(mask: Floats, weights: Floats) -> Floats:
+    """G m ``[h, w]``, and 1 where that is 0, so that one may divide by it."""
+    share = _gaussian(mask[None], weights)[0]
     return np.where(share > 0, share, np.float32(1))
 
 
-def _gaussian(image: Floats, sigma: float) -> Floats:
-    """G x along both axes of ``[h, w, C]``."""
-    weights = _weights(sigma)
-    if len(weights) == 1:
-        return image
-    height, width, colors = image.shape
-    columns = _along_rows(image.reshape(height, width * colors), weights).reshape(height, width, colors)
-    turned = np.ascontiguousarray(columns.transpose(1, 0, 2)).reshape(width, height * colors)
-    return np.ascontiguousarray(_along_rows(turned, weights).reshape(width, height, colors).transpose(1, 0, 2))
+def _as_planes(image: Floats) -> Floats:
+    """``[C, h, w]``, contiguous."""
+    return np.ascontiguousarray(image.transpose(2, 0, 1))
+
+
+def _as_image(planes: Floats) -> Floats:
+    """``[h, w, C]``, contiguous."""
+    return np.ascontiguousarray(planes.transpose(1, 2, 0))
 
 
 def _weights(sigma: float) -> Floats:
     """g from -k to k, of sum 1; a single 1 where neighbours would get less than the last bit of float32."""
-    places = np.arange(-math.ceil(REACH * sigma), math.ceil(REACH * sigma) + 1, dtype=np.float64)
+    reach = math.ceil(REACH * sigma)
+    places = np.arange(-reach, reach + 1, dtype=np.float64)
     with np.errstate(over="ignore", under="ignore"):
         weights = np.exp(-0.5 * (places / sigma) ** 2) if sigma > 0 else np.ones(1)
     weights = weights[weights > 1e-9]
@@ -84,18 +102,28 @@ def _weights(sigma: float) -> Floats:
     return scaled
 
 
-def _along_rows(image: Floats, weights: Floats) -> Floats:
-    """Blur ``[n, m]`` along its first axis, as products of one banded matrix with `_ROWS` rows at a time.
+def _gaussian(planes: Floats, weights: Floats) -> Floats:
+    """G x along both axes of ``[C, h, w]``, as products of one banded matrix with some rows, or columns, at a time.
 
-    The fastest way there is without a compiled kernel: matrix products use all cores.
+    Matrix products use all cores, and are the fastest there is without a compiled kernel.
     """
-    reach, rows = len(weights) // 2, image.shape[0]
-    padded = np.pad(image, ((reach, reach), (0, 0)), mode="symmetric")
-    band = np.zeros((_ROWS, _ROWS + 2 * reach), np.float32)
-    for row in range(_ROWS):
+    reach = len(weights) // 2
+    if reach == 0:
+        return planes
+    some = min(max(2 * reach, _ROWS[0]), _ROWS[1])
+    band = np.zeros((some, some + 2 * reach), np.float32)
+    for row in range(some):
         band[row, row : row + len(weights)] = weights
-    out = np.empty_like(image)
-    for top in range(0, rows, _ROWS):
-        some = min(_ROWS, rows - top)
-        np.matmul(band[:some, : some + 2 * reach], padded[top : top + some + 2 * reach], out=out[top : top + some])
+    down, out = np.empty_like(planes), np.empty_like(planes)
+    padded = np.pad(planes, ((0, 0), (reach, reach), (0, 0)), mode="symmetric")
+    for top, n in _pieces(planes.shape[1], some):
+        np.matmul(band[:n, : n + 2 * reach], padded[:, top : top + n + 2 * reach], out=down[:, top : top + n])
+    padded = np.pad(down, ((0, 0), (0, 0), (reach, reach)), mode="symmetric")
+    for left, n in _pieces(planes.shape[2], some):
+        out[..., left : left + n] = padded[..., left : left + n + 2 * reach] @ band[:n, : n + 2 * reach].T
     return out
+
+
+def _pieces(count: int, some: int) -> Iterator[tuple[int, int]]:
+    """Beginnings and lengths of pieces of at most ``some``."""
+    yield from ((start, min(some, count - start)) for start in range(0, count, some))

@@ -30,9 +30,9 @@ _SHORTEST = 0.5
 
 
 def read_map(path: Path, kind: str) -> Floats:
-    """The ``texture [h, w, C]``, ``mask [h, w]`` or ``normals [h, w, 3]`` of a file, float32. Raises InputError.
+    """The ``texture [h, w, C]``, ``mask [h, w]`` or ``normals [h, w, 3]`` of a file, float32, read-only.
 
-    Normals are made unit vectors; shorter ones than half of that, and those away from the camera, become 0.
+    Raises InputError. Normals are made unit vectors; shorter ones than half of that, and those away from the camera, become 0.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -43,7 +43,9 @@ def read_map(path: Path, kind: str) -> Floats:
         found = decode(codes)
         if not np.isfinite(found).all():
             raise InputError("expected finite values, found NaN or infinite ones")
-    return np.ascontiguousarray(found, dtype=np.float32)
+    kept = np.ascontiguousarray(found, dtype=np.float32)
+    kept.flags.writeable = False
+    return kept
 
 
 def hash_map(path: Path) -> str:

@@ -32,7 +32,8 @@ _SHORTEST = 0.5
 def read_map(path: Path, kind: str) -> Floats:
     """The ``texture [h, w, C]``, ``mask [h, w]`` or ``normals [h, w, 3]`` of a file, float32, read-only.
 
-    Raises InputError. Normals are made unit vectors; shorter ones than half of that, and those away from the camera, become 0.
+    Normals are made unit vectors; shorter ones than half of that, and those away from the camera, become 0. Raises
+    InputError.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:

@@ -322,18 +322,18 @@ def as_picture(frame: Separated, images: Images, look: Look, preview: bool) -> P
     line = {"frame": frame.index, **report["statistics"]}
     if report["warnings"]:
         line["warnings"] = report["warnings"]
-    return Picture(diffuse, specular, _panels(diffuse, specular, look.gain) if preview else None, line)
+    return Picture(diffuse, specular, draw_panels(diffuse, specular, look.gain) if preview else None, line)
 
 
-def _panels(diffuse: Floats, specular: Floats, gain: float) -> NDArray[np.uint8]:
-    """Input, diffuse and specular to watch."""
+def draw_panels(diffuse: Floats, specular: Floats, gain: float) -> NDArray[np.uint8]:
+    """Input, diffuse and specular ``[h, w, C]`` to watch, sRGB ``uint8 [h', 3 w', 3]``, at a ``gain``."""
     return make_panels((diffuse, specular), gain, _TONES, PANEL)
 
 
 def _missing(damaged: Damaged, look: Look, preview: bool) -> Picture:
     """A black picture."""
     black = np.zeros(look.size, np.float32)
-    panels = _panels(black, black, 1.0) if preview else None
+    panels = draw_panels(black, black, 1.0) if preview else None
     return Picture(black, black, panels, {"frame": damaged.index, "damaged": damaged.reason})
 
 

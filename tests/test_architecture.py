@@ -55,6 +55,7 @@ RANKS = {
     "workers": 1,
     "video": 6,
     "dataset": 6,
+    "edit": 6,
     "bench": 6,
     "testsets": 6,
     "train": 6,
@@ -92,6 +93,8 @@ WITHIN = {
     ("testsets", "testsets"),
     ("train", "train"),
     ("capture", "capture"),
+    ("edit", "edit"),
+    ("edit", "video"),
     ("cli", "cli"),
 }
 #: Libraries that only one room may use.

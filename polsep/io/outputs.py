@@ -24,7 +24,7 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -48,15 +48,17 @@ LAYERS = ("diffuse", "specular", "dolp", "aolp", "valid")
 #: The layer of frames whose method expects an error: two channels, for diffuse and specular.
 ERROR = "error"
 
-_LIGHT = "linear light, 1.0 = one measurement at the white level (an unclipped s0 = diffuse + specular reaches 2)"
+#: The unit of images.
+LIGHT = "linear light, 1.0 = one measurement at the white level (an unclipped s0 = diffuse + specular reaches 2)"
 #: What the numbers in EXR, NPZ and TIFF files mean.
 UNITS = {
-    "diffuse": _LIGHT,
-    "specular": f"{_LIGHT}; may exceed 2 where highlights were clipped",
+    "diffuse": LIGHT,
+    "specular": f"{LIGHT}; may exceed 2 where highlights were clipped",
     "dolp": "degree of linear polarization, 0 to 1; above 1 by noise",
     "aolp": "angle of linear polarization in radians, in [0, pi), from image-right toward image-up",
     "valid": "1 (TIFF: 255) where the separation is trustworthy, else 0",
     ERROR: "expected standard deviation of the error of diffuse and of specular, over all colours, in their unit",
+    "combined": f"{LIGHT}; the sum of diffuse and specular, as edited",
 }
 #: What the codes in the PNG set mean.
 PNG_UNITS = {
@@ -114,11 +116,22 @@ def write_separation(
     directory = Path(directory)
     refuse_targets(directory, targets, overwrite)
     _check_frame(frame)
+    write_all(targets, stem, lambda folder: _stage(frame, folder, stem, format))
+    return [directory / name for name in _file_names(stem, format, _layers(frame))]
+
+
+def write_all(targets: list[Path], stem: str, stage: Callable[[Path], None]) -> None:
+    """Let ``stage`` write files into a folder, and move them to the ``targets`` of the same names, in one directory.
+
+    All or nothing, as in `write_separation`; a target that was not staged is removed. Makes the directory. Raises
+    OutputError, naming ``stem``, when anything fails.
+    """
+    directory = targets[0].parent
     made = [d for d in (directory, *directory.parents) if not os.path.exists(d)]
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with _unbroken():
-            _write_and_move(frame, targets, stem, format)
+            _write_and_move(targets, stage)
     except BaseException as error:
         for path in made:
             with suppress(OSError):
@@ -129,7 +142,6 @@ def write_separation(
         raise OutputError(
             f"expected to write {stem!r} into {directory}, found {type(error).__name__}: {reason}"
         ) from error
-    return [directory / name for name in _file_names(stem, format, _layers(frame))]
 
 
 def refuse_targets(directory: Path, targets: list[Path], overwrite: bool) -> None:
@@ -202,13 +214,13 @@ def _flat_names(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]
     return flat
 
 
-def _write_and_move(frame: SeparatedFrame, targets: list[Path], stem: str, format: str) -> None:
+def _write_and_move(targets: list[Path], stage: Callable[[Path], None]) -> None:
     """Write into a hidden directory beside the targets, then rename; that directory is gone afterwards."""
     staging = Path(tempfile.mkdtemp(prefix=".polsep-", dir=targets[0].parent))
     try:
         (staging / "new").mkdir()
         (staging / "old").mkdir()
-        _stage(frame, staging / "new", stem, format)
+        stage(staging / "new")
         _move_into_place(staging, targets)
         shutil.rmtree(staging / "old", ignore_errors=True)
     finally:
@@ -220,12 +232,9 @@ def _write_and_move(frame: SeparatedFrame, targets: list[Path], stem: str, forma
 
 def _stage(frame: SeparatedFrame, folder: Path, stem: str, format: str) -> None:
     """Write every output of ``frame`` into ``folder``, the sidecar last."""
-    files = []
-    for name, data in _encoded_files(frame, stem, format):
-        write_checked(folder / name, data)
-        files.append({"name": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()})
+    files = write_hashed(folder, _encoded_files(frame, stem, format))
     sidecar: dict[str, Any] = {
-        "polsep": _version(),
+        "polsep": version_text(),
         "source": frame.report.get("source"),
         "format": format,
         "shape": list(frame.diffuse.shape),
@@ -237,6 +246,15 @@ def _stage(frame: SeparatedFrame, folder: Path, stem: str, format: str) -> None:
     if format == "png":
         sidecar["limited_samples"] = _limited_samples(frame)
     write_checked(folder / f"{stem}.json", (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
+
+
+def write_hashed(folder: Path, encoded: Iterable[tuple[str, bytes | memoryview]]) -> list[dict[str, Any]]:
+    """Write files by name into ``folder``; name, size and sha256 of each, for a sidecar."""
+    files = []
+    for name, data in encoded:
+        write_checked(folder / name, data)
+        files.append({"name": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()})
+    return files
 
 
 def _move_into_place(staging: Path, targets: list[Path]) -> None:
@@ -273,8 +291,8 @@ def _encoded_files(frame: SeparatedFrame, stem: str, format: str) -> Iterator[tu
             yield f"{stem}_{layer}.tiff", _encode_tiff(frame, layer)
     else:
         for layer in _layers(frame):
-            yield f"{stem}_{layer}.png", _encode_png(_png_codes(frame, layer))
-    yield f"{stem}.png", _encode_png(contact_sheet(frame))
+            yield f"{stem}_{layer}.png", encode_png(_png_codes(frame, layer))
+    yield f"{stem}.png", encode_png(contact_sheet(frame))
 
 
 def _encode_exr(frame: SeparatedFrame) -> memoryview:
@@ -285,7 +303,7 @@ def _encode_exr(frame: SeparatedFrame) -> memoryview:
             planes[f"{layer}.{color}"] = image[..., k]
     if frame.error is not None:
         planes |= {f"{ERROR}.{image}": frame.error[..., k] for k, image in enumerate(("diffuse", "specular"))}
-    notes = {"polsepVersion": _version(), **{f"{layer}Units": UNITS[layer] for layer in _layers(frame)}}
+    notes = {"polsepVersion": version_text(), **{f"{layer}Units": UNITS[layer] for layer in _layers(frame)}}
     return encode_exr({name: plane.astype(np.float32) for name, plane in planes.items()}, notes)
 
 
@@ -313,13 +331,13 @@ def _encode_tiff(frame: SeparatedFrame, layer: str) -> bytes:
         compression="zlib",
         predictor=predictor,
         description=f"{layer}: {UNITS[layer]}",
-        software=f"polsep {_version()}",
+        software=f"polsep {version_text()}",
         metadata=None,
     )
     return stream.getvalue()
 
 
-def _encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+def encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     """``[H, W]`` or ``[H, W, 3]`` codes as they are; no colour space is claimed."""
     return bytes(imagecodecs.png_encode(np.ascontiguousarray(pixels)))
 
@@ -357,7 +375,7 @@ def _flat(image: NDArray[Any]) -> NDArray[Any]:
     return image[..., 0] if image.ndim == 3 and image.shape[-1] == 1 else image
 
 
-def _version() -> str:
+def version_text() -> str:
     """The version of the installed polsep."""
     try:
         return importlib.metadata.version("polsep")

@@ -138,14 +138,14 @@ def live_sheet(frame: SeparatedFrame) -> Pixels:
     total = diffuse + specular
     gain = exposure_of(total)
     gap = np.full((total.shape[0], GUTTER, 3), BACKGROUND, np.uint8)
-    return np.concatenate([_toned(total, gain), gap, _toned(diffuse, gain), gap, _toned(specular, gain)], axis=1)
+    return np.concatenate([toned(total, gain), gap, toned(diffuse, gain), gap, toned(specular, gain)], axis=1)
 
 
 def _panels(frame: SeparatedFrame, total: Values, flags: list[Flag]) -> list[Panel]:
     """The six pictures of the contact sheet in reading order, all of one size; ``total`` is the linear input."""
     gain = exposure_of(total)
     dolp, aolp = _shrunk_polarization(frame, total.mean(axis=-1))
-    combined, diffuse, specular = (_toned(_shrunk(image), gain) for image in (total, frame.diffuse, frame.specular))
+    combined, diffuse, specular = (toned(_shrunk(image), gain) for image in (total, frame.diffuse, frame.specular))
     exposure = f"exposure x {gain:.3g}"
     return [
         Panel("Input", exposure, combined),
@@ -162,8 +162,8 @@ def _to_bytes(display: Values) -> Pixels:
     return np.rint(np.clip(display, 0, 1) * 255).astype(np.uint8)
 
 
-def _toned(image: Values, gain: float) -> Pixels:
-    """A linear image ``[H, W, C]`` as sRGB ``uint8 [H, W, 3]``."""
+def toned(image: Values, gain: float) -> Pixels:
+    """A linear image ``[H, W, C]``, times ``gain``, as sRGB ``uint8 [H, W, 3]``."""
     return _to_bytes(np.broadcast_to(srgb(gain * image), (*image.shape[:2], 3)))
 
 

@@ -37,12 +37,16 @@ State = dict[str, NDArray[Any]]
 
 
 class Picture(NamedTuple):
-    """What is kept of a frame: float32 ``diffuse``, ``specular [h, w, C]``, ``panels`` to watch, a ``line`` to log."""
+    """What is kept of a frame: float32 ``diffuse``, ``specular [h, w, C]``, ``panels`` to watch, a ``line`` to log.
+
+    ``combined``: for EXR files only, of frames that were edited.
+    """
 
     diffuse: NDArray[np.float32]
     specular: NDArray[np.float32]
     panels: NDArray[np.uint8] | None
     line: dict[str, Any]
+    combined: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -204,9 +208,12 @@ class Part:
 
 
 def write_exr(path: Path, picture: Picture, compression: str) -> None:
-    """One part of half floats, layers diffuse and specular, beside its place and then renamed."""
-    planes = as_half_planes({"diffuse": picture.diffuse, "specular": picture.specular})
-    notes = {f"{layer}Units": UNITS[layer] for layer in ("diffuse", "specular")}
+    """One part of half floats, layers diffuse, specular and any combined, beside its place and then renamed."""
+    layers = {"diffuse": picture.diffuse, "specular": picture.specular}
+    if picture.combined is not None:
+        layers["combined"] = picture.combined
+    planes = as_half_planes(layers)
+    notes = {f"{layer}Units": UNITS[layer] for layer in layers}
     with beside(path) as part:
         if compression == "none":
             write_exr_halves(part, planes, notes)

@@ -1,0 +1,269 @@
+"""Edits on files: separated frames in, edited frames out, single ones and sequences.
+
+Nothing is skipped silently: a frame that is missing or damaged ends a sequence, or is named and left out. Inputs are
+never overwritten. The same recipe on the same files writes the same bytes, however often a run was stopped.
+
+Previews show the input's exposure, or less where edits add light; in sequences, that of the first frame.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field
+from os.path import realpath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polsep.edit.images import Maps, SeparatedImages
+from polsep.edit.parameters import EditError
+from polsep.edit.recipe import Recipe, apply, recipe_as_data, recipe_from_text
+from polsep.io.edited import EditedFrame, edited_targets, read_recipe_text, write_edited, write_preview
+from polsep.io.errors import InputError, input_error
+from polsep.io.maps import hash_map, read_map
+from polsep.io.outputs import OutputError, refuse_targets
+from polsep.io.previews import exposure_of, toned
+from polsep.io.separated import Numbered, find_numbered, read_separated
+from polsep.io.sequences import PART, Part, Picture, SequenceKind
+from polsep.io.sequences import Sequence as Writer
+from polsep.video import ON_DAMAGE, Progress, draw_panels
+from polsep.workers import map_ahead
+
+#: Frames that are read and edited at once.
+AT_ONCE = 2
+
+
+@dataclass(frozen=True)
+class Work:
+    """A ``recipe`` with the images that it names, and the sha256 of their files."""
+
+    recipe: Recipe
+    maps: Maps = field(default_factory=dict)
+    hashes: dict[str, str] = field(default_factory=dict)
+
+    def said(self) -> dict[str, Any]:
+        """What sidecars say of it."""
+        return {"recipe": recipe_as_data(self.recipe), "images": self.hashes}
+
+
+@dataclass(frozen=True)
+class EditTarget:
+    """Where edited frames go; ``kind``: of sequences; ``damaged``: of `ON_DAMAGE`, what becomes of one with gaps."""
+
+    directory: Path
+    overwrite: bool = False
+    kind: SequenceKind = field(default_factory=SequenceKind)
+    damaged: str = "stop"
+
+    def __post_init__(self) -> None:
+        if self.damaged not in ON_DAMAGE:
+            raise ValueError(f"expected stop or skip for damaged frames, found {self.damaged!r}")
+        if self.kind.format != "exr":
+            raise ValueError(f"expected exr as format of edited sequences, found {self.kind.format!r}")
+
+
+@dataclass(frozen=True)
+class Edited:
+    """What became of one file: the files written, or the error in one line."""
+
+    source: Path
+    written: tuple[Path, ...] = ()
+    error: str | None = None
+
+
+def read_recipe(path: Path) -> Recipe:
+    """The recipe of a file. Raises InputError."""
+    try:
+        return recipe_from_text(read_recipe_text(path))
+    except EditError as error:
+        raise input_error(path, error) from error
+
+
+def load_work(recipe: Recipe, folder: Path) -> Work:
+    """Read the images that a recipe names, relative to ``folder``. Raises InputError."""
+    paths = {name: folder / name for name in recipe.images()}
+    maps = {name: read_map(paths[name], kind) for name, kind in recipe.images().items()}
+    return Work(recipe, maps, {name: hash_map(path) for name, path in paths.items()})
+
+
+def edit_files(paths: Sequence[Path], work: Work, target: EditTarget) -> Iterator[Edited]:
+    """Edit single frames; a bad file is an outcome with an error, and the rest go on.
+
+    Raises OutputError before any work when two inputs have one name.
+    """
+    stems = Counter(path.stem for path in paths)
+    repeated = [path for path in paths if stems[path.stem] > 1]
+    if repeated:
+        same = ", ".join(str(path) for path in repeated if path.stem == repeated[0].stem)
+        raise OutputError(f"expected inputs of different names, found {same}: their outputs would be one file")
+    inputs = {realpath(path) for path in paths}
+    for path in paths:
+        try:
+            targets = edited_targets(target.directory, path.stem)
+            if clash := [str(output) for output in targets if realpath(output) in inputs]:
+                raise OutputError(f"{path}: expected outputs apart from inputs, found that {clash[0]} is an input")
+            refuse_targets(target.directory, targets, target.overwrite)
+            frame = _edited_frame(path, work)
+            yield Edited(path, tuple(write_edited(frame, target.directory, path.stem, target.overwrite)))
+        except (ValueError, OSError, MemoryError) as error:
+            yield Edited(path, error=" ".join(str(error).split())[:500] or type(error).__name__)
+
+
+def _edited_frame(path: Path, work: Work) -> EditedFrame:
+    """One file's frame, edited, and its preview."""
+    before, after = _edit(path, work)
+    gain = _exposure(before, after)
+    said = {"source": path.name, **work.said(), "light": _light(before, after), "exposure": gain}
+    layers = {"diffuse": after.diffuse, "specular": after.specular, "combined": after.combined}
+    return EditedFrame(layers, toned(after.combined, gain), {**said, "warnings": work.recipe.cautions()})
+
+
+def _edit(path: Path, work: Work) -> tuple[SeparatedImages, SeparatedImages]:
+    """A frame before and after the edits. Raises InputError that names its file."""
+    before = SeparatedImages(*read_separated(path))
+    try:
+        return before, apply(before, work.recipe, work.maps)
+    except EditError as error:
+        raise input_error(path, error) from error
+
+
+def _exposure(before: SeparatedImages, after: SeparatedImages) -> float:
+    """The gain of previews."""
+    lit = [image for image in (before.combined, after.combined) if image.any()]
+    return min(map(exposure_of, lit), default=1.0)
+
+
+def _light(before: SeparatedImages, after: SeparatedImages) -> dict[str, Any]:
+    """What the edits did to the mean light of each image."""
+    return {"before": before.light(), "after": after.light()}
+
+
+def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Iterator[Progress]:
+    """Edit a sequence as `polsep video` writes it, and say how far it is; a stopped run goes on with the same bytes.
+
+    Writes STEM_000123.exr (half floats, layers diffuse, specular, combined), STEM.png of the first frame, a film to
+    watch if ``kind`` has one, STEM.jsonl and STEM.json. Raises ValueError on what can't be read or written and, with
+    ``damaged`` "stop", at the first missing or damaged frame; what was done by then stays.
+    """
+    found = find_numbered(folder)
+    if (missing := found.missing()) and target.damaged == "stop":
+        some = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
+        raise input_error(folder, f"expected frames without gaps, found none of number {some}; --damaged skip goes on")
+    before, after = _first_frame(found, work, target.damaged)
+    gain, size = _exposure(before, after), before.diffuse.shape
+    settings = {
+        **work.said(),
+        "source": folder.resolve().name,
+        "first": found.first,
+        "count": len(found.files),
+        "missing": missing,
+        "damaged": target.damaged,
+        "kind": asdict(target.kind),
+        "gain": gain,
+        "shape": list(size),
+        "colors": size[2],
+    }
+    _refuse_frames(folder, found, target)
+    writer = Writer(target.directory, found.stem, target.kind, settings, target.overwrite)
+    count = len(found.files)
+    for caution in work.recipe.cautions():
+        yield Progress(writer.first, count, caution)
+    yield Progress(writer.first, count)
+    yield from _run(found, work, writer, (gain, size, target.damaged))
+    preview = target.directory / f"{found.stem}.png"
+    write_preview(preview, toned(after.combined, gain))
+    lines = writer.lines()
+    damaged = [line for line in lines if "damaged" in line]
+    report = {"frames": len(lines), "damaged": damaged, "settings": settings, "warnings": work.recipe.cautions()}
+    yield Progress(count, count, written=(preview, *writer.finish(report)))
+
+
+def _first_frame(found: Numbered, work: Work, on_damage: str) -> tuple[SeparatedImages, SeparatedImages]:
+    """The first frame before and after the edits; with "skip", the first that can be read."""
+    failed: ValueError | None = None
+    for path in found.files:
+        try:
+            if path is not None:
+                return _edit(path, work)
+        except ValueError as error:
+            if on_damage == "stop":
+                raise
+            failed = failed or error
+    assert failed is not None
+    raise failed
+
+
+def _refuse_frames(folder: Path, found: Numbered, target: EditTarget) -> None:
+    """Raise OutputError rather than write over inputs, or over frames of another run unasked."""
+    if realpath(folder) == realpath(target.directory):
+        raise OutputError(f"expected another directory than that of the input, found {target.directory}")
+    if target.overwrite or (target.directory / f".polsep-{found.stem}").exists():
+        return
+    numbers = range(found.first, found.first + len(found.files))
+    frames = [target.directory / f"{found.stem}_{number:06d}.exr" for number in numbers]
+    refuse_targets(target.directory, [*frames, target.directory / f"{found.stem}.png"], overwrite=False)
+
+
+def _run(found: Numbered, work: Work, writer: Writer, look: tuple[float, Any, str]) -> Iterator[Progress]:
+    """The frames that are not done, part after part."""
+    gain, size, on_damage = look
+    begin, part = writer.first, None
+    job = _picture_job(found, work, (gain, size, writer.kind.preview))
+    with closing(map_ahead(job, range(begin, len(found.files)), AT_ONCE)) as pictures:
+        try:
+            for place, picture in enumerate(pictures, begin):
+                part = part or writer.begin_part()
+                reason = picture.line.get("damaged")
+                if reason is None:
+                    part.write(found.first + place, picture)
+                elif on_damage == "stop":
+                    raise InputError(reason)
+                else:
+                    part.show(picture)
+                warning = None if reason is None else f"frame {found.first + place} is left out: {reason}"
+                yield Progress(place + 1, len(found.files), warning, damaged=reason is not None)
+                if len(part) == PART:
+                    writer.end_part(part, {})
+                    part = None
+            _end(writer, part)
+            part = None
+        finally:
+            if part is not None:
+                part.close()
+
+
+def _end(writer: Writer, part: Part | None) -> None:
+    """Let a last, short part count."""
+    if part is not None:
+        writer.end_part(part, {})
+
+
+def _picture_job(found: Numbered, work: Work, look: tuple[float, Any, bool]) -> Callable[[int], Picture]:
+    """What makes the edited frame at a place of the sequence; a black one, with the reason, where it can't."""
+    gain, size, preview = look
+
+    def black(place: int, reason: str) -> Picture:
+        dark = np.zeros(size, np.float32)
+        panels = draw_panels(dark, dark, 1.0) if preview else None
+        return Picture(dark, dark, panels, {"frame": found.first + place, "damaged": reason})
+
+    def make(place: int) -> Picture:
+        path = found.files[place]
+        if path is None:
+            return black(place, "there is no file of this number")
+        try:
+            before, after = _edit(path, work)
+        except (ValueError, OSError) as error:
+            return black(place, " ".join(str(error).split()))
+        if before.diffuse.shape != size:
+            return black(
+                place, f"{path}: expected {list(size)} as in the first frame, found {list(before.diffuse.shape)}"
+            )
+        panels = draw_panels(after.diffuse, after.specular, gain) if preview else None
+        line = {"frame": found.first + place, "light": _light(before, after)}
+        return Picture(after.diffuse, after.specular, panels, line, after.combined)
+
+    return make

@@ -1,0 +1,159 @@
+"""Recipes: edits in order, kept as small JSON files that can be replayed on other frames.
+
+    {"polsep_recipe": 1, "edits": [{"edit": "rougher", "sigma": 10.0}, {"edit": "metallic", "gain": 45.0}]}
+
+Values that a file leaves out are the defaults; what is written has them all. Anything else than that is refused in one
+line. Images stand in a recipe by name: file names, relative to the recipe, at the command line.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from polsep.edit.edits import EDITS, Edit
+from polsep.edit.images import Maps, Separated, SeparatedImages
+from polsep.edit.parameters import IMAGES, EditError
+
+#: The only version there is.
+VERSION = 1
+_KEY = "polsep_recipe"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Edits in the order in which they are applied. Raises EditError where one image name stands for two kinds."""
+
+    edits: tuple[Edit, ...] = ()
+
+    def __post_init__(self) -> None:
+        kinds: dict[str, str] = {}
+        for edit in self.edits:
+            for kind, name in edit.images():
+                if kinds.setdefault(name, kind) != kind:
+                    raise EditError(f"expected an image for each use, found {name!r} as {kinds[name]} and as {kind}")
+
+    def images(self) -> dict[str, str]:
+        """The names of all images, and of which kind each is."""
+        return {name: kind for edit in self.edits for kind, name in edit.images()}
+
+    def cautions(self) -> list[str]:
+        """What the edits, where they do anything, cannot do honestly: a line each."""
+        return list(dict.fromkeys(edit.caution for edit in self.edits if edit.caution and not edit.is_neutral()))
+
+
+def rename_images(recipe: Recipe, rename: Callable[[str], str]) -> Recipe:
+    """The same recipe with other names of its images."""
+    return Recipe(tuple(_renamed(edit, rename) for edit in recipe.edits))
+
+
+def _renamed(edit: Edit, rename: Callable[[str], str]) -> Edit:
+    names = {p.name: getattr(edit, p.name) for p in edit.parameters() if p.kind in IMAGES}
+    return replace(edit, **{field: rename(name) for field, name in names.items() if name is not None})
+
+
+def apply(images: Separated, recipe: Recipe, maps: Maps | None = None) -> SeparatedImages:
+    """The edits of a recipe on one frame, one after the other; ``maps`` has the images that they name.
+
+    ``images``: a `SeparatedFrame`, or anything with diffuse and specular images as float32 ``[h, w, 3 or 1]``, linear,
+    0 or more. The frame itself is never changed; images that no edit changes are the very same arrays.
+    Raises EditError, naming the edit, where one doesn't fit the images.
+    """
+    found = SeparatedImages(images.diffuse, images.specular)
+    for place, edit in enumerate(recipe.edits, 1):
+        try:
+            found = edit.change(found, maps or {})
+        except EditError as error:
+            raise EditError(f"edit {place}, {edit.name}: {error}") from error
+    return found
+
+
+def recipe_as_data(recipe: Recipe) -> dict[str, Any]:
+    """A recipe as JSON-able values, complete."""
+    return {_KEY: VERSION, "edits": [_edit_as_data(edit) for edit in recipe.edits]}
+
+
+def recipe_as_text(recipe: Recipe) -> str:
+    """A recipe as the JSON that a file of it holds, an edit per line."""
+    lines = ",\n".join(f"    {json.dumps(_edit_as_data(edit))}" for edit in recipe.edits)
+    return f'{{\n  "{_KEY}": {VERSION},\n  "edits": [\n{lines}\n  ]\n}}\n'
+
+
+def _edit_as_data(edit: Edit) -> dict[str, Any]:
+    values = {p.name: getattr(edit, p.name) for p in edit.parameters()}
+    kept = {n: list(v) if isinstance(v, tuple) else v for n, v in values.items() if v is not None}
+    return {"edit": edit.name, **kept}
+
+
+def recipe_from_text(text: str) -> Recipe:
+    """The recipe that a JSON text holds. Raises EditError."""
+    try:
+        data = json.loads(text, object_pairs_hook=_without_repeats)
+    except EditError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise EditError(f"expected a recipe as JSON, found {error}") from error
+    return recipe_from_data(data)
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = [name for name, _ in pairs]
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated is not None:
+        raise EditError(f"expected each key once, found {repeated!r} again")
+    return dict(pairs)
+
+
+def recipe_from_data(data: object) -> Recipe:
+    """The recipe of JSON values. Raises EditError."""
+    if not isinstance(data, Mapping):
+        raise EditError(f'expected a recipe {{"{_KEY}": {VERSION}, "edits": [...]}}, found {_brief(data)}')
+    if _KEY not in data:
+        raise EditError(f'expected "{_KEY}": {VERSION}, found no such key among {_names(data)}')
+    if isinstance(data[_KEY], bool) or data[_KEY] != VERSION:
+        raise EditError(f"expected a recipe of version {VERSION}, found {_brief(data[_KEY])}")
+    _refuse_unknown(data, (_KEY, "edits"), "a recipe")
+    edits = data.get("edits")
+    if not isinstance(edits, list):
+        raise EditError(f'expected a list as "edits", found {_brief(edits)}')
+    return Recipe(tuple(_edit_from_data(edit, place) for place, edit in enumerate(edits, 1)))
+
+
+def _edit_from_data(data: object, place: int) -> Edit:
+    """One edit of a recipe; its ``place`` is named in errors."""
+    if not isinstance(data, Mapping):
+        raise EditError(f'edit {place}: expected {{"edit": NAME, ...}}, found {_brief(data)}')
+    name = data.get("edit")
+    if not isinstance(name, str) or name not in EDITS:
+        raise EditError(f"edit {place}: expected an edit of {', '.join(EDITS)}, found {_brief(name)}")
+    kind = EDITS[name]
+    try:
+        return make_edit(kind, {key: value for key, value in data.items() if key != "edit"})
+    except EditError as error:
+        raise EditError(f"edit {place}, {name}: {error}") from error
+
+
+def make_edit(kind: type[Edit], values: Mapping[str, Any]) -> Edit:
+    """An edit of a kind from values by name; those that are left out are defaults. Raises EditError."""
+    parameters = kind.parameters()
+    _refuse_unknown(values, tuple(p.name for p in parameters), kind.name)
+    for parameter in parameters:
+        if parameter.required and parameter.name not in values:
+            raise EditError(f"expected {parameter.name}, found {_names(values)}")
+    return kind(**values)
+
+
+def _refuse_unknown(data: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
+    unknown = [key for key in data if key not in known]
+    if unknown:
+        raise EditError(f"expected only {', '.join(known)} in {where}, found {', '.join(map(_brief, unknown))}")
+
+
+def _names(data: Mapping[str, Any]) -> str:
+    return ", ".join(map(_brief, data)) or "nothing"
+
+
+def _brief(value: object) -> str:
+    return f"{value!r:.60}"

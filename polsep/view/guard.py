@@ -24,8 +24,10 @@ MOST_JSON = 1 << 20
 _AROUND = 1 << 16
 #: Names of this machine.
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-#: Parts of Gradio that the viewer has no use for, by how their paths begin.
-UNUSED = ("/proxy=", "/stream", "/component_server", "/dev/", "/vibe", "/process_recording", "/deep_link")
+#: The parts of Gradio that the page uses, by how their paths begin; "/" is the page itself.
+READ = ("/assets/", "/static/", "/svelte/", "/theme.css", "/config", "/favicon.ico", "/manifest.json", "/heartbeat/")
+READ += ("/queue/data", "/file=", "/upload_progress", "/startup-events", "/app_id")
+SENT = ("/queue/join", "/run/", "/upload", "/cancel", "/reset")
 
 
 class Guard:
@@ -41,18 +43,19 @@ class Guard:
             return
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
         path = unquote(scope["path"]).removeprefix("/gradio_api")
-        if (refused := self._refusal(headers, path)) is not None:
+        if (refused := self._refusal(headers, scope["method"], path)) is not None:
             await _answer(send, *refused)
         elif scope["method"] == "POST" and not path.startswith("/upload"):
             await self._pass_message(scope, receive, send)
         else:
             await self._app(scope, receive, send)
 
-    def _refusal(self, headers: dict[str, str], path: str) -> tuple[int, str] | None:
+    def _refusal(self, headers: dict[str, str], verb: str, path: str) -> tuple[int, str] | None:
         """Status and text for what is refused by its head alone."""
         if self._hosts is not None and host_name(headers.get("host", "")) not in self._hosts:
             return 403, "expected a request to this machine by its own name"
-        if path.startswith(UNUSED) or (path.startswith("/file=") and "://" in path):
+        used = SENT if verb == "POST" else READ if verb in ("GET", "HEAD") else ()
+        if not (path.startswith(used) or (path == "/" and verb != "POST")) or ":/" in path:
             return 403, "expected a part of the viewer"
         length = headers.get("content-length", "0")
         if not length.isdecimal() or int(length) > self._most_bytes + _AROUND:

@@ -37,7 +37,8 @@ _COLORS = {"R": "#ff6b6b", "G": "#63d471", "B": "#6ea8fe", "Y": "#d0d0d4"}
 class Small:
     """A frame at screen size, linear: ``step`` pixels of the frame on a side are one here; ``gain`` shows it well.
 
-    ``diffuse``, ``specular``: ``[h, w, C]``; ``dolp``, ``aolp``: ``[h, w]``; ``error``: ``[h, w, 2]`` or None.
+    ``diffuse``, ``specular``: ``[h, w, C]``; ``dolp``, ``aolp``: ``[h, w]``; ``error``: ``[h, w, 2]`` or None;
+    ``edited``: ``[h, w, C]`` after edits, None without.
     """
 
     step: int
@@ -47,6 +48,7 @@ class Small:
     aolp: Floats
     error: Floats | None
     gain: float
+    edited: Floats | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -82,7 +84,7 @@ def shrink(image: Floats, step: int) -> Floats:
 
 @cache
 def _tones() -> Pixels:
-    """8-bit sRGB codes of the squares of `_STEPS` even steps from 0 to 1: eyes and codes want fine steps in the dark."""
+    """8-bit sRGB codes of the squares of `_STEPS` even steps from 0 to 1: codes want fine steps in the dark."""
     return np.rint(255 * srgb((np.arange(_STEPS) / (_STEPS - 1)) ** 2)).astype(np.uint8)
 
 
@@ -98,6 +100,7 @@ VIEWS: dict[str, Callable[[Small, float], Pixels]] = {
     "Input": lambda small, gain: tone(small.diffuse + small.specular, gain),
     "Diffuse": lambda small, gain: tone(small.diffuse, gain),
     "Specular": lambda small, gain: tone(small.specular, gain),
+    "Edited": lambda small, gain: tone(small.diffuse + small.specular if small.edited is None else small.edited, gain),
     "DoLP": lambda small, gain: dolp_map(small.dolp),
     "AoLP": lambda small, gain: aolp_wheel(small.aolp, small.dolp),
 }
@@ -174,13 +177,12 @@ def confidence_panel(frame: SeparatedFrame, small: Small) -> str:
     ticks = "".join(f"<span>{white * k / 4:.2g}</span>" for k in range(5))
     assert frame.error is not None
     rms = [float(np.sqrt(np.mean(frame.error[..., k].astype(np.float64) ** 2))) for k in range(2)]
-    pair = _pair(
+    return _pair(
         _figure(f"Expected error of diffuse, rms {rms[0]:.2g}", drawn[0]),
         _scale(as_url(bar), ticks),
         _figure(f"Expected error of specular, rms {rms[1]:.2g}", drawn[1]),
         f'<div class="ps-legend"><p>standard deviation, 1 = one measurement at the white level<br>{valid}</p></div>',
     )
-    return pair
 
 
 def _figure(title: str, pixels: Pixels) -> str:

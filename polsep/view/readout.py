@@ -91,7 +91,7 @@ def readout_panel(found: Readout) -> str:
     if found.samples:
         name = {"R": "red", "G": "green", "B": "blue", "Y": "mono"}[found.color]
         raw = "".join(
-            f'<span{" class=ps-clipped" if s.clipped else ""}><i>{s.angle_deg:g}°</i>{s.value:g}</span>'
+            f"<span{' class=ps-clipped' if s.clipped else ''}><i>{s.angle_deg:g}°</i>{s.value:g}</span>"
             for s in found.samples
         )
         rows.append((f"Raw, {name}", f'<div class="ps-cells">{raw}</div>'))

@@ -14,16 +14,22 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from polsep.camera import Layout, Mosaic
+from polsep.edit import Recipe, apply, recipe_as_data, recipe_as_text
+from polsep.io.edited import EditedFrame, write_edited, write_recipe_text
 from polsep.io.errors import InputError
 from polsep.io.frames import FRAME_FILES, Frame, ReadOptions, read_frames
 from polsep.io.outputs import write_separation
 from polsep.io.pages import at_most
+from polsep.io.previews import toned
 from polsep.io.reopened import read_separation
 from polsep.io.scratch import Scratch, drop_file, drop_folder, find_upload, fresh_name, keep_upload, make_folder
 from polsep.methods import check_method
 from polsep.pipeline import LightColor, separate_capture
 from polsep.report import SeparatedFrame
+from polsep.view.edits import edit_small
 from polsep.view.pictures import Histogram, Small, histogram, shrink_frame
 
 #: The capture that comes with polsep, and its white level.
@@ -35,6 +41,8 @@ RESULT_FILES = (".exr",)
 MOST_SAMPLES = 2**26
 #: Pages that are open at once; beyond, the one idle for longest ends.
 MOST_SESSIONS = 32
+#: What can be fetched: the separation, its contact sheet, the edited frame, the edits as a file.
+WANTED = ("exr", "png", "edited", "recipe")
 #: What the page calls "nothing said".
 UNSAID = "as the file says"
 
@@ -139,6 +147,7 @@ class Session:
         self.used = time.monotonic()
         self.found: Found | None = None
         self.mark: tuple[int, int] | None = None
+        self.recipe = Recipe()
         self._path: Path | None = None
         self._stem = ""
         self._read: tuple[ReadOptions, int, Frame] | None = None
@@ -159,9 +168,23 @@ class Session:
                 self.mark = self.mark if self.found is not None and self.found.index == settings.index else None
                 begin = time.perf_counter()
                 found = self._reopen() if self._path.suffix in RESULT_FILES else self._separate(settings)
-                self.found = replace(found, seconds=time.perf_counter() - begin)
+                self.found = replace(found, small=self._edited(found.small), seconds=time.perf_counter() - begin)
                 self._settings = settings
             return self.found
+
+    def edit(self, recipe: Recipe) -> None:
+        """Show the frame with these edits from now on. Raises EditError where they do not fit it."""
+        with self.lock:
+            before, self.recipe = self.recipe, recipe
+            try:
+                if self.found is not None:
+                    self.found = replace(self.found, small=self._edited(self.found.small))
+            except ValueError:
+                self.recipe = before
+                raise
+
+    def _edited(self, small: Small) -> Small:
+        return replace(small, edited=edit_small(small, self.recipe) if self.recipe.edits else None)
 
     def _reopen(self) -> Found:
         assert self._path is not None
@@ -175,7 +198,9 @@ class Session:
         frame.report["source"] = self._stem
         frame.report["warnings"] = [*raw.notes, *frame.report["warnings"]]
         mosaic = raw.data if isinstance(raw.data, Mosaic) else None
-        remarks = tuple(remark.replace("say --white-level", "set White level to") for remark in frame.report["warnings"])
+        remarks = tuple(
+            remark.replace("say --white-level", "set White level to") for remark in frame.report["warnings"]
+        )
         counted = None if mosaic is None else histogram(mosaic)
         stem = self._stem if raw.count == 1 else f"{self._stem}_{raw.index:04d}"
         return Found(frame, shrink_frame(frame), mosaic, counted, remarks, stem, raw.index, raw.count)
@@ -191,14 +216,28 @@ class Session:
             self._read = (settings.read, settings.index, frame)
         return self._read[2]
 
-    def write(self, format: str) -> Path:
-        """Write the separation for the user to fetch: its EXR, or its contact sheet as PNG."""
+    def write(self, kind: str) -> Path:
+        """Write what the user wants to fetch, one of `WANTED`, into a folder of its own. Raises ValueError."""
         with self.lock:
             if self.found is None:
                 raise ValueError("expected a separated frame, found none: open a file first")
             folder = make_folder(self.fetched, fresh_name())
-            write_separation(self.found.frame, folder, self.found.stem, "exr")
-            return folder / f"{self.found.stem}.{format}"
+            stem = self.found.stem
+            if kind in ("exr", "png"):
+                write_separation(self.found.frame, folder, stem, "exr")
+                return folder / f"{stem}.{kind}"
+            if kind == "recipe":
+                write_recipe_text(folder / f"{stem}_recipe.json", recipe_as_text(self.recipe), False)
+                return folder / f"{stem}_recipe.json"
+            write_edited(self._edited_frame(self.found), folder, f"{stem}_edited", False)
+            return folder / f"{stem}_edited.exr"
+
+    def _edited_frame(self, found: Found) -> EditedFrame:
+        """The frame at its own size under the recipe, as `polsep edit` writes it."""
+        after = apply(found.frame, self.recipe)
+        layers = {"diffuse": after.diffuse, "specular": after.specular, "combined": after.combined}
+        said = {"source": found.stem, "recipe": recipe_as_data(self.recipe), "warnings": self.recipe.cautions()}
+        return EditedFrame(layers, np.asarray(toned(after.combined, found.small.gain)), said)
 
 
 class _renamed:

@@ -85,7 +85,7 @@ def _lay_out(start: Start) -> Parts:
     with gr.Row(equal_height=False):
         with gr.Column(scale=0, min_width=330, elem_id="ps-side"):
             gr.HTML("<b>polsep</b><p>Diffuse and specular from one raw frame</p>", elem_id="ps-title")
-            file = gr.File(label="Raw frame, or an EXR of polsep", height=112, elem_id="ps-file")
+            file = gr.File(label="Raw frame or polsep EXR", height=150, elem_id="ps-file")
             demo = gr.Button("Open the demo capture", variant="primary", elem_id="ps-demo")
             settings = _settings(start)
             suggest = gr.Button(visible=False, size="sm", elem_id="ps-suggest")
@@ -95,11 +95,17 @@ def _lay_out(start: Start) -> Parts:
             with gr.Tabs():
                 with gr.Tab("Compare"):
                     left, right, stops = _picture_row()
-                    picture = gr.HTML(EMPTY, js_on_load=STAGE, elem_id="ps-picture")
-                    readout = gr.HTML(HINT, elem_id="ps-pixel")
-                    settings["index"] = gr.Slider(0, 1, 0, step=1, label="Frame", visible=False, elem_id="ps-index")
-                with gr.Tab("Edit"):
-                    controls, neutral = _edit_panel()
+                    with gr.Row():
+                        with gr.Column(scale=3, min_width=420):
+                            picture = gr.HTML(EMPTY, js_on_load=STAGE, elem_id="ps-picture")
+                            settings["index"] = gr.Slider(
+                                0, 1, 0, step=1, label="Frame", visible=False, elem_id="ps-index"
+                            )
+                        with gr.Column(scale=1, min_width=300), gr.Tabs(elem_id="ps-beside"):
+                            with gr.Tab("Pixel"):
+                                readout = gr.HTML(HINT, elem_id="ps-pixel")
+                            with gr.Tab("Edit"):
+                                controls, neutral = _edit_panel()
                 with gr.Tab("Polarization"):
                     polarization = gr.HTML(EMPTY)
                 with gr.Tab("Exposure"):
@@ -147,25 +153,22 @@ def _picture_row() -> tuple[Any, Any, Any]:
 def _edit_panel() -> tuple[tuple[Any, ...], Any]:
     """A control for every value of every edit of the registry, and a button that sets all back."""
     made = []
-    gr.HTML('<p class="ps-hint">Edits show as the picture "Edited" under Compare.</p>')
     controls = list_controls()
-    with gr.Row():
+    neutral = gr.Button("Undo all edits", size="sm", elem_id="ps-neutral")
+    with gr.Column(elem_id="ps-edits"):
         for kind in dict.fromkeys(control.edit for control in controls):
-            with gr.Column(min_width=260), gr.Group():
-                title = html.escape(kind.title)
-                gr.HTML(f"<b>{title}</b>", padding=True)
+            with gr.Group():
+                gr.HTML(f'<b class="ps-edit">{html.escape(kind.title)}</b>')
                 made += [_control(control) for control in controls if control.edit is kind]
-    return tuple(made), gr.Button("Undo all edits", size="sm", elem_id="ps-neutral")
+    return tuple(made), neutral
 
 
 def _control(control: Any) -> Any:
     about, name = control.parameter, f"ps-{control.edit.name}-{control.parameter.name}"
     if about.kind == "color":
-        return gr.ColorPicker(control.start, label=control.label, info=about.text, elem_id=name)
+        return gr.ColorPicker(control.start, label=control.label, elem_id=name)
     step = (about.high - about.low) / 100
-    return gr.Slider(
-        about.low, about.high, control.start, step=step, label=control.label, info=about.text, elem_id=name
-    )
+    return gr.Slider(about.low, about.high, control.start, step=step, label=control.label, elem_id=name)
 
 
 def _fetch_panel() -> tuple[dict[str, Any], Any]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.camera import Mosaic
-from polsep.io.pictures import encode_lossless
+from polsep.io.pictures import encode_live, encode_lossless
 from polsep.io.previews import aolp_legend, aolp_wheel, dolp_map, exposure_of, srgb
 from polsep.report import SeparatedFrame
 
@@ -127,7 +127,16 @@ def error_at_white(small: Small) -> float:
 
 
 def as_url(pixels: Pixels) -> str:
-    """A picture as text that stands where a page expects an address: it never becomes a file."""
+    """A picture as text that stands where a page expects an address: it never becomes a file.
+
+    Note: JPEG of high quality, unlike the PNG that `io.outputs` writes, because it must follow a slider. Numbers are
+    read from the frame (`readout`), never from here.
+    """
+    return f"data:image/jpeg;base64,{b64encode(encode_live(pixels)).decode('ascii')}"
+
+
+def scale_url(pixels: Pixels) -> str:
+    """A legend or scale as such text, without loss."""
     return f"data:image/png;base64,{b64encode(encode_lossless(pixels)).decode('ascii')}"
 
 
@@ -157,10 +166,10 @@ def polarization_panel(small: Small) -> str:
     ticks = "".join(f"<span>{k / 4:g}</span>" for k in range(5))
     places = {"0°": (104, 50), "45°": (90, 8), "90°": (50, -8), "135°": (10, 8)}
     angles = "".join(f'<i style="left:{x}%;top:{y}%">{angle}</i>' for angle, (x, y) in places.items())
-    wheel = f'<div class="ps-wheel"><img src="{as_url(aolp_legend(96))}" alt="colour wheel">{angles}</div>'
+    wheel = f'<div class="ps-wheel"><img src="{scale_url(aolp_legend(96))}" alt="colour wheel">{angles}</div>'
     return _pair(
         _figure("Degree of linear polarization", draw(small, "DoLP", 0)),
-        _scale(as_url(bar), ticks),
+        _scale(scale_url(bar), ticks),
         _figure("Angle of linear polarization, from right toward up", draw(small, "AoLP", 0)),
         f'<div class="ps-legend">{wheel}<p>centre: unpolarized<br>rim: fully polarized</p></div>',
     )
@@ -179,7 +188,7 @@ def confidence_panel(frame: SeparatedFrame, small: Small) -> str:
     rms = [float(np.sqrt(np.mean(frame.error[..., k].astype(np.float64) ** 2))) for k in range(2)]
     return _pair(
         _figure(f"Expected error of diffuse, rms {rms[0]:.2g}", drawn[0]),
-        _scale(as_url(bar), ticks),
+        _scale(scale_url(bar), ticks),
         _figure(f"Expected error of specular, rms {rms[1]:.2g}", drawn[1]),
         f'<div class="ps-legend"><p>standard deviation, 1 = one measurement at the white level<br>{valid}</p></div>',
     )

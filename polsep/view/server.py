@@ -15,9 +15,10 @@ import torch
 from polsep.camera import Layout, Mosaic
 from polsep.io.scratch import drop_folder, make_scratch
 from polsep.methods import find_method
+from polsep.pipeline import separate_known
 from polsep.view.guard import LOOPBACK, Guard
 from polsep.view.session import Sessions
-from polsep.view.style import CSS, FONTS, MONOSPACE, ON_LOAD
+from polsep.view.style import CSS, FONTS, HEAD, MONOSPACE
 
 #: Upload limit: 24 frames of 2448x2048 in 16 bits.
 MOST_MB = 240
@@ -111,7 +112,7 @@ def _launch(page, options: ViewOptions) -> str:  # type: ignore[no-untyped-def]
             state_session_capacity=256,
             theme=gr.themes.Base(primary_hue="blue", neutral_hue="zinc", font=FONTS, font_mono=MONOSPACE),
             css=CSS,
-            js=ON_LOAD,
+            head=HEAD,
             app_kwargs={
                 "middleware": [(Guard, (), {"hosts": hosts, "most_bytes": most_bytes})],
                 "docs_url": None,
@@ -123,6 +124,6 @@ def _launch(page, options: ViewOptions) -> str:  # type: ignore[no-untyped-def]
 
 
 def warm_up(method: str) -> None:
-    """Do what the first separation would wait for: load kernels and weights."""
-    mosaic = Mosaic(torch.eye(32), Layout(), 0.0, 1.0)
-    find_method(method, mosaic).engine(mosaic)
+    """Do what the first separation would wait for: load kernels and weights, and make an engine of the usual size."""
+    mosaic = Mosaic(torch.zeros(2048, 2448), Layout(), 0.0, 1.0)
+    separate_known(mosaic, find_method(method, mosaic), (1.0, 1.0, 1.0))

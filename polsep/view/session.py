@@ -43,8 +43,8 @@ MOST_SAMPLES = 2**26
 MOST_SESSIONS = 32
 #: What can be fetched: the separation, its contact sheet, the edited frame, the edits as a file.
 WANTED = ("exr", "png", "edited", "recipe")
-#: What the page calls "nothing said".
-UNSAID = "as the file says"
+#: What the page calls "nothing said": the file, or the type of its samples, decides.
+UNSAID = "from file"
 
 
 @dataclass(frozen=True)

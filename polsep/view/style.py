@@ -9,8 +9,14 @@ from __future__ import annotations
 FONTS = ["system-ui", "Segoe UI", "Roboto", "Helvetica Neue", "sans-serif"]
 MONOSPACE = ["ui-monospace", "Menlo", "Consolas", "monospace"]
 
-#: Run when the page loads: dark, as pictures want it.
-ON_LOAD = "() => { document.body.classList.add('dark'); }"
+#: Always dark, as pictures want it; Gradio would follow the system.
+HEAD = """<script>
+addEventListener('DOMContentLoaded', () => {
+  const keep = () => document.body.classList.contains('dark') || document.body.classList.add('dark');
+  new MutationObserver(keep).observe(document.body, {attributes: true, attributeFilter: ['class']});
+  keep();
+});
+</script>"""
 
 #: Fetch what a hidden link holds, if what was asked for could be written.
 FETCH = "() => { const link = document.querySelector('#ps-fetch'); (link.querySelector('a') ?? link).click(); }"
@@ -60,14 +66,22 @@ EMPTY = (
 )
 
 CSS = """
-.gradio-container { max-width: none !important; padding: 14px 18px !important; }
+.gradio-container { max-width: none !important; padding: 0 !important; }
+.gradio-container .fillable { max-width: none !important; padding: 14px 20px !important; }
 footer { display: none !important; }
 #ps-title { padding: 2px 2px 0; }
 #ps-title b { font-size: 1.35rem; letter-spacing: -.01em; }
 #ps-title p { margin: 2px 0 0; color: #9a9aa2; font-size: .85rem; line-height: 1.35; }
 #ps-side { gap: 10px; }
 #ps-main { gap: 10px; }
-#ps-file { min-height: 112px; }
+#ps-file { min-height: 150px; }
+#ps-file .icon-wrap { display: none; }
+#ps-file .or { margin: 0; }
+#ps-edits { max-height: calc(100vh - 330px); min-height: 320px; overflow-y: auto; flex-wrap: nowrap; gap: 8px; }
+#ps-edits > * { flex: none; }
+#ps-edits .html-container { padding: 0 !important; }
+.ps-edit { display: block; padding: 7px 12px; font-size: .88rem; }
+#ps-edits .block { padding: 6px 12px 8px; border: 0 !important; }
 #ps-fetch { position: absolute; width: 1px; height: 1px; overflow: hidden; opacity: 0; pointer-events: none; }
 #ps-status { min-height: 26px; }
 .ps-line { font-size: .88rem; color: #c9c9ce; line-height: 1.5; }
@@ -79,8 +93,8 @@ footer { display: none !important; }
 .ps-nothing { display: grid; place-items: center; height: min(60vh, 620px); border: 1px dashed #45454d;
   border-radius: 8px; text-align: center; color: #9a9aa2; background: #1b1b1e; }
 .ps-nothing b { color: #e4e4e8; font-size: 1.05rem; }
-.ps-nothing p { margin: 6px 0 0; line-height: 1.5; }
-.ps-stage { position: relative; aspect-ratio: var(--ratio); width: min(100%, calc((100vh - 250px) * var(--ratio)));
+.ps-nothing p { margin: 6px 0 0; line-height: 1.5; color: #9a9aa2 !important; }
+.ps-stage { position: relative; aspect-ratio: var(--ratio); width: min(100%, calc((100vh - 255px) * var(--ratio)));
   min-width: min(100%, 420px); margin: 0 auto; cursor: crosshair; user-select: none; touch-action: none;
   background: #111; overflow: hidden; border-radius: 4px; }
 .ps-stage img { position: absolute; inset: 0; width: 100%; height: 100%; margin: 0; border-radius: 0; }
@@ -98,10 +112,12 @@ footer { display: none !important; }
 .ps-mark { position: absolute; width: 15px; height: 15px; margin: -8px 0 0 -8px; border: 2px solid #fff;
   border-radius: 50%; box-shadow: 0 0 0 1.5px #000, inset 0 0 0 1px #000; pointer-events: none; }
 .ps-hint, .ps-empty { color: #9a9aa2; font-size: .88rem; line-height: 1.5; }
+.ps-readout, .ps-readout * { border: 0 !important; }
 .ps-readout { width: 100%; border-collapse: collapse; font-size: .84rem; font-variant-numeric: tabular-nums; }
-.ps-readout th { text-align: left; font-weight: 500; color: #9a9aa2; padding: 4px 14px 4px 0; white-space: nowrap;
-  width: 1%; border: 0; }
-.ps-readout td { padding: 4px 0; color: #e4e4e8; border: 0; }
+.ps-readout tr + tr > * { border-top: 1px solid #2e2e33 !important; }
+.ps-readout th { text-align: left; vertical-align: top; font-weight: 500; color: #9a9aa2; padding: 4px 14px 4px 0;
+  white-space: nowrap; width: 1%; }
+.ps-readout td { padding: 4px 0; color: #e4e4e8; }
 .ps-cells { display: flex; flex-wrap: wrap; gap: 4px 16px; }
 .ps-cells i { font-style: normal; color: #85858d; margin-right: .4em; }
 .ps-clipped { color: #ff8f85; text-decoration: underline; }

@@ -54,8 +54,8 @@ class Guard:
         """Status and text for what is refused by its head alone."""
         if self._hosts is not None and host_name(headers.get("host", "")) not in self._hosts:
             return 403, "expected a request to this machine by its own name"
-        used = SENT if verb == "POST" else READ if verb in ("GET", "HEAD") else ()
-        if not (path.startswith(used) or (path == "/" and verb != "POST")) or ":/" in path:
+        used = {"POST": SENT, "GET": READ, "HEAD": READ}.get(verb, ())
+        if not (path.startswith(used) or (path == "/" and used is READ)) or ":/" in path:
             return 403, "expected a part of the viewer"
         length = headers.get("content-length", "0")
         if not length.isdecimal() or int(length) > self._most_bytes + _AROUND:

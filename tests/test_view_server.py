@@ -11,8 +11,11 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
+import imagecodecs
+import numpy as np
 import pytest
 from viewer import running
 
@@ -32,13 +35,22 @@ def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 def ask(address: str, verb: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
     """Status and body of one answer."""
-    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=120)
     try:
         connection.request(verb, path, body or None, {k.replace("_", "-"): v for k, v in headers.items()})
         answer = connection.getresponse()
         return answer.status, answer.read()
     finally:
         connection.close()
+
+
+def open_message(config: dict[str, Any], path: str) -> dict[str, Any]:
+    """What the page sends after an upload."""
+    (event,) = (d for d in config["dependencies"] if d["api_name"] == "open_upload")
+    kinds = {c["id"]: c for c in config["components"]}
+    file = {"path": path, "orig_name": "a.png", "meta": {"_type": "gradio.FileData"}}
+    data = [file if kinds[i]["type"] == "file" else kinds[i]["props"].get("value") for i in event["inputs"]]
+    return {"data": data, "fn_index": event["id"]}
 
 
 def test_the_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -123,24 +135,31 @@ def test_a_large_upload_is_refused_at_once(viewer: str) -> None:
 def test_claimed_paths_open_nothing(viewer: str) -> None:
     """A message that names a file which was not uploaded does not get to see it."""
     config = json.loads(ask(viewer, "GET", "/config")[1])
-    (event,) = (d for d in config["dependencies"] if d["api_name"] == "open_upload")
     for claim in ("/etc/passwd", str(Path(__file__).resolve()), "http://127.0.0.1:1/a.png"):
-        file = {"path": claim, "orig_name": "a.png", "meta": {"_type": "gradio.FileData"}}
-        kinds = {c["id"]: c for c in config["components"]}
-        data = [file if kinds[i]["type"] == "file" else kinds[i]["props"].get("value") for i in event["inputs"]]
-        message = {"data": data, "fn_index": event["id"], "session_hash": "stranger"}
-        body = json.dumps(message).encode()
+        body = json.dumps({**open_message(config, claim), "session_hash": "stranger"}).encode()
         status, said = ask(viewer, "POST", "/gradio_api/run/predict", body, content_type="application/json")
         assert status >= 400 or b"expected a file that this page uploaded" in said
         assert b"ps-stage" not in said
 
 
 @needs_gradio
-def test_many_at_once_are_answered(viewer: str) -> None:
-    """Twenty pages that load at the same time all get theirs."""
+def test_twenty_sessions_at_once_all_finish(viewer: str) -> None:
+    """Twenty pages send the same frame and wait in one queue; every one gets its picture."""
+    codes = (np.add.outer(np.arange(64), np.arange(64)) * 30).astype(np.uint16)
+    picture = bytes(imagecodecs.png_encode(codes))
+    body = b'--x\r\nContent-Disposition: form-data; name="files"; filename="a.png"\r\n\r\n' + picture + b"\r\n--x--\r\n"
+    config = json.loads(ask(viewer, "GET", "/config")[1])
+
+    def run(key: str) -> bytes:
+        status, said = ask(viewer, "POST", "/gradio_api/upload", body, content_type="multipart/form-data; boundary=x")
+        assert status == 200
+        message = json.dumps({**open_message(config, json.loads(said)[0]), "session_hash": key}).encode()
+        assert ask(viewer, "POST", "/gradio_api/queue/join", message, content_type="application/json")[0] == 200
+        return ask(viewer, "GET", f"/gradio_api/queue/data?session_hash={key}")[1]
+
     with ThreadPoolExecutor(20) as pool:
-        found = list(pool.map(lambda _: ask(viewer, "GET", "/config")[0], range(20)))
-    assert found == [200] * 20
+        found = list(pool.map(run, [f"page{k}" for k in range(20)]))
+    assert [b"process_completed" in said and b"ps-stage" in said for said in found] == [True] * 20
 
 
 @needs_gradio

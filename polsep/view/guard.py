@@ -25,8 +25,10 @@ _AROUND = 1 << 16
 #: Names of this machine.
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 #: The parts of Gradio that the page uses, by how their paths begin; "/" is the page itself.
-READ = ("/assets/", "/static/", "/svelte/", "/theme.css", "/config", "/favicon.ico", "/manifest.json", "/heartbeat/")
-READ += ("/queue/data", "/file=", "/upload_progress", "/startup-events", "/app_id")
+READ = (
+    *("/assets/", "/static/", "/svelte/", "/theme.css", "/config", "/favicon.ico", "/manifest.json", "/heartbeat/"),
+    *("/queue/data", "/file=", "/upload_progress", "/startup-events", "/app_id"),
+)
 SENT = ("/queue/join", "/run/", "/upload", "/cancel", "/reset")
 
 

@@ -225,11 +225,11 @@ class _Answers:
         """The capture that comes with polsep, whose white level is known."""
         white = self.parts.settings["white"]
         said = {**said, white: f"{DEMO_WHITE:g}", self.parts.settings["black"]: "0"}
-        return self._open(lambda: self._session(request).open(DEMO, DEMO.stem), said, request)
+        return self._open(lambda: self._session(request).begin(DEMO, DEMO.stem), said, request)
 
     def open_own(self, file: Any, said: Said, request: gr.Request) -> list[Any]:
         """The file that the command named."""
-        return self._open(lambda: self._session(request).open(file, file.stem), said, request)
+        return self._open(lambda: self._session(request).begin(file, file.stem), said, request)
 
     def use_white(self, said: Said, request: gr.Request) -> list[Any]:
         """The white level that a remark recommends."""
@@ -238,10 +238,10 @@ class _Answers:
         said = said if white is None else {**said, self.parts.settings["white"]: f"{white:g}"}
         return [*self.separate(said, request), said[self.parts.settings["white"]]]
 
-    def _open(self, begin: Callable[[], None], said: Said, request: gr.Request) -> list[Any]:
+    def _open(self, prepare: Callable[[], None], said: Said, request: gr.Request) -> list[Any]:
         session, white = self._session(request), said[self.parts.settings["white"]]
         try:
-            begin()
+            prepare()
         except FAILURES as error:
             session.found = None
             return [*self._failed(error, session), white]

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,11 +61,11 @@ def shrink_frame(frame: SeparatedFrame) -> Small:
     """The copy of a frame whose longer side is at most `SCREEN`."""
     step = -(-max(frame.valid.shape) // SCREEN)
     diffuse, specular = (shrink(np.maximum(image, 0), step) for image in (frame.diffuse, frame.specular))
-    s0 = (frame.diffuse + frame.specular).mean(axis=-1)
+    s0 = (frame.diffuse + frame.specular).mean(axis=-1, dtype=np.float32)
     polarized = s0 * frame.dolp
-    s1, s2 = (shrink(polarized * wave(2 * frame.aolp), step) for wave in (np.cos, np.sin))
+    s1, s2 = (shrink(polarized * wave, step) for wave in (np.cos(2 * frame.aolp), np.sin(2 * frame.aolp)))
     light = shrink(s0, step)
-    dolp = np.hypot(s1, s2) / np.where(light > 0, light, 1)
+    dolp = (np.hypot(s1, s2) / np.where(light > 0, light, 1)).astype(np.float32)
     aolp = np.mod(np.arctan2(s2, s1) / 2, np.float32(np.pi))
     error = None if frame.error is None else np.sqrt(shrink(frame.error**2, step))
     return Small(step, diffuse, specular, dolp, aolp, error, exposure_of(diffuse + specular))
@@ -76,7 +77,7 @@ def shrink(image: Floats, step: int) -> Floats:
         return image
     height, width = image.shape[:2]
     rows, cols = np.arange(0, height, step), np.arange(0, width, step)
-    sums: Floats = np.add.reduceat(np.add.reduceat(image, rows, axis=0), cols, axis=1)
+    sums: NDArray[Any] = np.add.reduceat(np.add.reduceat(image, rows, axis=0), cols, axis=1)
     count = np.diff(rows, append=height)[:, None] * np.diff(cols, append=width)
     mean: Floats = sums / count.reshape(count.shape + (1,) * (image.ndim - 2)).astype(np.float32)
     return mean
@@ -91,7 +92,7 @@ def _tones() -> Pixels:
 def tone(image: Floats, gain: float) -> Pixels:
     """A linear image ``[h, w, C]`` as sRGB ``[h, w, 3]``, 1 / ``gain`` and more as white."""
     place = np.sqrt(np.clip(image * np.float32(gain), 0, 1)) * np.float32(_STEPS - 1) + np.float32(0.5)
-    codes = _tones()[place.astype(np.uint16)]
+    codes: Pixels = _tones()[place.astype(np.uint16)]
     return codes if codes.shape[2] == 3 else codes.repeat(3, axis=2)
 
 

@@ -153,7 +153,7 @@ class Session:
         self._read: tuple[ReadOptions, int, Frame] | None = None
         self._settings: Settings | None = None
 
-    def open(self, path: Path, stem: str) -> None:
+    def begin(self, path: Path, stem: str) -> None:
         """Work on another file; what was found in the one before is forgotten."""
         with self.lock:
             self._path, self._stem = path, stem
@@ -286,7 +286,7 @@ class Sessions:
         session = self.find(key)
         with self._lock:
             self._uploads.setdefault(path, set()).add(key)
-        session.open(keep_upload(path, session.kept, f"{fresh_name()}{suffix}"), stem)
+        session.begin(keep_upload(path, session.kept, f"{fresh_name()}{suffix}"), stem)
 
     def end(self, key: str) -> None:
         """Forget a page, and remove its files."""

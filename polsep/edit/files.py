@@ -9,7 +9,7 @@ Previews show the input's exposure, or less where edits add light; in sequences,
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from os.path import realpath
@@ -141,7 +141,7 @@ def _light(before: SeparatedImages, after: SeparatedImages) -> dict[str, Any]:
     return {"before": before.light(), "after": after.light()}
 
 
-def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Iterator[Progress]:
+def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Progress, None, None]:
     """Edit a sequence as `polsep video` writes it, and say how far it is; a stopped run goes on with the same bytes.
 
     Writes STEM_000123.exr (half floats, layers diffuse, specular, combined), STEM.png of the first frame, a film to

@@ -44,14 +44,14 @@ class Recipe:
         return list(dict.fromkeys(edit.caution for edit in self.edits if edit.caution and not edit.is_neutral()))
 
 
-def rename_images(recipe: Recipe, rename: Callable[[str], str]) -> Recipe:
+def rename_images(recipe: Recipe, renaming: Callable[[str], str]) -> Recipe:
     """The same recipe with other names of its images."""
-    return Recipe(tuple(_renamed(edit, rename) for edit in recipe.edits))
+    return Recipe(tuple(_renamed(edit, renaming) for edit in recipe.edits))
 
 
-def _renamed(edit: Edit, rename: Callable[[str], str]) -> Edit:
+def _renamed(edit: Edit, renaming: Callable[[str], str]) -> Edit:
     names = {p.name: getattr(edit, p.name) for p in edit.parameters() if p.kind in IMAGES}
-    return replace(edit, **{field: rename(name) for field, name in names.items() if name is not None})
+    return replace(edit, **{field: renaming(name) for field, name in names.items() if name is not None})
 
 
 def apply(images: Separated, recipe: Recipe, maps: Maps | None = None) -> SeparatedImages:

@@ -9,6 +9,7 @@ camera), in EXR and NPY the vectors themselves.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from polsep.io.errors import InputError, decoding, input_error, naming
-from polsep.io.exr import read_exr_layers
 from polsep.io.frames import read_pages
+from polsep.io.pages import require_signature
+from polsep.io.separated import read_planes
 
 Floats = NDArray[np.float32]
 
@@ -38,8 +40,9 @@ def read_map(path: Path, kind: str) -> Floats:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise input_error(path, f"expected an image ({', '.join(SUFFIXES)}), found {suffix or 'no extension'!r}")
+    read = _read(path, suffix)
     with naming(path):
-        codes = _read(path, suffix)
+        codes = _checked(_from_planes(read) if isinstance(read, Mapping) else read)
         decode = {"texture": _as_texture, "mask": _as_mask, "normals": _as_normals}[kind]
         found = decode(codes)
         if not np.isfinite(found).all():
@@ -55,25 +58,29 @@ def hash_map(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _read(path: Path, suffix: str) -> NDArray[Any]:
-    """Codes or values ``[h, w]`` or ``[h, w, 1 or 3]``."""
+def _read(path: Path, suffix: str) -> NDArray[Any] | Mapping[str, NDArray[Any]]:
+    """The one image of a file, or its channels by name."""
     if suffix == ".exr":
-        codes = _from_exr(path)
-    elif suffix in _PHOTOS:
-        with path.open("rb") as stream, decoding("JPEG"), Image.open(stream, formats=["JPEG"]) as picture:
-            codes = np.asarray(picture.convert("L" if picture.mode == "L" else "RGB"))
-    else:
-        pages = [page.array for page in read_pages(path)]
-        if len(pages) != 1:
-            raise InputError(f"expected one image, found {len(pages)}")
-        codes = pages[0]
+        return read_planes(path)
+    if suffix in _PHOTOS:
+        with naming(path), path.open("rb") as stream:
+            require_signature(stream, (b"\xff\xd8\xff",), "a JPEG")
+            with decoding("JPEG"), Image.open(stream, formats=["JPEG"]) as picture:
+                return np.asarray(picture.convert("L" if picture.mode == "L" else "RGB"))
+    pages = [page.array for page in read_pages(path)]
+    if len(pages) != 1:
+        raise input_error(path, f"expected one image, found {len(pages)}")
+    return pages[0]
+
+
+def _checked(codes: NDArray[Any]) -> NDArray[Any]:
+    """Codes or values ``[h, w]`` or ``[h, w, 1 or 3]``."""
     if codes.ndim not in (2, 3) or (codes.ndim == 3 and codes.shape[2] not in (1, 3)):
         raise InputError(f"expected an image of 1 or 3 channels, found shape {list(codes.shape)}")
     return codes
 
 
-def _from_exr(path: Path) -> NDArray[Any]:
-    planes = read_exr_layers(path)
+def _from_planes(planes: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
     for names in ("RGB", "XYZ", "Y"):
         if set(names) <= set(planes):
             return np.stack([planes[name] for name in names], axis=-1)

@@ -49,13 +49,23 @@ def read_separated(path: Path) -> Pair:
         raise input_error(
             path, f"expected a separated frame ({', '.join(SUFFIXES)}), found {suffix or 'no extension'!r}"
         )
+    planes = read_planes(path) if suffix == ".exr" else None
     with naming(path):
-        found = _from_layers(read_exr_layers(path)) if suffix == ".exr" else _from_archive(path)
+        found = _from_archive(path) if planes is None else _from_layers(planes)
         for name, image in zip(("diffuse", "specular"), found, strict=True):
             wrong = int(np.count_nonzero(~((image >= 0) & (image < np.inf))))
             if wrong:
                 raise InputError(f"expected finite {name} light of 0 or more, found {wrong} other samples")
     return found
+
+
+def read_planes(path: Path) -> dict[str, NDArray[np.float32]]:
+    """`read_exr_layers`, whose every failure is an InputError that names the file."""
+    try:
+        return read_exr_layers(path)
+    except OSError:
+        with naming(path):
+            raise
 
 
 def _from_layers(planes: Mapping[str, NDArray[Any]]) -> Pair:
@@ -75,7 +85,7 @@ def _from_layers(planes: Mapping[str, NDArray[Any]]) -> Pair:
 
 def _from_archive(path: Path) -> Pair:
     """Images from arrays by name."""
-    with decoding("NPZ"), np.load(path, allow_pickle=False) as archive:
+    with path.open("rb") as stream, decoding("NPZ"), np.load(stream, allow_pickle=False) as archive:
         missing = [name for name in ("diffuse", "specular") if name not in archive.files]
         if missing:
             found = ", ".join(archive.files[:8]) or "none"

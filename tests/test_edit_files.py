@@ -1,0 +1,455 @@
+"""`polsep edit`: what polsep wrote goes in, whole files come out, sequences go on, what can't be is said in a line."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import imagecodecs
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from test_cli import Run, assert_refused, contents
+from test_edit import only, random_images, sphere
+
+from polsep import cli
+from polsep.edit import EDITS, Metallic, Recipe, Rougher, SeparatedImages, Sharper, SpecularGain, Texture, apply
+from polsep.edit.files import EditTarget, Work, edit_sequence, load_work, read_recipe
+from polsep.io.errors import InputError
+from polsep.io.exr import encode_exr, read_exr_layers
+from polsep.io.maps import linear_from_srgb, read_map
+from polsep.io.outputs import OutputError, write_separation
+from polsep.io.previews import srgb
+from polsep.io.separated import find_numbered, read_separated
+from polsep.io.sequences import PART, Picture, SequenceKind, write_exr
+from polsep.report import SeparatedFrame
+
+Cli = Callable[..., Run]
+
+COUNT = PART + 4
+#: Sequences without a film to watch, which needs the extra "video".
+SILENT = SequenceKind(preview=False)
+
+
+@pytest.fixture
+def polsep(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Cli:
+    """Run `polsep edit ARGS` inside this process."""
+
+    def run(*args: str | Path) -> Run:
+        monkeypatch.setattr(sys, "argv", ["polsep", "edit", *map(str, args)])
+        capfd.readouterr()
+        status: Any = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            status = stop.code
+        return Run(status or 0, *capfd.readouterr())
+
+    return run
+
+
+def frame_of(images: SeparatedImages) -> SeparatedFrame:
+    size = images.diffuse.shape[:2]
+    ones = np.ones(size, np.float32)
+    return SeparatedFrame(
+        images.diffuse, images.specular, np.ones(size, bool), 0 * ones, 0 * ones, {"source": "raw.png"}
+    )
+
+
+def separated(folder: Path, stem: str = "shot", colors: int = 3, format: str = "exr") -> Path:
+    """A file as `polsep separate` writes it."""
+    return write_separation(frame_of(random_images(colors=colors)), folder, stem, format)[0]
+
+
+def film(folder: Path, count: int = COUNT, first: int = 0) -> Path:
+    """A sequence as `polsep video` writes it."""
+    for k in range(count):
+        images = random_images(k)
+        write_exr(folder / f"take_{first + k:06d}.exr", Picture(images.diffuse, images.specular, None, {}), "none")
+    return folder
+
+
+def image_of(path: Path, layer: str) -> NDArray[np.float32]:
+    planes = read_exr_layers(path)
+    return np.stack([planes[f"{layer}.{c}"] for c in ("RGB" if f"{layer}.R" in planes else "Y")], axis=-1)
+
+
+def png(path: Path, pixels: NDArray[Any]) -> Path:
+    path.write_bytes(imagecodecs.png_encode(pixels))
+    return path
+
+
+# Single frames.
+
+
+@pytest.mark.parametrize("colors", [3, 1])
+@pytest.mark.parametrize("format", ["exr", "npz"])
+def test_a_frame_becomes_an_edited_one(tmp_path: Path, polsep: Cli, format: str, colors: int) -> None:
+    """Layers are what the library makes, bit for bit; preview and sidecar tell what was done and did to light."""
+    source = separated(tmp_path, colors=colors, format=format)
+    run = polsep(source, "-o", tmp_path / "out", "--rougher", "3", "--specular-gain", "2")
+    assert run.status == 0 and run.err == ""
+    paths = [tmp_path / "out" / f"shot.{suffix}" for suffix in ("exr", "png", "json")]
+    assert run.out == f"{source} -> {', '.join(map(str, paths))}\n"
+    before = random_images(colors=colors)
+    expected = apply(frame_of(before), Recipe((Rougher(sigma=3.0), SpecularGain(gain=2.0))))
+    for layer in ("diffuse", "specular", "combined"):
+        assert np.array_equal(image_of(paths[0], layer), getattr(expected, layer))
+    names = "RGB" if colors == 3 else "Y"
+    assert set(read_exr_layers(paths[0])) == {f"{a}.{c}" for a in ("diffuse", "specular", "combined") for c in names}
+    said = json.loads(paths[2].read_text())
+    assert said["recipe"]["edits"][0] == {"edit": "rougher", "sigma": 3.0}
+    assert said["light"]["after"]["specular"] == pytest.approx(2 * said["light"]["before"]["specular"], rel=1e-5)
+    assert said["light"]["after"]["diffuse"] == said["light"]["before"]["diffuse"]
+    shown = np.rint(255 * srgb(said["exposure"] * expected.combined))
+    assert np.array_equal(imagecodecs.png_decode(paths[1].read_bytes()), np.broadcast_to(shown, (*shown.shape[:2], 3)))
+
+
+def test_edited_frames_can_be_edited(tmp_path: Path, polsep: Cli) -> None:
+    """Two commands, one after the other, are one recipe."""
+    source = separated(tmp_path)
+    polsep(source, "-o", tmp_path / "a", "--rougher", "3")
+    polsep(tmp_path / "a" / "shot.exr", "-o", tmp_path / "b", "--metallic", "0.5")
+    polsep(source, "-o", tmp_path / "c", "--metallic", "0.5", "--rougher", "3")
+    assert (tmp_path / "b" / "shot.exr").read_bytes() == (tmp_path / "c" / "shot.exr").read_bytes()
+
+
+def test_recipes_are_saved_and_replayed(tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    """--save-recipe keeps the call; file names are relative to the recipe, from wherever it is replayed."""
+    monkeypatch.chdir(tmp_path)
+    source = separated(tmp_path)
+    (tmp_path / "maps").mkdir()
+    png(tmp_path / "maps" / "checks.png", np.full((4, 4, 3), 128, np.uint8))
+    png(tmp_path / "maps" / "mask.png", np.full((21, 26), 255, np.uint8))
+    options = (
+        "--texture",
+        "maps/checks.png",
+        "--texture-repeats",
+        "2.5",
+        "--mask",
+        "maps/mask.png",
+        "--tint",
+        "1,0.5,2",
+    )
+    first = polsep(source, "-o", "a", *options, "--save-recipe", "kept/look.json")
+    assert first.status == 0 and first.out.startswith("kept/look.json\n")
+    recipe = read_recipe(tmp_path / "kept" / "look.json")
+    assert recipe.images() == {"../maps/checks.png": "texture", "../maps/mask.png": "mask"}
+    assert [edit.name for edit in recipe.edits] == ["texture", "tint"]
+    monkeypatch.chdir(tmp_path / "maps")
+    assert polsep(source, "-o", "../b", "--recipe", "../kept/look.json").status == 0
+    assert (tmp_path / "a" / "shot.exr").read_bytes() == (tmp_path / "b" / "shot.exr").read_bytes()
+    hashes = [json.loads((tmp_path / k / "shot.json").read_text())["images"] for k in "ab"]
+    assert list(hashes[0].values()) == list(hashes[1].values()) and len(hashes[0]) == 2
+    assert_refused(
+        polsep(source, "-o", "../c", *("--rougher", "1"), "--save-recipe", "../kept/look.json"), "--overwrite"
+    )
+
+
+def test_a_shell_edits(tmp_path: Path) -> None:
+    """The program itself, with a warning about what sharpening can't do."""
+    command = [sys.executable, "-c", "from polsep.cli import main; main()", "edit", str(separated(tmp_path))]
+    done = subprocess.run(
+        [*command, "-o", str(tmp_path / "out"), "--sharper", "1"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0 and done.stderr == f"polsep: {Sharper.caution}\n"
+    assert json.loads((tmp_path / "out" / "shot.json").read_text())["warnings"] == [Sharper.caution]
+
+
+def test_every_edit_has_its_options(polsep: Cli) -> None:
+    """The command line has an option for every value of every edit, and --list tells of all."""
+    options = {option for parameter in cli.app.commands["edit"].params for option in parameter.opts}
+    listed = polsep("--list").out
+    for name, kind in EDITS.items():
+        first, *others = kind.parameters()
+        assert {f"--{name}", *(f"--{name}-{p.name}" if p.kind != "mask" else "--mask" for p in others)} <= options
+        assert f"{name}: {kind.title}" in listed and kind.light in listed
+        assert first.text in listed
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["shot.exr"], ["expected an edit such as --metallic 1, or --recipe FILE, found none"]),
+        (["--metallic", "1"], ["expected a separated frame or a folder of them, found nothing to edit"]),
+        (["none.exr", "--rougher", "1"], ["none.exr: expected a file, found nothing at this path"]),
+        (["shot.png", "--rougher", "1"], ["expected a separated frame (.exr, .npz), found '.png'"]),
+        (["shot.exr", "--rougher", "51"], ["expected sigma from 0 to 50, found 51"]),
+        (["shot.exr", "--metallic-gain", "3"], ["expected --metallic beside --metallic-gain, found none"]),
+        (["shot.exr", "--tint", "1,2"], ["expected --tint R,G,B like 0.8,0.1,0.05, found '1,2'"]),
+        (["shot.exr", "--tint", "1,2,x"], ["found '1,2,x'"]),
+        (["shot.exr", "--texture", "no.png"], ["no.png: expected a file, found nothing at this path"]),
+        (["shot.exr", "--texture", "shot.json"], ["shot.json: expected an image (.png", "found '.json'"]),
+        (
+            ["shot.exr", "--rougher", "1", "--mask", "small.png"],
+            ["edit 1, rougher: expected mask", "found float32 [3, 3]"],
+        ),
+        (["shot.exr", "--rougher", "1", "--recipe", "r.json"], ["expected --recipe or edits as options, found both"]),
+        (["shot.exr", "--recipe", "no.json"], ["no.json: expected a file, found nothing"]),
+        (["shot.exr", "--recipe", "shot.json"], ['shot.json: expected "polsep_recipe": 1, found no such key']),
+        (
+            ["mono.exr", "--metallic", "1"],
+            ["mono.exr: edit 1, metallic: expected images in colour", "found one channel"],
+        ),
+        (
+            ["other.exr", "--rougher", "1"],
+            ["other.exr: expected channels diffuse.R, .G and .B, or diffuse.Y, found a.Y"],
+        ),
+        (
+            ["negative.npz", "--rougher", "1"],
+            ["negative.npz: expected finite diffuse light of 0 or more, found 1 other"],
+        ),
+        (["other.npz", "--rougher", "1"], ["other.npz: expected arrays diffuse and specular, found a"]),
+        (["torn.npz", "--rougher", "1"], ["torn.npz: expected an intact NPZ file, found damage"]),
+        (["torn.exr", "--rougher", "1"], ["error: torn.exr: expected a complete single-part EXR file"]),
+        (["shot.exr", "--rougher", "1", "-o", "."], ["expected outputs apart from inputs", "is an input"]),
+        (["shot.exr", "--rougher", "1", "-o", "taken"], ["expected no taken/shot.exr", "--overwrite replaces it"]),
+        (
+            ["shot.exr", "a/shot.exr", "--rougher", "1"],
+            ["expected inputs of different names, found shot.exr, a/shot.exr"],
+        ),
+        (["a", "--rougher", "1"], ["a: expected a sequence STEM_000123.exr or .npz, found none"]),
+    ],
+)
+def test_bad_calls_leave_nothing(
+    tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch, args: list[str], words: list[str]
+) -> None:
+    """Exit status 2, one line, and the folder as it was."""
+    monkeypatch.chdir(tmp_path)
+    separated(tmp_path)
+    separated(tmp_path, "mono", colors=1)
+    png(tmp_path / "small.png", np.zeros((3, 3), np.uint8))
+    (tmp_path / "a").mkdir()
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "shot.exr").write_bytes(b"mine")
+    plane = np.zeros((4, 4), np.float32)
+    (tmp_path / "other.exr").write_bytes(encode_exr({"a.Y": plane}, {}))
+    (tmp_path / "torn.exr").write_bytes((tmp_path / "shot.exr").read_bytes()[:100])
+    np.savez(tmp_path / "other.npz", a=plane)
+    images = random_images()
+    np.savez(tmp_path / "negative.npz", diffuse=images.diffuse, specular=images.specular)
+    (tmp_path / "torn.npz").write_bytes((tmp_path / "negative.npz").read_bytes()[:900])
+    images.diffuse[0, 0, 0] = -1
+    np.savez(tmp_path / "negative.npz", diffuse=images.diffuse, specular=images.specular)
+    before = contents(tmp_path)
+    assert_refused(polsep(*args), *words)
+    assert contents(tmp_path) == before
+
+
+def test_good_files_go_on_beside_bad_ones(tmp_path: Path, polsep: Cli) -> None:
+    """One bad frame costs exit status 2, not the others."""
+    good, bad = separated(tmp_path), tmp_path / "bad.exr"
+    bad.write_bytes(b"nothing")
+    run = polsep(bad, good, "-o", tmp_path / "out", "--rougher", "1")
+    assert run.status == 2 and "bad.exr: expected" in run.err and "shot.exr ->" in run.out
+    assert sorted(contents(tmp_path / "out")) == ["shot.exr", "shot.json", "shot.png"]
+    assert polsep(good, "-o", tmp_path / "out", "--rougher", "2", "--overwrite").status == 0
+
+
+# Sequences.
+
+
+def test_sequences_are_edited_frame_by_frame(tmp_path: Path, polsep: Cli) -> None:
+    """Every frame is what the edit makes of it, in half floats; numbers stay; nothing else is left."""
+    folder = film(tmp_path / "in", first=7)
+    run = polsep(folder, "-o", tmp_path / "out", "--metallic", "1", "--no-preview")
+    assert run.status == 0 and run.err == ""
+    frames = {f"take_{7 + k:06d}.exr" for k in range(COUNT)}
+    assert set(contents(tmp_path / "out")) == frames | {"take.json", "take.jsonl", "take.png"}
+    assert run.out.splitlines() == [str(tmp_path / "out" / f"take.{s}") for s in ("png", "jsonl", "json")]
+    for k in (0, COUNT - 1):
+        name = f"take_{7 + k:06d}.exr"
+        expected = only(Metallic(), SeparatedImages(*read_separated(folder / name)))
+        for layer in ("diffuse", "specular", "combined"):
+            found = image_of(tmp_path / "out" / name, layer)
+            np.testing.assert_allclose(found, getattr(expected, layer), rtol=1e-3, atol=1e-6)
+    report = json.loads((tmp_path / "out" / "take.json").read_text())
+    assert report["frames"] == COUNT and report["damaged"] == []
+    assert report["settings"]["recipe"]["edits"][0]["gain"] == 45.0
+    lines = [json.loads(line) for line in (tmp_path / "out" / "take.jsonl").read_text().splitlines()]
+    assert [line["frame"] for line in lines] == list(range(7, 7 + COUNT))
+
+
+def test_stopped_runs_go_on_with_the_same_bytes(tmp_path: Path) -> None:
+    """Stopped after any frame, in the first part or behind it, and begun again: the files of a run that was not."""
+    folder, work = film(tmp_path / "in"), Work(Recipe((Rougher(sigma=2.0),)))
+    list(edit_sequence(folder, work, EditTarget(tmp_path / "whole", kind=SILENT)))
+    whole = contents(tmp_path / "whole")
+    for stop in (3, PART + 2):
+        target = EditTarget(tmp_path / f"stopped{stop}", kind=SILENT)
+        with closing(edit_sequence(folder, work, target)) as steps:
+            assert len(list(islice(steps, stop))) == stop
+        assert not (target.directory / "take.json").exists()
+        assert next(edit_sequence(folder, work, target)).done == (PART if stop > PART else 0)
+        list(edit_sequence(folder, work, target))
+        assert contents(target.directory) == whole
+
+
+def test_other_settings_are_not_mixed(tmp_path: Path) -> None:
+    """A run begun with another recipe is not gone on with; finished results and strange frames are not replaced."""
+    folder = film(tmp_path / "in", 3)
+    target = EditTarget(tmp_path / "out", kind=SILENT)
+    with closing(edit_sequence(folder, Work(Recipe((Rougher(sigma=2.0),))), target)) as steps:
+        next(steps)
+    other = Work(Recipe((Rougher(sigma=3.0),)))
+    with pytest.raises(OutputError, match=r"recipe edits .*--overwrite begins anew"):
+        list(edit_sequence(folder, other, target))
+    list(edit_sequence(folder, other, EditTarget(tmp_path / "out", overwrite=True, kind=SILENT)))
+    with pytest.raises(OutputError, match=r"expected no .*found one from before"):
+        list(edit_sequence(folder, other, target))
+    film(tmp_path / "strange", 3)
+    with pytest.raises(OutputError, match=r"expected no .*take_000000.exr, found one from before"):
+        list(edit_sequence(folder, other, EditTarget(tmp_path / "strange", kind=SILENT)))
+    before = contents(folder)
+    with pytest.raises(OutputError, match="expected another directory than that of the input"):
+        list(edit_sequence(folder, other, EditTarget(folder, overwrite=True, kind=SILENT)))
+    assert contents(folder) == before
+
+
+def test_gaps_and_damage_are_never_silent(tmp_path: Path, polsep: Cli) -> None:
+    """A missing frame, a torn one and one of another size end a run, or are named, left out, and cost status 2."""
+    folder = film(tmp_path / "in", 6)
+    os.remove(folder / "take_000002.exr")
+    assert_refused(polsep(folder, "-o", tmp_path / "a", "--rougher", "1", "--no-preview"), "found none of number 2;")
+    assert not (tmp_path / "a").exists()
+    (folder / "take_000000.exr").write_bytes(b"torn")
+    small = random_images(size=(5, 6))
+    write_exr(folder / "take_000004.exr", Picture(small.diffuse, small.specular, None, {}), "none")
+    run = polsep(folder, "-o", tmp_path / "b", "--rougher", "1", "--no-preview", "--damaged", "skip")
+    assert run.status == 2
+    for number in (0, 2, 4):
+        assert f"frame {number} is left out: " in run.err
+    assert [p for p in sorted(contents(tmp_path / "b")) if p.endswith(".exr")] == [
+        f"take_{k:06d}.exr" for k in (1, 3, 5)
+    ]
+    report = json.loads((tmp_path / "b" / "take.json").read_text())
+    assert [line["frame"] for line in report["damaged"]] == [0, 2, 4]
+    write_exr(folder / "take_000002.exr", Picture(small.diffuse, small.specular, None, {}), "none")
+    assert_refused(polsep(folder, "-o", tmp_path / "c", "--rougher", "1", "--no-preview"), "take_000000.exr: expected")
+    os.remove(folder / "take_000000.exr")
+    assert_refused(polsep(folder, "-o", tmp_path / "c", "--rougher", "1", "--no-preview"), "found [5, 6, 3]")
+
+
+def test_films_to_watch(tmp_path: Path, polsep: Cli) -> None:
+    """With the extra video, a sequence gets its film."""
+    pytest.importorskip("av", reason="needs the extra 'video'")
+    folder = film(tmp_path / "in", 3)
+    assert polsep(folder, "-o", tmp_path / "out", "--rougher", "1").status == 0
+    assert (tmp_path / "out" / "take_preview.mp4").stat().st_size > 500
+
+
+def test_sequences_are_found(tmp_path: Path) -> None:
+    """Numbers count as numbers, holes are known, and two sequences are not one."""
+    for name in ("a_0008.npz", "a_0010.npz", "note.txt", "a.exr"):
+        (tmp_path / name).touch()
+    found = find_numbered(tmp_path)
+    assert (found.stem, found.first, found.missing()) == ("a", 8, [9])
+    (tmp_path / "a_00010.npz").touch()
+    with pytest.raises(InputError, match="expected each number once"):
+        find_numbered(tmp_path)
+    os.remove(tmp_path / "a_00010.npz")
+    (tmp_path / "b_0001.exr").touch()
+    with pytest.raises(InputError, match=r"expected one sequence, found 2: a.npz, b.exr"):
+        find_numbered(tmp_path)
+
+
+def test_targets_are_checked(tmp_path: Path) -> None:
+    """Kinds of sequences that edits do not write."""
+    with pytest.raises(ValueError, match="expected exr as format"):
+        EditTarget(tmp_path, kind=SequenceKind("ffv1"))
+    with pytest.raises(ValueError, match="expected stop or skip"):
+        EditTarget(tmp_path, damaged="guess")
+
+
+# Images that edits name.
+
+
+def test_textures_are_decoded_once(tmp_path: Path) -> None:
+    """8 bits are sRGB, everything else is linear; the decoding is the inverse of the previews' encoding."""
+    codes = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    eight = read_map(png(tmp_path / "a.png", codes), "texture")
+    assert eight.shape == (16, 16, 1)
+    assert np.array_equal(np.rint(255 * srgb(eight[..., 0])), codes)
+    sixteen = read_map(png(tmp_path / "b.png", codes.astype(np.uint16) * 257), "texture")
+    np.testing.assert_allclose(sixteen[..., 0], codes / 255, atol=1e-7)
+    np.save(tmp_path / "c.npy", eight)
+    planes = dict(zip("RGB", np.repeat(eight, 3, axis=2).transpose(2, 0, 1), strict=True))
+    (tmp_path / "d.exr").write_bytes(encode_exr(planes, {}))
+    assert np.array_equal(read_map(tmp_path / "c.npy", "texture"), eight)
+    assert np.array_equal(read_map(tmp_path / "d.exr", "texture"), np.repeat(eight, 3, axis=2))
+    stream = io.BytesIO()
+    Image.new("RGB", (8, 8), (188, 188, 188)).save(stream, "JPEG", quality=95)
+    (tmp_path / "e.jpg").write_bytes(stream.getvalue())
+    np.testing.assert_allclose(read_map(tmp_path / "e.jpg", "texture"), linear_from_srgb(188 / 255), atol=0.01)
+
+
+def test_masks_and_normals_are_read(tmp_path: Path) -> None:
+    """Masks are never decoded; normals come back as unit vectors, and none where there are none."""
+    mask = np.array([[0, 51], [102, 255]], np.uint8)
+    np.testing.assert_allclose(read_map(png(tmp_path / "m.png", mask), "mask"), mask / 255, atol=1e-7)
+    rgb = png(tmp_path / "rgb.png", np.repeat(mask[..., None], 3, axis=2))
+    np.testing.assert_allclose(read_map(rgb, "mask"), mask / 255, atol=1e-7)
+    ball = sphere()
+    codes = np.rint((ball + 1) / 2 * 65535).astype(np.uint16)
+    found = read_map(png(tmp_path / "n.png", codes), "normals")
+    solid = ball[..., 2] > 0.01
+    np.testing.assert_allclose(found[solid], ball[solid], atol=1e-4)
+    assert not found[ball[..., 2] == 0].any()
+    assert not found.flags.writeable
+    np.save(tmp_path / "n.npy", ball * 0.9)
+    np.testing.assert_allclose(read_map(tmp_path / "n.npy", "normals")[solid], ball[solid], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("array", "kind", "said"),
+    [
+        (np.full((2, 2, 3), [1, 2, 3], np.uint8), "mask", "expected a grey image as mask, found colours"),
+        (np.full((2, 2), 1.5, np.float32), "mask", r"expected a mask in \[0, 1\], found 1.5 to 1.5"),
+        (np.full((2, 2), np.nan, np.float32), "mask", r"expected a mask in \[0, 1\], found nan"),
+        (np.full((2, 2), np.inf, np.float32), "texture", "expected finite values"),
+        (np.full((2, 2), -1, np.float32), "texture", "expected reflectance of 0 or more, found -1"),
+        (np.zeros((2, 2), np.int32), "texture", "expected unsigned integers or floats, found int32"),
+        (np.zeros((2, 2), np.float32), "normals", "expected normals of three channels"),
+        (np.zeros((3, 2, 2), np.float32), "texture", "expected one image, found 3"),
+        (np.zeros((2, 2, 4), np.float32), "texture", "expected an image of 1 or 3 channels"),
+    ],
+)
+def test_bad_images_are_refused(tmp_path: Path, array: NDArray[Any], kind: str, said: str) -> None:
+    """In one line that names the file."""
+    np.save(tmp_path / "x.npy", array)
+    with pytest.raises(InputError, match=rf"^{tmp_path / 'x.npy'}: {said}"):
+        read_map(tmp_path / "x.npy", kind)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "exr", "npy", "tiff"])
+def test_files_of_another_kind_are_refused(tmp_path: Path, suffix: str) -> None:
+    """Once by name, in one line."""
+    path = tmp_path / f"x.{suffix}"
+    path.write_bytes(b"hello")
+    with pytest.raises(InputError, match=rf"^{path}: expected a") as caught:
+        read_map(path, "texture")
+    assert str(caught.value).count(path.name) == 1
+    with pytest.raises(InputError, match=r"expected a file, found nothing") as caught:
+        read_map(tmp_path / f"none.{suffix}", "texture")
+    assert str(caught.value).count("none") == 1
+
+
+def test_work_names_its_files(tmp_path: Path) -> None:
+    """Images are found from the recipe's folder, and known by their hash."""
+    png(tmp_path / "t.png", np.zeros((2, 2), np.uint8))
+    work = load_work(Recipe((Texture(image="t.png"),)), tmp_path)
+    assert work.maps["t.png"].shape == (2, 2, 1)
+    assert len(work.said()["images"]["t.png"]) == 64

@@ -79,7 +79,7 @@ def shrink(image: Floats, step: int) -> Floats:
     rows, cols = np.arange(0, height, step), np.arange(0, width, step)
     sums: NDArray[Any] = np.add.reduceat(np.add.reduceat(image, rows, axis=0), cols, axis=1)
     count = np.diff(rows, append=height)[:, None] * np.diff(cols, append=width)
-    mean: Floats = sums / count.reshape(count.shape + (1,) * (image.ndim - 2)).astype(np.float32)
+    mean: Floats = (sums / count.reshape(count.shape + (1,) * (image.ndim - 2))).astype(np.float32)
     return mean
 
 

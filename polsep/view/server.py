@@ -18,7 +18,7 @@ from polsep.methods import find_method
 from polsep.pipeline import separate_known
 from polsep.view.guard import LOOPBACK, Guard
 from polsep.view.session import Sessions
-from polsep.view.style import CSS, FONTS, HEAD, MONOSPACE
+from polsep.view.style import CSS, FONTS, MONOSPACE, ON_LOAD
 
 #: Upload limit: 24 frames of 2448x2048 in 16 bits.
 MOST_MB = 240
@@ -112,7 +112,7 @@ def _launch(page, options: ViewOptions) -> str:  # type: ignore[no-untyped-def]
             state_session_capacity=256,
             theme=gr.themes.Base(primary_hue="blue", neutral_hue="zinc", font=FONTS, font_mono=MONOSPACE),
             css=CSS,
-            head=HEAD,
+            js=ON_LOAD,
             app_kwargs={
                 "middleware": [(Guard, (), {"hosts": hosts, "most_bytes": most_bytes})],
                 "docs_url": None,

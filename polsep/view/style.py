@@ -10,13 +10,11 @@ FONTS = ["system-ui", "Segoe UI", "Roboto", "Helvetica Neue", "sans-serif"]
 MONOSPACE = ["ui-monospace", "Menlo", "Consolas", "monospace"]
 
 #: Always dark, as pictures want it; Gradio would follow the system.
-HEAD = """<script>
-addEventListener('DOMContentLoaded', () => {
+ON_LOAD = """() => {
   const keep = () => document.body.classList.contains('dark') || document.body.classList.add('dark');
   new MutationObserver(keep).observe(document.body, {attributes: true, attributeFilter: ['class']});
   keep();
-});
-</script>"""
+}"""
 
 #: Fetch what a hidden link holds, if what was asked for could be written.
 FETCH = "() => { const link = document.querySelector('#ps-fetch'); (link.querySelector('a') ?? link).click(); }"

@@ -132,7 +132,6 @@ def test_a_wrong_file_gives_a_readable_message(page: Any) -> None:
     send(page, "broken.png", b"no picture at all")
     page.wait_for_selector(".ps-error")
     assert page.inner_text(".ps-error") == "broken.png: expected a PNG file, found text"
-    page.reload()
     page.click("#ps-demo")
     page.wait_for_selector(".ps-stage")
     assert page.locator(".ps-error").count() == 0

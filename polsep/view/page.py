@@ -187,7 +187,7 @@ def _connect(page: Any, parts: Parts, answers: _Answers) -> None:
     """Which answer follows which event."""
     settings, picture = set(parts.settings.values()), set(parts.picture())
     everything = settings | picture
-    opened = [*parts.shown(), parts.settings["white"]]
+    opened = [*parts.shown(), parts.settings["white"], parts.file]  # the place for files is empty again for the next
     parts.file.upload(answers.open_upload, {parts.file, *everything}, opened, preprocess=False, **_SEPARATE)
     parts.demo.click(answers.open_demo, everything, opened, **_SEPARATE)
     parts.suggest.click(answers.use_white, everything, opened, **_SEPARATE)
@@ -236,16 +236,16 @@ class _Answers:
         found = self._session(request).found
         white = None if found is None else found.suggested_white()
         said = said if white is None else {**said, self.parts.settings["white"]: f"{white:g}"}
-        return [*self.separate(said, request), said[self.parts.settings["white"]]]
+        return [*self.separate(said, request), said[self.parts.settings["white"]], None]
 
     def _open(self, prepare: Callable[[], None], said: Said, request: gr.Request) -> list[Any]:
         session, white = self._session(request), said[self.parts.settings["white"]]
         try:
             prepare()
         except FAILURES as error:
-            session.found = None
-            return [*self._failed(error, session), white]
-        return [*self.separate({**said, self.parts.settings["index"]: 0}, request), white]
+            session.forget()
+            return [*self._failed(error, session), white, None]
+        return [*self.separate({**said, self.parts.settings["index"]: 0}, request), white, None]
 
     def separate(self, said: Said, request: gr.Request) -> list[Any]:
         """The session's file under the settings that the page shows."""

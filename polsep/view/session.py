@@ -159,6 +159,11 @@ class Session:
             self._path, self._stem = path, stem
             self._read = self.found = self.mark = self._settings = None
 
+    def forget(self) -> None:
+        """Work on no file, as after one that could not be opened."""
+        with self.lock:
+            self._path = self._read = self.found = self.mark = self._settings = None
+
     def separate(self, settings: Settings) -> Found:
         """The opened file under these settings. Raises ValueError, in one line that names the file."""
         with self.lock:

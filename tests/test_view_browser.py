@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,9 +27,15 @@ WAIT_MS = 120_000
 
 
 @pytest.fixture(scope="module")
-def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the viewer's temporary files are."""
+    return tmp_path_factory.mktemp("view")
+
+
+@pytest.fixture(scope="module")
+def viewer(folder: Path) -> Iterator[str]:
     """A viewer."""
-    with running(tmp_path_factory.mktemp("view")) as address:
+    with running(folder) as address:
         yield address
 
 
@@ -154,6 +161,28 @@ def test_the_picture_follows_the_exposure_slider(page: Any) -> None:
     times = sorted(page.evaluate(script, value) for value in ("1", "-1", "2", "0.5", "-2", "0"))
     print(f"exposure: median {times[3]:.0f} ms of {[round(t) for t in times]}")
     assert times[0] < 2000
+
+
+def test_a_closed_page_leaves_nothing(browser: Any, viewer: str, folder: Path) -> None:
+    """Uploads, and what a session works on and handed out, go when its page does."""
+    codes = imagecodecs.png_decode(DEMO.read_bytes())[:256, :256]
+    context = browser.new_context()
+    opened = context.new_page()
+    opened.goto(viewer)
+    opened.wait_for_selector("#ps-demo", timeout=WAIT_MS)
+    send(opened, "private.png", bytes(imagecodecs.png_encode(np.ascontiguousarray(codes))))
+    opened.wait_for_selector(".ps-stage", timeout=WAIT_MS)
+    with opened.expect_download():
+        opened.click("#ps-get-exr")
+    (root,) = folder.glob("polsep-view-*")
+    assert list(root.rglob("private*")) != []
+    context.close()
+    for _ in range(150):
+        left = [*root.rglob("private*"), *(root / "kept").iterdir()]
+        if not left:
+            break
+        time.sleep(0.2)
+    assert left == []
 
 
 def test_parallel_pages_all_finish(browser: Any, viewer: str) -> None:

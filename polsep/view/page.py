@@ -7,7 +7,6 @@ not wait. A panel that a colleague's registry fills, such as `_edit_panel`, is g
 from __future__ import annotations
 
 import html
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -326,9 +325,7 @@ class _Answers:
         self.sessions.end(_key(request))
 
     def _session(self, request: gr.Request) -> Session:
-        session = self.sessions.find(_key(request))
-        session.used = time.monotonic()
-        return session
+        return self.sessions.find(_key(request))
 
     def _stage(self, session: Session, said: Said) -> Any:
         found = session.found

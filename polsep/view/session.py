@@ -144,7 +144,6 @@ class Session:
     def __init__(self, kept: Path, fetched: Path) -> None:
         self.kept, self.fetched = kept, fetched
         self.lock = threading.Lock()
-        self.used = time.monotonic()
         self.found: Found | None = None
         self.mark: tuple[int, int] | None = None
         self.recipe = Recipe()

@@ -6,6 +6,7 @@ import http.client
 import importlib.util
 import json
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -51,6 +52,21 @@ def open_message(config: dict[str, Any], path: str) -> dict[str, Any]:
     file = {"path": path, "orig_name": "a.png", "meta": {"_type": "gradio.FileData"}}
     data = [file if kinds[i]["type"] == "file" else kinds[i]["props"].get("value") for i in event["inputs"]]
     return {"data": data, "fn_index": event["id"]}
+
+
+def test_separating_starts_no_process_and_calls_nobody() -> None:
+    """The network's engine comes without the telemetry of its library, which a viewer must not send."""
+    program = (
+        "import sys, socket, multiprocessing, torch\n"
+        "socket.socket.connect = lambda *a: sys.exit('connected')\n"
+        "from polsep.camera import Layout, Mosaic\n"
+        "from polsep.pipeline import separate_capture\n"
+        "separate_capture(Mosaic(torch.rand(64, 64), Layout(), 0.0, 1.0), 'joint-fast')\n"
+        "assert 'openvino' in sys.modules and sys.modules['openvino_telemetry'] is None\n"
+        "assert multiprocessing.active_children() == []\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
+    assert run.returncode == 0, run.stderr
 
 
 def test_the_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

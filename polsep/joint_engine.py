@@ -8,6 +8,7 @@ frames that it does not take, torch does the work.
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 import warnings
 from collections.abc import Iterator
@@ -88,11 +89,10 @@ class OpenVinoEngine:
     """
 
     def __init__(self, network: Joint, shape: tuple[int, int], precision: str | None = None) -> None:
-        import openvino  # type: ignore[import-untyped]  # no stubs
-
         from polsep.kernels import get_threads
         from polsep.kernels.joint import Maps
 
+        openvino = _import_openvino()
         self._lock, self._colors = threading.Lock(), network.colors
         self._layout = Layout() if network.colors == 3 else Layout(bayer=None)
         h, w = shape[0] // PERIOD, shape[1] // PERIOD
@@ -165,6 +165,17 @@ class OpenVinoEngine:
         source = Source(samples, pattern, read_grid(pattern, angles, stokes_inverse(angles).float().numpy()))
         # A strip begins with rows that the one before has too, many of them: one for each thread.
         share(lambda rows: map_guided_rows(source, self._maps, rows), h, -(-h // get_threads()))
+
+
+def _import_openvino() -> Any:
+    """OpenVINO without its telemetry: importing it reports that to Google, from a forked process that may hang.
+
+    It does without where its module cannot be imported, which None in its place says.
+    """
+    sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
+    import openvino  # type: ignore[import-untyped]  # no stubs
+
+    return openvino
 
 
 def _as_model(layers: nn.Module, example: Tensor) -> Any:

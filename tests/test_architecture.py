@@ -60,6 +60,7 @@ RANKS = {
     "testsets": 6,
     "train": 6,
     "capture": 6,
+    "view": 6,
     "cli": 7,
 }
 #: Imports between modules of one rank that belong together.
@@ -95,6 +96,8 @@ WITHIN = {
     ("capture", "capture"),
     ("edit", "edit"),
     ("edit", "video"),
+    ("view", "view"),
+    ("view", "edit"),
     ("cli", "cli"),
 }
 #: Libraries that only one room may use.
@@ -127,6 +130,7 @@ HOMES = {
     "av": "io",
     "gi": "capture",
     "pypylon": "capture",
+    "gradio": "view",
 }
 #: Calls that touch files, by name of the function or method.
 FILE_CALLS = {"open", "read_bytes", "write_bytes", "read_text", "write_text", "imread", "imwrite", "fromfile", "tofile"}

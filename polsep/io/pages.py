@@ -7,6 +7,9 @@ read. Sizes in headers are believed only up to `MAX_SAMPLES`, before any memory 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -17,6 +20,8 @@ from polsep.io.errors import InputError
 
 #: Samples of one frame beyond which a header is not believed: fifty 5-megapixel sensors, or 1 GiB as float32.
 MAX_SAMPLES = 2**28
+
+_most_samples: ContextVar[int] = ContextVar("most_samples", default=MAX_SAMPLES)
 
 _SIGNATURES = (
     (b"\x89PNG\r\n\x1a\n", "a PNG file"),
@@ -74,9 +79,19 @@ def require_signature(stream: BinaryIO, signatures: tuple[bytes, ...], name: str
 
 
 def require_size(shape: tuple[int, ...]) -> None:
-    """Raise InputError for a frame without samples, or with more than `MAX_SAMPLES`."""
+    """Raise InputError for a frame without samples, or with more than are allowed, `MAX_SAMPLES` or fewer."""
     size = "x".join(str(n) for n in shape)
     if min(shape, default=0) < 1:
         raise InputError(f"expected an image with at least one pixel, found {size}")
-    if math.prod(shape) > MAX_SAMPLES:
-        raise InputError(f"expected at most {MAX_SAMPLES} samples in a frame, found {size}")
+    if math.prod(shape) > (most := _most_samples.get()):
+        raise InputError(f"expected at most {most} samples in a frame, found {size}")
+
+
+@contextmanager
+def at_most(samples: int) -> Iterator[None]:
+    """Inside the block, headers are believed only up to so many samples of a frame: for files of strangers."""
+    token = _most_samples.set(min(samples, MAX_SAMPLES))
+    try:
+        yield
+    finally:
+        _most_samples.reset(token)

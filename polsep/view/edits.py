@@ -1,0 +1,93 @@
+"""Edits as controls: what the registry of `polsep.edit` says of each, made into values of a page and back.
+
+The panel is generated: an edit that is added to `EDITS` appears by itself. Those that need an image are left out, since
+a page has none to name. Every control starts where its edit is the identity.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from polsep.edit import EDITS, Edit, Parameter, Recipe, SeparatedImages, apply, make_edit
+from polsep.io.maps import linear_from_srgb
+from polsep.io.previews import srgb
+from polsep.view.pictures import Floats, Small
+
+
+@dataclass(frozen=True)
+class Control:
+    """One value of an edit on the page; ``start``: where it stands at first."""
+
+    edit: type[Edit]
+    parameter: Parameter
+    start: float | str
+
+    @property
+    def label(self) -> str:
+        """The parameter for people, with its unit."""
+        name = self.parameter.name.capitalize()
+        return f"{name} [{self.parameter.unit}]" if self.parameter.unit else name
+
+
+def list_controls() -> tuple[Control, ...]:
+    """The controls of every edit that needs no image, in the order in which edits act."""
+    kinds = [kind for kind in EDITS.values() if not any(p.required for p in kind.parameters())]
+    return tuple(
+        Control(kind, parameter, _start(parameter))
+        for kind in kinds
+        for parameter in kind.parameters()
+        if parameter.kind in ("number", "color")
+    )
+
+
+def _start(parameter: Parameter) -> float | str:
+    """The neutral value, else the default; colours as sRGB text."""
+    value: Any = parameter.default if parameter.neutral is None else parameter.neutral
+    if parameter.kind == "number":
+        return float(value)
+    return "#" + "".join(f"{round(255 * float(part)):02x}" for part in srgb(np.asarray(value)))
+
+
+def recipe_of(values: Sequence[Any]) -> Recipe:
+    """The recipe that the controls stand for, in the order of `list_controls`, without edits that do nothing.
+
+    Raises ValueError on values out of range.
+    """
+    said: dict[type[Edit], dict[str, Any]] = {}
+    for control, value in zip(list_controls(), values, strict=True):
+        kept = _color(value) if control.parameter.kind == "color" else value
+        said.setdefault(control.edit, {})[control.parameter.name] = kept
+    edits = (make_edit(kind, named) for kind, named in said.items())
+    return Recipe(tuple(edit for edit in edits if not edit.is_neutral()))
+
+
+def _color(text: object) -> tuple[float, ...]:
+    """Linear light of ``#rrggbb`` or ``rgba(r, g, b, a)``, which are what browsers say."""
+    said = str(text)
+    if (found := re.fullmatch(r"#([0-9a-fA-F]{6})", said)) is not None:
+        codes = [float(code) for code in bytes.fromhex(found[1])]
+    elif (found := re.fullmatch(r"rgba?\(([\d.]+),\s*([\d.]+),\s*([\d.]+)(?:,\s*[\d.]+)?\)", said)) is not None:
+        codes = [float(found[k]) for k in (1, 2, 3)]
+    else:
+        raise ValueError(f"expected a colour like #c04020, found {said!r:.40}")
+    return tuple(float(part) for part in linear_from_srgb(np.array(codes) / 255))
+
+
+def edit_small(small: Small, recipe: Recipe) -> Floats:
+    """The edited picture at screen size, linear; lengths in pixels shrink with it. Raises EditError."""
+    return apply(SeparatedImages(small.diffuse, small.specular), at_scale(recipe, small.step)).combined
+
+
+def at_scale(recipe: Recipe, step: int) -> Recipe:
+    """The recipe for images of which one pixel is ``step`` of the frame's."""
+    return Recipe(tuple(_at_scale(edit, step) for edit in recipe.edits))
+
+
+def _at_scale(edit: Edit, step: int) -> Edit:
+    lengths = {p.name: getattr(edit, p.name) / step for p in edit.parameters() if p.unit == "px"}
+    return replace(edit, **lengths)

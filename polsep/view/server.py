@@ -1,0 +1,129 @@
+"""The viewer's server: this machine alone unless told otherwise, folders that end with it, nothing asked of others."""
+
+from __future__ import annotations
+
+import os
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from polsep.camera import Layout, Mosaic
+from polsep.io.scratch import drop_folder, make_scratch
+from polsep.methods import find_method
+from polsep.pipeline import separate_known
+from polsep.view.guard import LOOPBACK, Guard
+from polsep.view.session import Sessions
+from polsep.view.style import CSS, FONTS, MONOSPACE, ON_LOAD
+
+#: Upload limit: 24 frames of 2448x2048 in 16 bits.
+MOST_MB = 240
+#: Addresses that stand for all of a machine's.
+ANY_HOST = ("0.0.0.0", "::")
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Where the viewer listens and what it starts with: ``settings`` by the names of `session.parse_settings`.
+
+    ``port`` None: the first free one from 7860 on. ``most_mb``: of an upload.
+    """
+
+    host: str = LOOPBACK[0]
+    port: int | None = None
+    file: Path | None = None
+    settings: dict[str, str] = field(default_factory=dict)
+    most_mb: int = MOST_MB
+
+
+@contextmanager
+def serve(options: ViewOptions) -> Iterator[str]:
+    """Serve the viewer while the block runs, and give its address.
+
+    Raises ModuleNotFoundError without Gradio, and OSError when the port is taken.
+    """
+    scratch = make_scratch()
+    kept = {name: os.environ.get(name) for name in _environment(scratch.root)}
+    os.environ.update(_environment(scratch.root))
+    page = None
+    try:
+        warm = threading.Thread(target=warm_up, args=(options.settings.get("method", "auto"),), daemon=True)
+        warm.start()
+        page = _build(options, Sessions(scratch, options.most_mb << 20))
+        yield _launch(page, options)
+    finally:
+        if page is not None and page.is_running:
+            page.close(verbose=False)
+        drop_folder(scratch.root)
+        for name, value in kept.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _environment(root: Path) -> dict[str, str]:
+    """What Gradio reads from there: no analytics, and every file of its below ``root``."""
+    return {
+        "GRADIO_ANALYTICS_ENABLED": "False",
+        "HF_HUB_DISABLE_TELEMETRY": "1",
+        "HF_HUB_OFFLINE": "1",
+        "GRADIO_TEMP_DIR": str(root / "exchange"),
+        "GRADIO_EXAMPLES_CACHE": str(root / "kept" / "examples"),
+    }
+
+
+def _build(options: ViewOptions, sessions: Sessions):  # type: ignore[no-untyped-def]  # Gradio has no types for us
+    """Import Gradio where it is used first: it takes seconds, and its dependencies warn."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from polsep.view.page import Start, build_page
+
+        return build_page(sessions, Start(options.settings, options.file))
+
+
+def _launch(page, options: ViewOptions) -> str:  # type: ignore[no-untyped-def]
+    import gradio as gr
+
+    hosts = None if options.host in ANY_HOST else (*LOOPBACK, options.host)
+    most_bytes = options.most_mb << 20
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        _, address, _ = page.launch(
+            server_name=options.host,
+            server_port=options.port,
+            prevent_thread_lock=True,
+            inbrowser=False,
+            share=False,
+            quiet=True,
+            show_error=False,
+            footer_links=[],
+            run_history=False,
+            ssr_mode=False,
+            pwa=False,
+            mcp_server=False,
+            enable_monitoring=False,
+            allowed_paths=[],
+            max_file_size=most_bytes,
+            state_session_capacity=256,
+            theme=gr.themes.Base(primary_hue="blue", neutral_hue="zinc", font=FONTS, font_mono=MONOSPACE),
+            css=CSS,
+            js=ON_LOAD,
+            app_kwargs={
+                "middleware": [(Guard, (), {"hosts": hosts, "most_bytes": most_bytes})],
+                "docs_url": None,
+                "redoc_url": None,
+                "openapi_url": None,
+            },
+        )
+    return str(address)
+
+
+def warm_up(method: str) -> None:
+    """Do what the first separation would wait for: load kernels and weights, and make an engine of the usual size."""
+    mosaic = Mosaic(torch.zeros(2048, 2448), Layout(), 0.0, 1.0)
+    separate_known(mosaic, find_method(method, mosaic), (1.0, 1.0, 1.0))

@@ -1,0 +1,481 @@
+"""The viewer apart from any browser: sessions, pictures, read-outs, what is refused, and the server without network."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import imagecodecs
+import numpy as np
+import pytest
+import torch
+
+from polsep.camera import Layout, Mosaic
+from polsep.edit import EDITS, Metallic, Recipe, Rougher
+from polsep.edit import apply as apply_edits
+from polsep.io.errors import InputError
+from polsep.io.exr import read_exr_layers
+from polsep.io.outputs import write_separation
+from polsep.io.previews import srgb
+from polsep.io.reopened import read_separation
+from polsep.io.scratch import Scratch, drop_folder, find_upload, make_scratch
+from polsep.pipeline import separate_capture
+from polsep.report import SeparatedFrame
+from polsep.view import guard, session
+from polsep.view.edits import at_scale, edit_small, list_controls, recipe_of
+from polsep.view.guard import Guard, host_name, names_address
+from polsep.view.pictures import (
+    VIEWS,
+    confidence_panel,
+    draw,
+    histogram,
+    histogram_panel,
+    polarization_panel,
+    shrink,
+    shrink_frame,
+    stage,
+    tone,
+)
+from polsep.view.readout import read_pixel, readout_panel
+from polsep.view.session import Session, Sessions, Settings, parse_settings, plain_name
+
+WHITE = 4095
+
+
+def mosaic_codes(height: int = 96, width: int = 128, seed: int = 0) -> np.ndarray[Any, np.dtype[np.uint16]]:
+    """A colour mosaic of smooth light, 12 bits, a corner of it clipped."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width]
+    light = 600 + 1400 * (x / width) + 900 * np.sin(y / 9.0) ** 2
+    angle = np.choose((y % 2) * 2 + x % 2, [np.pi / 2, np.pi / 4, 3 * np.pi / 4, 0.0])
+    codes = light * (1 + 0.3 * np.cos(2 * angle - 0.7)) + rng.normal(0, 4, light.shape)
+    codes[:12, -12:] = 9000
+    return np.clip(np.rint(codes), 0, WHITE).astype(np.uint16)
+
+
+@pytest.fixture
+def scratch() -> Iterator[Scratch]:
+    """Folders of a server, gone afterwards."""
+    made = make_scratch()
+    yield made
+    drop_folder(made.root)
+
+
+@pytest.fixture
+def sessions(scratch: Scratch) -> Sessions:
+    """No page open yet."""
+    return Sessions(scratch, 10 << 20)
+
+
+def upload(sessions: Sessions, name: str, data: bytes) -> Path:
+    """A file as the page's server receives it."""
+    folder = sessions.scratch.exchange / f"upload-{len(list(sessions.scratch.exchange.iterdir()))}"
+    folder.mkdir()
+    (folder / name).write_bytes(data)
+    return folder / name
+
+
+def png(codes: np.ndarray[Any, Any]) -> bytes:
+    return bytes(imagecodecs.png_encode(codes))
+
+
+def opened(sessions: Sessions, key: str = "a", **said: Any) -> session.Found:
+    """A small raw frame, uploaded and separated by the closed form."""
+    sent = upload(sessions, "shot 1.png", png(mosaic_codes()))
+    sessions.open_upload(key, str(sent), sent.name)
+    return sessions.find(key).separate(parse_settings({"method": "color-affine", "white": "4095", **said}))
+
+
+def test_a_session_separates_as_the_library_does(sessions: Sessions) -> None:
+    """The frame behind the page is `separate_capture`'s, bit for bit, and so is the EXR that it hands out."""
+    found = opened(sessions)
+    mosaic = Mosaic(torch.from_numpy(mosaic_codes().astype(np.float32)), Layout(), 0.0, WHITE)
+    truth = separate_capture(mosaic, "color-affine")
+    for name in ("diffuse", "specular", "valid", "dolp", "aolp"):
+        np.testing.assert_array_equal(getattr(found.frame, name), getattr(truth, name))
+    assert found.stem == "shot_1"
+    layers = read_exr_layers(sessions.find("a").write("exr"))
+    for k, color in enumerate("RGB"):
+        np.testing.assert_array_equal(layers[f"diffuse.{color}"], truth.diffuse[..., k])
+        np.testing.assert_array_equal(layers[f"specular.{color}"], truth.specular[..., k])
+    assert sessions.find("a").write("png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_same_settings_cost_nothing_again(sessions: Sessions) -> None:
+    """A session keeps what it found until a setting changes; the file is read anew only where reading changes."""
+    found = opened(sessions)
+    page = sessions.find("a")
+    same = parse_settings({"method": "color-affine", "white": "4095"})
+    assert page.separate(same) is found
+    other = page.separate(parse_settings({"method": "analytic", "white": "4095"}))
+    assert other.frame.report["method"] == "analytic"
+    assert other.mosaic is found.mosaic
+    brighter = page.separate(parse_settings({"method": "analytic", "white": "2000"}))
+    assert brighter.mosaic is not found.mosaic
+
+
+def test_an_unsaid_white_level_is_recommended_not_guessed(sessions: Sessions) -> None:
+    """12 bits in 16 give a remark in the page's words, and the level that a button offers."""
+    found = opened(sessions, white=session.UNSAID)
+    assert found.mosaic is not None and found.mosaic.white_level == 65535
+    assert any("set White level to 4095" in remark for remark in found.remarks)
+    assert found.suggested_white() == 4095
+
+
+def test_results_are_opened_again(sessions: Sessions, tmp_path: Path) -> None:
+    """What `write_separation` wrote comes back bit for bit, with expected errors where there are any."""
+    frame = opened(sessions).frame
+    error = np.random.default_rng(0).random((*frame.valid.shape, 2), dtype=np.float32)
+    frame = SeparatedFrame(frame.diffuse, frame.specular, frame.valid, frame.dolp, frame.aolp, frame.report, error)
+    (path, *_) = write_separation(frame, tmp_path, "shot")
+    back = read_separation(path)
+    for name in ("diffuse", "specular", "valid", "dolp", "aolp", "error"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(frame, name))
+    sent = upload(sessions, "shot.exr", path.read_bytes())
+    sessions.open_upload("b", str(sent), sent.name)
+    found = sessions.find("b").separate(Settings())
+    assert found.mosaic is None and found.histogram is None
+    np.testing.assert_array_equal(found.frame.specular, frame.specular)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "said"),
+    [
+        ("notes.txt", b"hello", "notes.txt: expected PNG, TIFF, .* found '.txt'"),
+        ("photo.jpg", b"\xff\xd8\xff", "photo.jpg: expected PNG"),
+        ("recording.json", b"{}", "recording.json: expected PNG"),
+        ("film.mkv", b"", "film.mkv: expected PNG"),
+        ("broken.png", b"\x89PNG\r\n\x1a\nrest", "^broken.png: expected a PNG header"),
+        ("text.png", b"just text in disguise", "^text.png: expected a PNG file, found text"),
+        ("empty.npy", b"", "^empty.npy: expected .* found an empty file"),
+        ("rgb.png", png(np.dstack([mosaic_codes()] * 2 + [mosaic_codes(seed=1)])), "^rgb.png: expected one channel"),
+        ("dump.raw", b"0" * 64, "^dump.raw: expected the size and pixel format"),
+        ("cut.exr", b"\x76\x2f\x31\x01\2\0\0\0", "^cut.exr: expected"),
+        ("other.exr", b"not at all", "^other.exr: expected an OpenEXR file, found text"),
+    ],
+)
+def test_wrong_files_are_refused_in_one_line(sessions: Sessions, name: str, data: bytes, said: str) -> None:
+    """The message speaks of the user's file, never of where it is kept."""
+    sent = upload(sessions, name, data)
+
+    def try_it() -> None:
+        sessions.open_upload("a", str(sent), name)
+        sessions.find("a").separate(Settings())
+
+    with pytest.raises(ValueError, match=said) as caught:
+        try_it()
+    assert "\n" not in str(caught.value) and str(sessions.scratch.root) not in str(caught.value)
+
+
+def test_large_frames_are_refused_by_their_header(sessions: Sessions) -> None:
+    """A small file that promises more samples than the viewer opens is refused before it is decoded."""
+    header = b"\x93NUMPY\1\0" + (118).to_bytes(2, "little")
+    header += b"{'descr': '<u2', 'fortran_order': False, 'shape': (20000, 20000), }".ljust(117) + b"\n"
+    sent = upload(sessions, "big.npy", header)
+    sessions.open_upload("a", str(sent), sent.name)
+    with pytest.raises(InputError, match=f"big.npy: expected at most {session.MOST_SAMPLES} samples"):
+        sessions.find("a").separate(Settings())
+
+
+def test_nothing_outside_of_uploads_exists(sessions: Sessions, tmp_path: Path) -> None:
+    """Paths of a client name files in the exchange folder, or nothing, and the answer is the same either way."""
+    outside = tmp_path / "secret.png"
+    outside.write_bytes(png(mosaic_codes()))
+    scratch = sessions.scratch
+    (scratch.kept / "other.png").write_bytes(b"x")
+    link = scratch.exchange / "link.png"
+    link.symlink_to(outside)
+    claims = [outside, "/nowhere", link, scratch.kept / "other.png", f"{scratch.exchange}/../kept/other.png", "", None]
+    said = set()
+    for claim in [*claims, scratch.exchange, "a\0b", 7, "http://example.org/a.png"]:
+        with pytest.raises(InputError) as caught:
+            find_upload(scratch, str(claim) if isinstance(claim, Path) else claim, 1 << 20)
+        said.add(str(caught.value))
+    assert said == {"expected a file that this page uploaded, found another path"}
+    sent = upload(sessions, "a.png", bytes(2 << 20))
+    assert find_upload(scratch, str(sent), 2 << 20) == sent
+    with pytest.raises(InputError, match="expected a file of at most 1 MB, found 2 MB"):
+        find_upload(scratch, str(sent), 1 << 20)
+
+
+def test_names_of_files_become_harmless() -> None:
+    """Folders, templates and odd characters do not reach a path."""
+    assert plain_name("../../etc/shot.PNG") == ("shot", ".png")
+    assert plain_name("C:\\data\\a b.tif") == ("a_b", ".tif")
+    assert plain_name("s_{angle}.png") == ("s__angle", ".png")
+    assert plain_name("....raw")[0] == "frame"
+    assert len(plain_name("x" * 500 + ".npy")[0]) == 64
+
+
+def test_sessions_are_apart_and_leave_nothing(sessions: Sessions) -> None:
+    """Two pages that sent the same file do not share frames; the file goes with the last of them, and so does all."""
+    sent = upload(sessions, "shot.png", png(mosaic_codes()))
+    for key in ("a", "b"):
+        sessions.open_upload(key, str(sent), sent.name)
+        sessions.find(key).separate(parse_settings({"method": "analytic", "white": "4095"}))
+    assert sessions.find("a").found is not sessions.find("b").found
+    with pytest.raises(ValueError, match="expected an opened file"):
+        sessions.find("c").separate(Settings())
+    sessions.find("a").write("exr")
+    sessions.end("a")
+    assert sent.exists()
+    assert sessions.find("b").separate(parse_settings({"method": "paper", "white": "4095"})).count == 1
+    for key in ("b", "c", "never"):
+        sessions.end(key)
+    assert len(sessions) == 0
+    assert [*sessions.scratch.exchange.iterdir(), *sessions.scratch.kept.iterdir()] == []
+
+
+def test_the_page_idle_for_longest_makes_room(sessions: Sessions, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory is bounded: one page too many ends another."""
+    monkeypatch.setattr(session, "MOST_SESSIONS", 2)
+    first = sessions.find("a")
+    sessions.find("b")
+    assert sessions.find("a") is first
+    sessions.find("c")
+    assert len(sessions) == 2 and sessions.find("a") is first
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"method": "magic"}, "expected a method of auto"),
+        ({"layout": "rgb"}, 'expected "color", "mono"'),
+        ({"white": "bright"}, "expected a number as white level"),
+        ({"size": "2448"}, "expected a size like 2448x2048"),
+        ({"light": "1,2"}, "expected a light colour like"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(said: dict[str, str], message: str) -> None:
+    """Fields of the page are texts; each has its own one-line error."""
+    with pytest.raises(ValueError, match=message):
+        parse_settings(said)
+
+
+def test_settings_are_those_of_the_library() -> None:
+    """What the page says becomes read options and arguments of `separate`."""
+    settings = parse_settings({"layout": "mono", "black": "16", "white": "4095", "light": "1, 0.9,0.7", "index": 3})
+    assert settings.read.layout == Layout(bayer=None)
+    assert (settings.read.black_level, settings.read.white_level) == (16.0, 4095.0)
+    assert settings.light_color == (1.0, 0.9, 0.7) and settings.index == 3
+    plain = parse_settings({"layout": session.UNSAID, "white": session.UNSAID, "light": "white", "size": ""})
+    assert plain == Settings()
+    assert parse_settings({"size": "2448 x 2048"}).read.size == (2448, 2048)
+
+
+def test_frames_of_a_stack_are_reached_by_number(sessions: Sessions) -> None:
+    """A file of several frames has as many; each is separated as if it were alone."""
+    stack = np.stack([mosaic_codes(seed=k) for k in range(3)])
+    sent = upload(sessions, "stack.npy", b"")
+    np.save(sent, stack)
+    sessions.open_upload("a", str(sent), sent.name)
+    page = sessions.find("a")
+    found = page.separate(parse_settings({"white": "4095", "method": "analytic", "index": 2}))
+    assert (found.index, found.count, found.stem) == (2, 3, "stack_0002")
+    alone = separate_capture(Mosaic(torch.from_numpy(stack[2].astype(np.float32)), Layout(), 0.0, WHITE), "analytic")
+    np.testing.assert_array_equal(found.frame.diffuse, alone.diffuse)
+
+
+def test_tones_are_srgb() -> None:
+    """The table is within one code of the formula, hits both ends, and never goes down."""
+    light = np.linspace(0, 1.2, 4001, dtype=np.float32)[None, :, None]
+    codes = tone(light, 1.0)
+    assert np.abs(codes[..., 0].astype(int) - np.rint(255 * srgb(light[..., 0]))).max() <= 1
+    assert (codes[0, 0] == 0).all() and (codes[0, -1] == 255).all()
+    assert (np.diff(codes[0, :, 0].astype(int)) >= 0).all()
+    np.testing.assert_array_equal(tone(light / 4, 4.0), codes)
+
+
+def test_shrinking_keeps_means_and_angles(sessions: Sessions) -> None:
+    """Blocks are averaged as light and as Stokes vectors: a uniform field keeps its DoLP and AoLP."""
+    image = np.random.default_rng(0).random((7, 10, 3), dtype=np.float32)
+    small = shrink(image, 3)
+    assert small.shape == (3, 4, 3)
+    np.testing.assert_allclose(small[0, 0], image[:3, :3].mean(axis=(0, 1)), rtol=1e-6)
+    np.testing.assert_allclose(small[2, 3], image[6:, 9:].mean(axis=(0, 1)), rtol=1e-6)
+    size = (700, 1300)
+    ones = np.ones((*size, 3), np.float32)
+    frame = SeparatedFrame(
+        ones, ones, np.ones(size, bool), np.full(size, 0.25, np.float32), np.full(size, 2.8, np.float32), {}
+    )
+    copy = shrink_frame(frame)
+    assert copy.step == 3 and max(copy.size) <= 640
+    np.testing.assert_allclose(copy.dolp, 0.25, rtol=1e-4)
+    np.testing.assert_allclose(copy.aolp, 2.8, rtol=1e-4)
+
+
+def test_exposure_is_in_stops(sessions: Sessions) -> None:
+    """One stop more is twice the light, of the input as of its parts; maps of polarization stay."""
+    small = opened(sessions).small
+    np.testing.assert_array_equal(draw(small, "Diffuse", 1.0), tone(small.diffuse, 2 * small.gain))
+    np.testing.assert_array_equal(draw(small, "DoLP", 1.0), draw(small, "DoLP", -3.0))
+    assert draw(small, "Input", 1.0).astype(int).sum() > draw(small, "Input", 0.0).astype(int).sum()
+    for view in VIEWS:
+        picture = draw(small, view, 0.0)
+        assert picture.dtype == np.uint8 and picture.shape == (*small.size, 3)
+    with pytest.raises(ValueError, match="expected a picture of Input"):
+        draw(small, "<script>", 0.0)
+
+
+def test_panels_hold_their_pictures_and_nothing_from_elsewhere(sessions: Sessions) -> None:
+    """Everything that a page shows is in the text itself: no address, no file."""
+    found = opened(sessions)
+    panels = [
+        stage(found.small, ("Input", "Specular"), 0.0, (3, 4)),
+        polarization_panel(found.small),
+        histogram_panel(found.histogram),
+        histogram_panel(None),
+        confidence_panel(found.frame, found.small),
+        readout_panel(read_pixel(found.frame, found.mosaic, (3, 4))),
+    ]
+    for panel in panels:
+        assert "http" not in panel and "file=" not in panel and "<script" not in panel
+    assert panels[0].count("data:image/") == 2 and "ps-mark" in panels[0]
+    assert "does not say how far off" in panels[4]
+
+
+def test_the_histogram_counts_every_sample(sessions: Sessions) -> None:
+    """Shares of each colour sum to 1, and clipped shares are the mosaic's."""
+    found = opened(sessions)
+    assert found.mosaic is not None and found.histogram is not None
+    np.testing.assert_allclose(found.histogram.shares.sum(axis=1), 1.0, rtol=1e-12)
+    clipped = float(found.mosaic.clipped().float().mean())
+    weights = np.array([1, 2, 1]) / 4
+    assert math.isclose(float(np.dot(weights, found.histogram.clipped)), clipped, rel_tol=1e-6)
+    mono = Mosaic(found.mosaic.data, Layout(bayer=None), 0.0, WHITE)
+    assert histogram(mono).names == "Y" and math.isclose(histogram(mono).clipped[0], clipped, rel_tol=1e-6)
+
+
+def test_a_pixel_reads_its_own_cell(sessions: Sessions) -> None:
+    """Raw values are those of the file under the right angles, and their Stokes vector obeys Malus's law."""
+    found = opened(sessions)
+    codes = mosaic_codes()
+    seen = read_pixel(found.frame, found.mosaic, (20, 31))
+    assert [s.angle_deg for s in seen.samples] == [0, 45, 90, 135]
+    assert [s.value for s in seen.samples] == [codes[41, 63], codes[40, 63], codes[40, 62], codes[41, 62]]
+    assert seen.color == "G" and not any(s.clipped for s in seen.samples)
+    assert seen.stokes is not None
+    s0, s1, s2 = seen.stokes
+    assert math.isclose(s0, 2 * sum(s.value for s in seen.samples) / 4 / WHITE, rel_tol=1e-5)
+    assert math.isclose(s1, (seen.samples[0].value - seen.samples[2].value) / WHITE, rel_tol=1e-4)
+    assert math.isclose(s2, (seen.samples[1].value - seen.samples[3].value) / WHITE, rel_tol=1e-4)
+    assert seen.diffuse == tuple(found.frame.diffuse[20, 31].tolist())
+    assert all(s.clipped for s in read_pixel(found.frame, found.mosaic, (0, 63)).samples)
+    with pytest.raises(ValueError, match="expected a pixel of 64x48"):
+        read_pixel(found.frame, found.mosaic, (48, 0))
+
+
+def test_controls_are_generated_from_the_registry() -> None:
+    """Every edit that needs no image has its controls; where they start, nothing is edited."""
+    controls = list_controls()
+    wanted = {kind for kind in EDITS.values() if not any(p.required for p in kind.parameters())}
+    assert {control.edit for control in controls} == wanted
+    starts = [control.start for control in controls]
+    assert recipe_of(starts) == Recipe()
+    moved = [5.0 if (c.edit, c.parameter.name) == (Rougher, "sigma") else c.start for c in controls]
+    assert recipe_of(moved) == Recipe((Rougher(sigma=5.0),))
+    with pytest.raises(ValueError, match="expected a colour like"):
+        recipe_of(["url(x)" if c.parameter.kind == "color" else c.start for c in controls])
+    with pytest.raises(ValueError, match="expected sigma from"):
+        recipe_of([1e9 if c.parameter.name == "sigma" else c.start for c in controls])
+
+
+def test_edits_are_shown_small_and_written_large(sessions: Sessions) -> None:
+    """The page shows the recipe at its scale; the file that it hands out is `polsep.edit.apply`'s at full size."""
+    found = opened(sessions)
+    page = sessions.find("a")
+    recipe = Recipe((Rougher(sigma=4.0), Metallic(amount=0.5)))
+    assert at_scale(recipe, 2).edits == (Rougher(sigma=2.0), Metallic(amount=0.5))
+    page.edit(recipe)
+    assert page.found is not None and page.found.small.edited is not None
+    np.testing.assert_array_equal(page.found.small.edited, edit_small(found.small, recipe))
+    layers = read_exr_layers(page.write("edited"))
+    truth = apply_edits(found.frame, recipe)
+    np.testing.assert_array_equal(layers["combined.G"], truth.combined[..., 1])
+    assert json.loads(page.write("recipe").read_text())["edits"][0]["edit"] == "rougher"
+    page.edit(Recipe())
+    assert page.found.small.edited is None
+
+
+def test_requests_name_this_machine() -> None:
+    """Host headers lose port and brackets."""
+    assert [host_name(h) for h in ("127.0.0.1:7860", "localhost", "[::1]:80", "evil.example:7860")] == [
+        "127.0.0.1",
+        "localhost",
+        "::1",
+        "evil.example",
+    ]
+
+
+def test_addresses_in_messages_are_found() -> None:
+    """Gradio would fetch a file whose path is an address, however deep it lies in a message."""
+    assert names_address(b'{"data": [[{"a": {"path": "http://10.0.0.1/x"}}]]}')
+    assert names_address(b'{"path": "file:///etc/passwd"}')
+    assert not names_address(b'{"data": [{"path": "/tmp/x/a.png", "url": "http://127.0.0.1:7860/file=/tmp/x/a.png"}]}')
+    assert not names_address(b"") and not names_address(b"{")
+
+
+def ask(path: str, verb: str = "GET", body: bytes = b"", **headers: str) -> tuple[int, bytes]:
+    """Status and what the server behind the guard got."""
+    got: list[bytes] = []
+    sent: list[Any] = []
+
+    async def behind(scope: Any, receive: Any, send: Any) -> None:
+        got.append((await receive()).get("body", b""))
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+
+    async def receive() -> Any:
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    named = {"host": "127.0.0.1:7860", **headers}
+    pairs = [(name.replace("_", "-").encode(), value.encode()) for name, value in named.items()]
+    scope = {"type": "http", "method": verb, "path": path, "headers": pairs}
+    asyncio.run(Guard(behind, guard.LOOPBACK, 1 << 20)(scope, receive, send))
+    return sent[0]["status"], b"".join(got)
+
+
+@pytest.mark.parametrize(
+    ("path", "verb", "headers", "status"),
+    [
+        ("/", "GET", {}, 200),
+        ("/", "GET", {"host": "evil.example"}, 403),
+        ("/gradio_api/file=/tmp/a.exr", "GET", {}, 200),
+        ("/gradio_api/file=http://10.0.0.1/", "GET", {}, 403),
+        ("/gradio_api/file=http:/10.0.0.1/", "GET", {}, 403),
+        ("/gradio_api/proxy=http://10.0.0.1/", "GET", {}, 403),
+        ("/gradio_api/stream/x", "POST", {}, 403),
+        ("/gradio_api/run/predict", "POST", {}, 200),
+        ("/gradio_api/upload", "POST", {"content_length": "5000000000"}, 413),
+        ("/gradio_api/upload", "POST", {"content_length": "-1"}, 413),
+        ("/gradio_api/upload", "POST", {"content_length": "1000"}, 200),
+        ("/monitoring", "GET", {}, 403),
+        ("/", "DELETE", {}, 403),
+    ],
+)
+def test_only_the_viewers_own_requests_pass(path: str, verb: str, headers: dict[str, str], status: int) -> None:
+    """What the page does not need is refused by its head alone."""
+    assert ask(path, verb, **headers)[0] == status
+
+
+def test_messages_pass_whole_or_not_at_all() -> None:
+    """A message reaches the server as it was, unless it is too long or names an address as a file."""
+    body = b'{"data": [1, 2]}'
+    assert ask("/gradio_api/queue/join", "POST", body) == (200, body)
+    assert ask("/gradio_api/queue/join", "POST", b" " * (guard.MOST_JSON + 1))[0] == 413
+    assert ask("/gradio_api/queue/join", "POST", b'{"data": [{"path": "https://a.example"}]}')[0] == 403
+
+
+def test_a_session_without_a_file_says_so(tmp_path: Path) -> None:
+    """Nothing to separate, nothing to fetch."""
+    page = Session(tmp_path, tmp_path)
+    with pytest.raises(ValueError, match="expected an opened file"):
+        page.separate(Settings())
+    with pytest.raises(ValueError, match="expected a separated frame"):
+        page.write("exr")

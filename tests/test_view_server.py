@@ -1,0 +1,190 @@
+"""The viewer's server as strangers meet it: other hosts, other paths, files too large, many at once."""
+
+from __future__ import annotations
+
+import http.client
+import importlib.util
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import imagecodecs
+import numpy as np
+import pytest
+from viewer import running
+
+from polsep import cli
+
+GRADIO = importlib.util.find_spec("gradio") is not None
+needs_gradio = pytest.mark.skipif(not GRADIO, reason="needs the extra view")
+LIMIT_MB = 16
+
+
+@pytest.fixture(scope="module")
+def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A viewer that takes 16 MB."""
+    with running(tmp_path_factory.mktemp("view"), "--upload-limit", str(LIMIT_MB), "--method", "analytic") as address:
+        yield address
+
+
+def ask(address: str, verb: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
+    """Status and body of one answer."""
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=120)
+    try:
+        connection.request(verb, path, body or None, {k.replace("_", "-"): v for k, v in headers.items()})
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+    finally:
+        connection.close()
+
+
+def open_message(config: dict[str, Any], path: str) -> dict[str, Any]:
+    """What the page sends after an upload."""
+    (event,) = (d for d in config["dependencies"] if d["api_name"] == "open_upload")
+    kinds = {c["id"]: c for c in config["components"]}
+    file = {"path": path, "orig_name": "a.png", "meta": {"_type": "gradio.FileData"}}
+    data = [file if kinds[i]["type"] == "file" else kinds[i]["props"].get("value") for i in event["inputs"]]
+    return {"data": data, "fn_index": event["id"]}
+
+
+def test_separating_starts_no_process_and_calls_nobody() -> None:
+    """The network's engine comes without the telemetry of its library, which a viewer must not send."""
+    program = (
+        "import sys, socket, multiprocessing, torch\n"
+        "socket.socket.connect = lambda *a: sys.exit('connected')\n"
+        "from polsep.camera import Layout, Mosaic\n"
+        "from polsep.pipeline import separate_capture\n"
+        "separate_capture(Mosaic(torch.rand(64, 64), Layout(), 0.0, 1.0), 'joint-fast')\n"
+        "assert 'openvino' in sys.modules and sys.modules['openvino_telemetry'] is None\n"
+        "assert multiprocessing.active_children() == []\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
+    assert run.returncode == 0, run.stderr
+
+
+def test_the_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without Gradio the command says what to install, and ends with 2."""
+    monkeypatch.setitem(sys.modules, "gradio", None)
+    monkeypatch.delitem(sys.modules, "polsep.view.page", raising=False)
+    monkeypatch.setattr(sys, "argv", ["polsep", "view"])
+    with pytest.raises(SystemExit, match="2"):
+        cli.main()
+    said = capsys.readouterr()
+    assert (
+        said.out == ""
+        and said.err == "polsep: error: expected the extra 'view' (pip install 'polsep[view]'), found none\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["nowhere.png"], "nowhere.png: expected a file, found nothing"),
+        (["--method", "magic"], "expected a method of"),
+        (["--white-level", "much"], "expected a number as white level"),
+    ],
+)
+def test_bad_options_are_one_line(
+    options: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before anything starts."""
+    monkeypatch.setattr(sys, "argv", ["polsep", "view", *options])
+    with pytest.raises(SystemExit, match="2"):
+        cli.main()
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+
+
+@needs_gradio
+def test_it_listens_to_this_machine_alone(viewer: str) -> None:
+    """The page is there by this machine's names, and not by another, wherever that points."""
+    status, page = ask(viewer, "GET", "/")
+    assert status == 200 and b"polsep" in page
+    assert ask(viewer, "GET", "/", host="evil.example")[0] == 403
+    port = urlsplit(viewer).port
+    assert port is not None
+    others = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
+    for other in others - {"127.0.0.1", "127.0.1.1"}:
+        with socket.socket() as probe:
+            probe.settimeout(2)
+            assert probe.connect_ex((other, port)) != 0
+
+
+@needs_gradio
+def test_nothing_of_the_file_system_is_handed_out(viewer: str, tmp_path: Path) -> None:
+    """Neither files nor addresses, by any of the ways that Gradio has."""
+    secret = tmp_path / "secret.txt"
+    secret.write_text("hidden words")
+    source = Path(__file__).resolve()
+    for path in (str(secret), str(source), "/etc/passwd", "../../etc/passwd", "http://127.0.0.1:1/x"):
+        for way in ("/gradio_api/file=", "/gradio_api/file/", "/gradio_api/proxy=", "/file=", "/static/", "/assets/"):
+            status, body = ask(viewer, "GET", f"{way}{path}")
+            assert status in (403, 404, 405) and b"hidden words" not in body and b"root:" not in body
+
+
+@needs_gradio
+def test_a_large_upload_is_refused_at_once(viewer: str) -> None:
+    """5 GB are refused by what they announce, in under a second; without an announcement, at the limit."""
+    address = urlsplit(viewer)
+    begin = time.perf_counter()
+    with socket.create_connection((address.hostname, address.port), 10) as line:
+        line.sendall(
+            f"POST /gradio_api/upload HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Length: 5000000000\r\n"
+            "Content-Type: multipart/form-data; boundary=x\r\n\r\n".encode()
+        )
+        answer = line.recv(4096)
+    assert answer.startswith(b"HTTP/1.1 413") and time.perf_counter() - begin < 1
+    head = b'--x\r\nContent-Disposition: form-data; name="files"; filename="a.png"\r\n\r\n'
+    body = head + bytes((LIMIT_MB << 20) + 1) + b"\r\n--x--\r\n"
+    status, said = ask(viewer, "POST", "/gradio_api/upload", body, content_type="multipart/form-data; boundary=x")
+    assert status == 413 and b"maximum allowed size" in said
+
+
+@needs_gradio
+def test_claimed_paths_open_nothing(viewer: str) -> None:
+    """A message that names a file which was not uploaded does not get to see it."""
+    config = json.loads(ask(viewer, "GET", "/config")[1])
+    for claim in ("/etc/passwd", str(Path(__file__).resolve()), "http://127.0.0.1:1/a.png"):
+        body = json.dumps({**open_message(config, claim), "session_hash": "stranger"}).encode()
+        status, said = ask(viewer, "POST", "/gradio_api/run/predict", body, content_type="application/json")
+        assert status >= 400 or b"expected a file that this page uploaded" in said
+        assert b"ps-stage" not in said
+
+
+@needs_gradio
+def test_twenty_sessions_at_once_all_finish(viewer: str) -> None:
+    """Twenty pages send the same frame and wait in one queue; every one gets its picture."""
+    codes = (np.add.outer(np.arange(64), np.arange(64)) * 30).astype(np.uint16)
+    picture = bytes(imagecodecs.png_encode(codes))
+    body = b'--x\r\nContent-Disposition: form-data; name="files"; filename="a.png"\r\n\r\n' + picture + b"\r\n--x--\r\n"
+    config = json.loads(ask(viewer, "GET", "/config")[1])
+
+    def run(key: str) -> bytes:
+        status, said = ask(viewer, "POST", "/gradio_api/upload", body, content_type="multipart/form-data; boundary=x")
+        assert status == 200
+        message = json.dumps({**open_message(config, json.loads(said)[0]), "session_hash": key}).encode()
+        assert ask(viewer, "POST", "/gradio_api/queue/join", message, content_type="application/json")[0] == 200
+        return ask(viewer, "GET", f"/gradio_api/queue/data?session_hash={key}")[1]
+
+    with ThreadPoolExecutor(20) as pool:
+        found = list(pool.map(run, [f"page{k}" for k in range(20)]))
+    assert [b"process_completed" in said and b"ps-stage" in said for said in found] == [True] * 20
+
+
+@needs_gradio
+def test_temporary_files_go_with_the_program(tmp_path: Path) -> None:
+    """What was uploaded and never opened is gone after the end."""
+    with running(tmp_path / "t", "--method", "analytic") as address:
+        body = b'--x\r\nContent-Disposition: form-data; name="files"; filename="a.png"\r\n\r\nabc\r\n--x--\r\n'
+        status, said = ask(address, "POST", "/gradio_api/upload", body, content_type="multipart/form-data; boundary=x")
+        assert status == 200 and Path(json.loads(said)[0]).exists()
+        (root,) = (tmp_path / "t").glob("polsep-view-*")
+        assert root.stat().st_mode & 0o077 == 0
+    assert list((tmp_path / "t").glob("polsep-view-*")) == []

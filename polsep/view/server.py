@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -46,18 +47,21 @@ def serve(options: ViewOptions) -> Iterator[str]:
 
     Raises ModuleNotFoundError without Gradio, and OSError when the port is taken.
     """
+    if find_spec("gradio") is None:
+        raise ModuleNotFoundError("No module named 'gradio'", name="gradio")
     scratch = make_scratch()
     kept = {name: os.environ.get(name) for name in _environment(scratch.root)}
     os.environ.update(_environment(scratch.root))
     page = None
+    warm = threading.Thread(target=warm_up, args=(options.settings.get("method", "auto"),))
+    warm.start()
     try:
-        warm = threading.Thread(target=warm_up, args=(options.settings.get("method", "auto"),), daemon=True)
-        warm.start()
         page = _build(options, Sessions(scratch, options.most_mb << 20))
         yield _launch(page, options)
     finally:
         if page is not None and page.is_running:
             page.close(verbose=False)
+        warm.join()  # a program must not end while a network is being compiled
         drop_folder(scratch.root)
         for name, value in kept.items():
             if value is None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -408,20 +407,33 @@ def test_an_interrupt_cleans_up_and_stays_an_interrupt(tmp_path: Path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interrupt_waits_until_a_frame_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C while files are moved: they are all there, nothing else is, and then it interrupts."""
-    move = outputs._move_into_place
+INTERRUPTED = """
+import signal, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from test_outputs import outputs, random_frame, write_separation
+move = outputs._move_into_place
+def interrupted(*arguments):
+    signal.raise_signal(signal.SIGINT)
+    move(*arguments)
+outputs._move_into_place = interrupted
+before = signal.getsignal(signal.SIGINT)
+try:
+    write_separation(random_frame(), Path(sys.argv[2]), "shot")
+except KeyboardInterrupt:
+    print("interrupted", signal.getsignal(signal.SIGINT) is before)
+"""
 
-    def interrupted(*arguments: Any) -> None:
-        signal.raise_signal(signal.SIGINT)
-        move(*arguments)
 
-    monkeypatch.setattr(outputs, "_move_into_place", interrupted)
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        write_separation(random_frame(), tmp_path, "shot")
+def test_an_interrupt_waits_until_a_frame_is_written(tmp_path: Path) -> None:
+    """Ctrl-C while files are moved: they are all there, nothing else is, and then it interrupts.
+
+    In a program of its own, as signals are a whole program's.
+    """
+    program = [sys.executable, "-c", INTERRUPTED, str(Path(__file__).parent), str(tmp_path)]
+    run = subprocess.run(program, capture_output=True, text=True, timeout=60)
+    assert run.stdout.split() == ["interrupted", "True"], run.stderr
     assert {path.name for path in tmp_path.iterdir()} == {"shot.exr", "shot.png", "shot.json"}
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_short_write_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -102,7 +103,7 @@ class OpenVinoEngine:
         options: dict[str, Any] = {"INFERENCE_NUM_THREADS": get_threads(), "PERFORMANCE_HINT": "LATENCY"}
         options |= {"ENABLE_CPU_PINNING": False}
         options |= {} if precision is None else {"INFERENCE_PRECISION_HINT": precision}
-        core = openvino.Core()
+        core = _core()
         if precision is None:
             precision = core.get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name()
         halves = precision == "bf16"
@@ -176,6 +177,17 @@ def _import_openvino() -> Any:
     import openvino  # type: ignore[import-untyped]  # no stubs
 
     return openvino
+
+
+@lru_cache(maxsize=1)
+def _core() -> Any:
+    """The one of this program, which stays.
+
+    Note: OpenVINO's CPU plugin gives the thread that loads it a stack for signals of its own, and takes that away with
+    itself, also where another thread ends it or a newer plugin has been put on top. Then the next signal that Python
+    catches, Ctrl-C say, ends the program without a word. The plugin lives as long as its core.
+    """
+    return _import_openvino().Core()
 
 
 def _as_model(layers: nn.Module, example: Tensor) -> Any:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -231,3 +234,31 @@ def test_what_it_does_not_take_is_left_to_torch(shipped: None, monkeypatch: pyte
     monkeypatch.setattr(joint_engine, "MOST_PIXELS", math.inf)
     monkeypatch.setattr(joint_engine, "find_spec", lambda name: None)
     assert run_engine("joint", mosaic) is None
+
+
+INTERRUPTED = """
+import gc, signal, sys, threading
+sys.path.insert(0, sys.argv[1])
+from test_joint_engine import COLOR, OpenVinoEngine, random_net
+engines = [OpenVinoEngine(random_net(COLOR), (16, width)) for width in (16, 32)]
+here, there = ([OpenVinoEngine(random_net(COLOR), (16, width))] for width in (48, 64))
+def forget(several):
+    del several[0]
+    gc.collect()
+forget(engines)
+forget(engines)
+other = threading.Thread(target=forget, args=(there,))
+other.start()
+other.join()
+try:
+    signal.raise_signal(signal.SIGINT)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+def test_an_interrupt_comes_through_after_engines_have_gone() -> None:
+    """Wherever and in whatever order: a program that no longer has a stack for signals dies without a word."""
+    program = [sys.executable, "-c", INTERRUPTED, str(Path(__file__).parent)]
+    run = subprocess.run(program, capture_output=True, text=True, timeout=100)
+    assert run.stdout.split() == ["interrupted"], f"{run.returncode} {run.stderr}"

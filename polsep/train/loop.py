@@ -1,4 +1,4 @@
-"""The one training loop: AdamW, warm-up and cosine, clipped gradients, a moving average of the weights, checkpoints.
+"""The one training loop: warm-up and cosine, clipped gradients, a moving average of the weights, checkpoints.
 
 A training that is killed goes on from its last checkpoint and ends with the same bits as one that was not: the state
 holds all that a step depends on, and the stream starts at any batch.
@@ -24,13 +24,13 @@ from polsep.io.checkpoints import read_checkpoint, write_checkpoint
 from polsep.io.weights import read_weights
 from polsep.kernels.threads import set_threads
 from polsep.train.log import Report, open_log
+from polsep.train.optimizers import Optimizers
 from polsep.train.stream import Examples, ExampleStream, StreamOptions
 from polsep.train.tasks import Task, View
 from polsep.train.validation import score_references, validate, validation_batches
 
 #: The learning rate ends at this share of its peak.
 LAST_SHARE = 0.01
-WEIGHT_DECAY, BETAS = 1e-4, (0.9, 0.99)
 #: Norm of a network's gradient at most. Usual ones are 13 to 42, so only outliers are cut.
 MOST_GRADIENT = 100.0
 
@@ -98,14 +98,13 @@ def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | Non
     fabric = _fabric(run)
     fabric.launch()
     network = task.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, betas=BETAS, weight_decay=WEIGHT_DECAY)
     state = read_checkpoint(run.out / "checkpoint.pt")
     if state is None:
         task.begin(run.stream) if run.start is None else begin_at(run.start, network)
+    wrapped = fabric.setup_module(network)
+    optimizer = Optimizers(network)
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
     step = _restore(state, run, (network, optimizer, average))
-    wrapped, wrapped_optimizer = fabric.setup(network, optimizer)
-    average = {name: value.to(fabric.device) for name, value in average.items()}
     batches = _batches(run, fabric, step)
     with ExitStack() as stack:
         log, views = None, list[View]()
@@ -113,14 +112,12 @@ def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | Non
             views = [task.prepare(_to(fabric.device, batch)) for batch in validation_batches(run.stream)]
             log = stack.enter_context(open_log(run.out, step, report, lambda: score_references(task, views)))
         while step < run.schedule.steps:
-            for group in optimizer.param_groups:
-                group["lr"] = run.schedule.rate_at(step)
+            rate = run.schedule.rate_at(step)
             loss = task.loss(wrapped, task.prepare(_to(fabric.device, next(batches))), step / run.schedule.steps)
-            optimizer.zero_grad(set_to_none=True)
             fabric.backward(loss)
             for net in _parts(network):
                 nn.utils.clip_grad_norm_(net.parameters(), MOST_GRADIENT)
-            wrapped_optimizer.step()
+            optimizer.step(rate)
             step += 1
             follow(average, network, min(run.schedule.average, (1 + step) / (10 + step)))
             if log is None:
@@ -163,7 +160,7 @@ def _describe(run: Run) -> str:
     return json.dumps(described | {"workers": run.workers, "devices": run.devices})
 
 
-def _restore(state: dict[str, Any] | None, run: Run, into: tuple[nn.Module, Any, dict[str, Tensor]]) -> int:
+def _restore(state: dict[str, Any] | None, run: Run, into: tuple[nn.Module, Optimizers, dict[str, Tensor]]) -> int:
     """Fill network, optimizer and average from a checkpoint; the step it was made at, 0 without one."""
     if state is None:
         return 0
@@ -172,7 +169,8 @@ def _restore(state: dict[str, Any] | None, run: Run, into: tuple[nn.Module, Any,
     network, optimizer, average = into
     network.load_state_dict(state["network"])
     optimizer.load_state_dict(state["optimizer"])
-    average.update(state["average"])
+    for name, value in average.items():
+        value.copy_(state["average"][name])
     return int(state["step"])
 
 

@@ -1,0 +1,82 @@
+"""What moves the weights: Muon for the convolutions inside U-Nets, AdamW for all others.
+
+Muon (Jordan et al. 2024, kellerjordan.github.io/posts/muon) takes the momentum of a layer's matrix to the nearest orthogonal
+one, so that all directions of a layer learn alike; rare ones, which AdamW drowns in frequent ones, are why it needs fewer
+steps. Its steps have the root mean square of AdamW's (Liu et al. 2025, arXiv 2502.16982, Sec. 2.2), so that both share
+one learning rate. First guesses, output layers and biases are no maps between features; they are left to AdamW.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from polsep.networks import ResidualUNet, UNet
+
+WEIGHT_DECAY, BETAS = 1e-4, (0.9, 0.99)
+#: Smaller matrices are nearly all directions that matter; AdamW serves them as well.
+LEAST_SIDE = 16
+
+
+class Optimizers:
+    """Both, for a ``network`` that is where it will stay.
+
+    State: that of both. Muon takes matrices alone, so it has twins of the convolutions that share their memory.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        hidden = list(hidden_weights(network))
+        taken = {id(weight) for weight in hidden}
+        rest = [weight for weight in network.parameters() if id(weight) not in taken]
+        self._adam = torch.optim.AdamW(rest, lr=0.0, betas=BETAS, weight_decay=WEIGHT_DECAY)
+        self._twins = [(weight, nn.Parameter(as_matrix(weight.detach()))) for weight in hidden]
+        matrices = [twin for _, twin in self._twins]
+        self._muon = None
+        if matrices:
+            self._muon = torch.optim.Muon(matrices, lr=0.0, weight_decay=WEIGHT_DECAY, adjust_lr_fn="match_rms_adamw")
+
+    def step(self, rate: float) -> None:
+        """Move all weights along their gradients, which are forgotten, at a learning ``rate``."""
+        for optimizer in self._both():
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+        for weight, twin in self._twins:
+            twin.grad = None if weight.grad is None else as_matrix(weight.grad, like=weight)
+            weight.grad = None
+        for optimizer in self._both():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+
+    def state_dict(self) -> list[dict[str, Any]]:
+        """What a checkpoint needs."""
+        return [optimizer.state_dict() for optimizer in self._both()]
+
+    def load_state_dict(self, states: list[dict[str, Any]]) -> None:
+        """The twin of `state_dict`."""
+        for optimizer, state in zip(self._both(), states, strict=True):
+            optimizer.load_state_dict(state)
+
+    def _both(self) -> list[torch.optim.Optimizer]:
+        return [self._adam] if self._muon is None else [self._adam, self._muon]
+
+
+def hidden_weights(network: nn.Module) -> Iterator[Tensor]:
+    """The convolutions of a network that map features to features."""
+    for module in network.modules():
+        if isinstance(module, (UNet, ResidualUNet)):
+            last = {id(weight) for weight in module.last.parameters()} if isinstance(module, UNet) else set()
+            for weight in module.parameters():
+                if weight.ndim == 4 and id(weight) not in last and min(as_matrix(weight).shape) >= LEAST_SIDE:
+                    yield weight
+
+
+def as_matrix(weight: Tensor, like: Tensor | None = None) -> Tensor:
+    """Weights ``[n, m, k, k]`` as a matrix ``[n, m k k]``, of which the columns' order is that of ``like`` in memory.
+
+    A view, where ``weight`` lies in memory as ``like`` does.
+    """
+    last = not (weight if like is None else like).is_contiguous()
+    return (weight.permute(0, 2, 3, 1) if last else weight).reshape(weight.shape[0], -1)

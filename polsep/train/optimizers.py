@@ -1,9 +1,10 @@
 """What moves the weights: Muon for the convolutions inside U-Nets, AdamW for all others.
 
-Muon (Jordan et al. 2024, kellerjordan.github.io/posts/muon) takes the momentum of a layer's matrix to the nearest orthogonal
-one, so that all directions of a layer learn alike; rare ones, which AdamW drowns in frequent ones, are why it needs fewer
-steps. Its steps have the root mean square of AdamW's (Liu et al. 2025, arXiv 2502.16982, Sec. 2.2), so that both share
-one learning rate. First guesses, output layers and biases are no maps between features; they are left to AdamW.
+Muon (Jordan et al. 2024, kellerjordan.github.io/posts/muon) takes the momentum of a layer's matrix to the nearest
+orthogonal one, so that all directions of a layer learn alike; AdamW drowns rare ones in frequent ones. The joint
+network is after a third of the steps where AdamW takes it (docs/experiments.md). Steps have the root mean square of
+AdamW's (Liu et al. 2025, arXiv 2502.16982, Sec. 2.2), so that both share one learning rate. First guesses, output
+layers and biases are no maps between features; they are left to AdamW.
 """
 
 from __future__ import annotations

@@ -68,6 +68,7 @@ def takes_anything(capture: Capture) -> bool:
 
 
 def _joint(name: str, summary: str) -> Method:
+    colors = "colour or mono" if is_shipped(weights_name(name, Layout(bayer=None))) else "colour"
     return Method(
         name,
         separate_mosaic(name, "half"),
@@ -75,7 +76,7 @@ def _joint(name: str, summary: str) -> Method:
         takes(name),
         partial(run_engine, name),
         summary,
-        "a raw mosaic with Sony's filters in any orientation, colour or mono; trained under white light",
+        f"a raw mosaic with Sony's filters in any orientation, {colors}; trained under white light",
         "this project; after Dave et al. 2022 and the colour-affine closed form",
     )
 

@@ -323,6 +323,7 @@ REFUSED: list[tuple[Any, dict[str, Any], str]] = [
     (np.zeros((2, 8, 8, 2), np.uint8), {}, "expected a mosaic"),
     (np.random.default_rng(0).random((8, 8, 3)), {}, "demosaicked picture"),
     ([[1, 2], [3, 4]], {}, "expected a NumPy array, found list"),
+    (np.ma.array(np.zeros((8, 8), np.uint8), mask=True), {}, "expected a NumPy array, found MaskedArray"),
     (np.zeros((8, 8), np.uint8), {"method": "magic"}, "expected a method of auto"),
     (np.zeros((8, 8), np.uint8), {"method": "Analytic"}, "expected a method of auto"),
     (np.zeros((8, 8), np.uint8), {"device": "toaster"}, "expected a device"),
@@ -347,9 +348,9 @@ def test_bad_arguments_are_one_line(raw: Any, options: dict[str, Any], message: 
     assert "\n" not in str(caught.value) and "found" in str(caught.value)
 
 
-@pytest.mark.parametrize("options", [{"device": "meta"}, {"light_color": 5}, {"light_color": None}])
+@pytest.mark.parametrize("options", [{"device": "meta"}, {"device": None}, {"light_color": 5}, {"light_color": None}])
 def test_arguments_of_other_kinds_are_one_line(options: dict[str, Any]) -> None:
-    """A device without data, or a light colour that is no sequence, is a ValueError of one line too."""
+    """A device without data or none, or a light colour that is no sequence, is a ValueError of one line too."""
     with pytest.raises(ValueError, match="expected") as caught:
         polsep.separate(raw_frame(), **options)
     assert "\n" not in str(caught.value)

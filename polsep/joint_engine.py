@@ -335,8 +335,16 @@ def _turn_back(images: JointImages, orientation: Orientation) -> JointImages:
 
     aolp, tally, mirrored = turn(images.aolp), images.tally, orientation.down != orientation.across
     if orientation.transposed:
-        aolp, tally = np.mod(np.float32(np.pi / 2) - aolp, np.float32(np.pi)), replace(tally, along=-tally.along)
+        aolp, tally = _wrap(np.float32(np.pi / 2) - aolp), replace(tally, along=-tally.along)
     if mirrored:
-        aolp, tally = np.mod(-aolp, np.float32(np.pi)), replace(tally, across=-tally.across)
+        aolp, tally = _wrap(-aolp), replace(tally, across=-tally.across)
     diffuse, specular, error = (turn(image) for image in (images.diffuse, images.specular, images.error))
     return JointImages(diffuse, specular, turn(images.valid), turn(images.dolp), aolp, error, tally)
+
+
+def _wrap(angle: Floats) -> Floats:
+    """The same AoLP in [0, pi); what rounding takes to pi is 0."""
+    pi = np.float32(np.pi)
+    wrapped: Floats = np.mod(angle, pi)
+    wrapped[wrapped >= pi] = 0
+    return wrapped

@@ -144,7 +144,7 @@ def _shape(array: NDArray[Any]) -> str:
 
 def _checked(array: NDArray[Any]) -> NDArray[Any]:
     """``array`` in native byte order, once its type, size and values are known to be acceptable."""
-    if not isinstance(array, np.ndarray):
+    if not isinstance(array, np.ndarray) or isinstance(array, np.ma.MaskedArray):  # masked samples have no value
         raise ValueError(f"expected a NumPy array, found {type(array).__name__}")
     if array.dtype.name not in WHITE_LEVELS:
         raise ValueError(f"expected samples of uint8, uint16, float32 or float64, found {array.dtype}")

@@ -19,7 +19,7 @@ from polsep.guided import demosaic_guided, demosaic_guided_half
 from polsep.io.weights import is_shipped
 from polsep.joint_engine import JointImages, run_engine
 from polsep.learned import separate_paper
-from polsep.mosaic_network import separate_mosaic, takes, weights_name
+from polsep.mosaic_network import NAMES, separate_mosaic, takes, weights_name
 from polsep.separation import Separation, separate_analytic
 from polsep.stokes import Measurements
 
@@ -68,6 +68,7 @@ def takes_anything(capture: Capture) -> bool:
 
 
 def _joint(name: str, summary: str) -> Method:
+    colors = "colour or mono" if is_shipped(weights_name(name, Layout(bayer=None))) else "colour"
     return Method(
         name,
         separate_mosaic(name, "half"),
@@ -75,7 +76,7 @@ def _joint(name: str, summary: str) -> Method:
         takes(name),
         partial(run_engine, name),
         summary,
-        "a raw mosaic with Sony's filters in any orientation, colour or mono; trained under white light",
+        f"a raw mosaic with Sony's filters in any orientation, {colors}; trained under white light",
         "this project; after Dave et al. 2022 and the colour-affine closed form",
     )
 
@@ -122,15 +123,28 @@ METHODS = {m.name: m for m in _ALL if not m.name.startswith("joint") or is_shipp
 BEST = tuple(METHODS[name] for name in ("joint", "color-affine") if name in METHODS)
 
 
+#: The same of `auto-fast`, for streams.
+FASTEST = tuple(METHODS[name] for name in ("joint-fast", "joint", "color-affine") if name in METHODS)
+
+#: Names that choose a method by the capture.
+_CHOICES = {"auto": BEST, "auto-fast": FASTEST}
+
+
 def find_method(name: str, capture: Capture) -> Method:
-    """The method of that name, or the best one for a capture; ValueError, with the names there are, for any other."""
-    if name == "auto":
-        return next(method for method in BEST if method.takes(capture))
+    """The method of that name, or the best one for a capture.
+
+    Raises ValueError, with the names there are, for any other, and where no weights for the capture's colours are.
+    """
     check_method(name)
+    if name in _CHOICES:
+        return next(method for method in _CHOICES[name] if method.takes(capture))
+    if name in NAMES and isinstance(capture, Mosaic) and not is_shipped(weights_name(name, capture.layout)):
+        kind = "mono" if capture.layout.bayer is None else "colour"
+        raise ValueError(f"expected a method with weights for {kind} frames, as auto finds, found {name}")
     return METHODS[name]
 
 
 def check_method(name: str) -> None:
     """Raise ValueError, with the names there are, unless a method is called so."""
-    if name != "auto" and name not in METHODS:
-        raise ValueError(f"expected a method of {', '.join(['auto', *METHODS])}, found {name!r}")
+    if name not in _CHOICES and name not in METHODS:
+        raise ValueError(f"expected a method of {', '.join([*_CHOICES, *METHODS])}, found {name!r}")

@@ -122,7 +122,10 @@ class Separated:
 
 @dataclass(frozen=True)
 class Progress:
-    """``done`` of ``count`` frames; ``warning``: a line for the user; ``written``: the files of a run that is done."""
+    """``done`` of ``count`` frames; ``warning``: a line for the user; ``written``: the files of a run that is done.
+
+    ``damaged``: this frame is missing or, of a run that is done, some frame is, also where an earlier run left it out.
+    """
 
     done: int
     count: int
@@ -144,7 +147,6 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
         "source": path.name,
         "frames": options.frames,
         "read": {**asdict(read), "layout": read.layout.spec if read.layout else None},
-        "damaged": options.damaged,
         "filter": options.filter,
         "kind": asdict(target.kind),
         "method": look.method,
@@ -163,7 +165,8 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
         last = step.done
         yield replace(step, count=max(count, step.done))
     lines = sequence.lines()
-    yield Progress(last, last, written=tuple(sequence.finish(_report(settings, look, lines))))
+    report = _report({**settings, "damaged": options.damaged}, look, lines)
+    yield Progress(last, last, damaged=bool(report["damaged"]), written=tuple(sequence.finish(report)))
 
 
 def look_at(footage: Footage, options: VideoOptions) -> Look:

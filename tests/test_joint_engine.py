@@ -26,8 +26,9 @@ from polsep.kernels.threads import own_threads
 from polsep.kernels.unpack import as_samples
 from polsep.mosaic_network import own_order, run_joint
 from polsep.networks import ResidualSize
+from polsep.orient import Orientation
 from polsep.pipeline import in_light
-from polsep.report import tally
+from polsep.report import Tally, tally
 from polsep.separation import Separation
 from polsep.stokes import aolp, dolp
 
@@ -199,6 +200,17 @@ def test_frames_of_any_orientation_and_side(layout: Layout, turn: str, shipped: 
     grey = white.stokes.map(lambda s: s.mean(dim=-3))
     polarized = dolp(grey) > 0.05
     assert_same_angle(torch.from_numpy(found.aolp)[polarized], aolp(grey)[polarized], NOISE)
+
+
+@pytest.mark.parametrize("turned", [{"across": True}, {"down": True}, {"transposed": True}])
+def test_angles_that_were_turned_back_stay_below_pi(turned: dict[str, bool]) -> None:
+    """Also those that rounding takes there."""
+    colors, one = np.zeros((2, 2, 3), np.float32), np.ones((2, 2), np.float32)
+    for near in (0, np.pi / 2):
+        aolp = np.nextafter(np.float32(near), np.float32(4)) * one
+        images = JointImages(colors, colors, one > 0, one, aolp, colors[..., :2], Tally())
+        found = joint_engine._turn_back(images, Orientation(4, 4, **turned)).aolp
+        assert found.min() >= 0 and found.max() < np.pi
 
 
 def test_threads_with_engines_of_their_own_find_the_same(shipped: None) -> None:

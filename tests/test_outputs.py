@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -415,8 +416,12 @@ from test_outputs import outputs, random_frame, write_separation
 move = outputs._move_into_place
 def interrupted(*arguments):
     signal.raise_signal(signal.SIGINT)
+    if "fail" in sys.argv:
+        raise OSError("no room")
     move(*arguments)
 outputs._move_into_place = interrupted
+if "default" in sys.argv:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 before = signal.getsignal(signal.SIGINT)
 try:
     write_separation(random_frame(), Path(sys.argv[2]), "shot")
@@ -430,10 +435,25 @@ def test_an_interrupt_waits_until_a_frame_is_written(tmp_path: Path) -> None:
 
     In a program of its own, as signals are a whole program's.
     """
-    program = [sys.executable, "-c", INTERRUPTED, str(Path(__file__).parent), str(tmp_path)]
-    run = subprocess.run(program, capture_output=True, text=True, timeout=60)
+    run = run_interrupted(tmp_path)
     assert run.stdout.split() == ["interrupted", "True"], run.stderr
     assert {path.name for path in tmp_path.iterdir()} == {"shot.exr", "shot.png", "shot.json"}
+
+
+def test_an_interrupt_ends_a_program_that_leaves_it_to_the_system(tmp_path: Path) -> None:
+    assert run_interrupted(tmp_path, "default").returncode == -signal.SIGINT
+    assert {path.name for path in tmp_path.iterdir()} == {"shot.exr", "shot.png", "shot.json"}
+
+
+def test_an_interrupt_is_not_lost_when_writing_fails(tmp_path: Path) -> None:
+    assert run_interrupted(tmp_path, "fail").stdout.split() == ["interrupted", "True"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def run_interrupted(folder: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    """`INTERRUPTED`, to its end."""
+    program = [sys.executable, "-c", INTERRUPTED, str(Path(__file__).parent), str(folder), *more]
+    return subprocess.run(program, capture_output=True, text=True, timeout=60)
 
 
 def test_a_short_write_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

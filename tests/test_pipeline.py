@@ -22,7 +22,7 @@ from polsep.camera import IDEAL, IMX250, Layout, Mosaic, expose
 from polsep.demosaic import demosaic_bilinear_half
 from polsep.engine import run_nothing
 from polsep.joint import LEAST_LIGHT, Joint
-from polsep.methods import BEST, METHODS, find_method
+from polsep.methods import BEST, FASTEST, METHODS, Method, find_method
 from polsep.mosaic_network import NAMES, run_joint
 from polsep.networks import ResidualSize
 from polsep.pipeline import estimate_light_color, find_device, separate_capture
@@ -90,7 +90,9 @@ def test_public_names_are_there() -> None:
 def test_shapes_and_types(method: str, full: bool, layout: Layout | None) -> None:
     """[H/2, W/2, C], or [H, W, C] at full resolution; float32 images, a bool mask, and ranges as documented."""
     if method in NAMES and not METHODS[method].takes(Mosaic(torch.zeros(SIZE, SIZE), layout or Layout(), 0.0, 1.0)):
-        with pytest.raises(ValueError, match=f"expected the weights '{method}-mono' in .*, found none of that name"):
+        with pytest.raises(
+            ValueError, match=f"expected a method with weights for mono frames, as auto finds, found {method}"
+        ):
             quietly(raw_frame(layout=layout), method=method, layout=layout, full=full)
         return
     out = quietly(raw_frame(layout=layout), method=method, layout=layout, full=full)
@@ -105,12 +107,15 @@ def test_shapes_and_types(method: str, full: bool, layout: Layout | None) -> Non
     assert float(out.dolp.min()) >= 0
 
 
-@pytest.mark.parametrize("layout", [None, Layout(bayer=None)], ids=["color", "mono"])
-def test_auto_is_the_best_that_takes_a_frame(layout: Layout | None) -> None:
+@pytest.mark.parametrize(
+    "layout", [None, Layout(bayer=None), Layout(((0, 45), (90, 135)))], ids=["color", "mono", "odd"]
+)
+@pytest.mark.parametrize(("choice", "choices"), [("auto", BEST), ("auto-fast", FASTEST)])
+def test_auto_is_the_best_that_takes_a_frame(layout: Layout | None, choice: str, choices: tuple[Method, ...]) -> None:
     """And the report says which method ran."""
     mosaic = Mosaic(torch.zeros(SIZE, SIZE), layout or Layout(), 0.0, 1.0)
-    best = next(method.name for method in BEST if method.takes(mosaic))
-    auto, named = (quietly(raw_frame(layout=layout), method=name, layout=layout) for name in ("auto", best))
+    best = next(method.name for method in choices if method.takes(mosaic))
+    auto, named = (quietly(raw_frame(layout=layout), method=name, layout=layout) for name in (choice, best))
     assert auto.report["method"] == best
     assert np.array_equal(auto.specular, named.specular) is True
 
@@ -318,6 +323,7 @@ REFUSED: list[tuple[Any, dict[str, Any], str]] = [
     (np.zeros((2, 8, 8, 2), np.uint8), {}, "expected a mosaic"),
     (np.random.default_rng(0).random((8, 8, 3)), {}, "demosaicked picture"),
     ([[1, 2], [3, 4]], {}, "expected a NumPy array, found list"),
+    (np.ma.array(np.zeros((8, 8), np.uint8), mask=True), {}, "expected a NumPy array, found MaskedArray"),
     (np.zeros((8, 8), np.uint8), {"method": "magic"}, "expected a method of auto"),
     (np.zeros((8, 8), np.uint8), {"method": "Analytic"}, "expected a method of auto"),
     (np.zeros((8, 8), np.uint8), {"device": "toaster"}, "expected a device"),
@@ -342,9 +348,9 @@ def test_bad_arguments_are_one_line(raw: Any, options: dict[str, Any], message: 
     assert "\n" not in str(caught.value) and "found" in str(caught.value)
 
 
-@pytest.mark.parametrize("options", [{"device": "meta"}, {"light_color": 5}, {"light_color": None}])
+@pytest.mark.parametrize("options", [{"device": "meta"}, {"device": None}, {"light_color": 5}, {"light_color": None}])
 def test_arguments_of_other_kinds_are_one_line(options: dict[str, Any]) -> None:
-    """A device without data, or a light colour that is no sequence, is a ValueError of one line too."""
+    """A device without data or none, or a light colour that is no sequence, is a ValueError of one line too."""
     with pytest.raises(ValueError, match="expected") as caught:
         polsep.separate(raw_frame(), **options)
     assert "\n" not in str(caught.value)

@@ -28,7 +28,7 @@ from polsep.io.exr import read_exr_layers
 from polsep.io.footage import Damaged, natural_order, open_footage
 from polsep.io.frames import Frame, ReadOptions
 from polsep.io.outputs import OutputError
-from polsep.io.sequences import FILM_WHITE, PART, Picture, SequenceKind, write_exr
+from polsep.io.sequences import FILM_WHITE, PART, Picture, Sequence, SequenceKind, write_exr
 from polsep.levels import as_mosaic
 from polsep.pipeline import separate_capture
 from polsep.report import SeparatedFrame
@@ -278,6 +278,31 @@ def test_a_damaged_frame_stops_the_run_until_it_is_repaired(
     assert run(monkeypatch, *command(folder, tmp_path / "out")) == 0
     found, expected = contents(tmp_path / "out"), contents(undisturbed)
     assert {k: v for k, v in found.items() if k != "run.json"} == {k: v for k, v in expected.items() if k != "run.json"}
+
+
+def test_a_run_that_a_damaged_frame_stopped_goes_on_without_it(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing that is done depends on what becomes of damage; a run that goes on says that a frame is missing."""
+    folder, out = write_folder(tmp_path / "run", frames()), tmp_path / "out"
+    (folder / f"shot{PART + 3}.png").write_bytes(b"no picture")
+    assert run(monkeypatch, *command(folder, out)) == 2
+    first = (out / "run_000000.exr").stat().st_ino
+    finish = Sequence.finish
+    monkeypatch.setattr(Sequence, "finish", interrupt)
+    assert run(monkeypatch, *command(folder, out, "--damaged", "skip")) == 130
+    monkeypatch.setattr(Sequence, "finish", finish)
+    assert run(monkeypatch, *command(folder, out, "--damaged", "skip")) == 2
+    assert (out / "run_000000.exr").stat().st_ino == first
+    report = json.loads((out / "run.json").read_text())
+    assert [line["frame"] for line in report["damaged"]] == [PART + 3] and report["settings"]["damaged"] == "skip"
+    found, expected = contents(out), contents(undisturbed)
+    assert set(expected) - set(found) == {f"run_{PART + 3:06d}.exr"}
+
+
+def interrupt(*arguments: object) -> None:
+    """Ctrl-C, in place of some function."""
+    raise KeyboardInterrupt
 
 
 def test_damaged_frames_are_left_out_when_that_is_asked(

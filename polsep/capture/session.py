@@ -60,7 +60,7 @@ class CapturePlan:
     """
 
     output: Path | None = None
-    method: str | None = "joint-fast"
+    method: str | None = "auto-fast"
     layout: Layout | None = None
     port: int | None = None
     overwrite: bool = False

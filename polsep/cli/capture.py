@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 @click.option("--trigger", metavar="SOURCE", help="off, Software (at --rate), or a line, like Line0.")
 @click.option("--pixel-format", metavar="NAME", help="GenICam pixel format, like BayerRG12p.")
 @click.option("--set", "features", multiple=True, metavar="NAME=VALUE", help="Any further GenICam feature.")
-@click.option("--method", default="joint-fast", metavar="NAME", help="For the live view; none records alone.")
+@click.option("--method", default="auto-fast", metavar="NAME", help="For the live view; none records alone.")
 @click.option("--layout", metavar="color|mono|SPEC", help="The sensor's filters.  [default: by the pixel format]")
 @click.option("--show", type=int, metavar="PORT", help="Show the live view at http://127.0.0.1:PORT/; 0 picks a port.")
 @click.option("--timeout", type=float, default=30.0, metavar="S", help="How long to wait for a lost camera.")

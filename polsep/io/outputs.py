@@ -27,7 +27,6 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import imagecodecs
@@ -184,14 +183,14 @@ def _unbroken() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread() or before is None:  # no signal comes here
         yield
         return
-    caught: list[tuple[int, FrameType | None]] = []
-    signal.signal(signal.SIGINT, lambda number, place: caught.append((number, place)))
+    caught: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, place: caught.append(number))
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-    if caught and callable(before):
-        before(*caught[0])
+        if caught:  # also where the block has failed, or the system's own handler ends the program
+            signal.raise_signal(signal.SIGINT)
 
 
 def require_same(path: Path, settings: Mapping[str, Any], begun: str, advice: str = "") -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -18,6 +21,20 @@ OPERATORS = 18
 EXAMPLE = (1, 64, 96)
 
 
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Inside, torch does not speak about its own parts, such as a library that is not needed here."""
+    log = logging.getLogger("torch.onnx")
+    before = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(before)
+
+
 def write_onnx(path: Path, graph: nn.Module, outputs: tuple[str, ...], metadata: dict[str, str]) -> None:
     """Write what maps uint16 frames, black and white level to ``outputs``, whole or not at all.
 
@@ -30,8 +47,7 @@ def write_onnx(path: Path, graph: nn.Module, outputs: tuple[str, ...], metadata:
     frame = torch.zeros(EXAMPLE, dtype=torch.uint16)
     arguments = (frame, torch.tensor([0.0]), torch.tensor([4095.0]))
     free = torch.export.Dim.DYNAMIC
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of torch about its own parts
+    with _quiet():
         program = torch.onnx.export(
             graph,
             arguments,

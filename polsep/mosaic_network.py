@@ -113,8 +113,8 @@ def own_order(layout: Layout) -> Layout:
 def run_joint(network: Joint, mosaic: Mosaic, resolution: Resolution) -> Separation:
     """A mosaic ``[..., H, W]`` through a network; negative light is cut to 0.
 
-    The polarization is that of the network's linear filter, at half resolution. ``valid`` is False where all samples of
-    a cell clip. ``doubt``: see `Separation`. Raises ValueError on layouts that are not Sony's in any orientation.
+    The polarization is that of the network's linear filter, at half resolution. ``valid`` is False near cells of
+    which all samples clip. ``doubt``: see `Separation`. Raises ValueError on layouts that are not Sony's in any orientation.
     """
     orientation = orient(mosaic, own_order(mosaic.layout))
     if resolution == "half" and not orientation.keeps_cells:  # then the network's cells are not the frame's
@@ -181,10 +181,13 @@ def _rows(image: Tensor, rows: tuple[int, int], height: int) -> Tensor:
 
 
 def _cells(clipped: Tensor) -> Tensor:
-    """Cells ``[N, 2, H/2, W/2]`` near which a sample clips, and those of which all do."""
+    """Cells ``[N, 2, H/2, W/2]`` near which a sample clips, and near which all of a cell do.
+
+    A cell is of one colour, so where it clips, the cells around, which are of the others, lack that colour too.
+    """
     mask = clipped.float()
     some, all_of_it = max_pool2d(mask, 2), -max_pool2d(-mask, 2)
-    return torch.cat([max_pool2d(some, 3, 1, 1), all_of_it], dim=1) > 0
+    return max_pool2d(torch.cat([some, all_of_it], dim=1), 3, 1, 1) > 0
 
 
 def _as_separation(images: list[Tensor], cells: Tensor, orientation: Orientation) -> Separation:

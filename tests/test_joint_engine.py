@@ -109,6 +109,20 @@ def test_networks_that_see_less_are_shown_less(left_out: str) -> None:
     assert_same(in_engine(net, mosaic), in_torch(net, mosaic), run_joint(net, mosaic, "half"))
 
 
+@pytest.mark.parametrize("cell", [(0, 0), (5, 6), (15, 23)])
+def test_cells_around_one_that_clips_as_a_whole_are_not_valid(cell: tuple[int, int]) -> None:
+    """The cells around are of other colours, and lack that of the one that clips; three samples of a cell leave one."""
+    net, (row, col) = random_net(COLOR), cell
+    mosaic = random_frame(32, 48, COLOR, most=900)
+    data = mosaic.data.numpy()
+    data[2 * row : 2 * row + 2, 2 * col : 2 * col + 2] = 4095
+    wanted = np.ones((16, 24), bool)
+    wanted[max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2] = False
+    assert np.array_equal(in_engine(net, mosaic).valid, wanted)
+    data[2 * row, 2 * col] = 900
+    assert in_engine(net, mosaic).valid.all()
+
+
 def test_a_frame_without_clipped_samples_is_valid_everywhere() -> None:
     net, mosaic = random_net(COLOR), random_frame(32, 48, COLOR, most=3000)
     found = in_engine(net, mosaic)

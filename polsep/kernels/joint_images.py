@@ -136,9 +136,9 @@ def _add_polarization(rows: tuple[Any, Any, Any], room: Any, sums: Any) -> None:
 
 @compiled
 def _mark_clipped(clipped: Any, y: int, valid: Any, near: Any) -> int:
-    """False in ``valid [2 w]`` where all of a cell clips; how many cells of the row are near a clipped sample.
+    """False in ``valid [2 w]`` near cells of which all clips; how many cells of the row are near a clipped sample.
 
-    ``near [2 w + 2]``, uint8: for the cells of a row and one more on both sides.
+    ``near [2 w + 2]``, uint8: for the cells of a row and one more on both sides, 1 where a sample clips, 2 where all do.
     """
     h, w = clipped.shape
     first, last, some = max(y - 1, 0), min(y + 1, 2 * h - 1), np.uint16(0)
@@ -156,15 +156,14 @@ def _mark_clipped(clipped: Any, y: int, valid: Any, near: Any) -> int:
         bits, shift = clipped[row // 2], np.uint16(8 * (row % 2))
         for j in range(w):
             own = bits[j] >> shift
-            near[2 * j + 1] |= own & _CELL != 0
-            near[2 * j + 2] |= own >> 2 & _CELL != 0
-    bits, shift, count = clipped[y // 2], np.uint16(8 * (y % 2)), 0
-    for j in range(w):
-        own = bits[j] >> shift
-        valid[2 * j] = own & _CELL != _CELL
-        valid[2 * j + 1] = own >> 2 & _CELL != _CELL
+            left, right = own & _CELL, own >> 2 & _CELL
+            near[2 * j + 1] |= (left != 0) + 2 * (left == _CELL)
+            near[2 * j + 2] |= (right != 0) + 2 * (right == _CELL)
+    count = 0
     for x in range(2 * w):
-        count += near[x] | near[x + 1] | near[x + 2]
+        around = near[x] | near[x + 1] | near[x + 2]
+        valid[x] = around < 2
+        count += around != 0
     return count
 
 

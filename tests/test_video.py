@@ -355,6 +355,20 @@ def test_what_is_there_is_not_replaced_unasked(
     assert contents(tmp_path) == before
 
 
+def test_a_run_that_replaces_a_longer_one_leaves_none_of_its_frames(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And touches nothing else."""
+    others = {name: b"mine" for name in ("other_000004.exr", f"{recording.stem}_4.exr", f"{recording.stem}_000004.txt")}
+    for name, data in others.items():
+        (tmp_path / name).write_bytes(data)
+    assert run(monkeypatch, *command(recording, tmp_path, "--frames", "5")) == 0
+    assert run(monkeypatch, *command(recording, tmp_path, "--frames", "3", "--overwrite")) == 0
+    left = sorted(path.name for path in tmp_path.glob("*_00*.exr"))
+    assert left == sorted([*(f"{recording.stem}_{k:06d}.exr" for k in range(3)), "other_000004.exr"])
+    assert {name: (tmp_path / name).read_bytes() for name in others} == others
+
+
 def test_a_run_does_not_go_on_with_other_settings(recording: Path, tmp_path: Path) -> None:
     def steps(method: str) -> Iterator[video.Progress]:
         options = video.VideoOptions(method)

@@ -11,6 +11,7 @@ Conventions: images are linear light, 1.0 = one measurement at the white level. 
 
 from __future__ import annotations
 
+import glob
 import io
 import json
 import shutil
@@ -80,6 +81,7 @@ class Sequence:
         self, directory: Path, stem: str, kind: SequenceKind, settings: dict[str, Any], overwrite: bool = False
     ) -> None:
         self.directory, self.stem, self.kind, self._settings = directory, stem, kind, settings
+        self._overwrite = overwrite
         self._parts = directory / f".polsep-{stem}"
         self.report = directory / f"{stem}.json"
         if overwrite:
@@ -161,8 +163,17 @@ class Sequence:
         if self.kind.format == "ffv1":
             units = {name: f"{units[name]}; code 65535 is {white:g}" for name, white in FILM_WHITE.items()}
         replace_text(self.report, json.dumps({**report, "units": units}, indent=2) + "\n")
+        if self._overwrite:
+            self._drop_older_frames()
         shutil.rmtree(self._parts)
         return [*written, log, self.report]
+
+    def _drop_older_frames(self) -> None:
+        """Remove single frames of the run that this one replaces, where it has none of that number."""
+        own = {self.exr_path(line["frame"]) for line in self.lines() if "damaged" not in line}
+        for path in self.directory.glob(f"{glob.escape(self.stem)}_{6 * '[0-9]'}.exr"):
+            if self.kind.format != "exr" or path not in own:
+                path.unlink()
 
     def lines(self) -> list[dict[str, Any]]:
         """What was logged of every frame that is done."""

@@ -91,7 +91,7 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 @click.option("--input", "seen", default="separated", metavar="NAME", help="material: unseparated, separated, perfect.")
 @click.option("--examples", type=int, default=768, metavar="N", help="material: how many it is trained on.")
 @click.option("--folder", type=DIR, metavar="DIR", help="material: where these are, or go.  [default: DIR/../examples]")
-@click.option("--steps", type=int, metavar="N", help="Batches.  [default: 20000; material: 2000]")
+@click.option("--steps", type=int, default=20_000, metavar="N", help="Batches of 8 crops, or of 4 materials.")
 @click.option("--rate", type=float, default=1e-3, metavar="X", help="Peak learning rate.")
 @click.option("--seed", type=int, default=0, metavar="N", help="Of the weights and of the data.")
 @click.option("--workers", type=int, default=1, metavar="N", help="Processes that render, per device.")
@@ -109,7 +109,7 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     polsep train joint -o runs/joint
     polsep train paper --data mono -o runs/mono                           for cameras without colour filters
     polsep train paper --width 64 --levels 4 --fold 1 -o runs/unet64      the classic U-Net
-    polsep train material --input separated -o runs/separated             maps of materials
+    polsep train material --input separated --steps 2000 -o runs/separated
     """
     try:
         from polsep.train.command import choose_options, plan_run, train_weights
@@ -127,7 +127,7 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
             path = train_material(material, Run(output, schedule=schedule, **given), folder, _show_training)
         else:
             asked = choose_options(rung, data, options)
-            schedule = Schedule(options["steps"] or 20_000, options["rate"], precision=options["precision"])
+            schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])
             run = plan_run(Run(output, schedule=schedule, **given), asked)
             path = train_weights(asked, run, _show_training)
     except ValueError as error:

@@ -34,8 +34,6 @@ DATA_MODULES = (
     "svbrdf.py",
     "textures.py",
 )
-#: Batches; half an hour of one core for each input.
-STEPS = 2_000
 #: Steps of warm-up, and decay of the moving average: of shorter trainings than others.
 WARM_UP, AVERAGE = 50, 0.99
 
@@ -44,9 +42,8 @@ def choose_material(asked: dict[str, Any]) -> tuple[MaterialOptions, Schedule]:
     """What is trained, and how long, from options of the command line; see `polsep train`."""
     size = MaterialSize() if asked["width"] is None else MaterialSize(asked["width"])
     options = MaterialOptions(asked["seen"], size, asked["seed"], examples=asked["examples"])
-    steps = STEPS if asked["steps"] is None else asked["steps"]
     due = {"checkpoint_every": 50, "validate_every": 200}
-    return options, Schedule(steps, asked["rate"], WARM_UP, AVERAGE, precision=asked["precision"], **due)
+    return options, Schedule(asked["steps"], asked["rate"], WARM_UP, AVERAGE, precision=asked["precision"], **due)
 
 
 def train_material(options: MaterialOptions, run: Run, folder: Path, report: Callable[[dict[str, Any]], None]) -> Path:

@@ -117,14 +117,13 @@ def test_examples_hold_every_input() -> None:
     assert example.maps.shape == (9, 128, 128)
 
 
-def test_order_and_repetition_of_views_do_not_matter() -> None:
-    """The maximum over views does not know which came first, or how often."""
+def test_order_of_views_does_not_matter() -> None:
+    """What is pooled over views does not know which came first; how many there are does matter."""
     network = small_network().eval()
     views = torch.rand(2, 3, 6, 32, 32, generator=seeded(8))
     with torch.no_grad():
         found = network(views)
         torch.testing.assert_close(network(views[:, [2, 0, 1]]), found)
-        torch.testing.assert_close(network(views[:, [0, 1, 2, 1]]), found)
         assert not torch.allclose(network(views[:, :1]), found, atol=1e-4)
 
 

@@ -11,6 +11,7 @@ import math
 import statistics
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -67,8 +68,8 @@ def _measure(data: Path, count: int) -> Iterator[Row]:
         for views in (1, VIEWS):
             case = f"{name}, {views} light{'s' if views > 1 else ''}"
             for method, estimator in estimators.items():
-                for metric, unit, values in score_examples(estimator, examples, views):
-                    yield Row("material", case, method, metric, statistics.fmean(values), unit)
+                for part, metric, unit, values in score_examples(estimator, examples, views):
+                    yield Row(f"material/{part}", case, method, metric, statistics.fmean(values), unit)
 
 
 def procedural_examples(count: int) -> list[Example]:
@@ -94,38 +95,57 @@ def _middle(image: Tensor) -> Tensor:
     return image[..., top : top + RAW_SIZE, left : left + RAW_SIZE]
 
 
+class Score(NamedTuple):
+    """One number of one material: which table it belongs to, its name, unit and value."""
+
+    part: str
+    metric: str
+    unit: str
+    value: float
+
+
 def score_examples(
     estimator: Estimator, examples: Sequence[Example], views: int
-) -> Iterator[tuple[str, str, list[float]]]:
-    """Metric, unit and its value for every example where it means something."""
+) -> Iterator[tuple[str, str, str, list[float]]]:
+    """Table, metric, unit and its value for every example where it means something."""
     part = INPUTS[estimator.input]
-    scores: dict[tuple[str, str], list[float]] = {}
+    scores: dict[tuple[str, str, str], list[float]] = {}
     for example in examples:
         found = estimator.estimate(example.views[:views, part].float())
         truth = unstack(example.maps.float())
-        for metric, unit, value in (*score_maps(found, truth), *score_relit(found, truth)):
-            scores.setdefault((metric, unit), []).append(value)
-    for (metric, unit), values in scores.items():
-        yield metric, unit, values
+        for score in (*score_maps(found, truth), *score_failure(found, truth), *score_relit(found, truth)):
+            scores.setdefault(score[:3], []).append(score.value)
+    for (table, metric, unit), values in scores.items():
+        yield table, metric, unit, values
 
 
-def score_maps(found: Svbrdf, truth: Svbrdf) -> Iterator[tuple[str, str, float]]:
-    """RMSE of every map, the mean angle between normals, detail of normals and chroma of the specular map."""
+def score_maps(found: Svbrdf, truth: Svbrdf) -> Iterator[Score]:
+    """RMSE of every map, of normals that of x and y, and the mean angle between normals."""
     for name in ("normal", "diffuse", "roughness", "specular"):
         error = getattr(found, name) - getattr(truth, name)
         if name == "normal":
             error = error[:2]
-        yield f"{name} RMSE", "1", float(error.square().mean().sqrt())
+        yield Score("maps", f"{name} RMSE", "1", float(error.square().mean().sqrt()))
     cosine = dot(found.normal, truth.normal).clamp(-1, 1)
-    yield "normal angle", "deg", math.degrees(float(torch.acos(cosine).mean()))
+    yield Score("maps", "normal angle", "deg", math.degrees(float(torch.acos(cosine).mean())))
+
+
+def score_failure(found: Svbrdf, truth: Svbrdf) -> Iterator[Score]:
+    """Fig. 9's failure in numbers: colour in the specular map, and normals that are too flat.
+
+    Detail of normals is what differs from the mean around; how much of it there is, found over true, and how well it
+    goes with the true one, where there is some.
+    """
+    spread = found.specular.amax(dim=0) - found.specular.amin(dim=0)
+    chroma = spread / found.specular.mean(dim=0).clamp(min=LEAST_SPECULAR)
+    yield Score("failure", "specular chroma", "1", float(chroma.mean()))
     fine, true = detail(found.normal), detail(truth.normal)
     energy, found_energy = (float(x.square().sum(dim=0).mean()) for x in (true, fine))
     if energy > LEAST_DETAIL**2:
         both = float((fine * true).sum(dim=0).mean())
-        yield "normal detail, found / true", "1", math.sqrt(found_energy / energy)
-        yield "normal detail, correlation", "1", both / math.sqrt(max(energy * found_energy, 1e-12))
-    spread = found.specular.amax(dim=0) - found.specular.amin(dim=0)
-    yield "specular chroma", "1", float((spread / found.specular.mean(dim=0).clamp(min=LEAST_SPECULAR)).mean())
+        yield Score("failure", "normal detail, found / true", "1", math.sqrt(found_energy / energy))
+        correlation = both / math.sqrt(max(energy * found_energy, 1e-12))
+        yield Score("failure", "normal detail, correlation", "1", correlation)
 
 
 def detail(normal: Tensor) -> Tensor:
@@ -135,19 +155,17 @@ def detail(normal: Tensor) -> Tensor:
     return normal[:2] - avg_pool2d(padded, size, 1)[0]
 
 
-def score_relit(found: Svbrdf, truth: Svbrdf) -> Iterator[tuple[str, str, float]]:
+def score_relit(found: Svbrdf, truth: Svbrdf) -> Iterator[Score]:
     """Mean over lights: difference of logarithms, PSNR, FLIP."""
     whole = torch.ones(truth.roughness.shape[-2:], dtype=torch.bool)
-    scores: dict[tuple[str, str], list[float]] = {("relit log-L1", "1"): [], ("relit PSNR", "dB"): []}
-    scores[("relit FLIP", "1")] = []
+    scores: list[tuple[float, float, float]] = []
     for light in novel_lights():
-        pictures = [see_under(maps, light) for maps in (found, truth)]
-        logarithms = [torch.log(picture + FLOOR) for picture in pictures]
-        scores[("relit log-L1", "1")].append(float((logarithms[0] - logarithms[1]).abs().mean()))
-        scores[("relit PSNR", "dB")].append(psnr(pictures[0], pictures[1], whole))
-        scores[("relit FLIP", "1")].append(flip(pictures[0], pictures[1], whole))
-    for (metric, unit), values in scores.items():
-        yield metric, unit, statistics.fmean(values)
+        a, b = (see_under(maps, light) for maps in (found, truth))
+        difference = (torch.log(a + FLOOR) - torch.log(b + FLOOR)).abs().mean()
+        scores.append((float(difference), psnr(a, b, whole), flip(a, b, whole)))
+    names = (("log-L1", "1"), ("PSNR", "dB"), ("FLIP", "1"))
+    for (name, unit), values in zip(names, zip(*scores, strict=True), strict=True):
+        yield Score("relit", name, unit, statistics.fmean(values))
 
 
 def novel_lights() -> list[Tensor]:

@@ -92,6 +92,7 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 @click.option("--examples", type=int, default=768, metavar="N", help="material: how many it is trained on.")
 @click.option("--folder", type=DIR, metavar="DIR", help="material: where these are, or go.  [default: DIR/../examples]")
 @click.option("--steps", type=int, default=20_000, metavar="N", help="Batches of 8 crops, or of 4 materials.")
+@click.option("--until", type=int, metavar="N", help="material: end at this step of the schedule.")
 @click.option("--rate", type=float, default=1e-3, metavar="X", help="Peak learning rate.")
 @click.option("--seed", type=int, default=0, metavar="N", help="Of the weights and of the data.")
 @click.option("--workers", type=int, default=1, metavar="N", help="Processes that render, per device.")
@@ -124,7 +125,8 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
         if rung == "material":
             material, schedule = choose_material(options)
             folder = options["folder"] or output.parent / "examples"
-            path = train_material(material, Run(output, schedule=schedule, **given), folder, _show_training)
+            run = Run(output, schedule=schedule, until=options["until"], **given)
+            path = train_material(material, run, folder, _show_training)
         else:
             asked = choose_options(rung, data, options)
             schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])

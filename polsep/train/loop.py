@@ -68,7 +68,8 @@ class Schedule:
 class Run:
     """Where a training writes, ``what`` it trains, on which data; ``workers`` render, ``devices`` train.
 
-    ``start``: a file of weights to begin with, instead of random ones.
+    ``start``: a file of weights to begin with, instead of random ones. ``until``: a step of the schedule to end at; a
+    later run goes on from its last checkpoint.
     """
 
     out: Path
@@ -78,6 +79,12 @@ class Run:
     workers: int = 1
     devices: int = 1
     start: Path | None = None
+    until: int | None = None
+
+    @property
+    def last(self) -> int:
+        """The step after which it ends."""
+        return self.schedule.steps if self.until is None else min(self.until, self.schedule.steps)
 
 
 class ExactInputs(MixedPrecision):
@@ -134,7 +141,7 @@ def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | Non
 
 
 def train_course(course: Course, run: Run, report: Report) -> dict[str, Tensor] | None:
-    """Train to the end of the schedule, from the last checkpoint if there is one; returns the averaged weights.
+    """Train to the end, from the last checkpoint if there is one; returns the averaged weights.
 
     ``report`` is called with every line of the log. Of several processes only the first one writes and reports, and
     the others return None. Raises ValueError when the checkpoint is of another training.
@@ -153,7 +160,7 @@ def train_course(course: Course, run: Run, report: Report) -> dict[str, Tensor] 
     batches = course.batches(step, (fabric.global_rank, fabric.world_size))
     with ExitStack() as stack:
         log = stack.enter_context(open_log(run.out, step, report, course.references)) if fabric.is_global_zero else None
-        while step < run.schedule.steps:
+        while step < run.last:
             for group in optimizer.param_groups:
                 group["lr"] = run.schedule.rate_at(step)
             loss = course.loss(wrapped, _to(fabric.device, next(batches)), step / run.schedule.steps)

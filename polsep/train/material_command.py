@@ -73,6 +73,7 @@ def train_material(options: MaterialOptions, run: Run, folder: Path, report: Cal
         "schedule": json.dumps(asdict(run.schedule)),
         "options": json.dumps(asdict(options)),
         "data": digest_data(options),
+        "steps": str(run.last),
         "command": describe_command(options, run),
         "validation": json.dumps(course.score(course.network)),
         "curve": json.dumps([[line["step"], round(line["loss"], 5)] for line in read_log(run.out) if line["step"]]),
@@ -95,5 +96,6 @@ def describe_command(options: MaterialOptions, run: Run) -> str:
     asked = {"input": options.input, "width": options.size.width, "steps": run.schedule.steps}
     asked |= {"rate": run.schedule.rate, "seed": options.seed, "examples": options.examples}
     asked |= {"devices": run.devices, "precision": run.schedule.precision, "output": run.out.name}
+    asked |= {} if run.until is None else {"until": run.until}
     words = [word for name, value in asked.items() for word in (f"--{name}", str(value))]
     return shlex.join(["polsep", "train", "material", *words])

@@ -20,6 +20,7 @@ from torch.nn.functional import avg_pool2d, pad
 from polsep.bench.rows import Row
 from polsep.io.svbrdf import find_panels, read_panels
 from polsep.material.estimate import Estimator, load_estimator, shipped_inputs
+from polsep.material.procedural import halve, random_svbrdf
 from polsep.material.shots import CAMERA_HEIGHT, INPUTS, RAW_SIZE, Example, make_example, random_example
 from polsep.metrics import flip, psnr, require_flip
 from polsep.optics import dot
@@ -62,12 +63,12 @@ def _measure(data: Path, count: int) -> Iterator[Row]:
     estimators = {name: load_estimator(name) for name in shipped_inputs()}
     if not estimators:
         raise ValueError(f"expected weights for one of {', '.join(INPUTS)}, found none; see polsep train material")
-    sets = {"procedural": procedural_examples(count)}
+    sets = {"procedural": procedural_examples(count), "procedural, larger frames": larger_examples(count)}
     published = published_examples(data, count)
     if published:
         sets["published"] = published
     for name, examples in sets.items():
-        for views in (1, VIEWS):
+        for views in dict.fromkeys((1, len(examples[0].views))):
             case = f"{name}, {views} light{'s' if views > 1 else ''}"
             for method, estimator in estimators.items():
                 for part, metric, unit, values in score_examples(estimator, examples, views):
@@ -77,6 +78,18 @@ def _measure(data: Path, count: int) -> Iterator[Row]:
 def procedural_examples(count: int) -> list[Example]:
     """The first held-out procedural materials."""
     return [random_example("test", 0, number, VIEWS) for number in range(count)]
+
+
+def larger_examples(count: int) -> list[Example]:
+    """The same materials under the flash, photographed with twice as many pixels along a side, and then averaged."""
+    found = []
+    for number in range(count):
+        generator = torch.Generator().manual_seed(scene_seed("test", 0, number))
+        example = make_example(random_svbrdf(2 * RAW_SIZE, generator), 1, generator)
+        views = avg_pool2d(example.views.flatten(0, 1), 2)[None]
+        maps = halve(unstack(example.maps)).stack()
+        found.append(Example(views, maps))
+    return found
 
 
 def published_examples(data: Path, count: int) -> list[Example]:

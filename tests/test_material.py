@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from polsep.bench.material import novel_lights, score_failure, score_maps, score_relit
 from polsep.cli.app import main
 from polsep.io.exr import read_exr_layers
 from polsep.io.gltf import DIELECTRIC, encode_glb, encode_materialx, specular_scale, texture_pixels
@@ -314,3 +315,30 @@ def test_weights_say_what_they_are(weights: Path, tmp_path: Path) -> None:
     write_weights(other, {"x": torch.ones(1)}, {"method": "joint"})
     with pytest.raises(ValueError, match="expected weights of a network for materials"):
         load_estimator(path=other)
+
+
+def test_scores_of_the_truth_are_perfect() -> None:
+    """No error, all of the detail, no colour in the specular map; and flat, coloured maps show as such."""
+    pytest.importorskip("flip_evaluator")
+    truth = halve(random_svbrdf(48, seeded(7)))
+    scores = {score.metric: score.value for score in (*score_maps(truth, truth), *score_failure(truth, truth))}
+    assert all(value == 0 for name, value in scores.items() if "RMSE" in name or "chroma" in name)
+    assert scores["normal angle"] < 0.1
+    shares = [scores[f"normal detail, {name}"] for name in ("found / true", "correlation")]
+    assert shares == pytest.approx([1, 1])
+    assert {score.metric: score.value for score in score_relit(truth, truth)} == {"log-L1": 0, "PSNR": 120, "FLIP": 0}
+    flat = torch.tensor([0.0, 0.0, 1.0]).view(3, 1, 1).expand(3, 24, 24)
+    tint = torch.tensor([0.5, 1.0, 1.5]).view(3, 1, 1)
+    failed = Svbrdf(flat, truth.diffuse, truth.roughness, truth.specular * tint)
+    scores = {score.metric: score.value for score in score_failure(failed, truth)}
+    assert scores["specular chroma"] == pytest.approx(1)
+    assert scores["normal detail, found / true"] == 0
+    relit = {score.metric: score.value for score in score_relit(failed, truth)}
+    assert relit["log-L1"] > 0 and relit["PSNR"] < 60 and relit["FLIP"] > 0
+
+
+def test_novel_lights_are_above() -> None:
+    """And are always the same."""
+    lights, again = novel_lights(), novel_lights()
+    assert len(lights) == 20 and all(float(light[2]) > 0.4 for light in lights)
+    assert all(torch.equal(a, b) for a, b in zip(lights, again, strict=True))

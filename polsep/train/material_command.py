@@ -17,6 +17,7 @@ from polsep.io.weights import write_weights
 from polsep.material.examples import make_examples
 from polsep.material_network import MaterialSize
 from polsep.networks import count_parameters
+from polsep.train.command import check_run
 from polsep.train.log import read_log
 from polsep.train.loop import Run, Schedule, train_course
 from polsep.train.material_task import MaterialOptions, material_course
@@ -49,8 +50,10 @@ def choose_material(asked: dict[str, Any]) -> tuple[MaterialOptions, Schedule]:
 def train_material(options: MaterialOptions, run: Run, folder: Path, report: Callable[[dict[str, Any]], None]) -> Path:
     """Make the examples that ``folder`` lacks, train to the end, go on where a run in ``run.out`` stopped.
 
-    Returns the file of the averaged weights, in half precision; the scores in their metadata are of these.
+    Returns the file of the averaged weights, in half precision; the scores in their metadata are of these. Raises
+    ValueError on what cannot be trained.
     """
+    check_run(run)
     for split, count in (("train", options.examples), ("validation", options.validation)):
         for made in make_examples(folder, split, options.seed, count, options.views):
             if made % 100 == 0:

@@ -28,7 +28,7 @@ from polsep.svbrdf import Svbrdf, plane_points, relight, unstack
 from polsep.views import scene_seed
 
 #: Held-out materials, those of the quick version, and photographs of each: one by a flash, the others by moved lights.
-PROCEDURAL, QUICK, VIEWS = 16, 2, 4
+PROCEDURAL, QUICK, VIEWS = 12, 2, 4
 #: Published maps are every so many of the pictures in this folder.
 PUBLISHED, EVERY = "svbrdf/deschaintre_subset", 5
 #: Lights that relit pictures are taken under, and how they are drawn: from anywhere above, this far from the middle.

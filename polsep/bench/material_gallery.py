@@ -18,7 +18,7 @@ from polsep.material.shots import INPUTS, Example, random_example
 from polsep.svbrdf import Svbrdf, unstack
 
 #: Held-out procedural materials that are shown, and with how many photographs.
-SHOWN, VIEWS = (3, 8), 1
+SHOWN, VIEWS = (1, 8), 1
 #: Which of `novel_lights` the relit picture is under.
 LIGHT = 4
 #: Reflectance that is white in the pictures of specular maps.

@@ -17,6 +17,8 @@ from polsep.bench.exactness import bench_exactness
 from polsep.bench.frontend import bench_frontend
 from polsep.bench.gallery import draw_paper
 from polsep.bench.joint import bench_joint
+from polsep.bench.material import bench_material, bench_material_quick
+from polsep.bench.material_gallery import draw_material
 from polsep.bench.paper import bench_paper, bench_paper_quick
 from polsep.bench.real import bench_real
 from polsep.bench.rendering import bench_rendering
@@ -56,6 +58,7 @@ BENCHES: dict[str, Bench] = {
     "ablations": Bench(bench_ablations),
     "dynamic": Bench(bench_dynamic, bench_dynamic_quick),
     "calibration": Bench(bench_calibration),
+    "material": Bench(bench_material, bench_material_quick, draw_material),
     "video": Bench(bench_video, bench_video_quick),
     "paper": Bench(bench_paper, bench_paper_quick, draw_paper),
 }

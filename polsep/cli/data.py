@@ -88,7 +88,11 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 @click.option("--blocks", metavar="N,N,...", help="Residual blocks per level of a joint network.")
 @click.option("--entry", type=int, metavar="N", help="Channels that its maps are brought to first; 0: all.")
 @click.option("--ablation", default="none", metavar="NAME", help="What a joint network goes without.")
-@click.option("--steps", type=int, default=20_000, metavar="N", help="Batches of 8 crops.")
+@click.option("--input", "seen", default="separated", metavar="NAME", help="material: unseparated, separated, perfect.")
+@click.option("--examples", type=int, default=768, metavar="N", help="material: how many it is trained on.")
+@click.option("--folder", type=DIR, metavar="DIR", help="material: where these are, or go.  [default: DIR/../examples]")
+@click.option("--steps", type=int, default=20_000, metavar="N", help="Batches of 8 crops, or of 4 materials.")
+@click.option("--until", type=int, metavar="N", help="material: end at this step of the schedule.")
 @click.option("--rate", type=float, default=1e-3, metavar="X", help="Peak learning rate.")
 @click.option("--seed", type=int, default=0, metavar="N", help="Of the weights and of the data.")
 @click.option("--workers", type=int, default=1, metavar="N", help="Processes that render, per device.")
@@ -96,8 +100,8 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 @click.option("--start", type=click.Path(path_type=Path), metavar="FILE", help="Weights to begin with.")
 @click.option("--precision", default="bf16-mixed", metavar="NAME", help="bf16-mixed or 32-true.")
 def train(rung: str, output: Path, data: str, **options: Any) -> None:
-    """Train joint, joint-fast or a rung of the paper's ladder: paper, unpolarized, polarized, shared, signed,
-    no-angle, stokes.
+    """Train joint, joint-fast, material or a rung of the paper's ladder: paper, unpolarized, polarized, shared,
+    signed, no-angle, stokes.
 
     Data are rendered while training, from seeds that no test has. A run that was stopped or killed goes on when the
     same command is given again. 'tensorboard --logdir DIR' shows its curves. Needs the extra train.
@@ -106,20 +110,28 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     polsep train joint -o runs/joint
     polsep train paper --data mono -o runs/mono                           for cameras without colour filters
     polsep train paper --width 64 --levels 4 --fold 1 -o runs/unet64      the classic U-Net
+    polsep train material --input separated --steps 2000 -o runs/separated
     """
     try:
         from polsep.train.command import choose_options, plan_run, train_weights
         from polsep.train.loop import Run, Schedule
+        from polsep.train.material_command import choose_material, train_material
     except ModuleNotFoundError as error:
         raise click.ClickException(
             f"expected the extra 'train' (pip install 'polsep[train]'), found no {error.name}"
         ) from None
     try:
-        asked = choose_options(rung, data, options)
-        schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])
         given = {name: options[name] for name in ("workers", "devices", "start")}
-        run = plan_run(Run(output, schedule=schedule, **given), asked)
-        path = train_weights(asked, run, _show_training)
+        if rung == "material":
+            material, schedule = choose_material(options)
+            folder = options["folder"] or output.parent / "examples"
+            run = Run(output, schedule=schedule, until=options["until"], **given)
+            path = train_material(material, run, folder, _show_training)
+        else:
+            asked = choose_options(rung, data, options)
+            schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])
+            run = plan_run(Run(output, schedule=schedule, **given), asked)
+            path = train_weights(asked, run, _show_training)
     except ValueError as error:
         raise click.ClickException(str(error)) from None
     print(path)

@@ -9,6 +9,7 @@ angle atan2(-d_row, d_col). Shrinking averages light, and polarization as Stokes
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -265,3 +266,17 @@ def _percent(where: NDArray[np.bool_]) -> str:
     """The share of True in percent; a few pixels never read as none."""
     share = 100 * float(np.mean(where))
     return "none" if share == 0 else f"{share:.3g} %" if share >= 0.01 else "below 0.01 %"
+
+
+def titled_sheet(rows: Sequence[Sequence[Panel]]) -> Pixels:
+    """Rows of titled pictures of one size on a dark sheet."""
+    height, width = rows[0][0].pixels.shape[:2]
+    columns = max(len(row) for row in rows)
+    size = (MARGIN + columns * (width + GUTTER) - GUTTER + MARGIN, MARGIN + len(rows) * (TITLE + height + GUTTER))
+    sheet = Image.new("RGB", size, BACKGROUND)
+    for r, row in enumerate(rows):
+        for c, panel in enumerate(row):
+            left, top = MARGIN + c * (width + GUTTER), MARGIN + r * (TITLE + height + GUTTER) - GUTTER
+            _draw_title(sheet, (left, top, width), panel.title, panel.note)
+            _paste(sheet, panel.pixels, (left, top + TITLE))
+    return np.asarray(sheet)

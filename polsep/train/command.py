@@ -228,17 +228,19 @@ def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:
 
 
 def plan_run(run: Run, options: Options) -> Run:
-    """The same with what is trained and the stream that it needs.
+    """The same with what is trained and the stream that it needs. Raises ValueError as `check_run`."""
+    check_run(run)
+    stream = StreamOptions(seed=options.seed, crop=options.crop)
+    return replace(run, what=json.dumps(asdict(options)), stream=stream)
 
-    Raises ValueError on what would only fail later, or train nothing.
-    """
+
+def check_run(run: Run) -> None:
+    """Raise ValueError on what would only fail later, or train nothing."""
     out, schedule = run.out, run.schedule
     if out.exists() and not out.is_dir():
         raise ValueError(f"expected a directory to write into, found a file: {out}")
-    if min(schedule.steps, run.devices, run.workers + 1) < 1:
-        found = f"steps {schedule.steps}, devices {run.devices}, workers {run.workers}"
+    if min(run.last, run.devices, run.workers + 1) < 1:
+        found = f"steps {run.last}, devices {run.devices}, workers {run.workers}"
         raise ValueError(f"expected at least 1 step, 1 device and 0 workers, found {found}")
     if schedule.precision not in PRECISIONS:
         raise ValueError(f"expected a precision of {', '.join(PRECISIONS)}, found {schedule.precision!r}")
-    stream = StreamOptions(seed=options.seed, crop=options.crop)
-    return replace(run, what=json.dumps(asdict(options)), stream=stream)

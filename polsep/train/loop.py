@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from lightning_fabric import Fabric
@@ -27,12 +27,14 @@ from polsep.train.log import Report, open_log
 from polsep.train.optimizers import Optimizers
 from polsep.train.stream import Examples, ExampleStream, StreamOptions
 from polsep.train.tasks import Task, View
-from polsep.train.validation import score_references, validate, validation_batches
+from polsep.train.validation import score, score_averaged, score_references, validation_batches
 
 #: The learning rate ends at this share of its peak.
 LAST_SHARE = 0.01
 #: Norm of a network's gradient at most. Usual ones are 13 to 42, so only outliers are cut.
 MOST_GRADIENT = 100.0
+#: A batch: a named tuple of tensors.
+Batch = TypeVar("Batch", bound=tuple[Any, ...])
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,8 @@ class Schedule:
 class Run:
     """Where a training writes, ``what`` it trains, on which data; ``workers`` render, ``devices`` train.
 
-    ``start``: a file of weights to begin with, instead of random ones.
+    ``start``: a file of weights to begin with, instead of random ones. ``until``: a step of the schedule to end at; a
+    later run goes on from its last checkpoint.
     """
 
     out: Path
@@ -76,6 +79,12 @@ class Run:
     workers: int = 1
     devices: int = 1
     start: Path | None = None
+    until: int | None = None
+
+    @property
+    def last(self) -> int:
+        """The step after which it ends."""
+        return self.schedule.steps if self.until is None else min(self.until, self.schedule.steps)
 
 
 class ExactInputs(MixedPrecision):
@@ -89,31 +98,70 @@ class ExactInputs(MixedPrecision):
         return data
 
 
+@dataclass(frozen=True)
+class Course:
+    """What the loop trains: a ``network``, ``batches`` from a step on for one process of so many, and their ``loss``.
+
+    Batches are named tuples of tensors; the loss is told which share of the training is done. ``score`` of a network
+    is what a line of the log says; ``begin`` is called before the first step, ``references`` for the log's first line.
+    """
+
+    network: nn.Module
+    batches: Callable[[int, tuple[int, int]], Iterator[Any]]
+    loss: Callable[[nn.Module, Any, float], Tensor]
+    score: Callable[[nn.Module], dict[str, float]]
+    begin: Callable[[], None] = field(default=lambda: None)
+    references: Callable[[], dict[str, float]] = field(default=dict)
+
+
 def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | None:
-    """Train to the end of the schedule, from the last checkpoint if there is one; returns the averaged weights.
+    """Train a task on streamed examples; see `train_course`."""
+    views: list[View] = []
+
+    def look() -> list[View]:
+        """Validation views, prepared where the network is when they are first asked for."""
+        if not views:
+            device = next(task.network.parameters()).device
+            views.extend(task.prepare(_to(device, batch)) for batch in validation_batches(run.stream))
+        return views
+
+    def batches(step: int, lane: tuple[int, int]) -> Iterator[Examples]:
+        stream = ExampleStream(run.stream, step, lane)
+        return iter(DataLoader(stream, batch_size=None, num_workers=run.workers, worker_init_fn=take_one_core))
+
+    course = Course(
+        task.network,
+        batches,
+        lambda network, batch, done: task.loss(network, task.prepare(batch), done),
+        lambda _: score(task.separate, look()),
+        lambda: task.begin(run.stream),
+        lambda: score_references(task, look()),
+    )
+    return train_course(course, run, report)
+
+
+def train_course(course: Course, run: Run, report: Report) -> dict[str, Tensor] | None:
+    """Train to the end, from the last checkpoint if there is one; returns the averaged weights.
 
     ``report`` is called with every line of the log. Of several processes only the first one writes and reports, and
     the others return None. Raises ValueError when the checkpoint is of another training.
     """
     fabric = _fabric(run)
     fabric.launch()
-    network = task.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = course.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     state = read_checkpoint(run.out / "checkpoint.pt")
     if state is None:
-        task.begin(run.stream) if run.start is None else begin_at(run.start, network)
+        course.begin() if run.start is None else begin_at(run.start, network)
     wrapped = fabric.setup_module(network)
     optimizer = Optimizers(network)
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
     step = _restore(state, run, (network, optimizer, average))
-    batches = _batches(run, fabric, step)
+    batches = course.batches(step, (fabric.global_rank, fabric.world_size))
     with ExitStack() as stack:
-        log, views = None, list[View]()
-        if fabric.is_global_zero:
-            views = [task.prepare(_to(fabric.device, batch)) for batch in validation_batches(run.stream)]
-            log = stack.enter_context(open_log(run.out, step, report, lambda: score_references(task, views)))
-        while step < run.schedule.steps:
+        log = stack.enter_context(open_log(run.out, step, report, course.references)) if fabric.is_global_zero else None
+        while step < run.last:
             rate = run.schedule.rate_at(step)
-            loss = task.loss(wrapped, task.prepare(_to(fabric.device, next(batches))), step / run.schedule.steps)
+            loss = course.loss(wrapped, _to(fabric.device, next(batches)), step / run.schedule.steps)
             fabric.backward(loss)
             for net in _parts(network):
                 nn.utils.clip_grad_norm_(net.parameters(), MOST_GRADIENT)
@@ -124,7 +172,8 @@ def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | Non
                 continue
             log.note(step, float(loss.detach()), run.schedule.rate_at(step))
             if run.schedule.is_due(step, run.schedule.validate_every):
-                log.add_scores(step, run.schedule.rate_at(step), validate(task, average, views))
+                scores = score_averaged(network, average, course.score)
+                log.add_scores(step, run.schedule.rate_at(step), scores)
             if run.schedule.is_due(step, run.schedule.checkpoint_every):
                 state = {"step": step, "run": _describe(run), "network": network.state_dict()}
                 state |= {"optimizer": optimizer.state_dict(), "average": average}
@@ -149,8 +198,8 @@ def begin_at(path: Path, network: nn.Module) -> None:
         raise ValueError(f"expected weights of the network to be trained in {path}, found those of another") from None
 
 
-def _to(device: torch.device, examples: Examples) -> Examples:
-    return Examples(*(x.to(device) for x in examples))
+def _to(device: torch.device, batch: Batch) -> Batch:
+    return type(batch)(*(x.to(device) for x in batch))
 
 
 def _describe(run: Run) -> str:
@@ -178,12 +227,6 @@ def _parts(network: nn.Module) -> list[nn.Module]:
     """Networks that are trained independently have their gradients clipped so."""
     nets = getattr(network, "nets", None)
     return [*nets, network.linear] if nets is not None else [network]  # type: ignore[list-item]
-
-
-def _batches(run: Run, fabric: Fabric, step: int) -> Iterator[Examples]:
-    """Batches from ``step`` on; every device has lanes of its own."""
-    stream = ExampleStream(run.stream, step, (fabric.global_rank, fabric.world_size))
-    return iter(DataLoader(stream, batch_size=None, num_workers=run.workers, worker_init_fn=take_one_core))
 
 
 def take_one_core(worker: int) -> None:

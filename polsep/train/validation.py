@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from polsep.color_affine import separate_color_affine
 from polsep.metrics import psnr
@@ -47,10 +47,16 @@ def score(separate: Callable[[View], Separation], views: list[View]) -> dict[str
 
 def validate(task: Task[View], average: dict[str, Tensor], views: list[View]) -> dict[str, float]:
     """Scores of the task's network with the averaged weights; it has its own again afterwards."""
-    network = task.network
+    return score_averaged(task.network, average, lambda _: score(task.separate, views))
+
+
+def score_averaged(
+    network: nn.Module, average: dict[str, Tensor], measure: Callable[[nn.Module], dict[str, float]]
+) -> dict[str, float]:
+    """Scores of a network with averaged weights; it has its own again afterwards."""
     own = {name: value.detach().clone() for name, value in network.state_dict().items()}
     network.load_state_dict(average)
-    scores = score(task.separate, views)
+    scores = measure(network)
     network.load_state_dict(own)
     return scores
 

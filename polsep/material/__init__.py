@@ -1,0 +1,1 @@
+"""Materials of flat samples from one or several captures: made at random, photographed, estimated, written."""

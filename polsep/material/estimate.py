@@ -1,0 +1,64 @@
+"""Maps of a flat material from photographs of it, by the shipped networks."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from polsep.io.weights import is_shipped, read_weights, shipped_weights
+from polsep.material.shots import INPUTS
+from polsep.material_network import MaterialNetwork, MaterialSize
+from polsep.svbrdf import Svbrdf, unstack
+
+#: Sides of the images that the networks were trained on.
+USUAL_SIZE = 128
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """A trained ``network`` and which ``input`` of `shots.INPUTS` it sees."""
+
+    network: MaterialNetwork
+    input: str
+
+    def estimate(self, views: Tensor) -> Svbrdf:
+        """Maps ``[C, h, w]`` of views ``[V, C, h, w]``, 1 = white paper under the same light, in any order.
+
+        Raises ValueError on another number of channels.
+        """
+        if views.ndim != 4 or views.shape[1] != self.network.inputs:
+            raise ValueError(f"expected views [V, {self.network.inputs}, h, w], found {tuple(views.shape)}")
+        with torch.no_grad():
+            return unstack(self.network(views[None].float())[0])
+
+
+def weights_name(name: str) -> str:
+    """The name of the shipped weights for that input."""
+    return f"material/{name}"
+
+
+def shipped_inputs() -> tuple[str, ...]:
+    """The inputs whose weights are installed."""
+    return tuple(name for name in INPUTS if is_shipped(weights_name(name)))
+
+
+def load_estimator(name: str = "separated", path: Path | None = None) -> Estimator:
+    """The shipped network for an input, or the one in a file of `polsep train material`.
+
+    Raises ValueError on inputs and files that there are not, and on weights of something else.
+    """
+    if path is None and name not in INPUTS:
+        raise ValueError(f"expected an input of {', '.join(INPUTS)}, found {name!r}")
+    source = shipped_weights(weights_name(name)) if path is None else path
+    tensors, metadata = read_weights(source)
+    if metadata["method"] != "material":
+        raise ValueError(f"expected weights of a network for materials in {source}, found {metadata['method']!r}")
+    size = json.loads(metadata["size"])
+    part = INPUTS[metadata["input"]]
+    network = MaterialNetwork(part.stop - part.start, MaterialSize(size["width"], tuple(size["growth"])))
+    network.load_state_dict(tensors)
+    return Estimator(network.eval(), metadata["input"])

@@ -1,0 +1,38 @@
+"""A folder of examples: made once, in any number of goes, read by every training and measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+
+from polsep.io.examples import has_example, read_example, write_example
+from polsep.material.shots import INPUTS, Example, random_example
+from polsep.svbrdf import STACKED
+
+#: Planes of one view.
+PLANES = max(part.stop for part in INPUTS.values())
+
+
+def example_path(folder: Path, split: str, seed: int, number: int) -> Path:
+    """Where an example lies."""
+    return folder / f"{split}-{seed}-{number:06d}.npy"
+
+
+def make_examples(folder: Path, split: str, seed: int, count: int, views: int) -> Iterator[int]:
+    """Make those of the first ``count`` examples that are not there yet; yields how many are, after each."""
+    for number in range(count):
+        path = example_path(folder, split, seed, number)
+        if not has_example(path):
+            example = random_example(split, seed, number, views)
+            write_example(path, torch.cat([example.views.flatten(0, 1), example.maps]))
+        yield number + 1
+
+
+def load_example(path: Path) -> Example:
+    """An example in half precision. Raises ValueError on a file that holds none."""
+    planes = read_example(path)
+    if len(planes) <= STACKED or (len(planes) - STACKED) % PLANES:
+        raise ValueError(f"expected views of {PLANES} planes and {STACKED} maps in {path}, found {len(planes)} planes")
+    return Example(planes[:-STACKED].view(-1, PLANES, *planes.shape[1:]), planes[-STACKED:])

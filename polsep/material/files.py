@@ -1,0 +1,193 @@
+"""`polsep material`: photographs of one flat material as files in, its maps as files out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from polsep.io.errors import InputError, input_error
+from polsep.io.frames import ReadOptions, output_stem, read_frames
+from polsep.io.materials import MaterialFiles, material_targets, write_material
+from polsep.io.outputs import OutputError, refuse_targets
+from polsep.io.previews import Panel, Pixels, titled_sheet, toned
+from polsep.io.separated import read_separated
+from polsep.material.estimate import USUAL_SIZE, load_estimator
+from polsep.material.shots import CAMERA_HEIGHT
+from polsep.pipeline import LightColor, separate_capture
+from polsep.svbrdf import Svbrdf, plane_points, relight
+
+Floats = NDArray[np.float32]
+
+#: Median of the separated diffuse images of training, 1 = white paper: what an unknown exposure is taken for.
+USUAL_DIFFUSE = 0.29
+#: Sides that maps may have.
+LEAST_SIZE, LARGEST_SIZE = 32, 1024
+#: Where the lights of the preview are, and the side of its pictures in pixels.
+PREVIEW_LIGHTS = ((0.0, 0.0, 2.75), (-1.2, 0.8, 1.8), (1.3, 0.9, 1.5), (1.0, -1.3, 1.2), (-1.6, -0.6, 0.9))
+PREVIEW_SIDE = 256
+
+
+@dataclass(frozen=True)
+class MaterialOptions:
+    """How photographs are read and seen: see `polsep material`.
+
+    ``white``: s0 of white paper in the middle of each photograph, or one number for all; empty: unknown. ``size``: side
+    of the maps. ``weights``: a file instead of the shipped ones. Raises ValueError on numbers out of range.
+    """
+
+    read: ReadOptions = field(default_factory=ReadOptions)
+    method: str = "auto"
+    light_color: LightColor | str = (1.0, 1.0, 1.0)
+    white: tuple[float, ...] = ()
+    size: int = USUAL_SIZE
+    input: str = "separated"
+    weights: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not LEAST_SIZE <= self.size <= LARGEST_SIZE:
+            raise ValueError(f"expected a size of {LEAST_SIZE} to {LARGEST_SIZE} pixels, found {self.size}")
+        if not all(0 < level < float("inf") for level in self.white):
+            raise ValueError(f"expected levels of white above 0, found {', '.join(f'{x:g}' for x in self.white)}")
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """Separated views ``[V, 6, size, size]`` of one material and what each came from; ``notes`` for the user."""
+
+    views: Tensor
+    sources: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def estimate_files(
+    paths: Sequence[str], options: MaterialOptions, target: tuple[Path, str | None, bool]
+) -> tuple[list[Path], list[str]]:
+    """Estimate a material from all photographs in the files and write it; the paths written, and notes for the user.
+
+    ``target``: directory, name (None: that of the first file) and whether results from before are replaced. Raises
+    ValueError, in one line, on what cannot be read or written.
+    """
+    directory, name, overwrite = target
+    name = output_stem(paths[0]) if name is None else name
+    refuse_targets(directory, targets := material_targets(directory, name), overwrite)
+    _refuse_inputs(paths, targets)
+    estimator = load_estimator(options.input, options.weights)
+    photographs = read_photographs(paths, options)
+    white = find_white(photographs.views, options.white)
+    views = photographs.views / torch.tensor(white)[:, None, None, None]
+    seen = views[:, :3] + views[:, 3:] if estimator.input == "unseparated" else views
+    maps = estimator.estimate(seen)
+    notes = list(photographs.notes)
+    if not options.white:
+        notes.append("the level of white paper is not known (--white): the diffuse map's brightness is a guess")
+    said = {
+        "sources": list(photographs.sources),
+        "input": estimator.input,
+        "method": options.method,
+        "white": list(white),
+        "warnings": notes,
+    }
+    arrays = {kind: np.ascontiguousarray(x.movedim(0, -1).numpy()) for kind, x in vars(maps).items()}
+    files = MaterialFiles(arrays, draw_material(maps, views), said)
+    return write_material(files, directory, name, overwrite), notes
+
+
+def _refuse_inputs(paths: Sequence[str], targets: Sequence[Path]) -> None:
+    """Raise OutputError where an output would replace an input."""
+    inputs = {Path(path).resolve() for path in paths}
+    clash = [path for path in targets if path.resolve() in inputs]
+    if clash:
+        raise OutputError(f"expected outputs apart from inputs, found that {clash[0]} is an input")
+
+
+def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photographs:
+    """Every frame of the files, separated, its middle square at the maps' size. Raises InputError."""
+    views, sources, notes = [], [], list[str]()
+    for path in paths:
+        found: list[tuple[Floats, Floats]] = []
+        if Path(path).suffix.lower() == ".exr":
+            found.append(read_separated(Path(path)))
+        else:
+            for frame in read_frames(path, options.read):
+                done = separate_capture(frame.data, options.method, options.light_color)
+                found.append((done.diffuse, done.specular))
+                notes += [f"{path}: {note}" for note in (*frame.notes, *done.report["warnings"])]
+        for pair in found:
+            planes = [torch.from_numpy(x).movedim(-1, 0).expand(3, -1, -1) for x in pair]
+            view = torch.cat([_middle_square(x, options.size) for x in planes])
+            if not float(view.sum()) > 0:
+                raise input_error(path, "expected light in the middle of a photograph, found a black one")
+            views.append(view)
+            sources.append(Path(path).name)
+    if not views:
+        raise InputError("expected photographs of a material, found none")
+    return Photographs(torch.stack(views), tuple(sources), tuple(notes))
+
+
+def _middle_square(image: Tensor, size: int) -> Tensor:
+    """The largest square in the middle of an image, by area averages where it shrinks."""
+    height, width = image.shape[-2:]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    square = image[None, :, top : top + side, left : left + side]
+    if side >= size:
+        return interpolate(square, (size, size), mode="area")[0]
+    return interpolate(square, (size, size), mode="bilinear", align_corners=False)[0]
+
+
+def find_white(views: Tensor, given: tuple[float, ...]) -> tuple[float, ...]:
+    """The level of white paper for each view ``[V, 6, h, w]``: as given, or so that materials are as bright as usual.
+
+    Raises ValueError where the numbers given are neither one nor one for each view.
+    """
+    count = len(views)
+    if given and len(given) not in (1, count):
+        raise ValueError(f"expected one level of white, or {count}, one for each photograph, found {len(given)}")
+    if given:
+        return given * count if len(given) == 1 else given
+    levels = views[:, :3].mean(dim=1).flatten(1).median(dim=1).values
+    return tuple(max(float(level) / USUAL_DIFFUSE, 1e-6) for level in levels)
+
+
+def draw_material(maps: Svbrdf, views: Tensor) -> Pixels:
+    """A sheet for people: photograph and maps, and what the material looks like under other lights."""
+    first = views[0, :3] + views[0, 3:]
+    scale = max(float(maps.specular.max()), 1e-6)
+    pictures = [
+        Panel("Photograph", "", _shown(first)),
+        Panel("Normal", "", _shown_linear(maps.normal * 0.5 + 0.5)),
+        Panel("Diffuse", "", _shown(maps.diffuse)),
+        Panel("Roughness", "", _shown_linear(maps.roughness.expand(3, -1, -1))),
+        Panel("Specular", f"white {scale:.2g}", _shown(maps.specular / scale)),
+    ]
+    relit = [Panel("Relit", "light {:g} {:g} {:g}".format(*at), _shown(see_under(maps, at))) for at in PREVIEW_LIGHTS]
+    return titled_sheet([pictures, relit])
+
+
+def see_under(maps: Svbrdf, light: tuple[float, float, float]) -> Tensor:
+    """The picture ``[3, h, w]`` of maps from the photographs' own place, under a light there."""
+    points = plane_points(*maps.roughness.shape[-2:])
+    camera, place = (torch.tensor(p)[:, None, None] for p in ((0.0, 0.0, CAMERA_HEIGHT), light))
+    return relight(maps, points, camera, place)
+
+
+def _shown(image: Tensor) -> Pixels:
+    """Linear light ``[3, h, w]`` as sRGB of the preview's size."""
+    return toned(_enlarged(image), 1.0)
+
+
+def _shown_linear(image: Tensor) -> Pixels:
+    """Numbers ``[3, h, w]`` from 0 to 1 as they are."""
+    return np.rint(np.clip(_enlarged(image), 0, 1) * 255).astype(np.uint8)
+
+
+def _enlarged(image: Tensor) -> Floats:
+    side = (PREVIEW_SIDE, PREVIEW_SIDE)
+    return interpolate(image[None], side, mode="nearest")[0].movedim(0, -1).contiguous().numpy()

@@ -1,0 +1,125 @@
+"""Photographs of flat materials by a polarization camera with a polarized flash, and what the networks see of them.
+
+The camera looks straight down at the plane of `polsep.svbrdf`, whose sides fill the frame; a point light behind a
+polarizer is near the lens, as a flash is, or anywhere above. Light follows `optics`, the frame the camera model with
+noise, and the frame is separated by `METHOD`. Images are divided by what white paper in the middle would show, as a
+photograph of white paper under the same light tells: 1 is white.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from polsep.camera import IMX250, Layout, Mosaic
+from polsep.guided import demosaic_guided_half
+from polsep.material.procedural import GLASS, halve, random_svbrdf
+from polsep.methods import METHODS
+from polsep.optics import fresnel
+from polsep.pipeline import separate_known
+from polsep.render import GBuffer, PinholeCamera, PointLight, Scene, Vector, shade
+from polsep.simulate import blur, capture, expose_to_clip, expose_to_level, half_resolution
+from polsep.svbrdf import Svbrdf, plane_points
+from polsep.views import BLURS, scene_seed
+
+#: How high the camera is above a plane of sides 2.
+CAMERA_HEIGHT = 2.75
+CAMERA = PinholeCamera((0.0, 0.0, CAMERA_HEIGHT), (0.0, 0.0, 0.0), 2 * math.degrees(math.atan(1 / CAMERA_HEIGHT)))
+#: How far a flash is from the lens at most, along every axis, and where a light that is moved may be.
+FLASH, AROUND, HEIGHTS = 0.15, 1.4, (1.8, 3.2)
+#: Shares of the samples that clip at most, and the least level of the median one, white at 1.
+LARGEST_CLIPPED, LEAST_LEVEL = 0.03, 0.06
+#: What separates the frames: the best method that polsep ships.
+METHOD = "joint"
+#: Log of what the level of white paper is off by, standard deviation.
+WHITE_ERROR = 0.05
+#: What each input shows, by name: its channels of the 15 of an example's views.
+INPUTS: dict[str, slice] = {"unseparated": slice(0, 3), "separated": slice(3, 9), "perfect": slice(9, 15)}
+#: Raw pixels along the side of a frame.
+RAW_SIZE = 256
+
+
+@dataclass(frozen=True)
+class Example:
+    """Views ``[V, 15, h, w]`` of one material (see `INPUTS`) and its ``maps [9, h, w]`` (see `Svbrdf.stack`)."""
+
+    views: Tensor
+    maps: Tensor
+
+
+def random_flash(generator: torch.Generator) -> PointLight:
+    """A flash beside the lens, behind a random polarizer."""
+    x, y, z = ((2 * torch.rand(3, generator=generator, dtype=torch.float64) - 1) * FLASH).tolist()
+    return _light((x, y, CAMERA_HEIGHT + z), generator)
+
+
+def random_light(generator: torch.Generator) -> PointLight:
+    """A light somewhere above the plane, behind a random polarizer."""
+    a, b, c = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
+    height = HEIGHTS[0] + (HEIGHTS[1] - HEIGHTS[0]) * c
+    return _light(((2 * a - 1) * AROUND, (2 * b - 1) * AROUND, height), generator)
+
+
+def _light(position: Vector, generator: torch.Generator) -> PointLight:
+    turn = math.pi * float(torch.rand(1, generator=generator, dtype=torch.float64))
+    return PointLight(position, 1.0, turn)
+
+
+def photograph(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> tuple[Mosaic, Scene, float]:
+    """A raw frame of a plane, the exposed light behind it, and s0 of white paper in the plane's middle.
+
+    The specular map is that of a dielectric: its mean colour counts.
+    """
+    height, width = maps.roughness.shape[-2:]
+    strength = maps.specular.mean(dim=0, keepdim=True)
+    albedo = maps.diffuse * (1 - strength) / fresnel(torch.ones(1)).t_plus ** 2
+    points = plane_points(height, width)
+    everywhere = torch.ones(1, height, width, dtype=torch.bool)
+    buffer = GBuffer(points, maps.normal, albedo, maps.roughness, strength / GLASS, everywhere)
+    diffuse, specular = shade(buffer, CAMERA, light, everywhere)
+    low, high = BLURS
+    place, share = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+    scene = blur(Scene(diffuse, specular, everywhere[0]), low + (high - low) * place)
+    exposed = expose_to_clip(scene, LARGEST_CLIPPED * share, Layout(), IMX250)
+    exposed = expose_to_level(exposed, LEAST_LEVEL, Layout(), IMX250)
+    gain = float(exposed.diffuse.s0.mean() / scene.diffuse.s0.mean())
+    distance = math.dist(light.position, (0, 0, 0))
+    white = gain * light.intensity / distance**2 * light.position[2] / distance / math.pi
+    return capture(exposed, Layout(), IMX250, generator).mosaic, exposed, white
+
+
+def see_unseparated(mosaic: Mosaic) -> Tensor:
+    """What a camera without analysers shows, ``[3, h, w]``: s0, every sample at face value."""
+    return 2 * demosaic_guided_half(mosaic).data.mean(dim=-4)
+
+
+def see_separated(mosaic: Mosaic) -> Tensor:
+    """Diffuse and specular image of `METHOD`, ``[6, h, w]``."""
+    frame = separate_known(mosaic, METHODS[METHOD], (1.0, 1.0, 1.0))
+    images = (torch.from_numpy(x).movedim(-1, 0) for x in (frame.diffuse, frame.specular))
+    return torch.cat([x.expand(3, -1, -1) for x in images])
+
+
+def see(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> Tensor:
+    """Everything that networks may see of one photograph, ``[15, h, w]``; see `INPUTS`."""
+    mosaic, scene, white = photograph(maps, light, generator)
+    diffuse, specular, _ = half_resolution(scene)
+    off = math.exp(WHITE_ERROR * float(torch.randn(1, generator=generator, dtype=torch.float64)))
+    return torch.cat([see_unseparated(mosaic), see_separated(mosaic), diffuse, specular]) / (white * off)
+
+
+def make_example(maps: Svbrdf, views: int, generator: torch.Generator) -> Example:
+    """Photographs of a material ``[., H, W]``: the first by a flash beside the lens, the others by lights that move."""
+    place: list[Callable[[torch.Generator], PointLight]] = [random_flash, *[random_light] * (views - 1)]
+    seen = [see(maps, draw(generator), generator) for draw in place]
+    return Example(torch.stack(seen), halve(maps).stack())
+
+
+def random_example(split: str, seed: int, number: int, views: int) -> Example:
+    """Example ``number`` of a split, which depends on nothing else; ValueError on a split not in `views.SPLITS`."""
+    generator = torch.Generator().manual_seed(scene_seed(split, seed, number))
+    return make_example(random_svbrdf(RAW_SIZE, generator), views, generator)

@@ -1,0 +1,129 @@
+"""The training of the network for materials: examples from a folder, turned and mirrored, one to all of their views.
+
+Batch number n follows from the options and n, so a training that goes on sees what one without a break would.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from polsep.material.examples import example_path, load_example
+from polsep.material.shots import INPUTS, Example
+from polsep.material_network import MaterialNetwork, MaterialSize
+from polsep.svbrdf import unstack
+from polsep.train.loop import Course
+from polsep.train.material_losses import maps_loss, material_loss, random_configurations, rendering_loss
+from polsep.train.tasks import find
+
+#: The seed of validation's pictures, and how many of them there are, anywhere and mirrored.
+VALIDATION_SEED, VALIDATION_PICTURES = 2026, (3, 6)
+#: Steps times this plus the rank seed a batch.
+RANKS = 1024
+
+
+@dataclass(frozen=True)
+class MaterialOptions:
+    """What a training for materials sees: ``input`` of `shots.INPUTS`, of the first ``examples`` of ``seed``.
+
+    ``views`` that examples are made with; a batch has 1 to all of them. Raises ValueError on inputs that there are not.
+    """
+
+    input: str
+    size: MaterialSize = field(default_factory=MaterialSize)
+    seed: int = 0
+    batch: int = 4
+    examples: int = 768
+    views: int = 3
+    validation: int = 16
+
+    def __post_init__(self) -> None:
+        find(INPUTS, "an input", self.input)
+        if min(self.batch, self.examples, self.views, self.validation) < 1:
+            raise ValueError(f"expected a batch, examples, views and validation of at least 1, found {self}")
+
+
+class MaterialBatch(NamedTuple):
+    """Views ``[B, V, C, h, w]`` of materials and their maps ``[B, 9, h, w]``."""
+
+    views: Tensor
+    maps: Tensor
+
+
+def turn_example(example: MaterialBatch, ways: tuple[bool, bool, bool], colors: Tensor) -> MaterialBatch:
+    """Mirrored across, mirrored down, transposed, colours permuted; normals turn with their picture.
+
+    Images without polarization and their maps are as likely in all these ways.
+    """
+    across, down, transposed = ways
+    views, maps = example
+    x, y = maps[..., 0:1, :, :], maps[..., 1:2, :, :]
+    x, y = (-x if across else x), (-y if down else y)
+    diffuse, specular = maps[..., 2:5, :, :][..., colors, :, :], maps[..., 6:9, :, :][..., colors, :, :]
+    axes = [axis for axis, wanted in ((-1, across), (-2, down)) if wanted]
+    if transposed:  # rows become columns: x is minus y
+        x, y = -y, -x
+    maps = torch.cat([x, y, diffuse, maps[..., 5:6, :, :], specular], dim=-3).flip(axes)
+    colored = views.reshape(*views.shape[:-3], -1, 3, *views.shape[-2:])[..., colors, :, :]
+    views = colored.flatten(-4, -3).flip(axes)
+    if transposed:
+        views, maps = views.transpose(-1, -2), maps.transpose(-1, -2)
+    return MaterialBatch(views, maps)
+
+
+def batches(options: MaterialOptions, folder: Path, step: int, lane: tuple[int, int]) -> Iterator[MaterialBatch]:
+    """Batches from ``step`` on, for the process of that number among so many."""
+    while True:
+        generator = torch.Generator().manual_seed((options.seed << 24) ^ (step * RANKS + lane[0]))
+        count = 1 + int(torch.randint(options.views, (1,), generator=generator))
+        found = []
+        for number in torch.randint(options.examples, (options.batch,), generator=generator).tolist():
+            example = load_example(example_path(folder, "train", options.seed, number))
+            chosen = torch.randperm(options.views, generator=generator)[:count]
+            seen = MaterialBatch(example.views[chosen, INPUTS[options.input]], example.maps)
+            ways = tuple(bool(w) for w in torch.randint(2, (3,), generator=generator))
+            found.append(turn_example(seen, (ways[0], ways[1], ways[2]), torch.randperm(3, generator=generator)))
+        views, maps = (torch.stack(x).float() for x in zip(*found, strict=True))
+        yield MaterialBatch(views, maps)
+        step += 1
+
+
+def score_maps(estimate: Callable[[Tensor], Tensor], examples: Sequence[Example], part: slice) -> dict[str, float]:
+    """Mean losses of what is estimated from one view and from all: "relit, 1 view", "maps, 3 views" and their like."""
+    scores: dict[str, float] = {}
+    generator = torch.Generator().manual_seed(VALIDATION_SEED)
+    seen = random_configurations(*VALIDATION_PICTURES, generator)
+    for count in (1, len(examples[0].views)):
+        relit, maps = [], []
+        for example in examples:
+            found = unstack(estimate(example.views[None, :count, part].float()))
+            truth = unstack(example.maps[None].float())
+            relit.append(float(rendering_loss(found, truth, seen)))
+            maps.append(float(maps_loss(found, truth)))
+        name = f"{count} view{'s' if count > 1 else ''}"
+        scores |= {f"relit, {name}": statistics.fmean(relit), f"maps, {name}": statistics.fmean(maps)}
+    return scores
+
+
+def material_course(options: MaterialOptions, folder: Path) -> Course:
+    """The training of a network for one input, on examples that are there already."""
+    part = INPUTS[options.input]
+    network = MaterialNetwork(part.stop - part.start, options.size)
+
+    def loss(net: nn.Module, batch: MaterialBatch, done: float) -> Tensor:
+        seed = int(done * 2**31)  # a share of the training: the same for every input
+        return material_loss(net(batch.views), batch.maps, torch.Generator().manual_seed(seed))
+
+    def score(net: nn.Module) -> dict[str, float]:
+        device = next(net.parameters()).device
+        paths = [example_path(folder, "validation", options.seed, n) for n in range(options.validation)]
+        with torch.no_grad():
+            return score_maps(lambda x: net(x.to(device)).cpu(), [load_example(path) for path in paths], part)
+
+    return Course(network, lambda step, lane: batches(options, folder, step, lane), loss, score)

@@ -1,17 +1,18 @@
 """From normals to depth: bilateral normal integration, which keeps jumps, and plain least squares to compare with.
 
-Normals ``[H, W, 3]`` have x right, y up, z to the camera, as in `polsep.render`. Depth counts away from the camera along
-its axis: in pixels, with a mean of 0, for an orthographic camera; with a camera matrix in the unit of ``depth``'s mean,
-which is free, 1. In either case q dz/du = a and q dz/dv = b (u right, v down) with
+Normals ``[H, W, 3]`` have x right, y up, z to the camera, as in `polsep.render`. Depth counts away from the camera
+along its axis: in pixels around a mean of 0 for an orthographic camera, relative to a mean of 1 for a pinhole. In either
+case q dz/du = a and q dz/dv = b (u right, v down) with
 
 * orthographic: z = depth, q = n_z, a = n_x, b = -n_y;
-* pinhole: z = log(depth), q = -f_u n.r, a = n_x, b = -n_y f_u / f_v for the ray r = ((u - c_u) / f_u, (c_v - v) / f_v, -1).
+* pinhole: z = log(depth), q = -f_u n.r, a = n_x, b = -n_y f_u / f_v, r = ((u - c_u) / f_u, (c_v - v) / f_v, -1) the
+  pixel's ray.
 
 Every pixel has such an equation toward each of its four neighbours. Bilateral weights ask, along u and along v, which
 of the two sides is smooth: w = sigmoid(k ((q dz-)^2 - (q dz+)^2)) of the forward side and 1 - w of the other.
 Source: Cao, Santo, Shi, Okura, Matsushita 2022, Bilateral normal integration, ECCV, Eqs. 12-18, arXiv:2207.05063.
-Note: where a pixel has one neighbour only along an axis its equation has weight 1. The paper takes the absent difference
-for 0, so that slopes at the outline lose weight.
+Note: where a pixel has one neighbour only along an axis its equation has weight 1. The paper takes the absent
+difference for 0, so that slopes at the outline lose weight.
 Needs the extra ``render``.
 """
 

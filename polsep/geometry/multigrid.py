@@ -83,9 +83,9 @@ class Multigrid:
 
 
 def _gather(matrix: Any, diagonal: Floats, rows: Integers, cols: Integers) -> tuple[Integers, Integers, Integers]:
-    """Which unknown of the next level each one belongs to, and the blocks' rows and cols; ``rows``, ``cols``: its block.
+    """Which unknown of the next level each one belongs to, and the blocks' rows and cols.
 
-    Unknowns of one block belong together where strong links join them inside it.
+    ``rows``, ``cols``: the block of each. Unknowns of one belong together where strong links join them inside it.
     """
     links = matrix.tocoo()
     first, second = links.coords

@@ -90,10 +90,9 @@ def load_subjects(data: Path, names: Sequence[str] | None = None) -> list[Subjec
 
 def _statue(folder: Path) -> tuple[Mesh, PinholeCamera]:
     """A DiLiGenT object from where its camera was."""
-    normals, mask, depth, matrix = (
-        read(folder / file)
-        for read, file in zip((read_normal_map, read_mask, read_depth, read_intrinsics), DILIGENT_FILES, strict=True)
-    )
+    paths = [folder / file for file in DILIGENT_FILES]
+    normals, mask, depth = read_normal_map(paths[0]), read_mask(paths[1]), read_depth(paths[2])
+    matrix = read_intrinsics(paths[3])
     surface = span_surface(unproject(depth, matrix), normals, mask & np.isfinite(depth))
     middle = (surface.vertices.min(axis=0) + surface.vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(surface.vertices - middle, axis=1).max())
@@ -143,7 +142,8 @@ def _turned(direction: Tensor, generator: torch.Generator) -> Tensor:
     draws = 2 * torch.rand(3, generator=generator, dtype=torch.float64) - 1
     sideways = draws - (draws @ direction) * direction
     angle = math.radians(LARGEST_TURN_DEG) * torch.rand(1, generator=generator, dtype=torch.float64)
-    return torch.cos(angle) * direction + torch.sin(angle) * sideways / sideways.norm()
+    way: Tensor = torch.cos(angle) * direction + torch.sin(angle) * sideways / sideways.norm()
+    return way
 
 
 def _light(way: Tensor, generator: torch.Generator) -> PointLight:

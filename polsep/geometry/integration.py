@@ -1,8 +1,8 @@
 """From normals to depth: bilateral normal integration, which keeps jumps, and plain least squares to compare with.
 
 Normals ``[H, W, 3]`` have x right, y up, z to the camera, as in `polsep.render`. Depth counts away from the camera
-along its axis: in pixels around a mean of 0 for an orthographic camera, relative to a mean of 1 for a pinhole. In either
-case q dz/du = a and q dz/dv = b (u right, v down) with
+along its axis: in pixels around a mean of 0 for an orthographic camera, relative to a mean of 1 for a pinhole. In
+either case q dz/du = a and q dz/dv = b (u right, v down) with
 
 * orthographic: z = depth, q = n_z, a = n_x, b = -n_y;
 * pinhole: z = log(depth), q = -f_u n.r, a = n_x, b = -n_y f_u / f_v, r = ((u - c_u) / f_u, (c_v - v) / f_v, -1) the
@@ -19,6 +19,7 @@ Needs the extra ``render``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -68,7 +69,7 @@ def find_slopes(normals: Floats, mask: Mask, intrinsics: Floats | None = None) -
 def integrate_bilateral(normals: Floats, mask: Mask, intrinsics: Floats | None = None) -> Floats:
     """Depth ``[H, W]`` of a surface with jumps, NaN outside the mask. Raises ValueError on an empty mask."""
     slopes = find_slopes(normals, mask, intrinsics)
-    system = _System(slopes)
+    system = Equations(slopes)
     weights = system.even_weights()
     depth = np.zeros(system.count)
     energy = np.inf
@@ -83,12 +84,12 @@ def integrate_bilateral(normals: Floats, mask: Mask, intrinsics: Floats | None =
 
 def integrate_smooth(normals: Floats, mask: Mask, intrinsics: Floats | None = None) -> Floats:
     """Depth of a surface without jumps: the same equations, all of weight 1/2, which is Poisson's equation."""
-    system = _System(find_slopes(normals, mask, intrinsics))
+    system = Equations(find_slopes(normals, mask, intrinsics))
     depth = system.solve(system.even_weights(), np.zeros(system.count), 1e-8)
     return system.as_image(depth, intrinsics is not None)
 
 
-class _System:
+class Equations:
     """The equations between neighbours along both axes, and the Laplacian that weights make of them."""
 
     def __init__(self, slopes: Slopes) -> None:
@@ -131,6 +132,16 @@ class _System:
 
     def solve(self, weights: list[Floats], start: Floats, tolerance: float) -> Floats:
         """The depth of least energy for fixed weights."""
+        matrix, right = self.assemble(weights)
+        if self.multigrid is None:
+            self.multigrid = Multigrid(matrix, *self.places)
+        found, steps = solve(matrix, right, start, self.multigrid, (tolerance, MOST_STEPS))
+        if steps > STALE:
+            self.multigrid = None
+        return found
+
+    def assemble(self, weights: list[Floats]) -> tuple[Any, Floats]:
+        """The symmetric matrix and the right side whose solution that is."""
         diagonal, right = np.zeros(self.count), np.zeros(self.count)
         links = []
         for axis, weight in zip(self.axes, weights, strict=True):
@@ -143,13 +154,7 @@ class _System:
         all_pixels = np.arange(self.count)
         entries = np.concatenate([strength, strength, diagonal])
         at = (np.concatenate([first, second, all_pixels]), np.concatenate([second, first, all_pixels]))
-        matrix = scipy.sparse.coo_array((entries, at), (self.count, self.count)).tocsr()
-        if self.multigrid is None:
-            self.multigrid = Multigrid(matrix, *self.places)
-        found, steps = solve(matrix, right, start, self.multigrid, (tolerance, MOST_STEPS))
-        if steps > STALE:
-            self.multigrid = None
-        return found
+        return scipy.sparse.coo_array((entries, at), (self.count, self.count)).tocsr(), right
 
     def as_image(self, depth: Floats, logarithmic: bool) -> Floats:
         """The solution as depth in an image."""

@@ -2,8 +2,8 @@
 
 Directions point from the object to the light, in the camera's frame: x right, y up, z to the camera.
 Source of the six: Lichy, Wu, Sengupta, Jacobs 2021, Shape and material capture at home, CVPR, Sec. 3: right,
-front-right, front (beside the camera), front-left, left, above. Note: that paper gives no angles, "roughly" is its word;
-those here are what a hand with a flash does about an object on a table.
+front-right, front (beside the camera), front-left, left, above. Note: angles here are this project's, what a hand with
+a flash does about an object on a table.
 """
 
 from __future__ import annotations
@@ -52,4 +52,5 @@ def parse_lights(text: str) -> Floats:
             raise ValueError(f"expected a light direction that points somewhere, found {word!r}")
         found.append((x, y, z))
     vectors = np.array(found, dtype=np.float64).reshape(-1, 3)
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit: Floats = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return unit

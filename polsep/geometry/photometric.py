@@ -1,11 +1,11 @@
 """Photometric stereo: normals and albedo from photographs under some lights of roughly known direction.
 
 Images ``[L, H, W, C]`` are linear light, one camera, one light each; ``directions [L, 3]`` are unit vectors toward the
-lights, with x right, y up, z to the camera, and lights are far and equally bright. Normals ``[H, W, 3]`` are in the same
-frame and face the camera; albedo ``[H, W, C]`` is relative: the light of a surface that faces light and camera. Outside
-the mask both are 0. `fit_lambertian` is plain least squares (Woodham 1980, doi:10.1117/12.7972479). `fit_robust` knows
-what that lacks: shadows, highlights, the Fresnel transmission that dims grazing diffuse light, lights that are off by
-degrees, and, where it is given, the polarization of the diffuse light.
+lights, with x right, y up, z to the camera, and lights are far and equally bright. Normals ``[H, W, 3]`` are in the
+same frame and face the camera; albedo ``[H, W, C]`` is relative: the light of a surface that faces light and camera.
+Outside the mask both are 0. `fit_lambertian` is plain least squares (Woodham 1980, doi:10.1117/12.7972479).
+`fit_robust` knows what that lacks: shadows, highlights, the Fresnel transmission that dims grazing diffuse light,
+lights that are off by degrees, and, where it is given, the polarization of the diffuse light.
 
 Note: five of the six lights of `lights.NAMED` lie in one plane, and the sixth, above, leaves half of an object in the
 dark. There nothing but the shadow itself and polarization says how far a normal is tilted up or down.
@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from polsep.geometry.polarization import Cue
 from polsep.optics import fresnel
@@ -35,6 +36,8 @@ SHADOW_DEVIATION = 0.5
 RIDGE = 1e-4
 #: Rounds of reweighting, and residuals in deviations that lose half of their weight.
 ROUNDS, OUTLYING = 12, 2.0
+#: Pixels (sigma) that choose together which of a cue's normals is meant.
+NEIGHBOURS = 2.0
 #: Least cosine toward the camera.
 LEAST_COSINE = 0.02
 
@@ -69,12 +72,12 @@ def fit_robust(images: Floats, directions: Floats, mask: Mask, cue: Cue | None =
     _check(images, directions, mask)
     light = images.mean(axis=-1)[:, mask]
     lit = light > np.maximum(SHADOW * light.max(axis=0), DARK)
-    frames = _Frames(light, lit, directions)
+    frames = _Frames(light, lit, directions, mask)
     choices = None if cue is None else (cue.first[mask], cue.second[mask], cue.deviation[mask])
     weight = lit.astype(np.float64)
-    albedo = np.maximum(light.max(axis=0), 1e-6)
+    albedo: Floats = np.maximum(light.max(axis=0), 1e-6)
     normals = _facing(frames.solve(light, weight, albedo, np.ones_like(lit), None))
-    even = light
+    even: Floats = light
     for _ in range(ROUNDS):
         even = light / _transmission(normals, directions)
         albedo = _albedo(even, weight, frames.cosines(normals))
@@ -91,11 +94,12 @@ def fit_robust(images: Floats, directions: Floats, mask: Mask, cue: Cue | None =
 
 @dataclass(frozen=True)
 class _Frames:
-    """Grey ``light`` and which of it is ``lit`` ``[L, P]``, under lights ``directions [L, 3]``."""
+    """Grey ``light`` and which of it is ``lit`` ``[L, P]``, of the pixels of ``mask``, under ``directions [L, 3]``."""
 
     light: Floats
     lit: Mask
     directions: Floats
+    mask: Mask
 
     def cosines(self, normals: Floats) -> Floats:
         """Toward every light, ``[L, P]``."""
@@ -134,14 +138,25 @@ def _choose(
         wrong = np.minimum((relative - shading) ** 2 / spread, 9) * frames.lit
         dark = np.minimum((shading / 0.2) ** 2, 2) * ~frames.lit
         costs.append((wrong + dark).sum(axis=0))
-    return np.where((costs[0] <= costs[1])[:, None], first, second), deviation
+    return np.where((_vote(costs[1] - costs[0], first, frames.mask) >= 0)[:, None], first, second), deviation
+
+
+def _vote(preference: Floats, first: Floats, mask: Mask) -> Floats:
+    """How much a pixel and those around it prefer the side to which ``first`` leans, ``[P]``."""
+    votes = np.zeros(mask.shape)
+    total = np.zeros(len(first))
+    for axis in (0, 1):
+        votes[mask] = preference * first[:, axis]
+        total += gaussian_filter(votes, NEIGHBOURS)[mask] * first[:, axis]
+    return total
 
 
 def _albedo(even: Floats, weight: Floats, cosines: Floats) -> Floats:
     """The factor ``[P]`` between cosines and light, by weighted least squares."""
     shading = np.maximum(cosines, 0)
     power = (weight * shading**2).sum(axis=0)
-    return np.maximum((weight * even * shading).sum(axis=0) / np.maximum(power, 1e-6), 1e-6)
+    albedo: Floats = np.maximum((weight * even * shading).sum(axis=0) / np.maximum(power, 1e-6), 1e-6)
+    return albedo
 
 
 def _transmission(normals: Floats, directions: Floats) -> Floats:
@@ -151,11 +166,12 @@ def _transmission(normals: Floats, directions: Floats) -> Floats:
     """
     inward = _through(np.clip(directions @ normals.T, 0.05, 1))
     outward = _through(np.clip(normals[:, 2], 0.05, 1))
-    return inward * outward / _through(np.ones(1)) ** 2
+    relative: Floats = inward * outward / _through(np.ones(1)) ** 2
+    return relative
 
 
 def _through(cosines: Floats) -> Floats:
-    through: Floats = fresnel(torch.from_numpy(np.ascontiguousarray(cosines))).t_plus.numpy()
+    through: Floats = fresnel(torch.from_numpy(np.ascontiguousarray(cosines))).t_plus.double().numpy()
     return through
 
 

@@ -29,7 +29,11 @@ def encode_glb(vertices: ArrayLike, normals: ArrayLike, colors: ArrayLike, faces
     blob = b""
     for array in arrays:
         index = array.dtype == np.uint32
-        accessor = {"bufferView": len(views), "componentType": _UINT if index else _FLOAT, "count": len(array)}
+        accessor: dict[str, Any] = {
+            "bufferView": len(views),
+            "componentType": _UINT if index else _FLOAT,
+            "count": len(array),
+        }
         if index:
             accessor |= {"count": int(array.size), "type": "SCALAR"}
         else:

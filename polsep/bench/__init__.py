@@ -16,7 +16,7 @@ from polsep.bench.dynamic import bench_dynamic, bench_dynamic_quick
 from polsep.bench.exactness import bench_exactness
 from polsep.bench.frontend import bench_frontend
 from polsep.bench.gallery import draw_paper
-from polsep.bench.geometry import bench_geometry, bench_geometry_quick
+from polsep.bench.geometry import bench_geometry, bench_geometry_quick, draw_geometry
 from polsep.bench.joint import bench_joint
 from polsep.bench.paper import bench_paper, bench_paper_quick
 from polsep.bench.real import bench_real
@@ -58,6 +58,6 @@ BENCHES: dict[str, Bench] = {
     "dynamic": Bench(bench_dynamic, bench_dynamic_quick),
     "calibration": Bench(bench_calibration),
     "video": Bench(bench_video, bench_video_quick),
-    "geometry": Bench(bench_geometry, bench_geometry_quick),
+    "geometry": Bench(bench_geometry, bench_geometry_quick, draw_geometry),
     "paper": Bench(bench_paper, bench_paper_quick, draw_paper),
 }

@@ -1,4 +1,4 @@
-"""The picture of docs/geometry.md in the manner of Fig. 10 of Dave et al. 2022: public-domain meshes under six lights."""
+"""The pictures of docs/geometry.md in the manner of Fig. 10 of Dave et al. 2022: meshes under six lights, by input."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LARGEST_DEG, SIDE, VIEW = 30.0, 240, (35.0, 15.0)
 
 
 def draw_subject(subject: Subject, number: int) -> Pixels:
-    """Normals, their error, albedo, another light and the mesh, by input, of an object; ``number`` is part of its seed."""
+    """Normals, their error, albedo, another light and the mesh of an object, by input; ``number`` makes its seed."""
     shoot = photograph(subject, SEED + 1000 + number)
     found = {name: shape for name, shape in appearances_of(shoot) if name in ROWS}
     best = found["joint, polarization"]

@@ -19,6 +19,7 @@ Needs the extra ``render``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -35,9 +36,9 @@ SHARPNESS = 2.0
 #: Rounds at most, and the relative change of the energy that ends them. Source: the same, with 150 and 1e-4.
 MOST_ROUNDS, LEAST_CHANGE = 100, 1e-4
 #: Residual of each round's linear system relative to where it starts, and its steps at most.
-TOLERANCE, MOST_STEPS = 0.1, 60
+TOLERANCE, MOST_STEPS = 0.2, 60
 #: Steps after which a multigrid made for the weights of an earlier round is made anew.
-STALE = 10
+STALE = 6
 #: Normals that are seen at a more grazing angle are taken for this one: q >= this cosine.
 LEAST_COSINE = 0.02
 
@@ -144,17 +145,26 @@ class Equations:
         """The symmetric matrix and the right side whose solution that is."""
         diagonal, right = np.zeros(self.count), np.zeros(self.count)
         links = []
-        for axis, weight in zip(self.axes, weights, strict=True):
+        for axis, weight in zip(self.axes, weights, strict=True):  # no pixel comes twice at one end of an axis's links
             strength, target = axis.links(weight)
-            for end, sign in ((axis.first, -1.0), (axis.second, 1.0)):
-                diagonal += np.bincount(end, strength, self.count)
-                right += sign * np.bincount(end, target, self.count)
-            links.append((axis.first, axis.second, -strength))
-        first, second, strength = (np.concatenate(part) for part in zip(*links, strict=True))
-        all_pixels = np.arange(self.count)
-        entries = np.concatenate([strength, strength, diagonal])
-        at = (np.concatenate([first, second, all_pixels]), np.concatenate([second, first, all_pixels]))
-        return scipy.sparse.coo_array((entries, at), (self.count, self.count)).tocsr(), right
+            diagonal[axis.first] += strength
+            diagonal[axis.second] += strength
+            right[axis.first] -= target
+            right[axis.second] += target
+            links.append(-strength)
+        entries = np.concatenate([*links, *links, diagonal])
+        order, indices, starts = self.pattern
+        return scipy.sparse.csr_array((entries[order], indices, starts), (self.count, self.count)), right
+
+    @cached_property
+    def pattern(self) -> tuple[NDArray[np.int64], NDArray[Any], NDArray[Any]]:
+        """Where links there, back, and the diagonal stand in the matrix: their order, columns and starts of rows."""
+        first, second = (np.concatenate(ends) for ends in zip(*((a.first, a.second) for a in self.axes), strict=True))
+        pixels = np.arange(self.count)
+        at = (np.concatenate([first, second, pixels]), np.concatenate([second, first, pixels]))
+        numbered = scipy.sparse.coo_array((np.arange(at[0].size) + 1.0, at), (self.count, self.count)).tocsr()
+        numbered.sort_indices()
+        return numbered.data.astype(np.int64) - 1, numbered.indices, numbered.indptr
 
     def as_image(self, depth: Floats, logarithmic: bool) -> Floats:
         """The solution as depth in an image."""

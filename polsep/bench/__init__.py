@@ -16,6 +16,7 @@ from polsep.bench.dynamic import bench_dynamic, bench_dynamic_quick
 from polsep.bench.exactness import bench_exactness
 from polsep.bench.frontend import bench_frontend
 from polsep.bench.gallery import draw_paper
+from polsep.bench.geometry import bench_geometry, bench_geometry_quick, draw_geometry
 from polsep.bench.joint import bench_joint
 from polsep.bench.material import bench_material, bench_material_quick
 from polsep.bench.material_gallery import draw_material
@@ -60,5 +61,6 @@ BENCHES: dict[str, Bench] = {
     "calibration": Bench(bench_calibration),
     "material": Bench(bench_material, bench_material_quick, draw_material),
     "video": Bench(bench_video, bench_video_quick),
+    "geometry": Bench(bench_geometry, bench_geometry_quick, draw_geometry),
     "paper": Bench(bench_paper, bench_paper_quick, draw_paper),
 }

@@ -1,0 +1,231 @@
+"""From files of six lights to normals, albedo, depth and a mesh, as files.
+
+Inputs are separated EXR files of `polsep separate`, raw frames, which are separated first, or photographs of an
+ordinary camera, which are taken as they are: they have no polarization to help.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os.path import realpath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.geometry.integration import integrate_bilateral
+from polsep.geometry.photometric import Appearance, fit_robust
+from polsep.geometry.polarization import Polarized, find_slope, normals_of_slope
+from polsep.geometry.surface import Surface, draw_views, relight, span_surface
+from polsep.io.errors import InputError, input_error
+from polsep.io.frames import ReadOptions, read_frames
+from polsep.io.geometry import ShapeFiles
+from polsep.io.maps import read_map
+from polsep.io.meshes import encode_glb, encode_ply
+from polsep.io.previews import exposure_of, toned
+from polsep.io.separated import read_planes
+from polsep.pipeline import separate_capture
+from polsep.report import SeparatedFrame
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Pixels = NDArray[np.uint8]
+
+#: Without a mask, the object is where the brightest of the frames exceeds this share of what it exceeds in 1 %.
+OBJECT_SHARE = 0.06
+#: Side of the preview's pictures, and from where its meshes are seen: azimuth and elevation [degrees].
+CELL = 360
+VIEWS = ((-50.0, 5.0), (-20.0, 10.0), (20.0, 10.0), (50.0, 5.0))
+#: Colour around the object in previews.
+GREY = 40
+
+
+@dataclass(frozen=True)
+class Views:
+    """Linear ``images [L, H, W, C]`` under different lights, and their polarization where there is some."""
+
+    images: Floats
+    polarized: Polarized | None
+
+
+@dataclass(frozen=True)
+class Source:
+    """How files are read: ``kind`` is "photographs" or "frames"; raw frames by ``options`` and ``method``."""
+
+    kind: str
+    options: ReadOptions
+    method: str
+
+
+def read_views(paths: Sequence[Path], source: Source) -> Views:
+    """Read, and separate where needed. Raises InputError, also on images of different shapes."""
+    if source.kind == "photographs":
+        images = [read_map(path, "texture") for path in paths]
+        _require_one_shape(paths, images)
+        return Views(np.stack(images).astype(np.float64), None)
+    frames = [_read_frame(path, source) for path in paths]
+    _require_one_shape(paths, [frame.diffuse for frame in frames])
+    return views_of(frames)
+
+
+def views_of(frames: Sequence[SeparatedFrame]) -> Views:
+    """Separated frames of one size with their polarization."""
+    diffuse, specular = (np.stack([getattr(f, name) for f in frames]).astype(np.float64) for name in _LOBES)
+    grey, highlight = diffuse.mean(axis=-1), specular.mean(axis=-1)
+    dolp, aolp, valid = (np.stack([getattr(f, name) for f in frames]).astype(np.float64) for name in _STATES)
+    strength = dolp * (grey + highlight)
+    return Views(diffuse, Polarized(grey, highlight, strength * np.cos(2 * aolp), strength * np.sin(2 * aolp), valid))
+
+
+_LOBES, _STATES = ("diffuse", "specular"), ("dolp", "aolp", "valid")
+
+
+def _read_frame(path: Path, source: Source) -> SeparatedFrame:
+    """One frame, separated."""
+    if path.suffix.lower() == ".exr":
+        return _from_planes(path)
+    frames = list(read_frames(path, source.options))
+    if len(frames) != 1:
+        raise input_error(path, f"expected one frame under one light, found {len(frames)}")
+    try:
+        return separate_capture(frames[0].data, source.method)
+    except (ValueError, RuntimeError) as error:
+        raise input_error(path, error) from error
+
+
+def _from_planes(path: Path) -> SeparatedFrame:
+    """A separated EXR file with its polarization."""
+    planes = read_planes(path)
+    colors = "RGB" if "diffuse.R" in planes else "Y"
+    names = [f"{lobe}.{color}" for lobe in _LOBES for color in colors] + [f"{state}.Y" for state in _STATES]
+    missing = [name for name in names if name not in planes]
+    if missing:
+        raise input_error(path, f"expected a file of polsep separate with {missing[0]}, found none")
+    images = [np.stack([planes[f"{lobe}.{color}"] for color in colors], axis=-1) for lobe in _LOBES]
+    dolp, aolp, valid = (planes[f"{state}.Y"] for state in _STATES)
+    return SeparatedFrame(images[0], images[1], valid > 0.5, dolp, aolp, {})
+
+
+def _require_one_shape(paths: Sequence[Path], images: Sequence[NDArray[Any]]) -> None:
+    for path, image in zip(paths, images, strict=True):
+        if image.shape != images[0].shape:
+            raise input_error(path, f"expected {list(images[0].shape)} as {paths[0]} has, found {list(image.shape)}")
+        if not np.isfinite(image).all():
+            raise input_error(path, "expected finite light, found NaN or infinite samples")
+
+
+def read_object(path: Path, size: tuple[int, int]) -> Mask:
+    """The mask ``[H, W]`` of a file of that size, or of twice that: raw frames become half as large."""
+    found = read_map(path, "mask") > 0.5
+    if found.shape == (2 * size[0], 2 * size[1]):
+        found = found.reshape(size[0], 2, size[1], 2).all(axis=(1, 3))
+    if found.shape != size:
+        raise input_error(path, f"expected a mask of {list(size)}, found {list(found.shape)}")
+    if not found.any():
+        raise input_error(path, "expected a mask that holds pixels, found none")
+    return found
+
+
+def shrink(views: Views, mask: Mask, longest: int) -> tuple[Views, Mask]:
+    """Means over blocks of so many pixels that no side exceeds ``longest``; pixels on the object wholly stay in it."""
+    factor = -(-max(mask.shape) // longest)
+    if factor == 1:
+        return views, mask
+
+    def mean(images: Floats) -> Floats:
+        rows, cols = (side // factor for side in images.shape[1:3])
+        cut = images[:, : rows * factor, : cols * factor]
+        blocks: Floats = cut.reshape(len(images), rows, factor, cols, factor, *images.shape[3:]).mean(axis=(2, 4))
+        return blocks
+
+    small = mean(mask[None].astype(np.float64))[0] == 1
+    if not small.any():
+        raise InputError(f"expected an object that is wider than {factor} pixels, found none")
+    states = None if views.polarized is None else Polarized(*(mean(image) for image in vars(views.polarized).values()))
+    return Views(mean(views.images), states), small
+
+
+def find_object(views: Views) -> Mask:
+    """Where some light reaches: a guess for objects before a dark background. Raises InputError where nothing is."""
+    brightest = views.images.mean(axis=-1).max(axis=0)
+    mask: Mask = brightest > OBJECT_SHARE * np.percentile(brightest, 99)
+    if not mask.any():
+        raise InputError("expected light on an object, found black images")
+    return mask
+
+
+def find_shape(views: Views, directions: Floats, mask: Mask, look: tuple[str, float | None]) -> ShapeFiles:
+    """Normals, albedo, depth, mesh and preview; ``look``: the mesh's format, and the vertical field of view [degrees]
+    or None for an orthographic camera. Raises ValueError."""
+    cue = None
+    if views.polarized is not None:
+        cue = normals_of_slope(find_slope(views.polarized, mask))
+    found = fit_robust(views.images, directions, mask, cue)
+    format, fov_deg = look
+    intrinsics = None if fov_deg is None else intrinsics_of(fov_deg, mask.shape)
+    depth = integrate_bilateral(found.normals, mask, intrinsics)
+    gain = 1 / max(float(np.percentile(found.albedo[mask], 99.5)), 1e-9)
+    shown = Appearance(found.normals, np.minimum(found.albedo * gain, 1), mask)
+    surface = span_surface(shown, depth, intrinsics)
+    encode = encode_glb if format == "glb" else encode_ply
+    mesh = encode(surface.vertices, surface.normals, surface.colors, surface.faces)
+    said = {
+        "lights": directions.round(6).tolist(),
+        "polarization": cue is not None,
+        "field_of_view_deg": fov_deg,
+        "triangles": len(surface.faces),
+        "albedo_of_mesh": f"albedo x {gain:.6g}, limited to 1",
+    }
+    return ShapeFiles(found.normals, found.albedo, depth, mask, mesh, draw_sheet(views, shown, surface), said)
+
+
+def intrinsics_of(fov_deg: float, size: tuple[int, ...]) -> Floats:
+    """The camera matrix of a vertical field of view, centred. Raises ValueError unless it is in (0, 120]."""
+    if not 0 < fov_deg <= 120:
+        raise ValueError(f"expected a field of view in (0, 120] degrees, found {fov_deg:g}")
+    focal = size[0] / 2 / math.tan(math.radians(fov_deg) / 2)
+    return np.array([[focal, 0, (size[1] - 1) / 2], [0, focal, (size[0] - 1) / 2], [0, 0, 1]])
+
+
+def draw_sheet(views: Views, shown: Appearance, surface: Surface) -> Pixels:
+    """Two rows of pictures: brightest frame, normals, albedo, another light; and the mesh from four sides."""
+    mask = shown.mask
+    front = views.images[int(views.images.sum(axis=(1, 2, 3)).argmax())]
+    relit = relight(shown)
+    flat = [
+        toned(front, exposure_of(front[mask])),
+        np.rint(255 * (shown.normals + 1) / 2).astype(np.uint8),
+        toned(shown.albedo, 0.9),
+        toned(relit, exposure_of(relit[mask])),
+    ]
+    meshes = draw_views(surface, CELL, VIEWS)
+    gain = exposure_of(np.stack(meshes)[np.stack(meshes).sum(axis=-1) > 0])
+    solid = [np.where(picture.sum(axis=-1, keepdims=True) > 0, toned(picture, gain), GREY) for picture in meshes]
+    rows = [np.concatenate([_cell(picture, mask) for picture in flat], axis=1), np.concatenate(solid, axis=1)]
+    return np.concatenate(rows).astype(np.uint8)
+
+
+def _cell(picture: Pixels, mask: Mask) -> Pixels:
+    """A picture around its object, in `CELL` x `CELL` pixels; the nearest pixels, on grey."""
+    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    cut = np.where(mask[..., None], picture, GREY)[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+    scale = (CELL - 20) / max(cut.shape[:2])
+    height, width = (max(1, round(side * scale)) for side in cut.shape[:2])
+    at = [
+        np.minimum(((np.arange(n) + 0.5) / scale).astype(int), side - 1)
+        for n, side in zip((height, width), cut.shape[:2], strict=True)
+    ]
+    cell = np.full((CELL, CELL, 3), GREY, np.uint8)
+    top, left = (CELL - height) // 2, (CELL - width) // 2
+    cell[top : top + height, left : left + width] = cut[at[0]][:, at[1]]
+    return cell
+
+
+def refuse_inputs(targets: Sequence[Path], inputs: Sequence[Path]) -> None:
+    """Raise InputError where an output would replace an input."""
+    clash = {realpath(path) for path in targets} & {realpath(path) for path in inputs}
+    if clash:
+        raise InputError(f"expected outputs apart from inputs, found that {sorted(clash)[0]} is an input")

@@ -1,0 +1,56 @@
+"""The light directions that photometric stereo is told: six named ones, or three numbers each.
+
+Directions point from the object to the light, in the camera's frame: x right, y up, z to the camera.
+Source of the six: Lichy, Wu, Sengupta, Jacobs 2021, Shape and material capture at home, CVPR, Sec. 3: right,
+front-right, front (beside the camera), front-left, left, above. Note: angles here are this project's, what a hand with
+a flash does about an object on a table.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def _direction(right_deg: float, up_deg: float) -> tuple[float, float, float]:
+    """A unit vector so far to the right of the camera, and above it."""
+    right, up = math.radians(right_deg), math.radians(up_deg)
+    return (math.sin(right) * math.cos(up), math.sin(up), math.cos(right) * math.cos(up))
+
+
+#: The six lights, in the order of the photographs.
+NAMED = {
+    "right": _direction(70, 0),
+    "front-right": _direction(35, 0),
+    "front": _direction(0, 0),
+    "front-left": _direction(-35, 0),
+    "left": _direction(-70, 0),
+    "above": _direction(0, 60),
+}
+
+
+def parse_lights(text: str) -> Floats:
+    """Unit vectors ``[L, 3]`` of names, or of ``x,y,z``, with spaces between: ``"right 0,0,1 above"``.
+
+    Raises ValueError.
+    """
+    found = []
+    for word in text.split():
+        if word in NAMED:
+            found.append(NAMED[word])
+            continue
+        try:
+            x, y, z = (float(part) for part in word.split(","))
+        except ValueError:
+            names = ", ".join(NAMED)
+            raise ValueError(f"expected light directions of {names}, or x,y,z, found {word!r}") from None
+        if not 1e-6 < math.hypot(x, y, z) < math.inf:
+            raise ValueError(f"expected a light direction that points somewhere, found {word!r}")
+        found.append((x, y, z))
+    vectors = np.array(found, dtype=np.float64).reshape(-1, 3)
+    unit: Floats = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return unit

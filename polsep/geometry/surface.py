@@ -1,0 +1,132 @@
+"""From depth to a mesh with colours, and pictures of what was found: under another light, and from around.
+
+Meshes have x right, y up, z to the camera, are centred and have a largest extent of 1. Where the depth jumps by more
+than normals say, triangles are left out: nobody saw what is there. Needs the extra ``render``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polsep.geometry.integration import LEAST_COSINE
+from polsep.geometry.photometric import Appearance
+from polsep.raycast import MeshScene, find_hits
+from polsep.render import PinholeCamera
+from polsep.shapes import Mesh
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+#: A rise between neighbours that differs from the one of their normals by this many pixels, and by this share, jumps.
+JUMP, JUMP_SHARE = 1.5, 1.5
+#: The field of view of pictures of a mesh [degrees], and its camera's distance in extents.
+FOV_DEG, DISTANCE = 24.0, 2.9
+#: Toward the light of pictures, in the camera's frame.
+PICTURE_LIGHT = (-0.45, 0.55, 0.7)
+#: Light that reaches surfaces that face away.
+AMBIENT = 0.06
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Triangles ``faces [F, 3]`` of ``vertices [V, 3]`` with unit ``normals [V, 3]`` and linear ``colors [V, 3]``."""
+
+    vertices: Floats
+    normals: Floats
+    colors: Floats
+    faces: Integers
+
+
+def span_surface(appearance: Appearance, depth: Floats, intrinsics: Floats | None = None) -> Surface:
+    """The surface of a depth map of `integration`, with the normals and albedo of its pixels. Raises ValueError."""
+    mask = appearance.mask & np.isfinite(depth)
+    rows, cols = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float64)
+    if intrinsics is None:
+        points, scale = np.stack([cols, -rows, -depth], axis=-1), np.ones_like(depth)
+    else:
+        across = (cols - intrinsics[0, 2]) / intrinsics[0, 0]
+        upward = (intrinsics[1, 2] - rows) / intrinsics[1, 1]
+        points, scale = np.stack([across, upward, -np.ones_like(depth)], axis=-1) * depth[..., None], depth
+        scale = scale / intrinsics[0, 0]
+    faces = _triangles(mask, _steady_links(appearance.normals, depth / scale, mask))
+    if not len(faces):
+        raise ValueError("expected a surface of three pixels or more, found none")
+    kept, faces = np.unique(faces, return_inverse=True)
+    vertices = points[mask][kept]
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    vertices = (vertices - (low + high) / 2) / max(float((high - low).max()), 1e-12)
+    colors = np.broadcast_to(appearance.albedo, (*mask.shape, 3))[mask][kept]
+    return Surface(vertices, appearance.normals[mask][kept], colors, faces.reshape(-1, 3))
+
+
+def _steady_links(normals: Floats, depth: Floats, mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ...]:
+    """Links to the right ``[H, W-1]`` and down ``[H-1, W]`` across which the depth, in pixels, goes on as it should."""
+    cosine = np.maximum(normals[..., 2], LEAST_COSINE)
+    steady = []
+    for slope, first, second in (
+        (normals[..., 0] / cosine, np.s_[:, :-1], np.s_[:, 1:]),
+        (-normals[..., 1] / cosine, np.s_[:-1], np.s_[1:]),
+    ):
+        expected = (slope[first] + slope[second]) / 2
+        largest = np.maximum(np.abs(slope[first]), np.abs(slope[second]))
+        with np.errstate(invalid="ignore"):
+            off = np.abs(depth[second] - depth[first] - expected)
+        steady.append(mask[first] & mask[second] & (off <= JUMP + JUMP_SHARE * largest))
+    return tuple(steady)
+
+
+def _triangles(mask: NDArray[np.bool_], links: tuple[NDArray[np.bool_], ...]) -> Integers:
+    """Two triangles per square of four pixels, counter-clockwise, of numbers of pixels in the mask."""
+    right, down = links
+    number = np.cumsum(mask.reshape(-1)).reshape(mask.shape) - 1
+    corner, beside, below, across = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    upper, lower = right[:-1] & down[:, :-1] & mask[:-1, 1:], right[1:] & down[:, 1:]
+    first, second = upper & mask[1:, :-1], lower & mask[1:, :-1] & mask[:-1, 1:]
+    return np.concatenate(
+        [
+            np.stack([corner, below, beside], axis=-1)[first],
+            np.stack([beside, below, across], axis=-1)[second],
+        ]
+    )
+
+
+def relight(appearance: Appearance, direction: tuple[float, float, float] = PICTURE_LIGHT) -> Floats:
+    """The image ``[H, W, C]`` under a far light from there, without cast shadows."""
+    toward = np.array(direction) / math.hypot(*direction)
+    shading = np.maximum(appearance.normals @ toward, 0) + AMBIENT
+    image: Floats = appearance.albedo * shading[..., None]
+    return image
+
+
+def draw_views(surface: Surface, size: int, views: tuple[tuple[float, float], ...]) -> list[Floats]:
+    """Linear pictures ``[size, size, 3]`` of a mesh from (azimuth, elevation) [degrees]; the light comes along.
+
+    Where there is no mesh they are 0. Faces that were seen from behind are drawn too.
+    """
+    count = len(surface.faces)
+    flat = np.zeros((len(surface.vertices), 2))
+    scene = MeshScene(Mesh(surface.vertices, surface.normals, flat, surface.faces, np.arange(count, dtype=np.int64)))
+    colors = surface.colors[surface.faces].mean(axis=1)
+    ticks = torch.arange(size * 2) / 2 + 0.25
+    rows, cols = (g.flatten() for g in torch.meshgrid(ticks, ticks, indexing="ij"))
+    pictures = []
+    for azimuth_deg, elevation_deg in views:
+        azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
+        back = np.array(
+            [math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)]
+        )
+        right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
+        x, y, z = DISTANCE * back
+        hits = find_hits(scene, PinholeCamera((x, y, z), (0.0, 0.0, 0.0), FOV_DEG), (rows, cols), (size, size))
+        light = np.array(PICTURE_LIGHT) / math.hypot(*PICTURE_LIGHT)
+        toward = light[0] * right + light[1] * np.cross(back, right) + light[2] * back
+        shading = np.maximum(hits.normal[..., 0].double().numpy().T @ toward, 0) + AMBIENT
+        fine = np.zeros((rows.numel(), 3))
+        fine[hits.ray.numpy()] = colors[hits.slot.numpy()] * shading[:, None]
+        pictures.append(fine.reshape(size, 2, size, 2, 3).mean(axis=(1, 3)))
+    return pictures

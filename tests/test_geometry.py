@@ -1,0 +1,234 @@
+"""Photometric stereo, diffuse polarization and integration: exact where they must be, and the same from every side."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from polsep.optics import diffuse_dolp, fresnel
+
+pytest.importorskip("scipy")
+
+from polsep.geometry.integration import integrate_bilateral, integrate_smooth
+from polsep.geometry.lights import NAMED, parse_lights
+from polsep.geometry.multigrid import Multigrid, solve
+from polsep.geometry.photometric import fit_lambertian, fit_robust
+from polsep.geometry.polarization import Polarized, find_slope, normals_of_slope
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Six lights, no three in a plane, that all reach a cap of 50 degrees.
+LIGHTS = parse_lights("0,0,1 0.4,0.1,1 -0.4,0.2,1 0.1,0.5,1 0.2,-0.5,1 -0.3,-0.3,1")
+SIX = np.array(list(NAMED.values()))
+
+
+def cap(size: int, zenith_deg: float) -> tuple[Floats, Mask]:
+    """Normals of a sphere up to a zenith, and where they are; an even number of pixels per side."""
+    at = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(at, -at)
+    radius = np.hypot(x, y) * math.sin(math.radians(zenith_deg))
+    mask = np.hypot(x, y) < 1
+    z = np.sqrt(np.maximum(1 - radius**2, 0))
+    scale = math.sin(math.radians(zenith_deg))
+    return np.stack([x * scale, y * scale, z], axis=-1) * mask[..., None], mask
+
+
+def angles(found: Floats, truth: Floats, mask: Mask) -> Floats:
+    """Angles between normals [degrees]; by the sine, which is exact for small ones."""
+    cross = np.linalg.norm(np.cross(found[mask], truth[mask]), axis=-1)
+    return np.degrees(np.arctan2(cross, (found[mask] * truth[mask]).sum(axis=-1)))
+
+
+def through(cosines: Floats) -> Floats:
+    return np.asarray(fresnel(torch.from_numpy(np.clip(cosines, 0.05, 1))).t_plus.numpy())
+
+
+def lambertian(normals: Floats, directions: Floats, albedo: Floats) -> Floats:
+    """Images ``[L, H, W, C]``, no cast shadows."""
+    shading = np.maximum(np.einsum("li,hwi->lhw", directions, normals), 0)
+    return shading[..., None] * albedo
+
+
+def dielectric(normals: Floats, directions: Floats, albedo: Floats) -> Floats:
+    """The same behind an interface of refractive index 1.5, unpolarized light."""
+    cosines = np.einsum("li,hwi->lhw", directions, normals)
+    passed = through(cosines) * through(normals[..., 2]) / through(np.ones(1)) ** 2
+    return lambertian(normals, directions, albedo) * passed[..., None]
+
+
+def slope_of(normals: Floats) -> NDArray[np.complex128]:
+    dolp = diffuse_dolp(torch.from_numpy(normals[..., 2])).numpy()
+    return np.asarray(dolp * np.exp(2j * np.arctan2(normals[..., 1], normals[..., 0])))
+
+
+def test_a_lambertian_sphere_is_found_exactly() -> None:
+    """Least squares: normals and albedo to rounding, whatever the colours."""
+    normals, mask = cap(48, 50)
+    albedo = np.random.default_rng(0).uniform(0.1, 1, (48, 48, 3))
+    found = fit_lambertian(lambertian(normals, LIGHTS, albedo), LIGHTS, mask)
+    assert np.abs(found.normals - normals)[mask].max() < 1e-6
+    assert np.abs(found.albedo - albedo)[mask].max() < 1e-6
+    assert (found.normals[~mask] == 0).all() and (found.albedo[~mask] == 0).all()
+
+
+def test_a_dielectric_sphere_is_found_where_all_lights_reach() -> None:
+    """Robust fit: its model includes the transmission, so it is exact where nothing is in shadow."""
+    normals, mask = cap(48, 50)
+    images = dielectric(normals, LIGHTS, np.full((48, 48, 1), 0.4))
+    found = fit_robust(images, LIGHTS, mask)
+    assert angles(found.normals, normals, mask).max() < 0.05
+    assert np.abs(found.albedo / 0.4 - 1)[mask].max() < 2e-3
+
+
+def test_highlights_and_shadows_are_outlived() -> None:
+    """One light of six is a highlight here, none there: the robust fit is several times nearer than least squares."""
+    normals, mask = cap(64, 50)
+    images = dielectric(normals, LIGHTS, np.full((64, 64, 1), 0.4))
+    for k in range(6):
+        images[k, 10 * k : 10 * k + 5, :] += 0.3
+        images[k, :, 10 * k : 10 * k + 4] = 0
+    robust, plain = (angles(fit(images, LIGHTS, mask).normals, normals, mask) for fit in (fit_robust, fit_lambertian))
+    assert robust.mean() < 0.35 * plain.mean()
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_normals_turn_with_the_camera(turns: int) -> None:
+    """Images, lights and polarization turned by 90 degrees give normals that are turned."""
+    normals, mask = cap(32, 70)
+    images = dielectric(normals, SIX, np.full((32, 32, 3), 0.4))
+    found = fit_robust(images, SIX, mask, normals_of_slope(slope_of(normals)))
+    turned = np.rot90(images, turns, axes=(1, 2))
+    c, s = (round(f(turns * math.pi / 2)) for f in (math.cos, math.sin))
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    slope = np.rot90(slope_of(normals), turns) * (-1.0) ** turns
+    again = fit_robust(turned, SIX @ rotation.T, np.rot90(mask, turns), normals_of_slope(slope))
+    assert np.abs(again.normals - np.rot90(found.normals, turns) @ rotation.T).max() < 1e-3
+
+
+def test_polarization_says_what_shading_leaves_open() -> None:
+    """Five of the named lights lie in one plane: below, only polarization knows how far a normal is tilted."""
+    normals, mask = cap(48, 75)
+    images = dielectric(normals, SIX, np.full((48, 48, 1), 0.4))
+    dark = mask & (normals @ SIX[5] < 0)
+    alone = angles(fit_robust(images, SIX, mask).normals, normals, dark)
+    helped = angles(fit_robust(images, SIX, mask, normals_of_slope(slope_of(normals))).normals, normals, dark)
+    assert helped.mean() < 2.0 and helped.mean() < 0.3 * alone.mean()
+
+
+def test_a_slope_has_two_normals_half_a_turn_apart() -> None:
+    """`normals_of_slope` undoes the Fresnel curve; the other normal has the opposite azimuth."""
+    normals, mask = cap(32, 80)
+    cue = normals_of_slope(slope_of(normals))
+    nearer = np.minimum(angles(cue.first, normals, mask), angles(cue.second, normals, mask))
+    assert nearer[nearer.size // 4 :].max() < 0.5
+    assert np.allclose(cue.first[mask] * [-1, -1, 1], cue.second[mask])
+    assert (cue.deviation[mask] > 0).all()
+
+
+def test_slopes_ignore_the_frames_whose_light_is_specular() -> None:
+    """The slope of the diffuse light is found although one frame of six is full of polarized specular light."""
+    generator = np.random.default_rng(3)
+    diffuse = generator.uniform(0.2, 0.8, (6, 24, 24))
+    slope = 0.08 * np.exp(1.1j)
+    specular = np.zeros_like(diffuse)
+    specular[2] = 0.3
+    both = slope * diffuse + specular * np.exp(0.4j)
+    frames = Polarized(diffuse, specular, both.real, both.imag, np.ones_like(diffuse))
+    found = find_slope(frames, np.ones((24, 24), np.bool_))
+    assert np.abs(found - slope).max() < 1e-3
+
+
+def bumps(height: int, width: int) -> tuple[Floats, Floats]:
+    """Depth of a smooth surface and its normals."""
+    rows, cols = np.mgrid[:height, :width].astype(np.float64)
+    depth = 6 * np.sin(cols / 17) * np.cos(rows / 21)
+    along_u = 6 / 17 * np.cos(cols / 17) * np.cos(rows / 21)
+    along_v = -6 / 21 * np.sin(cols / 17) * np.sin(rows / 21)
+    normals = np.stack([along_u, -along_v, np.ones_like(depth)], axis=-1)
+    return depth, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("integrate", [integrate_bilateral, integrate_smooth])
+def test_an_analytic_surface_comes_back(integrate: object) -> None:
+    """Orthographic: depth to a small part of a pixel, up to its mean."""
+    depth, normals = bumps(60, 72)
+    mask = np.ones(depth.shape, np.bool_)
+    mask[:10, :12] = False
+    assert callable(integrate)
+    found = integrate(normals, mask)
+    assert np.isnan(found[~mask]).all()
+    off = (found - depth)[mask]
+    assert np.abs(off - off.mean()).max() < 0.12
+
+
+def test_a_plane_before_a_pinhole_comes_back() -> None:
+    """Perspective: relative depths of a slanted plane are exact, whatever the focal lengths."""
+    matrix = np.array([[200.0, 0, 30], [0, 190, 22], [0, 0, 1]])
+    normal = np.array([0.3, -0.2, 0.9]) / np.linalg.norm([0.3, -0.2, 0.9])
+    rows, cols = np.mgrid[:48, :64]
+    rays = np.stack([(cols - 30) / 200, (22 - rows) / 190, -np.ones((48, 64))], axis=-1)
+    depth = -1 / (rays @ normal)
+    found = integrate_bilateral(np.broadcast_to(normal, (48, 64, 3)), np.ones((48, 64), np.bool_), matrix)
+    assert np.abs(found / depth * depth.mean() - 1).max() < 2e-3
+
+
+def test_a_jump_is_kept() -> None:
+    """A ridge that is cut off: least squares smears the cut, bilateral weights keep most of it."""
+    rows, cols = np.mgrid[:96, :120].astype(np.float64)
+    down, across = rows - 48, cols - 60
+    bell = np.where(across >= 0, 45 * np.exp(-((down / 19) ** 2) - (across / 38) ** 2), 0)
+    normals = np.stack([bell * 2 * across / 38**2, -bell * 2 * down / 19**2, np.ones_like(bell)], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    mask = np.ones(bell.shape, np.bool_)
+    kept, smeared = (f(normals, mask) for f in (integrate_bilateral, integrate_smooth))
+    assert kept[48, 59] - kept[48, 60] > 0.75 * 45
+    assert smeared[48, 59] - smeared[48, 60] < 0.6 * 45
+    assert np.std(kept + bell) < 0.4 * np.std(smeared + bell)
+
+
+def test_multigrid_solves_what_sparse_elimination_solves() -> None:
+    """Conjugate gradients under multigrid agree with SciPy's direct solver, in few steps, over links of all sizes."""
+    from scipy.sparse import coo_array, eye_array
+    from scipy.sparse.linalg import spsolve
+
+    generator, side = np.random.default_rng(5), 40
+    number = np.arange(side * side).reshape(side, side)
+    first = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
+    second = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
+    strength = 10.0 ** generator.uniform(-4, 0, first.size)
+    count = side * side
+    links = coo_array((strength, (first, second)), (count, count)).tocsr()
+    links = links + links.T
+    matrix = (coo_array((links.sum(axis=1), (range(count), range(count)))) - links + 1e-3 * eye_array(count)).tocsr()
+    right = generator.normal(size=count)
+    rows, cols = np.divmod(np.arange(count), side)
+    found, steps = solve(matrix, right, np.zeros(count), Multigrid(matrix, rows, cols), (1e-9, 200))
+    exact = spsolve(matrix.tocsc(), right)
+    assert np.abs(found - exact).max() < 1e-6 * np.abs(exact).max()
+    assert steps < 100
+
+
+def test_lights_are_named_or_given() -> None:
+    """Names and vectors become unit vectors; anything else is said in one line."""
+    found = parse_lights("front 0,3,4")
+    assert np.allclose(found, [[0, 0, 1], [0, 0.6, 0.8]])
+    for text in ("behind", "1,2", "0,0,0", "1,nan,2"):
+        with pytest.raises(ValueError, match="expected"):
+            parse_lights(text)
+
+
+def test_lights_of_one_plane_are_refused() -> None:
+    """Without a third dimension there are no normals to find."""
+    images, mask = np.ones((5, 4, 4, 1)), np.ones((4, 4), np.bool_)
+    for fit in (fit_lambertian, fit_robust):
+        with pytest.raises(ValueError, match="not in one plane"):
+            fit(images, SIX[:5], mask)
+    with pytest.raises(ValueError, match="holds pixels"):
+        fit_robust(np.ones((6, 4, 4, 1)), SIX, ~mask)
+    with pytest.raises(ValueError, match="holds pixels"):
+        integrate_bilateral(np.ones((4, 4, 3)), ~mask)

@@ -1,0 +1,201 @@
+"""`polsep geometry`: files of six lights in, whole files out that other programs read, or one line why not."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_cli import Run, assert_refused, contents
+
+pytest.importorskip("scipy")
+pytest.importorskip("embreex")
+pytest.importorskip("trimesh")
+
+import trimesh
+from test_geometry import SIX, cap, dielectric, slope_of
+
+from polsep import cli
+from polsep.geometry.integration import integrate_bilateral
+from polsep.geometry.photometric import Appearance
+from polsep.geometry.surface import draw_views, relight, span_surface
+from polsep.io.exr import read_exr_layers
+from polsep.io.meshes import encode_glb, encode_ply
+from polsep.io.outputs import encode_png, write_separation
+from polsep.io.previews import srgb
+from polsep.report import SeparatedFrame
+
+Cli = Callable[..., Run]
+SIDE = 40
+
+
+@pytest.fixture
+def polsep(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Cli:
+    """Run `polsep geometry ARGS` inside this process."""
+
+    def run(*args: str | Path) -> Run:
+        monkeypatch.setattr(sys, "argv", ["polsep", "geometry", *map(str, args)])
+        capfd.readouterr()
+        status: Any = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            status = stop.code
+        return Run(status or 0, *capfd.readouterr())
+
+    return run
+
+
+def sphere_images() -> NDArray[np.float64]:
+    """A sphere under the six named lights."""
+    normals, _ = cap(SIDE, 70)
+    return dielectric(normals, SIX, np.broadcast_to([0.5, 0.3, 0.2], (SIDE, SIDE, 3)))
+
+
+@pytest.fixture
+def separated(tmp_path: Path) -> list[Path]:
+    """Six separated EXR files with their polarization, and a mask."""
+    normals, mask = cap(SIDE, 70)
+    slope = slope_of(normals) * mask
+    paths = []
+    for number, image in enumerate(sphere_images()):
+        frame = SeparatedFrame(
+            image.astype(np.float32),
+            np.zeros((SIDE, SIDE, 3), np.float32),
+            np.ones((SIDE, SIDE), np.bool_),
+            np.abs(slope).astype(np.float32),
+            np.mod(np.angle(slope) / 2, np.pi).astype(np.float32),
+            {},
+        )
+        paths.append(write_separation(frame, tmp_path / "in", f"light{number}")[0])
+    (tmp_path / "mask.png").write_bytes(encode_png(255 * mask.astype(np.uint8)))
+    return paths
+
+
+def test_separated_files_become_maps_and_a_mesh(polsep: Cli, separated: list[Path], tmp_path: Path) -> None:
+    """All files appear; normals are those of the sphere, the PNG holds the same; a second run is refused."""
+    out = tmp_path / "out"
+    run = polsep(*separated, "-o", out, "--name", "ball", "--mask", tmp_path / "mask.png")
+    names = ["ball.exr", "ball_normals.png", "ball.glb", "ball.png", "ball.json"]
+    assert (run.status, run.out.split()) == (0, [str(out / name) for name in names]), run
+    planes = read_exr_layers(out / "ball.exr")
+    truth, mask = cap(SIDE, 70)
+    found = np.stack([planes[f"normal.{axis}"] for axis in "XYZ"], axis=-1)
+    inner = mask & (planes["mask.Y"] > 0)
+    assert np.degrees(np.arccos(np.clip((found * truth).sum(axis=-1), -1, 1)))[inner].mean() < 2
+    assert (found[planes["mask.Y"] == 0] == 0).all()
+    sidecar = json.loads((out / "ball.json").read_text())
+    assert sidecar["polarization"] is True and [f["name"] for f in sidecar["files"]] == names[:-1]
+    before = contents(out)
+    assert_refused(polsep(*separated, "-o", out, "--name", "ball"), "--overwrite")
+    assert contents(out) == before
+    assert polsep(*separated, "-o", out, "--name", "ball", "--mask", tmp_path / "mask.png", "--overwrite").status == 0
+    assert contents(out) == before
+
+
+def test_photographs_do_too(polsep: Cli, tmp_path: Path) -> None:
+    """8-bit sRGB, no mask, a field of view, a PLY mesh, maps made smaller."""
+    paths = [tmp_path / f"{number}.png" for number in range(6)]
+    for path, image in zip(paths, sphere_images(), strict=True):
+        path.write_bytes(encode_png(np.rint(255 * srgb(image)).astype(np.uint8)))
+    run = polsep("--srgb", *paths, "-o", tmp_path / "out", "--fov", "25", "--mesh", "ply", "--size", "20")
+    assert run.status == 0, run
+    assert read_exr_layers(tmp_path / "out" / "shape.exr")["depth.Z"].shape == (20, 20)
+    mesh = trimesh.load(tmp_path / "out" / "shape.ply", force="mesh", process=False)
+    assert len(mesh.faces) > 300 and mesh.visual.kind == "vertex"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (["--lights", "right left"], ["2 files", "found 6"]),
+        (["--lights", "right left behind 0,0,1 1,0,1 0,1,1"], ["behind"]),
+        (["--lights", "1,0,1 0,0,1 1,0,0 1,0,2 1,0,3 1,0,4"], ["one plane"]),
+        (["--fov", "190"], ["field of view"]),
+        (["--mesh", "obj"], ["glb or ply"]),
+        (["--size", "0"], ["--size"]),
+        (["--name", "a/b"], ["stem"]),
+        (["--method", "magic"], ["magic"]),
+        (["--mask", "absent.png"], ["absent.png"]),
+        (["--srgb"], ["light0.exr"]),
+    ],
+)
+def test_what_cannot_be_is_said_in_a_line(
+    polsep: Cli, separated: list[Path], tmp_path: Path, change: list[str], words: list[str]
+) -> None:
+    """Exit 2, one line, and nothing is written."""
+    assert_refused(polsep(*separated, "-o", tmp_path / "out", *change), *words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_files_that_do_not_fit_are_named(polsep: Cli, separated: list[Path], tmp_path: Path) -> None:
+    """Another size, a damaged file, a mask of another size, an input in the place of an output."""
+    small = tmp_path / "small.png"
+    small.write_bytes(encode_png(np.full((8, 8), 255, np.uint8)))
+    damaged = tmp_path / "damaged.exr"
+    damaged.write_bytes(separated[0].read_bytes()[:200])
+    out = ["-o", tmp_path / "out"]
+    assert_refused(polsep(*separated[:5], damaged, *out), "damaged.exr")
+    assert_refused(polsep(*separated, "--mask", small, *out), "small.png", "[40, 40]")
+    assert_refused(polsep(*separated, "-o", tmp_path / "in", "--name", "light0", "--overwrite"), "is an input")
+    assert_refused(polsep(*out), "6 files")
+    assert not (tmp_path / "out").exists()
+
+
+def ball() -> Any:
+    """The surface of a sphere's cap."""
+    normals, mask = cap(SIDE, 60)
+    appearance = Appearance(normals, np.full((SIDE, SIDE, 3), 0.5) * mask[..., None], mask)
+    return appearance, span_surface(appearance, integrate_bilateral(normals, mask))
+
+
+def test_meshes_come_back_through_trimesh() -> None:
+    """GLB and PLY keep positions, normals, triangles and colours; triangles face the way that normals do."""
+    _, surface = ball()
+    arrays = (surface.vertices, surface.normals, surface.colors, surface.faces)
+    for encode, kind in ((encode_glb, "glb"), (encode_ply, "ply")):
+        mesh: Any = trimesh.load(io.BytesIO(encode(*arrays)), file_type=kind, force="mesh", process=False)
+        assert np.abs(mesh.vertices - surface.vertices).max() < 1e-6
+        assert (mesh.faces == surface.faces).all()
+        assert np.abs(mesh.vertex_normals - surface.normals).max() < 0.05  # trimesh makes its own
+        facing = (mesh.face_normals * surface.normals[surface.faces].mean(axis=1)).sum(axis=1)
+        assert facing.min() > 0.9
+    with pytest.raises(ValueError, match="triangles of"):
+        encode_glb(*arrays[:3], surface.faces + len(surface.vertices))
+    with pytest.raises(ValueError, match="finite"):
+        encode_ply(surface.vertices * np.nan, *arrays[1:])
+
+
+def test_a_surface_is_centred_and_has_its_shape() -> None:
+    """The largest extent is 1, and all vertices of a cap lie on a sphere."""
+    _, surface = ball()
+    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+    assert np.abs(low + high).max() < 1e-9 and (high - low).max() == pytest.approx(1)
+    center = surface.vertices - surface.normals * (0.5 / np.sin(np.radians(60)))
+    assert np.linalg.norm(center - center.mean(axis=0), axis=1).max() < 0.03
+
+
+def test_jumps_become_gaps() -> None:
+    """No triangle spans a step between two planes that face the camera."""
+    depth = np.zeros((8, 8))
+    depth[:, 4:] = 20
+    normals = np.broadcast_to([0.0, 0, 1], (8, 8, 3))
+    surface = span_surface(Appearance(normals, np.ones((8, 8, 1)), np.ones((8, 8), np.bool_)), depth)
+    assert len(surface.faces) == 2 * (7 * 3 + 7 * 3)
+    assert np.ptp(surface.vertices[surface.faces][..., 2], axis=1).max() == 0
+
+
+def test_pictures_show_the_side_that_is_lit() -> None:
+    """Relit images and pictures of the mesh are brighter toward the light, and black where nothing is."""
+    appearance, surface = ball()
+    image = relight(appearance, (-1.0, 0.0, 0.4))
+    assert image[:, : SIDE // 2].mean() > 2 * image[:, SIDE // 2 :].mean()
+    (picture,) = draw_views(surface, 48, ((0.0, 0.0),))
+    assert picture[:24, :24].sum() > 1.3 * picture[24:, 24:].sum()
+    assert (picture[0, 0] == 0).all()

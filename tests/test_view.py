@@ -21,8 +21,8 @@ from polsep.io.errors import InputError
 from polsep.io.exr import read_exr_layers
 from polsep.io.outputs import write_separation
 from polsep.io.previews import srgb
-from polsep.io.reopened import read_separation
 from polsep.io.scratch import Scratch, drop_folder, find_upload, make_scratch
+from polsep.io.separated import read_separated
 from polsep.pipeline import separate_capture
 from polsep.report import SeparatedFrame
 from polsep.view import guard, session
@@ -132,7 +132,7 @@ def test_results_are_opened_again(sessions: Sessions, tmp_path: Path) -> None:
     error = np.random.default_rng(0).random((*frame.valid.shape, 2), dtype=np.float32)
     frame = SeparatedFrame(frame.diffuse, frame.specular, frame.valid, frame.dolp, frame.aolp, frame.report, error)
     (path, *_) = write_separation(frame, tmp_path, "shot")
-    back = read_separation(path)
+    back = read_separated(path)
     for name in ("diffuse", "specular", "valid", "dolp", "aolp", "error"):
         np.testing.assert_array_equal(getattr(back, name), getattr(frame, name))
     sent = upload(sessions, "shot.exr", path.read_bytes())
@@ -247,7 +247,7 @@ def test_the_page_idle_for_longest_makes_room(sessions: Sessions, monkeypatch: p
         ({"layout": "rgb"}, 'expected "color", "mono"'),
         ({"white": "bright"}, "expected a number as white level"),
         ({"size": "2448"}, "expected a size like 2448x2048"),
-        ({"light": "1,2"}, "expected a light colour like"),
+        ({"light": "1,2"}, "expected a light colour R,G,B like"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(said: dict[str, str], message: str) -> None:

@@ -24,10 +24,10 @@ from polsep.io.frames import FRAME_FILES, Frame, ReadOptions, read_frames
 from polsep.io.outputs import write_separation
 from polsep.io.pages import at_most
 from polsep.io.previews import toned
-from polsep.io.reopened import read_separation
 from polsep.io.scratch import Scratch, drop_file, drop_folder, find_upload, fresh_name, keep_upload, make_folder
+from polsep.io.separated import read_separated
 from polsep.methods import check_method
-from polsep.pipeline import LightColor, separate_capture
+from polsep.pipeline import LightColor, parse_light_color, separate_capture
 from polsep.report import SeparatedFrame
 from polsep.view.edits import edit_small
 from polsep.view.pictures import Histogram, Small, histogram, shrink_frame
@@ -72,7 +72,7 @@ def parse_settings(said: Mapping[str, Any]) -> Settings:
         _size(_text(said.get("size"))),
         _text(said.get("pixel_format")),
     )
-    return Settings(read, method, _light(_text(said.get("light"))), int(said.get("index") or 0))
+    return Settings(read, method, parse_light_color(_text(said.get("light")) or "white"), int(said.get("index") or 0))
 
 
 def _text(value: object) -> str | None:
@@ -95,18 +95,6 @@ def _size(text: str | None) -> tuple[int, int] | None:
     if found is None:
         raise ValueError(f"expected a size like 2448x2048, found {text!r:.40}")
     return int(found[1]), int(found[2])
-
-
-def _light(text: str | None) -> LightColor | str:
-    if text is None or text == "white":
-        return (1.0, 1.0, 1.0)
-    if text == "estimate":
-        return text
-    try:
-        r, g, b = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f'expected a light colour like 1,0.9,0.7, "white" or "estimate", found {text!r:.40}') from None
-    return (r, g, b)
 
 
 @dataclass(frozen=True)
@@ -193,7 +181,7 @@ class Session:
     def _reopen(self) -> Found:
         assert self._path is not None
         with at_most(MOST_SAMPLES), _renamed(self._path, self._stem):
-            frame = read_separation(self._path)
+            frame = read_separated(self._path)
         return Found(frame, shrink_frame(frame), None, None, (), self._stem)
 
     def _separate(self, settings: Settings) -> Found:

@@ -20,7 +20,7 @@ from PIL import Image
 from polsep.io.errors import InputError, decoding, input_error, naming
 from polsep.io.exr import read_exr_layers
 from polsep.io.frames import read_pages
-from polsep.io.pages import require_signature
+from polsep.io.pages import require_signature, require_size
 
 Floats = NDArray[np.float32]
 
@@ -66,6 +66,7 @@ def _read(path: Path, suffix: str) -> NDArray[Any] | Mapping[str, NDArray[Any]]:
         with naming(path), path.open("rb") as stream:
             require_signature(stream, (b"\xff\xd8\xff",), "a JPEG")
             with decoding("JPEG"), Image.open(stream, formats=["JPEG"]) as picture:
+                require_size((picture.height, picture.width, 3))
                 return np.asarray(picture.convert("L" if picture.mode == "L" else "RGB"))
     pages = [page.array for page in read_pages(path)]
     if len(pages) != 1:

@@ -183,7 +183,7 @@ def _connect(page: Any, parts: Parts, answers: Answers) -> None:
         button.upload(answers.add_image(kind), {button, *controls}, changed, preprocess=False, **_SEPARATE)
     parts.neutral.click(answers.undo, picture, [*parts.edited(), *images, *parts.controls], **_AT_ONCE)
     played = parts.play.click(answers.toggle, None, [parts.play, parts.timer], **_AT_ONCE)
-    played.then(answers.settle, everything, parts.shown(), **_SEPARATE)
+    played.then(answers.settle, everything, parts.shown(), **{**_SEPARATE, "show_progress": "hidden"})
     parts.timer.tick(answers.advance, picture, parts.played(), **{**_AT_ONCE, "trigger_mode": "once"})
     for kind, button in parts.fetch.items():
         written = button.click(answers.write(kind), None, [parts.link, parts.status], **_SEPARATE)

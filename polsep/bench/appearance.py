@@ -1,8 +1,8 @@
 """The gallery of docs/gallery.md, after the paper's Figs. 6 to 8: captures, what they become, what edits make of them.
 
-Captures are the demo's and renders of known truth: spot and fish by Keenan Crane (public domain, from the data folder)
-and shapes of this project, in 12 bits with the noise of the IMX250. Every picture is of what `separate` found in one
-such frame. `draw_real` does the same with frames of real cameras; their pictures are not part of the project.
+Captures are renders of known truth: spot and fish by Keenan Crane (public domain, from the data folder) and a shape of
+this project, in 12 bits with the noise of the IMX250. Every picture is of what `separate` found in one
+such frame. `draw_gallery_real` does the same with frames of real cameras; their pictures are not part of the project.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polsep.bench.figures import Panel, Pixels, draw_grid
-from polsep.bench.gallery import REAL
+from polsep.bench.gallery import REAL, crop
 from polsep.bench.rows import Row
 from polsep.camera import IMX250, Layout, Mosaic, expose
 from polsep.edit import (
@@ -32,6 +32,8 @@ from polsep.edit import (
     Recolor,
     RemoveHighlights,
     Rougher,
+    Sharper,
+    SpecularGain,
     Texture,
     Tint,
     apply,
@@ -40,22 +42,24 @@ from polsep.edit.images import Maps
 from polsep.io.frames import ReadOptions, read_frames
 from polsep.io.pictures import write_picture
 from polsep.io.previews import exposure_of, toned
+from polsep.materials import Materials
 from polsep.metrics import psnr
 from polsep.pipeline import separate_capture
-from polsep.render import GBuffer, PinholeCamera, PointLight, Scene, camera_axes, render
+from polsep.render import PinholeCamera, PointLight, Scene, Vector, camera_axes
 from polsep.report import SeparatedFrame
-from polsep.scenes import Field, cells, marble, still_life, stripes
-from polsep.simulate import expose_to_clip, half_resolution
+from polsep.simulate import blur, expose_to_clip, half_resolution
+from polsep.textures import CLOUDS, PATCHES, STRIPES, Textures
 
 if TYPE_CHECKING:
     from polsep.raycast import MeshScene
+    from polsep.shapes import Mesh
 
 Floats = NDArray[np.float32]
 
 #: Raw pixels per side, width of a panel, share of the samples that clips, seed of the noise.
-SIDE, CELL, CLIPPED, SEED = 1024, 300, 0.003, 8
-#: How much brighter specular images are shown.
-SPECULAR_GAIN = 2.0
+SIDE, CELL, CLIPPED, SEED = 768, 240, 0.002, 8
+#: Where patterns change from one colour to the other, and over which width: within `materials.THRESHOLDS` and `EDGES`.
+THRESHOLD_AND_EDGE = {CLOUDS: (0.0, 0.3), STRIPES: (0.5, 0.2), PATCHES: (0.0, 0.3)}
 
 
 @dataclass(frozen=True)
@@ -85,65 +89,96 @@ def expose_scene(title: str, scene: Scene, normals: Floats | None = None) -> Tak
     return Taken(title, expose(exposed.diffuse + exposed.specular, Layout(), IMX250, generator), exposed, normals)
 
 
-def take_still_life(_data: Path) -> Taken:
-    """The demo's scene, made anew at half its size."""
-    parts, camera, light = still_life()
-    size = (SIDE, SIDE * 6 // 5)
-    diffuse, specular = render(parts, camera, light, size)
-    lit = (diffuse + specular).s0.amax(dim=0) > 0
-    return expose_scene("the demo's scene", Scene(diffuse, specular, lit))
-
-
 def take_spot(data: Path) -> Taken | None:
-    """Spot with veins of two colours."""
-    return _take_mesh(
-        "spot", data / "meshes/spot.obj", (140.0, 14.0), (marble((0.62, 0.16, 0.06), (0.78, 0.5, 0.2), 0.9), 0.32)
-    )
+    """Spot, clouded in two warm colours."""
+    skin = Skin(((0.66, 0.2, 0.07),), ((0.8, 0.55, 0.22),), CLOUDS, 0.35, 0.3)
+    return _take_model("spot", data / "meshes/spot.obj", (140.0, 14.0), skin)
 
 
 def take_fish(data: Path) -> Taken | None:
-    """The fish with stripes."""
-    skin = stripes((0.05, 0.3, 0.42), (0.62, 0.5, 0.16), 0.16)
-    return _take_mesh("fish", data / "meshes/fish.obj", (65.0, 12.0), (skin, 0.3))
+    """The fish, striped."""
+    skin = Skin(((0.05, 0.3, 0.42),), ((0.62, 0.48, 0.14),), STRIPES, 0.25, 0.26)
+    return _take_model("fish", data / "meshes/fish.obj", (65.0, 12.0), skin)
 
 
-def take_shape(_data: Path) -> Taken:
-    """A random shape of the test split, in patches of a few colours."""
-    from polsep.views import seeded_shape
+def take_gourd(_data: Path) -> Taken:
+    """A glazed gourd of this page's own, in patches."""
+    from polsep.raycast import MeshScene
 
-    colors = ((0.55, 0.06, 0.08), (0.75, 0.66, 0.5), (0.08, 0.2, 0.35), (0.16, 0.4, 0.2))
-    skin = cells(colors, 0.35, torch.Generator().manual_seed(SEED))
-    return _render_mesh("a random shape", seeded_shape("test", 0, 4), (30.0, 25.0), (skin, 0.3))
+    skin = Skin(((0.07, 0.26, 0.2),), ((0.3, 0.5, 0.16),), PATCHES, 0.3, 0.22)
+    return _render("gourd", MeshScene(make_gourd()), (20.0, 18.0), skin)
 
 
-def _take_mesh(title: str, path: Path, pose: tuple[float, float], look: tuple[Field, float]) -> Taken | None:
+def make_gourd(rows: int = 160, cols: int = 240) -> Mesh:
+    """A closed surface of revolution about y: radius 2 sqrt(t (1 - t)) (0.45 + 0.2 cos 2 pi (t - 0.3)) at height t."""
+    from polsep.shapes import Mesh
+
+    t, turn = np.meshgrid(np.linspace(1e-4, 1 - 1e-4, rows), np.linspace(0, 2 * np.pi, cols), indexing="ij")
+
+    def radius(t: NDArray[np.float64]) -> NDArray[np.float64]:
+        return 2 * np.sqrt(t * (1 - t)) * (0.45 + 0.2 * np.cos(2 * np.pi * (t - 0.3)))
+
+    slope = (radius(t + 5e-5) - radius(t - 5e-5)) / 1e-4 / 2.2
+    points = np.stack([radius(t) * np.sin(turn), 2.2 * t - 1.1, radius(t) * np.cos(turn)], axis=-1)
+    normals = np.stack([np.sin(turn), -slope, np.cos(turn)], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    corner = (np.arange(rows - 1)[:, None] * cols + np.arange(cols - 1)).ravel()
+    faces = np.concatenate(
+        [np.stack(c, -1) for c in ((corner, corner + 1, corner + cols), (corner + 1, corner + cols + 1, corner + cols))]
+    )
+    flat = [x.reshape(-1, x.shape[-1]) for x in (points, normals, np.stack([t, turn / (2 * np.pi)], axis=-1))]
+    return Mesh(flat[0], flat[1], flat[2], faces, np.zeros(len(faces), np.int64))
+
+
+class Skin(NamedTuple):
+    """Two albedos of each slot in turn, the pattern of `polsep.textures` that mixes them, a cell's size, roughness."""
+
+    first: tuple[Vector, ...]
+    second: tuple[Vector, ...]
+    pattern: int
+    size: float
+    roughness: float
+
+
+def _materials(skin: Skin, slots: int) -> Materials:
+    """A skin as materials of so many slots."""
+    first, second = (
+        torch.tensor([colors[k % len(colors)] for k in range(slots)]) for colors in (skin.first, skin.second)
+    )
+    one = torch.ones(slots)
+    transform = torch.cat([torch.eye(3) / skin.size, torch.full((3, 1), 0.3)], dim=1).expand(slots, 3, 4).contiguous()
+    whole = {"pattern": skin.pattern, "seed": SEED, "octaves": 2}
+    numbers = {name: torch.full((slots,), value, dtype=torch.int64) for name, value in whole.items()}
+    threshold, edge = THRESHOLD_AND_EDGE[skin.pattern]
+    even = {name: value * one for name, value in (("warp", 0.4), ("threshold", threshold), ("edge", edge))}
+    textures = Textures(second, skin.roughness * one, transform=transform, **even, **numbers)
+    return Materials(first, skin.roughness * one, one, textures)
+
+
+def _take_model(title: str, path: Path, pose: tuple[float, float], skin: Skin) -> Taken | None:
     from polsep.io.objects import read_mesh
     from polsep.raycast import MeshScene
 
     if not path.is_file():
         print(f"polsep: {title} is left out: expected {path}, found none", file=sys.stderr)
         return None
-    return _render_mesh(title, MeshScene(read_mesh(path)), pose, look)
+    return _render(title, MeshScene(read_mesh(path)), pose, skin)
 
 
-def _render_mesh(title: str, model: MeshScene, pose: tuple[float, float], look: tuple[Field, float]) -> Taken:
-    """A mesh from azimuth and elevation [degrees], of an albedo and a roughness, lit from above the camera."""
-    from polsep.raycast import Hits
-    from polsep.testsets.casting import look_at, render_covered
+def _render(title: str, model: MeshScene, pose: tuple[float, float], skin: Skin) -> Taken:
+    """A mesh from azimuth and elevation [degrees], lit from above the camera, through its lens."""
+    from polsep.raycast import render_scene
+    from polsep.testsets.casting import LENS_BLUR, SAMPLES, look_at
 
-    albedo, roughness = look
     camera = look_at(model.mesh, *pose)
     right, up, _ = camera_axes(camera)
     eye = torch.tensor(camera.position)
     far = float(eye.norm())
-    lamp = eye - 0.35 * far * right + 0.45 * far * up
-    light = PointLight(tuple(lamp.tolist()), 1.0, math.radians(30))
-
-    def cover(hits: Hits) -> GBuffer:
-        one = torch.ones_like(hits.position[:1])
-        return GBuffer(hits.position, hits.normal, albedo(hits.position), roughness * one, one, one > 0)
-
-    return expose_scene(title, render_covered(model, cover, camera, light, SIDE), find_normals(model, camera))
+    x, y, z = (eye - 0.35 * far * right + 0.45 * far * up).tolist()
+    light = PointLight((x, y, z), 1.0, math.radians(30))
+    materials = _materials(skin, model.mesh.slot_count)
+    scene = render_scene((model, materials), camera, light, (SIDE, SIDE), SAMPLES)
+    return expose_scene(title, blur(scene, LENS_BLUR), find_normals(model, camera))
 
 
 def find_normals(model: MeshScene, camera: PinholeCamera) -> Floats:
@@ -172,11 +207,13 @@ def make_cloth(side: int = 512) -> Floats:
     return image.astype(np.float32)
 
 
-SUBJECTS: tuple[Callable[[Path], Taken | None], ...] = (take_spot, take_fish, take_shape, take_still_life)
-#: The edits of the gallery: title, edits, whether normals guide them.
+SUBJECTS: tuple[Callable[[Path], Taken | None], ...] = (take_spot, take_fish, take_gourd)
+#: The edits of the gallery by title; all are inside the object, so that no light is spread beyond its outline.
 EDITS: tuple[tuple[str, tuple[Edit, ...]], ...] = (
-    ("metallic (45 x specular, as the paper)", (Metallic(),)),
-    ("rougher (sigma 10 px, as the paper)", (Rougher(sigma=10.0),)),
+    ("metallic, gain 45 as the paper's", (Metallic(),)),
+    ("rougher, sigma 10 as the paper's", (Rougher(sigma=10.0),)),
+    ("rough metal", (Rougher(sigma=5.0), Metallic(gain=25.0))),
+    ("glossier", (Sharper(sigma=3.0), SpecularGain(gain=1.5))),
     (
         "texture under the highlights",
         (Recolor(color=(1.0, 1.0, 1.0)), Texture(image="cloth", repeats=3.0, normals="normals")),
@@ -184,7 +221,6 @@ EDITS: tuple[tuple[str, tuple[Edit, ...]], ...] = (
     ("recoloured", (Recolor(color=(0.05, 0.22, 0.6)),)),
     ("without highlights", (RemoveHighlights(),)),
     ("highlights alone", (IsolateHighlights(),)),
-    ("rough metal", (Rougher(sigma=5.0), Metallic(gain=25.0))),
     ("evening light", (Tint(color=(1.0, 0.62, 0.3)),)),
 )
 
@@ -194,37 +230,31 @@ def bench_gallery(data: Path) -> Iterator[Row]:
 
     Raises ValueError without the extras render and bench.
     """
-    for taken in take_all(data):
-        found = taken.separate()
+    for taken, found in separate_all(data):
         diffuse, specular, mask = taken.truth()
         for name, image, truth in (("diffuse", found.diffuse, diffuse), ("specular", found.specular, specular)):
             value = psnr(torch.from_numpy(image).permute(2, 0, 1), truth, mask)
             yield Row("gallery", taken.title, found.report["method"], f"{name} PSNR", value, "dB")
 
 
-def take_all(data: Path) -> Iterator[Taken]:
-    """The captures that can be made here. Raises ValueError without Embree."""
+@cache
+def separate_all(data: Path) -> tuple[tuple[Taken, SeparatedFrame], ...]:
+    """The captures that can be made here, separated. Raises ValueError without Embree."""
     try:
         import polsep.raycast  # noqa: F401
     except ImportError as error:
         raise ValueError(f"expected the extra render, found no {error.name}") from None
-    yield from (taken for make in SUBJECTS if (taken := make(data)) is not None)
+    taken = [made for make in SUBJECTS if (made := make(data)) is not None]
+    return tuple((capture, capture.separate()) for capture in taken)
 
 
 def draw_gallery(_rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
     """Write the pictures of docs/gallery.md into ``folder`` and give their paths."""
-    separations, edited = [], {}
-    for taken in take_all(data):
-        found = taken.separate()
-        separations.append(_separation_row(taken, found))
-        if taken.normals is not None:
-            edited[taken.title] = partial(draw_edits, taken.title, found, taken.normals)
-    yield _written(
-        folder / "separated.jpg",
-        draw_grid(separations, "One 12-bit frame each: input, what polsep finds, and the truth", CELL),
-    )
-    for title, draw in edited.items():
-        yield _written(folder / f"edits-{title.replace(' ', '-')}.jpg", draw())
+    all_of_them = separate_all(data)
+    separations = [_separation_row(taken, found) for taken, found in all_of_them]
+    yield _written(folder / "separated.jpg", draw_grid(separations, "One 12-bit frame each", CELL))
+    for taken, found in all_of_them:
+        yield _written(folder / f"edits-{taken.title}.jpg", draw_edits(taken, found))
 
 
 def _written(path: Path, pixels: Pixels) -> Path:
@@ -232,41 +262,46 @@ def _written(path: Path, pixels: Pixels) -> Path:
     return path
 
 
+def _frame_of(taken: Taken, image: Floats) -> Floats:
+    """An image around its object, or all of it where that is unknown."""
+    if taken.scene is None:
+        return image
+    around = crop(torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1), taken.truth()[2])
+    return around.permute(1, 2, 0).numpy()
+
+
 def _separation_row(taken: Taken, found: SeparatedFrame) -> list[Panel]:
     """Input, diffuse and specular, and the truth of both where it is known."""
     light = found.diffuse + found.specular
     gain = exposure_of(light)
-    images = [
-        (f"{taken.title}: input", light, 1.0),
-        ("diffuse", found.diffuse, 1.0),
-        ("specular x 2", found.specular, SPECULAR_GAIN),
-    ]
+    images = [(f"{taken.title}: input", light), ("diffuse", found.diffuse), ("specular x 2", 2 * found.specular)]
     if taken.scene is not None:
-        diffuse, specular, _ = (image.float().numpy() for image in taken.truth())
-        images += [
-            ("true diffuse", diffuse.transpose(1, 2, 0), 1.0),
-            ("true specular x 2", specular.transpose(1, 2, 0), SPECULAR_GAIN),
-        ]
-    return [Panel(title, toned(image, factor * gain)) for title, image, factor in images]
+        diffuse, specular = (image.float().permute(1, 2, 0).numpy() for image in taken.truth()[:2])
+        images += [("true diffuse", diffuse), ("true specular x 2", 2 * specular)]
+    return [Panel(title, toned(_frame_of(taken, image), gain)) for title, image in images]
 
 
-def draw_edits(title: str, found: SeparatedFrame, normals: Floats | None) -> Pixels:
-    """The input and every edit of `EDITS` that there is an image for, four in a row, at the input's exposure."""
-    maps: Maps = {"cloth": make_cloth()} | ({} if normals is None else {"normals": normals})
+def draw_edits(taken: Taken, found: SeparatedFrame) -> Pixels:
+    """The input and every edit of `EDITS` that the frame has colours for, at the input's exposure, five in a row."""
+    maps = {"cloth": make_cloth()}
+    if taken.scene is not None and taken.normals is not None:
+        maps |= {"normals": taken.normals, "object": taken.truth()[2].float().numpy()}
     light = found.diffuse + found.specular
     gain = exposure_of(light)
-    panels = [Panel("input", toned(light, gain))]
+    panels = [Panel(f"{taken.title}: input", toned(_frame_of(taken, light), gain))]
     for name, edits in EDITS:
-        fitting = tuple(_without_normals(edit) if normals is None else edit for edit in edits)
-        if found.diffuse.shape[2] == 1 and any(edit.needs_color for edit in fitting):
+        if found.diffuse.shape[2] == 1 and any(edit.needs_color for edit in edits):
             continue
-        panels.append(Panel(name, toned(apply(found, Recipe(fitting), maps).combined, gain)))
-    rows = [panels[first : first + 3] for first in range(0, len(panels), 3)]
-    return draw_grid(rows, f"{title}: edits of one separated frame, same exposure", CELL)
+        recipe = Recipe(tuple(_fitting(edit, maps) for edit in edits))
+        panels.append(Panel(name, toned(_frame_of(taken, apply(found, recipe, maps).combined), gain)))
+    rows = [panels[first : first + 5] for first in range(0, len(panels), 5)]
+    return draw_grid(rows, "Edits of one separated frame, at its exposure", CELL)
 
 
-def _without_normals(edit: Edit) -> Edit:
-    return Texture(image=edit.image, repeats=edit.repeats) if isinstance(edit, Texture) else edit
+def _fitting(edit: Edit, maps: Maps) -> Edit:
+    """The edit inside the object, and along its normals, where they are known."""
+    inside = replace(edit, mask="object" if "object" in maps else None)
+    return inside if "normals" in maps or not isinstance(inside, Texture) else replace(inside, normals=None)
 
 
 def bench_gallery_real(data: Path) -> Iterator[Row]:
@@ -291,4 +326,4 @@ def draw_gallery_real(_rows: Sequence[Row], data: Path, folder: Path) -> Iterato
         found = taken.separate()
         stem = taken.title.replace(", ", "-").replace(" ", "-")
         yield _written(folder / f"{stem}.jpg", draw_grid([_separation_row(taken, found)], taken.title, CELL))
-        yield _written(folder / f"{stem}-edits.jpg", draw_edits(taken.title, found, None))
+        yield _written(folder / f"{stem}-edits.jpg", draw_edits(taken, found))

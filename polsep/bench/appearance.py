@@ -48,7 +48,7 @@ from polsep.pipeline import separate_capture
 from polsep.render import PinholeCamera, PointLight, Scene, Vector, camera_axes
 from polsep.report import SeparatedFrame
 from polsep.simulate import blur, expose_to_clip, half_resolution
-from polsep.textures import CLOUDS, PATCHES, STRIPES, Textures
+from polsep.textures import CLOUDS, STRIPES, Textures
 
 if TYPE_CHECKING:
     from polsep.raycast import MeshScene
@@ -59,7 +59,7 @@ Floats = NDArray[np.float32]
 #: Raw pixels per side, width of a panel, share of the samples that clips, seed of the noise.
 SIDE, CELL, CLIPPED, SEED = 768, 240, 0.002, 8
 #: Where patterns change from one colour to the other, and over which width: within `materials.THRESHOLDS` and `EDGES`.
-THRESHOLD_AND_EDGE = {CLOUDS: (0.0, 0.3), STRIPES: (0.5, 0.2), PATCHES: (0.0, 0.3)}
+THRESHOLD_AND_EDGE = {CLOUDS: (0.0, 0.3), STRIPES: (0.5, 0.2)}
 
 
 @dataclass(frozen=True)
@@ -102,10 +102,10 @@ def take_fish(data: Path) -> Taken | None:
 
 
 def take_gourd(_data: Path) -> Taken:
-    """A glazed gourd of this page's own, in patches."""
+    """A glazed gourd of this page's own, clouded."""
     from polsep.raycast import MeshScene
 
-    skin = Skin(((0.07, 0.26, 0.2),), ((0.3, 0.5, 0.16),), PATCHES, 0.3, 0.22)
+    skin = Skin(((0.1, 0.36, 0.32),), ((0.72, 0.6, 0.34),), CLOUDS, 0.45, 0.34)
     return _render("gourd", MeshScene(make_gourd()), (20.0, 18.0), skin)
 
 
@@ -208,7 +208,7 @@ def make_cloth(side: int = 512) -> Floats:
 
 
 SUBJECTS: tuple[Callable[[Path], Taken | None], ...] = (take_spot, take_fish, take_gourd)
-#: The edits of the gallery by title; all are inside the object, so that no light is spread beyond its outline.
+#: The edits of the gallery by title.
 EDITS: tuple[tuple[str, tuple[Edit, ...]], ...] = (
     ("metallic, gain 45 as the paper's", (Metallic(),)),
     ("rougher, sigma 10 as the paper's", (Rougher(sigma=10.0),)),
@@ -299,9 +299,10 @@ def draw_edits(taken: Taken, found: SeparatedFrame) -> Pixels:
 
 
 def _fitting(edit: Edit, maps: Maps) -> Edit:
-    """The edit inside the object, and along its normals, where they are known."""
-    inside = replace(edit, mask="object" if "object" in maps else None)
-    return inside if "normals" in maps or not isinstance(inside, Texture) else replace(inside, normals=None)
+    """The edit along the object's normals, and inside its outline if it spreads light, where these are known."""
+    if isinstance(edit, Texture) and "normals" not in maps:
+        return replace(edit, normals=None)
+    return replace(edit, mask="object") if isinstance(edit, (Rougher, Metallic)) and "object" in maps else edit
 
 
 def bench_gallery_real(data: Path) -> Iterator[Row]:

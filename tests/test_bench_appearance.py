@@ -40,7 +40,7 @@ def test_the_gallery_shows_every_edit_that_fits(colors: int, rows: int) -> None:
     from polsep.bench.figures import GAP, TITLE
 
     size = (30, 30)
-    taken = Taken("a frame", Mosaic(torch.zeros(60, 60), Layout()))
+    taken = Taken("a frame", Mosaic(torch.zeros(60, 60), Layout(), 0.0, 1.0))
     pixels = draw_edits(taken, frame_of(random_images(size=size, colors=colors)))
     assert pixels.shape == (rows * (CELL + TITLE + GAP) + TITLE + GAP, 5 * (CELL + GAP) + GAP, 3)
 

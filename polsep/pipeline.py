@@ -127,6 +127,18 @@ def to_device(capture: Capture, device: torch.device) -> Capture:
     return replace(capture, **moved)  # type: ignore[arg-type]
 
 
+def parse_light_color(text: str) -> LightColor | str:
+    """The light's colour as people write it: ``R,G,B``, ``white``, or ``estimate``. Raises ValueError."""
+    if text == "estimate":
+        return text
+    try:
+        r, g, b = (1.0, 1.0, 1.0) if text == "white" else (float(part) for part in text.split(","))
+    except ValueError:
+        expected = 'expected a light colour R,G,B like 1,0.9,0.7, "white" or "estimate"'
+        raise ValueError(f"{expected}, found {text!r:.40}") from None
+    return (r, g, b)
+
+
 def resolve_light_color(light_color: LightColor | str, capture: Capture) -> tuple[tuple[float, ...], list[str]]:
     """One gain per channel, and remarks; "estimate" takes the colour of the highlights. ValueError on anything else."""
     channels = capture.layout.channels if isinstance(capture, Mosaic) else capture.data.shape[-3]

@@ -91,6 +91,8 @@ WITHIN = {
     ("io", "io"),
     ("kernels", "kernels"),
     ("bench", "bench"),
+    ("bench", "edit"),
+    ("bench", "view"),
     ("bench", "testsets"),
     ("bench", "dataset"),
     ("bench", "train"),

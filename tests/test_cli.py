@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -54,17 +55,19 @@ Cli = Callable[..., Run]
 def polsep(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Cli:
     """Run `polsep ARGS` inside this process."""
 
-    def run(*args: str | Path) -> Run:
-        monkeypatch.setattr(sys, "argv", ["polsep", *map(str, args)])
-        capfd.readouterr()
-        status: Any = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            status = stop.code
-        return Run(status or 0, *capfd.readouterr())
+    return partial(run_here, monkeypatch, capfd)
 
-    return run
+
+def run_here(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], *args: str | Path) -> Run:
+    """Run `polsep ARGS` inside this process."""
+    monkeypatch.setattr(sys, "argv", ["polsep", *map(str, args)])
+    capfd.readouterr()
+    status: Any = 0
+    try:
+        cli.main()
+    except SystemExit as stop:
+        status = stop.code
+    return Run(status or 0, *capfd.readouterr())
 
 
 def subprocess_run(*args: str | Path, **options: Any) -> Run:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from test_cli import Run, assert_refused, contents
+from test_cli import Run, assert_refused, contents, run_here
 from test_edit import only, random_images, sphere
 
 from polsep import cli
@@ -44,17 +45,7 @@ SILENT = SequenceKind(preview=False)
 def polsep(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Cli:
     """Run `polsep edit ARGS` inside this process."""
 
-    def run(*args: str | Path) -> Run:
-        monkeypatch.setattr(sys, "argv", ["polsep", "edit", *map(str, args)])
-        capfd.readouterr()
-        status: Any = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            status = stop.code
-        return Run(status or 0, *capfd.readouterr())
-
-    return run
+    return partial(run_here, monkeypatch, capfd, "edit")
 
 
 def frame_of(images: SeparatedImages) -> SeparatedFrame:
@@ -272,7 +263,8 @@ def test_sequences_are_edited_frame_by_frame(tmp_path: Path, polsep: Cli) -> Non
     assert run.out.splitlines() == [str(tmp_path / "out" / f"take.{s}") for s in ("png", "jsonl", "json")]
     for k in (0, COUNT - 1):
         name = f"take_{7 + k:06d}.exr"
-        expected = only(Metallic(), SeparatedImages(*read_separated(folder / name)))
+        frame = read_separated(folder / name)
+        expected = only(Metallic(), SeparatedImages(frame.diffuse, frame.specular))
         for layer in ("diffuse", "specular", "combined"):
             found = image_of(tmp_path / "out" / name, layer)
             np.testing.assert_allclose(found, getattr(expected, layer), rtol=1e-3, atol=1e-6)

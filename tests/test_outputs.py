@@ -502,6 +502,6 @@ def test_reading_a_short_exr_is_refused(tmp_path: Path, kept: float, capfd: pyte
     write_separation(random_frame(), tmp_path, "shot")
     data = (tmp_path / "shot.exr").read_bytes()
     (tmp_path / "short.exr").write_bytes(data[: int(kept * len(data))])
-    with pytest.raises(InputError, match=r"short\.exr: expected a complete single-part EXR"):
+    with pytest.raises(InputError, match=r"short\.exr: expected an? (complete single-part EXR|OpenEXR)"):
         read_exr_layers(tmp_path / "short.exr")
     capfd.readouterr()  # OpenEXR warns on the terminal by itself

@@ -15,19 +15,20 @@ import pytest
 import torch
 
 from polsep.camera import Layout, Mosaic
-from polsep.edit import EDITS, Metallic, Recipe, Rougher
+from polsep.edit import EDITS, Metallic, Recipe, Rougher, Texture
 from polsep.edit import apply as apply_edits
 from polsep.io.errors import InputError
 from polsep.io.exr import read_exr_layers
 from polsep.io.outputs import write_separation
 from polsep.io.previews import srgb
-from polsep.io.reopened import read_separation
 from polsep.io.scratch import Scratch, drop_folder, find_upload, make_scratch
+from polsep.io.separated import read_separated
 from polsep.pipeline import separate_capture
 from polsep.report import SeparatedFrame
-from polsep.view import guard, session
+from polsep.view import guard, opening, session
 from polsep.view.edits import at_scale, edit_small, list_controls, recipe_of
 from polsep.view.guard import Guard, host_name, names_address
+from polsep.view.opening import Settings, parse_settings, plain_name
 from polsep.view.pictures import (
     VIEWS,
     confidence_panel,
@@ -40,8 +41,9 @@ from polsep.view.pictures import (
     stage,
     tone,
 )
+from polsep.view.playing import Ahead
 from polsep.view.readout import read_pixel, readout_panel
-from polsep.view.session import Session, Sessions, Settings, parse_settings, plain_name
+from polsep.view.session import Session, Sessions
 
 WHITE = 4095
 
@@ -83,10 +85,10 @@ def png(codes: np.ndarray[Any, Any]) -> bytes:
     return bytes(imagecodecs.png_encode(codes))
 
 
-def opened(sessions: Sessions, key: str = "a", **said: Any) -> session.Found:
+def opened(sessions: Sessions, key: str = "a", **said: Any) -> opening.Found:
     """A small raw frame, uploaded and separated by the closed form."""
     sent = upload(sessions, "shot 1.png", png(mosaic_codes()))
-    sessions.open_upload(key, str(sent), sent.name)
+    sessions.open_upload(key, [(str(sent), sent.name)])
     return sessions.find(key).separate(parse_settings({"method": "color-affine", "white": "4095", **said}))
 
 
@@ -120,7 +122,7 @@ def test_the_same_settings_cost_nothing_again(sessions: Sessions) -> None:
 
 def test_an_unsaid_white_level_is_recommended_not_guessed(sessions: Sessions) -> None:
     """12 bits in 16 give a remark in the page's words, and the level that a button offers."""
-    found = opened(sessions, white=session.UNSAID)
+    found = opened(sessions, white=opening.UNSAID)
     assert found.mosaic is not None and found.mosaic.white_level == 65535
     assert any("set White level to 4095" in remark for remark in found.remarks)
     assert found.suggested_white() == 4095
@@ -132,11 +134,11 @@ def test_results_are_opened_again(sessions: Sessions, tmp_path: Path) -> None:
     error = np.random.default_rng(0).random((*frame.valid.shape, 2), dtype=np.float32)
     frame = SeparatedFrame(frame.diffuse, frame.specular, frame.valid, frame.dolp, frame.aolp, frame.report, error)
     (path, *_) = write_separation(frame, tmp_path, "shot")
-    back = read_separation(path)
+    back = read_separated(path)
     for name in ("diffuse", "specular", "valid", "dolp", "aolp", "error"):
         np.testing.assert_array_equal(getattr(back, name), getattr(frame, name))
     sent = upload(sessions, "shot.exr", path.read_bytes())
-    sessions.open_upload("b", str(sent), sent.name)
+    sessions.open_upload("b", [(str(sent), sent.name)])
     found = sessions.find("b").separate(Settings())
     assert found.mosaic is None and found.histogram is None
     np.testing.assert_array_equal(found.frame.specular, frame.specular)
@@ -163,7 +165,7 @@ def test_wrong_files_are_refused_in_one_line(sessions: Sessions, name: str, data
     sent = upload(sessions, name, data)
 
     def try_it() -> None:
-        sessions.open_upload("a", str(sent), name)
+        sessions.open_upload("a", [(str(sent), name)])
         sessions.find("a").separate(Settings())
 
     with pytest.raises(ValueError, match=said) as caught:
@@ -176,8 +178,8 @@ def test_large_frames_are_refused_by_their_header(sessions: Sessions) -> None:
     header = b"\x93NUMPY\1\0" + (118).to_bytes(2, "little")
     header += b"{'descr': '<u2', 'fortran_order': False, 'shape': (20000, 20000), }".ljust(117) + b"\n"
     sent = upload(sessions, "big.npy", header)
-    sessions.open_upload("a", str(sent), sent.name)
-    with pytest.raises(InputError, match=f"big.npy: expected at most {session.MOST_SAMPLES} samples"):
+    sessions.open_upload("a", [(str(sent), sent.name)])
+    with pytest.raises(InputError, match=f"big.npy: expected at most {opening.MOST_SAMPLES} samples"):
         sessions.find("a").separate(Settings())
 
 
@@ -215,7 +217,7 @@ def test_sessions_are_apart_and_leave_nothing(sessions: Sessions) -> None:
     """Two pages that sent the same file do not share frames; the file goes with the last of them, and so does all."""
     sent = upload(sessions, "shot.png", png(mosaic_codes()))
     for key in ("a", "b"):
-        sessions.open_upload(key, str(sent), sent.name)
+        sessions.open_upload(key, [(str(sent), sent.name)])
         sessions.find(key).separate(parse_settings({"method": "analytic", "white": "4095"}))
     assert sessions.find("a").found is not sessions.find("b").found
     with pytest.raises(ValueError, match="expected an opened file"):
@@ -247,7 +249,7 @@ def test_the_page_idle_for_longest_makes_room(sessions: Sessions, monkeypatch: p
         ({"layout": "rgb"}, 'expected "color", "mono"'),
         ({"white": "bright"}, "expected a number as white level"),
         ({"size": "2448"}, "expected a size like 2448x2048"),
-        ({"light": "1,2"}, "expected a light colour like"),
+        ({"light": "1,2"}, "expected a light colour R,G,B like"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(said: dict[str, str], message: str) -> None:
@@ -262,7 +264,7 @@ def test_settings_are_those_of_the_library() -> None:
     assert settings.read.layout == Layout(bayer=None)
     assert (settings.read.black_level, settings.read.white_level) == (16.0, 4095.0)
     assert settings.light_color == (1.0, 0.9, 0.7) and settings.index == 3
-    plain = parse_settings({"layout": session.UNSAID, "white": session.UNSAID, "light": "white", "size": ""})
+    plain = parse_settings({"layout": opening.UNSAID, "white": opening.UNSAID, "light": "white", "size": ""})
     assert plain == Settings()
     assert parse_settings({"size": "2448 x 2048"}).read.size == (2448, 2048)
 
@@ -272,7 +274,7 @@ def test_frames_of_a_stack_are_reached_by_number(sessions: Sessions) -> None:
     stack = np.stack([mosaic_codes(seed=k) for k in range(3)])
     sent = upload(sessions, "stack.npy", b"")
     np.save(sent, stack)
-    sessions.open_upload("a", str(sent), sent.name)
+    sessions.open_upload("a", [(str(sent), sent.name)])
     page = sessions.find("a")
     found = page.separate(parse_settings({"white": "4095", "method": "analytic", "index": 2}))
     assert (found.index, found.count, found.stem) == (2, 3, "stack_0002")
@@ -370,14 +372,18 @@ def test_a_pixel_reads_its_own_cell(sessions: Sessions) -> None:
 
 
 def test_controls_are_generated_from_the_registry() -> None:
-    """Every edit that needs no image has its controls; where they start, nothing is edited."""
+    """Every edit has its controls; where they start, nothing is edited, and edits without their image do nothing."""
     controls = list_controls()
-    wanted = {kind for kind in EDITS.values() if not any(p.required for p in kind.parameters())}
-    assert {control.edit for control in controls} == wanted
+    assert {control.edit for control in controls} == set(EDITS.values())
     starts = [control.start for control in controls]
     assert recipe_of(starts) == Recipe()
     moved = [5.0 if (c.edit, c.parameter.name) == (Rougher, "sigma") else c.start for c in controls]
     assert recipe_of(moved) == Recipe((Rougher(sigma=5.0),))
+    laid = [1.0 if (c.edit, c.parameter.name) == (Texture, "amount") else c.start for c in controls]
+    assert recipe_of(laid) == recipe_of(laid, {"mask": "m.png"}) == Recipe()
+    assert recipe_of(laid, {"texture": "t.png"}) == Recipe((Texture(image="t.png"),))
+    sent = {"texture": "t.png", "normals": "n.png", "mask": "m.png"}
+    assert recipe_of(laid, sent) == Recipe((Texture(image="t.png", normals="n.png", mask="m.png"),))
     with pytest.raises(ValueError, match="expected a colour like"):
         recipe_of(["url(x)" if c.parameter.kind == "color" else c.start for c in controls])
     with pytest.raises(ValueError, match="expected sigma from"):
@@ -391,8 +397,8 @@ def test_edits_are_shown_small_and_written_large(sessions: Sessions) -> None:
     recipe = Recipe((Rougher(sigma=4.0), Metallic(amount=0.5)))
     assert at_scale(recipe, 2).edits == (Rougher(sigma=2.0), Metallic(amount=0.5))
     page.edit(recipe)
-    assert page.found is not None and page.found.small.edited is not None
-    np.testing.assert_array_equal(page.found.small.edited, edit_small(found.small, recipe))
+    assert page.shown is not None and page.shown.edited is not None
+    np.testing.assert_array_equal(page.shown.edited, edit_small(found.small, recipe))
     layers = read_exr_layers(page.write("edited"))
     truth = apply_edits(found.frame, recipe)
     np.testing.assert_array_equal(layers["combined.G"], truth.combined[..., 1])
@@ -474,7 +480,7 @@ def test_messages_pass_whole_or_not_at_all() -> None:
 
 def test_a_session_without_a_file_says_so(tmp_path: Path) -> None:
     """Nothing to separate, nothing to fetch."""
-    page = Session(tmp_path, tmp_path)
+    page = Session(tmp_path, tmp_path, Ahead())
     with pytest.raises(ValueError, match="expected an opened file"):
         page.separate(Settings())
     with pytest.raises(ValueError, match="expected a separated frame"):

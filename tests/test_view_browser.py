@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+import sys
 import time
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ import pytest
 from viewer import running
 
 import polsep
+from polsep import cli
 from polsep.io.exr import read_exr_layers
 
 CHROMIUM = shutil.which("chromium")
@@ -145,22 +148,21 @@ def test_a_wrong_file_gives_a_readable_message(page: Any) -> None:
 
 
 def test_the_picture_follows_the_exposure_slider(page: Any) -> None:
-    """Another picture comes for another exposure; how long that takes is printed, since machines may be busy."""
+    """Another picture comes for another exposure; `polsep bench view` says how soon."""
     page.click("#ps-demo")
     page.wait_for_selector(".ps-stage")
     script = """async (value) => {
       const slider = document.querySelector('#ps-stops input[type=range]');
       const source = () => document.querySelector('.ps-left').src;
-      const before = source(), begin = performance.now();
+      const before = source();
       Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set.call(slider, value);
       slider.dispatchEvent(new Event('input', {bubbles: true}));
-      while (source() === before && performance.now() - begin < 20000) await new Promise(done => setTimeout(done, 2));
+      while (source() === before) await new Promise(done => setTimeout(done, 2));
       await document.querySelector('.ps-left').decode();
-      return performance.now() - begin;
+      return source();
     }"""
-    times = sorted(page.evaluate(script, value) for value in ("1", "-1", "2", "0.5", "-2", "0"))
-    print(f"exposure: median {times[3]:.0f} ms of {[round(t) for t in times]}")
-    assert times[0] < 2000
+    pictures = [page.evaluate(script, value) for value in ("1", "-1", "2")]
+    assert len(set(pictures)) == 3 and all(picture.startswith("data:image/jpeg") for picture in pictures)
 
 
 def test_a_closed_page_leaves_nothing(browser: Any, viewer: str, folder: Path) -> None:
@@ -185,17 +187,106 @@ def test_a_closed_page_leaves_nothing(browser: Any, viewer: str, folder: Path) -
     assert left == []
 
 
-def test_parallel_pages_all_finish(browser: Any, viewer: str) -> None:
-    """Four users ask at once and wait in one queue; each gets a picture."""
-    contexts = [browser.new_context() for _ in range(4)]
+def small_frame(place: int = 0) -> bytes:
+    """A part of the demo capture as a 12-bit PNG."""
+    codes = imagecodecs.png_decode(DEMO.read_bytes())[700 + 8 * place : 1020 + 8 * place, 1000:1384]
+    return bytes(imagecodecs.png_encode(np.ascontiguousarray(codes)))
+
+
+def test_twenty_pages_all_finish(browser: Any, viewer: str) -> None:
+    """Twenty users ask at once and wait in one queue; each gets a picture of their own frame."""
+    contexts = [browser.new_context() for _ in range(20)]
     pages = [context.new_page() for context in contexts]
     for opened in pages:
+        opened.set_default_timeout(WAIT_MS)
         opened.goto(viewer)
-        opened.wait_for_selector("#ps-demo", timeout=WAIT_MS)
     for opened in pages:
-        opened.click("#ps-demo")
-    for opened in pages:
-        opened.wait_for_selector(".ps-stage", timeout=WAIT_MS)
-    assert all(opened.locator(".ps-error").count() == 0 for opened in pages)
+        opened.wait_for_selector("#ps-demo")
+    for place, opened in enumerate(pages):
+        send(opened, f"shot{place}.png", small_frame(place))
+    for place, opened in enumerate(pages):
+        opened.wait_for_selector(".ps-stage")
+        assert f"shot{place}" in opened.inner_text("#ps-status") and opened.locator(".ps-error").count() == 0
     for context in contexts:
         context.close()
+
+
+def test_five_gigabytes_are_refused_by_the_page(page: Any, tmp_path: Path) -> None:
+    """Before a byte is sent, and in words; the next file works."""
+    large = tmp_path / "large.raw"
+    with large.open("wb") as stream:
+        stream.truncate(5_000_000_000)
+    sent: list[str] = []
+    page.on("request", lambda request: sent.append(request.url) if "upload?" in request.url else None)
+    page.set_input_files("#ps-file input[type=file]", large)
+    page.wait_for_selector("text=/maximum|exceeds|too large/i")
+    assert sent == []
+    send(page, "shot.png", small_frame())
+    page.wait_for_selector(".ps-stage")
+
+
+def choose_image(page: Any, kind: str, path: Path) -> None:
+    """Send an image for edits."""
+    with page.expect_file_chooser() as waiting:
+        page.click(f"#ps-image-{kind}")
+    waiting.value.set_files(path)
+
+
+def test_a_sequence_plays_under_edits(page: Any, tmp_path: Path) -> None:
+    """Several files are one sequence: it plays, edits are on what plays, a pause has the numbers of its frame."""
+    files = [{"name": f"s{k}.png", "mimeType": "image/png", "buffer": small_frame(4 * k)} for k in range(4)]
+    choose(page, "ps-white", "4095")
+    page.set_input_files("#ps-file input[type=file]", files)
+    page.wait_for_selector("#ps-play:visible")
+    assert "s0" in page.inner_text("#ps-status")
+    page.click("#ps-play")
+    index = "document.querySelector('#ps-index input[type=number]').value"
+    for place in ("1", "2", "3", "0"):
+        page.wait_for_function(f"{index} === '{place}'")
+    page.get_by_role("tab", name="Edit", exact=True).click()
+    field = page.locator("#ps-specular-gain-gain input[type=number]")
+    field.fill("0")
+    field.press("Enter")
+    page.wait_for_selector(".ps-right[alt=Edited]")
+    before = page.get_attribute(".ps-right", "src")
+    page.wait_for_function(f"document.querySelector('.ps-right').src !== {before!r}")
+    page.click("#ps-play")
+    page.wait_for_selector("#ps-play:has-text('Play')")
+    page.wait_for_function(f"document.querySelector('#ps-status').innerText.startsWith('s' + {index})")
+    edited = read_exr_layers(fetch(page, "edited", tmp_path))
+    place = int(page.evaluate(index))
+    truth = polsep.separate(imagecodecs.png_decode(small_frame(4 * place)), white_level=4095)
+    np.testing.assert_array_equal(edited["combined.G"], truth.diffuse[..., 1])
+
+
+def test_a_recipe_with_images_is_replayed_by_the_command(
+    page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A texture and a mask that were sent come with the recipe; `polsep edit` makes the same frame of it."""
+    choose(page, "ps-white", "4095")
+    send(page, "shot.png", small_frame())
+    page.wait_for_selector(".ps-stage")
+    page.get_by_role("tab", name="Edit", exact=True).click()
+    wood, mask, wrong = tmp_path / "my wood.png", tmp_path / "m.png", tmp_path / "wrong.png"
+    rng = np.random.default_rng(0)
+    wood.write_bytes(imagecodecs.png_encode(rng.integers(0, 255, (20, 30, 3), np.uint8)))
+    mask.write_bytes(imagecodecs.png_encode(rng.integers(0, 255, (160, 192), np.uint8)))
+    wrong.write_bytes(imagecodecs.png_encode(np.zeros((5, 7), np.uint8)))
+    choose_image(page, "texture", wood)
+    page.wait_for_selector(".ps-right[alt=Edited]")
+    page.wait_for_selector("#ps-image-texture:has-text('my_wood.png')")
+    choose_image(page, "mask", wrong)
+    page.wait_for_selector(".ps-error")
+    assert page.inner_text(".ps-error").startswith("wrong.png: expected mask of 192x160 pixels")
+    choose_image(page, "mask", mask)
+    page.wait_for_selector("#ps-image-mask:has-text('m.png')")
+    shot, edited, recipe = (fetch(page, kind, tmp_path) for kind in ("exr", "edited", "recipe"))
+    with zipfile.ZipFile(recipe) as archive:
+        archive.extractall(tmp_path / "at-home")
+    options = ["-o", str(tmp_path / "again"), "--recipe", str(tmp_path / "at-home" / "shot_recipe.json")]
+    monkeypatch.setattr(sys, "argv", ["polsep", "edit", str(shot), *options])
+    cli.main()
+    again, shown = read_exr_layers(tmp_path / "again" / "shot.exr"), read_exr_layers(edited)
+    assert set(again) == set(shown)
+    for name, plane in again.items():
+        np.testing.assert_array_equal(plane, shown[name])

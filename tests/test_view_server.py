@@ -8,7 +8,6 @@ import json
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -50,7 +49,7 @@ def open_message(config: dict[str, Any], path: str) -> dict[str, Any]:
     (event,) = (d for d in config["dependencies"] if d["api_name"] == "open_upload")
     kinds = {c["id"]: c for c in config["components"]}
     file = {"path": path, "orig_name": "a.png", "meta": {"_type": "gradio.FileData"}}
-    data = [file if kinds[i]["type"] == "file" else kinds[i]["props"].get("value") for i in event["inputs"]]
+    data = [[file] if kinds[i]["type"] == "file" else kinds[i]["props"].get("value") for i in event["inputs"]]
     return {"data": data, "fn_index": event["id"]}
 
 
@@ -131,16 +130,15 @@ def test_nothing_of_the_file_system_is_handed_out(viewer: str, tmp_path: Path) -
 
 @needs_gradio
 def test_a_large_upload_is_refused_at_once(viewer: str) -> None:
-    """5 GB are refused by what they announce, in under a second; without an announcement, at the limit."""
+    """5 GB are refused by what they announce, before any of it is sent; without an announcement, at the limit."""
     address = urlsplit(viewer)
-    begin = time.perf_counter()
     with socket.create_connection((address.hostname, address.port), 10) as line:
         line.sendall(
             f"POST /gradio_api/upload HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Length: 5000000000\r\n"
             "Content-Type: multipart/form-data; boundary=x\r\n\r\n".encode()
         )
         answer = line.recv(4096)
-    assert answer.startswith(b"HTTP/1.1 413") and time.perf_counter() - begin < 1
+    assert answer.startswith(b"HTTP/1.1 413") and b"expected a file of at most 16 MB" in answer
     head = b'--x\r\nContent-Disposition: form-data; name="files"; filename="a.png"\r\n\r\n'
     body = head + bytes((LIMIT_MB << 20) + 1) + b"\r\n--x--\r\n"
     status, said = ask(viewer, "POST", "/gradio_api/upload", body, content_type="multipart/form-data; boundary=x")

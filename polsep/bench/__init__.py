@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polsep.bench.ablations import bench_ablations
+from polsep.bench.appearance import bench_gallery, bench_gallery_real, draw_gallery, draw_gallery_real
 from polsep.bench.calibration import bench_calibration
 from polsep.bench.dynamic import bench_dynamic, bench_dynamic_quick
 from polsep.bench.exactness import bench_exactness
@@ -29,6 +30,7 @@ from polsep.bench.separation import bench_separation
 from polsep.bench.sets import bench_sets
 from polsep.bench.truth import SCENE_SEEDS, SCENE_SIZE, render_scene
 from polsep.bench.video import bench_video, bench_video_quick
+from polsep.bench.viewing import bench_view
 
 __all__ = ["BENCHES", "SCENE_SEEDS", "SCENE_SIZE", "Bench", "Row", "provenance", "render_scene", "to_jsonl"]
 
@@ -62,5 +64,8 @@ BENCHES: dict[str, Bench] = {
     "material": Bench(bench_material, bench_material_quick, draw_material),
     "video": Bench(bench_video, bench_video_quick),
     "geometry": Bench(bench_geometry, bench_geometry_quick, draw_geometry),
+    "view": Bench(bench_view),
+    "gallery": Bench(bench_gallery, draw=draw_gallery),
+    "gallery_real": Bench(bench_gallery_real, draw=draw_gallery_real),
     "paper": Bench(bench_paper, bench_paper_quick, draw_paper),
 }

@@ -90,21 +90,21 @@ def _to_pixels(display: NDArray[np.floating[Any]]) -> Pixels:
     return pixels
 
 
-def draw_grid(rows: Sequence[Sequence[Panel]], caption: str) -> Pixels:
+def draw_grid(rows: Sequence[Sequence[Panel]], caption: str, cell_width: int = CELL) -> Pixels:
     """Rows of titled pictures under a caption; all of a row have the height of its first picture."""
-    heights = [_cell_height(row) for row in rows]
+    heights = [_cell_height(row, cell_width) for row in rows]
     columns = max(len(row) for row in rows)
-    height, width = sum(heights) + (TITLE + GAP) * len(rows) + TITLE + GAP, columns * (CELL + GAP) + GAP
+    height, width = sum(heights) + (TITLE + GAP) * len(rows) + TITLE + GAP, columns * (cell_width + GAP) + GAP
     with _plain_style():
         figure = _new_figure(height, width)
         figure.text(GAP / width, 1 - (TITLE - 5) / height, caption, fontsize=TEXT + 1, weight="bold")
         top = TITLE + GAP
         for row, cell in zip(rows, heights, strict=True):
             for column, (title, pixels) in enumerate(row):
-                left = GAP + column * (CELL + GAP)
+                left = GAP + column * (cell_width + GAP)
                 figure.text(left / width, 1 - (top + TITLE - 6) / height, title, fontsize=TEXT)
                 if pixels is not None:
-                    box = (left / width, 1 - (top + TITLE + cell) / height, CELL / width, cell / height)
+                    box = (left / width, 1 - (top + TITLE + cell) / height, cell_width / width, cell / height)
                     axes = figure.add_axes(box)
                     axes.imshow(pixels, aspect="auto")
                     axes.set_axis_off()
@@ -112,10 +112,10 @@ def draw_grid(rows: Sequence[Sequence[Panel]], caption: str) -> Pixels:
         return _render(figure)
 
 
-def _cell_height(row: Sequence[Panel]) -> int:
+def _cell_height(row: Sequence[Panel], cell_width: int) -> int:
     first = next(panel.pixels for panel in row if panel.pixels is not None)
     height, width = first.shape[:2]
-    return int(CELL * height / width + 0.5)
+    return int(cell_width * height / width + 0.5)
 
 
 def draw_plots(plots: Sequence[Axes]) -> Pixels:

@@ -26,17 +26,6 @@ def say(line: str) -> None:
     print(f"polsep: {line}", file=sys.stderr)
 
 
-def parse_light_color(text: str) -> tuple[float, ...] | str:
-    """``R,G,B`` or ``estimate``."""
-    if text == "estimate":
-        return text
-    try:
-        r, g, b = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f'expected --light-color R,G,B like 1,0.9,0.7, or "estimate", found {text!r}') from None
-    return (r, g, b)
-
-
 def parse_size(text: str | None) -> tuple[int, int] | None:
     """``WIDTHxHEIGHT``."""
     if text is None:

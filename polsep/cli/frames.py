@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import polsep
-from polsep.cli.app import DIR, app, parse_light_color, parse_size, say
+from polsep.cli.app import DIR, app, parse_size, say
 
 if TYPE_CHECKING:
     from polsep.batch import Outcome
@@ -67,7 +67,7 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     from polsep.camera import Layout
     from polsep.io.frames import ReadOptions
     from polsep.methods import check_method
-    from polsep.pipeline import find_device
+    from polsep.pipeline import find_device, parse_light_color
 
     try:
         given = click.get_current_context().get_parameter_source("layout") == click.core.ParameterSource.COMMANDLINE

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from polsep.cli.app import DIR, app, parse_light_color, parse_size, say
+from polsep.cli.app import DIR, app, parse_size, say
 
 if TYPE_CHECKING:
     from polsep.video import Progress
@@ -55,6 +55,7 @@ def video(recording: Path, output: Path, **options: Any) -> None:
     from polsep.io.frames import ReadOptions
     from polsep.io.sequences import SequenceKind
     from polsep.methods import check_method
+    from polsep.pipeline import parse_light_color
     from polsep.video import Target, VideoOptions, separate_video
     from polsep.workers import keep_memory
 

@@ -30,24 +30,27 @@ from polsep.cli.app import app, say
 def view(file: Path | None, host: str, port: int | None, opens: bool, upload_limit: int, **options: Any) -> None:
     """Open raw frames and results in the browser: compare, inspect, edit, download.
 
-    FILE is a raw frame, or an EXR file of polsep; others are opened on the page. The page is served to this machine
-    alone unless --host says otherwise, needs no network, and forgets what was opened when it is closed.
-    Needs the extra view.
+    FILE is a raw frame, a file of several, an EXR or NPZ file of polsep, or a folder of 'polsep video'; others are
+    opened on the page. The page is served to this machine alone unless --host says otherwise, needs no network, and
+    forgets what was opened when it is closed. Needs the extra view.
 
     \b
     polsep view
     polsep view shot.tiff --white-level 4095 --open
+    polsep view film/
     polsep view dump.raw --size 2448x2048 --pixel-format BayerRG12p
     """
+    from polsep.view.opening import find_sources, parse_settings
     from polsep.view.server import ViewOptions, serve
-    from polsep.view.session import parse_settings
 
     names = {"black_level": "black", "white_level": "white", "light_color": "light"}
     settings = {names.get(name, name): value for name, value in options.items() if value is not None}
     try:
         parse_settings(settings)
-        if file is not None and not file.is_file():
-            raise ValueError(f"{file}: expected a file, found {'a folder' if file.is_dir() else 'nothing'}")
+        if file is not None and not file.exists():
+            raise ValueError(f"{file}: expected a file, found nothing")
+        if file is not None:
+            find_sources(file)
         signal.signal(signal.SIGTERM, _stop)
         with serve(ViewOptions(host, port, file, settings, upload_limit)) as address:
             print(address, flush=True)

@@ -10,6 +10,7 @@ Source: Dave et al. 2022, doi 10.1364/OE.460984, "Appearance editing application
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -22,7 +23,7 @@ from polsep.edit.texture import texture_of
 
 
 @dataclass(frozen=True, kw_only=True)
-class Edit:
+class Edit(ABC):
     """What all edits have: a name, a mask, and what is said of them. Raises EditError on values out of range.
 
     ``title``: for people. ``light``: what the edit does to the sum of light. ``caution``: what it cannot do honestly.
@@ -67,8 +68,9 @@ class Edit:
         mask = None if self.mask is None else find_map(maps, "mask", self.mask, images)
         return self._changed(images, mask, maps)
 
+    @abstractmethod
     def _changed(self, images: SeparatedImages, mask: Floats | None, maps: Maps) -> SeparatedImages:
-        raise NotImplementedError
+        """The images after an edit that is not neutral; ``mask`` is that of the edit."""
 
 
 def within(mask: Floats | None, before: Floats, after: Floats) -> Floats:
@@ -77,6 +79,11 @@ def within(mask: Floats | None, before: Floats, after: Floats) -> Floats:
         return after
     share = np.repeat(mask[..., None], before.shape[2], axis=2)  # sixfold faster than broadcasting
     return (1 - share) * before + share * after
+
+
+def scaled(mask: Floats | None, light: Floats, factor: float) -> Floats:
+    """Light times a factor, within the mask."""
+    return within(mask, light, np.float32(factor) * light)
 
 
 def mean_of_colors(light: Floats) -> Floats:
@@ -214,7 +221,7 @@ class SpecularGain(Edit):
     gain: float = number_field(1.0, (0.0, 10.0), "Factor of the specular light.", neutral=1.0)
 
     def _changed(self, images: SeparatedImages, mask: Floats | None, maps: Maps) -> SeparatedImages:
-        return SeparatedImages(images.diffuse, within(mask, images.specular, np.float32(self.gain) * images.specular))
+        return SeparatedImages(images.diffuse, scaled(mask, images.specular, self.gain))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,7 +235,7 @@ class DiffuseGain(Edit):
     gain: float = number_field(1.0, (0.0, 10.0), "Factor of the diffuse light.", neutral=1.0)
 
     def _changed(self, images: SeparatedImages, mask: Floats | None, maps: Maps) -> SeparatedImages:
-        return SeparatedImages(within(mask, images.diffuse, np.float32(self.gain) * images.diffuse), images.specular)
+        return SeparatedImages(scaled(mask, images.diffuse, self.gain), images.specular)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,8 +249,7 @@ class RemoveHighlights(Edit):
     amount: float = number_field(1.0, (0.0, 1.0), "Share of the specular light that is removed.", neutral=0.0)
 
     def _changed(self, images: SeparatedImages, mask: Floats | None, maps: Maps) -> SeparatedImages:
-        left = within(mask, images.specular, np.float32(1 - self.amount) * images.specular)
-        return SeparatedImages(images.diffuse, left)
+        return SeparatedImages(images.diffuse, scaled(mask, images.specular, 1 - self.amount))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,8 +263,7 @@ class IsolateHighlights(Edit):
     amount: float = number_field(1.0, (0.0, 1.0), "Share of the diffuse light that is removed.", neutral=0.0)
 
     def _changed(self, images: SeparatedImages, mask: Floats | None, maps: Maps) -> SeparatedImages:
-        left = within(mask, images.diffuse, np.float32(1 - self.amount) * images.diffuse)
-        return SeparatedImages(left, images.specular)
+        return SeparatedImages(scaled(mask, images.diffuse, 1 - self.amount), images.specular)
 
 
 @dataclass(frozen=True, kw_only=True)

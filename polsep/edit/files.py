@@ -123,7 +123,8 @@ def _edited_frame(path: Path, work: Work) -> EditedFrame:
 
 def _edit(path: Path, work: Work) -> tuple[SeparatedImages, SeparatedImages]:
     """A frame before and after the edits. Raises InputError that names its file."""
-    before = SeparatedImages(*read_separated(path))
+    frame = read_separated(path)
+    before = SeparatedImages(frame.diffuse, frame.specular)
     try:
         return before, apply(before, work.recipe, work.maps)
     except EditError as error:

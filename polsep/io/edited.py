@@ -7,6 +7,7 @@ picture in sRGB, and the sidecar DIR/STEM.json.
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,6 +48,22 @@ def write_recipe_text(path: Path, text: str, overwrite: bool) -> None:
     """Write a recipe as a whole. Raises OutputError where one is there and ``overwrite`` is False."""
     refuse_targets(path.parent, [path], overwrite)
     replace_text(path, text)
+
+
+def write_recipe(folder: Path, stem: str, text: str, images: Mapping[str, Path]) -> Path:
+    """Write a recipe into a new folder, with the images that it names beside it; a ZIP archive of all if there are any.
+
+    Unpacked anywhere, `polsep edit --recipe` finds them.
+    """
+    if not images:
+        replace_text(folder / f"{stem}.json", text)
+        return folder / f"{stem}.json"
+    path = folder / f"{stem}.zip"
+    with zipfile.ZipFile(path, "x", zipfile.ZIP_STORED) as archive:
+        archive.writestr(f"{stem}.json", text)
+        for name, image in images.items():
+            archive.write(image, name)
+    return path
 
 
 def edited_targets(directory: Path, stem: str) -> list[Path]:

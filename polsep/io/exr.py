@@ -20,7 +20,8 @@ import OpenEXR  # a bare extension module without stubs
 import torch
 from numpy.typing import NDArray
 
-from polsep.io.errors import input_error
+from polsep.io.errors import InputError, decoding, naming
+from polsep.io.pages import require_signature, require_size
 
 COMPRESSIONS = {
     "none": OpenEXR.NO_COMPRESSION,
@@ -30,22 +31,37 @@ COMPRESSIONS = {
 #: Half floats end here.
 LARGEST_HALF = 65504.0
 _MAGIC, _VERSION, _HALF = 20000630, 2, 1
+_SIGNATURE = _MAGIC.to_bytes(4, "little")
 
 
 def read_exr_layers(path: Path) -> dict[str, NDArray[np.float32]]:
     """Every channel of a single-part EXR file by its full name, such as ``diffuse.R``, each ``[H, W]``.
 
-    Raises OSError when it cannot be read, and InputError for anything but a complete single-part EXR (OpenEXR itself
-    returns no part and prints a warning when pixels are missing).
+    Raises InputError for anything but a complete single-part EXR (OpenEXR itself returns no part and prints a warning
+    when pixels are missing), and for a header that promises too much, before any pixel is read.
     """
+    with naming(path):
+        with Path(path).open("rb") as stream:
+            require_signature(stream, (_SIGNATURE,), "an OpenEXR")
+            data = stream.read()
+        header = _open_exr(data, header_only=True).header()
+        with decoding("EXR"):
+            (left, top), (right, bottom) = header["dataWindow"]
+            shape = (int(bottom) - int(top) + 1, int(right) - int(left) + 1, max(len(header["channels"]), 1))
+        require_size(shape)
+        return {name: channel.pixels for name, channel in _open_exr(data).channels().items()}
+
+
+def _open_exr(data: bytes, header_only: bool = False) -> Any:
+    """OpenEXR's view of a file of one part."""
     expected = "expected a complete single-part EXR file"
     try:
-        file = OpenEXR.File(io.BytesIO(Path(path).read_bytes()), separate_channels=True)
+        file = OpenEXR.File(io.BytesIO(data), separate_channels=True, header_only=header_only)
     except RuntimeError as error:
-        raise input_error(path, f"{expected}, found one that OpenEXR cannot open") from error
+        raise InputError(f"{expected}, found one that OpenEXR cannot open") from error
     if len(file.parts) != 1:
-        raise input_error(path, f"{expected}, found {len(file.parts)} readable parts")
-    return {name: channel.pixels for name, channel in file.channels().items()}
+        raise InputError(f"{expected}, found {len(file.parts)} readable parts")
+    return file
 
 
 def encode_exr(planes: Mapping[str, NDArray[Any]], notes: Mapping[str, str], compression: str = "zip") -> memoryview:

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from polsep.io.errors import InputError, decoding, input_error, naming
+from polsep.io.exr import read_exr_layers
 from polsep.io.frames import read_pages
-from polsep.io.pages import require_signature
-from polsep.io.separated import read_planes
+from polsep.io.pages import require_signature, require_size
 
 Floats = NDArray[np.float32]
 
@@ -61,11 +61,12 @@ def hash_map(path: Path) -> str:
 def _read(path: Path, suffix: str) -> NDArray[Any] | Mapping[str, NDArray[Any]]:
     """The one image of a file, or its channels by name."""
     if suffix == ".exr":
-        return read_planes(path)
+        return read_exr_layers(path)
     if suffix in _PHOTOS:
         with naming(path), path.open("rb") as stream:
             require_signature(stream, (b"\xff\xd8\xff",), "a JPEG")
             with decoding("JPEG"), Image.open(stream, formats=["JPEG"]) as picture:
+                require_size((picture.height, picture.width, 3))
                 return np.asarray(picture.convert("L" if picture.mode == "L" else "RGB"))
     pages = [page.array for page in read_pages(path)]
     if len(pages) != 1:

@@ -11,7 +11,7 @@ import io
 import math
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -43,17 +43,26 @@ def read_npy(path: Path) -> Iterator[Page]:
 
 def read_npz(path: Path) -> Iterator[Page]:
     """The frames of an NPZ archive: its only one, one named raw or mosaic, or four named by angle."""
-    with path.open("rb") as stream:
-        require_signature(stream, (b"PK\x03\x04", b"PK\x05\x06"), "an NPZ")
-        with decoding("NPZ"):
-            archive = zipfile.ZipFile(stream)
-        with archive:
-            names = [name.removesuffix(".npy") for name in archive.namelist()]
-            arrays = {name: _read_member(archive, name) for name in _choose(names)}
+    with path.open("rb") as stream, _open_archive(stream) as archive:
+        names = [name.removesuffix(".npy") for name in archive.namelist()]
+        arrays = {name: _read_member(archive, name) for name in _choose(names)}
     if len(arrays) == 1:
         yield from _split(next(iter(arrays.values())))
         return
     yield Page(stack_angles(arrays), angles=True)
+
+
+def read_arrays(path: Path, wanted: Container[str]) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """The arrays of an NPZ archive that are wanted and there, and the names of all. Raises ValueError."""
+    with path.open("rb") as stream, _open_archive(stream) as archive:
+        names = [name.removesuffix(".npy") for name in archive.namelist()]
+        return {name: _read_member(archive, name) for name in names if name in wanted}, names
+
+
+def _open_archive(stream: BinaryIO) -> zipfile.ZipFile:
+    require_signature(stream, (b"PK\x03\x04", b"PK\x05\x06"), "an NPZ")
+    with decoding("NPZ"):
+        return zipfile.ZipFile(stream)
 
 
 def stack_angles(images: dict[str, NDArray[Any]]) -> NDArray[Any]:

@@ -37,6 +37,11 @@ def read_array(path: Path) -> NDArray[Any]:
     return np.asarray(np.load(path, allow_pickle=False))
 
 
+def read_bytes(path: Path) -> bytes:
+    """What a file holds."""
+    return path.read_bytes()
+
+
 def read_memory() -> float:
     """Resident memory of this process now [MiB]."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])

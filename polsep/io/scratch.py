@@ -64,6 +64,17 @@ def make_folder(parent: Path, name: str) -> Path:
     return folder
 
 
+def clear_folder(folder: Path) -> Path:
+    """An empty folder for its owner alone."""
+    drop_folder(folder)
+    return make_folder(folder.parent, folder.name)
+
+
+def file_size(path: Path) -> int:
+    """Bytes of a file."""
+    return path.stat().st_size
+
+
 def find_upload(scratch: Scratch, claimed: object, most_bytes: int) -> Path:
     """The file of an upload that a client names; only what lies in ``exchange`` exists for it.
 
@@ -82,9 +93,7 @@ def find_upload(scratch: Scratch, claimed: object, most_bytes: int) -> Path:
 
 
 def keep_upload(path: Path, folder: Path, name: str) -> Path:
-    """The same file under a ``name`` of ours in a session's folder, in place of what was there."""
-    for old in folder.iterdir():
-        old.unlink()
+    """The same file under a ``name`` of ours in a session's folder."""
     kept = folder / name
     try:
         os.link(path, kept)

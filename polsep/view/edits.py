@@ -1,19 +1,20 @@
 """Edits as controls: what the registry of `polsep.edit` says of each, made into values of a page and back.
 
-The panel is generated: an edit that is added to `EDITS` appears by itself. Those that need an image are left out, since
-a page has none to name. Every control starts where its edit is the identity.
+The panel is generated: an edit that is added to `EDITS` appears by itself. Every control starts where its edit is the
+identity.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from polsep.edit import EDITS, Edit, Parameter, Recipe, SeparatedImages, apply, make_edit
+from polsep.edit.images import Maps
 from polsep.io.maps import linear_from_srgb
 from polsep.io.previews import srgb
 from polsep.view.pictures import Floats, Small
@@ -35,11 +36,10 @@ class Control:
 
 
 def list_controls() -> tuple[Control, ...]:
-    """The controls of every edit that needs no image, in the order in which edits act."""
-    kinds = [kind for kind in EDITS.values() if not any(p.required for p in kind.parameters())]
+    """The controls of every edit, in the order in which edits act. Images are no controls: they are sent."""
     return tuple(
         Control(kind, parameter, _start(parameter))
-        for kind in kinds
+        for kind in EDITS.values()
         for parameter in kind.parameters()
         if parameter.kind in ("number", "color")
     )
@@ -53,16 +53,20 @@ def _start(parameter: Parameter) -> float | str:
     return "#" + "".join(f"{round(255 * float(part)):02x}" for part in srgb(np.asarray(value)))
 
 
-def recipe_of(values: Sequence[Any]) -> Recipe:
+def recipe_of(values: Sequence[Any], images: Mapping[str, str] | None = None) -> Recipe:
     """The recipe that the controls stand for, in the order of `list_controls`, without edits that do nothing.
 
-    Raises ValueError on values out of range.
+    ``images``: names of what was sent, by kind; the mask is that of all edits, as with `polsep edit --mask`. Edits
+    whose image was not sent are left out. Raises ValueError on values out of range.
     """
+    sent = images or {}
     said: dict[type[Edit], dict[str, Any]] = {}
     for control, value in zip(list_controls(), values, strict=True):
         kept = _color(value) if control.parameter.kind == "color" else value
         said.setdefault(control.edit, {})[control.parameter.name] = kept
-    edits = (make_edit(kind, named) for kind, named in said.items())
+    named = {kind: {p.name: sent[p.kind] for p in kind.parameters() if p.kind in sent} for kind in said}
+    ready = [kind for kind in said if all(p.name in named[kind] for p in kind.parameters() if p.required)]
+    edits = (make_edit(kind, said[kind] | named[kind]) for kind in ready)
     return Recipe(tuple(edit for edit in edits if not edit.is_neutral()))
 
 
@@ -78,9 +82,12 @@ def _color(text: object) -> tuple[float, ...]:
     return tuple(float(part) for part in linear_from_srgb(np.array(codes) / 255))
 
 
-def edit_small(small: Small, recipe: Recipe) -> Floats:
-    """The edited picture at screen size, linear; lengths in pixels shrink with it. Raises EditError."""
-    return apply(SeparatedImages(small.diffuse, small.specular), at_scale(recipe, small.step)).combined
+def edit_small(small: Small, recipe: Recipe, maps: Maps | None = None) -> Floats:
+    """The edited picture at screen size, linear; lengths in pixels shrink with it. ``maps``: images, as small.
+
+    Raises EditError.
+    """
+    return apply(SeparatedImages(small.diffuse, small.specular), at_scale(recipe, small.step), maps).combined
 
 
 def at_scale(recipe: Recipe, step: int) -> Recipe:

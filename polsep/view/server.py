@@ -52,16 +52,17 @@ def serve(options: ViewOptions) -> Iterator[str]:
     scratch = make_scratch()
     kept = {name: os.environ.get(name) for name in _environment(scratch.root)}
     os.environ.update(_environment(scratch.root))
-    page = None
+    page, sessions = None, Sessions(scratch, options.most_mb << 20)
     warm = threading.Thread(target=warm_up, args=(options.settings.get("method", "auto"),))
     warm.start()
     try:
-        page = _build(options, Sessions(scratch, options.most_mb << 20))
+        page = _build(options, sessions)
         yield _launch(page, options)
     finally:
         if page is not None and page.is_running:
             page.close(verbose=False)
         warm.join()  # a program must not end while a network is being compiled
+        sessions.close()
         drop_folder(scratch.root)
         for name, value in kept.items():
             if value is None:
@@ -85,7 +86,8 @@ def _build(options: ViewOptions, sessions: Sessions):  # type: ignore[no-untyped
     """Import Gradio where it is used first: it takes seconds, and its dependencies warn."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        from polsep.view.page import Start, build_page
+        from polsep.view.answers import Start
+        from polsep.view.page import build_page
 
         return build_page(sessions, Start(options.settings, options.file))
 

@@ -1,0 +1,73 @@
+"""Images that edits name, sent to a page: textures, masks and normals, at screen size; the files wait for downloads.
+
+Textures are of any size. Masks and normals are of the separated frame's, pixel by pixel, and hold for all frames of
+that size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from polsep.edit import EditError
+from polsep.io.errors import InputError
+from polsep.io.maps import SUFFIXES, read_map
+from polsep.io.pages import at_most
+from polsep.view.opening import MOST_SAMPLES, plain_name
+from polsep.view.pictures import Floats, shrink
+
+#: Kinds of images in the order of the page.
+KINDS = ("texture", "normals", "mask")
+#: Longest side of a texture at screen size: twice the picture's.
+TEXTURE = 1280
+
+
+@dataclass(frozen=True)
+class Sent:
+    """An image of a page: its ``name`` in recipes, the file, its ``size`` (height, width), and ``small``, read-only.
+
+    ``step``: pixels of the frame on a side of one of ``small``; of textures, nothing depends on it.
+    """
+
+    kind: str
+    name: str
+    path: Path
+    size: tuple[int, int]
+    step: int
+    small: Floats
+
+
+def image_name(name: str) -> tuple[str, str]:
+    """Stem and extension of an image's name, harmless in any path. Raises InputError for what is no image."""
+    return plain_name(name, SUFFIXES, "an image as PNG, JPEG, TIFF, NPY or EXR")
+
+
+def read_image(kind: str, name: str, path: Path, frame: tuple[int, int], step: int) -> Sent:
+    """An image of a page for a frame of the size ``frame`` (height, width), shown at ``step``. Raises InputError."""
+    try:
+        with at_most(MOST_SAMPLES):
+            found = read_map(path, kind)
+    except ValueError as error:
+        raise InputError(str(error).replace(str(path), name)) from error
+    size = (found.shape[0], found.shape[1])
+    if kind != "texture":
+        require_fit(kind, name, size, frame)
+        small = shrink(found, step)
+        if kind == "normals":
+            length = np.linalg.norm(small, axis=2, keepdims=True)
+            small = (small / np.where(length > 0, length, 1)).astype(np.float32)
+    else:
+        small = shrink(found, -(-max(size) // TEXTURE))
+    small = np.ascontiguousarray(small)
+    small.flags.writeable = False  # normals are then unfolded once
+    return Sent(kind, name, path, size, step, small)
+
+
+def require_fit(kind: str, name: str, size: tuple[int, int], frame: tuple[int, int]) -> None:
+    """Raise EditError for a mask or normals of another size than the frame's."""
+    if kind != "texture" and size != frame:
+        raise EditError(
+            f"{name}: expected {kind} of {frame[1]}x{frame[0]} pixels as the separated frame, found {size[1]}x{size[0]}"
+        )

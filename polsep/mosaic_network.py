@@ -114,7 +114,8 @@ def run_joint(network: Joint, mosaic: Mosaic, resolution: Resolution) -> Separat
     """A mosaic ``[..., H, W]`` through a network; negative light is cut to 0.
 
     The polarization is that of the network's linear filter, at half resolution. ``valid`` is False near cells of
-    which all samples clip. ``doubt``: see `Separation`. Raises ValueError on layouts that are not Sony's in any orientation.
+    which all samples clip. ``doubt``: see `Separation`. Raises ValueError on layouts that are not Sony's in any
+    orientation.
     """
     orientation = orient(mosaic, own_order(mosaic.layout))
     if resolution == "half" and not orientation.keeps_cells:  # then the network's cells are not the frame's

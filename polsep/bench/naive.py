@@ -37,7 +37,7 @@ def _sharper(edit: Any, diffuse: Floats, specular: Floats) -> Pair:
     found = specular
     for _ in range(4):
         seen = np.maximum(_blurred(found, edit.sigma), np.float32(1e-30))
-        found = found * _blurred(specular / seen, edit.sigma)
+        found = found * _blurred((specular / seen).astype(np.float32), edit.sigma)
     return diffuse, found
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from polsep.cli.app import DIR, app, parse_light_color, parse_size, say
+from polsep.cli.app import DIR, app, parse_size, say
 
 
 @app.command()
@@ -46,6 +46,7 @@ def material(files: tuple[str, ...], **options: Any) -> None:
     from polsep.io.frames import ReadOptions
     from polsep.material.files import MaterialOptions, estimate_files
     from polsep.methods import check_method
+    from polsep.pipeline import parse_light_color
 
     try:
         check_method(options["method"])

@@ -26,7 +26,7 @@ from polsep.io.geometry import ShapeFiles
 from polsep.io.maps import read_map
 from polsep.io.meshes import encode_glb, encode_ply
 from polsep.io.previews import exposure_of, toned
-from polsep.io.separated import read_planes
+from polsep.io.separated import SUFFIXES, read_separated
 from polsep.pipeline import separate_capture
 from polsep.report import SeparatedFrame
 
@@ -85,8 +85,11 @@ _LOBES, _STATES = ("diffuse", "specular"), ("dolp", "aolp", "valid")
 
 def _read_frame(path: Path, source: Source) -> SeparatedFrame:
     """One frame, separated."""
-    if path.suffix.lower() == ".exr":
-        return _from_planes(path)
+    if path.suffix.lower() in SUFFIXES:
+        frame = read_separated(path)
+        if not frame.dolp.any():
+            raise input_error(path, "expected a file of polsep separate with its polarization, found none in it")
+        return frame
     frames = list(read_frames(path, source.options))
     if len(frames) != 1:
         raise input_error(path, f"expected one frame under one light, found {len(frames)}")
@@ -94,19 +97,6 @@ def _read_frame(path: Path, source: Source) -> SeparatedFrame:
         return separate_capture(frames[0].data, source.method)
     except (ValueError, RuntimeError) as error:
         raise input_error(path, error) from error
-
-
-def _from_planes(path: Path) -> SeparatedFrame:
-    """A separated EXR file with its polarization."""
-    planes = read_planes(path)
-    colors = "RGB" if "diffuse.R" in planes else "Y"
-    names = [f"{lobe}.{color}" for lobe in _LOBES for color in colors] + [f"{state}.Y" for state in _STATES]
-    missing = [name for name in names if name not in planes]
-    if missing:
-        raise input_error(path, f"expected a file of polsep separate with {missing[0]}, found none")
-    images = [np.stack([planes[f"{lobe}.{color}"] for color in colors], axis=-1) for lobe in _LOBES]
-    dolp, aolp, valid = (planes[f"{state}.Y"] for state in _STATES)
-    return SeparatedFrame(images[0], images[1], valid > 0.5, dolp, aolp, {})
 
 
 def _require_one_shape(paths: Sequence[Path], images: Sequence[NDArray[Any]]) -> None:
@@ -119,9 +109,9 @@ def _require_one_shape(paths: Sequence[Path], images: Sequence[NDArray[Any]]) ->
 
 def read_object(path: Path, size: tuple[int, int]) -> Mask:
     """The mask ``[H, W]`` of a file of that size, or of twice that: raw frames become half as large."""
-    found = read_map(path, "mask") > 0.5
+    found: Mask = read_map(path, "mask") > 0.5
     if found.shape == (2 * size[0], 2 * size[1]):
-        found = found.reshape(size[0], 2, size[1], 2).all(axis=(1, 3))
+        found = np.all(found.reshape(size[0], 2, size[1], 2), axis=(1, 3))
     if found.shape != size:
         raise input_error(path, f"expected a mask of {list(size)}, found {list(found.shape)}")
     if not found.any():

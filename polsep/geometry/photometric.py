@@ -115,11 +115,11 @@ class _Frames:
         dark = (shaded & ~self.lit) / SHADOW_DEVIATION**2
         outer = self.directions[:, :, None] * self.directions[:, None, :]
         matrix = np.tensordot((certainty + dark).T, outer, axes=1) + RIDGE * np.eye(3)
-        right = (certainty * relative).T @ self.directions
+        right: Floats = np.matmul((certainty * relative).T, self.directions)
         if prior is not None:
             normals, deviation = prior
             matrix += np.eye(3) / deviation[:, None, None] ** 2
-            right += normals / deviation[:, None] ** 2
+            right = right + normals / deviation[:, None] ** 2
         found: Floats = np.linalg.solve(matrix, right[..., None])[..., 0]
         return found
 

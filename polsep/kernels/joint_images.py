@@ -138,7 +138,7 @@ def _add_polarization(rows: tuple[Any, Any, Any], room: Any, sums: Any) -> None:
 def _mark_clipped(clipped: Any, y: int, valid: Any, near: Any) -> int:
     """False in ``valid [2 w]`` near cells of which all clips; how many cells of the row are near a clipped sample.
 
-    ``near [2 w + 2]``, uint8, for the cells of a row and one more on both sides: 1 where a sample clips, 2 where all do.
+    ``near [2 w + 2]``, uint8, for cells of a row and one more on both sides: 1 where a sample clips, 2 where all do.
     """
     h, w = clipped.shape
     first, last, some = max(y - 1, 0), min(y + 1, 2 * h - 1), np.uint16(0)

@@ -113,12 +113,13 @@ def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photogra
     for path in paths:
         found: list[tuple[Floats, Floats]] = []
         if Path(path).suffix.lower() == ".exr":
-            found.append(read_separated(Path(path)))
+            frame = read_separated(Path(path))
+            found.append((frame.diffuse, frame.specular))
         else:
-            for frame in read_frames(path, options.read):
-                done = separate_capture(frame.data, options.method, options.light_color)
+            for raw in read_frames(path, options.read):
+                done = separate_capture(raw.data, options.method, options.light_color)
                 found.append((done.diffuse, done.specular))
-                notes += [f"{path}: {note}" for note in (*frame.notes, *done.report["warnings"])]
+                notes += [f"{path}: {note}" for note in (*raw.notes, *done.report["warnings"])]
         for pair in found:
             planes = [torch.from_numpy(x).movedim(-1, 0).expand(3, -1, -1) for x in pair]
             view = torch.cat([_middle_square(x, options.size) for x in planes])

@@ -14,6 +14,7 @@ dark. There nothing but the shadow itself and polarization says how far a normal
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -115,7 +116,7 @@ class _Frames:
         dark = (shaded & ~self.lit) / SHADOW_DEVIATION**2
         outer = self.directions[:, :, None] * self.directions[:, None, :]
         matrix = np.tensordot((certainty + dark).T, outer, axes=1) + RIDGE * np.eye(3)
-        right: Floats = np.matmul((certainty * relative).T, self.directions)
+        right: NDArray[np.floating[Any]] = (certainty * relative).T @ self.directions
         if prior is not None:
             normals, deviation = prior
             matrix += np.eye(3) / deviation[:, None, None] ** 2

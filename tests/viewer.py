@@ -25,7 +25,7 @@ def running(folder: Path, *options: str) -> Iterator[str]:
             yield _address(process, said)
         finally:
             process.send_signal(signal.SIGTERM)
-            process.wait(30)
+            process.wait(120)
 
 
 def _address(process: subprocess.Popen[str], said) -> str:  # type: ignore[no-untyped-def]

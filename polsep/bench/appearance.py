@@ -23,7 +23,7 @@ from torch import Tensor
 from polsep.bench.figures import Panel, Pixels, draw_grid
 from polsep.bench.gallery import REAL, crop
 from polsep.bench.rows import Row
-from polsep.camera import IMX250, Layout, Mosaic, expose
+from polsep.camera import IMX250, Layout, expose
 from polsep.edit import (
     Edit,
     IsolateHighlights,
@@ -43,6 +43,7 @@ from polsep.io.frames import ReadOptions, read_frames
 from polsep.io.pictures import write_picture
 from polsep.io.previews import exposure_of, toned
 from polsep.materials import Materials
+from polsep.methods import Capture
 from polsep.metrics import psnr
 from polsep.pipeline import separate_capture
 from polsep.render import PinholeCamera, PointLight, Scene, Vector, camera_axes
@@ -68,7 +69,7 @@ class Taken:
     resolution (x right, y up, z to the camera, 0 without a surface)."""
 
     title: str
-    mosaic: Mosaic
+    mosaic: Capture
     scene: Scene | None = None
     normals: Floats | None = None
 
@@ -310,7 +311,7 @@ def bench_gallery_real(data: Path) -> Iterator[Row]:
     for taken in take_real(data):
         found = taken.separate()
         share = float(found.specular.mean() / max(float((found.diffuse + found.specular).mean()), 1e-9))
-        yield Row("gallery-real", taken.title, found.report["method"], "specular light", 100 * share, "%")
+        yield Row("gallery_real", taken.title, found.report["method"], "specular light", 100 * share, "%")
 
 
 def take_real(data: Path) -> Iterator[Taken]:
@@ -318,7 +319,7 @@ def take_real(data: Path) -> Iterator[Taken]:
     for name, title, white in REAL:
         if (data / name.format(angle=0)).is_file():
             frame = next(read_frames(data / name, ReadOptions(Layout(bayer=None), white_level=white)))
-            yield Taken(title, frame.data)  # type: ignore[arg-type]  # measurements are separated alike
+            yield Taken(title, frame.data)
 
 
 def draw_gallery_real(_rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:

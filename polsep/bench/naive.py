@@ -36,8 +36,9 @@ def _blurred(image: Floats, sigma: float) -> Floats:
 def _sharper(edit: Any, diffuse: Floats, specular: Floats) -> Pair:
     found = specular
     for _ in range(4):
-        seen = np.maximum(_blurred(found, edit.sigma), np.float32(1e-30))
-        found = found * _blurred((specular / seen).astype(np.float32), edit.sigma)
+        seen: Floats = np.maximum(_blurred(found, edit.sigma), np.float32(1e-30))
+        ratio: Floats = specular / seen
+        found = found * _blurred(ratio, edit.sigma)
     return diffuse, found
 
 

@@ -87,7 +87,7 @@ def fit_robust(images: Floats, directions: Floats, mask: Mask, cue: Cue | None =
         cosines = frames.cosines(normals)
         albedo = _albedo(even, weight, cosines)
         deviation = np.hypot(RELATIVE * even / albedo, ABSOLUTE)
-        weight = lit / (1 + ((even / albedo - cosines) / (OUTLYING * deviation)) ** 2)
+        weight = lit / (1 + frames.around(((even / albedo - cosines) / (OUTLYING * deviation)) ** 2))
     shading = np.maximum(frames.cosines(normals), 0) * _transmission(normals, directions)
     return _appearance(images, mask, normals, (shading, weight))
 
@@ -106,6 +106,16 @@ class _Frames:
         cosines: Floats = self.directions @ normals.T
         return cosines
 
+    def around(self, values: Floats) -> Floats:
+        """Means ``[L, P]`` over the lit samples around each one: what is wrong of a sample is wrong of its neighbours."""
+        means = np.zeros_like(values)
+        for number, (row, lit) in enumerate(zip(values, self.lit, strict=True)):
+            image, share = np.zeros(self.mask.shape), np.zeros(self.mask.shape)
+            image[self.mask], share[self.mask] = row * lit, lit
+            total, count = (gaussian_filter(x, NEIGHBOURS)[self.mask] for x in (image, share))
+            means[number] = total / np.maximum(count, 1e-6)
+        return means
+
     def solve(
         self, even: Floats, weight: Floats, albedo: Floats, shaded: Mask, prior: tuple[Floats, Floats] | None
     ) -> Floats:
@@ -114,8 +124,8 @@ class _Frames:
         certainty = weight / ((RELATIVE * relative) ** 2 + ABSOLUTE**2)
         dark = (shaded & ~self.lit) / SHADOW_DEVIATION**2
         outer = self.directions[:, :, None] * self.directions[:, None, :]
-        matrix = np.tensordot((certainty + dark).T, outer, axes=1) + RIDGE * np.eye(3)
-        right = (certainty * relative).T @ self.directions
+        matrix: Floats = np.tensordot((certainty + dark).T, outer, axes=1) + RIDGE * np.eye(3)
+        right: Floats = (certainty * relative).T @ self.directions
         if prior is not None:
             normals, deviation = prior
             matrix += np.eye(3) / deviation[:, None, None] ** 2

@@ -59,7 +59,7 @@ def write_shape(shape: ShapeFiles, targets: list[Path], stem: str) -> None:
 
 def _stage(shape: ShapeFiles, folder: Path, targets: list[Path], stem: str) -> None:
     """Every file, the sidecar last."""
-    planes = {f"normal.{axis}": shape.normals[..., k] for k, axis in enumerate("XYZ")}
+    planes: dict[str, NDArray[Any]] = {f"normal.{axis}": shape.normals[..., k] for k, axis in enumerate("XYZ")}
     colors = "RGB" if shape.albedo.shape[2] == 3 else "Y"
     planes |= {f"albedo.{color}": shape.albedo[..., k] for k, color in enumerate(colors)}
     planes |= {"depth.Z": np.where(shape.mask, shape.depth, 0), "mask.Y": shape.mask}
@@ -69,7 +69,12 @@ def _stage(shape: ShapeFiles, folder: Path, targets: list[Path], stem: str) -> N
     notes = {"polsepVersion": version_text(), **{f"{layer}Units": unit for layer, unit in UNITS.items()}}
     floats = {name: plane.astype(np.float32) for name, plane in planes.items()}
     codes = np.rint((shape.normals + 1) / 2 * 65535).astype(np.uint16)
-    data = [encode_exr(floats, notes), encode_png(codes), shape.mesh, encode_png(shape.preview)]
+    data: list[bytes | memoryview] = [
+        encode_exr(floats, notes),
+        encode_png(codes),
+        shape.mesh,
+        encode_png(shape.preview),
+    ]
     names = [path.name for path in targets]
     sidecar = {
         "polsep": version_text(),

@@ -38,8 +38,8 @@ RIDGE = 1e-4
 ROUNDS, OUTLYING = 12, 2.0
 #: Pixels (sigma) that choose together which of a cue's normals is meant.
 NEIGHBOURS = 2.0
-#: Least cosine toward the camera.
-LEAST_COSINE = 0.02
+#: Least cosine toward the camera: what is seen at more than 84 degrees is a pixel wide and mixed with what is behind.
+LEAST_COSINE = 0.1
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class _Frames:
         return cosines
 
     def around(self, values: Floats) -> Floats:
-        """Means ``[L, P]`` over the lit samples around each one: what is wrong of a sample is wrong of its neighbours."""
+        """Means ``[L, P]`` over the lit samples around each one: what is wrong of one is wrong of its neighbours."""
         means = np.zeros_like(values)
         for number, (row, lit) in enumerate(zip(values, self.lit, strict=True)):
             image, share = np.zeros(self.mask.shape), np.zeros(self.mask.shape)
@@ -128,10 +128,10 @@ class _Frames:
         right: Floats = (certainty * relative).T @ self.directions
         if prior is not None:
             normals, deviation = prior
-            matrix += np.eye(3) / deviation[:, None, None] ** 2
+            matrix = matrix + np.eye(3) / deviation[:, None, None] ** 2
             right += normals / deviation[:, None] ** 2
-        found: Floats = np.linalg.solve(matrix, right[..., None])[..., 0]
-        return found
+        solved: Floats = np.linalg.solve(matrix, right[..., None])[..., 0]
+        return solved
 
 
 def _choose(

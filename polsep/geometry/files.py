@@ -137,7 +137,7 @@ def read_object(path: Path, size: tuple[int, int]) -> Mask:
     """The mask ``[H, W]`` of a file of that size, or of twice that: raw frames become half as large."""
     found: Mask = np.asarray(read_map(path, "mask") > 0.5)
     if found.shape == (2 * size[0], 2 * size[1]):
-        found = found.reshape(size[0], 2, size[1], 2).all(axis=(1, 3))
+        found = found.reshape(size[0], 2, size[1], 2).min(axis=(1, 3))
     if found.shape != size:
         raise input_error(path, f"expected a mask of {list(size)}, found {list(found.shape)}")
     if not found.any():

@@ -128,10 +128,9 @@ class _Frames:
         right: Floats = (certainty * relative).T @ self.directions
         if prior is not None:
             normals, deviation = prior
-            matrix = matrix + np.eye(3) / deviation[:, None, None] ** 2
-            right += normals / deviation[:, None] ** 2
-        solved: Floats = np.linalg.solve(matrix, right[..., None])[..., 0]
-        return solved
+            matrix = np.asarray(matrix + np.eye(3) / deviation[:, None, None] ** 2)
+            right = np.asarray(right + normals / deviation[:, None] ** 2)
+        return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
 
 
 def _choose(

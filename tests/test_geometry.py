@@ -41,7 +41,7 @@ def cap(size: int, zenith_deg: float) -> tuple[Floats, Mask]:
 def angles(found: Floats, truth: Floats, mask: Mask) -> Floats:
     """Angles between normals [degrees]; by the sine, which is exact for small ones."""
     cross = np.linalg.norm(np.cross(found[mask], truth[mask]), axis=-1)
-    return np.degrees(np.arctan2(cross, (found[mask] * truth[mask]).sum(axis=-1)))
+    return np.asarray(np.degrees(np.arctan2(cross, (found[mask] * truth[mask]).sum(axis=-1))))
 
 
 def through(cosines: Floats) -> Floats:
@@ -51,7 +51,7 @@ def through(cosines: Floats) -> Floats:
 def lambertian(normals: Floats, directions: Floats, albedo: Floats) -> Floats:
     """Images ``[L, H, W, C]``, no cast shadows."""
     shading = np.maximum(np.einsum("li,hwi->lhw", directions, normals), 0)
-    return shading[..., None] * albedo
+    return np.asarray(shading[..., None] * albedo)
 
 
 def dielectric(normals: Floats, directions: Floats, albedo: Floats) -> Floats:
@@ -126,7 +126,7 @@ def test_a_slope_has_two_normals_half_a_turn_apart() -> None:
     cue = normals_of_slope(slope_of(normals))
     nearer = np.minimum(angles(cue.first, normals, mask), angles(cue.second, normals, mask))
     assert nearer[nearer.size // 4 :].max() < 0.5
-    assert np.allclose(cue.first[mask] * [-1, -1, 1], cue.second[mask])
+    assert np.allclose(cue.first[mask] * np.array([-1.0, -1.0, 1.0]), cue.second[mask])
     assert (cue.deviation[mask] > 0).all()
 
 
@@ -216,7 +216,7 @@ def test_multigrid_solves_what_sparse_elimination_solves() -> None:
 def test_lights_are_named_or_given() -> None:
     """Names and vectors become unit vectors; anything else is said in one line."""
     found = parse_lights("front 0,3,4")
-    assert np.allclose(found, [[0, 0, 1], [0, 0.6, 0.8]])
+    assert np.allclose(found, np.array([[0, 0, 1.0], [0, 0.6, 0.8]]))
     for text in ("behind", "1,2", "0,0,0", "1,nan,2"):
         with pytest.raises(ValueError, match="expected"):
             parse_lights(text)

@@ -107,7 +107,7 @@ def test_photographs_do_too(polsep: Cli, tmp_path: Path) -> None:
     run = polsep("--srgb", *paths, "-o", tmp_path / "out", "--fov", "25", "--mesh", "ply", "--size", "20")
     assert run.status == 0, run
     assert read_exr_layers(tmp_path / "out" / "shape.exr")["depth.Z"].shape == (20, 20)
-    mesh = trimesh.load(tmp_path / "out" / "shape.ply", force="mesh", process=False)
+    mesh: Any = trimesh.load(tmp_path / "out" / "shape.ply", force="mesh", process=False)
     assert len(mesh.faces) > 300 and mesh.visual.kind == "vertex"
 
 
@@ -119,6 +119,7 @@ def test_photographs_do_too(polsep: Cli, tmp_path: Path) -> None:
         (["--lights", "1,0,1 0,0,1 1,0,0 1,0,2 1,0,3 1,0,4"], ["one plane"]),
         (["--fov", "190"], ["field of view"]),
         (["--mesh", "obj"], ["glb or ply"]),
+        (["--integration", "rough"], ["bilateral or smooth"]),
         (["--size", "0"], ["--size"]),
         (["--name", "a/b"], ["stem"]),
         (["--method", "magic"], ["magic"]),

@@ -27,6 +27,7 @@ ORDER = "right front-right front front-left left above"
 @click.option("--white-level", type=float, metavar="N", help="Of raw frames.  [default: the type's largest]")
 @click.option("--fov", type=float, metavar="DEG", help="The camera's vertical field of view.  [default: orthographic]")
 @click.option("--size", type=int, default=640, metavar="PX", help="Longer side of the maps at most.")
+@click.option("--integration", default="bilateral", metavar="bilateral|smooth", help="Depth with jumps, or without.")
 @click.option("--mesh", default="glb", metavar="glb|ply", help="Format of the mesh.")
 @click.option("--overwrite", is_flag=True, help="Replace results that exist.")
 def geometry(files: tuple[Path, ...], **options: Any) -> None:
@@ -49,6 +50,7 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     """
     try:
         from polsep.geometry.files import (
+            Asked,
             Source,
             find_object,
             find_shape,
@@ -69,6 +71,7 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     from polsep.methods import check_method
 
     try:
+        asked = Asked(options["mesh"], options["fov"], options["integration"])
         directions = parse_lights(options["lights"])
         if len(files) != len(directions):
             raise ValueError(f"expected {len(directions)} files, one per light of --lights, found {len(files)}")
@@ -85,7 +88,7 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
         if options["size"] < 1:
             raise ValueError(f"expected --size of 1 or more, found {options['size']}")
         views, mask = shrink(views, mask, options["size"])
-        shape = find_shape(views, directions, mask, (options["mesh"], options["fov"]))
+        shape = find_shape(views, directions, mask, asked)
         write_shape(shape, targets, options["name"])
     except (ValueError, RuntimeError) as error:
         raise click.ClickException(str(error)) from None

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.geometry.integration import integrate_bilateral
+from polsep.geometry.integration import integrate_bilateral, integrate_smooth
 from polsep.geometry.photometric import Appearance, fit_robust
 from polsep.geometry.polarization import Polarized, find_slope, normals_of_slope
 from polsep.geometry.surface import Surface, draw_views, relight, span_surface
@@ -39,6 +39,8 @@ OBJECT_SHARE = 0.06
 #: Side of the preview's pictures, and from where its meshes are seen: azimuth and elevation [degrees].
 CELL = 360
 VIEWS = ((-50.0, 5.0), (-20.0, 10.0), (20.0, 10.0), (50.0, 5.0))
+#: How normals become depth: with jumps, or as one smooth surface.
+INTEGRATIONS = {"bilateral": integrate_bilateral, "smooth": integrate_smooth}
 #: Colour around the object in previews.
 GREY = 40
 
@@ -58,6 +60,20 @@ class Source:
     kind: str
     options: ReadOptions
     method: str
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The format of the ``mesh``, the vertical field of view [degrees] or None for an orthographic camera, and one of
+    `INTEGRATIONS`. Raises ValueError."""
+
+    mesh: str = "glb"
+    fov_deg: float | None = None
+    integration: str = "bilateral"
+
+    def __post_init__(self) -> None:
+        if self.integration not in INTEGRATIONS:
+            raise ValueError(f"expected an integration of {' or '.join(INTEGRATIONS)}, found {self.integration!r}")
 
 
 def read_views(paths: Sequence[Path], source: Source) -> Views:
@@ -109,9 +125,9 @@ def _require_one_shape(paths: Sequence[Path], images: Sequence[NDArray[Any]]) ->
 
 def read_object(path: Path, size: tuple[int, int]) -> Mask:
     """The mask ``[H, W]`` of a file of that size, or of twice that: raw frames become half as large."""
-    found: Mask = read_map(path, "mask") > 0.5
+    found: Mask = np.asarray(read_map(path, "mask") > 0.5)
     if found.shape == (2 * size[0], 2 * size[1]):
-        found = np.all(found.reshape(size[0], 2, size[1], 2), axis=(1, 3))
+        found = found.reshape(size[0], 2, size[1], 2).min(axis=(1, 3))
     if found.shape != size:
         raise input_error(path, f"expected a mask of {list(size)}, found {list(found.shape)}")
     if not found.any():
@@ -147,25 +163,24 @@ def find_object(views: Views) -> Mask:
     return mask
 
 
-def find_shape(views: Views, directions: Floats, mask: Mask, look: tuple[str, float | None]) -> ShapeFiles:
-    """Normals, albedo, depth, mesh and preview; ``look``: the mesh's format, and the vertical field of view [degrees]
-    or None for an orthographic camera. Raises ValueError."""
+def find_shape(views: Views, directions: Floats, mask: Mask, asked: Asked) -> ShapeFiles:
+    """Normals, albedo, depth, mesh and preview. Raises ValueError."""
     cue = None
     if views.polarized is not None:
         cue = normals_of_slope(find_slope(views.polarized, mask))
     found = fit_robust(views.images, directions, mask, cue)
-    format, fov_deg = look
-    intrinsics = None if fov_deg is None else intrinsics_of(fov_deg, mask.shape)
-    depth = integrate_bilateral(found.normals, mask, intrinsics)
+    intrinsics = None if asked.fov_deg is None else intrinsics_of(asked.fov_deg, mask.shape)
+    depth = INTEGRATIONS[asked.integration](found.normals, mask, intrinsics)
     gain = 1 / max(float(np.percentile(found.albedo[mask], 99.5)), 1e-9)
     shown = Appearance(found.normals, np.minimum(found.albedo * gain, 1), mask)
     surface = span_surface(shown, depth, intrinsics)
-    encode = encode_glb if format == "glb" else encode_ply
+    encode = encode_glb if asked.mesh == "glb" else encode_ply
     mesh = encode(surface.vertices, surface.normals, surface.colors, surface.faces)
     said = {
         "lights": directions.round(6).tolist(),
         "polarization": cue is not None,
-        "field_of_view_deg": fov_deg,
+        "field_of_view_deg": asked.fov_deg,
+        "integration": asked.integration,
         "triangles": len(surface.faces),
         "albedo_of_mesh": f"albedo x {gain:.6g}, limited to 1",
     }

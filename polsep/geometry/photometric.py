@@ -14,7 +14,6 @@ dark. There nothing but the shadow itself and polarization says how far a normal
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -39,8 +38,8 @@ RIDGE = 1e-4
 ROUNDS, OUTLYING = 12, 2.0
 #: Pixels (sigma) that choose together which of a cue's normals is meant.
 NEIGHBOURS = 2.0
-#: Least cosine toward the camera.
-LEAST_COSINE = 0.02
+#: Least cosine toward the camera: what is seen at more than 84 degrees is a pixel wide and mixed with what is behind.
+LEAST_COSINE = 0.1
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ def fit_robust(images: Floats, directions: Floats, mask: Mask, cue: Cue | None =
         cosines = frames.cosines(normals)
         albedo = _albedo(even, weight, cosines)
         deviation = np.hypot(RELATIVE * even / albedo, ABSOLUTE)
-        weight = lit / (1 + ((even / albedo - cosines) / (OUTLYING * deviation)) ** 2)
+        weight = lit / (1 + frames.around(((even / albedo - cosines) / (OUTLYING * deviation)) ** 2))
     shading = np.maximum(frames.cosines(normals), 0) * _transmission(normals, directions)
     return _appearance(images, mask, normals, (shading, weight))
 
@@ -107,6 +106,16 @@ class _Frames:
         cosines: Floats = self.directions @ normals.T
         return cosines
 
+    def around(self, values: Floats) -> Floats:
+        """Means ``[L, P]`` over the lit samples around each one: what is wrong of one is wrong of its neighbours."""
+        means = np.zeros_like(values)
+        for number, (row, lit) in enumerate(zip(values, self.lit, strict=True)):
+            image, share = np.zeros(self.mask.shape), np.zeros(self.mask.shape)
+            image[self.mask], share[self.mask] = row * lit, lit
+            total, count = (gaussian_filter(x, NEIGHBOURS)[self.mask] for x in (image, share))
+            means[number] = total / np.maximum(count, 1e-6)
+        return means
+
     def solve(
         self, even: Floats, weight: Floats, albedo: Floats, shaded: Mask, prior: tuple[Floats, Floats] | None
     ) -> Floats:
@@ -115,14 +124,13 @@ class _Frames:
         certainty = weight / ((RELATIVE * relative) ** 2 + ABSOLUTE**2)
         dark = (shaded & ~self.lit) / SHADOW_DEVIATION**2
         outer = self.directions[:, :, None] * self.directions[:, None, :]
-        matrix = np.tensordot((certainty + dark).T, outer, axes=1) + RIDGE * np.eye(3)
-        right: NDArray[np.floating[Any]] = (certainty * relative).T @ self.directions
+        matrix: Floats = np.tensordot((certainty + dark).T, outer, axes=1) + RIDGE * np.eye(3)
+        right: Floats = (certainty * relative).T @ self.directions
         if prior is not None:
             normals, deviation = prior
-            matrix += np.eye(3) / deviation[:, None, None] ** 2
-            right = right + normals / deviation[:, None] ** 2
-        found: Floats = np.linalg.solve(matrix, right[..., None])[..., 0]
-        return found
+            matrix = np.asarray(matrix + np.eye(3) / deviation[:, None, None] ** 2)
+            right = np.asarray(right + normals / deviation[:, None] ** 2)
+        return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
 
 
 def _choose(

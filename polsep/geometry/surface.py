@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from polsep.geometry.integration import LEAST_COSINE
 from polsep.geometry.photometric import Appearance
@@ -24,6 +26,8 @@ Integers = NDArray[np.int64]
 
 #: A rise between neighbours that differs from the one of their normals by this many pixels, and by this share, jumps.
 JUMP, JUMP_SHARE = 1.5, 1.5
+#: Rises of more pixels than this are guessed, not seen; parts with fewer of the triangles than this share are loose.
+MOST_RISE, SMALLEST_PART = 8.0, 0.01
 #: The field of view of pictures of a mesh [degrees], and its camera's distance in extents.
 FOV_DEG, DISTANCE = 24.0, 2.9
 #: Toward the light of pictures, in the camera's frame.
@@ -54,6 +58,7 @@ def span_surface(appearance: Appearance, depth: Floats, intrinsics: Floats | Non
         points, scale = np.stack([across, upward, -np.ones_like(depth)], axis=-1) * depth[..., None], depth
         scale = scale / intrinsics[0, 0]
     faces = _triangles(mask, _steady_links(appearance.normals, depth / scale, mask))
+    faces = _without_fragments(faces)
     if not len(faces):
         raise ValueError("expected a surface of three pixels or more, found none")
     kept, faces = np.unique(faces, return_inverse=True)
@@ -75,8 +80,9 @@ def _steady_links(normals: Floats, depth: Floats, mask: NDArray[np.bool_]) -> tu
         expected = (slope[first] + slope[second]) / 2
         largest = np.maximum(np.abs(slope[first]), np.abs(slope[second]))
         with np.errstate(invalid="ignore"):
-            off = np.abs(depth[second] - depth[first] - expected)
-        steady.append(mask[first] & mask[second] & (off <= JUMP + JUMP_SHARE * largest))
+            rise = depth[second] - depth[first]
+            goes_on = (np.abs(rise - expected) <= JUMP + JUMP_SHARE * largest) & (np.abs(rise) <= MOST_RISE)
+        steady.append(mask[first] & mask[second] & goes_on)
     return tuple(steady)
 
 
@@ -93,6 +99,18 @@ def _triangles(mask: NDArray[np.bool_], links: tuple[NDArray[np.bool_], ...]) ->
             np.stack([beside, below, across], axis=-1)[second],
         ]
     )
+
+
+def _without_fragments(faces: Integers) -> Integers:
+    """The triangles of parts that are large enough."""
+    if not len(faces):
+        return faces
+    links = (np.ones(2 * len(faces)), (np.repeat(faces[:, 0], 2), faces[:, 1:].reshape(-1)))
+    count = int(faces.max()) + 1
+    _, part = connected_components(coo_array(links, (count, count)), directed=False)
+    owner = part[faces[:, 0]]
+    kept: Integers = faces[np.bincount(owner)[owner] >= SMALLEST_PART * len(faces)]
+    return kept
 
 
 def relight(appearance: Appearance, direction: tuple[float, float, float] = PICTURE_LIGHT) -> Floats:

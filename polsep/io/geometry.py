@@ -59,7 +59,7 @@ def write_shape(shape: ShapeFiles, targets: list[Path], stem: str) -> None:
 
 def _stage(shape: ShapeFiles, folder: Path, targets: list[Path], stem: str) -> None:
     """Every file, the sidecar last."""
-    planes = {f"normal.{axis}": shape.normals[..., k] for k, axis in enumerate("XYZ")}
+    planes: dict[str, NDArray[Any]] = {f"normal.{axis}": shape.normals[..., k] for k, axis in enumerate("XYZ")}
     colors = "RGB" if shape.albedo.shape[2] == 3 else "Y"
     planes |= {f"albedo.{color}": shape.albedo[..., k] for k, color in enumerate(colors)}
     planes |= {"depth.Z": np.where(shape.mask, shape.depth, 0), "mask.Y": shape.mask.astype(np.float64)}

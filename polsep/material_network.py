@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, leaky_relu, selu
+from torch.nn.functional import avg_pool2d, interpolate, leaky_relu, pad, selu
 
 from polsep.networks import pad_to_multiple
 from polsep.optics import normalize
@@ -36,6 +36,8 @@ LARGEST_SLOPE = 3.0
 LEAK = 0.2
 #: What an untrained network says: flat, as bright as the photograph, roughness 0.4, reflectance 0.04.
 USUAL = (0.0, 0.0, 0.0, 0.0, 0.0, -0.2, -0.6, -0.6, -0.6)
+#: Pixels around over which the mean of brightness is taken; squared way from a highlight that counts as near.
+DETAIL_RADIUS, NEAR = 4, 0.05
 #: Light below which a photograph's root is no longer steep.
 LEAST_SEEN = 1e-4
 #: Standard deviation of the weights by which layers take from the global track.
@@ -46,15 +48,18 @@ TAKEN = 0.1
 class MaterialSize:
     """``width`` channels at half resolution, multiplied as ``growth`` says at every further halving.
 
-    Raises ValueError on what is below 1.
+    ``cues``: what of `CUES` it sees of every image beside the image. Raises ValueError on what cannot be built.
     """
 
     width: int = 16
     growth: tuple[int, ...] = (1, 2, 4, 4, 4, 4)
+    cues: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.width < 1 or not self.growth or min(self.growth) < 1:
             raise ValueError(f"expected a width and growth of at least 1, found {self}")
+        if not set(self.cues) <= set(CUES):
+            raise ValueError(f"expected cues of {', '.join(CUES)}, found {', '.join(self.cues)}")
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -89,7 +94,7 @@ class MaterialNetwork(nn.Module):
     def __init__(self, inputs: int, size: MaterialSize) -> None:
         super().__init__()
         self.inputs, self.size = inputs, size
-        widths, seen = size.widths, inputs + 2
+        widths, seen = size.widths, inputs + 2 + 2 * len(size.cues) * (inputs // 3)
         self.encoders, self.narrow, self.decoders = nn.ModuleList(), nn.ModuleList(), nn.ModuleList()
         before, track = seen, size.width
         for width in widths:
@@ -120,7 +125,8 @@ class MaterialNetwork(nn.Module):
     def forward(self, views: Tensor) -> Tensor:
         """Maps of each material; V and the sides are free."""
         count, height, width = views.shape[1], *views.shape[-2:]
-        seen = see_with_places(views.flatten(0, 1))
+        images = views.flatten(0, 1)
+        seen = torch.cat([see_with_places(images), *(CUES[cue](images) for cue in self.size.cues)], dim=1)
         x = pad_to_multiple(seen, self.multiple).contiguous(memory_format=torch.channels_last)
         track = x.new_zeros(len(x), self.size.width)
         skips = []
@@ -143,6 +149,32 @@ def see_with_places(images: Tensor) -> Tensor:
     y, x = (torch.linspace(-1, 1, n).to(images) for n in (height, width))
     places = torch.stack(torch.meshgrid(-y, x, indexing="ij")[::-1])
     return torch.cat([2 * scaled - 1, places.expand(len(images), -1, -1, -1)], dim=1)
+
+
+def see_details(images: Tensor) -> Tensor:
+    """Details of each image's brightness times the way from its highlight, ``[N, 2 C / 3, H, W]``.
+
+    Facets that lean toward the middle between light and camera are brighter than what is around them, on whichever side
+    of it they lie: so details times the direction from there are, to first order, slopes. The middle is where the last
+    three channels are bright.
+    """
+    height, width = images.shape[-2:]
+    y, x = (torch.linspace(-1, 1, n).to(images) for n in (height, width))
+    places = torch.stack(torch.meshgrid(-y, x, indexing="ij")[::-1])
+    weight = images[:, -3:].mean(dim=1, keepdim=True).clamp(0, 1) ** 2
+    middle = (weight * places).mean(dim=(-2, -1)) / weight.mean(dim=(-2, -1)).clamp(min=1e-6)
+    away = places - middle[..., None, None]
+    away = away / ((away**2).sum(dim=1, keepdim=True) + NEAR)
+    found = []
+    for image in torch.split(images, 3, dim=1):
+        light = torch.log(image.mean(dim=1, keepdim=True).clamp(min=0) + FLOOR)
+        around = pad(light, (DETAIL_RADIUS,) * 4, mode="replicate")
+        found.append(away * (light - avg_pool2d(around, 2 * DETAIL_RADIUS + 1, 1)))
+    return torch.cat(found, dim=1)
+
+
+#: What the network may see beside images, by name: of images ``[N, C, H, W]``, two channels for every three.
+CUES = {"details": see_details}
 
 
 def stack_maps(said: Tensor, seen: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ import re
 import struct
 import sys
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from polsep.io.weights import write_weights
 from polsep.material.estimate import load_estimator
 from polsep.material.procedural import halve, random_svbrdf
 from polsep.material.shots import CAMERA, INPUTS, photograph, random_example, random_flash
-from polsep.material_network import MaterialNetwork, MaterialSize, see_with_places
+from polsep.material_network import MaterialNetwork, MaterialSize, see_details, see_with_places
 from polsep.render import PointLight
 from polsep.svbrdf import Svbrdf, plane_points, relight, unstack
 from polsep.train.material_losses import material_loss
@@ -342,3 +343,19 @@ def test_novel_lights_are_above() -> None:
     lights, again = novel_lights(), novel_lights()
     assert len(lights) == 20 and all(float(light[2]) > 0.4 for light in lights)
     assert all(torch.equal(a, b) for a, b in zip(lights, again, strict=True))
+
+
+def test_details_are_slopes_of_a_glossy_bump() -> None:
+    """The cue of a photograph with a highlight in the middle goes with the true slopes, and not with turned ones."""
+    maps = halve(random_svbrdf(128, seeded(7)))
+    glossy = replace(maps, diffuse=torch.full((3, 64, 64), 0.02), roughness=torch.full((1, 64, 64), 0.4))
+    above = torch.tensor([0.0, 0.0, 2.75]).view(3, 1, 1)
+    photograph = relight(glossy, plane_points(64, 64), above, above)
+    cue, true = see_details(photograph[None])[0], maps.normal[:2]
+    along = float((cue * true).sum()) / float(cue.norm() * true.norm())
+    across = float((cue * true.flip(0)).sum()) / float(cue.norm() * true.norm())
+    assert along < -0.25 and abs(across) < 0.5 * abs(along)
+    with pytest.raises(ValueError, match="expected cues of details, found magic"):
+        MaterialSize(cues=("magic",))
+    network = MaterialNetwork(6, replace(SMALL, cues=("details",)))
+    assert network(torch.rand(1, 2, 6, 40, 32, generator=seeded(1))).shape == (1, 9, 40, 32)

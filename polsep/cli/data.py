@@ -90,6 +90,7 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 @click.option("--ablation", default="none", metavar="NAME", help="What a joint network goes without.")
 @click.option("--input", "seen", default="separated", metavar="NAME", help="material: unseparated, separated, perfect.")
 @click.option("--examples", type=int, default=768, metavar="N", help="material: how many it is trained on.")
+@click.option("--cues", metavar="NAME,...", help="material: what it sees beside images (details), to find normals.")
 @click.option("--folder", type=DIR, metavar="DIR", help="material: where these are, or go.  [default: DIR/../examples]")
 @click.option("--steps", type=int, default=20_000, metavar="N", help="Batches of 8 crops, or of 4 materials.")
 @click.option("--until", type=int, metavar="N", help="material: end at this step of the schedule.")

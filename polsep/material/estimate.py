@@ -59,6 +59,8 @@ def load_estimator(name: str = "separated", path: Path | None = None) -> Estimat
         raise ValueError(f"expected weights of a network for materials in {source}, found {metadata['method']!r}")
     size = json.loads(metadata["size"])
     part = INPUTS[metadata["input"]]
-    network = MaterialNetwork(part.stop - part.start, MaterialSize(size["width"], tuple(size["growth"])))
+    network = MaterialNetwork(
+        part.stop - part.start, MaterialSize(size["width"], tuple(size["growth"]), tuple(size.get("cues", ())))
+    )
     network.load_state_dict(tensors)
     return Estimator(network.eval(), metadata["input"])

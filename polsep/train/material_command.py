@@ -41,7 +41,8 @@ WARM_UP, AVERAGE = 50, 0.99
 
 def choose_material(asked: dict[str, Any]) -> tuple[MaterialOptions, Schedule]:
     """What is trained, and how long, from options of the command line; see `polsep train`."""
-    size = MaterialSize() if asked["width"] is None else MaterialSize(asked["width"])
+    cues = tuple(asked["cues"].split(",")) if asked["cues"] else ()
+    size = replace(MaterialSize(), cues=cues) if asked["width"] is None else MaterialSize(asked["width"], cues=cues)
     options = MaterialOptions(asked["seen"], size, asked["seed"], examples=asked["examples"])
     due = {"checkpoint_every": 50, "validate_every": 200}
     return options, Schedule(asked["steps"], asked["rate"], WARM_UP, AVERAGE, precision=asked["precision"], **due)
@@ -99,6 +100,7 @@ def describe_command(options: MaterialOptions, run: Run) -> str:
     asked = {"input": options.input, "width": options.size.width, "steps": run.schedule.steps}
     asked |= {"rate": run.schedule.rate, "seed": options.seed, "examples": options.examples}
     asked |= {"devices": run.devices, "precision": run.schedule.precision, "output": run.out.name}
+    asked |= {"cues": ",".join(options.size.cues)} if options.size.cues else {}
     asked |= {} if run.until is None else {"until": run.until}
     words = [word for name, value in asked.items() for word in (f"--{name}", str(value))]
     return shlex.join(["polsep", "train", "material", *words])

@@ -28,6 +28,9 @@ FAR = 4.0
 PICTURE_FLOOR, ALBEDO_FLOOR = 0.1, 0.01
 #: Weight of the maps themselves.
 MAPS = 0.1
+#: Weight of the squares of errors of slopes, where asked for: absolute ones are least for flat normals, while their
+#: direction is in doubt.
+SLOPES = 3.0
 #: Pixels between those that a picture shows.
 LATTICE = 3
 
@@ -81,6 +84,11 @@ def maps_loss(found: Svbrdf, truth: Svbrdf) -> Tensor:
         ((torch.log(a + ALBEDO_FLOOR) - torch.log(b + ALBEDO_FLOOR)).abs().mean() for a, b in pairs),
         torch.zeros_like(plain),
     )
+
+
+def slopes_loss(found: Tensor, truth: Tensor) -> Tensor:
+    """Mean square error of the normals' x and y of stacked maps ``[B, 9, H, W]``, times `SLOPES`."""
+    return SLOPES * (found[:, :2] - truth[:, :2]).square().mean()
 
 
 def material_loss(found: Tensor, truth: Tensor, generator: torch.Generator) -> Tensor:

@@ -19,7 +19,13 @@ from polsep.material.shots import INPUTS, Example
 from polsep.material_network import MaterialNetwork, MaterialSize
 from polsep.svbrdf import unstack
 from polsep.train.loop import Course
-from polsep.train.material_losses import maps_loss, material_loss, random_configurations, rendering_loss
+from polsep.train.material_losses import (
+    maps_loss,
+    material_loss,
+    random_configurations,
+    rendering_loss,
+    slopes_loss,
+)
 from polsep.train.tasks import find
 
 #: The seed of validation's pictures, and how many of them there are, anywhere and mirrored.
@@ -118,7 +124,9 @@ def material_course(options: MaterialOptions, folder: Path) -> Course:
 
     def loss(net: nn.Module, batch: MaterialBatch, done: float) -> Tensor:
         seed = int(done * 2**31)  # a share of the training: the same for every input
-        return material_loss(net(batch.views), batch.maps, torch.Generator().manual_seed(seed))
+        found = net(batch.views)
+        total = material_loss(found, batch.maps, torch.Generator().manual_seed(seed))
+        return total + slopes_loss(found, batch.maps) if options.size.cues else total
 
     def score(net: nn.Module) -> dict[str, float]:
         device = next(net.parameters()).device

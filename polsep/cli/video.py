@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @app.command()
 @click.argument("recording", type=click.Path(path_type=Path), metavar="IN")
 @click.option("-o", "--output", type=DIR, required=True, metavar="DIR", help="Where results go.")
-@click.option("--method", default="auto-fast", metavar="NAME", help="auto-fast is joint-fast, on mono frames joint.")
+@click.option("--method", default="auto-fast", metavar="NAME", help="auto-fast: joint-fast where it fits the frames.")
 @click.option("--layout", metavar="color|mono|SPEC", help="The sensor's filters, as for 'polsep separate'.")
 @click.option("--black-level", type=float, default=0.0, metavar="N", help="Sample value of no light.")
 @click.option(

@@ -314,7 +314,8 @@ def test_the_command_measures_and_draws(weights: Path, tiny_sets: None, tmp_path
 
 
 def test_benches_without_a_quick_version_say_so() -> None:
-    expected = r"expected a benchmark with a quick version for --quick \(dynamic, video, paper\), found 'sets'"
+    names = "dynamic, material, video, geometry, paper"
+    expected = rf"expected a benchmark with a quick version for --quick \({names}\), found 'sets'"
     with pytest.raises(ClickException, match=expected):
         app(["bench", "sets", "--quick"], standalone_mode=False)
 

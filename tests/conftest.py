@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,10 @@ from polsep.methods import METHODS
 
 settings.register_profile("polsep", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("polsep")
+
+# Where a script runs the suite in the background, Ctrl-C is ignored, and so it would be in the programs that tests start.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Thousands of tiny operations: a second thread only waits, and on a busy machine it waits long.
 torch.set_num_threads(1)

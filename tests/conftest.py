@@ -18,7 +18,7 @@ from polsep.methods import METHODS
 settings.register_profile("polsep", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("polsep")
 
-# Where a script runs the suite in the background, Ctrl-C is ignored, and so it would be in the programs that tests start.
+# Where a script runs the suite in the background, Ctrl-C is ignored, as it would be in programs that tests start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

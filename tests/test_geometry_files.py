@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import io
 import json
-import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_cli import Run, assert_refused, contents
+from test_cli import Run, assert_refused, contents, run_here
 
 pytest.importorskip("scipy")
 pytest.importorskip("embreex")
@@ -21,7 +21,6 @@ pytest.importorskip("trimesh")
 import trimesh
 from test_geometry import SIX, cap, dielectric, slope_of
 
-from polsep import cli
 from polsep.geometry.integration import integrate_bilateral
 from polsep.geometry.photometric import Appearance
 from polsep.geometry.surface import draw_views, relight, span_surface
@@ -38,18 +37,7 @@ SIDE = 40
 @pytest.fixture
 def polsep(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Cli:
     """Run `polsep geometry ARGS` inside this process."""
-
-    def run(*args: str | Path) -> Run:
-        monkeypatch.setattr(sys, "argv", ["polsep", "geometry", *map(str, args)])
-        capfd.readouterr()
-        status: Any = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            status = stop.code
-        return Run(status or 0, *capfd.readouterr())
-
-    return run
+    return partial(run_here, monkeypatch, capfd, "geometry")
 
 
 def sphere_images() -> NDArray[np.float64]:

@@ -6,7 +6,6 @@ picture in sRGB, and the sidecar DIR/STEM.json.
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,15 +18,15 @@ from polsep.io.errors import naming
 from polsep.io.exr import encode_exr
 from polsep.io.outputs import (
     UNITS,
-    OutputError,
     encode_png,
     planned_outputs,
     refuse_targets,
+    require_finite,
     version_text,
     write_all,
-    write_hashed,
+    write_with_sidecar,
 )
-from polsep.io.whole import replace_bytes, replace_text, write_checked
+from polsep.io.whole import replace_bytes, replace_text
 
 
 class EditedFrame(NamedTuple):
@@ -76,10 +75,7 @@ def write_edited(frame: EditedFrame, directory: Path, stem: str, overwrite: bool
     """Write a frame's files; their paths. All or nothing. Raises OutputError."""
     targets = edited_targets(directory, stem)
     refuse_targets(directory, targets, overwrite)
-    for name, image in frame.layers.items():
-        wrong = int(np.count_nonzero(~np.isfinite(image)))
-        if wrong:
-            raise OutputError(f"expected finite values in {name}, found {wrong} NaN or infinite samples")
+    require_finite(frame.layers)
     write_all(targets, stem, lambda folder: _stage(frame, folder, stem))
     return targets
 
@@ -97,15 +93,8 @@ def _stage(frame: EditedFrame, folder: Path, stem: str) -> None:
         (f"{stem}.exr", encode_exr(planes, notes)),
         (f"{stem}.png", encode_png(frame.preview)),
     ]
-    sidecar = {
-        "polsep": version_text(),
-        **frame.said,
-        "shape": list(next(iter(frame.layers.values())).shape),
-        "units": units,
-        "preview": f"{stem}.png is sRGB, 8 bit, for people: do not measure in it",
-        "files": write_hashed(folder, encoded),
-    }
-    write_checked(folder / f"{stem}.json", (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
+    shape = list(next(iter(frame.layers.values())).shape)
+    write_with_sidecar(folder, stem, encoded, {**frame.said, "shape": shape, "units": units})
 
 
 def write_preview(path: Path, pixels: NDArray[np.uint8]) -> None:

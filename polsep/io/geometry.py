@@ -6,7 +6,6 @@ DIR/STEM.glb or .ply, DIR/STEM.png to look at, and the sidecar DIR/STEM.json.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.exr import encode_exr
-from polsep.io.outputs import OutputError, encode_png, planned_outputs, version_text, write_all, write_hashed
-from polsep.io.whole import write_checked
+from polsep.io.outputs import (
+    OutputError,
+    encode_png,
+    planned_outputs,
+    require_finite,
+    version_text,
+    write_all,
+    write_with_sidecar,
+)
 
 #: Mesh files by name.
 MESHES = ("glb", "ply")
@@ -63,9 +69,7 @@ def _stage(shape: ShapeFiles, folder: Path, targets: list[Path], stem: str) -> N
     colors = "RGB" if shape.albedo.shape[2] == 3 else "Y"
     planes |= {f"albedo.{color}": shape.albedo[..., k] for k, color in enumerate(colors)}
     planes |= {"depth.Z": np.where(shape.mask, shape.depth, 0), "mask.Y": shape.mask.astype(np.float64)}
-    wrong = sum(int(np.count_nonzero(~np.isfinite(plane))) for plane in planes.values())
-    if wrong:
-        raise OutputError(f"expected finite maps, found {wrong} NaN or infinite samples")
+    require_finite(planes)
     notes = {"polsepVersion": version_text(), **{f"{layer}Units": unit for layer, unit in UNITS.items()}}
     floats = {name: plane.astype(np.float32) for name, plane in planes.items()}
     codes = np.rint((shape.normals + 1) / 2 * 65535).astype(np.uint16)
@@ -76,12 +80,5 @@ def _stage(shape: ShapeFiles, folder: Path, targets: list[Path], stem: str) -> N
         encode_png(shape.preview),
     ]
     names = [path.name for path in targets]
-    sidecar = {
-        "polsep": version_text(),
-        **shape.said,
-        "shape": list(shape.mask.shape),
-        "units": UNITS,
-        "preview": f"{stem}.png is sRGB, 8 bit, for people: do not measure in it",
-        "files": write_hashed(folder, zip(names[:-1], data, strict=True)),
-    }
-    write_checked(folder / names[-1], (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
+    said = {**shape.said, "shape": list(shape.mask.shape), "units": UNITS}
+    write_with_sidecar(folder, stem, zip(names[:-1], data, strict=True), said)

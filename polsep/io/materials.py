@@ -7,7 +7,6 @@ NAME.mtlx are the material for renderers, the latter beside its textures; NAME.p
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,15 +18,14 @@ from numpy.typing import NDArray
 from polsep.io.exr import encode_exr
 from polsep.io.gltf import TEXTURES, encode_glb, encode_materialx, specular_scale, texture_pixels
 from polsep.io.outputs import (
-    OutputError,
     encode_png,
     planned_outputs,
     refuse_targets,
+    require_finite,
     version_text,
     write_all,
-    write_hashed,
+    write_with_sidecar,
 )
-from polsep.io.whole import write_checked
 
 Floats = NDArray[np.float32]
 
@@ -60,10 +58,7 @@ def write_material(files: MaterialFiles, directory: Path, name: str, overwrite: 
     """Write a material's files; their paths. All or nothing. Raises OutputError."""
     targets = material_targets(directory, name)
     refuse_targets(directory, targets, overwrite)
-    for kind, image in files.maps.items():
-        wrong = int(np.count_nonzero(~np.isfinite(image)))
-        if wrong:
-            raise OutputError(f"expected finite values in {kind}, found {wrong} NaN or infinite samples")
+    require_finite(files.maps)
     write_all(targets, name, lambda folder: _stage(files, folder, name))
     return targets
 
@@ -81,13 +76,5 @@ def _stage(files: MaterialFiles, folder: Path, name: str) -> None:
     encoded.append((f"{name}.glb", encode_glb(textures, scale, plain)))
     encoded.append((f"{name}.mtlx", encode_materialx(named, scale, plain).encode()))
     encoded.append((f"{name}.png", encode_png(files.preview)))
-    sidecar = {
-        "polsep": version_text(),
-        **files.said,
-        "shape": list(files.maps["normal"].shape[:2]),
-        "specular_scale": scale,
-        "units": UNITS,
-        "preview": f"{name}.png is sRGB, 8 bit, for people: do not measure in it",
-        "files": write_hashed(folder, encoded),
-    }
-    write_checked(folder / f"{name}.json", (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
+    shape = list(files.maps["normal"].shape[:2])
+    write_with_sidecar(folder, name, encoded, {**files.said, "shape": shape, "specular_scale": scale, "units": UNITS})

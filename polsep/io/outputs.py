@@ -169,9 +169,7 @@ def _check_frame(frame: SeparatedFrame) -> None:
         image = getattr(frame, name)
         if image.shape != shape or image.dtype != np.float32:
             raise OutputError(f"expected {name} as float32 {list(shape)}, found {image.dtype} {list(image.shape)}")
-        wrong = int(np.count_nonzero(~np.isfinite(image)))
-        if wrong:
-            raise OutputError(f"expected finite values in {name}, found {wrong} NaN or infinite samples")
+    require_finite({name: getattr(frame, name) for name in shapes})
     if frame.error is not None and float(frame.error.min()) < 0:
         raise OutputError(f"expected deviations of 0 or more in {ERROR}, found {float(frame.error.min()):.3g}")
 
@@ -254,6 +252,26 @@ def write_hashed(folder: Path, encoded: Iterable[tuple[str, bytes | memoryview]]
         write_checked(folder / name, data)
         files.append({"name": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()})
     return files
+
+
+def require_finite(images: Mapping[str, NDArray[Any]]) -> None:
+    """Raise OutputError, with a name and a count, where an image holds NaN or infinite samples."""
+    for name, image in images.items():
+        if wrong := int(np.count_nonzero(~np.isfinite(image))):
+            raise OutputError(f"expected finite values in {name}, found {wrong} NaN or infinite samples")
+
+
+def write_with_sidecar(
+    folder: Path, stem: str, encoded: Iterable[tuple[str, bytes | memoryview]], said: Mapping[str, Any]
+) -> None:
+    """Write files by name into ``folder``, and last the sidecar STEM.json: what is ``said``, and `write_hashed`'s."""
+    sidecar = {
+        "polsep": version_text(),
+        **said,
+        "preview": f"{stem}.png is sRGB, 8 bit, for people: do not measure in it",
+        "files": write_hashed(folder, encoded),
+    }
+    write_checked(folder / f"{stem}.json", (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
 
 
 def _move_into_place(staging: Path, targets: list[Path]) -> None:

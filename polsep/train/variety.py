@@ -23,10 +23,10 @@ from polsep.views import LEAST_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
 #: Share of the views that show a part of the object, and how many times larger than the whole, log-uniform.
 CLOSE_SHARE, MAGNIFICATIONS = 0.5, (1.0, 5.0)
 #: Shares of the looks of which all is near-grey, and of those without textures.
-GREY_SHARE, PLAIN_SHARE = 0.2, 0.2
+GREY_SHARE, PLAIN_SHARE = 0.3, 0.2
 #: Share of the looks that are matte: what is left of their specular light, log-uniform for every material. Photographs
 #: of painted, dusty or paper things have half a percent of it, which random materials rarely have.
-MATTE_SHARE, MATTE_STRENGTH = 0.3, (0.02, 1.0)
+MATTE_SHARE, MATTE_STRENGTH = 0.4, (0.005, 1.0)
 #: Share of the looks whose highlights clip all analysers over an area, as mirror images of lamps do, which points of
 #: light do not make. How bright their middle is against the diffuse light, log-uniform; roughness from which on it is
 #: less.
@@ -37,7 +37,7 @@ DEPOLARIZED_SHARE, UNPOLARIZED_SHARE = 0.4, 0.3
 #: Share of the looks in which a part of the diffuse light keeps the polarization of the lamp, as light that was
 #: scattered once does (Ma et al. 2007), and how much of it, log-uniform. Crossed polarizers count it as specular; on
 #: matte photographs it is most of what they measure.
-RETAINING_SHARE, RETAINED = 0.5, (0.002, 0.03)
+RETAINING_SHARE, RETAINED = 0.6, (0.002, 0.03)
 #: Saturation that near-grey looks keep, at most.
 GREY_SATURATION = 0.15
 #: Standard deviation of the lens's point spread in raw pixels: that of `views.BLURS` and, slightly defocused, more.

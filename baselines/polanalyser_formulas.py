@@ -23,7 +23,7 @@ from polsep.bench import Row, provenance, to_jsonl
 from polsep.camera import Layout
 from polsep.demosaic import demosaic_bilinear
 from polsep.io.frames import ReadOptions, read_frames
-from polsep.io.results import write_text
+from polsep.io.whole import replace_text
 from polsep.separation import separate_analytic
 from polsep.stokes import Measurements, fit_stokes
 
@@ -79,7 +79,7 @@ def main() -> None:
     for row in rows:
         print(f"{row.method:20} {row.metric:32} {row.value:.4g} {row.unit}")
     made_by = provenance("python baselines/polanalyser_formulas.py")
-    write_text(Path("results/polanalyser.jsonl"), to_jsonl(rows, made_by))
+    replace_text(Path("results/polanalyser.jsonl"), to_jsonl(rows, made_by))
 
 
 def polarized(stokes: polsep.Stokes) -> np.ndarray:

@@ -43,7 +43,7 @@ def _row(name: str, found: Appearance, truth: Floats, gain: float) -> Sequence[P
     error = np.where(mask, angular_error(found.normals, truth), 0)
     shown = Appearance(found.normals, np.minimum(gain * found.albedo, 1), mask)
     surface = span_surface(shown, integrate_bilateral(found.normals, mask))
-    (mesh,) = draw_views(surface, SIDE, (VIEW,))
+    (mesh,) = draw_views(surface, SIDE, [VIEW])
     grey = np.repeat(error[..., None] / LARGEST_DEG, 3, axis=-1)
     pictures = (
         (f"{ROWS[name]}: normals", (found.normals + 1) / 2 * mask[..., None], False),

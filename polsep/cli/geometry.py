@@ -29,6 +29,7 @@ ORDER = "right front-right front front-left left above"
 @click.option("--size", type=int, default=640, metavar="PX", help="Longer side of the maps at most.")
 @click.option("--integration", default="bilateral", metavar="bilateral|smooth", help="Depth with jumps, or without.")
 @click.option("--mesh", default="glb", metavar="glb|ply", help="Format of the mesh.")
+@click.option("--turntable", is_flag=True, help="Also DIR/STEM.mp4: the mesh, turning. Needs the extra video.")
 @click.option("--overwrite", is_flag=True, help="Replace results that exist.")
 def geometry(files: tuple[Path, ...], **options: Any) -> None:
     """Normals, albedo, depth and a mesh of an object from frames under different lights.
@@ -71,14 +72,14 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     from polsep.methods import check_method
 
     try:
-        asked = Asked(options["mesh"], options["fov"], options["integration"])
+        asked = Asked(options["mesh"], options["fov"], options["integration"], options["turntable"])
         directions = parse_lights(options["lights"])
         if len(files) != len(directions):
             raise ValueError(f"expected {len(directions)} files, one per light of --lights, found {len(files)}")
         check_method(options["method"])
         layout = None if options["layout"] is None else Layout.parse(options["layout"])
         read = ReadOptions(layout, options["black_level"], options["white_level"])
-        targets = shape_targets(options["output"], options["name"], options["mesh"])
+        targets = shape_targets(options["output"], options["name"], options["mesh"], asked.turntable)
         refuse_inputs(targets, [*files, *([options["mask"]] if options["mask"] else [])])
         refuse_targets(options["output"], targets, options["overwrite"])
         source = Source("photographs" if options["srgb"] else "frames", read, options["method"])

@@ -7,7 +7,7 @@ ordinary camera, which are taken as they are: they have no polarization to help.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from os.path import realpath
 from pathlib import Path
@@ -27,6 +27,7 @@ from polsep.io.maps import read_map
 from polsep.io.meshes import encode_glb, encode_ply
 from polsep.io.previews import exposure_of, toned
 from polsep.io.separated import SUFFIXES, read_separated
+from polsep.io.videos import WATCHABLE, encode_film, load_library
 from polsep.pipeline import separate_capture
 from polsep.report import SeparatedFrame
 
@@ -39,6 +40,8 @@ OBJECT_SHARE = 0.06
 #: Side of the preview's pictures, and from where its meshes are seen: azimuth and elevation [degrees].
 CELL = 360
 VIEWS = ((-50.0, 5.0), (-20.0, 10.0), (20.0, 10.0), (50.0, 5.0))
+#: A turntable: how far it swings to both sides and up [degrees], its pictures, and how many of them a second has.
+SWING, TURN_PICTURES, TURN_RATE = (60.0, 12.0), 96, 24.0
 #: How normals become depth: with jumps, or as one smooth surface.
 INTEGRATIONS = {"bilateral": integrate_bilateral, "smooth": integrate_smooth}
 #: Colour around the object in previews.
@@ -65,15 +68,18 @@ class Source:
 @dataclass(frozen=True)
 class Asked:
     """The format of the ``mesh``, the vertical field of view [degrees] or None for an orthographic camera, and one of
-    `INTEGRATIONS`. Raises ValueError."""
+    `INTEGRATIONS`; whether there is a film of the mesh. Raises ValueError."""
 
     mesh: str = "glb"
     fov_deg: float | None = None
     integration: str = "bilateral"
+    turntable: bool = False
 
     def __post_init__(self) -> None:
         if self.integration not in INTEGRATIONS:
             raise ValueError(f"expected an integration of {' or '.join(INTEGRATIONS)}, found {self.integration!r}")
+        if self.turntable:
+            load_library()  # says at once that it is absent
 
 
 def read_views(paths: Sequence[Path], source: Source) -> Views:
@@ -184,7 +190,11 @@ def find_shape(views: Views, directions: Floats, mask: Mask, asked: Asked) -> Sh
         "triangles": len(surface.faces),
         "albedo_of_mesh": f"albedo x {gain:.6g}, limited to 1",
     }
-    return ShapeFiles(found.normals, found.albedo, depth, mask, mesh, draw_sheet(views, shown, surface), said)
+    sheet, film = draw_sheet(views, shown, surface), None
+    if asked.turntable:
+        film = encode_film(draw_turntable(surface), WATCHABLE, TURN_RATE)
+        said |= {"turntable": f"seen from {SWING[0]:g} degrees left to {SWING[0]:g} right, the light beside the camera"}
+    return ShapeFiles(found.normals, found.albedo, depth, mask, mesh, sheet, film, said)
 
 
 def intrinsics_of(fov_deg: float, size: tuple[int, ...]) -> Floats:
@@ -206,11 +216,30 @@ def draw_sheet(views: Views, shown: Appearance, surface: Surface) -> Pixels:
         toned(shown.albedo, 0.9),
         toned(relit, exposure_of(relit[mask])),
     ]
-    meshes = draw_views(surface, CELL, VIEWS)
-    gain = exposure_of(np.stack(meshes)[np.stack(meshes).sum(axis=-1) > 0])
-    solid = [np.where(picture.sum(axis=-1, keepdims=True) > 0, toned(picture, gain), GREY) for picture in meshes]
+    meshes = np.stack(list(draw_views(surface, CELL, VIEWS)))
+    gain = exposure_of(meshes[meshes.sum(axis=-1) > 0])
+    solid = [_on_grey(picture, gain) for picture in meshes]
     rows = [np.concatenate([_cell(picture, mask) for picture in flat], axis=1), np.concatenate(solid, axis=1)]
     return np.concatenate(rows).astype(np.uint8)
+
+
+def draw_turntable(surface: Surface) -> Iterator[Pixels]:
+    """`TURN_PICTURES` pictures of a mesh that swings to both sides and back, so that a player can repeat them.
+
+    Nobody saw it from behind, so it does not turn around.
+    """
+    turns = 2 * np.pi * np.arange(TURN_PICTURES) / TURN_PICTURES
+    places = [(SWING[0] * math.sin(turn), SWING[1] * math.cos(turn)) for turn in turns]
+    gain = None
+    for picture in draw_views(surface, CELL, places):
+        gain = gain or exposure_of(picture[picture.sum(axis=-1) > 0])
+        yield _on_grey(picture, gain)
+
+
+def _on_grey(picture: Floats, gain: float) -> Pixels:
+    """A picture of `draw_views`, as bright as ``gain`` says, before grey."""
+    there = picture.sum(axis=-1, keepdims=True) > 0
+    return np.where(there, toned(picture, gain), GREY).astype(np.uint8)
 
 
 def _cell(picture: Pixels, mask: Mask) -> Pixels:

@@ -7,6 +7,7 @@ than normals say, triangles are left out: nobody saw what is there. Needs the ex
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,7 +122,7 @@ def relight(appearance: Appearance, direction: tuple[float, float, float] = PICT
     return image
 
 
-def draw_views(surface: Surface, size: int, views: tuple[tuple[float, float], ...]) -> list[Floats]:
+def draw_views(surface: Surface, size: int, views: Sequence[tuple[float, float]]) -> Iterator[Floats]:
     """Linear pictures ``[size, size, 3]`` of a mesh from (azimuth, elevation) [degrees]; the light comes along.
 
     Where there is no mesh they are 0. Faces that were seen from behind are drawn too.
@@ -132,7 +133,6 @@ def draw_views(surface: Surface, size: int, views: tuple[tuple[float, float], ..
     colors = surface.colors[surface.faces].mean(axis=1)
     ticks = torch.arange(size * 2) / 2 + 0.25
     rows, cols = (g.flatten() for g in torch.meshgrid(ticks, ticks, indexing="ij"))
-    pictures = []
     for azimuth_deg, elevation_deg in views:
         azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
         back = np.array(
@@ -146,5 +146,5 @@ def draw_views(surface: Surface, size: int, views: tuple[tuple[float, float], ..
         shading = np.maximum(hits.normal[..., 0].double().numpy().T @ toward, 0) + AMBIENT
         fine = np.zeros((rows.numel(), 3))
         fine[hits.ray.numpy()] = colors[hits.slot.numpy()] * shading[:, None]
-        pictures.append(fine.reshape(size, 2, size, 2, 3).mean(axis=(1, 3)))
-    return pictures
+        picture: Floats = fine.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))
+        yield picture

@@ -1,7 +1,7 @@
 """What `polsep geometry` writes, all of it or nothing.
 
 DIR/STEM.exr (normal.X/Y/Z, albedo.R/G/B, depth.Z, mask.Y, float32), DIR/STEM_normals.png (16 bit, n = 2 c / 65535 - 1),
-DIR/STEM.glb or .ply, DIR/STEM.png to look at, and the sidecar DIR/STEM.json.
+DIR/STEM.glb or .ply, DIR/STEM.png to look at, DIR/STEM.mp4 if a film is asked for, and the sidecar DIR/STEM.json.
 """
 
 from __future__ import annotations
@@ -47,15 +47,20 @@ class ShapeFiles:
     mask: NDArray[np.bool_]
     mesh: bytes
     preview: NDArray[np.uint8]
+    film: bytes | None
     said: Mapping[str, Any]
 
 
-def shape_targets(directory: Path, stem: str, mesh: str) -> list[Path]:
-    """The files of one shape. Raises OutputError where ``stem`` is no plain name or ``mesh`` is not of `MESHES`."""
+def shape_targets(directory: Path, stem: str, mesh: str, film: bool) -> list[Path]:
+    """The files of one shape, with a ``film`` or without.
+
+    Raises OutputError where ``stem`` is no plain name or ``mesh`` is not of `MESHES`.
+    """
     if mesh not in MESHES:
         raise OutputError(f"expected a mesh of {' or '.join(MESHES)}, found {mesh!r}")
     planned_outputs(directory, stem, "exr")
-    return [directory / f"{stem}{end}" for end in (".exr", "_normals.png", f".{mesh}", ".png", ".json")]
+    ends = (".exr", "_normals.png", f".{mesh}", ".png", *((".mp4",) if film else ()), ".json")
+    return [directory / f"{stem}{end}" for end in ends]
 
 
 def write_shape(shape: ShapeFiles, targets: list[Path], stem: str) -> None:
@@ -78,6 +83,7 @@ def _stage(shape: ShapeFiles, folder: Path, targets: list[Path], stem: str) -> N
         encode_png(codes),
         shape.mesh,
         encode_png(shape.preview),
+        *(() if shape.film is None else (shape.film,)),
     ]
     names = [path.name for path in targets]
     said = {**shape.said, "shape": list(shape.mask.shape), "units": UNITS}

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from fractions import Fraction
+from io import BytesIO
 from itertools import count as count_from
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,10 +157,11 @@ class Film:
     State: the encoder. ``rate`` in frames per second.
     """
 
-    def __init__(self, path: Path, kind: FilmKind, size: tuple[int, int], rate: float) -> None:
+    def __init__(self, target: Path | BinaryIO, kind: FilmKind, size: tuple[int, int], rate: float) -> None:
         av = load_library()
         self._kind, self._count = kind, 0
-        self._container: Any = av.open(str(path), "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
+        file = str(target) if isinstance(target, Path) else target
+        self._container: Any = av.open(file, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
         fraction = Fraction(rate).limit_denominator(1001)
         self._stream: Any = self._container.add_stream(kind.codec, rate=fraction, options=dict(kind.options))
         self._stream.height, self._stream.width = size
@@ -187,6 +189,18 @@ class Film:
             for packet in self._stream.encode():
                 self._container.mux(packet)
         self._container.close()
+
+
+def encode_film(images: Iterable[NDArray[Any]], kind: FilmKind, rate: float) -> bytes:
+    """A short film of images of one shape as a file's bytes. Raises ValueError without images or PyAV."""
+    target, film = BytesIO(), None
+    for image in images:
+        film = film or Film(target, kind, image.shape[:2], rate)
+        film.write(image)
+    if film is None:
+        raise ValueError("expected a film of one image or more, found none")
+    film.close()
+    return target.getvalue()
 
 
 def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -> None:

@@ -47,7 +47,7 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     \b
     polsep geometry right.png fr.png front.png fl.png left.png above.png -o out
     polsep geometry sep/*.exr --lights "0,0,1 0.5,0,0.9 -0.5,0,0.9 0,0.6,0.8" -o out
-    polsep geometry --srgb [0-5].JPG --mask mask.png -o out
+    polsep geometry --srgb [0-5].JPG --mask mask.png --turntable -o out
     """
     try:
         from polsep.geometry.files import (

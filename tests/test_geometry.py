@@ -13,7 +13,7 @@ from polsep.optics import diffuse_dolp, fresnel
 
 pytest.importorskip("scipy")
 
-from polsep.geometry.integration import integrate_bilateral, integrate_smooth
+from polsep.geometry.integration import SHARPNESS, Equations, find_slopes, integrate_bilateral, integrate_smooth
 from polsep.geometry.lights import NAMED, parse_lights
 from polsep.geometry.multigrid import Multigrid, solve
 from polsep.geometry.photometric import fit_lambertian, fit_robust
@@ -189,6 +189,54 @@ def test_a_jump_is_kept() -> None:
     assert kept[48, 59] - kept[48, 60] > 0.75 * 45
     assert smeared[48, 59] - smeared[48, 60] < 0.6 * 45
     assert np.std(kept + bell) < 0.4 * np.std(smeared + bell)
+
+
+def residuals(image: Floats, normals: Floats, mask: Mask, axis: int) -> tuple[Floats, Floats, Floats, Floats]:
+    """Of every pixel on the mask along x (1) or down (0): (q dz)^2 and the squared residual, behind and ahead.
+
+    NaN where there is no neighbour.
+    """
+    wanted = normals[..., 0] if axis == 1 else -normals[..., 1]
+    padded = np.pad(np.where(mask, image, np.nan), 1, constant_values=np.nan)
+    behind = image - np.roll(padded, 1, axis)[1:-1, 1:-1]
+    ahead = np.roll(padded, -1, axis)[1:-1, 1:-1] - image
+    sides = [normals[..., 2] * rise for rise in (behind, ahead)]
+    before, after = ((side**2)[mask] for side in sides)
+    return before, after, *(((side - wanted) ** 2)[mask] for side in sides)  # type: ignore[return-value]
+
+
+def test_a_round_is_what_cao_et_al_write() -> None:
+    """Eqs. 12-18 in NumPy: weights and energy; and the matrix is the one of which that energy is the square form."""
+    generator = np.random.default_rng(11)
+    mask = generator.random((9, 12)) < 0.8
+    normals = generator.normal(size=(9, 12, 3))
+    normals[..., 2] = np.abs(normals[..., 2]) + 0.3
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    image = generator.normal(size=(9, 12))
+    system = Equations(find_slopes(normals, mask))
+    weights, energy = system.weigh(image[mask])
+
+    def energy_of(depth: Floats) -> float:
+        full, total = np.zeros_like(image), 0.0
+        full[mask] = depth
+        for axis, weight in ((1, weights[0]), (0, weights[1])):
+            _, _, behind, ahead = residuals(full, normals, mask, axis)
+            total += float((np.nan_to_num(behind) * (1 - weight) + np.nan_to_num(ahead) * weight).sum())
+        return total
+
+    for axis, weight in ((1, weights[0]), (0, weights[1])):
+        behind, ahead, *_ = residuals(image, normals, mask, axis)
+        both = np.isfinite(behind) & np.isfinite(ahead)
+        expected = 1 / (1 + np.exp(-SHARPNESS * (behind - ahead)[both]))
+        assert np.abs(weight[both] - expected).max() < 1e-12
+        assert (weight[~both] == np.isfinite(ahead)[~both]).all()
+    assert energy == pytest.approx(energy_of(image[mask]), rel=1e-12)
+    matrix, right = system.assemble(weights)
+    assert np.abs(matrix.toarray() - matrix.toarray().T).max() == 0
+    for _ in range(3):
+        depth = generator.normal(size=int(mask.sum()))
+        form = float(depth @ (matrix @ depth) - 2 * depth @ right)
+        assert energy_of(depth) - energy_of(0 * depth) == pytest.approx(form, rel=1e-9)
 
 
 def test_multigrid_solves_what_sparse_elimination_solves() -> None:

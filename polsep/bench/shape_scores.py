@@ -130,7 +130,7 @@ def _time_solvers() -> Iterator[Row]:
     times = {}
     for method in ("multigrid", "Jacobi"):
         began = time.process_time()
-        step = Multigrid(matrix, *equations.places) if method == "multigrid" else lambda residual: inverse * residual
+        step = Multigrid(matrix, *equations.pixels) if method == "multigrid" else lambda residual: inverse * residual
         _, steps = solve(matrix, right, np.zeros_like(right), step, (1e-6, 20_000))
         times[method] = time.process_time() - began
         yield Row("geometry/time", case, method, "steps of conjugate gradients", steps, "1")

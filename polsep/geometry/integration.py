@@ -19,7 +19,6 @@ Needs the extra ``render``.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from polsep.geometry.multigrid import Multigrid, solve
+from polsep.kernels.slopes import DOWN, LEFT, RIGHT, UP, Places, Wanted, fill_system, fill_weights
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -76,8 +76,8 @@ def integrate_bilateral(normals: Floats, mask: Mask, intrinsics: Floats | None =
     energy = np.inf
     for _ in range(MOST_ROUNDS):
         depth = system.solve(weights, depth, TOLERANCE)
-        weights = system.bilateral_weights(depth)
-        before, energy = energy, system.energy(weights, depth)
+        before = energy
+        weights, energy = system.weigh(depth)
         if abs(before - energy) <= LEAST_CHANGE * energy or energy <= 1e-12 * system.count:
             break
     return system.as_image(depth, intrinsics is not None)
@@ -97,74 +97,44 @@ class Equations:
         if not slopes.mask.any():
             raise ValueError("expected a mask that holds pixels, found none")
         self.mask, self.count = slopes.mask, int(slopes.mask.sum())
-        self.places = np.nonzero(slopes.mask)
-        number = np.full(slopes.mask.shape, -1)
-        number[slopes.mask] = np.arange(self.count)
-        cosine = slopes.cosine[slopes.mask]
-        self.cosine = cosine
+        self.pixels = np.nonzero(slopes.mask)
+        number = np.full(tuple(side + 2 for side in slopes.mask.shape), -1, np.int32)
+        number[1:-1, 1:-1][slopes.mask] = np.arange(self.count)
+        rows, cols = (index + 1 for index in self.pixels)
+        # The order of a matrix's row: above, left, the pixel itself, right, below.
+        around = np.stack([number[rows + y, cols + x] for y, x in ((-1, 0), (0, -1), (0, 0), (0, 1), (1, 0))], axis=1)
+        self.indices = around[around >= 0]
+        starts = np.concatenate([[0], np.cumsum((around >= 0).sum(axis=1))]).astype(np.int32)
+        self.places = Places(np.ascontiguousarray(around[:, [0, 1, 3, 4]]), starts)
+        self.wanted = Wanted(slopes.cosine[slopes.mask], np.stack([slopes.right, slopes.down])[:, slopes.mask])
         self.multigrid: Multigrid | None = None
-        self.axes = tuple(
-            _Axis.of(number, cosine, value[slopes.mask], step)
-            for value, step in ((slopes.right, (0, 1)), (slopes.down, (1, 0)))
-        )
 
-    def even_weights(self) -> list[Floats]:
-        """The first guess: half of each side, all of the only one."""
-        return [np.where(axis.both, 0.5, axis.forward.astype(float)) for axis in self.axes]
+    def even_weights(self) -> Floats:
+        """The first guess ``[2, N]``: half of each side, all of the only one."""
+        there = self.places.near >= 0
+        behind, ahead = there[:, [LEFT, UP]].T, there[:, [RIGHT, DOWN]].T
+        return np.where(behind & ahead, 0.5, ahead.astype(float))
 
-    def bilateral_weights(self, depth: Floats) -> list[Floats]:
-        """The weight of the forward side per axis and pixel."""
-        weights = []
-        for axis in self.axes:
-            ahead, behind = axis.differences(depth)
-            rise = SHARPNESS * ((self.cosine * behind) ** 2 - (self.cosine * ahead) ** 2)
-            smooth = 0.5 * (1 + np.tanh(0.5 * rise))
-            weights.append(np.where(axis.both, smooth, axis.forward.astype(float)))
-        return weights
+    def weigh(self, depth: Floats) -> tuple[Floats, float]:
+        """The weights ``[2, N]`` of the forward sides along both axes, and the weighted sum of squared residuals."""
+        weights = np.empty((2, self.count))
+        return weights, float(fill_weights(depth, self.places, self.wanted, SHARPNESS, weights))
 
-    def energy(self, weights: list[Floats], depth: Floats) -> float:
-        """The weighted sum of squared residuals."""
-        total = 0.0
-        for axis, weight in zip(self.axes, weights, strict=True):
-            ahead, behind = axis.differences(depth)
-            total += float((weight * axis.forward * (self.cosine * ahead - axis.value) ** 2).sum())
-            total += float(((1 - weight) * axis.backward * (self.cosine * behind - axis.value) ** 2).sum())
-        return total
-
-    def solve(self, weights: list[Floats], start: Floats, tolerance: float) -> Floats:
+    def solve(self, weights: Floats, start: Floats, tolerance: float) -> Floats:
         """The depth of least energy for fixed weights."""
         matrix, right = self.assemble(weights)
         if self.multigrid is None:
-            self.multigrid = Multigrid(matrix, *self.places)
+            self.multigrid = Multigrid(matrix, *self.pixels)
         found, steps = solve(matrix, right, start, self.multigrid, (tolerance, MOST_STEPS))
         if steps > STALE:
             self.multigrid = None
         return found
 
-    def assemble(self, weights: list[Floats]) -> tuple[Any, Floats]:
+    def assemble(self, weights: Floats) -> tuple[Any, Floats]:
         """The symmetric matrix and the right side whose solution that is."""
-        diagonal, right = np.zeros(self.count), np.zeros(self.count)
-        links = []
-        for axis, weight in zip(self.axes, weights, strict=True):  # no pixel comes twice at one end of an axis's links
-            strength, target = axis.links(weight)
-            diagonal[axis.first] += strength
-            diagonal[axis.second] += strength
-            right[axis.first] -= target
-            right[axis.second] += target
-            links.append(-strength)
-        entries = np.concatenate([*links, *links, diagonal])
-        order, indices, starts = self.pattern
-        return scipy.sparse.csr_array((entries[order], indices, starts), (self.count, self.count)), right
-
-    @cached_property
-    def pattern(self) -> tuple[NDArray[np.int64], NDArray[Any], NDArray[Any]]:
-        """Where links there, back, and the diagonal stand in the matrix: their order, columns and starts of rows."""
-        first, second = (np.concatenate(ends) for ends in zip(*((a.first, a.second) for a in self.axes), strict=True))
-        pixels = np.arange(self.count)
-        at = (np.concatenate([first, second, pixels]), np.concatenate([second, first, pixels]))
-        numbered = scipy.sparse.coo_array((np.arange(at[0].size) + 1.0, at), (self.count, self.count)).tocsr()
-        numbered.sort_indices()
-        return numbered.data.astype(np.int64) - 1, numbered.indices, numbered.indptr
+        entries, right = np.empty(self.indices.size), np.empty(self.count)
+        fill_system(self.places, self.wanted, weights, entries, right)
+        return scipy.sparse.csr_array((entries, self.indices, self.places.starts), (self.count, self.count)), right
 
     def as_image(self, depth: Floats, logarithmic: bool) -> Floats:
         """The solution as depth in an image."""
@@ -175,45 +145,3 @@ class Equations:
             centred = centred / centred.mean()
         image[self.mask] = centred
         return image
-
-
-@dataclass(frozen=True)
-class _Axis:
-    """Links between neighbours along one axis: from pixel ``first`` to ``second``; ``value [N]``: q times the slope.
-
-    ``forward``, ``backward``, ``both`` ``[N]``: which neighbours a pixel has.
-    """
-
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
-    cosine: Floats
-    value: Floats
-    forward: Mask
-    backward: Mask
-
-    @classmethod
-    def of(cls, number: NDArray[np.int64], cosine: Floats, value: Floats, step: tuple[int, int]) -> _Axis:
-        height, width = number.shape
-        here, there = number[: height - step[0], : width - step[1]], number[step[0] :, step[1] :]
-        linked = (here >= 0) & (there >= 0)
-        first, second = here[linked], there[linked]
-        forward, backward = (np.bincount(end, minlength=cosine.size) > 0 for end in (first, second))
-        return cls(first, second, cosine, value, forward, backward)
-
-    @property
-    def both(self) -> Mask:
-        return self.forward & self.backward
-
-    def differences(self, depth: Floats) -> tuple[Floats, Floats]:
-        """The rise to the next and from the last pixel, 0 where there is none."""
-        ahead, behind = np.zeros_like(depth), np.zeros_like(depth)
-        rise = depth[self.second] - depth[self.first]
-        ahead[self.first], behind[self.second] = rise, rise
-        return ahead, behind
-
-    def links(self, weight: Floats) -> tuple[Floats, Floats]:
-        """Per link the strength, which weights the squared rise, and the strength times the rise that is wanted."""
-        one, other = weight[self.first], (1 - weight)[self.second]
-        near, far = self.cosine[self.first], self.cosine[self.second]
-        strength = one * near**2 + other * far**2
-        return strength, one * near * self.value[self.first] + other * far * self.value[self.second]

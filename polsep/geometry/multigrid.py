@@ -21,6 +21,7 @@ import scipy.sparse.linalg
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Integers = NDArray[np.int64]
 
 #: Side of the blocks that become one unknown.
@@ -37,10 +38,10 @@ SHIFT = 1e-8
 
 @dataclass(frozen=True)
 class _Level:
-    """A matrix, the inverse of its diagonal times `DAMPING`, and the way to the next level."""
+    """A matrix, the inverse of its diagonal times `DAMPING`, and the way to the next level, all of float32."""
 
     matrix: Any
-    damped: Floats
+    damped: Singles
     down: Any
     up: Any
 
@@ -61,22 +62,24 @@ class Multigrid:
             tentative = scipy.sparse.csr_array((np.ones(count), owner, np.arange(count + 1)), (count, rows.size))
             up = (tentative - scipy.sparse.diags_array(DAMPING * inverse) @ (matrix @ tentative)).tocsr()
             down = up.T.tocsr()
-            self.levels.append(_Level(matrix, DAMPING * inverse, down, up))
+            single = (x.astype(np.float32) for x in (matrix, DAMPING * inverse, down, up))
+            self.levels.append(_Level(*single))
             matrix = (down @ (matrix @ up)).tocsr()
         diagonal = matrix.diagonal()
         shift = SHIFT * max(float(diagonal.max(initial=0.0)), np.finfo(float).tiny)
         self.coarsest = scipy.sparse.linalg.splu((matrix + shift * scipy.sparse.eye_array(diagonal.size)).tocsc())
 
     def __call__(self, residual: Floats) -> Floats:
-        """One V-cycle from zero."""
-        return self._descend(0, residual)
+        """One V-cycle from zero, in single precision: what conjugate gradients ask of it is a direction."""
+        scale = float(np.abs(residual).max(initial=0.0)) or 1.0
+        return scale * self._descend(0, (residual / scale).astype(np.float32)).astype(np.float64)
 
-    def _descend(self, number: int, residual: Floats) -> Floats:
+    def _descend(self, number: int, residual: Singles) -> Singles:
         if number == len(self.levels):
-            solved: Floats = self.coarsest.solve(residual)
-            return solved
+            solved: Floats = self.coarsest.solve(residual.astype(np.float64))
+            return solved.astype(np.float32)
         level = self.levels[number]
-        found: Floats = level.damped * residual
+        found: Singles = level.damped * residual
         found += level.up @ self._descend(number + 1, level.down @ (residual - level.matrix @ found))
         found += level.damped * (residual - level.matrix @ found)
         return found

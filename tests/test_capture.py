@@ -29,7 +29,7 @@ from test_cli import polsep as polsep  # the fixture
 from polsep.camera import Layout
 from polsep.capture import find, session
 from polsep.capture.folder import FolderSource
-from polsep.capture.live import LiveView, Shown
+from polsep.capture.live import LiveView, Shown, advise
 from polsep.capture.page import serve_page
 from polsep.capture.ring import Ring
 from polsep.capture.session import CapturePlan, Counters, Limits, Session, Status
@@ -49,6 +49,7 @@ from polsep.io.frames import Frame, ReadOptions, read_frames
 from polsep.io.genicam import pack_frame
 from polsep.io.outputs import OutputError
 from polsep.io.recording import INDEX, RAW, RECORD, Header, RawImage, RecordingWriter, read_images
+from polsep.levels import level_notes
 from polsep.pipeline import separate_capture
 
 WIDTH, HEIGHT, PACKED = 36, 32, "BayerRG12p"
@@ -656,3 +657,14 @@ def test_cameras_are_found_by_name(monkeypatch: pytest.MonkeyPatch, polsep: Cli)
     listed = polsep("capture", "--list")
     assert listed.out == "pylon:A1  first\npylon:B2  second\n"
     assert "aravis: expected Aravis, found nothing" in listed.err
+
+
+@pytest.mark.parametrize(("pixel_format", "advised"), [("BayerRG16", "BayerRG12"), ("Mono16", "Mono12")])
+def test_advice_is_what_a_camera_takes(pixel_format: str, advised: str) -> None:
+    """Narrow codes in wide words: cameras have pixel formats, not white levels. Other remarks stay as they are."""
+    (remark,) = level_notes(np.full((4, 4), 4000, np.uint16) + np.arange(4, dtype=np.uint16), 0.0, None)
+    assert "--white-level 4095" in remark
+    assert advise(remark, pixel_format) == remark.replace("--white-level 4095", f"--pixel-format {advised}")
+    (left,) = level_notes(np.full((4, 4), 4000, np.uint16) << 4, 0.0, None)
+    assert "say" not in advise(left, pixel_format)
+    assert advise("black frame", pixel_format) == "black frame"

@@ -6,6 +6,7 @@ What is shown comes from the same functions as `polsep separate` uses on the rec
 from __future__ import annotations
 
 import os
+import re
 import sys
 import threading
 from dataclasses import dataclass
@@ -54,7 +55,8 @@ class LiveView:
         """One frame, and what is remarkable about it."""
         data, notes = decode_frame(payload, self._options)
         frame = separate_capture(data, self._method)
-        return frame, (*notes, *frame.report["warnings"])
+        remarks = (*notes, *frame.report["warnings"])
+        return frame, tuple(advise(remark, self._options.pixel_format or "") for remark in remarks)
 
     def show(self, image: RawImage) -> Shown:
         """Separate a frame and replace the picture, as a whole."""
@@ -65,6 +67,17 @@ class LiveView:
             replace_bytes(self._picture, shown.jpeg)
         self.latest = shown
         return shown
+
+
+def advise(remark: str, pixel_format: str) -> str:
+    """A remark that advises a white level, which cameras do not have: it is that of a pixel format with other bits."""
+    found = re.fullmatch(r"(.*); say --white-level (\d+) if so", remark)
+    if found is None:
+        return remark
+    bits = int(found[2]).bit_length()
+    if int(found[2]) != 2**bits - 1:  # codes in the upper bits, which no format's name says
+        return found[1]
+    return f"{found[1]}; say --pixel-format {re.sub(r'[0-9]+[a-z]*$', str(bits), pixel_format)} if so"
 
 
 def lower_priority() -> None:

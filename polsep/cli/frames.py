@@ -140,6 +140,7 @@ def export(method: str, output: Path, mono: bool, full: bool, weights: Path | No
 
     try:
         network, metadata = find_joint(method, Layout(bayer=None) if mono else Layout(), weights)
+        say(f"writing the graph of {method}, which takes a minute or a few")
         write_onnx(output, Graph(network, full), OUTPUT_NAMES, metadata)
     except ValueError as error:
         raise click.ClickException(str(error)) from None

@@ -169,3 +169,18 @@ def test_fast_noise_has_the_sensors_statistics() -> None:
 def test_bad_options_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="expected"):
         replace(SMALL, **wrong)
+
+
+def test_usual_looks_are_those_of_the_paper() -> None:
+    """Smooth dielectrics: the diffuse light is as polarized as any, highlights exceed it, and no other kind exists."""
+    scenes = {
+        looks: list(itertools.islice(pool_scenes(replace(SMALL, looks=looks), 0, 0), 6))
+        for looks in ("usual", "varied")
+    }
+    for scene in scenes["usual"]:
+        s0, s1, s2 = scene.diffuse.float()[:, scene.mask].reshape(3, 3, -1).double()
+        degree = torch.hypot(s1, s2) / s0.clamp(min=1e-3)
+        assert 0.005 < float(degree.quantile(0.98)) < 0.4
+    assert any(not torch.equal(a.diffuse, b.diffuse) for a, b in zip(scenes["usual"], scenes["varied"], strict=True))
+    with pytest.raises(ValueError, match="varied or usual, found 'odd'"):
+        replace(SMALL, looks="odd")

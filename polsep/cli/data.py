@@ -82,6 +82,9 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
     metavar="NAME",
     help="mosaic: noisy frames; mono: without colours; co-sited: as the paper.",
 )
+@click.option(
+    "--looks", default="varied", metavar="NAME", help="varied; usual: as in the paper, without glare and relief."
+)
 @click.option("--width", type=int, metavar="N", help="Channels of the network's first level; 32 on the ladder.")
 @click.option("--levels", type=int, default=3, metavar="N", help="Halvings of a rung's networks.")
 @click.option("--fold", type=int, default=2, metavar="N", help="N x N pixels are folded into channels; 1: none.")
@@ -117,6 +120,7 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
         from polsep.train.command import choose_options, plan_run, train_weights
         from polsep.train.loop import Run, Schedule
         from polsep.train.material_command import choose_material, train_material
+        from polsep.train.stream import StreamOptions
     except ModuleNotFoundError as error:
         raise click.ClickException(
             f"expected the extra 'train' (pip install 'polsep[train]'), found no {error.name}"
@@ -131,7 +135,7 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
         else:
             asked = choose_options(rung, data, options)
             schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])
-            run = plan_run(Run(output, schedule=schedule, **given), asked)
+            run = plan_run(Run(output, stream=StreamOptions(looks=options["looks"]), schedule=schedule, **given), asked)
             path = train_weights(asked, run, _show_training)
     except ValueError as error:
         raise click.ClickException(str(error)) from None

@@ -187,7 +187,7 @@ def digest_data(stream: StreamOptions) -> str:
 def describe_command(options: Options, run: Run) -> str:
     """The command line that trains this again."""
     schedule = run.schedule
-    asked: dict[str, object] = {"data": options.variant}
+    asked: dict[str, object] = {"data": options.variant, "looks": run.stream.looks}
     if isinstance(options, TrainOptions):
         asked |= {"width": options.size.width, "levels": options.size.levels, "fold": options.size.fold}
     else:
@@ -230,7 +230,7 @@ def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:
 def plan_run(run: Run, options: Options) -> Run:
     """The same with what is trained and the stream that it needs. Raises ValueError as `check_run`."""
     check_run(run)
-    stream = StreamOptions(seed=options.seed, crop=options.crop)
+    stream = replace(run.stream, seed=options.seed, crop=options.crop)
     return replace(run, what=json.dumps(asdict(options)), stream=stream)
 
 

@@ -30,7 +30,8 @@ from polsep.stokes import Stokes
 from polsep.train.variety import (
     random_sensor,
     relight,
-    vary_materials,
+    vary_colors,
+    vary_gloss,
     vary_normals,
     vary_polarization,
     vary_retention,
@@ -57,6 +58,9 @@ LEAST_COVERED, MOST_DRAWS = 0.6, 4
 #: Light at most, in white levels, so that half precision holds it.
 MOST_LIGHT = 2.0**14
 
+#: What examples show: all that `variety` has; or, as the paper's training data, smooth surfaces of usual gloss whose
+#: diffuse light is as polarized as Fresnel says, without what keeps the lamp's polarization.
+LOOK_KINDS = ("varied", "usual")
 #: Analysers of the examples [rad].
 ANGLES = Layout().angles
 
@@ -66,8 +70,8 @@ class StreamOptions:
     """What a stream gives: ``batch`` crops of ``crop`` x ``crop`` raw pixels from views of ``size`` x ``size``.
 
     ``pool``: scenes to draw from, per lane; ``uses``: how often a scene's pixels are taken, on average, before it is
-    replaced; 0 for one crop of each. ``samples``: rays along a pixel's side. Raises ValueError when crops do not fit or
-    are no multiples of the mosaic's period.
+    replaced; 0 for one crop of each. ``samples``: rays along a pixel's side. ``looks``: of `LOOK_KINDS`. Raises
+    ValueError when crops do not fit or are no multiples of the mosaic's period.
     """
 
     split: str = "train"
@@ -78,12 +82,15 @@ class StreamOptions:
     samples: int = 2
     pool: int = 48
     uses: int = 6
+    looks: str = "varied"
 
     def __post_init__(self) -> None:
         if self.crop % 4 or not 4 <= self.crop <= self.size:
             raise ValueError(f"expected crops of a multiple of 4 up to {self.size} pixels, found {self.crop}")
         if min(self.batch, self.samples, self.pool, self.uses + 1) < 1:
             raise ValueError(f"expected batch, samples and pool of at least 1 and uses of at least 0, found {self}")
+        if self.looks not in LOOK_KINDS:
+            raise ValueError(f"expected looks of {' or '.join(LOOK_KINDS)}, found {self.looks!r}")
 
     @property
     def reuse(self) -> int:
@@ -186,13 +193,19 @@ def pool_scenes(options: StreamOptions, lane: int, first: int) -> Iterator[Poole
 def _look_at(shape: MeshScene, options: StreamOptions, generator: torch.Generator) -> list[Pooled]:
     """One view of a shape under several lights, with other materials under each."""
     shot = vary_shot(shape, random_shot(shape, generator), generator)
-    view = vary_normals(find_view(shape, shot.camera, (options.size, options.size), options.samples), generator)
+    view = find_view(shape, shot.camera, (options.size, options.size), options.samples)
+    varied = options.looks == "varied"
+    if varied:
+        view = vary_normals(view, generator)
     light = shot.light
     looks = []
     for _ in range(LOOKS):
-        materials = vary_materials(random_materials(shape.mesh.slot_count, generator, shape.size), generator)
+        materials = vary_colors(random_materials(shape.mesh.slot_count, generator, shape.size), generator)
+        if varied:
+            materials = vary_gloss(materials, generator)
         scene = blur(shade_view(view, materials, light, light_view(shape, view, light)), shot.blur)
-        scene = vary_retention(vary_polarization(scene, generator), generator)
+        if varied:
+            scene = vary_retention(vary_polarization(scene, generator), generator)
         looks.append(_as_pooled(scene))
         light = relight(shape, shot, generator)
     return looks

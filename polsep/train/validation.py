@@ -30,7 +30,9 @@ REFERENCES: dict[str, Callable[[Measurements], Separation]] = {
 @lru_cache(maxsize=1)  # a training asks when it begins and when it has ended
 def validation_batches(stream: StreamOptions, count: int = 8) -> tuple[Examples, ...]:
     """The first batches of the validation split, of which every example is of a scene of its own."""
-    options = StreamOptions("validation", 0, 8, stream.crop, stream.size, stream.samples, pool=1, uses=0)
+    options = StreamOptions(
+        "validation", 0, 8, stream.crop, stream.size, stream.samples, pool=1, uses=0, looks=stream.looks
+    )
     batches = iter(ExampleStream(options))
     return tuple(next(batches) for _ in range(count))
 

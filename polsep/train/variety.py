@@ -106,18 +106,24 @@ def vary_normals(view: View, generator: torch.Generator) -> View:
     return replace(view, bands=tuple(bands))
 
 
-def vary_materials(materials: Materials, generator: torch.Generator) -> Materials:
-    """The same, near-grey, without textures, matte or glaring at random."""
-    grey, plain, saturation, matte, glare = torch.rand(5, generator=generator).tolist()
+def vary_gloss(materials: Materials, generator: torch.Generator) -> Materials:
+    """The same, or matte, or glaring."""
+    matte, glare = torch.rand(2, generator=generator).tolist()
     places = torch.rand(materials.specular.shape, generator=generator)
     if matte < MATTE_SHARE:
         left = MATTE_STRENGTH[0] * (MATTE_STRENGTH[1] / MATTE_STRENGTH[0]) ** places
-        materials = replace(materials, specular=materials.specular * left)
-    elif matte < MATTE_SHARE + GLARE_SHARE:
+        return replace(materials, specular=materials.specular * left)
+    if matte < MATTE_SHARE + GLARE_SHARE:
         # The lobe's peak over an albedo of a half: F / (4 pi r^4) over 0.5 / pi, for F = 0.04.
         narrow = materials.roughness.clamp(max=GLARE_ROUGHNESS) ** 4
         stronger = GLARES[0] * (GLARES[1] / GLARES[0]) ** glare * narrow / 0.02
-        materials = replace(materials, specular=materials.specular * stronger.clamp(min=1))
+        return replace(materials, specular=materials.specular * stronger.clamp(min=1))
+    return materials
+
+
+def vary_colors(materials: Materials, generator: torch.Generator) -> Materials:
+    """The same, near-grey or without textures at random."""
+    grey, plain, saturation = torch.rand(3, generator=generator).tolist()
     if plain < PLAIN_SHARE:
         materials = replace(materials, textures=None)
     if grey >= GREY_SHARE:

@@ -1,7 +1,9 @@
 """Whether Blender opens what `polsep geometry` and `polsep material` write, and sees the same numbers in it.
 
     python3.11 -m venv blender && blender/bin/pip install bpy==5.0.1
-    python baselines/blender_opens.py blender/bin/python out/shape.glb wood.glb        # writes results/blender.jsonl
+    polsep geometry --srgb 196CANON/[0-5].JPG --mask 196CANON/mask.png --integration smooth -o out
+    polsep material polsep/data/still_life.png --white-level 4095 -o out
+    python baselines/blender_opens.py blender/bin/python out/shape.glb out/still_life.glb   # results/blender.jsonl
 
 Blender imports each file in an empty scene, checks its meshes, and says what it has; trimesh reads the same file.
 """
@@ -68,14 +70,7 @@ def compare(blender: Path, path: Path) -> Iterator[Row]:
         colors = np.array(found["colors"])
         stored = read_colors(path)
         wanted = stored[found["loops"]] if found["corners"] else stored
-        yield Row(
-            "blender",
-            case,
-            "import",
-            "colours, largest difference",
-            float(np.abs(colors - wanted).max()),
-            "1",
-        )
+        yield Row("blender", case, "import", "colours, largest difference", float(np.abs(colors - wanted).max()), "1")
     print(case, found["linked"], found["textures"])
 
 
@@ -97,7 +92,7 @@ def main() -> None:
     rows = [row for path in paths for row in compare(blender, path)]
     for row in rows:
         print(f"{row.case:40} {row.metric:36} {row.value:.4g}")
-    made_by = provenance("python baselines/blender_opens.py blender/bin/python out/shape.glb wood.glb")
+    made_by = provenance(f"python baselines/blender_opens.py blender/bin/python {' '.join(map(str, paths))}")
     replace_text(Path("results/blender.jsonl"), to_jsonl(rows, made_by))
 
 

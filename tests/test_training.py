@@ -302,14 +302,14 @@ def test_rate_warms_up_and_falls_as_a_cosine() -> None:
 
 @pytest.mark.parametrize("see", [see_mosaic, see_co_sited])
 def test_a_net_learns_a_picture_by_heart(see: Callable[[Examples], Seen]) -> None:
-    """One 32 x 32 example, 200 steps: both outputs reach 40 dB, 15 dB above the analytic split they start at."""
+    """One 32 x 32 example, 200 steps: both outputs reach 40 dB, from an analytic split below 25."""
     torch.manual_seed(0)
     task = ladder_task(find_rung("paper"), "mosaic", Size(12, 2, 1))
     for examples in stream_lane(replace(STREAM, batch=1, looks="usual"), 0, 0):
         seen = see(examples)
         everywhere = [(*seen[:3], torch.ones_like(seen[3]))]
         before = score(task.separate, everywhere)
-        if min(before.values()) > 20 and max(before.values()) < 25:  # so that 40 dB are 15 more
+        if min(before.values()) > 20 and max(before.values()) < 25:  # so that 40 dB are 15 to learn
             break
     optimizer = torch.optim.Adam(task.network.parameters(), 3e-3)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 200)
@@ -318,9 +318,8 @@ def test_a_net_learns_a_picture_by_heart(see: Callable[[Examples], Seen]) -> Non
         task.loss(task.network, seen, 1.0).backward()
         optimizer.step()
         falling.step()
-    for name, end in score(task.separate, everywhere).items():
+    for end in score(task.separate, everywhere).values():
         assert end > 40
-        assert end > before[name] + 15
 
 
 @pytest.mark.parametrize("rung", RUNGS)

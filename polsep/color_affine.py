@@ -225,7 +225,7 @@ def _solve_clipped(
     kept = ~clipped[:, :, touched]
     samples = measurements.data.movedim((-4, -3), (0, 1))[:, :, touched]
     a = slope.movedim(-3, 0)[:, touched]
-    b, s0, determined[touched] = _least_squares(2 * samples, kept.to(samples), a, measurements.angles)
+    b, s0, determined[touched] = fit_unclipped(2 * samples, kept.to(samples), a, measurements.angles)
     solved = [s.movedim(-3, 0).clone() for s in (stokes.s0, stokes.s1, stokes.s2)]
     partly = kept.any(dim=0) & ~kept.all(dim=0)
     for image, values in zip(solved, (s0, a[0] * s0 + b[0], a[1] * s0 + b[1]), strict=True):
@@ -235,10 +235,10 @@ def _solve_clipped(
     return Stokes(*(s.movedim(0, -3) for s in solved)), offset.movedim(0, -3), determined
 
 
-def _least_squares(y: Tensor, kept: Tensor, a: Tensor, angles: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
+def fit_unclipped(y: Tensor, kept: Tensor, a: Tensor, angles: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
     """Solve y = g s0 + u . b over N pixels: b ``[2, N]``, s0 ``[C, N]``, and where b is determined.
 
-    ``y`` and the weights ``kept`` are ``[K, C, N]``, ``a`` is ``[2, N]``.
+    ``y``, twice the samples, and the weights ``kept`` are ``[K, C, N]``, ``a`` is ``[2, N]``.
     """
     t = 2 * torch.tensor(angles).to(y)
     u = torch.stack([torch.cos(t), torch.sin(t)])[:, :, None, None]
@@ -249,7 +249,7 @@ def _least_squares(y: Tensor, kept: Tensor, a: Tensor, angles: tuple[float, ...]
     projected = [u[i] - g * gu[i] / gg for i in (0, 1)]
     m00, m01, m11 = ((kept * projected[i] * projected[j]).sum((0, 1)) for i, j in ((0, 0), (0, 1), (1, 1)))
     r0, r1 = ((kept * projected[i] * y).sum((0, 1)) for i in (0, 1))
-    smallest = (m00 + m11) / 2 - torch.hypot((m00 - m11) / 2, m01)
+    smallest = (m00 + m11) / 2 - torch.sqrt(((m00 - m11) / 2) ** 2 + m01**2)  # hypot is not known to ONNX
     det = (m00 * m11 - m01 * m01).clamp(min=1e-6)
     b = torch.stack([m11 * r0 - m01 * r1, m00 * r1 - m01 * r0]) / det
     s0 = (gy - gu[0] * b[0] - gu[1] * b[1]) / gg

@@ -3,9 +3,9 @@
 A mosaic is packed to quarter resolution: the 16 samples of a period become channels, so every pixel of the network
 sees the same filters. Stokes images come from the intensity guide (`guided.guide_once`) or, in less time, from a linear
 filter fitted to examples. The colour-affine closed form (`color_affine`) with windows of two sizes makes a first
-separation of these. A U-Net of residual blocks, which sees samples, clip masks and the closed form, says how much of
-that one's specular light to believe and adds what is missing. The specular light is white by construction. Diffuse and
-specular sum to the network's own s0.
+separation of these, with what clipping hid of highlights as far as unclipped samples tell. A U-Net of residual blocks,
+which sees samples, clip masks and the closed form, says how much of that one's specular light to believe and adds what
+is missing. The specular light is white by construction. Diffuse and specular sum to the network's own s0.
 
 Inputs and corrections are relative to the brightness around, so that a darker exposure of a scene gives a darker image
 of the same separation, as far as noise and clipping allow. There are no statistics of whole images: crop and frame
@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, pad, pixel_shuffle, pixel_unshuffle
 
 from polsep.camera import Layout, Mosaic
-from polsep.color_affine import MAX_DIFFUSE_DOLP
+from polsep.color_affine import MAX_DIFFUSE_DOLP, fit_unclipped
 from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
 from polsep.guided import MARGIN, guide_once
 from polsep.networks import ResidualSize, ResidualUNet
@@ -54,8 +54,8 @@ class Guess(NamedTuple):
     """What the closed form says at half resolution: ``diffuse [N, 4 C, h, w]``, ``specular [N, 4, h, w]``, packed.
 
     ``polarized [N, 8 C, h, w]``: s1 and s2. ``light``, ``misfit [N, 1, h, w]``: the brightness around, and the rms
-    distance of s1 and s2 from the model; ``pose [N, 4, h, w]``: slope and direction as in `Pose`; ``maps``: what the
-    network sees, relative to the light.
+    distance of s1 and s2 from the model; ``pose [N, 4, h, w]``: slope and direction as in `Pose`; ``lift [N, C, h, w]``
+    is what clipped samples lacked of s0; ``maps``: what the network sees, relative to the light.
     """
 
     diffuse: Tensor
@@ -64,6 +64,7 @@ class Guess(NamedTuple):
     light: Tensor
     misfit: Tensor
     pose: Tensor
+    lift: Tensor
     maps: Tensor
 
 
@@ -169,6 +170,7 @@ class Joint(nn.Module):
         with torch.autocast(raw.device.type, enabled=False), torch.no_grad():
             half, total = self.demosaicked(planes, full)
             guess = self.guess(half, planes, masks)
+            total = total + guess.lift.repeat_interleave(total.shape[1] // self.colors, dim=1)
         features = self.net(guess.maps)
         doubt = self.doubt(features.detach()).float()
         return total, guess, features, pixel_shuffle(torch.minimum(doubt, self.most_doubt), 2)
@@ -190,11 +192,15 @@ class Joint(nn.Module):
         mean = _mean(s0)
         light = avg_pool2d(_mean(mean.chunk(4, dim=1)), 3, 1, 1, count_include_pad=False).clamp(min=0) + LEAST_LIGHT
         free = 1 - max_pool2d(masks, 3, 1, 1).amax(dim=1, keepdim=True)
-        slopes, contrast = find_slopes((s0, s1, s2), free / light**2)
+        moments = find_moments((s0, s1, s2), self._whole_colors(masks))
+        slopes, contrast = find_slopes(moments[:, :3], light)
         a1, a2 = slopes[-1].chunk(2, dim=1)
-        offsets = [[s - a * x for s, x in zip(values, s0, strict=True)] for values, a in ((s1, a1), (s2, a2))]
-        b1, b2 = (_mean(values) for values in offsets)
-        misfit = _mean([(o - b) ** 2 for values, b in zip(offsets, (b1, b2), strict=True) for o in values])
+        b1, b2 = (_mean(values) - a * mean for values, a in ((s1, a1), (s2, a2)))
+        m1, m2, m0, both = moments.chunk(4, dim=1)
+        misfit = 0.5 * (both - 2 * (a1 * m1 + a2 * m2) + (a1 * a1 + a2 * a2) * m0)
+        moved, lift = self.unclip(planes, masks, slopes[-1])
+        b1, b2 = b1 + moved[:, :1], b2 + moved[:, 1:]
+        s0 = tuple(x + lift[:, c : c + 1] for c, x in enumerate(s0))
         specular = white_specular((b1, b2), (a1, a2)).clamp(min=0)
         least = s0[0]
         for color in s0[1:]:
@@ -205,7 +211,7 @@ class Joint(nn.Module):
         direction = [_mean((b + a * specular).chunk(4, dim=1)) for b, a in ((b1, a1), (b2, a2))]
         length = torch.sqrt(direction[0] ** 2 + direction[1] ** 2 + 1e-12)
         pose = torch.cat([a1, a2, direction[0] / length, direction[1] / length], dim=1)
-        misfit = torch.sqrt(_mean(misfit.chunk(4, dim=1)) + 1e-12)
+        misfit = torch.sqrt(misfit.clamp(min=0) + 1e-12)
         seen = {
             "samples": [planes / light],
             "clipping": [masks, free],
@@ -214,22 +220,70 @@ class Joint(nn.Module):
             "split": [diffuse / light, specular / light, *slopes, contrast, misfit / light],
         }
         maps = torch.cat([image for name in self.inputs for image in seen[name]] + [torch.log(light)], dim=1)
-        return Guess(diffuse, specular, found[:, 4 * colors :], light, misfit, pose, maps)
+        return Guess(diffuse, specular, found[:, 4 * colors :], light, misfit, pose, lift, maps)
+
+    def _cells_of_colors(self) -> list[list[int]]:
+        """Which of a packed pixel's four cells, in reading order, are of each colour."""
+        found = [min(self.layout.filter_at(2 * (k // 2), 2 * (k % 2))[1], self.colors - 1) for k in range(4)]
+        return [[k for k in range(4) if found[k] == c] for c in range(self.colors)]
+
+    def _whole_colors(self, masks: Tensor) -> list[Tensor]:
+        """1 where no sample of a colour clips in a packed pixel, of every colour ``[N, 1, h, w]``."""
+        cells = _by_analyser(masks).amax(dim=0).view(4, masks.shape[0], 1, *masks.shape[2:])
+        return [1 - cells[own].amax(dim=0) for own in self._cells_of_colors()]
+
+    def unclip(self, planes: Tensor, masks: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
+        """What clipping hid: of the offset b ``[N, 2, h, w]``, and of every colour's s0 ``[N, C, h, w]``.
+
+        In a packed pixel of four cells the samples that did not clip determine b and the cells' s0 for a given slope
+        (`color_affine.fit_unclipped`). What that differs from a fit to all samples as they are is missing from images
+        that took them so. Zero where nothing clips, or where too few samples are left.
+        """
+        n, h, w = planes.shape[0], *planes.shape[2:]
+        samples, kept = _by_analyser(planes), 1 - _by_analyser(masks)
+        a = slope.movedim(1, 0).reshape(2, -1)
+        angles = tuple(math.radians(angle) for row in self.layout.polarizer for angle in row)
+        seen, s0_seen, _ = fit_unclipped(2 * samples, torch.ones_like(kept), a, angles)
+        b, s0, determined = fit_unclipped(2 * samples, kept, a, angles)
+        determined = determined & (kept.amin(dim=(0, 1)) == 0)
+        lacking = torch.where(determined & (kept.amax(dim=0) > 0), s0 - s0_seen, 0.0).clamp(min=0)
+        lift = [_mean([lacking[k] for k in cells]) for cells in self._cells_of_colors()]
+        moved = torch.cat([torch.where(determined, b - seen, 0.0), torch.stack(lift)])
+        found = moved.view(-1, n, h, w).movedim(0, 1)
+        return found[:, :2], found[:, 2:]
 
 
-def find_slopes(stokes: tuple[tuple[Tensor, ...], ...], weight: Tensor) -> tuple[list[Tensor], Tensor]:
+def _by_analyser(packed: Tensor) -> Tensor:
+    """Packed samples ``[N, 16, h, w]`` as ``[4, 4, N h w]``, of every analyser, in reading order, and cell."""
+    n, _, h, w = packed.shape
+    return packed.view(n, 2, 2, 2, 2, h, w).permute(2, 4, 1, 3, 0, 5, 6).reshape(4, 4, n * h * w)
+
+
+def find_moments(stokes: tuple[tuple[Tensor, ...], ...], whole: list[Tensor]) -> Tensor:
+    """How the colours' s0 vary with their s1, s2 and s0, and how both of these do: means ``[N, 4, h, w]`` over cells.
+
+    ``stokes``: s0, s1, s2, of every colour ``[N, 4, h, w]``; ``whole``: the colours that count, of every colour
+    ``[N, 1, h, w]``. They vary around their own mean, so one colour alone does not vary.
+    """
+    s0, s1, s2 = (_deviations(values, whole) for values in stokes)
+    products = [[x * y for x, y in zip(s0, values, strict=True)] for values in (s1, s2, s0)]
+    products.append([x * x + y * y for x, y in zip(s1, s2, strict=True)])
+    return torch.cat([_mean(_mean(product).chunk(4, dim=1)) for product in products], dim=1)
+
+
+def _deviations(values: tuple[Tensor, ...], whole: list[Tensor]) -> list[Tensor]:
+    """What whole colours differ from their mean; 0 for the others."""
+    count = (_mean(whole) * len(whole)).clamp(min=1)
+    mean = _mean([x * one for x, one in zip(values, whole, strict=True)]) * (len(whole) / count)
+    return [(x - mean) * one for x, one in zip(values, whole, strict=True)]
+
+
+def find_slopes(moments: Tensor, light: Tensor) -> tuple[list[Tensor], Tensor]:
     """The diffuse polarization ``[N, 2, h, w]`` in `WINDOWS`, widest first, and the contrast ``[N, 1, h, w]``.
 
-    ``stokes``: s0, s1, s2, of every colour ``[N, 4, h, w]``; ``weight [N, 1, h, w]`` of packed pixels.
+    ``moments [N, 3, h, w]``: the first three of `find_moments`; ``light [N, 1, h, w]``: the brightness around.
     """
-    s0, s1, s2 = stokes
-    mean = _mean(s0)
-    deviations = [x - mean for x in s0]
-    moments = [
-        _mean(_mean([d * x for d, x in zip(deviations, values, strict=True)]).chunk(4, dim=1))
-        for values in (s1, s2, deviations)
-    ]
-    sums = torch.cat(moments, dim=1) * weight
+    sums = moments / light**2
     slope, slopes, pooled = torch.zeros_like(sums[:, :2]), [], sums
     for window, trust in zip(WINDOWS, TRUST, strict=True):
         pooled = avg_pool2d(sums, window, 1, window // 2, count_include_pad=False)

@@ -20,10 +20,12 @@ from polsep.joint import (
     INPUTS,
     MOST_DOUBT,
     PERIOD,
+    Demosaicker,
     Images,
     Joint,
     Pose,
     bilinear_filter,
+    find_moments,
     find_slopes,
     limit,
     pool_outputs,
@@ -41,6 +43,8 @@ SIZE = ResidualSize(4, (1, 1))
 EDGE = 4
 #: How far a uniform field's slope falls toward 0, and with it the separation: (trust / contrast)^2 of the colours.
 TRUSTED = 1e-4
+#: The same where specular light is twice the diffuse, so that colours differ by a tenth of the brightness only.
+DRAWN = 0.08
 #: What the floor under the brightness changes when the exposure of a bright frame is halved.
 FLOORED = 5e-3
 #: What bf16 changes in corrections of order one.
@@ -234,33 +238,106 @@ def test_white_specular_solves_the_closed_form(layout: Layout) -> None:
     assert_close(found, color_affine.white_specular(b, a))
 
 
+def slopes_of(stokes: tuple[tuple[Tensor, ...], ...], light: Tensor, whole: list[Tensor]) -> list[Tensor]:
+    return find_slopes(find_moments(stokes, whole)[:, :3], light)[0]
+
+
 def test_slopes_are_those_of_polarization_over_colour() -> None:
     """p = a s0 + b with the same a and b in every colour gives a, whatever b; limited to what dielectrics can do."""
     s0 = tuple(torch.full((1, 4, 12, 12), level) for level in (1.8, 0.1, 0.1))
-    light = torch.full((1, 1, 12, 12), (2 / 3) ** -2)
+    light, whole = torch.full((1, 1, 12, 12), 2 / 3), [torch.ones(1, 1, 12, 12)] * 3
     for a, b in itertools.product((0.2, -0.1), (0.0, 0.4)):
-        slopes, contrast = find_slopes((s0, *(tuple(a * x + b for x in s0) for _ in (1, 2))), light)
+        moments = find_moments((s0, *(tuple(a * x + b for x in s0) for _ in (1, 2))), whole)
+        slopes, contrast = find_slopes(moments[:, :3], light)
         for slope in slopes[1:]:
             assert_within(slope, a, TRUSTED)
         deviations = torch.tensor([1.8, 0.1, 0.1]) - 2 / 3
         assert_within(contrast, float((deviations**2).mean().sqrt()) / (2 / 3), TRUSTED)
-    steep = find_slopes((s0, s0, s0), light)[0]
-    for slope in steep:
+    for slope in slopes_of((s0, s0, s0), light, whole):
         assert_close(torch.linalg.vector_norm(slope, dim=1), torch.full((1, 12, 12), MAX_DIFFUSE_DOLP))
 
 
-def test_clipped_packed_pixels_say_nothing_about_slopes() -> None:
-    """Without weight anywhere the slope is 0, and what is around takes over where some is left."""
-    s0 = tuple(torch.full((1, 4, 12, 12), level) for level in (1.8, 0.1, 0.1))
-    wrong = tuple(torch.full((1, 4, 12, 12), 0.0) for _ in range(3))
-    weight = torch.ones(1, 1, 12, 12)
-    assert not bool(find_slopes((s0, s0, s0), 0 * weight)[0][-1].any())
-    weight[..., 6, 6] = 0
-    right = tuple(0.2 * x for x in s0)
-    for x in right:
-        x[..., 6, 6] = 9.0
-    slope = find_slopes((s0, right, wrong), weight)[0][-1]
-    assert_within(slope[:, 0], 0.2, 1e-3)
+def test_colours_that_clip_say_nothing_about_slopes() -> None:
+    """Two colours are enough; with fewer the slope is 0, or that of what is around."""
+    s0 = tuple(torch.full((1, 4, 12, 12), level) for level in (1.8, 0.1, 0.6))
+    light, none, every = torch.ones(1, 1, 12, 12), torch.zeros(1, 1, 12, 12), torch.ones(1, 1, 12, 12)
+    wrong = (s0, tuple(0.2 * x for x in s0), tuple(torch.zeros(1, 4, 12, 12) for _ in range(3)))
+    wrong[1][2][:] = 9.0
+    for whole in ([none] * 3, [none, every, none]):
+        assert not bool(slopes_of(wrong, light, whole)[-1].any())
+    assert_within(slopes_of(wrong, light, [every, every, none])[-1][:, 0], 0.2, 1e-3)
+    here = torch.ones(1, 1, 12, 12)
+    here[..., 6, 6] = 0
+    right = (s0, tuple(0.2 * x for x in s0), wrong[2])
+    right[1][0][..., 6, 6] = right[1][1][..., 6, 6] = 9.0
+    assert_within(slopes_of(right, light, [here, here, here])[-1][:, 0], 0.2, 1e-3)
+
+
+def fit_half(planes: Tensor) -> tuple[Tensor, Tensor]:
+    """Offset ``[2, h, w]`` and s0 of each cell ``[4, h, w]`` of one frame's packed samples, for Sony's analysers and
+    the slope of `clipping_scene`; all samples count.
+    """
+    turns = torch.deg2rad(2 * torch.tensor([90.0, 45.0, 135.0, 0.0])).repeat(4)
+    rows = torch.tensor(
+        [4 * r + c for top in (0, 2) for left in (0, 2) for r in (top, top + 1) for c in (left, left + 1)]
+    )
+    cells = torch.eye(4).repeat_interleave(4, dim=0) * (1 + 0.06 * turns.cos() + 0.08 * turns.sin())[:, None]
+    system = torch.cat([turns.cos()[:, None], turns.sin()[:, None], cells], dim=1)
+    values = 2 * planes[0, rows].flatten(1)
+    found = torch.linalg.lstsq(system, values).solution.view(6, *planes.shape[-2:])
+    return found[:2], found[2:]
+
+
+def clipping_scene(layout: Layout) -> tuple[Images, Tensor, Tensor]:
+    """Uniform diffuse light, specular light on the middle packed pixels, and frames of both: whole, and clipped at 1.
+
+    Red clips everywhere; in the middle, green clips behind two analysers and blue behind none.
+    """
+    c = layout.channels
+    diffuse = torch.tensor([2.4, 0.8, 0.1])[-c:, None, None].expand(1, c, 96, 96)
+    specular = torch.zeros(1, 1, 96, 96)
+    specular[..., 40:56, 40:56] = 1.0
+    turn = torch.tensor([0.8, 0.6]).view(1, 2, 1, 1).expand(1, 2, 24, 24)
+    images = Images(diffuse, specular, *[torch.zeros(1, 1, 1, 1)] * 5)
+    raw = predict_samples(images, Pose(0.1 * turn.flip(1), turn), layout)
+    return images, raw, raw.clamp(max=1)
+
+
+def test_what_is_left_determines_what_clipped() -> None:
+    """For the true slope: of green s0 exactly, and of the offset b all that half of the samples lack."""
+    _, _, clipped = clipping_scene(COLOR)
+    turn = torch.tensor([0.8, 0.6])
+    slope = 0.1 * turn.flip(0).view(1, 2, 1, 1).expand(1, 2, 24, 24)
+    planes, masks = (pixel_unshuffle(x, PERIOD)[..., 11:13, 11:13] for x in (clipped, (clipped >= 1).float()))
+    assert float(masks.mean()) == 0.5
+    moved, lift = untrained(COLOR).unclip(planes, masks, slope[..., :2, :2])
+    seen = fit_half(planes)
+    assert_close(seen[1][1] + lift[:, 1], torch.full((1, 2, 2), 1.8))
+    assert_close(seen[0] + moved[0], (turn - 0.1 * turn.flip(0)).view(2, 1, 1).expand(2, 2, 2))
+    assert not bool(lift[:, ::2].any())
+
+
+@pytest.mark.parametrize("demosaicker", ["linear", "guided"])
+def test_clipped_highlights_are_not_lost(demosaicker: Demosaicker) -> None:
+    """The closed form's specular light where half of the samples clip, away from edges; taken as they are, they hide
+    a sixth of it. Nothing says how red it is there.
+    """
+    images, _, clipped = clipping_scene(COLOR)
+    net, inside = Joint(3, SIZE, INPUTS, demosaicker), (..., slice(22, 26), slice(22, 26))
+    wanted = [avg_pool2d(x, 2)[inside] for x in (images.diffuse[:, 1:], images.specular)]
+    found, as_it_is = (net.half_resolution(clipped, mask) for mask in (clipped >= 1, nothing_clipped(clipped)))
+    for image, true in zip((found.diffuse[:, 1:], found.specular), wanted, strict=True):
+        assert_within(image[inside], true, DRAWN)
+    assert bool((as_it_is.specular[inside] < found.specular[inside] - DRAWN).all())
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
+def test_frames_that_do_not_clip_lack_nothing(layout: Layout) -> None:
+    net, (_, raw, _) = untrained(layout), clipping_scene(layout)
+    planes, slope = pixel_unshuffle(raw, PERIOD), torch.zeros(1, 2, 24, 24)
+    for masks in (torch.zeros_like(planes), torch.ones_like(planes)):
+        for lacking in net.unclip(planes, masks, slope):
+            assert not bool(lacking.any())
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)

@@ -17,8 +17,8 @@ from polsep.io.whole import beside
 INPUTS = ("raw", "black_level", "white_level")
 #: The oldest set of operators that torch's exporter writes.
 OPERATORS = 18
-#: Frames that the exporter traces; any batch and any multiple of 4 can follow.
-EXAMPLE = (1, 64, 96)
+#: Frames that the exporter traces; any batch and any multiple of 4 can follow. A batch of 1 would stay one.
+EXAMPLE = (2, 64, 96)
 
 
 @contextmanager

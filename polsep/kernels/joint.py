@@ -34,6 +34,7 @@ from polsep.kernels.rows import (
     weave,
 )
 from polsep.kernels.threads import Piece
+from polsep.kernels.unclip import leave_clipped_out, unclip
 from polsep.kernels.unpack import Samples, read_row
 
 Floats = NDArray[np.float32]
@@ -45,8 +46,8 @@ REACH = 1 + WINDOWS[0] // 2
 _WIDE, _NARROW = (window // 2 for window in WINDOWS)
 _TRUST_WIDE, _TRUST_NARROW = (np.float32(trust) for trust in TRUST)
 _LEAST_LIGHT, _TINY = np.float32(LEAST_LIGHT), np.float32(1e-12)
-#: Rows of scratch.
-_ROWS = 12
+#: Rows of scratch, the last five of them for what clipping hid.
+_ROWS = 17
 
 
 class Taps(NamedTuple):
@@ -216,11 +217,12 @@ def _describe(colors: int, u: int, rings: _Rings, polarized: Any, spare: Any) ->
                 subtract(polarized[4 * (colors * k + c) + cell], means, y)
                 multiply(x, y, count, moments[k + 1])
                 multiply(y, y, count, moments[3])
+    leave_clipped_out(rings.clipped[slot], s0, polarized, moments)
 
 
 @compiled
 def _look_around(v: int, h: int, rings: _Rings, spare: Any) -> None:
-    """The light around row ``v``, whether anything there clips, and the weighted moments."""
+    """The light around row ``v``, whether anything there clips, and the moments relative to the light."""
     w, slot = rings.light.shape[1], v % KEPT
     total, light, free = spare[0], rings.light[slot], rings.free[slot]
     fill(ZERO, light)
@@ -244,7 +246,7 @@ def _look_around(v: int, h: int, rings: _Rings, spare: Any) -> None:
     for j in range(w):
         light[j] = (light[j] if light[j] > ZERO else ZERO) + _LEAST_LIGHT
     for j in range(w):
-        weight[j] = free[j] / (light[j] * light[j])
+        weight[j] = ONE / (light[j] * light[j])
     sums, moments = rings.sums[v % SUMMED], rings.moments[slot]
     for k, moment in ((0, 1), (1, 2), (2, 0)):
         fill(ZERO, sums[k])
@@ -268,6 +270,8 @@ def _find_slopes(t: int, h: int, sums: Any, spare: Any) -> None:
 @compiled
 def _split(colors: int, slot: int, rings: _Rings, base: Any, spare: Any) -> None:
     """Diffuse, specular and polarization of a row to its base; ``spare[6:8]``: its slope."""
+    lacking = spare[12 : 14 + colors]
+    clips = unclip(rings.planes[slot, :, 1:], rings.clipped[slot], spare[6:8], lacking)
     a1, a2, mean, b1, b2, share = spare[6], spare[7], spare[8], spare[9], spare[10], np.float32(1 / colors)
     for cell in range(4):
         tau, cosine, sine = base[4 * colors + cell], rings.cosine[slot, cell], rings.sine[slot, cell]
@@ -276,6 +280,11 @@ def _split(colors: int, slot: int, rings: _Rings, base: Any, spare: Any) -> None
             add_product(rings.s0[slot, 4 * c + cell], share, mean)
         offset(cosine, a1, mean, b1)
         offset(sine, a2, mean, b2)
+        if clips:
+            add_product(lacking[0], ONE, b1)
+            add_product(lacking[1], ONE, b2)
+            for c in range(colors):
+                add_product(lacking[2 + c], ONE, rings.s0[slot, 4 * c + cell])
         white_specular(b1, b2, a1, a2, tau)
         for c in range(colors):
             limit(rings.s0[slot, 4 * c + cell], tau)

@@ -287,6 +287,8 @@ def test_a_training_begins_with_given_weights(tmp_path: Path) -> None:
     before, found = read_weights(first)[0], read_weights(second)[0]
     assert all(torch.allclose(before[name], found[name], rtol=1e-3, atol=1e-6) for name in before)
     assert read_weights(second)[1]["command"].endswith("--start paper-co-sited.safetensors")
+    begun, ended = json.loads(read_weights(second)[1]["curve"])
+    assert begun[0] == 0 and begun[1:] == pytest.approx(ended[1:], abs=0.01)
     other = replace(run, out=tmp_path / "third", start=first)
     with pytest.raises(ValueError, match=r"expected weights of the network .*, found those of another"):
         train_weights(replace(options, size=Size(8, 1, 1)), other, lambda _: None)

@@ -95,8 +95,9 @@ def read_log(folder: Path) -> list[Line]:
 
 
 def curve_of(lines: list[Line]) -> list[list[float]]:
-    """Step, diffuse PSNR and specular PSNR [dB] of every validation of a log."""
-    rows = [[line[name] for name in ("step", "diffuse PSNR", "specular PSNR")] for line in lines if line["step"]]
+    """Step, diffuse and specular PSNR [dB] of every validation of a log; step 0 is one where it began with weights."""
+    names = ("step", "diffuse PSNR", "specular PSNR")
+    rows = [[line[name] for name in names] for line in lines if names[1] in line]
     return [[step, round(diffuse, 3), round(specular, 3)] for step, diffuse, specular in rows]
 
 

@@ -135,7 +135,7 @@ def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | Non
         lambda network, batch, done: task.loss(network, task.prepare(batch), done),
         lambda _: score(task.separate, look()),
         lambda: task.begin(run.stream),
-        lambda: score_references(task, look()),
+        lambda: score_references(task, look()) | ({} if run.start is None else score(task.separate, look())),
     )
     return train_course(course, run, report)
 

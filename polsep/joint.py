@@ -237,8 +237,11 @@ class Joint(nn.Module):
 
         In a packed pixel of four cells the samples that did not clip determine b and the cells' s0 for a given slope
         (`color_affine.fit_unclipped`). What that differs from a fit to all samples as they are is missing from images
-        that took them so. Zero where nothing clips, or where too few samples are left.
+        that took them so. Zero where nothing clips, or where too few samples are left; and for one colour, which seldom
+        has enough of them (docs/experiments.md).
         """
+        if self.colors == 1:
+            return torch.zeros_like(slope), torch.zeros_like(slope[:, :1])
         n, h, w = planes.shape[0], *planes.shape[2:]
         samples, kept = _by_analyser(planes), 1 - _by_analyser(masks)
         a = slope.movedim(1, 0).reshape(2, -1)

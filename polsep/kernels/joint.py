@@ -271,7 +271,7 @@ def _find_slopes(t: int, h: int, sums: Any, spare: Any) -> None:
 def _split(colors: int, slot: int, rings: _Rings, base: Any, spare: Any) -> None:
     """Diffuse, specular and polarization of a row to its base; ``spare[6:8]``: its slope."""
     lacking = spare[12 : 14 + colors]
-    clips = unclip(rings.planes[slot, :, 1:], rings.clipped[slot], spare[6:8], lacking)
+    clips = colors > 1 and unclip(rings.planes[slot, :, 1:], rings.clipped[slot], spare[6:8], lacking)
     a1, a2, mean, b1, b2, share = spare[6], spare[7], spare[8], spare[9], spare[10], np.float32(1 / colors)
     for cell in range(4):
         tau, cosine, sine = base[4 * colors + cell], rings.cosine[slot, cell], rings.sine[slot, cell]

@@ -117,7 +117,7 @@ def _fit(samples: Any, bits: Any, slope: tuple[Any, Any], found: Any) -> Any:
 
 @compiled
 def unclip(planes: Any, bits: Any, slopes: Any, lacking: Any) -> bool:
-    """What clipping hid of a row of packed pixels, ``lacking [2 + C, w]``: of the offset, and of every colour's s0.
+    """What clipping hid of a row of packed pixels, ``lacking [5, w]``: of the offset, and of three colours' s0.
 
     ``planes [16, w]``: samples, ``slopes [2, w]``. False, and nothing in ``lacking``, of rows where nothing clips.
     """
@@ -136,17 +136,16 @@ def unclip(planes: Any, bits: Any, slopes: Any, lacking: Any) -> bool:
 
 @compiled
 def _unclip_one(samples: Any, bits: Any, slope: tuple[Any, Any], results: tuple[Any, Any]) -> None:
-    """What one packed pixel is ``lacking [2 + C]``; nothing where too few samples are left."""
+    """What one packed pixel is ``lacking [5]``; nothing where too few samples are left."""
     room, lacking = results
-    left, seen, colors = room[0], room[1], lacking.size - 2
+    left, seen = room[0], room[1]
     if _fit(samples, bits, slope, left) <= _LEAST_EIGENVALUE:
         return
     _fit(samples, np.uint16(0), slope, seen)
     lacking[0], lacking[1] = left[0] - seen[0], left[1] - seen[1]
     for cell in range(4):
-        some_left, c = False, _COLORS[cell] if colors > 1 else 0
+        some_left, c = False, _COLORS[cell]
         for k in range(4):
             some_left |= not _clips(bits, cell, k)
         if some_left and left[2 + cell] > seen[2 + cell]:
-            cells = 4 if colors == 1 else 2 if c == 1 else 1
-            lacking[2 + c] += (left[2 + cell] - seen[2 + cell]) / np.float32(cells)
+            lacking[2 + c] += (left[2 + cell] - seen[2 + cell]) * (HALF if c == 1 else ONE)

@@ -237,8 +237,8 @@ class Joint(nn.Module):
 
         In a packed pixel of four cells the samples that did not clip determine b and the cells' s0 for a given slope
         (`color_affine.fit_unclipped`). What that differs from a fit to all samples as they are is missing from images
-        that took them so. Zero where nothing clips, or where too few samples are left; and for one colour, which seldom
-        has enough of them (docs/experiments.md).
+        that took them so. Zero where nothing clips, or where too few samples are left; and for one colour, whose cells
+        clip behind the same analysers: it gained nothing there (docs/experiments.md).
         """
         if self.colors == 1:
             return torch.zeros_like(slope), torch.zeros_like(slope[:, :1])

@@ -332,12 +332,16 @@ def test_clipped_highlights_are_not_lost(demosaicker: Demosaicker) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
-def test_frames_that_do_not_clip_lack_nothing(layout: Layout) -> None:
-    net, (_, raw, _) = untrained(layout), clipping_scene(layout)
+def test_only_frames_that_clip_in_part_and_in_colour_lack_something(layout: Layout) -> None:
+    """Nothing where no sample clips, or all do."""
+    net, (_, raw, clipped) = untrained(layout), clipping_scene(layout)
     planes, slope = pixel_unshuffle(raw, PERIOD), torch.zeros(1, 2, 24, 24)
     for masks in (torch.zeros_like(planes), torch.ones_like(planes)):
-        for lacking in net.unclip(planes, masks, slope):
-            assert not bool(lacking.any())
+        assert not any(bool(lacking.any()) for lacking in net.unclip(planes, masks, slope))
+    partly = (planes > planes.median()).float()
+    moved, lift = net.unclip(pixel_unshuffle(clipped, PERIOD).clamp(max=0.5), partly, slope)
+    assert moved.shape == (1, 2, 24, 24) and lift.shape == (1, layout.channels, 24, 24)
+    assert bool(moved.any() or lift.any()) == (layout == COLOR)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from polsep.joint import Joint
+from polsep.material_network import MaterialNetwork, MaterialSize
 from polsep.networks import ResidualSize, ResidualUNet, Size, UNet
 from polsep.refine import Refinement
 from polsep.train.optimizers import WEIGHT_DECAY, Optimizers, as_matrix, hidden_weights
@@ -66,6 +67,10 @@ def test_features_alone_are_hidden() -> None:
     assert len(set(hidden)) == len(hidden)
     assert all(name.startswith(("net.", "nets.")) and name.endswith("weight") for name in hidden)
     assert not any(".last." in name for name in hidden)
+    material = MaterialNetwork(6, MaterialSize(cues=("details",)))
+    names = {id(w): n for n, w in material.named_parameters()}
+    found = {names[id(w)] for w in hidden_weights(material)}
+    assert found == {n for n, w in material.named_parameters() if w.ndim == 4 and n != "last.weight" and len(w) >= 16}
     inner = [m for m in net.net.modules() if isinstance(m, nn.Conv2d)]
     assert len([name for name in hidden if name.startswith("net.")]) == len(inner)
 

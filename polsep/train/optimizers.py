@@ -1,4 +1,4 @@
-"""What moves the weights: Muon for the convolutions inside U-Nets, AdamW for all others.
+"""What moves the weights: Muon for the convolutions inside networks, AdamW for all others.
 
 Muon (Jordan et al. 2024, kellerjordan.github.io/posts/muon) takes the momentum of a layer's matrix to the nearest
 orthogonal one, so that all directions of a layer learn alike; AdamW drowns rare ones in frequent ones. The joint
@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from polsep.material_network import MaterialNetwork
 from polsep.networks import ResidualUNet, UNet
 
 WEIGHT_DECAY, BETAS = 1e-4, (0.9, 0.99)
@@ -67,8 +68,8 @@ class Optimizers:
 def hidden_weights(network: nn.Module) -> Iterator[Tensor]:
     """The convolutions of a network that map features to features."""
     for module in network.modules():
-        if isinstance(module, (UNet, ResidualUNet)):
-            last = {id(weight) for weight in module.last.parameters()} if isinstance(module, UNet) else set()
+        if isinstance(module, (UNet, ResidualUNet, MaterialNetwork)):
+            last = set() if isinstance(module, ResidualUNet) else {id(weight) for weight in module.last.parameters()}
             for weight in module.parameters():
                 if weight.ndim == 4 and id(weight) not in last and min(as_matrix(weight).shape) >= LEAST_SIDE:
                     yield weight

@@ -20,8 +20,7 @@ from torch.nn.functional import avg_pool2d, pad
 from polsep.bench.rows import Row
 from polsep.io.svbrdf import find_panels, read_panels
 from polsep.material.estimate import Estimator, load_estimator, shipped_inputs
-from polsep.material.procedural import halve, random_svbrdf
-from polsep.material.shots import CAMERA_HEIGHT, INPUTS, RAW_SIZE, Example, make_example, random_example
+from polsep.material.shots import CAMERA_HEIGHT, INPUTS, MAP_SIZE, Example, make_example, random_example
 from polsep.metrics import flip, psnr, require_flip
 from polsep.optics import dot
 from polsep.svbrdf import Svbrdf, plane_points, relight, unstack
@@ -29,6 +28,8 @@ from polsep.views import scene_seed
 
 #: Held-out materials, those of the quick version, and photographs of each: one by a flash, the others by moved lights.
 PROCEDURAL, QUICK, VIEWS = 12, 2, 4
+#: Raw pixels along the side of small frames, and of those of published maps.
+SMALL = 2 * MAP_SIZE
 #: Published maps are every so many of the pictures in this folder.
 PUBLISHED, EVERY = "svbrdf/deschaintre_subset", 5
 #: Lights that relit pictures are taken under, and how they are drawn: from anywhere above, this far from the middle.
@@ -63,7 +64,7 @@ def _measure(data: Path, count: int) -> Iterator[Row]:
     estimators = {name: load_estimator(name) for name in shipped_inputs()}
     if not estimators:
         raise ValueError(f"expected weights for one of {', '.join(INPUTS)}, found none; see polsep train material")
-    sets = {"procedural": procedural_examples(count), "procedural, larger frames": larger_examples(count)}
+    sets = {"procedural": procedural_examples(count), "procedural, small frames": small_examples(count)}
     published = published_examples(data, count)
     if published:
         sets["published"] = published
@@ -80,16 +81,9 @@ def procedural_examples(count: int) -> list[Example]:
     return [random_example("test", 0, number, VIEWS) for number in range(count)]
 
 
-def larger_examples(count: int) -> list[Example]:
-    """The same materials under the flash, photographed with twice as many pixels along a side, and then averaged."""
-    found = []
-    for number in range(count):
-        generator = torch.Generator().manual_seed(scene_seed("test", 0, number))
-        example = make_example(random_svbrdf(2 * RAW_SIZE, generator), 1, generator)
-        views = avg_pool2d(example.views.flatten(0, 1), 2)[None]
-        maps = halve(unstack(example.maps)).stack()
-        found.append(Example(views, maps))
-    return found
+def small_examples(count: int) -> list[Example]:
+    """The same materials in frames of as many cells as the maps have pixels."""
+    return [random_example("test", 0, number, VIEWS, SMALL) for number in range(count)]
 
 
 def published_examples(data: Path, count: int) -> list[Example]:
@@ -105,9 +99,9 @@ def published_examples(data: Path, count: int) -> list[Example]:
 
 
 def _middle(image: Tensor) -> Tensor:
-    """The middle `RAW_SIZE` pixels of a larger image."""
-    top, left = ((n - RAW_SIZE) // 2 for n in image.shape[-2:])
-    return image[..., top : top + RAW_SIZE, left : left + RAW_SIZE]
+    """The middle `SMALL` pixels of a larger image."""
+    top, left = ((n - SMALL) // 2 for n in image.shape[-2:])
+    return image[..., top : top + SMALL, left : left + SMALL]
 
 
 class Score(NamedTuple):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from polsep.camera import IMX250, Layout, Mosaic
 from polsep.guided import demosaic_guided_half
@@ -39,8 +40,9 @@ METHOD = "joint"
 WHITE_ERROR = 0.05
 #: What each input shows, by name: its channels of the 15 of an example's views.
 INPUTS: dict[str, slice] = {"unseparated": slice(0, 3), "separated": slice(3, 9), "perfect": slice(9, 15)}
-#: Raw pixels along the side of a frame.
-RAW_SIZE = 256
+#: Raw pixels along the side of a frame, and pixels of the maps, to which images are averaged, as frames of real
+#: cameras are.
+RAW_SIZE, MAP_SIZE = 512, 128
 
 
 @dataclass(frozen=True)
@@ -113,13 +115,22 @@ def see(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> Tensor:
 
 
 def make_example(maps: Svbrdf, views: int, generator: torch.Generator) -> Example:
-    """Photographs of a material ``[., H, W]``: the first by a flash beside the lens, the others by lights that move."""
+    """Photographs of a material ``[., H, W]``: the first by a flash beside the lens, the others by lights that move.
+
+    Half-resolution images and maps are averaged further until their sides are `MAP_SIZE`; H and W are twice that, or
+    twice that times a power of 2.
+    """
     place: list[Callable[[torch.Generator], PointLight]] = [random_flash, *[random_light] * (views - 1)]
-    seen = [see(maps, draw(generator), generator) for draw in place]
-    return Example(torch.stack(seen), halve(maps).stack())
+    seen = torch.stack([see(maps, draw(generator), generator) for draw in place])
+    while maps.roughness.shape[-1] > MAP_SIZE:
+        maps = halve(maps)
+    return Example(avg_pool2d(seen, seen.shape[-1] // MAP_SIZE), maps.stack())
 
 
-def random_example(split: str, seed: int, number: int, views: int) -> Example:
-    """Example ``number`` of a split, which depends on nothing else; ValueError on a split not in `views.SPLITS`."""
+def random_example(split: str, seed: int, number: int, views: int, size: int = RAW_SIZE) -> Example:
+    """Example ``number`` of a split, in frames of ``size`` raw pixels along a side, which depends on nothing else.
+
+    Raises ValueError on a split not in `views.SPLITS`.
+    """
     generator = torch.Generator().manual_seed(scene_seed(split, seed, number))
-    return make_example(random_svbrdf(RAW_SIZE, generator), views, generator)
+    return make_example(random_svbrdf(size, generator), views, generator)

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from recorded import record
 
-from polsep.bench import Row, provenance, to_jsonl
-from polsep.io.whole import replace_text
+from polsep.bench import Row
 
 #: Runs inside Blender: what it finds in a file, as one line of JSON.
 INSIDE = """
@@ -87,13 +87,10 @@ def read_colors(path: Path) -> np.ndarray:
 
 
 def main() -> None:
-    """Measure, print and write the rows."""
+    """Measure and record the rows."""
     blender, *paths = (Path(word) for word in sys.argv[1:])
     rows = [row for path in paths for row in compare(blender, path)]
-    for row in rows:
-        print(f"{row.case:40} {row.metric:36} {row.value:.4g}")
-    made_by = provenance(f"python baselines/blender_opens.py blender/bin/python {' '.join(map(str, paths))}")
-    replace_text(Path("results/blender.jsonl"), to_jsonl(rows, made_by))
+    record("blender", rows, f"python baselines/blender_opens.py blender/bin/python {' '.join(map(str, paths))}")
 
 
 if __name__ == "__main__":

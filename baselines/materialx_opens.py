@@ -16,8 +16,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from polsep.bench import Row, provenance, to_jsonl
-from polsep.io.whole import replace_text
+from recorded import record
+
+from polsep.bench import Row
 
 #: Runs beside MaterialX: what it says of a file, as one line of JSON.
 INSIDE = """
@@ -70,13 +71,10 @@ def check(python: Path, path: Path) -> Iterator[Row]:
 
 
 def main() -> None:
-    """Measure, print and write the rows."""
+    """Measure and record the rows."""
     python, *paths = (Path(word) for word in sys.argv[1:])
     rows = [row for path in paths for row in check(python, path)]
-    for row in rows:
-        print(f"{row.case:40} {row.metric:42} {row.value:.4g}")
-    made_by = provenance(f"python baselines/materialx_opens.py materialx/bin/python {' '.join(map(str, paths))}")
-    replace_text(Path("results/materialx.jsonl"), to_jsonl(rows, made_by))
+    record("materialx", rows, f"python baselines/materialx_opens.py materialx/bin/python {' '.join(map(str, paths))}")
 
 
 if __name__ == "__main__":

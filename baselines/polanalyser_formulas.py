@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import polanalyser as pa
 import torch
+from recorded import record
 
 import polsep
-from polsep.bench import Row, provenance, to_jsonl
+from polsep.bench import Row
 from polsep.camera import Layout
 from polsep.demosaic import demosaic_bilinear
 from polsep.io.frames import ReadOptions, read_frames
-from polsep.io.whole import replace_text
 from polsep.separation import separate_analytic
 from polsep.stokes import Measurements, fit_stokes
 
@@ -46,7 +46,7 @@ def peer_chain(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main() -> None:
-    """Measure parity and time, print and write the rows."""
+    """Measure parity and time, and record the rows."""
     capture = Path(polsep.__file__).parent / "data" / "still_life.png"
     mosaic = next(read_frames(capture, ReadOptions(white_level=4095.0))).data
     raw = mosaic.data.numpy().astype(np.uint16)
@@ -76,10 +76,7 @@ def main() -> None:
         Row("polanalyser", case, "polsep analytic", "seconds, half resolution", half_seconds, "s"),
         Row("polanalyser", case, "polsep analytic", "times faster, half resolution", peer_seconds / half_seconds, "x"),
     ]
-    for row in rows:
-        print(f"{row.method:20} {row.metric:32} {row.value:.4g} {row.unit}")
-    made_by = provenance("python baselines/polanalyser_formulas.py")
-    replace_text(Path("results/polanalyser.jsonl"), to_jsonl(rows, made_by))
+    record("polanalyser", rows, "python baselines/polanalyser_formulas.py")
 
 
 def polarized(stokes: polsep.Stokes) -> np.ndarray:

@@ -59,7 +59,7 @@ def test_steps_of_convolutions_are_orthogonal_and_of_adams_size() -> None:
 
 
 def test_features_alone_are_hidden() -> None:
-    """First and inner convolutions of both U-Nets; no biases, no heads, no linear first guess."""
+    """First and inner convolutions of the networks; no biases, no heads, no linear first guess."""
     net, paper = seeded("joint"), seeded("paper")
     assert isinstance(net, Joint)
     names = {id(w): n for n, w in (*net.named_parameters(), *paper.named_parameters())}

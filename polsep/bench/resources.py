@@ -53,7 +53,8 @@ def bench_resources(_data: Path | None = None) -> Iterator[Row]:
     """Seconds and peak memory of `polsep.separate` on the 2448x2048 demo capture, each method in its own process.
 
     The first call loads compiled kernels, and does not compile them. Memory is that of the whole process. The rate is
-    that of many frames, as many at once as there are cores and each on one of them, as `polsep video` takes them.
+    that of many frames, as many at once as there are cores and each on one of them, as `polsep video` takes them; what
+    runs in torch (`paper`) shares torch's own threads.
     """
     warm_up()
     capture = Path(polsep.__file__).parent / "data" / "still_life.png"

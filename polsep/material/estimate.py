@@ -14,9 +14,6 @@ from polsep.material.shots import INPUTS
 from polsep.material_network import MaterialNetwork, MaterialSize
 from polsep.svbrdf import Svbrdf, unstack
 
-#: Sides of the images that the networks were trained on.
-USUAL_SIZE = 128
-
 
 @dataclass(frozen=True)
 class Estimator:

@@ -18,8 +18,8 @@ from polsep.io.materials import MaterialFiles, material_targets, write_material
 from polsep.io.outputs import OutputError, refuse_targets
 from polsep.io.previews import Panel, Pixels, titled_sheet, toned
 from polsep.io.separated import read_separated
-from polsep.material.estimate import USUAL_SIZE, load_estimator
-from polsep.material.shots import CAMERA_HEIGHT
+from polsep.material.estimate import load_estimator
+from polsep.material.shots import CAMERA_HEIGHT, MAP_SIZE
 from polsep.pipeline import LightColor, separate_capture
 from polsep.svbrdf import Svbrdf, plane_points, relight
 
@@ -46,7 +46,7 @@ class MaterialOptions:
     method: str = "auto"
     light_color: LightColor | str = (1.0, 1.0, 1.0)
     white: tuple[float, ...] = ()
-    size: int = USUAL_SIZE
+    size: int = MAP_SIZE
     input: str = "separated"
     weights: Path | None = None
 

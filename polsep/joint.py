@@ -28,6 +28,7 @@ from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, pad, pixel_shuff
 from polsep.camera import Layout, Mosaic
 from polsep.color_affine import MAX_DIFFUSE_DOLP, fit_unclipped
 from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
+from polsep.details import Details
 from polsep.guided import MARGIN, guide_once
 from polsep.networks import ResidualSize, ResidualUNet
 from polsep.stokes import fit_stokes
@@ -114,7 +115,7 @@ class Joint(nn.Module):
         self.register_buffer("demosaic", bilinear_filter(self.layout) if demosaicker == "linear" else None)
         counts = {"samples": 16, "clipping": 17, "cosine": 4, "sine": 4, "split": 4 * colors + 10}
         self.net = ResidualUNet(1 + sum(counts[name] for name in inputs), size)
-        self.last = nn.Conv2d(size.widths[0], 16 * (colors + 1), 1)
+        self.last = nn.Conv2d(size.widths[0], 4 * (colors + 1), 1)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
         # Without the closed form among its maps the network does not know what it would believe.
@@ -128,6 +129,7 @@ class Joint(nn.Module):
         most = torch.tensor(MOST_DOUBT).repeat_interleave(4).view(1, 8, 1, 1)
         self.register_buffer("most_doubt", most, persistent=False)
         self.doubt = nn.Sequential(nn.Conv2d(size.widths[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 8, 1))
+        self.details = Details(colors, size.widths[0])
 
     def forward(self, raw: Tensor, clipped: Tensor) -> tuple[Images, Pose]:
         """Images at full resolution, ``[N, C, H, W]``.
@@ -135,32 +137,32 @@ class Joint(nn.Module):
         ``raw``, ``clipped [N, 1, H, W]``: samples and which of them clipped, H and W multiples of 4.
         """
         total, guess, features, doubt = self._see(raw, clipped, full=True)
-        change, turn, trust = self.last(features), self.pose(features), self._trust(features)
+        half, turn = self._correct(guess, features), self.pose(features)
         with torch.autocast(raw.device.type, enabled=False):
-            specular = _spread(guess.specular * (1 + trust))
-            diffuse = total - torch.cat([specular] * self.colors, dim=1)
-            images = torch.cat([diffuse, specular], dim=1) + change.float() * guess.light
             slope, direction = (guess.pose + turn.float()).chunk(2, dim=1)
             length = torch.sqrt((direction**2).sum(dim=1, keepdim=True) + 1e-6)
-            return self._unpack(images, guess, doubt), Pose(slope, direction / length)
+        full = self.details(half, total, features, guess.light)
+        return self._as_images(full, guess, doubt), Pose(slope, direction / length)
 
     def half_resolution(self, raw: Tensor, clipped: Tensor) -> Images:
         """The means over 2x2 cells of what `forward` gives, ``[N, C, H/2, W/2]``, in less time."""
         _, guess, features, doubt = self._see(raw, clipped, full=False)
-        weight, bias = pool_outputs(self.last.weight), pool_outputs(self.last.bias)  # type: ignore[arg-type]
-        change, trust = conv2d(features, weight, bias), self._trust(features)
-        with torch.autocast(raw.device.type, enabled=False):
+        return self._as_images(self._correct(guess, features), guess, doubt)
+
+    def _correct(self, guess: Guess, features: Tensor) -> Tensor:
+        """Diffuse colours and specular at half resolution ``[N, C + 1, H/2, W/2]``."""
+        change, trust = self.last(features), self._trust(features)
+        with torch.autocast(features.device.type, enabled=False):
             moved = guess.specular * trust
             closed = torch.cat([guess.diffuse - torch.cat([moved] * self.colors, dim=1), guess.specular + moved], dim=1)
-            return self._unpack(closed + change.float() * guess.light, guess, doubt)
+            return pixel_shuffle(closed + change.float() * guess.light, 2)
 
     def _trust(self, features: Tensor) -> Tensor:
         """How much more specular light there is than in the closed form, relative to that ``[N, 4 or 1, h, w]``."""
         trust = torch.zeros_like(features[:, :1]) if self.trust is None else self.trust(features)
         return trust.float()
 
-    def _unpack(self, packed: Tensor, guess: Guess, doubt: Tensor) -> Images:
-        images = pixel_shuffle(packed, math.isqrt(packed.shape[1] // (self.colors + 1)))
+    def _as_images(self, images: Tensor, guess: Guess, doubt: Tensor) -> Images:
         s1, s2 = (pixel_shuffle(s, 2) for s in guess.polarized.chunk(2, dim=1))
         return Images(images[:, : self.colors], images[:, self.colors :], s1, s2, doubt, guess.light, guess.misfit)
 
@@ -314,12 +316,6 @@ def _filter(planes: Tensor, weight: Tensor) -> Tensor:
 def pool_outputs(weight: Tensor) -> Tensor:
     """Weights of packed full-resolution outputs ``[16 k, ...]``, as those of their means over cells ``[4 k, ...]``."""
     return weight.view(-1, 2, 2, 2, 2, *weight.shape[1:]).mean(dim=(2, 4)).flatten(0, 2)
-
-
-def _spread(half: Tensor) -> Tensor:
-    """Packed images at half resolution ``[N, 4, h, w]``, repeated to full resolution ``[N, 16, h, w]``."""
-    places = [2 * (row // 2) + col // 2 for row in range(4) for col in range(4)]
-    return half[:, places]
 
 
 def limit(images: Images) -> tuple[Tensor, Tensor, Tensor]:

@@ -67,7 +67,7 @@ class Layers(nn.Module):
         super().__init__()
         self.net, self.doubt, self.most_doubt = network.net, network.doubt, network.most_doubt
         assert network.last.bias is not None
-        weight, bias = (pool_outputs(x) for x in (network.last.weight, network.last.bias))
+        weight, bias = network.last.weight, network.last.bias
         if network.trust is None:
             trust = [torch.zeros_like(weight[:4]), torch.zeros_like(bias[:4])]
         else:

@@ -182,4 +182,4 @@ def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:
 
 def count_parameters(module: nn.Module) -> int:
     """How many numbers training sets."""
-    return sum(p.numel() for p in module.parameters() if p.requires_grad)
+    return sum(p.numel() for p in module.parameters())

@@ -28,6 +28,7 @@ RANKS = {
     "guided": 3,
     "refine": 3,
     "orient": 3,
+    "details": 3,
     "joint": 4,
     "graph": 5,
     "layout_check": 3,

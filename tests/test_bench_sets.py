@@ -118,14 +118,20 @@ def test_full_resolution_is_scored_at_full_resolution() -> None:
 def test_reliability_is_that_of_all_pixels_of_a_set(tmp_path: Path) -> None:
     rows = list(measure_reliability("grey", (GREY,), tmp_path))
     assert {(row.method, row.metric) for row in rows if row.unit == "octaves"} == {
-        (method, f"{output}, miss") for method in NAMES for output in ("diffuse", "specular")
+        (method, f"{output}, miss{where}")
+        for method in NAMES
+        for output in ("diffuse", "specular")
+        for where in ("", " where nothing clips")
     }
     case = build_case(GREY)
     (diffuse, _, mask), found = case.half_truth(), METHODS["joint"].half(case.noisy)
-    assert found.doubt is not None
+    assert found.doubt is not None and found.clipped is not None
     curve = reliability(found.diffuse - diffuse, found.doubt[0], mask, BINS)
     said = [row.value for row in rows if row.method == "joint" and row.metric == "diffuse error, expected"]
     assert said == pytest.approx(curve.expected.tolist())
+    away = reliability(found.diffuse - diffuse, found.doubt[0], mask & ~found.clipped, BINS)
+    (miss,) = (row.value for row in rows if row.method == "joint" and row.metric == "diffuse, miss where nothing clips")
+    assert miss == pytest.approx(away.miss)
 
 
 def test_sets_without_their_data_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -379,6 +379,7 @@ def test_without_tensorboard_the_extra_is_named(
         (["joint", "--width", "0"], "expected a width"),
         (["joint", "--blocks", "1,x"], "expected blocks per level like 1,1,2, found '1,x'"),
         (["joint", "--ablation", "x"], "expected an ablation of none"),
+        (["joint", "--part", "x"], "expected a part of all, details"),
         (["joint-fast", "--data", "co-sited"], "expected a variant of mosaic, mono"),
         (["paper", "--steps", "0"], "expected at least 1 step"),
         (["paper", "--workers", "-1"], "expected at least 1 step"),

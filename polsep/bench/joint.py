@@ -74,23 +74,28 @@ def enlarge(image: Tensor) -> Tensor:
 
 
 def measure_reliability(name: str, recipes: Sequence[Recipe], data: Path) -> Iterator[Row]:
-    """Of both outputs of the joint networks, over all pixels on objects of a set: a curve, and how far it is off."""
+    """Of both outputs of the joint networks, over all pixels on objects of a set: a curve, and how far it is off.
+
+    The latter also of the pixels near which nothing clips: the others, a few, hold most of what can be off.
+    """
     from polsep.testsets import build_cases
 
-    seen: dict[tuple[str, str], list[tuple[Tensor, Tensor]]] = {}
+    seen: dict[tuple[str, str], list[tuple[Tensor, Tensor, Tensor]]] = {}
     for case in build_cases(recipes, data):
         capture, (diffuse, specular, mask) = see_noisy(case)
         for method in NAMES:
             found = METHODS[method].half(capture)
-            assert found.doubt is not None
+            assert found.doubt is not None and found.clipped is not None
             outputs = (("diffuse", found.diffuse - diffuse), ("specular", found.specular - specular))
             for (output, error), expected in zip(outputs, found.doubt, strict=True):
-                seen.setdefault((method, output), []).append((error[:, mask], expected[mask]))
+                part = (error[:, mask], expected[mask], ~found.clipped[mask])
+                seen.setdefault((method, output), []).append(part)
     for (method, output), parts in seen.items():
-        errors, expected = (torch.cat(x, dim=-1) for x in zip(*parts, strict=True))
-        everywhere = torch.ones(1, expected.numel(), dtype=torch.bool)
-        curve = reliability(errors[:, None], expected[None], everywhere, BINS)
+        errors, expected, whole = (torch.cat(x, dim=-1)[..., None, :] for x in zip(*parts, strict=True))
+        curve = reliability(errors, expected, torch.ones_like(whole), BINS)
         yield Row("joint/reliability", name, method, f"{output}, miss", curve.miss, "octaves")
+        away = reliability(errors, expected, whole, BINS)
+        yield Row("joint/reliability", name, method, f"{output}, miss where nothing clips", away.miss, "octaves")
         for k, (said, true) in enumerate(zip(curve.expected.tolist(), curve.found.tolist(), strict=True)):
             yield Row("joint/curve", f"{name}, tenth {k + 1}", method, f"{output} error, expected", said, "white")
             yield Row("joint/curve", f"{name}, tenth {k + 1}", method, f"{output} error, found", true, "white")

@@ -17,7 +17,7 @@ from polsep.io.checkpoints import read_module
 from polsep.io.weights import write_weights
 from polsep.joint import Demosaicker
 from polsep.networks import ResidualSize, Size, count_parameters
-from polsep.train.joint_task import ABLATIONS, DEMOSAICKERS, SIZES, VIEWS, joint_task
+from polsep.train.joint_task import ABLATIONS, DEMOSAICKERS, PARTS, SIZES, VIEWS, hold_others, joint_task
 from polsep.train.joint_views import JointSeen
 from polsep.train.log import curve_of, read_log, references_of
 from polsep.train.loop import Run, train
@@ -89,7 +89,8 @@ class TrainOptions:
 class JointOptions:
     """The joint network to train, by ``name`` of `joint_task.SIZES`; ``variant``: for colour (mosaic) or mono frames.
 
-    ``ablation``: what of `joint_task.ABLATIONS` differs. Raises ValueError on names that there are not.
+    ``ablation``: what of `joint_task.ABLATIONS` differs. ``part``: what of `joint_task.PARTS` is trained, others held.
+    Raises ValueError on names that there are not.
     """
 
     name: str
@@ -97,17 +98,21 @@ class JointOptions:
     size: ResidualSize | None = None
     ablation: str = "none"
     seed: int = 0
+    part: str = "all"
 
     def __post_init__(self) -> None:
         find(SIZES, "a joint network", self.name)
         find(VIEWS, "a variant", self.variant)
         find(ABLATIONS, "an ablation", self.ablation)
+        find(PARTS, "a part", self.part)
         if self.size is None:
             object.__setattr__(self, "size", SIZES[self.name])
 
     def task(self) -> Task[JointSeen]:
         """That of the network and its ablation."""
-        return joint_task(self.variant, self.size or SIZES[self.name], ABLATIONS[self.ablation], self.demosaicker)
+        task = joint_task(self.variant, self.size or SIZES[self.name], ABLATIONS[self.ablation], self.demosaicker)
+        hold_others(task.network, self.part)
+        return task
 
     @property
     def demosaicker(self) -> Demosaicker:
@@ -193,7 +198,7 @@ def describe_command(options: Options, run: Run) -> str:
     else:
         size = options.size or SIZES[options.name]
         asked |= {"width": size.width, "blocks": ",".join(map(str, size.blocks)), "entry": size.entry}
-        asked |= {"ablation": options.ablation}
+        asked |= {"ablation": options.ablation, "part": options.part}
     asked |= {
         "steps": schedule.steps,
         "rate": schedule.rate,
@@ -224,7 +229,7 @@ def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:
         raise ValueError(f"expected blocks per level like 1,1,2, found {asked['blocks']!r}") from None
     entry = usual.entry if asked["entry"] is None else asked["entry"]
     larger = ResidualSize(usual.width if width is None else width, blocks, entry)
-    return JointOptions(name, data, larger, asked["ablation"], asked["seed"])
+    return JointOptions(name, data, larger, asked["ablation"], asked["seed"], asked["part"])
 
 
 def plan_run(run: Run, options: Options) -> Run:

@@ -60,6 +60,8 @@ ABLATIONS = {
     "no-data-term": Ablation(goal=Goal(data=0.0)),
     "paper-loss": Ablation(goal=Goal(paper_difference)),
 }
+#: What can be trained alone: which parameters of a network it is, by the beginning of their names.
+PARTS = {"all": "", "details": "details."}
 #: How examples are seen, and in how many colours.
 VIEWS = {"mosaic": (see_raw, 3), "mono": (see_raw_mono, 1)}
 
@@ -89,6 +91,12 @@ def joint_task(
         network.demosaic.copy_(fit_filter(see(batch) for batch in batches))
 
     return Task(network, see, loss, separate, measure_bilinearly, begin)
+
+
+def hold_others(network: nn.Module, part: str) -> None:
+    """Let only one of `PARTS` of a network be trained."""
+    for name, weight in network.named_parameters():
+        weight.requires_grad_(name.startswith(PARTS[part]))
 
 
 def measure_bilinearly(seen: JointSeen) -> Measurements:

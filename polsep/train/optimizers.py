@@ -24,15 +24,15 @@ LEAST_SIDE = 16
 
 
 class Optimizers:
-    """Both, for a ``network`` that is where it will stay.
+    """Both, for those weights of a ``network``, which is where it will stay, that are to be trained.
 
     State: that of both. Muon takes matrices alone, so it has twins of the convolutions that share their memory.
     """
 
     def __init__(self, network: nn.Module) -> None:
-        hidden = list(hidden_weights(network))
+        hidden = [weight for weight in hidden_weights(network) if weight.requires_grad]
         taken = {id(weight) for weight in hidden}
-        rest = [weight for weight in network.parameters() if id(weight) not in taken]
+        rest = [weight for weight in network.parameters() if weight.requires_grad and id(weight) not in taken]
         self._adam = torch.optim.AdamW(rest, lr=0.0, betas=BETAS, weight_decay=WEIGHT_DECAY)
         self._twins = [(weight, nn.Parameter(as_matrix(weight.detach()))) for weight in hidden]
         matrices = [twin for _, twin in self._twins]

@@ -17,9 +17,10 @@ from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
 from polsep.engine import run_analytic, run_color_affine, run_nothing
 from polsep.guided import demosaic_guided, demosaic_guided_half
 from polsep.io.weights import is_shipped
-from polsep.joint_engine import JointImages, run_engine
+from polsep.joint_engine import run_engine
 from polsep.learned import separate_paper
 from polsep.mosaic_network import NAMES, separate_mosaic, takes, weights_name
+from polsep.openvino_engine import JointImages
 from polsep.separation import Separation, separate_analytic
 from polsep.stokes import Measurements
 
@@ -35,7 +36,7 @@ class Method:
     """A separation method: what it makes of a frame at ``half`` and at ``full`` resolution; the rest is to be read.
 
     Co-sited measurements keep their resolution. ``takes``: whether it can separate a capture; the others are a
-    ValueError. ``engine``: the compiled twin of ``half``, which gives None for frames that it does not take.
+    ValueError. ``engine``, ``full_engine``: their compiled twins, which give None for frames that they do not take.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Method:
     summary: str
     needs: str
     source: str
+    full_engine: Callable[[Mosaic], JointImages | None] = run_nothing
 
 
 def compose(
@@ -74,10 +76,11 @@ def _joint(name: str, summary: str) -> Method:
         separate_mosaic(name, "half"),
         separate_mosaic(name, "full"),
         takes(name),
-        partial(run_engine, name),
+        partial(run_engine, name, "half"),
         summary,
         f"a raw mosaic with Sony's filters in any orientation, {colors}; trained under white light",
         "this project; after Dave et al. 2022 and the colour-affine closed form",
+        partial(run_engine, name, "full"),
     )
 
 

@@ -20,10 +20,10 @@ from torch import Tensor
 
 from polsep.camera import Layout, Mosaic
 from polsep.demosaic import demosaic_bilinear_half
-from polsep.joint_engine import JointImages
 from polsep.layout_check import check_layout
 from polsep.levels import as_mosaic
 from polsep.methods import Capture, Method, find_method
+from polsep.openvino_engine import JointImages
 from polsep.report import SeparatedFrame, describe, grey, tally
 from polsep.separation import Separation
 from polsep.stokes import Measurements, aolp, dolp, fit_stokes_unclipped, polarized_intensity
@@ -83,7 +83,7 @@ def separate_capture(
 
 def separate_known(capture: Capture, method: Method, light: tuple[float, ...], full: bool = False) -> SeparatedFrame:
     """`separate_capture` where method, light and layout are settled, as from the second frame of a video on."""
-    frame = None if full else separate_in_engine(capture, method, light)
+    frame = separate_in_engine(capture, method, light, full)
     if frame is None:
         frame = separate_in_torch(capture, method, light, full)
     frame.report.update(method=method.name, light_color=list(light), full_resolution=full)
@@ -91,9 +91,12 @@ def separate_known(capture: Capture, method: Method, light: tuple[float, ...], f
     return frame
 
 
-def separate_in_engine(capture: Capture, method: Method, light: tuple[float, ...]) -> SeparatedFrame | None:
-    """A capture through the method's compiled twin, at half resolution, or None where that does not take it."""
-    images = method.engine(replace(capture, light_color=light)) if isinstance(capture, Mosaic) else None
+def separate_in_engine(
+    capture: Capture, method: Method, light: tuple[float, ...], full: bool = False
+) -> SeparatedFrame | None:
+    """A capture through the method's compiled twin, or None where that does not take it."""
+    engine = method.full_engine if full else method.engine
+    images = engine(replace(capture, light_color=light)) if isinstance(capture, Mosaic) else None
     if images is None:
         return None
     assert images.dolp is not None and images.aolp is not None and images.tally is not None

@@ -6,7 +6,7 @@ this room imports numba; ``import polsep`` does not.
 
 from __future__ import annotations
 
-from polsep.kernels import analytic, color_affine, joint_images, temporal
+from polsep.kernels import analytic, color_affine, joint_details, joint_images, temporal
 from polsep.kernels.analytic import AnalyticImages, AnalyticOptions, separate_analytic_half
 from polsep.kernels.color_affine import ColorAffineImages, ColorAffineOptions, separate_color_affine_half
 from polsep.kernels.threads import get_threads, set_threads
@@ -31,4 +31,5 @@ def warm_up() -> None:
     analytic.warm_up()
     color_affine.warm_up()
     joint_images.warm_up()
+    joint_details.warm_up()
     temporal.warm_up()

@@ -109,6 +109,17 @@ def mean_cells(planes: Any, mean: Any) -> None:
 
 
 @compiled
+def detail_cells(planes: Any, details: Any) -> None:
+    """Left less right, top less bottom and the diagonal of each cell of ``planes [4, n]``; see `polsep.details`."""
+    a, b, c, d = planes[0], planes[1], planes[2], planes[3]
+    across, down, diagonal = details[0], details[1], details[2]
+    for j in range(across.size):
+        across[j] = QUARTER * ((a[j] - b[j]) + (c[j] - d[j]))
+        down[j] = QUARTER * ((a[j] + b[j]) - (c[j] + d[j]))
+        diagonal[j] = QUARTER * ((a[j] - b[j]) - (c[j] - d[j]))
+
+
+@compiled
 def _vertical(rows: tuple[Any, Any, Any, Any], other: Any, room: Any) -> None:
     """Vertical part of `demosaic_bilinear_half` for one analyser: the row's own red or blue, the next row's, green."""
     own, near, back, far = rows[0][GUARD:], rows[1][GUARD:], rows[2][GUARD:], rows[3][GUARD:]

@@ -25,6 +25,7 @@ from polsep.kernels.cells import (
     blur_pixels_along,
     blur_pixels_down,
     choose,
+    detail_cells,
     load_cells,
     mean_cells,
     polarize_row,
@@ -58,9 +59,10 @@ class Stream(NamedTuple):
 
     ``raw``: samples. ``sums``: s1 and s2 of three colours, over the cells of a row's window; ``smooth``: over all.
     ``mosaic``: s0 of each pixel's colour. ``means [length, n]``: its cells'. ``green``, ``filled``: s0. ``total``: cell
-    means of red, green, blue. ``tent``, ``detail``: of the guide. ``residual``: samples minus half the guide.
-    ``found``: s1 and s2, means over colours or of each. ``sensor_row``: room for one. ``rows``: for others. ``first``:
-    row of the frame that the stream begins with, an even one. ``pushed [1]``: rows so far.
+    means of red, green, blue, and the details of all three where asked for. ``tent``, ``detail``: of the guide.
+    ``residual``: samples minus half the guide. ``found``: s1 and s2, means over colours or of each. ``sensor_row``:
+    room for one. ``rows``: for others. ``first``: row of the frame that the stream begins with, an even one. ``pushed
+    [1]``: rows so far.
     """
 
     raw: NDArray[np.float32]
@@ -83,8 +85,11 @@ class Stream(NamedTuple):
     pushed: NDArray[np.int64]
 
 
-def open_stream(source: Source, start: int, apart: bool = False) -> Stream:
-    """A stream whose results begin with the frame's row ``start``, an even one; ``apart``: s1, s2 of every colour."""
+def open_stream(source: Source, start: int, apart: bool = False, details: bool = False) -> Stream:
+    """A stream whose results begin with the frame's row ``start``, an even one.
+
+    ``apart``: with s1, s2 of every colour; ``details``, then only: and with those of s0.
+    """
     n = source.grid.n
     return Stream(
         np.zeros((_RESIDUAL + 1, 4, n), np.float32),
@@ -94,7 +99,7 @@ def open_stream(source: Source, start: int, apart: bool = False) -> Stream:
         np.zeros((_GREEN - _INTENSITY + 2, n), np.float32),
         np.zeros((_RESIDUAL - _GREEN + 1, 4, n), np.float32),
         np.zeros((3, 8, n), np.float32),
-        np.zeros((REACH - _FILLED + 1, 3, n), np.float32),
+        np.zeros((REACH - _FILLED + 1, 12 if details else 3, n), np.float32),
         np.zeros((2, 4, n), np.float32),
         np.zeros((3, 4, n), np.float32),
         np.zeros((5, 4, n), np.float32),
@@ -253,6 +258,10 @@ def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
     mean_cells(stream.filled[r % 3], total[0])
     mean_cells(stream.green[r % stream.green.shape[0]], total[1])
     mean_cells(stream.filled[r % 3, 4:], total[2])
+    if total.shape[0] > 3:
+        detail_cells(stream.filled[r % 3], total[3:6])
+        detail_cells(stream.green[r % stream.green.shape[0]], total[6:9])
+        detail_cells(stream.filled[r % 3, 4:], total[9:12])
 
     _tent_row(stream, u - _TENT, grid)
     _residual_row(stream, u - _RESIDUAL)
@@ -266,6 +275,8 @@ def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
     for s in range(above.shape[0]):
         blur_gently_down(above[s], here[s], below[s], rows[0])
         _copy_inside(rows[0], out[3 + s])
+    for k in range(3, total.shape[0]):
+        _copy_inside(total[k], out[above.shape[0] + k])
 
 
 @entry
@@ -273,7 +284,7 @@ def demosaic_rows(source: Source, stream: Stream, piece: Piece, out: Any) -> Non
     """The frame's cell rows of a piece, which continues the one before, to ``out [rows, 5, w]``.
 
     A row is s0 of three colours and the means over colours of s1 and s2; of a stream ``apart``, each colour's s1, then
-    s2, ``[rows, 9, w]``.
+    s2, ``[rows, 9, w]``, and with details those of each colour, ``[rows, 18, w]``.
     """
     for t in range(piece[0], piece[1]):
         while stream.first + stream.pushed[0] <= t + REACH:

@@ -53,8 +53,9 @@ _ROWS = 17
 class Taps(NamedTuple):
     """The linear filter at half resolution, and its ``colors``.
 
-    ``weight [4, 3 C, K]``: of 4 cells, s0, s1, s2 of C colours; ``row``, ``place [4, K]``: of the samples that a cell's
-    outputs see, their packed row, 0 to 2, and their place in rows ``[16, w + 2]``; K is a multiple of `rows.AT_ONCE`.
+    ``weight [4, 3 C, K]``: of 4 cells, s0, s1, s2 of C colours, and ``[4, 6 C, K]`` with the details of s0; ``row``,
+    ``place [4, K]``: of the samples that a cell's outputs see, their packed row, 0 to 2, and their place in rows
+    ``[16, w + 2]``; K is a multiple of `rows.AT_ONCE`.
     """
 
     weight: Floats
@@ -68,7 +69,7 @@ class Maps(NamedTuple):
 
     ``first [6]``: the first channel of samples, clipping, cosine, sine, split, logarithm; -1 for what is not wanted.
     ``base [h, 4 C + 14, w]``: diffuse, specular, means over colours of s1 and s2, light, misfit. ``clipped [h, w]``: a
-    bit per sample of a packed pixel.
+    bit per sample of a packed pixel. ``details [2 h, 3 C, 2 w]``: of s0, three of every colour; or empty.
     """
 
     floats: Floats
@@ -76,6 +77,7 @@ class Maps(NamedTuple):
     first: NDArray[np.int64]
     base: Floats
     clipped: NDArray[np.uint16]
+    details: Floats
 
 
 class _Rings(NamedTuple):
@@ -172,6 +174,21 @@ def _filter_samples(taps: Taps, u: int, h: int, rings: _Rings, polarized: Any) -
 
 
 @compiled
+def _filter_details(taps: Taps, u: int, h: int, rings: _Rings, work: tuple[Any, Any]) -> None:
+    """Details of s0 of row ``u`` by the linear filter."""
+    details, spare = work
+    near = (rings.planes.reshape(-1), _starts(u, h, rings.planes[0].size))
+    for cell in range(4):
+        for k in range(0, 3 * taps.colors, 3):
+            weight = taps.weight[cell, 3 * taps.colors + k : 3 * taps.colors + k + 3]
+            filter_rows(weight, (taps.row[cell], taps.place[cell]), near, (spare[0], spare[1], spare[2]))
+            for i in range(3):
+                row, out = spare[i], details[2 * u + cell // 2, k + i, cell % 2 :]
+                for j in range(row.size):
+                    out[2 * j] = row[j]
+
+
+@compiled
 def _stokes_row(k: int, s0: Any, polarized: Any) -> Any:
     """One of the rows of s0, s1 and s2."""
     return s0[k] if k < s0.shape[0] else polarized[k - s0.shape[0]]
@@ -179,7 +196,7 @@ def _stokes_row(k: int, s0: Any, polarized: Any) -> Any:
 
 @compiled
 def _take_apart(rows: Any, s0: Any, polarized: Any) -> None:
-    """Stokes rows ``[2, 9, 2 w]`` of two rows of cells as packed ones, ``[12, w]`` and ``[24, w]``."""
+    """Stokes rows ``[2, 9 or 18, 2 w]`` of two rows of cells as packed ones, ``[12, w]`` and ``[24, w]``."""
     for cell in range(4):
         for k in range(9):
             row, packed = rows[cell // 2, k, cell % 2 :], s0[4 * k + cell] if k < 3 else polarized[4 * (k - 3) + cell]
@@ -371,6 +388,8 @@ def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, piece: 
             _enter((samples, pattern), u + 1, piece, rings, maps.clipped)
         if u < h:
             _filter_samples(taps, u, h, rings, polarized)
+            if maps.details.size and piece[0] <= u < piece[1]:
+                _filter_details(taps, u, h, rings, (maps.details, spare))
             _describe(taps.colors, u, rings, polarized, spare)
         _go_on(u, piece, rings, maps, spare)
 
@@ -379,17 +398,20 @@ def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, piece: 
 def _map_guided_rows(source: Source, stream: Stream, maps: Maps, piece: Piece) -> None:
     h, w = maps.clipped.shape
     rings, spare, polarized = _make_rings(3, maps), np.zeros((_ROWS, w), np.float32), np.empty((24, w), np.float32)
-    rows = np.empty((2, 9, 2 * w), np.float32)
+    rows = np.empty((2, 18 if maps.details.size else 9, 2 * w), np.float32)
     for u in range(max(piece[0] - REACH, 0), piece[1] + REACH):
         if u < h:
             _enter((source.samples, source.pattern), u, piece, rings, maps.clipped)
             demosaic_rows(source, stream, (2 * u, 2 * u + 2), rows)
             _take_apart(rows, rings.s0[u % KEPT], polarized)
+            if maps.details.size and piece[0] <= u < piece[1]:
+                for k in range(18):
+                    copy(rows[k // 9, 9 + k % 9], maps.details[2 * u + k // 9, k % 9])
             _describe(3, u, rings, polarized, spare)
         _go_on(u, piece, rings, maps, spare)
 
 
 def map_guided_rows(source: Source, maps: Maps, piece: Piece) -> None:
     """The maps and the closed form of a piece of the packed rows of a colour frame, by the intensity guide."""
-    stream = open_stream(source, 2 * max(piece[0] - REACH, 0), apart=True)
+    stream = open_stream(source, 2 * max(piece[0] - REACH, 0), apart=True, details=maps.details.size > 0)
     _map_guided_rows(source, stream, maps, piece)

@@ -69,7 +69,7 @@ def _correct(closed: Any, change: Any, light: Any, moved: Any, image: Any) -> No
 
 
 @compiled
-def _spread(row: Any, gain: Any, place: int, image: Any) -> None:
+def spread(row: Any, gain: Any, place: int, image: Any) -> None:
     """A row to every so many numbers of an image row, from ``place`` on; as many as make its size."""
     step = image.size // row.size
     for j in range(row.size):
@@ -93,12 +93,12 @@ def _write_cells(found: Found, t: int, cell: int, gains: Any, work: tuple[Target
     for c in range(colors):
         _correct(base[4 * c + cell], found.change[4 * c + cell, t], light, moved, image)
         add_product(image, np.float32(1 / colors), s0)
-        _spread(image, gains[c], colors * side + c, targets.diffuse[y])
-        _spread(tau, gains[c], colors * side + c, targets.specular[y])
+        spread(image, gains[c], colors * side + c, targets.diffuse[y])
+        spread(tau, gains[c], colors * side + c, targets.specular[y])
     s1, s2 = base[4 * colors + 4 + cell], base[4 * colors + 8 + cell]
     polarize(s0, s1, s2, dolp, aolp)
-    _spread(dolp, ONE, side, targets.dolp[y])
-    _spread(aolp, ONE, side, targets.aolp[y])
+    spread(dolp, ONE, side, targets.dolp[y])
+    spread(aolp, ONE, side, targets.aolp[y])
     mean_gain = ZERO
     for c in range(colors):
         mean_gain += gains[c] / np.float32(colors)
@@ -107,7 +107,7 @@ def _write_cells(found: Found, t: int, cell: int, gains: Any, work: tuple[Target
         doubt = found.doubt[4 * kind + cell, t]
         for j in range(image.size):
             image[j] = doubt[j] * light[j]
-        _spread(image, mean_gain, 2 * side + kind, targets.error[y])
+        spread(image, mean_gain, 2 * side + kind, targets.error[y])
         for j in range(image.size):
             image[j] *= image[j]
         sums[6 + kind] += add_up(image)
@@ -116,11 +116,11 @@ def _write_cells(found: Found, t: int, cell: int, gains: Any, work: tuple[Target
     for j in range(dolp.size):
         moved[j] = ONE if dolp[j] > ONE else ZERO
     sums[2] += add_up(moved)
-    _add_polarization((tau, s1, s2), image, sums[3:6])
+    add_polarization((tau, s1, s2), image, sums[3:6])
 
 
 @compiled
-def _add_polarization(rows: tuple[Any, Any, Any], room: Any, sums: Any) -> None:
+def add_polarization(rows: tuple[Any, Any, Any], room: Any, sums: Any) -> None:
     """Add power, and power along and across, of the polarization ``rows[1:]`` where there is specular light."""
     tau, p1, p2 = rows
     for j in range(room.size):
@@ -135,7 +135,7 @@ def _add_polarization(rows: tuple[Any, Any, Any], room: Any, sums: Any) -> None:
 
 
 @compiled
-def _mark_clipped(clipped: Any, y: int, valid: Any, near: Any) -> int:
+def mark_clipped(clipped: Any, y: int, valid: Any, near: Any) -> int:
     """False in ``valid [2 w]`` near cells of which all clips; how many cells of the row are near a clipped sample.
 
     ``near [2 w + 2]``, uint8, for cells of a row and one more on both sides: 1 where a sample clips, 2 where all do.
@@ -176,7 +176,7 @@ def write_rows(found: Found, gains: Floats, targets: Targets, piece: Piece) -> N
         for cell in range(4):
             _write_cells(found, t, cell, gains, (targets, spare))
         for y in range(2 * t, 2 * t + 2):
-            targets.sums[y, 8] = _mark_clipped(found.clipped, y, targets.valid[y], near)
+            targets.sums[y, 8] = mark_clipped(found.clipped, y, targets.valid[y], near)
             targets.sums[y, 9] = _CELLS * add_up(found.base[t, found.base.shape[1] - 1])
 
 
@@ -187,7 +187,8 @@ def warm_up() -> None:
     pattern = read_pattern((PERIOD * size, PERIOD * size), layout, 0, 1, (1.0, 1.0, 1.0))
     base, clipped = np.zeros((size, 26, size), np.float32), np.zeros((size, size), np.uint16)
     first = np.array([-1, -1, -1, -1, -1, 0], np.int64)
-    maps = Maps(np.zeros((size, size, 1), np.float32), np.zeros((0, 0, 0), np.uint16), first, base, clipped)
+    none = np.zeros((0, 0, 0), np.float32)
+    maps = Maps(np.zeros((size, size, 1), np.float32), none.astype(np.uint16), first, base, clipped, none)
     nothing = np.zeros((4, AT_ONCE), np.int64)
     map_rows(samples, pattern, Taps(np.zeros((4, 9, AT_ONCE), np.float32), nothing, nothing, 3), maps, (0, size))
     grid = read_grid(pattern, layout.angles, stokes_inverse(layout.angles).float().numpy())

@@ -15,7 +15,7 @@ pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 
 from polsep import testsets
 from polsep.bench.ablations import ablation_entry, find_ablations
-from polsep.bench.joint import BINS, enlarge, full_entries, measure_reliability, see_full
+from polsep.bench.joint import BINS, enlarge, full_entries, measure_engines, measure_reliability, see_full
 from polsep.bench.rendering import bench_rendering
 from polsep.bench.scoring import Entry, Protocol, score_case, score_sets, see_clean, see_co_sited, see_noisy
 from polsep.bench.sets import bench_sets
@@ -36,7 +36,14 @@ def make_grey(_paths: list[Path], _generator: torch.Generator) -> Scene:
     return Scene(Stokes(grey, 0 * grey, 0 * grey), Stokes(grey, grey, 0 * grey), grey[0] > 0)
 
 
-GREY = Recipe("grey", 1, (), make_grey)
+def make_step(_paths: list[Path], _generator: torch.Generator) -> Scene:
+    """A grey frame of which one half is too dark to clip."""
+    grey = torch.ones(3, 32, 32)
+    grey[:, :, 16:] = 0.3
+    return Scene(Stokes(grey, 0 * grey, 0 * grey), Stokes(grey, grey, 0 * grey), grey[0] > 0)
+
+
+GREY, STEP = Recipe("grey", 1, (), make_grey), Recipe("step", 1, (), make_step)
 ANALYTIC = Entry("analytic", compose(demosaic_bilinear_half, separate_analytic))
 PROTOCOLS = [
     Protocol(n, s, (ANALYTIC,)) for n, s in (("noisy", see_noisy), ("clean", see_clean), ("all", see_co_sited))
@@ -116,14 +123,14 @@ def test_full_resolution_is_scored_at_full_resolution() -> None:
 
 
 def test_reliability_is_that_of_all_pixels_of_a_set(tmp_path: Path) -> None:
-    rows = list(measure_reliability("grey", (GREY,), tmp_path))
+    rows = list(measure_reliability("step", (STEP,), tmp_path))
     assert {(row.method, row.metric) for row in rows if row.unit == "octaves"} == {
         (method, f"{output}, miss{where}")
         for method in NAMES
         for output in ("diffuse", "specular")
         for where in ("", " where nothing clips")
     }
-    case = build_case(GREY)
+    case = build_case(STEP)
     (diffuse, _, mask), found = case.half_truth(), METHODS["joint"].half(case.noisy)
     assert found.doubt is not None and found.clipped is not None
     curve = reliability(found.diffuse - diffuse, found.doubt[0], mask, BINS)
@@ -132,6 +139,18 @@ def test_reliability_is_that_of_all_pixels_of_a_set(tmp_path: Path) -> None:
     away = reliability(found.diffuse - diffuse, found.doubt[0], mask & ~found.clipped, BINS)
     (miss,) = (row.value for row in rows if row.method == "joint" and row.metric == "diffuse, miss where nothing clips")
     assert miss == pytest.approx(away.miss)
+
+
+def test_engines_are_compared_with_torch(tmp_path: Path) -> None:
+    """Only layers are rounded."""
+    rows = list(measure_engines("grey", (GREY,), tmp_path))
+    assert {(row.method, row.metric) for row in rows} == {
+        (method, f"{output} PSNR, {kind} resolution, largest change")
+        for method in NAMES
+        for output in ("diffuse", "specular")
+        for kind in ("half", "full")
+    }
+    assert all(0 <= row.value < 0.5 for row in rows)
 
 
 def test_sets_without_their_data_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""The joint networks on the fixed test sets: images at full resolution, and whether they know their own errors.
+"""The joint networks on the fixed test sets: at full resolution, whether they know their errors, what engines change.
 
 Full resolution is scored against the truth of every pixel of the noisy mosaic. Methods that give half-resolution images
 only have theirs enlarged, linearly between the cells' centres.
@@ -18,8 +18,9 @@ from torch.nn.functional import interpolate
 from polsep.bench.rows import Row
 from polsep.bench.scoring import Entry, Protocol, Truth, find_absent, score_sets, see_noisy
 from polsep.bench.sets import load_sets
+from polsep.camera import Mosaic
 from polsep.methods import METHODS, Capture
-from polsep.metrics import reliability
+from polsep.metrics import psnr, reliability
 from polsep.mosaic_network import NAMES
 from polsep.separation import Separation
 
@@ -33,7 +34,7 @@ BINS = 10
 
 
 def bench_joint(data: Path) -> Iterator[Row]:
-    """Full-resolution scores of all methods, and reliability curves of expected errors, on the test sets.
+    """On the test sets: full-resolution scores of all methods, reliability of expected errors, engines against torch.
 
     Raises ValueError without the extras render and bench, and on a scene that does not come out as recorded.
     """
@@ -42,6 +43,7 @@ def bench_joint(data: Path) -> Iterator[Row]:
     for name, recipes in sets.items():
         if find_absent(recipes, data) is None:
             yield from measure_reliability(name, recipes, data)
+            yield from measure_engines(name, recipes, data)
 
 
 def see_full(case: Case) -> tuple[Capture, Truth]:
@@ -99,3 +101,28 @@ def measure_reliability(name: str, recipes: Sequence[Recipe], data: Path) -> Ite
         for k, (said, true) in enumerate(zip(curve.expected.tolist(), curve.found.tolist(), strict=True)):
             yield Row("joint/curve", f"{name}, tenth {k + 1}", method, f"{output} error, expected", said, "white")
             yield Row("joint/curve", f"{name}, tenth {k + 1}", method, f"{output} error, found", true, "white")
+
+
+def measure_engines(name: str, recipes: Sequence[Recipe], data: Path) -> Iterator[Row]:
+    """How far an engine, in bfloat16 where the processor has it, is at most from a scene's PSNR in torch."""
+    from polsep.testsets import build_cases
+
+    largest: dict[tuple[str, str], float] = {}
+    for case in build_cases(recipes, data):
+        for see, kind in ((see_noisy, "half"), (see_full, "full")):
+            mosaic, (*truth, mask) = see(case)
+            assert isinstance(mosaic, Mosaic)
+            for method in NAMES:
+                own = METHODS[method]
+                images = (own.engine if kind == "half" else own.full_engine)(mosaic)
+                exact = (own.half if kind == "half" else own.full)(mosaic)
+                if images is None:
+                    raise ValueError("expected the engine of OpenVINO, found none")
+                pairs = ((images.diffuse, exact.diffuse), (images.specular, exact.specular))
+                for output, (found, wanted), image in zip(("diffuse", "specular"), pairs, truth, strict=True):
+                    planes = torch.from_numpy(found).movedim(-1, 0)
+                    change = abs(psnr(planes, image, mask) - psnr(wanted, image, mask))
+                    key = method, f"{output} PSNR, {kind} resolution, largest change"
+                    largest[key] = max(largest.get(key, 0.0), change)
+    for (method, metric), value in largest.items():
+        yield Row("joint/engines", name, method, metric, value, "dB")

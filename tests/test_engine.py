@@ -90,7 +90,7 @@ def test_dolp_aolp_and_statistics_are_of_white_light(method: str, full: bool) ->
     white = Mosaic(0.5 * capture(COLOR).linear(), COLOR, 0.0, 1.0)
     colored = replace(white, data=replace(white, light_color=tuple(1 / gain for gain in ODD_LIGHT)).linear())
     one, other = separate_capture(white, method, full=full), separate_capture(colored, method, ODD_LIGHT, full=full)
-    rounded = method in NAMES and not full  # layers may run in bfloat16
+    rounded = method in NAMES  # layers may run in bfloat16
     np.testing.assert_allclose(other.dolp, one.dolp, rtol=0, atol=2e-3 if rounded else 1e-4)
     loose = {"rel": 2e-3, "abs": 2e-3} if rounded else {"rel": STATISTICS}
     assert other.report["statistics"] == pytest.approx(one.report["statistics"], **loose)
@@ -118,18 +118,22 @@ def test_small_and_mono_frames_of_color_affine_are_left_to_torch() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_full_resolution_and_measurements_are_torchs(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No kernel runs for them."""
-    calls: list[Mosaic] = []
-    monkeypatch.setitem(METHODS, method, replace(METHODS[method], engine=calls.append))
+def test_every_resolution_has_its_engine_and_measurements_are_torchs(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No kernel runs for co-sited measurements; what an engine leaves goes to torch."""
+    half: list[Mosaic] = []
+    full: list[Mosaic] = []
+    monkeypatch.setitem(METHODS, method, replace(METHODS[method], engine=half.append, full_engine=full.append))
     mosaic = capture(COLOR, (32, 32))
-    separate_capture(mosaic, method, full=True, device="cpu")
     co_sited = Measurements(torch.rand(4, 3, 16, 16), COLOR.angles)
     if METHODS[method].takes(co_sited):
         separate_capture(co_sited, method, device="cpu")
-    assert calls == []
+    assert not half and not full
+    separate_capture(mosaic, method, full=True, device="cpu")
+    assert not half and len(full) == 1
     separate_capture(mosaic, method, device="cpu")
-    assert len(calls) == 1
+    assert len(half) == 1 and len(full) == 1
 
 
 def test_slow_compilation_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
@@ -151,11 +155,11 @@ def test_slow_compilation_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: 
 
 
 def test_kernels_are_loaded_with_the_first_frame() -> None:
-    """``polsep.separate`` can be named, and frames at full resolution separated, without numba."""
+    """``polsep.separate`` can be named, and frames separated by what has no kernels, without numba."""
     code = (
         "import sys, numpy as np, polsep;"
         "raw = np.full((32, 32), 0.5, np.float32);"
-        "polsep.separate(raw, layout=polsep.Layout(bayer=None), full=True, device='cpu');"
+        "polsep.separate(raw, layout=polsep.Layout(bayer=None), method='analytic', full=True, device='cpu');"
         "print('numba' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)

@@ -5,7 +5,8 @@ sees the same filters. Stokes images come from the intensity guide (`guided.guid
 filter fitted to examples. The colour-affine closed form (`color_affine`) with windows of two sizes makes a first
 separation of these, with what clipping hid of highlights as far as unclipped samples tell. A U-Net of residual blocks,
 which sees samples, clip masks and the closed form, says how much of that one's specular light to believe and adds what
-is missing. The specular light is white by construction. Diffuse and specular sum to the network's own s0.
+is missing. The specular light is white by construction. Diffuse and specular sum to the network's own s0. Full
+resolution is half resolution with `details`.
 
 Inputs and corrections are relative to the brightness around, so that a darker exposure of a scene gives a darker image
 of the same separation, as far as noise and clipping allow. There are no statistics of whole images: crop and frame

@@ -11,7 +11,7 @@ import threading
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from polsep.stokes import stokes_inverse
 
 if TYPE_CHECKING:
     from polsep.kernels.bilinear import Pattern
-    from polsep.kernels.joint import Taps
+    from polsep.kernels.joint import Seen, Taps
     from polsep.kernels.unpack import RawFrame, Samples
 
 Floats = NDArray[np.float32]
@@ -93,18 +93,6 @@ class FullLayers(Layers):
         return *self.correct(features), share
 
 
-class _Room(NamedTuple):
-    """Channels last ``[h, w, n]``, in one of two kinds; the other is empty."""
-
-    floats: Floats
-    halves: NDArray[np.uint16]
-
-    @property
-    def filled(self) -> NDArray[Any]:
-        """The one that is not empty."""
-        return self.floats if self.floats.size else self.halves
-
-
 class OpenVinoEngine:
     """A network for frames of one shape in its own order of filters, H and W multiples of 4; images at half resolution.
 
@@ -152,11 +140,13 @@ class OpenVinoEngine:
         diffuse, specular, error = (image.reshape(h, w, -1) for image in images)
         return JointImages(diffuse, specular, valid, angles[0], angles[1], error, _tally(targets))
 
-    def _make_room(self, h: int, w: int, count: int) -> _Room:
+    def _make_room(self, h: int, w: int, count: int) -> Seen:
         """For what the layers see, in their precision."""
+        from polsep.kernels.joint import Seen
+
         nothing, room = (0, 0, 0), (h, w, count)
         floats, halves = (nothing, room) if self._halves else (room, nothing)
-        return _Room(np.empty(floats, np.float32), np.empty(halves, np.uint16))
+        return Seen(np.empty(floats, np.float32), np.empty(halves, np.uint16))
 
     def _details(self, size: tuple[int, int]) -> Floats:
         """Room for the details of s0 of ``size`` packed pixels; none at half resolution."""
@@ -204,13 +194,12 @@ class FullEngine(OpenVinoEngine):
         return np.empty((2 * size[0], 3 * self._colors, 2 * size[1]), np.float32)
 
     def _open(self, network: Joint, size: tuple[int, int]) -> tuple[nn.Module, list[NDArray[Any]], list[Floats]]:
-        from polsep.kernels.joint_details import Seen, Shares, read_smooth
+        from polsep.kernels.joint_details import Shares, read_smooth
 
-        room = self._make_room(*size, 12)
-        self._seen = Seen(room.floats, room.halves)
+        self._seen = self._make_room(*size, 12)
         share = np.empty((24 + 12 * (self._colors + 1), *size), np.float32)
         self._shares = Shares(share, self._maps.details, read_smooth(network.details.smooth.detach().numpy()))
-        return FullLayers(network), [room.filled], [share]
+        return FullLayers(network), [self._seen.filled], [share]
 
     def _look(self) -> None:
         """How large details are around."""

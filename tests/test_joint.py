@@ -62,7 +62,7 @@ def untrained(layout: Layout) -> Joint:
 
 def random_net(layout: Layout, inputs: tuple[str, ...] = INPUTS) -> Joint:
     """A net whose every layer does something, as after training."""
-    torch.manual_seed(0)
+    torch.manual_seed(3)
     net = Joint(layout.channels, SIZE, inputs)
     for name, weight in net.named_parameters():
         if name.endswith("weight"):
@@ -437,7 +437,7 @@ def test_random_weights_do_something(layout: Layout) -> None:
     raw = random_raw(1, 16, 16)
     (one, pose), (other, own) = (net(layout)(raw, raw > 0.85) for net in (untrained, random_net))
     for a, b in zip((*one[:2], one.doubt, *pose), (*other[:2], other.doubt, *own), strict=True):
-        assert float((a - b).detach().abs().mean()) > 0.01
+        assert float((a - b).detach().abs().mean()) > 0.02
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)

@@ -80,6 +80,18 @@ class Maps(NamedTuple):
     details: Floats
 
 
+class Seen(NamedTuple):
+    """Channels that layers see, last ``[h, w, n]``, in one of the two kinds of `Maps`; the other is empty."""
+
+    floats: Floats
+    halves: NDArray[np.uint16]
+
+    @property
+    def filled(self) -> NDArray[Any]:
+        """The one that is not empty."""
+        return self.floats if self.floats.size else self.halves
+
+
 class _Rings(NamedTuple):
     """Rows on their way, by row number modulo `KEPT` or `SUMMED`; ``planes`` have a column more on both sides.
 

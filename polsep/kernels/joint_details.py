@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from polsep.details import LEAST_DETAIL
 from polsep.joint import PERIOD
 from polsep.kernels.compiling import ONE, ZERO, compiled, entry
+from polsep.kernels.joint import Seen
 from polsep.kernels.joint_images import SUMS, Found, Targets, add_polarization, mark_clipped, spread
 from polsep.kernels.polarization import polarize
 from polsep.kernels.rows import AT_ONCE, add_product, add_up, average, copy, emit, fill, filter_rows, sum_three, weave
@@ -37,13 +38,6 @@ class Smooth(NamedTuple):
     weight: Floats
     row: NDArray[np.int64]
     place: NDArray[np.int64]
-
-
-class Seen(NamedTuple):
-    """What the network is shown of details, of one of both kinds as in `joint.Maps`: ``[h, w, 12]``."""
-
-    floats: Floats
-    halves: NDArray[np.uint16]
 
 
 class Shares(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import deque
 from dataclasses import replace
 
 import pytest
@@ -19,6 +20,7 @@ from polsep.simulate import filter_light
 from polsep.stokes import Stokes
 from polsep.train import stream
 from polsep.train.stream import (
+    BRIGHT_SHARE,
     BRIGHTEST,
     CLIPPED,
     GLARING_SHARE,
@@ -36,6 +38,7 @@ from polsep.train.stream import (
     StreamOptions,
     add_gaussian_noise,
     pool_scenes,
+    random_crop,
     random_gain,
     stream_lane,
 )
@@ -119,7 +122,7 @@ def test_exposures_clip_what_was_drawn() -> None:
     """
     ranks = torch.linspace(LOWEST_QUANTILE, 1, QUANTILES)
     nothing = torch.zeros(0)
-    scene = Pooled(nothing, nothing, nothing, nothing, ranks, 2.0)
+    scene = Pooled(nothing, nothing, nothing, nothing, nothing, ranks, 2.0)
     gains = [random_gain(scene, torch.Generator().manual_seed(k)) for k in range(500)]
     leveled = [gain for gain in gains if gain < BRIGHTEST[0]]
     assert LEVELS[0] / 2 <= min(leveled) <= max(leveled) <= LEVELS[1] / 2
@@ -137,10 +140,23 @@ def test_exposures_clip_what_was_drawn() -> None:
     assert float((places - torch.linspace(0, 1, len(places))).abs().max()) < 1.95 / math.sqrt(len(places)) + 0.02
 
 
+def test_some_crops_are_about_the_brightest_pixels() -> None:
+    """The others are about any pixel: of one bright pixel among thousands nearly all crops that hold it mean to."""
+    size, crop, draws = 128, 16, 400
+    mask = torch.ones(size, size, dtype=torch.bool)
+    light, bright = torch.zeros(3, size, size), torch.tensor([[40, 90]])
+    light[0, 40, 90] = 1
+    scene = Pooled(torch.zeros(9, size, size), light, mask, mask.nonzero(), bright, torch.ones(QUANTILES), 0.5)
+    crops = [random_crop(deque([scene]), crop, torch.Generator().manual_seed(k)) for k in range(draws)]
+    about = sum(bool(drawn.light[9].any()) for drawn in crops)
+    expected = BRIGHT_SHARE + (1 - BRIGHT_SHARE) * (crop / size) ** 2
+    assert abs(about - draws * expected) < SIGMAS * math.sqrt(draws * expected * (1 - expected))
+
+
 def test_glaring_scenes_are_mostly_exposed_for_the_rest() -> None:
     """Where the brightest are far above the median, most exposures let them clip."""
     nothing = torch.zeros(0)
-    glaring = Pooled(nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 0.01)
+    glaring = Pooled(nothing, nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 0.01)
     gains = [random_gain(glaring, torch.Generator().manual_seed(k)) for k in range(300)]
     leveled = [gain for gain in gains if gain > 2 * LEAST_LEVEL / 0.01]
     assert LEVELS[0] / 0.01 <= min(leveled) <= max(leveled) <= LEVELS[1] / 0.01
@@ -149,7 +165,7 @@ def test_glaring_scenes_are_mostly_exposed_for_the_rest() -> None:
 
 def test_dark_scenes_are_exposed_to_the_floor() -> None:
     nothing = torch.zeros(0)
-    dark = Pooled(nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 1e-4)
+    dark = Pooled(nothing, nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 1e-4)
     assert all(random_gain(dark, torch.Generator().manual_seed(k)) >= LEAST_LEVEL / 1e-4 for k in range(20))
 
 

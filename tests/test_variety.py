@@ -14,7 +14,7 @@ pytest.importorskip("embreex")
 
 from polsep.camera import IMX250
 from polsep.materials import Materials, random_materials
-from polsep.raycast import MeshScene, View, find_view
+from polsep.raycast import MeshScene, View, find_view, light_view, shade_view
 from polsep.render import Scene
 from polsep.stokes import Stokes
 from polsep.train.variety import (
@@ -30,12 +30,17 @@ from polsep.train.variety import (
     MAGNIFICATIONS,
     MATTE_SHARE,
     MATTE_STRENGTH,
+    MOST_SHEEN,
     PLAIN_SHARE,
     RELIEF_SHARE,
     RELIEF_TILTS,
     RETAINED,
     RETAINING_SHARE,
+    SHEEN_ROUGHNESS,
+    SHEEN_SHARE,
     UNPOLARIZED_SHARE,
+    Look,
+    find_sheen,
     random_sensor,
     relight,
     vary_colors,
@@ -213,21 +218,44 @@ def test_some_diffuse_light_is_less_polarized_and_nothing_else_differs() -> None
 
 
 def test_some_diffuse_light_keeps_its_polarization() -> None:
-    """What is added is white, fully polarized at the angle of the highlights, and a share of the diffuse light."""
+    """What is added is white, fully polarized at the angle of the highlights or of a sheen, a share of the diffuse."""
     draws, generator = 2000, seeded(6)
     diffuse = Stokes(torch.tensor([0.9, 0.6, 0.3])[:, None, None], *torch.zeros(2, 3, 1, 1))
     specular = Stokes(torch.full((3, 1, 1), 0.5), torch.full((3, 1, 1), 0.3), torch.full((3, 1, 1), 0.4))
     scene = Scene(diffuse, specular, torch.ones(1, 1, dtype=torch.bool))
-    shares = []
+    shares, rough = [], []
+
+    def sheen(roughness: float) -> Stokes:
+        rough.append(roughness)
+        return Stokes(*(torch.full((1, 1, 1), value) for value in (1.0, -0.6, 0.8)))
+
     for _ in range(draws):
-        found = vary_retention(scene, generator)
+        before = len(rough)
+        found = vary_retention(scene, sheen, generator)
         assert found.diffuse is diffuse
         more = found.specular.s0 - specular.s0
         shares.append(float(more[0]) / 0.6)
-        assert_close(found.specular.s1 - specular.s1, 0.6 * more)
+        assert_close(found.specular.s1 - specular.s1, (0.6 if len(rough) == before else -0.6) * more)
         assert_close(found.specular.s2 - specular.s2, 0.8 * more)
         assert_close(more, more[:1].expand(3, 1, 1))
     kept = [share for share in shares if share > 0]
     expect_share(len(kept), draws, RETAINING_SHARE)
+    expect_share(len(rough), draws, RETAINING_SHARE * SHEEN_SHARE)
     assert min(kept) >= RETAINED[0] - 1e-6
     assert max(kept) <= RETAINED[1] + 1e-6
+    assert SHEEN_ROUGHNESS[0] <= min(rough) <= max(rough) <= SHEEN_ROUGHNESS[1]
+
+
+def test_sheens_are_polarized_light_that_knows_no_material(shape: MeshScene, shots: list[Shot]) -> None:
+    """1 in the median of what is lit, at most `MOST_SHEEN`, fully polarized, and the same for every albedo."""
+    view = find_view(shape, shots[0].camera, (48, 48))
+    light = shots[0].light
+    lit = light_view(shape, view, light)
+    looks = [Look(view, random_materials(shape.mesh.slot_count, seeded(k)), light, lit) for k in range(2)]
+    found, other = (find_sheen(look, 0.7) for look in looks)
+    assert torch.equal(found.s0, other.s0)
+    reached = shade_view(*looks[0]).diffuse.s0[:1] > 0
+    assert float(found.s0[~reached].abs().max()) == 0
+    assert abs(float(found.s0[reached].median()) - 1) < 1e-5
+    assert float(found.s0.max()) <= MOST_SHEEN + 1e-5
+    assert_close(torch.hypot(found.s1, found.s2), found.s0, scale=MOST_SHEEN)

@@ -14,6 +14,7 @@ import hashlib
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,8 @@ from polsep.render import Scene
 from polsep.simulate import HEADROOM, blur, filter_light
 from polsep.stokes import Stokes
 from polsep.train.variety import (
+    Look,
+    find_sheen,
     random_sensor,
     relight,
     vary_colors,
@@ -51,6 +54,9 @@ CLIPPED = (0.0005, 0.06)
 #: highlights: the brightest 0.3 % of the object exceed the median of the lit samples so many times. That median lies
 #: between these shares of white then.
 LEVEL_SHARE, GLARING_SHARE, GLARING, LEVELS = 0.2, 0.8, (0.003, 10.0), (0.05, 0.4)
+#: Share of the crops that are about one of the brightest of the object's pixels, and what share of it these are: there
+#: highlights and white surfaces clip, which must be told apart.
+BRIGHT_SHARE, BRIGHT_PIXELS = 0.3, 0.02
 #: A crop is drawn anew, at most so many times, while less than this share of it is on objects.
 LEAST_COVERED, MOST_DRAWS = 0.6, 4
 
@@ -116,7 +122,7 @@ class Examples(NamedTuple):
 class Pooled:
     """A scene in half precision, with the ``places [N, 2]`` and the ``brightness`` quantiles of its object's pixels.
 
-    ``level``: the median of the lit ones.
+    ``level``: the median of the lit ones; ``bright [M, 2]``: places of the brightest ones.
 
     ``diffuse [9, H, W]``: s0, s1, s2 of three colours each; ``specular [3, H, W]``: of white light.
     """
@@ -125,6 +131,7 @@ class Pooled:
     specular: Tensor
     mask: Tensor
     places: Tensor
+    bright: Tensor
     brightness: Tensor
     level: float
 
@@ -203,9 +210,10 @@ def _look_at(shape: MeshScene, options: StreamOptions, generator: torch.Generato
         materials = vary_colors(random_materials(shape.mesh.slot_count, generator, shape.size), generator)
         if varied:
             materials = vary_gloss(materials, generator)
-        scene = blur(shade_view(view, materials, light, light_view(shape, view, light)), shot.blur)
+        look = Look(view, materials, light, light_view(shape, view, light))
+        scene = blur(shade_view(*look), shot.blur)
         if varied:
-            scene = vary_retention(vary_polarization(scene, generator), generator)
+            scene = vary_retention(vary_polarization(scene, generator), partial(find_sheen, look), generator)
         looks.append(_as_pooled(scene))
         light = relight(shape, shot, generator)
     return looks
@@ -213,16 +221,18 @@ def _look_at(shape: MeshScene, options: StreamOptions, generator: torch.Generato
 
 def _as_pooled(scene: Scene) -> Pooled:
     """A scene for the pool, scaled so that its brightest object sample is 1."""
-    samples = filter_light(scene.diffuse + scene.specular, Layout(), IMX250)[scene.mask]
+    signal = filter_light(scene.diffuse + scene.specular, Layout(), IMX250)
+    samples = signal[scene.mask]
     lowest = int(LOWEST_QUANTILE * (samples.numel() - 1))
     brightest = np.sort(np.partition(samples.numpy(), lowest)[lowest:])
     ranks = np.linspace(0, brightest.size - 1, QUANTILES).round().astype(np.int64)
     brightness = torch.from_numpy(brightest[ranks])
+    bright = (scene.mask & (signal >= float(brightness[_rank(BRIGHT_PIXELS)]))).nonzero()
     gain, lit = 1 / max(float(brightness[-1]), 1e-12), samples[samples > 0]
     level = gain * float(lit.median()) if lit.numel() else 1.0
     white = scene.specular.map(lambda s: s[:1])
     diffuse, specular = (torch.cat([s.s0, s.s1, s.s2]).mul_(gain).half() for s in (scene.diffuse, white))
-    return Pooled(diffuse, specular, scene.mask, scene.mask.nonzero(), brightness * gain, level)
+    return Pooled(diffuse, specular, scene.mask, scene.mask.nonzero(), bright, brightness * gain, level)
 
 
 class Crop(NamedTuple):
@@ -274,8 +284,10 @@ def _integer(limit: int, generator: torch.Generator) -> int:
 
 def _random_place(scene: Pooled, crop: int, generator: torch.Generator) -> tuple[slice, slice]:
     """A crop about a random pixel of the object, as far as the frame allows, with much of the object in it."""
+    bright = float(torch.rand(1, generator=generator)) < BRIGHT_SHARE
+    places = scene.bright if bright else scene.places
     for _ in range(MOST_DRAWS):
-        center = scene.places[_integer(len(scene.places), generator)].tolist()
+        center = places[_integer(len(places), generator)].tolist()
         starts = [min(max(c - crop // 2, 0), n - crop) for c, n in zip(center, scene.mask.shape, strict=True)]
         rows, cols = (slice(start, start + crop) for start in starts)
         if float(scene.mask[rows, cols].float().mean()) >= LEAST_COVERED:

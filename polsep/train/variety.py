@@ -6,7 +6,9 @@ Whoever uses a trained network photographs more than objects that fill the frame
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +17,7 @@ from torch import Tensor
 from polsep.camera import IMX250, Sensor
 from polsep.kernels.relief import Relief, roughen_normals
 from polsep.materials import Materials
-from polsep.raycast import MeshScene, View, find_view, light_view
+from polsep.raycast import MeshScene, View, find_view, light_view, shade_view
 from polsep.render import PointLight, Scene, pixel_side
 from polsep.stokes import Stokes
 from polsep.views import LEAST_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
@@ -38,6 +40,9 @@ DEPOLARIZED_SHARE, UNPOLARIZED_SHARE = 0.4, 0.3
 #: scattered once does (Ma et al. 2007), and how much of it, log-uniform. Crossed polarizers count it as specular; on
 #: matte photographs it is most of what they measure.
 RETAINING_SHARE, RETAINED = 0.6, (0.002, 0.03)
+#: Share of these in which how much is kept follows a rough lobe over the surface instead of being the same everywhere,
+#: as on painted and paper things. The lobe's roughness, and its most over its median.
+SHEEN_SHARE, SHEEN_ROUGHNESS, MOST_SHEEN = 0.6, (0.5, 1.0), 4.0
 #: Saturation that near-grey looks keep, at most.
 GREY_SATURATION = 0.15
 #: Standard deviation of the lens's point spread in raw pixels: that of `views.BLURS` and, slightly defocused, more.
@@ -52,6 +57,15 @@ RELIEF_SHARE, RELIEF_PIXELS, RELIEF_TILTS = 0.5, (3.0, 60.0), (0.05, 0.6)
 MOST_OCTAVES, LEAST_CELL = 3, 2.5
 #: Lights are drawn anew, at most so many times, while they leave most of a view dark.
 MOST_DRAWS = 10
+
+
+class Look(NamedTuple):
+    """What `raycast.shade_view` takes: a view, its materials, a light, and what that reaches."""
+
+    view: View
+    materials: Materials
+    light: PointLight
+    lit: tuple[Tensor, ...]
 
 
 def vary_shot(shape: MeshScene, shot: Shot, generator: torch.Generator) -> Shot:
@@ -145,17 +159,40 @@ def vary_polarization(scene: Scene, generator: torch.Generator) -> Scene:
     return replace(scene, diffuse=Stokes(s0, kept * s1, kept * s2))
 
 
-def vary_retention(scene: Scene, generator: torch.Generator) -> Scene:
-    """The same, or with a share of the diffuse light added as white light at the AoLP of all highlights together."""
-    wanted, place = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+def vary_retention(scene: Scene, sheen: Callable[[float], Stokes], generator: torch.Generator) -> Scene:
+    """The same, or with a share of the diffuse light added as white light.
+
+    It is polarized at the AoLP of all highlights together, or as ``sheen`` of a roughness says (`find_sheen`).
+    """
+    wanted, place, shaped, rough = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
     if wanted >= RETAINING_SHARE:
         return scene
     share = RETAINED[0] * (RETAINED[1] / RETAINED[0]) ** place
     specular = scene.specular
-    angle = math.atan2(float(specular.s2.double().sum()), float(specular.s1.double().sum()))
     kept = share * scene.diffuse.s0.mean(dim=0, keepdim=True)
+    if shaped < SHEEN_SHARE:
+        lobe = sheen(SHEEN_ROUGHNESS[0] + (SHEEN_ROUGHNESS[1] - SHEEN_ROUGHNESS[0]) * rough)
+        return replace(scene, specular=specular + lobe.map(lambda s: kept * s))
+    angle = math.atan2(float(specular.s2.double().sum()), float(specular.s1.double().sum()))
     more = Stokes(specular.s0 + kept, specular.s1 + kept * math.cos(angle), specular.s2 + kept * math.sin(angle))
     return replace(scene, specular=more)
+
+
+def find_sheen(look: Look, roughness: float) -> Stokes:
+    """Specular light ``[1, H, W]`` of an even ``roughness``, relative to the diffuse light of white, 1 in the median.
+
+    At most `MOST_SHEEN`, and 0 where no light falls.
+    """
+    slots = look.materials.roughness.numel()
+    white = Materials(torch.ones(slots, 3), torch.full((slots,), roughness), torch.ones(slots))
+    scene = shade_view(look.view, white, look.light, look.lit)
+    lobe, diffuse = scene.specular.map(lambda s: s[:1]), scene.diffuse.s0.mean(dim=0, keepdim=True)
+    lit = diffuse > 0
+    ratio = torch.where(lit, lobe.s0 / diffuse.clamp(min=torch.finfo(diffuse.dtype).tiny), 0.0)
+    middle = float(ratio[lit].median()) if bool(lit.any()) else 1.0
+    wanted = (ratio / max(middle, 1e-12)).clamp(max=MOST_SHEEN)
+    scale = torch.where(lobe.s0 > 0, wanted / lobe.s0.clamp(min=torch.finfo(diffuse.dtype).tiny), 0.0)
+    return lobe.map(lambda s: scale * s)
 
 
 def _desaturate(albedo: Tensor, saturation: float) -> Tensor:

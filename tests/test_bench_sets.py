@@ -15,10 +15,11 @@ pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 
 from polsep import testsets
 from polsep.bench.ablations import ablation_entry, find_ablations
-from polsep.bench.joint import BINS, enlarge, full_entries, measure_engines, measure_reliability, see_full
+from polsep.bench.joint import BINS, enlarge, full_entries, measure_engines, measure_reliability, see_full, see_mono
 from polsep.bench.rendering import bench_rendering
 from polsep.bench.scoring import Entry, Protocol, score_case, score_sets, see_clean, see_co_sited, see_noisy
 from polsep.bench.sets import bench_sets
+from polsep.camera import Layout, Mosaic
 from polsep.demosaic import demosaic_bilinear_half, mean_cells
 from polsep.io.weights import read_weights
 from polsep.methods import METHODS, compose
@@ -120,6 +121,18 @@ def test_full_resolution_is_scored_at_full_resolution() -> None:
     scores = list(score_case(case, [Protocol("full", see_full, full_entries())]))
     value = {score.method: score.value for score in scores if score.metric == "diffuse PSNR"}
     assert value["analytic"] == psnr(found["analytic"].diffuse, diffuse, mask)
+
+
+def test_mono_frames_are_scored_in_one_colour() -> None:
+    """The analytic split of a mono frame is exact, but for noise, and knows neither FLIP nor chroma."""
+    scores = {s.metric: s.value for s in score_case(build_case(GREY), [Protocol("mono", see_mono, (ANALYTIC,))])}
+    assert {"diffuse PSNR", "specular SSIM"} <= set(scores)
+    assert not [metric for metric in scores if "FLIP" in metric or "chroma" in metric]
+    capture, (diffuse, specular, mask) = see_mono(build_case(GREY))
+    assert isinstance(capture, Mosaic) and capture.layout == Layout(bayer=None)
+    assert diffuse.shape == specular.shape == (1, *mask.shape)
+    colored = {s.metric: s.value for s in score_case(build_case(GREY), PROTOCOLS[:1])}
+    assert scores["diffuse PSNR"] == pytest.approx(colored["diffuse PSNR"], abs=1)
 
 
 def test_reliability_is_that_of_all_pixels_of_a_set(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The joint networks on the fixed test sets: at full resolution, whether they know their errors, what engines change.
+"""The joint networks on the fixed test sets: full resolution, mono frames, whether they know their errors, engines.
 
 Full resolution is scored against the truth of every pixel of the noisy mosaic. Methods that give half-resolution images
 only have theirs enlarged, linearly between the cells' centres.
@@ -19,7 +19,7 @@ from torch.nn.functional import interpolate
 from polsep.bench.rows import Row
 from polsep.bench.scoring import Entry, Protocol, Truth, find_absent, score_sets, see_noisy
 from polsep.bench.sets import load_sets
-from polsep.camera import Mosaic
+from polsep.camera import IMX250, Layout, Mosaic, expose
 from polsep.methods import METHODS, Capture
 from polsep.metrics import psnr, reliability
 from polsep.mosaic_network import NAMES
@@ -30,17 +30,21 @@ if TYPE_CHECKING:
 
 #: Methods whose images at full resolution would be of bilinear samples, as their networks' are at half.
 ENLARGED = ("paper",)
+#: Methods that separate mono frames with what the project ships, and the seed of these frames' noise.
+MONO, MONO_SEED = ("joint", "joint-fast", "color-affine", "analytic"), 2_000_000
 #: Groups of pixels in a reliability curve.
 BINS = 10
 
 
 def bench_joint(data: Path) -> Iterator[Row]:
-    """On the test sets: full-resolution scores of all methods, reliability of expected errors, engines against torch.
+    """On the test sets: scores at full resolution and of mono frames, reliability, engines against torch.
 
     Raises ValueError without the extras render and bench, and on a scene that does not come out as recorded.
     """
     sets = load_sets()
-    yield from score_sets("joint", sets, data, [Protocol("full", see_full, full_entries())])
+    mono = tuple(Entry(name, METHODS[name].half) for name in MONO)
+    protocols = [Protocol("full", see_full, full_entries()), Protocol("mono", see_mono, mono)]
+    yield from score_sets("joint", sets, data, protocols)
     for name, recipes in sets.items():
         if find_absent(recipes, data) is None:
             yield from measure_reliability(name, recipes, data)
@@ -50,6 +54,14 @@ def bench_joint(data: Path) -> Iterator[Row]:
 def see_full(case: Case) -> tuple[Capture, Truth]:
     """A 12-bit mosaic with noise, and the truth at its own resolution."""
     return case.noisy, (case.scene.diffuse.s0, case.scene.specular.s0, case.scene.mask)
+
+
+def see_mono(case: Case) -> tuple[Capture, Truth]:
+    """A 12-bit mosaic with noise of a camera without colour filters on which the green light falls, in half."""
+    light = (case.scene.diffuse + case.scene.specular).map(lambda s: s[1:2])
+    mosaic = expose(light, Layout(bayer=None), IMX250, torch.Generator().manual_seed(MONO_SEED))
+    diffuse, specular, mask = case.half_truth()
+    return mosaic, (diffuse[1:2], specular[1:2], mask)
 
 
 def full_entries() -> tuple[Entry, ...]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: Fewest pixels of a highlight that are worth a score.
 LEAST_HIGHLIGHT = 20
 
-#: True diffuse and specular ``[3, h, w]`` and mask ``[h, w]``.
+#: True diffuse and specular ``[C, h, w]`` and mask ``[h, w]``.
 Truth = tuple[Tensor, Tensor, Tensor]
 
 
@@ -130,8 +130,12 @@ def score_case(case: Case, protocols: Sequence[Protocol]) -> Iterator[Score]:
 
 
 def score_images(found: Separation, truth: Truth) -> Iterator[tuple[str, str, float]]:
-    """Every metric of a separation against true diffuse, specular and mask: name, unit, value."""
+    """Every metric of a separation against true diffuse, specular and mask: name, unit, value.
+
+    FLIP and chroma of three colours only.
+    """
     diffuse, specular, mask = truth
+    colored = len(diffuse) > 1
     bright = highlights(specular, mask)
     everywhere = torch.ones_like(mask)
     for output, image, true in (("diffuse", found.diffuse, diffuse), ("specular", found.specular, specular)):
@@ -139,8 +143,9 @@ def score_images(found: Separation, truth: Truth) -> Iterator[tuple[str, str, fl
         yield f"{output} PSNR, whole frame", "dB", psnr(image, true, everywhere)
         yield f"{output} PSNR, unlimited", "dB", psnr_unlimited(image, true, mask)
         yield f"{output} SSIM", "1", ssim(image, true, mask)
-        yield f"{output} FLIP", "1", flip(image, true, mask)
+        if colored:
+            yield f"{output} FLIP", "1", flip(image, true, mask)
         if int(bright.sum()) >= LEAST_HIGHLIGHT:
             yield f"{output} PSNR, highlights", "dB", psnr(image, true, bright)
-    if int(bright.sum()) >= LEAST_HIGHLIGHT:
+    if colored and int(bright.sum()) >= LEAST_HIGHLIGHT:
         yield "chroma of highlights", "1", chroma(found.specular, bright)

@@ -171,3 +171,4 @@ def test_tables_of_parts(tmp_path: Path) -> None:
     assert "| case | method | diffuse / specular PSNR [dB] |\n| --- | --- | --- |\n| case | m | 30 / 31 |" in filled
     assert fill_tables(filled, tmp_path) == filled
     assert "| n |" not in filled
+    assert "Not measured yet: `polsep bench a`." in fill_tables(markdown.replace("a/x", "a/z"), tmp_path)

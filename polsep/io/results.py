@@ -72,9 +72,9 @@ def fill_tables(markdown: str, results: Path) -> str:
 
     def table(match: re.Match[str]) -> str:
         path, bench = results / f"{match['name']}.jsonl", f"{match['name']}{match['part'] or ''}"
-        if not path.is_file():
+        rows = [row for row in read_rows(path) if row["bench"] == bench] if path.is_file() else []
+        if not rows:
             return f"{match[1]}Not measured yet: `polsep bench {match['name']}`.\n{match[5]}"
-        rows = [row for row in read_rows(path) if row["bench"] == bench]
         return match[1] + (method_table(rows) if match["turned"] else markdown_table(rows)) + match[5]
 
     return _TABLE.sub(table, markdown)

@@ -39,6 +39,8 @@ from polsep.train.variety import (
     SHEEN_ROUGHNESS,
     SHEEN_SHARE,
     UNPOLARIZED_SHARE,
+    WHITE,
+    WHITE_SHARE,
     Look,
     find_sheen,
     random_sensor,
@@ -153,9 +155,9 @@ def albedos(materials: Materials) -> list[Tensor]:
 def test_looks_keep_what_they_must() -> None:
     """Grey ones keep brightness and at most `GREY_SATURATION` of their saturation, matte ones some specular light.
 
-    Glaring ones have more of it.
+    Glaring ones have more of it. On white ground textures keep their colours.
     """
-    draws, grey, plain, matte, glaring = 200, 0, 0, 0, 0
+    draws, grey, white, plain, matte, glaring = 200, 0, 0, 0, 0, 0
     for seed in range(draws):
         before = random_materials(5, seeded(seed))
         generator = seeded(1000 + seed)
@@ -166,13 +168,20 @@ def test_looks_keep_what_they_must() -> None:
         glaring += bool((left > 1).any())
         assert bool((left >= 1).all()) or bool((left > MATTE_STRENGTH[0]).all() and (left < 1).all())
         same = torch.equal(after.albedo, before.albedo)
-        for old, new in zip(albedos(before), albedos(after), strict=False):
-            assert_close(new.amax(dim=1), old.amax(dim=1))
-            assert torch.equal(new, old) == same
-            assert same or bool((saturation(new) <= GREY_SATURATION * saturation(old) + 1e-6).all())
-        grey += not same
+        ground = bool((after.albedo.amax(dim=1) > before.albedo.amax(dim=1) + 1e-5).any())
+        pairs = list(zip(albedos(before), albedos(after), strict=False))
+        if ground:
+            assert float(after.albedo.amax(dim=1).min()) >= WHITE
+            assert all(torch.equal(new, old) for old, new in pairs[1:])
+        for old, new in pairs[: 1 if ground else 2]:
+            assert ground or torch.equal(new, old) == same
+            assert same or bool((saturation(new) <= GREY_SATURATION * saturation(old) + 1e-5).all())
+        if not ground:
+            assert all(torch.allclose(new.amax(dim=1), old.amax(dim=1)) for old, new in pairs)
+        grey += not same and not ground
         plain += before.textures is not None and after.textures is None
     expect_share(grey, draws, GREY_SHARE)
+    expect_share(white, draws, WHITE_SHARE)
     expect_share(plain, draws, PLAIN_SHARE)
     expect_share(matte, draws, MATTE_SHARE)
     expect_share(glaring, draws, GLARE_SHARE)

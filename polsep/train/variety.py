@@ -24,8 +24,9 @@ from polsep.views import LEAST_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
 
 #: Share of the views that show a part of the object, and how many times larger than the whole, log-uniform.
 CLOSE_SHARE, MAGNIFICATIONS = 0.5, (1.0, 5.0)
-#: Shares of the looks of which all is near-grey, and of those without textures.
-GREY_SHARE, PLAIN_SHARE = 0.3, 0.2
+#: Shares of the looks of which all is near-grey, of those on near-white ground, as painted and printed things have, and
+#: of those without textures.
+GREY_SHARE, WHITE_SHARE, PLAIN_SHARE = 0.3, 0.25, 0.2
 #: Share of the looks that are matte: what is left of their specular light, log-uniform for every material. Photographs
 #: of painted, dusty or paper things have half a percent of it, which random materials rarely have.
 MATTE_SHARE, MATTE_STRENGTH = 0.4, (0.005, 1.0)
@@ -43,8 +44,8 @@ RETAINING_SHARE, RETAINED = 0.6, (0.002, 0.03)
 #: Share of these in which how much is kept follows a rough lobe over the surface instead of being the same everywhere,
 #: as on painted and paper things. The lobe's roughness, and its most over its median.
 SHEEN_SHARE, SHEEN_ROUGHNESS, MOST_SHEEN = 0.6, (0.5, 1.0), 4.0
-#: Saturation that near-grey looks keep, at most.
-GREY_SATURATION = 0.15
+#: Saturation that near-grey and near-white looks keep, at most; the largest albedo of white ground at least.
+GREY_SATURATION, WHITE = 0.15, 0.6
 #: Standard deviation of the lens's point spread in raw pixels: that of `views.BLURS` and, slightly defocused, more.
 BLURS = (0.3, 1.2)
 #: Electrons at the white level, log-uniform: a gain of 12 to 0 dB on cameras like the IMX250, and larger pixels.
@@ -136,17 +137,20 @@ def vary_gloss(materials: Materials, generator: torch.Generator) -> Materials:
 
 
 def vary_colors(materials: Materials, generator: torch.Generator) -> Materials:
-    """The same, near-grey or without textures at random."""
+    """The same, near-grey, on near-white ground or without textures at random."""
     grey, plain, saturation = torch.rand(3, generator=generator).tolist()
     if plain < PLAIN_SHARE:
         materials = replace(materials, textures=None)
-    if grey >= GREY_SHARE:
+    if grey >= GREY_SHARE + WHITE_SHARE:
         return materials
     saturation *= GREY_SATURATION
-    textures = materials.textures
+    albedo, textures = _desaturate(materials.albedo, saturation), materials.textures
+    if grey >= GREY_SHARE:
+        value = albedo.amax(dim=1, keepdim=True)
+        return replace(materials, albedo=albedo * (WHITE + (1 - WHITE) * value) / value)
     if textures is not None:
         textures = replace(textures, albedo=_desaturate(textures.albedo, saturation))
-    return replace(materials, albedo=_desaturate(materials.albedo, saturation), textures=textures)
+    return replace(materials, albedo=albedo, textures=textures)
 
 
 def vary_polarization(scene: Scene, generator: torch.Generator) -> Scene:

@@ -10,7 +10,9 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import reduce
 from importlib.util import find_spec
+from operator import add
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,8 +21,8 @@ from numpy.typing import NDArray
 
 from polsep.camera import Layout, Mosaic
 from polsep.engine import make_ready
-from polsep.joint import PERIOD
-from polsep.mosaic_network import MOST_PIXELS, Resolution, find_joint, own_order
+from polsep.joint import PERIOD, Joint
+from polsep.mosaic_network import MARGIN, Resolution, cut_rows, find_joint, own_order
 from polsep.openvino_engine import Floats, FullEngine, JointImages, OpenVinoEngine
 from polsep.orient import Orientation, orient
 
@@ -41,11 +43,20 @@ class _Job(NamedTuple):
 class _Engines:
     """Engines, each for one frame at a time. State: those that wait, the last used at the end, and how many are busy.
 
-    As many are kept as were ever busy at once.
+    As many are kept as were ever busy at once, and all networks that they were made of.
     """
 
     def __init__(self) -> None:
         self._lock, self._idle, self._busy, self._kept = threading.Lock(), list[tuple[_Job, OpenVinoEngine]](), 0, KEPT
+        self._networks = dict[tuple[str, int], Joint]()
+
+    def network(self, method: str, colors: int) -> Joint:
+        """The network of a method."""
+        with self._lock:
+            if (method, colors) not in self._networks:
+                layout = Layout() if colors == 3 else Layout(bayer=None)
+                self._networks[method, colors] = find_joint(method, layout, None)[0]
+            return self._networks[method, colors]
 
     @contextmanager
     def borrow(self, job: _Job) -> Iterator[OpenVinoEngine]:
@@ -67,9 +78,9 @@ class _Engines:
                 del self._idle[: -self._kept]
 
     def clear(self) -> None:
-        """Forget those that wait."""
+        """Forget those that wait, and the networks."""
         with self._lock:
-            self._idle = []
+            self._idle, self._networks = [], {}
 
 
 ENGINES = _Engines()
@@ -79,7 +90,7 @@ _MAKING = threading.Lock()
 def _make_engine(job: _Job) -> OpenVinoEngine:
     """One at a time: torch cannot trace two modules at once."""
     with _MAKING:
-        network, _ = find_joint(job.method, Layout() if job.colors == 3 else Layout(bayer=None), None)
+        network = ENGINES.network(job.method, job.colors)
         logging.getLogger("polsep").debug("compiling %s for frames of %dx%d", job.method, *job.shape)
         return (FullEngine if job.resolution == "full" else OpenVinoEngine)(network, job.shape)
 
@@ -97,12 +108,12 @@ def _warm_up_full() -> None:
 
 
 def run_engine(method: str, resolution: Resolution, mosaic: Mosaic) -> JointImages | None:
-    """A method's images of one frame in its light, or None: batches, other devices, huge frames, no OpenVINO.
+    """A method's images of one frame in its light, or None: batches, other devices, no OpenVINO.
 
     Frames in other orientations than the network's are turned before and after, as `mosaic_network.run_joint` does.
     """
     data = mosaic.data
-    if find_spec("openvino") is None or data.ndim != 2 or data.device.type != "cpu" or data.numel() > MOST_PIXELS:
+    if find_spec("openvino") is None or data.ndim != 2 or data.device.type != "cpu":
         return None
     orientation = orient(mosaic, own_order(mosaic.layout))
     if not orientation.keeps_cells or data.dtype not in (torch.uint8, torch.uint16, torch.float32):
@@ -110,15 +121,56 @@ def run_engine(method: str, resolution: Resolution, mosaic: Mosaic) -> JointImag
     make_ready(_warm_up)
     if resolution == "full":
         make_ready(_warm_up_full)
-    from polsep.kernels import get_threads
-
-    levels, light = (mosaic.black_level, mosaic.white_level), mosaic.light_color
     as_it_is = orientation == Orientation(*data.shape) and not any(n % PERIOD for n in data.shape)
     turned = data if as_it_is else orientation.turn(data.float()).contiguous()
-    job = _Job(method, resolution, mosaic.layout.channels, (turned.shape[0], turned.shape[1]), get_threads())
-    with ENGINES.borrow(job) as engine:
-        images = engine.run(turned.numpy(), levels, light)
+    frame, grid = replace(mosaic, data=turned), PERIOD * ENGINES.network(method, mosaic.layout.channels).net.grid
+    strips = _strips((turned.shape[0], turned.shape[1]), grid)
+    images = _join([_run_strip(method, resolution, frame, strip) for strip in strips])
     return images if as_it_is else _turn_back(images, orientation, 2 if resolution == "full" else 1)
+
+
+class _Strip(NamedTuple):
+    """Raw rows of a frame that an engine sees, and those of which it is to give images."""
+
+    seen: tuple[int, int]
+    kept: tuple[int, int]
+
+
+def _strips(size: tuple[int, int], grid: int) -> Iterator[_Strip]:
+    """A frame as one strip or, if it is huge, as several of at most two heights, since an engine is for one."""
+    height, pieces = size[0], list(cut_rows(size, grid))
+    if len(pieces) == 1:
+        yield _Strip(pieces[0], pieces[0])
+        return
+    rows = pieces[0][1] + 2 * MARGIN
+    for first, last in pieces:
+        top = max(min(first - MARGIN, (height - rows) // grid * grid), 0)
+        bottom = height if height - top - rows < grid else top + rows
+        yield _Strip((top, bottom), (first, last))
+
+
+def _run_strip(method: str, resolution: Resolution, mosaic: Mosaic, strip: _Strip) -> JointImages:
+    """Images of the rows that a strip keeps."""
+    from polsep.kernels import get_threads
+
+    (top, bottom), cells = strip.seen, 1 if resolution == "full" else 2
+    job = _Job(method, resolution, mosaic.layout.channels, (bottom - top, mosaic.data.shape[1]), get_threads())
+    kept = slice(*((row - top) // cells for row in strip.kept))
+    with ENGINES.borrow(job) as engine:
+        raw, levels = mosaic.data[top:bottom].numpy(), (mosaic.black_level, mosaic.white_level)
+        return engine.run(raw, levels, mosaic.light_color, kept)
+
+
+def _join(parts: list[JointImages]) -> JointImages:
+    """Strips as one frame."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def rows(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    diffuse, specular, valid, dolp, aolp, error = map(rows, ("diffuse", "specular", "valid", "dolp", "aolp", "error"))
+    return JointImages(diffuse, specular, valid, dolp, aolp, error, reduce(add, (part.tally for part in parts)))
 
 
 def _turn_back(images: JointImages, orientation: Orientation, scale: int) -> JointImages:

@@ -101,7 +101,8 @@ def _phase_means(mosaic: Mosaic, data: Floats) -> tuple[Floats, Floats]:
     brightest = data.reshape(rows, side, -1).max(1).reshape(rows, cols, side).max(2)
     brightness = means.mean((0, 1))
     slope_y, slope_x = _gradient(brightness, 0) / side, _gradient(brightness, 1) / side
-    share = means.mean((2, 3), keepdims=True) / max(float(brightness.mean()), 1e-9)
+    average = float(brightness.mean())
+    share = means.mean((2, 3), keepdims=True) / (average if average > 1e-9 else 1.0)
     place = np.arange(4, dtype=np.float32) - 1.5
     shift = place[:, None, None, None] * slope_y + place[None, :, None, None] * slope_x
     usable = _linear(mosaic, brightest) < 1 - CLIP_MARGIN

@@ -12,6 +12,7 @@ import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -36,6 +37,9 @@ Floats = NDArray[np.float32]
 _CHANNELS = {"samples": 16, "clipping": 17, "cosine": 4, "sine": 4, "split": 10}
 #: Packed rows that a thread takes at a time.
 _ROWS = 16
+
+#: What `_model_of` has read.
+_MODELS: WeakKeyDictionary[nn.Module, dict[type[nn.Module], Any]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -117,10 +121,17 @@ class OpenVinoEngine:
         self._taps = make_taps(network, w, self.scale == 2) if network.demosaic is not None else None
         self._found = [np.empty((n, h, w), np.float32) for n in (4 * network.colors + 8, 8)]
         layers, inputs, outputs = self._open(network, (h, w))
-        self._request = _compile(layers, [seen.filled, *inputs], [*self._found, *outputs], precision)
+        inputs = [seen.filled, *inputs]
+        model = _model_of(network, layers, tuple(image.shape[2] for image in inputs))
+        self._request = _compile(model, inputs, [*self._found, *outputs], precision)
 
-    def run(self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...]) -> JointImages:
-        """Images of a frame ``[H, W]`` with black and white ``levels`` and a ``light`` of one gain per colour."""
+    def run(
+        self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...], kept: slice = slice(None)
+    ) -> JointImages:
+        """Images of a frame ``[H, W]`` with black and white ``levels`` and a ``light`` of one gain per colour.
+
+        ``kept``: rows of the images that are wanted, all others are left out, and do not count in the tally.
+        """
         from polsep.kernels.bilinear import read_pattern
         from polsep.kernels.joint_images import SUMS, Found, Targets
         from polsep.kernels.unpack import as_samples
@@ -137,8 +148,9 @@ class OpenVinoEngine:
             self._look()
             self._request.infer()
             self._write(Found(self._maps.base, self._maps.clipped, self._found[0], self._found[1]), gains, targets)
-        diffuse, specular, error = (image.reshape(h, w, -1) for image in images)
-        return JointImages(diffuse, specular, valid, angles[0], angles[1], error, _tally(targets))
+        targets = Targets._make(image[kept] for image in targets)
+        diffuse, specular, error = (image.reshape(image.shape[0], w, -1) for image in targets[:3])
+        return JointImages(diffuse, specular, targets.valid, targets.dolp, targets.aolp, error, _tally(targets))
 
     def _make_room(self, h: int, w: int, count: int) -> Seen:
         """For what the layers see, in their precision."""
@@ -153,10 +165,10 @@ class OpenVinoEngine:
         del size
         return np.empty((0, 0, 0), np.float32)
 
-    def _open(self, network: Joint, size: tuple[int, int]) -> tuple[nn.Module, list[NDArray[Any]], list[Floats]]:
+    def _open(self, network: Joint, size: tuple[int, int]) -> tuple[type[Layers], list[NDArray[Any]], list[Floats]]:
         """The layers, and what they see and say beside maps and corrections."""
-        del size
-        return Layers(network), [], []
+        del network, size
+        return Layers, [], []
 
     def _look(self) -> None:
         """What the layers see beside maps: nothing."""
@@ -193,13 +205,13 @@ class FullEngine(OpenVinoEngine):
     def _details(self, size: tuple[int, int]) -> Floats:
         return np.empty((2 * size[0], 3 * self._colors, 2 * size[1]), np.float32)
 
-    def _open(self, network: Joint, size: tuple[int, int]) -> tuple[nn.Module, list[NDArray[Any]], list[Floats]]:
+    def _open(self, network: Joint, size: tuple[int, int]) -> tuple[type[Layers], list[NDArray[Any]], list[Floats]]:
         from polsep.kernels.joint_details import Shares, read_smooth
 
         self._seen = self._make_room(*size, 12)
         share = np.empty((24 + 12 * (self._colors + 1), *size), np.float32)
         self._shares = Shares(share, self._maps.details, read_smooth(network.details.smooth.detach().numpy()))
-        return FullLayers(network), [self._seen.filled], [share]
+        return FullLayers, [self._seen.filled], [share]
 
     def _look(self) -> None:
         """How large details are around."""
@@ -217,12 +229,19 @@ class FullEngine(OpenVinoEngine):
         share(lambda rows: write_pixels(found, self._shares, gains, targets, rows), found.clipped.shape[0], _ROWS)
 
 
-def _compile(layers: nn.Module, inputs: list[NDArray[Any]], outputs: list[Floats], precision: str | None) -> Any:
+def _model_of(network: Joint, layers: type[Layers], channels: tuple[int, ...]) -> Any:
+    """OpenVINO's own of a network's layers, for whoever changes it; read once, as reading takes a second and 5 MiB."""
+    known = _MODELS.setdefault(network, {})
+    if layers not in known:
+        known[layers] = _as_model(layers(network).eval(), tuple(torch.zeros(1, n, 32, 32) for n in channels))
+    return known[layers].clone()
+
+
+def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[Floats], precision: str | None) -> Any:
     """A request that reads ``inputs [h, w, n]``, floats or bfloat16 as its bits, and fills ``outputs [n, h, w]``."""
     from polsep.kernels import get_threads
 
     openvino = _import_openvino()
-    model = _as_model(layers.eval(), tuple(torch.zeros(1, seen.shape[2], 32, 32) for seen in inputs))
     # Pinned threads of two engines would share a core, and wait there for whoever else works on it.
     options: dict[str, Any] = {"INFERENCE_NUM_THREADS": get_threads(), "PERFORMANCE_HINT": "LATENCY"}
     options |= {"ENABLE_CPU_PINNING": False}

@@ -8,6 +8,7 @@ place (`engine`).
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,6 +30,15 @@ from polsep.separation import Separation
 from polsep.stokes import Measurements, aolp, dolp, fit_stokes_unclipped, polarized_intensity
 
 LightColor = Sequence[float]
+
+
+def _calm_torch() -> None:
+    """In a forked child: the threads of torch have stayed behind, and with more than one it waits for them for ever."""
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_calm_torch)
 
 
 class PolsepWarning(UserWarning):

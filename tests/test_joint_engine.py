@@ -10,13 +10,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from tolerances import assert_close, assert_same_angle, assert_within
 
-from polsep import joint_engine
+from polsep import joint_engine, mosaic_network, openvino_engine
 from polsep.camera import Layout, Mosaic
 from polsep.joint import INPUTS, PERIOD, Demosaicker, Joint
 from polsep.joint_engine import run_engine
@@ -276,18 +277,75 @@ def test_threads_with_engines_of_their_own_find_the_same(shipped: None) -> None:
 
 
 def test_what_it_does_not_take_is_left_to_torch(shipped: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Batches, other dtypes, cells half a cell off, frames beyond `MOST_PIXELS`, and machines without OpenVINO."""
+    """Batches, other dtypes, cells half a cell off, and machines without OpenVINO."""
     mosaic = random_frame(32, 48, COLOR)
     assert run_engine("joint", "half", mosaic) is not None
     batch = Mosaic(mosaic.data.float()[None], COLOR, BLACK, WHITE)
     double = Mosaic(mosaic.data.double(), COLOR, BLACK, WHITE)
     half_off = random_frame(32, 48, MONO.rolled(1, 0))
     assert [run_engine("joint", "half", frame) for frame in (batch, double, half_off)] == [None] * 3
-    monkeypatch.setattr(joint_engine, "MOST_PIXELS", 32 * 48 - 1)
-    assert run_engine("joint", "half", mosaic) is None
-    monkeypatch.setattr(joint_engine, "MOST_PIXELS", math.inf)
     monkeypatch.setattr(joint_engine, "find_spec", lambda name: None)
     assert run_engine("joint", "half", mosaic) is None
+
+
+@pytest.mark.parametrize("resolution", RESOLUTIONS)
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.spec)
+def test_huge_frames_are_separated_in_strips(
+    layout: Layout, resolution: Resolution, shipped: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same as whole ones, by engines for two heights at most; also where the height is no multiple of strips."""
+    mosaic = random_frame(1452, 36, layout)
+    whole = run_engine("joint", resolution, mosaic)
+    monkeypatch.setattr(mosaic_network, "MOST_PIXELS", 36 * 720)
+    heights = {strip.seen[1] - strip.seen[0] for strip in joint_engine._strips((1452, 36), 16)}
+    assert len(heights) == 2 and max(heights) <= 720 + 16
+    parts = run_engine("joint", resolution, mosaic)
+    assert whole is not None and parts is not None
+    assert np.array_equal(parts.valid, whole.valid)
+    for name in ("diffuse", "specular", "error", "dolp"):
+        one, other = (torch.from_numpy(getattr(images, name)) for images in (parts, whole))
+        assert_close(one, other, 4.0)
+    for mine, theirs in zip(vars(parts.tally).values(), vars(whole.tally).values(), strict=True):
+        assert mine == theirs or mine == pytest.approx(theirs, rel=SUMMED)
+
+
+def test_layers_are_read_once_for_all_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, read = random_net(COLOR), []
+
+    def count(*given: Any) -> Any:
+        read.append(given)
+        return openvino_engine.__dict__["_read"](*given)
+
+    monkeypatch.setattr(openvino_engine, "_read", openvino_engine._as_model, raising=False)
+    monkeypatch.setattr(openvino_engine, "_as_model", count)
+    frames = [random_frame(32, width, COLOR) for width in (32, 48)]
+    for frame in frames:
+        engine = OpenVinoEngine(network, (32, frame.data.shape[1]), "f32")
+        found = engine.run(frame.data.numpy(), (BLACK, WHITE), LIGHT)
+        expected = run_joint(network, frame, "half").specular[0]
+        assert_close(torch.from_numpy(found.specular[..., 0]), LIGHT[0] * expected, 4.0)
+    assert len(read) == 1
+
+
+FORKED = """
+import multiprocessing, sys
+import numpy, polsep
+def separate(side, method="joint"):
+    return polsep.separate(numpy.full((side, side), 0.25, numpy.float32), method).diffuse.shape
+if __name__ == "__main__":
+    separate(32)
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        print(pool.apply_async(separate, (48,)).get(60))
+        print(pool.apply_async(separate, (48, "paper")).get(60))
+"""
+
+
+def test_forked_children_separate_frames_of_other_sizes() -> None:
+    """And by other methods: nothing waits for threads that have stayed behind."""
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", FORKED], capture_output=True, text=True, timeout=90, check=False
+    )
+    assert done.stdout == "(24, 24, 3)\n" * 2, done.stderr
 
 
 INTERRUPTED = """

@@ -178,7 +178,8 @@ def demo(output: Path) -> None:
             _print_demo(name, outcome.report["statistics"])
     print(f"Look at {output / 'joint' / 'still_life.png'} beside {output / 'analytic' / 'still_life.png'}:")
     print("  in 'specular', the analytic split leaves coloured rims of the objects, and holes where highlights clip;")
-    print("  the network removes both. The EXR files hold the linear images for Blender, Nuke or Python.")
+    print("  the network removes the rims and fills most of the holes. The EXR files hold the linear images for")
+    print("  Blender, Nuke or Python.")
 
 
 def _print_demo(name: str, statistics: dict[str, Any]) -> None:

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from polsep.kernels.compiling import HALF, ONE, ZERO, compiled, entry
+from polsep.stokes import MOST_DOLP
 
-_PI, _HALF_PI = np.float32(math.pi), np.float32(math.pi / 2)
+_PI, _HALF_PI, _MOST_DOLP = np.float32(math.pi), np.float32(math.pi / 2), np.float32(MOST_DOLP)
 
 # atan(x) / x on [0, 1] as a polynomial in x^2: own minimax fit (iteratively reweighted least squares), 2.5e-7 rad.
 _A0, _A1, _A2, _A3, _A4, _A5, _A6 = (
@@ -35,10 +36,10 @@ def half_angle(s1: Any, s2: Any) -> Any:
 
 @compiled
 def polarize(s0: Any, s1: Any, s2: Any, dolp: Any, aolp: Any) -> None:
-    """DoLP, 0 where s0 is not positive, and AoLP of rows of Stokes vectors."""
+    """DoLP, 0 where s0 is not positive, and AoLP of rows of Stokes vectors. Twin of `stokes.dolp` and `stokes.aolp`."""
     for j in range(dolp.size):
         degree = np.sqrt(s1[j] * s1[j] + s2[j] * s2[j]) / (s0[j] if s0[j] > ZERO else ONE)
-        dolp[j] = degree if s0[j] > ZERO else ZERO
+        dolp[j] = min(degree, _MOST_DOLP) if s0[j] > ZERO else ZERO
         aolp[j] = half_angle(s1[j], s2[j])
 
 

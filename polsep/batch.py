@@ -53,10 +53,11 @@ def separate_files(
 ) -> Iterator[Outcome]:
     """Separate every frame of the files, one outcome per frame; a bad file is one with an error, and the rest go on.
 
-    Raises OutputError before any work when two inputs have one name. A frame whose outputs would replace an input is
-    refused, also with ``overwrite``.
+    Raises OutputError before any work when two inputs have one name. A frame whose outputs would replace an input, or
+    what another frame has just given, is refused, also with ``overwrite``.
     """
     _refuse_equal_names(paths)
+    written: dict[str, str] = {}
     inputs = {realpath(path.replace("{angle}", angle)) for path in paths for angle in ("0", "45", "90", "135")}
     for path in paths:
         try:
@@ -64,8 +65,13 @@ def separate_files(
                 outputs = planned_outputs(write.directory, frame.stem, write.format)
                 if clash := sorted({realpath(output) for output in outputs} & inputs):
                     raise OutputError(f"{path}: expected outputs apart from inputs, found that {clash[0]} is an input")
+                if clash := sorted({realpath(output) for output in outputs} & written.keys()):
+                    other = written[clash[0]]
+                    raise OutputError(f"{path}: expected outputs of its own, found {clash[0]} of {other}")
                 refuse_targets(write.directory, outputs, write.overwrite)
-                yield _separate_frame(path, frame, read, options, write)
+                outcome = _separate_frame(path, frame, read, options, write)
+                written |= {realpath(output): path for output in outcome.written}
+                yield outcome
         except (ValueError, OSError, MemoryError, RuntimeError) as error:
             yield Outcome(path, error=_one_line(error))
 

@@ -27,7 +27,7 @@ from polsep.methods import Capture, Method, find_method
 from polsep.openvino_engine import JointImages
 from polsep.report import SeparatedFrame, describe, grey, tally
 from polsep.separation import Separation
-from polsep.stokes import Measurements, aolp, dolp, fit_stokes_unclipped, polarized_intensity
+from polsep.stokes import MOST_DOLP, Measurements, aolp, dolp, fit_stokes_unclipped, polarized_intensity
 
 LightColor = Sequence[float]
 
@@ -226,7 +226,7 @@ def to_numpy(found: Separation, report: dict[str, Any]) -> SeparatedFrame:
         image(found.diffuse),
         image(found.specular),
         found.valid.cpu().numpy(),
-        image(dolp(mean))[..., 0],
+        image(dolp(mean).clamp(max=MOST_DOLP))[..., 0],
         image(aolp(mean))[..., 0],
         report,
         None if found.doubt is None else image(found.doubt),

@@ -8,8 +8,7 @@ Conventions, shared by everything below and by every other module:
   Eqs. 11-12). Unit: 1.0 is one measurement at the sensor's white level, so an unclipped ``s0`` reaches 2.
 * Angles are radians, measured from image-right toward image-UP. Image rows grow downward, so a direction
   (d_row, d_col) in an array has the angle ``atan2(-d_row, d_col)``. AoLP lies in [0, pi).
-* Where ``s0`` is zero or negative, DoLP is 0. DoLP above 1 (noise, misregistration) is reported, not hidden, up to
-  `MOST_DOLP`.
+* Where ``s0`` is zero or negative, DoLP is 0. DoLP above 1 (noise, misregistration) is reported, not hidden.
 """
 
 from __future__ import annotations
@@ -23,7 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-#: DoLP at most: what least squares make of one bright analyser among four.
+#: DoLP of separated frames at most: what least squares make of one bright analyser among four. Methods whose s0 comes
+#: from other samples than their s1 and s2 would have any number in the dark.
 MOST_DOLP = 2.0
 
 
@@ -212,13 +212,9 @@ def polarized_intensity(stokes: Stokes) -> Tensor:
 
 
 def dolp(stokes: Stokes) -> Tensor:
-    """Degree of linear polarization (Eq. 2), 0 where s0 <= 0; above 1 only for unphysical (noisy) data.
-
-    At most `MOST_DOLP`, where s0 is next to nothing but not s1 and s2, which may come from other samples.
-    """
+    """Degree of linear polarization (Eq. 2), 0 where s0 <= 0; above 1 only for unphysical (noisy) data."""
     lit = stokes.s0 > 0
-    degree = polarized_intensity(stokes) / torch.where(lit, stokes.s0, 1.0)
-    return torch.where(lit, degree, 0.0).clamp(max=MOST_DOLP)
+    return torch.where(lit, polarized_intensity(stokes) / torch.where(lit, stokes.s0, 1.0), 0.0)
 
 
 def aolp(stokes: Stokes) -> Tensor:

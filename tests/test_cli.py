@@ -303,6 +303,19 @@ def test_template_and_file_of_one_name_are_refused(tmp_path: Path, polsep: Cli) 
     assert run.status == 2
 
 
+def test_results_of_one_run_replace_none_of_each_other(tmp_path: Path, polsep: Cli) -> None:
+    """The preview of shot_diffuse.png would be the diffuse image of shot.png: refused, also with --overwrite."""
+    for name in ("shot", "shot_diffuse"):
+        png(tmp_path / f"{name}.png", frame())
+    inputs, out = [tmp_path / "shot.png", tmp_path / "shot_diffuse.png"], tmp_path / "o"
+    run = polsep("separate", *inputs, "-o", out, "--format", "png", "--overwrite")
+    assert run.status == 2
+    assert "expected outputs of its own" in run.err and str(inputs[0]) in run.err
+    kept = (out / "shot_diffuse.png").read_bytes()
+    assert polsep("separate", inputs[0], "-o", out, "--format", "png", "--overwrite").status == 0
+    assert (out / "shot_diffuse.png").read_bytes() == kept
+
+
 def test_inputs_of_one_name_are_refused(tmp_path: Path, polsep: Cli) -> None:
     """Two inputs whose results would be one file are refused before any work."""
     for folder in ("x", "y"):

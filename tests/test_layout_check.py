@@ -209,6 +209,12 @@ def test_frames_that_show_nothing_are_silent(name: str) -> None:
         assert check.warning is None and check.pairs is None
 
 
+def test_frames_below_black_are_silent() -> None:
+    """Nor is there a warning of NumPy."""
+    frame = Mosaic(0.1 + 0.1 * torch.rand(64, 64, generator=torch.Generator().manual_seed(6)), COLOR, 0.9, 1.0)
+    assert check_layout(frame).warning is None
+
+
 @pytest.mark.parametrize(("height", "width"), [(2, 2), (2, 64), (64, 3)])
 def test_narrow_mono_frames_are_silent(height: int, width: int) -> None:
     """The check never raises, on no size that a `Mosaic` may have."""

@@ -36,7 +36,7 @@ def half_angle(s1: Any, s2: Any) -> Any:
 
 @compiled
 def polarize(s0: Any, s1: Any, s2: Any, dolp: Any, aolp: Any) -> None:
-    """DoLP, 0 where s0 is not positive, and AoLP of rows of Stokes vectors. Twin of `stokes.dolp` and `stokes.aolp`."""
+    """DoLP, 0 where s0 is not positive, and AoLP of rows of Stokes vectors. DoLP is at most `MOST_DOLP`."""
     for j in range(dolp.size):
         degree = np.sqrt(s1[j] * s1[j] + s2[j] * s2[j]) / (s0[j] if s0[j] > ZERO else ONE)
         dolp[j] = min(degree, _MOST_DOLP) if s0[j] > ZERO else ZERO

@@ -81,7 +81,7 @@ def _try_color_affine() -> None:
 
 def _tiny_frame() -> Mosaic:
     """With clipped samples."""
-    return Mosaic(torch.eye(2 * LEAST_CELLS), Layout(), 0.0, 1.0)
+    return Mosaic(torch.eye(2 * LEAST_CELLS, dtype=torch.float32), Layout(), 0.0, 1.0)
 
 
 @lru_cache

@@ -33,7 +33,7 @@ def load_refinement(path: Path, device: torch.device) -> tuple[Rung, Refinement]
         network.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"expected weights of a refinement in {path}, found {type(error).__name__}") from None
-    return rung, network.to(device).eval()
+    return rung, network.to(device, torch.float32).eval()
 
 
 @lru_cache(maxsize=4)

@@ -13,6 +13,7 @@ Conventions, shared by Python callers and by files:
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -187,6 +188,9 @@ def _one_channel(array: NDArray[Any]) -> tuple[NDArray[Any], Notes]:
 def _white_level(samples: NDArray[Any], black_level: float, white_level: float | None) -> float:
     """The white level said, or that of the dtype. Raises ValueError unless it is finite and above black."""
     white = WHITE_LEVELS[samples.dtype.name] if white_level is None else white_level
+    for name, level in (("black", black_level), ("white", white)):
+        if not isinstance(level, Real):
+            raise ValueError(f"expected a {name} level that is a number, found {level!r:.40}")
     if not (math.isfinite(white) and math.isfinite(black_level)):
         raise ValueError(f"expected finite black and white levels, found {black_level:g} and {white:g}")
     if not white > black_level:

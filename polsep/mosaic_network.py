@@ -48,7 +48,7 @@ def load_joint(path: Path, device: torch.device) -> Joint:
         network.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"expected weights of a joint network in {path}, found {type(error).__name__}") from None
-    return network.to(device).eval()
+    return network.to(device, torch.float32).eval()
 
 
 @lru_cache(maxsize=4)

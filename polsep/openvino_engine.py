@@ -233,7 +233,9 @@ def _model_of(network: Joint, layers: type[Layers], channels: tuple[int, ...]) -
     """OpenVINO's own of a network's layers, for whoever changes it; read once, as reading takes a second and 5 MiB."""
     known = _MODELS.setdefault(network, {})
     if layers not in known:
-        known[layers] = _as_model(layers(network).eval(), tuple(torch.zeros(1, n, 32, 32) for n in channels))
+        known[layers] = _as_model(
+            layers(network).eval(), tuple(torch.zeros(1, n, 32, 32, dtype=torch.float32) for n in channels)
+        )
     return known[layers].clone()
 
 
@@ -328,7 +330,7 @@ def make_taps(network: Joint, width: int, details: bool = False) -> Taps:
             .transpose(2, 3)
             .reshape(-1, 4, 4, whole.shape[1])
         )
-        split = torch.einsum("dp,cqpn->cdqn", torch.tensor(HAAR[1:]) / 4, pixels)
+        split = torch.einsum("dp,cqpn->cdqn", torch.tensor(HAAR[1:], dtype=torch.float32) / 4, pixels)
         whole = torch.cat([whole, split.reshape(-1, whole.shape[1])])
     cells = whole.numpy().reshape(-1, 4, whole.shape[1]).swapaxes(0, 1)
     most = max(int(np.count_nonzero(cell.any(axis=0))) for cell in cells)

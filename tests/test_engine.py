@@ -164,3 +164,27 @@ def test_kernels_are_loaded_with_the_first_frame() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout.strip() == "False"
+
+
+ELSEWHERE = """
+import sys, warnings
+import numpy, polsep, torch
+warnings.simplefilter("ignore")
+raw = numpy.random.default_rng(1).integers(0, 4000, (64, 64), numpy.uint16)
+if sys.argv[1] == "double":
+    torch.set_default_dtype(torch.float64)
+for method in sys.argv[2:]:
+    for full in (False, True):
+        found = polsep.separate(raw, method, white_level=4095, full=full)
+        print(method, full, found.diffuse.dtype, f"{found.diffuse.mean():.3f} {found.specular.mean():.3f}")
+"""
+
+
+def test_a_programs_default_type_does_not_matter() -> None:
+    """Whoever sets torch's default to double gets the same images, in float32."""
+    said = []
+    for kind in ("single", "double"):
+        command = [sys.executable, "-c", ELSEWHERE, kind, *METHODS]
+        said.append(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert said[0] == said[1]
+    assert said[0].count("float32") == 2 * len(METHODS)

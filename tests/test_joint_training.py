@@ -290,10 +290,20 @@ def known_views(layout: Layout, weight: Tensor) -> list[JointSeen]:
 
 
 def known_filter(layout: Layout) -> Tensor:
-    """Not the bilinear one; it sees what a fitted one does."""
+    """Not the bilinear one; it sees what a fitted one does, and leaves even light as it is."""
     weight = bilinear_filter(layout)
-    weight = weight + 0.1 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(4))
-    return weight * reach_of_filter(layout.channels).view_as(weight)
+    near = reach_of_filter(layout.channels).view_as(weight).float()
+    change = 0.1 * near * torch.randn(weight.shape, generator=torch.Generator().manual_seed(4))
+    for own in colors_of_samples(layout):
+        seen = near * own.view(1, 16, 1, 1)
+        change -= seen * ((change * seen).sum(dim=(1, 2, 3), keepdim=True) / seen.sum(dim=(1, 2, 3), keepdim=True))
+    return weight + change
+
+
+def colors_of_samples(layout: Layout) -> Tensor:
+    """Which of a period's samples lie behind a filter of each colour: ``[C, 16]``, 1 or 0."""
+    channels = torch.tensor([layout.filter_at(place // 4, place % 4).channel for place in range(16)])
+    return (channels == torch.arange(layout.channels)[:, None]).float()
 
 
 @pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
@@ -323,6 +333,18 @@ def test_the_fit_recovers_a_known_filter(layout: Layout) -> None:
     assert float((found - weight).square().mean()) < 1e-4 * float((weight - bilinear_filter(layout)).square().mean())
 
 
+@pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
+def test_the_fit_leaves_even_light_as_it_is(layout: Layout) -> None:
+    """Whatever the examples say: s0 of its own colour, no light of another, nothing polarized."""
+    c = layout.channels
+    weight = fit_filter(known_views(layout, 0.5 * bilinear_filter(layout)))
+    for k, own in enumerate(colors_of_samples(layout)):
+        found = (weight * 0.5 * own.view(1, 16, 1, 1)).sum(dim=(1, 2, 3))
+        expected = torch.zeros(24 * c)
+        expected[16 * k : 16 * (k + 1)] = 1
+        assert_close(found, expected)
+
+
 def test_samples_near_clipped_ones_say_nothing_about_the_filter() -> None:
     """Samples raised to white, whose truth does not follow them, leave what the others say."""
     weight = known_filter(COLOR)
@@ -333,12 +355,13 @@ def test_samples_near_clipped_ones_say_nothing_about_the_filter() -> None:
 
 
 def test_what_examples_leave_open_stays_bilinear() -> None:
-    """A single packed pixel without any light behind it hardly moves it; without one there is nothing to fit."""
-    views = known_views(COLOR, torch.zeros(72, 16, 3, 3))
+    """A single packed pixel of another filter hardly moves it; without one there is nothing to fit."""
+    known = known_filter(COLOR)
+    views = known_views(COLOR, known)
     corner = [view._replace(weight=pad(torch.ones(2, 1, 4, 4), (0, 60, 0, 60))) for view in views]
     bilinear = bilinear_filter(COLOR)
     assert_finite(fit_filter(corner))
-    assert float((fit_filter(corner) - bilinear).square().mean()) < 0.5 * float(bilinear.square().mean())
+    assert float((fit_filter(corner) - bilinear).square().mean()) < 0.5 * float((known - bilinear).square().mean())
     outside = [view._replace(weight=torch.zeros_like(view.weight)) for view in views]
     with pytest.raises(ValueError, match="expected examples to fit a filter to, found none"):
         fit_filter(outside)

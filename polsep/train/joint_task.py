@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d, pad, pixel_unshuffle, unfold
 
-from polsep.camera import Mosaic
+from polsep.camera import Layout, Mosaic
 from polsep.demosaic import demosaic_bilinear_half
 from polsep.joint import INPUTS, Demosaicker, Joint, bilinear_filter
 from polsep.networks import ResidualSize
@@ -108,15 +108,20 @@ def fit_filter(views: Iterable[JointSeen]) -> Tensor:
     """The packed filter, as `joint.bilinear_filter`, that is off least on examples in the mean square.
 
     Errors count relative to the light around, and only where nothing clips: it is a Wiener filter for scenes like
-    these, colours and polarization included, of samples within `FIT_REACH`. Raises ValueError without examples, or
-    without light on objects in them.
+    these, colours and polarization included, of samples within `FIT_REACH`, that leaves unpolarized light of one colour
+    as it is: else saturated surfaces get a grid. Raises ValueError without examples, or without light on objects in
+    them.
     """
-    start, power, goal = torch.zeros(0), torch.zeros(0), torch.zeros(0)
+    start, power, goal, even = torch.zeros(0), torch.zeros(0), torch.zeros(0), torch.zeros(0)
     for view in views:
         seen, wanted = _fit_samples(view)
         if not start.numel():
             start = bilinear_filter(view.layout).flatten(1).double().T
-            power, goal = start.new_zeros(len(start), len(start)), torch.zeros_like(start)
+            power, goal, even = (
+                start.new_zeros(len(start), len(start)),
+                torch.zeros_like(start),
+                _even_light(view.layout),
+            )
         power += seen.T @ seen
         goal += seen.T @ wanted
     if not bool(power.any()):
@@ -128,8 +133,21 @@ def fit_filter(views: Iterable[JointSeen]) -> Tensor:
         inputs, outputs = sees.nonzero()[:, 0], (near == sees[:, None]).all(dim=0).nonzero()[:, 0]
         own = torch.meshgrid(inputs, outputs, indexing="ij")
         system = power[inputs][:, inputs] + hold * torch.eye(len(inputs), dtype=torch.float64)
-        weights[own] = torch.linalg.solve(system, goal[own] + hold * start[own])
+        # Bilinear weights do what is demanded of even light; multipliers make the others do so, too.
+        bound, kept = even[inputs], even.T @ start[:, outputs]
+        system = torch.cat(
+            [torch.cat([system, bound], 1), torch.cat([bound.T, bound.new_zeros(2 * (bound.shape[1],))], 1)]
+        )
+        found = torch.linalg.solve(system, torch.cat([goal[own] + hold * start[own], kept]))
+        weights[own] = found[: len(inputs)]
     return weights.T.float().reshape(-1, 16, 3, 3)
+
+
+def _even_light(layout: Layout) -> Tensor:
+    """Neighbourhoods ``[144, C]`` of even, unpolarized light of one colour each."""
+    channels = torch.tensor([layout.filter_at(place // 4, place % 4).channel for place in range(16)])
+    lit = channels[:, None] == torch.arange(layout.channels)
+    return lit.double().repeat_interleave(9, dim=0)
 
 
 def reach_of_filter(colors: int) -> Tensor:

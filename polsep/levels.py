@@ -26,7 +26,7 @@ from polsep.stokes import Measurements
 #: Accepted samples and the white level that their type implies.
 WHITE_LEVELS = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0, "float64": 1.0}
 
-#: Floats of which the largest lies below this share of a white level that was said look like another white level's.
+#: Floats up to about 1 that lie below this share of the white level look as if white were 1.
 LEAST_USED = 0.01
 
 #: Order of four angle planes, as LUCID names them, in degrees.
@@ -113,7 +113,7 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
         notes += (f"every sample is clipped: the smallest is {low:g} of white level {white:g}",)
     if white_level is None and samples.dtype.kind == "f" and high > 2:
         return (*notes, f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white")
-    if samples.dtype.kind == "f" and 0 < high - black_level < LEAST_USED * (white - black_level):
+    if samples.dtype.kind == "f" and high <= 2 and high - black_level < LEAST_USED * (white - black_level):
         notes += (f"float values reach {high:g} of white level {white:g}: is white 1? Then leave out --white-level",)
     if high > white:
         above = int(np.count_nonzero(samples > white))

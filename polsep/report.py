@@ -18,10 +18,10 @@ from polsep.separation import Separation, light_polarizer_angle
 from polsep.stokes import Stokes, dolp
 
 #: Below this concentration of AoLP there is no single polarized light. Real frames: 0.76 to 0.97 where one light or one
-#: reflecting surface polarizes, 0.31 to 0.50 in the open; test sets under one light, by `joint`: 0.57 to 0.99. Of
-#: eight rendered objects under unpolarized light `joint` finds seven, closed forms find five or six.
+#: reflecting surface polarizes, 0.31 to 0.50 in the open; test sets under one light, by `joint`: 0.57 to 0.99.
 MIN_CONCENTRATION = 0.53
-#: The same of methods that take all polarized light for specular, or nearly all: the diffuse light has many angles.
+#: The same of methods that take all polarized light for specular, or nearly all, since the diffuse light has many
+#: angles: 0.46 and more on eight rendered objects under one light.
 MIN_CONCENTRATION_CLOSED = 0.45
 #: Above this distance of the polarization from its model, relative to s0, highlights are coloured as metals' are. Test
 #: sets down to 3 % of full exposure: up to 0.04; objects with golden highlights and no diffuse: 0.11 and more. Linear

@@ -117,11 +117,8 @@ def fit_filter(views: Iterable[JointSeen]) -> Tensor:
         seen, wanted = _fit_samples(view)
         if not start.numel():
             start = bilinear_filter(view.layout).flatten(1).double().T
-            power, goal, even = (
-                start.new_zeros(len(start), len(start)),
-                torch.zeros_like(start),
-                _even_light(view.layout),
-            )
+            power, goal = start.new_zeros(len(start), len(start)), torch.zeros_like(start)
+            even = _even_light(view.layout)
         power += seen.T @ seen
         goal += seen.T @ wanted
     if not bool(power.any()):
@@ -135,9 +132,8 @@ def fit_filter(views: Iterable[JointSeen]) -> Tensor:
         system = power[inputs][:, inputs] + hold * torch.eye(len(inputs), dtype=torch.float64)
         # Bilinear weights do what is demanded of even light; multipliers make the others do so, too.
         bound, kept = even[inputs], even.T @ start[:, outputs]
-        system = torch.cat(
-            [torch.cat([system, bound], 1), torch.cat([bound.T, bound.new_zeros(2 * (bound.shape[1],))], 1)]
-        )
+        nothing = bound.new_zeros(bound.shape[1], bound.shape[1])
+        system = torch.cat([torch.cat([system, bound], 1), torch.cat([bound.T, nothing], 1)])
         found = torch.linalg.solve(system, torch.cat([goal[own] + hold * start[own], kept]))
         weights[own] = found[: len(inputs)]
     return weights.T.float().reshape(-1, 16, 3, 3)

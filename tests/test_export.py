@@ -100,3 +100,19 @@ def test_bad_requests_are_one_line_and_leave_nothing(
     assert stopped.value.code == 2
     assert said in capsys.readouterr().err
     assert not Path("x.onnx").exists()
+
+
+def test_graphs_of_before_are_not_replaced_unasked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "joint.onnx"
+    target.write_bytes(b"of before")
+    monkeypatch.setattr(sys, "argv", ["polsep", "export", "joint", "-o", str(target)])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert stopped.value.code == 2
+    assert (
+        capsys.readouterr().err
+        == f"polsep: error: expected no {target}, found one from before; --overwrite replaces it\n"
+    )
+    assert target.read_bytes() == b"of before"

@@ -127,7 +127,8 @@ def _with_progress(outcomes: Iterator[Outcome], files: int) -> Iterator[Outcome]
 @click.option("--mono", is_flag=True, help="For cameras without colour filters.")
 @click.option("--full", is_flag=True, help="Images of the mosaic's own resolution.")
 @click.option("--weights", type=click.Path(path_type=Path), metavar="FILE", help="Of polsep train; default: shipped.")
-def export(method: str, output: Path, mono: bool, full: bool, weights: Path | None) -> None:
+@click.option("--overwrite", is_flag=True, help="Replace a file that exists.")
+def export(method: str, output: Path, weights: Path | None, **options: bool) -> None:
     """Write joint or joint-fast as one ONNX file: raw uint16 frames in, diffuse, specular and expected error out.
 
     It runs in onnxruntime and its like without polsep. Frames [N, H, W] are in Sony's order with sides that are
@@ -136,12 +137,14 @@ def export(method: str, output: Path, mono: bool, full: bool, weights: Path | No
     from polsep.camera import Layout
     from polsep.graph import OUTPUT_NAMES, Graph
     from polsep.io.onnx import write_onnx
+    from polsep.io.outputs import refuse_targets
     from polsep.mosaic_network import find_joint
 
     try:
-        network, metadata = find_joint(method, Layout(bayer=None) if mono else Layout(), weights)
+        refuse_targets(output.parent, [output], options["overwrite"])
+        network, metadata = find_joint(method, Layout(bayer=None) if options["mono"] else Layout(), weights)
         say(f"writing the graph of {method}, which takes a minute or a few")
-        write_onnx(output, Graph(network, full), OUTPUT_NAMES, metadata)
+        write_onnx(output, Graph(network, options["full"]), OUTPUT_NAMES, metadata)
     except ValueError as error:
         raise click.ClickException(str(error)) from None
     print(output)

@@ -21,7 +21,7 @@ pytest.importorskip("lightning_fabric")
 pytest.importorskip("tensorboard")
 
 from polsep.camera import CLIP_MARGIN, IDEAL, IMX250, Layout, expose
-from polsep.io.weights import read_weights
+from polsep.io.weights import read_weights, write_weights
 from polsep.joint import INPUTS, Images, Joint, Pose, bilinear_filter
 from polsep.metrics import psnr
 from polsep.networks import ResidualSize, count_parameters
@@ -481,13 +481,31 @@ def test_of_a_network_a_part_can_be_trained_alone(tmp_path: Path, shortened: Non
     """Everything else stays bit by bit as it began, and with it all images at half resolution."""
     run = Run(tmp_path / "all", "a test", STREAM, SCHEDULE, workers=0)
     start = train_weights(JointOptions("joint-fast", size=TINY), run, lambda _: None)
-    run = replace(run, out=tmp_path / "part", start=start)
+    run = replace(run, out=tmp_path / "part", start=(start,))
     held = train_weights(JointOptions("joint-fast", size=TINY, part="details"), run, lambda _: None)
     (before, _), (after, metadata) = read_weights(start), read_weights(held)
     moved = {name for name in before if not torch.equal(before[name], after[name])}
     assert moved and all(name.startswith("details.") for name in moved)
     assert "--part details" in metadata["command"]
     assert int(metadata["parameters"]) == sum(x.numel() for name, x in after.items() if name != "demosaic")
+
+
+def test_filters_are_fitted_anew_only_when_asked(tmp_path: Path, shortened: None) -> None:
+    """`--start` goes on with the filter of the weights; `--refit` fits one to today's examples, and nothing else."""
+    run = Run(tmp_path / "first", "a test", STREAM, SCHEDULE, workers=0)
+    first = train_weights(JointOptions("joint-fast", size=TINY), run, lambda _: None)
+    before, metadata = read_weights(first)
+    fitted = before["demosaic"]
+    write_weights(first, before | {"demosaic": torch.full_like(fitted, 0.25)}, {"method": metadata["method"]})
+    on = replace(run, start=(first,), schedule=replace(SCHEDULE, steps=0))
+    for refit, expected in ((False, torch.full_like(fitted, 0.25)), (True, fitted)):
+        asked = replace(on, out=tmp_path / str(refit), refit=refit)
+        found, metadata = read_weights(train_weights(JointOptions("joint-fast", size=TINY), asked, lambda _: None))
+        assert found.keys() == before.keys()
+        assert all(
+            torch.equal(value, expected if name == "demosaic" else before[name]) for name, value in found.items()
+        )
+        assert ("--refit" in metadata["command"]) == refit
 
 
 def die_at(step: int) -> Callable[[dict[str, Any]], None]:

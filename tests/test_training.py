@@ -282,16 +282,36 @@ def test_a_training_begins_with_given_weights(tmp_path: Path) -> None:
     options = TrainOptions("paper", "co-sited", Size(4, 1, 1), seed=5)
     run = replace(run_in(tmp_path / "first"), workers=0)
     first = train_weights(options, run, lambda _: None)
-    after = replace(run, out=tmp_path / "second", start=first, schedule=replace(SCHEDULE, steps=1, rate=1e-12))
+    after = replace(run, out=tmp_path / "second", start=(first,), schedule=replace(SCHEDULE, steps=1, rate=1e-12))
     second = train_weights(replace(options, seed=6), after, lambda _: None)
     before, found = read_weights(first)[0], read_weights(second)[0]
     assert all(torch.allclose(before[name], found[name], rtol=1e-3, atol=1e-6) for name in before)
     assert read_weights(second)[1]["command"].endswith("--start paper-co-sited.safetensors")
     begun, ended = json.loads(read_weights(second)[1]["curve"])
     assert begun[0] == 0 and begun[1:] == pytest.approx(ended[1:], abs=0.01)
-    other = replace(run, out=tmp_path / "third", start=first)
+    other = replace(run, out=tmp_path / "third", start=(first,))
     with pytest.raises(ValueError, match=r"expected weights of the network .*, found those of another"):
         train_weights(replace(options, size=Size(8, 1, 1)), other, lambda _: None)
+
+
+def test_a_training_of_no_steps_is_the_mean_of_what_it_begins_with(tmp_path: Path) -> None:
+    """A file that is given twice counts twice; the mean is scored, and the command says what it is of."""
+    options = TrainOptions("paper", "co-sited", Size(4, 1, 1), seed=5)
+    run = replace(run_in(tmp_path), workers=0, schedule=replace(SCHEDULE, steps=1))
+    first, second = (
+        train_weights(replace(options, seed=seed), replace(run, out=tmp_path / str(seed)), lambda _: None)
+        for seed in (5, 6)
+    )
+    mixed = replace(run, out=tmp_path / "mean", start=(first, second, first), schedule=replace(SCHEDULE, steps=0))
+    lines: list[dict[str, Any]] = []
+    found, metadata = read_weights(train_weights(options, mixed, lines.append))
+    one, other = read_weights(first)[0], read_weights(second)[0]
+    assert any(not torch.equal(one[name], other[name]) for name in one)
+    for name, value in found.items():
+        torch.testing.assert_close(value, (2 * one[name] + other[name]) / 3, rtol=1e-3, atol=1e-6)
+    scores = [round(lines[0][f"{image} PSNR"], 3) for image in ("diffuse", "specular")]
+    assert [line["step"] for line in lines] == [0] and json.loads(metadata["curve"]) == [[0, *scores]]
+    assert metadata["command"].count("--start paper-co-sited.safetensors") == 3
 
 
 def test_rate_warms_up_and_falls_as_a_cosine() -> None:

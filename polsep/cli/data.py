@@ -102,7 +102,14 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 @click.option("--seed", type=int, default=0, metavar="N", help="Of the weights and of the data.")
 @click.option("--workers", type=int, default=1, metavar="N", help="Processes that render, per device.")
 @click.option("--devices", type=int, default=1, metavar="N", help="GPUs, where there are any.")
-@click.option("--start", type=click.Path(path_type=Path), metavar="FILE", help="Weights to begin with.")
+@click.option(
+    "--start",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="FILE",
+    help="Weights to begin with; several: mean.",
+)
+@click.option("--refit", is_flag=True, help="Fit the linear filter of a joint network anew, after --start.")
 @click.option("--precision", default="bf16-mixed", metavar="NAME", help="bf16-mixed or 32-true.")
 def train(rung: str, output: Path, data: str, **options: Any) -> None:
     """Train joint, joint-fast, material or a rung of the paper's ladder: paper, unpolarized, polarized, shared,
@@ -127,7 +134,7 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
             f"expected the extra 'train' (pip install 'polsep[train]'), found no {error.name}"
         ) from None
     try:
-        given = {name: options[name] for name in ("workers", "devices", "start")}
+        given = {name: options[name] for name in ("workers", "devices", "start", "refit")}
         if rung == "material":
             material, schedule = choose_material(options)
             folder = options["folder"] or output.parent / "examples"

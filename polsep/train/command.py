@@ -208,8 +208,8 @@ def describe_command(options: Options, run: Run) -> str:
         "precision": schedule.precision,
         "output": run.out.name,
     }
-    asked |= {"start": run.start.name} if run.start else {}
     words = [word for name, value in asked.items() for word in (f"--{name}", str(value))]
+    words += [word for path in run.start for word in ("--start", path.name)] + ["--refit"] * run.refit
     return shlex.join(["polsep", "train", options.name, *words])
 
 
@@ -244,7 +244,7 @@ def check_run(run: Run) -> None:
     out, schedule = run.out, run.schedule
     if out.exists() and not out.is_dir():
         raise ValueError(f"expected a directory to write into, found a file: {out}")
-    if min(run.last, run.devices, run.workers + 1) < 1:
+    if min(run.last + bool(run.start), run.devices, run.workers + 1) < 1:
         found = f"steps {run.last}, devices {run.devices}, workers {run.workers}"
         raise ValueError(f"expected at least 1 step, 1 device and 0 workers, found {found}")
     if schedule.precision not in PRECISIONS:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -68,8 +68,9 @@ class Schedule:
 class Run:
     """Where a training writes, ``what`` it trains, on which data; ``workers`` render, ``devices`` train.
 
-    ``start``: a file of weights to begin with, instead of random ones. ``until``: a step of the schedule to end at; a
-    later run goes on from its last checkpoint.
+    ``start``: files of weights whose mean it begins with, instead of random ones; a schedule of 0 steps writes and
+    scores that. ``refit``: what is fitted instead of trained is fitted anew before. ``until``: a step of the schedule
+    to end at; a later run goes on from its last checkpoint.
     """
 
     out: Path
@@ -78,7 +79,8 @@ class Run:
     schedule: Schedule = field(default_factory=Schedule)
     workers: int = 1
     devices: int = 1
-    start: Path | None = None
+    start: tuple[Path, ...] = ()
+    refit: bool = False
     until: int | None = None
 
     @property
@@ -135,7 +137,7 @@ def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | Non
         lambda network, batch, done: task.loss(network, task.prepare(batch), done),
         lambda _: score(task.separate, look()),
         lambda: task.begin(run.stream),
-        lambda: score_references(task, look()) | ({} if run.start is None else score(task.separate, look())),
+        lambda: score_references(task, look()) | (score(task.separate, look()) if run.start else {}),
     )
     return train_course(course, run, report)
 
@@ -151,12 +153,14 @@ def train_course(course: Course, run: Run, report: Report) -> dict[str, Tensor] 
     network = course.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     state = read_checkpoint(run.out / "checkpoint.pt")
     if state is None:
-        course.begin() if run.start is None else begin_at(run.start, network)
+        begin_at(run.start, network)
+        if run.refit or not run.start:
+            course.begin()
     wrapped = fabric.setup_module(network)
     optimizer = Optimizers(network)
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
     step = _restore(state, run, (network, optimizer, average))
-    batches = course.batches(step, (fabric.global_rank, fabric.world_size))
+    batches = course.batches(step, (fabric.global_rank, fabric.world_size)) if step < run.last else iter(())
     with ExitStack() as stack:
         log = stack.enter_context(open_log(run.out, step, report, course.references)) if fabric.is_global_zero else None
         while step < run.last:
@@ -189,13 +193,21 @@ def _fabric(run: Run) -> Fabric:
     return Fabric(accelerator=device, devices=run.devices, plugins=[ExactInputs("bf16-mixed", device)])
 
 
-def begin_at(path: Path, network: nn.Module) -> None:
-    """Fill in a network's weights from a file. Raises ValueError when they are of another one."""
-    tensors, _ = read_weights(path)
-    try:
-        network.load_state_dict(tensors)
-    except RuntimeError:
-        raise ValueError(f"expected weights of the network to be trained in {path}, found those of another") from None
+def begin_at(paths: Sequence[Path], network: nn.Module) -> None:
+    """Fill in the mean of files of weights, where there are any. Raises ValueError on those of another network."""
+    mean: dict[str, Tensor] = {}
+    for count, path in enumerate(paths, start=1):
+        tensors, _ = read_weights(path)
+        try:
+            network.load_state_dict(tensors)
+        except RuntimeError:
+            raise ValueError(
+                f"expected weights of the network to be trained in {path}, found those of another"
+            ) from None
+        for name, value in network.state_dict().items():
+            mean[name] = value.clone() if count == 1 else mean[name].lerp(value, 1 / count)
+    if mean:
+        network.load_state_dict(mean)
 
 
 def _to(device: torch.device, batch: Batch) -> Batch:
@@ -205,7 +217,8 @@ def _to(device: torch.device, batch: Batch) -> Batch:
 def _describe(run: Run) -> str:
     """What must be the same for a checkpoint to go on."""
     described: dict[str, Any] = {"what": run.what, "stream": asdict(run.stream), "schedule": asdict(run.schedule)}
-    described |= {"start": run.start.name} if run.start else {}
+    described |= {"start": [path.name for path in run.start]} if run.start else {}
+    described |= {"refit": True} if run.refit else {}
     return json.dumps(described | {"workers": run.workers, "devices": run.devices})
 
 

@@ -1,12 +1,16 @@
 """The program's frame: the group of commands, what they share, and how failures are said.
 
-Exit status: 0 only when everything asked for was written; 2 after bad input, with one line per failure on stderr.
+Exit status: 0 only when everything asked for was written; 2 after bad input, with one line per failure on stderr;
+130 after Ctrl-C, 143 when the system ends it.
 """
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
+from types import FrameType
+from typing import NoReturn
 
 import click
 
@@ -38,6 +42,7 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 
 def main() -> None:
     """Entry point: bad input is one line on stderr and exit status 2."""
+    signal.signal(signal.SIGTERM, _end)
     try:
         app(standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -55,3 +60,8 @@ def main() -> None:
     except OSError as error:
         say(f"error: {error}")
         sys.exit(2)
+
+
+def _end(number: int, place: FrameType | None) -> NoReturn:
+    """End as after Ctrl-C when the system asks for it, so that temporary files go."""
+    sys.exit(128 + number)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 import threading
 from pathlib import Path
-from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
 import click
 
@@ -51,7 +48,6 @@ def view(file: Path | None, host: str, port: int | None, opens: bool, upload_lim
             raise ValueError(f"{file}: expected a file, found nothing")
         if file is not None:
             find_sources(file)
-        signal.signal(signal.SIGTERM, _stop)
         with serve(ViewOptions(host, port, file, settings, upload_limit)) as address:
             print(address, flush=True)
             say("serving until Ctrl-C")
@@ -64,8 +60,3 @@ def view(file: Path | None, host: str, port: int | None, opens: bool, upload_lim
         raise click.ClickException("expected the extra 'view' (pip install 'polsep[view]'), found none") from None
     except ValueError as error:
         raise click.ClickException(str(error)) from None
-
-
-def _stop(number: int, place: FrameType | None) -> NoReturn:
-    """End as after Ctrl-C, so that temporary files go."""
-    sys.exit(128 + number)

@@ -176,19 +176,24 @@ def _check_frame(frame: SeparatedFrame) -> None:
 
 @contextmanager
 def _unbroken() -> Iterator[None]:
-    """Ctrl-C waits until the block is done: otherwise it may come while the block cleans up, and leave a part of it."""
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is None:  # no signal comes here
+    """Ctrl-C, or the system's request to end, waits until the block is done.
+
+    Otherwise it may come while the block cleans up, and leave a part of it.
+    """
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    if threading.current_thread() is not threading.main_thread() or None in before.values():  # no signal comes here
         yield
         return
     caught: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, place: caught.append(number))
+    for number in before:
+        signal.signal(number, lambda number, place: caught.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         if caught:  # also where the block has failed, or the system's own handler ends the program
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(caught[0])
 
 
 def require_same(path: Path, settings: Mapping[str, Any], begun: str, advice: str = "") -> None:

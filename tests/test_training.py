@@ -403,6 +403,7 @@ def test_without_tensorboard_the_extra_is_named(
         (["joint", "--part", "x"], "expected a part of all, details"),
         (["joint-fast", "--data", "co-sited"], "expected a variant of mosaic, mono"),
         (["paper", "--steps", "0"], "expected at least 1 step"),
+        (["joint", "--refit"], "expected a network with a linear filter to refit, found joint for mosaic"),
         (["paper", "--workers", "-1"], "expected at least 1 step"),
         (["paper", "--devices", "0"], "expected at least 1 step"),
         (["paper", "--precision", "16-mixed"], "expected a precision of bf16-mixed"),

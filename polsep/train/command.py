@@ -233,8 +233,15 @@ def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:
 
 
 def plan_run(run: Run, options: Options) -> Run:
-    """The same with what is trained and the stream that it needs. Raises ValueError as `check_run`."""
+    """The same with what is trained and the stream that it needs.
+
+    Raises ValueError as `check_run`, and where there is no filter to fit anew.
+    """
     check_run(run)
+    if run.refit and not (isinstance(options, JointOptions) and options.demosaicker == "linear"):
+        raise ValueError(
+            f"expected a network with a linear filter to refit, found {options.name} for {options.variant}"
+        )
     stream = replace(run.stream, seed=options.seed, crop=options.crop)
     return replace(run, what=json.dumps(asdict(options)), stream=stream)
 

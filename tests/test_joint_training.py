@@ -477,16 +477,17 @@ def test_training_ends_in_weights_that_say_all(variant: str, tmp_path: Path, sho
     assert torch.equal(network.demosaic, fitted.half().float())
 
 
-def test_of_a_network_a_part_can_be_trained_alone(tmp_path: Path, shortened: None) -> None:
+@pytest.mark.parametrize("part", ["details", "doubt"])
+def test_of_a_network_a_part_can_be_trained_alone(part: str, tmp_path: Path, shortened: None) -> None:
     """Everything else stays bit by bit as it began, and with it all images at half resolution."""
     run = Run(tmp_path / "all", "a test", STREAM, SCHEDULE, workers=0)
     start = train_weights(JointOptions("joint-fast", size=TINY), run, lambda _: None)
     run = replace(run, out=tmp_path / "part", start=(start,))
-    held = train_weights(JointOptions("joint-fast", size=TINY, part="details"), run, lambda _: None)
+    held = train_weights(JointOptions("joint-fast", size=TINY, part=part), run, lambda _: None)
     (before, _), (after, metadata) = read_weights(start), read_weights(held)
     moved = {name for name in before if not torch.equal(before[name], after[name])}
-    assert moved and all(name.startswith("details.") for name in moved)
-    assert "--part details" in metadata["command"]
+    assert moved and all(name.startswith(f"{part}.") for name in moved)
+    assert f"--part {part}" in metadata["command"]
     assert int(metadata["parameters"]) == sum(x.numel() for name, x in after.items() if name != "demosaic")
 
 

@@ -91,7 +91,9 @@ def _show_counts(counts: Iterator[int], total: int) -> None:
 @click.option("--blocks", metavar="N,N,...", help="Residual blocks per level of a joint network.")
 @click.option("--entry", type=int, metavar="N", help="Channels that its maps are brought to first; 0: all.")
 @click.option("--ablation", default="none", metavar="NAME", help="What a joint network goes without.")
-@click.option("--part", default="all", metavar="NAME", help="What of a joint network is trained: all or details.")
+@click.option(
+    "--part", default="all", metavar="NAME", help="What of a joint network is trained: all, details or doubt."
+)
 @click.option("--input", "seen", default="separated", metavar="NAME", help="material: unseparated, separated, perfect.")
 @click.option("--examples", type=int, default=768, metavar="N", help="material: how many it is trained on.")
 @click.option("--cues", metavar="NAME,...", help="material: what it sees beside images (details), to find normals.")

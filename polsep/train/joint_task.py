@@ -61,7 +61,7 @@ ABLATIONS = {
     "paper-loss": Ablation(goal=Goal(paper_difference)),
 }
 #: What can be trained alone: which parameters of a network it is, by the beginning of their names.
-PARTS = {"all": "", "details": "details."}
+PARTS = {"all": "", "details": "details.", "doubt": "doubt."}
 #: How examples are seen, and in how many colours.
 VIEWS = {"mosaic": (see_raw, 3), "mono": (see_raw_mono, 1)}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,12 @@ def test_a_training_that_stops_goes_on(folder: Path, tmp_path: Path) -> None:
     assert whole.keys() == broken.keys() and all(torch.equal(whole[name], broken[name]) for name in whole)
     assert metadata["input"] == "separated" and "relit, 1 view" in metadata["validation"]
     assert MaterialNetwork(6, OPTIONS.size).load_state_dict(whole)
+    mean = Run(tmp_path / "mean", schedule=replace(schedule, steps=0), start=(paths[0], paths[1]))
+    again, metadata = read_weights(train_material(OPTIONS, mean, folder, lambda line: None))
+    assert all(torch.equal(whole[name], again[name]) for name in whole)
+    assert metadata["command"].count("--start material-separated.safetensors") == 2
+    with pytest.raises(ValueError, match="expected a network with a linear filter to refit, found material"):
+        train_material(OPTIONS, replace(mean, refit=True), folder, lambda line: None)
 
 
 def stop_at(step: int) -> Callable[[dict[str, Any]], None]:

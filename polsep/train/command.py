@@ -209,8 +209,12 @@ def describe_command(options: Options, run: Run) -> str:
         "output": run.out.name,
     }
     words = [word for name, value in asked.items() for word in (f"--{name}", str(value))]
-    words += [word for path in run.start for word in ("--start", path.name)] + ["--refit"] * run.refit
-    return shlex.join(["polsep", "train", options.name, *words])
+    return shlex.join(["polsep", "train", options.name, *words, *describe_start(run)])
+
+
+def describe_start(run: Run) -> list[str]:
+    """The options that say what a training begins with."""
+    return [word for path in run.start for word in ("--start", path.name)] + ["--refit"] * run.refit
 
 
 def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:

@@ -17,7 +17,7 @@ from polsep.io.weights import write_weights
 from polsep.material.examples import make_examples
 from polsep.material_network import MaterialSize
 from polsep.networks import count_parameters
-from polsep.train.command import check_run
+from polsep.train.command import check_run, describe_start
 from polsep.train.log import read_log
 from polsep.train.loop import Run, Schedule, train_course
 from polsep.train.material_task import MaterialOptions, material_course
@@ -55,6 +55,8 @@ def train_material(options: MaterialOptions, run: Run, folder: Path, report: Cal
     ValueError on what cannot be trained.
     """
     check_run(run)
+    if run.refit:
+        raise ValueError("expected a network with a linear filter to refit, found material")
     for split, count in (("train", options.examples), ("validation", options.validation)):
         for made in make_examples(folder, split, options.seed, count, options.views):
             if made % 100 == 0:
@@ -103,4 +105,4 @@ def describe_command(options: MaterialOptions, run: Run) -> str:
     asked |= {"cues": ",".join(options.size.cues)} if options.size.cues else {}
     asked |= {} if run.until is None else {"until": run.until}
     words = [word for name, value in asked.items() for word in (f"--{name}", str(value))]
-    return shlex.join(["polsep", "train", "material", *words])
+    return shlex.join(["polsep", "train", "material", *words, *describe_start(run)])

@@ -21,6 +21,7 @@ from polsep.video import Target, VideoOptions, separate_video
 
 def main(out: Path) -> None:
     """Write dynamic_turning.mp4, dynamic_light.mp4, dynamic_crossing.mp4 and dynamic.jpg."""
+    out.mkdir(parents=True, exist_ok=True)
     rows = []
     for film in FILMS.values():
         with TemporaryDirectory() as folder:

@@ -1,8 +1,8 @@
 """Make the capture that `polsep demo` separates: python examples/make_demo_capture.py polsep/data/still_life.png
 
-A 2448x2048 12-bit colour mosaic of `scenes.still_life`, seen by the IMX250MYR model with noise and clipping, stored
-right-justified in a 16-bit PNG (white level 4095). About three minutes on two cores. With a second path, the truth
-(diffuse and specular at half resolution) goes there as NPZ.
+A 2448x2048 12-bit colour mosaic of `render.distances.still_life`, seen by the IMX250MYR model with noise and clipping,
+stored right-justified in a 16-bit PNG (white level 4095). About three minutes on two cores. With a second path, the
+truth (diffuse and specular at half resolution) goes there as NPZ.
 """
 
 import sys
@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d
 
-from polsep.camera import IMX250, Layout, expose
-from polsep.render import render
-from polsep.scenes import still_life
+from polsep.render.distances import still_life
+from polsep.render.sphere_tracing import render
+from polsep.sensor.camera import IMX250, Layout, expose
 
 
 def main(path: str, truth: str | None = None) -> None:

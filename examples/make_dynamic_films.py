@@ -13,10 +13,10 @@ import av
 import numpy as np
 from PIL import Image
 
-from polsep.io.frames import ReadOptions
-from polsep.io.sequences import SequenceKind
-from polsep.testsets.dynamic import FILMS, RATE, play
-from polsep.video import Target, VideoOptions, separate_video
+from polsep.datasets.testsets.dynamic import FILMS, RATE, play
+from polsep.io.raw.frames import ReadOptions
+from polsep.io.results.sequences import SequenceKind
+from polsep.video.recordings import Target, VideoOptions, separate_video
 
 
 def main(out: Path) -> None:

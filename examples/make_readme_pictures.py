@@ -14,8 +14,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import polsep
-from polsep.dataset import RenderOptions, default_workers, render_dataset
-from polsep.io.previews import contact_sheet, exposure_of, srgb
+from polsep.datasets.rendered import RenderOptions, default_workers, render_dataset
+from polsep.io.results.previews import contact_sheet, exposure_of, srgb
 
 WIDTH, TITLE, GAP = 470, 30, 6
 

@@ -15,12 +15,12 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from polsep.camera import Layout, Mosaic
     from polsep.methods import METHODS
+    from polsep.physics.stokes import Measurements, Stokes
     from polsep.pipeline import PolsepWarning, separate
-    from polsep.report import SeparatedFrame
-    from polsep.separation import Separation
-    from polsep.stokes import Measurements, Stokes
+    from polsep.sensor.camera import Layout, Mosaic
+    from polsep.separation.analytic import Separation
+    from polsep.separation.report import SeparatedFrame
 
 __all__ = [
     "METHODS",
@@ -36,13 +36,13 @@ __all__ = [
 
 _HOME = {
     "METHODS": "methods",
-    "Layout": "camera",
-    "Measurements": "stokes",
-    "Mosaic": "camera",
+    "Layout": "sensor.camera",
+    "Measurements": "physics.stokes",
+    "Mosaic": "sensor.camera",
     "PolsepWarning": "pipeline",
-    "SeparatedFrame": "report",
-    "Separation": "separation",
-    "Stokes": "stokes",
+    "SeparatedFrame": "separation.report",
+    "Separation": "separation.analytic",
+    "Stokes": "physics.stokes",
     "separate": "pipeline",
 }
 

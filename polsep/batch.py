@@ -13,8 +13,8 @@ from os.path import realpath
 from pathlib import Path
 from typing import Any
 
-from polsep.io.frames import Frame, ReadOptions, output_stem, read_frames
-from polsep.io.outputs import OutputError, planned_outputs, refuse_targets, write_separation
+from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames
+from polsep.io.results.outputs import OutputError, planned_outputs, refuse_targets, write_separation
 from polsep.pipeline import LightColor, separate_capture
 
 

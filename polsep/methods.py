@@ -11,18 +11,18 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from polsep.camera import Layout, Mosaic
-from polsep.color_affine import separate_color_affine
-from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
-from polsep.engine import run_analytic, run_color_affine, run_nothing
-from polsep.guided import demosaic_guided, demosaic_guided_half
-from polsep.io.weights import is_shipped
-from polsep.joint_engine import run_engine
-from polsep.learned import separate_paper
-from polsep.mosaic_network import NAMES, separate_mosaic, takes, weights_name
-from polsep.openvino_engine import JointImages
-from polsep.separation import Separation, separate_analytic
-from polsep.stokes import Measurements
+from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
+from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half
+from polsep.io.store.weights import is_shipped
+from polsep.networks.engines import run_engine
+from polsep.networks.openvino_engine import JointImages
+from polsep.networks.run import NAMES, separate_mosaic, takes, weights_name
+from polsep.networks.shipped_paper import separate_paper
+from polsep.physics.stokes import Measurements
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.separation.analytic import Separation, separate_analytic
+from polsep.separation.color_affine import separate_color_affine
+from polsep.separation.engine import run_analytic, run_color_affine, run_nothing
 
 if TYPE_CHECKING:
     from polsep.kernels import AnalyticImages, ColorAffineImages

@@ -24,7 +24,7 @@ HIGHLIGHT = 0.2
 #: Share of scenes that count as the worst.
 WORST_SHARE = 0.1
 #: Errors below this, a PSNR of 120 dB, count as this where ratios are taken.
-LEAST_DEVIATION = 1e-6
+MIN_DEVIATION = 1e-6
 
 
 class Reliability(NamedTuple):
@@ -153,7 +153,7 @@ def reliability(error: Tensor, expected: Tensor, mask: Tensor, bins: int) -> Rel
     groups = torch.argsort(sigma, stable=True).tensor_split(bins)
     curves = (torch.stack([x[group].mean().sqrt() for group in groups]) for x in (sigma**2, squared))
     said, found = curves
-    octaves = torch.log2(found.clamp(min=LEAST_DEVIATION) / said.clamp(min=LEAST_DEVIATION))
+    octaves = torch.log2(found.clamp(min=MIN_DEVIATION) / said.clamp(min=MIN_DEVIATION))
     return Reliability(said, found, float(octaves.square().mean().sqrt()))
 
 

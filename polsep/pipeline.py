@@ -19,15 +19,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polsep.camera import Layout, Mosaic
-from polsep.demosaic import demosaic_bilinear_half
-from polsep.layout_check import check_layout
-from polsep.levels import as_mosaic
+from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.methods import Capture, Method, find_method
-from polsep.openvino_engine import JointImages
-from polsep.report import SeparatedFrame, describe, grey, tally
-from polsep.separation import Separation
-from polsep.stokes import MOST_DOLP, Measurements, aolp, dolp, fit_stokes_unclipped, polarized_intensity
+from polsep.networks.openvino_engine import JointImages
+from polsep.physics.stokes import MAX_DOLP, Measurements, aolp, dolp, fit_stokes_unclipped, polarized_intensity
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.layout_check import check_layout
+from polsep.sensor.levels import as_mosaic
+from polsep.separation.analytic import Separation
+from polsep.separation.report import SeparatedFrame, describe, grey, tally
 
 LightColor = Sequence[float]
 
@@ -211,8 +211,8 @@ def in_light(found: Separation, light: tuple[float, ...]) -> Separation:
     The expected errors are over all colours, so the mean of the colour multiplies them.
     """
     gain = torch.tensor(light, dtype=torch.float64).to(found.diffuse).view(-1, 1, 1)
-    doubt = None if found.doubt is None else found.doubt * gain.mean()
-    return replace(found, diffuse=found.diffuse * gain, specular=found.specular * gain, doubt=doubt)
+    expected_error = None if found.expected_error is None else found.expected_error * gain.mean()
+    return replace(found, diffuse=found.diffuse * gain, specular=found.specular * gain, expected_error=expected_error)
 
 
 def to_numpy(found: Separation, report: dict[str, Any]) -> SeparatedFrame:
@@ -226,8 +226,8 @@ def to_numpy(found: Separation, report: dict[str, Any]) -> SeparatedFrame:
         image(found.diffuse),
         image(found.specular),
         found.valid.cpu().numpy(),
-        image(dolp(mean).clamp(max=MOST_DOLP))[..., 0],
+        image(dolp(mean).clamp(max=MAX_DOLP))[..., 0],
         image(aolp(mean))[..., 0],
         report,
-        None if found.doubt is None else image(found.doubt),
+        None if found.expected_error is None else image(found.expected_error),
     )

@@ -10,10 +10,11 @@ import pytest
 import torch
 from hypothesis import settings
 
-from polsep import learned, mosaic_network
-from polsep.camera import Layout, Mosaic
-from polsep.io import weights
+from polsep.io.store import weights
 from polsep.methods import METHODS
+from polsep.networks import run as mosaic_network
+from polsep.networks import shipped_paper as learned
+from polsep.sensor.camera import Layout, Mosaic
 
 settings.register_profile("polsep", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("polsep")

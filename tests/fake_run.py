@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from polsep.cli import main
-from polsep.io.recording import RawImage, RecordingWriter
+from polsep.io.raw.recording import RawImage, RecordingWriter
 
 CAMERA = Path(__file__).with_name("fake_camera.py")
 

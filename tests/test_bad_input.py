@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 import tifffile
 
-from polsep.camera import Layout
-from polsep.io.errors import InputError
-from polsep.io.frames import ReadOptions, read_frames
-from polsep.levels import as_measurements, as_mosaic, interleave_planes
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.store.errors import InputError
+from polsep.sensor.camera import Layout
+from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
 
 CODES = np.random.default_rng(0).integers(0, 65536, (48, 64)).astype(np.uint16)
 

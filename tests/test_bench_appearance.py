@@ -7,11 +7,11 @@ import pytest
 import torch
 from test_edit import random_images
 
-from polsep.bench.naive import NAIVE, naive_texture
-from polsep.bench.viewing import VALUES
-from polsep.camera import Layout, Mosaic
+from evaluation.naive import NAIVE, naive_texture
+from evaluation.viewing import VALUES
 from polsep.edit import EDITS, SeparatedImages, Texture, make_edit
-from polsep.report import SeparatedFrame
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.separation.report import SeparatedFrame
 
 
 @pytest.mark.parametrize("name", EDITS)
@@ -36,8 +36,8 @@ def frame_of(images: SeparatedImages) -> SeparatedFrame:
 def test_the_gallery_shows_every_edit_that_fits(colors: int, rows: int) -> None:
     """Ten pictures of a colour frame, in fives; of a grey one, those that need no colours."""
     pytest.importorskip("matplotlib", reason="needs the extra bench")
-    from polsep.bench.appearance import CELL, Taken, draw_edits
-    from polsep.bench.figures import GAP, TITLE
+    from evaluation.appearance import CELL, Taken, draw_edits
+    from evaluation.figures import GAP, TITLE
 
     size = (30, 30)
     taken = Taken("a frame", Mosaic(torch.zeros(60, 60), Layout(), 0.0, 1.0))
@@ -47,7 +47,7 @@ def test_the_gallery_shows_every_edit_that_fits(colors: int, rows: int) -> None:
 
 def test_the_cloth_is_a_reflectance_that_repeats() -> None:
     """Between black and white, and the same at opposite borders, half a texel aside."""
-    from polsep.bench.appearance import make_cloth
+    from evaluation.appearance import make_cloth
 
     cloth = make_cloth(256)
     assert cloth.min() >= 0 and cloth.max() <= 1
@@ -58,10 +58,10 @@ def test_the_cloth_is_a_reflectance_that_repeats() -> None:
 def test_normals_of_the_gallery_are_the_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a ball before the camera: x to the right, y up, z to the camera, nothing beside it."""
     pytest.importorskip("embreex", reason="needs the extra render")
-    from polsep.bench import appearance
-    from polsep.raycast import MeshScene
-    from polsep.shapes import ellipsoid
-    from polsep.testsets.casting import look_at
+    from evaluation import appearance
+    from polsep.datasets.testsets.casting import look_at
+    from polsep.render.raycast import MeshScene
+    from polsep.render.shapes import ellipsoid
 
     monkeypatch.setattr(appearance, "SIDE", 64)
     ball = MeshScene(ellipsoid(np.ones(3), [np.zeros((4, 4))]))

@@ -13,7 +13,7 @@ from tolerances import assert_close, assert_same_angle, assert_within
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
 
-from polsep.bench.calibration import (
+from evaluation.calibration import (
     DEBEVEC,
     DING,
     NOMINAL_DEG,
@@ -27,14 +27,14 @@ from polsep.bench.calibration import (
     see_with_errors,
     separate_seen,
 )
-from polsep.bench.scoring import Entry
-from polsep.demosaic import demosaic_bilinear_half
-from polsep.materials import random_materials
+from evaluation.scoring import Entry
+from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.methods import compose
-from polsep.raycast import find_view, light_view, shade_view
-from polsep.separation import separate_analytic
-from polsep.stokes import intensity_behind
-from polsep.views import random_shot, seeded_shape
+from polsep.physics.stokes import intensity_behind
+from polsep.render.materials import random_materials
+from polsep.render.raycast import find_view, light_view, shade_view
+from polsep.render.views import random_shot, seeded_shape
+from polsep.separation.analytic import separate_analytic
 
 SIZE = (96, 96)
 ANALYTIC = Entry("analytic", compose(demosaic_bilinear_half, separate_analytic))
@@ -118,7 +118,7 @@ def test_deviates_are_normal_and_the_first_ones_stay() -> None:
 
 
 def test_sweeps_tell_the_change_and_the_range(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polsep.bench.calibration.SIZE", (48, 48))
+    monkeypatch.setattr("evaluation.calibration.SIZE", (48, 48))
     rows = list(measure_sweep("x", Sweep(1, (0, 20)), [ANALYTIC]))
     value = {(row.bench, row.case, row.method, row.metric): row.value for row in rows}
     right, wrong = (value["x", f"light polarizer off by {e} degrees rms", DING, "specular PSNR"] for e in (0, 20))

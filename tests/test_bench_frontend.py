@@ -22,10 +22,10 @@ from polsep.bench.frontend import (
 )
 from polsep.bench.peers import PEERS_VARIABLE, find_peers, run_json
 from polsep.bench.rows import Row, to_jsonl
-from polsep.camera import Layout, Mosaic, sample_mosaic
-from polsep.demosaic import mean_cells
-from polsep.io.results import fill_tables
-from polsep.stokes import Measurements, Stokes, measure
+from polsep.demosaic.bilinear import mean_cells
+from polsep.io.store.rows import fill_tables
+from polsep.physics.stokes import Measurements, Stokes, measure
+from polsep.sensor.camera import Layout, Mosaic, sample_mosaic
 
 EVERYWHERE = torch.ones(48, 64, dtype=torch.bool)
 

@@ -21,10 +21,10 @@ pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 pytest.importorskip("matplotlib", reason="figures need the extra 'bench'")
 from PIL import Image
 
-from polsep import testsets
-from polsep.bench import BENCHES, gallery, ladder, paper
-from polsep.bench.calibration import Sweep
-from polsep.bench.figures import (
+from evaluation import gallery, ladder, paper
+from evaluation.benches import BENCHES
+from evaluation.calibration import Sweep
+from evaluation.figures import (
     LARGEST_ERROR,
     Axes,
     Line,
@@ -35,7 +35,7 @@ from polsep.bench.figures import (
     require_matplotlib,
     tone,
 )
-from polsep.bench.ladder import (
+from evaluation.ladder import (
     CO_SITED,
     MOSAIC,
     SHIPPED,
@@ -45,18 +45,19 @@ from polsep.bench.ladder import (
     read_curves,
     rung_of,
 )
-from polsep.bench.paper import QUICK, Extent, measure_paper, table_rows
+from evaluation.paper import QUICK, Extent, measure_paper, table_rows
 from polsep.bench.rows import Row
-from polsep.camera import Layout, Mosaic
 from polsep.cli import app
-from polsep.io.pictures import write_picture
-from polsep.io.results import fill_tables, read_rows
-from polsep.io.weights import write_weights
-from polsep.networks import Size
-from polsep.refine import RUNGS, Refinement
-from polsep.render import Scene
-from polsep.stokes import Stokes
-from polsep.testsets import Recipe
+from polsep.datasets import testsets
+from polsep.datasets.testsets import Recipe
+from polsep.io.store.pictures import write_picture
+from polsep.io.store.rows import fill_tables, read_rows
+from polsep.io.store.weights import write_weights
+from polsep.networks.paper import RUNGS, Refinement
+from polsep.networks.unet import Size
+from polsep.physics.stokes import Stokes
+from polsep.render.sphere_tracing import Scene
+from polsep.sensor.camera import Layout, Mosaic
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZE = Size(2, 1, 1)
@@ -108,7 +109,7 @@ def tiny_sets(monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = Recipe("two-tones", 1, (), make_two_tones)
     monkeypatch.setattr(testsets, "SETS", {"objects": (recipe, recipe)})
     monkeypatch.setattr(testsets, "check_case", lambda _: None)
-    monkeypatch.setattr("polsep.bench.calibration.SIZE", (48, 48))
+    monkeypatch.setattr("evaluation.calibration.SIZE", (48, 48))
     monkeypatch.setattr(gallery, "VIEW_SIZE", (48, 48))
     monkeypatch.setattr(gallery, "SCENES", ("two-tones", "two-tones"))
     frame = Mosaic(0.5 * torch.ones(32, 32), Layout(), 0.0, 1.0)

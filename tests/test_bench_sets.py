@@ -13,22 +13,22 @@ pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
 pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 
-from polsep import testsets
-from polsep.bench.ablations import ablation_entry, find_ablations
-from polsep.bench.joint import BINS, enlarge, full_entries, measure_engines, measure_reliability, see_full, see_mono
-from polsep.bench.rendering import bench_rendering
-from polsep.bench.scoring import Entry, Protocol, score_case, score_sets, see_clean, see_co_sited, see_noisy
-from polsep.bench.sets import bench_sets
-from polsep.camera import Layout, Mosaic
-from polsep.demosaic import demosaic_bilinear_half, mean_cells
-from polsep.io.weights import read_weights
+from evaluation.ablations import ablation_entry, find_ablations
+from evaluation.joint import BINS, enlarge, full_entries, measure_engines, measure_reliability, see_full, see_mono
+from evaluation.rendering import bench_rendering
+from evaluation.scoring import Entry, Protocol, score_case, score_sets, see_clean, see_co_sited, see_noisy
+from evaluation.sets import bench_sets
+from polsep.datasets import testsets
+from polsep.datasets.testsets import Recipe, build_case
+from polsep.demosaic.bilinear import demosaic_bilinear_half, mean_cells
+from polsep.io.store.weights import read_weights
 from polsep.methods import METHODS, compose
 from polsep.metrics import psnr, reliability
-from polsep.mosaic_network import NAMES
-from polsep.render import Scene
-from polsep.separation import Separation, separate_analytic
-from polsep.stokes import Measurements, Stokes
-from polsep.testsets import Recipe, build_case
+from polsep.networks.run import NAMES
+from polsep.physics.stokes import Measurements, Stokes
+from polsep.render.sphere_tracing import Scene
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.separation.analytic import Separation, separate_analytic
 
 
 def make_grey(_paths: list[Path], _generator: torch.Generator) -> Scene:
@@ -145,11 +145,11 @@ def test_reliability_is_that_of_all_pixels_of_a_set(tmp_path: Path) -> None:
     }
     case = build_case(STEP)
     (diffuse, _, mask), found = case.half_truth(), METHODS["joint"].half(case.noisy)
-    assert found.doubt is not None and found.clipped is not None
-    curve = reliability(found.diffuse - diffuse, found.doubt[0], mask, BINS)
+    assert found.expected_error is not None and found.clipped is not None
+    curve = reliability(found.diffuse - diffuse, found.expected_error[0], mask, BINS)
     said = [row.value for row in rows if row.method == "joint" and row.metric == "diffuse error, expected"]
     assert said == pytest.approx(curve.expected.tolist())
-    away = reliability(found.diffuse - diffuse, found.doubt[0], mask & ~found.clipped, BINS)
+    away = reliability(found.diffuse - diffuse, found.expected_error[0], mask & ~found.clipped, BINS)
     (miss,) = (row.value for row in rows if row.method == "joint" and row.metric == "diffuse, miss where nothing clips")
     assert miss == pytest.approx(away.miss)
 

@@ -13,7 +13,19 @@ from hypothesis import strategies as st
 from tolerances import ROUNDING, SIGMAS, assert_close, assert_same_angle
 from torch import Tensor
 
-from polsep.camera import (
+from polsep.physics.stokes import (
+    Measurements,
+    Stokes,
+    aolp,
+    dolp,
+    fit_stokes,
+    flip_horizontal,
+    flip_vertical,
+    measure,
+    rotate_quarter,
+    transpose,
+)
+from polsep.sensor.camera import (
     BAYER_ORDERS,
     CLIP_MARGIN,
     IDEAL,
@@ -26,18 +38,6 @@ from polsep.camera import (
     expose,
     measure_with_analysers,
     sample_mosaic,
-)
-from polsep.stokes import (
-    Measurements,
-    Stokes,
-    aolp,
-    dolp,
-    fit_stokes,
-    flip_horizontal,
-    flip_vertical,
-    measure,
-    rotate_quarter,
-    transpose,
 )
 
 COLOR_TABLE = """

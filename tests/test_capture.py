@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from test_cli import Cli, assert_refused, frame, png
 from test_cli import polsep as polsep  # the fixture
 
-from polsep.camera import Layout
 from polsep.capture import find, session
 from polsep.capture.folder import FolderSource
 from polsep.capture.live import LiveView, Shown, advise
@@ -43,14 +42,15 @@ from polsep.capture.sources import (
     FrameIds,
     Loss,
 )
-from polsep.io.errors import InputError
-from polsep.io.footage import open_footage
-from polsep.io.frames import Frame, ReadOptions, read_frames
-from polsep.io.genicam import pack_frame
-from polsep.io.outputs import OutputError
-from polsep.io.recording import INDEX, RAW, RECORD, Header, RawImage, RecordingWriter, read_images
-from polsep.levels import level_notes
+from polsep.io.raw.footage import open_footage
+from polsep.io.raw.frames import Frame, ReadOptions, read_frames
+from polsep.io.raw.genicam import pack_frame
+from polsep.io.raw.recording import INDEX, RAW, RECORD, Header, RawImage, RecordingWriter, read_images
+from polsep.io.results.outputs import OutputError
+from polsep.io.store.errors import InputError
 from polsep.pipeline import separate_capture
+from polsep.sensor.camera import Layout
+from polsep.sensor.levels import level_notes
 
 WIDTH, HEIGHT, PACKED = 36, 32, "BayerRG12p"
 INFO = CameraInfo("scripted", WIDTH, HEIGHT, PACKED, patience_s=0.3)

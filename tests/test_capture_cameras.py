@@ -26,11 +26,11 @@ import polsep
 from polsep.capture.pylon import PylonSource, list_pylon
 from polsep.capture.session import CapturePlan
 from polsep.capture.sources import CameraError, CameraSettings
-from polsep.io.frames import read_frames
-from polsep.io.genicam import pack_frame, unpack_frame
-from polsep.io.pictures import encode_picture
-from polsep.io.previews import live_sheet
-from polsep.io.recording import RECORD, read_images
+from polsep.io.raw.frames import read_frames
+from polsep.io.raw.genicam import pack_frame, unpack_frame
+from polsep.io.raw.recording import RECORD, read_images
+from polsep.io.results.previews import live_sheet
+from polsep.io.store.pictures import encode_picture
 from polsep.pipeline import separate_capture
 
 TESTS = Path(__file__).parent

@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 from test_bad_input import FILES
 
 from polsep import cli
-from polsep.camera import IDEAL, Layout, expose
-from polsep.io.exr import read_exr_layers
-from polsep.io.genicam import pack_frame
-from polsep.io.outputs import FORMATS, LAYERS
+from polsep.io.raw.genicam import pack_frame
+from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.outputs import FORMATS, LAYERS
 from polsep.methods import BEST, METHODS
-from polsep.mosaic_network import NAMES
-from polsep.stokes import Stokes
+from polsep.networks.run import NAMES
+from polsep.physics.stokes import Stokes
+from polsep.sensor.camera import IDEAL, Layout, expose
 
 COLOR_LAYERS = {f"{image}.{color}" for image in ("diffuse", "specular") for color in "RGB"}
 MAPS = {"dolp.Y", "aolp.Y", "valid.Y"}

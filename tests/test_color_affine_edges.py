@@ -9,8 +9,8 @@ import torch
 from tolerances import assert_close
 from torch import Tensor
 
-from polsep.color_affine import EDGE_RADIUS, EDGE_REACH, polarization_edges, separate_color_affine
-from polsep.stokes import Measurements, Stokes, fit_stokes, measure
+from polsep.physics.stokes import Measurements, Stokes, fit_stokes, measure
+from polsep.separation.color_affine import EDGE_RADIUS, EDGE_REACH, polarization_edges, separate_color_affine
 
 ANGLES = tuple(math.radians(t) for t in (0.0, 45.0, 90.0, 135.0))
 SIZE = 48

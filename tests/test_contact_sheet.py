@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from polsep.io.dataset import GAP, GAP_LEVEL, SHEET_COLS, THUMBNAIL, contact_sheet
-from polsep.io.previews import srgb
+from polsep.io.results.dataset import GAP, GAP_LEVEL, SHEET_COLS, THUMBNAIL, contact_sheet
+from polsep.io.results.previews import srgb
 
 RED, GREEN, BLUE = 0.25, 0.5, 1.5
 

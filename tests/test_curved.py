@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from tolerances import MITSUBA, assert_within
 from torch import Tensor
 
-from polsep.materials import Materials, random_materials
-from polsep.optics import ETA, normalize
-from polsep.render import GBuffer, PinholeCamera, PointLight, shade
-from polsep.shapes import FINE, Mesh, ellipsoid, random_mesh
-from polsep.stokes import Stokes
+from polsep.physics.optics import ETA, normalize
+from polsep.physics.stokes import Stokes
+from polsep.render.materials import Materials, random_materials
+from polsep.render.shapes import FINE, Mesh, ellipsoid, random_mesh
+from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, shade
 
 pytest.importorskip("embreex")
 
-from polsep.raycast import MeshScene, dress, find_hits, is_lit, render_mesh
+from polsep.render.raycast import MeshScene, dress, find_hits, is_lit, render_mesh
 
 VARIANT = "scalar_spectral_polarized"
 SIZE = (36, 48)

@@ -25,26 +25,34 @@ import torch
 
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 
-import polsep.io.dataset as files
-from polsep import cli, dataset
-from polsep.camera import IMX250, Layout
-from polsep.dataset import ENGINES, Job, RenderOptions, plan_jobs, render_dataset, render_job
-from polsep.io.dataset import LAYERS, MANIFEST, UNFINISHED, find_finished, read_fingerprint, read_view, view_stem
-from polsep.io.frames import ReadOptions, read_frames
-from polsep.io.outputs import OutputError
-from polsep.kernels.threads import get_threads, set_threads
-from polsep.optics import dot
-from polsep.raycast import MeshScene, find_hits
-from polsep.simulate import Capture, filter_light
-from polsep.views import (
+import polsep.io.results.dataset as files
+from polsep import cli
+from polsep.compute.threads import get_threads, set_threads
+from polsep.datasets import rendered as dataset
+from polsep.datasets.rendered import ENGINES, Job, RenderOptions, plan_jobs, render_dataset, render_job
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.results.dataset import (
+    LAYERS,
+    MANIFEST,
+    UNFINISHED,
+    find_finished,
+    read_fingerprint,
+    read_view,
+    view_stem,
+)
+from polsep.io.results.outputs import OutputError
+from polsep.physics.optics import dot
+from polsep.render.raycast import MeshScene, find_hits
+from polsep.render.simulate import Capture, filter_light
+from polsep.render.views import (
     BLURS,
     FILLS,
     LARGEST_CLIPPED,
     LARGEST_ELEVATION,
     LARGEST_PHASE,
-    LEAST_LEVEL,
-    LEAST_LIT,
     LIGHT_DISTANCES,
+    MIN_LEVEL,
+    MIN_LIT,
     SPLITS,
     UNCLIPPED_SHARE,
     capture_shot,
@@ -56,6 +64,7 @@ from polsep.views import (
     scene_seed,
     seeded_shape,
 )
+from polsep.sensor.camera import IMX250, Layout
 
 KILLS = int(os.environ.get("POLSEP_KILLS", "2"))
 SHAPES, VIEWS = 6, 2 * max(1, KILLS)
@@ -219,11 +228,11 @@ def test_captures_are_lit_exposed_and_framed(shape: MeshScene) -> None:
     for seed in range(4):
         found, shot = take(shape, seed)
         scene = found.scene
-        assert lit_share(shape, shot) >= LEAST_LIT
+        assert lit_share(shape, shot) >= MIN_LIT
         assert BLURS[0] <= shot.blur <= BLURS[1]
         signal = filter_light(scene.diffuse + scene.specular, Layout(), IMX250)[scene.mask]
         assert int((signal > 1).sum()) >= shot.clip * signal.numel() - 1
-        if float(signal[signal > 0].median()) > 1.01 * LEAST_LEVEL:
+        if float(signal[signal > 0].median()) > 1.01 * MIN_LEVEL:
             assert int((signal > 1).sum()) <= shot.clip * signal.numel() + 1
         rows, cols = torch.meshgrid(torch.arange(64) + 0.5, torch.arange(64) + 0.5, indexing="ij")
         hits = find_hits(shape, shot.camera, (rows.flatten(), cols.flatten()), (64, 64))

@@ -15,12 +15,12 @@ from torch.nn.functional import avg_pool2d
 
 import polsep
 from polsep import cli
-from polsep.camera import IMX250, Layout, Sensor, expose
-from polsep.layout_check import check_layout
-from polsep.levels import as_mosaic
 from polsep.methods import METHODS
-from polsep.render import cast, is_lit, render, shade
-from polsep.scenes import still_life
+from polsep.render.distances import still_life
+from polsep.render.sphere_tracing import cast, is_lit, render, shade
+from polsep.sensor.camera import IMX250, Layout, Sensor, expose
+from polsep.sensor.layout_check import check_layout
+from polsep.sensor.levels import as_mosaic
 
 CAPTURE = Path(polsep.__file__).parent / "data" / "still_life.png"
 

@@ -12,9 +12,8 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from polsep.camera import BAYER_ORDERS, IDEAL, Layout, Mosaic, expose, sample_mosaic
-from polsep.demosaic import bilinear_variance, demosaic_bilinear, demosaic_bilinear_half, demosaic_dave2022
-from polsep.stokes import (
+from polsep.demosaic.bilinear import bilinear_variance, demosaic_bilinear, demosaic_bilinear_half, demosaic_dave2022
+from polsep.physics.stokes import (
     Measurements,
     Stokes,
     fit_stokes,
@@ -24,6 +23,7 @@ from polsep.stokes import (
     polarized_intensity,
     transpose,
 )
+from polsep.sensor.camera import BAYER_ORDERS, IDEAL, Layout, Mosaic, expose, sample_mosaic
 
 SONY = ((90, 45), (135, 0))
 OTHER = ((0, 45), (90, 135))

@@ -7,7 +7,7 @@ from tolerances import assert_close, assert_within
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pixel_unshuffle
 
-from polsep.details import Details, interpolating_filter, join_cells, split_cells
+from polsep.networks.details import Details, interpolating_filter, join_cells, split_cells
 
 COLORS, WIDTH = 3, 5
 

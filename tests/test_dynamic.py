@@ -13,17 +13,17 @@ from tolerances import SIGMAS, assert_close
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
 
-from polsep.bench.dynamic import APART, Tally, find_regions, score_film
-from polsep.camera import IMX250, Layout
-from polsep.materials import look_up, random_materials
+from evaluation.dynamic import APART, Tally, find_regions, score_film
+from polsep.datasets.testsets import dynamic
+from polsep.datasets.testsets.dynamic import FILMS, Film, FilmFrame, Look, Prop, check_frame, move, play
+from polsep.datasets.testsets.expected import EXPECTED_FRAMES
 from polsep.methods import METHODS
-from polsep.raycast import MeshScene
-from polsep.render import PointLight
-from polsep.shapes import ellipsoid
-from polsep.simulate import filter_light
-from polsep.testsets import dynamic
-from polsep.testsets.dynamic import FILMS, Film, FilmFrame, Look, Prop, check_frame, move, play
-from polsep.testsets.expected import EXPECTED_FRAMES
+from polsep.render.materials import look_up, random_materials
+from polsep.render.raycast import MeshScene
+from polsep.render.shapes import ellipsoid
+from polsep.render.simulate import filter_light
+from polsep.render.sphere_tracing import PointLight
+from polsep.sensor.camera import IMX250, Layout
 
 
 @pytest.fixture(scope="module")

@@ -39,9 +39,9 @@ from polsep.edit import (
     recipe_from_text,
 )
 from polsep.edit.blur import REACH, blur, deblur, gaussian_weights
+from polsep.edit.blur_kernel import filter_image
 from polsep.edit.recipe import rename_images
 from polsep.edit.texture import coordinates_on, flat_coordinates, sample, unfold
-from polsep.kernels.blur import filter_image
 
 Floats = NDArray[np.float32]
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import torch
 
-from polsep import engine
-from polsep.camera import Layout, Mosaic
 from polsep.methods import METHODS
-from polsep.mosaic_network import NAMES
+from polsep.networks.run import NAMES
+from polsep.physics.stokes import Measurements
 from polsep.pipeline import SeparatedFrame, resolve_light_color, separate_capture, separate_in_engine, separate_in_torch
-from polsep.stokes import Measurements
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.separation import engine
 
 SONY = ((90, 45), (135, 0))
 COLOR, MONO = Layout(), Layout(bayer=None)

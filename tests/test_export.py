@@ -18,12 +18,12 @@ pytest.importorskip("onnxscript", reason="exporting needs the extra 'export'")
 import onnxruntime
 
 from polsep import cli
-from polsep.camera import Layout, Mosaic
-from polsep.graph import Graph
-from polsep.io.weights import write_weights
-from polsep.joint import INPUTS, Joint
-from polsep.mosaic_network import load_joint, run_joint
-from polsep.networks import ResidualSize
+from polsep.io.store.weights import write_weights
+from polsep.networks.export import Graph
+from polsep.networks.joint import INPUTS, Joint
+from polsep.networks.run import load_joint, run_joint
+from polsep.networks.unet import ResidualSize
+from polsep.sensor.camera import Layout, Mosaic
 
 SIZE = ResidualSize(4, (0, 1))
 #: Rounding through two dozen layers, in white levels.
@@ -60,11 +60,11 @@ def test_exported_graphs_agree(
         given = {"raw": raw, "black_level": np.float32([64]), "white_level": np.float32([4095])}
         diffuse, specular, error = session.run(["diffuse", "specular", "error"], given)
         found = run_joint(network, Mosaic(torch.from_numpy(raw), Layout(), 64.0, 4095.0), resolution)  # type: ignore[arg-type]
-        assert found.doubt is not None
+        assert found.expected_error is not None
         assert_within(torch.from_numpy(diffuse).movedim(-1, -3), found.diffuse, ROUNDED)
         assert_within(torch.from_numpy(specular).movedim(-1, -3).expand_as(found.specular), found.specular, ROUNDED)
         step = 2 if resolution == "full" else 1
-        assert_within(torch.from_numpy(error).movedim(-1, -3), found.doubt[..., ::step, ::step], ROUNDED)
+        assert_within(torch.from_numpy(error).movedim(-1, -3), found.expected_error[..., ::step, ::step], ROUNDED)
 
 
 def test_what_graphs_do_otherwise_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

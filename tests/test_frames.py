@@ -15,11 +15,11 @@ import tifffile
 import torch
 from numpy.typing import NDArray
 
-from polsep.camera import Layout, Mosaic, sample_mosaic
-from polsep.io.frames import Frame, ReadOptions, read_frames
-from polsep.io.genicam import PIXEL_FORMATS, pack_frame
-from polsep.levels import as_measurements, as_mosaic, interleave_planes
-from polsep.stokes import Measurements
+from polsep.io.raw.frames import Frame, ReadOptions, read_frames
+from polsep.io.raw.genicam import PIXEL_FORMATS, pack_frame
+from polsep.physics.stokes import Measurements
+from polsep.sensor.camera import Layout, Mosaic, sample_mosaic
+from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
 
 Array = NDArray[Any]
 LUCID = "PolarizedAngles_0d_45d_90d_135d_"

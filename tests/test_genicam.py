@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polsep.io.errors import InputError
-from polsep.io.genicam import PIXEL_FORMATS, find_pixel_format, pack_frame, unpack_frame
+from polsep.io.raw.genicam import PIXEL_FORMATS, find_pixel_format, pack_frame, unpack_frame
+from polsep.io.store.errors import InputError
 
 LUCID = "PolarizedAngles_0d_45d_90d_135d_"
 

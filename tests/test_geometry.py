@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from polsep.optics import diffuse_dolp, fresnel
+from polsep.physics.optics import diffuse_dolp, fresnel
 
 pytest.importorskip("scipy")
 

@@ -24,11 +24,11 @@ from test_geometry import SIX, cap, dielectric, slope_of
 from polsep.geometry.integration import integrate_bilateral
 from polsep.geometry.photometric import Appearance
 from polsep.geometry.surface import draw_views, relight, span_surface
-from polsep.io.exr import read_exr_layers
-from polsep.io.meshes import encode_glb, encode_ply
-from polsep.io.outputs import encode_png, write_separation
-from polsep.io.previews import srgb
-from polsep.report import SeparatedFrame
+from polsep.io.assets.meshes import encode_glb, encode_ply
+from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.outputs import encode_png, write_separation
+from polsep.io.results.previews import srgb
+from polsep.separation.report import SeparatedFrame
 
 Cli = Callable[..., Run]
 SIDE = 40

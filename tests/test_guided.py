@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from polsep.camera import IDEAL, IMX250, Layout, Mosaic, expose
-from polsep.demosaic import demosaic_bilinear_half
-from polsep.guided import demosaic_guided, demosaic_guided_half, fill_colors
-from polsep.render import PinholeCamera, render
-from polsep.scenes import random_light, random_parts
-from polsep.separation import separate_analytic
-from polsep.stokes import Measurements, Stokes, fit_stokes, flip_horizontal, flip_vertical, transpose
+from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half, fill_colors
+from polsep.physics.stokes import Measurements, Stokes, fit_stokes, flip_horizontal, flip_vertical, transpose
+from polsep.render.distances import random_light, random_parts
+from polsep.render.sphere_tracing import PinholeCamera, render
+from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
+from polsep.separation.analytic import separate_analytic
 
 LAYOUTS = [
     Layout(),

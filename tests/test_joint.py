@@ -11,14 +11,11 @@ from tolerances import assert_close, assert_finite, assert_within
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, pad, pixel_shuffle, pixel_unshuffle
 
-from polsep import color_affine
-from polsep.camera import CLIP_MARGIN, IDEAL, Layout, Mosaic, expose, sample_mosaic
-from polsep.color_affine import MAX_DIFFUSE_DOLP
-from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half
-from polsep.guided import demosaic_guided_half
-from polsep.joint import (
+from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
+from polsep.demosaic.guided import demosaic_guided_half
+from polsep.networks.joint import (
     INPUTS,
-    MOST_DOUBT,
+    MAX_DOUBT,
     PERIOD,
     Demosaicker,
     Images,
@@ -32,8 +29,11 @@ from polsep.joint import (
     predict_samples,
     white_specular,
 )
-from polsep.networks import ResidualSize
-from polsep.stokes import Stokes, fit_stokes, measure
+from polsep.networks.unet import ResidualSize
+from polsep.physics.stokes import Stokes, fit_stokes, measure
+from polsep.sensor.camera import CLIP_MARGIN, IDEAL, Layout, Mosaic, expose, sample_mosaic
+from polsep.separation import color_affine
+from polsep.separation.color_affine import MAX_DIFFUSE_DOLP
 from polsep.train.joint_task import MARGIN
 
 COLOR, MONO = Layout(), Layout(bayer=None)
@@ -481,7 +481,7 @@ def test_expected_errors_stay_finite() -> None:
     torch.nn.init.constant_(net.doubt[2].bias, 1e6)  # type: ignore[arg-type]
     with torch.no_grad():
         images = net.half_resolution(raw, nothing_clipped(raw))
-    assert images.doubt.amin(dim=(0, 2, 3)).tolist() == list(MOST_DOUBT)
+    assert images.doubt.amin(dim=(0, 2, 3)).tolist() == list(MAX_DOUBT)
     assert_finite(*limit(images))
 
 

@@ -17,22 +17,24 @@ import pytest
 import torch
 from tolerances import assert_close, assert_same_angle, assert_within
 
-from polsep import joint_engine, mosaic_network, openvino_engine
-from polsep.camera import Layout, Mosaic
-from polsep.joint import INPUTS, PERIOD, Demosaicker, Joint
-from polsep.joint_engine import run_engine
+from polsep.compute.threads import own_threads
+from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.kernels import get_threads, set_threads
-from polsep.kernels.bilinear import read_pattern
-from polsep.kernels.threads import own_threads
-from polsep.kernels.unpack import as_samples
-from polsep.mosaic_network import Resolution, own_order, run_joint
-from polsep.networks import ResidualSize
-from polsep.openvino_engine import FullEngine, JointImages, OpenVinoEngine
-from polsep.orient import Orientation
+from polsep.networks import engines as joint_engine
+from polsep.networks import openvino_engine
+from polsep.networks import run as mosaic_network
+from polsep.networks.engines import run_engine
+from polsep.networks.joint import INPUTS, PERIOD, Demosaicker, Joint
+from polsep.networks.openvino_engine import FullEngine, JointImages, OpenVinoEngine
+from polsep.networks.run import Resolution, own_order, run_joint
+from polsep.networks.unet import ResidualSize
+from polsep.physics.stokes import MAX_DOLP, aolp, dolp
 from polsep.pipeline import in_light
-from polsep.report import Tally, tally
-from polsep.separation import Separation
-from polsep.stokes import MOST_DOLP, aolp, dolp
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.orient import Orientation
+from polsep.sensor.unpack_kernel import as_samples
+from polsep.separation.analytic import Separation
+from polsep.separation.report import Tally, tally
 
 COLOR, MONO = Layout(), Layout(bayer=None)
 LAYOUTS = [COLOR, MONO]
@@ -93,7 +95,7 @@ def assert_same(found: JointImages, expected: Separation, white: Separation, div
     assert_close(torch.from_numpy(found.error).movedim(-1, 0), expected.doubt)
     assert torch.equal(torch.from_numpy(found.valid), white.valid)
     grey = white.stokes.map(lambda s: s.mean(dim=-3))
-    assert_within(torch.from_numpy(found.dolp), dolp(grey).clamp(max=MOST_DOLP), NOISE)
+    assert_within(torch.from_numpy(found.dolp), dolp(grey).clamp(max=MAX_DOLP), NOISE)
     polarized = dolp(grey) > 0.05
     assert_same_angle(torch.from_numpy(found.aolp)[polarized], aolp(grey)[polarized], NOISE)
     sums = tally(white)
@@ -194,7 +196,7 @@ def test_a_thread_writes_no_row_of_another(
     engine._maps.base.fill(math.nan)
     engine._maps.details.fill(math.nan)
     engine._maps.clipped.fill(12345)
-    monkeypatch.setattr("polsep.kernels.threads.share", lambda work, rows, step: work(piece))
+    monkeypatch.setattr("polsep.compute.threads.share", lambda work, rows, step: work(piece))
     engine._fill_maps(as_samples(mosaic.data.numpy()), read_pattern((height, 64), layout, BLACK, WHITE, LIGHT))
     others = np.ones(height // PERIOD, np.bool_)
     others[slice(*piece)] = False
@@ -296,7 +298,7 @@ def test_huge_frames_are_separated_in_strips(
     """The same as whole ones, by engines for two heights at most; also where the height is no multiple of strips."""
     mosaic = random_frame(1452, 36, layout)
     whole = run_engine("joint", resolution, mosaic)
-    monkeypatch.setattr(mosaic_network, "MOST_PIXELS", 36 * 720)
+    monkeypatch.setattr(mosaic_network, "MAX_PIXELS", 36 * 720)
     heights = {strip.seen[1] - strip.seen[0] for strip in joint_engine._strips((1452, 36), 16)}
     assert len(heights) == 2 and max(heights) <= 720 + 16
     parts = run_engine("joint", resolution, mosaic)

@@ -20,19 +20,19 @@ pytest.importorskip("embreex")
 pytest.importorskip("lightning_fabric")
 pytest.importorskip("tensorboard")
 
-from polsep.camera import CLIP_MARGIN, IDEAL, IMX250, Layout, expose
-from polsep.io.weights import read_weights, write_weights
-from polsep.joint import INPUTS, Images, Joint, Pose, bilinear_filter
+from polsep.io.store.weights import read_weights, write_weights
 from polsep.metrics import psnr
-from polsep.networks import ResidualSize, count_parameters
-from polsep.simulate import filter_light
-from polsep.stokes import Stokes
+from polsep.networks.joint import INPUTS, Images, Joint, Pose, bilinear_filter
+from polsep.networks.unet import ResidualSize, count_parameters
+from polsep.physics.stokes import Stokes
+from polsep.render.simulate import filter_light
+from polsep.sensor.camera import CLIP_MARGIN, IDEAL, IMX250, Layout, expose
 from polsep.train import command, loop
 from polsep.train import joint_task as module
 from polsep.train.command import JointOptions, digest_data, train_weights
 from polsep.train.joint_losses import (
     DATA_SCALE,
-    LEAST_ERROR,
+    MIN_ERROR,
     SURPRISE,
     Goal,
     beyond_white,
@@ -135,7 +135,7 @@ def test_decibels_are_minus_the_score() -> None:
     found, truth = (1.5 * torch.rand(3, 3, 8, 8, generator=generator) for _ in range(2))
     everywhere = torch.ones(8, 8, dtype=torch.bool)
     scores = [psnr(x, t, everywhere) for x, t in zip(found, truth, strict=True)]
-    expected = sum(10 * math.log10(10 ** (-s / 10) + LEAST_ERROR) for s in scores) / 3
+    expected = sum(10 * math.log10(10 ** (-s / 10) + MIN_ERROR) for s in scores) / 3
     assert float(mean_decibels(found, truth, torch.ones(3, 1, 8, 8))) == pytest.approx(expected, abs=1e-4)
     assert expected == pytest.approx(-sum(scores) / 3, abs=0.01)
 
@@ -150,7 +150,7 @@ def test_decibels_are_taken_under_the_weight() -> None:
     assert_close(mean_decibels(found, truth, 0.1 * weight), mean_decibels(found, truth, weight), scale=10)
     each = [-psnr(x, t, w[0] > 0) for x, t, w in zip(found, truth, weight, strict=True)]
     assert float(mean_decibels(found, truth, weight)) == pytest.approx(sum(each) / 2, abs=0.01)
-    assert float(mean_decibels(truth + 2, truth * 0 + 1, weight)) == pytest.approx(10 * math.log10(LEAST_ERROR))
+    assert float(mean_decibels(truth + 2, truth * 0 + 1, weight)) == pytest.approx(10 * math.log10(MIN_ERROR))
 
 
 def test_the_loss_of_the_paper_is_that_of_its_network() -> None:
@@ -162,7 +162,7 @@ def test_light_beyond_white_counts() -> None:
     """Where the score is blind; the darker of two highlights of a true 3 is the worse one, none is -50 dB."""
     truth, weight = torch.full((1, 1, 4, 4), 3.0), torch.ones(1, 1, 4, 4)
     losses = [float(beyond_white(torch.full_like(truth, level), truth, weight)) for level in (1.0, 2.0, 3.0)]
-    assert losses[0] > losses[1] > losses[2] == pytest.approx(10 * math.log10(LEAST_ERROR))
+    assert losses[0] > losses[1] > losses[2] == pytest.approx(10 * math.log10(MIN_ERROR))
     assert losses[1] == pytest.approx(20 * math.log10(math.log(4 / 3)), abs=0.01)
 
 

@@ -14,17 +14,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tolerances import assert_within
 
-from polsep.camera import BAYER_ORDERS, CLIP_MARGIN, Layout, Mosaic
-from polsep.demosaic import demosaic_bilinear_half
-from polsep.io.genicam import pack_frame
-from polsep.kernels import AnalyticImages, AnalyticOptions, PackedFrame, analytic, separate_analytic_half
-from polsep.kernels.bilinear import clip_code
-from polsep.kernels.threads import get_threads, set_threads
+from polsep.compute.threads import get_threads, set_threads
+from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.demosaic.bilinear_kernel import clip_code
+from polsep.io.raw.genicam import pack_frame
+from polsep.kernels import AnalyticImages, AnalyticOptions, PackedFrame, separate_analytic_half
 from polsep.methods import compose
+from polsep.physics.stokes import Stokes
 from polsep.pipeline import in_light, to_numpy
-from polsep.report import tally
-from polsep.separation import Separation, separate_analytic
-from polsep.stokes import Stokes
+from polsep.sensor.camera import BAYER_ORDERS, CLIP_MARGIN, Layout, Mosaic
+from polsep.separation import analytic_kernel as analytic
+from polsep.separation.analytic import Separation, separate_analytic
+from polsep.separation.report import tally
 
 SONY = ((90, 45), (135, 0))
 PERMUTED = ((0, 135), (45, 90))

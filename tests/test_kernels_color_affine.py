@@ -7,13 +7,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from polsep.camera import BAYER_ORDERS, IDEAL, IMX250, Layout, Mosaic, Sensor, expose
-from polsep.color_affine import SLOPE_SCALES, separate_color_affine
-from polsep.demosaic import demosaic_bilinear_half
+from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.kernels import ColorAffineImages, ColorAffineOptions, get_threads, separate_color_affine_half, set_threads
-from polsep.kernels.moments import MIDDLE, NARROW, WIDEST
-from polsep.separation import Separation
-from polsep.stokes import Stokes
+from polsep.physics.stokes import Stokes
+from polsep.sensor.camera import BAYER_ORDERS, IDEAL, IMX250, Layout, Mosaic, Sensor, expose
+from polsep.separation.analytic import Separation
+from polsep.separation.color_affine import SLOPE_SCALES, separate_color_affine
+from polsep.separation.moments_kernel import MIDDLE, NARROW, WIDEST
 
 #: Of white: the largest and the median difference that float32 sums of another order may leave.
 LARGEST, MEDIAN = 1e-4, 1e-6

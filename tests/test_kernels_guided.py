@@ -7,15 +7,15 @@ import pytest
 import torch
 from test_kernels_color_affine import LIGHT, SOLVED, as_raw, assert_twins, random_frame
 
-from polsep.camera import BAYER_ORDERS, IDEAL, IMX250, Layout, Mosaic, Sensor
-from polsep.color_affine import separate_color_affine
-from polsep.guided import demosaic_guided_half
+from polsep.demosaic.guided import demosaic_guided_half
 from polsep.kernels import ColorAffineOptions, get_threads, separate_color_affine_half, set_threads
-from polsep.kernels.strips import CHUNK
 from polsep.methods import compose
-from polsep.report import describe, grey, tally
-from polsep.separation import Separation
-from polsep.stokes import aolp, dolp
+from polsep.physics.stokes import aolp, dolp
+from polsep.sensor.camera import BAYER_ORDERS, IDEAL, IMX250, Layout, Mosaic, Sensor
+from polsep.separation.analytic import Separation
+from polsep.separation.color_affine import separate_color_affine
+from polsep.separation.report import describe, grey, tally
+from polsep.separation.strips_kernel import CHUNK
 
 GUIDED = ColorAffineOptions(guided=True)
 #: What float32 sums leave of a frame's statistics, relative.

@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polsep.kernels import shading
-from polsep.kernels.shading import BLOCK, CHANNELS, Points, material_table, shade_pixels, spread_pixels
-from polsep.materials import Materials, look_up, random_materials
-from polsep.optics import dot, normalize
-from polsep.render import GBuffer, PinholeCamera, PointLight, shade
+from polsep.physics.optics import dot, normalize
+from polsep.render import shading_kernel as shading
+from polsep.render.materials import Materials, look_up, random_materials
+from polsep.render.shading_kernel import BLOCK, CHANNELS, Points, material_table, shade_pixels, spread_pixels
+from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, shade
 
 CAMERA, LIGHT = PinholeCamera((0.4, 0.8, 6.0)), PointLight((2.0, 1.0, 5.0), 30.0, 0.7)
 SLOTS, HITS = 30, 6000

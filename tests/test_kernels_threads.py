@@ -12,15 +12,15 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from polsep.camera import Layout
+from polsep.compute.threads import Piece, _default_threads, share
 from polsep.kernels import get_threads, separate_analytic_half, separate_color_affine_half, set_threads
-from polsep.kernels.threads import Piece, _default_threads, share
+from polsep.sensor.camera import Layout
 
 #: Children of a process with threads; Python warns of that since 3.12, and any warning is an error there.
 FORK = """
 import os, warnings
 import numpy as np
-from polsep.camera import Layout
+from polsep.sensor.camera import Layout
 from polsep.kernels import separate_analytic_half, separate_color_affine_half, set_threads
 
 set_threads(2)

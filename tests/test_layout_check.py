@@ -11,12 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from polsep.camera import IDEAL, IMX250, Layout, Mosaic, expose
-from polsep.layout_check import LayoutCheck, check_layout, crossed_pairs
-from polsep.levels import as_mosaic
-from polsep.render import PinholeCamera, render
-from polsep.scenes import random_light, random_parts
-from polsep.stokes import Stokes
+from polsep.physics.stokes import Stokes
+from polsep.render.distances import random_light, random_parts
+from polsep.render.sphere_tracing import PinholeCamera, render
+from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
+from polsep.sensor.layout_check import LayoutCheck, check_layout, crossed_pairs
+from polsep.sensor.levels import as_mosaic
 
 ORDERS = list(itertools.permutations((0, 45, 90, 135)))
 SONY = ((90, 45), (135, 0))

@@ -17,15 +17,23 @@ import torch
 from tolerances import assert_close
 from torch import Tensor
 
-from polsep.camera import Mosaic
-from polsep.demosaic import demosaic_bilinear_half
-from polsep.io.frames import ReadOptions, read_frames
-from polsep.io.weights import shipped_weights, write_weights
-from polsep.learned import PAPER, PAPER_MONO, is_shipped, load_refinement, separate_paper
+from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.store.weights import shipped_weights, write_weights
 from polsep.metrics import psnr
-from polsep.networks import Size
-from polsep.refine import RUNGS, Refinement, analytic_inputs
-from polsep.stokes import Measurements, Stokes, fit_stokes, flip_horizontal, flip_vertical, rotate_quarter, transpose
+from polsep.networks.paper import RUNGS, Refinement, analytic_inputs
+from polsep.networks.shipped_paper import PAPER, PAPER_MONO, is_shipped, load_refinement, separate_paper
+from polsep.networks.unet import Size
+from polsep.physics.stokes import (
+    Measurements,
+    Stokes,
+    fit_stokes,
+    flip_horizontal,
+    flip_vertical,
+    rotate_quarter,
+    transpose,
+)
+from polsep.sensor.camera import Mosaic
 
 SIZE = Size(4, 1, 1)
 ANGLES = tuple(math.radians(t) for t in (0.0, 45.0, 90.0, 135.0))

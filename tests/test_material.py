@@ -15,18 +15,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from polsep.bench.material import novel_lights, score_failure, score_maps, score_relit
+from evaluation.material import novel_lights, score_failure, score_maps, score_relit
 from polsep.cli.app import main
-from polsep.io.exr import read_exr_layers
-from polsep.io.gltf import DIELECTRIC, encode_glb, encode_materialx, specular_scale, texture_pixels
-from polsep.io.previews import srgb
-from polsep.io.weights import write_weights
+from polsep.io.assets.gltf import DIELECTRIC, encode_glb, encode_materialx, specular_scale, texture_pixels
+from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.previews import srgb
+from polsep.io.store.weights import write_weights
 from polsep.material.estimate import load_estimator
+from polsep.material.network import MaterialNetwork, MaterialSize, see_details, see_with_places
 from polsep.material.procedural import halve, random_svbrdf
 from polsep.material.shots import CAMERA, INPUTS, photograph, random_example, random_flash
-from polsep.material_network import MaterialNetwork, MaterialSize, see_details, see_with_places
-from polsep.render import PointLight
-from polsep.svbrdf import Svbrdf, plane_points, relight, unstack
+from polsep.material.svbrdf import Svbrdf, plane_points, relight, unstack
+from polsep.render.sphere_tracing import PointLight
 from polsep.train.material_losses import material_loss
 
 SMALL = MaterialSize(4, (1, 2, 2))

@@ -12,10 +12,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from polsep.io.weights import read_weights
+from polsep.io.store.weights import read_weights
 from polsep.material.examples import example_path, load_example, make_examples
-from polsep.material_network import MaterialNetwork, MaterialSize
-from polsep.svbrdf import plane_points, relight, unstack
+from polsep.material.network import MaterialNetwork, MaterialSize
+from polsep.material.svbrdf import plane_points, relight, unstack
 from polsep.train.loop import Run, Schedule
 from polsep.train.material_command import train_material
 from polsep.train.material_losses import maps_loss, random_configurations, rendering_loss

@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from polsep.materials import (
+from polsep.render.materials import (
     CELL_SIZES,
     DARK_SHARE,
     DARK_VALUES,
@@ -26,7 +26,7 @@ from polsep.materials import (
     random_materials,
     rgb_from_hsv,
 )
-from polsep.textures import pattern_weight
+from polsep.render.textures import pattern_weight
 
 COUNT = 4000
 

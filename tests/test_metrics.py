@@ -13,7 +13,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from tolerances import SIGMAS, assert_close, assert_within
 from torch import Tensor
 
-from polsep.io.previews import srgb
+from polsep.io.results.previews import srgb
 from polsep.metrics import chroma, flip, highlights, psnr, psnr_unlimited, reliability, require_flip, ssim, worst_mean
 
 EVERYWHERE = torch.ones(40, 50, dtype=torch.bool)

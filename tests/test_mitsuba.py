@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tolerances import MITSUBA, assert_within
 from torch import Tensor
 
-from polsep.optics import ETA, Geometry, beam_frame, diffuse_stokes, dot, normalize, specular_stokes
+from polsep.physics.optics import ETA, Geometry, beam_frame, diffuse_stokes, dot, normalize, specular_stokes
 
 mi = pytest.importorskip("mitsuba")
 

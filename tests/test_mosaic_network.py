@@ -10,16 +10,16 @@ import pytest
 import torch
 from tolerances import assert_close, assert_within
 
-from polsep import mosaic_network
-from polsep.camera import Layout, Mosaic
-from polsep.demosaic import mean_cells
-from polsep.io.weights import write_weights
-from polsep.joint import INPUTS, Joint
+from polsep.demosaic.bilinear import mean_cells
+from polsep.io.store.weights import write_weights
 from polsep.methods import METHODS, find_method
-from polsep.mosaic_network import cut_rows, load_joint, run_joint, separate_mosaic, takes, weights_name
-from polsep.networks import ResidualSize
-from polsep.orient import orient
-from polsep.stokes import Measurements
+from polsep.networks import run as mosaic_network
+from polsep.networks.joint import INPUTS, Joint
+from polsep.networks.run import cut_rows, load_joint, run_joint, separate_mosaic, takes, weights_name
+from polsep.networks.unet import ResidualSize
+from polsep.physics.stokes import Measurements
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.orient import orient
 
 SIZE = ResidualSize(4, (0, 1, 1))
 COLOR, MONO = Layout(), Layout(bayer=None)
@@ -87,7 +87,7 @@ def test_strips_are_the_whole_frame(
 ) -> None:
     network, mosaic = random_network(layout), random_mosaic(layout, 720, 36)
     whole = run_joint(network, mosaic, resolution)
-    monkeypatch.setattr(mosaic_network, "MOST_PIXELS", 36 * 600)
+    monkeypatch.setattr(mosaic_network, "MAX_PIXELS", 36 * 600)
     assert len(list(cut_rows((720, 36), 16))) > 5
     parts = run_joint(network, mosaic, resolution)
     assert torch.equal(parts.valid, whole.valid)

@@ -8,9 +8,9 @@ import pytest
 import torch
 from tolerances import assert_close, assert_finite
 
-from polsep.multi_capture import separate_debevec2000, separate_ding2021, separate_extremes
-from polsep.separation import separate_analytic
-from polsep.stokes import Measurements, Stokes, intensity_behind, measure
+from polsep.physics.stokes import Measurements, Stokes, intensity_behind, measure
+from polsep.separation.analytic import separate_analytic
+from polsep.separation.multi_capture import separate_debevec2000, separate_ding2021, separate_extremes
 
 ANGLES = tuple(math.radians(t) for t in (0.0, 45.0, 90.0, 135.0))
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tolerances import assert_close, assert_finite
 
-from polsep.networks import Size, UNet, count_parameters, pad_to_multiple
+from polsep.networks.unet import Size, UNet, count_parameters, pad_to_multiple
 
 SIZES = [Size(4, 2, 1), Size(4, 1, 2)]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tolerances import PRINTED, QUADRATURE, ROUNDING, assert_close, assert_finite, assert_same_angle, assert_within
 from torch import Tensor
 
-from polsep.optics import (
+from polsep.physics.optics import (
     ETA,
     Beam,
     Geometry,
@@ -37,7 +37,7 @@ from polsep.optics import (
     smith_shadowing,
     specular_stokes,
 )
-from polsep.stokes import Stokes, aolp, dolp, polarized_intensity
+from polsep.physics.stokes import Stokes, aolp, dolp, polarized_intensity
 
 DTYPES = (torch.float32, torch.float64)
 BREWSTER = math.atan(ETA)

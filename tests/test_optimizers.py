@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from polsep.joint import Joint
-from polsep.material_network import MaterialNetwork, MaterialSize
-from polsep.networks import ResidualSize, ResidualUNet, Size, UNet
-from polsep.refine import Refinement
+from polsep.material.network import MaterialNetwork, MaterialSize
+from polsep.networks.joint import Joint
+from polsep.networks.paper import Refinement
+from polsep.networks.unet import ResidualSize, ResidualUNet, Size, UNet
 from polsep.train.optimizers import WEIGHT_DECAY, Optimizers, as_matrix, hidden_weights
 from polsep.train.tasks import find_rung
 

@@ -21,11 +21,11 @@ import OpenEXR
 import pytest
 import tifffile
 
-from polsep.io import outputs
-from polsep.io.errors import InputError
-from polsep.io.exr import read_exr_layers
-from polsep.io.outputs import FORMATS, UNITS, OutputError, planned_outputs, write_separation
-from polsep.report import SeparatedFrame
+from polsep.io.results import outputs
+from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.outputs import FORMATS, UNITS, OutputError, planned_outputs, write_separation
+from polsep.io.store.errors import InputError
+from polsep.separation.report import SeparatedFrame
 
 LAYERS = ("diffuse", "specular", "dolp", "aolp", "valid")
 

@@ -13,16 +13,16 @@ import torch
 from tolerances import MITSUBA, SIGMAS, assert_within
 from torch import Tensor
 
-from polsep.materials import Materials, random_materials
-from polsep.optics import Geometry, diffuse_stokes, dot, normalize, specular_stokes
-from polsep.render import PinholeCamera, PointLight, Scene
-from polsep.shapes import FINE, Floats, Mesh, box, ellipsoid, join, moved, random_mesh
-from polsep.stokes import Stokes
+from polsep.physics.optics import Geometry, diffuse_stokes, dot, normalize, specular_stokes
+from polsep.physics.stokes import Stokes
+from polsep.render.materials import Materials, random_materials
+from polsep.render.shapes import FINE, Floats, Mesh, box, ellipsoid, join, moved, random_mesh
+from polsep.render.sphere_tracing import PinholeCamera, PointLight, Scene
 
 pytest.importorskip("mitsuba")
 pytest.importorskip("embreex")
 
-from polsep.pathtrace import (
+from polsep.render.pathtrace import (
     FAST_VARIANT,
     SLOW_VARIANT,
     AreaLight,
@@ -33,7 +33,7 @@ from polsep.pathtrace import (
     paths,
     trace_paths,
 )
-from polsep.raycast import MeshScene, Model, find_hits, render_mesh
+from polsep.render.raycast import MeshScene, Model, find_hits, render_mesh
 
 FLAT: list[Floats] = [np.zeros((FINE, FINE))] * 6
 #: Lobes of one scene by two renderers, relative to the lobe's peak.

@@ -18,16 +18,16 @@ from tolerances import assert_close
 from torch.nn.functional import interpolate
 
 import polsep
-from polsep.camera import IDEAL, IMX250, Layout, Mosaic, expose
-from polsep.demosaic import demosaic_bilinear_half
-from polsep.engine import run_nothing
-from polsep.joint import LEAST_LIGHT, Joint
+from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.methods import BEST, FASTEST, METHODS, Method, find_method
-from polsep.mosaic_network import NAMES, run_joint
-from polsep.networks import ResidualSize
+from polsep.networks.joint import MIN_LIGHT, Joint
+from polsep.networks.run import NAMES, run_joint
+from polsep.networks.unet import ResidualSize
+from polsep.physics.stokes import Measurements, Stokes, measure
 from polsep.pipeline import estimate_light_color, find_device, separate_capture
-from polsep.separation import Separation
-from polsep.stokes import Measurements, Stokes, measure
+from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
+from polsep.separation.analytic import Separation
+from polsep.separation.engine import run_nothing
 
 SIZE = 96
 #: What layers in bfloat16 make of other inputs by rounding.
@@ -290,7 +290,7 @@ def test_extreme_frames(method: str) -> None:
     Networks do not know zero, but less than what they take for black, and white only about.
     """
     black = quietly(np.zeros((SIZE, SIZE), np.uint8), method=method)
-    floor, least = (LEAST_LIGHT, 1.5) if method in (*NAMES, "paper") else (0.0, 2 - 1e-5)
+    floor, least = (MIN_LIGHT, 1.5) if method in (*NAMES, "paper") else (0.0, 2 - 1e-5)
     assert float(black.diffuse.max()) <= floor and float(black.specular.max()) <= floor and bool(black.valid.all())
     assert float(black.dolp.max()) == 0
     assert any("black frame" in note for note in black.report["warnings"])
@@ -462,7 +462,7 @@ def test_memory_of_a_whole_frame(method: str, most: float, compiled: None) -> No
     """A 5-megapixel frame needs so many MiB at most, Python, torch and numba included, once kernels are compiled."""
     code = (
         "import warnings, numpy as np, polsep;"
-        "from polsep.io.results import read_peak_memory;"
+        "from polsep.io.store.rows import read_peak_memory;"
         "warnings.simplefilter('ignore');"
         "raw = np.random.default_rng(0).integers(0, 40000, (2048, 2448), np.uint16); raw[:300, :300] = 65535;"
         f"polsep.separate(raw, {method!r}, device='cpu'); print(read_peak_memory())"

@@ -9,8 +9,17 @@ import numpy.testing as npt
 import pytest
 from skimage.color import rgb2lab
 
-from polsep.io.previews import NOT_VALID, PANEL, aolp_legend, aolp_wheel, contact_sheet, dolp_map, exposure_of, srgb
-from polsep.report import SeparatedFrame
+from polsep.io.results.previews import (
+    NOT_VALID,
+    PANEL,
+    aolp_legend,
+    aolp_wheel,
+    contact_sheet,
+    dolp_map,
+    exposure_of,
+    srgb,
+)
+from polsep.separation.report import SeparatedFrame
 
 
 def random_frame(height: int, width: int, channels: int = 3) -> SeparatedFrame:

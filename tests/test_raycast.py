@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from polsep import raycast, shapes
-from polsep.kernels.threads import get_threads, set_threads
-from polsep.materials import Materials, random_materials
-from polsep.optics import ETA, beam_frame, diffuse_dolp, dot, normalize
-from polsep.raycast import (
+from polsep.compute.threads import get_threads, set_threads
+from polsep.physics.optics import ETA, beam_frame, diffuse_dolp, dot, normalize
+from polsep.render import raycast, shapes
+from polsep.render.distances import ball, plain
+from polsep.render.materials import Materials, random_materials
+from polsep.render.raycast import (
     Hits,
     MeshScene,
     View,
@@ -27,9 +28,8 @@ from polsep.raycast import (
     render_scene,
     shade_view,
 )
-from polsep.render import Part, PinholeCamera, PointLight, Scene, cast, render, shade
-from polsep.scenes import ball, plain
-from polsep.shapes import FINE, Floats, box, ellipsoid, join, moved, random_mesh
+from polsep.render.shapes import FINE, Floats, box, ellipsoid, join, moved, random_mesh
+from polsep.render.sphere_tracing import Part, PinholeCamera, PointLight, Scene, cast, render, shade
 
 FLAT: list[Floats] = [np.zeros((FINE, FINE))] * 6
 SIZE = (96, 112)

@@ -10,8 +10,8 @@ import torch
 from tolerances import assert_close
 from torch import Tensor
 
-from polsep.optics import Geometry, diffuse_stokes, dot, normalize, specular_stokes
-from polsep.stokes import Stokes
+from polsep.physics.optics import Geometry, diffuse_stokes, dot, normalize, specular_stokes
+from polsep.physics.stokes import Stokes
 
 DIRECTIONS = 400
 Lobe = Callable[..., Stokes]

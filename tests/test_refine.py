@@ -8,10 +8,10 @@ import pytest
 import torch
 from tolerances import assert_close
 
-from polsep.networks import Size
-from polsep.refine import RUNGS, Refinement, Rung, analytic_inputs, separate_refined
-from polsep.separation import separate_analytic
-from polsep.stokes import Measurements, Stokes, measure
+from polsep.networks.paper import RUNGS, Refinement, Rung, analytic_inputs, separate_refined
+from polsep.networks.unet import Size
+from polsep.physics.stokes import Measurements, Stokes, measure
+from polsep.separation.analytic import separate_analytic
 from polsep.train.losses import diffuse_loss, gradient_loss, proxy_diffuse, specular_loss
 
 ANGLES = tuple(math.radians(t) for t in (0.0, 45.0, 90.0, 135.0))

@@ -10,10 +10,10 @@ import torch
 from tolerances import HIT, NORMALS, ROUNDING, SHADING, assert_close, assert_finite, assert_same_angle, assert_within
 from torch import Tensor
 
-from polsep import render as render_module
-from polsep.optics import diffuse_dolp, dot, normalize
-from polsep.render import GBuffer, Part, PinholeCamera, PointLight, camera_rays, cast, render, rotation_matrix
-from polsep.scenes import (
+from polsep.physics.optics import diffuse_dolp, dot, normalize
+from polsep.physics.stokes import Stokes, aolp, dolp, polarized_intensity
+from polsep.render import sphere_tracing as render_module
+from polsep.render.distances import (
     ball,
     bumpy,
     cells,
@@ -29,7 +29,16 @@ from polsep.scenes import (
     stripes,
     torus,
 )
-from polsep.stokes import Stokes, aolp, dolp, polarized_intensity
+from polsep.render.sphere_tracing import (
+    GBuffer,
+    Part,
+    PinholeCamera,
+    PointLight,
+    camera_rays,
+    cast,
+    render,
+    rotation_matrix,
+)
 
 WHITE = plain((0.8, 0.8, 0.8))
 BALL = (Part(ball(1.0), WHITE, roughness=0.3),)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from polsep.bench import Row, to_jsonl
-from polsep.io.results import fill_tables, markdown_table, read_rows
+from polsep.bench.rows import Row, to_jsonl
+from polsep.io.store.rows import fill_tables, markdown_table, read_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 

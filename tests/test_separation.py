@@ -14,19 +14,28 @@ from tolerances import assert_close, assert_finite, assert_within
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from polsep.color_affine import MAX_DIFFUSE_DOLP, separate_color_affine, white_specular
+from polsep.physics.stokes import (
+    Measurements,
+    Stokes,
+    dolp,
+    fit_stokes,
+    flip_horizontal,
+    flip_vertical,
+    measure,
+    transpose,
+)
 from polsep.pipeline import in_light, under_white_light
-from polsep.render import Part, PinholeCamera, PointLight, render
-from polsep.report import dominant_angle, tally
-from polsep.scenes import ball, plain
-from polsep.separation import (
+from polsep.render.distances import ball, plain
+from polsep.render.sphere_tracing import Part, PinholeCamera, PointLight, render
+from polsep.separation.analytic import (
     Separation,
     box_mean,
     light_polarizer_angle,
     separate_analytic,
     separate_analytic_unclipped,
 )
-from polsep.stokes import Measurements, Stokes, dolp, fit_stokes, flip_horizontal, flip_vertical, measure, transpose
+from polsep.separation.color_affine import MAX_DIFFUSE_DOLP, separate_color_affine, white_specular
+from polsep.separation.report import dominant_angle, tally
 
 SONY = tuple(math.radians(t) for t in (0, 45, 90, 135))
 Split = Callable[[Measurements], Separation]
@@ -167,11 +176,14 @@ def test_color_affine_returns_the_slope_of_the_diffuse() -> None:
     """The slope is the diffuse polarization itself: p = slope * diffuse + a phase of length tau_s."""
     truth = random_truth(6)
     found = separate_color_affine(measured(truth))
-    assert found.slope is not None
-    p1 = truth.stokes.s1 - found.slope[:1] * truth.diffuse
-    p2 = truth.stokes.s2 - found.slope[1:] * truth.diffuse
+    assert found.diffuse_polarization is not None
+    p1 = truth.stokes.s1 - found.diffuse_polarization[:1] * truth.diffuse
+    p2 = truth.stokes.s2 - found.diffuse_polarization[1:] * truth.diffuse
     assert_within(torch.hypot(p1, p2), truth.specular, 1e-9)
-    assert float(torch.hypot(found.slope[0], found.slope[1]).max()) <= MAX_DIFFUSE_DOLP + 1e-9
+    assert (
+        float(torch.hypot(found.diffuse_polarization[0], found.diffuse_polarization[1]).max())
+        <= MAX_DIFFUSE_DOLP + 1e-9
+    )
 
 
 def test_white_specular_is_the_positive_root() -> None:
@@ -256,13 +268,13 @@ def test_three_analysers_of_one_color_are_enough_for_the_specular() -> None:
     clipped = torch.zeros(4, 3, SIZE, SIZE, dtype=torch.bool)
     for color in range(3):  # one angle stays in every colour, and all four in the picked one
         clipped[1:, color] = where & (pick != color)
-    slope = separate_color_affine(measured(truth)).slope
+    slope = separate_color_affine(measured(truth)).diffuse_polarization
     found = separate_color_affine(with_clipped(measured(truth), clipped))
-    assert slope is not None and found.slope is not None
+    assert slope is not None and found.diffuse_polarization is not None
     outside = ~where
     assert largest((found.specular - truth.specular)[:, outside]) < 1e-9
     # Inside, the slope comes from the windows around: the specular is exact up to what that misses of it.
-    missed = torch.hypot(*(found.slope - slope))
+    missed = torch.hypot(*(found.diffuse_polarization - slope))
     bound = 3 * missed * truth.stokes.s0.amax(dim=0) + 1e-9
     assert bool(((found.specular - truth.specular).abs().amax(dim=0) <= bound).all())
     assert bool(found.valid.all())

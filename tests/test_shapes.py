@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from polsep.shapes import (
+from polsep.render.shapes import (
     COUNT_WEIGHTS,
     FINE,
     LARGEST_AXIS,

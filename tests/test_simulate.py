@@ -8,10 +8,18 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from polsep.camera import IDEAL, IMX250, Layout, Sensor, expose, measure_with_analysers, sample_mosaic
-from polsep.render import Scene
-from polsep.simulate import HEADROOM, blur, capture, expose_to_clip, expose_to_level, filter_light, half_resolution
-from polsep.stokes import Stokes
+from polsep.physics.stokes import Stokes
+from polsep.render.simulate import (
+    HEADROOM,
+    blur,
+    capture,
+    expose_to_clip,
+    expose_to_level,
+    filter_light,
+    half_resolution,
+)
+from polsep.render.sphere_tracing import Scene
+from polsep.sensor.camera import IDEAL, IMX250, Layout, Sensor, expose, measure_with_analysers, sample_mosaic
 
 SIZE = (48, 72)
 

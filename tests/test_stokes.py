@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tolerances import ROUNDING, SIGMAS, assert_close, assert_finite, assert_same_angle
 from torch import Tensor
 
-from polsep.stokes import (
+from polsep.physics.stokes import (
     Measurements,
     Stokes,
     analyser_matrix,

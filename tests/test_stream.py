@@ -15,20 +15,20 @@ from torch.utils.data import DataLoader
 
 pytest.importorskip("embreex")
 
-from polsep.camera import CLIP_MARGIN, IMX250, Layout
-from polsep.simulate import filter_light
-from polsep.stokes import Stokes
+from polsep.physics.stokes import Stokes
+from polsep.render.simulate import filter_light
+from polsep.sensor.camera import CLIP_MARGIN, IMX250, Layout
 from polsep.train import stream
 from polsep.train.stream import (
     BRIGHT_SHARE,
     BRIGHTEST,
     CLIPPED,
     GLARING_SHARE,
-    LEAST_LEVEL,
     LEVEL_SHARE,
     LEVELS,
     LOOKS,
     LOWEST_QUANTILE,
+    MIN_LEVEL,
     QUANTILES,
     UNCLIPPED_SHARE,
     VIEWS,
@@ -158,7 +158,7 @@ def test_glaring_scenes_are_mostly_exposed_for_the_rest() -> None:
     nothing = torch.zeros(0)
     glaring = Pooled(nothing, nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 0.01)
     gains = [random_gain(glaring, torch.Generator().manual_seed(k)) for k in range(300)]
-    leveled = [gain for gain in gains if gain > 2 * LEAST_LEVEL / 0.01]
+    leveled = [gain for gain in gains if gain > 2 * MIN_LEVEL / 0.01]
     assert LEVELS[0] / 0.01 <= min(leveled) <= max(leveled) <= LEVELS[1] / 0.01
     assert abs(len(leveled) - 300 * GLARING_SHARE) < SIGMAS * math.sqrt(300 * GLARING_SHARE * (1 - GLARING_SHARE))
 
@@ -166,7 +166,7 @@ def test_glaring_scenes_are_mostly_exposed_for_the_rest() -> None:
 def test_dark_scenes_are_exposed_to_the_floor() -> None:
     nothing = torch.zeros(0)
     dark = Pooled(nothing, nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 1e-4)
-    assert all(random_gain(dark, torch.Generator().manual_seed(k)) >= LEAST_LEVEL / 1e-4 for k in range(20))
+    assert all(random_gain(dark, torch.Generator().manual_seed(k)) >= MIN_LEVEL / 1e-4 for k in range(20))
 
 
 def test_fast_noise_has_the_sensors_statistics() -> None:

@@ -1,4 +1,4 @@
-"""The renderer for materials: laws of reflection, agreement with NumPy and with `polsep.optics`, gradients."""
+"""The renderer for materials: laws of reflection, agreement with NumPy and with `polsep.physics.optics`, gradients."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polsep.optics import Geometry, diffuse_stokes, fresnel, specular_stokes
-from polsep.svbrdf import Svbrdf, plane_points, reflect, relight, unstack
+from polsep.material.svbrdf import Svbrdf, plane_points, reflect, relight, unstack
+from polsep.physics.optics import Geometry, diffuse_stokes, fresnel, specular_stokes
 
 Doubles = NDArray[np.float64]
 
@@ -118,7 +118,7 @@ def test_agrees_with_numpy() -> None:
 
 @pytest.mark.parametrize("roughness", [0.15, 0.4, 0.8])
 def test_agrees_with_the_optics_straight_down(roughness: float) -> None:
-    """Light and camera above: the lobes of `polsep.optics` for index 1.5, unpolarized light, and albedo as made."""
+    """Light and camera above: the lobes of `physics.optics` for index 1.5, unpolarized light, and albedo as made."""
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).view(3, 1, 1)
     side = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).view(3, 1, 1)
     geometry, one = Geometry(up, up, up, side, side), torch.ones(1, 1, 1, dtype=torch.float64)

@@ -11,10 +11,10 @@ import pytest
 import torch
 from tolerances import ROUNDING, SIGMAS, assert_within
 
-from polsep.camera import IMX250, Layout, Mosaic, Sensor, add_noise
 from polsep.kernels import get_threads, set_threads
-from polsep.noise import BLOCK, Levels, blocks_of, estimate_noise, least_noise
-from polsep.temporal import (
+from polsep.sensor.camera import IMX250, Layout, Mosaic, Sensor, add_noise
+from polsep.sensor.noise import BLOCK, Levels, blocks_of, estimate_noise, least_noise
+from polsep.video.temporal import (
     FRAMES,
     REACH,
     SLOW_REACH,

@@ -16,13 +16,7 @@ pytest.importorskip("scipy", reason="depth maps need the extra 'render'")
 
 from tolerances import SIGMAS, assert_close, assert_same_angle, assert_within
 
-from polsep.camera import IMX250, Layout, measure_with_analysers, sample_mosaic
-from polsep.io.objects import hash_files, read_depth, read_mask, read_mesh, read_normal_map, read_photograph
-from polsep.optics import Geometry, diffuse_dolp, diffuse_stokes
-from polsep.render import PinholeCamera, Scene
-from polsep.shapes import Mesh
-from polsep.stokes import Stokes, aolp, dolp, measure
-from polsep.testsets import (
+from polsep.datasets.testsets import (
     OBJECTS,
     PHOTOGRAPHS,
     SETS,
@@ -36,12 +30,18 @@ from polsep.testsets import (
     fingerprint,
     version_of,
 )
-from polsep.testsets.cases import LARGEST_CLIPPED, TOLERANCE, record_of
-from polsep.testsets.casting import FILLED, LARGEST_ANGLE_DEG, look_at, random_light_near
-from polsep.testsets.expected import EXPECTED
-from polsep.testsets.photographs import normals_from_depth, polarize_diffuse
-from polsep.testsets.sheet import TILE
-from polsep.testsets.statues import DILIGENT_FILES, random_albedo, span_surface, unproject
+from polsep.datasets.testsets.cases import LARGEST_CLIPPED, TOLERANCE, record_of
+from polsep.datasets.testsets.casting import FILLED, LARGEST_ANGLE_DEG, look_at, random_light_near
+from polsep.datasets.testsets.expected import EXPECTED
+from polsep.datasets.testsets.photographs import normals_from_depth, polarize_diffuse
+from polsep.datasets.testsets.sheet import TILE
+from polsep.datasets.testsets.statues import DILIGENT_FILES, random_albedo, span_surface, unproject
+from polsep.io.assets.objects import hash_files, read_depth, read_mask, read_mesh, read_normal_map, read_photograph
+from polsep.physics.optics import Geometry, diffuse_dolp, diffuse_stokes
+from polsep.physics.stokes import Stokes, aolp, dolp, measure
+from polsep.render.shapes import Mesh
+from polsep.render.sphere_tracing import PinholeCamera, Scene
+from polsep.sensor.camera import IMX250, Layout, measure_with_analysers, sample_mosaic
 
 ROOT = Path(__file__).resolve().parents[1]
 SIDE = 48

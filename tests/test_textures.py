@@ -10,11 +10,11 @@ import torch
 from tolerances import SIGMAS
 from torch import Tensor
 
-from polsep import textures
-from polsep.kernels import patterns
-from polsep.kernels.compiling import entry
-from polsep.materials import USUAL_SIZE, Materials, random_materials
-from polsep.textures import (
+from polsep.compute.compiling import entry
+from polsep.render import patterns_kernel as patterns
+from polsep.render import textures
+from polsep.render.materials import USUAL_SIZE, Materials, random_materials
+from polsep.render.textures import (
     CHECKER,
     CLOUDS,
     CRACKS,

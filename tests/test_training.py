@@ -26,13 +26,13 @@ pytest.importorskip("tensorboard")
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from polsep import cli
-from polsep.io.checkpoints import read_checkpoint, read_lines, write_checkpoint, write_lines
-from polsep.io.weights import read_weights
-from polsep.learned import load_refinement
+from polsep.io.store.checkpoints import read_checkpoint, read_lines, write_checkpoint, write_lines
+from polsep.io.store.weights import read_weights
 from polsep.methods import METHODS
-from polsep.networks import Size
-from polsep.refine import RUNGS
-from polsep.stokes import Stokes, measure
+from polsep.networks.paper import RUNGS
+from polsep.networks.shipped_paper import load_refinement
+from polsep.networks.unet import Size
+from polsep.physics.stokes import Stokes, measure
 from polsep.train.command import (
     Options,
     TrainOptions,
@@ -380,7 +380,7 @@ def test_without_tensorboard_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     for name in (
         "torch.utils.tensorboard",
-        "polsep.io.events",
+        "polsep.io.store.events",
         *(f"polsep.train.{x}" for x in ("log", "loop", "command")),
     ):
         monkeypatch.delitem(sys.modules, name)

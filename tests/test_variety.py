@@ -12,11 +12,12 @@ from torch import Tensor
 
 pytest.importorskip("embreex")
 
-from polsep.camera import IMX250
-from polsep.materials import Materials, random_materials
-from polsep.raycast import MeshScene, View, find_view, light_view, shade_view
-from polsep.render import Scene
-from polsep.stokes import Stokes
+from polsep.physics.stokes import Stokes
+from polsep.render.materials import Materials, random_materials
+from polsep.render.raycast import MeshScene, View, find_view, light_view, shade_view
+from polsep.render.sphere_tracing import Scene
+from polsep.render.views import MIN_LIT, Shot, lit_share, random_shot, seeded_shape
+from polsep.sensor.camera import IMX250
 from polsep.train.variety import (
     BITS,
     BITS_SHARES,
@@ -30,7 +31,7 @@ from polsep.train.variety import (
     MAGNIFICATIONS,
     MATTE_SHARE,
     MATTE_STRENGTH,
-    MOST_SHEEN,
+    MAX_SHEEN,
     PLAIN_SHARE,
     RELIEF_SHARE,
     RELIEF_TILTS,
@@ -52,7 +53,6 @@ from polsep.train.variety import (
     vary_retention,
     vary_shot,
 )
-from polsep.views import LEAST_LIT, Shot, lit_share, random_shot, seeded_shape
 
 #: A field of view that shows one point.
 NARROW_DEG = 0.01
@@ -140,7 +140,7 @@ def test_new_lights_reach_much_of_the_view(shape: MeshScene, varied: list[Shot])
     for k, shot in enumerate(varied):
         light = relight(shape, shot, seeded(k))
         assert light != shot.light
-        assert lit_share(shape, replace(shot, light=light)) >= LEAST_LIT
+        assert lit_share(shape, replace(shot, light=light)) >= MIN_LIT
 
 
 def saturation(albedo: Tensor) -> Tensor:
@@ -257,7 +257,7 @@ def test_some_diffuse_light_keeps_its_polarization() -> None:
 
 
 def test_sheens_are_polarized_light_that_knows_no_material(shape: MeshScene, shots: list[Shot]) -> None:
-    """1 in the median of what is lit, at most `MOST_SHEEN`, fully polarized, and the same for every albedo."""
+    """1 in the median of what is lit, at most `MAX_SHEEN`, fully polarized, and the same for every albedo."""
     view = find_view(shape, shots[0].camera, (48, 48))
     light = shots[0].light
     lit = light_view(shape, view, light)
@@ -267,5 +267,5 @@ def test_sheens_are_polarized_light_that_knows_no_material(shape: MeshScene, sho
     reached = shade_view(*looks[0]).diffuse.s0[:1] > 0
     assert float(found.s0[~reached].abs().max()) == 0
     assert abs(float(found.s0[reached].median()) - 1) < 1e-5
-    assert float(found.s0.max()) <= MOST_SHEEN + 1e-5
-    assert_close(torch.hypot(found.s1, found.s2), found.s0, scale=MOST_SHEEN)
+    assert float(found.s0.max()) <= MAX_SHEEN + 1e-5
+    assert_close(torch.hypot(found.s1, found.s2), found.s0, scale=MAX_SHEEN)

@@ -22,17 +22,18 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
-from polsep import cli, video
-from polsep.camera import IDEAL, Layout, expose
-from polsep.io.exr import read_exr_layers
-from polsep.io.footage import Damaged, natural_order, open_footage
-from polsep.io.frames import Frame, ReadOptions
-from polsep.io.outputs import OutputError
-from polsep.io.sequences import FILM_WHITE, PART, Picture, Sequence, SequenceKind, write_exr
-from polsep.levels import as_mosaic
+from polsep import cli
+from polsep.io.raw.footage import Damaged, natural_order, open_footage
+from polsep.io.raw.frames import Frame, ReadOptions
+from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.outputs import OutputError
+from polsep.io.results.sequences import FILM_WHITE, PART, Picture, Sequence, SequenceKind, write_exr
+from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
-from polsep.report import SeparatedFrame
-from polsep.stokes import Stokes
+from polsep.sensor.camera import IDEAL, Layout, expose
+from polsep.sensor.levels import as_mosaic
+from polsep.separation.report import SeparatedFrame
+from polsep.video import recordings as video
 
 av = pytest.importorskip("av", reason="needs the extra 'video'")
 

@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 import torch
 
-from polsep.camera import Layout, Mosaic
 from polsep.edit import EDITS, Metallic, Recipe, Rougher, Texture
 from polsep.edit import apply as apply_edits
-from polsep.io.errors import InputError
-from polsep.io.exr import read_exr_layers
-from polsep.io.outputs import write_separation
-from polsep.io.previews import srgb
-from polsep.io.scratch import Scratch, drop_folder, find_upload, make_scratch
-from polsep.io.separated import read_separated
+from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.outputs import write_separation
+from polsep.io.results.previews import srgb
+from polsep.io.results.separated import read_separated
+from polsep.io.store.errors import InputError
+from polsep.io.store.scratch import Scratch, drop_folder, find_upload, make_scratch
 from polsep.pipeline import separate_capture
-from polsep.report import SeparatedFrame
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.separation.report import SeparatedFrame
 from polsep.view import guard, opening, session
 from polsep.view.edits import at_scale, edit_small, list_controls, recipe_of
 from polsep.view.guard import Guard, host_name, names_address
@@ -179,7 +179,7 @@ def test_large_frames_are_refused_by_their_header(sessions: Sessions) -> None:
     header += b"{'descr': '<u2', 'fortran_order': False, 'shape': (20000, 20000), }".ljust(117) + b"\n"
     sent = upload(sessions, "big.npy", header)
     sessions.open_upload("a", [(str(sent), sent.name)])
-    with pytest.raises(InputError, match=f"big.npy: expected at most {opening.MOST_SAMPLES} samples"):
+    with pytest.raises(InputError, match=f"big.npy: expected at most {opening.MAX_SAMPLES} samples"):
         sessions.find("a").separate(Settings())
 
 
@@ -234,7 +234,7 @@ def test_sessions_are_apart_and_leave_nothing(sessions: Sessions) -> None:
 
 def test_the_page_idle_for_longest_makes_room(sessions: Sessions, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory is bounded: one page too many ends another."""
-    monkeypatch.setattr(session, "MOST_SESSIONS", 2)
+    monkeypatch.setattr(session, "MAX_SESSIONS", 2)
     first = sessions.find("a")
     sessions.find("b")
     assert sessions.find("a") is first
@@ -474,7 +474,7 @@ def test_messages_pass_whole_or_not_at_all() -> None:
     """A message reaches the server as it was, unless it is too long or names an address as a file."""
     body = b'{"data": [1, 2]}'
     assert ask("/gradio_api/queue/join", "POST", body) == (200, body)
-    assert ask("/gradio_api/queue/join", "POST", b" " * (guard.MOST_JSON + 1))[0] == 413
+    assert ask("/gradio_api/queue/join", "POST", b" " * (guard.MAX_JSON + 1))[0] == 413
     assert ask("/gradio_api/queue/join", "POST", b'{"data": [{"path": "https://a.example"}]}')[0] == 403
 
 

@@ -18,7 +18,7 @@ from viewer import running
 
 import polsep
 from polsep import cli
-from polsep.io.exr import read_exr_layers
+from polsep.io.results.exr import read_exr_layers
 
 CHROMIUM = shutil.which("chromium")
 READY = CHROMIUM and all(importlib.util.find_spec(name) for name in ("gradio", "playwright"))

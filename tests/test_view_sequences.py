@@ -17,16 +17,16 @@ import torch
 from test_edit import sphere
 from test_view import mosaic_codes, opened, png, upload
 
-from polsep.camera import Layout, Mosaic
 from polsep.edit import Metallic, Recipe, Rougher, Texture, apply
 from polsep.edit.files import load_work, read_recipe
-from polsep.io.errors import InputError
-from polsep.io.exr import read_exr_layers
-from polsep.io.outputs import write_separation
-from polsep.io.scratch import drop_folder, make_scratch
-from polsep.io.separated import read_separated
-from polsep.io.sequences import Picture, write_exr
+from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.outputs import write_separation
+from polsep.io.results.separated import read_separated
+from polsep.io.results.sequences import Picture, write_exr
+from polsep.io.store.errors import InputError
+from polsep.io.store.scratch import drop_folder, make_scratch
 from polsep.pipeline import separate_capture
+from polsep.sensor.camera import Layout, Mosaic
 from polsep.view import images
 from polsep.view.edits import edit_small
 from polsep.view.opening import Settings, find_sources, parse_settings

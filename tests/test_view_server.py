@@ -58,7 +58,7 @@ def test_separating_starts_no_process_and_calls_nobody() -> None:
     program = (
         "import sys, socket, multiprocessing, torch\n"
         "socket.socket.connect = lambda *a: sys.exit('connected')\n"
-        "from polsep.camera import Layout, Mosaic\n"
+        "from polsep.sensor.camera import Layout, Mosaic\n"
         "from polsep.pipeline import separate_capture\n"
         "separate_capture(Mosaic(torch.rand(64, 64), Layout(), 0.0, 1.0), 'joint-fast')\n"
         "assert 'openvino' in sys.modules and sys.modules['openvino_telemetry'] is None\n"

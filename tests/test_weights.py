@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from polsep.io.weights import read_weights, shipped_weights, write_weights
+from polsep.io.store.weights import read_weights, shipped_weights, write_weights
 
 
 def test_round_trip_in_half_precision(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from polsep.kernels.threads import get_threads, own_threads
-from polsep.workers import ahead, map_ahead
+from polsep.compute.threads import get_threads, own_threads
+from polsep.compute.workers import ahead, map_ahead
 
 #: How long a thread is waited for.
 PATIENCE_S = 30.0
@@ -125,7 +125,7 @@ def test_memory_that_is_kept_is_there_for_the_next_array() -> None:
     program = """
 import resource, sys
 import numpy as np
-from polsep.workers import keep_memory
+from polsep.compute.workers import keep_memory
 if sys.argv[1] == "kept":
     keep_memory()
 def faults():

@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 
 from polsep.bench.rows import Row
-from polsep.camera import Layout
 from polsep.methods import METHODS
-from polsep.stokes import Measurements, Stokes, fit_stokes_unclipped, measure
+from polsep.physics.stokes import Measurements, Stokes, fit_stokes_unclipped, measure
+from polsep.sensor.camera import Layout
 
 
 def bench_exactness(_data: Path | None = None) -> Iterator[Row]:

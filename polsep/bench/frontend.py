@@ -29,14 +29,14 @@ from polsep.bench.peers import demosaic_by_peers, find_peers
 from polsep.bench.rows import Row
 from polsep.bench.speed import bench_speed
 from polsep.bench.truth import SCENE_SEEDS, captures, render_scene
-from polsep.camera import Layout, Mosaic, sample_mosaic
-from polsep.color_affine import separate_color_affine
-from polsep.demosaic import demosaic_bilinear, demosaic_bilinear_half, mean_cells
-from polsep.guided import demosaic_guided, demosaic_guided_half
-from polsep.io.frames import read_frames
+from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half, mean_cells
+from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half
+from polsep.io.raw.frames import read_frames
 from polsep.metrics import psnr
-from polsep.separation import separate_analytic
-from polsep.stokes import Measurements, Stokes, aolp, dolp, fit_stokes, measure
+from polsep.physics.stokes import Measurements, Stokes, aolp, dolp, fit_stokes, measure
+from polsep.sensor.camera import Layout, Mosaic, sample_mosaic
+from polsep.separation.analytic import separate_analytic
+from polsep.separation.color_affine import separate_color_affine
 
 Demosaicker = Callable[[Mosaic], Measurements]
 
@@ -50,7 +50,7 @@ SPLITS = {"analytic": separate_analytic, "color-affine": separate_color_affine}
 #: Pixels left out at the border, of half-resolution images.
 BORDER = 8
 #: Below this true DoLP an angle of polarization says nothing.
-LEAST_DOLP = 0.05
+MIN_DOLP = 0.05
 #: Rendered materials: the saturation of their colours, and their share of mixed ones, of which a quarter is grey.
 MATERIALS = {"colour": (1.0, 0.375), "desaturated": (0.3, 0.375), "grey": (0.0, 0.25)}
 #: Scenes whose demosaicking is scored; the separation takes all of `SCENE_SEEDS`.
@@ -157,7 +157,7 @@ def score_stokes(found: Stokes, truth: Stokes, mask: Tensor) -> tuple[float, flo
     """Rms errors of DoLP and, in degrees, of AoLP inside ``mask [h, w]``; AoLP 0 where nothing is polarized."""
     inside_mask = mask.expand_as(truth.s0)
     error = (dolp(found).clamp(max=1) - dolp(truth).clamp(max=1))[inside_mask]
-    polarized = inside_mask & (dolp(truth) > LEAST_DOLP)
+    polarized = inside_mask & (dolp(truth) > MIN_DOLP)
     apart = aolp(found)[polarized] - aolp(truth)[polarized]
     apart = torch.rad2deg(torch.remainder(apart + math.pi / 2, math.pi) - math.pi / 2)
     angle = float(apart.double().square().mean().sqrt()) if apart.numel() else 0.0

@@ -1,6 +1,6 @@
 """What others demosaick with, measured in a virtual environment of their own that `POLSEP_PEERS` names.
 
-baselines/frontend_peers.py does the work there; baselines/requirements.txt says what to install.
+evaluation/peers/frontend_peers.py does the work there; evaluation/peers/requirements.txt says what to install.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from polsep.io.results import read_array, write_array
+from polsep.io.store.rows import read_array, write_array
 
 #: The environment variable that holds the peers' python.
 PEERS_VARIABLE = "POLSEP_PEERS"
-SCRIPT = Path(__file__).parents[2] / "baselines" / "frontend_peers.py"
+SCRIPT = Path(__file__).parents[2] / "evaluation" / "peers" / "frontend_peers.py"
 #: Everything that is timed has two threads, whatever library it uses.
 TWO_THREADS = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "2")
 
@@ -31,7 +31,7 @@ def find_peers() -> str | None:
     """The peers' python; None, said on stderr, where none is named. Raises ValueError when it is not there."""
     python = os.environ.get(PEERS_VARIABLE)
     if not python:
-        print(f"polsep: peers are left out: {PEERS_VARIABLE} names no python, see baselines/", file=sys.stderr)
+        print(f"polsep: peers are left out: {PEERS_VARIABLE} names no python, see evaluation/peers/", file=sys.stderr)
         return None
     for path in (Path(python), SCRIPT):
         if not path.is_file():

@@ -10,11 +10,11 @@ from pathlib import Path
 import torch
 
 from polsep.bench.rows import Row
-from polsep.camera import Layout, Mosaic
-from polsep.demosaic import demosaic_bilinear_half
-from polsep.io.frames import ReadOptions, read_frames
-from polsep.layout_check import check_layout, crossed_pairs
-from polsep.stokes import aolp, fit_stokes
+from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.physics.stokes import aolp, fit_stokes
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.layout_check import check_layout, crossed_pairs
 
 #: The labelled polarizers of polarizer_IMX250MZR.png: label [deg], centre (row, col) and radius at half resolution.
 REFERENCE_POLARIZERS = ((0, 544, 189, 88), (45, 544, 502, 88), (90, 544, 778, 88), (135, 553, 1055, 78))

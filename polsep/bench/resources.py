@@ -13,8 +13,8 @@ import numpy as np
 
 import polsep
 from polsep.bench.rows import Row
-from polsep.io.frames import ReadOptions, read_frames
-from polsep.io.results import write_array
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.store.rows import write_array
 from polsep.kernels import warm_up
 from polsep.methods import METHODS
 
@@ -25,10 +25,10 @@ import json, sys, time, warnings
 import numpy as np
 warnings.simplefilter("ignore")
 import polsep
-from polsep.io.results import read_peak_memory
+from polsep.io.store.rows import read_peak_memory
 from polsep.kernels import get_threads
-from polsep.kernels.threads import own_threads
-from polsep.workers import map_ahead
+from polsep.compute.threads import own_threads
+from polsep.compute.workers import map_ahead
 raw = np.load(sys.argv[2])
 polsep.separate
 full, times = sys.argv[3] == "full", []

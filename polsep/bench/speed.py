@@ -27,19 +27,19 @@ from numpy.typing import NDArray
 import polsep
 from polsep.bench.peers import run_json, time_peers
 from polsep.bench.rows import Row
-from polsep.camera import Layout, Mosaic
-from polsep.color_affine import separate_color_affine
-from polsep.demosaic import demosaic_bilinear_half
-from polsep.guided import demosaic_guided_half
-from polsep.io.frames import ReadOptions, read_frames
-from polsep.io.results import read_array, read_peak_memory, write_array
-from polsep.separation import Separation, separate_analytic
-from polsep.stokes import Measurements
+from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.demosaic.guided import demosaic_guided_half
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.store.rows import read_array, read_peak_memory, write_array
+from polsep.physics.stokes import Measurements
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.separation.analytic import Separation, separate_analytic
+from polsep.separation.color_affine import separate_color_affine
 
 CASE = "2448x2048 colour frame"
 WHITE_LEVEL = 4095.0
 #: Every chain is timed in so many processes, in turns, each time so often or so long; the best time counts.
-ROUNDS, MOST_RUNS, MOST_SECONDS = 2, 40, 4.0
+ROUNDS, MAX_RUNS, MAX_SECONDS = 2, 40, 4.0
 #: Threads of every chain.
 THREADS = 2
 
@@ -144,7 +144,7 @@ def print_time(name: str, path: str) -> None:
     before = read_peak_memory()
     chain(raw)
     times: list[float] = []
-    while not times or (len(times) < MOST_RUNS and sum(times) < MOST_SECONDS):
+    while not times or (len(times) < MAX_RUNS and sum(times) < MAX_SECONDS):
         start = time.perf_counter()
         chain(raw)
         times.append(time.perf_counter() - start)

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from polsep.camera import IMX250, Layout, Mosaic, add_noise, expose
-from polsep.render import PinholeCamera, Scene, render
-from polsep.scenes import random_light, random_parts
-from polsep.stokes import Measurements, measure
+from polsep.physics.stokes import Measurements, measure
+from polsep.render.distances import random_light, random_parts
+from polsep.render.sphere_tracing import PinholeCamera, Scene, render
+from polsep.sensor.camera import IMX250, Layout, Mosaic, add_noise, expose
 
 #: Seeds of the benchmark's scenes; nothing is ever tuned or trained on seeds from 2000 to 2999.
 SCENE_SEEDS = tuple(range(2000, 2008))

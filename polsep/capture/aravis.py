@@ -22,8 +22,8 @@ from polsep.capture.sources import (
     FrameIds,
     Loss,
 )
-from polsep.io.genicam import find_pixel_format
-from polsep.io.recording import RawImage
+from polsep.io.raw.genicam import find_pixel_format
+from polsep.io.raw.recording import RawImage
 
 #: Buffers that Aravis fills while Python is busy: 1.6 s at 10 frames per second.
 BUFFERS = 16

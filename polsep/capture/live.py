@@ -12,16 +12,16 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-from polsep.camera import Layout
 from polsep.capture.sources import CameraInfo
-from polsep.io.frames import ReadOptions, decode_frame
-from polsep.io.genicam import find_pixel_format
-from polsep.io.pictures import encode_picture
-from polsep.io.previews import live_sheet
-from polsep.io.recording import RawImage
-from polsep.io.whole import replace_bytes
+from polsep.io.raw.frames import ReadOptions, decode_frame
+from polsep.io.raw.genicam import find_pixel_format
+from polsep.io.raw.recording import RawImage
+from polsep.io.results.previews import live_sheet
+from polsep.io.store.pictures import encode_picture
+from polsep.io.store.whole import replace_bytes
 from polsep.pipeline import separate_capture
-from polsep.report import SeparatedFrame
+from polsep.sensor.camera import Layout
+from polsep.separation.report import SeparatedFrame
 
 #: Added to the live view's nice value on Linux: receiving and recording go before it.
 NICENESS = 5

@@ -23,8 +23,8 @@ from polsep.capture.sources import (
     FrameIds,
     Loss,
 )
-from polsep.io.genicam import find_pixel_format
-from polsep.io.recording import RawImage
+from polsep.io.raw.genicam import find_pixel_format
+from polsep.io.raw.recording import RawImage
 
 #: Buffers that pylon fills while Python is busy.
 BUFFERS = 16

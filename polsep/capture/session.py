@@ -21,13 +21,13 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from polsep.camera import Layout
 from polsep.capture.live import LiveView, Shown
 from polsep.capture.page import serve_page
 from polsep.capture.ring import Ring
 from polsep.capture.sources import Camera, CameraError, CameraInfo, CameraLost, CameraSource, EndOfFrames, Loss
-from polsep.io.outputs import OutputError
-from polsep.io.recording import PICTURE, Header, RawImage, RecordingWriter, refuse_recording
+from polsep.io.raw.recording import PICTURE, Header, RawImage, RecordingWriter, refuse_recording
+from polsep.io.results.outputs import OutputError
+from polsep.sensor.camera import Layout
 
 #: Seconds between attempts to connect to a camera that was lost.
 RETRY_S = 1.0

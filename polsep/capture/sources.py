@@ -14,8 +14,8 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from polsep.io.errors import InputError
-from polsep.io.recording import RawImage
+from polsep.io.raw.recording import RawImage
+from polsep.io.store.errors import InputError
 
 #: Seconds without a frame after which a camera that runs by itself is taken for lost; exposure and period come on top.
 PATIENCE = 5.0

@@ -46,11 +46,11 @@ def capture(camera: str | None, listing: bool, **options: Any) -> None:
     polsep separate take1/recording.json -o out            every frame of a recording
     polsep separate take1/frames.raw --size 2448x2048 --pixel-format BayerRG12p
     """
-    from polsep.camera import Layout
     from polsep.capture.find import find_source
     from polsep.capture.session import CapturePlan, Limits, Session
     from polsep.capture.sources import CameraSettings
     from polsep.methods import check_method
+    from polsep.sensor.camera import Layout
 
     if listing:
         _list()

@@ -35,8 +35,8 @@ def render(output: Path, workers: int | None, engine: str, **options: Any) -> No
     polsep render --shapes 25 --views 20 --size 1024 --split test -o test    shapes that no training saw
     """
     try:
-        from polsep.dataset import RenderOptions, default_workers, render_dataset
-        from polsep.io.dataset import read_fingerprint
+        from polsep.datasets.rendered import RenderOptions, default_workers, render_dataset
+        from polsep.io.results.dataset import read_fingerprint
 
         asked = RenderOptions(**options)
         total = asked.shapes * asked.views
@@ -160,9 +160,7 @@ def _show_training(line: dict[str, Any]) -> None:
 
 @app.command()
 @click.argument("name", metavar="NAME", default="list")
-@click.option(
-    "--data", type=DIR, default=Path("../shared/data"), metavar="DIR", help="For real, frontend, sets, paper."
-)
+@click.option("--data", type=DIR, default=Path("../shared/data"), metavar="DIR", help="For real and frontend.")
 @click.option("-o", "--output", type=DIR, default=Path("results"), metavar="DIR", help="Where NAME.jsonl goes.")
 @click.option("--quick", is_flag=True, help="A part of it in minutes, to DIR/NAME-quick.jsonl.")
 @click.option(
@@ -174,36 +172,24 @@ def _show_training(line: dict[str, Any]) -> None:
 def bench(name: str, data: Path, output: Path, quick: bool, images: Path | None) -> None:
     """Measure NAME, print its rows and write them to DIR/NAME.jsonl; without NAME, list what can be measured.
 
-    'polsep bench readme' makes the tables of README.md and docs anew from DIR.
+    'polsep bench readme' makes the tables of README.md and docs anew from DIR. The paper's evaluation is run in a
+    checkout of the repository: python -m evaluation.
     """
-    from polsep.bench import BENCHES, provenance, to_jsonl
-    from polsep.io.results import fill_readme
-    from polsep.io.whole import replace_text
+    from polsep.bench import BENCHES
+    from polsep.bench.run import Folders, fill_tables_of_docs, list_benches, run_bench
 
     if name == "list":
-        for known, entry in BENCHES.items():
-            print(f"{known}: {(entry.run.__doc__ or '').splitlines()[0]}")
-        return
-    if name == "readme":
-        for page in (Path("README.md"), *sorted(Path("docs").glob("*.md"))):
-            fill_readme(page, output)
-        return
-    if name not in BENCHES:
-        raise click.ClickException(f"expected a benchmark of {', '.join([*BENCHES, 'readme'])}, found {name!r}")
-    chosen = BENCHES[name]
-    measure = chosen.quick if quick else chosen.run
-    if measure is None:
-        known = ", ".join(n for n, entry in BENCHES.items() if entry.quick)
-        raise click.ClickException(f"expected a benchmark with a quick version for --quick ({known}), found {name!r}")
-    stem, command = (f"{name}-quick", f"polsep bench {name} --quick") if quick else (name, f"polsep bench {name}")
-    folder = images or (output / stem if quick else Path("docs/images") / name)
-    rows = []
-    try:
-        for row in measure(data):
-            print(f"{row.case:48} {row.method:20} {row.metric:28} {row.value:10.4g} {row.unit}", flush=True)
-            rows.append(row)
-        replace_text(output / f"{stem}.jsonl", to_jsonl(rows, provenance(command)))
-        for path in chosen.draw(rows, data, folder) if chosen.draw else ():
-            print(path, flush=True)
-    except ValueError as error:
-        raise click.ClickException(str(error)) from None
+        print("\n".join(list_benches(BENCHES)))
+    elif name == "readme":
+        fill_tables_of_docs(output)
+    else:
+        try:
+            run_bench(BENCHES, name, "polsep bench", Folders(data, output, images), quick)
+        except ValueError as error:
+            raise click.ClickException(f"{error}{_in_the_laboratory(name)}") from None
+
+
+def _in_the_laboratory(name: str) -> str:
+    """Where benchmarks that left the package are run, for those who ask for one of them."""
+    known = "rendering sets joint ablations dynamic calibration material video geometry view gallery gallery_real paper"
+    return f"; in a checkout of polsep: python -m evaluation {name}" if name in known.split() else ""

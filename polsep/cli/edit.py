@@ -64,9 +64,9 @@ def edit(inputs: tuple[Path, ...], **options: Any) -> None:
     polsep edit out/shot.exr -o edited --texture wood.jpg --texture-normals normals.png --save-recipe wood.json
     polsep edit film/ -o edited --recipe wood.json
     """
+    from polsep.compute.workers import keep_memory
     from polsep.edit.files import EditTarget, load_work
-    from polsep.io.sequences import SequenceKind
-    from polsep.workers import keep_memory
+    from polsep.io.results.sequences import SequenceKind
 
     if options["listing"]:
         _list()
@@ -158,7 +158,7 @@ def _parse_color(name: str, text: str) -> tuple[float, ...]:
 def _save_recipe(recipe: Recipe, folder: Path, path: Path, overwrite: bool) -> None:
     """Write the recipe with file names relative to where it lies."""
     from polsep.edit.recipe import recipe_as_text, rename_images
-    from polsep.io.edited import write_recipe_text
+    from polsep.io.results.edited import write_recipe_text
 
     moved = rename_images(recipe, lambda name: os.path.relpath(folder / name, path.parent))
     write_recipe_text(path, recipe_as_text(moved), overwrite)

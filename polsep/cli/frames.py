@@ -64,10 +64,10 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     --layout SPEC    2x2 angles in reading order and the Bayer order, like 90,45,135,0/RGGB or 0,45,90,135/mono
     """
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
-    from polsep.camera import Layout
-    from polsep.io.frames import ReadOptions
+    from polsep.io.raw.frames import ReadOptions
     from polsep.methods import check_method
     from polsep.pipeline import find_device, parse_light_color
+    from polsep.sensor.camera import Layout
 
     try:
         given = click.get_current_context().get_parameter_source("layout") == click.core.ParameterSource.COMMANDLINE
@@ -134,11 +134,11 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     It runs in onnxruntime and its like without polsep. Frames [N, H, W] are in Sony's order with sides that are
     multiples of 4; black_level and white_level are in their units. Needs the extra export.
     """
-    from polsep.camera import Layout
-    from polsep.graph import OUTPUT_NAMES, Graph
-    from polsep.io.onnx import write_onnx
-    from polsep.io.outputs import refuse_targets
-    from polsep.mosaic_network import find_joint
+    from polsep.io.results.outputs import refuse_targets
+    from polsep.io.store.onnx import write_onnx
+    from polsep.networks.export import OUTPUT_NAMES, Graph
+    from polsep.networks.run import find_joint
+    from polsep.sensor.camera import Layout
 
     try:
         refuse_targets(output.parent, [output], options["overwrite"])
@@ -169,7 +169,7 @@ def demo(output: Path) -> None:
     at an angle that the methods are not told.
     """
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
-    from polsep.io.frames import ReadOptions
+    from polsep.io.raw.frames import ReadOptions
     from polsep.methods import METHODS
 
     capture = Path(polsep.__file__).parent / "data" / "still_life.png"

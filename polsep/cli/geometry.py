@@ -64,12 +64,12 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
         raise click.ClickException(
             f"expected the extra 'render' (pip install 'polsep[render]'), found no {error.name}"
         ) from None
-    from polsep.camera import Layout
     from polsep.geometry.lights import parse_lights
-    from polsep.io.frames import ReadOptions
-    from polsep.io.geometry import shape_targets, write_shape
-    from polsep.io.outputs import refuse_targets
+    from polsep.io.raw.frames import ReadOptions
+    from polsep.io.results.geometry import shape_targets, write_shape
+    from polsep.io.results.outputs import refuse_targets
     from polsep.methods import check_method
+    from polsep.sensor.camera import Layout
 
     try:
         asked = Asked(options["mesh"], options["fov"], options["integration"], options["turntable"])

@@ -42,11 +42,11 @@ def material(files: tuple[str, ...], **options: Any) -> None:
     polsep material flash.png left.png right.png --white 0.8 several, and white paper showed 0.8
     polsep material out/flash.exr                            separated before
     """
-    from polsep.camera import Layout
-    from polsep.io.frames import ReadOptions
+    from polsep.io.raw.frames import ReadOptions
     from polsep.material.files import MaterialOptions, estimate_files
     from polsep.methods import check_method
     from polsep.pipeline import parse_light_color
+    from polsep.sensor.camera import Layout
 
     try:
         check_method(options["method"])

@@ -12,7 +12,7 @@ import click
 from polsep.cli.app import DIR, app, parse_size, say
 
 if TYPE_CHECKING:
-    from polsep.video import Progress
+    from polsep.video.recordings import Progress
 
 
 @app.command()
@@ -51,13 +51,13 @@ def video(recording: Path, output: Path, **options: Any) -> None:
     polsep video run.raw --size 2448x2048 --pixel-format BayerRG12p -o out --rate 24
     polsep video run.mkv -o out --format ffv1 --method joint
     """
-    from polsep.camera import Layout
-    from polsep.io.frames import ReadOptions
-    from polsep.io.sequences import SequenceKind
+    from polsep.compute.workers import keep_memory
+    from polsep.io.raw.frames import ReadOptions
+    from polsep.io.results.sequences import SequenceKind
     from polsep.methods import check_method
     from polsep.pipeline import parse_light_color
-    from polsep.video import Target, VideoOptions, separate_video
-    from polsep.workers import keep_memory
+    from polsep.sensor.camera import Layout
+    from polsep.video.recordings import Target, VideoOptions, separate_video
 
     keep_memory()
     try:

@@ -18,7 +18,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.kernels.blur import filter_image
+from polsep.edit.blur_kernel import filter_image
 
 Floats = NDArray[np.float32]
 

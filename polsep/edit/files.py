@@ -18,19 +18,19 @@ from typing import Any
 
 import numpy as np
 
+from polsep.compute.workers import map_ahead
 from polsep.edit.images import Maps, SeparatedImages
 from polsep.edit.parameters import EditError
 from polsep.edit.recipe import Recipe, apply, recipe_as_data, recipe_from_text
-from polsep.io.edited import EditedFrame, edited_targets, read_recipe_text, write_edited, write_preview
-from polsep.io.errors import InputError, input_error
-from polsep.io.maps import hash_map, read_map
-from polsep.io.outputs import OutputError, refuse_targets
-from polsep.io.previews import exposure_of, toned
-from polsep.io.separated import Numbered, find_numbered, read_separated
-from polsep.io.sequences import PART, Part, Picture, SequenceKind
-from polsep.io.sequences import Sequence as Writer
-from polsep.video import ON_DAMAGE, Progress, draw_panels
-from polsep.workers import map_ahead
+from polsep.io.assets.maps import hash_map, read_map
+from polsep.io.results.edited import EditedFrame, edited_targets, read_recipe_text, write_edited, write_preview
+from polsep.io.results.outputs import OutputError, refuse_targets
+from polsep.io.results.previews import exposure_of, toned
+from polsep.io.results.separated import Numbered, find_numbered, read_separated
+from polsep.io.results.sequences import PART, Part, Picture, SequenceKind
+from polsep.io.results.sequences import Sequence as Writer
+from polsep.io.store.errors import InputError, input_error
+from polsep.video.recordings import ON_DAMAGE, Progress, draw_panels
 
 #: Frames that are read and edited at once.
 AT_ONCE = 2

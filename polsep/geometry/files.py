@@ -20,16 +20,16 @@ from polsep.geometry.integration import integrate_bilateral, integrate_smooth
 from polsep.geometry.photometric import Appearance, fit_robust
 from polsep.geometry.polarization import Polarized, find_slope, normals_of_slope
 from polsep.geometry.surface import Surface, draw_views, relight, span_surface
-from polsep.io.errors import InputError, input_error
-from polsep.io.frames import ReadOptions, read_frames
-from polsep.io.geometry import ShapeFiles
-from polsep.io.maps import read_map
-from polsep.io.meshes import encode_glb, encode_ply
-from polsep.io.previews import exposure_of, toned
-from polsep.io.separated import SUFFIXES, read_separated
-from polsep.io.videos import WATCHABLE, encode_film, load_library
+from polsep.io.assets.maps import read_map
+from polsep.io.assets.meshes import encode_glb, encode_ply
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.videos import WATCHABLE, encode_film, load_library
+from polsep.io.results.geometry import ShapeFiles
+from polsep.io.results.previews import exposure_of, toned
+from polsep.io.results.separated import SUFFIXES, read_separated
+from polsep.io.store.errors import InputError, input_error
 from polsep.pipeline import separate_capture
-from polsep.report import SeparatedFrame
+from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

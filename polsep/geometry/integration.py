@@ -1,8 +1,8 @@
 """From normals to depth: bilateral normal integration, which keeps jumps, and plain least squares to compare with.
 
-Normals ``[H, W, 3]`` have x right, y up, z to the camera, as in `polsep.render`. Depth counts away from the camera
-along its axis: in pixels around a mean of 0 for an orthographic camera, relative to a mean of 1 for a pinhole. In
-either case q dz/du = a and q dz/dv = b (u right, v down) with
+Normals ``[H, W, 3]`` have x right, y up, z to the camera, as in `polsep.render.sphere_tracing`. Depth counts away from
+the camera along its axis: in pixels around a mean of 0 for an orthographic camera, relative to a mean of 1 for a
+pinhole. In either case q dz/du = a and q dz/dv = b (u right, v down) with
 
 * orthographic: z = depth, q = n_z, a = n_x, b = -n_y;
 * pinhole: z = log(depth), q = -f_u n.r, a = n_x, b = -n_y f_u / f_v, r = ((u - c_u) / f_u, (c_v - v) / f_v, -1) the
@@ -26,7 +26,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from polsep.geometry.multigrid import Multigrid, solve
-from polsep.kernels.slopes import DOWN, LEFT, RIGHT, UP, Places, Wanted, fill_system, fill_weights
+from polsep.geometry.slopes_kernel import DOWN, LEFT, RIGHT, UP, Places, Wanted, fill_system, fill_weights
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -34,13 +34,13 @@ Mask = NDArray[np.bool_]
 #: Steepness k of the bilateral weights. Source: Cao et al. 2022, Sec. 5.
 SHARPNESS = 2.0
 #: Rounds at most, and the relative change of the energy that ends them. Source: the same, with 150 and 1e-4.
-MOST_ROUNDS, LEAST_CHANGE = 100, 1e-4
+MAX_ROUNDS, MIN_CHANGE = 100, 1e-4
 #: Residual of each round's linear system relative to where it starts, and its steps at most.
-TOLERANCE, MOST_STEPS = 0.2, 60
+TOLERANCE, MAX_STEPS = 0.2, 60
 #: Steps after which a multigrid made for the weights of an earlier round is made anew.
 STALE = 6
 #: Normals that are seen at a more grazing angle are taken for this one: q >= this cosine.
-LEAST_COSINE = 0.02
+MIN_COSINE = 0.02
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def find_slopes(normals: Floats, mask: Mask, intrinsics: Floats | None = None) -
         across = (cols - intrinsics[0, 2]) / intrinsics[0, 0]
         upward = (intrinsics[1, 2] - rows) / intrinsics[1, 1]
         cosine = -scale * (x * across + y * upward - z)
-    return Slopes(np.maximum(cosine, LEAST_COSINE * scale), x, -y * ratio, mask)
+    return Slopes(np.maximum(cosine, MIN_COSINE * scale), x, -y * ratio, mask)
 
 
 def integrate_bilateral(normals: Floats, mask: Mask, intrinsics: Floats | None = None) -> Floats:
@@ -74,11 +74,11 @@ def integrate_bilateral(normals: Floats, mask: Mask, intrinsics: Floats | None =
     weights = system.even_weights()
     depth = np.zeros(system.count)
     energy = np.inf
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         depth = system.solve(weights, depth, TOLERANCE)
         before = energy
         weights, energy = system.weigh(depth)
-        if abs(before - energy) <= LEAST_CHANGE * energy or energy <= 1e-12 * system.count:
+        if abs(before - energy) <= MIN_CHANGE * energy or energy <= 1e-12 * system.count:
             break
     return system.as_image(depth, intrinsics is not None)
 
@@ -125,7 +125,7 @@ class Equations:
         matrix, right = self.assemble(weights)
         if self.multigrid is None:
             self.multigrid = Multigrid(matrix, *self.pixels)
-        found, steps = solve(matrix, right, start, self.multigrid, (tolerance, MOST_STEPS))
+        found, steps = solve(matrix, right, start, self.multigrid, (tolerance, MAX_STEPS))
         if steps > STALE:
             self.multigrid = None
         return found

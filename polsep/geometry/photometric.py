@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from polsep.geometry.polarization import Cue
-from polsep.optics import fresnel
+from polsep.physics.optics import fresnel
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -39,7 +39,7 @@ ROUNDS, OUTLYING = 12, 2.0
 #: Pixels (sigma) that choose together which of a cue's normals is meant.
 NEIGHBOURS = 2.0
 #: Least cosine toward the camera: what is seen at more than 84 degrees is a pixel wide and mixed with what is behind.
-LEAST_COSINE = 0.1
+MIN_COSINE = 0.1
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def _facing(vectors: Floats) -> Floats:
     """Unit normals along ``vectors [P, 3]`` that face the camera; straight at it where a vector is 0."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     unit = np.where(length > 0, vectors / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
-    unit[:, 2] = np.maximum(unit[:, 2], LEAST_COSINE)
+    unit[:, 2] = np.maximum(unit[:, 2], MIN_COSINE)
     facing: Floats = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
     return facing
 

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from polsep.optics import diffuse_dolp
+from polsep.physics.optics import diffuse_dolp
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,7 +32,7 @@ REACH, ROUNDS = 1.0, 5
 #: Deviation of slopes as found on four test objects: 0.004 to 0.017 (docs/experiments.md).
 SLOPE_DEVIATION = 0.015
 #: Least deviation of a normal by polarization [rad].
-LEAST_DEVIATION = 0.04
+MIN_DEVIATION = 0.04
 
 
 @dataclass(frozen=True)
@@ -89,5 +89,5 @@ def normals_of_slope(slope: NDArray[np.complex128]) -> Cue:
     steepness = np.interp(zenith, zeniths, np.gradient(curve, zeniths))
     along = np.minimum(SLOPE_DEVIATION / np.maximum(steepness, 1e-6), 1)
     across = np.minimum(np.sin(zenith) * SLOPE_DEVIATION / np.maximum(2 * strength, 1e-6), 1)
-    deviation = np.sqrt((along**2 + across**2) / 2 + LEAST_DEVIATION**2)
+    deviation = np.sqrt((along**2 + across**2) / 2 + MIN_DEVIATION**2)
     return Cue(first, first * np.array([-1.0, -1.0, 1.0]), deviation)

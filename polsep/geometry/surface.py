@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from polsep.geometry.integration import LEAST_COSINE
+from polsep.geometry.integration import MIN_COSINE
 from polsep.geometry.photometric import Appearance
-from polsep.raycast import MeshScene, find_hits
-from polsep.render import PinholeCamera
-from polsep.shapes import Mesh
+from polsep.render.raycast import MeshScene, find_hits
+from polsep.render.shapes import Mesh
+from polsep.render.sphere_tracing import PinholeCamera
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -28,7 +28,7 @@ Integers = NDArray[np.int64]
 #: A rise between neighbours that differs from the one of their normals by this many pixels, and by this share, jumps.
 JUMP, JUMP_SHARE = 1.5, 1.5
 #: Rises of more pixels than this are guessed, not seen; parts with fewer of the triangles than this share are loose.
-MOST_RISE, SMALLEST_PART = 8.0, 0.01
+MAX_RISE, SMALLEST_PART = 8.0, 0.01
 #: The field of view of pictures of a mesh [degrees], and its camera's distance in extents.
 FOV_DEG, DISTANCE = 24.0, 2.9
 #: Toward the light of pictures, in the camera's frame.
@@ -72,7 +72,7 @@ def span_surface(appearance: Appearance, depth: Floats, intrinsics: Floats | Non
 
 def _steady_links(normals: Floats, depth: Floats, mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ...]:
     """Links to the right ``[H, W-1]`` and down ``[H-1, W]`` across which the depth, in pixels, goes on as it should."""
-    cosine = np.maximum(normals[..., 2], LEAST_COSINE)
+    cosine = np.maximum(normals[..., 2], MIN_COSINE)
     steady = []
     for slope, first, second in (
         (normals[..., 0] / cosine, np.s_[:, :-1], np.s_[:, 1:]),
@@ -82,7 +82,7 @@ def _steady_links(normals: Floats, depth: Floats, mask: NDArray[np.bool_]) -> tu
         largest = np.maximum(np.abs(slope[first]), np.abs(slope[second]))
         with np.errstate(invalid="ignore"):
             rise = depth[second] - depth[first]
-            goes_on = (np.abs(rise - expected) <= JUMP + JUMP_SHARE * largest) & (np.abs(rise) <= MOST_RISE)
+            goes_on = (np.abs(rise - expected) <= JUMP + JUMP_SHARE * largest) & (np.abs(rise) <= MAX_RISE)
         steady.append(mask[first] & mask[second] & goes_on)
     return tuple(steady)
 

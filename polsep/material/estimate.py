@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from polsep.io.weights import is_shipped, read_weights, shipped_weights
+from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
+from polsep.material.network import MaterialNetwork, MaterialSize
 from polsep.material.shots import INPUTS
-from polsep.material_network import MaterialNetwork, MaterialSize
-from polsep.svbrdf import Svbrdf, unstack
+from polsep.material.svbrdf import Svbrdf, unstack
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import torch
 
-from polsep.io.examples import has_example, read_example, write_example
+from polsep.io.store.examples import has_example, read_example, write_example
 from polsep.material.shots import INPUTS, Example, random_example
-from polsep.svbrdf import STACKED
+from polsep.material.svbrdf import STACKED
 
 #: Planes of one view.
 PLANES = max(part.stop for part in INPUTS.values())

@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from polsep.io.errors import InputError, input_error
-from polsep.io.frames import ReadOptions, output_stem, read_frames
-from polsep.io.materials import MaterialFiles, material_targets, write_material
-from polsep.io.outputs import OutputError, refuse_targets
-from polsep.io.previews import Panel, Pixels, titled_sheet, toned
-from polsep.io.separated import read_separated
+from polsep.io.raw.frames import ReadOptions, output_stem, read_frames
+from polsep.io.results.materials import MaterialFiles, material_targets, write_material
+from polsep.io.results.outputs import OutputError, refuse_targets
+from polsep.io.results.previews import Panel, Pixels, titled_sheet, toned
+from polsep.io.results.separated import read_separated
+from polsep.io.store.errors import InputError, input_error
 from polsep.material.estimate import load_estimator
 from polsep.material.shots import CAMERA_HEIGHT, MAP_SIZE
+from polsep.material.svbrdf import Svbrdf, plane_points, relight
 from polsep.pipeline import LightColor, separate_capture
-from polsep.svbrdf import Svbrdf, plane_points, relight
 
 Floats = NDArray[np.float32]
 
 #: Median of the separated diffuse images of training, 1 = white paper: what an unknown exposure is taken for.
 USUAL_DIFFUSE = 0.29
 #: Sides that maps may have.
-LEAST_SIZE, LARGEST_SIZE = 32, 1024
+MIN_SIZE, LARGEST_SIZE = 32, 1024
 #: Where the lights of the preview are, and the side of its pictures in pixels.
 PREVIEW_LIGHTS = ((0.0, 0.0, 2.75), (-1.2, 0.8, 1.8), (1.3, 0.9, 1.5), (1.0, -1.3, 1.2), (-1.6, -0.6, 0.9))
 PREVIEW_SIDE = 256
@@ -51,8 +51,8 @@ class MaterialOptions:
     weights: Path | None = None
 
     def __post_init__(self) -> None:
-        if not LEAST_SIZE <= self.size <= LARGEST_SIZE:
-            raise ValueError(f"expected a size of {LEAST_SIZE} to {LARGEST_SIZE} pixels, found {self.size}")
+        if not MIN_SIZE <= self.size <= LARGEST_SIZE:
+            raise ValueError(f"expected a size of {MIN_SIZE} to {LARGEST_SIZE} pixels, found {self.size}")
         if not all(0 < level < float("inf") for level in self.white):
             raise ValueError(f"expected levels of white above 0, found {', '.join(f'{x:g}' for x in self.white)}")
 

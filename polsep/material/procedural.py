@@ -1,4 +1,4 @@
-"""Random materials of a plane: layers of `polsep.materials` under random masks, with heights of the same patterns.
+"""Random materials of a plane: layers of `render.materials` under random masks, with heights of the same patterns.
 
 Everything is drawn from one generator, on every machine alike. No photograph and no library of materials is in it.
 Source: the idea of mixing procedural materials is Deschaintre et al. 2018, Sec. 4.1; these are this project's own.
@@ -12,10 +12,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from polsep.materials import random_materials
-from polsep.optics import fresnel, normalize
-from polsep.svbrdf import Svbrdf, plane_points
-from polsep.textures import PLAIN, pattern_weight
+from polsep.material.svbrdf import Svbrdf, plane_points
+from polsep.physics.optics import fresnel, normalize
+from polsep.render.materials import random_materials
+from polsep.render.textures import PLAIN, pattern_weight
 
 #: Layers of a material, and how often there are 1, 2, 3; each has a texture of its own, and a mask.
 LAYERS, LAYER_SHARES = 3, (0.3, 0.4, 0.3)
@@ -24,7 +24,7 @@ GLASS = 0.04
 #: By what the specular strength of a layer, 0.5 to 1, is multiplied; log-uniform: indices of refraction of 1.3 to 1.9.
 GAINS = (0.5, 2.5)
 #: Roughness at least: below it, the mirror image of a small flash is no more than a point.
-LEAST_ROUGHNESS = 0.12
+MIN_ROUGHNESS = 0.12
 #: Share of flat materials; rms slope of the others, log-uniform; no slope is steeper than the last number.
 FLAT_SHARE, SLOPES, STEEPEST = 0.08, (0.03, 0.45), 2.0
 #: How often a pattern that colours the material has height, too, and how many patterns have nothing but height.
@@ -66,7 +66,7 @@ def random_svbrdf(size: int, generator: torch.Generator) -> Svbrdf:
     passed = fresnel(torch.ones(1)).t_plus ** 2
     diffuse = albedo * passed / (1 - specular)
     normal = _normals(_random_height(patterns, generator), generator)
-    return Svbrdf(normal, diffuse, roughness.clamp(min=LEAST_ROUGHNESS), specular.expand(3, -1, -1))
+    return Svbrdf(normal, diffuse, roughness.clamp(min=MIN_ROUGHNESS), specular.expand(3, -1, -1))
 
 
 def _random_height(patterns: list[Tensor], generator: torch.Generator) -> Tensor:

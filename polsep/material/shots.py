@@ -1,9 +1,9 @@
 """Photographs of flat materials by a polarization camera with a polarized flash, and what the networks see of them.
 
-The camera looks straight down at the plane of `polsep.svbrdf`, whose sides fill the frame; a point light behind a
-polarizer is near the lens, as a flash is, or anywhere above. Light follows `optics`, the frame the camera model with
-noise, and the frame is separated by `METHOD`. Images are divided by what white paper in the middle would show, as a
-photograph of white paper under the same light tells: 1 is white.
+The camera looks straight down at the plane of `polsep.material.svbrdf`, whose sides fill the frame; a point light
+behind a polarizer is near the lens, as a flash is, or anywhere above. Light follows `optics`, the frame the camera
+model with noise, and the frame is separated by `METHOD`. Images are divided by what white paper in the middle would
+show, as a photograph of white paper under the same light tells: 1 is white.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from polsep.camera import IMX250, Layout, Mosaic
-from polsep.guided import demosaic_guided_half
+from polsep.demosaic.guided import demosaic_guided_half
 from polsep.material.procedural import GLASS, halve, random_svbrdf
+from polsep.material.svbrdf import Svbrdf, plane_points
 from polsep.methods import METHODS
-from polsep.optics import fresnel
+from polsep.physics.optics import fresnel
 from polsep.pipeline import separate_known
-from polsep.render import GBuffer, PinholeCamera, PointLight, Scene, Vector, shade
-from polsep.simulate import blur, capture, expose_to_clip, expose_to_level, half_resolution
-from polsep.svbrdf import Svbrdf, plane_points
-from polsep.views import BLURS, scene_seed
+from polsep.render.simulate import blur, capture, expose_to_clip, expose_to_level, half_resolution
+from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Scene, Vector, shade
+from polsep.render.views import BLURS, scene_seed
+from polsep.sensor.camera import IMX250, Layout, Mosaic
 
 #: How high the camera is above a plane of sides 2.
 CAMERA_HEIGHT = 2.75
@@ -33,7 +33,7 @@ CAMERA = PinholeCamera((0.0, 0.0, CAMERA_HEIGHT), (0.0, 0.0, 0.0), 2 * math.degr
 #: How far a flash is from the lens at most, along every axis, and where a light that is moved may be.
 FLASH, AROUND, HEIGHTS = 0.15, 1.4, (1.8, 3.2)
 #: Shares of the samples that clip at most, and the least level of the median one, white at 1.
-LARGEST_CLIPPED, LEAST_LEVEL = 0.03, 0.06
+LARGEST_CLIPPED, MIN_LEVEL = 0.03, 0.06
 #: What separates the frames: the best method that polsep ships.
 METHOD = "joint"
 #: Log of what the level of white paper is off by, standard deviation.
@@ -87,7 +87,7 @@ def photograph(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> t
     place, share = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
     scene = blur(Scene(diffuse, specular, everywhere[0]), low + (high - low) * place)
     exposed = expose_to_clip(scene, LARGEST_CLIPPED * share, Layout(), IMX250)
-    exposed = expose_to_level(exposed, LEAST_LEVEL, Layout(), IMX250)
+    exposed = expose_to_level(exposed, MIN_LEVEL, Layout(), IMX250)
     gain = float(exposed.diffuse.s0.mean() / scene.diffuse.s0.mean())
     distance = math.dist(light.position, (0, 0, 0))
     white = gain * light.intensity / distance**2 * light.position[2] / distance / math.pi

@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from polsep.io.checkpoints import read_module
-from polsep.io.weights import write_weights
-from polsep.joint import Demosaicker
-from polsep.networks import ResidualSize, Size, count_parameters
+from polsep.io.store.checkpoints import read_module
+from polsep.io.store.weights import write_weights
+from polsep.networks.joint import Demosaicker
+from polsep.networks.unet import ResidualSize, Size, count_parameters
 from polsep.train.joint_task import ABLATIONS, DEMOSAICKERS, PARTS, SIZES, VIEWS, hold_others, joint_task
 from polsep.train.joint_views import JointSeen
 from polsep.train.log import curve_of, read_log, references_of
@@ -52,7 +52,7 @@ DATA_MODULES = (
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """What is trained: a ``rung`` of `refine.RUNGS` on a ``variant`` of the data, of which size, from which seed.
+    """What is trained: a ``rung`` of `paper.RUNGS` on a ``variant`` of the data, of which size, from which seed.
 
     Raises ValueError on a rung or variant that there is not.
     """

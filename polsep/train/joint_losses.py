@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from polsep.joint import Images, Pose, predict_samples
+from polsep.networks.joint import Images, Pose, predict_samples
 from polsep.train.joint_views import JointSeen, find_clipped
 from polsep.train.losses import diffuse_loss
 
 #: Mean squared error below which a crop counts as done: 60 dB, which crops with hardly any specular light reach.
-LEAST_ERROR = 1e-6
+MIN_ERROR = 1e-6
 #: Weight of pixels off the object, against 1 on it.
 BACKGROUND = 0.05
 #: Weights, against dB at half resolution, of dB at full resolution, of dB of log(1 + light) and of the samples' misfit.
@@ -30,7 +30,7 @@ FULL_WEIGHT, BEYOND_WEIGHT, DATA_WEIGHT = 0.5, 0.3, 1.0
 DATA_SCALE = 0.02
 #: Squared error, in variances expected of it, from which on the likelihood grows as a logarithm.
 SURPRISE = 50.0
-#: The sum, in dB, times this gives gradients of about the size of the other networks' (`loop.MOST_GRADIENT`).
+#: The sum, in dB, times this gives gradients of about the size of the other networks' (`loop.MAX_GRADIENT`).
 LOSS_SCALE = 0.1
 
 #: How far images are from the truth ``[B, C, h, w]``, under weights ``[B, 1, h, w]``.
@@ -38,14 +38,14 @@ Difference = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def mean_decibels(found: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
-    """Minus the mean PSNR over crops, limited to white and by `LEAST_ERROR`."""
+    """Minus the mean PSNR over crops, limited to white and by `MIN_ERROR`."""
     return _mean_logarithm((found.clamp(max=1) - truth.clamp(max=1)) ** 2, weight)
 
 
 def _mean_logarithm(squared: Tensor, weight: Tensor) -> Tensor:
     """Of the mean of each crop, in dB."""
     mean = (squared * weight).mean(dim=(1, 2, 3)) / weight.mean(dim=(1, 2, 3))
-    return 10 / math.log(10) * torch.log(mean + LEAST_ERROR).mean()
+    return 10 / math.log(10) * torch.log(mean + MIN_ERROR).mean()
 
 
 def paper_difference(found: Tensor, truth: Tensor, weight: Tensor) -> Tensor:

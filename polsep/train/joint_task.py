@@ -11,12 +11,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d, pad, pixel_unshuffle, unfold
 
-from polsep.camera import Layout, Mosaic
-from polsep.demosaic import demosaic_bilinear_half
-from polsep.joint import INPUTS, Demosaicker, Joint, bilinear_filter
-from polsep.networks import ResidualSize
-from polsep.separation import Separation
-from polsep.stokes import Measurements, Stokes
+from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.networks.joint import INPUTS, Demosaicker, Joint, bilinear_filter
+from polsep.networks.unet import ResidualSize
+from polsep.physics.stokes import Measurements, Stokes
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.separation.analytic import Separation
 from polsep.train.joint_losses import Goal, joint_loss, paper_difference
 from polsep.train.joint_views import JointSeen, find_clipped, see_raw, see_raw_mono
 from polsep.train.stream import StreamOptions, stream_lane
@@ -31,7 +31,7 @@ MARGIN = 8
 #: Batches that the filter is fitted to, from a pool of so many scenes, of a lane that no worker has.
 FIT_BATCHES, FIT_POOL, FIT_LANE = 60, 24, 120
 #: Light around below which a pixel says nothing about the filter, and what is added to that light.
-LEAST_FIT, FIT_FLOOR = 0.01, 0.02
+MIN_FIT, FIT_FLOOR = 0.01, 0.02
 #: Raw pixels that the filter reaches beyond a pixel or cell: what lies farther would improve s0 by 2 %, polarization
 #: by 1 %, at more than twice the cost (docs/experiments.md).
 FIT_REACH = 3
@@ -167,7 +167,7 @@ def _fit_samples(view: JointSeen) -> tuple[Tensor, Tensor]:
     light = 2 * avg_pool2d(planes.mean(dim=1, keepdim=True), 3, 1, 1, count_include_pad=False)
     clipped = max_pool2d(pixel_unshuffle(find_clipped(view.raw).float(), 4).amax(dim=1, keepdim=True), 3, 1, 1) > 0
     inside = pixel_unshuffle(view.weight, 4).amin(dim=1, keepdim=True) > 0
-    kept = (inside & ~clipped & (light > LEAST_FIT)).flatten()
+    kept = (inside & ~clipped & (light > MIN_FIT)).flatten()
     size = (light.flatten()[kept] + FIT_FLOOR)[:, None]
     around = unfold(pad(planes, (1, 1, 1, 1), mode="replicate"), 3).transpose(1, 2).flatten(0, 1)
     wanted = wanted.flatten(2).transpose(1, 2).flatten(0, 1)

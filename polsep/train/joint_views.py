@@ -7,7 +7,7 @@ from typing import NamedTuple
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from polsep.camera import CLIP_MARGIN, Layout
+from polsep.sensor.camera import CLIP_MARGIN, Layout
 from polsep.train.stream import Examples
 from polsep.train.tasks import MONO, expose_mono, whole_cells
 

@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from polsep.io.checkpoints import append_line, read_lines, write_lines
-from polsep.io.events import EventWriter, add_events, open_events
+from polsep.io.store.checkpoints import append_line, read_lines, write_lines
+from polsep.io.store.events import EventWriter, add_events, open_events
 from polsep.train.validation import REFERENCES
 
 Line = dict[str, Any]

@@ -20,9 +20,9 @@ from lightning_fabric.plugins import MixedPrecision
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from polsep.io.checkpoints import read_checkpoint, write_checkpoint
-from polsep.io.weights import read_weights
-from polsep.kernels.threads import set_threads
+from polsep.compute.threads import set_threads
+from polsep.io.store.checkpoints import read_checkpoint, write_checkpoint
+from polsep.io.store.weights import read_weights
 from polsep.train.log import Report, open_log
 from polsep.train.optimizers import Optimizers
 from polsep.train.stream import Examples, ExampleStream, StreamOptions
@@ -32,7 +32,7 @@ from polsep.train.validation import score, score_averaged, score_references, val
 #: The learning rate ends at this share of its peak.
 LAST_SHARE = 0.01
 #: Norm of a network's gradient at most. Usual ones are 13 to 42, so only outliers are cut.
-MOST_GRADIENT = 100.0
+MAX_GRADIENT = 100.0
 #: A batch: a named tuple of tensors.
 Batch = TypeVar("Batch", bound=tuple[Any, ...])
 
@@ -168,7 +168,7 @@ def train_course(course: Course, run: Run, report: Report) -> dict[str, Tensor] 
             loss = course.loss(wrapped, _to(fabric.device, next(batches)), step / run.schedule.steps)
             fabric.backward(loss)
             for net in _parts(network):
-                nn.utils.clip_grad_norm_(net.parameters(), MOST_GRADIENT)
+                nn.utils.clip_grad_norm_(net.parameters(), MAX_GRADIENT)
             optimizer.step(rate)
             step += 1
             follow(average, network, min(run.schedule.average, (1 + step) / (10 + step)))

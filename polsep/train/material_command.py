@@ -12,11 +12,11 @@ from typing import Any
 
 import torch
 
-from polsep.io.checkpoints import read_module
-from polsep.io.weights import write_weights
+from polsep.io.store.checkpoints import read_module
+from polsep.io.store.weights import write_weights
 from polsep.material.examples import make_examples
-from polsep.material_network import MaterialSize
-from polsep.networks import count_parameters
+from polsep.material.network import MaterialSize
+from polsep.networks.unet import count_parameters
 from polsep.train.command import check_run, describe_start
 from polsep.train.log import read_log
 from polsep.train.loop import Run, Schedule, train_course

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polsep.svbrdf import Svbrdf, plane_points, relight, unstack
+from polsep.material.svbrdf import Svbrdf, plane_points, relight, unstack
 
 #: Pictures under lights from anywhere, and with light and camera as in a mirror.
 RANDOM, MIRRORED = 3, 6

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from polsep.material.examples import example_path, load_example
+from polsep.material.network import MaterialNetwork, MaterialSize
 from polsep.material.shots import INPUTS, Example
-from polsep.material_network import MaterialNetwork, MaterialSize
-from polsep.svbrdf import unstack
+from polsep.material.svbrdf import unstack
 from polsep.train.loop import Course
 from polsep.train.material_losses import (
     maps_loss,

@@ -15,12 +15,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from polsep.material_network import MaterialNetwork
-from polsep.networks import ResidualUNet, UNet
+from polsep.material.network import MaterialNetwork
+from polsep.networks.unet import ResidualUNet, UNet
 
 WEIGHT_DECAY, BETAS = 1e-4, (0.9, 0.99)
 #: Smaller matrices are nearly all directions that matter; AdamW serves them as well.
-LEAST_SIDE = 16
+MIN_SIDE = 16
 
 
 class Optimizers:
@@ -71,7 +71,7 @@ def hidden_weights(network: nn.Module) -> Iterator[Tensor]:
         if isinstance(module, (UNet, ResidualUNet, MaterialNetwork)):
             last = set() if isinstance(module, ResidualUNet) else {id(weight) for weight in module.last.parameters()}
             for weight in module.parameters():
-                if weight.ndim == 4 and id(weight) not in last and min(as_matrix(weight).shape) >= LEAST_SIDE:
+                if weight.ndim == 4 and id(weight) not in last and min(as_matrix(weight).shape) >= MIN_SIDE:
                     yield weight
 
 

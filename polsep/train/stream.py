@@ -22,12 +22,13 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from polsep.camera import IMX250, Layout, Mosaic, Sensor
-from polsep.materials import random_materials
-from polsep.raycast import MeshScene, find_view, light_view, shade_view
-from polsep.render import Scene
-from polsep.simulate import HEADROOM, blur, filter_light
-from polsep.stokes import Stokes
+from polsep.physics.stokes import Stokes
+from polsep.render.materials import random_materials
+from polsep.render.raycast import MeshScene, find_view, light_view, shade_view
+from polsep.render.simulate import HEADROOM, blur, filter_light
+from polsep.render.sphere_tracing import Scene
+from polsep.render.views import MIN_LEVEL, random_shot, scene_seed, seeded_shape
+from polsep.sensor.camera import IMX250, Layout, Mosaic, Sensor
 from polsep.train.variety import (
     Look,
     find_sheen,
@@ -40,7 +41,6 @@ from polsep.train.variety import (
     vary_retention,
     vary_shot,
 )
-from polsep.views import LEAST_LEVEL, random_shot, scene_seed, seeded_shape
 
 #: Views of a shape, and lights with materials of their own under which each is seen.
 VIEWS, LOOKS = 2, 3
@@ -58,11 +58,11 @@ LEVEL_SHARE, GLARING_SHARE, GLARING, LEVELS = 0.2, 0.8, (0.003, 10.0), (0.05, 0.
 #: highlights and white surfaces clip, which must be told apart.
 BRIGHT_SHARE, BRIGHT_PIXELS = 0.3, 0.02
 #: A crop is drawn anew, at most so many times, while less than this share of it is on objects.
-LEAST_COVERED, MOST_DRAWS = 0.6, 4
+MIN_COVERED, MAX_DRAWS = 0.6, 4
 
 
 #: Light at most, in white levels, so that half precision holds it.
-MOST_LIGHT = 2.0**14
+MAX_LIGHT = 2.0**14
 
 #: What examples show: all that `variety` has; or, as the paper's training data, smooth surfaces of usual gloss whose
 #: diffuse light is as polarized as Fresnel says, without what keeps the lamp's polarization.
@@ -269,7 +269,7 @@ def random_crop(pool: deque[Pooled], crop: int, generator: torch.Generator) -> C
 def expose_crops(crops: list[Crop], generator: torch.Generator) -> Examples:
     """A batch of crops as the sensor records them, and the truth."""
     factors = torch.stack([crop.factors for crop in crops])[..., None, None]
-    light = (torch.stack([crop.light for crop in crops]).float() * factors).clamp(-MOST_LIGHT, MOST_LIGHT)
+    light = (torch.stack([crop.light for crop in crops]).float() * factors).clamp(-MAX_LIGHT, MAX_LIGHT)
     diffuse, specular = light[:, :3], light[:, 9:10]
     s1, s2 = light[:, 3:6] + light[:, 10:11], light[:, 6:9] + light[:, 11:12]
     signal = filter_light(Stokes(diffuse + specular, s1, s2), Layout(), IMX250)
@@ -286,11 +286,11 @@ def _random_place(scene: Pooled, crop: int, generator: torch.Generator) -> tuple
     """A crop about a random pixel of the object, as far as the frame allows, with much of the object in it."""
     bright = float(torch.rand(1, generator=generator)) < BRIGHT_SHARE
     places = scene.bright if bright else scene.places
-    for _ in range(MOST_DRAWS):
+    for _ in range(MAX_DRAWS):
         center = places[_integer(len(places), generator)].tolist()
         starts = [min(max(c - crop // 2, 0), n - crop) for c, n in zip(center, scene.mask.shape, strict=True)]
         rows, cols = (slice(start, start + crop) for start in starts)
-        if float(scene.mask[rows, cols].float().mean()) >= LEAST_COVERED:
+        if float(scene.mask[rows, cols].float().mean()) >= MIN_COVERED:
             break
     return rows, cols
 
@@ -309,7 +309,7 @@ def random_gain(scene: Pooled, generator: torch.Generator) -> float:
     else:
         share = CLIPPED[0] + (CLIPPED[1] - CLIPPED[0]) * place**2
         gain = 1 / max(float(scene.brightness[_rank(share)]), 1e-6)
-    return float(max(gain, LEAST_LEVEL / scene.level))
+    return float(max(gain, MIN_LEVEL / scene.level))
 
 
 def _rank(share: float) -> int:

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
-from polsep.camera import IMX250, Layout, Mosaic
-from polsep.demosaic import demosaic_bilinear_half
-from polsep.networks import Size
-from polsep.refine import RUNGS, Refinement, Rung, separate_refined
-from polsep.separation import Separation
-from polsep.simulate import filter_light
-from polsep.stokes import Measurements, Stokes, measure
+from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.networks.paper import RUNGS, Refinement, Rung, separate_refined
+from polsep.networks.unet import Size
+from polsep.physics.stokes import Measurements, Stokes, measure
+from polsep.render.simulate import filter_light
+from polsep.sensor.camera import IMX250, Layout, Mosaic
+from polsep.separation.analytic import Separation
 from polsep.train.losses import diffuse_loss, first_specular_loss, specular_loss
 from polsep.train.stream import ANGLES, Examples, StreamOptions, add_gaussian_noise, as_mosaic
 from polsep.train.variety import random_sensor

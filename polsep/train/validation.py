@@ -13,10 +13,10 @@ from functools import lru_cache
 import torch
 from torch import Tensor, nn
 
-from polsep.color_affine import separate_color_affine
 from polsep.metrics import psnr
-from polsep.separation import Separation, separate_analytic
-from polsep.stokes import Measurements
+from polsep.physics.stokes import Measurements
+from polsep.separation.analytic import Separation, separate_analytic
+from polsep.separation.color_affine import separate_color_affine
 from polsep.train.stream import Examples, ExampleStream, StreamOptions
 from polsep.train.tasks import Task, View
 

@@ -1,4 +1,4 @@
-"""What training examples have beyond `polsep.views`: close-ups, relief, grey, plain, matte and rough objects, cameras.
+"""What training examples have beyond `render.views`: close-ups, relief, grey, plain, matte and rough objects, cameras.
 
 Whoever uses a trained network photographs more than objects that fill the frame, by one camera. Draws take a generator.
 """
@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from polsep.camera import IMX250, Sensor
-from polsep.kernels.relief import Relief, roughen_normals
-from polsep.materials import Materials
-from polsep.raycast import MeshScene, View, find_view, light_view, shade_view
-from polsep.render import PointLight, Scene, pixel_side
-from polsep.stokes import Stokes
-from polsep.views import LEAST_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
+from polsep.physics.stokes import Stokes
+from polsep.render.materials import Materials
+from polsep.render.raycast import MeshScene, View, find_view, light_view, shade_view
+from polsep.render.relief_kernel import Relief, roughen_normals
+from polsep.render.sphere_tracing import PointLight, Scene, pixel_side
+from polsep.render.views import MIN_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
+from polsep.sensor.camera import IMX250, Sensor
 
 #: Share of the views that show a part of the object, and how many times larger than the whole, log-uniform.
 CLOSE_SHARE, MAGNIFICATIONS = 0.5, (1.0, 5.0)
@@ -43,7 +43,7 @@ DEPOLARIZED_SHARE, UNPOLARIZED_SHARE = 0.4, 0.3
 RETAINING_SHARE, RETAINED = 0.6, (0.002, 0.03)
 #: Share of these in which how much is kept follows a rough lobe over the surface instead of being the same everywhere,
 #: as on painted and paper things. The lobe's roughness, and its most over its median.
-SHEEN_SHARE, SHEEN_ROUGHNESS, MOST_SHEEN = 0.6, (0.5, 1.0), 4.0
+SHEEN_SHARE, SHEEN_ROUGHNESS, MAX_SHEEN = 0.6, (0.5, 1.0), 4.0
 #: Saturation that near-grey and near-white looks keep, at most; the largest albedo of white ground at least.
 GREY_SATURATION, WHITE = 0.15, 0.6
 #: Standard deviation of the lens's point spread in raw pixels: that of `views.BLURS` and, slightly defocused, more.
@@ -55,13 +55,13 @@ BITS, BITS_SHARES = (8, 10, 12), (0.15, 0.15, 0.7)
 #: Share of the views with fine relief. Pixels along its largest cells and tangent of its tilt, log-uniform; octaves at
 #: most, while the finest cells are no smaller than the limit.
 RELIEF_SHARE, RELIEF_PIXELS, RELIEF_TILTS = 0.5, (3.0, 60.0), (0.05, 0.6)
-MOST_OCTAVES, LEAST_CELL = 3, 2.5
+MAX_OCTAVES, MIN_CELL = 3, 2.5
 #: Lights are drawn anew, at most so many times, while they leave most of a view dark.
-MOST_DRAWS = 10
+MAX_DRAWS = 10
 
 
 class Look(NamedTuple):
-    """What `raycast.shade_view` takes: a view, its materials, a light, and what that reaches."""
+    """What `render.raycast.shade_view` takes: a view, its materials, a light, and what that reaches."""
 
     view: View
     materials: Materials
@@ -88,9 +88,9 @@ def vary_shot(shape: MeshScene, shot: Shot, generator: torch.Generator) -> Shot:
 
 def relight(shape: MeshScene, shot: Shot, generator: torch.Generator) -> PointLight:
     """Another light for a shot, one that reaches much of what is seen."""
-    for _ in range(MOST_DRAWS):
+    for _ in range(MAX_DRAWS):
         light = random_light(shot.camera, shape.size / 2, generator)
-        if lit_share(shape, replace(shot, light=light)) >= LEAST_LIT:
+        if lit_share(shape, replace(shot, light=light)) >= MIN_LIT:
             break
     return light
 
@@ -105,11 +105,11 @@ def vary_normals(view: View, generator: torch.Generator) -> View:
     eye = torch.tensor(view.camera.position, dtype=torch.float32)
     distance = float((torch.cat(positions, dim=1) - eye[:, None]).norm(dim=0).median())
     pixels = RELIEF_PIXELS[0] * (RELIEF_PIXELS[1] / RELIEF_PIXELS[0]) ** width
-    most = 1 + int(math.log2(pixels / LEAST_CELL))
+    most = 1 + int(math.log2(pixels / MIN_CELL))
     relief = Relief(
         frequency=1 / (pixels * distance * pixel_side(view.camera, view.size[0])),
         strength=RELIEF_TILTS[0] * (RELIEF_TILTS[1] / RELIEF_TILTS[0]) ** tilt,
-        octaves=min(most, 1 + int(MOST_OCTAVES * octaves)),
+        octaves=min(most, 1 + int(MAX_OCTAVES * octaves)),
         seed=seed,
     )
     bands = []
@@ -185,7 +185,7 @@ def vary_retention(scene: Scene, sheen: Callable[[float], Stokes], generator: to
 def find_sheen(look: Look, roughness: float) -> Stokes:
     """Specular light ``[1, H, W]`` of an even ``roughness``, relative to the diffuse light of white, 1 in the median.
 
-    At most `MOST_SHEEN`, and 0 where no light falls.
+    At most `MAX_SHEEN`, and 0 where no light falls.
     """
     slots = look.materials.roughness.numel()
     white = Materials(torch.ones(slots, 3), torch.full((slots,), roughness), torch.ones(slots))
@@ -194,7 +194,7 @@ def find_sheen(look: Look, roughness: float) -> Stokes:
     lit = diffuse > 0
     ratio = torch.where(lit, lobe.s0 / diffuse.clamp(min=torch.finfo(diffuse.dtype).tiny), 0.0)
     middle = float(ratio[lit].median()) if bool(lit.any()) else 1.0
-    wanted = (ratio / max(middle, 1e-12)).clamp(max=MOST_SHEEN)
+    wanted = (ratio / max(middle, 1e-12)).clamp(max=MAX_SHEEN)
     scale = torch.where(lobe.s0 > 0, wanted / lobe.s0.clamp(min=torch.finfo(diffuse.dtype).tiny), 0.0)
     return lobe.map(lambda s: scale * s)
 

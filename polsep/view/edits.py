@@ -15,8 +15,8 @@ import numpy as np
 
 from polsep.edit import EDITS, Edit, Parameter, Recipe, SeparatedImages, apply, make_edit
 from polsep.edit.images import Maps
-from polsep.io.maps import linear_from_srgb
-from polsep.io.previews import srgb
+from polsep.io.assets.maps import linear_from_srgb
+from polsep.io.results.previews import srgb
 from polsep.view.pictures import Floats, Small
 
 

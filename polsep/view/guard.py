@@ -19,7 +19,7 @@ Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 #: Bytes of the largest message of a page that is no upload.
-MOST_JSON = 1 << 20
+MAX_JSON = 1 << 20
 #: What stands around the file in an upload.
 _AROUND = 1 << 16
 #: Names of this machine.
@@ -74,8 +74,8 @@ class Guard:
                 return
             body += message.get("body", b"")
             more = message.get("more_body", False)
-            if len(body) > MOST_JSON:
-                await _answer(send, 413, f"expected a message of at most {MOST_JSON} bytes")
+            if len(body) > MAX_JSON:
+                await _answer(send, 413, f"expected a message of at most {MAX_JSON} bytes")
                 return
         if names_address(body):
             await _answer(send, 403, "expected files that were uploaded, found an address")

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from polsep.edit import EditError
-from polsep.io.errors import InputError
-from polsep.io.maps import SUFFIXES, read_map
-from polsep.io.pages import at_most
-from polsep.view.opening import MOST_SAMPLES, plain_name
+from polsep.io.assets.maps import SUFFIXES, read_map
+from polsep.io.raw.pages import at_most
+from polsep.io.store.errors import InputError
+from polsep.view.opening import MAX_SAMPLES, plain_name
 from polsep.view.pictures import Floats, shrink
 
 #: Kinds of images in the order of the page.
@@ -47,7 +47,7 @@ def image_name(name: str) -> tuple[str, str]:
 def read_image(kind: str, name: str, path: Path, frame: tuple[int, int], step: int) -> Sent:
     """An image of a page for a frame of the size ``frame`` (height, width), shown at ``step``. Raises InputError."""
     try:
-        with at_most(MOST_SAMPLES):
+        with at_most(MAX_SAMPLES):
             found = read_map(path, kind)
     except ValueError as error:
         raise InputError(str(error).replace(str(path), name)) from error

@@ -12,14 +12,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from polsep.camera import Layout, Mosaic
-from polsep.io.errors import InputError
-from polsep.io.frames import FRAME_FILES, Frame, ReadOptions, read_frames
-from polsep.io.pages import at_most
-from polsep.io.separated import find_numbered, holds_separated, read_separated
+from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, read_frames
+from polsep.io.raw.pages import at_most
+from polsep.io.results.separated import find_numbered, holds_separated, read_separated
+from polsep.io.store.errors import InputError
 from polsep.methods import check_method
 from polsep.pipeline import LightColor, parse_light_color, separate_capture
-from polsep.report import SeparatedFrame
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.separation.report import SeparatedFrame
 from polsep.view.pictures import Histogram, Small, histogram, shrink_frame
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 DEMO = Path(__file__).resolve().parents[1] / "data" / "still_life.png"
 DEMO_WHITE = 4095.0
 #: Samples of the largest frame that is opened: four times a 16-megapixel sensor.
-MOST_SAMPLES = 2**26
+MAX_SAMPLES = 2**26
 #: What the page calls "nothing said": the file, or the type of its samples, decides.
 UNSAID = "from file"
 
@@ -136,7 +136,7 @@ def read_source(sources: tuple[Source, ...], read: ReadOptions, index: int) -> F
     """Frame number ``index`` of a sequence, as its file has it. Raises InputError, in one line that names the file."""
     several = len(sources) > 1
     source = sources[min(index, len(sources) - 1)]
-    with at_most(MOST_SAMPLES), _renamed(source):
+    with at_most(MAX_SAMPLES), _renamed(source):
         if source.separated:
             return read_separated(source.path)
         frame = next(read_frames(source.path, read, 0 if several else index), None)

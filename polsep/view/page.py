@@ -11,8 +11,8 @@ from typing import Any
 
 import gradio as gr
 
-from polsep.io.genicam import PIXEL_FORMATS
-from polsep.io.maps import SUFFIXES
+from polsep.io.assets.maps import SUFFIXES
+from polsep.io.raw.genicam import PIXEL_FORMATS
 from polsep.methods import METHODS
 from polsep.view.answers import HINT, IMAGES, Answers, Parts, Start
 from polsep.view.edits import list_controls
@@ -23,7 +23,7 @@ from polsep.view.session import WANTED, Sessions
 from polsep.view.style import EMPTY, FETCH, STAGE
 
 #: Pages that may wait for a separation; one more is told so.
-MOST_WAITING = 64
+MAX_WAITING = 64
 #: Gradio removes files that no page ended for, looking every so many seconds, when they are so old.
 SWEEP_S = (600, 7200)
 #: Seconds between frames that are played, at least.
@@ -37,7 +37,7 @@ def build_page(sessions: Sessions, start: Start) -> Any:
     with gr.Blocks(title="polsep", analytics_enabled=False, delete_cache=SWEEP_S, fill_width=True) as page:
         parts = _lay_out(start)
         _connect(page, parts, Answers(sessions, parts, start))
-    page.queue(max_size=MOST_WAITING, default_concurrency_limit=4, api_open=False)
+    page.queue(max_size=MAX_WAITING, default_concurrency_limit=4, api_open=False)
     return page
 
 

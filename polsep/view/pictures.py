@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.camera import Mosaic
-from polsep.io.pictures import encode_live, encode_lossless
-from polsep.io.previews import aolp_legend, aolp_wheel, dolp_map, exposure_of, srgb
-from polsep.report import SeparatedFrame
+from polsep.io.results.previews import aolp_legend, aolp_wheel, dolp_map, exposure_of, srgb
+from polsep.io.store.pictures import encode_live, encode_lossless
+from polsep.sensor.camera import Mosaic
+from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float32]
 Pixels = NDArray[np.uint8]

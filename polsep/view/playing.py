@@ -1,6 +1,6 @@
 """Frames of sequences that are being played: separated ahead by one thread for all pages, kept at screen size.
 
-What is kept is half floats, at most `MOST_BYTES` of all pages together, those that nobody saw for longest going first:
+What is kept is half floats, at most `MAX_BYTES` of all pages together, those that nobody saw for longest going first:
 memory does not depend on how long sequences are. A sequence that fits plays from memory from its second turn on.
 """
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from polsep.view.pictures import Small
 
 #: Bytes of all frames that are kept: 90 colour frames, about.
-MOST_BYTES = 512 << 20
+MAX_BYTES = 512 << 20
 #: Frames that are made before they are shown.
 AHEAD = 12
 #: Seconds for which a page that asks no more is still served.
@@ -62,7 +62,7 @@ class Reel:
 class Ahead:
     """State: frames that are kept, and who waits for which. Its methods may be called from several threads."""
 
-    def __init__(self, most_bytes: int = MOST_BYTES) -> None:
+    def __init__(self, most_bytes: int = MAX_BYTES) -> None:
         self._most_bytes = most_bytes
         self._lock = threading.Lock()
         self._kept: OrderedDict[tuple[Reel, int], Packed | Exception] = OrderedDict()

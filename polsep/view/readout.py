@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polsep.camera import Mosaic
-from polsep.report import SeparatedFrame
-from polsep.stokes import Measurements, fit_stokes
+from polsep.physics.stokes import Measurements, fit_stokes
+from polsep.sensor.camera import Mosaic
+from polsep.separation.report import SeparatedFrame
 
 
 @dataclass(frozen=True)

@@ -13,16 +13,16 @@ from pathlib import Path
 
 import torch
 
-from polsep.camera import Layout, Mosaic
-from polsep.io.scratch import drop_folder, make_scratch
+from polsep.io.store.scratch import drop_folder, make_scratch
 from polsep.methods import find_method
 from polsep.pipeline import separate_known
+from polsep.sensor.camera import Layout, Mosaic
 from polsep.view.guard import LOOPBACK, Guard
 from polsep.view.session import Sessions
 from polsep.view.style import CSS, FONTS, MONOSPACE, ON_LOAD
 
 #: Upload limit: 24 frames of 2448x2048 in 16 bits.
-MOST_MB = 240
+MAX_MB = 240
 #: Addresses that stand for all of a machine's.
 ANY_HOST = ("0.0.0.0", "::")
 
@@ -38,7 +38,7 @@ class ViewOptions:
     port: int | None = None
     file: Path | None = None
     settings: dict[str, str] = field(default_factory=dict)
-    most_mb: int = MOST_MB
+    most_mb: int = MAX_MB
 
 
 @contextmanager

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from polsep.edit import EditError, Recipe, apply, recipe_as_data, recipe_as_text
-from polsep.io.edited import EditedFrame, write_edited, write_recipe
-from polsep.io.errors import InputError
-from polsep.io.frames import Frame, ReadOptions
-from polsep.io.maps import read_map
-from polsep.io.outputs import write_separation
-from polsep.io.previews import toned
-from polsep.io.scratch import (
+from polsep.io.assets.maps import read_map
+from polsep.io.raw.frames import Frame, ReadOptions
+from polsep.io.results.edited import EditedFrame, write_edited, write_recipe
+from polsep.io.results.outputs import write_separation
+from polsep.io.results.previews import toned
+from polsep.io.store.errors import InputError
+from polsep.io.store.scratch import (
     Scratch,
     clear_folder,
     drop_file,
@@ -33,7 +33,7 @@ from polsep.io.scratch import (
     keep_upload,
     make_folder,
 )
-from polsep.report import SeparatedFrame
+from polsep.separation.report import SeparatedFrame
 from polsep.view.edits import edit_small
 from polsep.view.images import Sent, image_name, read_image, require_fit
 from polsep.view.opening import (
@@ -51,9 +51,9 @@ from polsep.view.pictures import Small
 from polsep.view.playing import AHEAD, Ahead, Reel
 
 #: Pages that are open at once; beyond, the one idle for longest ends.
-MOST_SESSIONS = 32
+MAX_SESSIONS = 32
 #: Files that a page opens at once.
-MOST_FILES = 1000
+MAX_FILES = 1000
 #: What can be fetched: the separation, its contact sheet, the edited frame, the edits as a file.
 WANTED = ("exr", "png", "edited", "recipe")
 
@@ -232,7 +232,7 @@ class Session:
 class Sessions:
     """All open pages by the key that the browser drew for each; a key that is not here has nothing.
 
-    At most `MOST_SESSIONS` are kept: beyond, the one idle for longest ends. ``most_bytes``: of what a page opens.
+    At most `MAX_SESSIONS` are kept: beyond, the one idle for longest ends. ``most_bytes``: of what a page opens.
     """
 
     def __init__(self, scratch: Scratch, most_bytes: int) -> None:
@@ -250,7 +250,7 @@ class Sessions:
                 kept, fetched = (make_folder(parent, name) for parent in (self.scratch.kept, self.scratch.exchange))
                 self._open[key] = Session(kept, fetched, self._ahead)
             self._open.move_to_end(key)
-            oldest = next(iter(self._open)) if len(self._open) > MOST_SESSIONS else None
+            oldest = next(iter(self._open)) if len(self._open) > MAX_SESSIONS else None
         if oldest is not None:
             self.end(oldest)
         return self._open[key]
@@ -260,8 +260,8 @@ class Sessions:
 
         Raises InputError for what is no upload, or no frame or result.
         """
-        if not 0 < len(sent) <= MOST_FILES:
-            raise InputError(f"expected 1 to {MOST_FILES} files, found {len(sent)}")
+        if not 0 < len(sent) <= MAX_FILES:
+            raise InputError(f"expected 1 to {MAX_FILES} files, found {len(sent)}")
         paths = [find_upload(self.scratch, claimed, self.most_bytes) for claimed, _ in sent]
         if (size := sum(file_size(path) for path in paths)) > self.most_bytes:
             most = self.most_bytes / 2**20

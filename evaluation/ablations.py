@@ -1,0 +1,59 @@
+"""What each idea of the joint network is worth: networks of one size and one training that go without one of them.
+
+Their weights are those of ``polsep train joint-fast --ablation NAME``, shipped in ``polsep/weights/ablations``: from
+one seed, on the same examples, for as many steps. "none" goes without nothing.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+
+from evaluation.scoring import Entry, Protocol, score_sets, see_noisy
+from evaluation.sets import load_sets
+from polsep.bench.rows import Row
+from polsep.io.store.weights import read_weights
+from polsep.methods import Capture
+from polsep.networks.run import load_joint, run_joint
+from polsep.sensor.camera import Mosaic
+from polsep.separation.analytic import Separation
+
+#: Metrics of the table.
+TABLED = ("diffuse PSNR", "specular PSNR", "diffuse PSNR, highlights", "specular PSNR, highlights")
+
+
+def find_ablations() -> dict[str, Path]:
+    """Files of weights by what their network goes without; "none" first."""
+    folder = Path(str(files("polsep") / "weights" / "ablations"))
+    found = {read_weights(path)[1]["ablation"]: path for path in sorted(folder.glob("*.safetensors"))}
+    return {name: found[name] for name in sorted(found, key=lambda name: (name != "none", name))}
+
+
+def ablation_entry(name: str, path: Path) -> Entry:
+    """A network without ``name``, at half resolution."""
+    network = load_joint(path, torch.device("cpu"))
+
+    def separate(capture: Capture) -> Separation:
+        assert isinstance(capture, Mosaic)
+        return run_joint(network, capture, "half")
+
+    return Entry(name, separate)
+
+
+def bench_ablations(data: Path) -> Iterator[Row]:
+    """Scores of the ablated networks on the test sets, noisy mosaics, and on the validation views of their training.
+
+    Raises ValueError without the extras render and bench, and on a scene that does not come out as recorded.
+    """
+    sets, found = load_sets(), find_ablations()
+    for name, path in found.items():
+        for metric, value in json.loads(read_weights(path)[1]["validation"]).items():
+            yield Row("ablations", "validation views", name, metric, value, "dB")
+    entries = tuple(ablation_entry(name, path) for name, path in found.items())
+    for row in score_sets("ablations", sets, data, [Protocol("noisy", see_noisy, entries)]):
+        if row.bench == "ablations/noisy" and row.metric in TABLED:
+            yield Row("ablations", row.case.partition(",")[0], row.method, row.metric, row.value, row.unit)

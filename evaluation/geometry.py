@@ -1,0 +1,49 @@
+"""Shape from six lights: what separation is worth for normals, and what integration makes of true normals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from evaluation.figures import require_matplotlib
+from polsep.bench.rows import Row
+from polsep.io.store.pictures import write_picture
+
+#: Objects of the quick version.
+QUICK = ("bear", "reading", "cow", "spot", "fish", "PowerDrill")
+#: Objects of the pictures, both in the public domain.
+SHOWN = ("spot", "fish")
+
+
+def bench_geometry(data: Path) -> Iterator[Row]:
+    """Normals from six lights by input, and depth from true normals, on statues and scans. Raises ValueError."""
+    yield from _measure(data, None)
+
+
+def bench_geometry_quick(data: Path) -> Iterator[Row]:
+    """`bench_geometry` on six objects."""
+    yield from _measure(data, QUICK)
+
+
+def draw_geometry(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
+    """Write the pictures of docs/geometry.md, of meshes in the public domain, and give their paths."""
+    del rows
+    from evaluation.shape_pictures import draw_subject
+    from evaluation.six_lights import load_subjects
+
+    for number, subject in enumerate(load_subjects(data, SHOWN)):
+        path = folder / f"{subject.name}.jpg"
+        write_picture(path, draw_subject(subject, number))
+        yield path
+
+
+def _measure(data: Path, names: Sequence[str] | None) -> Iterator[Row]:
+    try:
+        from evaluation.shape_scores import measure_depth, measure_normals
+    except ImportError as error:
+        raise ValueError(f"expected the extra bench, found no {error.name}") from None
+    require_matplotlib()
+    if not (data / "diligent_normals").is_dir() or not (data / "meshes").is_dir():
+        raise ValueError(f"expected diligent_normals and meshes in {data}, found none")
+    yield from measure_depth(data)
+    yield from measure_normals(data, names)

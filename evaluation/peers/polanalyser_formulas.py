@@ -1,0 +1,88 @@
+"""polanalyser 3.0.0 beside polsep: equal Stokes vectors, its formulas in our scale, and seconds in one run.
+
+    pip install polanalyser==3.0.0 opencv-python-headless matplotlib
+    python evaluation/peers/polanalyser_formulas.py           # writes results/polanalyser.jsonl
+
+polanalyser's diffuse is Imin, half of the paper's tau_d; its specular, Imax - Imin, equals tau_s, so its two images add
+up to Imax instead of s0. polsep's rows are the same formulas on the same four images.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polanalyser as pa
+import torch
+from recorded import record
+
+import polsep
+from polsep.bench.rows import Row
+from polsep.demosaic.bilinear import demosaic_bilinear
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.physics.stokes import Measurements, fit_stokes
+from polsep.sensor.camera import Layout
+from polsep.separation.analytic import separate_analytic
+
+
+def best_seconds(function: Callable[[], Any], repeats: int = 3) -> float:
+    """Shortest of a few runs."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def peer_chain(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """polanalyser's whole chain at full resolution."""
+    images = pa.demosaicing(raw, pa.COLOR_PolarRGB)
+    stokes = pa.calcStokes(images, np.deg2rad([0, 45, 90, 135]))
+    return pa.cvtStokesToDiffuse(stokes), pa.cvtStokesToSpecular(stokes)
+
+
+def main() -> None:
+    """Measure parity and time, and record the rows."""
+    capture = Path(polsep.__file__).parent / "data" / "still_life.png"
+    mosaic = next(read_frames(capture, ReadOptions(white_level=4095.0))).data
+    raw = mosaic.data.numpy().astype(np.uint16)
+    images = pa.demosaicing(raw, pa.COLOR_PolarRGB)
+    data = torch.from_numpy(np.stack(images).astype(np.float64) / 4095).permute(0, 3, 1, 2)
+    ours = Measurements(data, Layout().angles)
+    theirs = pa.calcStokes([image / 4095 for image in images], np.deg2rad([0, 45, 90, 135]))
+    stokes, split = fit_stokes(ours), separate_analytic(ours)
+    own = np.stack([s.permute(1, 2, 0).numpy() for s in (stokes.s0, stokes.s1, stokes.s2)], -1)
+    diffuse = np.abs(2 * pa.cvtStokesToDiffuse(theirs) - split.diffuse.permute(1, 2, 0).numpy())
+    specular = np.abs(pa.cvtStokesToSpecular(theirs) - split.specular.permute(1, 2, 0).numpy())
+    physical = stokes.s0.permute(1, 2, 0).numpy() >= polarized(stokes)
+    bilinear = demosaic_bilinear(mosaic).data.permute(0, 2, 3, 1).numpy()
+    inner = (slice(None), slice(8, -8), slice(8, -8))
+    apart = np.sqrt(np.mean((bilinear[inner] - np.stack(images)[..., ::-1][inner] / 4095) ** 2))
+    peer_seconds = best_seconds(lambda: peer_chain(raw))
+    own_seconds = best_seconds(lambda: polsep.separate(raw, method="analytic", white_level=4095, full=True))
+    half_seconds = best_seconds(lambda: polsep.separate(raw, method="analytic", white_level=4095))
+    case = "demo capture, 2448x2048"
+    rows = [
+        Row("polanalyser", case, "difference", "Stokes vectors", float(np.abs(theirs - own).max()), "white"),
+        Row("polanalyser", case, "difference", "2 x diffuse where DoLP <= 1", float(diffuse[physical].max()), "white"),
+        Row("polanalyser", case, "difference", "specular where DoLP <= 1", float(specular[physical].max()), "white"),
+        Row("polanalyser", case, "difference", "bilinear demosaicking, rms", float(apart), "white"),
+        Row("polanalyser", case, "polanalyser", "seconds, full resolution", peer_seconds, "s"),
+        Row("polanalyser", case, "polsep analytic", "seconds, full resolution", own_seconds, "s"),
+        Row("polanalyser", case, "polsep analytic", "seconds, half resolution", half_seconds, "s"),
+        Row("polanalyser", case, "polsep analytic", "times faster, half resolution", peer_seconds / half_seconds, "x"),
+    ]
+    record("polanalyser", rows, "python evaluation/peers/polanalyser_formulas.py")
+
+
+def polarized(stokes: polsep.Stokes) -> np.ndarray:
+    """Polarized intensity, channels last."""
+    return torch.hypot(stokes.s1, stokes.s2).permute(1, 2, 0).numpy()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,38 @@
+"""Every method on the fixed test sets: noisy and clean mosaics to half resolution, and noise-free co-sited samples.
+
+Per set the mean over its scenes of every metric of `polsep.metrics`; rows of "sets/scenes" hold the single scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from evaluation.scoring import Protocol, own_entries, score_sets, see_clean, see_co_sited, see_noisy
+from polsep.bench.rows import Row
+from polsep.metrics import require_flip
+
+if TYPE_CHECKING:
+    from polsep.datasets.testsets import Recipe
+
+
+def bench_sets(data: Path) -> Iterator[Row]:
+    """Scores of all methods on the sets of `polsep.datasets.testsets`, of which those that ``data`` lacks are left out.
+
+    Raises ValueError without the extras render and bench, and on a scene that does not come out as recorded.
+    """
+    sets = load_sets()
+    protocols = [Protocol(name, see, own_entries(True)) for name, see in (("noisy", see_noisy), ("clean", see_clean))]
+    protocols.append(Protocol("co-sited", see_co_sited, own_entries(False)))
+    yield from score_sets("sets", sets, data, protocols)
+
+
+def load_sets() -> dict[str, tuple[Recipe, ...]]:
+    """`datasets.testsets.SETS`. Raises ValueError, before anything is measured, without what scenes and scores need."""
+    require_flip()
+    try:
+        from polsep.datasets import testsets
+    except ImportError as error:
+        raise ValueError(f"expected the extra render, found no {error.name}") from None
+    return testsets.SETS

@@ -1,0 +1,204 @@
+"""Statues and scans as a polarization camera records them under six lights, with their true normals.
+
+The six lights stand where `geometry.lights.NAMED` says, but for the errors that a hand makes: each is a point at
+`LIGHT_DISTANCE` radii of the object, turned by up to `LARGEST_TURN_DEG`, brighter or darker by up to `LARGEST_GAIN`,
+behind a polarizer at any angle. Methods are told the named directions alone. Shapes, poses, skins and roughness are
+those of the test set `statues`; shadows are cast. One exposure serves all six frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from polsep.datasets.testsets.casting import LENS_BLUR, SAMPLES, look_at
+from polsep.datasets.testsets.statues import (
+    DILIGENT,
+    DILIGENT_FILES,
+    ROUGHNESSES,
+    SCANS,
+    random_albedo,
+    span_surface,
+    unproject,
+)
+from polsep.geometry.lights import NAMED
+from polsep.io.assets.objects import read_depth, read_intrinsics, read_mask, read_mesh, read_normal_map
+from polsep.physics.stokes import Stokes
+from polsep.render.distances import Field
+from polsep.render.raycast import Hits, MeshScene, find_hits, is_lit
+from polsep.render.shapes import Mesh
+from polsep.render.simulate import blur, capture, filter_light, half_resolution
+from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Scene, camera_axes, shade
+from polsep.sensor.camera import IMX250, Layout, Mosaic
+
+#: Distance of the lights in radii of the object, and what they are off by.
+LIGHT_DISTANCE, LARGEST_TURN_DEG, LARGEST_GAIN = 8.0, 6.0, 0.1
+#: Share of the brightest frame's samples on the object that clip.
+CLIPPED = 0.01
+#: Raw pixels per side; rows that are shaded together.
+SIDE, ROWS_AT_ONCE = 512, 64
+#: Seed of the first object.
+SEED = 9000
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is photographed: a mesh around the origin, its camera, the colours and the roughness of its skin."""
+
+    name: str
+    mesh: MeshScene
+    camera: PinholeCamera
+    albedo: Field
+    roughness: float
+
+
+@dataclass(frozen=True)
+class Shoot:
+    """Six frames of a subject and their truth at half resolution.
+
+    ``mosaics``; exposed exact ``scenes`` at raw resolution; ``normals [h, w, 3]`` with x right, y up, z to the camera;
+    the object's ``mask [h, w]``; ``directions [6, 3]``: toward the true lights from the object's middle.
+    """
+
+    name: str
+    mosaics: tuple[Mosaic, ...]
+    scenes: tuple[Scene, ...]
+    normals: NDArray[np.float64]
+    mask: NDArray[np.bool_]
+    directions: NDArray[np.float64]
+
+    def perfect(self) -> list[Tensor]:
+        """The true diffuse images ``[3, h, w]``."""
+        return [half_resolution(scene)[0] for scene in self.scenes]
+
+
+def load_subjects(data: Path, names: Sequence[str] | None = None) -> list[Subject]:
+    """The objects of the test set `statues`, or those of ``names`` (bear, spot, ...). Raises ValueError."""
+    found = []
+    for number, name in enumerate((*DILIGENT, *SCANS)):
+        stem = name.split(".")[0].split("-")[0].split("_")[0]
+        if names is not None and stem not in names:
+            continue
+        generator = torch.Generator().manual_seed(SEED + number)
+        albedo = random_albedo(number, generator)
+        low, high = ROUGHNESSES
+        roughness = low + (high - low) * torch.rand(1, generator=generator).item()
+        mesh, camera = _statue(data / "diligent_normals" / name) if name in DILIGENT else _scan(data, name)
+        found.append(Subject(stem, MeshScene(mesh), camera, albedo, roughness))
+    return found
+
+
+def _statue(folder: Path) -> tuple[Mesh, PinholeCamera]:
+    """A DiLiGenT object from where its camera was."""
+    paths = [folder / file for file in DILIGENT_FILES]
+    normals, mask, depth = read_normal_map(paths[0]), read_mask(paths[1]), read_depth(paths[2])
+    matrix = read_intrinsics(paths[3])
+    surface = span_surface(unproject(depth, matrix), normals, mask & np.isfinite(depth))
+    middle = (surface.vertices.min(axis=0) + surface.vertices.max(axis=0)) / 2
+    radius = float(np.linalg.norm(surface.vertices - middle, axis=1).max())
+    vertices = (surface.vertices - middle) / radius
+    mesh = Mesh(vertices, surface.normals, surface.uv, surface.faces, surface.slots)
+    x, y, z = (float(c) for c in -middle / radius)
+    fov = math.degrees(2 * math.atan(1.02 * float(np.abs(vertices[:, :2]).max()) / z))
+    return mesh, PinholeCamera((x, y, z), (0.0, 0.0, 0.0), fov)
+
+
+def _scan(data: Path, name: str) -> tuple[Mesh, PinholeCamera]:
+    """A scanned mesh in the pose of the test set."""
+    mesh, pose = read_mesh(data / "meshes" / name), SCANS[name]
+    if pose.up == "z":
+        turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+        mesh = Mesh(mesh.vertices @ turn.T, mesh.normals @ turn.T, mesh.uv, mesh.faces, mesh.slots)
+    return mesh, look_at(mesh, pose.azimuth_deg, pose.elevation_deg)
+
+
+def photograph(subject: Subject, seed: int, side: int = SIDE) -> Shoot:
+    """Six noisy frames ``side`` x ``side`` of a subject. Raises ValueError where a light reaches nothing."""
+    generator = torch.Generator().manual_seed(seed)
+    axes = camera_axes(subject.camera).double()
+    to_world = torch.stack([axes[0], axes[1], -axes[2]]).T
+    ways = [_turned(torch.tensor(direction, dtype=torch.float64), generator) for direction in NAMED.values()]
+    lights = [_light(to_world @ way, generator) for way in ways]
+    scenes, normals, mask = _render(subject, lights, side)
+    brightest = max(_level(scene) for scene in scenes)
+    scenes = [Scene(s.diffuse * (1 / brightest), s.specular * (1 / brightest), mask) for s in scenes]
+    mosaics = tuple(capture(scene, Layout(), IMX250, generator).mosaic for scene in scenes)
+    seen = (to_world.T.float() @ normals.reshape(3, -1)).reshape(3, side, side)
+    mean = avg_pool2d(seen, 2).permute(1, 2, 0).double().numpy()
+    whole = half_resolution(scenes[0])[2].numpy()
+    length = np.linalg.norm(mean, axis=-1, keepdims=True)
+    return Shoot(
+        subject.name,
+        mosaics,
+        tuple(scenes),
+        mean / np.where(length > 0, length, 1),
+        whole,
+        np.stack([way.numpy() for way in ways]),
+    )
+
+
+def _turned(direction: Tensor, generator: torch.Generator) -> Tensor:
+    """A unit vector within `LARGEST_TURN_DEG` of another."""
+    draws = 2 * torch.rand(3, generator=generator, dtype=torch.float64) - 1
+    sideways = draws - (draws @ direction) * direction
+    angle = math.radians(LARGEST_TURN_DEG) * torch.rand(1, generator=generator, dtype=torch.float64)
+    way: Tensor = torch.cos(angle) * direction + torch.sin(angle) * sideways / sideways.norm()
+    return way
+
+
+def _light(way: Tensor, generator: torch.Generator) -> PointLight:
+    """A light in that direction, of random strength and polarizer."""
+    gain, turn = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+    x, y, z = (LIGHT_DISTANCE * way).tolist()
+    return PointLight((x, y, z), LIGHT_DISTANCE**2 * (1 + LARGEST_GAIN * (2 * gain - 1)), math.pi * turn)
+
+
+def _render(subject: Subject, lights: list[PointLight], side: int) -> tuple[list[Scene], Tensor, Tensor]:
+    """Exact scenes behind the lens, and the normals ``[3, side, side]`` in the world's frame."""
+    bands: list[list[Tensor]] = []
+    for first in range(0, side, ROWS_AT_ONCE):
+        count = min(ROWS_AT_ONCE, side - first)
+        rows = first + (torch.arange(count * SAMPLES) + 0.5) / SAMPLES
+        cols = (torch.arange(side * SAMPLES) + 0.5) / SAMPLES
+        points = tuple(g.flatten() for g in torch.meshgrid(rows, cols, indexing="ij"))
+        hits = find_hits(subject.mesh, subject.camera, (points[0], points[1]), (side, side))
+        size = (count * SAMPLES, side * SAMPLES)
+        planes = [_pooled(torch.ones_like(hits.position[:1]), hits, size), _pooled(hits.normal, hits, size)]
+        for light in lights:
+            lobes = shade(_cover(subject, hits), subject.camera, light, is_lit(subject.mesh, hits, light))
+            planes += [_pooled(s, hits, size) for lobe in lobes for s in (lobe.s0, lobe.s1, lobe.s2)]
+        bands.append(planes)
+    covered, normals, *images = (torch.cat(planes, dim=1) for planes in zip(*bands, strict=True))
+    mask = covered[0] == 1
+    scenes = []
+    for k in range(0, len(images), 6):
+        scenes.append(blur(Scene(Stokes(*images[k : k + 3]), Stokes(*images[k + 3 : k + 6]), mask), LENS_BLUR))
+    return scenes, normals, mask
+
+
+def _cover(subject: Subject, hits: Hits) -> GBuffer:
+    one = torch.ones_like(hits.position[:1])
+    return GBuffer(hits.position, hits.normal, subject.albedo(hits.position), subject.roughness * one, one, one > 0)
+
+
+def _pooled(values: Tensor, hits: Hits, size: tuple[int, int]) -> Tensor:
+    """Values ``[C, M, 1]`` of hits as an image, the mean over each pixel's samples."""
+    image = torch.zeros(values.shape[0], size[0] * size[1])
+    image[:, hits.ray] = values[..., 0]
+    return avg_pool2d(image.reshape(1, -1, *size), SAMPLES)[0]
+
+
+def _level(scene: Scene) -> float:
+    """The level that `CLIPPED` of the object's samples exceed."""
+    samples = filter_light(scene.diffuse + scene.specular, Layout(), IMX250)[scene.mask]
+    if not samples.numel():
+        raise ValueError("expected an object that light reaches, found none in the mask")
+    return float(samples.kthvalue(max(1, samples.numel() - round(CLIPPED * samples.numel()))).values)

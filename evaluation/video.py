@@ -1,0 +1,112 @@
+"""How fast recordings go through `polsep video`, against the method alone, and whether memory stays as it is."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator
+from itertools import cycle, islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+
+import polsep
+from polsep.bench.rows import Row
+from polsep.compute.workers import keep_memory
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.genicam import pack_frame
+from polsep.io.results.sequences import SequenceKind
+from polsep.io.store.rows import read_memory, write_chunks
+from polsep.methods import METHODS
+from polsep.pipeline import separate_known
+from polsep.sensor.levels import as_mosaic
+from polsep.video.recordings import Target, VideoOptions, separate_video
+
+#: Frames of the long recording, and of those that compare formats.
+LONG, SHORT = 1000, 60
+#: Frames that differ, over and over: the demo capture moved by whole periods of its filters.
+DISTINCT = 12
+#: Frames after which memory is to stay as it is, and those that the method alone is timed on.
+SETTLED, ALONE = 50, 40
+#: Frames that do not count for rates: engines are made meanwhile.
+BEGINNING = 10
+SIZE, PIXELS = (2448, 2048), "BayerRG12p"
+#: What is written, behind which filter. The first costs reading and writing alone, the second is the default.
+KINDS = {
+    "EXR, no filter": (SequenceKind(preview=False), "none"),
+    "EXR and a film to watch, temporal filter": (SequenceKind(), "temporal"),
+    "EXR with ZIP, temporal filter": (SequenceKind(compression="zip", preview=False), "temporal"),
+    "FFV1 with 16 bits, temporal filter": (SequenceKind("ffv1", preview=False), "temporal"),
+}
+
+
+def bench_video(_data: Path | None = None) -> Iterator[Row]:
+    """1000 frames of 2448x2048 by joint-fast, 60 by joint and in other formats: rates against the method alone, memory.
+
+    The recording is a headless BayerRG12p stream in a folder for temporary files; 23 GB of it are needed.
+    """
+    yield from measure_recordings(LONG, SHORT)
+
+
+def bench_video_quick(_data: Path | None = None) -> Iterator[Row]:
+    """The same with 60 frames at most."""
+    yield from measure_recordings(SHORT, DISTINCT)
+
+
+def measure_recordings(long: int, short: int) -> Iterator[Row]:
+    """Rows of a recording of ``long`` frames, and of its first ``short`` ones."""
+    keep_memory()
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "run.raw"
+        frames = _frames()
+        write_chunks(path, (pack_frame(image, PIXELS) for image in islice(cycle(frames), long)))
+        bare, usual, *others = KINDS
+        runs = [("joint-fast", bare, long), ("joint-fast", usual, long), ("joint", bare, short)]
+        runs += [("joint", usual, short), *(("joint-fast", kind, short) for kind in others)]
+        for method, kind, count in runs:
+            alone = _rate_alone(method, frames)
+            yield Row("video", f"{count} frames, {kind}", method, "the method alone", alone, "frames/s")
+            yield from _measure(path, Path(folder), (method, kind, count), alone)
+
+
+def _measure(path: Path, folder: Path, run: tuple[str, str, int], alone: float) -> Iterator[Row]:
+    """The rate behind the first frames, its ratio to the method's ``alone``, and memory's spread."""
+    method, kind, count = run
+    times, memory = [], []
+    written, filter = KINDS[kind]
+    options, read = VideoOptions(method, frames=count, filter=filter), ReadOptions(size=SIZE, pixel_format=PIXELS)
+    output = folder / "out"
+    for step in separate_video(path, read, options, Target(output, written)):
+        times.append(time.perf_counter())
+        if step.done > SETTLED:
+            memory.append(read_memory())
+    shutil.rmtree(output)
+    counted = count - BEGINNING
+    rate = counted / (times[-2] - times[-2 - counted])
+    case = f"{count} frames, {kind}"
+    yield Row("video", case, method, "polsep video", rate, "frames/s")
+    yield Row("video", case, method, "of the method alone", 100 * rate / alone, "%")
+    if count > 2 * SETTLED:
+        yield Row(
+            "video", case, method, f"memory after frame {SETTLED}, largest - smallest", max(memory) - min(memory), "MiB"
+        )
+
+
+def _rate_alone(method: str, frames: list[NDArray[np.uint16]]) -> float:
+    """Frames per second of a method on frames in memory, after a few to warm up."""
+    mosaics = [as_mosaic(image, white_level=4095.0)[0] for image in frames]
+    for mosaic in mosaics[:3]:
+        separate_known(mosaic, METHODS[method], (1.0, 1.0, 1.0))
+    start = time.perf_counter()
+    for mosaic in islice(cycle(mosaics), ALONE):
+        separate_known(mosaic, METHODS[method], (1.0, 1.0, 1.0))
+    return ALONE / (time.perf_counter() - start)
+
+
+def _frames() -> list[NDArray[np.uint16]]:
+    """The demo capture, moved."""
+    capture = Path(polsep.__file__).parent / "data" / "still_life.png"
+    raw = next(read_frames(capture, ReadOptions(white_level=4095.0))).data.data.numpy().astype(np.uint16)
+    return [np.roll(raw, (8 * k, 16 * k), (0, 1)) for k in range(DISTINCT)]

@@ -1,0 +1,1 @@
+"""Compiling, threads, workers, cluster, filters: nothing here knows of light."""

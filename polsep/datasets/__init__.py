@@ -1,0 +1,1 @@
+"""Rendered sets, and the fixed sets of known truth."""

@@ -1,0 +1,32 @@
+"""Fixed test sets of known truth: random objects, statues and scans, and crossed-polarizer photographs.
+
+A set is a tuple of `Recipe`; `build_cases` makes its scenes one by one. Every scene's inputs and outputs are recorded
+in `expected`, and `version_of` is a sha256 over these records, so that nobody changes a test set unknowingly. Nothing
+may be trained or tuned on any of them. See docs/testsets.md. Needs the extra ``render``.
+"""
+
+from __future__ import annotations
+
+from polsep.datasets.testsets.cases import Case, Recipe, build_case, build_cases, check_case, fingerprint, version_of
+from polsep.datasets.testsets.objects import OBJECTS
+from polsep.datasets.testsets.photographs import PHOTOGRAPHS
+from polsep.datasets.testsets.sheet import draw_sheet
+from polsep.datasets.testsets.statues import STATUES
+
+#: The sets by name: (a), (b) and (c) of docs/testsets.md.
+SETS: dict[str, tuple[Recipe, ...]] = {"objects": OBJECTS, "statues": STATUES, "photographs": PHOTOGRAPHS}
+
+__all__ = [
+    "OBJECTS",
+    "PHOTOGRAPHS",
+    "SETS",
+    "STATUES",
+    "Case",
+    "Recipe",
+    "build_case",
+    "build_cases",
+    "check_case",
+    "draw_sheet",
+    "fingerprint",
+    "version_of",
+]

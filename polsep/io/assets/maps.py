@@ -1,0 +1,134 @@
+"""Images that edits name: textures, masks and normals, as files of any program.
+
+8-bit PNG and JPEG hold display values, as all programs write them: textures are decoded from sRGB to linear light.
+16-bit PNG and TIFF, EXR and NPY are taken as linear: integers run to 1 at their largest value. Masks are never
+decoded: 0 is 0, the largest value 1. Normals in PNG and TIFF are 2 c - 1 for c in [0, 1] (x right, y up, z to the
+camera), in EXR and NPY the vectors themselves.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+from polsep.io.raw.frames import read_pages
+from polsep.io.raw.pages import require_signature, require_size
+from polsep.io.results.exr import read_exr_layers
+from polsep.io.store.errors import InputError, decoding, input_error, naming
+
+Floats = NDArray[np.float32]
+
+_PAGED, _PHOTOS = (".png", ".tif", ".tiff", ".npy"), (".jpg", ".jpeg")
+#: Files that hold an image.
+SUFFIXES = (*_PAGED, *_PHOTOS, ".exr")
+#: Shortest normal that is one: half floats and 8 bits leave no less.
+_SHORTEST = 0.5
+
+
+def read_map(path: Path, kind: str) -> Floats:
+    """The ``texture [h, w, C]``, ``mask [h, w]`` or ``normals [h, w, 3]`` of a file, float32, read-only.
+
+    Normals are made unit vectors; shorter ones than half of that, and those away from the camera, become 0. Raises
+    InputError.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise input_error(path, f"expected an image ({', '.join(SUFFIXES)}), found {suffix or 'no extension'!r}")
+    read = _read(path, suffix)
+    with naming(path):
+        codes = _checked(_from_planes(read) if isinstance(read, Mapping) else read)
+        decode = {"texture": _as_texture, "mask": _as_mask, "normals": _as_normals}[kind]
+        found = decode(codes)
+        if not np.isfinite(found).all():
+            raise InputError("expected finite values, found NaN or infinite ones")
+    kept = np.ascontiguousarray(found, dtype=np.float32)
+    kept.flags.writeable = False
+    return kept
+
+
+def hash_map(path: Path) -> str:
+    """The sha256 of a file. Raises InputError."""
+    with naming(path):
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _read(path: Path, suffix: str) -> NDArray[Any] | Mapping[str, NDArray[Any]]:
+    """The one image of a file, or its channels by name."""
+    if suffix == ".exr":
+        return read_exr_layers(path)
+    if suffix in _PHOTOS:
+        with naming(path), path.open("rb") as stream:
+            require_signature(stream, (b"\xff\xd8\xff",), "a JPEG")
+            with decoding("JPEG"), Image.open(stream, formats=["JPEG"]) as picture:
+                require_size((picture.height, picture.width, 3))
+                return np.asarray(picture.convert("L" if picture.mode == "L" else "RGB"))
+    pages = [page.array for page in read_pages(path)]
+    if len(pages) != 1:
+        raise input_error(path, f"expected one image, found {len(pages)}")
+    return pages[0]
+
+
+def _checked(codes: NDArray[Any]) -> NDArray[Any]:
+    """Codes or values ``[h, w]`` or ``[h, w, 1 or 3]``."""
+    if codes.ndim not in (2, 3) or (codes.ndim == 3 and codes.shape[2] not in (1, 3)):
+        raise InputError(f"expected an image of 1 or 3 channels, found shape {list(codes.shape)}")
+    return codes
+
+
+def _from_planes(planes: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    for names in ("RGB", "XYZ", "Y"):
+        if set(names) <= set(planes):
+            return np.stack([planes[name] for name in names], axis=-1)
+    raise InputError(f"expected channels R, G and B, or X, Y and Z, or Y, found {', '.join(sorted(planes)[:8])}")
+
+
+def _in_unit(codes: NDArray[Any]) -> NDArray[Any]:
+    """Integers in [0, 1], other values as they are."""
+    if codes.dtype.kind == "u":
+        return codes / np.float32(np.iinfo(codes.dtype).max)
+    if codes.dtype.kind in "fb":
+        return codes.astype(np.float32)
+    raise InputError(f"expected unsigned integers or floats, found {codes.dtype}")
+
+
+def _as_texture(codes: NDArray[Any]) -> NDArray[Any]:
+    values = _in_unit(codes)
+    values = values[..., None] if values.ndim == 2 else values
+    if codes.dtype == np.uint8:
+        return linear_from_srgb(values)
+    if float(values.min()) < 0:
+        raise InputError(f"expected reflectance of 0 or more, found {float(values.min()):g}")
+    return values
+
+
+def _as_mask(codes: NDArray[Any]) -> NDArray[Any]:
+    values = _in_unit(codes)
+    if values.ndim == 3:
+        if (values != values[..., :1]).any():
+            raise InputError("expected a grey image as mask, found colours")
+        values = values[..., 0]
+    if not (values.min() >= 0 and values.max() <= 1):
+        raise InputError(f"expected a mask in [0, 1], found {values.min():g} to {values.max():g}")
+    return values
+
+
+def _as_normals(codes: NDArray[Any]) -> NDArray[Any]:
+    if codes.ndim != 3 or codes.shape[2] != 3:
+        raise InputError(f"expected normals of three channels, found shape {list(codes.shape)}")
+    vectors = _in_unit(codes)
+    vectors = 2 * vectors - 1 if codes.dtype.kind == "u" else vectors
+    length = np.linalg.norm(vectors, axis=2, keepdims=True)
+    known = (length >= _SHORTEST) & (vectors[..., 2:] > 0)
+    return np.where(known, vectors / np.where(known, length, 1), 0)
+
+
+def linear_from_srgb(display: ArrayLike) -> NDArray[np.float32]:
+    """Linear light of sRGB values in [0, 1]: the inverse of `io.previews.srgb`. Source: IEC 61966-2-1:1999."""
+    x = np.asarray(display, dtype=np.float32)
+    return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.04045) + 0.055) / 1.055) ** 2.4)

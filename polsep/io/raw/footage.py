@@ -1,0 +1,98 @@
+"""Recordings as sequences of frames that can be begun anywhere: folders of files, and files of many frames.
+
+A folder with a ``recording.json`` is what `polsep capture` wrote, and one recording.
+
+A folder's frames are its files of one kind, in natural order (frame2 before frame10). What cannot be read is a
+`Damaged` frame in its place; the frames after it come all the same where the file allows that.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
+from polsep.io.raw.recording import RECORD
+from polsep.io.store.errors import input_error
+
+_NUMBER = re.compile(r"(\d+)")
+
+
+@dataclass(frozen=True)
+class Damaged:
+    """A frame that could not be read, and why, in one line that names the file."""
+
+    index: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Footage:
+    """A recording: ``begin(first)`` gives its frames from number ``first`` on, about ``count`` in all.
+
+    ``stem`` names its outputs.
+    """
+
+    stem: str
+    count: int
+    begin: Callable[[int], Iterator[Frame | Damaged]]
+
+
+def open_footage(path: Path, options: ReadOptions) -> Footage:
+    """The frames of a folder or of a file. Raises InputError where there are none, or none can be read."""
+    path = path / RECORD if (path / RECORD).is_file() else path
+    if path.is_dir():
+        files = _files_of(path)
+        return Footage(path.resolve().name, len(files), lambda first: _read_files(files, options, first))
+    start = next(read_frames(path, options), None)
+    if start is None:
+        raise input_error(path, "expected frames, found none")
+    return Footage(output_stem(path), start.count, lambda first: _read_stack(path, options, (first, start.count)))
+
+
+def _files_of(folder: Path) -> list[Path]:
+    """The frames of a folder in natural order; InputError unless they are of one kind."""
+    files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.suffix.lower() in FRAME_FILES]
+    kinds = Counter(p.suffix.lower() for p in files)
+    if not files:
+        raise input_error(folder, f"expected a folder of frames ({', '.join(FRAME_FILES)}), found none")
+    if len(kinds) > 1:
+        found = ", ".join(f"{count} {suffix}" for suffix, count in sorted(kinds.items()))
+        raise input_error(folder, f"expected frames of one kind, found {found}")
+    return sorted(files, key=natural_order)
+
+
+def natural_order(path: Path) -> list[tuple[int, int, str]]:
+    """A key by which numbers in names count as numbers."""
+    parts = _NUMBER.split(path.name)
+    return [(0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts if part]
+
+
+def _read_files(files: list[Path], options: ReadOptions, first: int) -> Iterator[Frame | Damaged]:
+    """One frame of each file."""
+    for index, path in enumerate(files[first:], first):
+        try:
+            frames = list(read_frames(path, options))
+            if len(frames) != 1:
+                raise input_error(path, f"expected one frame per file of a folder, found {len(frames)}")
+        except (ValueError, OSError) as error:
+            yield Damaged(index, " ".join(str(error).split()))
+            continue
+        yield Frame(frames[0].stem, frames[0].data, frames[0].notes, index, len(files))
+
+
+def _read_stack(path: Path, options: ReadOptions, numbers: tuple[int, int]) -> Iterator[Frame | Damaged]:
+    """The frames of one file from the first of these ``numbers`` on; behind a damaged one it is begun anew."""
+    at, count = numbers
+    while at < count:
+        try:
+            for frame in read_frames(path, options, at):
+                at, count = frame.index + 1, frame.count
+                yield frame
+            return
+        except (ValueError, OSError) as error:
+            yield Damaged(at, " ".join(str(error).split()))
+            at += 1

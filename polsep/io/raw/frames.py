@@ -1,0 +1,250 @@
+"""Raw frames from files of any supported kind, lazily, as `Mosaic` or `Measurements`.
+
+Supported: PNG, TIFF, NPY, NPZ, binary PGM, lossless grey video, headless dumps of a named size and pixel format,
+recordings of a camera by their ``recording.json``, and four angle images through a path with ``{angle}`` in it. The
+extension decides which is expected, the content must agree.
+
+Four angle images are co-sited `Measurements` when they are RGB, or gray without a colour layout;
+LUCID's four planes, and gray ones under a colour layout, are samples of one mosaic and go back to it.
+
+White levels: what the caller says, else what the file says (packed TIFF, PGM, pixel format), else that of the dtype;
+layouts: what the caller says, else what the pixel format's name says, else Sony's colour order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from polsep.io.raw.headless import headless_page, read_headless, read_pgm
+from polsep.io.raw.npy import read_npy, read_npz, stack_angles
+from polsep.io.raw.pages import Page, describe
+from polsep.io.raw.png import read_png
+from polsep.io.raw.recording import RECORD, read_recording
+from polsep.io.raw.tiff import read_tiff
+from polsep.io.raw.videos import read_video
+from polsep.io.store.errors import InputError, input_error, naming
+from polsep.physics.stokes import Measurements
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
+
+__all__ = ["Frame", "InputError", "ReadOptions", "decode_frame", "output_stem", "read_frames", "read_pages"]
+
+_READERS: dict[str, Callable[[Path], Iterator[Page]]] = {
+    ".png": read_png,
+    ".npy": read_npy,
+    ".npz": read_npz,
+    ".pgm": read_pgm,
+}
+#: Readers that begin at any picture.
+_SEEKING: dict[str, Callable[[Path, int], Iterator[Page]]] = {
+    ".tif": read_tiff,
+    ".tiff": read_tiff,
+    ".mkv": read_video,
+    ".avi": read_video,
+    ".mov": read_video,
+    ".nut": read_video,
+    ".json": read_recording,
+}
+_HEADLESS = (".raw", ".bin")
+#: Files of single frames, as folders of recordings hold them.
+FRAME_FILES = (*_READERS, ".tif", ".tiff", *_HEADLESS)
+_LOSSY = {".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".heic": "HEIC", ".mp4": "video"}
+_ANGLES = (0, 45, 90, 135)
+_PLACE = "{angle}"
+
+SUPPORTED = (
+    "PNG, TIFF, NPY, NPZ, PGM, a lossless video, a recording.json, "
+    "or headless raw (.raw, .bin) with a size and pixel format"
+)
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How to read what files don't say. Levels are in the units of the samples; None is explained above.
+
+    ``size`` (width, height) and ``pixel_format`` (a GenICam name) describe headless raw. ``pages``: several pages of
+    a file are separate "frames", or every four are the "angles" 0, 45, 90, 135. Raises ValueError on anything else.
+    """
+
+    layout: Layout | None = None
+    black_level: float = 0.0
+    white_level: float | None = None
+    size: tuple[int, int] | None = None
+    pixel_format: str | None = None
+    pages: str = "frames"
+
+    def __post_init__(self) -> None:
+        if self.pages not in ("frames", "angles"):
+            raise ValueError(f'expected pages "frames" or "angles", found {self.pages!r}')
+        if self.size is not None and (len(self.size) != 2 or min(self.size) < 1):
+            raise ValueError(f"expected a size of positive width and height, found {self.size}")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of a file: ``stem`` names its outputs, ``notes`` are one-line remarks for the user.
+
+    It is number ``index`` of ``count`` (about, where a film does not say).
+    """
+
+    stem: str
+    data: Mosaic | Measurements
+    notes: tuple[str, ...]
+    index: int = 0
+    count: int = 1
+
+
+def read_frames(path: str | Path, options: ReadOptions | None = None, first: int = 0) -> Iterator[Frame]:
+    """The frames of a file, or of the four files of a template with ``{angle}``, one page at a time, from ``first`` on.
+
+    A single frame has the stem of the file; of several, frame k is ``stem_000k``, counted from 0. Nothing is opened
+    before the first frame is asked for. Raises InputError, in one line that names the file, on whatever can't be
+    read; frames before a damaged one have been yielded by then.
+    """
+    options = ReadOptions() if options is None else options
+    if _PLACE in str(path):
+        pages: Iterator[Page] = iter([_read_template(str(path), options)])
+    elif options.pages == "angles":
+        pages = _group_angles(Path(path), options)
+    else:
+        pages = _read_pages(Path(path), options, first)
+    for page in pages:
+        if page.index < first:
+            continue
+        with naming(path):
+            data, notes = _convert(page, options)
+        stem = output_stem(path)
+        name = stem if page.count == 1 else f"{stem}_{page.index:04d}"
+        yield Frame(name, data, page.notes + notes, page.index, page.count)
+
+
+def read_pages(path: Path) -> Iterator[Page]:
+    """The pictures of one file that describes itself, as codes: not yet light. Raises InputError as `read_frames`."""
+    return _read_pages(path, ReadOptions())
+
+
+def decode_frame(payload: bytes, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
+    """One frame from the bytes a camera sent, and notes, exactly as `read_frames` takes it from a file of them.
+
+    ``options`` say size and pixel format. Raises ValueError when they do not or the bytes do not fit them.
+    """
+    if options.size is None or options.pixel_format is None:
+        raise ValueError(_missing_notes(options))
+    page = next(_noting_layout(iter([headless_page(payload, options.size, options.pixel_format)]), options))
+    data, notes = _convert(page, options)
+    return data, page.notes + notes
+
+
+def output_stem(path: str | Path) -> str:
+    """File name without extension and placeholder: ``nir_{angle}.png`` gives ``nir``; a recording has its folder's."""
+    if Path(path).name == RECORD:
+        return Path(path).absolute().parent.name or "recording"
+    stem = Path(path).stem
+    return stem if _PLACE not in stem else stem.replace(_PLACE, "").strip("_-. ") or "angles"
+
+
+def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
+    """Samples to light, by the rules of the module."""
+    layout = page.layout if options.layout is None else options.layout
+    white = page.white_level if options.white_level is None else options.white_level
+    array = page.array
+    if not page.angles:
+        return as_mosaic(array, layout, options.black_level, white)
+    if array.ndim == 4 and array.shape[-1] == 1:
+        array = array[..., 0]
+    if array.ndim == 3 and (page.sampled or (layout is not None and layout.bayer is not None)):
+        mosaic = interleave_planes(array, Layout() if layout is None else layout)
+        return as_mosaic(mosaic, layout, options.black_level, white)
+    return as_measurements(array, options.black_level, white)
+
+
+def _read_pages(path: Path, options: ReadOptions, first: int = 0) -> Iterator[Page]:
+    """The pictures of one file, by its extension; where that saves time, those before ``first`` are left out."""
+    with naming(path):
+        if path.is_dir():
+            raise ValueError("expected a file, found a directory")
+        suffix = path.suffix.lower()
+        if suffix in _READERS or suffix in _SEEKING:
+            notes = _ignored_notes(options)
+            reader = _SEEKING[suffix](path, first) if suffix in _SEEKING else _READERS[suffix](path)
+            for page in reader:
+                yield replace(page, notes=page.notes + notes)
+        elif suffix in _HEADLESS or (options.pixel_format is not None and suffix not in _LOSSY):
+            if options.size is None or options.pixel_format is None:
+                raise ValueError(_missing_notes(options))
+            yield from _noting_layout(read_headless(path, options.size, options.pixel_format, first), options)
+        elif suffix in _LOSSY:
+            raise ValueError(f"expected {SUPPORTED}, found {_LOSSY[suffix]}: lossy compression and gamma spoil samples")
+        else:
+            with path.open("rb") as stream:
+                found = describe(stream.read(64))
+            raise ValueError(f"expected {SUPPORTED}, found extension {path.suffix!r} and {found}")
+
+
+def _ignored_notes(options: ReadOptions) -> tuple[str, ...]:
+    """Said when a container describes itself and the caller describes it too."""
+    if options.size is None and options.pixel_format is None:
+        return ()
+    return ("the size and pixel format said are for headless raw: the file's own header is used",)
+
+
+def _missing_notes(options: ReadOptions) -> str:
+    """What headless raw lacks."""
+    found = "only the size" if options.size else "only the pixel format" if options.pixel_format else "neither"
+    return f"expected the size and pixel format of headless raw, such as 2448x2048 and BayerRG12p, found {found}"
+
+
+def _noting_layout(pages: Iterator[Page], options: ReadOptions) -> Iterator[Page]:
+    """Pages of a named pixel format, with a note where the caller's layout has other colours than the name."""
+    for page in pages:
+        said, named = options.layout, page.layout
+        if said is None or named is None:
+            yield page
+        elif said.bayer == named.bayer:
+            yield replace(page, notes=())
+        else:
+            note = f"layout {said.spec} is used although {options.pixel_format} says {named.bayer or 'mono'}"
+            yield replace(page, notes=(note,))
+
+
+def _group_angles(path: Path, options: ReadOptions) -> Iterator[Page]:
+    """Every four pages of a file as one page of angles; pages that are angles already pass."""
+    group: list[Page] = []
+    for page in _read_pages(path, options):
+        if page.angles:
+            yield page
+            continue
+        if page.count % 4:
+            raise input_error(path, f"expected four pages for the angles 0, 45, 90, 135, found {page.count}")
+        group.append(page)
+        if len(group) == 4:
+            with naming(path):
+                yield _stacked(group, [f"page {p.index}" for p in group])
+            group = []
+
+
+def _read_template(template: str, options: ReadOptions) -> Page:
+    """The four images of a path with ``{angle}`` as one page of angles."""
+    group: list[Page] = []
+    paths = [Path(template.replace(_PLACE, str(angle))) for angle in _ANGLES]
+    for path in paths:
+        page = next(_read_pages(path, options))
+        if page.count != 1 or page.angles:
+            raise input_error(path, f"expected one image of one angle, found {4 if page.angles else page.count}")
+        group.append(page)
+    with naming(template):
+        return _stacked(group, [f"{angle} deg" for angle in _ANGLES])
+
+
+def _stacked(group: list[Page], names: list[str]) -> Page:
+    """Four pages as one of angles; ValueError when they differ in size, type or white level."""
+    levels = {page.white_level for page in group}
+    if len(levels) != 1:
+        raise ValueError(f"expected angle images of one bit depth, found white levels {sorted(map(str, levels))}")
+    array = stack_angles({name: page.array for name, page in zip(names, group, strict=True)})
+    notes = tuple(dict.fromkeys(note for page in group for note in page.notes))
+    first = group[0]
+    count = max(first.count // 4, 1)
+    return Page(array, first.index // 4, count, first.white_level, first.layout, angles=True, notes=notes)

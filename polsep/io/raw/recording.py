@@ -1,0 +1,206 @@
+"""A camera's frames on disk exactly as they came, and the record of how they came.
+
+A recording is a folder:
+
+* ``frames.raw``      the payloads one after the other, in the camera's pixel format, without any header: headless raw;
+* ``frames.jsonl``    a line per frame: index, frame_id, timestamp_ns, crc32 of the payload, lost_before and away_s (the
+  frames that the wire lost just before it, and for how long the camera was away);
+* ``recording.json``  size, pixel format, layout, camera, settings, counters, interruptions.
+
+A payload is written before its line, and both before the next frame: whenever the program is killed, every whole frame
+can be read. ``recording.json`` is there from the start with ``finished`` false, and is replaced as a whole at the end.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from polsep.io.raw.genicam import find_pixel_format
+from polsep.io.raw.headless import headless_page
+from polsep.io.raw.pages import Page, require_size
+from polsep.io.results.outputs import refuse_targets
+from polsep.io.store.whole import replace_text
+from polsep.sensor.camera import Layout
+
+FORMAT = "polsep recording 1"
+RAW, INDEX, RECORD, PICTURE = "frames.raw", "frames.jsonl", "recording.json", "live.jpg"
+
+
+@dataclass(frozen=True)
+class Header:
+    """What is the same for all frames. ``layout``: a layout's spec where somebody said one, else None.
+
+    ``width`` and ``height`` are those of the pixel format (of ONE angle image for LUCID's angles); ``settings`` are
+    the camera's, as it reported them. Raises ValueError on an unknown pixel format, or a size that no frame has.
+    """
+
+    width: int
+    height: int
+    pixel_format: str
+    camera: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    layout: str | None = None
+
+    def __post_init__(self) -> None:
+        planes = find_pixel_format(self.pixel_format).planes
+        require_size((planes, self.height, self.width) if planes > 1 else (self.height, self.width))
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one payload."""
+        return find_pixel_format(self.pixel_format).frame_bytes(self.width, self.height)
+
+
+@dataclass(frozen=True)
+class RawImage:
+    """One whole frame: the bytes as the camera sent them, and what the camera says of them.
+
+    ``lost_before``: how many frames the wire lost between the one before and this one. ``away_s``: how long the camera
+    had been away, for the first frame after an interruption.
+    """
+
+    payload: bytes
+    frame_id: int
+    timestamp_ns: int
+    lost_before: int = 0
+    away_s: float = 0.0
+
+
+class RecordingWriter:
+    """Appends frames to a recording; to be closed. After a failure the frames before it are whole and readable."""
+
+    def __init__(self, directory: Path, header: Header, overwrite: bool = False) -> None:
+        """Make the folder and start its files. Raises OutputError where a recording is and ``overwrite`` is False."""
+        refuse_recording(directory, overwrite)
+        directory.mkdir(parents=True, exist_ok=True)
+        self.directory, self.header, self.frames = directory, header, 0
+        (directory / PICTURE).unlink(missing_ok=True)
+        self._raw: BinaryIO = (directory / RAW).open("wb", buffering=0)
+        self._index: BinaryIO = (directory / INDEX).open("wb", buffering=0)
+        self.note({}, finished=False)
+
+    def append(self, image: RawImage) -> None:
+        """Write one frame. Raises ValueError on a payload of another size, OSError when the disk does not take it."""
+        expected = self.header.frame_bytes
+        if len(image.payload) != expected:
+            raise ValueError(f"expected a payload of {expected} bytes, found {len(image.payload)}")
+        line = {
+            "index": self.frames,
+            "frame_id": image.frame_id,
+            "timestamp_ns": image.timestamp_ns,
+            "crc32": zlib.crc32(image.payload),
+            "lost_before": image.lost_before,
+            "away_s": round(image.away_s, 3),
+        }
+        try:
+            _write_all(self._raw, image.payload)
+            _write_all(self._index, (json.dumps(line) + "\n").encode())
+        except OSError:
+            with suppress(OSError):  # a disk that takes no bytes may still give some up
+                self._raw.truncate(self.frames * expected)
+            raise
+        self.frames += 1
+
+    def note(self, remarks: Mapping[str, Any], finished: bool) -> None:
+        """Replace the record: header, number of frames so far, and remarks such as counters."""
+        record = {
+            "format": FORMAT,
+            "polsep": importlib.metadata.version("polsep"),
+            "finished": finished,
+            "width": self.header.width,
+            "height": self.header.height,
+            "pixel_format": self.header.pixel_format,
+            "frame_bytes": self.header.frame_bytes,
+            "layout": self.header.layout,
+            "camera": self.header.camera,
+            "settings": dict(self.header.settings),
+            "frames": self.frames,
+            **remarks,
+        }
+        replace_text(self.directory / RECORD, json.dumps(record, indent=2, allow_nan=False) + "\n")
+
+    def close(self) -> None:
+        """Close the files; what they hold is on its way to the disk."""
+        self._raw.close()
+        self._index.close()
+
+
+def refuse_recording(directory: Path, overwrite: bool) -> None:
+    """Raise OutputError rather than replace an earlier recording unasked; to call before any work."""
+    refuse_targets(directory, [directory / name for name in (RAW, INDEX, RECORD, PICTURE)], overwrite)
+
+
+def read_header(path: Path) -> Header:
+    """The header of a ``recording.json``. Raises ValueError when it is another file or lacks something."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        raise ValueError(f"expected a polsep recording ({RECORD}), found a file that is not JSON") from None
+    if not isinstance(record, dict) or record.get("format") != FORMAT:
+        raise ValueError(f"expected a polsep recording ({RECORD} with format {FORMAT!r}), found another JSON file")
+    width, height = record.get("width"), record.get("height")
+    name, layout = record.get("pixel_format"), record.get("layout")
+    if not (isinstance(width, int) and isinstance(height, int) and isinstance(name, str)):
+        raise ValueError(f"expected width, height and pixel_format in {RECORD}, found {width}, {height} and {name!r}")
+    if layout is not None:
+        Layout.parse(str(layout))
+    camera, settings = str(record.get("camera", "")), record.get("settings")
+    return Header(width, height, name, camera, settings if isinstance(settings, dict) else {}, layout)
+
+
+def read_images(path: Path, first: int = 0) -> Iterator[RawImage]:
+    """The frames of a ``recording.json`` as the camera sent them, from ``first`` to the last whole one.
+
+    Frames without a line in the index, as the last one of a killed recording may be, have their own number as id.
+    Raises ValueError when there is none, or a payload differs from the checksum that was taken of it.
+    """
+    size = read_header(path).frame_bytes
+    raw, lines = path.with_name(RAW), _read_index(path.with_name(INDEX))
+    total = raw.stat().st_size
+    if total < size:
+        raise ValueError(f"expected at least one frame of {size} bytes in {RAW}, found {total} bytes")
+    with raw.open("rb") as stream:
+        stream.seek(first * size)
+        for index in range(first, total // size):
+            data, line = stream.read(size), lines.get(index, {})
+            found, expected = zlib.crc32(data), line.get("crc32")
+            if expected is not None and found != expected:
+                raise ValueError(f"expected frame {index} of {RAW} with checksum {expected}, found {found}: damage")
+            said = {name: line[name] for name in ("lost_before", "away_s") if name in line}
+            yield RawImage(data, line.get("frame_id", index), line.get("timestamp_ns", 0), **said)
+
+
+def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
+    """The frames of a ``recording.json``, from ``first`` to the last whole one. Raises ValueError as `read_images`."""
+    header = read_header(path)
+    count, rest = divmod(path.with_name(RAW).stat().st_size, header.frame_bytes)
+    notes = (f"{RAW} ends within a frame: {rest} bytes after frame {count - 1} are left out",) if rest else ()
+    size = (header.width, header.height)
+    for index, image in enumerate(read_images(path, first), first):
+        page = headless_page(image.payload, size, header.pixel_format, (index, count))
+        if header.layout is not None:
+            page = replace(page, layout=Layout.parse(header.layout), notes=())
+        yield replace(page, notes=page.notes + notes)
+
+
+def _read_index(path: Path) -> dict[int, dict[str, Any]]:
+    """The lines of the index by frame; a last line without an end was being written and is left out."""
+    whole = [line for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")]
+    try:
+        return {int(line["index"]): line for line in map(json.loads, whole)}
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError):
+        raise ValueError(f"expected a JSON object with an index in every line of {INDEX}, found another") from None
+
+
+def _write_all(stream: BinaryIO, data: bytes) -> None:
+    """Write every byte: an unbuffered stream may take a part."""
+    left = memoryview(data)
+    while left:
+        left = left[stream.write(left) :]

@@ -1,0 +1,103 @@
+"""TIFF of any lossless compression: 8 to 16 bits (packed too) and floats, one picture or many.
+
+tifffile tolerates much damage with a log message; what matters for measurements is checked here: that the chain of
+pictures is whole, that every strip lies inside the file, and that zero means dark. Orientation tags are not applied.
+Source: Adobe, TIFF Revision 6.0; Adobe, Digital Negative Specification 1.7 (photometric 32803, 34892).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import tifffile
+
+from polsep.io.raw.pages import Page, require_signature, require_size
+from polsep.io.store.errors import InputError, decoding
+
+#: Photometric interpretations in which larger means brighter and samples are the data themselves.
+_PHOTOMETRIC = {1: "black is zero", 2: "RGB", 32803: "colour filter array", 34892: "linear raw"}
+
+#: Compressions that change samples: old and new JPEG, lossy DNG, WebP.
+_LOSSY = {6: "old JPEG", 7: "JPEG", 34892: "lossy JPEG", 50001: "WebP"}
+
+# Without a handler, Python prints a library's warnings to the terminal; applications that configure logging see them.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+
+
+def read_tiff(path: Path, first: int = 0) -> Iterator[Page]:
+    """Every picture of a TIFF file in order, from ``first`` on: ``[H, W]`` or ``[H, W, C]``. Raises ValueError."""
+    with path.open("rb") as stream:
+        require_signature(stream, (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "a TIFF")
+        size = path.stat().st_size
+        with decoding("TIFF"):
+            tif = tifffile.TiffFile(stream)
+        with tif:
+            count = _count_pages(tif, stream)
+            for index in range(first, count):
+                with decoding("TIFF"):
+                    page = _read_page(tif.pages[index], size, index, count)
+                yield page
+
+
+def _count_pages(tif: tifffile.TiffFile, stream: BinaryIO) -> int:
+    """Number of pictures; InputError when the chain of directories breaks or one directory stands for many pictures."""
+    with decoding("TIFF"):
+        count = len(tif.pages)
+        if count:
+            stream.seek(tif.pages.next_page_offset or 0)
+            rest = stream.read(tif.tiff.offsetsize)
+    if count == 0:
+        raise InputError("expected a TIFF with a picture, found no readable directory: it is truncated or damaged")
+    if len(rest) < tif.tiff.offsetsize or any(rest):
+        raise InputError(f"expected a whole chain of TIFF directories, found it broken after {count}: it is truncated")
+    if count == 1:
+        with decoding("TIFF"):
+            page, series = tif.pages[0], tif.series[0]
+        if math.prod(series.shape) > math.prod(page.shape) > 0:
+            raise InputError(f"expected one TIFF directory per picture, found one for a series of shape {series.shape}")
+    return count
+
+
+def _read_page(page: tifffile.TiffPage | tifffile.TiffFrame, size: int, index: int, count: int) -> Page:
+    """Samples of one directory of a file of ``size`` bytes, after `_require_readable`."""
+    assert isinstance(page, tifffile.TiffPage)  # frames only come from TiffPages.useframes
+    _require_readable(page, size)
+    array = np.asarray(page.asarray())
+    if page.planarconfig == 2 and array.ndim == 3:  # separate planes [C, H, W]
+        array = np.moveaxis(array, 0, -1)
+    bits = page.bitspersample
+    white = 2.0**bits - 1 if array.dtype == np.uint16 and bits < 16 else None
+    orientation = page.tags.valueof(274, default=1)
+    notes = () if orientation == 1 else (f"TIFF orientation {orientation} is not applied: pixels stay as stored",)
+    return Page(array, index, count, white_level=white, notes=notes)
+
+
+def _require_readable(page: tifffile.TiffPage, size: int) -> None:
+    """Raise InputError unless a directory describes linear samples that all lie inside the file."""
+    samples = page.samplesperpixel
+    require_size((page.imagelength, page.imagewidth, *((samples,) if samples > 1 else ())))
+    if page.imagedepth != 1:
+        raise InputError(f"expected a TIFF of flat pictures, found depth {page.imagedepth}")
+    if page.photometric not in _PHOTOMETRIC:
+        raise InputError(f"expected gray samples with black at zero, found TIFF photometric {_name(page.photometric)}")
+    if page.compression in _LOSSY:
+        raise InputError(f"expected lossless samples, found TIFF compression {_LOSSY[int(page.compression)]}")
+    if page.dtype is None or page.bitspersample < 8:
+        bits, kind = page.bitspersample, page.sampleformat
+        raise InputError(f"expected samples of 8 bits or more, found {bits} bits of sample format {kind}")
+    strips = sum(1 for count in page.databytecounts if count)
+    if strips < math.prod(page.chunked):
+        raise InputError(f"expected {math.prod(page.chunked)} TIFF strips or tiles, found {strips}")
+    end = max(offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True))
+    if end > size:
+        raise InputError(f"expected TIFF samples up to byte {end}, found a file of {size} bytes: it is truncated")
+
+
+def _name(value: object) -> str:
+    """``PALETTE`` of an enumeration member, else the number."""
+    return str(getattr(value, "name", value))

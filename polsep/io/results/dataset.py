@@ -1,0 +1,210 @@
+"""The files of a rendered set: one raw frame, one truth and one record per view, and what holds them together.
+
+    DIR/options.json             what was asked for, and the versions of what made it
+    DIR/STEM.png                 the raw mosaic, 16-bit words that hold 12-bit codes (white level 4095)
+    DIR/STEM.exr or .npz         the truth at raw resolution in half floats: `LAYERS` and the mask
+    DIR/STEM.json                camera, light, exposure, seeds, and size and sha256 of the two files before
+    DIR/manifest.jsonl           options, then name, size and sha256 of every file above, in order of views
+    DIR/contact.png              a sample of the views to look at
+
+Units are those of `io.outputs`: linear light, 1.0 is one measurement at the white level. A view's files are written in
+a hidden directory and renamed into place, its record last: a view with a record is whole, whenever the program was
+killed. Nothing in a file depends on the time, the machine's name or who wrote it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import imagecodecs
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.io.results.exr import encode_exr, read_exr_layers
+from polsep.io.results.outputs import OutputError, require_same
+from polsep.io.results.previews import srgb
+from polsep.io.store.whole import write_checked
+
+FORMATS = ("exr", "npz")
+#: RGB images of the truth; s1 and s2 are of the light on the sensor, whose s0 is diffuse + specular.
+LAYERS = ("diffuse", "specular", "s1", "s2")
+OPTIONS, MANIFEST, SHEET, UNFINISHED = "options.json", "manifest.jsonl", "contact.png", ".unfinished"
+#: zlib level of the mosaic: noise does not shrink, and level 6 takes twice as long for 4 % less.
+PNG_LEVEL = 2
+#: Rows and columns of views on the contact sheet, and the side of each of their pictures in pixels.
+SHEET_ROWS, SHEET_COLS, THUMBNAIL = 5, 8, 160
+#: Width and grey level of the gaps between them.
+GAP, GAP_LEVEL = 6, 40
+
+Images = Mapping[str, NDArray[Any]]
+
+
+def view_stem(shape: int, view: int) -> str:
+    """``shape00012_view03``."""
+    return f"shape{shape:05d}_view{view:02d}"
+
+
+def begin_dataset(directory: Path, options: Mapping[str, Any]) -> None:
+    """Make the directory of a set, or go on with one that the same options and versions began.
+
+    Raises OutputError when it was begun with others, or holds what is no set.
+    """
+    path = directory / OPTIONS
+    if os.path.lexists(directory) and not directory.is_dir():
+        raise OutputError(f"expected a directory to write into, found a file: {directory}")
+    if path.is_file():
+        require_same(path, options, f"the set in {directory}")
+        return
+    if directory.is_dir() and (others := sorted(set(os.listdir(directory)) - {UNFINISHED})):
+        raise OutputError(f"expected {directory} empty, new, or a set begun before, found {others[0]!r} in it")
+    directory.mkdir(parents=True, exist_ok=True)
+    _write_whole(path, _as_json(options))
+
+
+def find_finished(directory: Path, stems: Sequence[str]) -> set[str]:
+    """Those of the views whose record is there, and all of whose files have the sizes that it says."""
+    sizes = {entry.name: entry.stat().st_size for entry in os.scandir(directory) if entry.is_file()}
+    return {stem for stem in stems if f"{stem}.json" in sizes and _is_whole(directory / f"{stem}.json", sizes)}
+
+
+def _is_whole(record: Path, sizes: Mapping[str, int]) -> bool:
+    """False for a record that a crash of the machine left empty or torn, too."""
+    try:
+        files = json.loads(record.read_bytes())["files"]
+        return all(sizes.get(file["name"]) == file["bytes"] for file in files)
+    except (ValueError, KeyError, TypeError):
+        return False
+
+
+def write_view(directory: Path, stem: str, images: Images, record: Mapping[str, Any], format: str) -> None:
+    """Write one view: ``mosaic`` uint16 ``[H, W]``, `LAYERS` float16 ``[H, W, 3]``, ``mask`` bool ``[H, W]``."""
+    encode = {"exr": _encode_exr, "npz": _encode_npz}[format]
+    mosaic = bytes(imagecodecs.png_encode(np.ascontiguousarray(images["mosaic"]), level=PNG_LEVEL))
+    contents = {f"{stem}.png": mosaic, f"{stem}.{format}": encode(images)}
+    contents[f"{stem}.json"] = _as_json({**record, "files": [_entry(*item) for item in contents.items()]})
+    hidden = directory / UNFINISHED
+    hidden.mkdir(exist_ok=True)
+    staging = Path(tempfile.mkdtemp(dir=hidden))
+    try:
+        for name, data in contents.items():
+            write_checked(staging / name, data)
+        for name in contents:  # the record is the last
+            os.replace(staging / name, directory / name)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def read_view(directory: Path, stem: str) -> dict[str, NDArray[Any]]:
+    """The images of `write_view`, exactly."""
+    images: dict[str, NDArray[Any]] = {"mosaic": imagecodecs.png_decode((directory / f"{stem}.png").read_bytes())}
+    packed = directory / f"{stem}.npz"
+    if packed.is_file():
+        with np.load(packed) as arrays:
+            return images | {name: arrays[name] for name in (*LAYERS, "mask")}
+    planes = read_exr_layers(directory / f"{stem}.exr")
+    for layer in LAYERS:
+        images[layer] = np.stack([planes[f"{layer}.{color}"] for color in "RGB"], axis=-1)
+    return images | {"mask": planes["mask.Y"] == 1}
+
+
+def finish_dataset(directory: Path, stems: Sequence[str], options: Mapping[str, Any]) -> None:
+    """Write contact sheet and manifest of a whole set, and remove what was left unfinished."""
+    count = min(len(stems), SHEET_ROWS * SHEET_COLS)
+    shown = [stems[k * len(stems) // count] for k in range(count)]
+    sheet = contact_sheet(read_view(directory, stem) for stem in shown)
+    _write_whole(directory / SHEET, bytes(imagecodecs.png_encode(sheet)))
+    lines = [json.dumps({"options": options, "views": len(stems)})]
+    for stem in stems:
+        data = (directory / f"{stem}.json").read_bytes()
+        files = [*json.loads(data)["files"], _entry(f"{stem}.json", data)]
+        lines.append(json.dumps({"view": stem, "files": files}))
+    _write_whole(directory / MANIFEST, "".join(f"{line}\n" for line in lines).encode())
+    remove_unfinished(directory)
+
+
+def read_fingerprint(directory: Path) -> str:
+    """The sha256 of a set's manifest, which stands for every byte of it."""
+    return hashlib.sha256((directory / MANIFEST).read_bytes()).hexdigest()
+
+
+def remove_unfinished(directory: Path) -> None:
+    """Remove what programs that were killed had begun to write."""
+    shutil.rmtree(directory / UNFINISHED, ignore_errors=True)
+
+
+def contact_sheet(views: Iterator[Images]) -> NDArray[np.uint8]:
+    """Views in reading order, each the raw frame, the diffuse and the specular below one another, sRGB.
+
+    The raw frame is the mean of each 4x4 period of the mosaic per colour, so clipping and noise show. White is an s0 of
+    2, the largest that can be measured.
+    """
+    cells = [np.concatenate([_thumbnail(image) for image in _pictures(view)]) for view in views]
+    cells += [np.full_like(cells[0], GAP_LEVEL)] * (-len(cells) % SHEET_COLS)
+    margins = ((0, GAP), (0, GAP), (0, 0))
+    padded = [np.pad(cell, margins, constant_values=GAP_LEVEL) for cell in cells]
+    return np.concatenate(
+        [np.concatenate(padded[k : k + SHEET_COLS], axis=1) for k in range(0, len(padded), SHEET_COLS)]
+    )
+
+
+def _pictures(view: Images) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """s0 of the mosaic, diffuse and specular, linear ``[H, W, 3]``; the first at a quarter of the size."""
+    codes = view["mosaic"][: view["mosaic"].shape[0] // 4 * 4, : view["mosaic"].shape[1] // 4 * 4] * (2 / 4095)
+    blocks = codes.reshape(codes.shape[0] // 4, 2, 2, codes.shape[1] // 4, 2, 2).mean(axis=(2, 5))
+    red, blue, green = blocks[:, 0, :, 0], blocks[:, 1, :, 1], (blocks[:, 0, :, 1] + blocks[:, 1, :, 0]) / 2
+    return np.stack([red, green, blue], axis=-1), view["diffuse"], view["specular"]
+
+
+def _thumbnail(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """A square image as sRGB with a side of `THUMBNAIL` pixels: means over blocks, or pixels repeated."""
+    side = image.shape[0]
+    edges = np.arange(THUMBNAIL) * side // THUMBNAIL
+    small = np.asarray(image, np.float64)
+    if side <= THUMBNAIL:
+        small = small[edges][:, edges]
+    else:
+        counts = np.diff(edges, append=side)
+        small = np.add.reduceat(np.add.reduceat(small, edges, axis=0), edges, axis=1)
+        small /= counts[:, None, None] * counts[:, None]
+    return np.rint(255 * srgb(small / 2)).astype(np.uint8)
+
+
+def _encode_exr(images: Images) -> bytes:
+    """One part of half floats, ZIP compressed, as every reader of EXR knows it."""
+    planes = {f"{layer}.{c}": images[layer][..., k] for layer in LAYERS for k, c in enumerate("RGB")}
+    planes["mask.Y"] = images["mask"]
+    notes = {"units": "linear light, 1.0 = one measurement at the white level: s0 = diffuse + specular = 2"}
+    return bytes(encode_exr({name: plane.astype(np.float16) for name, plane in planes.items()}, notes))
+
+
+def _encode_npz(images: Images) -> bytes:
+    """The arrays as they are, deflated."""
+    stream = io.BytesIO()
+    arrays: dict[str, Any] = {name: images[name] for name in (*LAYERS, "mask")}
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
+def _entry(name: str, data: bytes) -> dict[str, Any]:
+    return {"name": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+
+
+def _as_json(record: Mapping[str, Any]) -> bytes:
+    return (json.dumps(record, indent=1, allow_nan=False) + "\n").encode()
+
+
+def _write_whole(path: Path, data: bytes) -> None:
+    """Replace a file as a whole: written in the hidden directory, then renamed."""
+    hidden = path.parent / UNFINISHED
+    hidden.mkdir(exist_ok=True)
+    beside = hidden / f"{path.name}.{os.getpid()}"
+    write_checked(beside, data)
+    os.replace(beside, path)

@@ -1,0 +1,127 @@
+"""OpenEXR files: layers in, layers out.
+
+Note: files of half floats without compression are the one file format that polsep writes itself. A stream of frames
+must not wait for its writer, and the library spends 35 of 50 ms per 2448x2048 frame on moving channels about.
+Uncompressed scanlines are a header, a table of offsets and the rows; the library reads them back in the tests. Whatever
+is compressed, it writes.
+Source: OpenEXR, "OpenEXR File Layout" (openexr.com/en/latest/OpenEXRFileLayout.html).
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR  # a bare extension module without stubs
+import torch
+from numpy.typing import NDArray
+
+from polsep.io.raw.pages import require_signature, require_size
+from polsep.io.store.errors import InputError, decoding, naming
+
+COMPRESSIONS = {
+    "none": OpenEXR.NO_COMPRESSION,
+    "zip": OpenEXR.ZIP_COMPRESSION,
+    "piz": OpenEXR.PIZ_COMPRESSION,
+}
+#: Half floats end here.
+LARGEST_HALF = 65504.0
+_MAGIC, _VERSION, _HALF = 20000630, 2, 1
+_SIGNATURE = _MAGIC.to_bytes(4, "little")
+
+
+def read_exr_layers(path: Path) -> dict[str, NDArray[np.float32]]:
+    """Every channel of a single-part EXR file by its full name, such as ``diffuse.R``, each ``[H, W]``.
+
+    Raises InputError for anything but a complete single-part EXR (OpenEXR itself returns no part and prints a warning
+    when pixels are missing), and for a header that promises too much, before any pixel is read.
+    """
+    with naming(path):
+        with Path(path).open("rb") as stream:
+            require_signature(stream, (_SIGNATURE,), "an OpenEXR")
+            data = stream.read()
+        header = _open_exr(data, header_only=True).header()
+        with decoding("EXR"):
+            (left, top), (right, bottom) = header["dataWindow"]
+            shape = (int(bottom) - int(top) + 1, int(right) - int(left) + 1, max(len(header["channels"]), 1))
+        require_size(shape)
+        return {name: channel.pixels for name, channel in _open_exr(data).channels().items()}
+
+
+def _open_exr(data: bytes, header_only: bool = False) -> Any:
+    """OpenEXR's view of a file of one part."""
+    expected = "expected a complete single-part EXR file"
+    try:
+        file = OpenEXR.File(io.BytesIO(data), separate_channels=True, header_only=header_only)
+    except RuntimeError as error:
+        raise InputError(f"{expected}, found one that OpenEXR cannot open") from error
+    if len(file.parts) != 1:
+        raise InputError(f"{expected}, found {len(file.parts)} readable parts")
+    return file
+
+
+def encode_exr(planes: Mapping[str, NDArray[Any]], notes: Mapping[str, str], compression: str = "zip") -> memoryview:
+    """One part of scanlines: channels ``[H, W]``, float16 or float32, by name; ``notes``: attributes."""
+    header = {**notes, "compression": COMPRESSIONS[compression], "type": OpenEXR.scanlineimage}
+    # A fresh dict, because OpenEXR replaces its arrays, and contiguous planes, because it misreads others silently.
+    channels = {name: np.ascontiguousarray(plane) for name, plane in planes.items()}
+    stream = io.BytesIO()
+    OpenEXR.File(header, channels).write(stream)
+    return stream.getbuffer()
+
+
+def as_half_planes(images: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float16]]:
+    """Layers, float32 ``[H, W, 3]`` as name.R, name.G, name.B or ``[H, W, 1]`` as name.Y; views of half floats.
+
+    Light above the largest half float becomes that.
+    """
+    planes: dict[str, NDArray[np.float16]] = {}
+    for name, image in images.items():
+        writable = np.require(image, requirements="W")  # arrays of other processes are read-only
+        # PyTorch converts ten times as fast as NumPy.
+        halves = torch.from_numpy(writable).half().clamp_(max=LARGEST_HALF).numpy()
+        colors = "RGB" if image.shape[2] == 3 else "Y"
+        planes |= {f"{name}.{color}": halves[..., k] for k, color in enumerate(colors)}
+    return planes
+
+
+def write_exr_halves(path: Path, planes: Mapping[str, NDArray[np.float16]], notes: Mapping[str, str]) -> None:
+    """Write channels ``[H, W]`` without compression; ``notes``: attributes. Raises OSError."""
+    names = sorted(planes)
+    height, width = planes[names[0]].shape
+    rows = np.empty(height, np.dtype([("y", "<i4"), ("bytes", "<i4"), ("light", "<f2", (len(names), width))]))
+    rows["y"], rows["bytes"] = np.arange(height), 2 * len(names) * width
+    for place, name in enumerate(names):
+        rows["light"][:, place] = planes[name]
+    head = _header(names, (width, height), notes)
+    offsets = len(head) + 8 * height + rows.itemsize * np.arange(height, dtype="<u8")
+    with path.open("wb") as stream:
+        stream.write(head)
+        stream.write(offsets.astype("<u8").tobytes())
+        stream.write(rows.data)
+
+
+def _header(channels: list[str], size: tuple[int, int], notes: Mapping[str, str]) -> bytes:
+    """Magic number, version and attributes of a part of scanlines."""
+    window = struct.pack("<4i", 0, 0, size[0] - 1, size[1] - 1)
+    listed = b"".join(name.encode() + b"\0" + struct.pack("<i4B2i", _HALF, 0, 0, 0, 0, 1, 1) for name in channels)
+    attributes = [
+        ("channels", "chlist", listed + b"\0"),
+        ("compression", "compression", b"\0"),
+        ("dataWindow", "box2i", window),
+        ("displayWindow", "box2i", window),
+        ("lineOrder", "lineOrder", b"\0"),
+        ("pixelAspectRatio", "float", struct.pack("<f", 1)),
+        ("screenWindowCenter", "v2f", struct.pack("<2f", 0, 0)),
+        ("screenWindowWidth", "float", struct.pack("<f", 1)),
+        *((name, "string", text.encode()) for name, text in notes.items()),
+    ]
+    packed = (
+        name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
+        for name, kind, value in attributes
+    )
+    return struct.pack("<2i", _MAGIC, _VERSION) + b"".join(packed) + b"\0"

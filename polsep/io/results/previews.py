@@ -1,0 +1,282 @@
+"""Pictures of a separated frame for people: tone curve, colour maps with legends, and a contact sheet.
+
+Pure functions on arrays; nothing here reads or writes a file, and nothing measured should be read off a preview.
+
+Conventions: images come in as linear light ``[H, W, C]`` (C = 3 or 1) and leave as sRGB ``uint8 [h, w, 3]``. Angles
+are radians in [0, pi) from image-right toward image-UP; rows grow downward, so a direction (d_row, d_col) has the
+angle atan2(-d_row, d_col). Shrinking averages light, and polarization as Stokes vectors, before any tone curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+if TYPE_CHECKING:
+    from polsep.separation.report import SeparatedFrame
+
+Values = NDArray[np.floating[Any]]
+Pixels = NDArray[np.uint8]
+
+PANEL = 640  # longest side of a panel in pixels
+TITLE, GUTTER, MARGIN, LEGEND = 34, 12, 16, 116  # heights and gaps of the contact sheet in pixels
+NARROWEST = 300  # width that titles and legends need
+BACKGROUND, TEXT, FAINT = (22, 22, 24), (235, 235, 235), (150, 150, 155)
+
+#: Nine evenly spaced colours of matplotlib's "inferno" (van der Walt and Smith 2015, CC0): ever lighter.
+INFERNO = "000004 210c4a 56106e 89226a bb3754 e35932 f98c0a f9c932 fcffa4"
+#: Three colours that also colour-blind people tell apart (Okabe and Ito 2008): vermilion, sky blue, yellow.
+NOT_VALID, ABOVE_RANGE, ABOVE_ONE = (213, 94, 0), (86, 180, 233), (240, 228, 66)
+
+
+class Flag(NamedTuple):
+    """One kind of pixel to point out: where ``[H, W]``, in which colour, under which name."""
+
+    where: NDArray[np.bool_]
+    color: tuple[int, int, int]
+    name: str
+
+
+class Panel(NamedTuple):
+    """One cell of the contact sheet: a title, a remark and the picture ``uint8 [h, w, 3]``."""
+
+    title: str
+    note: str
+    pixels: Pixels
+
+
+def srgb(linear: ArrayLike) -> NDArray[np.float64]:
+    """Encode linear light with the sRGB transfer function; values are clipped to [0, 1] first. Any shape.
+
+    Source: IEC 61966-2-1:1999.
+    """
+    x = np.clip(np.asarray(linear, dtype=np.float64), 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def exposure_of(image: Values, percentile: float = 99.5) -> float:
+    """The gain that shows ``percentile`` of the samples of a linear image at 0.9; one gain serves all its parts.
+
+    The brightest sample takes over where that percentile is dark, and an image without light has gain 1.
+    """
+    level = float(np.percentile(image, percentile))
+    level = level if level > 0 else float(np.max(image))
+    return 0.9 / level if level > 0 else 1.0
+
+
+def aolp_wheel(aolp: ArrayLike, dolp: ArrayLike | None = None) -> Pixels:
+    """Colours ``uint8 [..., 3]`` of angles in radians: red at 0, green at 60, blue at 120 degrees, and around again.
+
+    Channel k is cos^2(aolp - k 60 deg), Malus's law for three analysers. These are the hues of the HSV wheel at
+    hue = aolp / pi without its corners, so a rotation by 60 degrees permutes the channels. With ``dolp`` (limited to
+    [0, 1]) colours darken so that their light is proportional to it: unpolarized is black, however random its angle.
+    """
+    angles = np.asarray(aolp, dtype=np.float64)[..., None] - np.arange(3) * (np.pi / 3)
+    color = np.cos(angles) ** 2
+    if dolp is not None:
+        color = color * srgb(dolp)[..., None]
+    return _to_bytes(color)
+
+
+def aolp_legend(size: int) -> Pixels:
+    """The disc ``uint8 [size, size, 3]`` that explains `aolp_wheel`: angle around, DoLP from 0 at the centre to 1."""
+    fine = 4 * size
+    right = np.broadcast_to(np.arange(fine) - (fine - 1) / 2, (fine, fine))
+    up = -right.T
+    radius = np.hypot(right, up) / (fine / 2)
+    color = aolp_wheel(np.arctan2(up, right), radius).astype(np.float64)
+    color[radius > 1] = BACKGROUND
+    mean: NDArray[np.float64] = color.reshape(size, 4, size, 4, 3).mean(axis=(1, 3))
+    return np.rint(mean).astype(np.uint8)
+
+
+def dolp_map(dolp: ArrayLike) -> Pixels:
+    """Colours ``uint8 [..., 3]`` of degrees of polarization: black at 0 over purple and orange to pale yellow at 1.
+
+    `INFERNO`, linearly interpolated. Values above 1 get the last colour here and a mark in `contact_sheet`.
+    """
+    table = np.array([list(bytes.fromhex(color)) for color in INFERNO.split()]) / 255
+    x = np.clip(np.asarray(dolp, dtype=np.float64), 0, 1)
+    at = np.linspace(0, 1, len(table))
+    return _to_bytes(np.stack([np.interp(x, at, table[:, k]) for k in range(3)], axis=-1))
+
+
+def contact_sheet(frame: SeparatedFrame) -> Pixels:
+    """One picture ``uint8 [h, w, 3]`` of a frame: input, diffuse, specular; DoLP, AoLP and a mask, with legends.
+
+    Input is diffuse + specular; the three share one gain, printed on them. Panels keep the aspect ratio, at most
+    `PANEL` pixels on the longer side; frames smaller than half of that show every pixel as 2x2.
+    The mask points out pixels that are not valid, sums above the measurable 2, and DoLP above 1, with their shares.
+    """
+    total = np.maximum(frame.diffuse, 0) + np.maximum(frame.specular, 0)
+    flags = _flags(frame, total)
+    panels = _panels(frame, total, flags)
+    height, width = panels[0].pixels.shape[:2]
+    scale = 2 if 2 * max(height, width) <= PANEL else 1
+    cell_width, cell_height = max(scale * width, NARROWEST), TITLE + scale * height + GUTTER
+    lefts = [MARGIN + k * (cell_width + GUTTER) for k in range(3)]
+    size = (lefts[-1] + cell_width + MARGIN, 2 * cell_height + LEGEND + 2 * MARGIN)
+    sheet = Image.new("RGB", size, BACKGROUND)
+    for k, panel in enumerate(panels):
+        left, top = lefts[k % 3], MARGIN + k // 3 * cell_height
+        _draw_title(sheet, (left, top, cell_width), panel.title, panel.note)
+        _paste(sheet, panel.pixels.repeat(scale, axis=0).repeat(scale, axis=1), (left, top + TITLE))
+    below = MARGIN + 2 * cell_height
+    _draw_dolp_legend(sheet, (lefts[0], below, cell_width))
+    _draw_aolp_legend(sheet, (lefts[1], below))
+    _draw_flag_legend(sheet, (lefts[2], below), flags)
+    return np.array(sheet, dtype=np.uint8)
+
+
+def live_sheet(frame: SeparatedFrame) -> Pixels:
+    """Input, diffuse and specular side by side, ``uint8 [h, w, 3]``, with one gain: what is quick enough to be live."""
+    diffuse, specular = (_shrunk(np.maximum(image, 0)) for image in (frame.diffuse, frame.specular))
+    total = diffuse + specular
+    gain = exposure_of(total)
+    gap = np.full((total.shape[0], GUTTER, 3), BACKGROUND, np.uint8)
+    return np.concatenate([toned(total, gain), gap, toned(diffuse, gain), gap, toned(specular, gain)], axis=1)
+
+
+def _panels(frame: SeparatedFrame, total: Values, flags: list[Flag]) -> list[Panel]:
+    """The six pictures of the contact sheet in reading order, all of one size; ``total`` is the linear input."""
+    gain = exposure_of(total)
+    dolp, aolp = _shrunk_polarization(frame, total.mean(axis=-1))
+    combined, diffuse, specular = (toned(_shrunk(image), gain) for image in (total, frame.diffuse, frame.specular))
+    exposure = f"exposure x {gain:.3g}"
+    return [
+        Panel("Input", exposure, combined),
+        Panel("Diffuse", exposure, diffuse),
+        Panel("Specular", exposure, specular),
+        Panel("DoLP", "degree of linear polarization", dolp_map(dolp)),
+        Panel("AoLP", "angle of linear polarization", aolp_wheel(aolp, dolp)),
+        Panel("Mask", "", _flagged(combined, flags)),
+    ]
+
+
+def _to_bytes(display: Values) -> Pixels:
+    """Display values in [0, 1] as 8 bits."""
+    return np.rint(np.clip(display, 0, 1) * 255).astype(np.uint8)
+
+
+def toned(image: Values, gain: float) -> Pixels:
+    """A linear image ``[H, W, C]``, times ``gain``, as sRGB ``uint8 [H, W, 3]``."""
+    return _to_bytes(np.broadcast_to(srgb(gain * image), (*image.shape[:2], 3)))
+
+
+def _shrunk(image: Values) -> NDArray[np.float64]:
+    """Area average over square blocks, cut at the border, so that neither side of ``[H, W, ...]`` exceeds `PANEL`."""
+    height, width = image.shape[:2]
+    k = -(-max(height, width) // PANEL)
+    rows, cols = np.arange(0, height, k), np.arange(0, width, k)
+    sums: NDArray[np.float64] = np.add.reduceat(np.add.reduceat(image.astype(np.float64), rows, axis=0), cols, axis=1)
+    count = np.diff(rows, append=height)[:, None] * np.diff(cols, append=width)
+    mean: NDArray[np.float64] = sums / count.reshape(count.shape + (1,) * (image.ndim - 2))
+    return mean
+
+
+def _shrunk_polarization(frame: SeparatedFrame, s0: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """DoLP and AoLP ``[h, w]`` of the averaged Stokes vectors; DoLP 0 where there is no light."""
+    light = _shrunk(s0)
+    s1 = _shrunk(s0 * frame.dolp * np.cos(2 * frame.aolp))
+    s2 = _shrunk(s0 * frame.dolp * np.sin(2 * frame.aolp))
+    dolp = np.hypot(s1, s2) / np.where(light > 0, light, 1)
+    return dolp, np.mod(np.arctan2(s2, s1) / 2, np.pi)
+
+
+def _flags(frame: SeparatedFrame, total: Values) -> list[Flag]:
+    """What the mask panel points out, later ones drawn over earlier ones."""
+    return [
+        Flag(frame.dolp > 1, ABOVE_ONE, "DoLP above 1"),
+        Flag(np.max(total, axis=-1) > 2, ABOVE_RANGE, "above the measurable range"),
+        Flag(~frame.valid, NOT_VALID, "not valid"),
+    ]
+
+
+def _flagged(picture: Pixels, flags: list[Flag]) -> Pixels:
+    """The picture grey and dim, with every flagged pixel tinted, however few of a block they are."""
+    grey = picture.astype(np.float64).mean(axis=-1, keepdims=True) * 0.55
+    out: NDArray[np.float64] = np.broadcast_to(grey, picture.shape)
+    for flag in flags:
+        share = _shrunk(flag.where.astype(np.float64))[..., None]
+        opacity = np.where(share > 0, 0.45 + 0.4 * share, 0)
+        out = (1 - opacity) * out + opacity * np.array(flag.color)
+    return np.rint(out).astype(np.uint8)
+
+
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The font that comes with Pillow."""
+    return ImageFont.load_default(size=size)
+
+
+def _paste(sheet: Image.Image, pixels: Pixels, corner: tuple[int, int]) -> None:
+    """Copy an array onto the sheet with its top left pixel at ``corner`` (x, y)."""
+    sheet.paste(Image.fromarray(np.ascontiguousarray(pixels)), corner)
+
+
+def _draw_title(sheet: Image.Image, box: tuple[int, int, int], title: str, note: str) -> None:
+    """Title at the left and note at the right above a panel; ``box`` is left, top, width."""
+    draw, (left, top, width) = ImageDraw.Draw(sheet), box
+    base = top + TITLE - 10
+    draw.text((left, base), title, fill=TEXT, font=_font(20), anchor="ls")
+    draw.text((left + width, base), note, fill=FAINT, font=_font(15), anchor="rs")
+
+
+def _draw_dolp_legend(sheet: Image.Image, box: tuple[int, int, int]) -> None:
+    """The scale bar of `dolp_map` with five ticks; ``box`` is left, top, width."""
+    draw, (left, top, width) = ImageDraw.Draw(sheet), box
+    bar = np.repeat(dolp_map(np.linspace(0, 1, width))[None], 18, axis=0)
+    _paste(sheet, bar, (left, top))
+    draw.rectangle((left, top, left + width - 1, top + 17), outline=FAINT)
+    for k in range(5):
+        x = left + round((width - 1) * k / 4)
+        draw.line((x, top + 18, x, top + 23), fill=FAINT)
+        draw.text((x, top + 28), f"{k / 4:g}", fill=TEXT, font=_font(15), anchor="lmmmr"[k] + "t")
+
+
+def _draw_aolp_legend(sheet: Image.Image, corner: tuple[int, int]) -> None:
+    """The wheel with its angles in degrees and a note beside it, from ``corner`` (x, y) right and down."""
+    draw, size = ImageDraw.Draw(sheet), 96
+    left, top = corner[0] + 36, corner[1] + 18
+    _paste(sheet, aolp_legend(size), (left, top))
+    x, y, reach = left + size / 2, top + size / 2, size / 2 + 5
+    for angle, anchor in ((0, "lm"), (45, "lb"), (90, "mb"), (135, "rb")):
+        at = (x + reach * np.cos(np.radians(angle)), y - reach * np.sin(np.radians(angle)))
+        draw.text(at, f"{angle}°", fill=TEXT, font=_font(14), anchor=anchor)
+    for text, offset in (("centre: DoLP 0", -12), ("rim: DoLP 1", 12)):
+        draw.text((left + size + 44, y + offset), text, fill=FAINT, font=_font(15), anchor="lm")
+
+
+def _draw_flag_legend(sheet: Image.Image, corner: tuple[int, int], flags: list[Flag]) -> None:
+    """A coloured square, a name and a share of the pixels per flag, from ``corner`` (x, y) down."""
+    draw, (left, top) = ImageDraw.Draw(sheet), corner
+    for k, flag in enumerate(reversed(flags)):
+        y = top + 26 * k
+        draw.rectangle((left, y + 1, left + 15, y + 16), fill=flag.color)
+        text = f"{flag.name}: {_percent(flag.where)}"
+        draw.text((left + 26, y + 9), text, fill=TEXT, font=_font(15), anchor="lm")
+
+
+def _percent(where: NDArray[np.bool_]) -> str:
+    """The share of True in percent; a few pixels never read as none."""
+    share = 100 * float(np.mean(where))
+    return "none" if share == 0 else f"{share:.3g} %" if share >= 0.01 else "below 0.01 %"
+
+
+def titled_sheet(rows: Sequence[Sequence[Panel]]) -> Pixels:
+    """Rows of titled pictures of one size on a dark sheet."""
+    height, width = rows[0][0].pixels.shape[:2]
+    columns = max(len(row) for row in rows)
+    size = (MARGIN + columns * (width + GUTTER) - GUTTER + MARGIN, MARGIN + len(rows) * (TITLE + height + GUTTER))
+    sheet = Image.new("RGB", size, BACKGROUND)
+    for r, row in enumerate(rows):
+        for c, panel in enumerate(row):
+            left, top = MARGIN + c * (width + GUTTER), MARGIN + r * (TITLE + height + GUTTER) - GUTTER
+            _draw_title(sheet, (left, top, width), panel.title, panel.note)
+            _paste(sheet, panel.pixels, (left, top + TITLE))
+    return np.asarray(sheet)

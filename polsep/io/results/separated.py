@@ -1,0 +1,142 @@
+"""Separated frames as polsep wrote them, read back: EXR by layers, NPZ, and numbered sequences of them.
+
+The twin of `outputs` and `sequences`. Half floats become float32. TIFF and PNG sets and lossless films are not read:
+PNG limits light, and sets are many files for one frame.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.io.raw.npy import read_arrays
+from polsep.io.results.exr import read_exr_layers
+from polsep.io.store.errors import InputError, input_error, naming
+from polsep.separation.report import SeparatedFrame
+
+Floats = NDArray[np.float32]
+#: Arrays of a file by the names of `SeparatedFrame`.
+Images = dict[str, Floats]
+
+#: Files that hold a separated frame.
+SUFFIXES = (".exr", ".npz")
+_MAPS = ("dolp", "aolp", "valid")
+#: Shapes behind height and width, of all but the images.
+_BESIDE: dict[str, tuple[tuple[int, ...], ...]] = {**dict.fromkeys(_MAPS, ((),)), "error": ((2,),)}
+_NUMBERED = re.compile(r"(?P<stem>.+)_(?P<number>\d{4,})\.(exr|npz)")
+
+
+@dataclass(frozen=True)
+class Numbered:
+    """A sequence of separated frames: ``stem``, and for each number from ``first`` on its file, None where it lacks."""
+
+    stem: str
+    first: int
+    files: tuple[Path | None, ...]
+
+    def missing(self) -> list[int]:
+        """The numbers in between that have no file."""
+        return [number for number, path in enumerate(self.files, self.first) if path is None]
+
+
+def read_separated(path: Path) -> SeparatedFrame:
+    """The frame of a file that polsep wrote, bit for bit, but for its report.
+
+    Files of diffuse and specular alone, as of `polsep video` and `polsep edit`, are valid everywhere and of DoLP and
+    AoLP 0. Raises InputError, also for values that no separation has: below 0, infinite, not a number; for too large
+    ones by their header.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise input_error(
+            path, f"expected a separated frame ({', '.join(SUFFIXES)}), found {suffix or 'no extension'!r}"
+        )
+    planes = read_exr_layers(path) if suffix == ".exr" else None
+    with naming(path):
+        images = _from_archive(path) if planes is None else _from_layers(planes)
+        return _as_frame(images, path.name)
+
+
+def holds_separated(path: Path) -> bool:
+    """True for an NPZ archive with the names of a separated frame's arrays, False for any other."""
+    try:
+        return {"diffuse", "specular"} <= set(read_arrays(path, ())[1])
+    except (ValueError, OSError):
+        return False
+
+
+def _from_layers(planes: Mapping[str, NDArray[Any]]) -> Images:
+    """Images from channels by their full names; whatever else the file has is left."""
+    images = {}
+    for layer in ("diffuse", "specular"):
+        channels = next((c for c in ("RGB", "Y") if all(f"{layer}.{color}" in planes for color in c)), None)
+        if channels is None:
+            found = ", ".join(sorted(planes)[:8])
+            raise InputError(f"expected channels {layer}.R, .G and .B, or {layer}.Y, found {found}")
+        images[layer] = _stacked(planes, [f"{layer}.{color}" for color in channels])
+    images |= {name: planes[f"{name}.Y"].astype(np.float32) for name in _MAPS if f"{name}.Y" in planes}
+    errors = [f"error.{name}" for name in ("diffuse", "specular")]
+    return images | ({"error": _stacked(planes, errors)} if all(name in planes for name in errors) else {})
+
+
+def _stacked(planes: Mapping[str, NDArray[Any]], names: list[str]) -> Floats:
+    return np.stack([planes[name] for name in names], axis=-1).astype(np.float32)
+
+
+def _from_archive(path: Path) -> Images:
+    """Images from arrays by name."""
+    arrays, names = read_arrays(path, ("diffuse", "specular", *_MAPS, "error"))
+    if not {"diffuse", "specular"} <= set(arrays):
+        raise InputError(f"expected arrays diffuse and specular, found {', '.join(names[:8]) or 'none'}")
+    for image in (arrays["diffuse"], arrays["specular"]):
+        if image.dtype != np.float32 or image.ndim != 3 or image.shape[2] not in (1, 3):
+            raise InputError(f"expected arrays float32 [h, w, 3 or 1], found {image.dtype} {list(image.shape)}")
+    return {name: array.astype(np.float32, copy=False) for name, array in arrays.items()}
+
+
+def _as_frame(images: Images, source: str) -> SeparatedFrame:
+    """The frame of images by name, once they are believed."""
+    diffuse, specular = images["diffuse"], images["specular"]
+    if diffuse.shape != specular.shape:
+        shapes = f"{list(diffuse.shape)} and {list(specular.shape)}"
+        raise InputError(f"expected diffuse and specular of one shape, found {shapes}")
+    size = diffuse.shape[:2]
+    for name, image in images.items():
+        if image.shape[:2] != size or image.shape[2:] not in _BESIDE.get(name, ((1,), (3,))):
+            raise InputError(f"expected {name} like the images {list(size)}, found {list(image.shape)}")
+        wrong = int(np.count_nonzero(~((image >= 0) & (image < np.inf))))
+        if wrong:
+            unit = "values" if name in _BESIDE else "light"
+            raise InputError(f"expected finite {name} {unit} of 0 or more, found {wrong} other samples")
+    zero = np.zeros(size, np.float32)
+    dolp, aolp = (images.get(name, zero) for name in ("dolp", "aolp"))
+    valid = images["valid"] > 0.5 if "valid" in images else np.ones(size, bool)
+    report = {"statistics": {}, "warnings": [], "source": source, "method": "opened as a result"}
+    return SeparatedFrame(diffuse, specular, valid, dolp, aolp, report, images.get("error"))
+
+
+def find_numbered(folder: Path) -> Numbered:
+    """The sequence in a folder, as `polsep video` writes it: STEM_000123.exr. Raises InputError unless there is one."""
+    found: dict[str, dict[int, Path]] = {}
+    for path in sorted(folder.iterdir()):
+        if (match := _NUMBERED.fullmatch(path.name)) is not None:
+            frames = found.setdefault(match["stem"] + path.suffix, {})
+            if frames.setdefault(int(match["number"]), path) != path:
+                raise input_error(
+                    folder, f"expected each number once, found {frames[int(match['number'])].name} and {path.name}"
+                )
+    if not found:
+        raise input_error(
+            folder, "expected a sequence STEM_000123.exr or .npz, found none; name single files themselves"
+        )
+    if len(found) > 1:
+        raise input_error(folder, f"expected one sequence, found {len(found)}: {', '.join(found)}")
+    ((name, frames),) = found.items()
+    first, last = min(frames), max(frames)
+    return Numbered(Path(name).stem, first, tuple(frames.get(number) for number in range(first, last + 1)))

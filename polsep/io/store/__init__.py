@@ -1,0 +1,1 @@
+"""What polsep keeps for itself: whole files, weights, checkpoints, rows of results."""

@@ -1,0 +1,57 @@
+"""What a training keeps on disk: its state and its log, replaced by renaming, so a kill leaves the last whole one."""
+
+from __future__ import annotations
+
+import os
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from polsep.io.store.whole import beside, replace_text
+
+
+def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write a state of tensors, numbers and strings, whole or not at all."""
+    with beside(path) as part, part.open("wb") as file:
+        torch.save(state, file)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_checkpoint(path: Path) -> dict[str, Any] | None:
+    """The state in ``path``, or None where there is no file. Raises ValueError on a file that is none of ours."""
+    if not path.exists():
+        return None
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise ValueError(f"expected a checkpoint of a training in {path}, found {type(error).__name__}") from None
+    if not isinstance(state, dict) or "step" not in state:
+        raise ValueError(f"expected a checkpoint of a training in {path}, found something else")
+    return state
+
+
+def append_line(path: Path, line: str) -> None:
+    """Add a line to a log."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(line + "\n")
+
+
+def read_lines(path: Path) -> list[str]:
+    """The lines of a log; none without a file. A last one that a kill cut short does not count."""
+    if not path.exists():
+        return []
+    return path.read_bytes().decode("utf-8", errors="replace").split("\n")[:-1]
+
+
+def write_lines(path: Path, lines: list[str]) -> None:
+    """Replace a log as a whole."""
+    replace_text(path, "".join(line + "\n" for line in lines))
+
+
+def read_module(name: str) -> bytes:
+    """The source of a module of the installed package, by its path there: part of what a training depends on."""
+    return files("polsep").joinpath(name).read_bytes()

@@ -1,0 +1,129 @@
+"""Benchmark rows on disk, arrays that benchmarks hand to other programs, and the README tables made from rows."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import resource
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.io.store.whole import replace_text
+
+#: A table in a Markdown file stands between these two comments.
+_TABLE = re.compile(
+    r"(<!-- table: (?P<name>\w+)(?P<part>/\w+)?(?P<turned> by method)? -->\n).*?(<!-- end -->)", re.DOTALL
+)
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of a results file in JSON lines."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def write_array(path: Path, array: NDArray[Any]) -> None:
+    """An NPY file that hands an array to another program; makes its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, array, allow_pickle=False)
+
+
+def read_array(path: Path) -> NDArray[Any]:
+    """The array of an NPY file from another program."""
+    return np.asarray(np.load(path, allow_pickle=False))
+
+
+def read_bytes(path: Path) -> bytes:
+    """What a file holds."""
+    return path.read_bytes()
+
+
+def read_memory() -> float:
+    """Resident memory of this process now [MiB]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def write_chunks(path: Path, chunks: Iterable[bytes]) -> None:
+    """One file of many chunks."""
+    with path.open("wb") as stream:
+        for chunk in chunks:
+            stream.write(chunk)
+
+
+def read_peak_memory() -> float:
+    """Peak resident MiB of this program; outside Linux that of the program that started it counts too."""
+    status = Path("/proc/self/status")
+    if status.is_file():
+        return int(re.findall(r"VmHWM:\s*(\d+) kB", status.read_text(encoding="utf-8"))[0]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def fill_tables(markdown: str, results: Path) -> str:
+    """The Markdown text with every table between its comments made anew from ``results``/NAME.jsonl.
+
+    ``table: NAME/PART`` takes the rows whose bench is NAME/PART alone, ``by method`` turns the table. A table without
+    results yet says what makes them.
+    """
+
+    def table(match: re.Match[str]) -> str:
+        path, bench = results / f"{match['name']}.jsonl", f"{match['name']}{match['part'] or ''}"
+        rows = [row for row in read_rows(path) if row["bench"] == bench] if path.is_file() else []
+        if not rows:
+            return f"{match[1]}Not measured yet: `polsep bench {match['name']}`.\n{match[5]}"
+        return match[1] + (method_table(rows) if match["turned"] else markdown_table(rows)) + match[5]
+
+    return _TABLE.sub(table, markdown)
+
+
+def fill_readme(readme: Path, results: Path) -> None:
+    """`fill_tables` on a file, replaced as a whole."""
+    replace_text(readme, fill_tables(readme.read_text(encoding="utf-8"), results))
+
+
+def markdown_table(rows: list[dict[str, Any]]) -> str:
+    """One line per case and metric, one column per method, and what made the numbers.
+
+    Metrics that differ in "diffuse" and "specular" alone share a line, as "diffuse / specular".
+    """
+    cells = _cells(rows)
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    lines = dict.fromkeys((case, metric) for case, metric, _ in cells)
+    body = [[case, metric, *(cells.get((case, metric, method), "") for method in methods)] for case, metric in lines]
+    return _table([["case", "measured", *methods], *body], rows)
+
+
+def method_table(rows: list[dict[str, Any]]) -> str:
+    """`markdown_table` turned: one line per case and method, one column per metric."""
+    cells = _cells(rows)
+    metrics = list(dict.fromkeys(metric for _, metric, _ in cells))
+    lines = dict.fromkeys((case, method) for case, _, method in cells)
+    body = [[case, method, *(cells.get((case, metric, method), "") for metric in metrics)] for case, method in lines]
+    return _table([["case", "method", *metrics], *body], rows)
+
+
+def _cells(rows: list[dict[str, Any]]) -> dict[tuple[str, str, str], str]:
+    """Numbers by case, metric with unit, and method."""
+    values: dict[tuple[str, str, str], list[str]] = {}
+    for row in rows:
+        metric = re.sub(r"^(diffuse|specular) (?=PSNR|flicker)", "diffuse / specular ", row["metric"])
+        values.setdefault((row["case"], f"{metric} [{row['unit']}]", row["method"]), []).append(_number(row["value"]))
+    return {key: " / ".join(texts) for key, texts in values.items()}
+
+
+def _table(cells: list[list[str]], rows: list[dict[str, Any]]) -> str:
+    """Markdown of a head and its lines, and what made the rows."""
+    lines = ["| " + " | ".join(texts) + " |" for texts in (cells[0], ["---"] * len(cells[0]), *cells[1:])]
+    first = rows[0]
+    return "\n".join(lines) + f"\n\n`{first['command']}`, commit {first['commit']}, {first['machine']}\n"
+
+
+def _number(value: float) -> str:
+    """One decimal from 10 on, else three significant digits; whole numbers as they are."""
+    if value == int(value) or abs(value) >= 200:
+        return f"{value:.0f}"
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3g}"

@@ -1,0 +1,89 @@
+"""Materials that vary over a plane as maps, and what light makes of them: the renderer that networks learn through.
+
+Conventions: the plane is x, y in [-1, 1] at z = 0, x right, y up, z toward the camera; maps are ``[..., C, H, W]``,
+row 0 at y = 1. ``diffuse`` and ``specular`` are linear RGB in [0, 1], the latter the reflectance at normal incidence,
+0.04 for glass; roughness r is GGX alpha = r^2. The shading is that of Deschaintre et al. 2018, which game engines and
+glTF share: GGX, Smith with k = alpha / 2, Schlick by a power of two, diffuse (1 - specular) / pi. No polarization.
+
+Source: Deschaintre, Aittala, Durand, Drettakis, Bousseau 2018, doi:10.1145/3197517.3201378; Karis 2013.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from polsep.physics.optics import dot, normalize
+
+#: Exponents of Schlick's term as a power of two (Karis 2013).
+SCHLICK = (-5.55473, -6.98316)
+#: Roughness and cosines from which on shading is computed.
+MIN_ROUGHNESS, MIN_COSINE = 0.03, 1e-3
+#: Channels of maps that are stacked: normal x and y, diffuse, roughness, specular.
+STACKED = 9
+
+
+@dataclass(frozen=True)
+class Svbrdf:
+    """Maps ``[..., C, H, W]``: unit ``normal``, ``diffuse`` and ``specular`` of C = 3, ``roughness`` of C = 1."""
+
+    normal: Tensor
+    diffuse: Tensor
+    roughness: Tensor
+    specular: Tensor
+
+    def stack(self) -> Tensor:
+        """All maps as ``[..., 9, H, W]``: x and y of the normal, diffuse, roughness, specular."""
+        return torch.cat([self.normal[..., :2, :, :], self.diffuse, self.roughness, self.specular], dim=-3)
+
+    def at(self, rows: slice, cols: slice) -> Svbrdf:
+        """The maps at some rows and columns."""
+        maps = (self.normal, self.diffuse, self.roughness, self.specular)
+        return Svbrdf(*(x[..., rows, cols] for x in maps))
+
+
+def unstack(maps: Tensor) -> Svbrdf:
+    """The twin of `Svbrdf.stack`; normals look up."""
+    xy = maps[..., :2, :, :]
+    z = torch.sqrt((1 - dot(xy, xy)).clamp(min=1e-6))
+    normal = normalize(torch.cat([xy, z], dim=-3))
+    return Svbrdf(normal, maps[..., 2:5, :, :], maps[..., 5:6, :, :], maps[..., 6:9, :, :])
+
+
+def plane_points(height: int, width: int) -> Tensor:
+    """Pixel centres of the plane, ``[3, H, W]``."""
+    rows, cols = 1 - (torch.arange(height) + 0.5) * (2 / height), (torch.arange(width) + 0.5) * (2 / width) - 1
+    y, x = torch.meshgrid(rows, cols, indexing="ij")
+    return torch.stack([x, y, torch.zeros_like(x)])
+
+
+def reflect(maps: Svbrdf, to_camera: Tensor, to_light: Tensor) -> Tensor:
+    """The BRDF times the light's cosine for unit directions, all ``[..., 3, H, W]``; 0 behind the surface.
+
+    Times pi it is the radiance under a light by which white paper shows 1.
+    """
+    half = normalize(to_camera + to_light)
+    lit, seen = dot(maps.normal, to_light), dot(maps.normal, to_camera)
+    front = ((lit > 0) & (seen > 0)).to(lit)
+    lit, seen = lit.clamp(MIN_COSINE, 1), seen.clamp(MIN_COSINE, 1)
+    vh = dot(to_camera, half).clamp(0, 1)
+    nh = dot(maps.normal, half).clamp(0, 1)
+    alpha = maps.roughness.clamp(min=MIN_ROUGHNESS) ** 2
+    alpha2 = alpha * alpha
+    spread = 1 - nh * nh + nh * nh * alpha2
+    k = alpha / 2
+    smith = (lit * (1 - k) + k) * (seen * (1 - k) + k)
+    fresnel = maps.specular + (1 - maps.specular) * torch.exp2((SCHLICK[0] * vh + SCHLICK[1]) * vh)
+    lobe = alpha2 / (4 * math.pi * spread * spread * smith)
+    return front * lit * (fresnel * lobe + (1 - maps.specular) * maps.diffuse / math.pi)
+
+
+def relight(maps: Svbrdf, points: Tensor, camera: Tensor, light: Tensor) -> Tensor:
+    """What a camera at ``camera`` sees of the plane under a light at ``light``, both ``[..., 3, 1, 1]``.
+
+    The light is as strong at every point: white paper that faces it shows 1.
+    """
+    return math.pi * reflect(maps, normalize(camera - points), normalize(light - points))

@@ -1,0 +1,1 @@
+"""The networks: plain modules, the joint network, its engines and its export."""

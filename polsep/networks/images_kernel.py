@@ -1,0 +1,200 @@
+"""Twin of what follows the network in `joint.Joint.half_resolution`: corrections and closed form become images.
+
+Row after row of packed pixels, of which each makes two rows of images; see `networks.maps_kernel`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.compute.compiling import ONE, ZERO, compiled, entry
+from polsep.compute.rows import AT_ONCE, add_product, add_up, copy
+from polsep.compute.threads import Piece
+from polsep.demosaic.bilinear_kernel import read_pattern
+from polsep.demosaic.cells_kernel import Source, read_grid
+from polsep.networks.joint import PERIOD
+from polsep.networks.maps_kernel import Maps, Taps, map_guided_rows, map_rows
+from polsep.physics.stokes import stokes_inverse
+from polsep.sensor.camera import Layout
+from polsep.sensor.unpack_kernel import as_samples
+from polsep.separation.polarization_kernel import polarize
+
+Floats = NDArray[np.float32]
+
+#: Columns of ``sums``: s0, specular, DoLP above 1, power, power along and across, variance of diffuse and of specular
+#: that is expected, pixels near clipped ones, misfit.
+SUMS = 10
+#: Bits of the samples of a packed pixel's first cell.
+_CELL = 0b110011
+#: Cells of a packed pixel in one row, times what makes a distance of the rms of its two components.
+_CELLS = 2 * math.sqrt(2)
+
+
+class Found(NamedTuple):
+    """What is known of every packed pixel: ``base [h, 4 C + 14, w]`` and ``clipped [h, w]`` as in `joint.Maps`.
+
+    ``change [4 C + 8, h, w]``: the network's corrections, relative to the light, and for the closed form's specular
+    light relative to that. ``doubt [8, h, w]``: standard deviations of the errors of four cells' diffuse, then
+    specular, relative to the light.
+    """
+
+    base: Floats
+    clipped: NDArray[np.uint16]
+    change: Floats
+    doubt: Floats
+
+
+class Targets(NamedTuple):
+    """What is filled: colours ``[2 h, 2 w C]``, ``error [2 h, 2 w 2]``, others ``[2 h, 2 w]``; ``sums [2 h, 10]``."""
+
+    diffuse: Floats
+    specular: Floats
+    error: Floats
+    valid: NDArray[np.bool_]
+    dolp: Floats
+    aolp: Floats
+    sums: NDArray[np.float64]
+
+
+@compiled
+def _correct(closed: Any, change: Any, light: Any, moved: Any, image: Any) -> None:
+    """The closed form, more by ``moved``, with its correction, not below 0."""
+    for j in range(image.size):
+        value = closed[j] + moved[j] + change[j] * light[j]
+        image[j] = value if value > ZERO else ZERO
+
+
+@compiled
+def spread(row: Any, gain: Any, place: int, image: Any) -> None:
+    """A row to every so many numbers of an image row, from ``place`` on; as many as make its size."""
+    step = image.size // row.size
+    for j in range(row.size):
+        image[step * j + place] = gain * row[j]
+
+
+@compiled
+def _write_cells(found: Found, t: int, cell: int, gains: Any, work: tuple[Targets, Any]) -> None:
+    """One of the four cells of every packed pixel of row ``t``."""
+    targets, spare = work
+    y, side, colors = 2 * t + cell // 2, cell % 2, gains.size
+    base, light = found.base[t], found.base[t, 4 * colors + 12]
+    image, tau, s0, dolp, aolp, moved = spare[0], spare[1], spare[2], spare[3], spare[4], spare[5]
+    specular, trust = base[4 * colors + cell], found.change[4 * colors + 4 + cell, t]
+    for j in range(moved.size):
+        moved[j] = specular[j] * trust[j]
+    _correct(specular, found.change[4 * colors + cell, t], light, moved, tau)
+    copy(tau, s0)
+    for j in range(moved.size):
+        moved[j] = -moved[j]
+    for c in range(colors):
+        _correct(base[4 * c + cell], found.change[4 * c + cell, t], light, moved, image)
+        add_product(image, np.float32(1 / colors), s0)
+        spread(image, gains[c], colors * side + c, targets.diffuse[y])
+        spread(tau, gains[c], colors * side + c, targets.specular[y])
+    s1, s2 = base[4 * colors + 4 + cell], base[4 * colors + 8 + cell]
+    polarize(s0, s1, s2, dolp, aolp)
+    spread(dolp, ONE, side, targets.dolp[y])
+    spread(aolp, ONE, side, targets.aolp[y])
+    mean_gain = ZERO
+    for c in range(colors):
+        mean_gain += gains[c] / np.float32(colors)
+    sums = targets.sums[y]
+    for kind in range(2):
+        doubt = found.doubt[4 * kind + cell, t]
+        for j in range(image.size):
+            image[j] = doubt[j] * light[j]
+        spread(image, mean_gain, 2 * side + kind, targets.error[y])
+        for j in range(image.size):
+            image[j] *= image[j]
+        sums[6 + kind] += add_up(image)
+    sums[0] += add_up(s0)
+    sums[1] += add_up(tau)
+    for j in range(dolp.size):
+        moved[j] = ONE if dolp[j] > ONE else ZERO
+    sums[2] += add_up(moved)
+    add_polarization((tau, s1, s2), image, sums[3:6])
+
+
+@compiled
+def add_polarization(rows: tuple[Any, Any, Any], room: Any, sums: Any) -> None:
+    """Add power, and power along and across, of the polarization ``rows[1:]`` where there is specular light."""
+    tau, p1, p2 = rows
+    for j in range(room.size):
+        room[j] = tau[j] * np.sqrt(p1[j] * p1[j] + p2[j] * p2[j])
+    sums[0] += add_up(room)
+    for j in range(room.size):
+        room[j] = tau[j] * p1[j]
+    sums[1] += add_up(room)
+    for j in range(room.size):
+        room[j] = tau[j] * p2[j]
+    sums[2] += add_up(room)
+
+
+@compiled
+def mark_clipped(clipped: Any, y: int, valid: Any, near: Any) -> int:
+    """False in ``valid [2 w]`` near cells of which all clips; how many cells of the row are near a clipped sample.
+
+    ``near [2 w + 2]``, uint8, for cells of a row and one more on both sides: 1 where a sample clips, 2 where all do.
+    """
+    h, w = clipped.shape
+    first, last, some = max(y - 1, 0), min(y + 1, 2 * h - 1), np.uint16(0)
+    for row in range(first // 2, last // 2 + 1):
+        bits = clipped[row]
+        for j in range(w):
+            some |= bits[j]
+    for x in range(2 * w):
+        valid[x] = True
+    if some == 0:
+        return 0
+    for x in range(near.size):
+        near[x] = 0
+    for row in range(first, last + 1):
+        bits, shift = clipped[row // 2], np.uint16(8 * (row % 2))
+        for j in range(w):
+            own = bits[j] >> shift
+            left, right = own & _CELL, own >> 2 & _CELL
+            near[2 * j + 1] |= (left != 0) + 2 * (left == _CELL)
+            near[2 * j + 2] |= (right != 0) + 2 * (right == _CELL)
+    count = 0
+    for x in range(2 * w):
+        around = near[x] | near[x + 1] | near[x + 2]
+        valid[x] = around < 2
+        count += around != 0
+    return count
+
+
+@entry
+def write_rows(found: Found, gains: Floats, targets: Targets, piece: Piece) -> None:
+    """Images of a piece of the packed rows; ``gains [C]``: the light's colour."""
+    w = found.base.shape[2]
+    spare, near = np.zeros((6, w), np.float32), np.zeros(2 * w + 2, np.uint8)
+    for t in range(piece[0], piece[1]):
+        for cell in range(4):
+            _write_cells(found, t, cell, gains, (targets, spare))
+        for y in range(2 * t, 2 * t + 2):
+            targets.sums[y, 8] = mark_clipped(found.clipped, y, targets.valid[y], near)
+            targets.sums[y, 9] = _CELLS * add_up(found.base[t, found.base.shape[1] - 1])
+
+
+def warm_up() -> None:
+    """Compile both ways to the maps and what writes the images, or load them from numba's cache on disk."""
+    layout, size = Layout(), 4
+    samples = as_samples(np.eye(PERIOD * size, dtype=np.uint8))
+    pattern = read_pattern((PERIOD * size, PERIOD * size), layout, 0, 1, (1.0, 1.0, 1.0))
+    base, clipped = np.zeros((size, 26, size), np.float32), np.zeros((size, size), np.uint16)
+    first = np.array([-1, -1, -1, -1, -1, 0], np.int64)
+    none = np.zeros((0, 0, 0), np.float32)
+    maps = Maps(np.zeros((size, size, 1), np.float32), none.astype(np.uint16), first, base, clipped, none)
+    nothing = np.zeros((4, AT_ONCE), np.int64)
+    map_rows(samples, pattern, Taps(np.zeros((4, 9, AT_ONCE), np.float32), nothing, nothing, 3), maps, (0, size))
+    grid = read_grid(pattern, layout.angles, stokes_inverse(layout.angles).float().numpy())
+    map_guided_rows(Source(samples, pattern, grid), maps, (0, size))
+    found = Found(base, clipped, *(np.zeros((n, size, size), np.float32) for n in (20, 8)))
+    colors, pairs, grey = (np.zeros((2 * size, 2 * size * n), np.float32) for n in (3, 2, 1))
+    sums = np.zeros((2 * size, SUMS))
+    targets = Targets(colors, colors, pairs, np.zeros((2 * size, 2 * size), np.bool_), grey, grey, sums)
+    write_rows(found, np.ones(3, np.float32), targets, (0, size))

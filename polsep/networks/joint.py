@@ -1,0 +1,367 @@
+"""The joint network: a raw mosaic in, diffuse and specular out; demosaicking, closed form and refinement in one graph.
+
+A mosaic is packed to quarter resolution: the 16 samples of a period become channels, so every pixel of the network
+sees the same filters. Stokes images come from the intensity guide (`guided.guide_once`) or, in less time, from a linear
+filter fitted to examples. The colour-affine closed form (`color_affine`) with windows of two sizes makes a first
+separation of these, with what clipping hid of highlights as far as unclipped samples tell. A U-Net of residual blocks,
+which sees samples, clip masks and the closed form, says how much of that one's specular light to believe and adds what
+is missing. The specular light is white by construction. Diffuse and specular sum to the network's own s0. Full
+resolution is half resolution with `details`.
+
+Inputs and corrections are relative to the brightness around, so that a darker exposure of a scene gives a darker image
+of the same separation, as far as noise and clipping allow. There are no statistics of whole images: crop and frame
+agree away from the border.
+
+Conventions: quarter resolution [h, w] is [H/4, W/4] of the mosaic. "Packed" images ``[N, C k^2, h, w]`` hold k x k
+pixels per period, in the order of `torch.nn.functional.pixel_unshuffle`; k = 4 at full, 2 at half resolution.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, pad, pixel_shuffle, pixel_unshuffle
+
+from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
+from polsep.demosaic.guided import MARGIN, guide_once
+from polsep.networks.details import Details
+from polsep.networks.unet import ResidualSize, ResidualUNet
+from polsep.physics.stokes import fit_stokes
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.separation.color_affine import MAX_DIFFUSE_DOLP, fit_unclipped
+
+#: Raw pixels along the side of a packed pixel.
+PERIOD = 4
+#: What the network sees besides the logarithm of the brightness; ablations leave some out.
+INPUTS = ("samples", "clipping", "cosine", "sine", "split")
+#: Brightness around that counts as black: below it inputs and corrections fade.
+MIN_LIGHT = 0.01
+#: Log variances of diffuse and specular that are expected at most: errors of 2 and 26 times the light around, which are
+#: those of the hundredth of the validation views where they are largest (docs/experiments.md).
+MAX_DOUBT = (1.5, 6.5)
+#: Windows of the slope in packed pixels, and the contrast of colours, relative to the brightness and squared, below
+#: which they fall back to the wider window and to zero. Chosen on validation views (docs/experiments.md).
+WINDOWS, TRUST = (9, 3), (3e-3, 3e-3)
+
+
+#: Where Stokes images come from.
+Demosaicker = Literal["linear", "guided"]
+
+
+class Guess(NamedTuple):
+    """What the closed form says at half resolution: ``diffuse [N, 4 C, h, w]``, ``specular [N, 4, h, w]``, packed.
+
+    ``polarized [N, 8 C, h, w]``: s1 and s2. ``light``, ``misfit [N, 1, h, w]``: the brightness around, and the rms
+    distance of s1 and s2 from the model; ``pose [N, 4, h, w]``: slope and direction as in `Pose`; ``lift [N, C, h, w]``
+    is what clipped samples lacked of s0; ``maps``: what the network sees, relative to the light.
+    """
+
+    diffuse: Tensor
+    specular: Tensor
+    polarized: Tensor
+    light: Tensor
+    misfit: Tensor
+    pose: Tensor
+    lift: Tensor
+    maps: Tensor
+
+
+class Pose(NamedTuple):
+    """Diffuse polarization ``slope`` and the specular one's ``direction``, a unit vector, ``[N, 2, H/4, W/4]`` each.
+
+    Both as (cos 2 phi, sin 2 phi), the slope times its degree.
+    """
+
+    slope: Tensor
+    direction: Tensor
+
+
+class Images(NamedTuple):
+    """``diffuse [N, C, ...]`` and ``specular [N, 1, ...]``, not limited to be positive, and what goes with them.
+
+    At half resolution: ``s1``, ``s2 [N, C, H/2, W/2]`` as linearly demosaicked; ``doubt [N, 2, H/2, W/2]``, the log
+    variance of the error of diffuse and specular, relative to the square of the brightness around,
+    ``light [N, 1, H/4, W/4]``; ``misfit [N, 1, H/4, W/4]`` as in `Guess`.
+    """
+
+    diffuse: Tensor
+    specular: Tensor
+    s1: Tensor
+    s2: Tensor
+    doubt: Tensor
+    light: Tensor
+    misfit: Tensor
+
+
+class Joint(nn.Module):
+    """Samples ``[N, 1, H, W]`` (black 0, white 1, Sony's order) to diffuse and specular images.
+
+    ``inputs``: those of `INPUTS` that it sees. ``demosaicker``: "guided" with frames continued by ``margin`` cells, or
+    "linear" by the filter ``demosaic``, no subject of gradients; see `bilinear_filter`.
+    """
+
+    demosaic: Tensor | None
+    most_doubt: Tensor
+
+    def __init__(
+        self, colors: int, size: ResidualSize, inputs: tuple[str, ...] = INPUTS, demosaicker: Demosaicker = "linear"
+    ) -> None:
+        super().__init__()
+        self.colors, self.size, self.inputs, self.margin = colors, size, inputs, MARGIN
+        self.layout = Layout(bayer="RGGB" if colors == 3 else None)
+        self.register_buffer("demosaic", bilinear_filter(self.layout) if demosaicker == "linear" else None)
+        counts = {"samples": 16, "clipping": 17, "cosine": 4, "sine": 4, "split": 4 * colors + 10}
+        self.net = ResidualUNet(1 + sum(counts[name] for name in inputs), size)
+        self.last = nn.Conv2d(size.widths[0], 4 * (colors + 1), 1)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
+        # Without the closed form among its maps the network does not know what it would believe.
+        self.trust = nn.Conv2d(size.widths[0], 4, 1) if "split" in inputs else None
+        if self.trust is not None:
+            nn.init.zeros_(self.trust.weight)
+            nn.init.zeros_(self.trust.bias)  # type: ignore[arg-type]
+        self.pose = nn.Conv2d(size.widths[0], 4, 1)
+        nn.init.zeros_(self.pose.weight)
+        nn.init.zeros_(self.pose.bias)  # type: ignore[arg-type]
+        most = torch.tensor(MAX_DOUBT).repeat_interleave(4).view(1, 8, 1, 1)
+        self.register_buffer("most_doubt", most, persistent=False)
+        self.doubt = nn.Sequential(nn.Conv2d(size.widths[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 8, 1))
+        self.details = Details(colors, size.widths[0])
+
+    def forward(self, raw: Tensor, clipped: Tensor) -> tuple[Images, Pose]:
+        """Images at full resolution, ``[N, C, H, W]``.
+
+        ``raw``, ``clipped [N, 1, H, W]``: samples and which of them clipped, H and W multiples of 4.
+        """
+        total, guess, features, doubt = self._see(raw, clipped, full=True)
+        half, turn = self._correct(guess, features), self.pose(features)
+        with torch.autocast(raw.device.type, enabled=False):
+            slope, direction = (guess.pose + turn.float()).chunk(2, dim=1)
+            length = torch.sqrt((direction**2).sum(dim=1, keepdim=True) + 1e-6)
+        full = self.details(half, total, features, guess.light)
+        return self._as_images(full, guess, doubt), Pose(slope, direction / length)
+
+    def half_resolution(self, raw: Tensor, clipped: Tensor) -> Images:
+        """The means over 2x2 cells of what `forward` gives, ``[N, C, H/2, W/2]``, in less time."""
+        _, guess, features, doubt = self._see(raw, clipped, full=False)
+        return self._as_images(self._correct(guess, features), guess, doubt)
+
+    def _correct(self, guess: Guess, features: Tensor) -> Tensor:
+        """Diffuse colours and specular at half resolution ``[N, C + 1, H/2, W/2]``."""
+        change, trust = self.last(features), self._trust(features)
+        with torch.autocast(features.device.type, enabled=False):
+            moved = guess.specular * trust
+            closed = torch.cat([guess.diffuse - torch.cat([moved] * self.colors, dim=1), guess.specular + moved], dim=1)
+            return pixel_shuffle(closed + change.float() * guess.light, 2)
+
+    def _trust(self, features: Tensor) -> Tensor:
+        """How much more specular light there is than in the closed form, relative to that ``[N, 4 or 1, h, w]``."""
+        trust = torch.zeros_like(features[:, :1]) if self.trust is None else self.trust(features)
+        return trust.float()
+
+    def _as_images(self, images: Tensor, guess: Guess, doubt: Tensor) -> Images:
+        s1, s2 = (pixel_shuffle(s, 2) for s in guess.polarized.chunk(2, dim=1))
+        return Images(images[:, : self.colors], images[:, self.colors :], s1, s2, doubt, guess.light, guess.misfit)
+
+    def _see(self, raw: Tensor, clipped: Tensor, full: bool) -> tuple[Tensor, Guess, Tensor, Tensor]:
+        """Packed s0 at full resolution, the closed form, the network's features and doubt."""
+        planes, masks = pixel_unshuffle(raw, PERIOD), pixel_unshuffle(clipped.to(raw), PERIOD)
+        with torch.autocast(raw.device.type, enabled=False), torch.no_grad():
+            half, total = self.demosaicked(planes, full)
+            guess = self.guess(half, planes, masks)
+            total = total + guess.lift.repeat_interleave(total.shape[1] // self.colors, dim=1)
+        features = self.net(guess.maps)
+        doubt = self.doubt(features.detach()).float()
+        return total, guess, features, pixel_shuffle(torch.minimum(doubt, self.most_doubt), 2)
+
+    def demosaicked(self, planes: Tensor, full: bool) -> tuple[Tensor, Tensor]:
+        """Of packed samples s0, s1, s2 at half resolution ``[N, 12 C, h, w]``, and s0 at full resolution or nothing."""
+        if self.demosaic is None:
+            stokes, s0 = guide_once(Mosaic(pixel_shuffle(planes, PERIOD)[:, 0], self.layout, 0.0, 1.0), self.margin)
+            half = torch.cat([pixel_unshuffle(s, 2) for s in (stokes.s0, stokes.s1, stokes.s2)], dim=1)
+            return half, pixel_unshuffle(s0, PERIOD) if full else half[:, :0]
+        s0_full = 16 * self.colors
+        half = torch.cat([pool_outputs(self.demosaic[:s0_full]), self.demosaic[s0_full:]])
+        return _filter(planes, half), _filter(planes, self.demosaic[:s0_full]) if full else planes[:, :0]
+
+    def guess(self, found: Tensor, planes: Tensor, masks: Tensor) -> Guess:
+        """The closed form on Stokes images at half resolution ``found``; ``planes``, ``masks [N, 16, h, w]``."""
+        colors = self.colors
+        s0, s1, s2 = (x.chunk(colors, dim=1) for x in torch.split(found, 4 * colors, dim=1))
+        mean = _mean(s0)
+        light = avg_pool2d(_mean(mean.chunk(4, dim=1)), 3, 1, 1, count_include_pad=False).clamp(min=0) + MIN_LIGHT
+        free = 1 - max_pool2d(masks, 3, 1, 1).amax(dim=1, keepdim=True)
+        moments = find_moments((s0, s1, s2), self._whole_colors(masks))
+        slopes, contrast = find_slopes(moments[:, :3], light)
+        a1, a2 = slopes[-1].chunk(2, dim=1)
+        b1, b2 = (_mean(values) - a * mean for values, a in ((s1, a1), (s2, a2)))
+        m1, m2, m0, both = moments.chunk(4, dim=1)
+        misfit = 0.5 * (both - 2 * (a1 * m1 + a2 * m2) + (a1 * a1 + a2 * a2) * m0)
+        moved, lift = self.unclip(planes, masks, slopes[-1])
+        b1, b2 = b1 + moved[:, :1], b2 + moved[:, 1:]
+        s0 = tuple(x + lift[:, c : c + 1] for c, x in enumerate(s0))
+        specular = white_specular((b1, b2), (a1, a2)).clamp(min=0)
+        least = s0[0]
+        for color in s0[1:]:
+            least = torch.minimum(least, color)
+        specular = torch.minimum(specular, least.clamp(min=0))
+        diffuse = torch.cat([color - specular for color in s0], dim=1)
+        # p - a d = b + a s is the specular polarization.
+        direction = [_mean((b + a * specular).chunk(4, dim=1)) for b, a in ((b1, a1), (b2, a2))]
+        length = torch.sqrt(direction[0] ** 2 + direction[1] ** 2 + 1e-12)
+        pose = torch.cat([a1, a2, direction[0] / length, direction[1] / length], dim=1)
+        misfit = torch.sqrt(misfit.clamp(min=0) + 1e-12)
+        seen = {
+            "samples": [planes / light],
+            "clipping": [masks, free],
+            "cosine": [_mean(s1) / light],
+            "sine": [_mean(s2) / light],
+            "split": [diffuse / light, specular / light, *slopes, contrast, misfit / light],
+        }
+        maps = torch.cat([image for name in self.inputs for image in seen[name]] + [torch.log(light)], dim=1)
+        return Guess(diffuse, specular, found[:, 4 * colors :], light, misfit, pose, lift, maps)
+
+    def _cells_of_colors(self) -> list[list[int]]:
+        """Which of a packed pixel's four cells, in reading order, are of each colour."""
+        found = [min(self.layout.filter_at(2 * (k // 2), 2 * (k % 2))[1], self.colors - 1) for k in range(4)]
+        return [[k for k in range(4) if found[k] == c] for c in range(self.colors)]
+
+    def _whole_colors(self, masks: Tensor) -> list[Tensor]:
+        """1 where no sample of a colour clips in a packed pixel, of every colour ``[N, 1, h, w]``."""
+        cells = _by_analyser(masks).amax(dim=0).view(4, masks.shape[0], 1, *masks.shape[2:])
+        return [1 - cells[own].amax(dim=0) for own in self._cells_of_colors()]
+
+    def unclip(self, planes: Tensor, masks: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
+        """What clipping hid: of the offset b ``[N, 2, h, w]``, and of every colour's s0 ``[N, C, h, w]``.
+
+        In a packed pixel of four cells the samples that did not clip determine b and the cells' s0 for a given slope
+        (`color_affine.fit_unclipped`). What that differs from a fit to all samples as they are is missing from images
+        that took them so. Zero where nothing clips, or where too few samples are left; and for one colour, whose cells
+        clip behind the same analysers: it gained nothing there (docs/experiments.md).
+        """
+        if self.colors == 1:
+            return torch.zeros_like(slope), torch.zeros_like(slope[:, :1])
+        n, h, w = planes.shape[0], *planes.shape[2:]
+        samples, kept = _by_analyser(planes), 1 - _by_analyser(masks)
+        a = slope.movedim(1, 0).reshape(2, -1)
+        angles = tuple(math.radians(angle) for row in self.layout.polarizer for angle in row)
+        seen, s0_seen, _ = fit_unclipped(2 * samples, torch.ones_like(kept), a, angles)
+        b, s0, determined = fit_unclipped(2 * samples, kept, a, angles)
+        determined = determined & (kept.amin(dim=(0, 1)) == 0)
+        lacking = torch.where(determined & (kept.amax(dim=0) > 0), s0 - s0_seen, 0.0).clamp(min=0)
+        lift = [_mean([lacking[k] for k in cells]) for cells in self._cells_of_colors()]
+        moved = torch.cat([torch.where(determined, b - seen, 0.0), torch.stack(lift)])
+        found = moved.view(-1, n, h, w).movedim(0, 1)
+        return found[:, :2], found[:, 2:]
+
+
+def _by_analyser(packed: Tensor) -> Tensor:
+    """Packed samples ``[N, 16, h, w]`` as ``[4, 4, N h w]``, of every analyser, in reading order, and cell."""
+    n, _, h, w = packed.shape
+    return packed.view(n, 2, 2, 2, 2, h, w).permute(2, 4, 1, 3, 0, 5, 6).reshape(4, 4, n * h * w)
+
+
+def find_moments(stokes: tuple[tuple[Tensor, ...], ...], whole: list[Tensor]) -> Tensor:
+    """How the colours' s0 vary with their s1, s2 and s0, and how both of these do: means ``[N, 4, h, w]`` over cells.
+
+    ``stokes``: s0, s1, s2, of every colour ``[N, 4, h, w]``; ``whole``: the colours that count, of every colour
+    ``[N, 1, h, w]``. They vary around their own mean, so one colour alone does not vary.
+    """
+    s0, s1, s2 = (_deviations(values, whole) for values in stokes)
+    products = [[x * y for x, y in zip(s0, values, strict=True)] for values in (s1, s2, s0)]
+    products.append([x * x + y * y for x, y in zip(s1, s2, strict=True)])
+    return torch.cat([_mean(_mean(product).chunk(4, dim=1)) for product in products], dim=1)
+
+
+def _deviations(values: tuple[Tensor, ...], whole: list[Tensor]) -> list[Tensor]:
+    """What whole colours differ from their mean; 0 for the others."""
+    count = (_mean(whole) * len(whole)).clamp(min=1)
+    mean = _mean([x * one for x, one in zip(values, whole, strict=True)]) * (len(whole) / count)
+    return [(x - mean) * one for x, one in zip(values, whole, strict=True)]
+
+
+def find_slopes(moments: Tensor, light: Tensor) -> tuple[list[Tensor], Tensor]:
+    """The diffuse polarization ``[N, 2, h, w]`` in `WINDOWS`, widest first, and the contrast ``[N, 1, h, w]``.
+
+    ``moments [N, 3, h, w]``: the first three of `find_moments`; ``light [N, 1, h, w]``: the brightness around.
+    """
+    sums = moments / light**2
+    slope, slopes, pooled = torch.zeros_like(sums[:, :2]), [], sums
+    for window, trust in zip(WINDOWS, TRUST, strict=True):
+        pooled = avg_pool2d(sums, window, 1, window // 2, count_include_pad=False)
+        slope = (pooled[:, :2] + trust * slope) / (pooled[:, 2:] + trust)
+        size = torch.sqrt(slope[:, :1] ** 2 + slope[:, 1:] ** 2 + 1e-12)
+        slope = slope * (MAX_DIFFUSE_DOLP / size.clamp(min=MAX_DIFFUSE_DOLP))
+        slopes.append(slope)
+    return slopes, torch.sqrt(pooled[:, 2:] + 1e-12)
+
+
+def _mean(images: Sequence[Tensor]) -> Tensor:
+    """The mean of images; sums of slices, because engines reduce over channels slowly."""
+    total = images[0]
+    for image in images[1:]:
+        total = total + image
+    return total / len(images)
+
+
+def _filter(planes: Tensor, weight: Tensor) -> Tensor:
+    """Correlate packed samples, repeated beyond the border."""
+    reach = weight.shape[-1] // 2
+    return conv2d(pad(planes, (reach, reach, reach, reach), mode="replicate"), weight)
+
+
+def pool_outputs(weight: Tensor) -> Tensor:
+    """Weights of packed full-resolution outputs ``[16 k, ...]``, as those of their means over cells ``[4 k, ...]``."""
+    return weight.view(-1, 2, 2, 2, 2, *weight.shape[1:]).mean(dim=(2, 4)).flatten(0, 2)
+
+
+def limit(images: Images) -> tuple[Tensor, Tensor, Tensor]:
+    """Diffuse and specular without negative light, and the standard deviation of their errors ``[N, 2, H/2, W/2]``."""
+    light = images.light.repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)
+    error = light * torch.exp(0.5 * images.doubt)
+    return images.diffuse.clamp(min=0), images.specular.clamp(min=0), error
+
+
+def white_specular(offset: tuple[Tensor, Tensor], slope: tuple[Tensor, Tensor]) -> Tensor:
+    """The positive root of (|a|^2 - 1) tau^2 + 2 Re(b a*) tau + |b|^2 = 0 for slope a and offset b."""
+    real = offset[0] * slope[0] + offset[1] * slope[1]
+    free = 1 - slope[0] ** 2 - slope[1] ** 2
+    return (real + torch.sqrt(real**2 + free * (offset[0] ** 2 + offset[1] ** 2) + 1e-12)) / free
+
+
+def bilinear_filter(layout: Layout) -> Tensor:
+    """Packed filter ``[24 C, 16, 3, 3]``: full-resolution s0 and half-resolution s1, s2, bilinearly.
+
+    Found by showing `demosaic` one bright sample after the other.
+    """
+    middle, size = PERIOD * 4, 9 * PERIOD
+    frames = torch.zeros(16, size, size)
+    for k in range(16):
+        frames[k, middle + k // 4, middle + k % 4] = 1
+    mosaic = Mosaic(frames, layout, 0.0, 2.0)
+    full, half = (fit_stokes(demosaic(mosaic)) for demosaic in (demosaic_bilinear, demosaic_bilinear_half))
+    images = torch.cat([pixel_unshuffle(2 * full.s0, 4)] + [pixel_unshuffle(2 * s, 2) for s in (half.s1, half.s2)], 1)
+    # The response at packed place 4 + i to a sample at packed place 4 is the weight of a neighbour at -i.
+    return images[:, :, 3:6, 3:6].flip(-1, -2).transpose(0, 1).contiguous()
+
+
+def predict_samples(images: Images, pose: Pose, layout: Layout) -> Tensor:
+    """The samples ``[N, 1, H, W]`` that full-resolution images explain: what lies behind each pixel's filter.
+
+    m = (d_c + s + Re((a d_c + s e) exp(-2 i t))) / 2 for the analyser t and colour c of the pixel, with slope a and
+    specular direction e. Not limited at the white level.
+    """
+    colors = images.diffuse.shape[1]
+    diffuse, specular = (pixel_unshuffle(x, PERIOD) for x in (images.diffuse, images.specular))
+    samples = []
+    for place in range(16):
+        angle_deg, channel = layout.filter_at(place // 4, place % 4)
+        turn = torch.tensor([math.cos(2 * math.radians(angle_deg)), math.sin(2 * math.radians(angle_deg))])
+        a, e = ((x * turn.to(x).view(1, 2, 1, 1)).sum(dim=1) for x in pose)
+        own = diffuse[:, 16 * min(channel, colors - 1) + place]
+        samples.append((own * (1 + a) + specular[:, place] * (1 + e)) / 2)
+    return pixel_shuffle(torch.stack(samples, dim=1), PERIOD)

@@ -1,0 +1,429 @@
+"""Twin of what surrounds the network in `joint.Joint.half_resolution`: from raw rows to its maps, and on to images.
+
+One pass makes the network's input, the closed form of its module, row after row of packed pixels: rings hold the rows
+that windows look back on. Another adds the network's corrections and writes images and what a report takes. Words are
+those of `polsep.networks.joint`; rows are planar, ``[..., w]``, w packed pixels. Rows depend on nothing but the frame,
+so the number of threads changes no bit.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.compute.compiling import ONE, QUARTER, ZERO, compiled, entry
+from polsep.compute.rows import (
+    add_product,
+    average,
+    copy,
+    emit,
+    emit_bits,
+    emit_product,
+    fill,
+    filter_rows,
+    multiply,
+    subtract,
+    sum_three,
+    weave,
+)
+from polsep.compute.threads import Piece
+from polsep.demosaic.bilinear_kernel import Pattern
+from polsep.demosaic.cells_kernel import Source
+from polsep.demosaic.guided_kernel import Stream, demosaic_rows, open_stream
+from polsep.networks.closed_form_kernel import SUMMED, find_slope, limit, misfit, offset, pool, white_specular
+from polsep.networks.joint import MIN_LIGHT, PERIOD, TRUST, WINDOWS
+from polsep.networks.unclip_kernel import leave_clipped_out, unclip
+from polsep.sensor.unpack_kernel import Samples, read_row
+
+Floats = NDArray[np.float32]
+
+#: Rows that rings keep: those from a row to the last one it waits for.
+KEPT = 8
+#: How many rows behind the newest one a row is left: the light around, and half of the widest window.
+REACH = 1 + WINDOWS[0] // 2
+_WIDE, _NARROW = (window // 2 for window in WINDOWS)
+_TRUST_WIDE, _TRUST_NARROW = (np.float32(trust) for trust in TRUST)
+_MIN_LIGHT, _TINY = np.float32(MIN_LIGHT), np.float32(1e-12)
+#: Rows of scratch, the last five of them for what clipping hid.
+_ROWS = 17
+
+
+class Taps(NamedTuple):
+    """The linear filter at half resolution, and its ``colors``.
+
+    ``weight [4, 3 C, K]``: of 4 cells, s0, s1, s2 of C colours, and ``[4, 6 C, K]`` with the details of s0; ``row``,
+    ``place [4, K]``: of the samples that a cell's outputs see, their packed row, 0 to 2, and their place in rows
+    ``[16, w + 2]``; K is a multiple of `rows.AT_ONCE`.
+    """
+
+    weight: Floats
+    row: NDArray[np.int64]
+    place: NDArray[np.int64]
+    colors: int
+
+
+class Maps(NamedTuple):
+    """What the first pass fills. ``floats`` or ``halves [h, w, channels]``, bfloat16 as its bits; the other is empty.
+
+    ``first [6]``: the first channel of samples, clipping, cosine, sine, split, logarithm; -1 for what is not wanted.
+    ``base [h, 4 C + 14, w]``: diffuse, specular, means over colours of s1 and s2, light, misfit. ``clipped [h, w]``: a
+    bit per sample of a packed pixel. ``details [2 h, 3 C, 2 w]``: of s0, three of every colour; or empty.
+    """
+
+    floats: Floats
+    halves: NDArray[np.uint16]
+    first: NDArray[np.int64]
+    base: Floats
+    clipped: NDArray[np.uint16]
+    details: Floats
+
+
+class Seen(NamedTuple):
+    """Channels that layers see, last ``[h, w, n]``, in one of the two kinds of `Maps`; the other is empty."""
+
+    floats: Floats
+    halves: NDArray[np.uint16]
+
+    @property
+    def filled(self) -> NDArray[Any]:
+        """The one that is not empty."""
+        return self.floats if self.floats.size else self.halves
+
+
+class _Rings(NamedTuple):
+    """Rows on their way, by row number modulo `KEPT` or `SUMMED`; ``planes`` have a column more on both sides.
+
+    ``s0 [8, 4 C, w]``, ``cosine``, ``sine [8, 4, w]``: means over colours; ``moments [8, 4, w]``: of the colours'
+    deviations, s0 with s0, s1, s2 and what s1, s2 have. ``luminance``, ``light``, ``free [8, w]``; ``sums [16, 3, w]``.
+    ``room [channels, w]``: a row of the maps as bfloat16. ``clipped [8, w]``: as in `Maps`, of rows beyond the piece as
+    well, which another thread may be writing there.
+    """
+
+    planes: Floats
+    s0: Floats
+    cosine: Floats
+    sine: Floats
+    moments: Floats
+    luminance: Floats
+    light: Floats
+    free: Floats
+    sums: Floats
+    room: NDArray[np.uint16]
+    clipped: NDArray[np.uint16]
+
+
+@compiled
+def _make_rings(colors: int, maps: Maps) -> _Rings:
+    w = maps.clipped.shape[1]
+    return _Rings(
+        np.zeros((KEPT, 16, w + 2), np.float32),
+        np.zeros((KEPT, 4 * colors, w), np.float32),
+        np.zeros((KEPT, 4, w), np.float32),
+        np.zeros((KEPT, 4, w), np.float32),
+        np.zeros((KEPT, 4, w), np.float32),
+        np.zeros((KEPT, w + 2), np.float32),
+        np.zeros((KEPT, w), np.float32),
+        np.zeros((KEPT, w), np.float32),
+        np.zeros((SUMMED, 3, w), np.float32),
+        np.zeros((maps.halves.shape[2], w), np.uint16),
+        np.zeros((KEPT, w), np.uint16),
+    )
+
+
+@compiled
+def _enter(source: tuple[Samples, Pattern], u: int, piece: Piece, rings: _Rings, found: Any) -> None:
+    """Samples of packed row ``u``, and which of them clip, to their rings; the latter to ``found`` too in the piece."""
+    samples, pattern = source
+    planes, clipped = rings.planes[u % KEPT], rings.clipped[u % KEPT]
+    w = clipped.size
+    codes = np.empty(PERIOD * w, np.float32)
+    for j in range(w):
+        clipped[j] = 0
+    for row in range(PERIOD):
+        read_row(samples, PERIOD * u + row, 0, codes)
+        some = False
+        for x in range(codes.size):
+            some |= codes[x] >= pattern.clip_at
+        for col in range(PERIOD):
+            plane, gain = planes[PERIOD * row + col], pattern.gains[row // 2, col // 2]
+            inner, own = plane[1:], codes[col:]
+            for j in range(w):
+                inner[j] = (own[PERIOD * j] - pattern.black) * gain
+            plane[0], plane[w + 1] = plane[1], plane[w]
+            if some:
+                for j in range(w):
+                    if own[PERIOD * j] >= pattern.clip_at:
+                        clipped[j] |= np.uint16(1 << (PERIOD * row + col))
+    if piece[0] <= u < piece[1]:
+        copy(clipped, found[u])
+
+
+@compiled
+def _starts(u: int, h: int, size: int) -> Any:
+    """Where the rows around packed row ``u`` begin in a ring of rows of ``size``; the border's are repeated."""
+    starts = np.empty(3, np.int64)
+    for k in range(3):
+        starts[k] = min(max(u - 1 + k, 0), h - 1) % KEPT * size
+    return starts
+
+
+@compiled
+def _filter_samples(taps: Taps, u: int, h: int, rings: _Rings, polarized: Any) -> None:
+    """Stokes images of row ``u`` by the linear filter: s0 to its ring, s1 and s2 to ``polarized [8 C, w]``."""
+    near = (rings.planes.reshape(-1), _starts(u, h, rings.planes[0].size))
+    s0, colors = rings.s0[u % KEPT], taps.colors
+    for cell in range(4):
+        for k in range(0, 3 * colors, 3):
+            first, second, third = (
+                _stokes_row(4 * k + cell, s0, polarized),
+                _stokes_row(4 * k + 4 + cell, s0, polarized),
+                _stokes_row(4 * k + 8 + cell, s0, polarized),
+            )
+            weight = taps.weight[cell, k : k + 3]
+            filter_rows(weight, (taps.row[cell], taps.place[cell]), near, (first, second, third))
+
+
+@compiled
+def _filter_details(taps: Taps, u: int, h: int, rings: _Rings, work: tuple[Any, Any]) -> None:
+    """Details of s0 of row ``u`` by the linear filter."""
+    details, spare = work
+    near = (rings.planes.reshape(-1), _starts(u, h, rings.planes[0].size))
+    for cell in range(4):
+        for k in range(0, 3 * taps.colors, 3):
+            weight = taps.weight[cell, 3 * taps.colors + k : 3 * taps.colors + k + 3]
+            filter_rows(weight, (taps.row[cell], taps.place[cell]), near, (spare[0], spare[1], spare[2]))
+            for i in range(3):
+                row, out = spare[i], details[2 * u + cell // 2, k + i, cell % 2 :]
+                for j in range(row.size):
+                    out[2 * j] = row[j]
+
+
+@compiled
+def _stokes_row(k: int, s0: Any, polarized: Any) -> Any:
+    """One of the rows of s0, s1 and s2."""
+    return s0[k] if k < s0.shape[0] else polarized[k - s0.shape[0]]
+
+
+@compiled
+def _take_apart(rows: Any, s0: Any, polarized: Any) -> None:
+    """Stokes rows ``[2, 9 or 18, 2 w]`` of two rows of cells as packed ones, ``[12, w]`` and ``[24, w]``."""
+    for cell in range(4):
+        for k in range(9):
+            row, packed = rows[cell // 2, k, cell % 2 :], s0[4 * k + cell] if k < 3 else polarized[4 * (k - 3) + cell]
+            for j in range(packed.size):
+                packed[j] = row[2 * j]
+
+
+@compiled
+def _describe(colors: int, u: int, rings: _Rings, polarized: Any, spare: Any) -> None:
+    """What is kept of row ``u``: means over colours, the colours' moments, and the brightness."""
+    slot = u % KEPT
+    moments = rings.moments[slot]
+    for k in range(4):
+        fill(ZERO, moments[k])
+    luminance = rings.luminance[slot]
+    fill(ZERO, luminance)
+    mean, x, y, s0 = spare[0], spare[1], spare[2], rings.s0[slot]
+    share, count = np.float32(1 / colors), np.float32(1 / (4 * colors))
+    for cell in range(4):
+        fill(ZERO, mean)
+        for c in range(colors):
+            add_product(s0[4 * c + cell], share, mean)
+        add_product(mean, QUARTER, luminance[1:-1])
+        for k, means in ((0, rings.cosine[slot, cell]), (1, rings.sine[slot, cell])):
+            fill(ZERO, means)
+            for c in range(colors):
+                add_product(polarized[4 * (colors * k + c) + cell], share, means)
+        if colors == 1:
+            continue
+        for c in range(colors):
+            subtract(s0[4 * c + cell], mean, x)
+            for j in range(x.size):
+                moments[0, j] += x[j] * x[j] * count
+            for k, means in ((0, rings.cosine[slot, cell]), (1, rings.sine[slot, cell])):
+                subtract(polarized[4 * (colors * k + c) + cell], means, y)
+                multiply(x, y, count, moments[k + 1])
+                multiply(y, y, count, moments[3])
+    leave_clipped_out(rings.clipped[slot], s0, polarized, moments)
+
+
+@compiled
+def _look_around(v: int, h: int, rings: _Rings, spare: Any) -> None:
+    """The light around row ``v``, whether anything there clips, and the moments relative to the light."""
+    w, slot = rings.light.shape[1], v % KEPT
+    total, light, free = spare[0], rings.light[slot], rings.free[slot]
+    fill(ZERO, light)
+    fill(ONE, free)
+    first, last = max(v - 1, 0), min(v + 1, h - 1)
+    for row in range(first, last + 1):
+        around = rings.luminance[row % KEPT]
+        sum_three(around, around[1:], around[2:], total)
+        add_product(total, ONE, light)
+        bits, some = rings.clipped[row % KEPT], False
+        for j in range(w):
+            some |= bits[j] != 0
+        if some:
+            for j in range(w):
+                if bits[j] != 0:
+                    for i in range(max(j - 1, 0), min(j + 2, w)):
+                        free[i] = ZERO
+    rows = np.float32(last - first + 1)
+    average(light, 1, rows)
+    weight = spare[1]
+    for j in range(w):
+        light[j] = (light[j] if light[j] > ZERO else ZERO) + _MIN_LIGHT
+    for j in range(w):
+        weight[j] = ONE / (light[j] * light[j])
+    sums, moments = rings.sums[v % SUMMED], rings.moments[slot]
+    for k, moment in ((0, 1), (1, 2), (2, 0)):
+        fill(ZERO, sums[k])
+        multiply(moments[moment], weight, ONE, sums[k])
+
+
+@compiled
+def _find_slopes(t: int, h: int, sums: Any, spare: Any) -> None:
+    """Slopes of row ``t``, wide and narrow, to ``spare[4:8]``; the moments of the narrow window stay in ``[1:4]``."""
+    pooled, wide, narrow = spare[1:4], spare[4:6], spare[6:8]
+    fill(ZERO, wide[0])
+    fill(ZERO, wide[1])
+    pool(t, h, _WIDE, sums, pooled)
+    find_slope(pooled, _TRUST_WIDE, wide[0], wide[1])
+    copy(wide[0], narrow[0])
+    copy(wide[1], narrow[1])
+    pool(t, h, _NARROW, sums, pooled)
+    find_slope(pooled, _TRUST_NARROW, narrow[0], narrow[1])
+
+
+@compiled
+def _split(colors: int, slot: int, rings: _Rings, base: Any, spare: Any) -> None:
+    """Diffuse, specular and polarization of a row to its base; ``spare[6:8]``: its slope."""
+    lacking = spare[12 : 14 + colors]
+    clips = colors > 1 and unclip(rings.planes[slot, :, 1:], rings.clipped[slot], spare[6:8], lacking)
+    a1, a2, mean, b1, b2, share = spare[6], spare[7], spare[8], spare[9], spare[10], np.float32(1 / colors)
+    for cell in range(4):
+        tau, cosine, sine = base[4 * colors + cell], rings.cosine[slot, cell], rings.sine[slot, cell]
+        fill(ZERO, mean)
+        for c in range(colors):
+            add_product(rings.s0[slot, 4 * c + cell], share, mean)
+        offset(cosine, a1, mean, b1)
+        offset(sine, a2, mean, b2)
+        if clips:
+            add_product(lacking[0], ONE, b1)
+            add_product(lacking[1], ONE, b2)
+            for c in range(colors):
+                add_product(lacking[2 + c], ONE, rings.s0[slot, 4 * c + cell])
+        white_specular(b1, b2, a1, a2, tau)
+        for c in range(colors):
+            limit(rings.s0[slot, 4 * c + cell], tau)
+        for c in range(colors):
+            subtract(rings.s0[slot, 4 * c + cell], tau, base[4 * c + cell])
+        copy(cosine, base[4 * colors + 4 + cell])
+        copy(sine, base[4 * colors + 8 + cell])
+
+
+@compiled
+def _show_samples(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> None:
+    """Samples of row ``t``, relative to the light, and which of them clip, to their maps."""
+    samples, clipping, inverse, row = maps.first[0], maps.first[1], spare[0], spare[11]
+    if samples >= 0:
+        for k in range(16):
+            emit_product(rings.planes[slot, k, 1:], inverse, (maps.floats, rings.room, samples + k, t), row)
+    if clipping >= 0:
+        for k in range(16):
+            emit_bits(maps.clipped[t], k, (maps.floats, rings.room, clipping + k, t), row)
+        emit(rings.free[slot], (maps.floats, rings.room, clipping + 16, t))
+
+
+@compiled
+def _show_split(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> None:
+    """The closed form of row ``t`` to its maps."""
+    base, inverse, row, images = maps.base[t], spare[0], spare[11], maps.base.shape[1] - 10
+    split, contrast = maps.first[4], spare[3]
+    for k in range(images):
+        emit_product(base[k], inverse, (maps.floats, rings.room, split + k, t), row)
+    for k in range(4):
+        emit(spare[4 + k], (maps.floats, rings.room, split + images + k, t))
+    for j in range(row.size):
+        row[j] = np.sqrt(contrast[j] + _TINY)
+    emit(row, (maps.floats, rings.room, split + images + 4, t))
+    emit_product(base[images + 9], inverse, (maps.floats, rings.room, split + images + 5, t), row)
+
+
+@compiled
+def _leave(t: int, rings: _Rings, maps: Maps, spare: Any) -> None:
+    """The closed form of row ``t``, and the network's maps of it."""
+    slot, colors = t % KEPT, rings.s0.shape[1] // 4
+    light, inverse, row = rings.light[slot], spare[0], spare[11]
+    for j in range(light.size):
+        inverse[j] = ONE / light[j]
+    _find_slopes(t, maps.base.shape[0], rings.sums, spare)
+    _split(colors, slot, rings, maps.base[t], spare)
+    copy(light, maps.base[t, 4 * colors + 12])
+    misfit(rings.moments[slot], (spare[6], spare[7]), maps.base[t, 4 * colors + 13])
+    _show_samples(t, slot, rings, maps, spare)
+    for first, rows in ((maps.first[2], rings.cosine[slot]), (maps.first[3], rings.sine[slot])):
+        if first >= 0:
+            for cell in range(4):
+                emit_product(rows[cell], inverse, (maps.floats, rings.room, first + cell, t), row)
+    if maps.first[4] >= 0:
+        _show_split(t, slot, rings, maps, spare)
+    for j in range(row.size):
+        row[j] = np.log(light[j])
+    emit(row, (maps.floats, rings.room, maps.first[5], t))
+    if maps.halves.size:
+        weave(rings.room, maps.halves[t])
+
+
+@compiled
+def _go_on(u: int, piece: Piece, rings: _Rings, maps: Maps, spare: Any) -> None:
+    """What can be done of earlier rows once row ``u`` is described."""
+    v, h = u - 1, maps.clipped.shape[0]
+    if (v > max(piece[0] - REACH, 0) or v == 0) and v < h:
+        _look_around(v, h, rings, spare)
+    if u - REACH >= piece[0]:
+        _leave(u - REACH, rings, maps, spare)
+
+
+@entry
+def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, piece: Piece) -> None:
+    """The maps and the closed form of a piece of the packed rows, by the linear filter."""
+    h, w = maps.clipped.shape
+    rings, spare = _make_rings(taps.colors, maps), np.zeros((_ROWS, w), np.float32)
+    polarized = np.empty((8 * taps.colors, w), np.float32)
+    begin = max(piece[0] - REACH, 0)
+    for u in range(max(begin - 1, 0), begin + 1):
+        _enter((samples, pattern), u, piece, rings, maps.clipped)
+    for u in range(begin, piece[1] + REACH):
+        if u + 1 < h:
+            _enter((samples, pattern), u + 1, piece, rings, maps.clipped)
+        if u < h:
+            _filter_samples(taps, u, h, rings, polarized)
+            if maps.details.size and piece[0] <= u < piece[1]:
+                _filter_details(taps, u, h, rings, (maps.details, spare))
+            _describe(taps.colors, u, rings, polarized, spare)
+        _go_on(u, piece, rings, maps, spare)
+
+
+@entry
+def _map_guided_rows(source: Source, stream: Stream, maps: Maps, piece: Piece) -> None:
+    h, w = maps.clipped.shape
+    rings, spare, polarized = _make_rings(3, maps), np.zeros((_ROWS, w), np.float32), np.empty((24, w), np.float32)
+    rows = np.empty((2, 18 if maps.details.size else 9, 2 * w), np.float32)
+    for u in range(max(piece[0] - REACH, 0), piece[1] + REACH):
+        if u < h:
+            _enter((source.samples, source.pattern), u, piece, rings, maps.clipped)
+            demosaic_rows(source, stream, (2 * u, 2 * u + 2), rows)
+            _take_apart(rows, rings.s0[u % KEPT], polarized)
+            if maps.details.size and piece[0] <= u < piece[1]:
+                for k in range(18):
+                    copy(rows[k // 9, 9 + k % 9], maps.details[2 * u + k // 9, k % 9])
+            _describe(3, u, rings, polarized, spare)
+        _go_on(u, piece, rings, maps, spare)
+
+
+def map_guided_rows(source: Source, maps: Maps, piece: Piece) -> None:
+    """The maps and the closed form of a piece of the packed rows of a colour frame, by the intensity guide."""
+    stream = open_stream(source, 2 * max(piece[0] - REACH, 0), apart=True, details=maps.details.size > 0)
+    _map_guided_rows(source, stream, maps, piece)

@@ -1,0 +1,207 @@
+"""Methods of the joint network: any mosaic in, a separation out, with shipped weights and in bounded memory.
+
+Frames are turned into the order of filters that the network knows (`orient`), cut into overlapping strips of rows where
+they are large, and turned back. Strips begin at multiples of the network's own grid and overlap by more than it sees,
+so that they agree with the whole frame.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from polsep.demosaic.bilinear import mean_cells
+from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
+from polsep.networks.joint import PERIOD, Images, Joint, limit
+from polsep.networks.unet import ResidualSize
+from polsep.physics.stokes import Measurements, Stokes
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.orient import Orientation, orient
+from polsep.separation.analytic import Separation
+
+#: Raw pixels of a frame, or of a strip with its margins, that are seen at once: some 250 bytes of memory each.
+MAX_PIXELS = 6_000_000
+#: Methods of the joint network.
+NAMES = ("joint", "joint-fast")
+#: Raw rows that a strip sees beyond its own, farther than the network does (a test measures that).
+MARGIN = 256
+
+Resolution = Literal["half", "full"]
+
+
+def load_joint(path: Path, device: torch.device) -> Joint:
+    """The network from a file of weights. Raises ValueError when the file is damaged or of another network."""
+    tensors, metadata = read_weights(path)
+    try:
+        size = json.loads(metadata["size"])
+        size = ResidualSize(size["width"], tuple(size["blocks"]), size.get("entry", 0))
+        demosaicker: Any = metadata.get("demosaicker", "linear")  # what weights without a word on it were trained with
+        network = Joint(int(metadata["colors"]), size, tuple(json.loads(metadata["inputs"])), demosaicker)
+        network.load_state_dict(tensors)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"expected weights of a joint network in {path}, found {type(error).__name__}") from None
+    return network.to(device, torch.float32).eval()
+
+
+@lru_cache(maxsize=4)
+def _shipped_joint(name: str, device: torch.device) -> Joint:
+    return load_joint(shipped_weights(name), device)
+
+
+def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[Joint, dict[str, str]]:
+    """A method's network for frames of a layout, shipped or from a file of weights, and the weights' metadata.
+
+    Raises ValueError on methods without such a network, and on weights for other frames.
+    """
+    if method not in NAMES:
+        raise ValueError(f"expected a method of {', '.join(NAMES)}, found {method!r}")
+    path = path or shipped_weights(weights_name(method, layout))
+    network, metadata = load_joint(path, torch.device("cpu")), read_weights(path)[1]
+    if network.colors != layout.channels:
+        raise ValueError(f"expected weights for {layout.channels} colours in {path}, found {network.colors}")
+    return network, metadata
+
+
+def weights_name(method: str, layout: Layout) -> str:
+    """The name of a method's weights for frames of a layout."""
+    return f"{method}-{'mono' if layout.bayer is None else 'mosaic'}"
+
+
+def separate_mosaic(method: str, resolution: Resolution) -> Callable[[Mosaic | Measurements], Separation]:
+    """What the method ``joint`` or ``joint-fast`` makes of a mosaic.
+
+    Raises ValueError on co-sited measurements, and on layouts that are not Sony's in any orientation.
+    """
+
+    def separate_capture(capture: Mosaic | Measurements) -> Separation:
+        if isinstance(capture, Measurements):
+            raise ValueError(f"expected a mosaic for the method {method}, found four co-sited angle images")
+        network = _shipped_joint(weights_name(method, capture.layout), capture.data.device)
+        return run_joint(network, capture, resolution)
+
+    return separate_capture
+
+
+def takes(method: str) -> Callable[[Mosaic | Measurements], bool]:
+    """Whether a capture is a mosaic in an order that the method knows, with weights shipped for its colours."""
+
+    def takes_capture(capture: Mosaic | Measurements) -> bool:
+        if isinstance(capture, Measurements) or not is_shipped(weights_name(method, capture.layout)):
+            return False
+        try:
+            orient(capture, own_order(capture.layout))
+        except ValueError:
+            return False
+        return True
+
+    return takes_capture
+
+
+def own_order(layout: Layout) -> Layout:
+    """Sony's order, in colour or mono as the layout is: what networks are trained on."""
+    return Layout(bayer=None) if layout.bayer is None else Layout()
+
+
+def run_joint(network: Joint, mosaic: Mosaic, resolution: Resolution) -> Separation:
+    """A mosaic ``[..., H, W]`` through a network; negative light is cut to 0.
+
+    The polarization is that of the network's linear filter, at half resolution. ``valid`` is False near cells of
+    which all samples clip. ``expected_error``: see `Separation`. Raises ValueError on layouts that are not
+    Sony's in any orientation.
+    """
+    orientation = orient(mosaic, own_order(mosaic.layout))
+    if resolution == "half" and not orientation.keeps_cells:  # then the network's cells are not the frame's
+        return _halve(run_joint(network, mosaic, "full"))
+    raw, clipped = (orientation.turn(x) for x in (mosaic.linear().float(), mosaic.clipped()))
+    batch, (height, width) = raw.shape[:-2], raw.shape[-2:]
+    raw, clipped = (x.reshape(-1, 1, height, width) for x in (raw, clipped))
+    look = _look_full if resolution == "full" else _look_half
+    parts = []
+    for first, last in cut_rows((height, width), PERIOD * network.net.grid):
+        top, bottom = max(first - MARGIN, 0), min(last + MARGIN, height)
+        with torch.no_grad():
+            seen = look(network, raw[..., top:bottom, :], clipped[..., top:bottom, :])
+        parts.append([_rows(x, (first - top, last - top), bottom - top) for x in seen])
+    joined = (torch.cat(strips, dim=-2) for strips in zip(*parts, strict=True))
+    images = [image.reshape(*batch, *image.shape[1:]) for image in joined]
+    return _as_separation(images, _cells(clipped).reshape(*batch, 2, height // 2, width // 2), orientation)
+
+
+def _halve(found: Separation) -> Separation:
+    """Means over 2x2 cells of a separation at full resolution; masks hold where one of the four does not."""
+    diffuse, specular, valid = (
+        mean_cells(found.diffuse),
+        mean_cells(found.specular),
+        mean_cells(found.valid.float()) == 1,
+    )
+    clipped = None if found.clipped is None else mean_cells(found.clipped.float()) > 0
+    residual, expected_error = (None if x is None else mean_cells(x) for x in (found.residual, found.expected_error))
+    stokes = found.stokes.map(mean_cells)
+    return Separation(
+        diffuse, specular, valid, stokes, residual=residual, clipped=clipped, expected_error=expected_error
+    )
+
+
+def cut_rows(size: tuple[int, int], grid: int) -> Iterator[tuple[int, int]]:
+    """First and last row of the strips of a frame of ``size``: one, or several that begin at multiples of ``grid``."""
+    height, width = size
+    rows = height if height * width <= MAX_PIXELS else max(MAX_PIXELS // width - 2 * MARGIN, grid) // grid * grid
+    for first in range(0, height, rows):
+        yield first, min(first + rows, height)
+
+
+def _look_half(network: Joint, raw: Tensor, clipped: Tensor) -> list[Tensor]:
+    """Diffuse, specular, s1, s2, the standard deviations of the errors of both, and the misfit, of a strip."""
+    return _as_list(network.half_resolution(raw, clipped))
+
+
+def _look_full(network: Joint, raw: Tensor, clipped: Tensor) -> list[Tensor]:
+    return _as_list(network(raw, clipped)[0])
+
+
+def _as_list(images: Images) -> list[Tensor]:
+    diffuse, specular, error = limit(images)
+    return [diffuse, specular, images.s1, images.s2, error, _repeat(images.misfit, 2)]
+
+
+def _repeat(image: Tensor, times: int) -> Tensor:
+    """Every pixel's value ``times`` in both directions."""
+    return image.repeat_interleave(times, dim=-1).repeat_interleave(times, dim=-2) if times > 1 else image
+
+
+def _rows(image: Tensor, rows: tuple[int, int], height: int) -> Tensor:
+    """Some raw rows of an image of a strip of ``height`` raw rows, at whatever resolution."""
+    first, last = (row * image.shape[-2] // height for row in rows)
+    return image[..., first:last, :]
+
+
+def _cells(clipped: Tensor) -> Tensor:
+    """Cells ``[N, 2, H/2, W/2]`` near which a sample clips, and near which all of a cell do.
+
+    A cell is of one colour, so where it clips, the cells around, which are of the others, lack that colour too.
+    """
+    mask = clipped.float()
+    some, all_of_it = max_pool2d(mask, 2), -max_pool2d(-mask, 2)
+    return max_pool2d(torch.cat([some, all_of_it], dim=1), 3, 1, 1) > 0
+
+
+def _as_separation(images: list[Tensor], cells: Tensor, orientation: Orientation) -> Separation:
+    """Turn everything back to the frame's own orientation, and the masks and Stokes images to the images' size."""
+    diffuse, specular = images[0], images[1].expand_as(images[0])
+    scale = 2 if diffuse.shape[-1] > cells.shape[-1] else 1
+    s1, s2, error, misfit, cells = (_repeat(x, scale) for x in (*images[2:], cells))
+    stokes = Stokes(diffuse + specular, s1, s2)
+    turned = [orientation.turn_back(x, scale) for x in (diffuse, specular, cells, error, math.sqrt(2) * misfit)]
+    diffuse, specular, cells, error, residual = turned
+    valid, clipped = ~cells[..., 1, :, :], cells[..., 0, :, :]
+    stokes = orientation.turn_back_stokes(stokes, scale)
+    model = {"residual": residual} if diffuse.shape[-3] > 1 else {}  # one colour fits any line
+    return Separation(diffuse, specular, valid, stokes, clipped=clipped, expected_error=error, **model)

@@ -1,0 +1,1 @@
+"""What light does: Stokes vectors, Mueller matrices, Fresnel, microfacets."""

@@ -1,0 +1,237 @@
+"""What surfaces and filters do to polarized light: Mueller matrices, Fresnel, GGX, the polarimetric BRDF.
+
+Conventions:
+
+* Directions are unit vectors ``[..., 3, H, W]`` that point away from the surface: normal n, to the camera (wo = v), to
+  the light (wi = l), half vector h. Axes are right-handed; scalars are ``[..., 1, H, W]``, colours ``[..., C, H, W]``.
+* A beam's frame has z along its propagation, y the projection of an "up" vector and x = y cross z. The camera's beam
+  travels along v, so x is image-right and y image-up and angles count from x toward y, as in `stokes`. The light's beam
+  travels along -l; its polarizer angle is measured in the frame of the light's own up vector.
+* Fresnel coefficients follow Verdet's convention (r_p = -r_s at normal incidence), with the angle on the AIR side, also
+  for light that leaves the material; Stokes vectors carry no eta^2 factor on leaving (reciprocal, as Mitsuba 3).
+* Roughness r is GGX alpha = r^2. The diffuse lobe is albedo/pi, so both lobes have their physical ratio.
+
+Notes (deviations from the paper; derivation and check in docs/conventions.md): its Eq. 6 needs the INCIDENT azimuth,
+its Eq. 8 has a wrong sign of R^x in the numerator and lacks the 1/2 and the two-argument arctangent. Implemented here
+is the form that an electric-field ray trace confirms to rounding error, and that equals Mitsuba's ``pplastic``.
+Source: Baek, Jeon, Tong, Kim 2018, Simultaneous acquisition of polarimetric SVBRDF and normals, TOG 37(6) 268.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from polsep.physics.stokes import Stokes
+
+#: Refractive index of every dielectric in the paper (Sec. 3.1).
+ETA = 1.5
+
+
+class Fresnel(NamedTuple):
+    """Half sums and differences of the power coefficients for s and p light, and the signed product r_s r_p."""
+
+    r_plus: Tensor
+    r_minus: Tensor
+    r_cross: Tensor
+    t_plus: Tensor
+    t_minus: Tensor
+
+
+class Beam(NamedTuple):
+    """Axes x and y of a beam's transverse plane, each ``[..., 3, H, W]``."""
+
+    x: Tensor
+    y: Tensor
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Directions at the surface points and the up vectors of the two beams, all ``[..., 3, H, W]`` or broadcastable."""
+
+    normal: Tensor
+    to_camera: Tensor
+    to_light: Tensor
+    camera_up: Tensor
+    light_up: Tensor
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Dot product over the vector axis, kept: ``[..., 1, H, W]``."""
+    return (a * b).sum(dim=-3, keepdim=True)
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross product over the vector axis."""
+    product: Tensor = torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=-3)  # type: ignore[no-untyped-call]
+    return product
+
+
+def normalize(v: Tensor) -> Tensor:
+    """Unit vectors; a zero vector stays zero, with finite gradients."""
+    squared = dot(v, v)
+    return v * torch.rsqrt(squared.clamp(min=torch.finfo(v.dtype).tiny * 4))
+
+
+def fresnel(cos_theta: Tensor, eta: float = ETA) -> Fresnel:
+    """Fresnel coefficients of an air-dielectric interface for the air-side angle of incidence.
+
+    r_cross = r_s r_p is negative below Brewster's angle arctan(eta) and positive above. t_minus = -r_minus <= 0:
+    transmission favours p. Source: Born and Wolf, Principles of Optics, 1.5.2; signs as Mitsuba 3 `fresnel.h`.
+    """
+    c = cos_theta.clamp(0, 1)
+    ct = torch.sqrt(1 - (1 - c * c) / eta**2)
+    rs = (c - eta * ct) / (c + eta * ct)
+    rp = (eta * c - ct) / (eta * c + ct)
+    power_s, power_p = rs * rs, rp * rp
+    plus, minus = 0.5 * (power_s + power_p), 0.5 * (power_s - power_p)
+    return Fresnel(plus, minus, rs * rp, 1 - plus, -minus)
+
+
+def diffuse_dolp(cos_theta: Tensor, eta: float = ETA) -> Tensor:
+    """beta_d = -T^-/T^+: DoLP of diffuse light that leaves at that zenith angle; 0.044 at 45 degrees, at most 0.385.
+
+    At exact grazing, where no light leaves, it is 0.
+    """
+    f = fresnel(cos_theta, eta)
+    return -f.t_minus / f.t_plus.clamp(min=torch.finfo(cos_theta.dtype).eps)
+
+
+def ggx_distribution(normal: Tensor, half: Tensor, alpha: Tensor) -> Tensor:
+    """GGX microfacet distribution D(n, h). Source: Walter et al. 2007, Eq. 33. ``alpha = roughness**2``.
+
+    The sine comes from the cross product: 1 - cos^2 would lose the highlight of a glossy surface in float32.
+    """
+    c, s = dot(normal, half), cross(normal, half)
+    return alpha**2 / (math.pi * (c * c * alpha**2 + dot(s, s)) ** 2)
+
+
+def smith_shadowing(cos_theta: Tensor, alpha: Tensor) -> Tensor:
+    """Smith's G1 for GGX. Source: Walter et al. 2007, Eq. 34."""
+    c = cos_theta.clamp(min=1e-6)
+    return 2 / (1 + torch.sqrt(1 + alpha**2 * (1 - c * c).clamp(min=0) / (c * c)))
+
+
+def beam_frame(propagation: Tensor, up: Tensor) -> Beam:
+    """The frame of a beam: y is ``up`` made perpendicular to the unit vector ``propagation``, x = y cross z."""
+    y = normalize(up - dot(up, propagation) * propagation)
+    return Beam(cross(y, propagation), y)
+
+
+def double_angle(vector: Tensor, beam: Beam) -> tuple[Tensor, Tensor]:
+    """cos and sin of twice the azimuth of ``vector`` in the beam's frame; (0, 0) if it lies along the beam."""
+    a, b = dot(vector, beam.x), dot(vector, beam.y)
+    scale = 1 / (a * a + b * b).clamp(min=torch.finfo(a.dtype).tiny * 4)
+    return (a * a - b * b) * scale, 2 * a * b * scale
+
+
+def _camera_and_light_beams(g: Geometry) -> tuple[Beam, Beam]:
+    return beam_frame(g.to_camera, g.camera_up), beam_frame(-g.to_light, g.light_up)
+
+
+def _lit(g: Geometry) -> tuple[Tensor, Tensor, Tensor]:
+    """cos at the light, cos at the camera, and where both see the surface's front."""
+    cos_i, cos_o = dot(g.normal, g.to_light), dot(g.normal, g.to_camera)
+    return cos_i.clamp(0, 1), cos_o.clamp(0, 1), ((cos_i > 0) & (cos_o > 0)).to(cos_i)
+
+
+def diffuse_stokes(g: Geometry, polarizer: Tensor, irradiance: Tensor, albedo: Tensor) -> Stokes:
+    """Stokes image of the diffuse lobe: transmitted in, depolarized, transmitted out.
+
+    ``polarizer``: angle [rad] of the fully polarized light in its own frame; ``irradiance``: I/d^2 at the point,
+    without the cosine; ``albedo`` ``[..., C, H, W]``. AoLP is the azimuth of the normal, DoLP is `diffuse_dolp`.
+    No shadows: multiply ``irradiance``. Source: Eqs. 4-6 corrected (the incident azimuth of n).
+    """
+    camera, light = _camera_and_light_beams(g)
+    cos_i, cos_o, lit = _lit(g)
+    into, out = fresnel(cos_i), fresnel(cos_o)
+    ci, si = double_angle(g.normal, light)
+    co, so = double_angle(g.normal, camera)
+    entered = into.t_plus - into.t_minus * (ci * torch.cos(2 * polarizer) + si * torch.sin(2 * polarizer))
+    shading = lit * cos_i * irradiance / math.pi * entered * albedo
+    return Stokes(shading * out.t_plus, -shading * out.t_minus * co, -shading * out.t_minus * so)
+
+
+def _mirror_axis(g: Geometry, camera: Beam) -> Tensor:
+    """The s axis of the mirror reflection: perpendicular to both beams, so one axis serves both frames.
+
+    With light and camera in line every perpendicular axis is right, but both frames must use the same one.
+    """
+    axis = cross(g.to_camera, g.to_light)
+    in_line = dot(axis, axis) < torch.finfo(axis.dtype).eps ** 1.5
+    return torch.where(in_line, camera.y, axis)
+
+
+def specular_stokes(g: Geometry, polarizer: Tensor, irradiance: Tensor, roughness: Tensor) -> Stokes:
+    """Stokes image of the specular lobe: Fresnel reflection off GGX microfacets, for specular strength 1.
+
+    Arguments as `diffuse_stokes`; ``roughness`` ``[..., 1, H, W]``, above 0. Linear light stays fully polarized:
+    s1^2 + s2^2 = s0^2. Multiply the result by a specular strength or colour. Source: Eqs. 7-8 corrected.
+    """
+    camera, light = _camera_and_light_beams(g)
+    cos_i, cos_o, lit = _lit(g)
+    h = normalize(torch.where(lit > 0, g.to_camera + g.to_light, g.normal))
+    alpha = roughness**2
+    lobe = ggx_distribution(g.normal, h, alpha) * smith_shadowing(cos_i, alpha) * smith_shadowing(cos_o, alpha)
+    shading = lit * irradiance * lobe / (4 * cos_o.clamp(min=1e-4))
+    f = fresnel(dot(h, g.to_light))
+    axis = _mirror_axis(g, camera)
+    # The azimuth of h is that of the s axis turned by 90 degrees in either frame, hence the minus signs.
+    ci, si = (-x for x in double_angle(axis, light))
+    co, so = (-x for x in double_angle(axis, camera))
+    cn, sn = torch.cos(2 * polarizer), torch.sin(2 * polarizer)
+    c, s = ci * cn + si * sn, si * cn - ci * sn
+    a, b = f.r_plus * c - f.r_minus, f.r_cross * s
+    return Stokes(shading * (f.r_plus - f.r_minus * c), shading * (a * co + b * so), shading * (a * so - b * co))
+
+
+def mueller_rotator(angle: Tensor) -> Tensor:
+    """C(t) ``[..., 4, 4]``: turns the frame of a Stokes vector by ``+angle`` [rad]. Source: Baek et al. 2018."""
+    c, s, zero, one = torch.cos(2 * angle), torch.sin(2 * angle), torch.zeros_like(angle), torch.ones_like(angle)
+    return _matrix(
+        [[one, zero, zero, zero], [zero, c, s, zero], [zero, -s, c, zero], [zero, zero, zero, one]],
+    )
+
+
+def mueller_polarizer(angle: Tensor, diattenuation: float = 1.0) -> Tensor:
+    """Linear polarizer at ``angle`` [rad]; half of unpolarized light passes, D = (ER-1)/(ER+1). Goldstein, 5.3."""
+    d = torch.full_like(angle, diattenuation)
+    zero, one, root = torch.zeros_like(angle), torch.ones_like(angle), torch.sqrt(1 - d * d)
+    straight = 0.5 * _matrix(
+        [[one, d, zero, zero], [d, one, zero, zero], [zero, zero, root, zero], [zero, zero, zero, root]],
+    )
+    return mueller_rotator(-angle) @ straight @ mueller_rotator(angle)
+
+
+def mueller_reflection(f: Fresnel) -> Tensor:
+    """Fresnel reflection ``[..., 4, 4]`` in the frame whose x axis is s (perpendicular to the plane of incidence)."""
+    zero = torch.zeros_like(f.r_plus)
+    return _matrix(
+        [
+            [f.r_plus, f.r_minus, zero, zero],
+            [f.r_minus, f.r_plus, zero, zero],
+            [zero, zero, f.r_cross, zero],
+            [zero, zero, zero, f.r_cross],
+        ]
+    )
+
+
+def mueller_diffuse(out: Fresnel, into: Fresnel) -> Tensor:
+    """Transmission in, complete depolarization, transmission out: ``[..., 4, 4]`` in the s frames of both beams."""
+    zero = torch.zeros_like(out.t_plus)
+    return _matrix(
+        [
+            [out.t_plus * into.t_plus, out.t_plus * into.t_minus, zero, zero],
+            [out.t_minus * into.t_plus, out.t_minus * into.t_minus, zero, zero],
+            [zero, zero, zero, zero],
+            [zero, zero, zero, zero],
+        ]
+    )
+
+
+def _matrix(rows: list[list[Tensor]]) -> Tensor:
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)

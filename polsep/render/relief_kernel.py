@@ -1,0 +1,65 @@
+"""Fine relief: normals tilted by the gradient of solid noise, as on leather, bark, plaster or cast metal.
+
+Geometry and cast shadows stay those of the smooth surface; shading, and what faces the light, follow the normals
+(bump mapping after Blinn 1978).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.compute.compiling import ONE, TWO, ZERO, entry
+from polsep.compute.threads import share
+from polsep.render.patterns_kernel import gradient_noise
+
+Floats = NDArray[np.float32]
+
+#: Step of the differences that stand for the gradient, in cells of the noise.
+_STEP = np.float32(1 / 32)
+#: How much less an octave tilts than the one before, and the least cosine to the eye that a tilted normal may have.
+_GAIN, _MIN_COSINE = np.float32(0.7), np.float32(0.02)
+#: Between the seeds of octaves.
+_KEY_STEP = np.uint32(77)
+#: Points that a thread takes at once.
+_POINTS_AT_ONCE = 1 << 14
+
+
+class Relief(NamedTuple):
+    """Noise of ``octaves`` with ``frequency`` cells per scene unit; ``strength``: tangent of a usual tilt."""
+
+    frequency: float
+    strength: float
+    octaves: int
+    seed: int
+
+
+def roughen_normals(positions: Floats, normals: Floats, eye: Floats, relief: Relief) -> None:
+    """Tilt unit ``normals [3, M]`` at ``positions [3, M]`` in place; those that would turn from the eye stay."""
+    numbers = (np.float32(relief.frequency), np.float32(relief.strength), relief.octaves, np.uint32(relief.seed))
+    share(lambda piece: _roughen(positions, normals, eye, numbers, piece), positions.shape[1], _POINTS_AT_ONCE)
+
+
+@entry
+def _roughen(positions: Floats, normals: Floats, eye: Floats, numbers: Any, piece: Any) -> None:
+    frequency, strength, octaves, seed = numbers
+    for m in range(piece[0], piece[1]):
+        x, y, z = positions[0, m] * frequency, positions[1, m] * frequency, positions[2, m] * frequency
+        gx, gy, gz, gain, key = ZERO, ZERO, ZERO, strength / _STEP, seed
+        for _ in range(octaves):
+            here = gradient_noise(x, y, z, key)
+            gx += gain * (gradient_noise(x + _STEP, y, z, key) - here)
+            gy += gain * (gradient_noise(x, y + _STEP, z, key) - here)
+            gz += gain * (gradient_noise(x, y, z + _STEP, key) - here)
+            x, y, z, gain, key = x * TWO, y * TWO, z * TWO, gain * _GAIN, np.uint32(key + _KEY_STEP)
+        nx, ny, nz = normals[0, m], normals[1, m], normals[2, m]
+        along = gx * nx + gy * ny + gz * nz
+        nx, ny, nz = nx - gx + along * nx, ny - gy + along * ny, nz - gz + along * nz
+        scale = ONE / np.float32(np.sqrt(nx * nx + ny * ny + nz * nz))
+        nx, ny, nz = nx * scale, ny * scale, nz * scale
+        vx, vy, vz = eye[0] - positions[0, m], eye[1] - positions[1, m], eye[2] - positions[2, m]
+        facing = nx * vx + ny * vy + nz * vz
+        if facing > _MIN_COSINE * np.float32(np.sqrt(vx * vx + vy * vy + vz * vz)):
+            normals[0, m], normals[1, m], normals[2, m] = nx, ny, nz

@@ -1,0 +1,174 @@
+"""Random views of a shape: where the camera and the light are, how the frame is exposed, and the frame itself.
+
+All draws of a view come from one generator, whose seed `scene_seed` makes of four numbers: the split of the data, the
+user's seed, and which shape and view it is. So a view never depends on what was rendered before it, or where.
+
+Conventions are those of `polsep.render.sphere_tracing`; shapes are centred on the origin. Source: Dave et al. 2022,
+Sec. 4.4, which varies the light's "position and polarization angle for each data point" and leaves the rest open. Note:
+materials are drawn per view, not per shape, because 20 times as many cost nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from polsep.render.materials import random_materials
+from polsep.render.raycast import MeshScene, find_view, light_view, render_scene
+from polsep.render.shapes import Floats, random_mesh
+from polsep.render.simulate import Capture, blur, capture, expose_to_clip, expose_to_level
+from polsep.render.sphere_tracing import PinholeCamera, PointLight, Vector
+from polsep.sensor.camera import IMX250, Layout
+
+#: Whom data are for; the position is part of every seed.
+SPLITS = ("train", "validation", "test")
+#: Cameras stay this far from the vertical: their up vector is world +y.
+LARGEST_ELEVATION = math.radians(75)
+#: Vertical field of view [degrees], and the share of the frame that the object fills along its longer side.
+FIELDS_OF_VIEW, FILLS = (15.0, 50.0), (0.6, 1.0)
+#: The light lies within this angle of the camera, seen from the object: beyond it most of what is seen is unlit.
+LARGEST_PHASE = math.radians(60)
+#: Distance of the light from the object's centre, and the least one of the camera, in radii of the object.
+LIGHT_DISTANCES, MIN_DISTANCE = (2.0, 8.0), 1.5
+#: Share of the views in which nothing clips, and the largest share of object samples that clips in the others.
+UNCLIPPED_SHARE, LARGEST_CLIPPED = 1 / 3, 0.05
+#: Median of the lit samples at least, white at 1: exposed for a mirror-like highlight alone, a frame would be black.
+#: Where it applies, more samples clip than asked.
+MIN_LEVEL = 0.02
+#: Standard deviation of the lens's point spread in raw pixels: 0.42 wavelength x f-number (Zhang, Zerubia and
+#: Olivo-Marin 2007, doi:10.1364/AO.46.001819) over pixels of 3.45 um is 0.3 at f/4.5 and 0.8 at f/12 for 550 nm.
+BLURS = (0.3, 0.8)
+#: A view is drawn anew when less than this share of the object's pixels is lit, seen in a small picture; at most so
+#: many times.
+MIN_LIT, PREVIEW_SIZE, MAX_DRAWS = 0.4, (48, 48), 100
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What of a picture of a shape is random besides its materials; ``clip`` is the share of samples that clips."""
+
+    camera: PinholeCamera
+    light: PointLight
+    clip: float
+    blur: float
+
+
+def scene_seed(split: str, seed: int, shape: int, view: int | None = None) -> int:
+    """The seed of a view, or of the shape itself for None: a number below 2^32.
+
+    The two highest bits are the split's, so no two splits share a seed; the others are SHA-256 of the four numbers.
+    Not more bits, because torch's CPU generator is a Mersenne twister that takes 32 of its seed and drops the rest.
+    Raises ValueError on a split not in `SPLITS`.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"expected a split of {', '.join(SPLITS)}, found {split!r}")
+    label = f"{split}/{seed}/{shape}/{'shape' if view is None else view}"
+    return SPLITS.index(split) << 30 | int.from_bytes(hashlib.sha256(label.encode()).digest()[:4]) >> 2
+
+
+def seeded_shape(split: str, seed: int, shape: int) -> MeshScene:
+    """Random shape number ``shape`` of a split."""
+    return MeshScene(random_mesh(torch.Generator().manual_seed(scene_seed(split, seed, shape))))
+
+
+def random_camera(vertices: Floats, generator: torch.Generator) -> PinholeCamera:
+    """A camera that looks at the middle of what it sees of points ``[V, 3]`` about the origin, from any side.
+
+    The distance is the one at which they fill a share in `FILLS` of a square frame.
+    """
+    azimuth = _uniform((0.0, 2 * math.pi), generator)
+    limit = math.sin(LARGEST_ELEVATION)
+    sine = _uniform((-limit, limit), generator)
+    fov, fill = _uniform(FIELDS_OF_VIEW, generator), _uniform(FILLS, generator)
+    cosine = math.sqrt(1 - sine**2)
+    back = np.array([cosine * math.sin(azimuth), sine, cosine * math.cos(azimuth)])
+    right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
+    up = np.cross(back, right)
+    x, y, nearness = (_along(vertices, axis) for axis in (right, up, back))
+    middle = (x.min() + x.max()) / 2 * right + (y.min() + y.max()) / 2 * up
+    reach = np.maximum(np.abs(x - _along(middle, right)), np.abs(y - _along(middle, up)))
+    distance = float((reach / (fill * math.tan(math.radians(fov) / 2)) + nearness).max())
+    distance = max(distance, MIN_DISTANCE * _radius(vertices))
+    return PinholeCamera(_rounded(middle + distance * back), _rounded(middle), round(fov, 6))
+
+
+def random_light(camera: PinholeCamera, radius: float, generator: torch.Generator) -> PointLight:
+    """A light within `LARGEST_PHASE` of the camera, at a random distance and behind a random polarizer.
+
+    Its irradiance at the origin is 1; the exposure comes later. ``radius``: of the object.
+    """
+    away = np.array(camera.position) - np.array(camera.target)
+    away /= math.hypot(*away)
+    cosine = _uniform((math.cos(LARGEST_PHASE), 1.0), generator)
+    turn = _uniform((0.0, 2 * math.pi), generator)
+    distance = radius * _uniform(LIGHT_DISTANCES, generator)
+    side = np.cross([0.0, 1.0, 0.0], away)
+    side /= math.hypot(*side)
+    across = math.cos(turn) * side + math.sin(turn) * np.cross(away, side)
+    position = distance * (cosine * away + math.sqrt(1 - cosine**2) * across)
+    return PointLight(_rounded(position), round(distance**2, 6), round(_uniform((0.0, math.pi), generator), 6))
+
+
+def random_clip(generator: torch.Generator) -> float:
+    """The share of an object's samples that is to clip: 0 for `UNCLIPPED_SHARE` of the draws."""
+    some = _uniform((0.0, 1.0), generator) >= UNCLIPPED_SHARE
+    share = _uniform((0.0, LARGEST_CLIPPED), generator)
+    return round(share, 6) if some else 0.0
+
+
+def random_shot(shape: MeshScene, generator: torch.Generator) -> Shot:
+    """A view that shows enough of the lit side of a shape: others are drawn anew, by `MIN_LIT`.
+
+    Raises ValueError when none of `MAX_DRAWS` does.
+    """
+    for _ in range(MAX_DRAWS):
+        camera = random_camera(shape.mesh.vertices, generator)
+        light = random_light(camera, _radius(shape.mesh.vertices), generator)
+        shot = Shot(camera, light, random_clip(generator), round(_uniform(BLURS, generator), 6))
+        if lit_share(shape, shot) >= MIN_LIT:
+            return shot
+    raise ValueError(f"expected a view that shows {MIN_LIT:.0%} of the shape lit, found none in {MAX_DRAWS} draws")
+
+
+def lit_share(shape: MeshScene, shot: Shot) -> float:
+    """The share of a shape's pixels that the light reaches, in a picture of `PREVIEW_SIZE`."""
+    view = find_view(shape, shot.camera, PREVIEW_SIZE)
+    lit = torch.cat([found[0, :, 0] for found in light_view(shape, view, shot.light)])
+    return float(lit.float().mean()) if lit.numel() else 0.0
+
+
+def capture_shot(shape: MeshScene, shot: Shot, size: int, samples: int, generator: torch.Generator) -> Capture:
+    """A ``size`` x ``size`` frame of a shape with random materials by the camera `camera.IMX250`, and its truth.
+
+    Raises ValueError when the light reaches no pixel that the shape covers wholly.
+    """
+    materials = random_materials(shape.mesh.slot_count, generator, shape.size)
+    scene = render_scene((shape, materials), shot.camera, shot.light, (size, size), samples)
+    exposed = expose_to_clip(blur(scene, shot.blur), shot.clip, Layout(), IMX250)
+    return capture(expose_to_level(exposed, MIN_LEVEL, Layout(), IMX250), Layout(), IMX250, generator)
+
+
+def _radius(vertices: Floats) -> float:
+    """The largest distance of points ``[V, 3]`` from the origin."""
+    return math.sqrt(float((vertices**2).sum(axis=1).max()))
+
+
+def _along(points: Floats, axis: Floats) -> Floats:
+    """Coordinates of points ``[..., 3]`` along a unit vector; no matrix product, whose last bit is the machine's."""
+    along: Floats = points[..., 0] * axis[0] + points[..., 1] * axis[1] + points[..., 2] * axis[2]
+    return along
+
+
+def _uniform(interval: tuple[float, float], generator: torch.Generator) -> float:
+    low, high = interval
+    return low + (high - low) * float(torch.rand(1, generator=generator, dtype=torch.float64))
+
+
+def _rounded(point: Floats) -> Vector:
+    """A point as it is printed, so that what is read in a file is what was rendered, on every machine."""
+    x, y, z = (round(float(c), 6) for c in point)
+    return (x, y, z)

@@ -1,0 +1,1 @@
+"""What the sensor does: layouts, levels, noise, orientation, packed samples."""

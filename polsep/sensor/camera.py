@@ -1,0 +1,312 @@
+"""The forward sensor: which filter sits on which pixel, and what a sample of light becomes in a file.
+
+`Layout` says which analyser and colour filter covers each pixel, `Sensor` what exposure does to the light, and
+`Mosaic` is one raw frame. `demosaic` is the inverse of this module.
+
+Conventions: rows grow downward. A layout's polarizer angles are in DEGREES, as printed in camera manuals, because
+they are data that people type; everything computed from them is in radians. Sony's IMX250MZR/MYR and relatives have
+
+    90  45        colour sensors repeat this 2x2 cell inside        R90  R45  G90  G45
+    135  0        each pixel of a 2x2 Bayer block (RGGB):           R135 R0   G135 G0
+                                                                    G90  G45  B90  B45
+                                                                    G135 G0   B135 B0
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from polsep.physics.stokes import Measurements, Stokes
+
+BAYER_ORDERS = ("RGGB", "BGGR", "GRBG", "GBRG")
+
+#: A sample within this fraction of the white level counts as clipped: 12-bit data shifted left into 16 bits stops
+#: at 65520 of 65535, and 10-bit data at 65472; 8-bit data are only clipped at 255.
+CLIP_MARGIN = 2.0**-10
+
+Cell = tuple[tuple[float, float], tuple[float, float]]
+
+
+class Filter(NamedTuple):
+    """What covers one pixel: the analyser angle [degrees] and the colour channel (0, 1, 2; 0 on mono sensors)."""
+
+    angle_deg: float
+    channel: int
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which filters cover which pixel of a mosaic; data, never a global.
+
+    ``polarizer``: 2x2 analyser angles in degrees, four different ones. ``bayer``: the colours of a 2x2 block of such
+    cells in reading order, or None for mono sensors. ``origin``: row and column (0 or 1) of the first whole cell,
+    for colour frames cropped at an odd offset. Raises ValueError on anything else.
+    """
+
+    polarizer: Cell = ((90, 45), (135, 0))
+    bayer: str | None = "RGGB"
+    origin: tuple[int, int] = (0, 0)
+
+    def __post_init__(self) -> None:
+        try:
+            (a, b), (c, d) = self.polarizer
+            flat = [float(angle) for angle in (a, b, c, d)]
+        except (TypeError, ValueError):
+            raise ValueError(f"a layout's polarizer must be 2x2 angles in degrees, found {self.polarizer!r}") from None
+        if not all(math.isfinite(angle) for angle in flat):
+            raise ValueError(f"a layout's polarizer must be 2x2 angles in degrees, found {self.polarizer!r}")
+        object.__setattr__(self, "polarizer", ((a, b), (c, d)))
+        if len({angle % 180 for angle in flat}) != 4:
+            raise ValueError(
+                f"polarizer must hold four different angles (modulo 180 degrees), found {self.polarizer!r}"
+            )
+        if self.bayer is not None and self.bayer not in BAYER_ORDERS:
+            raise ValueError(f"bayer must be one of {', '.join(BAYER_ORDERS)} or None, found {self.bayer!r}")
+        if self.origin not in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            raise ValueError(f"origin must be two of 0 or 1, found {self.origin!r}")
+        object.__setattr__(self, "origin", (int(self.origin[0]), int(self.origin[1])))
+        if self.bayer is None and self.origin != (0, 0):
+            raise ValueError("a mono layout needs no origin: permute its polarizer cell instead")
+
+    @classmethod
+    def parse(cls, spec: str) -> Layout:
+        """A layout from ``color``, ``mono`` or ``"90,45,135,0/RGGB"``: angles in reading order, Bayer order or mono."""
+        if spec in ("color", "colour"):
+            return cls()
+        if spec == "mono":
+            return cls(bayer=None)
+        expected = f'expected "color", "mono" or angles and colours like "90,45,135,0/RGGB", found {spec!r}'
+        angles, slash, colors = spec.partition("/")
+        colors, at, offset = colors.partition("@")
+        try:
+            a, b, c, d = (float(angle) for angle in angles.split(","))
+            row, col = (int(o) for o in offset.split(",")) if at else (0, 0)
+        except ValueError:
+            raise ValueError(expected) from None
+        if not slash or not colors:
+            raise ValueError(expected)
+        return cls(((a, b), (c, d)), None if colors == "mono" else colors, (row, col))
+
+    @property
+    def spec(self) -> str:
+        """The text that `parse` reads back."""
+        angles = ",".join(repr(float(angle)).removesuffix(".0") for row in self.polarizer for angle in row)
+        offset = f"@{self.origin[0]},{self.origin[1]}" if self.origin != (0, 0) else ""
+        return f"{angles}/{self.bayer or 'mono'}{offset}"
+
+    @property
+    def channels(self) -> int:
+        """3 for colour sensors, 1 for mono."""
+        return 1 if self.bayer is None else 3
+
+    @property
+    def period(self) -> int:
+        """Pixels after which the filters repeat in both directions: 4 for colour, 2 for mono."""
+        return 2 if self.bayer is None else 4
+
+    @property
+    def angles_deg(self) -> tuple[float, ...]:
+        """The four analyser angles in degrees, sorted (0, 45, 90, 135 for Sony): the order of `Measurements`."""
+        return tuple(sorted(float(angle) for row in self.polarizer for angle in row))
+
+    @property
+    def angles(self) -> tuple[float, ...]:
+        """`angles_deg` in radians."""
+        return tuple(math.radians(angle) for angle in self.angles_deg)
+
+    def filter_at(self, row: int, col: int) -> Filter:
+        """The filter on pixel (row, col) of the mosaic."""
+        row, col = row - self.origin[0], col - self.origin[1]
+        angle = float(self.polarizer[row % 2][col % 2])
+        if self.bayer is None:
+            return Filter(angle, 0)
+        return Filter(angle, "RGB".index(self.bayer[row // 2 % 2 * 2 + col // 2 % 2]))
+
+    def table(self) -> list[list[Filter]]:
+        """One 4x4 period of filters."""
+        return [[self.filter_at(row, col) for col in range(4)] for row in range(4)]
+
+    @classmethod
+    def from_table(cls, table: list[list[Filter]]) -> Layout:
+        """The layout whose 4x4 `table` is given; ValueError when no layout has it."""
+        mono = len({f.channel for row in table for f in row}) == 1
+        for origin in [(0, 0)] if mono else [(0, 0), (0, 1), (1, 0), (1, 1)]:
+            at = [[table[(row + origin[0]) % 4][(col + origin[1]) % 4] for col in range(4)] for row in range(4)]
+            cell = ((at[0][0].angle_deg, at[0][1].angle_deg), (at[1][0].angle_deg, at[1][1].angle_deg))
+            order = "".join("RGB"[at[row][col].channel] for row in (0, 2) for col in (0, 2))
+            if mono or order in BAYER_ORDERS:
+                layout = cls(cell, None if mono else order, origin)
+                if layout.table() == table:
+                    return layout
+        raise ValueError("no layout has this table of filters")
+
+    def rolled(self, rows: int, cols: int) -> Layout:
+        """The layout of a mosaic rolled by (rows, cols) pixels, or cropped by (-rows, -cols)."""
+        t = self.table()
+        return Layout.from_table([[t[(row - rows) % 4][(col - cols) % 4] for col in range(4)] for row in range(4)])
+
+    def flipped_horizontal(self, width: int) -> Layout:
+        """The layout of the left-right mirrored frame of that width: columns reverse and angles change sign."""
+        t = [[Filter(-f.angle_deg % 180, f.channel) for f in row] for row in self.table()]
+        return Layout.from_table([[t[row][(width - 1 - col) % 4] for col in range(4)] for row in range(4)])
+
+    def flipped_vertical(self, height: int) -> Layout:
+        """The layout of the top-bottom mirrored frame of that height: rows reverse and angles change sign."""
+        t = [[Filter(-f.angle_deg % 180, f.channel) for f in row] for row in self.table()]
+        return Layout.from_table([t[(height - 1 - row) % 4] for row in range(4)])
+
+    def transposed(self) -> Layout:
+        """The layout of the transposed frame: rows and columns swap and an angle t becomes 90 degrees - t."""
+        t = self.table()
+        turned = [[Filter((90 - f.angle_deg) % 180, f.channel) for f in row] for row in t]
+        return Layout.from_table([[turned[col][row] for col in range(4)] for row in range(4)])
+
+
+@dataclass(frozen=True)
+class Mosaic:
+    """One raw frame (or a batch): linear sensor values ``data [..., H, W]`` with what is needed to read them.
+
+    ``black_level`` and ``white_level`` are in the units of ``data``. Samples within `CLIP_MARGIN` of the white level
+    count as clipped. ``light_color``: one gain per channel that `linear` divides out, so that what follows sees white
+    light. Raises ValueError when white is not above black or the frame is smaller than one period.
+    """
+
+    data: Tensor
+    layout: Layout
+    black_level: float
+    white_level: float
+    light_color: tuple[float, ...] = (1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        rows, cols = (self.layout.period + start for start in self.layout.origin)
+        if self.data.ndim < 2 or self.data.shape[-2] < rows or self.data.shape[-1] < cols:
+            raise ValueError(f"expected a mosaic [..., H, W] of at least {rows}x{cols}, found {tuple(self.data.shape)}")
+        if not self.white_level > self.black_level:
+            raise ValueError(f"white_level must be above black_level, found {self.white_level} and {self.black_level}")
+
+    def linear(self) -> Tensor:
+        """Samples with black at 0 and white at 1, under white light; float32 (float64 for float64 data)."""
+        samples = self._samples()
+        if all(gain == 1 for gain in self.light_color):
+            return samples
+        period = self.layout.period
+        for row in range(period):
+            for col in range(period):
+                channel = self.layout.filter_at(row, col).channel
+                samples[..., row::period, col::period] /= self.light_color[channel]
+        return samples
+
+    def _samples(self) -> Tensor:
+        data = self.data if self.data.dtype == torch.float64 else self.data.float()
+        return (data - self.black_level) / (self.white_level - self.black_level)
+
+    def clipped(self) -> Tensor:
+        """Mask ``[..., H, W]`` of samples that only bound the light from below."""
+        return self._samples() >= 1 - CLIP_MARGIN
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What a pixel does to light. Signals are fractions of ``full_well``, which maps to the white level.
+
+    ``full_well``: electrons at the white level (inf: no shot noise). ``read_noise``: electrons rms.
+    ``bits``: depth of the converter, None for none. ``diattenuation``: D = (ER - 1) / (ER + 1) of the analysers for
+    extinction ratio ER, one value or one per colour. Source of `IMX250`: docs/conventions.md, sensor constants.
+    """
+
+    full_well: float = math.inf
+    read_noise: float = 0.0
+    bits: int | None = None
+    diattenuation: tuple[float, ...] = (1.0,)
+
+    def __post_init__(self) -> None:
+        if not (self.full_well > 0 and self.read_noise >= 0):
+            raise ValueError(f"full_well must be positive and read_noise not negative, found {self}")
+        if self.bits is not None and self.bits < 1:
+            raise ValueError(f"bits must be at least 1, found {self.bits}")
+        if len(self.diattenuation) not in (1, 3) or not all(0 <= d <= 1 for d in self.diattenuation):
+            raise ValueError(f"diattenuation must be one or three numbers in [0, 1], found {self.diattenuation}")
+
+    @property
+    def white_level(self) -> float:
+        """Largest code: 2^bits - 1, or 1.0 without a converter."""
+        return 1.0 if self.bits is None else 2.0**self.bits - 1
+
+    def noise_variance(self, signal: Tensor) -> Tensor:
+        """Variance of one unclipped sample of mean ``signal`` (white = 1): shot, read and quantization noise."""
+        shot = signal.clamp(min=0) / self.full_well
+        read = (self.read_noise / self.full_well) ** 2
+        step = 0.0 if self.bits is None else 1 / self.white_level
+        return shot + read + step**2 / 12
+
+
+#: Sony IMX250MYR as published by third parties: full well 10.5 ke-, 2.4 e- read noise, 12 bits, extinction ratios of
+#: about 150 (R), 300 (G) and 425 (B). No data sheet was found; see docs/conventions.md.
+IMX250 = Sensor(10_500.0, 2.4, 12, (149 / 151, 299 / 301, 424 / 426))
+
+#: A perfect sensor that still clips at 1.
+IDEAL = Sensor()
+
+
+def sample_mosaic(measurements: Measurements, layout: Layout) -> Tensor:
+    """The mosaic ``[..., H, W]`` of angle images ``[..., 4, C, H, W]``: of each pixel the sample behind its filter.
+
+    The twin of every demosaicker. Channels beyond the layout's colours are not looked at. Raises ValueError when the
+    measurements lack an analyser of the layout.
+    """
+    data = measurements.data
+    out = torch.empty((*data.shape[:-4], *data.shape[-2:]), dtype=data.dtype, device=data.device)
+    degrees = [round(math.degrees(t), 6) for t in measurements.angles]
+    for row in range(layout.period):
+        for col in range(layout.period):
+            filt = layout.filter_at(row, col)
+            if round(filt.angle_deg, 6) not in degrees:
+                raise ValueError(f"expected measurements at {layout.angles_deg} degrees, found {degrees}")
+            k = degrees.index(round(filt.angle_deg, 6))
+            out[..., row :: layout.period, col :: layout.period] = data[
+                ..., k, filt.channel, row :: layout.period, col :: layout.period
+            ]
+    return out
+
+
+def measure_with_analysers(stokes: Stokes, angles: tuple[float, ...], diattenuation: tuple[float, ...]) -> Measurements:
+    """`stokes.measure` behind real analysers: m = (s0 + D (s1 cos 2t + s2 sin 2t)) / 2 with D per colour.
+
+    Of three values a mono image takes the middle one, the green's.
+    """
+    if stokes.s0.shape[-3] == 1:
+        diattenuation = diattenuation[len(diattenuation) // 2 :][:1]
+    d = torch.tensor(diattenuation, dtype=stokes.s0.dtype, device=stokes.s0.device)[:, None, None]
+    data = [0.5 * (stokes.s0 + d * (stokes.s1 * math.cos(2 * t) + stokes.s2 * math.sin(2 * t))) for t in angles]
+    return Measurements(torch.stack(data, dim=-4), angles)
+
+
+def expose(stokes: Stokes, layout: Layout, sensor: Sensor, generator: torch.Generator | None = None) -> Mosaic:
+    """One raw frame of the Stokes image ``[..., C, H, W]`` that lies on the sensor, at raw resolution.
+
+    In physical order: analyser and colour filter of each pixel, Poisson shot noise, Gaussian read noise, clipping at
+    the full well (Eq. 13), quantization. Float data in [0, 1] without a converter, else integer codes as float32.
+    Deterministic for a given ``generator``; none is needed for a noise-free sensor.
+    """
+    signal = sample_mosaic(measure_with_analysers(stokes, layout.angles, sensor.diattenuation), layout)
+    signal = add_noise(signal, sensor, generator)
+    codes = signal.clamp(0, 1)
+    if sensor.bits is not None:
+        codes = torch.round(codes * sensor.white_level)
+    return Mosaic(codes, layout, 0.0, sensor.white_level)
+
+
+def add_noise(signal: Tensor, sensor: Sensor, generator: torch.Generator | None) -> Tensor:
+    """Shot and read noise of ``sensor`` on a signal in units of the white level; neither clipped nor quantized."""
+    if math.isinf(sensor.full_well):
+        return signal
+    electrons = torch.poisson(signal.clamp(min=0) * sensor.full_well, generator=generator)
+    if sensor.read_noise:
+        noise = torch.empty_like(electrons).normal_(generator=generator)
+        electrons = electrons + sensor.read_noise * noise
+    return electrons / sensor.full_well

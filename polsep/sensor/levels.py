@@ -1,0 +1,203 @@
+"""From arrays of any origin to `Mosaic` and `Measurements`: which samples are accepted, where black and white lie.
+
+Conventions, shared by Python callers and by files:
+
+* Samples are uint8, uint16, float32 or float64, finite, one value per pixel; they become float32, in which 8- and
+  16-bit codes are exact. Signed integers, booleans and complex numbers are refused.
+* A white level of None means the largest code of the dtype: 255, 65535, or 1.0 for floats. Nothing else is ever
+  assumed: what the values look like (12 bits in 16, for example) is said in a note, a one-line remark for the user.
+* Samples above the white level are kept and count as clipped; samples below the black level are kept.
+* Everything refused raises ValueError with one line: what was expected, what was found.
+"""
+
+from __future__ import annotations
+
+import math
+from numbers import Real
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polsep.physics.stokes import Measurements
+from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
+
+#: Accepted samples and the white level that their type implies.
+WHITE_LEVELS = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0, "float64": 1.0}
+
+#: Floats up to about 1 that lie below this share of the white level look as if white were 1.
+MIN_USED = 0.01
+
+#: Order of four angle planes, as LUCID names them, in degrees.
+PLANE_ANGLES_DEG = (0.0, 45.0, 90.0, 135.0)
+
+#: Bit depths of converters that are stored in 16-bit words.
+_NARROW_BITS = (8, 10, 12, 14)
+
+Notes = tuple[str, ...]
+
+
+def as_mosaic(
+    array: NDArray[Any], layout: Layout | None = None, black_level: float = 0.0, white_level: float | None = None
+) -> tuple[Mosaic, Notes]:
+    """One raw frame ``[H, W]`` (or ``[H, W, 1]``) as a `Mosaic` of float32, with notes for the user.
+
+    ``layout`` None is Sony's colour order; levels are in the units of ``array``. An odd last row or column is cropped
+    and gray stored as three equal channels is reduced to one, both with a note. Bit depth is not guessed. Raises
+    ValueError on another dtype or shape, values that are not finite, or white not above black.
+    """
+    layout = Layout() if layout is None else layout
+    if not isinstance(layout, Layout):
+        raise ValueError(f"expected a Layout or None, found {type(layout).__name__}")
+    plane, notes = _one_channel(_checked(array))
+    height, width = plane.shape
+    odd_rows, odd_cols = ((n - start) % 2 for n, start in zip((height, width), layout.origin, strict=True))
+    if odd_rows or odd_cols:
+        plane = plane[: height - odd_rows, : width - odd_cols]
+        notes += (f"odd size {width}x{height}: cropped to {plane.shape[1]}x{plane.shape[0]}, whole polarizer cells",)
+    rows, cols = (layout.period + start for start in layout.origin)
+    if plane.shape[0] < rows or plane.shape[1] < cols:
+        raise ValueError(f"expected a mosaic of at least {cols}x{rows} pixels, found {width}x{height}")
+    white = _white_level(plane, black_level, white_level)
+    data = torch.from_numpy(_as_float32(plane))
+    return Mosaic(data, layout, black_level, white), notes + level_notes(plane, black_level, white_level)
+
+
+def as_measurements(
+    planes: NDArray[Any], black_level: float = 0.0, white_level: float | None = None
+) -> tuple[Measurements, Notes]:
+    """Four co-sited images behind 0, 45, 90, 135 degrees as `Measurements` ``[4, C, H, W]``, black 0 and white 1.
+
+    ``planes``: ``[4, H, W]``, or ``[4, H, W, C]`` with C = 1 or 3. ``clipped`` marks samples within `CLIP_MARGIN` of
+    white. Not for planes sampled from one mosaic: their pixels are not at the same points, see `interleave_planes`.
+    Raises ValueError as `as_mosaic` does.
+    """
+    planes = _checked(planes)
+    if planes.ndim == 3:
+        planes = planes[..., None]
+    if planes.ndim != 4 or planes.shape[0] != 4 or planes.shape[-1] not in (1, 3):
+        raise ValueError(f"expected four gray or RGB images, found shape {_shape(planes)}")
+    white = _white_level(planes, black_level, white_level)
+    linear = (torch.from_numpy(_as_float32(planes)) - black_level) / (white - black_level)
+    data = linear.permute(0, 3, 1, 2).contiguous()
+    angles = tuple(math.radians(angle) for angle in PLANE_ANGLES_DEG)
+    return Measurements(data, angles, data >= 1 - CLIP_MARGIN), level_notes(planes, black_level, white_level)
+
+
+def interleave_planes(planes: NDArray[Any], layout: Layout) -> NDArray[Any]:
+    """The mosaic ``[2H, 2W]`` whose pixels behind 0, 45, 90, 135 degrees are the four ``planes`` ``[4, H, W]``.
+
+    Undoes what cameras do that send angle images. Raises ValueError for other shapes, or a layout of other angles.
+    """
+    if planes.ndim != 3 or planes.shape[0] != 4:
+        raise ValueError(f"expected four planes [4, H, W] of one mosaic, found shape {_shape(planes)}")
+    order = [angle % 180 for angle in PLANE_ANGLES_DEG]
+    if sorted(angle % 180 for angle in layout.angles_deg) != order:
+        raise ValueError(f"expected a layout of the angles 0, 45, 90, 135 for four planes, found {layout.spec}")
+    mosaic = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), planes.dtype)
+    for row in (0, 1):
+        for col in (0, 1):
+            mosaic[row::2, col::2] = planes[order.index(layout.filter_at(row, col).angle_deg % 180)]
+    return mosaic
+
+
+def level_notes(samples: NDArray[Any], black_level: float, white_level: float | None) -> Notes:
+    """What the values say about exposure and bit depth, one line each; ``white_level`` None was not said by anyone."""
+    white = WHITE_LEVELS[samples.dtype.name] if white_level is None else white_level
+    low, high = float(samples.min()), float(samples.max())
+    if high <= black_level:
+        return (f"black frame: no sample exceeds the black level {black_level:g} (largest {high:g})",)
+    notes: Notes = ()
+    if low - black_level >= (1 - CLIP_MARGIN) * (white - black_level):
+        notes += (f"every sample is clipped: the smallest is {low:g} of white level {white:g}",)
+    if white_level is None and samples.dtype.kind == "f" and high > 2:
+        return (*notes, f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white")
+    if samples.dtype.kind == "f" and high <= 2 and high - black_level < MIN_USED * (white - black_level):
+        notes += (f"float values reach {high:g} of white level {white:g}: is white 1? Then leave out --white-level",)
+    if high > white:
+        above = int(np.count_nonzero(samples > white))
+        notes += (f"{above} samples exceed the white level {white:g} (largest {high:g}): they count as clipped",)
+    if samples.dtype.kind == "u" and white > WHITE_LEVELS[samples.dtype.name]:
+        notes += (f"white level {white:g} is beyond {samples.dtype.name}: no sample can count as clipped",)
+    if white_level is None and samples.dtype == np.uint16:
+        notes += _depth_notes(samples, int(high))
+    return notes
+
+
+def _depth_notes(samples: NDArray[Any], high: int) -> Notes:
+    """What uint16 values look like when nobody has said their white level. Left-justified codes have idle low bits."""
+    used = int(np.bitwise_or.reduce(samples, axis=None))
+    idle = (used & -used).bit_length() - 1
+    left = next((bits for bits in _NARROW_BITS if idle >= 16 - bits), None)
+    if left is not None:
+        largest = (2**left - 1) << (16 - left)
+        seen = f"the lowest {16 - left} bits are always zero: {left}-bit left-justified data"
+        if largest >= (1 - CLIP_MARGIN) * 65535:
+            return (f"{seen}; white level 65535 fits",)
+        return (f"{seen}; say --white-level {largest} if so",)
+    right = next((bits for bits in _NARROW_BITS if high < 2**bits), None)
+    if right is None:
+        return ()
+    top = 2**right - 1
+    seen = f"values never exceed {top} of 65535: looks like {right}-bit right-justified data"
+    return (f"{seen}; say --white-level {top} if so",)
+
+
+def _shape(array: NDArray[Any]) -> str:
+    return "x".join(str(n) for n in array.shape) or "a single number"
+
+
+def _checked(array: NDArray[Any]) -> NDArray[Any]:
+    """``array`` in native byte order, once its type, size and values are known to be acceptable."""
+    if not isinstance(array, np.ndarray) or isinstance(array, np.ma.MaskedArray):  # masked samples have no value
+        raise ValueError(f"expected a NumPy array, found {type(array).__name__}")
+    if array.dtype.name not in WHITE_LEVELS:
+        raise ValueError(f"expected samples of uint8, uint16, float32 or float64, found {array.dtype}")
+    if array.size == 0 or array.ndim < 2:
+        raise ValueError(f"expected an image [H, W], found shape {_shape(array)}")
+    if array.dtype.kind == "f":
+        _require_finite(array)
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+def _require_finite(array: NDArray[Any]) -> None:
+    """Raise ValueError when a value is not finite, or has no finite float32."""
+    bad = ~(np.abs(array) <= np.finfo(np.float32).max)
+    if bad.any():
+        first = tuple(int(i) for i in np.unravel_index(int(bad.argmax()), bad.shape))
+        count = np.count_nonzero(bad)
+        raise ValueError(f"expected finite values, found {count} that are not, the first ({array[first]:g}) at {first}")
+
+
+def _one_channel(array: NDArray[Any]) -> tuple[NDArray[Any], Notes]:
+    """``[H, W]`` of an array with one channel, or with three equal ones."""
+    if array.ndim == 2:
+        return array, ()
+    if array.ndim == 3 and array.shape[-1] == 1:
+        return array[..., 0], ()
+    if array.ndim == 3 and array.shape[-1] == 3:
+        if bool((array == array[..., :1]).all()):
+            return array[..., 0], ("gray stored as three equal channels: one is used",)
+        raise ValueError("expected one channel, found 3: a demosaicked picture is not a raw mosaic")
+    if array.ndim == 3 and array.shape[-1] in (2, 4):
+        raise ValueError(f"expected one channel, found {array.shape[-1]}: transparency has no place in a raw mosaic")
+    raise ValueError(f"expected a mosaic [H, W], found shape {_shape(array)}")
+
+
+def _white_level(samples: NDArray[Any], black_level: float, white_level: float | None) -> float:
+    """The white level said, or that of the dtype. Raises ValueError unless it is finite and above black."""
+    white = WHITE_LEVELS[samples.dtype.name] if white_level is None else white_level
+    for name, level in (("black", black_level), ("white", white)):
+        if not isinstance(level, Real):
+            raise ValueError(f"expected a {name} level that is a number, found {level!r:.40}")
+    if not (math.isfinite(white) and math.isfinite(black_level)):
+        raise ValueError(f"expected finite black and white levels, found {black_level:g} and {white:g}")
+    if not white > black_level:
+        raise ValueError(f"expected a white level above the black level, found white {white:g}, black {black_level:g}")
+    return float(white)
+
+
+def _as_float32(samples: NDArray[Any]) -> NDArray[np.float32]:
+    """A contiguous float32 copy, so that later changes of the caller's array don't reach the mosaic."""
+    return np.array(samples, dtype=np.float32, order="C")

@@ -1,0 +1,172 @@
+"""How noisy a stream of raw frames is, measured from the stream itself: variance = gain x signal + floor.
+
+Photons make the noise of a sample grow with its light (shot noise), the converter adds the same to all (read noise and
+rounding). Two differences show both: of a sample to the same sample's mean over the frames before, where nothing moves,
+and to its neighbours behind the same filter, where the picture is smooth. Motion and texture only ever add to them, so
+at each brightness the smaller one counts, and of each the median over blocks of 4x4 samples after blocks that differ by
+far more than most are left out: a minority that moves does not matter, nor does a pan over a scene with smooth parts.
+
+Unit: that of the samples (codes), black included where it says sample, taken off where it says signal.
+Source: the linear model is Janesick 2007 (Photon transfer, doi:10.1117/3.725073) and Foi et al. 2008
+(doi:10.1109/TIP.2008.2001399); the estimator is this project's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+
+#: Samples along the side of a block: one period of any layout's filters.
+BLOCK = 4
+#: Blocks that an estimate looks at, about; most and fewest bins of brightness, blocks per bin, and the fewest of one.
+BLOCKS, MAX_BINS, FEWEST_BINS, BLOCKS_PER_BIN, MIN_BLOCKS = 6144, 64, 6, 48, 24
+#: Quarter and median of chi-squared over its degrees, of 12: a block's 16 samples are not of one brightness.
+QUARTER, MEDIAN = 8.438 / 12, 11.34 / 12
+#: Blocks this many times as different as the quieter quarter says are moving or textured.
+OUTLIER = 2.0
+#: Least full well that a gain may mean [electrons at white], and the largest deviation of black, relative to white.
+MIN_WELL, LARGEST_FLOOR = 200.0, 0.05
+#: Least deviation of floats, relative to white: noise-free renderings are not exact either.
+ROUNDING = 2.0**-20
+#: Rounds of the robust fit, and the deviation of a bin of one block, relative to its variance: of a median of
+#: chi-squared, 1.25 sqrt(2 / 16). Bins off by more count less, those above the line least: motion and texture only add.
+ROUNDS, DEVIATION = 16, 0.44
+#: What neighbours say is a limit with this margin: the smaller of two guesses is too small on average.
+MARGIN = 1.15
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Black and white in the unit of the samples; ``step`` between codes, 0 for floats; ``clip``: the least clipped."""
+
+    black: float
+    white: float
+    step: float
+    clip: float
+
+    @property
+    def span(self) -> float:
+        """White above black."""
+        return self.white - self.black
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variance of one unclipped sample: ``gain`` times its signal, plus ``floor``."""
+
+    gain: float
+    floor: float
+
+    def variance(self, signal: Any) -> Any:
+        """Of samples that are ``signal`` above black; float32 stays float32."""
+        return np.float32(self.gain) * np.maximum(signal, np.float32(0)) + np.float32(self.floor)
+
+
+def least_noise(levels: Levels) -> Noise:
+    """Of exact samples: rounding to codes, of light just between two, or to floats."""
+    return Noise(0.0, levels.step**2 / 4 + (ROUNDING * levels.span) ** 2)
+
+
+def blocks_of(image: NDArray[Any]) -> NDArray[Any]:
+    """Samples ``[H, W]`` as blocks ``[H/4, W/4, 16]``."""
+    rows, cols = (n // BLOCK for n in image.shape)
+    return image.reshape(rows, BLOCK, cols, BLOCK).swapaxes(1, 2).reshape(rows, cols, BLOCK * BLOCK)
+
+
+def estimate_noise(now: NDArray[Any], before: tuple[Floats, Floats] | None, levels: Levels, turn: int) -> Noise | None:
+    """The noise of samples ``now [H, W]``; None where too few blocks can say.
+
+    ``before``: means ``[H, W]`` and of how many frames, per block; None in the first frame, when only neighbours
+    speak. ``turn`` chooses which rows of blocks are looked at in large frames. H and W are multiples of 4.
+    """
+    rows, cols = (n // BLOCK for n in now.shape)
+    step = max(1, rows * cols // BLOCKS)
+    kept = slice(turn % step, None, step)
+    x = blocks_of(_rows(now, kept)).astype(np.float32)
+    unclipped: NDArray[np.bool_] = np.all((x > 0) & (x < levels.clip), axis=-1)
+    across = x[:, 1:-1] - np.float32(0.5) * (x[:, :-2] + x[:, 2:])
+    spread = np.full(unclipped.shape, np.inf, np.float32)
+    spread[:, 1:-1] = np.square(across).mean(axis=-1) / np.float32(1.5)
+    spread[:, 1:-1][~(unclipped[:, :-2] & unclipped[:, 2:])] = np.inf
+    signal = x.mean(axis=-1) - np.float32(levels.black)
+    changes = [spread]
+    if before is not None:
+        spread *= np.float32(MARGIN)
+        mean, count = blocks_of(_rows(before[0], kept)), before[1][kept]
+        unclipped &= np.all((mean > 0) & (mean < levels.clip), axis=-1)
+        changes.append(np.square(x - mean).mean(axis=-1) / (1 + 1 / count))
+        signal = mean.mean(axis=-1) - np.float32(levels.black)
+    chosen = [values[unclipped] for values in (signal, *changes)]
+    if chosen[0].size < MIN_BLOCKS:
+        return None
+    return _fit(_by_brightness(chosen[0], chosen[1:], levels.span), levels)
+
+
+def _rows(image: NDArray[Any], kept: slice) -> NDArray[Any]:
+    """Some rows of blocks."""
+    return image.reshape(-1, BLOCK, image.shape[1])[kept].reshape(-1, image.shape[1])
+
+
+def _by_brightness(signal: Floats, changes: list[Floats], span: float) -> Doubles:
+    """Signal, variance and number ``[K, 3]`` of the blocks of each bin of brightness.
+
+    Bins are of equal width in the root of the signal: of the noise's width times the same number in dark and light.
+    """
+    root = np.sqrt(np.maximum(signal, 0))
+    bins = min(max(root.size // BLOCKS_PER_BIN, FEWEST_BINS), MAX_BINS)
+    scale = np.float32(bins / max(float(root.max()), 1e-3 * span**0.5))
+    which = np.minimum(root * scale, np.float32(bins - 1)).astype(np.int64)
+    order = np.argsort(which, kind="stable")
+    found = []
+    for part in np.split(order, np.cumsum(np.bincount(which, minlength=bins))[:-1]):
+        variance = min(_central(values[part]) for values in changes)
+        if np.isfinite(variance):
+            found.append((float(np.median(signal[part])), variance, part.size))
+    return np.array(found, np.float64).reshape(-1, 3)
+
+
+def _central(values: Floats) -> float:
+    """The variance of which blocks' mean squares ``values`` are samples, most of them; inf where too few are finite."""
+    values = values[np.isfinite(values)]
+    if values.size < MIN_BLOCKS:
+        return float("inf")
+    quiet = float(np.quantile(values, 0.25)) / QUARTER
+    return float(np.median(values[values <= OUTLIER * quiet])) / MEDIAN
+
+
+def _fit(points: Doubles, levels: Levels) -> Noise:
+    """The line through variances, relative residuals by size, within what cameras can be."""
+    least = least_noise(levels)
+    if not len(points):
+        return least
+    signal, variance, count = points[:, 0], np.maximum(points[:, 1], least.floor), points[:, 2]
+    most = Noise(levels.span / MIN_WELL, (LARGEST_FLOOR * levels.span) ** 2)
+    trust = count / variance**2
+    line, weight = least, trust
+    for _ in range(ROUNDS):
+        line = _line(signal, variance, weight, least.floor)
+        line = Noise(min(line.gain, most.gain), min(line.floor, most.floor))
+        above = (variance - line.gain * signal - line.floor) / variance / (DEVIATION / np.sqrt(count))
+        weight = trust / np.where(above > 0, np.maximum(above, 1) ** 2, np.maximum(-above, 1))
+    return line
+
+
+def _line(x: Doubles, y: Doubles, weight: Doubles, least: float) -> Noise:
+    """Weighted least squares of y = gain x + floor with a gain of 0 or more and a floor of ``least`` or more."""
+    middle, height = np.average(x, weights=weight), np.average(y, weights=weight)
+    spread = float((weight * (x - middle) ** 2).sum())
+    gain = float((weight * (x - middle) * (y - height)).sum()) / spread if spread > 0 else 0.0
+    floor = float(height - gain * middle)
+    if gain < 0:
+        return Noise(0.0, max(float(height), least))
+    if floor < least:
+        power = float((weight * x**2).sum())
+        gain = float((weight * x * (y - least)).sum()) / power if power > 0 else 0.0
+        return Noise(max(gain, 0.0), least)
+    return Noise(gain, floor)

@@ -1,0 +1,398 @@
+"""The colour-affine closed form: exact separation of polarized diffuse and white specular light from colour alone.
+
+Let p = s1 + i s2 and a = beta_d exp(2i phi_d), the diffuse polarization, which depends on geometry but not on colour.
+The specular light of a dielectric is white and fully polarized, so in every pixel and every colour c
+
+    p_c = a tau_d,c + tau_s exp(2i phi_s)   and   s0_c = tau_d,c + tau_s   give   p_c = a s0_c + b,
+    b = tau_s (exp(2i phi_s) - a).
+
+The slope a follows from how p varies with s0 over the three colours, b from the mean, and |exp(2i phi_s)| = 1 leaves
+one positive tau_s. No light angle, no calibration, no training. Where there is no colour contrast the slope tends to
+zero and the result to the paper's analytic split.
+
+With the slope known, every unclipped sample is linear in (s0_R, s0_G, s0_B, b): a highlight that clips some analysers
+in some colours is still solved by least squares over the samples that are left (`_solve_clipped`).
+
+Derivation, related work (Nayar, Fang, Boult 1997; Kajiyama et al., WACV 2023) and tests: docs/conventions.md.
+Complex numbers are pairs ``[..., 2, h, w]``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from polsep.physics.stokes import Measurements, Stokes, analyser_residual, fit_stokes_unclipped
+from polsep.separation.analytic import Separation, box_mean, separate_analytic_unclipped
+
+#: Largest possible |slope|: DoLP of diffuse light at grazing exit for eta = 1.5 (`optics.diffuse_dolp` at 90 degrees).
+MAX_DIFFUSE_DOLP = 0.3847
+
+#: Windows of the slope, widest first: radius in pixels and how far the slope may stray from the next wider window's
+#: (standard deviation per component). The widest one is held toward zero, the paper's unpolarized diffuse.
+#: Chosen on random scenes outside every test set; see docs/experiments.md.
+SLOPE_SCALES = ((12, 0.1), (6, 0.04), (2, 0.01), (0, 0.005))
+
+#: The window that ends at edges, where they are known: every third pixel of the one of this radius.
+EDGE_RADIUS, EDGE_STEP = 6, 3
+#: Difference of mean s1 / s0 or s2 / s0 beyond which a pixel lies on another surface: twice a Gaussian's 0.05.
+EDGE_REACH = 0.1
+#: Light below which polarization says nothing about edges.
+EDGE_FLOOR = 1e-3
+
+#: Colour contrast counts only where it exceeds this many times its expected noise.
+CONTRAST_MARGIN = 2.0
+
+#: Pixels are weighted 1 / (variance + this): below it (0.3 % of white, rms) all are equally good.
+VARIANCE_FLOOR = 1e-5
+
+#: Weight, against 1 of a sample, of the diffuse light around in pixels where clipping leaves b undetermined.
+PRIOR_WEIGHT = 0.05
+
+#: Where light must be added for samples to clip: how much more freely than the diffuse light, relative to each one's
+#: brightness around, the specular varies; to the fourth power it decides who takes how much.
+SPECULAR_FREEDOM = 12.0
+#: Brightness squared below which freedom is not told apart.
+FREEDOM_FLOOR = 1e-6
+
+#: Least weight of the specular light around as a prior, far below that of any sample and above rounding.
+MIN_PRIOR = 1e-6
+
+#: Least eigenvalue of the normal equations of b, 6 without clipping, above which b counts as determined.
+MIN_EIGENVALUE = 0.3
+
+
+def separate_color_affine(measurements: Measurements) -> Separation:
+    """Diffuse and white specular of colour samples ``[..., 4, 3, h, w]`` by the closed form above.
+
+    Falls back to `separation.separate_analytic_unclipped` on mono data and, smoothly, on grey surfaces. Recovers
+    clipped samples from the unclipped analysers and colours of the same pixel; where too few are left, ``valid`` is
+    False, the diffuse is interpolated from around and the specular the least that explains the clipping.
+    """
+    if measurements.data.shape[-3] != 3:
+        return separate_analytic_unclipped(measurements)
+    even = measurements.uniform or measurements
+    stokes, exact = fit_stokes_unclipped(even)
+    sample = sample_variance(even)
+    edges = None if even is measurements else polarization_edges(even, stokes)
+    slope = color_slope((stokes, exact), sample, even.variance, edges)
+    offset, residual = _offset(stokes, slope)
+    if even is not measurements:
+        stokes = fit_stokes_unclipped(measurements)[0]
+        offset, _ = _offset(stokes, slope)
+    stokes, offset, determined = _solve_clipped(measurements, stokes, slope, offset)
+    valid = determined
+    if measurements.clipped is not None:
+        valid = valid & ~measurements.clipped.all(dim=-4).any(dim=-3)
+    total = stokes.s0.clamp(min=0)
+    specular = torch.minimum(white_specular(offset, slope), total.amin(dim=-3, keepdim=True)).expand_as(total)
+    found = Separation(total - specular, specular, valid, stokes, slope, residual, torch.sqrt(sample))
+    return found if bool(valid.all()) else _fill(found, measurements, offset, determined)
+
+
+def _color_mean(x: Tensor) -> Tensor:
+    return x.mean(dim=-3, keepdim=True)
+
+
+def sample_variance(measurements: Measurements, radius: int = 3) -> Tensor:
+    """Local noise variance of one sample ``[..., 1, h, w]`` from the analysers' contradiction of m0 + m90 = m45 + m135.
+
+    It covers sensor noise and misregistration alike, needs no calibration, and is zero on exact data. Clipped samples
+    are left out of the mean over the window.
+    """
+    squared = _color_mean(analyser_residual(measurements) ** 2)
+    if measurements.clipped is None:
+        return box_mean(squared, radius)
+    weight = (~measurements.clipped.any(dim=-4).any(dim=-3, keepdim=True)).to(squared)
+    return box_mean(squared * weight, radius) / box_mean(weight, radius).clamp(min=1e-6)
+
+
+def polarization_edges(measurements: Measurements, stokes: Stokes) -> Tensor:
+    """s1 / s0 and s2 / s0 ``[..., 2, h, w]`` of all colours in 3x3 pixels, clipped ones left out.
+
+    They change where the surface does, and at the rim of a highlight, but hardly with texture.
+    """
+    light = torch.cat([_color_mean(s) for s in (stokes.s0, stokes.s1, stokes.s2)], dim=-3)
+    if measurements.clipped is not None:
+        light = light * ~measurements.clipped.any(dim=-4).any(dim=-3, keepdim=True)
+    light = box_mean(light, 1)
+    return light[..., 1:, :, :] / (light[..., :1, :, :] + EDGE_FLOOR)
+
+
+def color_slope(
+    known: tuple[Stokes, Tensor], sample: Tensor, interpolation: Tensor | None, edges: Tensor | None = None
+) -> Tensor:
+    """Slope a ``[..., 2, h, w]`` from how p varies with s0 over colours; |a| at most `MAX_DIFFUSE_DOLP`.
+
+    Fitted to deviations from each pixel's own mean over colours, in which white specular light cancels exactly. Wide
+    windows steady narrow ones, down to the single pixel, each in the proportion of its noise to its colour contrast (a
+    Gaussian prior per scale). Noise in s0 would pull the slope toward p/s0 and so erase the specular of grey surfaces:
+    contrast that noise explains is not counted, and pixels at colour edges, where demosaicking invents contrast, weigh
+    less. ``known``: Stokes images and ``exact [..., C, h, w]``, the colours that clipping leaves known, of which a
+    pixel needs two. ``sample``, ``interpolation``: variances of a sample. ``edges``: `polarization_edges`, if any.
+    """
+    stokes, exact = known
+    colors = exact.sum(dim=-3, keepdim=True)
+    means = ((s * exact).sum(dim=-3, keepdim=True) / colors.clamp(min=1) for s in (stokes.s0, stokes.s1, stokes.s2))
+    d0, d1, d2 = ((s - m) * exact for s, m in zip((stokes.s0, stokes.s1, stokes.s2), means, strict=True))
+    usable = colors > 1
+    error = 2 * CONTRAST_MARGIN * sample
+    if interpolation is not None:
+        error = error + interpolation
+    weight = usable.to(error) * VARIANCE_FLOOR / (error + VARIANCE_FLOOR)
+    moments = torch.cat([d.sum(dim=-3, keepdim=True) for d in (d0 * d0, d0 * d1, d0 * d2)] + [error], dim=-3)
+    slope = torch.zeros_like(moments[..., :2, :, :])
+    floor = torch.finfo(error.dtype).eps * 1e-2
+    for radius, spread in SLOPE_SCALES:
+        if radius == EDGE_RADIUS and edges is not None:
+            pooled, samples = _pool_to_edges(moments, weight, edges)
+        else:
+            pooled, samples = _pool(moments, weight, radius) if radius else (moments * usable, torch.ones_like(weight))
+        contrast, moment, noise = pooled[..., :1, :, :], pooled[..., 1:3, :, :], pooled[..., 3:, :, :]
+        counted = ((contrast - noise) / (contrast + floor)).clamp(min=0)
+        held = noise / CONTRAST_MARGIN / (spread**2 * samples) + floor
+        slope = (moment * counted + held * slope) / (contrast + held)
+    size = torch.sqrt((slope * slope).sum(dim=-3, keepdim=True))
+    return slope * (MAX_DIFFUSE_DOLP / size.clamp(min=MAX_DIFFUSE_DOLP))
+
+
+def _pool(moments: Tensor, weight: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """Weighted window means, and the number of independent pixels in each (interpolated neighbours count a quarter)."""
+    means = box_mean(torch.cat([moments * weight, weight, weight * weight], dim=-3), radius)
+    total, squares = means[..., -2:-1, :, :].clamp(min=1e-12), means[..., -1:, :, :].clamp(min=1e-20)
+    pixels = (2 * radius + 1) ** 2 * total * total / squares
+    return means[..., :-2, :, :] / total, (pixels / 4).clamp(min=1)
+
+
+def _pool_to_edges(moments: Tensor, weight: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
+    """`_pool` over the window of `EDGE_RADIUS`, whose pixels count less the more their polarization differs.
+
+    A bilateral window (Tomasi and Manduchi 1998) with Tukey's biweight for a kernel, which is zero beyond `EDGE_REACH`.
+    Every third pixel is independent of the others.
+    """
+    height, width = weight.shape[-2:]
+    weighted = torch.cat([moments * weight, weight, weight * weight], dim=-3)
+    sums = torch.zeros_like(weighted)
+    steps = range(-EDGE_RADIUS, EDGE_RADIUS + 1, EDGE_STEP)
+    for down, right in ((down, right) for down in steps for right in steps):
+        here = (..., slice(max(-down, 0), height - max(down, 0)), slice(max(-right, 0), width - max(right, 0)))
+        there = (..., slice(max(down, 0), height - max(-down, 0)), slice(max(right, 0), width - max(-right, 0)))
+        if abs(down) < height and abs(right) < width:
+            apart = edges[there] - edges[here]
+            near = (1 - (apart * apart).sum(dim=-3, keepdim=True) / EDGE_REACH**2).clamp(min=0) ** 2
+            sums[here] += weighted[there] * torch.cat([near.expand_as(weighted[there][..., 1:, :, :]), near * near], -3)
+    total, squares = sums[..., -2:-1, :, :].clamp(min=1e-12), sums[..., -1:, :, :].clamp(min=1e-20)
+    return sums[..., :-2, :, :] / total, (total * total / squares).clamp(min=1)
+
+
+def white_specular(offset: Tensor, slope: Tensor) -> Tensor:
+    """tau_s ``[..., 1, h, w]`` from b = tau_s (exp(2i phi_s) - a).
+
+    The positive root of (|a|^2 - 1) t^2 + 2 Re(b conj a) t + |b|^2 = 0, unique because |a| < 1; |b| where a = 0.
+    """
+    ba = (offset * slope).sum(dim=-3, keepdim=True)
+    bb = (offset * offset).sum(dim=-3, keepdim=True)
+    aa = (slope * slope).sum(dim=-3, keepdim=True)
+    return (ba + torch.sqrt(ba * ba + (1 - aa) * bb)) / (1 - aa)
+
+
+def _offset(stokes: Stokes, slope: Tensor) -> tuple[Tensor, Tensor]:
+    """b of p_c = a s0_c + b, the mean over colours ``[..., 2, h, w]``, and the rms it leaves ``[..., 1, h, w]``."""
+    lines = [s - slope[..., k : k + 1, :, :] * stokes.s0 for k, s in enumerate((stokes.s1, stokes.s2))]
+    offset = torch.cat([_color_mean(line) for line in lines], dim=-3)
+    left = sum(((line - _color_mean(line)) ** 2).sum(dim=-3, keepdim=True) for line in lines)
+    return offset, torch.sqrt(torch.as_tensor(left) / 3)
+
+
+def _solve_clipped(
+    measurements: Measurements, stokes: Stokes, slope: Tensor, offset: Tensor
+) -> tuple[Stokes, Tensor, Tensor]:
+    """Stokes and b of pixels with clipped samples by least squares over the others, and where those determine b.
+
+    For given a, twice a sample is g_k s0_c + u_k . b with u_k = (cos 2t_k, sin 2t_k) and g_k = 1 + u_k . a. The s0 of
+    each colour is eliminated, which leaves 2x2 normal equations for b. What they leave open is for `_fill`.
+    """
+    determined = torch.ones_like(stokes.s0[..., 0, :, :], dtype=torch.bool)
+    if measurements.clipped is None or not bool(measurements.clipped.any()):
+        return stokes, offset, determined
+    clipped = measurements.clipped.movedim((-4, -3), (0, 1))
+    touched = clipped.any(dim=0).any(dim=0)
+    kept = ~clipped[:, :, touched]
+    samples = measurements.data.movedim((-4, -3), (0, 1))[:, :, touched]
+    a = slope.movedim(-3, 0)[:, touched]
+    b, s0, determined[touched] = fit_unclipped(2 * samples, kept.to(samples), a, measurements.angles)
+    solved = [s.movedim(-3, 0).clone() for s in (stokes.s0, stokes.s1, stokes.s2)]
+    partly = kept.any(dim=0) & ~kept.all(dim=0)
+    for image, values in zip(solved, (s0, a[0] * s0 + b[0], a[1] * s0 + b[1]), strict=True):
+        image[:, touched] = torch.where(partly, values, image[:, touched])
+    offset = offset.movedim(-3, 0).clone()
+    offset[:, touched] = b
+    return Stokes(*(s.movedim(0, -3) for s in solved)), offset.movedim(0, -3), determined
+
+
+def fit_unclipped(y: Tensor, kept: Tensor, a: Tensor, angles: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """Solve y = g s0 + u . b over N pixels: b ``[2, N]``, s0 ``[C, N]``, and where b is determined.
+
+    ``y``, twice the samples, and the weights ``kept`` are ``[K, C, N]``, ``a`` is ``[2, N]``.
+    """
+    t = 2 * torch.tensor(angles).to(y)
+    u = torch.stack([torch.cos(t), torch.sin(t)])[:, :, None, None]
+    g = 1 + u[0] * a[0] + u[1] * a[1]
+    gg = (kept * g * g).sum(0).clamp(min=1e-6)
+    gy = (kept * g * y).sum(0)
+    gu = [(kept * g * u[i]).sum(0) for i in (0, 1)]
+    projected = [u[i] - g * gu[i] / gg for i in (0, 1)]
+    m00, m01, m11 = ((kept * projected[i] * projected[j]).sum((0, 1)) for i, j in ((0, 0), (0, 1), (1, 1)))
+    r0, r1 = ((kept * projected[i] * y).sum((0, 1)) for i in (0, 1))
+    smallest = (m00 + m11) / 2 - torch.sqrt(((m00 - m11) / 2) ** 2 + m01**2)  # hypot is not known to ONNX
+    det = (m00 * m11 - m01 * m01).clamp(min=1e-6)
+    b = torch.stack([m11 * r0 - m01 * r1, m00 * r1 - m01 * r0]) / det
+    s0 = (gy - gu[0] * b[0] - gu[1] * b[1]) / gg
+    return b, s0, smallest > MIN_EIGENVALUE
+
+
+def _fill(found: Separation, measurements: Measurements, offset: Tensor, determined: Tensor) -> Separation:
+    """Complete pixels that clipping left undetermined, with the valid pixels around as a weak prior.
+
+    Where b is not ``determined`` the specular has the phase of its surroundings and fits the unclipped samples. What
+    clipped samples lack to clip is light of the lobe that varies more freely: specular beside a highlight, diffuse on a
+    bright matte surface. Where everything clips the specular is at least as bright as around. Of a colour without
+    unclipped samples the diffuse follows from around and from what makes it clip.
+    """
+    assert measurements.clipped is not None
+    assert found.diffuse_polarization is not None
+    hole, known = ~found.valid[..., None, :, :], determined[..., None, :, :]
+    own = _unit(offset + found.diffuse_polarization * found.specular[..., :1, :, :])
+    nearby = interpolate_around(own * found.specular[..., :1, :, :], found.valid)
+    around = interpolate_around(found.diffuse, found.valid)
+    phase, freedom = torch.where(known, own, _unit(nearby)), specular_freedom(nearby, around)
+    sums = _sum_unclipped(measurements, found.diffuse_polarization, phase, around)
+    fitted = _fit_specular(sums, nearby, freedom)
+    lit = (found.diffuse_polarization, phase, _fit_diffuse(sums, fitted), fitted)
+    specular = torch.where(known, found.specular[..., :1, :, :], _raise_specular(measurements, lit, freedom))
+    diffuse = torch.maximum(_fit_diffuse(sums, specular), _least_diffuse(measurements, found, specular, phase))
+    core = measurements.clipped.all(dim=-4).all(dim=-3)
+    if bool(core.any()):
+        rim = interpolate_around(torch.where(hole, specular, found.specular[..., :1, :, :]), ~core)
+        specular = torch.where(core[..., None, :, :], torch.maximum(specular, rim), specular)
+    p1, p2 = (
+        found.diffuse_polarization[..., i : i + 1, :, :] * diffuse + phase[..., i : i + 1, :, :] * specular
+        for i in (0, 1)
+    )
+    seen = found.stokes
+    stokes = [torch.where(hole, new, old) for new, old in ((diffuse + specular, seen.s0), (p1, seen.s1), (p2, seen.s2))]
+    diffuse = torch.where(hole, diffuse, found.diffuse)
+    specular = torch.where(hole, specular, found.specular)
+    return replace(found, diffuse=diffuse, specular=specular, stokes=Stokes(*stokes))
+
+
+def specular_freedom(nearby: Tensor, around: Tensor) -> Tensor:
+    """Variance of the specular light over the diffuse light's ``[..., 1, h, w]``, see `SPECULAR_FREEDOM`.
+
+    ``nearby [..., 2, h, w]``: the specular polarization around, ``around [..., C, h, w]``: the diffuse light.
+    """
+    specular = SPECULAR_FREEDOM**2 * (nearby * nearby).sum(dim=-3, keepdim=True)
+    ratio = (specular + FREEDOM_FLOOR) / (_color_mean(around) ** 2 + FREEDOM_FLOOR)
+    return ratio * ratio
+
+
+class _Sums(NamedTuple):
+    """_Sums over unclipped samples of 2 m = g tau_d + p tau_s and the prior tau_d = around, each ``[..., C, h, w]``."""
+
+    gg: Tensor
+    gp: Tensor
+    pp: Tensor
+    gy: Tensor
+    py: Tensor
+
+
+def _sum_unclipped(measurements: Measurements, slope: Tensor, phase: Tensor, around: Tensor) -> _Sums:
+    """`_Sums` for a given slope and phase of the specular light ``[..., 2, h, w]`` and the diffuse light ``around``."""
+    assert measurements.clipped is not None
+    gg, gy = torch.full_like(around, PRIOR_WEIGHT), PRIOR_WEIGHT * around
+    gp, pp, py = torch.zeros_like(around), torch.zeros_like(around), torch.zeros_like(around)
+    for k, t in enumerate(measurements.angles):
+        kept = ~measurements.clipped[..., k, :, :, :]
+        g, p, y = _transmitted(slope, t) * kept, _transmitted(phase, t) * kept, 2 * measurements.data[..., k, :, :, :]
+        gg, gp, pp, gy, py = gg + g * g, gp + g * p, pp + p * p, gy + g * y, py + p * y
+    return _Sums(gg, gp, pp, gy, py)
+
+
+def _fit_specular(sums: _Sums, nearby: Tensor, freedom: Tensor) -> Tensor:
+    """tau_s ``[..., 1, h, w]`` by least squares over all colours, tau_d eliminated; ``nearby`` is its prior."""
+    likely = torch.sqrt((nearby * nearby).sum(dim=-3, keepdim=True))
+    weight = (PRIOR_WEIGHT / freedom).clamp(min=MIN_PRIOR)
+    curvature = (sums.pp - sums.gp**2 / sums.gg).sum(dim=-3, keepdim=True) + weight
+    pull = (sums.py - sums.gp * sums.gy / sums.gg).sum(dim=-3, keepdim=True) + weight * likely
+    return (pull / curvature.clamp(min=MIN_PRIOR / 2)).clamp(min=0)
+
+
+def _fit_diffuse(sums: _Sums, specular: Tensor) -> Tensor:
+    """tau_d ``[..., C, h, w]`` by least squares for given tau_s."""
+    return ((sums.gy - sums.gp * specular) / sums.gg).clamp(min=0)
+
+
+def _raise_specular(measurements: Measurements, lit: tuple[Tensor, ...], freedom: Tensor) -> Tensor:
+    """tau_s ``[..., 1, h, w]`` with its share of what every clipped sample lacks: 2 m = g tau_d + p tau_s >= 2.
+
+    Never more than the unclipped samples allow, except those nearly crossed with it. ``lit``: slope and phase, tau_d
+    and tau_s so far.
+    """
+    assert measurements.clipped is not None
+    slope, phase, diffuse, specular = lit
+    raised, most = specular, torch.full_like(specular, torch.inf)
+    for k, t in enumerate(measurements.angles):
+        g, p, clipped = _transmitted(slope, t), _transmitted(phase, t), measurements.clipped[..., k, :, :, :]
+        y = 2 * measurements.data[..., k, :, :, :]
+        lack = torch.where(clipped, (y - g * diffuse - p * specular).clamp(min=0), 0.0).amax(dim=-3, keepdim=True)
+        raised = torch.maximum(raised, specular + lack * p * freedom / (p * p * freedom + g * g))
+        allowed = torch.where(clipped | (p <= 0.5), torch.inf, y / p.clamp(min=0.5)).amin(dim=-3, keepdim=True)
+        most = torch.minimum(most, allowed)
+    return torch.minimum(raised, most.clamp(min=0))
+
+
+def _least_diffuse(measurements: Measurements, found: Separation, specular: Tensor, phase: Tensor) -> Tensor:
+    """The least tau_d ``[..., C, h, w]`` that makes every clipped sample clip for given tau_s; 0 where none does."""
+    assert measurements.clipped is not None
+    assert found.diffuse_polarization is not None
+    least = torch.zeros_like(found.diffuse)
+    for k, t in enumerate(measurements.angles):
+        needed = 2 * measurements.data[..., k, :, :, :] - _transmitted(phase, t) * specular
+        needed = torch.where(
+            measurements.clipped[..., k, :, :, :], needed / _transmitted(found.diffuse_polarization, t), 0.0
+        )
+        least = torch.maximum(least, needed)
+    return least
+
+
+def _transmitted(polarization: Tensor, angle: float) -> Tensor:
+    """1 + u.a: twice the share of light of that polarization ``[..., 2, h, w]`` that an analyser passes."""
+    return 1 + math.cos(2 * angle) * polarization[..., :1, :, :] + math.sin(2 * angle) * polarization[..., 1:, :, :]
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    """Vectors ``[..., 2, h, w]`` at length 1; zero stays zero."""
+    return vectors / torch.sqrt((vectors * vectors).sum(dim=-3, keepdim=True)).clamp(min=1e-12)
+
+
+def interpolate_around(image: Tensor, valid: Tensor) -> Tensor:
+    """``image`` where ``valid [..., h, w]``, elsewhere interpolated from the valid pixels around; 0 if there are none.
+
+    Push and pull over a pyramid (after Gortler et al. 1996, The Lumigraph, Sec. 3.3): cost and reach grow with holes.
+    """
+    *batch, height, width = image.shape
+    weight = valid[..., None, :, :].to(image).expand(image.shape).reshape(-1, 1, height, width)
+    levels = [(image.reshape(-1, 1, height, width) * weight, weight)]
+    while max(levels[-1][0].shape[-2:]) > 1:
+        levels.append(tuple(avg_pool2d(x, 2, ceil_mode=True) for x in levels[-1]))  # type: ignore[arg-type]
+    total, weight = levels.pop()
+    result = total / weight.clamp(min=1e-12)
+    for total, weight in reversed(levels):
+        coarse = interpolate(result, size=total.shape[-2:], mode="bilinear")
+        result = torch.where(weight > 0.25, total / weight.clamp(min=1e-12), coarse)
+    return result.reshape(*batch, height, width)

@@ -1,0 +1,250 @@
+"""Twin of ``separate_color_affine(demosaic_bilinear_half(mosaic))`` in one pass over the frame, on the CPU.
+
+With ``guided`` it is the twin of ``separate_color_affine(demosaic_guided_half(mosaic))``, which the pipeline uses.
+
+Pixels with clipped samples are few: `separation.strips_kernel` leaves them out of the slope as the twin does, and
+`separation.clipped_kernel` solves them afterwards. Strips are computed independently of each other, so the number of
+threads (`set_threads`) does not change a bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polsep.compute.threads import get_threads, share
+from polsep.demosaic.bilinear_kernel import Pattern, read_pattern
+from polsep.demosaic.cells_kernel import Source, read_grid
+from polsep.physics.stokes import Measurements, analyser_residual, stokes_inverse, unclipped_inverse
+from polsep.sensor.camera import Layout
+from polsep.sensor.unpack_kernel import RawFrame, as_samples
+from polsep.separation.clipped_kernel import (
+    ALL_CLIPPED,
+    Analysers,
+    Pixels,
+    fill_pixels,
+    make_pixels,
+    raise_cores,
+    solve_pixels,
+)
+from polsep.separation.fill_kernel import halve_separation, halve_specular, interpolate_holes
+from polsep.separation.images_kernel import check_images
+from polsep.separation.moments_kernel import Conversion
+from polsep.separation.polarization_kernel import polarize_pixels
+from polsep.separation.report import Tally
+from polsep.separation.strips_kernel import (
+    SUMS,
+    Frame,
+    Targets,
+    collect,
+    find_clipped,
+    rows_clip,
+    separate_guided_piece,
+    separate_piece,
+)
+
+#: Fewest cell rows of a strip that is worth a thread.
+MIN_ROWS = 64
+#: Pixels with clipped samples that one thread takes at a time.
+PIXELS = 1024
+
+
+@dataclass(frozen=True)
+class ColorAffineImages:
+    """The separated frame, channels last; also the room that a stream gives to be filled again and again.
+
+    ``diffuse``, ``specular``: float32 ``[h, w, 3]``, ``valid``: bool ``[h, w]``, as in `Separation`. For a report,
+    else None: ``dolp``, ``aolp``: float32 ``[h, w]``, of all colours together in white light, and ``tally``.
+    """
+
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    dolp: NDArray[np.float32] | None = None
+    aolp: NDArray[np.float32] | None = None
+    tally: Tally | None = None
+
+    @classmethod
+    def empty(cls, shape: tuple[int, int], layout: Layout, report: bool = False) -> ColorAffineImages:
+        """Room for mosaics of that ``shape`` (H, W)."""
+        h, w = ((n - start) // 2 for n, start in zip(shape, layout.origin, strict=True))
+        diffuse, specular = (np.empty((h, w, 3), np.float32) for _ in range(2))
+        dolp, aolp = (np.empty((h, w), np.float32) if report else None for _ in range(2))
+        return cls(diffuse, specular, np.empty((h, w), np.bool_), dolp, aolp)
+
+
+@dataclass(frozen=True)
+class ColorAffineOptions:
+    """What a stream of frames has in common beside its layout and levels.
+
+    ``light_color``: one gain per channel, divided out of every sample, as in `Mosaic`. ``in_light``: multiply it back
+    into diffuse and specular, as the pipeline does. ``out``: images to fill. ``guided``: demosaic as
+    `guided.demosaic_guided_half`, a third as fast. ``report``: fill dolp, aolp and tally.
+    """
+
+    light_color: tuple[float, ...] = (1.0, 1.0, 1.0)
+    in_light: bool = False
+    out: ColorAffineImages | None = None
+    guided: bool = False
+    report: bool = False
+
+
+def separate_color_affine_half(
+    raw: RawFrame,
+    layout: Layout,
+    black_level: float,
+    white_level: float,
+    options: ColorAffineOptions | None = None,
+) -> ColorAffineImages:
+    """Diffuse and white specular of one raw colour mosaic, at half resolution, by the colour-affine closed form.
+
+    ``raw``: ``[H, W]`` uint8, uint16, float32, or a `PackedFrame`; levels in its units. Images are ``[h, w, 3]`` with
+    h and w the whole 2x2 cells from the layout's origin on, in white light unless ``options`` say otherwise. Pixels
+    with clipped samples are solved, and where too few are left filled, as in `polsep.separation.color_affine`. Raises
+    ValueError on a mono layout, another dtype or shape, levels out of order, or images in ``options.out`` that do not
+    fit.
+    """
+    options = ColorAffineOptions() if options is None else options
+    if layout.channels != 3:
+        raise ValueError(f"expected a colour layout, found {layout.spec!r}; mono frames have separate_analytic_half")
+    samples = as_samples(raw)
+    pattern = read_pattern((raw.shape[0], raw.shape[1]), layout, black_level, white_level, options.light_color)
+    out = options.out
+    if out is None:
+        out = ColorAffineImages.empty((raw.shape[0], raw.shape[1]), layout, options.report)
+    height = strip_height(pattern.h)
+    clips = any(share(partial(rows_clip, samples, pattern), pattern.h, height))
+    targets = _as_targets(out, pattern, clips, options.report)
+    gains = np.array(options.light_color[:3] if options.in_light else (1, 1, 1), np.float32)
+    # Filling compares colours with each other, so with clipped samples the light waits until it is done.
+    conversion = Conversion(*_matrices(layout), np.ones(3, np.float32) if clips else gains)
+    grid = read_grid(pattern, layout.angles, conversion.inverses[0])
+    frame = Frame(Source(samples, pattern, grid), conversion)
+    share(partial(separate_guided_piece if options.guided else separate_piece, frame, targets), pattern.h, height)
+    out.valid[:] = True
+    places = find_clipped(targets.clipped)
+    tally = _sum_rows(targets, pattern.h * pattern.w - places.size)
+    if places.size:
+        doubled = 2 * np.array(layout.angles)
+        analysers = Analysers(np.cos(doubled).astype(np.float32), np.sin(doubled).astype(np.float32), conversion)
+        tally += _complete((frame, analysers), targets, places, out)
+    if clips and options.in_light:
+        out.diffuse[...] *= gains
+        out.specular[...] *= gains
+    return replace(out, tally=tally) if options.report else out
+
+
+def warm_up() -> None:
+    """Compile the kernels, or load them from numba's cache on disk. One compilation serves all dtypes and layouts."""
+    for guided in (False, True):
+        separate_color_affine_half(np.eye(8, dtype=np.uint8), Layout(), 0, 1, ColorAffineOptions(guided=guided))
+
+
+def strip_height(rows: int) -> int:
+    """Cell rows of a strip, an even number: a share of all for each thread, as every strip starts with rows twice."""
+    return max(MIN_ROWS, (-(-rows // get_threads()) + 1) // 2 * 2)
+
+
+def _as_targets(out: ColorAffineImages, pattern: Pattern, clips: bool, report: bool) -> Targets:
+    """Where the kernel writes. Raises ValueError on images of a wrong shape or dtype, or missing for a report."""
+    shape = (pattern.h, pattern.w)
+    images = {name: image for name, image in vars(out).items() if image is not None and name != "tally"}
+    check_images(images, (*shape, 3))
+    if report and (out.dolp is None or out.aolp is None):
+        raise ValueError("expected room for dolp and aolp, which a report needs, found none")
+    nothing = np.empty((0, 0), np.float32)
+    room = shape if clips else (0, 0)
+    rows = (pattern.h, 3 * pattern.w)
+    return Targets(
+        out.diffuse.reshape(rows),
+        out.specular.reshape(rows),
+        np.empty((4, *room), np.float32),
+        np.zeros(room, np.uint16),
+        nothing if out.dolp is None or not report else out.dolp,
+        nothing if out.aolp is None or not report else out.aolp,
+        np.zeros((pattern.h if report else 0, SUMS)),
+    )
+
+
+@lru_cache(maxsize=8)
+def _matrices(layout: Layout) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+    """The matrices of `fit_stokes_unclipped`, which of them are exact, and the vector of `analyser_residual`."""
+    full = stokes_inverse(layout.angles).float().numpy()
+    inverses, exact = np.stack([full] * 16), np.zeros(16, np.bool_)
+    exact[0] = True
+    for code in range(1, 16):
+        matrix, exact[code] = unclipped_inverse(layout.angles, code)
+        if matrix is not None:
+            inverses[code] = matrix.float().numpy()
+    unit = torch.eye(4, dtype=torch.float64).reshape(4, 1, 1, 4)
+    null = analyser_residual(Measurements(unit, layout.angles)).reshape(4).float().numpy()
+    return inverses, exact, null
+
+
+def _complete(
+    given: tuple[Frame, Analysers], targets: Targets, places: NDArray[np.int64], out: ColorAffineImages
+) -> Tally:
+    """Solve and fill the N pixels ``places`` with clipped samples, into ``out``; their sums."""
+    (frame, analysers), lines = given, targets.lines.reshape(4, -1)
+    pixels = make_pixels(targets.clipped.reshape(-1)[places], np.ascontiguousarray(lines[:, places]))
+    share(partial(collect, frame.source, places, pixels.samples), places.size, PIXELS)
+    share(partial(solve_pixels, pixels, analysers), places.size, PIXELS)
+    lines[2:, places] = pixels.lines[2:]
+    out.valid.reshape(-1)[places] = pixels.valid
+    _write(pixels, places, out)
+    if not pixels.valid.all():
+        _fill(pixels, analysers, targets, places, out)
+    if out.dolp is None or out.aolp is None or not targets.sums.size:
+        return Tally()
+    degree, angle = np.empty(places.size, np.float32), np.empty(places.size, np.float32)
+    polarize_pixels(pixels.stokes, degree, angle)
+    out.dolp.reshape(-1)[places], out.aolp.reshape(-1)[places] = degree, angle
+    diffuse = pixels.diffuse.mean(axis=0)
+    p1, p2 = (pixels.stokes[1 + i] - pixels.lines[i] * diffuse for i in range(2))
+    power = np.hypot(p1, p2).astype(np.float64)
+    return Tally(
+        places.size,
+        places.size,
+        int(pixels.valid.sum()),
+        int((degree > 1).sum()),
+        float(diffuse.sum(dtype=np.float64) + pixels.specular.sum(dtype=np.float64)),
+        float(pixels.specular.sum(dtype=np.float64)),
+        float((power * power).sum()),
+        float((power * p1).sum()),
+        float((power * p2).sum()),
+        float(pixels.residual.sum(dtype=np.float64)),
+    )
+
+
+def _fill(
+    pixels: Pixels, analysers: Analysers, targets: Targets, places: NDArray[np.int64], out: ColorAffineImages
+) -> None:
+    """Complete the pixels that clipping left undetermined from what is around them."""
+    h, w = out.valid.shape
+    holes = np.flatnonzero(~pixels.valid)
+    level = halve_separation(out.diffuse, out.specular, targets.lines, out.valid)
+    fill_pixels(pixels, analysers, holes, interpolate_holes(level, (h, w), places[holes]))
+    _write(pixels, places, out)
+    core = pixels.clipped == ALL_CLIPPED
+    if core.any():
+        outside = np.ones((h, w), np.bool_)
+        outside.reshape(-1)[places[core]] = False
+        rim = interpolate_holes(halve_specular(out.specular, outside), (h, w), places[core])
+        raise_cores(pixels, np.flatnonzero(core), rim[0])
+        _write(pixels, places, out)
+
+
+def _write(pixels: Pixels, places: NDArray[np.int64], out: ColorAffineImages) -> None:
+    """Put the colours of N pixels into the frame."""
+    out.diffuse.reshape(-1, 3)[places] = pixels.diffuse.T
+    out.specular.reshape(-1, 3)[places] = pixels.specular[:, None]
+
+
+def _sum_rows(targets: Targets, pixels: int) -> Tally:
+    """The sums of the rows' ``pixels`` that hold no clipped sample, and the noise of all."""
+    s0, specular, above_one, power, along, across, residual, noise = targets.sums.sum(axis=0).tolist()
+    return Tally(pixels, 0, pixels, int(above_one), s0, specular, power, along, across, residual, noise)

@@ -1,0 +1,120 @@
+"""The window of `color_affine`'s slope that ends at edges: pixels count as far as their polarization is alike.
+
+Two rows after a row has entered its ring, ratios of mean Stokes values in 3x3 pixels are made of it (twin:
+`polarization_edges`); the window about a row then sums every third pixel by itself (twin: `_pool_to_edges`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from polsep.compute.compiling import ONE, THIRD, ZERO, compiled
+from polsep.demosaic.bilinear_kernel import PAD, Pattern
+from polsep.separation import color_affine as twin
+from polsep.separation.moments_kernel import KEPT, MIDDLE, Rings, Rows, rows_around
+
+_EDGE_FLOOR = np.float32(twin.EDGE_FLOOR)
+_PER_REACH = np.float32(1 / twin.EDGE_REACH**2)
+_STEP = twin.EDGE_STEP
+_TAPS = 2 * MIDDLE // _STEP + 1
+
+
+@compiled
+def _light_of(stokes: Any, w: int, light: Any) -> None:
+    """Means of s0, s1 and s2 over the colours of a row."""
+    r, g, b, m1, m2 = stokes[0, PAD:], stokes[1, PAD:], stokes[2, PAD:], stokes[3, PAD:], stokes[4, PAD:]
+    s0, s1, s2 = light[0, PAD:], light[1, PAD:], light[2, PAD:]
+    for j in range(w):
+        s0[j] = THIRD * (r[j] + g[j] + b[j])
+        s1[j] = m1[j]
+        s2[j] = m2[j]
+
+
+@compiled
+def enter_light(pattern: Pattern, flagged: bool, t: int, scratch: tuple[Rows, Rings]) -> None:
+    """Mean Stokes values of row ``t``, which has just entered the rings; zero where samples are clipped."""
+    rows, rings = scratch
+    light = rings.light[t % 4]
+    _light_of(rings.stokes[t % 16], pattern.w, light)
+    if flagged:
+        for j in range(pattern.w):
+            if rows.clipped[j] != 0:
+                light[:, PAD + j] = ZERO
+
+
+@compiled
+def _sum_columns(above: Any, here: Any, below: Any, out: Any) -> None:
+    for j in range(out.size):
+        out[j] = above[j] + here[j] + below[j]
+
+
+@compiled
+def _ratios(sums: Any, per_column: Any, counts: Any, edges: Any) -> None:
+    """s1 / s0 and s2 / s0 of 3x3 pixels from sums over three rows."""
+    s0, s1, s2 = sums[0, PAD - 1 :], sums[1, PAD - 1 :], sums[2, PAD - 1 :]
+    columns, first, second = counts[PAD:], edges[0, PAD:], edges[1, PAD:]
+    least = _EDGE_FLOOR * per_column
+    for j in range(counts.size - 2 * PAD):
+        total = s0[j] + s0[j + 1] + s0[j + 2] + least * columns[j]
+        first[j] = (s1[j] + s1[j + 1] + s1[j + 2]) / total
+        second[j] = (s2[j] + s2[j + 1] + s2[j + 2]) / total
+
+
+@compiled
+def measure_edges(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
+    """Ratios of mean Stokes values about row ``t`` of the frame. Twin: `polarization_edges`."""
+    rows, rings = scratch
+    if not 0 <= t < pattern.h:
+        return
+    outside = rows.nothing
+    above = rings.light[(t - 1) % 4] if t > 0 else outside
+    below = rings.light[(t + 1) % 4] if t + 1 < pattern.h else outside
+    for i in range(3):
+        _sum_columns(above[i], rings.light[t % 4, i], below[i], rows.sums[i])
+    _ratios(rows.sums, rows_around(t, 1, pattern.h), rows.counts[3], rings.edges[t % KEPT])
+
+
+@compiled
+def _likeness(there: Any, here: Any, w: int, near: Any) -> None:
+    """How alike pixels of two rows of edges are, ``near [5, w]``: one row for every step along the window."""
+    first, second = here[0, PAD:], here[1, PAD:]
+    for i in range(_TAPS):
+        other1, other2, out = there[0, PAD - MIDDLE + _STEP * i :], there[1, PAD - MIDDLE + _STEP * i :], near[i]
+        for j in range(w):
+            d1, d2 = other1[j] - first[j], other2[j] - second[j]
+            alike = ONE - _PER_REACH * (d1 * d1 + d2 * d2)
+            alike = alike if alike > ZERO else ZERO
+            out[j] = alike * alike
+
+
+@compiled
+def _add_alike(x: Any, near: Any, w: int, out: Any) -> None:
+    """Add the steps of a row about each pixel."""
+    n0, n1, n2, n3, n4 = near[0], near[1], near[2], near[3], near[4]
+    for j in range(w):
+        left, right = n0[j] * x[j] + n1[j] * x[j + _STEP], n3[j] * x[j + 3 * _STEP] + n4[j] * x[j + 4 * _STEP]
+        out[j] += left + n2[j] * x[j + 2 * _STEP] + right
+
+
+@compiled
+def _square(near: Any) -> None:
+    for i in range(near.size):
+        near[i] *= near[i]
+
+
+@compiled
+def sum_alike(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
+    """Sums over the middle window about row ``t`` as far as edges allow, into ``rows.sums``. Twin: `_pool_to_edges`."""
+    rows, rings = scratch
+    rows.sums[:] = ZERO
+    here, w = rings.edges[t % KEPT], pattern.w
+    for row in range(t - MIDDLE, t + MIDDLE + 1, _STEP):
+        if 0 <= row < pattern.h:
+            weighted = rings.weighted[row % KEPT]
+            _likeness(rings.edges[row % KEPT], here, w, rows.near)
+            for k in range(5):
+                _add_alike(weighted[k, PAD - MIDDLE :], rows.near, w, rows.sums[k, PAD:])
+            _square(rows.near.reshape(-1))
+            _add_alike(weighted[5, PAD - MIDDLE :], rows.near, w, rows.sums[5, PAD:])

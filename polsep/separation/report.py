@@ -1,0 +1,166 @@
+"""What a separation says of its frame: images, exposure, the light's polarizer, how well the model fits.
+
+Statistics come from sums over pixels (`Tally`), so that a frame may be tallied in parts. All are of white light, that
+is before the light's colour is multiplied back, and polarization is that of all colours together.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polsep.physics.stokes import Stokes, dolp
+from polsep.separation.analytic import Separation, light_polarizer_angle
+
+#: Below this concentration of AoLP there is no single polarized light. Real frames: 0.76 to 0.97 where one light or one
+#: reflecting surface polarizes, 0.31 to 0.50 in the open; test sets under one light, by `joint`: 0.57 to 0.99.
+MIN_CONCENTRATION = 0.53
+#: The same of methods that take all polarized light for specular, or nearly all, since the diffuse light has many
+#: angles: 0.46 and more on eight rendered objects under one light.
+MIN_CONCENTRATION_CLOSED = 0.45
+#: Above this distance of the polarization from its model, relative to s0, highlights are coloured as metals' are. Test
+#: sets down to 3 % of full exposure: up to 0.04; objects with golden highlights and no diffuse: 0.11 and more. Linear
+#: demosaicking (`joint-fast`) hides a part of the distance.
+MAX_RESIDUAL = 0.07
+
+
+@dataclass(frozen=True)
+class SeparatedFrame:
+    """A separated frame as NumPy arrays, channels last.
+
+    ``diffuse``, ``specular``: float32 ``[h, w, C]``, C = 3 or 1, linear, 1.0 = one measurement at the white level, so
+    their sum s0 reaches 2 (more where clipped highlights were recovered). ``valid``: bool ``[h, w]``, False where
+    clipping left something to assumption. ``dolp``: float32 ``[h, w]``, of all channels together in white light, at
+    most 2, the most that four analysers show, and ``aolp``: radians in [0, pi), image-right toward image-up.
+    ``report``: JSON-able settings, statistics and warnings. ``error``: float32 ``[h, w, 2]``, the standard deviation
+    that the method expects of the errors of diffuse and specular, over all colours, in the images' unit; None where a
+    method expects none.
+    """
+
+    diffuse: NDArray[np.float32]
+    specular: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    dolp: NDArray[np.float32]
+    aolp: NDArray[np.float32]
+    report: dict[str, Any]
+    error: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Sums over the ``pixels`` of a frame or of a part of it; parts add.
+
+    ``clipped``, ``valid``, ``above_one``: pixels with a clipped sample, without an assumption, with DoLP above 1.
+    ``s0``, ``specular``: of the means over colours; s0 is diffuse + specular. ``power``, ``along``, ``across``: w |p|,
+    w p1 and w p2 for the specular light's polarization p = (p1, p2) and w, the specular light that polarization or, of
+    networks, the image says there is: highlights speak and noise does not.
+    ``residual``, ``noise``: of `Separation`'s, None where it has none. ``diffuse_variance``, ``specular_variance``: of
+    the squares of its ``expected_error``, None likewise.
+    """
+
+    pixels: int = 0
+    clipped: int = 0
+    valid: int = 0
+    above_one: int = 0
+    s0: float = 0.0
+    specular: float = 0.0
+    power: float = 0.0
+    along: float = 0.0
+    across: float = 0.0
+    residual: float | None = None
+    noise: float | None = None
+    diffuse_variance: float | None = None
+    specular_variance: float | None = None
+
+    def __add__(self, other: Tally) -> Tally:
+        """Sums over the pixels of both; a sum that one of them has not is the other's."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Tally(*(theirs if mine is None else mine if theirs is None else mine + theirs for mine, theirs in pairs))
+
+
+def grey(stokes: Stokes) -> Stokes:
+    """Stokes images ``[..., 1, h, w]`` of all colours together."""
+    return stokes.map(lambda image: image.mean(dim=-3, keepdim=True))
+
+
+def tally(found: Separation) -> Tally:
+    """Sums over all pixels of a separation."""
+    mean = grey(found.stokes)
+    p1, p2 = (image.double() for image in (mean.s1[..., 0, :, :], mean.s2[..., 0, :, :]))
+    diffuse, specular = (image.mean(dim=-3).double() for image in (found.diffuse, found.specular))
+    if found.diffuse_polarization is not None:
+        p1, p2 = (p - found.diffuse_polarization[..., i, :, :] * diffuse for i, p in enumerate((p1, p2)))
+    strength = torch.hypot(p1, p2)
+    # Networks find specular light where |p| is mostly the diffuse's; in closed forms both are the same.
+    weight = strength if found.expected_error is None else specular
+    doubt = (None, None) if found.expected_error is None else found.expected_error.double().unbind(dim=-3)
+    variances = (None if deviation is None else float((deviation**2).sum()) for deviation in doubt)
+    return Tally(
+        found.valid.numel(),
+        0 if found.clipped is None else int(found.clipped.sum()),
+        int(found.valid.sum()),
+        int((dolp(mean) > 1).sum()),
+        float((diffuse + specular).sum()),
+        float(specular.sum()),
+        float((weight * strength).sum()),
+        float((weight * p1).sum()),
+        float((weight * p2).sum()),
+        None if found.residual is None else float(found.residual.double().sum()),
+        None if found.noise is None else float(found.noise.double().sum()),
+        *variances,
+    )
+
+
+def dominant_angle(sums: Tally) -> tuple[float, float]:
+    """Dominant angle [rad, in [0, pi)] of the specular light's polarization, and its concentration in [0, 1].
+
+    Concentration 1: one AoLP everywhere, as under one polarized light; near 0: no common direction.
+    """
+    angle = (0.5 * math.atan2(sums.across, sums.along)) % math.pi
+    return angle, math.hypot(sums.along, sums.across) / sums.power if sums.power > 0 else 0.0
+
+
+def describe(sums: Tally) -> dict[str, Any]:
+    """Statistics and warnings of a frame for its report, without what its method does not measure.
+
+    docs/conventions.md lists them all.
+    """
+    pixels = max(sums.pixels, 1)
+    angle, concentration = dominant_angle(sums)
+    brightness = sums.s0 / pixels
+    remarks = []
+    least = MIN_CONCENTRATION_CLOSED if sums.diffuse_variance is None else MIN_CONCENTRATION
+    if brightness > 1e-3 and concentration < least:
+        remarks.append(
+            f"polarized light of one angle was expected, found many (concentration {concentration:.2f}): "
+            "is the light polarized, and the only one?"
+        )
+    statistics: dict[str, Any] = {
+        "clipped_fraction": sums.clipped / pixels,
+        "valid_fraction": sums.valid / pixels,
+        "mean_s0": brightness,
+        "specular_fraction": sums.specular / sums.s0 if sums.s0 > 0 else 0.0,
+        "dolp_above_1_fraction": sums.above_one / pixels,
+        "specular_aolp_deg": math.degrees(angle),
+        "specular_aolp_concentration": concentration,
+        "light_polarizer_deg": math.degrees(light_polarizer_angle(angle)),
+    }
+    if sums.residual is not None:
+        misfit = sums.residual / sums.s0 if sums.s0 > 0 else 0.0
+        statistics["fit_residual"] = misfit
+        if brightness > 1e-3 and misfit > MAX_RESIDUAL:
+            remarks.append(
+                f"white highlights on coloured things were expected, found polarization of other colours (misfit "
+                f"{misfit:.2f} of the light): are there metals, or several lights?"
+            )
+    if sums.noise is not None:
+        statistics["sample_noise"] = sums.noise / pixels
+    if sums.diffuse_variance is not None and sums.specular_variance is not None:
+        statistics["expected_diffuse_error"] = math.sqrt(sums.diffuse_variance / pixels)
+        statistics["expected_specular_error"] = math.sqrt(sums.specular_variance / pixels)
+    return {"statistics": statistics, "warnings": remarks}

@@ -1,0 +1,1 @@
+"""Recordings in, separated recordings out."""

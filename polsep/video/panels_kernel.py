@@ -1,0 +1,92 @@
+"""Small sRGB pictures of large linear images, fast enough for every frame of a stream.
+
+Pixels are means over squares, times a gain, through a table of the tone curve; see `io.previews`, whose pictures for
+reading are made with more care.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.compute.compiling import ONE, ZERO, compiled, entry
+from polsep.compute.threads import Piece, share
+
+#: Steps of the tone curve's table.
+STEPS = 4096
+#: Rows of a panel that a thread takes at a time.
+_ROWS = 16
+
+
+@compiled
+def _shrink(image: Any, y: int, factor: int, rows: Any, row: Any) -> None:
+    """Sums over squares of an image ``[H, W C]`` to ``row [w C]``; ``rows``: room for a row of the image."""
+    colors, n = row.shape[1], row.shape[0]
+    for x in range(rows.size):
+        rows[x] = ZERO
+    for k in range(factor * y, factor * y + factor):
+        line = image[k]
+        for x in range(rows.size):
+            rows[x] += line[x]
+    for c in range(colors):
+        own = rows[c:]
+        for x in range(n):
+            total = ZERO
+            for k in range(factor):
+                total += own[(factor * x + k) * colors]
+            row[x, c] = total
+
+
+@compiled
+def _encode(light: Any, scale: Any, table: Any, codes: Any) -> None:
+    """Codes ``[w, 3]`` of a row of light ``[w, C]``."""
+    colors = light.shape[1]
+    for x in range(codes.shape[0]):
+        for c in range(3):
+            value = light[x, c if colors == 3 else 0] * scale
+            value = (value if value < ONE else ONE) if value > ZERO else ZERO
+            codes[x, c] = table[np.int32(np.sqrt(value) * np.float32(STEPS) + np.float32(0.5))]
+
+
+@entry
+def fill_panels(
+    images: tuple[NDArray[np.float32], NDArray[np.float32]],
+    gain: float,
+    table: NDArray[np.uint8],
+    out: NDArray[np.uint8],
+    piece: Piece,
+) -> None:
+    """Rows of ``out [h, 3 w, 3]``: the sum of both ``images [H, W, C]``, the first and the second."""
+    height, full, colors = images[0].shape
+    width = out.shape[1] // 3
+    factor = height // out.shape[0]
+    scale = np.float32(gain / (factor * factor))
+    rows = np.empty(full * colors, np.float32)
+    one, two = np.empty((width, colors), np.float32), np.empty((width, colors), np.float32)
+    both = np.empty((width, colors), np.float32)
+    first, second = images[0].reshape(height, -1), images[1].reshape(height, -1)
+    for y in range(piece[0], piece[1]):
+        _shrink(first, y, factor, rows, one)
+        _shrink(second, y, factor, rows, two)
+        for x in range(width):
+            for c in range(colors):
+                both[x, c] = one[x, c] + two[x, c]
+        _encode(both, scale, table, out[y, :width])
+        _encode(one, scale, table, out[y, width : 2 * width])
+        _encode(two, scale, table, out[y, 2 * width :])
+
+
+def make_panels(
+    images: tuple[NDArray[np.float32], NDArray[np.float32]], gain: float, table: NDArray[np.uint8], widest: int
+) -> NDArray[np.uint8]:
+    """Sum, first and second of ``images [H, W, C]`` side by side, ``[h, 3 w, 3]``; sides even, at most ``widest``.
+
+    ``table``: codes of `STEPS` + 1 equal steps of the square root of linear light from 0 to 1.
+    """
+    height, width = images[0].shape[:2]
+    factor = -(-max(height, width) // widest)
+    out = np.empty((max(height // factor // 2 * 2, 2), 3 * max(width // factor // 2 * 2, 2), 3), np.uint8)
+    share(lambda rows: fill_panels(images, gain, table, out, rows), out.shape[0], _ROWS)
+    return out

@@ -1,0 +1,268 @@
+"""Less flicker in video: where nothing moves, raw samples are averaged over frames before any method sees them.
+
+The filter works on blocks of 4x4 samples, one period of any layout, with the noise that `noise` measures in the stream.
+Whether a block has changed is asked of the differences of its samples to their means, in standard deviations, which
+are 0 on average and 1 in square if nothing has:
+
+* sudden: the mean square of one block exceeds `SUDDEN`. It and the blocks around it begin anew.
+* slow: over 5x5 blocks, differences behind the same filter have one sign (light that fades, soft highlights on their
+  way). What they exceed their noise by is the lag of the means, squared, in variances of a sample.
+* rough: the mean square over 3x3 blocks exceeds `ROUGH` (fine texture that creeps); the excess counts as lag too.
+
+A block that has averaged ``n`` frames has averaged min(1 + 1 / (1/n + lag), `FRAMES`) with the next: the optimal weight
+(Kalman 1960) of a mean that is off by the lag. Beyond `LAG` it begins anew: where something moves, the current frame's
+samples are handed on as they are, bit for bit, so that no highlight leaves a trace. A sample that clips is handed on as
+it is too; its mean, of values that clipping has limited, is only what later ones are compared with.
+
+What moves also disturbs the separated images of what stands still near it, through the windows of demosaickers, methods
+and networks. `steady_images` averages those too, over fewer frames.
+
+All that a stream carries on is its `TemporalState`, a value: the same state and frame give the same bytes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polsep.sensor.camera import CLIP_MARGIN, Mosaic
+from polsep.sensor.noise import BLOCK, Floats, Levels, Noise, blocks_of, estimate_noise, least_noise
+
+if TYPE_CHECKING:
+    from polsep.video.temporal_kernel import Rules
+
+#: Diffuse, specular, or whatever else a method finds, ``[h, w, C]`` each.
+Images = tuple[Floats, ...]
+
+#: Frames that are averaged at most.
+FRAMES = 16.0
+#: Frames over which separated images are averaged at most: what disturbs them is not noise, but has its own motion.
+IMAGE_FRAMES = 4.0
+#: Mean square of the 16 differences of a block from which it has changed: 5 blocks in 100 000 of a still picture.
+SUDDEN = 3.0
+#: Mean square of the signed sums over 5x5 blocks, and of the differences of 3x3 blocks, up to which lag is 0.
+SLOW, ROUGH = 1.75, 1.5
+#: Squared lag from which a block begins anew, in variances of a sample: a quarter of its standard deviation.
+LAG = 0.05
+#: Blocks on either side that make up the windows of slow and of rough changes, and that begin anew with a sudden one.
+SLOW_REACH, REACH = 2, 1
+#: The noise is measured in each of so many frames at first, then in every fourth; estimates that are averaged.
+FIRST_FRAMES, EVERY, ESTIMATES = 8, 4, 16
+#: Codes are whole numbers where white is at least this far above black.
+MIN_SPAN = 100.0
+
+
+@dataclass(frozen=True)
+class TemporalState:
+    """What a stream carries from frame to frame.
+
+    ``mean [H, W]`` float32, in the unit of the samples, of clipped ones as they come. ``count [H/4, W/4]`` float32: how
+    many frames each block's mean is of. ``noise``: as measured so far, from ``estimates`` of it. ``frames`` so far.
+    ``levels``: black and white.
+    """
+
+    mean: Floats
+    count: Floats
+    noise: Noise
+    estimates: int
+    frames: int
+    levels: tuple[float, float]
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """The state as arrays, which an npz file holds exactly."""
+        numbers = (self.noise.gain, self.noise.floor, *self.levels)
+        counts = np.array([self.estimates, self.frames], np.int64)
+        return {"mean": self.mean, "count": self.count, "numbers": np.array(numbers, np.float64), "counts": counts}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> TemporalState:
+        """The twin of `to_arrays`. Raises ValueError on arrays of another kind."""
+        expected = {
+            "mean": (np.float32, 2),
+            "count": (np.float32, 2),
+            "numbers": (np.float64, 1),
+            "counts": (np.int64, 1),
+        }
+        found = {name: (arrays[name].dtype.type, arrays[name].ndim) for name in expected if name in arrays}
+        fits = found == expected and arrays["numbers"].size == 4 and arrays["counts"].size == 2
+        if not fits or arrays["count"].shape != _blocks(arrays["mean"].shape):
+            raise ValueError(f"expected the arrays {', '.join(expected)} of a temporal state, found {sorted(arrays)}")
+        gain, floor, black, white = (float(x) for x in arrays["numbers"])
+        estimates, frames = (int(x) for x in arrays["counts"])
+        return cls(arrays["mean"], arrays["count"], Noise(gain, floor), estimates, frames, (black, white))
+
+
+def filter_frame(mosaic: Mosaic, state: TemporalState | None = None) -> tuple[Mosaic, TemporalState]:
+    """The next raw frame of a stream with less noise where nothing moves, and the state for the one after it.
+
+    The frame is ``[H, W]``, of any layout; the filtered one is float32 in the same unit. ``state`` None: the stream
+    begins, and the frame is handed on as it is. Nothing is changed in place, and frames share memory with states:
+    neither is to be written to. Raises ValueError on a batch, and on a frame of another size or other levels.
+    """
+    from polsep.video import temporal_kernel as temporal
+
+    return _filter(mosaic, state, temporal.filter_samples)
+
+
+def filter_frame_reference(mosaic: Mosaic, state: TemporalState | None = None) -> tuple[Mosaic, TemporalState]:
+    """`filter_frame` by the readable `filter_samples` instead of compiled code; the same to rounding."""
+    return _filter(mosaic, state, filter_samples)
+
+
+def steady_images(images: Images, before: Images | None, state: TemporalState) -> Images:
+    """Separated images ``[h, w, C]`` of a filtered frame, steadier where its blocks have been still for frames.
+
+    The images are of half or full resolution; ``before``: what this returned for the frame before, None at first;
+    ``state``: as `filter_frame` returned it with the frame. A block that began anew is handed on as it is. Raises
+    ValueError on images of another size than before, or of neither resolution.
+    """
+    if before is None:
+        return images
+    from polsep.video.temporal_kernel import blend_images
+
+    weight = 1 / np.minimum(state.count, np.float32(IMAGE_FRAMES))
+    sides = _sides(images, before, state.mean.shape)
+    return tuple(blend_images((new, old), weight, side) for new, old, side in zip(images, before, sides, strict=True))
+
+
+def _sides(images: Images, before: Images, frame: tuple[int, ...]) -> list[int]:
+    """How many pixels of each image a block of the frame has along its side."""
+    shapes, old = ([image.shape for image in some] for some in (images, before))
+    if shapes != old:
+        raise ValueError(f"expected images of {old} as before, found {shapes}")
+    known = {frame: BLOCK, tuple(n // 2 for n in frame): BLOCK // 2}
+    wrong = [shape for shape in shapes if len(shape) != 3 or shape[:2] not in known]
+    if wrong:
+        raise ValueError(f"expected images [h, w, C] of {' or '.join(map(str, known))} pixels, found {wrong[0]}")
+    return [known[shape[:2]] for shape in shapes]
+
+
+def _filter(mosaic: Mosaic, state: TemporalState | None, apply: Any) -> tuple[Mosaic, TemporalState]:
+    raw = _raw_samples(mosaic, state)
+    samples = _padded(raw)
+    levels = _levels_of(mosaic, samples)
+    if state is None:
+        estimate = estimate_noise(samples, None, levels, 0)
+        noise = estimate or least_noise(levels)
+        count = np.ones(_blocks(raw.shape), np.float32)
+        mean = raw.astype(np.float32)
+        state = TemporalState(mean, count, noise, 0, 1, (levels.black, levels.white))
+        return replace(mosaic, data=_as_tensor(mean, mosaic)), state
+    before = (_padded(state.mean), state.count)
+    noise, estimates = _next_noise(samples, before, levels, state)
+    filtered, mean, count = apply(samples, before, make_rules(noise, levels))
+    filtered, mean = (np.ascontiguousarray(x[: raw.shape[0], : raw.shape[1]]) for x in (filtered, mean))
+    state = TemporalState(mean, count, noise, estimates, state.frames + 1, state.levels)
+    return replace(mosaic, data=_as_tensor(filtered, mosaic)), state
+
+
+def _raw_samples(mosaic: Mosaic, state: TemporalState | None) -> NDArray[Any]:
+    """A frame's samples as the kernel takes them. Raises ValueError where they do not go on with the stream."""
+    data, levels = mosaic.data, (float(mosaic.black_level), float(mosaic.white_level))
+    if data.ndim != 2 or min(data.shape) < BLOCK:
+        raise ValueError(f"expected one raw frame [H, W] of at least {BLOCK}x{BLOCK}, found {tuple(data.shape)}")
+    if state is not None and tuple(data.shape) != state.mean.shape:
+        sizes = ["x".join(str(n) for n in shape) for shape in (state.mean.shape, data.shape)]
+        raise ValueError(f"expected frames of {sizes[0]} as before, found {sizes[1]}")
+    if state is not None and levels != state.levels:
+        raise ValueError(f"expected black and white at {state.levels} as before, found {levels}")
+    if data.dtype not in (torch.uint8, torch.uint16, torch.float32):
+        data = data.float()
+    return data.detach().cpu().numpy()
+
+
+def _as_tensor(mean: Floats, mosaic: Mosaic) -> torch.Tensor:
+    return torch.from_numpy(mean).to(mosaic.data.device)
+
+
+def _blocks(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(-(-n // BLOCK) for n in shape)
+
+
+def _padded(image: NDArray[Any]) -> NDArray[Any]:
+    """The image up to whole blocks: what is missing is repeated from one period before, behind the same filters."""
+    for axis in (0, 1):
+        missing = -image.shape[axis] % BLOCK
+        if missing:
+            n = image.shape[axis]
+            image = np.concatenate([image, image.take(range(n - BLOCK, n - BLOCK + missing), axis)], axis)
+    return image
+
+
+def _levels_of(mosaic: Mosaic, samples: NDArray[Any]) -> Levels:
+    """Levels of a frame; codes are told from other numbers by a row of them."""
+    black, white = float(mosaic.black_level), float(mosaic.white_level)
+    row = samples[samples.shape[0] // 2]
+    whole = white - black >= MIN_SPAN and bool((row == np.floor(row)).all())
+    return Levels(black, white, 1.0 if whole else 0.0, black + (1 - CLIP_MARGIN) * (white - black))
+
+
+def _next_noise(
+    samples: NDArray[Any], before: tuple[Floats, Floats], levels: Levels, state: TemporalState
+) -> tuple[Noise, int]:
+    """The noise that is known when a frame has come, and from how many estimates."""
+    if state.frames > FIRST_FRAMES and state.frames % EVERY:
+        return state.noise, state.estimates
+    found = estimate_noise(samples, before, levels, state.frames)
+    if found is None:
+        return state.noise, state.estimates
+    number = state.estimates + 1
+    weight, old = 1 / min(number, ESTIMATES), state.noise
+    gain, floor = old.gain + weight * (found.gain - old.gain), old.floor + weight * (found.floor - old.floor)
+    return Noise(gain, floor), number
+
+
+def make_rules(noise: Noise, levels: Levels) -> Rules:
+    """The numbers that a frame is filtered by."""
+    from polsep.video.temporal_kernel import Rules
+
+    numbers = (noise.gain, noise.floor, levels.black, levels.clip, FRAMES, SUDDEN, SLOW, ROUGH, LAG)
+    return Rules(*(np.float32(x) for x in numbers))
+
+
+def filter_samples(raw: NDArray[Any], before: tuple[Floats, Floats], rules: Rules) -> tuple[Floats, Floats, Floats]:
+    """Samples ``[H, W]`` filtered, and new means and counts ``[H/4, W/4]`` from those ``before``; see the module.
+
+    H and W are multiples of 4. Twin of `video.temporal_kernel.filter_samples`.
+    """
+    (mean, count), samples = before, raw.astype(np.float32)
+    anew, lag = find_changes(samples, before, rules)
+    grown = np.minimum(1 + 1 / (1 / count + lag), rules.most)
+    count = np.where(anew, np.float32(1), grown).astype(np.float32)
+    weight = _per_sample(1 / count)
+    mean = np.where(weight == 1, samples, mean + (samples - mean) * weight)
+    return np.where(samples >= rules.clip, samples, mean), mean, count
+
+
+def find_changes(samples: Floats, before: tuple[Floats, Floats], rules: Rules) -> tuple[NDArray[np.bool_], Floats]:
+    """Which blocks ``[H/4, W/4]`` begin anew, and the squared lag of their means in variances."""
+    mean, count = before
+    variance = rules.gain * np.maximum(mean - rules.black, 0) + rules.floor
+    score = (samples - mean) / np.sqrt(variance * _per_sample(1 + 1 / count))
+    scores = blocks_of(score)
+    square = np.square(scores).mean(axis=-1)
+    calm = square <= rules.sudden  # not so where a sample is no number
+    scores, square, kept = np.where(calm[..., None], scores, 0), np.where(calm, square, 0), calm.astype(np.float32)
+    blocks = np.maximum(_window_sum(kept, SLOW_REACH), 1)
+    slow = np.square(_window_sum(scores, SLOW_REACH)).mean(axis=-1) / blocks
+    rough = _window_sum(square, REACH) / np.maximum(_window_sum(kept, REACH), 1)
+    excess = np.maximum((slow - rules.slow) / blocks, rough - rules.rough)
+    lag = np.maximum(excess, 0) * (1 + 1 / count)
+    return (_window_sum(1 - kept, REACH) > 0) | (lag > rules.lag), lag
+
+
+def _per_sample(blocks: NDArray[Any]) -> Floats:
+    return blocks.astype(np.float32).repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)
+
+
+def _window_sum(values: Floats, reach: int) -> Floats:
+    """Sums over 2 ``reach`` + 1 blocks along both first axes, fewer at the borders."""
+    for axis in (0, 1):
+        padding = [(reach, reach) if k == axis else (0, 0) for k in range(values.ndim)]
+        padded, n = np.pad(values, padding), values.shape[axis]
+        values = sum((padded.take(range(k, k + n), axis) for k in range(2 * reach + 1)), np.zeros_like(values))
+    return values

@@ -168,7 +168,7 @@ def _take_model(title: str, path: Path, pose: tuple[float, float], skin: Skin) -
 
 def _render(title: str, model: MeshScene, pose: tuple[float, float], skin: Skin) -> Taken:
     """A mesh from azimuth and elevation [degrees], lit from above the camera, through its lens."""
-    from polsep.datasets.testsets.casting import LENS_BLUR, SAMPLES, look_at
+    from evaluation.testsets.casting import LENS_BLUR, SAMPLES, look_at
     from polsep.render.raycast import render_scene
 
     camera = look_at(model.mesh, *pose)

@@ -31,7 +31,7 @@ from polsep.sensor.camera import IMX250, Layout, Mosaic, expose
 from polsep.video.temporal import Images, TemporalState, filter_frame, steady_images
 
 if TYPE_CHECKING:
-    from polsep.datasets.testsets.dynamic import Film
+    from evaluation.testsets.dynamic import Film
 
 #: Methods that are compared, those of them that are installed.
 COMPARED = ("color-affine", "joint-fast", "joint")
@@ -108,7 +108,7 @@ def _bench(numbers: range) -> Iterator[Row]:
 def _load_films() -> tuple[dict[str, Film], int]:
     """The films, and how many frames they have. Raises ValueError without what they need."""
     try:
-        from polsep.datasets.testsets import dynamic
+        from evaluation.testsets import dynamic
     except ImportError as error:
         raise ValueError(f"expected the extra render, found no {error.name}") from None
     return dynamic.FILMS, dynamic.FRAMES
@@ -116,7 +116,7 @@ def _load_films() -> tuple[dict[str, Film], int]:
 
 def score_film(film: Film, numbers: range, methods: Sequence[Method]) -> Iterator[Row]:
     """Rows of every method on some frames of a film: alone, filtered, and what the filter changes."""
-    from polsep.datasets.testsets.dynamic import check_frame, play
+    from evaluation.testsets.dynamic import check_frame, play
 
     alone, filtered, steady = ({method.name: Tally() for method in methods} for _ in range(3))
     state: TemporalState | None = None

@@ -50,7 +50,7 @@ from polsep.physics.stokes import Measurements, fit_stokes
 from polsep.sensor.camera import Layout, Mosaic
 
 if TYPE_CHECKING:
-    from polsep.datasets.testsets import Case, Recipe
+    from evaluation.testsets import Case, Recipe
 
 #: Entries of the columns and what the paper calls them.
 COLUMNS = {
@@ -103,7 +103,7 @@ def draw_paper(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
 
 def find_scene(name: str, data: Path) -> Case:
     """The test scene of that name, or `STAND_IN` where its data are absent."""
-    from polsep.datasets.testsets import build_case
+    from evaluation.testsets import build_case
 
     recipes: dict[str, Recipe] = {recipe.name: recipe for recipes in load_sets().values() for recipe in recipes}
     there = find_absent([recipes[name]], data) is None

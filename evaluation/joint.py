@@ -26,7 +26,7 @@ from polsep.sensor.camera import IMX250, Layout, Mosaic, expose
 from polsep.separation.analytic import Separation
 
 if TYPE_CHECKING:
-    from polsep.datasets.testsets import Case, Recipe
+    from evaluation.testsets import Case, Recipe
 
 #: Methods whose images at full resolution would be of bilinear samples, as their networks' are at half.
 ENLARGED = ("paper",)
@@ -93,7 +93,7 @@ def measure_reliability(name: str, recipes: Sequence[Recipe], data: Path) -> Ite
 
     The latter also of the pixels near which nothing clips: the others, a few, hold most of what can be off.
     """
-    from polsep.datasets.testsets import build_cases
+    from evaluation.testsets import build_cases
 
     seen: dict[tuple[str, str], list[tuple[Tensor, Tensor, Tensor]]] = {}
     for case in build_cases(recipes, data):
@@ -118,7 +118,7 @@ def measure_reliability(name: str, recipes: Sequence[Recipe], data: Path) -> Ite
 
 def measure_engines(name: str, recipes: Sequence[Recipe], data: Path) -> Iterator[Row]:
     """How far an engine, in bfloat16 where the processor has it, is from torch: in PSNR of a set, and of a scene."""
-    from polsep.datasets.testsets import build_cases
+    from evaluation.testsets import build_cases
 
     changes: dict[tuple[str, str], list[float]] = {}
     for case in build_cases(recipes, data):

@@ -24,7 +24,7 @@ from polsep.networks.run import NAMES
 from polsep.separation.analytic import Separation
 
 if TYPE_CHECKING:
-    from polsep.datasets.testsets import Case, Recipe
+    from evaluation.testsets import Case, Recipe
 
 #: Fewest pixels of a highlight that are worth a score.
 MIN_HIGHLIGHT = 20
@@ -92,7 +92,7 @@ def score_sets(
     Sets whose files are not in ``data`` are left out, which one line on stderr says. Raises ValueError on files other
     than recorded, and on a scene that does not come out as recorded.
     """
-    from polsep.datasets.testsets import build_cases, check_case
+    from evaluation.testsets import build_cases, check_case
 
     for name, recipes in sets.items():
         absent = find_absent(recipes, data)

@@ -14,11 +14,11 @@ from polsep.bench.rows import Row
 from polsep.metrics import require_flip
 
 if TYPE_CHECKING:
-    from polsep.datasets.testsets import Recipe
+    from evaluation.testsets import Recipe
 
 
 def bench_sets(data: Path) -> Iterator[Row]:
-    """Scores of all methods on the sets of `polsep.datasets.testsets`, of which those that ``data`` lacks are left out.
+    """Scores of all methods on the sets of `evaluation.testsets`, of which those that ``data`` lacks are left out.
 
     Raises ValueError without the extras render and bench, and on a scene that does not come out as recorded.
     """
@@ -29,10 +29,10 @@ def bench_sets(data: Path) -> Iterator[Row]:
 
 
 def load_sets() -> dict[str, tuple[Recipe, ...]]:
-    """`datasets.testsets.SETS`. Raises ValueError, before anything is measured, without what scenes and scores need."""
+    """`testsets.SETS`. Raises ValueError, before anything is measured, without what scenes and scores need."""
     require_flip()
     try:
-        from polsep.datasets import testsets
+        from evaluation import testsets
     except ImportError as error:
         raise ValueError(f"expected the extra render, found no {error.name}") from None
     return testsets.SETS

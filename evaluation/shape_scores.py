@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
 from evaluation.six_lights import SEED, Shoot, load_subjects, photograph
+from evaluation.testsets.statues import DILIGENT
 from polsep.bench.rows import Row
-from polsep.datasets.testsets.statues import DILIGENT
 from polsep.geometry.files import Views, views_of
 from polsep.geometry.integration import Equations, find_slopes, integrate_bilateral, integrate_smooth
 from polsep.geometry.lights import NAMED

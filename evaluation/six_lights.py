@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from polsep.datasets.testsets.casting import LENS_BLUR, SAMPLES, look_at
-from polsep.datasets.testsets.statues import (
+from evaluation.testsets.casting import LENS_BLUR, SAMPLES, look_at
+from evaluation.testsets.statues import (
     DILIGENT,
     DILIGENT_FILES,
     ROUGHNESSES,

@@ -59,7 +59,7 @@ def test_normals_of_the_gallery_are_the_surfaces(monkeypatch: pytest.MonkeyPatch
     """Of a ball before the camera: x to the right, y up, z to the camera, nothing beside it."""
     pytest.importorskip("embreex", reason="needs the extra render")
     from evaluation import appearance
-    from polsep.datasets.testsets.casting import look_at
+    from evaluation.testsets.casting import look_at
     from polsep.render.raycast import MeshScene
     from polsep.render.shapes import ellipsoid
 

@@ -21,7 +21,7 @@ pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 pytest.importorskip("matplotlib", reason="figures need the extra 'bench'")
 from PIL import Image
 
-from evaluation import gallery, ladder, paper
+from evaluation import gallery, ladder, paper, testsets
 from evaluation.benches import BENCHES
 from evaluation.calibration import Sweep
 from evaluation.figures import (
@@ -46,10 +46,9 @@ from evaluation.ladder import (
     rung_of,
 )
 from evaluation.paper import QUICK, Extent, measure_paper, table_rows
+from evaluation.testsets import Recipe
 from polsep.bench.rows import Row
 from polsep.cli import app
-from polsep.datasets import testsets
-from polsep.datasets.testsets import Recipe
 from polsep.io.store.pictures import write_picture
 from polsep.io.store.rows import fill_tables, read_rows
 from polsep.io.store.weights import write_weights

@@ -13,13 +13,13 @@ pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
 pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 
+from evaluation import testsets
 from evaluation.ablations import ablation_entry, find_ablations
 from evaluation.joint import BINS, enlarge, full_entries, measure_engines, measure_reliability, see_full, see_mono
 from evaluation.rendering import bench_rendering
 from evaluation.scoring import Entry, Protocol, score_case, score_sets, see_clean, see_co_sited, see_noisy
 from evaluation.sets import bench_sets
-from polsep.datasets import testsets
-from polsep.datasets.testsets import Recipe, build_case
+from evaluation.testsets import Recipe, build_case
 from polsep.demosaic.bilinear import demosaic_bilinear_half, mean_cells
 from polsep.io.store.weights import read_weights
 from polsep.methods import METHODS, compose

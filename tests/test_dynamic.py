@@ -14,9 +14,9 @@ pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
 
 from evaluation.dynamic import APART, Tally, find_regions, score_film
-from polsep.datasets.testsets import dynamic
-from polsep.datasets.testsets.dynamic import FILMS, Film, FilmFrame, Look, Prop, check_frame, move, play
-from polsep.datasets.testsets.expected import EXPECTED_FRAMES
+from evaluation.testsets import dynamic
+from evaluation.testsets.dynamic import FILMS, Film, FilmFrame, Look, Prop, check_frame, move, play
+from evaluation.testsets.expected import EXPECTED_FRAMES
 from polsep.methods import METHODS
 from polsep.render.materials import look_up, random_materials
 from polsep.render.raycast import MeshScene

@@ -16,7 +16,7 @@ pytest.importorskip("scipy", reason="depth maps need the extra 'render'")
 
 from tolerances import SIGMAS, assert_close, assert_same_angle, assert_within
 
-from polsep.datasets.testsets import (
+from evaluation.testsets import (
     OBJECTS,
     PHOTOGRAPHS,
     SETS,
@@ -30,12 +30,12 @@ from polsep.datasets.testsets import (
     fingerprint,
     version_of,
 )
-from polsep.datasets.testsets.cases import LARGEST_CLIPPED, TOLERANCE, record_of
-from polsep.datasets.testsets.casting import FILLED, LARGEST_ANGLE_DEG, look_at, random_light_near
-from polsep.datasets.testsets.expected import EXPECTED
-from polsep.datasets.testsets.photographs import normals_from_depth, polarize_diffuse
-from polsep.datasets.testsets.sheet import TILE
-from polsep.datasets.testsets.statues import DILIGENT_FILES, random_albedo, span_surface, unproject
+from evaluation.testsets.cases import LARGEST_CLIPPED, TOLERANCE, record_of
+from evaluation.testsets.casting import FILLED, LARGEST_ANGLE_DEG, look_at, random_light_near
+from evaluation.testsets.expected import EXPECTED
+from evaluation.testsets.photographs import normals_from_depth, polarize_diffuse
+from evaluation.testsets.sheet import TILE
+from evaluation.testsets.statues import DILIGENT_FILES, random_albedo, span_surface, unproject
 from polsep.io.assets.objects import hash_files, read_depth, read_mask, read_mesh, read_normal_map, read_photograph
 from polsep.physics.optics import Geometry, diffuse_dolp, diffuse_stokes
 from polsep.physics.stokes import Stokes, aolp, dolp, measure

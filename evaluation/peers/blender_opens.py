@@ -3,7 +3,7 @@
     python3.11 -m venv blender && blender/bin/pip install bpy==5.0.1
     polsep geometry --srgb 196CANON/[0-5].JPG --mask 196CANON/mask.png --integration smooth -o out
     polsep material polsep/data/still_life.png --white-level 4095 -o out
-    python evaluation/peers/blender_opens.py blender/bin/python out/shape.glb out/still_life.glb   # results/blender.jsonl
+    python evaluation/peers/blender_opens.py blender/bin/python out/shape.glb out/still_life.glb
 
 Blender imports each file in an empty scene, checks its meshes, and says what it has; trimesh reads the same file.
 """

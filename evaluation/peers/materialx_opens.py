@@ -74,7 +74,11 @@ def main() -> None:
     """Measure and record the rows."""
     python, *paths = (Path(word) for word in sys.argv[1:])
     rows = [row for path in paths for row in check(python, path)]
-    record("materialx", rows, f"python evaluation/peers/materialx_opens.py materialx/bin/python {' '.join(map(str, paths))}")
+    record(
+        "materialx",
+        rows,
+        f"python evaluation/peers/materialx_opens.py materialx/bin/python {' '.join(map(str, paths))}",
+    )
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from polsep.datasets.testsets.cases import Case
+from evaluation.testsets.cases import Case
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.io.results.previews import Pixels, aolp_wheel, dolp_map, exposure_of, srgb
 from polsep.physics.stokes import Stokes, aolp, dolp, fit_stokes

@@ -20,8 +20,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polsep.datasets.testsets.cases import Recipe
-from polsep.datasets.testsets.casting import FILLED, look_at, random_light_near, render_covered
+from evaluation.testsets.cases import Recipe
+from evaluation.testsets.casting import FILLED, look_at, random_light_near, render_covered
 from polsep.io.assets.objects import read_depth, read_intrinsics, read_mask, read_mesh, read_normal_map
 from polsep.render.distances import Field, cells, marble, plain
 from polsep.render.materials import rgb_from_hsv

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import torch
 
-from polsep.datasets.testsets.cases import Recipe
-from polsep.datasets.testsets.casting import LENS_BLUR, SAMPLES
+from evaluation.testsets.cases import Recipe
+from evaluation.testsets.casting import LENS_BLUR, SAMPLES
 from polsep.render.materials import random_materials
 from polsep.render.raycast import render_scene
 from polsep.render.simulate import blur

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from polsep.datasets.testsets.expected import EXPECTED, Expected
+from evaluation.testsets.expected import EXPECTED, Expected
 from polsep.io.assets.objects import hash_files
 from polsep.physics.stokes import Measurements, Stokes, measure
 from polsep.render.simulate import expose_to_clip, half_resolution

@@ -1,4 +1,4 @@
-"""Make the films of docs/video.md (the paper's Fig. 7): python examples/make_dynamic_films.py docs/images
+"""Make the films of docs/video.md (the paper's Fig. 7): python -m evaluation.dynamic_films docs/images
 
 Renders the three test films (extras render, video), separates them as recordings and keeps the films to watch: what the
 camera sees, diffuse, specular. dynamic.jpg shows three frames of each.
@@ -13,7 +13,7 @@ import av
 import numpy as np
 from PIL import Image
 
-from polsep.datasets.testsets.dynamic import FILMS, RATE, play
+from evaluation.testsets.dynamic import FILMS, RATE, play
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.sequences import SequenceKind
 from polsep.video.recordings import Target, VideoOptions, separate_video

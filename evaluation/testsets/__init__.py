@@ -7,11 +7,11 @@ may be trained or tuned on any of them. See docs/testsets.md. Needs the extra ``
 
 from __future__ import annotations
 
-from polsep.datasets.testsets.cases import Case, Recipe, build_case, build_cases, check_case, fingerprint, version_of
-from polsep.datasets.testsets.objects import OBJECTS
-from polsep.datasets.testsets.photographs import PHOTOGRAPHS
-from polsep.datasets.testsets.sheet import draw_sheet
-from polsep.datasets.testsets.statues import STATUES
+from evaluation.testsets.cases import Case, Recipe, build_case, build_cases, check_case, fingerprint, version_of
+from evaluation.testsets.objects import OBJECTS
+from evaluation.testsets.photographs import PHOTOGRAPHS
+from evaluation.testsets.sheet import draw_sheet
+from evaluation.testsets.statues import STATUES
 
 #: The sets by name: (a), (b) and (c) of docs/testsets.md.
 SETS: dict[str, tuple[Recipe, ...]] = {"objects": OBJECTS, "statues": STATUES, "photographs": PHOTOGRAPHS}

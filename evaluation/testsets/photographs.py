@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from polsep.datasets.testsets.cases import Recipe
+from evaluation.testsets.cases import Recipe
 from polsep.io.assets.objects import read_depth, read_mask, read_photograph
 from polsep.physics.optics import diffuse_dolp
 from polsep.physics.stokes import Stokes

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from polsep.datasets.testsets.cases import NOISE_SEED, TOLERANCE, UNIT, weigh_scene
-from polsep.datasets.testsets.casting import LENS_BLUR, SAMPLES
-from polsep.datasets.testsets.expected import EXPECTED_FRAMES
+from evaluation.testsets.cases import NOISE_SEED, TOLERANCE, UNIT, weigh_scene
+from evaluation.testsets.casting import LENS_BLUR, SAMPLES
+from evaluation.testsets.expected import EXPECTED_FRAMES
 from polsep.render.materials import Materials, random_materials
 from polsep.render.raycast import MeshScene, Model, render_scene
 from polsep.render.shapes import Floats, Mesh, box, join, moved, random_heights

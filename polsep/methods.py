@@ -9,13 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half
 from polsep.io.store.weights import is_shipped
 from polsep.networks.engines import run_engine
-from polsep.networks.openvino_engine import JointImages
 from polsep.networks.run import NAMES, separate_mosaic, takes, weights_name
 from polsep.networks.shipped_paper import separate_paper
 from polsep.physics.stokes import Measurements
@@ -23,9 +21,7 @@ from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.analytic import Separation, separate_analytic
 from polsep.separation.color_affine import separate_color_affine
 from polsep.separation.engine import run_analytic, run_color_affine, run_nothing
-
-if TYPE_CHECKING:
-    from polsep.kernels import AnalyticImages, ColorAffineImages
+from polsep.separation.images import FrameImages
 
 #: What a camera gives: a raw frame, or co-sited samples.
 Capture = Mosaic | Measurements
@@ -43,11 +39,11 @@ class Method:
     half: Callable[[Capture], Separation]
     full: Callable[[Capture], Separation]
     takes: Callable[[Capture], bool]
-    engine: Callable[[Mosaic], AnalyticImages | ColorAffineImages | JointImages | None]
+    engine: Callable[[Mosaic], FrameImages | None]
     summary: str
     needs: str
     source: str
-    full_engine: Callable[[Mosaic], JointImages | None] = run_nothing
+    full_engine: Callable[[Mosaic], FrameImages | None] = run_nothing
 
 
 def compose(

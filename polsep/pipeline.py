@@ -21,7 +21,6 @@ from torch import Tensor
 
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.methods import Capture, Method, find_method
-from polsep.networks.openvino_engine import JointImages
 from polsep.physics.stokes import MAX_DOLP, Measurements, aolp, dolp, fit_stokes_unclipped, polarized_intensity
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.layout_check import check_layout
@@ -111,8 +110,7 @@ def separate_in_engine(
         return None
     assert images.dolp is not None and images.aolp is not None and images.tally is not None
     report = describe(images.tally)
-    error = images.error if isinstance(images, JointImages) else None
-    return SeparatedFrame(images.diffuse, images.specular, images.valid, images.dolp, images.aolp, report, error)
+    return SeparatedFrame(images.diffuse, images.specular, images.valid, images.dolp, images.aolp, report, images.error)
 
 
 def separate_in_torch(capture: Capture, method: Method, light: tuple[float, ...], full: bool) -> SeparatedFrame:

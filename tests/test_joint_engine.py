@@ -25,7 +25,7 @@ from polsep.networks import openvino_engine
 from polsep.networks import run as mosaic_network
 from polsep.networks.engines import run_engine
 from polsep.networks.joint import INPUTS, PERIOD, Demosaicker, Joint
-from polsep.networks.openvino_engine import FullEngine, JointImages, OpenVinoEngine
+from polsep.networks.openvino_engine import FullEngine, OpenVinoEngine
 from polsep.networks.run import Resolution, own_order, run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import MAX_DOLP, aolp, dolp
@@ -34,7 +34,8 @@ from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation
 from polsep.sensor.unpack_kernel import as_samples
 from polsep.separation.analytic import Separation
-from polsep.separation.report import Tally, tally
+from polsep.separation.images import FrameImages, Tally
+from polsep.separation.report import tally
 
 COLOR, MONO = Layout(), Layout(bayer=None)
 LAYOUTS = [COLOR, MONO]
@@ -80,13 +81,13 @@ def in_torch(net: Joint, mosaic: Mosaic, resolution: Resolution = "half") -> Sep
     return in_light(run_joint(net, mosaic, resolution), mosaic.light_color)
 
 
-def in_engine(net: Joint, mosaic: Mosaic, precision: str = "f32", resolution: Resolution = "half") -> JointImages:
+def in_engine(net: Joint, mosaic: Mosaic, precision: str = "f32", resolution: Resolution = "half") -> FrameImages:
     height, width = mosaic.data.shape
     engine = (FullEngine if resolution == "full" else OpenVinoEngine)(net, (height, width), precision)
     return engine.run(mosaic.data.numpy(), (mosaic.black_level, mosaic.white_level), mosaic.light_color)
 
 
-def assert_same(found: JointImages, expected: Separation, white: Separation, divided: float = 0.0) -> None:
+def assert_same(found: FrameImages, expected: Separation, white: Separation, divided: float = 0.0) -> None:
     """Images in the light, and polarization and tally in white light; images within ``divided``, if that is not 0."""
     for image, wanted in ((found.diffuse, expected.diffuse), (found.specular, expected.specular)):
         planes = torch.from_numpy(image).movedim(-1, 0)
@@ -179,7 +180,7 @@ def test_threads_and_frames_before_change_no_bit(kind: type[OpenVinoEngine]) -> 
     finally:
         set_threads(threads)
     for first, second in ((0, 2), (0, 3), (1, 4), (2, 5)):
-        for field in fields(JointImages):
+        for field in fields(FrameImages):
             one, other = (getattr(runs[k], field.name) for k in (first, second))
             assert one == other if field.name == "tally" else np.array_equal(one, other)
     assert not np.array_equal(runs[0].diffuse, runs[1].diffuse)
@@ -253,7 +254,7 @@ def test_angles_that_were_turned_back_stay_below_pi(turned: dict[str, bool]) -> 
     colors, one = np.zeros((2, 2, 3), np.float32), np.ones((2, 2), np.float32)
     for near in (0, np.pi / 2):
         aolp = np.nextafter(np.float32(near), np.float32(4)) * one
-        images = JointImages(colors, colors, one > 0, one, aolp, colors[..., :2], Tally())
+        images = FrameImages(colors, colors, one > 0, one, aolp, Tally(), colors[..., :2])
         found = joint_engine._turn_back(images, Orientation(4, 4, **turned), 1).aolp
         assert found.min() >= 0 and found.max() < np.pi
 
@@ -263,7 +264,7 @@ def test_threads_with_engines_of_their_own_find_the_same(shipped: None) -> None:
     sizes = [(32, 48), (48, 32), (32, 48), (32, 48)]
     frames = [random_frame(*size, COLOR, most) for size, most in zip(sizes, (4095, 4095, 2000, 1000), strict=True)]
 
-    def separate(frame: Mosaic) -> JointImages:
+    def separate(frame: Mosaic) -> FrameImages:
         with own_threads(1):
             found = run_engine("joint", "half", frame)
         assert found is not None
@@ -273,7 +274,7 @@ def test_threads_with_engines_of_their_own_find_the_same(shipped: None) -> None:
     with ThreadPoolExecutor(2) as pool:
         together = list(pool.map(separate, frames * 3))
     for found, expected in zip(together, alone * 3, strict=True):
-        for field in fields(JointImages):
+        for field in fields(FrameImages):
             one, other = (getattr(images, field.name) for images in (found, expected))
             assert one == other if field.name == "tally" else np.array_equal(one, other)
 

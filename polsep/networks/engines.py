@@ -20,11 +20,12 @@ import torch
 from numpy.typing import NDArray
 
 from polsep.networks.joint import PERIOD, Joint
-from polsep.networks.openvino_engine import Floats, FullEngine, JointImages, OpenVinoEngine
+from polsep.networks.openvino_engine import Floats, FullEngine, OpenVinoEngine
 from polsep.networks.run import MARGIN, Resolution, cut_rows, find_joint, own_order
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation, orient
 from polsep.separation.engine import make_ready
+from polsep.separation.images import FrameImages
 
 #: Engines that are kept at least, each with the memory that its frames need.
 KEPT = 2
@@ -107,7 +108,7 @@ def _warm_up_full() -> None:
     joint_details.warm_up()
 
 
-def run_engine(method: str, resolution: Resolution, mosaic: Mosaic) -> JointImages | None:
+def run_engine(method: str, resolution: Resolution, mosaic: Mosaic) -> FrameImages | None:
     """A method's images of one frame in its light, or None: batches, other devices, no OpenVINO.
 
     Frames in other orientations than the network's are turned before and after, as `networks.run.run_joint` does.
@@ -149,7 +150,7 @@ def _strips(size: tuple[int, int], grid: int) -> Iterator[_Strip]:
         yield _Strip((top, bottom), (first, last))
 
 
-def _run_strip(method: str, resolution: Resolution, mosaic: Mosaic, strip: _Strip) -> JointImages:
+def _run_strip(method: str, resolution: Resolution, mosaic: Mosaic, strip: _Strip) -> FrameImages:
     """Images of the rows that a strip keeps."""
     from polsep.kernels import get_threads
 
@@ -161,7 +162,7 @@ def _run_strip(method: str, resolution: Resolution, mosaic: Mosaic, strip: _Stri
         return engine.run(raw, levels, mosaic.light_color, kept)
 
 
-def _join(parts: list[JointImages]) -> JointImages:
+def _join(parts: list[FrameImages]) -> FrameImages:
     """Strips as one frame."""
     if len(parts) == 1:
         return parts[0]
@@ -170,10 +171,12 @@ def _join(parts: list[JointImages]) -> JointImages:
         return np.concatenate([getattr(part, name) for part in parts])
 
     diffuse, specular, valid, dolp, aolp, error = map(rows, ("diffuse", "specular", "valid", "dolp", "aolp", "error"))
-    return JointImages(diffuse, specular, valid, dolp, aolp, error, reduce(add, (part.tally for part in parts)))
+    return FrameImages(
+        diffuse, specular, valid, dolp, aolp, reduce(add, (part.tally for part in parts if part.tally)), error
+    )
 
 
-def _turn_back(images: JointImages, orientation: Orientation, scale: int) -> JointImages:
+def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> FrameImages:
     """Images of a turned frame, ``scale`` pixels along a cell's side, as those of the frame itself.
 
     The tally is of all that was seen.
@@ -185,13 +188,14 @@ def _turn_back(images: JointImages, orientation: Orientation, scale: int) -> Joi
         planes = orientation.turn_back(planes, scale)
         return np.ascontiguousarray((planes.movedim(0, -1) if planes.ndim == 3 else planes).numpy())
 
+    assert images.dolp is not None and images.aolp is not None and images.error is not None and images.tally is not None
     aolp, tally, mirrored = turn(images.aolp), images.tally, orientation.down != orientation.across
     if orientation.transposed:
         aolp, tally = _wrap(np.float32(np.pi / 2) - aolp), replace(tally, along=-tally.along)
     if mirrored:
         aolp, tally = _wrap(-aolp), replace(tally, across=-tally.across)
     diffuse, specular, error = (turn(image) for image in (images.diffuse, images.specular, images.error))
-    return JointImages(diffuse, specular, turn(images.valid), turn(images.dolp), aolp, error, tally)
+    return FrameImages(diffuse, specular, turn(images.valid), turn(images.dolp), aolp, tally, error)
 
 
 def _wrap(angle: Floats) -> Floats:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import sys
 import threading
 import warnings
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -24,7 +23,7 @@ from polsep.networks.details import HAAR
 from polsep.networks.joint import INPUTS, PERIOD, Joint, pool_outputs
 from polsep.physics.stokes import stokes_inverse
 from polsep.sensor.camera import Layout
-from polsep.separation.report import Tally
+from polsep.separation.images import FrameImages, Tally
 
 if TYPE_CHECKING:
     from polsep.demosaic.bilinear_kernel import Pattern
@@ -40,19 +39,6 @@ _ROWS = 16
 
 #: What `_model_of` has read.
 _MODELS: WeakKeyDictionary[nn.Module, dict[type[nn.Module], Any]] = WeakKeyDictionary()
-
-
-@dataclass(frozen=True)
-class JointImages:
-    """A separated frame, channels last, in its light; fields as in `report.SeparatedFrame`, and its ``tally``."""
-
-    diffuse: Floats
-    specular: Floats
-    valid: NDArray[np.bool_]
-    dolp: Floats
-    aolp: Floats
-    error: Floats
-    tally: Tally
 
 
 class Layers(nn.Module):
@@ -127,7 +113,7 @@ class OpenVinoEngine:
 
     def run(
         self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...], kept: slice = slice(None)
-    ) -> JointImages:
+    ) -> FrameImages:
         """Images of a frame ``[H, W]`` with black and white ``levels`` and a ``light`` of one gain per colour.
 
         ``kept``: rows of the images that are wanted, all others are left out, and do not count in the tally.
@@ -150,7 +136,7 @@ class OpenVinoEngine:
             self._write(Found(self._maps.base, self._maps.clipped, self._found[0], self._found[1]), gains, targets)
         targets = Targets._make(image[kept] for image in targets)
         diffuse, specular, error = (image.reshape(image.shape[0], w, -1) for image in targets[:3])
-        return JointImages(diffuse, specular, targets.valid, targets.dolp, targets.aolp, error, _tally(targets))
+        return FrameImages(diffuse, specular, targets.valid, targets.dolp, targets.aolp, _tally(targets), error)
 
     def _make_room(self, h: int, w: int, count: int) -> Seen:
         """For what the layers see, in their precision."""

@@ -30,37 +30,16 @@ from polsep.demosaic.bilinear_kernel import (
 from polsep.physics.stokes import stokes_inverse
 from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import RawFrame, Samples, as_samples
+from polsep.separation.images import FrameImages, Tally
 from polsep.separation.images_kernel import check_images, interleave_colors
 from polsep.separation.polarization_kernel import polarize
-from polsep.separation.report import Tally
 
 #: Least cell rows that a thread computes at a time: few enough to share the work, many enough to reuse loaded rows.
 STRIP = 32
 
 
-@dataclass(frozen=True)
-class AnalyticImages:
-    """The separated frame, channels last; also the room that a stream gives to be filled again and again.
-
-    ``diffuse``, ``specular``: float32 ``[h, w, C]``, ``valid``: bool ``[h, w]``, as in `Separation`. For a report,
-    else None: ``dolp`` and ``aolp`` [rad], float32 ``[h, w]``, and ``tally``, all of white light and the mean over
-    colours.
-    """
-
-    diffuse: NDArray[np.float32]
-    specular: NDArray[np.float32]
-    valid: NDArray[np.bool_]
-    dolp: NDArray[np.float32] | None = None
-    aolp: NDArray[np.float32] | None = None
-    tally: Tally | None = None
-
-    @classmethod
-    def empty(cls, shape: tuple[int, int], layout: Layout, report: bool = False) -> AnalyticImages:
-        """Room for mosaics of that ``shape`` (H, W); for a ``report`` also for DoLP and AoLP."""
-        h, w = ((n - start) // 2 for n, start in zip(shape, layout.origin, strict=True))
-        images = [np.empty((h, w, layout.channels), np.float32) for _ in range(2)]
-        angles = [np.empty((h, w), np.float32) for _ in range(2)] if report else [None, None]
-        return cls(images[0], images[1], np.empty((h, w), np.bool_), angles[0], angles[1])
+#: The images of a frame, as streams of this method name them.
+AnalyticImages = FrameImages
 
 
 @dataclass(frozen=True)
@@ -135,7 +114,7 @@ def _inverse(layout: Layout) -> NDArray[np.float32]:
 
 def _as_targets(out: AnalyticImages, shape: tuple[int, int, int], report: bool) -> _Targets:
     """The images of ``out``, checked. Raises ValueError on a wrong shape or dtype, gaps, or no room for a report."""
-    check_images({name: image for name, image in vars(out).items() if isinstance(image, np.ndarray)}, shape)
+    check_images(out.arrays(), shape)
     dolp = aolp = np.empty((0, 0), np.float32)
     if report:
         if out.dolp is None or out.aolp is None:

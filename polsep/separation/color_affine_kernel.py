@@ -32,10 +32,10 @@ from polsep.separation.clipped_kernel import (
     solve_pixels,
 )
 from polsep.separation.fill_kernel import halve_separation, halve_specular, interpolate_holes
+from polsep.separation.images import FrameImages, Tally
 from polsep.separation.images_kernel import check_images
 from polsep.separation.moments_kernel import Conversion
 from polsep.separation.polarization_kernel import polarize_pixels
-from polsep.separation.report import Tally
 from polsep.separation.strips_kernel import (
     SUMS,
     Frame,
@@ -53,28 +53,8 @@ MIN_ROWS = 64
 PIXELS = 1024
 
 
-@dataclass(frozen=True)
-class ColorAffineImages:
-    """The separated frame, channels last; also the room that a stream gives to be filled again and again.
-
-    ``diffuse``, ``specular``: float32 ``[h, w, 3]``, ``valid``: bool ``[h, w]``, as in `Separation`. For a report,
-    else None: ``dolp``, ``aolp``: float32 ``[h, w]``, of all colours together in white light, and ``tally``.
-    """
-
-    diffuse: NDArray[np.float32]
-    specular: NDArray[np.float32]
-    valid: NDArray[np.bool_]
-    dolp: NDArray[np.float32] | None = None
-    aolp: NDArray[np.float32] | None = None
-    tally: Tally | None = None
-
-    @classmethod
-    def empty(cls, shape: tuple[int, int], layout: Layout, report: bool = False) -> ColorAffineImages:
-        """Room for mosaics of that ``shape`` (H, W)."""
-        h, w = ((n - start) // 2 for n, start in zip(shape, layout.origin, strict=True))
-        diffuse, specular = (np.empty((h, w, 3), np.float32) for _ in range(2))
-        dolp, aolp = (np.empty((h, w), np.float32) if report else None for _ in range(2))
-        return cls(diffuse, specular, np.empty((h, w), np.bool_), dolp, aolp)
+#: The images of a frame, as streams of this method name them.
+ColorAffineImages = FrameImages
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,12 @@ import logging
 import threading
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import torch
 
 from polsep.demosaic.guided import MIN_CELLS
 from polsep.sensor.camera import Layout, Mosaic
-
-if TYPE_CHECKING:
-    from polsep.kernels import AnalyticImages, ColorAffineImages
+from polsep.separation.images import FrameImages
 
 #: Loading compiled code takes less than this many seconds, also on a busy machine; compiling it takes more.
 PATIENCE = 6.0
@@ -28,7 +25,7 @@ PATIENCE = 6.0
 _DTYPES = (torch.uint8, torch.uint16, torch.float32)
 
 
-def run_analytic(mosaic: Mosaic) -> AnalyticImages | None:
+def run_analytic(mosaic: Mosaic) -> FrameImages | None:
     """`kernels.separate_analytic_half` of one frame, in its light, for a report; None for batches and other devices."""
     if not _is_plain(mosaic):
         return None
@@ -36,7 +33,7 @@ def run_analytic(mosaic: Mosaic) -> AnalyticImages | None:
     return _run_analytic(mosaic)
 
 
-def run_color_affine(mosaic: Mosaic) -> ColorAffineImages | None:
+def run_color_affine(mosaic: Mosaic) -> FrameImages | None:
     """`kernels.separate_color_affine_half`, guided, as `run_analytic`; None also for mono and very small frames."""
     if not _is_plain(mosaic) or mosaic.layout.channels != 3 or min(_cells(mosaic)) < MIN_CELLS:
         return None
@@ -44,14 +41,14 @@ def run_color_affine(mosaic: Mosaic) -> ColorAffineImages | None:
     return _run_color_affine(mosaic)
 
 
-def _run_analytic(mosaic: Mosaic) -> AnalyticImages:
+def _run_analytic(mosaic: Mosaic) -> FrameImages:
     from polsep.kernels import AnalyticOptions, separate_analytic_half
 
     options = AnalyticOptions(mosaic.light_color, in_light=True, report=True)
     return separate_analytic_half(mosaic.data.numpy(), mosaic.layout, mosaic.black_level, mosaic.white_level, options)
 
 
-def _run_color_affine(mosaic: Mosaic) -> ColorAffineImages:
+def _run_color_affine(mosaic: Mosaic) -> FrameImages:
     from polsep.kernels import ColorAffineOptions, separate_color_affine_half
 
     options = ColorAffineOptions(mosaic.light_color, in_light=True, guided=True, report=True)

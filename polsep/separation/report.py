@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from polsep.physics.stokes import Stokes, dolp
 from polsep.separation.analytic import Separation, light_polarizer_angle
+from polsep.separation.images import Tally
 
 #: Below this concentration of AoLP there is no single polarized light. Real frames: 0.76 to 0.97 where one light or one
 #: reflecting surface polarizes, 0.31 to 0.50 in the open; test sets under one light, by `joint`: 0.57 to 0.99.
@@ -49,38 +50,6 @@ class SeparatedFrame:
     aolp: NDArray[np.float32]
     report: dict[str, Any]
     error: NDArray[np.float32] | None = None
-
-
-@dataclass(frozen=True)
-class Tally:
-    """Sums over the ``pixels`` of a frame or of a part of it; parts add.
-
-    ``clipped``, ``valid``, ``above_one``: pixels with a clipped sample, without an assumption, with DoLP above 1.
-    ``s0``, ``specular``: of the means over colours; s0 is diffuse + specular. ``power``, ``along``, ``across``: w |p|,
-    w p1 and w p2 for the specular light's polarization p = (p1, p2) and w, the specular light that polarization or, of
-    networks, the image says there is: highlights speak and noise does not.
-    ``residual``, ``noise``: of `Separation`'s, None where it has none. ``diffuse_variance``, ``specular_variance``: of
-    the squares of its ``expected_error``, None likewise.
-    """
-
-    pixels: int = 0
-    clipped: int = 0
-    valid: int = 0
-    above_one: int = 0
-    s0: float = 0.0
-    specular: float = 0.0
-    power: float = 0.0
-    along: float = 0.0
-    across: float = 0.0
-    residual: float | None = None
-    noise: float | None = None
-    diffuse_variance: float | None = None
-    specular_variance: float | None = None
-
-    def __add__(self, other: Tally) -> Tally:
-        """Sums over the pixels of both; a sum that one of them has not is the other's."""
-        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return Tally(*(theirs if mine is None else mine if theirs is None else mine + theirs for mine, theirs in pairs))
 
 
 def grey(stokes: Stokes) -> Stokes:

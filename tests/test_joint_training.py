@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,8 @@ from polsep.render.simulate import filter_light
 from polsep.sensor.camera import CLIP_MARGIN, IDEAL, IMX250, Layout, expose
 from polsep.train import command, loop
 from polsep.train import joint_task as module
-from polsep.train.command import JointOptions, digest_data, train_weights
+from polsep.train.command import JointOptions, train_weights
+from polsep.train.digest import digest_examples
 from polsep.train.joint_losses import (
     DATA_SCALE,
     MIN_ERROR,
@@ -457,7 +458,8 @@ def test_training_ends_in_weights_that_say_all(variant: str, tmp_path: Path, sho
     path = train_weights(options, run, lines.append)
     assert path.name == f"joint-fast-{variant}.safetensors"
     weights, metadata = read_weights(path)
-    known = {"method": "joint-fast", "ablation": "none", "variant": variant, "seed": "0", "data": digest_data(STREAM)}
+    data = digest_examples(asdict(STREAM), "polsep.train.stream")
+    known = {"method": "joint-fast", "ablation": "none", "variant": variant, "seed": "0", "data": data}
     assert known.items() <= metadata.items()
     colors = int(metadata["colors"])
     assert colors == VIEWS[variant][1]

@@ -9,7 +9,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ pytest.importorskip("tensorboard")
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import polsep
 from polsep import cli
 from polsep.io.store.checkpoints import read_checkpoint, read_lines, write_checkpoint, write_lines
 from polsep.io.store.weights import read_weights
@@ -33,15 +34,16 @@ from polsep.networks.paper import RUNGS
 from polsep.networks.shipped_paper import load_refinement
 from polsep.networks.unet import Size
 from polsep.physics.stokes import Stokes, measure
+from polsep.train import digest
 from polsep.train.command import (
     Options,
     TrainOptions,
     choose_options,
     describe_command,
-    digest_data,
     plan_run,
     train_weights,
 )
+from polsep.train.digest import digest_examples, find_sources
 from polsep.train.log import open_log, read_log
 from polsep.train.loop import Run, Schedule, train
 from polsep.train.losses import FIRST_WEIGHT, first_specular_loss
@@ -178,7 +180,7 @@ def test_weights_say_how_they_came_about(variant: str, tmp_path: Path) -> None:
     assert path.name == f"paper-{variant}.safetensors"
     metadata = read_weights(path)[1]
     assert metadata["colors"] == ("1" if variant == "mono" else "3")
-    assert metadata["data"] == digest_data(STREAM)
+    assert metadata["data"] == digest_examples(asdict(STREAM), "polsep.train.stream")
     last = [round(lines[-1][f"{image} PSNR"], 3) for image in ("diffuse", "specular")]
     assert json.loads(metadata["curve"]) == [[2, *last]]
     halves = json.loads(metadata["validation"])
@@ -195,10 +197,33 @@ def test_weights_say_how_they_came_about(variant: str, tmp_path: Path) -> None:
 
 
 def test_data_have_a_digest_of_their_options() -> None:
-    digests = [digest_data(stream) for stream in (STREAM, STREAM, replace(STREAM, seed=1), replace(STREAM, crop=64))]
+    streams = (STREAM, STREAM, replace(STREAM, seed=1), replace(STREAM, crop=64))
+    digests = [digest_examples(asdict(stream), "polsep.train.stream") for stream in streams]
     assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in digests)
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3
+
+
+def test_digests_cover_every_module_that_makes_examples() -> None:
+    """Optics, Stokes algebra, sensor and all of the renderer; of the package, nothing that only trains."""
+    drawn, separated = find_sources("polsep.train.stream"), find_sources("polsep.material.examples")
+    render = {f"polsep.render.{path.stem}" for path in Path(polsep.__file__).parent.glob("render/*.py")}
+    unused = {"polsep.render.__init__", "polsep.render.distances"}  # the demo's scenes
+    common = {"polsep.physics.optics", "polsep.physics.stokes", "polsep.sensor.camera"}
+    assert common | (render - unused) | {"polsep.train.variety"} <= set(drawn)
+    assert common | {"polsep.material.shots", "polsep.demosaic.guided"} <= set(separated)
+    assert not {name for name in drawn if name.startswith(("polsep.networks", "polsep.separation", "polsep.train.t"))}
+
+
+def test_digests_change_with_any_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A comment in `polsep.physics.optics` is enough; the names of modules do not count."""
+    before = digest_examples({}, "polsep.render.simulate")
+    sources = find_sources("polsep.render.simulate")
+    renamed = {f"other.{name}": source for name, source in sources.items()}
+    monkeypatch.setattr(digest, "find_sources", lambda _: renamed)
+    assert digest_examples({}, "polsep.render.simulate") == before
+    renamed["other.polsep.physics.optics"] += "# more\n"
+    assert digest_examples({}, "polsep.render.simulate") != before
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shlex
 from collections.abc import Callable
@@ -13,15 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from polsep.io.store.checkpoints import read_module
 from polsep.io.store.weights import write_weights
 from polsep.networks.joint import Demosaicker
 from polsep.networks.unet import ResidualSize, Size, count_parameters
+from polsep.train.digest import digest_examples
 from polsep.train.joint_task import ABLATIONS, DEMOSAICKERS, PARTS, SIZES, VIEWS, hold_others, joint_task
 from polsep.train.joint_views import JointSeen
 from polsep.train.log import curve_of, read_log, references_of
 from polsep.train.loop import Run, train
-from polsep.train.stream import StreamOptions
 from polsep.train.tasks import VARIANTS, Seen, Task, find, find_rung, ladder_task
 from polsep.train.validation import validate, validation_batches
 
@@ -29,25 +27,6 @@ from polsep.train.validation import validate, validation_batches
 SMALL = Size()
 #: Those without a scale of the loss, which checkpoints would have to hold.
 PRECISIONS = ("bf16-mixed", "32-true")
-#: The code that examples depend on.
-DATA_MODULES = (
-    "camera.py",
-    "kernels/patterns.py",
-    "kernels/raster.py",
-    "kernels/rays.py",
-    "kernels/relief.py",
-    "kernels/shading.py",
-    "kernels/shadows.py",
-    "materials.py",
-    "raycast.py",
-    "render.py",
-    "shapes.py",
-    "simulate.py",
-    "textures.py",
-    "train/stream.py",
-    "train/variety.py",
-    "views.py",
-)
 
 
 @dataclass(frozen=True)
@@ -143,7 +122,7 @@ def train_weights(options: Options, run: Run, report: Callable[[dict[str, Any]],
     training.
     """
     torch.manual_seed(options.seed)
-    data = digest_data(run.stream)
+    data = digest_examples(asdict(run.stream), "polsep.train.stream")
     path = run.out / f"{options.name}-{options.variant}.safetensors"
     trained = _train(options.task(), run, report)
     if trained is None:
@@ -179,14 +158,6 @@ def _train(
     halves = {name: value.cpu().half().float() for name, value in average.items()}
     scores = validate(anything, halves, [task.prepare(batch) for batch in validation_batches(run.stream)])
     return halves, scores, count_parameters(task.network)
-
-
-def digest_data(stream: StreamOptions) -> str:
-    """sha256 of what makes the examples: the options, and the code of every module that draws, renders or exposes."""
-    digest = hashlib.sha256(json.dumps(asdict(stream)).encode())
-    for name in DATA_MODULES:
-        digest.update(read_module(name))
-    return digest.hexdigest()
 
 
 def describe_command(options: Options, run: Run) -> str:

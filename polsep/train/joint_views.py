@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from polsep.sensor.camera import CLIP_MARGIN, Layout
-from polsep.train.stream import Examples
-from polsep.train.tasks import MONO, expose_mono, whole_cells
+from polsep.train.stream import MONO, Examples, expose_mono
+from polsep.train.tasks import whole_cells
 
 
 class JointSeen(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shlex
 from collections.abc import Callable
@@ -12,29 +11,16 @@ from typing import Any
 
 import torch
 
-from polsep.io.store.checkpoints import read_module
 from polsep.io.store.weights import write_weights
 from polsep.material.examples import make_examples
 from polsep.material.network import MaterialSize
 from polsep.networks.unet import count_parameters
 from polsep.train.command import check_run, describe_start
+from polsep.train.digest import digest_examples
 from polsep.train.log import read_log
 from polsep.train.loop import Run, Schedule, train_course
 from polsep.train.material_task import MaterialOptions, material_course
 
-#: The code that examples depend on, beside the weights of the method that separates them.
-DATA_MODULES = (
-    "camera.py",
-    "guided.py",
-    "material/procedural.py",
-    "material/shots.py",
-    "materials.py",
-    "optics.py",
-    "render.py",
-    "simulate.py",
-    "svbrdf.py",
-    "textures.py",
-)
 #: Steps of warm-up, and decay of the moving average: of shorter trainings than others.
 WARM_UP, AVERAGE = 50, 0.99
 
@@ -70,6 +56,7 @@ def train_material(options: MaterialOptions, run: Run, folder: Path, report: Cal
         return path
     halves = {name: value.cpu().half().float() for name, value in average.items()}
     course.network.cpu().load_state_dict(halves)
+    counts = [options.seed, options.examples, options.views, options.validation]
     metadata = {
         "method": "material",
         "input": options.input,
@@ -78,7 +65,7 @@ def train_material(options: MaterialOptions, run: Run, folder: Path, report: Cal
         "parameters": str(count_parameters(course.network)),
         "schedule": json.dumps(asdict(run.schedule)),
         "options": json.dumps(asdict(options)),
-        "data": digest_data(options),
+        "data": digest_examples(counts, "polsep.material.examples"),
         "steps": str(run.last),
         "command": describe_command(options, run),
         "validation": json.dumps(course.score(course.network)),
@@ -86,15 +73,6 @@ def train_material(options: MaterialOptions, run: Run, folder: Path, report: Cal
     }
     write_weights(path, halves, metadata)
     return path
-
-
-def digest_data(options: MaterialOptions) -> str:
-    """sha256 of what makes the examples: how many, and the code of every module that draws, renders or exposes."""
-    counts = [options.seed, options.examples, options.views, options.validation]
-    digest = hashlib.sha256(json.dumps(counts).encode())
-    for name in DATA_MODULES:
-        digest.update(read_module(name))
-    return digest.hexdigest()
 
 
 def describe_command(options: MaterialOptions, run: Run) -> str:

@@ -11,6 +11,7 @@ Conventions: images at raw resolution, linear, 1 = the white level of one measur
 from __future__ import annotations
 
 import hashlib
+import zlib
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -67,6 +68,8 @@ MAX_LIGHT = 2.0**14
 #: What examples show: all that `variety` has; or, as the paper's training data, smooth surfaces of usual gloss whose
 #: diffuse light is as polarized as Fresnel says, without what keeps the lamp's polarization.
 LOOK_KINDS = ("varied", "usual")
+#: Sony's order without colours.
+MONO = Layout(bayer=None)
 #: Analysers of the examples [rad].
 ANGLES = Layout().angles
 
@@ -327,6 +330,21 @@ def add_gaussian_noise(signal: Tensor, sensor: Sensor, generator: torch.Generato
     variance = signal.clamp(min=0) / sensor.full_well + (sensor.read_noise / sensor.full_well) ** 2
     noisy = (signal + variance.sqrt() * noise).clamp(0, 1)
     return torch.round(noisy * sensor.white_level) / sensor.white_level
+
+
+def expose_mono(examples: Examples) -> Examples:
+    """Examples as a camera without colour filters records their green light; one colour, single precision.
+
+    Their noise and sensors are drawn from a seed that the colour frames give, so a batch is always seen alike.
+    """
+    diffuse, specular, polarized = (x.float().cpu() for x in examples[1:4])
+    diffuse, polarized = diffuse[:, 1:2], polarized[:, 1::3]
+    signal = filter_light(Stokes(diffuse + specular, polarized[:, :1], polarized[:, 1:]), MONO, IMX250)
+    generator = torch.Generator().manual_seed(zlib.crc32(examples.raw.cpu().numpy().tobytes()))
+    raw = torch.stack([add_gaussian_noise(x, random_sensor(generator), generator) for x in signal])
+    device = examples.raw.device
+    raw, diffuse, specular, polarized = (x.to(device) for x in (raw, diffuse, specular, polarized))
+    return Examples(raw, diffuse, specular, polarized, examples.mask)
 
 
 def as_mosaic(raw: Tensor) -> Mosaic:

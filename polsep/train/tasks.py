@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -15,17 +14,13 @@ from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.networks.paper import RUNGS, Refinement, Rung, separate_refined
 from polsep.networks.unet import Size
 from polsep.physics.stokes import Measurements, Stokes, measure
-from polsep.render.simulate import filter_light
-from polsep.sensor.camera import IMX250, Layout, Mosaic
+from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import Separation
 from polsep.train.losses import diffuse_loss, first_specular_loss, specular_loss
-from polsep.train.stream import ANGLES, Examples, StreamOptions, add_gaussian_noise, as_mosaic
-from polsep.train.variety import random_sensor
+from polsep.train.stream import ANGLES, MONO, Examples, StreamOptions, as_mosaic, expose_mono
 
 #: The share of a training for which `losses.first_specular_loss` stands in for Eq. 21 on rungs without a first guess.
 FIRST_SHARE = 1 / 8
-#: Sony's order without colours.
-MONO = Layout(bayer=None)
 
 #: Co-registered analysers, true diffuse and specular ``[B, C, h, w]`` and the mask ``[B, h, w]`` of a batch.
 Seen = tuple[Measurements, Tensor, Tensor, Tensor]
@@ -80,21 +75,6 @@ def see_mono(examples: Examples) -> Seen:
     view = expose_mono(examples)
     diffuse, specular = (avg_pool2d(x, 2) for x in (view.diffuse, view.specular))
     return demosaic_bilinear_half(Mosaic(view.raw, MONO, 0.0, 1.0)), diffuse, specular, whole_cells(view.mask)
-
-
-def expose_mono(examples: Examples) -> Examples:
-    """Examples as a camera without colour filters records their green light; one colour, single precision.
-
-    Their noise and sensors are drawn from a seed that the colour frames give, so a batch is always seen alike.
-    """
-    diffuse, specular, polarized = (x.float().cpu() for x in examples[1:4])
-    diffuse, polarized = diffuse[:, 1:2], polarized[:, 1::3]
-    signal = filter_light(Stokes(diffuse + specular, polarized[:, :1], polarized[:, 1:]), MONO, IMX250)
-    generator = torch.Generator().manual_seed(zlib.crc32(examples.raw.cpu().numpy().tobytes()))
-    raw = torch.stack([add_gaussian_noise(x, random_sensor(generator), generator) for x in signal])
-    device = examples.raw.device
-    raw, diffuse, specular, polarized = (x.to(device) for x in (raw, diffuse, specular, polarized))
-    return Examples(raw, diffuse, specular, polarized, examples.mask)
 
 
 def whole_cells(mask: Tensor) -> Tensor:

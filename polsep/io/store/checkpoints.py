@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +49,3 @@ def read_lines(path: Path) -> list[str]:
 def write_lines(path: Path, lines: list[str]) -> None:
     """Replace a log as a whole."""
     replace_text(path, "".join(line + "\n" for line in lines))
-
-
-def read_module(name: str) -> bytes:
-    """The source of a module of the installed package, by its path there: part of what a training depends on."""
-    return files("polsep").joinpath(name).read_bytes()

@@ -1,1 +1,8 @@
 """The laboratory: the paper's tables, the test sets, galleries and peers, from a checkout of the repository."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+#: Weights of networks that are measured here alone, and so are not in the package.
+WEIGHTS = Path(__file__).parent / "weights"

@@ -1,6 +1,6 @@
 """What each idea of the joint network is worth: networks of one size and one training that go without one of them.
 
-Their weights are those of ``polsep train joint-fast --ablation NAME``, shipped in ``polsep/weights/ablations``: from
+Their weights are those of ``polsep train joint-fast --ablation NAME``, in ``evaluation/weights/ablations``: from
 one seed, on the same examples, for as many steps. "none" goes without nothing.
 """
 
@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from importlib.resources import files
 from pathlib import Path
 
 import torch
 
+from evaluation import WEIGHTS
 from evaluation.scoring import Entry, Protocol, score_sets, see_noisy
 from evaluation.sets import load_sets
 from polsep.bench.rows import Row
@@ -28,8 +28,8 @@ TABLED = ("diffuse PSNR", "specular PSNR", "diffuse PSNR, highlights", "specular
 
 def find_ablations() -> dict[str, Path]:
     """Files of weights by what their network goes without; "none" first."""
-    folder = Path(str(files("polsep") / "weights" / "ablations"))
-    found = {read_weights(path)[1]["ablation"]: path for path in sorted(folder.glob("*.safetensors"))}
+    paths = sorted((WEIGHTS / "ablations").glob("*.safetensors"))
+    found = {read_weights(path)[1]["ablation"]: path for path in paths}
     return {name: found[name] for name in sorted(found, key=lambda name: (name != "none", name))}
 
 

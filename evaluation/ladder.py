@@ -1,7 +1,7 @@
 """The ladder of the paper's Tables 2 and 3 as entries: formulas, networks by what they see, and what each costs.
 
-All rungs have networks of one size, trained on the same data for as many steps; their weights are shipped as
-``polsep/weights/ladder/RUNG-VARIANT``. A rung without weights is left out, which one line on stderr says.
+All rungs have networks of one size, trained on the same data for as many steps; their weights are
+``evaluation/weights/ladder/RUNG-VARIANT``. A rung without weights is left out, which one line on stderr says.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from pathlib import Path
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from evaluation import WEIGHTS
 from evaluation.scoring import Entry
 from polsep.bench.rows import Row
 from polsep.demosaic.bilinear import demosaic_bilinear_half
-from polsep.io.store.weights import read_weights, shipped_weights
+from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
 from polsep.methods import METHODS, compose
 from polsep.networks.paper import RUNGS, Refinement, separate_refined
 from polsep.networks.shipped_paper import PAPER, load_refinement
@@ -48,9 +49,9 @@ class Weights:
 
 
 def find_ladder(variant: str, rungs: Iterable[str]) -> Iterator[Weights]:
-    """Shipped weights of ``rungs`` for data of a ``variant``; of mosaics, and named so, where a rung has no others."""
+    """Weights of ``rungs`` for data of a ``variant``; of mosaics, and named so, where a rung has no others."""
     for rung in rungs:
-        own, other = (find_weights(f"ladder/{rung}-{of}") for of in (variant, MOSAIC))
+        own, other = (find_weights(rung, of) for of in (variant, MOSAIC))
         if own is not None:
             yield Weights(rung, rung, own)
         elif other is not None:
@@ -59,12 +60,10 @@ def find_ladder(variant: str, rungs: Iterable[str]) -> Iterator[Weights]:
             print(f"polsep: the rung {rung} is left out: no weights ladder/{rung}-{variant}", file=sys.stderr)
 
 
-def find_weights(name: str) -> Path | None:
-    """Where shipped weights lie; None when there are none of that name."""
-    try:
-        return shipped_weights(name)
-    except ValueError:
-        return None
+def find_weights(rung: str, variant: str) -> Path | None:
+    """The file of a rung's weights; None when there is none."""
+    path = WEIGHTS / "ladder" / f"{rung}-{variant}.safetensors"
+    return path if path.is_file() else None
 
 
 @lru_cache(maxsize=3)
@@ -78,9 +77,8 @@ def ladder_entries(variant: str, rungs: tuple[str, ...] = tuple(RUNGS)) -> tuple
         Entry("min and max", compose(demosaic_bilinear_half, separate_extremes)),
         *(network_entry(weights) for weights in find_ladder(variant, rungs)),
     ]
-    shipped = find_weights(PAPER)
-    if shipped is not None:
-        entries.append(network_entry(Weights("paper", SHIPPED, shipped)))
+    if is_shipped(PAPER):
+        entries.append(network_entry(Weights("paper", SHIPPED, shipped_weights(PAPER))))
     own = METHODS["color-affine"]
     if variant == MOSAIC:
         entries.append(Entry("color-affine, bilinear", compose(demosaic_bilinear_half, separate_color_affine)))
@@ -114,7 +112,7 @@ def read_curves() -> dict[str, Curve]:
     curves: dict[str, Curve] = {}
     references: dict[str, list[float]] = {}
     for rung in RUNGS:
-        path = find_weights(f"ladder/{rung}-{MOSAIC}")
+        path = find_weights(rung, MOSAIC)
         metadata = read_weights(path)[1] if path is not None else {}
         points = json.loads(metadata.get("curve", "[]"))
         if points:

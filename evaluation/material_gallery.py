@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from evaluation.figures import Panel, Pixels, draw_grid, tone
-from evaluation.material import novel_lights, see_under
+from evaluation.material import load_estimators, novel_lights, see_under
 from polsep.bench.rows import Row
 from polsep.io.store.pictures import write_picture
-from polsep.material.estimate import load_estimator, shipped_inputs
 from polsep.material.shots import INPUTS, Example, random_example
 from polsep.material.svbrdf import Svbrdf, unstack
 
@@ -38,9 +37,9 @@ def draw_example(example: Example) -> Pixels:
     """A row for the truth and for each input: what the network saw, what it found, and that under another light."""
     views = example.views.float()
     shown = [_row("truth", views[0, INPUTS["unseparated"]], unstack(example.maps.float()))]
-    for name in shipped_inputs():
+    for name, estimator in load_estimators().items():
         part = INPUTS[name]
-        found = load_estimator(name).estimate(views[:VIEWS, part])
+        found = estimator.estimate(views[:VIEWS, part])
         shown.append(_row(name, views[0, part], found))
     return draw_grid(shown, "Maps of a held-out procedural material from one photograph")
 

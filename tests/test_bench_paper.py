@@ -76,16 +76,12 @@ def write_rung(folder: Path, rung: str, variant: str) -> None:
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder of weights in place of the shipped ones: two rungs of mosaics, one of them of co-sited data too."""
     folder = tmp_path / "weights"
+    monkeypatch.setattr(ladder, "WEIGHTS", folder)
     for rung, variant in (("paper", MOSAIC), ("paper", CO_SITED), ("stokes", MOSAIC)):
         write_rung(folder, rung, variant)
 
-    def find(name: str) -> Path:
-        path = folder / f"{name}.safetensors"
-        if not path.exists():
-            raise ValueError("none")
-        return path
-
-    monkeypatch.setattr(ladder, "shipped_weights", find)
+    monkeypatch.setattr(ladder, "shipped_weights", lambda name: folder / f"{name}.safetensors")
+    monkeypatch.setattr(ladder, "is_shipped", lambda name: (folder / f"{name}.safetensors").is_file())
     ladder_entries.cache_clear()
     yield folder
     ladder_entries.cache_clear()

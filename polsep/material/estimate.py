@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
+from polsep.io.store.weights import read_weights, shipped_weights
 from polsep.material.network import MaterialNetwork, MaterialSize
 from polsep.material.shots import INPUTS
 from polsep.material.svbrdf import Svbrdf, unstack
@@ -33,16 +33,6 @@ class Estimator:
             return unstack(self.network(views[None].float())[0])
 
 
-def weights_name(name: str) -> str:
-    """The name of the shipped weights for that input."""
-    return f"material/{name}"
-
-
-def shipped_inputs() -> tuple[str, ...]:
-    """The inputs whose weights are installed."""
-    return tuple(name for name in INPUTS if is_shipped(weights_name(name)))
-
-
 def load_estimator(name: str = "separated", path: Path | None = None) -> Estimator:
     """The shipped network for an input, or the one in a file of `polsep train material`.
 
@@ -50,7 +40,7 @@ def load_estimator(name: str = "separated", path: Path | None = None) -> Estimat
     """
     if path is None and name not in INPUTS:
         raise ValueError(f"expected an input of {', '.join(INPUTS)}, found {name!r}")
-    source = shipped_weights(weights_name(name)) if path is None else path
+    source = shipped_weights(f"material/{name}") if path is None else path
     tensors, metadata = read_weights(source)
     if metadata["method"] != "material":
         raise ValueError(f"expected weights of a network for materials in {source}, found {metadata['method']!r}")

@@ -1,8 +1,8 @@
 """Fixed test sets of known truth: random objects, statues and scans, and crossed-polarizer photographs.
 
 A set is a tuple of `Recipe`; `build_cases` makes its scenes one by one. Every scene's inputs and outputs are recorded
-in `expected`, and `version_of` is a sha256 over these records, so that nobody changes a test set unknowingly. No network
-is trained on them; docs/testsets.md lists the choices that were made by their scores. Needs the extra ``render``.
+in `expected`, and `version_of` is a sha256 over these records, so that nobody changes a test set unknowingly. No
+network is trained on them; docs/testsets.md lists the choices made by their scores. Needs the extra ``render``.
 """
 
 from __future__ import annotations

@@ -17,7 +17,9 @@ from polsep.io.store.whole import replace_text
 
 #: A table in a Markdown file stands between these two comments.
 _TABLE = re.compile(
-    r"(<!-- table: (?P<name>\w+)(?P<part>/\w+)?(?P<turned> by method)? -->\n).*?(<!-- end -->)", re.DOTALL
+    r"(<!-- table: (?P<name>\w+)(?P<part>/\w+)?( only (?P<metric>\w+))?(?P<turned> by method)? -->\n)"
+    r".*?(?P<end><!-- end -->)",
+    re.DOTALL,
 )
 
 
@@ -66,16 +68,19 @@ def read_peak_memory() -> float:
 def fill_tables(markdown: str, results: Path) -> str:
     """The Markdown text with every table between its comments made anew from ``results``/NAME.jsonl.
 
-    ``table: NAME/PART`` takes the rows whose bench is NAME/PART alone, ``by method`` turns the table. A table without
-    results yet says what makes them.
+    ``table: NAME/PART`` selects the rows of bench NAME/PART, ``only PSNR`` those whose metric is PSNR, alone or of an
+    output ("diffuse PSNR"), and ``by method`` turns the table. A table without results yet names the command that
+    measures them.
     """
 
     def table(match: re.Match[str]) -> str:
         path, bench = results / f"{match['name']}.jsonl", f"{match['name']}{match['part'] or ''}"
         rows = [row for row in read_rows(path) if row["bench"] == bench] if path.is_file() else []
+        if metric := match["metric"]:
+            rows = [row for row in rows if row["metric"] in (metric, f"diffuse {metric}", f"specular {metric}")]
         if not rows:
-            return f"{match[1]}Not measured yet: `polsep bench {match['name']}`.\n{match[5]}"
-        return match[1] + (method_table(rows) if match["turned"] else markdown_table(rows)) + match[5]
+            return f"{match[1]}Not measured yet: `polsep bench {match['name']}`.\n{match['end']}"
+        return match[1] + (method_table(rows) if match["turned"] else markdown_table(rows)) + match["end"]
 
     return _TABLE.sub(table, markdown)
 

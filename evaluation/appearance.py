@@ -40,7 +40,7 @@ from polsep.edit import (
 from polsep.edit.images import Maps
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.results.previews import exposure_of, toned
-from polsep.io.store.pictures import write_picture
+from polsep.io.store.image_codecs import write_jpeg
 from polsep.methods import Capture
 from polsep.metrics import psnr
 from polsep.pipeline import separate_capture
@@ -259,7 +259,7 @@ def draw_gallery(_rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Pat
 
 
 def _written(path: Path, pixels: Pixels) -> Path:
-    write_picture(path, pixels)
+    write_jpeg(path, pixels)
     return path
 
 

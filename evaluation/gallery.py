@@ -44,7 +44,7 @@ from polsep.bench.rows import Row
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.results.previews import exposure_of
-from polsep.io.store.pictures import write_picture
+from polsep.io.store.image_codecs import write_jpeg
 from polsep.metrics import psnr
 from polsep.physics.stokes import Measurements, fit_stokes
 from polsep.sensor.camera import Layout, Mosaic
@@ -97,7 +97,7 @@ def draw_paper(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
             print(f"polsep: the picture {name} is left out: nothing to show in it", file=sys.stderr)
             continue
         path = folder / f"{name}.jpg"
-        write_picture(path, pixels)
+        write_jpeg(path, pixels)
         yield path
 
 

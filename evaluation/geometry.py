@@ -7,7 +7,7 @@ from pathlib import Path
 
 from evaluation.figures import require_matplotlib
 from polsep.bench.rows import Row
-from polsep.io.store.pictures import write_picture
+from polsep.io.store.image_codecs import write_jpeg
 
 #: Objects of the quick version.
 QUICK = ("bear", "reading", "cow", "spot", "fish", "PowerDrill")
@@ -33,7 +33,7 @@ def draw_geometry(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Pat
 
     for number, subject in enumerate(load_subjects(data, SHOWN)):
         path = folder / f"{subject.name}.jpg"
-        write_picture(path, draw_subject(subject, number))
+        write_jpeg(path, draw_subject(subject, number))
         yield path
 
 

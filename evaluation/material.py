@@ -19,7 +19,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from evaluation import WEIGHTS
 from polsep.bench.rows import Row
-from polsep.io.assets.svbrdf import find_panels, read_panels
+from polsep.io.assets.materials import find_panels, read_panels
 from polsep.material.estimate import Estimator, load_estimator
 from polsep.material.shots import CAMERA_HEIGHT, INPUTS, MAP_SIZE, Example, make_example, random_example
 from polsep.material.svbrdf import Svbrdf, plane_points, relight, unstack

@@ -12,7 +12,7 @@ from torch import Tensor
 from evaluation.figures import Panel, Pixels, draw_grid, tone
 from evaluation.material import load_estimators, novel_lights, see_under
 from polsep.bench.rows import Row
-from polsep.io.store.pictures import write_picture
+from polsep.io.store.image_codecs import write_jpeg
 from polsep.material.shots import INPUTS, Example, random_example
 from polsep.material.svbrdf import Svbrdf, unstack
 
@@ -29,7 +29,7 @@ def draw_material(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Pat
     del rows, data
     for number in SHOWN:
         path = folder / f"material-{number}.jpg"
-        write_picture(path, draw_example(random_example("test", 0, number, VIEWS)))
+        write_jpeg(path, draw_example(random_example("test", 0, number, VIEWS)))
         yield path
 
 

@@ -45,7 +45,7 @@ KINDS = {
 def bench_video(_data: Path | None = None) -> Iterator[Row]:
     """1000 frames of 2448x2048 by joint-fast, 60 by joint and in other formats: rates against the method alone, memory.
 
-    The recording is a headless BayerRG12p stream in a folder for temporary files; 23 GB of it are needed.
+    The recording is a headerless BayerRG12p stream in a folder for temporary files; 23 GB of it are needed.
     """
     yield from measure_recordings(LONG, SHORT)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import imagecodecs
 
 import polsep
-from polsep.io.results.outputs import write_separation
+from polsep.io.results.separation_writer import write_separation
 
 path = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(polsep.__file__).parent / "data" / "still_life.png"
 raw = imagecodecs.imread(path)  # uint16 [2048, 2448], 12-bit values

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames
-from polsep.io.results.outputs import OutputError, planned_outputs, refuse_targets, write_separation
+from polsep.io.results.separation_writer import planned_outputs, write_separation
+from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.pipeline import LightColor, separate_capture
 
 
@@ -30,7 +31,7 @@ class SeparateOptions:
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """Where and how results are written; ``format`` is one of `io.outputs.FORMATS`."""
+    """Where and how results are written; ``format`` is one of `io.results.separation_writer.FORMATS`."""
 
     directory: Path = Path("polsep-out")
     format: str = "exr"
@@ -65,7 +66,7 @@ def separate_files(
                 outputs = planned_outputs(write.directory, frame.stem, write.format)
                 if clash := sorted({realpath(output) for output in outputs} & taken.keys()):
                     raise OutputError(f"{path}: expected outputs of its own, found that {clash[0]} {taken[clash[0]]}")
-                refuse_targets(write.directory, outputs, write.overwrite)
+                refuse_existing(write.directory, outputs, write.overwrite)
                 outcome = _separate_frame(path, frame, read, options, write)
                 taken |= {realpath(output): f"is of {path}" for output in outcome.written}
                 yield outcome

@@ -204,8 +204,8 @@ FILES: list[tuple[str, bytes, dict[str, Any], str]] = [
     ("half.pgm", b"P5 4 4 255\n" + bytes(9), {}, "expected 16 bytes for 4x4 of maxval 255, found 9"),
     ("huge.pgm", b"P5 999999999 999999999 255\n", {}, "expected at most"),
     ("maxval.pgm", b"P5 4 4 70000\n" + bytes(32), {}, "found 70000"),
-    # headless raw
-    ("nothing.raw", bytes(4608), {}, "expected the size and pixel format of headless raw"),
+    # headerless raw
+    ("nothing.raw", bytes(4608), {}, "expected the size and pixel format of headerless raw"),
     ("nosize.raw", bytes(4608), {"pixel_format": "Mono12p"}, "found only the pixel format"),
     ("noformat.bin", bytes(4608), {"size": (64, 48)}, "found only the size"),
     ("half.raw", bytes(4607), RAW, "frames of 4608 bytes (64x48 Mono12p), found 4607 bytes"),

@@ -49,7 +49,7 @@ from evaluation.paper import QUICK, Extent, measure_paper, table_rows
 from evaluation.testsets import Recipe
 from polsep.bench.rows import Row
 from polsep.cli import app
-from polsep.io.store.pictures import write_picture
+from polsep.io.store.image_codecs import write_jpeg
 from polsep.io.store.rows import fill_tables, read_rows
 from polsep.io.store.weights import write_weights
 from polsep.networks.paper import RUNGS, Refinement
@@ -290,7 +290,7 @@ def test_grids_and_plots_have_the_size_that_they_say() -> None:
 
 def test_pictures_are_refused_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"expected pixels uint8 \[h, w, 3\], found float64 \(4, 4\)"):
-        write_picture(tmp_path / "x.jpg", np.zeros((4, 4)))  # type: ignore[arg-type]
+        write_jpeg(tmp_path / "x.jpg", np.zeros((4, 4)))  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
 
 

@@ -42,11 +42,11 @@ from polsep.capture.sources import (
     FrameIds,
     Loss,
 )
-from polsep.io.raw.footage import open_footage
 from polsep.io.raw.frames import Frame, ReadOptions, read_frames
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.raw.recording import INDEX, RAW, RECORD, Header, RawImage, RecordingWriter, read_images
-from polsep.io.results.outputs import OutputError
+from polsep.io.raw.sequences import open_sequence
+from polsep.io.store.atomic import OutputError
 from polsep.io.store.errors import InputError
 from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout
@@ -332,7 +332,7 @@ def test_a_recording_cut_anywhere_is_read_to_its_last_whole_frame(
 def test_a_recording_can_be_begun_anywhere(recording: Path) -> None:
     frames = list(read_frames(recording / RECORD, first=3))
     assert [(f.index, f.count, f.stem) for f in frames] == [(3, 5, "take_0003"), (4, 5, "take_0004")]
-    footage = open_footage(recording, ReadOptions())
+    footage = open_sequence(recording, ReadOptions())
     assert (footage.stem, footage.count) == ("take", 5)
     later = next(footage.begin(4))
     assert isinstance(later, Frame) and torch.equal(later.data.data, torch.from_numpy(codes(4)).float())

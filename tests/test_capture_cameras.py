@@ -30,7 +30,7 @@ from polsep.io.raw.frames import read_frames
 from polsep.io.raw.genicam import pack_frame, unpack_frame
 from polsep.io.raw.recording import RECORD, read_images
 from polsep.io.results.previews import live_sheet
-from polsep.io.store.pictures import encode_picture
+from polsep.io.store.image_codecs import encode_jpeg
 from polsep.pipeline import separate_capture
 
 TESTS = Path(__file__).parent
@@ -100,7 +100,7 @@ def test_a_gige_camera_from_end_to_end(tmp_path: Path, alone: list[str]) -> None
     assert watched["changes"] >= max(1, int(float(seconds) / 5)) and watched["partial"] == 0
     pictures = []
     for _, frame in zip(range(2), read_frames(tmp_path / "steady" / RECORD), strict=False):
-        pictures.append(encode_picture(live_sheet(separate_capture(frame.data, "analytic"))))
+        pictures.append(encode_jpeg(live_sheet(separate_capture(frame.data, "analytic"))))
     assert (tmp_path / "steady" / "live.jpg").read_bytes() in pictures
     print(json.dumps({"steady": steady["counters"], "slow": slow["counters"], **watched}))
     for name in ("steady", "slow"):

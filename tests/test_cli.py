@@ -27,7 +27,7 @@ from test_bad_input import FILES
 from polsep import cli
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.outputs import FORMATS, LAYERS
+from polsep.io.results.separation_writer import FORMATS, LAYERS
 from polsep.methods import BEST, METHODS
 from polsep.networks.run import NAMES
 from polsep.physics.stokes import Stokes
@@ -205,7 +205,7 @@ def test_four_angle_images(tmp_path: Path, polsep: Cli) -> None:
         assert np.abs(one[layer].astype(float) - other[layer]).max() == 0
 
 
-def test_headless_raw_is_the_png(tmp_path: Path, polsep: Cli) -> None:
+def test_headerless_raw_is_the_png(tmp_path: Path, polsep: Cli) -> None:
     """A packed dump of the codes of a PNG gives the same images."""
     codes = frame() >> 4
     png(tmp_path / "a.png", codes)

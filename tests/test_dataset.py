@@ -40,7 +40,7 @@ from polsep.io.results.dataset import (
     read_view,
     view_stem,
 )
-from polsep.io.results.outputs import OutputError
+from polsep.io.store.atomic import OutputError
 from polsep.physics.optics import dot
 from polsep.render.raycast import MeshScene, find_hits
 from polsep.render.simulate import Capture, filter_light

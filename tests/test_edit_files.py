@@ -25,12 +25,13 @@ from test_edit import only, random_images, sphere
 from polsep import cli
 from polsep.edit import EDITS, Metallic, Recipe, Rougher, SeparatedImages, Sharper, SpecularGain, Texture, apply
 from polsep.edit.files import EditTarget, Work, edit_sequence, load_work, read_recipe
-from polsep.io.assets.maps import linear_from_srgb, read_map
+from polsep.io.assets.maps import read_map
 from polsep.io.results.exr import encode_exr, read_exr_layers
-from polsep.io.results.outputs import OutputError, write_separation
-from polsep.io.results.previews import srgb
-from polsep.io.results.separated import find_numbered, read_separated
+from polsep.io.results.previews import linear_from_srgb, srgb
+from polsep.io.results.separation_reader import find_numbered, read_separated
+from polsep.io.results.separation_writer import write_separation
 from polsep.io.results.sequences import PART, Picture, SequenceKind, write_exr
+from polsep.io.store.atomic import OutputError
 from polsep.io.store.errors import InputError
 from polsep.separation.report import SeparatedFrame
 

@@ -153,7 +153,7 @@ def test_damage_in_a_later_page_comes_after_the_good_ones(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", PIXEL_FORMATS)
-def test_headless_frames_of_every_format(tmp_path: Path, name: str) -> None:
+def test_headerless_frames_of_every_format(tmp_path: Path, name: str) -> None:
     fmt = PIXEL_FORMATS[name]
     layout = Layout(bayer=fmt.bayer)
     mosaics = [random_codes("uint16", (8 + 2 * k, 16), top=2**fmt.bits - 1)[:8] for k in range(2)]

@@ -1,4 +1,4 @@
-"""Laws of headless pixel formats: known bytes, round trips of every format, and refusals."""
+"""Laws of headerless pixel formats: known bytes, round trips of every format, and refusals."""
 
 from __future__ import annotations
 

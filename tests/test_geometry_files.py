@@ -24,10 +24,11 @@ from test_geometry import SIX, cap, dielectric, slope_of
 from polsep.geometry.integration import integrate_bilateral
 from polsep.geometry.photometric import Appearance
 from polsep.geometry.surface import draw_views, relight, span_surface
-from polsep.io.assets.meshes import encode_glb, encode_ply
+from polsep.io.assets.shapes import encode_glb, encode_ply
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.outputs import encode_png, write_separation
 from polsep.io.results.previews import srgb
+from polsep.io.results.separation_writer import write_separation
+from polsep.io.store.image_codecs import encode_png
 from polsep.separation.report import SeparatedFrame
 
 Cli = Callable[..., Run]

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from evaluation.material import novel_lights, score_failure, score_maps, score_relit
 from polsep.cli.app import main
-from polsep.io.assets.gltf import DIELECTRIC, encode_glb, encode_materialx, specular_scale, texture_pixels
+from polsep.io.assets.materials import DIELECTRIC, encode_glb, encode_materialx, specular_scale, texture_pixels
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
 from polsep.io.store.weights import write_weights

@@ -21,9 +21,10 @@ import OpenEXR
 import pytest
 import tifffile
 
-from polsep.io.results import outputs
+from polsep.io.results import separation_writer
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.outputs import FORMATS, UNITS, OutputError, planned_outputs, write_separation
+from polsep.io.results.separation_writer import FORMATS, UNITS, planned_outputs, write_separation
+from polsep.io.store.atomic import OutputError
 from polsep.io.store.errors import InputError
 from polsep.separation.report import SeparatedFrame
 
@@ -273,7 +274,7 @@ def test_writing_twice_gives_the_same_bytes_and_needs_overwrite(tmp_path: Path) 
 
 def test_an_existing_output_is_refused_by_name_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "shot.png").write_text("a picture of mine")
-    monkeypatch.setattr(outputs, "_encode_exr", lambda frame: pytest.fail("worked before looking"))
+    monkeypatch.setattr(separation_writer, "_encode_exr", lambda frame: pytest.fail("worked before looking"))
     with pytest.raises(OutputError, match=r"shot\.png.*--overwrite"):
         write_separation(random_frame(), tmp_path, "shot")
     assert contents(tmp_path) == {"shot.png": b"a picture of mine"}
@@ -357,7 +358,7 @@ def test_a_failing_encoder_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Mo
     def fail(frame: object) -> np.ndarray:
         raise RuntimeError("out of\npaint")
 
-    monkeypatch.setattr(outputs, "contact_sheet", fail)  # the last image of every format
+    monkeypatch.setattr(separation_writer, "contact_sheet", fail)  # the last image of every format
     with pytest.raises(OutputError, match="RuntimeError: out of paint") as caught:
         write_separation(random_frame(), tmp_path / "new", "shot", format)
     assert "\n" not in str(caught.value)
@@ -412,14 +413,15 @@ INTERRUPTED = """
 import signal, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from test_outputs import outputs, random_frame, write_separation
-move = outputs._move_into_place
+from test_outputs import random_frame, write_separation
+from polsep.io.store import atomic
+move = atomic._move_into_place
 def interrupted(*arguments):
     signal.raise_signal(signal.SIGINT)
     if "fail" in sys.argv:
         raise OSError("no room")
     move(*arguments)
-outputs._move_into_place = interrupted
+atomic._move_into_place = interrupted
 if "default" in sys.argv:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 before = signal.getsignal(signal.SIGINT)

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
 from polsep import cli
-from polsep.io.raw.footage import Damaged, natural_order, open_footage
 from polsep.io.raw.frames import Frame, ReadOptions
+from polsep.io.raw.sequences import DamagedFrame, natural_order, open_sequence
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.outputs import OutputError
 from polsep.io.results.sequences import FILM_WHITE, PART, Picture, Sequence, SequenceKind, write_exr
+from polsep.io.store.atomic import OutputError
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
 from polsep.sensor.camera import IDEAL, Layout, expose
@@ -226,7 +226,7 @@ def test_a_recording_goes_on_from_any_frame(recording: Path, tmp_path: Path) -> 
     write_film(tmp_path / "a.mkv", images)
     write_folder(tmp_path / "a", images)
     for path in (tmp_path / "a.npy", tmp_path / "a.tiff", tmp_path / "a.mkv", tmp_path / "a"):
-        footage = open_footage(path, ReadOptions(white_level=WHITE))
+        footage = open_sequence(path, ReadOptions(white_level=WHITE))
         for first in (0, 1, PART, FRAMES - 1, FRAMES):
             seen = list(footage.begin(first))
             assert [frame.index for frame in seen] == list(range(first, FRAMES))
@@ -334,8 +334,8 @@ def test_damage_in_the_middle_of_a_film_costs_its_frame_only(tmp_path: Path) -> 
     middle = len(data) // 2
     data[middle : middle + 8] = bytes(255 - b for b in data[middle : middle + 8])
     path.write_bytes(data)
-    seen = list(open_footage(path, ReadOptions()).begin(0))
-    damaged = [frame for frame in seen if isinstance(frame, Damaged)]
+    seen = list(open_sequence(path, ReadOptions()).begin(0))
+    damaged = [frame for frame in seen if isinstance(frame, DamagedFrame)]
     assert len(damaged) == 1 and "run.mkv" in damaged[0].reason
     for frame in seen:
         if isinstance(frame, Frame):
@@ -412,7 +412,7 @@ def test_what_is_no_recording_is_said_in_a_line(
 def test_films_that_hold_no_mosaic_are_refused(codec: str, pixels: str, tmp_path: Path) -> None:
     path = write_film(tmp_path / "run.mkv", frames(2), codec, pixels)
     with pytest.raises(ValueError, match=r"run.mkv: expected a mosaic as grey samples, found pixels"):
-        open_footage(path, ReadOptions())
+        open_sequence(path, ReadOptions())
 
 
 @pytest.mark.parametrize(

@@ -17,11 +17,11 @@ import torch
 from polsep.edit import EDITS, Metallic, Recipe, Rougher, Texture
 from polsep.edit import apply as apply_edits
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.outputs import write_separation
 from polsep.io.results.previews import srgb
-from polsep.io.results.separated import read_separated
+from polsep.io.results.separation_reader import read_separated
+from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.errors import InputError
-from polsep.io.store.scratch import Scratch, drop_folder, find_upload, make_scratch
+from polsep.io.store.temporary import TemporaryFolders, find_upload, make_temporary_folders, remove_folder
 from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.report import SeparatedFrame
@@ -60,15 +60,15 @@ def mosaic_codes(height: int = 96, width: int = 128, seed: int = 0) -> np.ndarra
 
 
 @pytest.fixture
-def scratch() -> Iterator[Scratch]:
+def scratch() -> Iterator[TemporaryFolders]:
     """Folders of a server, gone afterwards."""
-    made = make_scratch()
+    made = make_temporary_folders()
     yield made
-    drop_folder(made.root)
+    remove_folder(made.root)
 
 
 @pytest.fixture
-def sessions(scratch: Scratch) -> Sessions:
+def sessions(scratch: TemporaryFolders) -> Sessions:
     """No page open yet."""
     return Sessions(scratch, 10 << 20)
 

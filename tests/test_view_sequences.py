@@ -20,11 +20,11 @@ from test_view import mosaic_codes, opened, png, upload
 from polsep.edit import Metallic, Recipe, Rougher, Texture, apply
 from polsep.edit.files import load_work, read_recipe
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.outputs import write_separation
-from polsep.io.results.separated import read_separated
+from polsep.io.results.separation_reader import read_separated
+from polsep.io.results.separation_writer import write_separation
 from polsep.io.results.sequences import Picture, write_exr
 from polsep.io.store.errors import InputError
-from polsep.io.store.scratch import drop_folder, make_scratch
+from polsep.io.store.temporary import make_temporary_folders, remove_folder
 from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.view import images
@@ -41,11 +41,11 @@ ANALYTIC = {"white": "4095", "method": "analytic"}
 @pytest.fixture
 def sessions() -> Iterator[Sessions]:
     """No page open yet; afterwards, nothing is left to be made."""
-    scratch = make_scratch()
+    scratch = make_temporary_folders()
     made = Sessions(scratch, 10 << 20)
     yield made
     made.close()
-    drop_folder(scratch.root)
+    remove_folder(scratch.root)
 
 
 def small_frame(level: float, size: tuple[int, int] = (6, 8)) -> Small:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from polsep.bench.rows import Row, provenance, to_jsonl
-from polsep.io.store.whole import replace_text
+from polsep.io.store.atomic import replace_text
 
 
 def record(name: str, rows: list[Row], command: str) -> None:

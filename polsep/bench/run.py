@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polsep.bench.rows import Row, provenance, to_jsonl
+from polsep.io.store.atomic import replace_text
 from polsep.io.store.rows import fill_readme
-from polsep.io.store.whole import replace_text
 
 Measure = Callable[[Path], Iterator[Row]]
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from polsep.capture.sources import CameraError, CameraInfo, CameraSettings, EndOfFrames
-from polsep.io.raw.footage import natural_order
 from polsep.io.raw.frames import read_pages
 from polsep.io.raw.genicam import find_pixel_format, pack_frame
-from polsep.io.raw.pages import Page
+from polsep.io.raw.page import Page
 from polsep.io.raw.recording import RECORD, RawImage, read_header, read_images
+from polsep.io.raw.sequences import natural_order
 from polsep.io.store.errors import input_error, naming
 
 #: Kinds of files that describe themselves, so that their codes can be sent without being told anything.

@@ -17,8 +17,8 @@ from polsep.io.raw.frames import ReadOptions, decode_frame
 from polsep.io.raw.genicam import find_pixel_format
 from polsep.io.raw.recording import RawImage
 from polsep.io.results.previews import live_sheet
-from polsep.io.store.pictures import encode_picture
-from polsep.io.store.whole import replace_bytes
+from polsep.io.store.atomic import replace_bytes
+from polsep.io.store.image_codecs import encode_jpeg
 from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout
 from polsep.separation.report import SeparatedFrame
@@ -62,7 +62,7 @@ class LiveView:
         """Separate a frame and replace the picture, as a whole."""
         frame, remarks = self.separate(image.payload)
         light = float(frame.report["statistics"]["light_polarizer_deg"])
-        shown = Shown(encode_picture(live_sheet(frame)), image.frame_id, light, remarks)
+        shown = Shown(encode_jpeg(live_sheet(frame)), image.frame_id, light, remarks)
         if self._picture is not None:
             replace_bytes(self._picture, shown.jpeg)
         self.latest = shown

@@ -26,7 +26,7 @@ from polsep.capture.page import serve_page
 from polsep.capture.ring import Ring
 from polsep.capture.sources import Camera, CameraError, CameraInfo, CameraLost, CameraSource, EndOfFrames, Loss
 from polsep.io.raw.recording import PICTURE, Header, RawImage, RecordingWriter, refuse_recording
-from polsep.io.results.outputs import OutputError
+from polsep.io.store.atomic import OutputError
 from polsep.sensor.camera import Layout
 
 #: Seconds between attempts to connect to a camera that was lost.

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     help="A PNG preview always comes along.",
 )
 @click.option("--full", is_flag=True, help="Full resolution instead of one pixel per 2x2 cell.")
-@click.option("--size", metavar="WxH", help="Size of headless raw, like 2448x2048.")
-@click.option("--pixel-format", metavar="NAME", help="GenICam pixel format of headless raw, like BayerRG12p.")
+@click.option("--size", metavar="WxH", help="Size of headerless raw, like 2448x2048.")
+@click.option("--pixel-format", metavar="NAME", help="GenICam pixel format of headerless raw, like BayerRG12p.")
 @click.option(
     "--pages",
     type=click.Choice(["frames", "angles"]),
@@ -46,10 +46,10 @@ if TYPE_CHECKING:
 def separate(files: tuple[str, ...], **options: Any) -> None:
     """Separate raw frames of a polarization camera into diffuse and specular images.
 
-    FILE is PNG, TIFF, NPY, NPZ, PGM or headless raw; 'shot_{angle}.png' names four images at 0, 45, 90 and 135 degrees.
-    For every frame, DIR/STEM.exr gets the layers diffuse.R/G/B, specular.R/G/B, dolp.Y, aolp.Y [radians] and valid.Y
-    (networks also write error.diffuse and error.specular, how far off they expect to be), DIR/STEM.png is a preview,
-    and DIR/STEM.json tells settings and statistics.
+    FILE is PNG, TIFF, NPY, NPZ, PGM or headerless raw; 'shot_{angle}.png' names four images at 0, 45, 90 and 135
+    degrees. For every frame, DIR/STEM.exr gets the layers diffuse.R/G/B, specular.R/G/B, dolp.Y, aolp.Y [radians] and
+    valid.Y (networks also write error.diffuse and error.specular, how far off they expect to be), DIR/STEM.png is a
+    preview, and DIR/STEM.json tells settings and statistics.
 
     \b
     polsep separate shot.png -o out                   Sony colour mosaic, 8 or 16 bit
@@ -134,14 +134,14 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     It runs in onnxruntime and its like without polsep. Frames [N, H, W] are in Sony's order with sides that are
     multiples of 4; black_level and white_level are in their units. Needs the extra export.
     """
-    from polsep.io.results.outputs import refuse_targets
+    from polsep.io.store.atomic import refuse_existing
     from polsep.io.store.onnx import write_onnx
     from polsep.networks.export import OUTPUT_NAMES, Graph
     from polsep.networks.run import find_joint
     from polsep.sensor.camera import Layout
 
     try:
-        refuse_targets(output.parent, [output], options["overwrite"])
+        refuse_existing(output.parent, [output], options["overwrite"])
         network, metadata = find_joint(method, Layout(bayer=None) if options["mono"] else Layout(), weights)
         say(f"writing the graph of {method}, which takes a minute or a few")
         write_onnx(output, Graph(network, options["full"]), OUTPUT_NAMES, metadata)

@@ -65,9 +65,9 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
             f"expected the extra 'render' (pip install 'polsep[render]'), found no {error.name}"
         ) from None
     from polsep.geometry.lights import parse_lights
+    from polsep.io.assets.shapes import shape_targets, write_shape
     from polsep.io.raw.frames import ReadOptions
-    from polsep.io.results.geometry import shape_targets, write_shape
-    from polsep.io.results.outputs import refuse_targets
+    from polsep.io.store.atomic import refuse_existing
     from polsep.methods import check_method
     from polsep.sensor.camera import Layout
 
@@ -81,7 +81,7 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
         read = ReadOptions(layout, options["black_level"], options["white_level"])
         targets = shape_targets(options["output"], options["name"], options["mesh"], asked.turntable)
         refuse_inputs(targets, [*files, *([options["mask"]] if options["mask"] else [])])
-        refuse_targets(options["output"], targets, options["overwrite"])
+        refuse_existing(options["output"], targets, options["overwrite"])
         source = Source("photographs" if options["srgb"] else "frames", read, options["method"])
         views = read_views(files, source)
         size = views.images.shape[1:3]
@@ -90,7 +90,7 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
             raise ValueError(f"expected --size of 1 or more, found {options['size']}")
         views, mask = shrink(views, mask, options["size"])
         shape = find_shape(views, directions, mask, asked)
-        write_shape(shape, targets, options["name"])
+        write_shape(shape, targets)
     except (ValueError, RuntimeError) as error:
         raise click.ClickException(str(error)) from None
     for path in targets:

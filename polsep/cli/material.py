@@ -23,8 +23,8 @@ from polsep.cli.app import DIR, app, parse_size, say
 @click.option("--black-level", type=float, default=0.0, metavar="N", help="Sample value of no light.")
 @click.option("--white-level", type=float, metavar="N", help="Sample value where the sensor clips.")
 @click.option("--light-color", default="1,1,1", metavar="R,G,B", help="Camera RGB of the light, or 'estimate'.")
-@click.option("--frame-size", metavar="WxH", help="Size of headless raw, like 2448x2048.")
-@click.option("--pixel-format", metavar="NAME", help="GenICam pixel format of headless raw, like BayerRG12p.")
+@click.option("--frame-size", metavar="WxH", help="Size of headerless raw, like 2448x2048.")
+@click.option("--pixel-format", metavar="NAME", help="GenICam pixel format of headerless raw, like BayerRG12p.")
 @click.option("--overwrite", is_flag=True, help="Replace results that exist.")
 def material(files: tuple[str, ...], **options: Any) -> None:
     """Estimate normals, diffuse colour, roughness and specular reflectance of a flat material.

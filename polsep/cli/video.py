@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 @click.option("--filter", default="temporal", metavar="temporal|none", help="Averages over frames what does not move.")
 @click.option("--frames", type=int, metavar="N", help="No more than the first N frames.")
 @click.option("--damaged", default="stop", metavar="stop|skip", help="What to do at a damaged frame.")
-@click.option("--size", metavar="WxH", help="Size of headless raw, like 2448x2048.")
-@click.option("--pixel-format", metavar="NAME", help="GenICam pixel format of headless raw, like BayerRG12p.")
+@click.option("--size", metavar="WxH", help="Size of headerless raw, like 2448x2048.")
+@click.option("--pixel-format", metavar="NAME", help="GenICam pixel format of headerless raw, like BayerRG12p.")
 @click.option("--overwrite", is_flag=True, help="Replace results that exist.")
 @click.option("--device", default="auto", metavar="NAME", help="auto, cpu or cuda.")
 @click.option("--engine", default="local", metavar="NAME", help="local, or ray: the cluster of RAY_ADDRESS.")
@@ -41,7 +41,7 @@ def video(recording: Path, output: Path, **options: Any) -> None:
     """Separate every frame of a recording.
 
     IN is a folder of frames or of 'polsep capture', a TIFF or NPY file of many, a lossless grey video (FFV1 in .mkv,
-    raw .avi), or a headless raw stream. DIR gets STEM_000123.exr (half floats, layers diffuse and specular) for every
+    raw .avi), or a headerless raw stream. DIR gets STEM_000123.exr (half floats, layers diffuse and specular) for every
     frame, or STEM_diffuse.mkv and STEM_specular.mkv (FFV1, 16 bits); STEM_preview.mp4 to watch; STEM.jsonl with a line
     of statistics per frame; and STEM.json. A run that was stopped or killed goes on when the same command is given
     again. Films need the extra video.

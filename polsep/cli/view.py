@@ -21,8 +21,8 @@ from polsep.cli.app import app, say
 @click.option("--black-level", metavar="N", help="Sample value of no light.")
 @click.option("--white-level", metavar="N", help="Sample value where the sensor clips.")
 @click.option("--light-color", metavar="R,G,B", help="Camera RGB of the light, or 'estimate'.")
-@click.option("--size", metavar="WxH", help="Size of headless raw, like 2448x2048.")
-@click.option("--pixel-format", metavar="NAME", help="GenICam pixel format of headless raw, like BayerRG12p.")
+@click.option("--size", metavar="WxH", help="Size of headerless raw, like 2448x2048.")
+@click.option("--pixel-format", metavar="NAME", help="GenICam pixel format of headerless raw, like BayerRG12p.")
 @click.option("--upload-limit", type=click.IntRange(1), default=240, metavar="MB", help="Largest file taken.")
 def view(file: Path | None, host: str, port: int | None, opens: bool, upload_limit: int, **options: Any) -> None:
     """Open raw frames and results in the browser: compare, inspect, edit, download.

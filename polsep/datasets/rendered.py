@@ -182,7 +182,7 @@ def describe_shot(shot: Shot, found: Capture) -> dict[str, Any]:
 
 
 def images_of(found: Capture) -> dict[str, NDArray[Any]]:
-    """A capture as `io.dataset.write_view` takes it."""
+    """A capture as `io.results.dataset.write_view` takes it."""
     scene = found.scene
     light = scene.diffuse + scene.specular
 

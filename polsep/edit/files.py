@@ -23,12 +23,13 @@ from polsep.edit.images import Maps, SeparatedImages
 from polsep.edit.parameters import EditError
 from polsep.edit.recipe import Recipe, apply, recipe_as_data, recipe_from_text
 from polsep.io.assets.maps import hash_map, read_map
-from polsep.io.results.edited import EditedFrame, edited_targets, read_recipe_text, write_edited, write_preview
-from polsep.io.results.outputs import OutputError, refuse_targets
+from polsep.io.results.edited import EditedFrame, read_recipe_text, write_edited, write_preview
 from polsep.io.results.previews import exposure_of, toned
-from polsep.io.results.separated import Numbered, find_numbered, read_separated
+from polsep.io.results.separation_reader import Numbered, find_numbered, read_separated
+from polsep.io.results.separation_writer import planned_outputs
 from polsep.io.results.sequences import PART, Part, Picture, SequenceKind
 from polsep.io.results.sequences import Sequence as Writer
+from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import InputError, input_error
 from polsep.video.recordings import ON_DAMAGE, Progress, draw_panels
 
@@ -102,10 +103,10 @@ def edit_files(paths: Sequence[Path], work: Work, target: EditTarget) -> Iterato
     inputs = {realpath(path) for path in paths}
     for path in paths:
         try:
-            targets = edited_targets(target.directory, path.stem)
+            targets = planned_outputs(target.directory, path.stem, "exr")
             if clash := [str(output) for output in targets if realpath(output) in inputs]:
                 raise OutputError(f"{path}: expected outputs apart from inputs, found that {clash[0]} is an input")
-            refuse_targets(target.directory, targets, target.overwrite)
+            refuse_existing(target.directory, targets, target.overwrite)
             frame = _edited_frame(path, work)
             yield Edited(path, tuple(write_edited(frame, target.directory, path.stem, target.overwrite)))
         except (ValueError, OSError, MemoryError) as error:
@@ -205,7 +206,7 @@ def _refuse_frames(folder: Path, found: Numbered, target: EditTarget) -> None:
         return
     numbers = range(found.first, found.first + len(found.files))
     frames = [target.directory / f"{found.stem}_{number:06d}.exr" for number in numbers]
-    refuse_targets(target.directory, [*frames, target.directory / f"{found.stem}.png"], overwrite=False)
+    refuse_existing(target.directory, [*frames, target.directory / f"{found.stem}.png"], overwrite=False)
 
 
 def _run(found: Numbered, work: Work, writer: Writer, look: tuple[float, Any, str]) -> Iterator[Progress]:

@@ -21,12 +21,12 @@ from polsep.geometry.photometric import Appearance, fit_robust
 from polsep.geometry.polarization import Polarized, find_slope, normals_of_slope
 from polsep.geometry.surface import Surface, draw_views, relight, span_surface
 from polsep.io.assets.maps import read_map
-from polsep.io.assets.meshes import encode_glb, encode_ply
+from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
 from polsep.io.raw.frames import ReadOptions, read_frames
-from polsep.io.raw.videos import WATCHABLE, encode_film, load_library
-from polsep.io.results.geometry import ShapeFiles
+from polsep.io.raw.videos import load_library
+from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import exposure_of, toned
-from polsep.io.results.separated import SUFFIXES, read_separated
+from polsep.io.results.separation_reader import SUFFIXES, read_separated
 from polsep.io.store.errors import InputError, input_error
 from polsep.pipeline import separate_capture
 from polsep.separation.report import SeparatedFrame

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from polsep.io.assets.materials import MaterialFiles, material_targets, write_material
 from polsep.io.raw.frames import ReadOptions, output_stem, read_frames
-from polsep.io.results.materials import MaterialFiles, material_targets, write_material
-from polsep.io.results.outputs import OutputError, refuse_targets
 from polsep.io.results.previews import Panel, Pixels, titled_sheet, toned
-from polsep.io.results.separated import read_separated
+from polsep.io.results.separation_reader import read_separated
+from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import InputError, input_error
 from polsep.material.estimate import load_estimator
 from polsep.material.shots import CAMERA_HEIGHT, MAP_SIZE
@@ -76,7 +76,7 @@ def estimate_files(
     """
     directory, name, overwrite = target
     name = output_stem(paths[0]) if name is None else name
-    refuse_targets(directory, targets := material_targets(directory, name), overwrite)
+    refuse_existing(directory, targets := material_targets(directory, name), overwrite)
     _refuse_inputs(paths, targets)
     estimator = load_estimator(options.input, options.weights)
     photographs = read_photographs(paths, options)

@@ -2,7 +2,7 @@
 
 A graph takes a batch of raw frames ``[N, H, W]`` in Sony's order, H and W multiples of 4, with their black and white
 level, and gives ``[N, h, w, ...]`` images: what `networks.run.run_joint` makes of such frames, without turning them.
-It knows no file format: `io.onnx` writes it.
+It knows no file format: `io.store.onnx` writes it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Methods with learned weights: the networks that come with polsep, loaded once, applied to any frame.
 
-Weights are those of `polsep/weights`, read by `io.weights`; their metadata says which network they belong to.
+Weights are those of `polsep/weights`, read by `io.store.weights`; their metadata says which network they belong to.
 """
 
 from __future__ import annotations

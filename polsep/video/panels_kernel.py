@@ -1,7 +1,7 @@
 """Small sRGB pictures of large linear images, fast enough for every frame of a stream.
 
-Pixels are means over squares, times a gain, through a table of the tone curve; see `io.previews`, whose pictures for
-reading are made with more care.
+Pixels are means over squares, times a gain, through a table of the tone curve; `io.results.previews` draws the
+pictures for reading, with more care.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Frames go through three threads: one reads and unpacks, one separates, the caller's writes; queues between them are
 short, so that the slowest sets the pace. What decides about the bytes of a run are its settings and its frames alone,
-not how often it was interrupted (`io.sequences`) and not where frames were separated (`engine`).
+not how often it was interrupted (`io.results.sequences`) and not where frames were separated (`engine`).
 
 Where nothing moves, raw samples and images are averaged over frames (`temporal`), whose state is part of a run's.
 What is estimated of a scene, its light's colour and the exposure of the film to watch, is so from its first frame, and
@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from polsep.compute.cluster import map_ordered
 from polsep.compute.threads import get_threads, own_threads
 from polsep.compute.workers import DEPTH, ahead, map_ahead
-from polsep.io.raw.footage import Damaged, Footage, open_footage
 from polsep.io.raw.frames import Frame, ReadOptions
+from polsep.io.raw.sequences import DamagedFrame, FrameSequence, open_sequence
 from polsep.io.results.previews import exposure_of, srgb
 from polsep.io.results.sequences import PART, Part, Picture, Sequence, SequenceKind, State
 from polsep.methods import Capture, find_method
@@ -116,7 +116,7 @@ class Separated:
     """A frame that was separated, or is damaged, and the state of the filter behind it, if there is one."""
 
     index: int
-    found: Found | Damaged
+    found: Found | DamagedFrame
     state: TemporalState | None
 
 
@@ -140,7 +140,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     Raises ValueError on what cannot be read or written and, with ``damaged`` "stop", at the first damaged frame; what
     was done by then stays, and the same call goes on there.
     """
-    footage = open_footage(path, read)
+    footage = open_sequence(path, read)
     count = footage.count if options.frames is None else min(footage.count, options.frames)
     look = look_at(footage, options)
     settings = {
@@ -169,11 +169,11 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     yield Progress(last, last, damaged=bool(report["damaged"]), written=tuple(sequence.finish(report)))
 
 
-def look_at(footage: Footage, options: VideoOptions) -> Look:
+def look_at(footage: FrameSequence, options: VideoOptions) -> Look:
     """Separate the first frame that is whole. Raises ValueError where there is none among those of one part."""
     reason = "none at all"
     for _, frame in zip(range(PART), footage.begin(0), strict=False):
-        if isinstance(frame, Damaged):
+        if isinstance(frame, DamagedFrame):
             reason = frame.reason
             continue
         found = separate_capture(frame.data, options.method, options.light_color, options.device)
@@ -185,7 +185,7 @@ def look_at(footage: Footage, options: VideoOptions) -> Look:
     raise ValueError(f"expected a frame that can be read, found {reason}")
 
 
-def _run(footage: Footage, options: VideoOptions, look: Look, sequence: Sequence) -> Iterator[Progress]:
+def _run(footage: FrameSequence, options: VideoOptions, look: Look, sequence: Sequence) -> Iterator[Progress]:
     """The frames that are not done, into the sequence, part after part."""
     kept = sequence.state()
     images: Images | None = tuple(kept.pop(name) for name in IMAGES) if set(IMAGES) <= set(kept) else None
@@ -196,7 +196,7 @@ def _run(footage: Footage, options: VideoOptions, look: Look, sequence: Sequence
             for frame in ready:
                 part = part or sequence.begin_part()
                 warning = None
-                if isinstance(frame.found, Damaged):
+                if isinstance(frame.found, DamagedFrame):
                     if options.damaged == "stop":
                         raise ValueError(frame.found.reason)
                     part.show(_missing(frame.found, look, sequence.kind.preview))
@@ -229,7 +229,7 @@ def _as_arrays(state: TemporalState | None, images: Images | None) -> State:
 
 
 def separate_here(
-    footage: Footage, options: VideoOptions, look: Look, start: tuple[int, TemporalState | None]
+    footage: FrameSequence, options: VideoOptions, look: Look, start: tuple[int, TemporalState | None]
 ) -> Generator[Separated, None, None]:
     """Frames from number ``start[0]`` on, in order, by threads of this process: each separates a frame by itself.
 
@@ -238,9 +238,9 @@ def separate_here(
     device, cores = find_device(options.device), get_threads()
     workers = min(cores, AT_ONCE)
 
-    def separate(ready: tuple[Frame | Damaged, TemporalState | None]) -> Separated:
+    def separate(ready: tuple[Frame | DamagedFrame, TemporalState | None]) -> Separated:
         frame, state = ready
-        if isinstance(frame, Damaged):
+        if isinstance(frame, DamagedFrame):
             return Separated(frame.index, frame, state)
         with own_threads(cores // workers):
             return Separated(frame.index, separate_one((frame.data, look, device)), state)
@@ -250,22 +250,22 @@ def separate_here(
 
 
 def separate_on_ray(
-    footage: Footage, options: VideoOptions, look: Look, start: tuple[int, TemporalState | None]
+    footage: FrameSequence, options: VideoOptions, look: Look, start: tuple[int, TemporalState | None]
 ) -> Generator[Separated, None, None]:
     """The same by a Ray cluster; this process reads and writes."""
     workers, device = get_threads(), find_device(options.device)
-    asked: deque[tuple[int | Damaged, TemporalState | None]] = deque()
+    asked: deque[tuple[int | DamagedFrame, TemporalState | None]] = deque()
 
     def whole_frames() -> Iterator[tuple[Capture, Look, torch.device]]:
         for frame, state in frames:
-            asked.append((frame if isinstance(frame, Damaged) else frame.index, state))
-            if not isinstance(frame, Damaged):
+            asked.append((frame if isinstance(frame, DamagedFrame) else frame.index, state))
+            if not isinstance(frame, DamagedFrame):
                 yield frame.data, look, device
 
     def waiting() -> Iterator[Separated]:
-        while asked and isinstance(asked[0][0], Damaged):
+        while asked and isinstance(asked[0][0], DamagedFrame):
             damaged, state = asked.popleft()
-            assert isinstance(damaged, Damaged)
+            assert isinstance(damaged, DamagedFrame)
             yield Separated(damaged.index, damaged, state)
 
     with closing(ahead(_prepared(footage, options, look, start))) as frames:
@@ -290,8 +290,8 @@ def separate_one(job: tuple[Capture, Look, torch.device]) -> Found:
 
 
 def _prepared(
-    footage: Footage, options: VideoOptions, look: Look, start: tuple[int, TemporalState | None]
-) -> Iterator[tuple[Frame | Damaged, TemporalState | None]]:
+    footage: FrameSequence, options: VideoOptions, look: Look, start: tuple[int, TemporalState | None]
+) -> Iterator[tuple[Frame | DamagedFrame, TemporalState | None]]:
     """Frames from number ``start[0]`` on as they are to be separated, each with the state behind it."""
     first, state = start
     for frame in limited(footage.begin(first), first, options.frames):
@@ -302,12 +302,14 @@ def _prepared(
         yield frame, state
 
 
-def whole(frame: Frame | Damaged, look: Look) -> Frame | Damaged:
+def whole(frame: Frame | DamagedFrame, look: Look) -> Frame | DamagedFrame:
     """The frame, or why it does not belong to the recording: its size."""
-    if isinstance(frame, Damaged) or tuple(frame.data.data.shape) == look.shape:
+    if isinstance(frame, DamagedFrame) or tuple(frame.data.data.shape) == look.shape:
         return frame
     wanted, found = ("x".join(map(str, reversed(shape))) for shape in (look.shape, tuple(frame.data.data.shape)))
-    return Damaged(frame.index, f"frame {frame.index}: expected {wanted} samples as in the first one, found {found}")
+    return DamagedFrame(
+        frame.index, f"frame {frame.index}: expected {wanted} samples as in the first one, found {found}"
+    )
 
 
 def limited(frames: Iterator[Item], first: int, count: int | None) -> Iterator[Item]:
@@ -333,7 +335,7 @@ def draw_panels(diffuse: Floats, specular: Floats, gain: float) -> NDArray[np.ui
     return make_panels((diffuse, specular), gain, _TONES, PANEL)
 
 
-def _missing(damaged: Damaged, look: Look, preview: bool) -> Picture:
+def _missing(damaged: DamagedFrame, look: Look, preview: bool) -> Picture:
     """A black picture."""
     black = np.zeros(look.size, np.float32)
     panels = draw_panels(black, black, 1.0) if preview else None

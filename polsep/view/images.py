@@ -13,8 +13,8 @@ import numpy as np
 
 from polsep.edit import EditError
 from polsep.io.assets.maps import SUFFIXES, read_map
-from polsep.io.raw.pages import at_most
 from polsep.io.store.errors import InputError
+from polsep.io.store.header_checks import at_most
 from polsep.view.opening import MAX_SAMPLES, plain_name
 from polsep.view.pictures import Floats, shrink
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, read_frames
-from polsep.io.raw.pages import at_most
-from polsep.io.results.separated import find_numbered, holds_separated, read_separated
+from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
 from polsep.io.store.errors import InputError
+from polsep.io.store.header_checks import at_most
 from polsep.methods import check_method
 from polsep.pipeline import LightColor, parse_light_color, separate_capture
 from polsep.sensor.camera import Layout, Mosaic
@@ -185,6 +185,6 @@ def plain_name(name: str, suffixes: tuple[str, ...] = (*FRAME_FILES, ".exr"), ki
     base = re.split(r"[/\\]", name)[-1]
     stem, suffix = Path(base).stem, Path(base).suffix.lower()
     if suffix not in suffixes:
-        kinds = kinds or "PNG, TIFF, NPY, NPZ, PGM, headless raw (.raw, .bin) or polsep's own EXR"
+        kinds = kinds or "PNG, TIFF, NPY, NPZ, PGM, headerless raw (.raw, .bin) or polsep's own EXR"
         raise InputError(f"{base[:80]}: expected {kinds}, found {suffix or 'no extension'!r}")
     return re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("._")[:64] or "frame", suffix

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.results.previews import aolp_legend, aolp_wheel, dolp_map, exposure_of, srgb
-from polsep.io.store.pictures import encode_live, encode_lossless
+from polsep.io.store.image_codecs import encode_jpeg_quickly, encode_png
 from polsep.sensor.camera import Mosaic
 from polsep.separation.report import SeparatedFrame
 
@@ -130,15 +130,15 @@ def error_at_white(small: Small) -> float:
 def as_url(pixels: Pixels) -> str:
     """A picture as text that stands where a page expects an address: it never becomes a file.
 
-    Note: JPEG of high quality, unlike the PNG that `io.outputs` writes, because it must follow a slider. Numbers are
-    read from the frame (`readout`), never from here.
+    Note: JPEG of high quality, unlike the PNG previews in files, because it must follow a slider. Numbers are read from
+    the frame (`readout`), never from here.
     """
-    return f"data:image/jpeg;base64,{b64encode(encode_live(pixels)).decode('ascii')}"
+    return f"data:image/jpeg;base64,{b64encode(encode_jpeg_quickly(pixels)).decode('ascii')}"
 
 
 def scale_url(pixels: Pixels) -> str:
     """A legend or scale as such text, without loss."""
-    return f"data:image/png;base64,{b64encode(encode_lossless(pixels)).decode('ascii')}"
+    return f"data:image/png;base64,{b64encode(encode_png(pixels)).decode('ascii')}"
 
 
 def stage(small: Small, views: tuple[str, str], stops: float, mark: tuple[int, int] | None = None) -> str:

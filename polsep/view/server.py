@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from polsep.io.store.scratch import drop_folder, make_scratch
+from polsep.io.store.temporary import make_temporary_folders, remove_folder
 from polsep.methods import find_method
 from polsep.pipeline import separate_known
 from polsep.sensor.camera import Layout, Mosaic
@@ -49,7 +49,7 @@ def serve(options: ViewOptions) -> Iterator[str]:
     """
     if find_spec("gradio") is None:
         raise ModuleNotFoundError("No module named 'gradio'", name="gradio")
-    scratch = make_scratch()
+    scratch = make_temporary_folders()
     kept = {name: os.environ.get(name) for name in _environment(scratch.root)}
     os.environ.update(_environment(scratch.root))
     page, sessions = None, Sessions(scratch, options.most_mb << 20)
@@ -63,7 +63,7 @@ def serve(options: ViewOptions) -> Iterator[str]:
             page.close(verbose=False)
         warm.join()  # a program must not end while a network is being compiled
         sessions.close()
-        drop_folder(scratch.root)
+        remove_folder(scratch.root)
         for name, value in kept.items():
             if value is None:
                 os.environ.pop(name, None)

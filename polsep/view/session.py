@@ -19,19 +19,19 @@ from polsep.edit import EditError, Recipe, apply, recipe_as_data, recipe_as_text
 from polsep.io.assets.maps import read_map
 from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.results.edited import EditedFrame, write_edited, write_recipe
-from polsep.io.results.outputs import write_separation
 from polsep.io.results.previews import toned
+from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.errors import InputError
-from polsep.io.store.scratch import (
-    Scratch,
+from polsep.io.store.temporary import (
+    TemporaryFolders,
     clear_folder,
-    drop_file,
-    drop_folder,
     file_size,
     find_upload,
-    fresh_name,
-    keep_upload,
+    link_upload,
     make_folder,
+    random_name,
+    remove_file,
+    remove_folder,
 )
 from polsep.separation.report import SeparatedFrame
 from polsep.view.edits import edit_small
@@ -207,7 +207,7 @@ class Session:
         with self.lock:
             if self.found is None:
                 raise ValueError("expected a separated frame, found none: open a file first")
-            folder = make_folder(self.fetched, fresh_name())
+            folder = make_folder(self.fetched, random_name())
             stem = self.found.stem
             if kind in ("exr", "png"):
                 write_separation(self.found.frame, folder, stem, "exr")
@@ -235,7 +235,7 @@ class Sessions:
     At most `MAX_SESSIONS` are kept: beyond, the one idle for longest ends. ``most_bytes``: of what a page opens.
     """
 
-    def __init__(self, scratch: Scratch, most_bytes: int) -> None:
+    def __init__(self, scratch: TemporaryFolders, most_bytes: int) -> None:
         self.scratch, self.most_bytes = scratch, most_bytes
         self._ahead = Ahead()
         self._lock = threading.Lock()
@@ -246,7 +246,7 @@ class Sessions:
         """The session of a page, made when it asks first."""
         with self._lock:
             if key not in self._open:
-                name = fresh_name()
+                name = random_name()
                 kept, fetched = (make_folder(parent, name) for parent in (self.scratch.kept, self.scratch.exchange))
                 self._open[key] = Session(kept, fetched, self._ahead)
             self._open.move_to_end(key)
@@ -286,7 +286,7 @@ class Sessions:
         """The file of an upload under a name of ours; the upload goes with the last page that has it."""
         with self._lock:
             self._uploads.setdefault(path, set()).add(key)
-        return keep_upload(path, folder, f"{fresh_name()}{suffix}")
+        return link_upload(path, folder, f"{random_name()}{suffix}")
 
     def end(self, key: str) -> None:
         """Forget a page, and remove its files."""
@@ -298,11 +298,11 @@ class Sessions:
             for path in alone:
                 del self._uploads[path]
         for path in alone:
-            drop_file(path)
+            remove_file(path)
         if session is not None:
             session.forget()
             for folder in (session.kept, session.fetched):
-                drop_folder(folder)
+                remove_folder(folder)
 
     def close(self) -> None:
         """End all pages, and wait for the frame that is being made ahead."""

@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from PIL import Image
 
 from polsep.io.raw.frames import read_pages
-from polsep.io.raw.pages import require_signature, require_size
 from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.previews import linear_from_srgb
 from polsep.io.store.errors import InputError, decoding, input_error, naming
+from polsep.io.store.header_checks import require_signature, require_size
 
 Floats = NDArray[np.float32]
 
@@ -126,9 +127,3 @@ def _as_normals(codes: NDArray[Any]) -> NDArray[Any]:
     length = np.linalg.norm(vectors, axis=2, keepdims=True)
     known = (length >= _SHORTEST) & (vectors[..., 2:] > 0)
     return np.where(known, vectors / np.where(known, length, 1), 0)
-
-
-def linear_from_srgb(display: ArrayLike) -> NDArray[np.float32]:
-    """Linear light of sRGB values in [0, 1]: the inverse of `io.previews.srgb`. Source: IEC 61966-2-1:1999."""
-    x = np.asarray(display, dtype=np.float32)
-    return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.04045) + 0.055) / 1.055) ** 2.4)

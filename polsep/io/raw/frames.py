@@ -1,6 +1,6 @@
 """Raw frames from files of any supported kind, lazily, as `Mosaic` or `Measurements`.
 
-Supported: PNG, TIFF, NPY, NPZ, binary PGM, lossless grey video, headless dumps of a named size and pixel format,
+Supported: PNG, TIFF, NPY, NPZ, binary PGM, lossless grey video, headerless dumps of a named size and pixel format,
 recordings of a camera by their ``recording.json``, and four angle images through a path with ``{angle}`` in it. The
 extension decides which is expected, the content must agree.
 
@@ -17,14 +17,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from polsep.io.raw.headless import headless_page, read_headless, read_pgm
+from polsep.io.raw.headerless import headerless_page, read_headerless
 from polsep.io.raw.npy import read_npy, read_npz, stack_angles
-from polsep.io.raw.pages import Page, describe
+from polsep.io.raw.page import Page
+from polsep.io.raw.pgm import read_pgm
 from polsep.io.raw.png import read_png
 from polsep.io.raw.recording import RECORD, read_recording
 from polsep.io.raw.tiff import read_tiff
 from polsep.io.raw.videos import read_video
 from polsep.io.store.errors import InputError, input_error, naming
+from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
@@ -56,7 +58,7 @@ _PLACE = "{angle}"
 
 SUPPORTED = (
     "PNG, TIFF, NPY, NPZ, PGM, a lossless video, a recording.json, "
-    "or headless raw (.raw, .bin) with a size and pixel format"
+    "or headerless raw (.raw, .bin) with a size and pixel format"
 )
 
 
@@ -64,7 +66,7 @@ SUPPORTED = (
 class ReadOptions:
     """How to read what files don't say. Levels are in the units of the samples; None is explained above.
 
-    ``size`` (width, height) and ``pixel_format`` (a GenICam name) describe headless raw. ``pages``: several pages of
+    ``size`` (width, height) and ``pixel_format`` (a GenICam name) describe headerless raw. ``pages``: several pages of
     a file are separate "frames", or every four are the "angles" 0, 45, 90, 135. Raises ValueError on anything else.
     """
 
@@ -132,7 +134,7 @@ def decode_frame(payload: bytes, options: ReadOptions) -> tuple[Mosaic | Measure
     """
     if options.size is None or options.pixel_format is None:
         raise ValueError(_missing_notes(options))
-    page = next(_noting_layout(iter([headless_page(payload, options.size, options.pixel_format)]), options))
+    page = next(_noting_layout(iter([headerless_page(payload, options.size, options.pixel_format)]), options))
     data, notes = _convert(page, options)
     return data, page.notes + notes
 
@@ -174,7 +176,7 @@ def _read_pages(path: Path, options: ReadOptions, first: int = 0) -> Iterator[Pa
         elif suffix in _HEADLESS or (options.pixel_format is not None and suffix not in _LOSSY):
             if options.size is None or options.pixel_format is None:
                 raise ValueError(_missing_notes(options))
-            yield from _noting_layout(read_headless(path, options.size, options.pixel_format, first), options)
+            yield from _noting_layout(read_headerless(path, options.size, options.pixel_format, first), options)
         elif suffix in _LOSSY:
             raise ValueError(f"expected {SUPPORTED}, found {_LOSSY[suffix]}: lossy compression and gamma spoil samples")
         else:
@@ -187,13 +189,13 @@ def _ignored_notes(options: ReadOptions) -> tuple[str, ...]:
     """Said when a container describes itself and the caller describes it too."""
     if options.size is None and options.pixel_format is None:
         return ()
-    return ("the size and pixel format said are for headless raw: the file's own header is used",)
+    return ("the size and pixel format said are for headerless raw: the file's own header is used",)
 
 
 def _missing_notes(options: ReadOptions) -> str:
-    """What headless raw lacks."""
+    """What headerless raw lacks."""
     found = "only the size" if options.size else "only the pixel format" if options.pixel_format else "neither"
-    return f"expected the size and pixel format of headless raw, such as 2448x2048 and BayerRG12p, found {found}"
+    return f"expected the size and pixel format of headerless raw, such as 2448x2048 and BayerRG12p, found {found}"
 
 
 def _noting_layout(pages: Iterator[Page], options: ReadOptions) -> Iterator[Page]:

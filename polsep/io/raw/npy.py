@@ -19,8 +19,9 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from polsep.io.raw.pages import MAX_SAMPLES, Page, describe, require_signature, require_size
+from polsep.io.raw.page import Page
 from polsep.io.store.errors import decoding
+from polsep.io.store.header_checks import MAX_SAMPLES, describe, require_signature, require_size
 
 MAGIC = b"\x93NUMPY"
 

@@ -15,8 +15,9 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 
-from polsep.io.raw.pages import Page, require_signature, require_size
+from polsep.io.raw.page import Page
 from polsep.io.store.errors import decoding
+from polsep.io.store.header_checks import require_signature, require_size
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 

@@ -2,7 +2,7 @@
 
 A recording is a folder:
 
-* ``frames.raw``      the payloads one after the other, in the camera's pixel format, without any header: headless raw;
+* ``frames.raw``      the payloads one after the other, in the camera's pixel format: headerless raw;
 * ``frames.jsonl``    a line per frame: index, frame_id, timestamp_ns, crc32 of the payload, lost_before and away_s (the
   frames that the wire lost just before it, and for how long the camera was away);
 * ``recording.json``  size, pixel format, layout, camera, settings, counters, interruptions.
@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from polsep.io.raw.genicam import find_pixel_format
-from polsep.io.raw.headless import headless_page
-from polsep.io.raw.pages import Page, require_size
-from polsep.io.results.outputs import refuse_targets
-from polsep.io.store.whole import replace_text
+from polsep.io.raw.headerless import headerless_page
+from polsep.io.raw.page import Page
+from polsep.io.store.atomic import refuse_existing, replace_text
+from polsep.io.store.header_checks import require_size
 from polsep.sensor.camera import Layout
 
 FORMAT = "polsep recording 1"
@@ -134,7 +134,7 @@ class RecordingWriter:
 
 def refuse_recording(directory: Path, overwrite: bool) -> None:
     """Raise OutputError rather than replace an earlier recording unasked; to call before any work."""
-    refuse_targets(directory, [directory / name for name in (RAW, INDEX, RECORD, PICTURE)], overwrite)
+    refuse_existing(directory, [directory / name for name in (RAW, INDEX, RECORD, PICTURE)], overwrite)
 
 
 def read_header(path: Path) -> Header:
@@ -184,7 +184,7 @@ def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
     notes = (f"{RAW} ends within a frame: {rest} bytes after frame {count - 1} are left out",) if rest else ()
     size = (header.width, header.height)
     for index, image in enumerate(read_images(path, first), first):
-        page = headless_page(image.payload, size, header.pixel_format, (index, count))
+        page = headerless_page(image.payload, size, header.pixel_format, (index, count))
         if header.layout is not None:
             page = replace(page, layout=Layout.parse(header.layout), notes=())
         yield replace(page, notes=page.notes + notes)

@@ -16,8 +16,9 @@ from typing import BinaryIO
 import numpy as np
 import tifffile
 
-from polsep.io.raw.pages import Page, require_signature, require_size
+from polsep.io.raw.page import Page
 from polsep.io.store.errors import InputError, decoding
+from polsep.io.store.header_checks import require_signature, require_size
 
 #: Photometric interpretations in which larger means brighter and samples are the data themselves.
 _PHOTOMETRIC = {1: "black is zero", 2: "RGB", 32803: "colour filter array", 34892: "linear raw"}

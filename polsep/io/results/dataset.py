@@ -7,9 +7,9 @@
     DIR/manifest.jsonl           options, then name, size and sha256 of every file above, in order of views
     DIR/contact.png              a sample of the views to look at
 
-Units are those of `io.outputs`: linear light, 1.0 is one measurement at the white level. A view's files are written in
-a hidden directory and renamed into place, its record last: a view with a record is whole, whenever the program was
-killed. Nothing in a file depends on the time, the machine's name or who wrote it.
+Units are those of `separation_writer`: linear light, 1.0 is one measurement at the white level. A view's files are
+written in a hidden directory and renamed into place, its record last: a view with a record is complete, whenever the
+program was killed. Nothing in a file depends on the time, the machine's name or who wrote it.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.results.exr import encode_exr, read_exr_layers
-from polsep.io.results.outputs import OutputError, require_same
 from polsep.io.results.previews import srgb
-from polsep.io.store.whole import write_checked
+from polsep.io.results.sidecars import require_same_settings
+from polsep.io.store.atomic import OutputError, write_checked
 
 FORMATS = ("exr", "npz")
 #: RGB images of the truth; s1 and s2 are of the light on the sensor, whose s0 is diffuse + specular.
@@ -61,7 +61,7 @@ def begin_dataset(directory: Path, options: Mapping[str, Any]) -> None:
     if os.path.lexists(directory) and not directory.is_dir():
         raise OutputError(f"expected a directory to write into, found a file: {directory}")
     if path.is_file():
-        require_same(path, options, f"the set in {directory}")
+        require_same_settings(path, options, f"the set in {directory}")
         return
     if directory.is_dir() and (others := sorted(set(os.listdir(directory)) - {UNFINISHED})):
         raise OutputError(f"expected {directory} empty, new, or a set begun before, found {others[0]!r} in it")

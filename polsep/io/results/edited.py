@@ -1,4 +1,4 @@
-"""What editing reads and writes as files: recipes, and one edited frame, whole or not at all.
+"""Files of `polsep edit`: recipes, and one edited frame, written atomically.
 
 An edited frame is DIR/STEM.exr with the layers diffuse, specular and combined (float32, ZIP), DIR/STEM.png, the edited
 picture in sRGB, and the sidecar DIR/STEM.json.
@@ -7,7 +7,7 @@ picture in sRGB, and the sidecar DIR/STEM.json.
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,26 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.results.exr import encode_exr
-from polsep.io.results.outputs import (
-    UNITS,
-    encode_png,
-    planned_outputs,
-    refuse_targets,
-    require_finite,
-    version_text,
-    write_all,
-    write_with_sidecar,
-)
+from polsep.io.results.separation_writer import UNITS, planned_outputs
+from polsep.io.results.sidecars import EncodedFile, require_finite, version_text, write_with_sidecar
+from polsep.io.store.atomic import refuse_existing, replace_bytes, replace_text
 from polsep.io.store.errors import naming
-from polsep.io.store.whole import replace_bytes, replace_text
+from polsep.io.store.image_codecs import encode_png
 
 
 class EditedFrame(NamedTuple):
-    """Linear float32 ``layers [h, w, C]`` by name, ``preview`` as sRGB ``uint8 [h, w, 3]``, and what is ``said``."""
+    """Linear float32 ``layers [h, w, C]``, ``preview`` ``uint8 [h, w, 3]`` in sRGB, ``facts`` of the sidecar."""
 
     layers: Mapping[str, NDArray[np.float32]]
     preview: NDArray[np.uint8]
-    said: Mapping[str, Any]
+    facts: Mapping[str, Any]
 
 
 def read_recipe_text(path: Path) -> str:
@@ -45,7 +38,7 @@ def read_recipe_text(path: Path) -> str:
 
 def write_recipe_text(path: Path, text: str, overwrite: bool) -> None:
     """Write a recipe as a whole. Raises OutputError where one is there and ``overwrite`` is False."""
-    refuse_targets(path.parent, [path], overwrite)
+    refuse_existing(path.parent, [path], overwrite)
     replace_text(path, text)
 
 
@@ -65,36 +58,27 @@ def write_recipe(folder: Path, stem: str, text: str, images: Mapping[str, Path])
     return path
 
 
-def edited_targets(directory: Path, stem: str) -> list[Path]:
-    """The files of one edited frame. Raises OutputError where ``stem`` is no plain file name."""
-    exr, *_ = planned_outputs(directory, stem, "exr")
-    return [exr, exr.with_name(f"{stem}.png"), exr.with_name(f"{stem}.json")]
-
-
 def write_edited(frame: EditedFrame, directory: Path, stem: str, overwrite: bool) -> list[Path]:
-    """Write a frame's files; their paths. All or nothing. Raises OutputError."""
-    targets = edited_targets(directory, stem)
-    refuse_targets(directory, targets, overwrite)
+    """Write a frame's files, which are `planned_outputs` of EXR, atomically; return their paths. Raises OutputError."""
+    targets = planned_outputs(directory, stem, "exr")
+    refuse_existing(directory, targets, overwrite)
     require_finite(frame.layers)
-    write_all(targets, stem, lambda folder: _stage(frame, folder, stem))
+    shape = list(next(iter(frame.layers.values())).shape)
+    units = {layer: UNITS[layer] for layer in frame.layers}
+    write_with_sidecar(targets, _encoded_files(frame, stem, units), {**frame.facts, "shape": shape, "units": units})
     return targets
 
 
-def _stage(frame: EditedFrame, folder: Path, stem: str) -> None:
-    """Every file of a frame, the sidecar last."""
-    units = {layer: UNITS[layer] for layer in frame.layers}
+def _encoded_files(frame: EditedFrame, stem: str, units: Mapping[str, str]) -> Iterator[EncodedFile]:
+    """The EXR file and the preview."""
     notes = {"polsepVersion": version_text(), **{f"{layer}Units": unit for layer, unit in units.items()}}
     planes = {
         f"{layer}.{color}": image[..., k]
         for layer, image in frame.layers.items()
         for k, color in enumerate("RGB" if image.shape[2] == 3 else "Y")
     }
-    encoded: list[tuple[str, bytes | memoryview]] = [
-        (f"{stem}.exr", encode_exr(planes, notes)),
-        (f"{stem}.png", encode_png(frame.preview)),
-    ]
-    shape = list(next(iter(frame.layers.values())).shape)
-    write_with_sidecar(folder, stem, encoded, {**frame.said, "shape": shape, "units": units})
+    yield f"{stem}.exr", encode_exr(planes, notes)
+    yield f"{stem}.png", encode_png(frame.preview)
 
 
 def write_preview(path: Path, pixels: NDArray[np.uint8]) -> None:

@@ -20,8 +20,8 @@ import OpenEXR  # a bare extension module without stubs
 import torch
 from numpy.typing import NDArray
 
-from polsep.io.raw.pages import require_signature, require_size
 from polsep.io.store.errors import InputError, decoding, naming
+from polsep.io.store.header_checks import require_signature, require_size
 
 COMPRESSIONS = {
     "none": OpenEXR.NO_COMPRESSION,

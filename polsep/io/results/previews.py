@@ -59,6 +59,12 @@ def srgb(linear: ArrayLike) -> NDArray[np.float64]:
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
+def linear_from_srgb(display: ArrayLike) -> NDArray[np.float32]:
+    """Linear light of sRGB values in [0, 1]: the inverse of `srgb`. Source: IEC 61966-2-1:1999."""
+    x = np.asarray(display, dtype=np.float32)
+    return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.04045) + 0.055) / 1.055) ** 2.4)
+
+
 def exposure_of(image: Values, percentile: float = 99.5) -> float:
     """The gain that shows ``percentile`` of the samples of a linear image at 0.9; one gain serves all its parts.
 

@@ -6,7 +6,7 @@ without a record, so its files are those of a run that was not. `finish` joins t
 DIR/STEM.jsonl with a line per frame, and no part behind.
 
 Conventions: images are linear light, 1.0 = one measurement at the white level. EXR: half floats, layers as in
-`io.outputs`. Films: 16 bits, of which 65535 is the value in `FILM_WHITE`.
+`io.results.separation_writer`. Films: 16 bits, of which 65535 is the value in `FILM_WHITE`.
 """
 
 from __future__ import annotations
@@ -22,10 +22,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.io.raw.videos import LOSSLESS, LOSSLESS_GREY, WATCHABLE, Film, FilmKind, as_codes, join_films, load_library
+from polsep.io.raw.videos import load_library
 from polsep.io.results.exr import COMPRESSIONS, as_half_planes, encode_exr, write_exr_halves
-from polsep.io.results.outputs import UNITS, OutputError, require_same
-from polsep.io.store.whole import beside, replace_bytes, replace_text, write_checked
+from polsep.io.results.films import LOSSLESS, LOSSLESS_GREY, WATCHABLE, Film, FilmKind, as_codes, join_films
+from polsep.io.results.separation_writer import UNITS
+from polsep.io.results.sidecars import require_same_settings
+from polsep.io.store.atomic import OutputError, atomic_path, replace_bytes, replace_text, write_checked
 
 #: Frames after which a run can go on: a second, about. Films have a key frame at least as often.
 PART = 25
@@ -93,7 +95,7 @@ class Sequence:
         self._parts.mkdir(parents=True, exist_ok=True)
         kept = self._parts / "run.json"
         if kept.exists():
-            require_same(kept, settings, f"{directory / stem}", "; --overwrite begins anew")
+            require_same_settings(kept, settings, f"{directory / stem}", "; --overwrite begins anew")
         else:
             replace_text(kept, json.dumps(settings, sort_keys=True))
         self.done = 0
@@ -154,7 +156,7 @@ class Sequence:
         for image, kind in self.films().items():
             target = self.directory / f"{self.stem}_{image}{kind.suffix}"
             parts = [path for k in range(self.done) if (path := self._film(k, image, kind)).exists()]
-            with beside(target) as joined:
+            with atomic_path(target) as joined:
                 join_films(parts, joined, kind, self.kind.rate)
             written.append(target)
         log = self.directory / f"{self.stem}.jsonl"
@@ -225,7 +227,7 @@ def write_exr(path: Path, picture: Picture, compression: str) -> None:
         layers["combined"] = picture.combined
     planes = as_half_planes(layers)
     notes = {f"{layer}Units": UNITS[layer] for layer in layers}
-    with beside(path) as part:
+    with atomic_path(path) as part:
         if compression == "none":
             write_exr_halves(part, planes, notes)
         else:

@@ -8,12 +8,12 @@ from typing import Any
 
 import torch
 
-from polsep.io.store.whole import beside, replace_text
+from polsep.io.store.atomic import atomic_path, replace_text
 
 
 def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """Write a state of tensors, numbers and strings, whole or not at all."""
-    with beside(path) as part, part.open("wb") as file:
+    with atomic_path(path) as part, part.open("wb") as file:
         torch.save(state, file)
         file.flush()
         os.fsync(file.fileno())

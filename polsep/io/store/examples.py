@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from polsep.io.store.whole import beside
+from polsep.io.store.atomic import atomic_path
 
 
 def write_example(path: Path, planes: Tensor) -> None:
     """Write planes ``[K, h, w]``; what half precision does not hold becomes its largest number."""
     largest = float(np.finfo(np.float16).max)
-    with beside(path) as part, part.open("wb") as file:
+    with atomic_path(path) as part, part.open("wb") as file:
         np.save(file, planes.clamp(-largest, largest).half().numpy())
 
 

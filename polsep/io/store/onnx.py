@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from polsep.io.store.whole import beside
+from polsep.io.store.atomic import atomic_path
 
 #: What a graph is given, in order.
 INPUTS = ("raw", "black_level", "white_level")
@@ -60,5 +60,5 @@ def write_onnx(path: Path, graph: nn.Module, outputs: tuple[str, ...], metadata:
         )
     assert program is not None
     program.model.metadata_props.update(metadata)
-    with beside(path) as part:
+    with atomic_path(path) as part:
         program.save(part)

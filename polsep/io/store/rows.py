@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.io.store.whole import replace_text
+from polsep.io.store.atomic import replace_text
 
 #: A table in a Markdown file stands between these two comments.
 _TABLE = re.compile(

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from polsep.io.store.whole import beside
+from polsep.io.store.atomic import atomic_path
 
 Tensors = dict[str, Tensor]
 
@@ -32,7 +32,7 @@ def digest_tensors(tensors: Tensors) -> str:
 def write_weights(path: Path, tensors: Tensors, metadata: dict[str, str]) -> None:
     """Write tensors in half precision, whole or not at all."""
     halves = {name: tensor.detach().cpu().half().contiguous() for name, tensor in tensors.items()}
-    with beside(path) as part:
+    with atomic_path(path) as part:
         save_file(halves, part, metadata | {"sha256": digest_tensors(halves)})
         part.chmod(0o644)  # safetensors makes files that only their owner can read
 

@@ -1,7 +1,6 @@
-"""What every reader returns, and the checks that all of them make before they decode.
+"""Checks of a file's first bytes and sizes, made before it is decoded.
 
-A reader takes a path and yields one `Page` per picture, lazily; it raises ValueError, in one line, on what it can't
-read. Sizes in headers are believed only up to `MAX_SAMPLES`, before any memory is allocated for them.
+Sizes in headers are believed only up to `MAX_SAMPLES`, before any memory is allocated for them.
 """
 
 from __future__ import annotations
@@ -10,13 +9,9 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
-from typing import Any, BinaryIO
-
-from numpy.typing import NDArray
+from typing import BinaryIO
 
 from polsep.io.store.errors import InputError
-from polsep.sensor.camera import Layout
 
 #: Samples of one frame beyond which a header is not believed: fifty 5-megapixel sensors, or 1 GiB as float32.
 MAX_SAMPLES = 2**28
@@ -38,24 +33,6 @@ _SIGNATURES = (
     (b"P5", "a binary PGM file"),
     (b"version https://git-lfs", "a Git LFS pointer instead of the file"),
 )
-
-
-@dataclass(frozen=True)
-class Page:
-    """One picture of a file: ``array`` ``[H, W]`` or ``[H, W, C]``; with ``angles`` a leading axis of 0, 45, 90, 135.
-
-    ``index`` of ``count`` pictures. ``white_level`` and ``layout`` are what the file itself says, None where it says
-    nothing. ``sampled`` angle planes were taken from one mosaic: their pixels lie at different points.
-    """
-
-    array: NDArray[Any]
-    index: int = 0
-    count: int = 1
-    white_level: float | None = None
-    layout: Layout | None = None
-    angles: bool = False
-    sampled: bool = False
-    notes: tuple[str, ...] = ()
 
 
 def describe(head: bytes) -> str:

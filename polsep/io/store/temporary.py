@@ -16,7 +16,7 @@ from polsep.io.store.errors import InputError
 
 
 @dataclass(frozen=True)
-class Scratch:
+class TemporaryFolders:
     """``root`` holds ``exchange``, whose files a server hands out by name, and ``kept``, whose files it does not."""
 
     root: Path
@@ -32,27 +32,27 @@ class Scratch:
         return self.root / "kept"
 
 
-def make_scratch() -> Scratch:
+def make_temporary_folders() -> TemporaryFolders:
     """New folders below the system's temporary one. Raises OSError."""
-    scratch = Scratch(Path(os.path.realpath(tempfile.mkdtemp(prefix="polsep-view-"))))
+    scratch = TemporaryFolders(Path(os.path.realpath(tempfile.mkdtemp(prefix="polsep-view-"))))
     scratch.exchange.mkdir(mode=0o700)
     scratch.kept.mkdir(mode=0o700)
     return scratch
 
 
-def drop_folder(folder: Path) -> None:
+def remove_folder(folder: Path) -> None:
     """Remove a folder and all that is in it, as far as that can be done."""
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def drop_file(path: Path) -> None:
+def remove_file(path: Path) -> None:
     """Remove a file, and its folder when that is empty then."""
     path.unlink(missing_ok=True)
     if not any(path.parent.iterdir()):
         path.parent.rmdir()
 
 
-def fresh_name() -> str:
+def random_name() -> str:
     """A name that nobody guesses."""
     return secrets.token_urlsafe(24)
 
@@ -66,7 +66,7 @@ def make_folder(parent: Path, name: str) -> Path:
 
 def clear_folder(folder: Path) -> Path:
     """An empty folder for its owner alone."""
-    drop_folder(folder)
+    remove_folder(folder)
     return make_folder(folder.parent, folder.name)
 
 
@@ -75,7 +75,7 @@ def file_size(path: Path) -> int:
     return path.stat().st_size
 
 
-def find_upload(scratch: Scratch, claimed: object, most_bytes: int) -> Path:
+def find_upload(scratch: TemporaryFolders, claimed: object, most_bytes: int) -> Path:
     """The file of an upload that a client names; only what lies in ``exchange`` exists for it.
 
     Raises InputError for any other path, for links and for folders, without saying whether they are there, and for
@@ -92,7 +92,7 @@ def find_upload(scratch: Scratch, claimed: object, most_bytes: int) -> Path:
     return path
 
 
-def keep_upload(path: Path, folder: Path, name: str) -> Path:
+def link_upload(path: Path, folder: Path, name: str) -> Path:
     """The same file under a ``name`` of ours in a session's folder."""
     kept = folder / name
     try:

@@ -3,7 +3,7 @@
 A folder with a ``recording.json`` is what `polsep capture` wrote, and one recording.
 
 A folder's frames are its files of one kind, in natural order (frame2 before frame10). What cannot be read is a
-`Damaged` frame in its place; the frames after it come all the same where the file allows that.
+`DamagedFrame` frame in its place; the frames after it come all the same where the file allows that.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _NUMBER = re.compile(r"(\d+)")
 
 
 @dataclass(frozen=True)
-class Damaged:
+class DamagedFrame:
     """A frame that could not be read, and why, in one line that names the file."""
 
     index: int
@@ -30,7 +30,7 @@ class Damaged:
 
 
 @dataclass(frozen=True)
-class Footage:
+class FrameSequence:
     """A recording: ``begin(first)`` gives its frames from number ``first`` on, about ``count`` in all.
 
     ``stem`` names its outputs.
@@ -38,19 +38,19 @@ class Footage:
 
     stem: str
     count: int
-    begin: Callable[[int], Iterator[Frame | Damaged]]
+    begin: Callable[[int], Iterator[Frame | DamagedFrame]]
 
 
-def open_footage(path: Path, options: ReadOptions) -> Footage:
+def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
     """The frames of a folder or of a file. Raises InputError where there are none, or none can be read."""
     path = path / RECORD if (path / RECORD).is_file() else path
     if path.is_dir():
         files = _files_of(path)
-        return Footage(path.resolve().name, len(files), lambda first: _read_files(files, options, first))
+        return FrameSequence(path.resolve().name, len(files), lambda first: _read_files(files, options, first))
     start = next(read_frames(path, options), None)
     if start is None:
         raise input_error(path, "expected frames, found none")
-    return Footage(output_stem(path), start.count, lambda first: _read_stack(path, options, (first, start.count)))
+    return FrameSequence(output_stem(path), start.count, lambda first: _read_stack(path, options, (first, start.count)))
 
 
 def _files_of(folder: Path) -> list[Path]:
@@ -71,7 +71,7 @@ def natural_order(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts if part]
 
 
-def _read_files(files: list[Path], options: ReadOptions, first: int) -> Iterator[Frame | Damaged]:
+def _read_files(files: list[Path], options: ReadOptions, first: int) -> Iterator[Frame | DamagedFrame]:
     """One frame of each file."""
     for index, path in enumerate(files[first:], first):
         try:
@@ -79,12 +79,12 @@ def _read_files(files: list[Path], options: ReadOptions, first: int) -> Iterator
             if len(frames) != 1:
                 raise input_error(path, f"expected one frame per file of a folder, found {len(frames)}")
         except (ValueError, OSError) as error:
-            yield Damaged(index, " ".join(str(error).split()))
+            yield DamagedFrame(index, " ".join(str(error).split()))
             continue
         yield Frame(frames[0].stem, frames[0].data, frames[0].notes, index, len(files))
 
 
-def _read_stack(path: Path, options: ReadOptions, numbers: tuple[int, int]) -> Iterator[Frame | Damaged]:
+def _read_stack(path: Path, options: ReadOptions, numbers: tuple[int, int]) -> Iterator[Frame | DamagedFrame]:
     """The frames of one file from the first of these ``numbers`` on; behind a damaged one it is begun anew."""
     at, count = numbers
     while at < count:
@@ -94,5 +94,5 @@ def _read_stack(path: Path, options: ReadOptions, numbers: tuple[int, int]) -> I
                 yield frame
             return
         except (ValueError, OSError) as error:
-            yield Damaged(at, " ".join(str(error).split()))
+            yield DamagedFrame(at, " ".join(str(error).split()))
             at += 1

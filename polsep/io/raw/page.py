@@ -1,0 +1,32 @@
+"""`Page`, the type that every reader of raw files yields.
+
+A reader takes a path and yields one `Page` per picture, lazily; it raises ValueError, in one line, on what it can't
+read. Before it decodes, it makes the checks of `io.store.header_checks`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from polsep.sensor.camera import Layout
+
+
+@dataclass(frozen=True)
+class Page:
+    """One picture of a file: ``array`` ``[H, W]`` or ``[H, W, C]``; with ``angles`` a leading axis of 0, 45, 90, 135.
+
+    ``index`` of ``count`` pictures. ``white_level`` and ``layout`` are what the file itself says, None where it says
+    nothing. ``sampled`` angle planes were taken from one mosaic: their pixels lie at different points.
+    """
+
+    array: NDArray[Any]
+    index: int = 0
+    count: int = 1
+    white_level: float | None = None
+    layout: Layout | None = None
+    angles: bool = False
+    sampled: bool = False
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,126 @@
+"""Films by PyAV (extra ``video``): lossless ones to measure in, and ones to watch.
+
+Films are written in parts, each a whole file that begins with a key frame, and joined without decoding. So a film that
+was made with interruptions has the bytes of one that was not: containers are written without dates and random numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from fractions import Fraction
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.io.raw.videos import load_library
+
+#: Containers by suffix.
+_FORMATS = {".mp4": "mp4", ".mkv": "matroska"}
+#: No dates and random numbers in them.
+_EXACTLY = {"fflags": "+bitexact"}
+
+
+@dataclass(frozen=True)
+class FilmKind:
+    """How a film is kept: ``codec``, ``pixels`` and ``options`` as FFmpeg names them; ``given``: callers' pixels."""
+
+    suffix: str
+    codec: str
+    pixels: str
+    given: str
+    options: tuple[tuple[str, str], ...]
+
+
+_EXACT = (("level", "3"), ("slicecrc", "1"), ("slices", "4"), ("g", "1"))
+#: To watch: H.264 that every player knows, of ``uint8 [H, W, 3]`` with even sides.
+WATCHABLE = FilmKind(".mp4", "libx264", "yuv420p", "rgb24", (("preset", "superfast"), ("crf", "18")))
+#: To measure: every bit as given, with a checksum in each slice; ``uint16 [H, W, 3]``, and ``[H, W, 1]``.
+LOSSLESS = FilmKind(".mkv", "ffv1", "gbrp16le", "gbrp16le", _EXACT)
+LOSSLESS_GREY = FilmKind(".mkv", "ffv1", "gray16le", "gray16le", _EXACT)
+
+
+class Film:
+    """A film that is being written: frames in, a whole file after `close`. Raises ValueError without PyAV.
+
+    State: the encoder. ``rate`` in frames per second.
+    """
+
+    def __init__(self, target: Path | BinaryIO, kind: FilmKind, size: tuple[int, int], rate: float) -> None:
+        av = load_library()
+        self._kind, self._count = kind, 0
+        file = str(target) if isinstance(target, Path) else target
+        self._container: Any = av.open(file, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
+        fraction = Fraction(rate).limit_denominator(1001)
+        self._stream: Any = self._container.add_stream(kind.codec, rate=fraction, options=dict(kind.options))
+        self._stream.height, self._stream.width = size
+        self._stream.pix_fmt = kind.pixels
+        self._stream.codec_context.thread_count = 1  # threads belong to the separation
+        self._stream.codec_context.flags |= av.codec.context.Flags.bitexact
+        self._rate = fraction
+
+    def write(self, image: NDArray[Any]) -> None:
+        """One more frame, in the pixels that the kind is given."""
+        import av
+
+        image = image[..., 0] if image.shape[-1] == 1 else image
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=self._kind.given)
+        if self._kind.given != self._kind.pixels:
+            frame = frame.reformat(format=self._kind.pixels)
+        frame.pts, frame.time_base = self._count, 1 / self._rate
+        self._count += 1
+        for packet in self._stream.encode(frame):
+            self._container.mux(packet)
+
+    def close(self) -> None:
+        """Write what is left."""
+        if self._count:
+            for packet in self._stream.encode():
+                self._container.mux(packet)
+        self._container.close()
+
+
+def encode_film(images: Iterable[NDArray[Any]], kind: FilmKind, rate: float) -> bytes:
+    """A short film of images of one shape as a file's bytes. Raises ValueError without images or PyAV."""
+    target, film = BytesIO(), None
+    for image in images:
+        film = film or Film(target, kind, image.shape[:2], rate)
+        film.write(image)
+    if film is None:
+        raise ValueError("expected a film of one image or more, found none")
+    film.close()
+    return target.getvalue()
+
+
+def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -> None:
+    """One film of several of one ``kind`` and ``rate``, in their order, by copying what is encoded."""
+    av = load_library()
+    stream, shown = None, 0
+    with closing(av.open(str(path), "w", format=_FORMATS[kind.suffix], options=_EXACTLY)) as output:
+        for part in parts:
+            with av.open(str(part)) as source:
+                given = source.streams.video[0]
+                stream = stream or output.add_stream_from_template(given)
+                packets = [packet for packet in source.demux(given) if packet.size]
+                for packet in packets:
+                    # Every part counts its frames from 0.
+                    later = round(shown / (Fraction(rate).limit_denominator(1001) * packet.time_base))
+                    packet.pts, packet.dts, packet.stream = packet.pts + later, packet.dts + later, stream
+                    output.mux(packet)
+                shown += len(packets)
+
+
+def as_codes(image: NDArray[np.float32], white: float) -> NDArray[np.uint16]:
+    """Linear light as 16-bit codes, 65535 = ``white``, limited."""
+    scaled: NDArray[np.float32] = image * np.float32(65535 / white)
+    return np.rint(np.clip(scaled, 0, 65535, out=scaled), out=scaled).astype(np.uint16)
+
+
+def even_side(length: float) -> int:
+    """The next even number of pixels, at least 2."""
+    return max(2, 2 * math.ceil(length / 2))

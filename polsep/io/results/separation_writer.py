@@ -1,0 +1,222 @@
+"""Writer of one separated frame to files, atomically.
+
+Whatever the format, a frame becomes DIR/STEM.<format> (or a set of DIR/STEM_<layer>.<format> images), the preview
+DIR/STEM.png and the sidecar DIR/STEM.json, which holds the polsep version, the report, the units and a sha256 per file.
+The layer `ERROR` exists only where a frame has one. Its image belongs to STEM all the same: an older one is refused or
+replaced like the others, and never stays beside images of another frame.
+
+Conventions: images are linear light with 1.0 = one measurement at the white level, so an unclipped s0 reaches 2;
+aolp is in radians in [0, pi), from image-right toward image-up. Files hold the very float32 values of the frame,
+except the PNG set, whose scales are in `PNG_UNITS` and whose limited samples the sidecar counts.
+
+Every file is encoded in memory and written by Python: OpenEXR's own writes report a full disk, but a short file only as
+a warning on the terminal.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import imagecodecs
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from polsep.io.results.exr import encode_exr
+from polsep.io.results.previews import contact_sheet
+from polsep.io.results.sidecars import EncodedFile, require_finite, require_stem, version_text, write_with_sidecar
+from polsep.io.store.atomic import OutputError, refuse_existing
+from polsep.io.store.image_codecs import encode_png
+
+if TYPE_CHECKING:
+    from polsep.separation.report import SeparatedFrame
+
+FORMATS = ("exr", "npz", "tiff", "png")
+#: Layers of every frame.
+LAYERS = ("diffuse", "specular", "dolp", "aolp", "valid")
+#: The layer of frames whose method expects an error: two channels, for diffuse and specular.
+ERROR = "error"
+
+#: The unit of images.
+LIGHT = "linear light, 1.0 = one measurement at the white level (an unclipped s0 = diffuse + specular reaches 2)"
+#: What the numbers in EXR, NPZ and TIFF files mean.
+UNITS = {
+    "diffuse": LIGHT,
+    "specular": f"{LIGHT}; may exceed 2 where highlights were clipped",
+    "dolp": "degree of linear polarization, 0 to 1; above 1 by noise",
+    "aolp": "angle of linear polarization in radians, in [0, pi), from image-right toward image-up",
+    "valid": "1 (TIFF: 255) where the separation is trustworthy, else 0",
+    ERROR: "expected standard deviation of the error of diffuse and of specular, over all colours, in their unit",
+    "combined": f"{LIGHT}; the sum of diffuse and specular, as edited",
+}
+#: What the codes in the PNG set mean.
+PNG_UNITS = {
+    "diffuse": "16 bit, LINEAR (no gamma): 65535 = 2.0; 1.0 = one measurement at the white level",
+    "specular": "16 bit, LINEAR (no gamma): 65535 = 2.0; 1.0 = one measurement at the white level",
+    "dolp": "16 bit: 65535 = degree of linear polarization 1.0",
+    "aolp": "16 bit: 65536 = pi radians (180 degrees), from image-right toward image-up",
+    "valid": "8 bit: 255 where the separation is trustworthy, else 0",
+    ERROR: "16 bit, LINEAR: 65535 = 2.0; expected standard deviation of the error, red: of diffuse, green: of specular",
+}
+#: The value that code 65535 stands for in the PNG set.
+PNG_WHITE = {"diffuse": 2.0, "specular": 2.0, "dolp": 1.0, ERROR: 2.0}
+
+
+def planned_outputs(directory: Path, stem: str, format: str) -> list[Path]:
+    """Every file that `write_separation` may write, images first, then preview and sidecar. Touches no file.
+
+    All are written, but for the image of `ERROR` (TIFF and PNG) where a frame has none.
+    Raises OutputError when ``format`` is not one of `FORMATS` or ``stem`` is not a plain file name.
+    """
+    if format not in FORMATS:
+        raise OutputError(f"expected a format of {', '.join(FORMATS)}, found {format!r}")
+    require_stem(stem)
+    return [Path(directory) / name for name in _file_names(stem, format, (*LAYERS, ERROR))]
+
+
+def _file_names(stem: str, format: str, layers: tuple[str, ...]) -> list[str]:
+    """The files of one frame with these layers."""
+    images = [f"{stem}_{layer}.{format}" for layer in layers] if format in ("tiff", "png") else [f"{stem}.{format}"]
+    return [*images, f"{stem}.png", f"{stem}.json"]
+
+
+def _layers(frame: SeparatedFrame) -> tuple[str, ...]:
+    """The layers that a frame has."""
+    return LAYERS if frame.error is None else (*LAYERS, ERROR)
+
+
+def write_separation(
+    frame: SeparatedFrame, directory: Path, stem: str, format: str = "exr", overwrite: bool = False
+) -> list[Path]:
+    """Write the images, preview and sidecar of ``frame`` into ``directory`` (made if missing); return their paths.
+
+    Atomic, as `write_set` is; ``overwrite`` also removes an older error image where ``frame`` has none. Files of an
+    earlier run in another format are left alone.
+    Raises OutputError when one of `planned_outputs` exists and ``overwrite`` is False (before any work), when the frame
+    breaks its contract (shapes, dtypes, values that are not finite, a report that is not JSON) or when writing fails.
+    """
+    targets = planned_outputs(directory, stem, format)
+    directory = Path(directory)
+    refuse_existing(directory, targets, overwrite)
+    _check_frame(frame)
+    facts = {
+        "source": frame.report.get("source"),
+        "format": format,
+        "shape": list(frame.diffuse.shape),
+        "units": {layer: (PNG_UNITS if format == "png" else UNITS)[layer] for layer in _layers(frame)},
+    }
+    limited = {"limited_samples": _limited_samples(frame)} if format == "png" else {}
+    write_with_sidecar(targets, _encoded_files(frame, stem, format), facts, {"report": frame.report, **limited})
+    return [directory / name for name in _file_names(stem, format, _layers(frame))]
+
+
+def _check_frame(frame: SeparatedFrame) -> None:
+    """Hold the frame to its contract, so that no file carries a surprise."""
+    size = frame.valid.shape
+    if len(size) != 2 or 0 in size or frame.valid.dtype != np.bool_:
+        raise OutputError(f"expected valid as bool [H, W], found {frame.valid.dtype} {list(size)}")
+    channels = frame.diffuse.shape[-1]
+    color = (*size, 3 if channels == 3 else 1)
+    shapes = {"diffuse": color, "specular": color, "dolp": size, "aolp": size}
+    if frame.error is not None:
+        shapes[ERROR] = (*size, 2)
+    for name, shape in shapes.items():
+        image = getattr(frame, name)
+        if image.shape != shape or image.dtype != np.float32:
+            raise OutputError(f"expected {name} as float32 {list(shape)}, found {image.dtype} {list(image.shape)}")
+    require_finite({name: getattr(frame, name) for name in shapes})
+    if frame.error is not None and float(frame.error.min()) < 0:
+        raise OutputError(f"expected deviations of 0 or more in {ERROR}, found {float(frame.error.min()):.3g}")
+
+
+def _encoded_files(frame: SeparatedFrame, stem: str, format: str) -> Iterator[EncodedFile]:
+    """Name and contents of each image file, then of the preview; one in memory at a time."""
+    if format == "exr":
+        yield f"{stem}.exr", _encode_exr(frame)
+    elif format == "npz":
+        yield f"{stem}.npz", _encode_npz(frame)
+    elif format == "tiff":
+        for layer in _layers(frame):
+            yield f"{stem}_{layer}.tiff", _encode_tiff(frame, layer)
+    else:
+        for layer in _layers(frame):
+            yield f"{stem}_{layer}.png", encode_png(_png_codes(frame, layer))
+    yield f"{stem}.png", encode_png(contact_sheet(frame))
+
+
+def _encode_exr(frame: SeparatedFrame) -> memoryview:
+    """One part of float32 channels, ZIP compressed, with the units as header attributes."""
+    planes = {"dolp.Y": frame.dolp, "aolp.Y": frame.aolp, "valid.Y": frame.valid}
+    for layer, image in (("diffuse", frame.diffuse), ("specular", frame.specular)):
+        for k, color in enumerate("RGB" if image.shape[-1] == 3 else "Y"):
+            planes[f"{layer}.{color}"] = image[..., k]
+    if frame.error is not None:
+        planes |= {f"{ERROR}.{image}": frame.error[..., k] for k, image in enumerate(("diffuse", "specular"))}
+    notes = {"polsepVersion": version_text(), **{f"{layer}Units": UNITS[layer] for layer in _layers(frame)}}
+    return encode_exr({name: plane.astype(np.float32) for name, plane in planes.items()}, notes)
+
+
+def _encode_npz(frame: SeparatedFrame) -> bytes:
+    """The layers as they are, deflated."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **{layer: getattr(frame, layer) for layer in _layers(frame)})
+    return stream.getvalue()
+
+
+def _encode_tiff(frame: SeparatedFrame, layer: str) -> bytes:
+    """One layer: float32 deflated after the floating-point predictor where there is one; valid as uint8 0 or 255.
+
+    The error is one page of two samples per pixel.
+    """
+    image = np.where(frame.valid, 255, 0).astype(np.uint8) if layer == "valid" else _flat(getattr(frame, layer))
+    predictor = 3 if image.dtype == np.float32 and imagecodecs.FLOATPRED.available else 1  # TIFF: 1 none, 3 float
+    stream = io.BytesIO()
+    tifffile.imwrite(
+        stream,
+        image,
+        photometric="rgb" if image.shape[2:] == (3,) else "minisblack",
+        planarconfig="contig" if image.ndim == 3 else None,
+        extrasamples=("unspecified",) if layer == ERROR else None,
+        compression="zlib",
+        predictor=predictor,
+        description=f"{layer}: {UNITS[layer]}",
+        software=f"polsep {version_text()}",
+        metadata=None,
+    )
+    return stream.getvalue()
+
+
+def _png_codes(frame: SeparatedFrame, layer: str) -> NDArray[np.uint16] | NDArray[np.uint8]:
+    """One layer in the integer codes of `PNG_UNITS`, values outside the scale limited to its ends.
+
+    The error gets a third colour of zeros: PNG would take the second of two channels for opacity.
+    """
+    if layer == "valid":
+        return np.where(frame.valid, 255, 0).astype(np.uint8)
+    if layer == "aolp":
+        steps = np.rint(frame.aolp.astype(np.float64) * (65536 / np.pi)).astype(np.int64)
+        return np.mod(steps, 65536).astype(np.uint16)
+    image: NDArray[np.float64] = _flat(getattr(frame, layer)).astype(np.float64)
+    if layer == ERROR:
+        image = np.concatenate([image, np.zeros_like(image[..., :1])], axis=-1)
+    return np.rint(np.clip(image / PNG_WHITE[layer], 0, 1) * 65535).astype(np.uint16)
+
+
+def _limited_samples(frame: SeparatedFrame) -> dict[str, dict[str, int]]:
+    """How many samples of each layer `_png_codes` limits: below 0 and above the value of code 65535."""
+    return {
+        layer: {
+            "below": int(np.count_nonzero(getattr(frame, layer) < 0)),
+            "above": int(np.count_nonzero(getattr(frame, layer) > white)),
+        }
+        for layer, white in PNG_WHITE.items()
+        if layer in _layers(frame)
+    }
+
+
+def _flat(image: NDArray[Any]) -> NDArray[Any]:
+    """``[H, W, 1]`` as ``[H, W]``; other shapes unchanged."""
+    return image[..., 0] if image.ndim == 3 and image.shape[-1] == 1 else image

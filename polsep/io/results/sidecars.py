@@ -1,0 +1,89 @@
+"""Sets of files with a sidecar: STEM.json holds the polsep version, what its images mean, and a sha256 per file."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.io.store.atomic import OutputError, write_checked, write_set
+
+#: A file name and the file's contents.
+EncodedFile = tuple[str, bytes | memoryview]
+
+
+def require_stem(stem: str) -> None:
+    """Raise OutputError unless ``stem`` is a plain file name."""
+    if stem in ("", ".", "..") or any(c in stem for c in "/\\\0"):
+        raise OutputError(f"expected a file name without path separators as stem, found {stem!r}")
+
+
+def require_finite(images: Mapping[str, NDArray[Any]]) -> None:
+    """Raise OutputError, with a name and a count, where an image holds NaN or infinite samples."""
+    for name, image in images.items():
+        if wrong := int(np.count_nonzero(~np.isfinite(image))):
+            raise OutputError(f"expected finite values in {name}, found {wrong} NaN or infinite samples")
+
+
+def write_with_sidecar(
+    targets: Sequence[Path],
+    files: Iterable[EncodedFile],
+    facts: Mapping[str, Any],
+    report: Mapping[str, Any] | None = None,
+) -> None:
+    """Write ``files`` and then their sidecar STEM.json, the last of ``targets``; atomically, as `write_set` does.
+
+    ``files`` may be lazy: each is in memory alone. The sidecar holds ``facts`` before the list of files and ``report``
+    after it. Raises OutputError, also on a sidecar that is not JSON.
+    """
+    stem = targets[-1].stem
+
+    def write(folder: Path) -> None:
+        listed = []
+        for name, data in files:
+            write_checked(folder / name, data)
+            listed.append({"name": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()})
+        sidecar = {
+            "polsep": version_text(),
+            **facts,
+            "preview": f"{stem}.png is sRGB, 8 bit, for people: do not measure in it",
+            "files": listed,
+            **(report or {}),
+        }
+        write_checked(folder / f"{stem}.json", (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
+
+    write_set(targets, stem, write)
+
+
+def require_same_settings(path: Path, settings: Mapping[str, Any], owner: str, advice: str = "") -> None:
+    """Raise OutputError, naming what differs, unless ``path`` holds these settings; ``owner``: what they belong to."""
+    try:
+        before, now = (_flat_names(json.loads(text)) for text in (path.read_text("utf-8"), json.dumps(settings)))
+    except (ValueError, AttributeError) as error:
+        raise OutputError(f"expected the settings of {owner} in {path}, found {error}") from error
+    different = [name for name in before | now if before.get(name) != now.get(name)]
+    if different:
+        expected, found = (", ".join(f"{name} {all.get(name)}" for name in different) for all in (before, now))
+        raise OutputError(f"expected {expected}, with which {owner} was begun, found {found}{advice}")
+
+
+def _flat_names(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Settings within settings under both names, separated by a space."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= _flat_names(value, f"{prefix}{name} ") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat
+
+
+def version_text() -> str:
+    """The version of the installed polsep."""
+    try:
+        return importlib.metadata.version("polsep")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,153 @@
+"""Atomic files and sets of files.
+
+A reader sees all of a file or the one from before; a set of files appears complete or not at all.
+Everything is written under a hidden name in the same directory, then renamed.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import signal
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+
+class OutputError(ValueError):
+    """The outputs could not be written, and nothing was: one line of what was expected and what was found."""
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A hidden path to write to, which is renamed to ``path`` at the end of the block. Makes the folder.
+
+    Removes what was written where anything is raised inside; an OSError then names ``path``.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        os.replace(part, path)
+    except BaseException as error:
+        part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, str(part)):
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
+
+
+def replace_bytes(path: Path, data: bytes | memoryview) -> None:
+    """Replace a file atomically; makes its folder. Raises OSError."""
+    with atomic_path(path) as part:
+        write_checked(part, data)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Replace a text file atomically; makes its folder. Raises OSError."""
+    replace_bytes(path, text.encode())
+
+
+def write_checked(path: Path, data: bytes | memoryview) -> None:
+    """Write a file and check its size; raises an OSError that names it. The write itself is not atomic."""
+    try:
+        path.write_bytes(data)
+    except OSError as error:  # names the file where it cannot be opened, but not where the disk is full
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    found = path.stat().st_size
+    if found != len(data):
+        raise OSError(errno.EIO, f"expected {len(data)} bytes, found {found}", str(path))
+
+
+def refuse_existing(directory: Path, targets: Sequence[Path], overwrite: bool) -> None:
+    """Raise OutputError where files would be replaced without ``overwrite``, or a directory at all. Call it first."""
+    nearest = next((d for d in (directory, *directory.parents) if os.path.lexists(d)), None)
+    if nearest is not None and not os.path.isdir(nearest):
+        raise OutputError(f"expected a directory to write into, found a file: {nearest}")
+    for target in targets:
+        if os.path.isdir(target) and not os.path.islink(target):
+            raise OutputError(f"expected a file or nothing at {target}, found a directory")
+        if not overwrite and os.path.lexists(target):
+            raise OutputError(f"expected no {target}, found one from before; --overwrite replaces it")
+
+
+def write_set(targets: Sequence[Path], name: str, write: Callable[[Path], None]) -> None:
+    """Write a set of files atomically: ``write(folder)`` makes them, then they move to ``targets`` of the same names.
+
+    The targets share one directory, which is made if missing. After a failure no new file is left and the files from
+    before are back in place. A target that was not written is removed. Two writers of one set at the same time are not
+    guarded against. Raises OutputError, naming the set by ``name``.
+    """
+    directory = targets[0].parent
+    missing = [d for d in (directory, *directory.parents) if not os.path.exists(d)]
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with _delayed_signals():
+            _write_and_move(targets, write)
+    except BaseException as error:
+        for path in missing:
+            with suppress(OSError):
+                path.rmdir()
+        if isinstance(error, OutputError) or not isinstance(error, Exception):
+            raise
+        reason = " ".join(str(error).split()) or "no reason given"
+        raise OutputError(
+            f"expected to write {name!r} into {directory}, found {type(error).__name__}: {reason}"
+        ) from error
+
+
+@contextmanager
+def _delayed_signals() -> Iterator[None]:
+    """Ctrl-C and the system's request to end take effect after the block, so that they do not interrupt its cleanup."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    if threading.current_thread() is not threading.main_thread() or None in before.values():  # no signal arrives here
+        yield
+        return
+    caught: list[int] = []
+    for number in before:
+        signal.signal(number, lambda number, frame: caught.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if caught:  # also where the block has failed, or the system's own handler ends the program
+            signal.raise_signal(caught[0])
+
+
+def _write_and_move(targets: Sequence[Path], write: Callable[[Path], None]) -> None:
+    """Write into a hidden directory beside the targets, then rename; that directory is gone afterwards."""
+    staging = Path(tempfile.mkdtemp(prefix=".polsep-", dir=targets[0].parent))
+    try:
+        (staging / "new").mkdir()
+        (staging / "old").mkdir()
+        write(staging / "new")
+        _move_into_place(staging, targets)
+        shutil.rmtree(staging / "old", ignore_errors=True)
+    finally:
+        shutil.rmtree(staging / "new", ignore_errors=True)
+        for path in (staging / "old", staging):  # not emptied by force: only a failed restore leaves files in old/
+            with suppress(OSError):
+                path.rmdir()
+
+
+def _move_into_place(staging: Path, targets: Sequence[Path]) -> None:
+    """Rename staging/new/* to the targets and keep what was there in staging/old; undo everything on failure."""
+    begun: list[Path] = []
+    written = {path.name for path in (staging / "new").iterdir()}
+    try:
+        for target in targets:
+            begun.append(target)
+            if os.path.lexists(target):
+                os.replace(target, staging / "old" / target.name)
+            if target.name in written:
+                os.replace(staging / "new" / target.name, target)
+    except BaseException:
+        for target in reversed(begun):
+            if target.name in written and not (staging / "new" / target.name).exists():
+                target.unlink(missing_ok=True)
+            if os.path.lexists(staging / "old" / target.name):
+                os.replace(staging / "old" / target.name, target)
+        raise

@@ -173,13 +173,13 @@ def normal_deviates(index: int) -> list[float]:
 def make_turnable(shape: MeshScene, size: tuple[int, int], generator: torch.Generator) -> TurnableScene:
     """A random view of a shape, exposed so that `CLIPPED` of the object's samples clips under the light at 0."""
     from polsep.render.materials import random_materials
-    from polsep.render.raycast import find_view, light_view, shade_view
+    from polsep.render.raycast import find_lit, find_view, shade_view
     from polsep.render.views import random_shot
 
     shot = random_shot(shape, generator)
     view = find_view(shape, shot.camera, size, 2)
     materials = random_materials(shape.mesh.slot_count, generator, shape.size)
-    lit = light_view(shape, view, shot.light)
+    lit = find_lit(shape, view, shot.light)
     angles = [k * math.pi / 3 for k in range(3)]
     thirds = [shade_view(view, materials, replace(shot.light, polarizer=angle), lit) for angle in angles]
     # The discrete Fourier transform of the three gives mean, cosine and sine.

@@ -123,7 +123,7 @@ def _build_renderers(seed: int) -> dict[str, Callable[[], tuple[Stokes, Stokes]]
     """What renders the diffuse and specular images of a random shape, by name."""
     from polsep.render.materials import random_materials
     from polsep.render.pathtrace import FAST_VARIANT, PathOptions, build_path_model, trace_paths
-    from polsep.render.raycast import MeshScene, render_mesh
+    from polsep.render.raycast import MeshScene, render_scene
     from polsep.render.shapes import random_mesh
     from polsep.render.sphere_tracing import PinholeCamera, PointLight
 
@@ -135,7 +135,8 @@ def _build_renderers(seed: int) -> dict[str, Callable[[], tuple[Stokes, Stokes]]
     model = build_path_model((scene, materials), FAST_VARIANT)
 
     def ours() -> tuple[Stokes, Stokes]:
-        return render_mesh((scene, materials), camera, light, SIZE, SAMPLES)
+        rendered = render_scene((scene, materials), camera, light, SIZE, SAMPLES)
+        return rendered.diffuse, rendered.specular
 
     def theirs() -> tuple[Stokes, Stokes]:
         traced = trace_paths(model, camera, light, SIZE, PathOptions(SAMPLES, 1, 1))

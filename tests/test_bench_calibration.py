@@ -32,7 +32,7 @@ from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.methods import compose
 from polsep.physics.stokes import intensity_behind
 from polsep.render.materials import random_materials
-from polsep.render.raycast import find_view, light_view, shade_view
+from polsep.render.raycast import find_lit, find_view, shade_view
 from polsep.render.views import random_shot, seeded_shape
 from polsep.separation.analytic import separate_analytic
 
@@ -52,7 +52,7 @@ def test_a_turned_polarizer_is_a_sum_of_three(scene: TurnableScene) -> None:
     view = find_view(shape, shot.camera, SIZE, 2)
     materials = random_materials(shape.mesh.slot_count, generator, shape.size)
     light = replace(shot.light, polarizer=0.4)
-    rendered = shade_view(view, materials, light, light_view(shape, view, light))
+    rendered = shade_view(view, materials, light, find_lit(shape, view, light))
     turned = scene.under(0.4)
     gain = float(turned.diffuse.s0.sum() / rendered.diffuse.s0.sum())
     for found, expected in ((turned.diffuse, rendered.diffuse), (turned.specular, rendered.specular)):

@@ -26,7 +26,7 @@ from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, sha
 
 pytest.importorskip("embreex")
 
-from polsep.render.raycast import MeshScene, dress, find_hits, is_lit, render_mesh
+from polsep.render.raycast import MeshScene, build_gbuffer, find_hits, is_lit, render_scene
 
 VARIANT = "scalar_spectral_polarized"
 SIZE = (36, 48)
@@ -162,8 +162,8 @@ def test_rendered_shapes_agree_with_mitsuba(mi: Any, seed: int) -> None:
             pixel = mitsuba_pixel(mi, scene, light, ((col + 0.5) / SIZE[1], (row + 0.5) / SIZE[0]))
             if pixel is not None:
                 expected[:, :, row, col], hit[row, col] = pixel, True
-    lobes = render_mesh((MeshScene(mesh), materials), camera, light, SIZE)
-    found = [stacked(lobe)[:, 0].double().numpy() for lobe in lobes]
+    rendered = render_scene((MeshScene(mesh), materials), camera, light, SIZE)
+    found = [stacked(lobe)[:, 0].double().numpy() for lobe in (rendered.diffuse, rendered.specular)]
     lit = expected[0, 0] > 0
     same = lit == (found[0][0] > 0)
     assert int((lit & same).sum()) > 100
@@ -210,7 +210,7 @@ def test_rendered_shapes_agree_with_the_reference(reference: Any, seed: int) -> 
     scene = MeshScene(mesh)
     rows, cols = torch.meshgrid(*(torch.arange(n) + 0.5 for n in SIZE), indexing="ij")
     hits = find_hits(scene, camera, (rows.flatten(), cols.flatten()), SIZE)
-    buffer, lit = dress(hits, materials), is_lit(scene, hits, light)
+    buffer, lit = build_gbuffer(hits, materials), is_lit(scene, hits, light)
     assert int(lit.sum()) > 100
     expected = reference_lobes(reference, buffer, camera, light) * lit[0, :, 0]
     for stokes, exact in zip(shade(buffer, camera, light, lit), expected, strict=True):

@@ -33,7 +33,7 @@ from polsep.render.pathtrace import (
     paths,
     trace_paths,
 )
-from polsep.render.raycast import MeshScene, Model, find_hits, render_mesh
+from polsep.render.raycast import MeshScene, Model, find_hits, render_scene
 
 FLAT: list[Floats] = [np.zeros((FINE, FINE))] * 6
 #: Lobes of one scene by two renderers, relative to the lobe's peak.
@@ -88,14 +88,14 @@ def assert_lobes_agree(found: Tensor, expected: Tensor, outliers: int) -> None:
 @pytest.mark.parametrize("variant", [FAST_VARIANT, SLOW_VARIANT])
 @pytest.mark.parametrize("textured", [True, False])
 def test_direct_light_is_what_rays_give(variant: str, textured: bool) -> None:
-    """With depth 1 and a point light there is no noise: the images of `render_mesh`, shadows and silhouettes too."""
+    """With depth 1 and a point light there is no noise: the images of `render_scene`, shadows and silhouettes too."""
     if variant == FAST_VARIANT != find_variant():
         pytest.skip("no LLVM that works")
     size = (90, 120) if variant == FAST_VARIANT else (18, 24)
     for seed in (5, 8):
         (scene, materials), camera, light = random_model(seed)
         model = (scene, materials if textured else replace(materials, textures=None))
-        expected = torch.stack([stacked(lobe) for lobe in render_mesh(model, camera, light, size, 2)])
+        expected = lobes(render_scene(model, camera, light, size, 2))
         found = trace_paths(build_path_model(model, variant), camera, light, size, PathOptions(2, 1, 1))
         rows, cols = torch.meshgrid(*(torch.arange(2 * n) / 2 + 0.25 for n in size), indexing="ij")
         hits = find_hits(scene, camera, (rows.flatten(), cols.flatten()), size)
@@ -192,7 +192,7 @@ def test_small_disks_are_points() -> None:
     size, place = (40, 50), torch.tensor(CORNER_LIGHT.position)
     target = (-1.0, 0.5, -1.0)
     disk = AreaLight(CORNER_LIGHT.position, target, 1e-5, CORNER_LIGHT.intensity, CORNER_LIGHT.polarizer)
-    expected = torch.stack([stacked(lobe) for lobe in render_mesh(corner(), CORNER_CAMERA, CORNER_LIGHT, size)])
+    expected = lobes(render_scene(corner(), CORNER_CAMERA, CORNER_LIGHT, size))
     rows, cols = torch.meshgrid(*(torch.arange(n) + 0.5 for n in size), indexing="ij")
     hits = find_hits(corner()[0], CORNER_CAMERA, (rows.flatten(), cols.flatten()), size)
     axis = normalize((torch.tensor(target) - place).view(3, 1, 1))
@@ -223,7 +223,7 @@ def test_disks_are_many_points(monkeypatch: pytest.MonkeyPatch) -> None:
         way = normalize(hits.position - torch.from_numpy(place).float().view(3, 1, 1))
         cosine = torch.zeros(size)
         cosine.view(-1)[hits.ray] = dot(way, torch.from_numpy(axis).float().view(3, 1, 1)).clamp(min=0)[0, :, 0]
-        lit = torch.stack([stacked(lobe) for lobe in render_mesh(model, camera, point, size)])
+        lit = lobes(render_scene(model, camera, point, size))
         expected += lit * cosine / count
     for share in (0.1, 0.9):
         monkeypatch.setattr(paths, "FIRST_SPECULAR", share)

@@ -12,6 +12,7 @@ import torch
 
 from polsep.compute.threads import get_threads, set_threads
 from polsep.physics.optics import ETA, beam_frame, diffuse_dolp, dot, normalize
+from polsep.physics.stokes import Stokes
 from polsep.render import raycast, shapes
 from polsep.render.distances import ball, plain
 from polsep.render.materials import Materials, random_materials
@@ -19,12 +20,11 @@ from polsep.render.raycast import (
     Hits,
     MeshScene,
     View,
-    dress,
+    build_gbuffer,
     find_hits,
+    find_lit,
     find_view,
     is_lit,
-    light_view,
-    render_mesh,
     render_scene,
     shade_view,
 )
@@ -54,6 +54,10 @@ def unit_ball() -> MeshScene:
     return MeshScene(ellipsoid(np.ones(3), FLAT))
 
 
+def lobes_of(scene: Scene) -> tuple[Stokes, Stokes]:
+    return scene.diffuse, scene.specular
+
+
 def every_point(size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
     rows, cols = torch.meshgrid(torch.arange(size[0]) + 0.5, torch.arange(size[1]) + 0.5, indexing="ij")
     return rows.flatten(), cols.flatten()
@@ -63,7 +67,7 @@ def every_point(size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
 def test_a_ball_is_the_ball(light: PointLight) -> None:
     """Diffuse and specular Stokes images of the mesh agree with those of the signed distance."""
     camera = PinholeCamera((0.5, 1.0, 6.0))
-    found = render_mesh((unit_ball(), one_material()), camera, light, SIZE, 3)
+    found = lobes_of(render_scene((unit_ball(), one_material()), camera, light, SIZE, 3))
     expected = render((Part(ball(1.0), plain(COLOR), roughness=0.35, specular=0.8),), camera, light, SIZE, 3)
     hits = find_hits(unit_ball(), camera, every_point(SIZE), SIZE)
     to_camera = torch.tensor(camera.position).view(3, 1, 1) - hits.position
@@ -85,7 +89,7 @@ def test_finer_meshes_come_closer(monkeypatch: pytest.MonkeyPatch) -> None:
     wrong = []
     for grid in ((25, 50), (50, 100), (100, 200)):
         monkeypatch.setattr(shapes, "ELLIPSOID_GRID", grid)
-        found = render_mesh((unit_ball(), one_material()), camera, light, SIZE, 2)
+        found = lobes_of(render_scene((unit_ball(), one_material()), camera, light, SIZE, 2))
         wrong.append(max(float((a.s0 - b.s0).abs().mean()) for a, b in zip(found, exact, strict=True)))
     assert wrong[1] < wrong[0] / 2
     assert wrong[2] < wrong[1] / 2
@@ -108,7 +112,7 @@ def test_what_misses_is_black() -> None:
     hits = find_hits(unit_ball(), camera, every_point(SIZE), SIZE)
     assert hits.ray.numel() == 0
     assert hits.rays == SIZE[0] * SIZE[1]
-    for lobe in render_mesh((unit_ball(), one_material()), camera, PointLight(), SIZE):
+    for lobe in lobes_of(render_scene((unit_ball(), one_material()), camera, PointLight(), SIZE)):
         assert float(lobe.s0.abs().max()) == 0
 
 
@@ -134,7 +138,7 @@ def test_slots_choose_materials() -> None:
     for face, eye in ((0, (9.0, 0.0, 0.0)), (1, (-9.0, 0.0, 0.0)), (4, (0.0, 0.0, 9.0)), (5, (0.0, 0.0, -9.0))):
         hits = find_hits(scene, PinholeCamera(eye), (torch.tensor([48.0]), torch.tensor([56.0])), SIZE)
         assert int(hits.slot) == face
-        torch.testing.assert_close(dress(hits, materials).albedo[:, 0, 0], colors[face])
+        torch.testing.assert_close(build_gbuffer(hits, materials).albedo[:, 0, 0], colors[face])
         direction = torch.tensor(eye) / math.hypot(*eye)
         torch.testing.assert_close(hits.normal[:, 0, 0], direction, rtol=0, atol=1e-5)
 
@@ -147,7 +151,7 @@ def test_random_shapes_obey_physics() -> None:
         slots = scene.mesh.slot_count
         camera = PinholeCamera((0.0, 0.6 * scene.size, 2.4 * scene.size))
         light = PointLight((scene.size, 2 * scene.size, 2 * scene.size), 5 * scene.size**2, 1.0)
-        diffuse, specular = render_mesh((scene, one_material(slots)), camera, light, (64, 64))
+        diffuse, specular = lobes_of(render_scene((scene, one_material(slots)), camera, light, (64, 64)))
         assert float(diffuse.s0.max()) > 0.01
         for stokes in (diffuse, specular):
             assert all(bool(torch.isfinite(s).all()) for s in (stokes.s0, stokes.s1, stokes.s2))
@@ -194,11 +198,11 @@ def hits_of(view: View) -> Hits:
 
 @pytest.mark.parametrize("samples", [1, 2])
 def test_scenes_are_those_of_the_torch_twin(samples: int) -> None:
-    """A textured shape, shadows and all: dress and shade in torch, averaged over samples; black and out elsewhere."""
+    """A textured shape, shadows and all: G-buffer and shading in torch, averaged over samples; black elsewhere."""
     (scene, materials), camera, light = textured_object()
     found = render_scene((scene, materials), camera, light, SIZE, samples)
     hits = hits_of(find_view(scene, camera, SIZE, samples))
-    lobes = shade(dress(hits, materials), camera, light, is_lit(scene, hits, light))
+    lobes = shade(build_gbuffer(hits, materials), camera, light, is_lit(scene, hits, light))
 
     def average(values: torch.Tensor) -> torch.Tensor:
         every = torch.zeros(3, hits.rays)
@@ -219,7 +223,7 @@ def test_views_serve_many_lights_and_materials() -> None:
     other = PointLight((-light.position[0], *light.position[1:]), light.intensity, 0.3)
     view = find_view(scene, camera, SIZE, 2)
     for lamp in (light, other):
-        lit = light_view(scene, view, lamp)
+        lit = find_lit(scene, view, lamp)
         for materials in (first, second):
             expected = render_scene((scene, materials), camera, lamp, SIZE, 2)
             assert_same_scene(shade_view(view, materials, lamp, lit), expected)
@@ -230,7 +234,7 @@ def test_threads_and_bands_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     model, camera, light = textured_object()
     set_threads(1)
     alone = render_scene(model, camera, light, SIZE, 2)
-    monkeypatch.setattr(raycast, "RAYS_AT_ONCE", 3000)
+    monkeypatch.setattr(raycast, "RAYS_PER_BAND", 3000)
     bands = render_scene(model, camera, light, SIZE, 2)
     assert_same_scene(bands, alone, 1e-6)
     for threads in (2, 5):
@@ -300,7 +304,8 @@ def test_the_light_behind_a_mesh_in_part(monkeypatch: pytest.MonkeyPatch) -> Non
     scene = unit_ball()
     hits = find_hits(scene, PinholeCamera(), every_point(SIZE), SIZE)
     asked = []
-    monkeypatch.setattr(raycast, "_trace_to_light", lambda *_: asked.append(True))
+    aim = raycast.rays.aim_at_light
+    monkeypatch.setattr(raycast.rays, "aim_at_light", lambda *given: asked.append(True) or aim(*given))
     is_lit(scene, hits, PointLight((0.0, 0.0, 3.0)))
     assert asked == []
     is_lit(scene, hits, PointLight((0.0, 0.0, 0.5)))
@@ -348,7 +353,7 @@ def test_the_diffuse_of_a_ball_is_radial_and_follows_fresnel() -> None:
     camera = PinholeCamera((0.0, 0.0, 8.0), fov_deg=16.0)
     cosine, angle, steep = zenith_and_azimuth(camera)
     for light in (PointLight((1.0, 2.0, 8.0), 60.0, 0.4), PointLight((-6.0, 1.0, 3.0), 60.0, 2.0)):
-        diffuse, _ = render_mesh((unit_ball(), one_material()), camera, light, SIZE)
+        diffuse = render_scene((unit_ball(), one_material()), camera, light, SIZE).diffuse
         seen = steep & (diffuse.s0[1] > 1e-2)
         assert int(seen.sum()) > 500
         dolp = torch.hypot(diffuse.s1, diffuse.s2)[1, seen] / diffuse.s0[1, seen]
@@ -362,7 +367,7 @@ def test_the_specular_of_a_ball_is_fully_polarized() -> None:
     """s1² + s2² = s0² at every pixel of one ray, whatever the polarizer of the light."""
     for polarizer in (0.0, 0.7, 2.2):
         light = PointLight((-3.0, 2.0, 6.0), 60.0, polarizer)
-        _, specular = render_mesh((unit_ball(), one_material()), PinholeCamera((0.5, 1.0, 6.0)), light, SIZE)
+        specular = render_scene((unit_ball(), one_material()), PinholeCamera((0.5, 1.0, 6.0)), light, SIZE).specular
         peak = float(specular.s0.max())
         assert peak > 0.1
         polarized = torch.hypot(specular.s1, specular.s2)
@@ -378,6 +383,6 @@ def test_no_highlight_at_brewsters_angle() -> None:
     peaks = []
     for polarizer in (0.0, math.pi / 2):
         light = PointLight(position, 6400.0, polarizer)
-        _, specular = render_mesh((unit_ball(), glossy), camera, light, SIZE)
+        specular = render_scene((unit_ball(), glossy), camera, light, SIZE).specular
         peaks.append(float(specular.s0.max()))
     assert peaks[0] < 2e-3 * peaks[1]

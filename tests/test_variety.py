@@ -14,7 +14,7 @@ pytest.importorskip("embreex")
 
 from polsep.physics.stokes import Stokes
 from polsep.render.materials import Materials, random_materials
-from polsep.render.raycast import MeshScene, View, find_view, light_view, shade_view
+from polsep.render.raycast import MeshScene, View, find_lit, find_view, shade_view
 from polsep.render.sphere_tracing import Scene
 from polsep.render.views import MIN_LIT, Shot, lit_share, random_shot, seeded_shape
 from polsep.sensor.camera import IMX250
@@ -260,7 +260,7 @@ def test_sheens_are_polarized_light_that_knows_no_material(shape: MeshScene, sho
     """1 in the median of what is lit, at most `MAX_SHEEN`, fully polarized, and the same for every albedo."""
     view = find_view(shape, shots[0].camera, (48, 48))
     light = shots[0].light
-    lit = light_view(shape, view, light)
+    lit = find_lit(shape, view, light)
     looks = [Look(view, random_materials(shape.mesh.slot_count, seeded(k)), light, lit) for k in range(2)]
     found, other = (find_sheen(look, 0.7) for look in looks)
     assert torch.equal(found.s0, other.s0)

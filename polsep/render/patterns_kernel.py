@@ -1,7 +1,7 @@
-"""Twin of `polsep.render.textures.pattern_weight` for runs of points of one slot, to the same bits.
+"""`polsep.render.textures.pattern_weight` for runs of points of one slot, bit by bit the same.
 
-Points are computed by the run, not one by one, so that loops without branches become vector instructions. Unlike other
-kernels, nothing here may be fused into multiply-adds: a point that rounds differently lies in another cell.
+Loops run over the points of a run without branches, so that LLVM vectorises them. Unlike other kernels, nothing here
+may be fused into multiply-adds: a point that rounds differently lies in another cell.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from polsep.render.textures import (
     RINGS,
 )
 
-#: Points of a run at most.
+#: Largest number of points in a run.
 RUN = 256
-# Rows of a run's room for numbers and for integers.
+# Offsets of the rows in the float and integer buffers of a run.
 _X, _Y, _Z, _U, _V, _W, _FIRST, _SECOND, _NOISE = (k * RUN for k in range(9))
 _I, _J, _K, _HASH, _NEXT = (k * RUN for k in range(5))
 NUMBER_ROWS, INTEGER_ROWS = 9, 5
@@ -50,9 +50,9 @@ _FAR = np.float32(np.inf)
 
 
 def _strict(function: Compilable) -> Compilable:
-    """As `compiling.compiled`, inlined, with every operation rounded on its own.
+    """Decorator like `compiling.compiled`, inlined, with every operation rounded on its own.
 
-    The option must be said: a function that says nothing is compiled with its caller's.
+    ``fastmath=False`` must be given: without it numba compiles a function with its caller's setting.
     """
     decorated: Compilable = njit(  # type: ignore[call-overload]  # numba's stubs lack some of its options
         nogil=True,
@@ -66,7 +66,7 @@ def _strict(function: Compilable) -> Compilable:
 
 
 class PatternTable(NamedTuple):
-    """`polsep.render.textures.Textures` as kernels take them: ``pattern``, ``octaves [S]``, ``seed [S]``.
+    """Arrays of `polsep.render.textures.Textures`: ``pattern``, ``octaves``, ``seed``, each ``[S]``.
 
     ``numbers [S, 15]``: the transform row by row, then warp, threshold and edge.
     """
@@ -78,7 +78,7 @@ class PatternTable(NamedTuple):
 
 
 def pattern_table(materials: Materials) -> PatternTable:
-    """The table of materials; all plain without textures."""
+    """The table of the textures of materials; all slots are plain without textures."""
     textures, slots = materials.textures, materials.roughness.numel()
     if textures is None:
         plain = np.full(slots, PLAIN)
@@ -115,7 +115,7 @@ def _wave(x: Any) -> Any:
 
 @_strict
 def _mix(h: Any) -> Any:
-    """The hash of `textures.hash_cell` after the lattice coordinates are in it."""
+    """`textures.hash_cell` from the combined lattice coordinates on."""
     h = np.uint32(h ^ (h >> _S16))
     h = np.uint32(h * _M0)
     h = np.uint32(h ^ (h >> _S15))
@@ -125,20 +125,20 @@ def _mix(h: Any) -> Any:
 
 @_strict
 def _fraction(h: Any, shift: Any) -> Any:
-    """Ten bits as a fraction; by way of signed integers, which every machine converts fast."""
+    """Ten bits as a fraction; via signed integers, which every CPU converts fast."""
     return np.float32(np.int32(np.uint32(h >> shift) & _TEN_BITS)) * _FRACTION
 
 
 @_strict
 def _shade(h: Any) -> Any:
-    """The shade of a cell."""
+    """The shade of a cell, as in `textures.cells`."""
     h = np.uint32((h ^ (h >> _S7)) * _M0)
     return np.float32(np.int32(np.uint32(h >> _S8) & _SIXTEEN_BITS)) * _SHADE
 
 
 @_strict
-def _slope(h: Any, x: Any, y: Any, z: Any) -> Any:
-    """The random gradient of a lattice point along (x, y, z)."""
+def _gradient(h: Any, x: Any, y: Any, z: Any) -> Any:
+    """Product of a lattice point's random gradient with (x, y, z)."""
     gx = TWO * _fraction(h, np.uint32(0)) - ONE
     gy = TWO * _fraction(h, _S10) - ONE
     gz = TWO * _fraction(h, _S20) - ONE
@@ -147,7 +147,7 @@ def _slope(h: Any, x: Any, y: Any, z: Any) -> Any:
 
 @_strict
 def _fade(t: Any) -> Any:
-    """Perlin's quintic."""
+    """Perlin's quintic interpolant."""
     return t * t * t * (t * (t * _SIX - _FIFTEEN) + _TEN)
 
 
@@ -160,18 +160,18 @@ def gradient_noise(x: Any, y: Any, z: Any, seed: Any) -> Any:
     i1, j1, k1 = np.uint32(i0 + _P0), np.uint32(j0 + _P1), np.uint32(k0 + _P2)
     x1, y1, z1 = x - ONE, y - ONE, z - ONE
     u, v, w = _fade(x), _fade(y), _fade(z)
-    a = _slope(_mix(i0 ^ j0 ^ k0 ^ seed), x, y, z)
-    b = _slope(_mix(i0 ^ j0 ^ k1 ^ seed), x, y, z1)
+    a = _gradient(_mix(i0 ^ j0 ^ k0 ^ seed), x, y, z)
+    b = _gradient(_mix(i0 ^ j0 ^ k1 ^ seed), x, y, z1)
     near = a + w * (b - a)
-    a = _slope(_mix(i0 ^ j1 ^ k0 ^ seed), x, y1, z)
-    b = _slope(_mix(i0 ^ j1 ^ k1 ^ seed), x, y1, z1)
+    a = _gradient(_mix(i0 ^ j1 ^ k0 ^ seed), x, y1, z)
+    b = _gradient(_mix(i0 ^ j1 ^ k1 ^ seed), x, y1, z1)
     far = a + w * (b - a)
     left = near + v * (far - near)
-    a = _slope(_mix(i1 ^ j0 ^ k0 ^ seed), x1, y, z)
-    b = _slope(_mix(i1 ^ j0 ^ k1 ^ seed), x1, y, z1)
+    a = _gradient(_mix(i1 ^ j0 ^ k0 ^ seed), x1, y, z)
+    b = _gradient(_mix(i1 ^ j0 ^ k1 ^ seed), x1, y, z1)
     near = a + w * (b - a)
-    a = _slope(_mix(i1 ^ j1 ^ k0 ^ seed), x1, y1, z)
-    b = _slope(_mix(i1 ^ j1 ^ k1 ^ seed), x1, y1, z1)
+    a = _gradient(_mix(i1 ^ j1 ^ k0 ^ seed), x1, y1, z)
+    b = _gradient(_mix(i1 ^ j1 ^ k1 ^ seed), x1, y1, z1)
     far = a + w * (b - a)
     right = near + v * (far - near)
     return left + u * (right - left)
@@ -192,7 +192,7 @@ def _octave_noise(f: Any, count: int, seed: Any, octaves: int) -> None:
 
 @_strict
 def _visit_cell(f: Any, k: Any, count: int, step: tuple[Any, Any, Any], seed: Any) -> None:
-    """Compare the centres that lie this ``step`` from the cells of a run with the nearest two yet."""
+    """Update the two nearest centres of every point by the centre in the cell at this ``step`` from its own."""
     di, dj, dk = np.uint32(step[0]) * _P0, np.uint32(step[1]) * _P1, np.uint32(step[2]) * _P2
     di, dj, dk = np.uint32(di), np.uint32(dj), np.uint32(dk)
     sx, sy, sz = np.float32(step[0]), np.float32(step[1]), np.float32(step[2])
@@ -232,9 +232,8 @@ def _find_cells(f: Any, k: Any, count: int, seed: Any) -> None:
 
 
 @_strict
-def _weigh_cells(f: Any, k: Any, count: int, which: int, levels: tuple[Any, Any]) -> None:
-    """Weights of PATCHES, CRACKS and DOTS from what `_find_cells` found, to row X."""
-    threshold, edge = levels
+def _weigh_cells(f: Any, k: Any, count: int, which: int, threshold: Any, edge: Any) -> None:
+    """Weights of PATCHES, CRACKS and DOTS from the rows of `_find_cells`, to row X."""
     if which == PATCHES:
         for n in range(count):
             first, second = _shade(k[_HASH + n]), _shade(k[_NEXT + n])
@@ -249,9 +248,8 @@ def _weigh_cells(f: Any, k: Any, count: int, which: int, levels: tuple[Any, Any]
 
 
 @_strict
-def _weigh_noise(f: Any, count: int, which: int, levels: tuple[Any, Any], warp: Any) -> None:
+def _weigh_noise(f: Any, count: int, which: int, threshold: Any, edge: Any, warp: Any) -> None:
     """Weights of CLOUDS, RINGS and STRIPES from row NOISE, to row X."""
-    threshold, edge = levels
     if which == CLOUDS:
         for n in range(count):
             f[_X + n] = _ramp((f[_NOISE + n] - threshold) / edge + HALF)
@@ -265,15 +263,15 @@ def _weigh_noise(f: Any, count: int, which: int, levels: tuple[Any, Any], warp: 
 
 @_strict
 def _side(x: Any, edge: Any) -> Any:
-    """On which side of the borders across one axis a point of a checker lies, from -1 to 1."""
+    """Side of a checker's borders along one axis, from -1 to 1, smooth across an ``edge``."""
     return min(max((_wave(HALF * x) - HALF) / edge, -ONE), ONE)
 
 
 @_strict
 def weigh_run(table: PatternTable, slot: int, count: int, f: Any, k: Any) -> None:
-    """Weights of ``count`` points of one slot, in place of x in the room ``f [NUMBER_ROWS RUN]``.
+    """Replace row x of ``f`` by the weights of ``count`` points of one slot.
 
-    ``f`` starts with rows x, y and z of `RUN` numbers each; ``k [INTEGER_ROWS RUN]`` is more room, of 32 bits.
+    ``f [NUMBER_ROWS RUN]`` starts with the rows x, y and z of `RUN` numbers each; ``k [INTEGER_ROWS RUN]``: work space.
     """
     p, which, seed = table.numbers[slot], table.pattern[slot], table.seed[slot]
     if which == PLAIN:
@@ -285,14 +283,14 @@ def weigh_run(table: PatternTable, slot: int, count: int, f: Any, k: Any) -> Non
         f[_X + n] = p[0] * x + p[1] * y + p[2] * z + p[3]
         f[_Y + n] = p[4] * x + p[5] * y + p[6] * z + p[7]
         f[_Z + n] = p[8] * x + p[9] * y + p[10] * z + p[11]
-    levels = (p[13], p[14])
+    warp, threshold, edge = p[12], p[13], p[14]
     if which in (PATCHES, CRACKS, DOTS):
         _find_cells(f, k, count, seed)
-        _weigh_cells(f, k, count, which, levels)
+        _weigh_cells(f, k, count, which, threshold, edge)
     elif which == CHECKER:
         for n in range(count):
-            x, y, z = (_side(f[_X + n], p[14]), _side(f[_Y + n], p[14]), _side(f[_Z + n], p[14]))
+            x, y, z = _side(f[_X + n], edge), _side(f[_Y + n], edge), _side(f[_Z + n], edge)
             f[_X + n] = HALF + HALF * (x * y * z)
     else:
         _octave_noise(f, count, seed, table.octaves[slot])
-        _weigh_noise(f, count, which, levels, p[12])
+        _weigh_noise(f, count, which, threshold, edge, warp)

@@ -1,8 +1,8 @@
-"""Which triangle every sample of an image sees, by filling triangles in: the first hits of a camera's rays, sooner.
+"""Rasterization of a mesh: the visible triangle at every sample of an image, faster than rays (see `raycast`).
 
-Triangles are filled in double precision from vertices that are projected once and rounded, so that two neighbours agree
-on which side of their edge a sample lies: no gaps. What is nearest is decided by the inverse depth, which is linear in
-the image. Source: Pineda 1988, A parallel algorithm for polygon rasterization.
+Vertices are projected once and rounded to float32. Edge functions are evaluated in double precision, so neighbouring
+triangles agree on which side of their edge a sample lies, and leave no gaps. The nearest triangle has the largest
+inverse depth, which is linear in the image. Source: Pineda 1988, A parallel algorithm for polygon rasterization.
 """
 
 from __future__ import annotations
@@ -11,21 +11,20 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, ZERO, compiled, entry
 from polsep.render.rays_kernel import Found, Pinhole, Triangles
 
-#: A mesh in an image: projected vertices ``[3, V]``, and the rows ``[F, 2]`` that triangles span.
-Image = tuple[NDArray[np.float32], NDArray[np.int32]]
-
-_NEAR = np.float32(1e-3)  # of its distance: the least depth of a vertex, as perspective has no meaning behind the eye
-_OUTSIDE = -1e-7  # square samples: what rounding makes of an edge function on an edge, amply
+_NEAR = np.float32(1e-3)  # of its distance: the least depth of a vertex; perspective has no meaning behind the eye
+_OUTSIDE = -1e-7  # square samples: bound on the rounding error of an edge function on an edge
 
 
 @entry
 def project_vertices(mesh: Triangles, view: Pinhole, samples: int, projected: Any) -> bool:
-    """Column, row, in samples, and inverse depth ``[3, V]`` of vertices; whether all are in front of the camera."""
+    """Fill in column, row (in samples) and inverse depth ``[3, V]`` of the vertices.
+
+    Return False, with ``projected`` incomplete, if any vertex is not in front of the camera.
+    """
     eye, axes, scale = view.eye, view.axes, np.float32(samples) / view.scale
     middle_row, middle_col = np.float32(HALF * view.size[0] * samples), np.float32(HALF * view.size[1] * samples)
     for n in range(mesh.vertices.shape[0]):
@@ -48,13 +47,13 @@ def _first(a: Any, b: Any, c: Any) -> Any:
 
 @compiled
 def _last(a: Any, b: Any, c: Any, most: int) -> Any:
-    """The last sample, at a half, that is not above the largest of three coordinates, and not after ``most``; or -1."""
+    """The last sample, at a half, that is not above the largest of three coordinates, at most ``most``; or -1."""
     return np.int32(min(math.floor(max(min(max(a, b, c), np.float32(most + 1)), -ONE) - HALF), most))
 
 
 @entry
 def span_rows(mesh: Triangles, projected: Any, rows: int, spans: Any) -> None:
-    """First and last row of samples ``[F, 2]`` that every triangle may cover, of an image of so many rows."""
+    """Fill in the first and last row of samples ``[F, 2]`` that each triangle may cover, of ``rows`` in all."""
     for f in range(mesh.faces.shape[0]):
         a, b, c = mesh.faces[f, 0], mesh.faces[f, 1], mesh.faces[f, 2]
         spans[f, 0] = _first(projected[1, a], projected[1, b], projected[1, c])
@@ -62,13 +61,11 @@ def span_rows(mesh: Triangles, projected: Any, rows: int, spans: Any) -> None:
 
 
 @entry
-def fill_triangles(mesh: Triangles, image: Image, first_row: int, nearest: Any, triangle: Any) -> None:
-    """Set ``nearest`` and ``triangle [rows, columns]`` of samples from ``first_row`` on to what is in front.
+def fill_triangles(mesh: Triangles, projected: Any, spans: Any, first_row: int, nearest: Any, triangle: Any) -> None:
+    """Set the index and inverse depth of the visible ``triangle [rows, columns]`` for samples from ``first_row`` on.
 
-    ``image``: vertices and triangles as `project_vertices` and `span_rows` leave them. ``nearest``: the inverse depth,
-    ``triangle``: which one, or -1; begin with 0 and -1.
+    ``projected``, ``spans``: from `project_vertices` and `span_rows`. ``nearest`` must start at 0, ``triangle`` at -1.
     """
-    projected, spans = image
     rows, cols = triangle.shape
     for f in range(mesh.faces.shape[0]):
         top, bottom = max(spans[f, 0], first_row), min(spans[f, 1], first_row + rows - 1)
@@ -113,21 +110,29 @@ def _corner(mesh: Triangles, corner: Any) -> Any:
 
 @compiled
 def _clamp_weights(u: Any, v: Any) -> Any:
-    """Weights of corners 1 and 2 of a point that rounding may have left just outside its triangle."""
+    """Barycentric weights of corners 1 and 2, limited to the triangle, outside of which rounding may put a point."""
     u, v = max(u, 0.0), max(v, 0.0)
     total = max(u + v, 1.0)
     return u / total, v / total
 
 
 @entry
-def meet_triangles(mesh: Triangles, view: Pinhole, triangle: Any, rays: tuple[int, int, Any, Any], found: Found) -> int:
-    """Where rays through the samples of some rows meet the ``triangle [rows, columns]`` that they see; how many do.
+def intersect_triangles(
+    mesh: Triangles,
+    view: Pinhole,
+    triangle: Any,
+    first_row: int,
+    samples: int,
+    which: Any,
+    directions: Any,
+    found: Found,
+) -> None:
+    """Intersect the rays through the samples of some rows with the ``triangle [rows, columns]`` visible at each.
 
-    ``rays``: the first row of pixels, the samples along a pixel's side, and what is filled beside ``found``, from the
-    front: which ray it is, and its direction ``[N, 3]``. A pixel's samples follow each other. Source: Moeller and
-    Trumbore 1997.
+    ``first_row``: of pixels; ``samples``: along a pixel's side; the samples of a pixel are consecutive. Fills
+    ``found``, the index ``which [M]`` of the ray and its ``directions [M, 3]`` for the M samples that show a triangle.
+    Source: Moeller and Trumbore 1997.
     """
-    first_row, samples, which, directions = rays
     eye, axes, scale = view.eye, view.axes, np.float64(view.scale)
     middle_row, middle_col = 0.5 * view.size[0], 0.5 * view.size[1]
     count = 0
@@ -161,4 +166,3 @@ def meet_triangles(mesh: Triangles, view: Pinhole, triangle: Any, rays: tuple[in
                 found.facing[count, 0], found.facing[count, 1], found.facing[count, 2] = nx, ny, nz
                 directions[count, 0], directions[count, 1], directions[count, 2] = dx, dy, dz
                 count += 1
-    return count

@@ -1,7 +1,6 @@
-"""What surrounds a cast of rays against a mesh: rays through image points, what lies where they hit, rays to a light.
+"""Kernels before and after a cast of rays against a mesh: camera rays, interpolation at hits, shadow rays; in float32.
 
-Twins, in `polsep.render.raycast` and `polsep.render.sphere_tracing`, say what is computed; here it takes one pass and
-float32 throughout.
+The camera's rays are those of `polsep.render.sphere_tracing.camera_rays`.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, ZERO, compiled, entry
 
-#: Cosine to the camera that a visible interpolated normal has at least: triangles at a silhouette are seen, though the
-#: smooth surface they stand for would be turned away.
+#: Least cosine between an interpolated normal and the direction to the camera: at a silhouette triangles are visible
+#: whose interpolated normals face away.
 MIN_COSINE = 1e-3
 
 _MIN_COSINE = np.float32(MIN_COSINE)
@@ -24,7 +23,7 @@ Floats = NDArray[np.float32]
 
 
 class Triangles(NamedTuple):
-    """A mesh in single precision: ``vertices``, ``normals [V, 3]``, ``faces [F, 3]``, ``slots [F]``; rows together."""
+    """A mesh in single precision: ``vertices``, ``normals [V, 3]``, ``faces [F, 3]``, ``slots [F]``; contiguous."""
 
     vertices: Floats
     normals: Floats
@@ -33,7 +32,10 @@ class Triangles(NamedTuple):
 
 
 class Pinhole(NamedTuple):
-    """A pinhole: ``eye [3]``; ``axes [3, 3]``, right, up and forward; (height, width); a pixel's side at distance 1."""
+    """A pinhole camera: ``eye [3]``; ``axes [3, 3]``: right, up and forward; ``size``: height and width in pixels.
+
+    ``scale``: side of a pixel at distance 1.
+    """
 
     eye: Floats
     axes: Floats
@@ -42,7 +44,10 @@ class Pinhole(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Embree's answer for N rays: triangle or -1, its normal of any length, weights of corners 1 and 2, distance."""
+    """First intersections of N rays: ``triangle`` or -1, its normal ``facing [N, 3]`` of any length, ``distance``.
+
+    ``u``, ``v``: barycentric weights of corners 1 and 2.
+    """
 
     triangle: NDArray[np.int32]
     facing: Floats
@@ -52,7 +57,7 @@ class Found(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """M hits: ``ray``, ``slot [M]``, ``position``, ``normal [3, M]``, ``above [M, 3]``, as in `raycast.Hits`."""
+    """M hits, as in `raycast.Hits`: ``ray``, ``slot [M]``, ``position``, ``normal [3, M]``, ``above [M, 3]``."""
 
     ray: NDArray[np.int64]
     slot: NDArray[np.int64]
@@ -62,7 +67,7 @@ class Surface(NamedTuple):
 
 
 class Shadows(NamedTuple):
-    """Rays toward a light: of which ``hit``, ``origin``, unit ``direction [N, 3]``, and ``distance`` to the light."""
+    """Rays toward a light: index of the ``hit``, ``origin``, unit ``direction [N, 3]``, ``distance`` to the light."""
 
     hit: NDArray[np.int64]
     origin: Floats
@@ -72,7 +77,7 @@ class Shadows(NamedTuple):
 
 @entry
 def aim_rays(rows: Any, cols: Any, view: Pinhole, directions: Any) -> None:
-    """`render.camera_rays`: unit ``directions [N, 3]`` through image points."""
+    """Fill in the unit ``directions [N, 3]`` of rays through image points: `sphere_tracing.camera_rays`."""
     axes, scale = view.axes, view.scale
     middle_row, middle_col = np.float32(HALF * view.size[0]), np.float32(HALF * view.size[1])
     for n in range(rows.size):
@@ -92,7 +97,10 @@ def _unit(x: Any, y: Any, z: Any) -> Any:
 
 @compiled
 def _smooth_offset(mesh: Triangles, corner: Any, weight: Any, p: Any) -> Any:
-    """How far the surface that a corner stands for lies above a point, times its weight. Source: Hanika 2021."""
+    """Offset of a point from the tangent plane of a corner, where it lies below, times the corner's weight.
+
+    Source: Hanika 2021, Hacking the shadow terminator.
+    """
     n = mesh.normals[corner]
     v = mesh.vertices[corner]
     below = min((p[0] - v[0]) * n[0] + (p[1] - v[1]) * n[1] + (p[2] - v[2]) * n[2], ZERO) * weight
@@ -100,9 +108,11 @@ def _smooth_offset(mesh: Triangles, corner: Any, weight: Any, p: Any) -> Any:
 
 
 @entry
-def interpolate_hits(mesh: Triangles, found: Found, rays: tuple[Any, Any], lift: Any, out: Surface) -> None:
-    """Fill ``out`` with the hits of ``rays``, an origin ``[3]`` and directions ``[N, 3]``, in their order."""
-    eye, directions = rays
+def interpolate_hits(mesh: Triangles, found: Found, eye: Any, directions: Any, offset: Any, out: Surface) -> None:
+    """Fill ``out`` with the hits of rays from ``eye [3]`` along ``directions [N, 3]``, in the order of the rays.
+
+    ``offset``: distance between shadow rays' origins and the surface.
+    """
     m = 0
     for ray in range(found.triangle.size):
         triangle = found.triangle[ray]
@@ -120,7 +130,7 @@ def interpolate_hits(mesh: Triangles, found: Found, rays: tuple[Any, Any], lift:
         missing = max(_MIN_COSINE + (nx * dx + ny * dy + nz * dz), ZERO)
         nx, ny, nz = _unit(nx - missing * dx, ny - missing * dy, nz - missing * dz)
         fx, fy, fz = _unit(found.facing[ray, 0], found.facing[ray, 1], found.facing[ray, 2])
-        side = -lift if fx * dx + fy * dy + fz * dz > ZERO else lift
+        side = -offset if fx * dx + fy * dy + fz * dz > ZERO else offset
         ax, ay, az = _smooth_offset(mesh, a, w, (px, py, pz))
         bx, by, bz = _smooth_offset(mesh, b, u, (px, py, pz))
         cx, cy, cz = _smooth_offset(mesh, c, v, (px, py, pz))
@@ -134,12 +144,11 @@ def interpolate_hits(mesh: Triangles, found: Found, rays: tuple[Any, Any], lift:
 
 
 @entry
-def aim_at_light(points: tuple[Any, Any, Any], light: Any, toward: Shadows) -> int:
-    """Fill ``toward`` from the front with a ray to a point ``light [3]`` per hit that faces it; how many.
+def aim_at_light(position: Any, normal: Any, above: Any, light: Any, toward: Shadows) -> int:
+    """Fill the first rows of ``toward`` with a ray to a point ``light [3]`` per hit that faces it; return their number.
 
-    ``points``: position and normal ``[3, M]`` of hits, and where their shadow rays start, ``[M, 3]``.
+    ``position``, ``normal [3, M]`` of hits; ``above [M, 3]``: where their shadow rays start.
     """
-    position, normal, above = points
     count = 0
     for m in range(position.shape[1]):
         x, y, z = light[0] - position[0, m], light[1] - position[1, m], light[2] - position[2, m]

@@ -1,7 +1,6 @@
-"""Fine relief: normals tilted by the gradient of solid noise, as on leather, bark, plaster or cast metal.
+"""Bump mapping: normals tilted by the gradient of solid noise, as on leather, bark, plaster or cast metal.
 
-Geometry and cast shadows stay those of the smooth surface; shading, and what faces the light, follow the normals
-(bump mapping after Blinn 1978).
+Geometry and cast shadows stay those of the smooth surface; shading follows the normals. Source: Blinn 1978.
 """
 
 from __future__ import annotations
@@ -12,23 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, TWO, ZERO, entry
-from polsep.compute.threads import share
+from polsep.compute.threads import Piece, share
 from polsep.render.patterns_kernel import gradient_noise
 
 Floats = NDArray[np.float32]
 
-#: Step of the differences that stand for the gradient, in cells of the noise.
+#: Step of the finite differences, in cells of the noise.
 _STEP = np.float32(1 / 32)
-#: How much less an octave tilts than the one before, and the least cosine to the eye that a tilted normal may have.
+#: Ratio of the tilts of successive octaves; least cosine between a tilted normal and the direction to the eye.
 _GAIN, _MIN_COSINE = np.float32(0.7), np.float32(0.02)
-#: Between the seeds of octaves.
+#: Difference between the seeds of octaves.
 _KEY_STEP = np.uint32(77)
-#: Points that a thread takes at once.
+#: Points per piece of work of a thread.
 _POINTS_AT_ONCE = 1 << 14
 
 
 class Relief(NamedTuple):
-    """Noise of ``octaves`` with ``frequency`` cells per scene unit; ``strength``: tangent of a usual tilt."""
+    """Noise of ``octaves``, the first of ``frequency`` cells per scene unit; ``strength``: tangent of a usual tilt."""
 
     frequency: float
     strength: float
@@ -37,14 +36,19 @@ class Relief(NamedTuple):
 
 
 def roughen_normals(positions: Floats, normals: Floats, eye: Floats, relief: Relief) -> None:
-    """Tilt unit ``normals [3, M]`` at ``positions [3, M]`` in place; those that would turn from the eye stay."""
-    numbers = (np.float32(relief.frequency), np.float32(relief.strength), relief.octaves, np.uint32(relief.seed))
-    share(lambda piece: _roughen(positions, normals, eye, numbers, piece), positions.shape[1], _POINTS_AT_ONCE)
+    """Tilt unit ``normals [3, M]`` at ``positions [3, M]`` in place, except those that would face away from the eye."""
+    frequency, strength, seed = np.float32(relief.frequency), np.float32(relief.strength), np.uint32(relief.seed)
+
+    def roughen(piece: Piece) -> None:
+        _roughen(positions, normals, eye, frequency, strength, relief.octaves, seed, piece)
+
+    share(roughen, positions.shape[1], _POINTS_AT_ONCE)
 
 
 @entry
-def _roughen(positions: Floats, normals: Floats, eye: Floats, numbers: Any, piece: Any) -> None:
-    frequency, strength, octaves, seed = numbers
+def _roughen(
+    positions: Any, normals: Any, eye: Any, frequency: Any, strength: Any, octaves: int, seed: Any, piece: Any
+) -> None:
     for m in range(piece[0], piece[1]):
         x, y, z = positions[0, m] * frequency, positions[1, m] * frequency, positions[2, m] * frequency
         gx, gy, gz, gain, key = ZERO, ZERO, ZERO, strength / _STEP, seed

@@ -1,11 +1,11 @@
-"""Twin of `materials.look_up` and `render.shade` for hits of many rays, summed to pixels, in one pass on the CPU.
+"""`materials.look_up` and `sphere_tracing.shade` for the hits of many rays, summed per pixel, in one pass on the CPU.
 
-Hits that no light reaches are left out first: they add nothing. The others are taken in blocks of pixels and sorted by
-slot within, so that a run of points has one material and its loops become vector instructions.
+Unlit hits are skipped. The others are processed in blocks of pixels, sorted by slot, so that a run of points has one
+material and LLVM vectorises its loops.
 
 The light of a pixel is twelve numbers: the diffuse lobe has one geometric Stokes vector for all colours, which albedo
-scales per hit; the specular lobe is white. Formulas are those of `polsep.physics.optics`, without normalizing what
-cancels.
+scales per hit; the specular lobe is white. Formulas are those of `polsep.physics.optics`, without normalizations that
+cancel.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from polsep.render.materials import Materials
 from polsep.render.patterns_kernel import INTEGER_ROWS, NUMBER_ROWS, RUN, PatternTable, pattern_table, weigh_run
 from polsep.render.sphere_tracing import PinholeCamera, PointLight
 
-#: Hits of a block at most, which are those of a whole number of pixels.
+#: Largest number of hits in a block; a block holds all hits of its pixels.
 BLOCK = 1024
 #: Numbers per pixel: diffuse s0, s1, s2 of three colours each, specular s0, s1, s2.
 CHANNELS = 12
 
-# Rows of a run's room, behind those that patterns use.
+# Offsets of the rows in the buffer of a run, after those that patterns use.
 _NX, _NY, _NZ, _ROUGH, _D0, _D1, _D2, _S0, _S1, _S2, _PX, _PY, _PZ, _WEIGHT = (
     (NUMBER_ROWS + k) * RUN for k in range(14)
 )
@@ -60,7 +60,7 @@ class Points(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Materials for the kernel: ``plain [S, 5]``, which is albedo, roughness, specular; ``second [S, 4]``; patterns."""
+    """Arrays of `Materials`: ``plain [S, 5]`` (albedo, roughness, specular), ``second [S, 4]``, and ``patterns``."""
 
     plain: NDArray[np.float32]
     second: NDArray[np.float32]
@@ -68,7 +68,7 @@ class Table(NamedTuple):
 
 
 def material_table(materials: Materials) -> Table:
-    """The table of materials, which needs a few microseconds."""
+    """The arrays of materials that `shade_pixels` reads."""
     plain = [materials.albedo.numpy(), materials.roughness.numpy()[:, None], materials.specular.numpy()[:, None]]
     second = plain[:2]
     if materials.textures is not None:
@@ -77,25 +77,24 @@ def material_table(materials: Materials) -> Table:
     return Table(rows[0], rows[1], pattern_table(materials))
 
 
-def shade_pixels(
-    hits: Points, table: Table, camera: PinholeCamera, light: PointLight, image: NDArray[np.float32]
-) -> None:
+def shade_pixels(hits: Points, table: Table, beams: Beams, image: NDArray[np.float32]) -> None:
     """Add the light of hits to their pixels of ``image [P, 12]``; see `CHANNELS`.
 
-    Divide by the samples per pixel afterwards. No pixel may have more than `BLOCK` hits.
+    The caller divides by the samples per pixel. No pixel may have more than `BLOCK` hits.
     """
     if hits.pixel.size:
-        _shade_pixels(hits, table, _beams(camera, light), image)
+        _shade_pixels(hits, table, beams, image)
 
 
-def _beams(camera: PinholeCamera, light: PointLight) -> Beams:
+def build_beams(camera: PinholeCamera, light: PointLight) -> Beams:
+    """Return the numbers of a camera and a light that `shade_pixels` reads."""
     eye, lamp = ((np.float32(p[0]), np.float32(p[1]), np.float32(p[2])) for p in (camera.position, light.position))
     cosine, sine = math.cos(2 * light.polarizer), math.sin(2 * light.polarizer)
     return Beams(eye, lamp, np.float32(light.intensity), np.float32(cosine), np.float32(sine))
 
 
 def _inlined(function: Compilable) -> Compilable:
-    """As `compiling.compiled`, and part of the loop that calls it, which could not become vector instructions else."""
+    """Decorator like `compiling.compiled`, inlined into the calling loop, which LLVM can vectorise only then."""
     decorated: Compilable = njit(  # type: ignore[call-overload]  # numba's stubs lack some of its options
         nogil=True,
         fastmath={"contract", "nsz"},
@@ -133,7 +132,7 @@ def _smith(c: Any, alpha2: Any) -> Any:
 
 @_inlined
 def _toward(target: Any, x: Any, y: Any, z: Any) -> Any:
-    """Unit vector to a point, and the square of the distance."""
+    """Unit vector to a point, and the squared distance."""
     x, y, z = target[0] - x, target[1] - y, target[2] - z
     square = x * x + y * y + z * z
     inverse = ONE / math.sqrt(square)
@@ -142,9 +141,9 @@ def _toward(target: Any, x: Any, y: Any, z: Any) -> Any:
 
 @_inlined
 def _shade_run(f: Any, count: int, beams: Beams) -> None:
-    """Stokes vectors of both lobes for albedo and specular strength 1, to rows D0 to S2, of points of one run.
+    """Write the Stokes vectors of both lobes, for albedo and specular strength 1, to rows D0 to S2.
 
-    With up = +y and a beam along v, an azimuth's vector n has the components (nx vz - nz vx, ny - vy (n v)) over one
+    With up = +y and a beam along v, n has the components (nx vz - nz vx, ny - vy (n v)) in the beam's frame, over one
     length, which cancels; along -l the first one changes its sign.
     """
     for n in range(count):
@@ -178,7 +177,7 @@ def _shade_run(f: Any, count: int, beams: Beams) -> None:
         plus, minus, mixed = _fresnel(min(max(hx * lx + hy * ly + hz * lz, ZERO), ONE))
         x, y, z = vy * lz - vz * ly, vz * lx - vx * lz, vx * ly - vy * lx
         in_line = x * x + y * y + z * z < _IN_LINE
-        # The camera frame's own y, which is up made perpendicular to v, where camera and light are in line.
+        # Where camera and light are in line: the y axis of the camera beam's frame, up made perpendicular to v.
         x, y, z = (-vy * vx if in_line else x), (ONE - vy * vy if in_line else y), (-vy * vz if in_line else z)
         ci, si = _double_angle(z * lx - x * lz, y - ly * (x * lx + y * ly + z * lz))
         co, so = _double_angle(x * vz - z * vx, y - vy * (x * vx + y * vy + z * vz))
@@ -215,7 +214,7 @@ def _add_run(f: Any, table: Table, slot: Any, pixels: Any, image: Any) -> None:
 
 @_inlined
 def _sort_block(hits: Points, first: int, stop: int, counts: Any, order: Any) -> None:
-    """The lit hits of ``range(first, stop)``, by slot, to ``order``; ``counts [S + 1]`` gets where each slot begins."""
+    """Sort the lit hits of ``range(first, stop)`` by slot into ``order``; ``counts [S + 1]``: start of each slot."""
     slots = counts.size - 1
     for s in range(slots + 1):
         counts[s] = 0
@@ -237,7 +236,7 @@ def _sort_block(hits: Points, first: int, stop: int, counts: Any, order: Any) ->
 
 @_inlined
 def _block_end(pixel: Any, first: int) -> int:
-    """Where the block ends that begins with hit ``first``: `BLOCK` hits on, less those of a pixel that is not whole."""
+    """End of the block that starts at hit ``first``: at most `BLOCK` hits, without those of an incomplete pixel."""
     stop: int = min(first + BLOCK, pixel.size)
     if stop < pixel.size:
         while stop > first and pixel[stop - 1] == pixel[stop]:
@@ -247,7 +246,7 @@ def _block_end(pixel: Any, first: int) -> int:
 
 @_inlined
 def _gather(hits: Points, order: Any, f: Any, pixels: Any) -> None:
-    """Points, normals and pixels of a run, which are the hits ``order``, to their rows."""
+    """Copy position, normal and pixel of the hits ``order`` to the rows of a run."""
     for n in range(order.size):
         m = order[n]
         f[n] = f[_PX + n] = hits.position[0, m]
@@ -259,7 +258,7 @@ def _gather(hits: Points, order: Any, f: Any, pixels: Any) -> None:
 
 @entry
 def _shade_pixels(hits: Points, table: Table, beams: Beams, image: Any) -> None:
-    """All hits, block by block and slot by slot."""
+    """Shade all hits, block by block and slot by slot."""
     slots = table.plain.shape[0]
     f, k = np.empty(_ROWS * RUN, np.float32), np.empty(INTEGER_ROWS * RUN, np.uint32)
     counts, order, pixels = np.empty(slots + 1, np.int64), np.empty(BLOCK, np.int64), np.empty(RUN, np.int64)
@@ -282,7 +281,7 @@ def _shade_pixels(hits: Points, table: Table, beams: Beams, image: Any) -> None:
 
 @entry
 def spread_pixels(image: Any, scale: Any, planes: Any) -> None:
-    """Planes ``[12, P]``, rows together, of an ``image [P, 12]`` times ``scale``."""
+    """Fill ``planes [12, P]`` with ``image [P, 12]`` times ``scale``."""
     for first in range(0, image.shape[0], RUN):
         stop = min(first + RUN, image.shape[0])
         for channel in range(CHANNELS):

@@ -1,9 +1,8 @@
-"""Which points a mesh hides from a light, by testing triangles against the points behind them, and no others.
+"""Shadows of a mesh by an irregular z-buffer: exact per point, faster than shadow rays (see `raycast`).
 
-Seen from the light, points are sorted into the cells of a grid, row by row. Every triangle is compared with the points
-in the cells that it overlaps: a point is in its shadow when it projects into it and is farther away. That is what a ray
-from the point to the light tells, at a third of its price. Source: Johnson et al. 2005, The irregular z-buffer;
-Aila and Laine 2004, Alias-free shadow maps.
+Points are projected toward the light and sorted into the cells of a grid. Every triangle is compared with the points in
+the cells that it overlaps: a point is in its shadow when it projects into it and is farther away. Source: Johnson et
+al. 2005, The irregular z-buffer; Aila and Laine 2004, Alias-free shadow maps.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from numpy.typing import NDArray
 from polsep.compute.compiling import ONE, ZERO, compiled, entry
 from polsep.render.rays_kernel import Floats, Pinhole, Triangles
 
-#: Points per cell of the grid, if they were spread evenly.
+#: Mean number of points per cell of the grid.
 POINTS_PER_CELL = 4
 
-_OUTSIDE = np.float32(-1e-5)  # of a triangle's area: neighbours overlap by a trifle, or light would leak through edges
+_OUTSIDE = np.float32(-1e-5)  # of a triangle's area: neighbours overlap a little, or light would leak through edges
 _TINY = np.float32(1e-30)
 
 
 class Facing(NamedTuple):
-    """Points that face a light, seen from it: ``x``, ``y``, inverse depth ``w [N]``, and which ``hit`` each is."""
+    """Points that face a light, projected toward it: ``x``, ``y``, inverse depth ``w``, index of the ``hit [N]``."""
 
     x: Floats
     y: Floats
@@ -34,19 +33,20 @@ class Facing(NamedTuple):
 
     @classmethod
     def empty(cls, count: int) -> Facing:
-        """Room for so many points."""
+        """Uninitialized arrays for ``count`` points."""
         x, y, w = np.empty((3, count), np.float32)
         return cls(x, y, w, np.empty(count, np.int64))
 
     def first(self, count: int) -> Facing:
-        """So many points from the front."""
+        """The first ``count`` points."""
         return Facing(self.x[:count], self.y[:count], self.w[:count], self.hit[:count])
 
 
 class Cells(NamedTuple):
-    """Points in the order of the cells they are in, where each cell's ``start``, and the ``farthest``, its least w.
+    """Points sorted by grid cell: index of each cell's first point (``start``) and its least w (``farthest``).
 
-    ``shape``: rows and columns of cells, which begin at ``corner`` (x, y); ``density``: of columns and rows.
+    ``shape``: rows and columns of cells; ``corner``: (x, y) of the grid's origin; ``density``: columns and rows per
+    unit.
     """
 
     points: Facing
@@ -58,12 +58,11 @@ class Cells(NamedTuple):
 
 
 @entry
-def face_light(view: Pinhole, hits: tuple[Any, Any, Any], out: Facing) -> int:
-    """Fill ``out`` from the front with the hits whose normals face a light, the eye of ``view``; how many.
+def select_facing(view: Pinhole, position: Any, normal: Any, above: Any, out: Facing) -> int:
+    """Fill the first rows of ``out`` with the hits that face a light at the eye of ``view``; return their number.
 
-    ``hits``: position and normal ``[3, M]``, and where shadow rays start, ``[M, 3]``.
+    ``position``, ``normal [3, M]`` of hits; ``above [M, 3]``: where their shadow rays start.
     """
-    position, normal, above = hits
     eye, axes = view.eye, view.axes
     count = 0
     for m in range(position.shape[1]):
@@ -81,13 +80,13 @@ def face_light(view: Pinhole, hits: tuple[Any, Any, Any], out: Facing) -> int:
 
 @compiled
 def _cell(value: Any, corner: Any, inverse: Any, count: int) -> int:
-    """The cell along one axis, the outermost ones for what lies outside."""
+    """Index of the cell along one axis, limited to the grid."""
     return int(min(max((value - corner) * inverse, ZERO), np.float32(count - 1)))
 
 
 @entry
 def sort_points(points: Facing, out: Facing) -> Cells:
-    """Points of any order by cells, into ``out``."""
+    """Sort points by cell into ``out``."""
     count = points.x.size
     left, right, low, high = points.x[0], points.x[0], points.y[0], points.y[0]
     for n in range(count):
@@ -119,10 +118,10 @@ def sort_points(points: Facing, out: Facing) -> Cells:
 
 @compiled
 def _hide(points: Facing, first: int, stop: int, plane: Any, hidden: Any) -> None:
-    """Mark those of a run of points that lie in a triangle and behind it.
+    """Mark the points ``range(first, stop)`` that a triangle covers and that are farther from the light.
 
-    ``plane``: its corner a; the first two edge functions over its area, which are weights of corners b and c, by their
-    growth along x and y; and its inverse depth at a, and what that grows by to b and c.
+    ``plane``: (x, y) of its corner a; gradients along x and y of the barycentric weights of corners b and c; its
+    inverse depth at a, and the differences to b and c.
     """
     ax, ay, bx, by, cx, cy, wa, wb, wc = plane
     x, y, w, to = points.x[first:stop], points.y[first:stop], points.w[first:stop], hidden[first:stop]
@@ -135,7 +134,7 @@ def _hide(points: Facing, first: int, stop: int, plane: Any, hidden: Any) -> Non
 
 @entry
 def hide_points(mesh: Triangles, projected: Any, cells: Cells, hidden: Any) -> None:
-    """Set ``hidden [N]`` of the sorted points that some triangle hides; ``projected [3, V]``, seen from the light."""
+    """Set ``hidden [N]`` for the sorted points that any triangle hides; ``projected [3, V]``: vertices."""
     rows, cols = cells.shape
     left, low = cells.corner
     per_col, per_row = cells.density
@@ -157,7 +156,7 @@ def hide_points(mesh: Triangles, projected: Any, cells: Cells, hidden: Any) -> N
         nearest = max(wa, projected[2, b], projected[2, c])
         first_col, last_col = _cell(x0, left, per_col, cols), _cell(x1, left, per_col, cols)
         for row in range(_cell(y0, low, per_row, rows), _cell(y1, low, per_row, rows) + 1):
-            # Triangles behind all points of their cells, as half of a solid's are, hide nothing.
+            # Cells whose points are all nearer than the triangle are skipped: half of a solid's triangles hide nothing.
             left_cell, right_cell = row * cols + first_col, row * cols + last_col
             while left_cell <= right_cell and cells.farthest[left_cell] >= nearest:
                 left_cell += 1
@@ -169,6 +168,6 @@ def hide_points(mesh: Triangles, projected: Any, cells: Cells, hidden: Any) -> N
 
 @entry
 def mark_lit(points: Facing, hidden: Any, lit: Any) -> None:
-    """Set ``lit [M]`` of the hits of points that nothing hides."""
+    """Set ``lit [M]`` for the hits of points that are not hidden."""
     for n in range(points.hit.size):
         lit[points.hit[n]] = not hidden[n]

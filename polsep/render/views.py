@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from polsep.render.materials import random_materials
-from polsep.render.raycast import MeshScene, find_view, light_view, render_scene
+from polsep.render.raycast import MeshScene, find_lit, find_view, render_scene
 from polsep.render.shapes import Floats, random_mesh
 from polsep.render.simulate import Capture, blur, capture, expose_to_clip, expose_to_level
 from polsep.render.sphere_tracing import PinholeCamera, PointLight, Vector
@@ -137,7 +137,7 @@ def random_shot(shape: MeshScene, generator: torch.Generator) -> Shot:
 def lit_share(shape: MeshScene, shot: Shot) -> float:
     """The share of a shape's pixels that the light reaches, in a picture of `PREVIEW_SIZE`."""
     view = find_view(shape, shot.camera, PREVIEW_SIZE)
-    lit = torch.cat([found[0, :, 0] for found in light_view(shape, view, shot.light)])
+    lit = torch.cat([found[0, :, 0] for found in find_lit(shape, view, shot.light)])
     return float(lit.float().mean()) if lit.numel() else 0.0
 
 

@@ -25,7 +25,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from polsep.physics.stokes import Stokes
 from polsep.render.materials import random_materials
-from polsep.render.raycast import MeshScene, find_view, light_view, shade_view
+from polsep.render.raycast import MeshScene, find_lit, find_view, shade_view
 from polsep.render.simulate import HEADROOM, blur, filter_light
 from polsep.render.sphere_tracing import Scene
 from polsep.render.views import MIN_LEVEL, random_shot, scene_seed, seeded_shape
@@ -213,7 +213,7 @@ def _look_at(shape: MeshScene, options: StreamOptions, generator: torch.Generato
         materials = vary_colors(random_materials(shape.mesh.slot_count, generator, shape.size), generator)
         if varied:
             materials = vary_gloss(materials, generator)
-        look = Look(view, materials, light, light_view(shape, view, light))
+        look = Look(view, materials, light, find_lit(shape, view, light))
         scene = blur(shade_view(*look), shot.blur)
         if varied:
             scene = vary_retention(vary_polarization(scene, generator), partial(find_sheen, look), generator)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from polsep.physics.stokes import Stokes
 from polsep.render.materials import Materials
-from polsep.render.raycast import MeshScene, View, find_view, light_view, shade_view
+from polsep.render.raycast import MeshScene, View, find_lit, find_view, shade_view
 from polsep.render.relief_kernel import Relief, roughen_normals
 from polsep.render.sphere_tracing import PointLight, Scene, pixel_side
 from polsep.render.views import MIN_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
@@ -76,7 +76,7 @@ def vary_shot(shape: MeshScene, shot: Shot, generator: torch.Generator) -> Shot:
     if close >= CLOSE_SHARE:
         return shot
     view = find_view(shape, shot.camera, PREVIEW_SIZE)
-    lit = light_view(shape, view, shot.light)
+    lit = find_lit(shape, view, shot.light)
     points = [band.hits.position[:, seen[0, :, 0], 0] for band, seen in zip(view.bands, lit, strict=True)]
     places = torch.cat(points, dim=1)
     target = places[:, int(torch.randint(places.shape[1], (1,), generator=generator))]

@@ -15,7 +15,7 @@ from polsep.physics.optics import ETA
 from polsep.render.materials import Materials, look_up
 from polsep.render.pathtrace.mueller import Matrix, turn_frames, turn_to_up
 from polsep.render.pathtrace.variants import in_variant, is_fast, only_errors
-from polsep.render.raycast import LIFT, Model
+from polsep.render.raycast import SHADOW_OFFSET, Model
 from polsep.render.shapes import Mesh
 
 #: Cosine to the viewer that a normal has at least, as in `raycast`.
@@ -85,7 +85,7 @@ def build_path_model(model: Model, variant: str) -> PathModel:
             }
         )
         world = mi.load_dict({"type": "scene", "mesh": shape})
-        return PathModel(variant, mesh, materials, world, shape, plastic, LIFT * scene.size)
+        return PathModel(variant, mesh, materials, world, shape, plastic, SHADOW_OFFSET * scene.size)
 
 
 def _bake(shape: Any, mesh: Mesh, materials: Materials) -> None:

@@ -92,8 +92,8 @@ def assert_same(found: FrameImages, expected: Separation, white: Separation, div
     for image, wanted in ((found.diffuse, expected.diffuse), (found.specular, expected.specular)):
         planes = torch.from_numpy(image).movedim(-1, 0)
         assert_within(planes, wanted, divided) if divided else assert_close(planes, wanted)
-    assert expected.doubt is not None
-    assert_close(torch.from_numpy(found.error).movedim(-1, 0), expected.doubt)
+    assert expected.expected_error is not None
+    assert_close(torch.from_numpy(found.error).movedim(-1, 0), expected.expected_error)
     assert torch.equal(torch.from_numpy(found.valid), white.valid)
     grey = white.stokes.map(lambda s: s.mean(dim=-3))
     assert_within(torch.from_numpy(found.dolp), dolp(grey).clamp(max=MAX_DOLP), NOISE)

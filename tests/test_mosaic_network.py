@@ -52,9 +52,9 @@ def test_half_resolution_is_the_mean_over_cells(layout: Layout) -> None:
     assert half.diffuse.shape == half.specular.shape == (layout.channels, 24, 32)
     assert full.diffuse.shape == full.specular.shape == full.stokes.s1.shape == (layout.channels, 48, 64)
     assert_close(half.diffuse, mean_cells(images[0].diffuse[0]).clamp(min=0))
-    assert half.doubt is not None and full.doubt is not None
-    assert half.doubt.shape == (2, 24, 32) and full.doubt.shape == (2, 48, 64)
-    assert float(half.doubt.min()) > 0
+    assert half.expected_error is not None and full.expected_error is not None
+    assert half.expected_error.shape == (2, 24, 32) and full.expected_error.shape == (2, 48, 64)
+    assert float(half.expected_error.min()) > 0
     assert half.clipped is not None and bool(half.clipped.any()) and not bool(half.clipped.all())
     assert bool((half.clipped | half.valid).all())
 

@@ -241,7 +241,7 @@ def test_expected_errors_reach_their_owner(doubting: Joint, resolution: Literal[
     """The frame holds what the method expects, and the report their rms; other methods have neither."""
     raw, full = raw_frame("float32"), resolution == "full"
     out = quietly(raw, method="joint", full=full)
-    expected = run_joint(doubting, Mosaic(torch.from_numpy(raw), Layout(), 0.0, 1.0), resolution).doubt
+    expected = run_joint(doubting, Mosaic(torch.from_numpy(raw), Layout(), 0.0, 1.0), resolution).expected_error
     assert expected is not None and out.error is not None
     assert out.error.shape == (*out.valid.shape, 2) and out.error.dtype == np.float32
     assert out.error.flags.c_contiguous and float(out.error.min()) > 0 and float(np.ptp(out.error)) > 0

@@ -39,7 +39,7 @@ def ablation_entry(name: str, path: Path) -> Entry:
 
     def separate(capture: Capture) -> Separation:
         assert isinstance(capture, Mosaic)
-        return run_joint(network, capture, "half")
+        return run_joint(network, capture)
 
     return Entry(name, separate)
 

@@ -161,11 +161,8 @@ def find_regions(mask: Tensor, still: Tensor) -> dict[str, Tensor]:
 
 def separate_half(method: Method, mosaic: Mosaic) -> Images:
     """A method's diffuse and specular ``[h, w, C]`` at half resolution, by its compiled twin where there is one."""
-    images = method.engine(mosaic)
-    if images is not None:
-        return images.diffuse, images.specular
-    found = method.half(mosaic)
-    return found.diffuse.movedim(0, -1).numpy(), found.specular.movedim(0, -1).numpy()
+    images = method.run(mosaic, mosaic.light_color, False)
+    return images.diffuse, images.specular
 
 
 def _as_pair(images: Images) -> Pair:

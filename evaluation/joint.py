@@ -21,6 +21,7 @@ from evaluation.sets import load_sets
 from polsep.bench.rows import Row
 from polsep.methods import METHODS, Capture
 from polsep.metrics import psnr, reliability
+from polsep.networks.engines import run_engine
 from polsep.networks.run import NAMES
 from polsep.sensor.camera import IMX250, Layout, Mosaic, expose
 from polsep.separation.analytic import Separation
@@ -42,7 +43,7 @@ def bench_joint(data: Path) -> Iterator[Row]:
     Raises ValueError without the extras render and bench, and on a scene that does not come out as recorded.
     """
     sets = load_sets()
-    mono = tuple(Entry(name, METHODS[name].half) for name in MONO)
+    mono = tuple(Entry(name, METHODS[name].reference) for name in MONO)
     protocols = [Protocol("full", see_full, full_entries()), Protocol("mono", see_mono, mono)]
     yield from score_sets("joint", sets, data, protocols)
     for name, recipes in sets.items():
@@ -67,7 +68,9 @@ def see_mono(case: Case) -> tuple[Capture, Truth]:
 def full_entries() -> tuple[Entry, ...]:
     """Every method at full resolution; those of `ENLARGED` from half."""
     return tuple(
-        Entry(f"{m.name}, enlarged", enlarged(m.half)) if m.name in ENLARGED else Entry(m.name, m.full)
+        Entry(f"{m.name}, enlarged", enlarged(m.reference))
+        if m.name in ENLARGED
+        else Entry(m.name, partial(m.reference, full=True))
         for m in METHODS.values()
     )
 
@@ -99,7 +102,7 @@ def measure_reliability(name: str, recipes: Sequence[Recipe], data: Path) -> Ite
     for case in build_cases(recipes, data):
         capture, (diffuse, specular, mask) = see_noisy(case)
         for method in NAMES:
-            found = METHODS[method].half(capture)
+            found = METHODS[method].reference(capture)
             assert found.expected_error is not None and found.clipped is not None
             outputs = (("diffuse", found.diffuse - diffuse), ("specular", found.specular - specular))
             for (output, error), expected in zip(outputs, found.expected_error, strict=True):
@@ -122,20 +125,20 @@ def measure_engines(name: str, recipes: Sequence[Recipe], data: Path) -> Iterato
 
     changes: dict[tuple[str, str], list[float]] = {}
     for case in build_cases(recipes, data):
-        for see, kind in ((see_noisy, "half"), (see_full, "full")):
+        for see, full in ((see_noisy, False), (see_full, True)):
             mosaic, (*truth, mask) = see(case)
             assert isinstance(mosaic, Mosaic)
             for method in NAMES:
-                own = METHODS[method]
-                images = (own.engine if kind == "half" else own.full_engine)(mosaic)
-                exact = (own.half if kind == "half" else own.full)(mosaic)
+                images, exact = run_engine(method, mosaic, full), METHODS[method].reference(mosaic, full)
                 if images is None:
                     raise ValueError("expected the engine of OpenVINO, found none")
                 pairs = ((images.diffuse, exact.diffuse), (images.specular, exact.specular))
                 for output, (found, wanted), image in zip(("diffuse", "specular"), pairs, truth, strict=True):
                     planes = torch.from_numpy(found).movedim(-1, 0)
                     change = psnr(planes, image, mask) - psnr(wanted, image, mask)
-                    changes.setdefault((method, f"{output} PSNR, {kind} resolution"), []).append(change)
+                    changes.setdefault((method, f"{output} PSNR, {'full' if full else 'half'} resolution"), []).append(
+                        change
+                    )
     for (method, metric), values in changes.items():
         yield Row("joint/engines", name, method, f"{metric}, change", statistics.fmean(values), "dB")
         yield Row("joint/engines", name, method, f"{metric}, largest change", max(abs(x) for x in values), "dB")

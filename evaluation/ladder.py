@@ -23,8 +23,7 @@ from polsep.bench.rows import Row
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
 from polsep.methods import METHODS, compose
-from polsep.networks.paper import RUNGS, Refinement, separate_refined
-from polsep.networks.shipped_paper import PAPER, load_refinement
+from polsep.networks.paper import PAPER, RUNGS, Refinement, load_refinement, separate_refined
 from polsep.networks.unet import count_parameters
 from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import separate_analytic
@@ -82,7 +81,7 @@ def ladder_entries(variant: str, rungs: tuple[str, ...] = tuple(RUNGS)) -> tuple
     own = METHODS["color-affine"]
     if variant == MOSAIC:
         entries.append(Entry("color-affine, bilinear", compose(demosaic_bilinear_half, separate_color_affine)))
-    return (*entries, Entry(own.name, own.half))
+    return (*entries, Entry(own.name, own.reference))
 
 
 def rung_of(method: str) -> str:

@@ -20,7 +20,6 @@ from polsep.bench.rows import Row
 from polsep.methods import METHODS, Capture
 from polsep.metrics import chroma, flip, highlights, psnr, psnr_unlimited, ssim, worst_mean
 from polsep.networks.paper import Refinement
-from polsep.networks.run import NAMES
 from polsep.separation.analytic import Separation
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ class Score(NamedTuple):
 
 def own_entries(mosaics: bool) -> tuple[Entry, ...]:
     """`pipeline.METHODS` as entries: all for ``mosaics``, those that take them for co-sited samples."""
-    return tuple(Entry(m.name, m.half) for m in METHODS.values() if mosaics or m.name not in NAMES)
+    return tuple(Entry(m.name, m.reference) for m in METHODS.values() if mosaics or not m.reads_mosaic)
 
 
 def see_noisy(case: Case) -> tuple[Capture, Truth]:

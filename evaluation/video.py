@@ -20,7 +20,6 @@ from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.sequences import SequenceKind
 from polsep.io.store.rows import read_memory, write_chunks
 from polsep.methods import METHODS
-from polsep.pipeline import separate_known
 from polsep.sensor.levels import as_mosaic
 from polsep.video.recordings import Target, VideoOptions, separate_video
 
@@ -98,10 +97,10 @@ def _rate_alone(method: str, frames: list[NDArray[np.uint16]]) -> float:
     """Frames per second of a method on frames in memory, after a few to warm up."""
     mosaics = [as_mosaic(image, white_level=4095.0)[0] for image in frames]
     for mosaic in mosaics[:3]:
-        separate_known(mosaic, METHODS[method], (1.0, 1.0, 1.0))
+        METHODS[method].run(mosaic, (1.0, 1.0, 1.0), False)
     start = time.perf_counter()
     for mosaic in islice(cycle(mosaics), ALONE):
-        separate_known(mosaic, METHODS[method], (1.0, 1.0, 1.0))
+        METHODS[method].run(mosaic, (1.0, 1.0, 1.0), False)
     return ALONE / (time.perf_counter() - start)
 
 

@@ -1,7 +1,8 @@
-"""The methods that are installed: every one maps a capture to a `Separation`.
+"""The methods that are installed: each maps a capture to a separation.
 
-Formulas and the paper's networks work on demosaicked samples, so they come with a demosaicker (`compose`); the joint
-network reads the mosaic itself.
+Formulas and the paper's networks work on demosaicked samples, so they come with a demosaicker; the joint network reads
+the mosaic itself. Every method has a `reference` in torch and a `run` for one frame, which uses compiled kernels and
+OpenVINO where these accept the frame and the reference elsewhere. Both agree to rounding.
 """
 
 from __future__ import annotations
@@ -9,47 +10,61 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol
 
+import torch
+
+from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
-from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half
+from polsep.demosaic.guided import MIN_CELLS, demosaic_guided, demosaic_guided_half
 from polsep.io.store.weights import is_shipped
 from polsep.networks.engines import run_engine
-from polsep.networks.run import NAMES, separate_mosaic, takes, weights_name
-from polsep.networks.shipped_paper import separate_paper
+from polsep.networks.paper import separate_paper
+from polsep.networks.run import NAMES, accepts_mosaic, separate_joint, weights_name
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.analytic import Separation, separate_analytic
 from polsep.separation.color_affine import separate_color_affine
-from polsep.separation.engine import run_analytic, run_color_affine, run_nothing
 from polsep.separation.images import FrameImages
+from polsep.separation.report import images_of, in_light, under_white_light
 
-#: What a camera gives: a raw frame, or co-sited samples.
+#: A raw frame, or co-sited samples.
 Capture = Mosaic | Measurements
+#: One gain per channel.
+Light = tuple[float, ...]
+
+
+class Reference(Protocol):
+    """A method in torch: any capture, batches, all devices; a `Separation` in white light at half or full resolution."""
+
+    def __call__(self, capture: Capture, full: bool = False) -> Separation:
+        """Separate a capture."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """A separation method: what it makes of a frame at ``half`` and at ``full`` resolution; the rest is to be read.
+    """A separation method.
 
-    Co-sited measurements keep their resolution. ``takes``: whether it can separate a capture; the others are a
-    ValueError. ``engine``, ``full_engine``: their compiled twins, which give None for frames that they do not take.
+    ``run(capture, light, full)``: the images of one frame in its light, by the fastest code that accepts it, at half or
+    full resolution; co-sited measurements keep theirs. ``accepts``: whether it can separate a capture; others are a
+    ValueError. ``expects_errors``: its images come with expected errors. ``reads_mosaic``: it needs raw mosaics.
     """
 
     name: str
-    half: Callable[[Capture], Separation]
-    full: Callable[[Capture], Separation]
-    takes: Callable[[Capture], bool]
-    engine: Callable[[Mosaic], FrameImages | None]
     summary: str
     needs: str
     source: str
-    full_engine: Callable[[Mosaic], FrameImages | None] = run_nothing
+    reference: Reference
+    run: Callable[[Capture, Light, bool], FrameImages]
+    accepts: Callable[[Capture], bool]
+    expects_errors: bool = False
+    reads_mosaic: bool = False
 
 
 def compose(
     demosaic: Callable[[Mosaic], Measurements], split: Callable[[Measurements], Separation]
 ) -> Callable[[Capture], Separation]:
-    """A demosaicker and what separates its samples; co-sited measurements are separated as they are."""
+    """A demosaicker and a function that separates its samples; co-sited measurements are separated as they are."""
 
     def separate_samples(capture: Capture) -> Separation:
         samples = capture if isinstance(capture, Measurements) else demosaic(capture)
@@ -59,8 +74,83 @@ def compose(
     return separate_samples
 
 
-def takes_anything(capture: Capture) -> bool:
-    """Every capture that can be made."""
+def analytic_reference(capture: Capture, full: bool = False) -> Separation:
+    """`separate_analytic` of bilinear samples."""
+    return compose(demosaic_bilinear if full else demosaic_bilinear_half, separate_analytic)(capture)
+
+
+def color_affine_reference(capture: Capture, full: bool = False) -> Separation:
+    """`separate_color_affine` of guided samples."""
+    return compose(demosaic_guided if full else demosaic_guided_half, separate_color_affine)(capture)
+
+
+def paper_reference(capture: Capture, full: bool = False) -> Separation:
+    """`separate_paper` of bilinear samples."""
+    return compose(demosaic_bilinear if full else demosaic_bilinear_half, separate_paper)(capture)
+
+
+def run_reference(reference: Reference, capture: Capture, light: Light, full: bool) -> FrameImages:
+    """One frame by a method's reference, in its light."""
+    separation = reference(under_white_light(capture, light), full)
+    return images_of(separation, in_light(separation, light))
+
+
+def run_analytic(capture: Capture, light: Light, full: bool) -> FrameImages:
+    """`separate_analytic` of bilinear samples: a compiled kernel at half resolution, else torch."""
+    if full or not isinstance(capture, Mosaic) or not _is_plain(capture):
+        return run_reference(analytic_reference, capture, light, full)
+    make_ready(_warm_up_analytic)
+    from polsep.separation.analytic_kernel import AnalyticOptions, separate_analytic_half
+
+    options = AnalyticOptions(light, in_light=True, report=True)
+    levels = (capture.black_level, capture.white_level)
+    return separate_analytic_half(capture.data.numpy(), capture.layout, *levels, options)
+
+
+def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
+    """`separate_color_affine` of guided samples: compiled kernels for colour at half resolution, else torch."""
+    if (
+        full
+        or not isinstance(capture, Mosaic)
+        or not _is_plain(capture)
+        or capture.layout.channels != 3
+        or min((n - start) // 2 for n, start in zip(capture.data.shape, capture.layout.origin, strict=True)) < MIN_CELLS
+    ):
+        return run_reference(color_affine_reference, capture, light, full)
+    make_ready(_warm_up_color_affine)
+    from polsep.separation.color_affine_kernel import ColorAffineOptions, separate_color_affine_half
+
+    options = ColorAffineOptions(light, in_light=True, guided=True, report=True)
+    levels = (capture.black_level, capture.white_level)
+    return separate_color_affine_half(capture.data.numpy(), capture.layout, *levels, options)
+
+
+def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameImages:
+    """The joint network of that name: kernels and OpenVINO, else torch."""
+    images = run_engine(name, replace(capture, light_color=light), full) if isinstance(capture, Mosaic) else None
+    return run_reference(partial(separate_joint, name), capture, light, full) if images is None else images
+
+
+def _is_plain(mosaic: Mosaic) -> bool:
+    """One frame in the computer's own memory, in samples that kernels read."""
+    data = mosaic.data
+    readable = data.dtype in (torch.uint8, torch.uint16, torch.float32)
+    return data.ndim == 2 and data.device.type == "cpu" and readable and not data.requires_grad
+
+
+def _warm_up_analytic() -> None:
+    from polsep.separation import analytic_kernel
+
+    analytic_kernel.warm_up()
+
+
+def _warm_up_color_affine() -> None:
+    from polsep.separation import color_affine_kernel
+
+    color_affine_kernel.warm_up()
+
+
+def _accepts_anything(capture: Capture) -> bool:
     del capture
     return True
 
@@ -69,14 +159,14 @@ def _joint(name: str, summary: str) -> Method:
     colors = "colour or mono" if is_shipped(weights_name(name, Layout(bayer=None))) else "colour"
     return Method(
         name,
-        separate_mosaic(name, "half"),
-        separate_mosaic(name, "full"),
-        takes(name),
-        partial(run_engine, name, "half"),
         summary,
         f"a raw mosaic with Sony's filters in any orientation, {colors}; trained under white light",
         "this project; after Dave et al. 2022 and the colour-affine closed form",
-        partial(run_engine, name, "full"),
+        partial(separate_joint, name),
+        partial(run_joint, name),
+        partial(accepts_mosaic, name),
+        expects_errors=True,
+        reads_mosaic=True,
     )
 
 
@@ -85,44 +175,40 @@ _ALL = (
     _joint("joint-fast", "the same, smaller, for real time"),
     Method(
         "color-affine",
-        compose(demosaic_guided_half, separate_color_affine),
-        compose(demosaic_guided, separate_color_affine),
-        takes_anything,
-        run_color_affine,
         "closed form for polarized diffuse and white specular light, recovers clipped samples",
         "colour; on mono and grey it is the analytic split with clipped samples recovered",
         "this project; after Nayar et al. 1997, Kajiyama et al. 2023",
+        color_affine_reference,
+        run_color_affine,
+        _accepts_anything,
     ),
     Method(
         "analytic",
-        compose(demosaic_bilinear_half, separate_analytic),
-        compose(demosaic_bilinear, separate_analytic),
-        takes_anything,
-        run_analytic,
         "the paper's first estimate: specular = polarized part, diffuse = the rest",
         "colour or mono; takes the diffuse light for unpolarized and clipped samples at face value",
         "Dave et al. 2022, Eqs. 15-18",
+        analytic_reference,
+        run_analytic,
+        _accepts_anything,
     ),
     Method(
         "paper",
-        compose(demosaic_bilinear_half, separate_paper),
-        compose(demosaic_bilinear, separate_paper),
-        takes_anything,
-        run_nothing,
         "the paper's two U-Nets, which refine the analytic split",
         "colour; mono frames go through as grey ones; trained on noisy mosaics under white light",
         "Dave et al. 2022, Sec. 4; weights are this project's",
+        paper_reference,
+        partial(run_reference, paper_reference),
+        _accepts_anything,
     ),
 )
 
-#: Every method that is installed; networks are where their weights are.
-METHODS = {m.name: m for m in _ALL if not m.name.startswith("joint") or is_shipped(weights_name(m.name, Layout()))}
+#: Every method that is installed; the joint networks only with their weights.
+METHODS = {m.name: m for m in _ALL if not m.reads_mosaic or is_shipped(weights_name(m.name, Layout()))}
 
-#: What `auto` means: the first of these that is installed and takes the capture.
+#: The meaning of `auto`: the first of these that is installed and accepts the capture.
 BEST = tuple(METHODS[name] for name in ("joint", "color-affine") if name in METHODS)
 
-
-#: The same of `auto-fast`, for streams.
+#: The meaning of `auto-fast`, for streams.
 FASTEST = tuple(METHODS[name] for name in ("joint-fast", "joint", "color-affine") if name in METHODS)
 
 #: Names that choose a method by the capture.
@@ -136,7 +222,7 @@ def find_method(name: str, capture: Capture) -> Method:
     """
     check_method(name)
     if name in _CHOICES:
-        return next(method for method in _CHOICES[name] if method.takes(capture))
+        return next(method for method in _CHOICES[name] if method.accepts(capture))
     if name in NAMES and isinstance(capture, Mosaic) and not is_shipped(weights_name(name, capture.layout)):
         kind = "mono" if capture.layout.bayer is None else "colour"
         raise ValueError(f"expected a method with weights for {kind} frames, as auto finds, found {name}")

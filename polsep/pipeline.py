@@ -1,9 +1,8 @@
 """The product on one page: raw frame -> mosaic -> demosaic -> separate -> NumPy images and a report.
 
-A `Method` (`methods`) maps one frame, a `Mosaic` or co-sited `Measurements`, to a `Separation`. The light's colour is
+A `Method` (`methods`) maps one frame, a `Mosaic` or co-sited `Measurements`, to its images. The light's colour is
 divided out before a method runs and multiplied back into its diffuse and specular image, so methods see white light,
-and DoLP, AoLP and statistics are of white light. On the CPU at half resolution a method's compiled twin runs in its
-place (`engine`).
+and DoLP, AoLP and statistics are of white light.
 """
 
 from __future__ import annotations
@@ -14,25 +13,24 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.methods import Capture, Method, find_method
-from polsep.physics.stokes import MAX_DOLP, Measurements, aolp, dolp, fit_stokes_unclipped, polarized_intensity
+from polsep.physics.stokes import Measurements, fit_stokes_unclipped, polarized_intensity
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.layout_check import check_layout
 from polsep.sensor.levels import as_mosaic
-from polsep.separation.analytic import Separation
-from polsep.separation.report import SeparatedFrame, describe, grey, tally
+from polsep.separation.images import FrameImages
+from polsep.separation.report import SeparatedFrame, describe
 
 LightColor = Sequence[float]
 
 
 def _calm_torch() -> None:
-    """In a forked child: the threads of torch have stayed behind, and with more than one it waits for them for ever."""
+    """In a forked child, which torch's threads did not follow: with more than one it would wait for them for ever."""
     torch.set_num_threads(1)
 
 
@@ -80,43 +78,24 @@ def separate_capture(
     """`separate` for a frame that is already a `Mosaic`, or co-sited `Measurements` (which keep their resolution)."""
     chosen = find_method(method, capture)
     capture = to_device(capture, find_device(device))
-    remarks = []
-    if isinstance(capture, Mosaic):
-        check = check_layout(capture)
-        remarks += [check.warning] if check.warning else []
-    light, light_remarks = resolve_light_color(light_color, capture)
-    frame = separate_known(capture, chosen, light, full)
-    frame.report["warnings"] = remarks + light_remarks + frame.report["warnings"]
+    check = check_layout(capture).warning if isinstance(capture, Mosaic) else None
+    light, remarks = resolve_light_color(light_color, capture)
+    images = chosen.run(capture, light, full)
+    frame = make_frame(images, chosen, capture, light, full)
+    frame.report["warnings"] = [*([check] if check else []), *remarks, *frame.report["warnings"]]
     return frame
 
 
-def separate_known(capture: Capture, method: Method, light: tuple[float, ...], full: bool = False) -> SeparatedFrame:
-    """`separate_capture` where method, light and layout are settled, as from the second frame of a video on."""
-    frame = separate_in_engine(capture, method, light, full)
-    if frame is None:
-        frame = separate_in_torch(capture, method, light, full)
-    frame.report.update(method=method.name, light_color=list(light), full_resolution=full)
-    frame.report["layout"] = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
-    return frame
-
-
-def separate_in_engine(
-    capture: Capture, method: Method, light: tuple[float, ...], full: bool = False
-) -> SeparatedFrame | None:
-    """A capture through the method's compiled twin, or None where that does not take it."""
-    engine = method.full_engine if full else method.engine
-    images = engine(replace(capture, light_color=light)) if isinstance(capture, Mosaic) else None
-    if images is None:
-        return None
+def make_frame(
+    images: FrameImages, method: Method, capture: Capture, light: tuple[float, ...], full: bool = False
+) -> SeparatedFrame:
+    """Images that a method made of a capture, with their report."""
     assert images.dolp is not None and images.aolp is not None and images.tally is not None
-    report = describe(images.tally)
-    return SeparatedFrame(images.diffuse, images.specular, images.valid, images.dolp, images.aolp, report, images.error)
-
-
-def separate_in_torch(capture: Capture, method: Method, light: tuple[float, ...], full: bool) -> SeparatedFrame:
-    """Any capture through the method's own functions, on the capture's device."""
-    found = (method.full if full else method.half)(under_white_light(capture, light))
-    return to_numpy(in_light(found, light), describe(tally(found)))
+    report = describe(images.tally, method.expects_errors)
+    layout = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
+    report |= {"method": method.name, "light_color": list(light), "full_resolution": full, "layout": layout}
+    arrays = (images.diffuse, images.specular, images.valid, images.dolp, images.aolp)
+    return SeparatedFrame(*arrays, report, images.error)
 
 
 def find_device(name: str) -> torch.device:
@@ -192,40 +171,3 @@ def estimate_light_color(measurements: Measurements) -> tuple[float, ...] | None
     if float(color.min()) < 0.05 * float(color.max()):
         return None
     return tuple((color / color[1]).tolist())
-
-
-def under_white_light(capture: Capture, light: tuple[float, ...]) -> Capture:
-    """The capture as it would be in white light: the light's colour divided out of every sample."""
-    if isinstance(capture, Mosaic):
-        return replace(capture, light_color=light)
-    return replace(
-        capture, data=capture.data / torch.tensor(light, dtype=torch.float64).to(capture.data).view(-1, 1, 1)
-    )
-
-
-def in_light(found: Separation, light: tuple[float, ...]) -> Separation:
-    """The twin of `under_white_light`: the light's colour multiplied back into diffuse and specular, not Stokes.
-
-    The expected errors are over all colours, so the mean of the colour multiplies them.
-    """
-    gain = torch.tensor(light, dtype=torch.float64).to(found.diffuse).view(-1, 1, 1)
-    expected_error = None if found.expected_error is None else found.expected_error * gain.mean()
-    return replace(found, diffuse=found.diffuse * gain, specular=found.specular * gain, expected_error=expected_error)
-
-
-def to_numpy(found: Separation, report: dict[str, Any]) -> SeparatedFrame:
-    """The public result of one frame: channels last, on the CPU, DoLP and AoLP of all channels together."""
-
-    def image(x: Tensor) -> NDArray[np.float32]:
-        return np.ascontiguousarray(x.detach().float().cpu().movedim(-3, -1).numpy())
-
-    mean = grey(found.stokes)
-    return SeparatedFrame(
-        image(found.diffuse),
-        image(found.specular),
-        found.valid.cpu().numpy(),
-        image(dolp(mean).clamp(max=MAX_DOLP))[..., 0],
-        image(aolp(mean))[..., 0],
-        report,
-        None if found.expected_error is None else image(found.expected_error),
-    )

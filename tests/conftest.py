@@ -12,8 +12,8 @@ from hypothesis import settings
 
 from polsep.io.store import weights
 from polsep.methods import METHODS
+from polsep.networks import paper as learned
 from polsep.networks import run as mosaic_network
-from polsep.networks import shipped_paper as learned
 from polsep.sensor.camera import Layout, Mosaic
 
 settings.register_profile("polsep", derandomize=True, deadline=None, max_examples=40)

@@ -144,7 +144,7 @@ def test_reliability_is_that_of_all_pixels_of_a_set(tmp_path: Path) -> None:
         for where in ("", " where nothing clips")
     }
     case = build_case(STEP)
-    (diffuse, _, mask), found = case.half_truth(), METHODS["joint"].half(case.noisy)
+    (diffuse, _, mask), found = case.half_truth(), METHODS["joint"].reference(case.noisy)
     assert found.expected_error is not None and found.clipped is not None
     curve = reliability(found.diffuse - diffuse, found.expected_error[0], mask, BINS)
     said = [row.value for row in rows if row.method == "joint" and row.metric == "diffuse error, expected"]

@@ -28,7 +28,7 @@ def look(details: Details, images: Tensor) -> Tensor:
 def smooth_images(details: Details, images: Tensor) -> Tensor:
     """What is guessed from the means of cells."""
     means = avg_pool2d(images, 2).split(1, dim=1)
-    return torch.cat([join_cells(mean, details.guess(mean).detach()) for mean in means], dim=1)
+    return torch.cat([join_cells(mean, details.smooth_details(mean).detach()) for mean in means], dim=1)
 
 
 def test_cells_are_split_and_joined() -> None:
@@ -51,7 +51,7 @@ def test_ramps_are_guessed_from_their_means() -> None:
     y, x = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
     ramp = (0.3 + 0.02 * x - 0.01 * y)[None, None]
     cells = split_cells(ramp)
-    found = Details(COLORS, WIDTH).guess(cells[:, :1]).detach()
+    found = Details(COLORS, WIDTH).smooth_details(cells[:, :1]).detach()
     assert_close(found[..., 2:-2, 2:-2], cells[:, 1:, 2:-2, 2:-2])
     assert_close(interpolating_filter().sum(dim=(-1, -2)), torch.zeros(3, 1))
 

@@ -127,7 +127,7 @@ def test_every_resolution_has_its_engine_and_measurements_are_torchs(
     monkeypatch.setitem(METHODS, method, replace(METHODS[method], engine=half.append, full_engine=full.append))
     mosaic = capture(COLOR, (32, 32))
     co_sited = Measurements(torch.rand(4, 3, 16, 16), COLOR.angles)
-    if METHODS[method].takes(co_sited):
+    if METHODS[method].accepts(co_sited):
         separate_capture(co_sited, method, device="cpu")
     assert not half and not full
     separate_capture(mosaic, method, full=True, device="cpu")

@@ -19,8 +19,9 @@ import onnxruntime
 
 from polsep import cli
 from polsep.io.store.weights import write_weights
+from polsep.networks.channels import INPUTS
 from polsep.networks.export import Graph
-from polsep.networks.joint import INPUTS, Joint
+from polsep.networks.joint import Joint
 from polsep.networks.run import load_joint, run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.sensor.camera import Layout, Mosaic

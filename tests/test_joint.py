@@ -18,12 +18,12 @@ from polsep.networks.joint import (
     MAX_DOUBT,
     PERIOD,
     Demosaicker,
-    Images,
     Joint,
-    Pose,
+    JointOutput,
+    Polarization,
     bilinear_filter,
     find_moments,
-    find_slopes,
+    fit_diffuse_polarization,
     limit,
     pool_outputs,
     predict_samples,
@@ -88,7 +88,7 @@ def crop(image: Tensor, edge: int) -> Tensor:
     return image[..., edge:-edge, edge:-edge]
 
 
-def scene(layout: Layout, height: int, width: int) -> tuple[Images, Pose, Stokes]:
+def scene(layout: Layout, height: int, width: int) -> tuple[JointOutput, Polarization, Stokes]:
     """Random diffuse and specular light, slopes and directions of every packed pixel, and their Stokes images."""
     generator, c = torch.Generator().manual_seed(1), layout.channels
     diffuse, specular = (torch.rand(2, n, height, width, generator=generator) for n in (c, 1))
@@ -98,7 +98,7 @@ def scene(layout: Layout, height: int, width: int) -> tuple[Images, Pose, Stokes
     a, e = (x.repeat_interleave(PERIOD, dim=-1).repeat_interleave(PERIOD, dim=-2) for x in (slope, direction))
     light = Stokes(diffuse + specular, *(a[:, k : k + 1] * diffuse + e[:, k : k + 1] * specular for k in (0, 1)))
     nothing = torch.zeros(2, 1, 1, 1)
-    return Images(diffuse, specular, *[nothing] * 5), Pose(slope, direction), light
+    return JointOutput(diffuse, specular, *[nothing] * 5), Polarization(slope, direction), light
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
@@ -187,11 +187,11 @@ def test_the_closed_form_is_exact_on_uniform_colour(angle: float, exposure: floa
     light = Stokes(diffuse + specular, *(a[k] * diffuse + e[k] * specular for k in (0, 1)))
     raw = expose(light, COLOR, IDEAL).data[:, None]
     net = untrained(COLOR)
-    images, pose = net(raw, raw >= 1 - CLIP_MARGIN)
+    images, polarization = net(raw, raw >= 1 - CLIP_MARGIN)
     assert_within(images.diffuse, diffuse, TRUSTED)
     assert_within(images.specular, specular, TRUSTED)
-    assert_within(pose.slope[0, :, 3, 3], a, 10 * TRUSTED)
-    assert_within(pose.direction[0, :, 3, 3], e, 10 * TRUSTED)
+    assert_within(polarization.diffuse[0, :, 3, 3], a, 10 * TRUSTED)
+    assert_within(polarization.specular[0, :, 3, 3], e, 10 * TRUSTED)
     half = net.half_resolution(raw, raw >= 1 - CLIP_MARGIN)
     assert_within(half.diffuse, avg_pool2d(diffuse, 2), TRUSTED)
 
@@ -203,11 +203,11 @@ def test_without_colours_unpolarized_diffuse_and_polarized_specular_come_out() -
         specular = torch.full((1, 1, 16, 16), 0.2)
         light = Stokes(diffuse + specular, 0.6 * specular.expand_as(diffuse), 0.8 * specular.expand_as(diffuse))
         raw = expose(light, layout, IDEAL).data[:, None]
-        images, pose = untrained(layout)(raw, nothing_clipped(raw))
+        images, polarization = untrained(layout)(raw, nothing_clipped(raw))
         assert_within(images.diffuse, diffuse, TRUSTED)
         assert_within(images.specular, specular, TRUSTED)
-        assert_within(pose.slope, 0.0, TRUSTED)
-        assert_within(pose.direction[0, :, 2, 2], (0.6, 0.8), TRUSTED)
+        assert_within(polarization.diffuse, 0.0, TRUSTED)
+        assert_within(polarization.specular[0, :, 2, 2], (0.6, 0.8), TRUSTED)
 
 
 def unit(phase: Tensor) -> Tensor:
@@ -239,7 +239,7 @@ def test_white_specular_solves_the_closed_form(layout: Layout) -> None:
 
 
 def slopes_of(stokes: tuple[tuple[Tensor, ...], ...], light: Tensor, whole: list[Tensor]) -> list[Tensor]:
-    return find_slopes(find_moments(stokes, whole)[:, :3], light)[0]
+    return fit_diffuse_polarization(find_moments(stokes, whole)[:, :3], light)[0]
 
 
 def test_slopes_are_those_of_polarization_over_colour() -> None:
@@ -248,7 +248,7 @@ def test_slopes_are_those_of_polarization_over_colour() -> None:
     light, whole = torch.full((1, 1, 12, 12), 2 / 3), [torch.ones(1, 1, 12, 12)] * 3
     for a, b in itertools.product((0.2, -0.1), (0.0, 0.4)):
         moments = find_moments((s0, *(tuple(a * x + b for x in s0) for _ in (1, 2))), whole)
-        slopes, contrast = find_slopes(moments[:, :3], light)
+        slopes, contrast = fit_diffuse_polarization(moments[:, :3], light)
         for slope in slopes[1:]:
             assert_within(slope, a, TRUSTED)
         deviations = torch.tensor([1.8, 0.1, 0.1]) - 2 / 3
@@ -288,7 +288,7 @@ def fit_half(planes: Tensor) -> tuple[Tensor, Tensor]:
     return found[:2], found[2:]
 
 
-def clipping_scene(layout: Layout) -> tuple[Images, Tensor, Tensor]:
+def clipping_scene(layout: Layout) -> tuple[JointOutput, Tensor, Tensor]:
     """Uniform diffuse light, specular light on the middle packed pixels, and frames of both: whole, and clipped at 1.
 
     Red clips everywhere; in the middle, green clips behind two analysers and blue behind none.
@@ -298,8 +298,8 @@ def clipping_scene(layout: Layout) -> tuple[Images, Tensor, Tensor]:
     specular = torch.zeros(1, 1, 96, 96)
     specular[..., 40:56, 40:56] = 1.0
     turn = torch.tensor([0.8, 0.6]).view(1, 2, 1, 1).expand(1, 2, 24, 24)
-    images = Images(diffuse, specular, *[torch.zeros(1, 1, 1, 1)] * 5)
-    raw = predict_samples(images, Pose(0.1 * turn.flip(1), turn), layout)
+    images = JointOutput(diffuse, specular, *[torch.zeros(1, 1, 1, 1)] * 5)
+    raw = predict_samples(images, Polarization(0.1 * turn.flip(1), turn), layout)
     return images, raw, raw.clamp(max=1)
 
 
@@ -348,8 +348,8 @@ def test_only_frames_that_clip_in_part_and_in_colour_lack_something(layout: Layo
 def test_images_of_a_batch_are_independent(layout: Layout) -> None:
     raw = random_raw(3, 16, 24)
     net = random_net(layout)
-    (together, pose), (alone, own) = (net(x, x > 0.85) for x in (raw, raw[1:2]))
-    for a, b in zip((*together, *pose), (*alone, *own), strict=True):
+    (together, polarization), (alone, own) = (net(x, x > 0.85) for x in (raw, raw[1:2]))
+    for a, b in zip((*together, *polarization), (*alone, *own), strict=True):
         assert_close(a[1:2], b)
 
 
@@ -374,15 +374,15 @@ def test_crop_and_frame_agree_away_from_the_border(layout: Layout, make: Callabl
 def test_any_multiple_of_four_goes_in(layout: Layout, shape: tuple[int, int]) -> None:
     raw = random_raw(1, *shape)
     net = random_net(layout)
-    images, pose = net(raw, nothing_clipped(raw))
+    images, polarization = net(raw, nothing_clipped(raw))
     half = net.half_resolution(raw, nothing_clipped(raw))
     cells, packed = tuple(n // 2 for n in shape), tuple(n // 4 for n in shape)
     assert images.diffuse.shape == (1, layout.channels, *shape)
     assert half.diffuse.shape == half.s1.shape == half.s2.shape == (1, layout.channels, *cells)
     assert half.doubt.shape == (1, 2, *cells)
     assert half.light.shape == (1, 1, *packed)
-    assert pose.slope.shape == pose.direction.shape == (1, 2, *packed)
-    assert_finite(*images, *pose, *half)
+    assert polarization.diffuse.shape == polarization.specular.shape == (1, 2, *packed)
+    assert_finite(*images, *polarization, *half)
 
 
 @pytest.mark.parametrize("inputs", [INPUTS, ("samples", "clipping"), ("cosine", "split")], ids=",".join)
@@ -392,11 +392,11 @@ def test_gradients_are_finite_on_extreme_frames(layout: Layout, level: float, in
     """Black, uniform without noise, and wholly clipped frames; every parameter has a gradient."""
     raw = torch.full((1, 1, 16, 16), level)
     net = random_net(layout, inputs)
-    images, pose = net(raw, raw >= 1 - CLIP_MARGIN)
-    total = sum(x.square().mean() for x in (images.diffuse, images.specular, images.doubt, *pose))
+    images, polarization = net(raw, raw >= 1 - CLIP_MARGIN)
+    total = sum(x.square().mean() for x in (images.diffuse, images.specular, images.log_variance, *polarization))
     assert isinstance(total, Tensor)
     total.backward()
-    assert_finite(*images, *pose)
+    assert_finite(*images, *polarization)
     assert_finite(*(p.grad for p in net.parameters()))
 
 
@@ -412,31 +412,31 @@ def test_networks_see_the_maps_they_were_asked_to_see(layout: Layout) -> None:
     planes = pixel_unshuffle(random_raw(1, 16, 16), 4)
     masks = (planes > 0.85).float()
     half = untrained(layout).demosaicked(planes, full=False)[0]
-    single = [Joint(layout.channels, SIZE, (name,)).guess(half, planes, masks) for name in INPUTS]
-    whole = Joint(layout.channels, SIZE).guess(half, planes, masks)
+    single = [Joint(layout.channels, SIZE, (name,)).closed_form(half, planes, masks) for name in INPUTS]
+    whole = Joint(layout.channels, SIZE).closed_form(half, planes, masks)
     assert torch.equal(
         whole.maps, torch.cat([*(guess.maps[:, :-1] for guess in single), torch.log(whole.light)], dim=1)
     )
     for name, guess in zip(INPUTS, single, strict=True):
         net = random_net(layout, tuple(other for other in INPUTS if other != name))
-        assert net.guess(half, planes, masks).maps.shape[1] == whole.maps.shape[1] - guess.maps.shape[1] + 1
+        assert net.closed_form(half, planes, masks).maps.shape[1] == whole.maps.shape[1] - guess.maps.shape[1] + 1
         assert bool(net(pixel_shuffle(planes, 4), pixel_shuffle(masks, 4))[0].diffuse.any())
 
 
 @pytest.mark.parametrize("layout", [*LAYOUTS, Layout(((0, 45), (90, 135)), "GRBG")], ids=spec)
 def test_true_images_predict_the_samples(layout: Layout) -> None:
     """Truth, true slope and direction give what `camera.sample_mosaic` measures of that light."""
-    images, pose, light = scene(layout, 16, 24)
+    images, polarization, light = scene(layout, 16, 24)
     expected = sample_mosaic(measure(light, layout.angles), layout)
-    assert_close(predict_samples(images, pose, layout)[:, 0], expected)
+    assert_close(predict_samples(images, polarization, layout)[:, 0], expected)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
 def test_random_weights_do_something(layout: Layout) -> None:
     """Or else what is claimed of them here says nothing."""
     raw = random_raw(1, 16, 16)
-    (one, pose), (other, own) = (net(layout)(raw, raw > 0.85) for net in (untrained, random_net))
-    for a, b in zip((*one[:2], one.doubt, *pose), (*other[:2], other.doubt, *own), strict=True):
+    (one, polarization), (other, own) = (net(layout)(raw, raw > 0.85) for net in (untrained, random_net))
+    for a, b in zip((*one[:2], one.doubt, *polarization), (*other[:2], other.doubt, *own), strict=True):
         assert float((a - b).detach().abs().mean()) > 0.02
 
 
@@ -478,10 +478,10 @@ def test_samples_beyond_the_border_are_repeated_by_periods(layout: Layout) -> No
 def test_expected_errors_stay_finite() -> None:
     """However far off a network expects to be, files can hold it."""
     net, raw = untrained(COLOR), random_raw(1, 16, 16)
-    torch.nn.init.constant_(net.doubt[2].bias, 1e6)  # type: ignore[arg-type]
+    torch.nn.init.constant_(net.log_variance[2].bias, 1e6)  # type: ignore[arg-type]
     with torch.no_grad():
         images = net.half_resolution(raw, nothing_clipped(raw))
-    assert images.doubt.amin(dim=(0, 2, 3)).tolist() == list(MAX_DOUBT)
+    assert images.log_variance.amin(dim=(0, 2, 3)).tolist() == list(MAX_DOUBT)
     assert_finite(*limit(images))
 
 

@@ -23,8 +23,9 @@ from polsep.kernels import get_threads, set_threads
 from polsep.networks import engines as joint_engine
 from polsep.networks import openvino_engine
 from polsep.networks import run as mosaic_network
+from polsep.networks.channels import INPUTS, PERIOD
 from polsep.networks.engines import run_engine
-from polsep.networks.joint import INPUTS, PERIOD, Demosaicker, Joint
+from polsep.networks.joint import Demosaicker, Joint
 from polsep.networks.openvino_engine import FullEngine, OpenVinoEngine
 from polsep.networks.run import Resolution, own_order, run_joint
 from polsep.networks.unet import ResidualSize
@@ -59,7 +60,7 @@ def random_net(layout: Layout, inputs: tuple[str, ...] = INPUTS, demosaicker: De
     for name, weight in net.named_parameters():
         if name.endswith("weight"):
             torch.nn.init.normal_(weight, std=0.5 / weight[0].numel() ** 0.5)
-    for layer in (net.last, net.details.change):
+    for layer in (net.corrections, net.details.change):
         torch.nn.init.normal_(layer.weight, std=0.02 / 16**0.5)
     if net.demosaic is not None:
         net.demosaic += 0.002 * torch.randn(net.demosaic.shape)
@@ -109,7 +110,7 @@ def assert_same(found: FrameImages, expected: Separation, white: Separation, div
 @pytest.mark.parametrize("size", [(64, 96), (4, 4), (8, 60), (60, 8), (132, 20)])
 def test_it_is_what_torch_makes_of_a_frame(layout: Layout, demosaicker: Demosaicker, size: tuple[int, int]) -> None:
     net, mosaic = random_net(layout, INPUTS, demosaicker), random_frame(*size, layout)
-    assert_same(in_engine(net, mosaic), in_torch(net, mosaic), run_joint(net, mosaic, "half"))
+    assert_same(in_engine(net, mosaic), in_torch(net, mosaic), run_joint(net, mosaic))
 
 
 @pytest.mark.parametrize(("layout", "demosaicker"), KINDS)
@@ -120,7 +121,7 @@ def test_full_resolution_is_what_torch_makes_of_it(
     net, mosaic = random_net(layout, INPUTS, demosaicker), random_frame(*size, layout)
     found, expected = in_engine(net, mosaic, resolution="full"), in_torch(net, mosaic, "full")
     assert found.diffuse.shape == (*size, layout.channels)
-    assert_same(found, expected, run_joint(net, mosaic, "full"), DIVIDED if demosaicker == "guided" else 0.0)
+    assert_same(found, expected, run_joint(net, mosaic, full=True), DIVIDED if demosaicker == "guided" else 0.0)
 
 
 @pytest.mark.parametrize("left_out", INPUTS)
@@ -324,7 +325,7 @@ def test_layers_are_read_once_for_all_sizes(monkeypatch: pytest.MonkeyPatch) -> 
     for frame in frames:
         engine = OpenVinoEngine(network, (32, frame.data.shape[1]), "f32")
         found = engine.run(frame.data.numpy(), (BLACK, WHITE), LIGHT)
-        expected = run_joint(network, frame, "half").specular[0]
+        expected = run_joint(network, frame).specular[0]
         assert_close(torch.from_numpy(found.specular[..., 0]), LIGHT[0] * expected, 4.0)
     assert len(read) == 1
 

@@ -22,7 +22,8 @@ pytest.importorskip("tensorboard")
 
 from polsep.io.store.weights import read_weights, write_weights
 from polsep.metrics import psnr
-from polsep.networks.joint import INPUTS, Images, Joint, Pose, bilinear_filter
+from polsep.networks.channels import INPUTS
+from polsep.networks.joint import Joint, JointOutput, Polarization, bilinear_filter
 from polsep.networks.unet import ResidualSize, count_parameters
 from polsep.physics.stokes import Stokes
 from polsep.render.simulate import filter_light
@@ -37,11 +38,11 @@ from polsep.train.joint_losses import (
     SURPRISE,
     Goal,
     beyond_white,
-    doubt_loss,
     joint_loss,
     mean_decibels,
     paper_difference,
     sample_misfit,
+    variance_loss,
 )
 from polsep.train.joint_task import (
     ABLATIONS,
@@ -86,16 +87,16 @@ def small_task(ablation: str = "none", variant: str = "mosaic") -> Task[JointSee
     return joint_task(variant, TINY, ABLATIONS[ablation])
 
 
-def truth_of(seen: JointSeen) -> Images:
+def truth_of(seen: JointSeen) -> JointOutput:
     """True light as the network would give it, with doubts about nothing."""
     s1, s2 = avg_pool2d(seen.polarized, 2).chunk(2, dim=1)
     count, _, height, width = seen.raw.shape
     doubt, light = torch.zeros(count, 2, height // 2, width // 2), torch.ones(count, 1, height // 4, width // 4)
-    return Images(seen.full_diffuse, seen.full_specular, s1, s2, doubt, light, torch.zeros_like(light))
+    return JointOutput(seen.full_diffuse, seen.full_specular, s1, s2, doubt, light, torch.zeros_like(light))
 
 
-def explained(layout: Layout) -> tuple[Images, Pose, JointSeen]:
-    """Images, the pose that polarizes them, and an example without noise that they explain, part of it clipped."""
+def explained(layout: Layout) -> tuple[JointOutput, Polarization, JointSeen]:
+    """Images, the polarization of their light, and an example without noise that they explain, part of it clipped."""
     generator, c = torch.Generator().manual_seed(5), layout.channels
     diffuse, specular = (3 * torch.rand(2, n, 16, 16, generator=generator) ** 2 for n in (c, 1))
     a, e = torch.tensor([0.1, -0.2]), torch.tensor([0.6, 0.8])
@@ -105,12 +106,12 @@ def explained(layout: Layout) -> tuple[Images, Pose, JointSeen]:
     polarized = torch.cat([light.s1, light.s2], dim=1)
     ones = torch.ones(2, 1, 16, 16)
     seen = JointSeen(raw, *half, ones[:, 0, ::2, ::2] > 0, layout, diffuse, specular, ones, polarized)
-    pose = Pose(*(x.view(1, 2, 1, 1).expand(2, 2, 4, 4) for x in (a, e)))
-    return truth_of(seen), pose, seen
+    polarization = Polarization(*(x.view(1, 2, 1, 1).expand(2, 2, 4, 4) for x in (a, e)))
+    return truth_of(seen), polarization, seen
 
 
-def as_variable(images: Images) -> Images:
-    return Images(*(x.detach().clone().requires_grad_() for x in images))
+def as_variable(images: JointOutput) -> JointOutput:
+    return JointOutput(*(x.detach().clone().requires_grad_() for x in images))
 
 
 @pytest.mark.parametrize("see", [see_raw, see_raw_mono])
@@ -176,7 +177,7 @@ def test_doubt_is_least_where_it_is_the_squared_error(share: float) -> None:
 
     def loss(doubt: Tensor) -> Tensor:
         nothing = torch.zeros(1)
-        return doubt_loss(Images(*[nothing] * 4, doubt, light, nothing), errors, torch.ones(1, 1, 4, 4))
+        return variance_loss(JointOutput(*[nothing] * 4, doubt, light, nothing), errors, torch.ones(1, 1, 4, 4))
 
     doubt = best.clone().requires_grad_()
     loss(doubt).backward()
@@ -192,7 +193,7 @@ def test_a_pixel_that_is_far_off_does_not_outweigh_the_others() -> None:
     pulls = []
     for sure in (0.0, -math.log(2 * SURPRISE), -200.0):
         doubt = torch.full((1, 2, 4, 4), sure, requires_grad=True)
-        loss = doubt_loss(Images(*[nothing] * 4, doubt, light, nothing), errors, torch.ones(1, 1, 4, 4))
+        loss = variance_loss(JointOutput(*[nothing] * 4, doubt, light, nothing), errors, torch.ones(1, 1, 4, 4))
         loss.backward()
         assert doubt.grad is not None
         assert_finite(loss, doubt.grad)
@@ -204,40 +205,40 @@ def test_a_pixel_that_is_far_off_does_not_outweigh_the_others() -> None:
 def test_doubt_moves_nothing_but_itself() -> None:
     images = as_variable(explained(COLOR)[0])
     diffuse, specular = avg_pool2d(images.diffuse, 2), avg_pool2d(images.specular, 2)
-    doubt_loss(images, (diffuse - 0.3, specular - 0.1), torch.ones(2, 1, 8, 8)).backward()
+    variance_loss(images, (diffuse - 0.3, specular - 0.1), torch.ones(2, 1, 8, 8)).backward()
     assert images.diffuse.grad is None and images.specular.grad is None
-    assert images.doubt.grad is not None and bool(images.doubt.grad.any())
+    assert images.log_variance.grad is not None and bool(images.log_variance.grad.any())
 
 
 @pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
 def test_the_truth_explains_all_samples_that_did_not_clip(layout: Layout) -> None:
     """The misfit is 0 although a part of the frame clips, and not where anything else is claimed."""
-    images, pose, seen = explained(layout)
+    images, polarization, seen = explained(layout)
     assert 0.02 < float(find_clipped(seen.raw).float().mean()) < 0.5
-    assert float(sample_misfit(images, pose, seen)) < 1e-8
+    assert float(sample_misfit(images, polarization, seen)) < 1e-8
     darker = images._replace(diffuse=0.9 * images.diffuse)
-    turned = pose._replace(direction=pose.direction.flip(1))
-    assert float(sample_misfit(darker, pose, seen)) > 0.1
+    turned = polarization._replace(direction=polarization.specular.flip(1))
+    assert float(sample_misfit(darker, polarization, seen)) > 0.1
     assert float(sample_misfit(images, turned, seen)) > 0.1
 
 
 def test_clipped_samples_have_no_misfit() -> None:
     """Their values and the light behind them change nothing and get no gradient; nor do wholly clipped frames."""
-    images, pose, seen = explained(MONO)
+    images, polarization, seen = explained(MONO)
     clipped = find_clipped(seen.raw)
     variable = as_variable(images._replace(diffuse=images.diffuse + 0.5))
-    sample_misfit(variable, pose, seen).backward()
+    sample_misfit(variable, polarization, seen).backward()
     gradient = variable.diffuse.grad
     assert gradient is not None
     assert not bool(gradient[clipped].any())
     assert bool((gradient[~clipped] != 0).all())
-    assert float(sample_misfit(images, pose, seen._replace(raw=torch.ones_like(seen.raw)))) == 0
+    assert float(sample_misfit(images, polarization, seen._replace(raw=torch.ones_like(seen.raw)))) == 0
 
 
 def test_misfit_is_quadratic_for_noise_and_linear_beyond() -> None:
-    images, pose, seen = explained(MONO)
+    images, polarization, seen = explained(MONO)
     nothing = seen._replace(raw=torch.zeros_like(seen.raw))
-    flat = Pose(torch.zeros_like(pose.slope), pose.direction)
+    flat = Polarization(torch.zeros_like(polarization.diffuse), polarization.specular)
 
     def misfit(sample: float) -> float:
         level = torch.full_like(images.diffuse, 2 * sample * DATA_SCALE)
@@ -251,16 +252,16 @@ def test_misfit_is_quadratic_for_noise_and_linear_beyond() -> None:
 @pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
 def test_nothing_is_better_than_the_truth(layout: Layout) -> None:
     """The whole loss, with the doubts that go with each."""
-    images, pose, seen = explained(layout)
+    images, polarization, seen = explained(layout)
     floor = math.log(1e-7)
-    best = joint_loss((images._replace(doubt=torch.full_like(images.doubt, floor)), pose), seen, Goal())
+    best = joint_loss((images._replace(doubt=torch.full_like(images.log_variance, floor)), polarization), seen, Goal())
     for change in (-0.05, 0.05):
         for other in (
             images._replace(diffuse=images.diffuse + change),
             images._replace(specular=images.specular + change),
         ):
-            doubt = torch.full_like(images.doubt, 2 * math.log(abs(change)))
-            assert float(joint_loss((other._replace(doubt=doubt), pose), seen, Goal())) > float(best) + 1
+            doubt = torch.full_like(images.log_variance, 2 * math.log(abs(change)))
+            assert float(joint_loss((other._replace(doubt=doubt), polarization), seen, Goal())) > float(best) + 1
 
 
 def known_views(layout: Layout, weight: Tensor) -> list[JointSeen]:
@@ -389,7 +390,7 @@ def relative_error(net: Joint, views: list[JointSeen]) -> float:
     for seen in views:
         with torch.no_grad():
             images = net(seen.raw, find_clipped(seen.raw))[0]
-        light = interpolate(images.light, scale_factor=4.0)
+        light = interpolate(images.local_brightness, scale_factor=4.0)
         near = interpolate(avg_pool2d(find_clipped(seen.raw).float(), 8, 4, 2), scale_factor=4.0)[..., :32, :32]
         kept = ((seen.weight > 0) & (near == 0)).expand_as(images.diffuse)
         error = (images.diffuse + images.specular - seen.full_diffuse - seen.full_specular) / light

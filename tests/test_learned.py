@@ -21,8 +21,16 @@ from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.store.weights import shipped_weights, write_weights
 from polsep.metrics import psnr
-from polsep.networks.paper import RUNGS, Refinement, analytic_inputs
-from polsep.networks.shipped_paper import PAPER, PAPER_MONO, is_shipped, load_refinement, separate_paper
+from polsep.networks.paper import (
+    PAPER,
+    PAPER_MONO,
+    RUNGS,
+    Refinement,
+    analytic_inputs,
+    is_shipped,
+    load_refinement,
+    separate_paper,
+)
 from polsep.networks.unet import Size
 from polsep.physics.stokes import (
     Measurements,
@@ -43,7 +51,7 @@ def write_constant(path: Path, colors: int = 3, value: float = 0.25, changed: di
     """Networks whose images are ``value`` everywhere, with other metadata where those are ``changed``."""
     network = Refinement(RUNGS["paper"], colors, SIZE)
     for net in network.nets:
-        torch.nn.init.constant_(net.last.bias, value)  # type: ignore[union-attr, arg-type]
+        torch.nn.init.constant_(net.corrections.bias, value)  # type: ignore[union-attr, arg-type]
     torch.nn.init.zeros_(network.linear.weight)
     torch.nn.init.zeros_(network.linear.bias)  # type: ignore[arg-type]
     metadata = {"method": "paper", "rung": "paper", "colors": str(colors), "size": json.dumps(asdict(SIZE))}

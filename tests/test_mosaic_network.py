@@ -14,7 +14,8 @@ from polsep.demosaic.bilinear import mean_cells
 from polsep.io.store.weights import write_weights
 from polsep.methods import METHODS, find_method
 from polsep.networks import run as mosaic_network
-from polsep.networks.joint import INPUTS, Joint
+from polsep.networks.channels import INPUTS
+from polsep.networks.joint import Joint
 from polsep.networks.run import cut_rows, load_joint, run_joint, separate_mosaic, takes, weights_name
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Measurements
@@ -48,7 +49,7 @@ def random_mosaic(layout: Layout, height: int, width: int) -> Mosaic:
 def test_half_resolution_is_the_mean_over_cells(layout: Layout) -> None:
     network, mosaic = random_network(layout), random_mosaic(layout, 48, 64)
     images = [network(*(x[None, None] for x in (mosaic.linear(), mosaic.clipped())))[0]]
-    half, full = run_joint(network, mosaic, "half"), run_joint(network, mosaic, "full")
+    half, full = run_joint(network, mosaic), run_joint(network, mosaic, full=True)
     assert half.diffuse.shape == half.specular.shape == (layout.channels, 24, 32)
     assert full.diffuse.shape == full.specular.shape == full.stokes.s1.shape == (layout.channels, 48, 64)
     assert_close(half.diffuse, mean_cells(images[0].diffuse[0]).clamp(min=0))
@@ -63,7 +64,7 @@ def test_half_resolution_is_the_mean_over_cells(layout: Layout) -> None:
 def test_mirrored_frames_give_mirrored_images(layout: Layout) -> None:
     network, mosaic = random_network(layout), random_mosaic(layout, 48, 64)
     mirrored = Mosaic(mosaic.data.flip(-1), layout.flipped_horizontal(64), 0.0, 1.0)
-    found, other = run_joint(network, mosaic, "half"), run_joint(network, mirrored, "half")
+    found, other = run_joint(network, mosaic), run_joint(network, mirrored)
     assert_close(other.diffuse.flip(-1), found.diffuse)
     assert_close(other.stokes.s1.flip(-1), found.stokes.s1)
     assert_close(-other.stokes.s2.flip(-1), found.stokes.s2)
@@ -74,7 +75,7 @@ def test_mono_cells_of_other_frames_are_their_own() -> None:
     layout = MONO.rolled(0, 1)
     network, mosaic = random_network(MONO), random_mosaic(layout, 48, 64)
     assert not orient(mosaic, MONO).keeps_cells
-    half, full = run_joint(network, mosaic, "half"), run_joint(network, mosaic, "full")
+    half, full = run_joint(network, mosaic), run_joint(network, mosaic, full=True)
     assert half.diffuse.shape == (1, 24, 32)
     assert_close(half.diffuse, mean_cells(full.diffuse))
     assert half.clipped is not None and half.clipped.shape == half.valid.shape == (24, 32)
@@ -98,7 +99,7 @@ def test_strips_are_the_whole_frame(
 def test_frames_of_a_batch_are_separated_alike() -> None:
     network, mosaic = random_network(COLOR), random_mosaic(COLOR, 32, 40)
     two = Mosaic(torch.stack([mosaic.data, 0.5 * mosaic.data]), COLOR, 0.0, 1.0)
-    assert_close(run_joint(network, two, "half").diffuse[0], run_joint(network, mosaic, "half").diffuse)
+    assert_close(run_joint(network, two).diffuse[0], run_joint(network, mosaic).diffuse)
 
 
 def test_reach_is_within_the_margin() -> None:
@@ -131,7 +132,7 @@ def test_methods_take_what_they_have_weights_for(ship: Path) -> None:
     assert not takes("joint")(random_mosaic(MONO, 32, 40))
     assert not takes("joint")(random_mosaic(Layout(((0, 60), (120, 30))), 32, 40))
     found = separate_mosaic("joint", "half")(mosaic)
-    assert_within(found.diffuse, run_joint(network, mosaic, "half").diffuse, 0.01)  # weights in half precision
+    assert_within(found.diffuse, run_joint(network, mosaic).diffuse, 0.01)  # weights in half precision
     co_sited = Measurements(torch.rand(4, 3, 8, 8), COLOR.angles)
     assert not takes("joint")(co_sited)
     with pytest.raises(ValueError, match="expected a mosaic for the method joint, found four co-sited angle images"):

@@ -14,20 +14,20 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from polsep.separation.engine import run_nothing
 from tolerances import assert_close
 from torch.nn.functional import interpolate
 
 import polsep
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.methods import BEST, FASTEST, METHODS, Method, find_method
-from polsep.networks.joint import MIN_LIGHT, Joint
+from polsep.networks.joint import MIN_BRIGHTNESS, Joint
 from polsep.networks.run import NAMES, run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Measurements, Stokes, measure
 from polsep.pipeline import estimate_light_color, find_device, separate_capture
 from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
 from polsep.separation.analytic import Separation
-from polsep.separation.engine import run_nothing
 
 SIZE = 96
 #: What layers in bfloat16 make of other inputs by rounding.
@@ -89,7 +89,7 @@ def test_public_names_are_there() -> None:
 @pytest.mark.parametrize("layout", [None, Layout(bayer=None)], ids=["color", "mono"])
 def test_shapes_and_types(method: str, full: bool, layout: Layout | None) -> None:
     """[H/2, W/2, C], or [H, W, C] at full resolution; float32 images, a bool mask, and ranges as documented."""
-    if method in NAMES and not METHODS[method].takes(Mosaic(torch.zeros(SIZE, SIZE), layout or Layout(), 0.0, 1.0)):
+    if method in NAMES and not METHODS[method].accepts(Mosaic(torch.zeros(SIZE, SIZE), layout or Layout(), 0.0, 1.0)):
         with pytest.raises(
             ValueError, match=f"expected a method with weights for mono frames, as auto finds, found {method}"
         ):
@@ -226,10 +226,10 @@ def doubting(monkeypatch: pytest.MonkeyPatch) -> Joint:
         torch.nn.init.normal_(weight, std=0.5)
 
     def half(mosaic: Mosaic) -> Separation:
-        return run_joint(network, mosaic, "half")
+        return run_joint(network, mosaic)
 
     def full(mosaic: Mosaic) -> Separation:
-        return run_joint(network, mosaic, "full")
+        return run_joint(network, mosaic, full=True)
 
     method = replace(METHODS["analytic"], name="joint", half=half, full=full, engine=run_nothing)
     monkeypatch.setitem(METHODS, "joint", method)
@@ -290,7 +290,7 @@ def test_extreme_frames(method: str) -> None:
     Networks do not know zero, but less than what they take for black, and white only about.
     """
     black = quietly(np.zeros((SIZE, SIZE), np.uint8), method=method)
-    floor, least = (MIN_LIGHT, 1.5) if method in (*NAMES, "paper") else (0.0, 2 - 1e-5)
+    floor, least = (MIN_BRIGHTNESS, 1.5) if method in (*NAMES, "paper") else (0.0, 2 - 1e-5)
     assert float(black.diffuse.max()) <= floor and float(black.specular.max()) <= floor and bool(black.valid.all())
     assert float(black.dolp.max()) == 0
     assert any("black frame" in note for note in black.report["warnings"])

@@ -30,8 +30,7 @@ from polsep import cli
 from polsep.io.store.checkpoints import read_checkpoint, read_lines, write_checkpoint, write_lines
 from polsep.io.store.weights import read_weights
 from polsep.methods import METHODS
-from polsep.networks.paper import RUNGS
-from polsep.networks.shipped_paper import load_refinement
+from polsep.networks.paper import RUNGS, load_refinement
 from polsep.networks.unet import Size
 from polsep.physics.stokes import Stokes, measure
 from polsep.train import digest
@@ -151,7 +150,7 @@ def test_a_log_begins_with_methods_without_training(
     lines = killed[2]
     views = [see_mosaic(batch) for batch in validation_batches(STREAM)]
     assert lines[0] == {"step": 0} | score_references(small_task(), views)
-    analytic = score(lambda seen: METHODS["analytic"].half(seen[0]), views)
+    analytic = score(lambda seen: METHODS["analytic"].reference(seen[0]), views)
     assert {f"analytic {name}": value for name, value in analytic.items()}.items() <= lines[0].items()
     with open_log(tmp_path, 0, lambda _: None, lambda: {"x": 1.0}) as log:
         log.note(2, 0.5, 0.1)

@@ -20,9 +20,9 @@ def bench_separation(_data: Path | None = None) -> Iterator[Row]:
             scene = render_scene(seed, saturation)
             for capture, frame, mask, (diffuse, specular) in captures(scene, seed):
                 for name, method in METHODS.items():
-                    if not method.takes(frame):
+                    if not method.accepts(frame):
                         continue
-                    found = method.half(frame)
+                    found = method.reference(frame)
                     for output, image, truth in (
                         ("diffuse", found.diffuse, diffuse),
                         ("specular", found.specular, specular),

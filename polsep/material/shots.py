@@ -21,7 +21,6 @@ from polsep.material.procedural import GLASS, halve, random_svbrdf
 from polsep.material.svbrdf import Svbrdf, plane_points
 from polsep.methods import METHODS
 from polsep.physics.optics import fresnel
-from polsep.pipeline import separate_known
 from polsep.render.simulate import blur, capture, expose_to_clip, expose_to_level, half_resolution
 from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Scene, Vector, shade
 from polsep.render.views import BLURS, scene_seed
@@ -101,9 +100,9 @@ def see_unseparated(mosaic: Mosaic) -> Tensor:
 
 def see_separated(mosaic: Mosaic) -> Tensor:
     """Diffuse and specular image of `METHOD`, ``[6, h, w]``."""
-    frame = separate_known(mosaic, METHODS[METHOD], (1.0, 1.0, 1.0))
-    images = (torch.from_numpy(x).movedim(-1, 0) for x in (frame.diffuse, frame.specular))
-    return torch.cat([x.expand(3, -1, -1) for x in images])
+    images = METHODS[METHOD].run(mosaic, (1.0, 1.0, 1.0), False)
+    planes = (torch.from_numpy(x).movedim(-1, 0) for x in (images.diffuse, images.specular))
+    return torch.cat([x.expand(3, -1, -1) for x in planes])
 
 
 def see(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> Tensor:

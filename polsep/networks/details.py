@@ -1,8 +1,8 @@
-"""From half to full resolution: what the pixels of a cell differ from their mean.
+"""From half to full resolution: the details of a cell, its pixels' differences from their mean.
 
-The two images are smooth at most places, so their details are guessed from the cells around first. What the demosaicked
-s0 has beyond such a guess is texture or noise, and the diffuse light's or the specular's; how much of it is believed in
-each of the two images is for the network to say, cell by cell. Means of cells stay as they are.
+Both images are smooth at most places, so their details are interpolated from the cells around first. Details of the
+demosaicked s0 beyond that are texture or noise, of the diffuse or of the specular light: the network says for each cell
+how much of them belongs to each of the two images. Means of cells do not change.
 
 Conventions: means and details are those of Haar, sums of the 2x2 pixels of a cell with the signs of `HAAR`, over four;
 "packed" as in `polsep.networks.joint`.
@@ -24,16 +24,16 @@ _SLOPES = (-3 / 256, 38 / 256, 0.0, -38 / 256, 3 / 256)
 _MEANS = (-3 / 256, 20 / 256, 222 / 256, 20 / 256, -3 / 256)
 #: Channels between features and beliefs.
 HIDDEN = 32
-#: Squared details, relative to the light around, below which they are as good as none.
+#: Squared details, relative to the local brightness, that count as none.
 MIN_DETAIL = 1e-7
 
 
 class Details(nn.Module):
     """The details of diffuse light in ``colors`` and of white specular light, from ``width`` channels of features.
 
-    ``smooth [3, 1, 5, 5]`` guesses details from means of cells. ``belief``: how much of what s0 has beyond is in the
-    diffuse image, then in the specular one, of three details and four cells each. ``change``: what the features say of
-    details themselves, relative to the light around.
+    ``smooth [3, 1, 5, 5]`` interpolates details from means of cells. ``belief``: the share of further details of s0
+    that is in the diffuse image, then in the specular one, for three details and four cells each. ``change``: details
+    from the features alone, relative to the local brightness.
     """
 
     def __init__(self, colors: int, width: int) -> None:
@@ -49,38 +49,38 @@ class Details(nn.Module):
         assert last.bias is not None
         nn.init.ones_(last.bias[:12])  # at first all of it is diffuse
 
-    def forward(self, half: Tensor, total: Tensor, features: Tensor, light: Tensor) -> Tensor:
+    def forward(self, half: Tensor, total: Tensor, features: Tensor, brightness: Tensor) -> Tensor:
         """Images ``[N, C + 1, H, W]`` with the means ``half [N, C + 1, H/2, W/2]``: diffuse colours, then specular.
 
-        ``total``: s0 of the colours, packed ``[N, 16 C, h, w]``; ``features [N, width, h, w]``; ``light
-        [N, 1, h, w]``: the brightness around.
+        ``total``: s0 of the colours, packed ``[N, 16 C, h, w]``; ``features [N, width, h, w]``; ``brightness
+        [N, 1, h, w]``: mean s0 around.
         """
-        with torch.autocast(light.device.type, enabled=False):
+        with torch.autocast(brightness.device.type, enabled=False):
             # One colour at a time: details of all of them at once would be half of a frame's memory.
             beyond = [self._beyond(color) for color in total.chunk(self.colors, dim=1)]
             power = reduce(torch.add, [x.square() for x in beyond]) / self.colors
             around = pixel_unshuffle(avg_pool2d(power, 3, 1, 1, count_include_pad=False), 2)
-            seen = torch.log(around / light**2 + MIN_DETAIL)
-        belief, change = self.belief(torch.cat([features, seen.to(features)], dim=1)), self.change(features)
-        with torch.autocast(light.device.type, enabled=False):
+            maps = torch.log(around / brightness**2 + MIN_DETAIL)
+        belief, change = self.belief(torch.cat([features, maps.to(features)], dim=1)), self.change(features)
+        with torch.autocast(brightness.device.type, enabled=False):
             diffuse, specular = pixel_shuffle(belief.float(), 2).chunk(2, dim=1)
             beyond.append(reduce(torch.add, beyond) / self.colors)
             images = []
-            for k, more in enumerate(change.chunk(self.colors + 1, dim=1)):
+            for k, correction in enumerate(change.chunk(self.colors + 1, dim=1)):
                 share = diffuse if k < self.colors else specular
                 means = half[:, k : k + 1]
-                details = self.guess(means) + share * beyond[k] + pixel_shuffle(more.float() * light, 2)
-                images.append(join_cells(means, details))
+                more = pixel_shuffle(correction.float() * brightness, 2)
+                images.append(join_cells(means, self.smooth_details(means) + share * beyond[k] + more))
             return torch.cat(images, dim=1)
 
-    def guess(self, means: Tensor) -> Tensor:
-        """Details ``[N, 3, h, w]`` of an image of which the means of cells ``[N, 1, h, w]`` are known."""
+    def smooth_details(self, means: Tensor) -> Tensor:
+        """Details ``[N, 3, h, w]`` of a smooth image with these means of cells ``[N, 1, h, w]``."""
         return conv2d(pad(means, (2, 2, 2, 2), mode="replicate"), self.smooth)
 
     def _beyond(self, packed: Tensor) -> Tensor:
-        """Of a packed image ``[N, 16, h, w]``, what its details ``[N, 3, 2 h, 2 w]`` differ from such a guess."""
+        """Details ``[N, 3, 2 h, 2 w]`` of a packed image ``[N, 16, h, w]``, less those of a smooth one."""
         cells = split_cells(pixel_shuffle(packed, 4))
-        return cells[:, 1:] - self.guess(cells[:, :1])
+        return cells[:, 1:] - self.smooth_details(cells[:, :1])
 
 
 def interpolating_filter() -> Tensor:

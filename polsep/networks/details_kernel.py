@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from polsep.compute.compiling import ONE, ZERO, compiled, entry
 from polsep.compute.rows import AT_ONCE, add_product, add_up, average, copy, emit, fill, filter_rows, sum_three, weave
 from polsep.compute.threads import Piece
+from polsep.networks.channels import DETAIL_MAPS, PERIOD
 from polsep.networks.details import MIN_DETAIL
-from polsep.networks.images_kernel import SUMS, Found, Targets, add_polarization, mark_clipped, spread
-from polsep.networks.joint import PERIOD
-from polsep.networks.maps_kernel import Seen
+from polsep.networks.images_kernel import LayerOutputs, Targets, add_polarization, mark_clipped, spread
+from polsep.networks.maps_kernel import ClosedFormRows, LayerInput
 from polsep.separation.polarization_kernel import polarize
 
 Floats = NDArray[np.float32]
@@ -40,14 +40,26 @@ class Smooth(NamedTuple):
     place: NDArray[np.int64]
 
 
-class Shares(NamedTuple):
-    """What the network says of details: ``share [24 + 12 (C + 1), h, w]``, of s0's that are diffuse, then specular, and
-    corrections of every image relative to the light; ``beyond [2 h, 3 C, 2 w]`` by `find_beyond`; ``smooth``.
+class DetailOutputs(NamedTuple):
+    """The layers' outputs on three details of four cells.
+
+    ``diffuse``, ``specular [12, h, w]``: the share of s0's further details in each image; ``change [12 (C + 1), h,
+    w]``: corrections of every image relative to the local brightness. ``beyond [2 h, 3 C, 2 w]``: by `find_beyond`;
+    ``smooth``: the interpolation.
     """
 
-    share: Floats
+    diffuse: Floats
+    specular: Floats
+    change: Floats
     beyond: Floats
     smooth: Smooth
+
+    @classmethod
+    def of(cls, output: Floats, beyond: Floats, smooth: Smooth) -> DetailOutputs:
+        """From the layers' output ``[24 + 12 (C + 1), h, w]``, the first three parts one after the other."""
+        return cls(
+            output[:DETAIL_MAPS], output[DETAIL_MAPS : 2 * DETAIL_MAPS], output[2 * DETAIL_MAPS :], beyond, smooth
+        )
 
 
 def read_smooth(weight: Floats) -> Smooth:
@@ -75,41 +87,44 @@ def _starts(y: int, h: int, size: int, starts: Any) -> None:
 
 
 @compiled
-def _guess(smooth: Smooth, ring: Any, starts: Any, found: Any) -> None:
+def _interpolate(smooth: Smooth, ring: Any, starts: Any, found: Any) -> None:
     """Three details ``found [3, n]`` of a row from a ring ``[5, n + 4]`` of means."""
     near = (ring.reshape(-1), starts)
     filter_rows(smooth.weight, (smooth.row, smooth.place), near, (found[0], found[1], found[2]))
 
 
 @compiled
-def _enter_total(base: Any, y: int, colors: int, rings: Any) -> None:
+def _enter_total(closed: ClosedFormRows, y: int, colors: int, rings: Any) -> None:
     """Means of s0 of the colours in cell row ``y`` to their rings ``[C, 5, n + 4]``."""
-    packed = base[y // 2]
     for c in range(colors):
         row = rings[c, y % _SIDE]
         for side in range(2):
             cell = 2 * (y % 2) + side
-            diffuse, specular, out = packed[4 * c + cell], packed[4 * colors + cell], row[2 + side :]
+            diffuse, specular, out = (
+                closed.diffuse[y // 2, 4 * c + cell],
+                closed.specular[y // 2, cell],
+                row[2 + side :],
+            )
             for j in range(diffuse.size):
                 out[2 * j] = diffuse[j] + specular[j]
         _close(row)
 
 
 @entry
-def find_beyond(base: Floats, smooth: Smooth, details: Floats, piece: Piece) -> None:
-    """Subtract from the details of a piece of the packed rows what is guessed from the means of s0 in ``base``."""
+def find_beyond(closed: ClosedFormRows, smooth: Smooth, details: Floats, piece: Piece) -> None:
+    """Subtract from the details of a piece of the packed rows those of a smooth image with its means of s0."""
     h, n = details.shape[0], details.shape[2]
     colors = details.shape[1] // 3
     rings, found = np.empty((colors, _SIDE, n + 4), np.float32), np.empty((3, n), np.float32)
     starts = np.empty(_SIDE, np.int64)
     for y in range(max(2 * piece[0] - 2, 0), min(2 * piece[0] + 2, h)):
-        _enter_total(base, y, colors, rings)
+        _enter_total(closed, y, colors, rings)
     for y in range(2 * piece[0], 2 * piece[1]):
         if y + 2 < h:
-            _enter_total(base, y + 2, colors, rings)
+            _enter_total(closed, y + 2, colors, rings)
         _starts(y, h, n + 4, starts)
         for c in range(colors):
-            _guess(smooth, rings[c], starts, found)
+            _interpolate(smooth, rings[c], starts, found)
             for k in range(3):
                 row, guess = details[y, 3 * c + k], found[k]
                 for j in range(n):
@@ -132,9 +147,9 @@ def _enter_power(details: Any, y: int, ring: Any) -> None:
 
 
 @entry
-def show_details(details: Floats, base: Floats, seen: Seen, piece: Piece) -> None:
-    """How large details are around the cells of a piece of the packed rows, relative to the light."""
-    h, n, colors = details.shape[0], details.shape[2], details.shape[1] // 3
+def emit_details(details: Floats, closed: ClosedFormRows, inputs: LayerInput, piece: Piece) -> None:
+    """Size of the details around the cells of a piece of the packed rows, relative to the local brightness."""
+    h, n = details.shape[0], details.shape[2]
     ring, total, around = (
         np.zeros((3, 3, n + 2), np.float32),
         np.empty(n, np.float32),
@@ -146,7 +161,7 @@ def show_details(details: Floats, base: Floats, seen: Seen, piece: Piece) -> Non
     for y in range(2 * piece[0], 2 * piece[1]):
         if y + 1 < h:
             _enter_power(details, y + 1, ring)
-        first, last, light = max(y - 1, 0), min(y + 1, h - 1), base[y // 2, 4 * colors + 12]
+        first, last, light = max(y - 1, 0), min(y + 1, h - 1), closed.brightness[y // 2]
         for k in range(3):
             fill(ZERO, around[k])
             for t in range(first, last + 1):
@@ -158,50 +173,49 @@ def show_details(details: Floats, base: Floats, seen: Seen, piece: Piece) -> Non
                 x = around[k, side:]
                 for j in range(row.size):
                     row[j] = np.log(x[2 * j] / (light[j] * light[j]) + _LEAST)
-                emit(row, (seen.floats, room, 4 * k + 2 * (y % 2) + side, y // 2))
-        if seen.halves.size and y % 2:
-            weave(room, seen.halves[y // 2])
+                emit(row, (inputs.floats, room, 4 * k + 2 * (y % 2) + side, y // 2))
+        if inputs.halves.size and y % 2:
+            weave(room, inputs.halves[y // 2])
 
 
 @compiled
-def _enter_images(found: Found, y: int, rings: Any, spare: Any) -> None:
+def _enter_images(outputs: LayerOutputs, y: int, rings: Any, spare: Any) -> None:
     """The images at half resolution in cell row ``y``, not limited, to their rings ``[C + 1, 5, n + 4]``."""
-    t, images = y // 2, rings.shape[0]
-    base, change, light = found.base[t], found.change, found.base[t, 4 * images + 8]
+    t, colors, closed = y // 2, rings.shape[0] - 1, outputs.closed
+    light = closed.brightness[t]
     for side in range(2):
         cell = 2 * (y % 2) + side
-        specular, trust = base[4 * images - 4 + cell], change[4 * images + cell, t]
+        specular, gain = closed.specular[t, cell], outputs.gain[cell, t]
         for j in range(spare.size):
-            spare[j] = specular[j] * trust[j]
-        for k in range(images):
-            closed, more, out = base[4 * k + cell], change[4 * k + cell, t], rings[k, y % _SIDE, 2 + side :]
-            sign = ONE if k == images - 1 else -ONE
+            spare[j] = specular[j] * gain[j]
+        for c in range(colors):
+            own, change = closed.diffuse[t, 4 * c + cell], outputs.diffuse[4 * c + cell, t]
+            out = rings[c, y % _SIDE, 2 + side :]
             for j in range(spare.size):
-                out[2 * j] = closed[j] + sign * spare[j] + more[j] * light[j]
-    for k in range(images):
+                out[2 * j] = own[j] - spare[j] + change[j] * light[j]
+        change, out = outputs.specular[cell, t], rings[colors, y % _SIDE, 2 + side :]
+        for j in range(spare.size):
+            out[2 * j] = specular[j] + spare[j] + change[j] * light[j]
+    for k in range(colors + 1):
         _close(rings[k, y % _SIDE])
 
 
 @compiled
-def _add_details(shares: Shares, place: tuple[int, int], light: Any, room: tuple[Any, Any]) -> None:
-    """To the guessed details ``found [3, n]`` of one image in a cell row, what is believed of s0's, and corrections.
-
-    ``place``: the row, and the image. ``room``: these and one row more.
-    """
-    (y, image), (found, spare) = place, room
-    colors, t = shares.beyond.shape[1] // 3, y // 2
-    kind, part = 12 * (image // colors), np.float32(1 / colors)
+def _add_details(outputs: DetailOutputs, y: int, image: int, light: Any, details: Any, spare: Any) -> None:
+    """Add to the interpolated ``details [3, n]`` of an image in cell row ``y`` its share of s0's, and corrections."""
+    colors, t = outputs.beyond.shape[1] // 3, y // 2
+    shares, part = outputs.diffuse if image < colors else outputs.specular, np.float32(1 / colors)
     for k in range(3):
         if image < colors:
-            copy(shares.beyond[y, 3 * image + k], spare)
+            copy(outputs.beyond[y, 3 * image + k], spare)
         else:
             fill(ZERO, spare)
             for c in range(colors):
-                add_product(shares.beyond[y, 3 * c + k], part, spare)
+                add_product(outputs.beyond[y, 3 * c + k], part, spare)
         for side in range(2):
             cell = 4 * k + 2 * (y % 2) + side
-            share, more = shares.share[kind + cell, t], shares.share[24 + 12 * image + cell, t]
-            beyond, out = spare[side:], found[k, side:]
+            share, more = shares[cell, t], outputs.change[12 * image + cell, t]
+            beyond, out = spare[side:], details[k, side:]
             for j in range(share.size):
                 out[2 * j] += share[j] * beyond[2 * j] + more[j] * light[j]
 
@@ -221,15 +235,14 @@ def _join(means: Any, found: Any, pixels: Any) -> None:
 
 
 @compiled
-def _write_errors(found: Found, y: int, gain: Any, work: tuple[Targets, Any]) -> None:
+def _write_errors(outputs: LayerOutputs, y: int, gain: Any, targets: Targets, spare: Any) -> None:
     """Expected errors of the two rows of pixels of cell row ``y``, and the sums of their squares."""
-    targets, spare = work
-    t, light = y // 2, found.base[y // 2, found.base.shape[1] - 2]
+    t, light = y // 2, outputs.closed.brightness[y // 2]
     for kind in range(2):
         for side in range(2):
-            doubt = found.doubt[4 * kind + 2 * (y % 2) + side, t]
+            deviation = outputs.deviation[4 * kind + 2 * (y % 2) + side, t]
             for j in range(spare.size):
-                spare[j] = doubt[j] * light[j]
+                spare[j] = deviation[j] * light[j]
             for row in range(2):
                 for pixel in range(2):
                     spread(spare, gain, 2 * (2 * side + pixel) + kind, targets.error[2 * y + row])
@@ -241,16 +254,14 @@ def _write_errors(found: Found, y: int, gain: Any, work: tuple[Targets, Any]) ->
 
 
 @compiled
-def _write_polarization(found: Found, y: int, pixels: tuple[Any, Any], work: tuple[Targets, Any]) -> None:
-    """DoLP, AoLP and the report's sums of two rows; ``pixels``: s0 and specular ``[2, m]``; ``work``: ``[5, m]``."""
-    (s0, tau), (targets, spare), base = pixels, work, found.base[y // 2]
-    first = base.shape[0] - 10
+def _write_polarization(closed: ClosedFormRows, y: int, s0: Any, tau: Any, targets: Targets, spare: Any) -> None:
+    """DoLP, AoLP and the report's sums of two rows of s0 and specular light ``[2, m]``; ``spare [4, m]``."""
     dolp, aolp, s1, s2 = spare[0], spare[1], spare[2], spare[3]
     for side in range(2):
         cell = 2 * (y % 2) + side
         for pixel in range(2):
-            spread(base[first + cell], ONE, 2 * side + pixel, s1)
-            spread(base[first + 4 + cell], ONE, 2 * side + pixel, s2)
+            spread(closed.s1[y // 2, cell], ONE, 2 * side + pixel, s1)
+            spread(closed.s2[y // 2, cell], ONE, 2 * side + pixel, s2)
     for row in range(2):
         polarize(s0[row], s1, s2, dolp, aolp)
         copy(dolp, targets.dolp[2 * y + row])
@@ -265,9 +276,8 @@ def _write_polarization(found: Found, y: int, pixels: tuple[Any, Any], work: tup
 
 
 @compiled
-def _write_image(image: int, pixels: Any, gains: Any, work: tuple[Targets, int, Any]) -> None:
+def _write_image(image: int, pixels: Any, gains: Any, targets: Targets, y: int, s0: Any) -> None:
     """Two rows of one image ``[2, m]``, a colour of the diffuse light or the specular, and what they add to ``s0``."""
-    targets, y, s0 = work
     colors = gains.size
     for i in range(2):
         if image < colors:
@@ -280,60 +290,56 @@ def _write_image(image: int, pixels: Any, gains: Any, work: tuple[Targets, int, 
 
 
 @compiled
-def _write_masks(found: Found, y: int, targets: Targets, room: tuple[Any, Any]) -> None:
+def _write_masks(closed: ClosedFormRows, y: int, targets: Targets, valid: Any, near: Any) -> None:
     """Where two rows are valid, how many of their pixels are near clipped samples, and their misfit."""
-    valid, near = room
-    clipped = mark_clipped(found.clipped, y, valid, near)
+    clipped = mark_clipped(closed.clipped, y, valid, near)
     for row in range(2 * y, 2 * y + 2):
         out, sums = targets.valid[row], targets.sums[row]
         for j in range(valid.size):
             out[2 * j] = out[2 * j + 1] = valid[j]
         sums[8] = 2 * clipped
-        sums[9] = _PIXELS * add_up(found.base[y // 2, found.base.shape[1] - 1])
+        sums[9] = _PIXELS * add_up(closed.fit_residual[y // 2])
 
 
 @entry
-def write_pixels(found: Found, shares: Shares, gains: Floats, targets: Targets, piece: Piece) -> None:
+def write_pixels(outputs: LayerOutputs, details: DetailOutputs, gains: Floats, targets: Targets, piece: Piece) -> None:
     """Images at full resolution of a piece of the packed rows; ``gains [C]``: the light's colour.
 
-    ``targets``: as `joint_images.write_rows` has them, of 4 h rows with 4 w pixels.
+    ``targets``: as of `images_kernel.write_rows`, of 4 h rows with 4 w pixels.
     """
-    h, n, colors = shares.beyond.shape[0], shares.beyond.shape[2], gains.size
-    rings, guessed = np.empty((colors + 1, _SIDE, n + 4), np.float32), np.empty((3, n), np.float32)
+    h, n, colors, closed = details.beyond.shape[0], details.beyond.shape[2], gains.size, outputs.closed
+    rings, own = np.empty((colors + 1, _SIDE, n + 4), np.float32), np.empty((3, n), np.float32)
     starts, spare, wide = np.empty(_SIDE, np.int64), np.empty(n // 2, np.float32), np.empty((4, 2 * n), np.float32)
     pixels, s0, row = np.empty((2, 2 * n), np.float32), np.empty((2, 2 * n), np.float32), np.empty(n, np.float32)
-    masks = (np.empty(n, np.bool_), np.zeros(n + 2, np.uint8))
+    valid, near = np.empty(n, np.bool_), np.zeros(n + 2, np.uint8)
     mean_gain = ZERO
     for c in range(colors):
         mean_gain += gains[c] / np.float32(colors)
     for y in range(max(2 * piece[0] - 2, 0), min(2 * piece[0] + 2, h)):
-        _enter_images(found, y, rings, spare)
+        _enter_images(outputs, y, rings, spare)
     for y in range(2 * piece[0], 2 * piece[1]):
         if y + 2 < h:
-            _enter_images(found, y + 2, rings, spare)
+            _enter_images(outputs, y + 2, rings, spare)
         _starts(y, h, n + 4, starts)
         fill(ZERO, s0.reshape(-1))
         for k in range(colors + 1):
-            _guess(shares.smooth, rings[k], starts, guessed)
-            _add_details(shares, (y, k), found.base[y // 2, 4 * colors + 12], (guessed, row))
-            _join(rings[k, y % _SIDE, 2:], guessed, pixels)
-            _write_image(k, pixels, gains, (targets, y, s0))
-        _write_polarization(found, y, (s0, pixels), (targets, wide))
-        _write_errors(found, y, mean_gain, (targets, spare))
-        _write_masks(found, y, targets, masks)
+            _interpolate(details.smooth, rings[k], starts, own)
+            _add_details(details, y, k, closed.brightness[y // 2], own, row)
+            _join(rings[k, y % _SIDE, 2:], own, pixels)
+            _write_image(k, pixels, gains, targets, y, s0)
+        _write_polarization(closed, y, s0, pixels, targets, wide)
+        _write_errors(outputs, y, mean_gain, targets, spare)
+        _write_masks(closed, y, targets, valid, near)
 
 
 def warm_up() -> None:
     """Compile the passes of full resolution, or load them from numba's cache on disk."""
     size = 4
-    base, clipped = np.zeros((size, 26, size), np.float32), np.zeros((size, size), np.uint16)
-    details, share = np.zeros((2 * size, 9, 2 * size), np.float32), np.zeros((72, size, size), np.float32)
-    shares = Shares(share, details, read_smooth(np.zeros((3, 1, _SIDE, _SIDE), np.float32)))
-    find_beyond(base, shares.smooth, details, (0, size))
-    seen = Seen(np.zeros((size, size, 12), np.float32), np.zeros((0, 0, 0), np.uint16))
-    show_details(details, base, seen, (0, size))
-    found = Found(base, clipped, *(np.zeros((n, size, size), np.float32) for n in (20, 8)))
-    side = PERIOD * size
-    colors, pairs, grey = (np.zeros((side, side * n), np.float32) for n in (3, 2, 1))
-    targets = Targets(colors, colors, pairs, np.zeros((side, side), np.bool_), grey, grey, np.zeros((side, SUMS)))
-    write_pixels(found, shares, np.ones(3, np.float32), targets, (0, size))
+    closed, beyond = ClosedFormRows.empty(3, size, size), np.zeros((2 * size, 9, 2 * size), np.float32)
+    smooth = read_smooth(np.zeros((3, 1, _SIDE, _SIDE), np.float32))
+    find_beyond(closed, smooth, beyond, (0, size))
+    emit_details(beyond, closed, LayerInput.empty((size, size, DETAIL_MAPS), halves=False), (0, size))
+    outputs = LayerOutputs.of(closed, *(np.zeros((n, size, size), np.float32) for n in (20, 8)))
+    details = DetailOutputs.of(np.zeros((72, size, size), np.float32), beyond, smooth)
+    targets = Targets.empty((PERIOD * size, PERIOD * size), 3)
+    write_pixels(outputs, details, np.ones(3, np.float32), targets, (0, size))

@@ -1,6 +1,7 @@
-"""The joint network on CPUs: engines of `openvino_engine` for frames of every size and orientation.
+"""The joint network on CPUs for frames of every size and orientation, by engines kept from frame to frame.
 
-They are kept from frame to frame. Without OpenVINO, and for frames that it does not take, torch does the work.
+An engine (`openvino_engine`) is for frames of one size. Without OpenVINO, and for frames that it does not accept, torch
+does the work (`run`).
 """
 
 from __future__ import annotations
@@ -19,12 +20,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from polsep.networks.joint import PERIOD, Joint
-from polsep.networks.openvino_engine import Floats, FullEngine, OpenVinoEngine
-from polsep.networks.run import MARGIN, Resolution, cut_rows, find_joint, own_order
+from polsep.compute.threads import get_threads
+from polsep.compute.warm_up import make_ready
+from polsep.networks.channels import PERIOD
+from polsep.networks.joint import Joint
+from polsep.networks.openvino_engine import OpenVinoEngine
+from polsep.networks.run import MARGIN, cut_rows, find_joint, own_order
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation, orient
-from polsep.separation.engine import make_ready
 from polsep.separation.images import FrameImages
 
 #: Engines that are kept at least, each with the memory that its frames need.
@@ -32,17 +35,17 @@ KEPT = 2
 
 
 class _Job(NamedTuple):
-    """What an engine is for."""
+    """A kind of work that an engine is made for."""
 
     method: str
-    resolution: Resolution
+    full: bool
     colors: int
     shape: tuple[int, int]
     threads: int
 
 
 class _Engines:
-    """Engines, each for one frame at a time. State: those that wait, the last used at the end, and how many are busy.
+    """Engines, each for one frame at a time. State: idle ones, the last used at the end, and how many are busy.
 
     As many are kept as were ever busy at once, and all networks that they were made of.
     """
@@ -61,7 +64,7 @@ class _Engines:
 
     @contextmanager
     def borrow(self, job: _Job) -> Iterator[OpenVinoEngine]:
-        """An engine that waits, or a new one."""
+        """An idle engine, or a new one."""
         with self._lock:
             found = next((pair for pair in reversed(self._idle) if pair[0] == job), None)
             if found is not None:
@@ -79,7 +82,7 @@ class _Engines:
                 del self._idle[: -self._kept]
 
     def clear(self) -> None:
-        """Forget those that wait, and the networks."""
+        """Forget idle engines and networks."""
         with self._lock:
             self._idle, self._networks = [], {}
 
@@ -93,25 +96,26 @@ def _make_engine(job: _Job) -> OpenVinoEngine:
     with _MAKING:
         network = ENGINES.network(job.method, job.colors)
         logging.getLogger("polsep").debug("compiling %s for frames of %dx%d", job.method, *job.shape)
-        return (FullEngine if job.resolution == "full" else OpenVinoEngine)(network, job.shape)
+        return OpenVinoEngine(network, job.shape, job.full)
 
 
 def _warm_up() -> None:
-    from polsep.networks import images_kernel as joint_images
+    from polsep.networks import images_kernel
 
-    joint_images.warm_up()
+    images_kernel.warm_up()
 
 
 def _warm_up_full() -> None:
-    from polsep.networks import details_kernel as joint_details
+    from polsep.networks import details_kernel
 
-    joint_details.warm_up()
+    details_kernel.warm_up()
 
 
-def run_engine(method: str, resolution: Resolution, mosaic: Mosaic) -> FrameImages | None:
+def run_engine(method: str, mosaic: Mosaic, full: bool) -> FrameImages | None:
     """A method's images of one frame in its light, or None: batches, other devices, no OpenVINO.
 
-    Frames in other orientations than the network's are turned before and after, as `networks.run.run_joint` does.
+    Frames in other orientations than the network's are turned before and after, as in `run.run_joint`. Huge frames are
+    cut into strips, all of one height, since an engine is for one size.
     """
     data = mosaic.data
     if find_spec("openvino") is None or data.ndim != 2 or data.device.type != "cpu":
@@ -120,66 +124,47 @@ def run_engine(method: str, resolution: Resolution, mosaic: Mosaic) -> FrameImag
     if not orientation.keeps_cells or data.dtype not in (torch.uint8, torch.uint16, torch.float32):
         return None
     make_ready(_warm_up)
-    if resolution == "full":
+    if full:
         make_ready(_warm_up_full)
     as_it_is = orientation == Orientation(*data.shape) and not any(n % PERIOD for n in data.shape)
     turned = data if as_it_is else orientation.turn(data.float()).contiguous()
-    frame, grid = replace(mosaic, data=turned), PERIOD * ENGINES.network(method, mosaic.layout.channels).net.grid
-    strips = _strips((turned.shape[0], turned.shape[1]), grid)
-    images = _join([_run_strip(method, resolution, frame, strip) for strip in strips])
-    return images if as_it_is else _turn_back(images, orientation, 2 if resolution == "full" else 1)
+    colors, cells, parts = mosaic.layout.channels, 1 if full else 2, []
+    grid = PERIOD * ENGINES.network(method, colors).net.grid
+    for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), grid):
+        job = _Job(method, full, colors, (bottom - top, turned.shape[1]), get_threads())
+        raw, levels = turned[top:bottom].numpy(), (mosaic.black_level, mosaic.white_level)
+        with ENGINES.borrow(job) as engine:
+            rows = slice(*((row - top) // cells for row in kept))
+            parts.append(engine.run(raw, levels, mosaic.light_color, rows))
+    images = _join(parts)
+    return images if as_it_is else _turn_back(images, orientation, 2 if full else 1)
 
 
-class _Strip(NamedTuple):
-    """Raw rows of a frame that an engine sees, and those of which it is to give images."""
-
-    seen: tuple[int, int]
-    kept: tuple[int, int]
-
-
-def _strips(size: tuple[int, int], grid: int) -> Iterator[_Strip]:
-    """A frame as one strip or, if it is huge, as several of at most two heights, since an engine is for one."""
+def _strips(size: tuple[int, int], grid: int) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """Raw rows that an engine sees and those that it makes images of: one strip, or several of at most two heights."""
     height, pieces = size[0], list(cut_rows(size, grid))
     if len(pieces) == 1:
-        yield _Strip(pieces[0], pieces[0])
+        yield pieces[0], pieces[0]
         return
     rows = pieces[0][1] + 2 * MARGIN
     for first, last in pieces:
         top = max(min(first - MARGIN, (height - rows) // grid * grid), 0)
         bottom = height if height - top - rows < grid else top + rows
-        yield _Strip((top, bottom), (first, last))
-
-
-def _run_strip(method: str, resolution: Resolution, mosaic: Mosaic, strip: _Strip) -> FrameImages:
-    """Images of the rows that a strip keeps."""
-    from polsep.kernels import get_threads
-
-    (top, bottom), cells = strip.seen, 1 if resolution == "full" else 2
-    job = _Job(method, resolution, mosaic.layout.channels, (bottom - top, mosaic.data.shape[1]), get_threads())
-    kept = slice(*((row - top) // cells for row in strip.kept))
-    with ENGINES.borrow(job) as engine:
-        raw, levels = mosaic.data[top:bottom].numpy(), (mosaic.black_level, mosaic.white_level)
-        return engine.run(raw, levels, mosaic.light_color, kept)
+        yield (top, bottom), (first, last)
 
 
 def _join(parts: list[FrameImages]) -> FrameImages:
     """Strips as one frame."""
     if len(parts) == 1:
         return parts[0]
-
-    def rows(name: str) -> NDArray[Any]:
-        return np.concatenate([getattr(part, name) for part in parts])
-
-    diffuse, specular, valid, dolp, aolp, error = map(rows, ("diffuse", "specular", "valid", "dolp", "aolp", "error"))
-    return FrameImages(
-        diffuse, specular, valid, dolp, aolp, reduce(add, (part.tally for part in parts if part.tally)), error
-    )
+    images = {name: np.concatenate([part.arrays()[name] for part in parts]) for name in parts[0].arrays()}
+    return FrameImages(**images, tally=reduce(add, (part.tally for part in parts if part.tally is not None)))
 
 
 def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> FrameImages:
     """Images of a turned frame, ``scale`` pixels along a cell's side, as those of the frame itself.
 
-    The tally is of all that was seen.
+    The tally is of all pixels that the network saw.
     """
 
     def turn(image: NDArray[Any]) -> NDArray[Any]:
@@ -188,19 +173,18 @@ def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> Fra
         planes = orientation.turn_back(planes, scale)
         return np.ascontiguousarray((planes.movedim(0, -1) if planes.ndim == 3 else planes).numpy())
 
-    assert images.dolp is not None and images.aolp is not None and images.error is not None and images.tally is not None
-    aolp, tally, mirrored = turn(images.aolp), images.tally, orientation.down != orientation.across
+    turned, tally = {name: turn(image) for name, image in images.arrays().items()}, images.tally
+    assert tally is not None
     if orientation.transposed:
-        aolp, tally = _wrap(np.float32(np.pi / 2) - aolp), replace(tally, along=-tally.along)
-    if mirrored:
-        aolp, tally = _wrap(-aolp), replace(tally, across=-tally.across)
-    diffuse, specular, error = (turn(image) for image in (images.diffuse, images.specular, images.error))
-    return FrameImages(diffuse, specular, turn(images.valid), turn(images.dolp), aolp, tally, error)
+        turned["aolp"], tally = _wrap(np.float32(np.pi / 2) - turned["aolp"]), replace(tally, along=-tally.along)
+    if orientation.down != orientation.across:
+        turned["aolp"], tally = _wrap(-turned["aolp"]), replace(tally, across=-tally.across)
+    return FrameImages(**turned, tally=tally)
 
 
-def _wrap(angle: Floats) -> Floats:
-    """The same AoLP in [0, pi); what rounding takes to pi is 0."""
+def _wrap(angle: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The same AoLP in [0, pi); values that rounding takes to pi become 0."""
     pi = np.float32(np.pi)
-    wrapped: Floats = np.mod(angle, pi)
+    wrapped: NDArray[np.float32] = np.mod(angle, pi)
     wrapped[wrapped >= pi] = 0
     return wrapped

@@ -16,8 +16,8 @@ from polsep.compute.rows import AT_ONCE, add_product, add_up, copy
 from polsep.compute.threads import Piece
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
-from polsep.networks.joint import PERIOD
-from polsep.networks.maps_kernel import Maps, Taps, map_guided_rows, map_rows
+from polsep.networks.channels import PERIOD, input_channels
+from polsep.networks.maps_kernel import ClosedFormRows, LayerInput, Maps, Taps, map_guided_rows, map_rows
 from polsep.physics.stokes import stokes_inverse
 from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import as_samples
@@ -34,18 +34,25 @@ _CELL = 0b110011
 _CELLS = 2 * math.sqrt(2)
 
 
-class Found(NamedTuple):
-    """What is known of every packed pixel: ``base [h, 4 C + 14, w]`` and ``clipped [h, w]`` as in `joint.Maps`.
+class LayerOutputs(NamedTuple):
+    """The closed form, and what the layers add to it, of every packed pixel, planar.
 
-    ``change [4 C + 8, h, w]``: the network's corrections, relative to the light, and for the closed form's specular
-    light relative to that. ``doubt [8, h, w]``: standard deviations of the errors of four cells' diffuse, then
-    specular, relative to the light.
+    ``diffuse [4 C, h, w]``, ``specular [4, h, w]``: corrections relative to the local brightness; ``gain [4, h, w]``:
+    more of the closed form's specular light, relative to that; ``deviation [8, h, w]``: expected standard deviations
+    of the diffuse errors of four cells, then of the specular ones, relative to the local brightness.
     """
 
-    base: Floats
-    clipped: NDArray[np.uint16]
-    change: Floats
-    doubt: Floats
+    closed: ClosedFormRows
+    diffuse: Floats
+    specular: Floats
+    gain: Floats
+    deviation: Floats
+
+    @classmethod
+    def of(cls, closed: ClosedFormRows, change: Floats, deviation: Floats) -> LayerOutputs:
+        """From the layers' two outputs, ``change [4 C + 8, h, w]`` being the first three parts one after the other."""
+        first = closed.diffuse.shape[1]
+        return cls(closed, change[:first], change[first : first + 4], change[first + 4 :], deviation)
 
 
 class Targets(NamedTuple):
@@ -58,6 +65,14 @@ class Targets(NamedTuple):
     dolp: Floats
     aolp: Floats
     sums: NDArray[np.float64]
+
+    @classmethod
+    def empty(cls, shape: tuple[int, int], colors: int) -> Targets:
+        """Buffers for images of that ``shape``, and sums of 0."""
+        h, w = shape
+        diffuse, specular, error = (np.empty((h, w * n), np.float32) for n in (colors, colors, 2))
+        dolp, aolp = (np.empty((h, w), np.float32) for _ in range(2))
+        return cls(diffuse, specular, error, np.empty((h, w), np.bool_), dolp, aolp, np.zeros((h, SUMS)))
 
 
 @compiled
@@ -77,25 +92,24 @@ def spread(row: Any, gain: Any, place: int, image: Any) -> None:
 
 
 @compiled
-def _write_cells(found: Found, t: int, cell: int, gains: Any, work: tuple[Targets, Any]) -> None:
+def _write_cells(outputs: LayerOutputs, t: int, cell: int, gains: Any, targets: Targets, spare: Any) -> None:
     """One of the four cells of every packed pixel of row ``t``."""
-    targets, spare = work
-    y, side, colors = 2 * t + cell // 2, cell % 2, gains.size
-    base, light = found.base[t], found.base[t, 4 * colors + 12]
+    y, side, colors, closed = 2 * t + cell // 2, cell % 2, gains.size, outputs.closed
+    light = closed.brightness[t]
     image, tau, s0, dolp, aolp, moved = spare[0], spare[1], spare[2], spare[3], spare[4], spare[5]
-    specular, trust = base[4 * colors + cell], found.change[4 * colors + 4 + cell, t]
+    specular, gain = closed.specular[t, cell], outputs.gain[cell, t]
     for j in range(moved.size):
-        moved[j] = specular[j] * trust[j]
-    _correct(specular, found.change[4 * colors + cell, t], light, moved, tau)
+        moved[j] = specular[j] * gain[j]
+    _correct(specular, outputs.specular[cell, t], light, moved, tau)
     copy(tau, s0)
     for j in range(moved.size):
         moved[j] = -moved[j]
     for c in range(colors):
-        _correct(base[4 * c + cell], found.change[4 * c + cell, t], light, moved, image)
+        _correct(closed.diffuse[t, 4 * c + cell], outputs.diffuse[4 * c + cell, t], light, moved, image)
         add_product(image, np.float32(1 / colors), s0)
         spread(image, gains[c], colors * side + c, targets.diffuse[y])
         spread(tau, gains[c], colors * side + c, targets.specular[y])
-    s1, s2 = base[4 * colors + 4 + cell], base[4 * colors + 8 + cell]
+    s1, s2 = closed.s1[t, cell], closed.s2[t, cell]
     polarize(s0, s1, s2, dolp, aolp)
     spread(dolp, ONE, side, targets.dolp[y])
     spread(aolp, ONE, side, targets.aolp[y])
@@ -104,9 +118,9 @@ def _write_cells(found: Found, t: int, cell: int, gains: Any, work: tuple[Target
         mean_gain += gains[c] / np.float32(colors)
     sums = targets.sums[y]
     for kind in range(2):
-        doubt = found.doubt[4 * kind + cell, t]
+        deviation = outputs.deviation[4 * kind + cell, t]
         for j in range(image.size):
-            image[j] = doubt[j] * light[j]
+            image[j] = deviation[j] * light[j]
         spread(image, mean_gain, 2 * side + kind, targets.error[y])
         for j in range(image.size):
             image[j] *= image[j]
@@ -168,16 +182,17 @@ def mark_clipped(clipped: Any, y: int, valid: Any, near: Any) -> int:
 
 
 @entry
-def write_rows(found: Found, gains: Floats, targets: Targets, piece: Piece) -> None:
+def write_rows(outputs: LayerOutputs, gains: Floats, targets: Targets, piece: Piece) -> None:
     """Images of a piece of the packed rows; ``gains [C]``: the light's colour."""
-    w = found.base.shape[2]
+    closed = outputs.closed
+    w = closed.brightness.shape[1]
     spare, near = np.zeros((6, w), np.float32), np.zeros(2 * w + 2, np.uint8)
     for t in range(piece[0], piece[1]):
         for cell in range(4):
-            _write_cells(found, t, cell, gains, (targets, spare))
+            _write_cells(outputs, t, cell, gains, targets, spare)
         for y in range(2 * t, 2 * t + 2):
-            targets.sums[y, 8] = mark_clipped(found.clipped, y, targets.valid[y], near)
-            targets.sums[y, 9] = _CELLS * add_up(found.base[t, found.base.shape[1] - 1])
+            targets.sums[y, 8] = mark_clipped(closed.clipped, y, targets.valid[y], near)
+            targets.sums[y, 9] = _CELLS * add_up(closed.fit_residual[t])
 
 
 def warm_up() -> None:
@@ -185,16 +200,12 @@ def warm_up() -> None:
     layout, size = Layout(), 4
     samples = as_samples(np.eye(PERIOD * size, dtype=np.uint8))
     pattern = read_pattern((PERIOD * size, PERIOD * size), layout, 0, 1, (1.0, 1.0, 1.0))
-    base, clipped = np.zeros((size, 26, size), np.float32), np.zeros((size, size), np.uint16)
-    first = np.array([-1, -1, -1, -1, -1, 0], np.int64)
-    none = np.zeros((0, 0, 0), np.float32)
-    maps = Maps(np.zeros((size, size, 1), np.float32), none.astype(np.uint16), first, base, clipped, none)
+    closed, channels = ClosedFormRows.empty(3, size, size), input_channels(3, ())
+    inputs = LayerInput.empty((size, size, channels.total), halves=False)
+    maps = Maps(*inputs, channels, closed, np.zeros((0, 0, 0), np.float32))
     nothing = np.zeros((4, AT_ONCE), np.int64)
     map_rows(samples, pattern, Taps(np.zeros((4, 9, AT_ONCE), np.float32), nothing, nothing, 3), maps, (0, size))
     grid = read_grid(pattern, layout.angles, stokes_inverse(layout.angles).float().numpy())
     map_guided_rows(Source(samples, pattern, grid), maps, (0, size))
-    found = Found(base, clipped, *(np.zeros((n, size, size), np.float32) for n in (20, 8)))
-    colors, pairs, grey = (np.zeros((2 * size, 2 * size * n), np.float32) for n in (3, 2, 1))
-    sums = np.zeros((2 * size, SUMS))
-    targets = Targets(colors, colors, pairs, np.zeros((2 * size, 2 * size), np.bool_), grey, grey, sums)
-    write_rows(found, np.ones(3, np.float32), targets, (0, size))
+    outputs = LayerOutputs.of(closed, *(np.zeros((n, size, size), np.float32) for n in (20, 8)))
+    write_rows(outputs, np.ones(3, np.float32), Targets.empty((2 * size, 2 * size), 3), (0, size))

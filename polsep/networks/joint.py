@@ -20,7 +20,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from functools import reduce
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -28,84 +29,89 @@ from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, pad, pixel_shuff
 
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import MARGIN, guide_once
+from polsep.networks.channels import INPUTS, PERIOD, input_channels, seen_maps
 from polsep.networks.details import Details
 from polsep.networks.unet import ResidualSize, ResidualUNet
 from polsep.physics.stokes import fit_stokes
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.color_affine import MAX_DIFFUSE_DOLP, fit_unclipped
 
-#: Raw pixels along the side of a packed pixel.
-PERIOD = 4
-#: What the network sees besides the logarithm of the brightness; ablations leave some out.
-INPUTS = ("samples", "clipping", "cosine", "sine", "split")
-#: Brightness around that counts as black: below it inputs and corrections fade.
-MIN_LIGHT = 0.01
-#: Log variances of diffuse and specular that are expected at most: errors of 2 and 26 times the light around, which are
-#: those of the hundredth of the validation views where they are largest (docs/experiments.md).
-MAX_DOUBT = (1.5, 6.5)
-#: Windows of the slope in packed pixels, and the contrast of colours, relative to the brightness and squared, below
-#: which they fall back to the wider window and to zero. Chosen on validation views (docs/experiments.md).
-WINDOWS, TRUST = (9, 3), (3e-3, 3e-3)
+#: Local brightness that counts as black: below it inputs and corrections fade.
+MIN_BRIGHTNESS = 0.01
+#: Largest log variances of diffuse and specular: errors of 2 and 26 times the local brightness, the hundredth largest
+#: of the validation views (docs/experiments.md).
+MAX_LOG_VARIANCE = (1.5, 6.5)
+#: Windows of the diffuse polarization in packed pixels, and the squared contrast of colours, relative to the local
+#: brightness, below which it falls back to the wider window and to zero. Chosen on validation views
+#: (docs/experiments.md).
+WINDOWS, MIN_CONTRAST = (9, 3), (3e-3, 3e-3)
+#: Parts of the network whose parameters have other names in files of weights.
+NAMES_IN_FILES = {
+    "corrections": "last",
+    "closed_form_gain": "trust",
+    "polarization": "pose",
+    "log_variance": "doubt",
+}
 
-
-#: Where Stokes images come from.
+#: Algorithms that make the Stokes images.
 Demosaicker = Literal["linear", "guided"]
 
 
-class Guess(NamedTuple):
-    """What the closed form says at half resolution: ``diffuse [N, 4 C, h, w]``, ``specular [N, 4, h, w]``, packed.
+class ClosedForm(NamedTuple):
+    """The closed form at half resolution: ``diffuse [N, 4 C, h, w]``, ``specular [N, 4, h, w]``, packed.
 
-    ``polarized [N, 8 C, h, w]``: s1 and s2. ``light``, ``misfit [N, 1, h, w]``: the brightness around, and the rms
-    distance of s1 and s2 from the model; ``pose [N, 4, h, w]``: slope and direction as in `Pose`; ``lift [N, C, h, w]``
-    is what clipped samples lacked of s0; ``maps``: what the network sees, relative to the light.
+    ``polarized [N, 8 C, h, w]``: s1 and s2. ``local_brightness``, ``fit_residual [N, 1, h, w]``: mean s0 around, and
+    the rms distance of s1 and s2 from the model; ``polarization [N, 4, h, w]``: the two of `Polarization`;
+    ``clipped_s0 [N, C, h, w]``: light that clipping took from s0; ``inputs``: the network's, see `channels`.
     """
 
     diffuse: Tensor
     specular: Tensor
     polarized: Tensor
-    light: Tensor
-    misfit: Tensor
-    pose: Tensor
-    lift: Tensor
-    maps: Tensor
+    local_brightness: Tensor
+    fit_residual: Tensor
+    polarization: Tensor
+    clipped_s0: Tensor
+    inputs: Tensor
 
 
-class Pose(NamedTuple):
-    """Diffuse polarization ``slope`` and the specular one's ``direction``, a unit vector, ``[N, 2, H/4, W/4]`` each.
+class Polarization(NamedTuple):
+    """Polarization of the ``diffuse`` light, and the direction of the ``specular`` one's, ``[N, 2, H/4, W/4]`` each.
 
-    Both as (cos 2 phi, sin 2 phi), the slope times its degree.
+    Both as (cos 2 phi, sin 2 phi); the diffuse one times its degree, the specular one a unit vector.
     """
 
-    slope: Tensor
-    direction: Tensor
+    diffuse: Tensor
+    specular: Tensor
 
 
-class Images(NamedTuple):
-    """``diffuse [N, C, ...]`` and ``specular [N, 1, ...]``, not limited to be positive, and what goes with them.
+class JointOutput(NamedTuple):
+    """``diffuse [N, C, ...]`` and ``specular [N, 1, ...]``, not limited to be positive, and images at half resolution.
 
-    At half resolution: ``s1``, ``s2 [N, C, H/2, W/2]`` as linearly demosaicked; ``doubt [N, 2, H/2, W/2]``, the log
-    variance of the error of diffuse and specular, relative to the square of the brightness around,
-    ``light [N, 1, H/4, W/4]``; ``misfit [N, 1, H/4, W/4]`` as in `Guess`.
+    ``s1``, ``s2 [N, C, H/2, W/2]`` as linearly demosaicked; ``log_variance [N, 2, H/2, W/2]`` of the errors of diffuse
+    and specular, relative to the squared ``local_brightness [N, 1, H/4, W/4]``; ``fit_residual [N, 1, H/4, W/4]``.
     """
 
     diffuse: Tensor
     specular: Tensor
     s1: Tensor
     s2: Tensor
-    doubt: Tensor
-    light: Tensor
-    misfit: Tensor
+    log_variance: Tensor
+    local_brightness: Tensor
+    fit_residual: Tensor
 
 
 class Joint(nn.Module):
     """Samples ``[N, 1, H, W]`` (black 0, white 1, Sony's order) to diffuse and specular images.
 
-    ``inputs``: those of `INPUTS` that it sees. ``demosaicker``: "guided" with frames continued by ``margin`` cells, or
-    "linear" by the filter ``demosaic``, no subject of gradients; see `bilinear_filter`.
+    ``inputs``: the groups of `channels.GROUPS` that it sees. ``demosaicker``: "guided" with frames continued by
+    ``margin`` cells, or "linear" by the filter ``demosaic``, which gradients do not change; see `bilinear_filter`.
+    ``corrections`` are added to the closed form, ``closed_form_gain`` scales its specular light, ``log_variance`` says
+    how large errors are, ``details`` makes full from half resolution.
     """
 
     demosaic: Tensor | None
-    most_doubt: Tensor
+    max_log_variance: Tensor
 
     def __init__(
         self, colors: int, size: ResidualSize, inputs: tuple[str, ...] = INPUTS, demosaicker: Demosaicker = "linear"
@@ -114,69 +120,62 @@ class Joint(nn.Module):
         self.colors, self.size, self.inputs, self.margin = colors, size, inputs, MARGIN
         self.layout = Layout(bayer="RGGB" if colors == 3 else None)
         self.register_buffer("demosaic", bilinear_filter(self.layout) if demosaicker == "linear" else None)
-        counts = {"samples": 16, "clipping": 17, "cosine": 4, "sine": 4, "split": 4 * colors + 10}
-        self.net = ResidualUNet(1 + sum(counts[name] for name in inputs), size)
-        self.last = nn.Conv2d(size.widths[0], 4 * (colors + 1), 1)
-        nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
-        # Without the closed form among its maps the network does not know what it would believe.
-        self.trust = nn.Conv2d(size.widths[0], 4, 1) if "split" in inputs else None
-        if self.trust is not None:
-            nn.init.zeros_(self.trust.weight)
-            nn.init.zeros_(self.trust.bias)  # type: ignore[arg-type]
-        self.pose = nn.Conv2d(size.widths[0], 4, 1)
-        nn.init.zeros_(self.pose.weight)
-        nn.init.zeros_(self.pose.bias)  # type: ignore[arg-type]
-        most = torch.tensor(MAX_DOUBT).repeat_interleave(4).view(1, 8, 1, 1)
-        self.register_buffer("most_doubt", most, persistent=False)
-        self.doubt = nn.Sequential(nn.Conv2d(size.widths[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 8, 1))
-        self.details = Details(colors, size.widths[0])
+        width = size.widths[0]
+        self.net = ResidualUNet(input_channels(colors, inputs).total, size)
+        self.corrections = _zero_convolution(width, 4 * (colors + 1))
+        # Without the closed form among its inputs the network cannot know how far to trust it.
+        self.closed_form_gain = _zero_convolution(width, 4) if "split" in inputs else None
+        self.polarization = _zero_convolution(width, 4)
+        largest = torch.tensor(MAX_LOG_VARIANCE).repeat_interleave(4).view(1, 8, 1, 1)
+        self.register_buffer("max_log_variance", largest, persistent=False)
+        self.log_variance = nn.Sequential(nn.Conv2d(width, 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 8, 1))
+        self.details = Details(colors, width)
+        self.register_state_dict_post_hook(_to_names_in_files)  # type: ignore[no-untyped-call]
+        self.register_load_state_dict_pre_hook(_from_names_in_files)  # type: ignore[no-untyped-call]
 
-    def forward(self, raw: Tensor, clipped: Tensor) -> tuple[Images, Pose]:
+    def forward(self, raw: Tensor, clipped: Tensor) -> tuple[JointOutput, Polarization]:
         """Images at full resolution, ``[N, C, H, W]``.
 
         ``raw``, ``clipped [N, 1, H, W]``: samples and which of them clipped, H and W multiples of 4.
         """
-        total, guess, features, doubt = self._see(raw, clipped, full=True)
-        half, turn = self._correct(guess, features), self.pose(features)
+        total, closed, features, log_variance = self._encode(raw, clipped, full=True)
+        half, change = self._correct(closed, features), self.polarization(features)
         with torch.autocast(raw.device.type, enabled=False):
-            slope, direction = (guess.pose + turn.float()).chunk(2, dim=1)
-            length = torch.sqrt((direction**2).sum(dim=1, keepdim=True) + 1e-6)
-        full = self.details(half, total, features, guess.light)
-        return self._as_images(full, guess, doubt), Pose(slope, direction / length)
+            diffuse, specular = (closed.polarization + change.float()).chunk(2, dim=1)
+            length = torch.sqrt((specular**2).sum(dim=1, keepdim=True) + 1e-6)
+        full = self.details(half, total, features, closed.local_brightness)
+        return self._as_output(full, closed, log_variance), Polarization(diffuse, specular / length)
 
-    def half_resolution(self, raw: Tensor, clipped: Tensor) -> Images:
+    def half_resolution(self, raw: Tensor, clipped: Tensor) -> JointOutput:
         """The means over 2x2 cells of what `forward` gives, ``[N, C, H/2, W/2]``, in less time."""
-        _, guess, features, doubt = self._see(raw, clipped, full=False)
-        return self._as_images(self._correct(guess, features), guess, doubt)
+        _, closed, features, log_variance = self._encode(raw, clipped, full=False)
+        return self._as_output(self._correct(closed, features), closed, log_variance)
 
-    def _correct(self, guess: Guess, features: Tensor) -> Tensor:
-        """Diffuse colours and specular at half resolution ``[N, C + 1, H/2, W/2]``."""
-        change, trust = self.last(features), self._trust(features)
-        with torch.autocast(features.device.type, enabled=False):
-            moved = guess.specular * trust
-            closed = torch.cat([guess.diffuse - torch.cat([moved] * self.colors, dim=1), guess.specular + moved], dim=1)
-            return pixel_shuffle(closed + change.float() * guess.light, 2)
-
-    def _trust(self, features: Tensor) -> Tensor:
-        """How much more specular light there is than in the closed form, relative to that ``[N, 4 or 1, h, w]``."""
-        trust = torch.zeros_like(features[:, :1]) if self.trust is None else self.trust(features)
-        return trust.float()
-
-    def _as_images(self, images: Tensor, guess: Guess, doubt: Tensor) -> Images:
-        s1, s2 = (pixel_shuffle(s, 2) for s in guess.polarized.chunk(2, dim=1))
-        return Images(images[:, : self.colors], images[:, self.colors :], s1, s2, doubt, guess.light, guess.misfit)
-
-    def _see(self, raw: Tensor, clipped: Tensor, full: bool) -> tuple[Tensor, Guess, Tensor, Tensor]:
-        """Packed s0 at full resolution, the closed form, the network's features and doubt."""
+    def _encode(self, raw: Tensor, clipped: Tensor, full: bool) -> tuple[Tensor, ClosedForm, Tensor, Tensor]:
+        """Packed s0 at full resolution, the closed form, the network's features and log variances."""
         planes, masks = pixel_unshuffle(raw, PERIOD), pixel_unshuffle(clipped.to(raw), PERIOD)
         with torch.autocast(raw.device.type, enabled=False), torch.no_grad():
             half, total = self.demosaicked(planes, full)
-            guess = self.guess(half, planes, masks)
-            total = total + guess.lift.repeat_interleave(total.shape[1] // self.colors, dim=1)
-        features = self.net(guess.maps)
-        doubt = self.doubt(features.detach()).float()
-        return total, guess, features, pixel_shuffle(torch.minimum(doubt, self.most_doubt), 2)
+            closed = self.closed_form(half, planes, masks)
+            total = total + closed.clipped_s0.repeat_interleave(total.shape[1] // self.colors, dim=1)
+        features = self.net(closed.inputs)
+        log_variance = self.log_variance(features.detach()).float()
+        return total, closed, features, pixel_shuffle(torch.minimum(log_variance, self.max_log_variance), 2)
+
+    def _correct(self, closed: ClosedForm, features: Tensor) -> Tensor:
+        """Diffuse colours and specular at half resolution ``[N, C + 1, H/2, W/2]``."""
+        change = self.corrections(features)
+        gain = torch.zeros_like(features[:, :1]) if self.closed_form_gain is None else self.closed_form_gain(features)
+        with torch.autocast(features.device.type, enabled=False):
+            moved = closed.specular * gain.float()
+            diffuse, specular = closed.diffuse - torch.cat([moved] * self.colors, dim=1), closed.specular + moved
+            images = torch.cat([diffuse, specular], dim=1) + change.float() * closed.local_brightness
+            return pixel_shuffle(images, 2)
+
+    def _as_output(self, images: Tensor, closed: ClosedForm, log_variance: Tensor) -> JointOutput:
+        s1, s2 = (pixel_shuffle(s, 2) for s in closed.polarized.chunk(2, dim=1))
+        diffuse, specular = images[:, : self.colors], images[:, self.colors :]
+        return JointOutput(diffuse, specular, s1, s2, log_variance, closed.local_brightness, closed.fit_residual)
 
     def demosaicked(self, planes: Tensor, full: bool) -> tuple[Tensor, Tensor]:
         """Of packed samples s0, s1, s2 at half resolution ``[N, 12 C, h, w]``, and s0 at full resolution or nothing."""
@@ -188,42 +187,47 @@ class Joint(nn.Module):
         half = torch.cat([pool_outputs(self.demosaic[:s0_full]), self.demosaic[s0_full:]])
         return _filter(planes, half), _filter(planes, self.demosaic[:s0_full]) if full else planes[:, :0]
 
-    def guess(self, found: Tensor, planes: Tensor, masks: Tensor) -> Guess:
-        """The closed form on Stokes images at half resolution ``found``; ``planes``, ``masks [N, 16, h, w]``."""
+    def closed_form(self, stokes: Tensor, planes: Tensor, masks: Tensor) -> ClosedForm:
+        """The closed form of packed Stokes images at half resolution; ``planes``, ``masks [N, 16, h, w]``."""
         colors = self.colors
-        s0, s1, s2 = (x.chunk(colors, dim=1) for x in torch.split(found, 4 * colors, dim=1))
+        s0, s1, s2 = (x.chunk(colors, dim=1) for x in torch.split(stokes, 4 * colors, dim=1))
         mean = _mean(s0)
-        light = avg_pool2d(_mean(mean.chunk(4, dim=1)), 3, 1, 1, count_include_pad=False).clamp(min=0) + MIN_LIGHT
-        free = 1 - max_pool2d(masks, 3, 1, 1).amax(dim=1, keepdim=True)
+        brightness = avg_pool2d(_mean(mean.chunk(4, dim=1)), 3, 1, 1, count_include_pad=False).clamp(min=0)
+        brightness = brightness + MIN_BRIGHTNESS
         moments = find_moments((s0, s1, s2), self._whole_colors(masks))
-        slopes, contrast = find_slopes(moments[:, :3], light)
-        a1, a2 = slopes[-1].chunk(2, dim=1)
+        polarizations, contrast = fit_diffuse_polarization(moments[:, :3], brightness)
+        a1, a2 = polarizations[-1].chunk(2, dim=1)
         b1, b2 = (_mean(values) - a * mean for values, a in ((s1, a1), (s2, a2)))
         m1, m2, m0, both = moments.chunk(4, dim=1)
-        misfit = 0.5 * (both - 2 * (a1 * m1 + a2 * m2) + (a1 * a1 + a2 * a2) * m0)
-        moved, lift = self.unclip(planes, masks, slopes[-1])
-        b1, b2 = b1 + moved[:, :1], b2 + moved[:, 1:]
-        s0 = tuple(x + lift[:, c : c + 1] for c, x in enumerate(s0))
+        residual = 0.5 * (both - 2 * (a1 * m1 + a2 * m2) + (a1 * a1 + a2 * a2) * m0)
+        residual = torch.sqrt(residual.clamp(min=0) + 1e-12)
+        clipped_offset, clipped_s0 = self.unclip(planes, masks, polarizations[-1])
+        b1, b2 = b1 + clipped_offset[:, :1], b2 + clipped_offset[:, 1:]
+        s0 = tuple(x + clipped_s0[:, c : c + 1] for c, x in enumerate(s0))
         specular = white_specular((b1, b2), (a1, a2)).clamp(min=0)
-        least = s0[0]
-        for color in s0[1:]:
-            least = torch.minimum(least, color)
-        specular = torch.minimum(specular, least.clamp(min=0))
+        specular = torch.minimum(specular, reduce(torch.minimum, s0).clamp(min=0))
         diffuse = torch.cat([color - specular for color in s0], dim=1)
         # p - a d = b + a s is the specular polarization.
         direction = [_mean((b + a * specular).chunk(4, dim=1)) for b, a in ((b1, a1), (b2, a2))]
         length = torch.sqrt(direction[0] ** 2 + direction[1] ** 2 + 1e-12)
-        pose = torch.cat([a1, a2, direction[0] / length, direction[1] / length], dim=1)
-        misfit = torch.sqrt(misfit.clamp(min=0) + 1e-12)
-        seen = {
-            "samples": [planes / light],
-            "clipping": [masks, free],
-            "cosine": [_mean(s1) / light],
-            "sine": [_mean(s2) / light],
-            "split": [diffuse / light, specular / light, *slopes, contrast, misfit / light],
+        maps = {
+            "samples": planes / brightness,
+            "clipped": masks,
+            "unclipped_around": 1 - max_pool2d(masks, 3, 1, 1).amax(dim=1, keepdim=True),
+            "cosine": _mean(s1) / brightness,
+            "sine": _mean(s2) / brightness,
+            "diffuse": diffuse / brightness,
+            "specular": specular / brightness,
+            "wide": polarizations[0],
+            "narrow": polarizations[1],
+            "contrast": contrast,
+            "fit_residual": residual / brightness,
+            "log_brightness": torch.log(brightness),
         }
-        maps = torch.cat([image for name in self.inputs for image in seen[name]] + [torch.log(light)], dim=1)
-        return Guess(diffuse, specular, found[:, 4 * colors :], light, misfit, pose, lift, maps)
+        inputs = torch.cat([maps[name] for name in seen_maps(self.inputs)], dim=1)
+        polarization = torch.cat([a1, a2, direction[0] / length, direction[1] / length], dim=1)
+        polarized = stokes[:, 4 * colors :]
+        return ClosedForm(diffuse, specular, polarized, brightness, residual, polarization, clipped_s0, inputs)
 
     def _cells_of_colors(self) -> list[list[int]]:
         """Which of a packed pixel's four cells, in reading order, are of each colour."""
@@ -235,19 +239,20 @@ class Joint(nn.Module):
         cells = _by_analyser(masks).amax(dim=0).view(4, masks.shape[0], 1, *masks.shape[2:])
         return [1 - cells[own].amax(dim=0) for own in self._cells_of_colors()]
 
-    def unclip(self, planes: Tensor, masks: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
+    def unclip(self, planes: Tensor, masks: Tensor, diffuse_polarization: Tensor) -> tuple[Tensor, Tensor]:
         """What clipping hid: of the offset b ``[N, 2, h, w]``, and of every colour's s0 ``[N, C, h, w]``.
 
-        In a packed pixel of four cells the samples that did not clip determine b and the cells' s0 for a given slope
+        In a packed pixel of four cells the samples that did not clip determine b and the cells' s0 for a given
+        diffuse polarization
         (`color_affine.fit_unclipped`). What that differs from a fit to all samples as they are is missing from images
         that took them so. Zero where nothing clips, or where too few samples are left; and for one colour, whose cells
         clip behind the same analysers: it gained nothing there (docs/experiments.md).
         """
         if self.colors == 1:
-            return torch.zeros_like(slope), torch.zeros_like(slope[:, :1])
+            return torch.zeros_like(diffuse_polarization), torch.zeros_like(diffuse_polarization[:, :1])
         n, h, w = planes.shape[0], *planes.shape[2:]
         samples, kept = _by_analyser(planes), 1 - _by_analyser(masks)
-        a = slope.movedim(1, 0).reshape(2, -1)
+        a = diffuse_polarization.movedim(1, 0).reshape(2, -1)
         angles = tuple(math.radians(angle) for row in self.layout.polarizer for angle in row)
         seen, s0_seen, _ = fit_unclipped(2 * samples, torch.ones_like(kept), a, angles)
         b, s0, determined = fit_unclipped(2 * samples, kept, a, angles)
@@ -284,20 +289,20 @@ def _deviations(values: tuple[Tensor, ...], whole: list[Tensor]) -> list[Tensor]
     return [(x - mean) * one for x, one in zip(values, whole, strict=True)]
 
 
-def find_slopes(moments: Tensor, light: Tensor) -> tuple[list[Tensor], Tensor]:
+def fit_diffuse_polarization(moments: Tensor, brightness: Tensor) -> tuple[list[Tensor], Tensor]:
     """The diffuse polarization ``[N, 2, h, w]`` in `WINDOWS`, widest first, and the contrast ``[N, 1, h, w]``.
 
-    ``moments [N, 3, h, w]``: the first three of `find_moments`; ``light [N, 1, h, w]``: the brightness around.
+    ``moments [N, 3, h, w]``: the first three of `find_moments`; ``brightness [N, 1, h, w]``: the local one.
     """
-    sums = moments / light**2
-    slope, slopes, pooled = torch.zeros_like(sums[:, :2]), [], sums
-    for window, trust in zip(WINDOWS, TRUST, strict=True):
+    sums = moments / brightness**2
+    polarization, all_windows, pooled = torch.zeros_like(sums[:, :2]), [], sums
+    for window, least in zip(WINDOWS, MIN_CONTRAST, strict=True):
         pooled = avg_pool2d(sums, window, 1, window // 2, count_include_pad=False)
-        slope = (pooled[:, :2] + trust * slope) / (pooled[:, 2:] + trust)
-        size = torch.sqrt(slope[:, :1] ** 2 + slope[:, 1:] ** 2 + 1e-12)
-        slope = slope * (MAX_DIFFUSE_DOLP / size.clamp(min=MAX_DIFFUSE_DOLP))
-        slopes.append(slope)
-    return slopes, torch.sqrt(pooled[:, 2:] + 1e-12)
+        polarization = (pooled[:, :2] + least * polarization) / (pooled[:, 2:] + least)
+        size = torch.sqrt(polarization[:, :1] ** 2 + polarization[:, 1:] ** 2 + 1e-12)
+        polarization = polarization * (MAX_DIFFUSE_DOLP / size.clamp(min=MAX_DIFFUSE_DOLP))
+        all_windows.append(polarization)
+    return all_windows, torch.sqrt(pooled[:, 2:] + 1e-12)
 
 
 def _mean(images: Sequence[Tensor]) -> Tensor:
@@ -319,17 +324,45 @@ def pool_outputs(weight: Tensor) -> Tensor:
     return weight.view(-1, 2, 2, 2, 2, *weight.shape[1:]).mean(dim=(2, 4)).flatten(0, 2)
 
 
-def limit(images: Images) -> tuple[Tensor, Tensor, Tensor]:
+def limit(output: JointOutput) -> tuple[Tensor, Tensor, Tensor]:
     """Diffuse and specular without negative light, and the standard deviation of their errors ``[N, 2, H/2, W/2]``."""
-    light = images.light.repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)
-    error = light * torch.exp(0.5 * images.doubt)
-    return images.diffuse.clamp(min=0), images.specular.clamp(min=0), error
+    brightness = output.local_brightness.repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)
+    error = brightness * torch.exp(0.5 * output.log_variance)
+    return output.diffuse.clamp(min=0), output.specular.clamp(min=0), error
 
 
-def white_specular(offset: tuple[Tensor, Tensor], slope: tuple[Tensor, Tensor]) -> Tensor:
-    """The positive root of (|a|^2 - 1) tau^2 + 2 Re(b a*) tau + |b|^2 = 0 for slope a and offset b."""
-    real = offset[0] * slope[0] + offset[1] * slope[1]
-    free = 1 - slope[0] ** 2 - slope[1] ** 2
+def _zero_convolution(channels: int, outputs: int) -> nn.Conv2d:
+    """A 1x1 convolution that gives 0 until it is trained."""
+    layer = nn.Conv2d(channels, outputs, 1)
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+    return layer
+
+
+def _to_names_in_files(module: nn.Module, state: dict[str, Any], prefix: str, *unused: Any) -> None:
+    """Rename parameters of a state as files of weights have them; tensors keep their order."""
+    del module, unused
+    items = list(state.items())
+    state.clear()
+    for name, value in items:
+        part, _, rest = name.removeprefix(prefix).partition(".")
+        renamed = name.startswith(prefix) and part in NAMES_IN_FILES
+        state[f"{prefix}{NAMES_IN_FILES[part]}.{rest}" if renamed else name] = value
+
+
+def _from_names_in_files(module: nn.Module, state: dict[str, Any], prefix: str, *unused: Any) -> None:
+    """The twin of `_to_names_in_files`."""
+    del module, unused
+    for ours, theirs in NAMES_IN_FILES.items():
+        for name in [name for name in state if name.startswith(f"{prefix}{theirs}.")]:
+            state[f"{prefix}{ours}.{name.removeprefix(f'{prefix}{theirs}.')}"] = state.pop(name)
+
+
+def white_specular(offset: tuple[Tensor, Tensor], diffuse_polarization: tuple[Tensor, Tensor]) -> Tensor:
+    """The positive root of (|a|^2 - 1) tau^2 + 2 Re(b a*) tau + |b|^2 = 0, diffuse polarization a, offset b."""
+    a1, a2 = diffuse_polarization
+    real = offset[0] * a1 + offset[1] * a2
+    free = 1 - a1**2 - a2**2
     return (real + torch.sqrt(real**2 + free * (offset[0] ** 2 + offset[1] ** 2) + 1e-12)) / free
 
 
@@ -349,19 +382,19 @@ def bilinear_filter(layout: Layout) -> Tensor:
     return images[:, :, 3:6, 3:6].flip(-1, -2).transpose(0, 1).contiguous()
 
 
-def predict_samples(images: Images, pose: Pose, layout: Layout) -> Tensor:
-    """The samples ``[N, 1, H, W]`` that full-resolution images explain: what lies behind each pixel's filter.
+def predict_samples(output: JointOutput, polarization: Polarization, layout: Layout) -> Tensor:
+    """The samples ``[N, 1, H, W]`` that full-resolution images explain, behind each pixel's own filter.
 
-    m = (d_c + s + Re((a d_c + s e) exp(-2 i t))) / 2 for the analyser t and colour c of the pixel, with slope a and
-    specular direction e. Not limited at the white level.
+    m = (d_c + s + Re((a d_c + s e) exp(-2 i t))) / 2 for the analyser t and colour c of the pixel, with diffuse
+    polarization a and specular direction e. Not limited at the white level.
     """
-    colors = images.diffuse.shape[1]
-    diffuse, specular = (pixel_unshuffle(x, PERIOD) for x in (images.diffuse, images.specular))
+    colors = output.diffuse.shape[1]
+    diffuse, specular = (pixel_unshuffle(x, PERIOD) for x in (output.diffuse, output.specular))
     samples = []
     for place in range(16):
         angle_deg, channel = layout.filter_at(place // 4, place % 4)
         turn = torch.tensor([math.cos(2 * math.radians(angle_deg)), math.sin(2 * math.radians(angle_deg))])
-        a, e = ((x * turn.to(x).view(1, 2, 1, 1)).sum(dim=1) for x in pose)
+        a, e = ((x * turn.to(x).view(1, 2, 1, 1)).sum(dim=1) for x in polarization)
         own = diffuse[:, 16 * min(channel, colors - 1) + place]
         samples.append((own * (1 + a) + specular[:, place] * (1 + e)) / 2)
     return pixel_shuffle(torch.stack(samples, dim=1), PERIOD)

@@ -32,8 +32,9 @@ from polsep.compute.threads import Piece
 from polsep.demosaic.bilinear_kernel import Pattern
 from polsep.demosaic.cells_kernel import Source
 from polsep.demosaic.guided_kernel import Stream, demosaic_rows, open_stream
+from polsep.networks.channels import PERIOD, InputChannels
 from polsep.networks.closed_form_kernel import SUMMED, find_slope, limit, misfit, offset, pool, white_specular
-from polsep.networks.joint import MIN_LIGHT, PERIOD, TRUST, WINDOWS
+from polsep.networks.joint import MIN_BRIGHTNESS, MIN_CONTRAST, WINDOWS
 from polsep.networks.unclip_kernel import leave_clipped_out, unclip
 from polsep.sensor.unpack_kernel import Samples, read_row
 
@@ -44,8 +45,8 @@ KEPT = 8
 #: How many rows behind the newest one a row is left: the light around, and half of the widest window.
 REACH = 1 + WINDOWS[0] // 2
 _WIDE, _NARROW = (window // 2 for window in WINDOWS)
-_TRUST_WIDE, _TRUST_NARROW = (np.float32(trust) for trust in TRUST)
-_MIN_LIGHT, _TINY = np.float32(MIN_LIGHT), np.float32(1e-12)
+_CONTRAST_WIDE, _CONTRAST_NARROW = (np.float32(least) for least in MIN_CONTRAST)
+_MIN_BRIGHTNESS, _TINY = np.float32(MIN_BRIGHTNESS), np.float32(1e-12)
 #: Rows of scratch, the last five of them for what clipping hid.
 _ROWS = 17
 
@@ -64,31 +65,60 @@ class Taps(NamedTuple):
     colors: int
 
 
-class Maps(NamedTuple):
-    """What the first pass fills. ``floats`` or ``halves [h, w, channels]``, bfloat16 as its bits; the other is empty.
+class ClosedFormRows(NamedTuple):
+    """The closed form of every packed pixel, planar: ``diffuse [h, 4 C, w]``, ``specular``, ``s1``, ``s2 [h, 4, w]``.
 
-    ``first [6]``: the first channel of samples, clipping, cosine, sine, split, logarithm; -1 for what is not wanted.
-    ``base [h, 4 C + 14, w]``: diffuse, specular, means over colours of s1 and s2, light, misfit. ``clipped [h, w]``: a
-    bit per sample of a packed pixel. ``details [2 h, 3 C, 2 w]``: of s0, three of every colour; or empty.
+    s1 and s2 are means over colours. ``brightness``, ``fit_residual [h, w]``: as in `joint.ClosedForm`; ``clipped
+    [h, w]``: a bit per sample of a packed pixel.
+    """
+
+    diffuse: Floats
+    specular: Floats
+    s1: Floats
+    s2: Floats
+    brightness: Floats
+    fit_residual: Floats
+    clipped: NDArray[np.uint16]
+
+    @classmethod
+    def empty(cls, colors: int, h: int, w: int) -> ClosedFormRows:
+        """Buffers for ``[h, w]`` packed pixels."""
+        diffuse, specular, s1, s2 = (np.empty((h, n, w), np.float32) for n in (4 * colors, 4, 4, 4))
+        brightness, residual = (np.empty((h, w), np.float32) for _ in range(2))
+        return cls(diffuse, specular, s1, s2, brightness, residual, np.empty((h, w), np.uint16))
+
+
+class Maps(NamedTuple):
+    """The first pass's outputs. ``floats`` or ``halves [h, w, n]``: the network's input; the other is empty.
+
+    ``halves``: bfloat16 as its bits. ``channels``: where each map lies. ``closed``: the closed form. ``details
+    [2 h, 3 C, 2 w]``: of s0, three of every colour; or empty.
     """
 
     floats: Floats
     halves: NDArray[np.uint16]
-    first: NDArray[np.int64]
-    base: Floats
-    clipped: NDArray[np.uint16]
+    channels: InputChannels
+    closed: ClosedFormRows
     details: Floats
 
 
-class Seen(NamedTuple):
-    """Channels that layers see, last ``[h, w, n]``, in one of the two kinds of `Maps`; the other is empty."""
+class LayerInput(NamedTuple):
+    """An input of the layers, channels last ``[h, w, n]``, as float32 or as bits of bfloat16; the other is empty."""
 
     floats: Floats
     halves: NDArray[np.uint16]
 
+    @classmethod
+    def empty(cls, shape: tuple[int, int, int], halves: bool) -> LayerInput:
+        """A buffer in one of the two precisions."""
+        nothing = (0, 0, 0)
+        return cls(
+            np.empty(nothing if halves else shape, np.float32), np.empty(shape if halves else nothing, np.uint16)
+        )
+
     @property
     def filled(self) -> NDArray[Any]:
-        """The one that is not empty."""
+        """The array that is not empty."""
         return self.floats if self.floats.size else self.halves
 
 
@@ -116,7 +146,7 @@ class _Rings(NamedTuple):
 
 @compiled
 def _make_rings(colors: int, maps: Maps) -> _Rings:
-    w = maps.clipped.shape[1]
+    w = maps.closed.clipped.shape[1]
     return _Rings(
         np.zeros((KEPT, 16, w + 2), np.float32),
         np.zeros((KEPT, 4 * colors, w), np.float32),
@@ -273,7 +303,7 @@ def _look_around(v: int, h: int, rings: _Rings, spare: Any) -> None:
     average(light, 1, rows)
     weight = spare[1]
     for j in range(w):
-        light[j] = (light[j] if light[j] > ZERO else ZERO) + _MIN_LIGHT
+        light[j] = (light[j] if light[j] > ZERO else ZERO) + _MIN_BRIGHTNESS
     for j in range(w):
         weight[j] = ONE / (light[j] * light[j])
     sums, moments = rings.sums[v % SUMMED], rings.moments[slot]
@@ -283,27 +313,28 @@ def _look_around(v: int, h: int, rings: _Rings, spare: Any) -> None:
 
 
 @compiled
-def _find_slopes(t: int, h: int, sums: Any, spare: Any) -> None:
-    """Slopes of row ``t``, wide and narrow, to ``spare[4:8]``; the moments of the narrow window stay in ``[1:4]``."""
+def _fit_polarization(t: int, h: int, sums: Any, spare: Any) -> None:
+    """Diffuse polarization of row ``t``, wide and narrow, to ``spare[4:8]``; narrow moments stay in ``[1:4]``."""
     pooled, wide, narrow = spare[1:4], spare[4:6], spare[6:8]
     fill(ZERO, wide[0])
     fill(ZERO, wide[1])
     pool(t, h, _WIDE, sums, pooled)
-    find_slope(pooled, _TRUST_WIDE, wide[0], wide[1])
+    find_slope(pooled, _CONTRAST_WIDE, wide[0], wide[1])
     copy(wide[0], narrow[0])
     copy(wide[1], narrow[1])
     pool(t, h, _NARROW, sums, pooled)
-    find_slope(pooled, _TRUST_NARROW, narrow[0], narrow[1])
+    find_slope(pooled, _CONTRAST_NARROW, narrow[0], narrow[1])
 
 
 @compiled
-def _split(colors: int, slot: int, rings: _Rings, base: Any, spare: Any) -> None:
-    """Diffuse, specular and polarization of a row to its base; ``spare[6:8]``: its slope."""
+def _split(t: int, slot: int, rings: _Rings, closed: ClosedFormRows, spare: Any) -> None:
+    """Diffuse, specular and polarization of row ``t``; ``spare[6:8]``: its diffuse polarization."""
+    colors = rings.s0.shape[1] // 4
     lacking = spare[12 : 14 + colors]
     clips = colors > 1 and unclip(rings.planes[slot, :, 1:], rings.clipped[slot], spare[6:8], lacking)
     a1, a2, mean, b1, b2, share = spare[6], spare[7], spare[8], spare[9], spare[10], np.float32(1 / colors)
     for cell in range(4):
-        tau, cosine, sine = base[4 * colors + cell], rings.cosine[slot, cell], rings.sine[slot, cell]
+        tau, cosine, sine = closed.specular[t, cell], rings.cosine[slot, cell], rings.sine[slot, cell]
         fill(ZERO, mean)
         for c in range(colors):
             add_product(rings.s0[slot, 4 * c + cell], share, mean)
@@ -318,109 +349,112 @@ def _split(colors: int, slot: int, rings: _Rings, base: Any, spare: Any) -> None
         for c in range(colors):
             limit(rings.s0[slot, 4 * c + cell], tau)
         for c in range(colors):
-            subtract(rings.s0[slot, 4 * c + cell], tau, base[4 * c + cell])
-        copy(cosine, base[4 * colors + 4 + cell])
-        copy(sine, base[4 * colors + 8 + cell])
+            subtract(rings.s0[slot, 4 * c + cell], tau, closed.diffuse[t, 4 * c + cell])
+        copy(cosine, closed.s1[t, cell])
+        copy(sine, closed.s2[t, cell])
 
 
 @compiled
-def _show_samples(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> None:
-    """Samples of row ``t``, relative to the light, and which of them clip, to their maps."""
-    samples, clipping, inverse, row = maps.first[0], maps.first[1], spare[0], spare[11]
-    if samples >= 0:
+def _emit_samples(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> None:
+    """Samples of row ``t``, relative to the brightness, and which of them clip, to their maps."""
+    channels, inverse, row = maps.channels, spare[0], spare[11]
+    if channels.samples >= 0:
         for k in range(16):
-            emit_product(rings.planes[slot, k, 1:], inverse, (maps.floats, rings.room, samples + k, t), row)
-    if clipping >= 0:
+            emit_product(rings.planes[slot, k, 1:], inverse, (maps.floats, rings.room, channels.samples + k, t), row)
+    if channels.clipped >= 0:
         for k in range(16):
-            emit_bits(maps.clipped[t], k, (maps.floats, rings.room, clipping + k, t), row)
-        emit(rings.free[slot], (maps.floats, rings.room, clipping + 16, t))
+            emit_bits(maps.closed.clipped[t], k, (maps.floats, rings.room, channels.clipped + k, t), row)
+        emit(rings.free[slot], (maps.floats, rings.room, channels.unclipped_around, t))
 
 
 @compiled
-def _show_split(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> None:
+def _emit_closed_form(t: int, rings: _Rings, maps: Maps, spare: Any) -> None:
     """The closed form of row ``t`` to its maps."""
-    base, inverse, row, images = maps.base[t], spare[0], spare[11], maps.base.shape[1] - 10
-    split, contrast = maps.first[4], spare[3]
-    for k in range(images):
-        emit_product(base[k], inverse, (maps.floats, rings.room, split + k, t), row)
+    channels, closed, inverse, row, contrast = maps.channels, maps.closed, spare[0], spare[11], spare[3]
+    for k in range(closed.diffuse.shape[1]):
+        emit_product(closed.diffuse[t, k], inverse, (maps.floats, rings.room, channels.diffuse + k, t), row)
     for k in range(4):
-        emit(spare[4 + k], (maps.floats, rings.room, split + images + k, t))
+        emit_product(closed.specular[t, k], inverse, (maps.floats, rings.room, channels.specular + k, t), row)
+    for k in range(2):
+        emit(spare[4 + k], (maps.floats, rings.room, channels.wide + k, t))
+        emit(spare[6 + k], (maps.floats, rings.room, channels.narrow + k, t))
     for j in range(row.size):
         row[j] = np.sqrt(contrast[j] + _TINY)
-    emit(row, (maps.floats, rings.room, split + images + 4, t))
-    emit_product(base[images + 9], inverse, (maps.floats, rings.room, split + images + 5, t), row)
+    emit(row, (maps.floats, rings.room, channels.contrast, t))
+    emit_product(closed.fit_residual[t], inverse, (maps.floats, rings.room, channels.fit_residual, t), row)
 
 
 @compiled
-def _leave(t: int, rings: _Rings, maps: Maps, spare: Any) -> None:
+def _finish_row(t: int, rings: _Rings, maps: Maps, spare: Any) -> None:
     """The closed form of row ``t``, and the network's maps of it."""
-    slot, colors = t % KEPT, rings.s0.shape[1] // 4
+    slot, closed, channels = t % KEPT, maps.closed, maps.channels
     light, inverse, row = rings.light[slot], spare[0], spare[11]
     for j in range(light.size):
         inverse[j] = ONE / light[j]
-    _find_slopes(t, maps.base.shape[0], rings.sums, spare)
-    _split(colors, slot, rings, maps.base[t], spare)
-    copy(light, maps.base[t, 4 * colors + 12])
-    misfit(rings.moments[slot], (spare[6], spare[7]), maps.base[t, 4 * colors + 13])
-    _show_samples(t, slot, rings, maps, spare)
-    for first, rows in ((maps.first[2], rings.cosine[slot]), (maps.first[3], rings.sine[slot])):
-        if first >= 0:
-            for cell in range(4):
-                emit_product(rows[cell], inverse, (maps.floats, rings.room, first + cell, t), row)
-    if maps.first[4] >= 0:
-        _show_split(t, slot, rings, maps, spare)
+    _fit_polarization(t, closed.clipped.shape[0], rings.sums, spare)
+    _split(t, slot, rings, closed, spare)
+    copy(light, closed.brightness[t])
+    misfit(rings.moments[slot], (spare[6], spare[7]), closed.fit_residual[t])
+    _emit_samples(t, slot, rings, maps, spare)
+    for cell in range(4):
+        if channels.cosine >= 0:
+            emit_product(rings.cosine[slot, cell], inverse, (maps.floats, rings.room, channels.cosine + cell, t), row)
+        if channels.sine >= 0:
+            emit_product(rings.sine[slot, cell], inverse, (maps.floats, rings.room, channels.sine + cell, t), row)
+    if channels.diffuse >= 0:
+        _emit_closed_form(t, rings, maps, spare)
     for j in range(row.size):
         row[j] = np.log(light[j])
-    emit(row, (maps.floats, rings.room, maps.first[5], t))
+    emit(row, (maps.floats, rings.room, channels.log_brightness, t))
     if maps.halves.size:
         weave(rings.room, maps.halves[t])
 
 
 @compiled
-def _go_on(u: int, piece: Piece, rings: _Rings, maps: Maps, spare: Any) -> None:
-    """What can be done of earlier rows once row ``u`` is described."""
-    v, h = u - 1, maps.clipped.shape[0]
+def _advance(u: int, piece: Piece, rings: _Rings, maps: Maps, spare: Any) -> None:
+    """Compute what earlier rows lacked until row ``u`` was described."""
+    v, h = u - 1, maps.closed.clipped.shape[0]
     if (v > max(piece[0] - REACH, 0) or v == 0) and v < h:
         _look_around(v, h, rings, spare)
     if u - REACH >= piece[0]:
-        _leave(u - REACH, rings, maps, spare)
+        _finish_row(u - REACH, rings, maps, spare)
 
 
 @entry
 def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, piece: Piece) -> None:
     """The maps and the closed form of a piece of the packed rows, by the linear filter."""
-    h, w = maps.clipped.shape
+    h, w = maps.closed.clipped.shape
     rings, spare = _make_rings(taps.colors, maps), np.zeros((_ROWS, w), np.float32)
     polarized = np.empty((8 * taps.colors, w), np.float32)
     begin = max(piece[0] - REACH, 0)
     for u in range(max(begin - 1, 0), begin + 1):
-        _enter((samples, pattern), u, piece, rings, maps.clipped)
+        _enter((samples, pattern), u, piece, rings, maps.closed.clipped)
     for u in range(begin, piece[1] + REACH):
         if u + 1 < h:
-            _enter((samples, pattern), u + 1, piece, rings, maps.clipped)
+            _enter((samples, pattern), u + 1, piece, rings, maps.closed.clipped)
         if u < h:
             _filter_samples(taps, u, h, rings, polarized)
             if maps.details.size and piece[0] <= u < piece[1]:
                 _filter_details(taps, u, h, rings, (maps.details, spare))
             _describe(taps.colors, u, rings, polarized, spare)
-        _go_on(u, piece, rings, maps, spare)
+        _advance(u, piece, rings, maps, spare)
 
 
 @entry
 def _map_guided_rows(source: Source, stream: Stream, maps: Maps, piece: Piece) -> None:
-    h, w = maps.clipped.shape
+    h, w = maps.closed.clipped.shape
     rings, spare, polarized = _make_rings(3, maps), np.zeros((_ROWS, w), np.float32), np.empty((24, w), np.float32)
     rows = np.empty((2, 18 if maps.details.size else 9, 2 * w), np.float32)
     for u in range(max(piece[0] - REACH, 0), piece[1] + REACH):
         if u < h:
-            _enter((source.samples, source.pattern), u, piece, rings, maps.clipped)
+            _enter((source.samples, source.pattern), u, piece, rings, maps.closed.clipped)
             demosaic_rows(source, stream, (2 * u, 2 * u + 2), rows)
             _take_apart(rows, rings.s0[u % KEPT], polarized)
             if maps.details.size and piece[0] <= u < piece[1]:
                 for k in range(18):
                     copy(rows[k // 9, 9 + k % 9], maps.details[2 * u + k // 9, k % 9])
             _describe(3, u, rings, polarized, spare)
-        _go_on(u, piece, rings, maps, spare)
+        _advance(u, piece, rings, maps, spare)
 
 
 def map_guided_rows(source: Source, maps: Maps, piece: Piece) -> None:

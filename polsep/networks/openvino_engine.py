@@ -1,7 +1,7 @@
-"""Frames of one size through the joint network: kernels make its maps, OpenVINO runs its layers, kernels make images.
+"""The joint network on CPUs for frames of one size: kernels make its inputs, OpenVINO runs its layers, kernels images.
 
-The same as `networks.run.run_joint`, in less time. Layers run in bfloat16 where the processor has it, in float32
-elsewhere; the closed form and the images are float32 always.
+The same as `run.run_joint`, in less time. Layers run in bfloat16 where the processor has it, in float32 elsewhere; the
+closed form and the images are float32 always.
 """
 
 from __future__ import annotations
@@ -19,204 +19,160 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import conv2d
 
+from polsep.networks.channels import DETAIL_MAPS, PERIOD, input_channels
 from polsep.networks.details import HAAR
-from polsep.networks.joint import INPUTS, PERIOD, Joint, pool_outputs
+from polsep.networks.joint import Joint, pool_outputs
 from polsep.physics.stokes import stokes_inverse
 from polsep.sensor.camera import Layout
 from polsep.separation.images import FrameImages, Tally
 
 if TYPE_CHECKING:
     from polsep.demosaic.bilinear_kernel import Pattern
-    from polsep.networks.maps_kernel import Seen, Taps
+    from polsep.networks.maps_kernel import Taps
     from polsep.sensor.unpack_kernel import RawFrame, Samples
 
 Floats = NDArray[np.float32]
 
-#: Channels of the maps of each of `joint.INPUTS`, beside 4 per colour of the split.
-_CHANNELS = {"samples": 16, "clipping": 17, "cosine": 4, "sine": 4, "split": 10}
-#: Packed rows that a thread takes at a time.
+#: Packed rows that a thread processes at a time.
 _ROWS = 16
 
-#: What `_model_of` has read.
+#: Models that `_model_of` has read.
 _MODELS: WeakKeyDictionary[nn.Module, dict[type[nn.Module], Any]] = WeakKeyDictionary()
 
 
 class Layers(nn.Module):
-    """A network's layers: maps ``[1, n, h, w]`` to corrections ``[1, 4 C + 8, h, w]``, deviations ``[1, 8, h, w]``."""
+    """A network's layers: inputs ``[1, n, h, w]`` to corrections ``[1, 4 C + 8, h, w]``, deviations ``[1, 8, h, w]``.
+
+    Corrections are those of diffuse, specular, and the closed form's gain, see `images_kernel.LayerOutputs`.
+    """
 
     def __init__(self, network: Joint) -> None:
         super().__init__()
-        self.net, self.doubt, self.most_doubt = network.net, network.doubt, network.most_doubt
-        assert network.last.bias is not None
-        weight, bias = network.last.weight, network.last.bias
-        if network.trust is None:
-            trust = [torch.zeros_like(weight[:4]), torch.zeros_like(bias[:4])]
+        self.net, self.log_variance, self.max_log_variance = network.net, network.log_variance, network.max_log_variance
+        assert network.corrections.bias is not None
+        weight, bias = network.corrections.weight, network.corrections.bias
+        if network.closed_form_gain is None:
+            gain = [torch.zeros_like(weight[:4]), torch.zeros_like(bias[:4])]
         else:
-            assert network.trust.bias is not None
-            trust = [network.trust.weight, network.trust.bias]
-        self.weight, self.bias = nn.Parameter(torch.cat([weight, trust[0]])), nn.Parameter(torch.cat([bias, trust[1]]))
+            assert network.closed_form_gain.bias is not None
+            gain = [network.closed_form_gain.weight, network.closed_form_gain.bias]
+        self.weight, self.bias = nn.Parameter(torch.cat([weight, gain[0]])), nn.Parameter(torch.cat([bias, gain[1]]))
 
-    def forward(self, maps: Tensor) -> tuple[Tensor, Tensor]:
-        """Relative to the light and to the closed form, at half resolution; see `networks.images_kernel.Found`."""
-        return self.correct(self.net(maps))
+    def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Relative to the local brightness and to the closed form, at half resolution."""
+        return self.correct(self.net(inputs))
 
     def correct(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """The same from the network's features."""
-        doubt = torch.minimum(self.doubt(features), self.most_doubt)
-        return conv2d(features, self.weight, self.bias), torch.exp(0.5 * doubt)
+        log_variance = torch.minimum(self.log_variance(features), self.max_log_variance)
+        return conv2d(features, self.weight, self.bias), torch.exp(0.5 * log_variance)
 
 
 class FullLayers(Layers):
-    """The same with what `details.Details` needs: from maps and 12 more of how large details are around.
+    """The same with the layers of `details.Details`: from the inputs and `DETAIL_MAPS` of the size of details.
 
-    Beside the others ``[1, 24 + 12 (C + 1), h, w]``; see `networks.details_kernel.Shares`.
+    A third output ``[1, 24 + 12 (C + 1), h, w]``, see `details_kernel.DetailOutputs`.
     """
 
     def __init__(self, network: Joint) -> None:
         super().__init__(network)
         self.belief, self.change = network.details.belief, network.details.change
 
-    def forward(self, maps: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
+    def forward(self, inputs: Tensor, details: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
         """See the class."""
-        features = self.net(maps)
-        share = torch.cat([self.belief(torch.cat([features, seen], dim=1)), self.change(features)], dim=1)
-        return *self.correct(features), share
+        features = self.net(inputs)
+        shares = torch.cat([self.belief(torch.cat([features, details], dim=1)), self.change(features)], dim=1)
+        return *self.correct(features), shares
 
 
 class OpenVinoEngine:
-    """A network for frames of one shape in its own order of filters, H and W multiples of 4; images at half resolution.
+    """A network for frames of one shape in its own order of filters, H and W multiples of 4.
 
-    State: compiled layers and the room for everything between raw samples and images, one frame at a time.
-    ``precision``: "bf16", "f32", or None for what suits the processor.
+    ``full``: images at full instead of half resolution. ``precision``: "bf16", "f32", or None for what suits the
+    processor. State: compiled layers and buffers between raw samples and images, for one frame at a time.
     """
 
-    #: Pixels of an image along the side of a cell.
-    scale = 1
+    def __init__(
+        self, network: Joint, shape: tuple[int, int], full: bool = False, precision: str | None = None
+    ) -> None:
+        from polsep.networks.details_kernel import DetailOutputs, read_smooth
+        from polsep.networks.images_kernel import LayerOutputs
+        from polsep.networks.maps_kernel import ClosedFormRows, LayerInput, Maps
 
-    def __init__(self, network: Joint, shape: tuple[int, int], precision: str | None = None) -> None:
-        from polsep.networks.maps_kernel import Maps
-
-        self._lock, self._colors = threading.Lock(), network.colors
+        self._lock, self._colors, self._full = threading.Lock(), network.colors, full
         self._layout = Layout() if network.colors == 3 else Layout(bayer=None)
         h, w = shape[0] // PERIOD, shape[1] // PERIOD
-        first, count = _first_channels(network)
-        self._halves = (precision or _usual_precision()) == "bf16"
-        seen = self._make_room(h, w, count)
-        base, clipped = np.empty((h, 4 * network.colors + 14, w), np.float32), np.empty((h, w), np.uint16)
-        self._maps = Maps(seen.floats, seen.halves, first, base, clipped, self._details((h, w)))
-        self._taps = make_taps(network, w, self.scale == 2) if network.demosaic is not None else None
-        self._found = [np.empty((n, h, w), np.float32) for n in (4 * network.colors + 8, 8)]
-        layers, inputs, outputs = self._open(network, (h, w))
-        inputs = [seen.filled, *inputs]
-        model = _model_of(network, layers, tuple(image.shape[2] for image in inputs))
-        self._request = _compile(model, inputs, [*self._found, *outputs], precision)
+        channels = input_channels(network.colors, network.inputs)
+        halves = (precision or _usual_precision()) == "bf16"
+        inputs = LayerInput.empty((h, w, channels.total), halves)
+        closed = ClosedFormRows.empty(network.colors, h, w)
+        beyond = np.empty((2 * h, 3 * network.colors, 2 * w) if full else (0, 0, 0), np.float32)
+        self._maps = Maps(inputs.floats, inputs.halves, channels, closed, beyond)
+        self._taps = make_taps(network, w, full) if network.demosaic is not None else None
+        change, deviation = (np.empty((n, h, w), np.float32) for n in (4 * network.colors + 8, 8))
+        self._outputs = LayerOutputs.of(closed, change, deviation)
+        filled, outputs = [inputs.filled], [change, deviation]
+        if full:
+            shares = np.empty((2 * DETAIL_MAPS + DETAIL_MAPS * (network.colors + 1), h, w), np.float32)
+            smooth = read_smooth(network.details.smooth.detach().numpy())
+            self._details = DetailOutputs.of(shares, beyond, smooth)
+            self._detail_input = LayerInput.empty((h, w, DETAIL_MAPS), halves)
+            filled, outputs = [*filled, self._detail_input.filled], [*outputs, shares]
+        model = _model_of(network, FullLayers if full else Layers, tuple(image.shape[2] for image in filled))
+        self._request = _compile(model, filled, outputs, precision)
 
     def run(
         self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...], kept: slice = slice(None)
     ) -> FrameImages:
         """Images of a frame ``[H, W]`` with black and white ``levels`` and a ``light`` of one gain per colour.
 
-        ``kept``: rows of the images that are wanted, all others are left out, and do not count in the tally.
+        ``kept``: rows of the images that are wanted; others are left out, and do not count in the tally.
         """
+        from polsep.compute.threads import share
         from polsep.demosaic.bilinear_kernel import read_pattern
-        from polsep.networks.images_kernel import SUMS, Found, Targets
+        from polsep.networks.details_kernel import write_pixels
+        from polsep.networks.images_kernel import Targets, write_rows
         from polsep.sensor.unpack_kernel import as_samples
 
         samples, shape = as_samples(raw), (raw.shape[0], raw.shape[1])
         pattern = read_pattern(shape, self._layout, *levels, light)
-        h, w = (n // 2 * self.scale for n in shape)
-        images = [np.empty((h, w * n), np.float32) for n in (self._colors, self._colors, 2)]
-        valid, angles = np.empty((h, w), np.bool_), [np.empty((h, w), np.float32) for _ in range(2)]
-        targets = Targets(images[0], images[1], images[2], valid, angles[0], angles[1], np.zeros((h, SUMS)))
-        gains = np.array(light[: self._colors], np.float32)
+        h, w = shape if self._full else (shape[0] // 2, shape[1] // 2)
+        targets, gains = Targets.empty((h, w), self._colors), np.array(light[: self._colors], np.float32)
         with self._lock:
-            self._fill_maps(samples, pattern)
-            self._look()
+            self._fill_inputs(samples, pattern)
             self._request.infer()
-            self._write(Found(self._maps.base, self._maps.clipped, self._found[0], self._found[1]), gains, targets)
+            rows = shape[0] // PERIOD
+            if self._full:
+                share(lambda piece: write_pixels(self._outputs, self._details, gains, targets, piece), rows, _ROWS)
+            else:
+                share(lambda piece: write_rows(self._outputs, gains, targets, piece), rows, _ROWS)
         targets = Targets._make(image[kept] for image in targets)
         diffuse, specular, error = (image.reshape(image.shape[0], w, -1) for image in targets[:3])
         return FrameImages(diffuse, specular, targets.valid, targets.dolp, targets.aolp, _tally(targets), error)
 
-    def _make_room(self, h: int, w: int, count: int) -> Seen:
-        """For what the layers see, in their precision."""
-        from polsep.networks.maps_kernel import Seen
-
-        nothing, room = (0, 0, 0), (h, w, count)
-        floats, halves = (nothing, room) if self._halves else (room, nothing)
-        return Seen(np.empty(floats, np.float32), np.empty(halves, np.uint16))
-
-    def _details(self, size: tuple[int, int]) -> Floats:
-        """Room for the details of s0 of ``size`` packed pixels; none at half resolution."""
-        del size
-        return np.empty((0, 0, 0), np.float32)
-
-    def _open(self, network: Joint, size: tuple[int, int]) -> tuple[type[Layers], list[NDArray[Any]], list[Floats]]:
-        """The layers, and what they see and say beside maps and corrections."""
-        del network, size
-        return Layers, [], []
-
-    def _look(self) -> None:
-        """What the layers see beside maps: nothing."""
-
-    def _write(self, found: Any, gains: Floats, targets: Any) -> None:
-        """Images of what the layers said."""
-        from polsep.compute.threads import share
-        from polsep.networks.images_kernel import write_rows
-
-        share(lambda rows: write_rows(found, gains, targets, rows), found.clipped.shape[0], _ROWS)
-
-    def _fill_maps(self, samples: Samples, pattern: Pattern) -> None:
-        """What the layers see, and the closed form, of a frame."""
-        from polsep.compute.threads import share
+    def _fill_inputs(self, samples: Samples, pattern: Pattern) -> None:
+        """The layers' inputs, and the closed form, of a frame."""
+        from polsep.compute.threads import get_threads, share
         from polsep.demosaic.cells_kernel import Source, read_grid
-        from polsep.kernels import get_threads
+        from polsep.networks.details_kernel import emit_details, find_beyond
         from polsep.networks.maps_kernel import map_guided_rows, map_rows
 
-        h, taps = pattern.h // 2, self._taps
+        h, taps, maps = pattern.h // 2, self._taps, self._maps
         if taps is not None:
-            share(lambda rows: map_rows(samples, pattern, taps, self._maps, rows), h, _ROWS)
-            return
-        angles = self._layout.angles
-        source = Source(samples, pattern, read_grid(pattern, angles, stokes_inverse(angles).float().numpy()))
-        # A strip begins with rows that the one before has too, many of them: one for each thread.
-        share(lambda rows: map_guided_rows(source, self._maps, rows), h, -(-h // get_threads()))
-
-
-class FullEngine(OpenVinoEngine):
-    """The same with images at full resolution, as `joint.Joint.forward`."""
-
-    scale = 2
-
-    def _details(self, size: tuple[int, int]) -> Floats:
-        return np.empty((2 * size[0], 3 * self._colors, 2 * size[1]), np.float32)
-
-    def _open(self, network: Joint, size: tuple[int, int]) -> tuple[type[Layers], list[NDArray[Any]], list[Floats]]:
-        from polsep.networks.details_kernel import Shares, read_smooth
-
-        self._seen = self._make_room(*size, 12)
-        share = np.empty((24 + 12 * (self._colors + 1), *size), np.float32)
-        self._shares = Shares(share, self._maps.details, read_smooth(network.details.smooth.detach().numpy()))
-        return FullLayers, [self._seen.filled], [share]
-
-    def _look(self) -> None:
-        """How large details are around."""
-        from polsep.compute.threads import share
-        from polsep.networks.details_kernel import find_beyond, show_details
-
-        (base, details), h = (self._maps.base, self._maps.details), self._maps.clipped.shape[0]
-        share(lambda rows: find_beyond(base, self._shares.smooth, details, rows), h, _ROWS)
-        share(lambda rows: show_details(details, base, self._seen, rows), h, _ROWS)
-
-    def _write(self, found: Any, gains: Floats, targets: Any) -> None:
-        from polsep.compute.threads import share
-        from polsep.networks.details_kernel import write_pixels
-
-        share(lambda rows: write_pixels(found, self._shares, gains, targets, rows), found.clipped.shape[0], _ROWS)
+            share(lambda piece: map_rows(samples, pattern, taps, maps, piece), h, _ROWS)
+        else:
+            angles = self._layout.angles
+            source = Source(samples, pattern, read_grid(pattern, angles, stokes_inverse(angles).float().numpy()))
+            # A strip begins with rows that the one before has too, many of them: one for each thread.
+            share(lambda piece: map_guided_rows(source, maps, piece), h, -(-h // get_threads()))
+        if self._full:
+            closed, beyond = maps.closed, maps.details
+            share(lambda piece: find_beyond(closed, self._details.smooth, beyond, piece), h, _ROWS)
+            share(lambda piece: emit_details(beyond, closed, self._detail_input, piece), h, _ROWS)
 
 
 def _model_of(network: Joint, layers: type[Layers], channels: tuple[int, ...]) -> Any:
-    """OpenVINO's own of a network's layers, for whoever changes it; read once, as reading takes a second and 5 MiB."""
+    """A copy of the OpenVINO model of a network's layers, which is read once: reading takes a second and 5 MiB."""
     known = _MODELS.setdefault(network, {})
     if layers not in known:
         known[layers] = _as_model(
@@ -226,8 +182,8 @@ def _model_of(network: Joint, layers: type[Layers], channels: tuple[int, ...]) -
 
 
 def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[Floats], precision: str | None) -> Any:
-    """A request that reads ``inputs [h, w, n]``, floats or bfloat16 as its bits, and fills ``outputs [n, h, w]``."""
-    from polsep.kernels import get_threads
+    """A request that reads ``inputs [h, w, n]``, float32 or bits of bfloat16, and fills ``outputs [n, h, w]``."""
+    from polsep.compute.threads import get_threads
 
     openvino = _import_openvino()
     # Pinned threads of two engines would share a core, and wait there for whoever else works on it.
@@ -250,15 +206,15 @@ def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[Floats], prec
 
 
 def _usual_precision() -> str:
-    """That in which OpenVINO computes on this processor: "bf16" or "f32"."""
+    """The precision in which OpenVINO computes on this processor: "bf16" or "f32"."""
     name: str = _core().get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name()
     return name
 
 
 def _import_openvino() -> Any:
-    """OpenVINO without its telemetry: importing it reports that to Google, from a forked process that may hang.
+    """OpenVINO without its telemetry, which reports its import to Google from a forked process that may hang.
 
-    It does without where its module cannot be imported, which None in its place says.
+    None in the place of the telemetry's module makes OpenVINO do without.
     """
     sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
     import openvino  # type: ignore[import-untyped]  # no stubs
@@ -268,17 +224,17 @@ def _import_openvino() -> Any:
 
 @lru_cache(maxsize=1)
 def _core() -> Any:
-    """The one of this program, which stays.
+    """OpenVINO's core, one for the life of the process.
 
-    Note: OpenVINO's CPU plugin gives the thread that loads it a stack for signals of its own, and takes that away with
-    itself, also where another thread ends it or a newer plugin has been put on top. Then the next signal that Python
-    catches, Ctrl-C say, ends the program without a word. The plugin lives as long as its core.
+    Note: OpenVINO's CPU plugin gives the thread that loads it a signal stack, and frees that when the plugin ends, even
+    in another thread or under a newer plugin. The next signal that Python catches, Ctrl-C say, then ends the process
+    without a message. The plugin lives as long as its core.
     """
     return _import_openvino().Core()
 
 
 def _as_model(layers: nn.Module, examples: tuple[Tensor, ...]) -> Any:
-    """Layers for OpenVINO: by its reader of traced modules, as its `convert_model`, which calls home, does."""
+    """Layers as an OpenVINO model, read as `openvino.convert_model` does, which sends telemetry."""
     from openvino.frontend import FrontEndManager  # type: ignore[import-untyped]  # no stubs
     from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder  # type: ignore[import-untyped]
 
@@ -287,15 +243,6 @@ def _as_model(layers: nn.Module, examples: tuple[Tensor, ...]) -> Any:
         reader = FrontEndManager().load_by_framework("pytorch")
         traced = TorchScriptPythonDecoder(layers, example_input=examples)  # must live until it is converted
         return reader.convert(reader.load(traced))
-
-
-def _first_channels(network: Joint) -> tuple[NDArray[np.int64], int]:
-    """Where each of the network's maps begins, -1 for those it does not see, and how many channels there are."""
-    first, count = dict.fromkeys(INPUTS, -1), 0
-    for name in network.inputs:
-        first[name] = count
-        count += _CHANNELS[name] + (4 * network.colors if name == "split" else 0)
-    return np.array([*first.values(), count], np.int64), count + 1
 
 
 def make_taps(network: Joint, width: int, details: bool = False) -> Taps:

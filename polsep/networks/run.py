@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,7 +21,8 @@ from torch.nn.functional import max_pool2d
 
 from polsep.demosaic.bilinear import mean_cells
 from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
-from polsep.networks.joint import PERIOD, Images, Joint, limit
+from polsep.networks.channels import PERIOD
+from polsep.networks.joint import Joint, limit
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Measurements, Stokes
 from polsep.sensor.camera import Layout, Mosaic
@@ -33,8 +35,6 @@ MAX_PIXELS = 6_000_000
 NAMES = ("joint", "joint-fast")
 #: Raw rows that a strip sees beyond its own, farther than the network does (a test measures that).
 MARGIN = 256
-
-Resolution = Literal["half", "full"]
 
 
 def load_joint(path: Path, device: torch.device) -> Joint:
@@ -75,34 +75,26 @@ def weights_name(method: str, layout: Layout) -> str:
     return f"{method}-{'mono' if layout.bayer is None else 'mosaic'}"
 
 
-def separate_mosaic(method: str, resolution: Resolution) -> Callable[[Mosaic | Measurements], Separation]:
-    """What the method ``joint`` or ``joint-fast`` makes of a mosaic.
+def separate_joint(method: str, capture: Mosaic | Measurements, full: bool = False) -> Separation:
+    """Separate a mosaic by the method ``joint`` or ``joint-fast`` in torch, with shipped weights.
 
     Raises ValueError on co-sited measurements, and on layouts that are not Sony's in any orientation.
     """
-
-    def separate_capture(capture: Mosaic | Measurements) -> Separation:
-        if isinstance(capture, Measurements):
-            raise ValueError(f"expected a mosaic for the method {method}, found four co-sited angle images")
-        network = _shipped_joint(weights_name(method, capture.layout), capture.data.device)
-        return run_joint(network, capture, resolution)
-
-    return separate_capture
+    if isinstance(capture, Measurements):
+        raise ValueError(f"expected a mosaic for the method {method}, found four co-sited angle images")
+    network = _shipped_joint(weights_name(method, capture.layout), capture.data.device)
+    return run_joint(network, capture, full)
 
 
-def takes(method: str) -> Callable[[Mosaic | Measurements], bool]:
-    """Whether a capture is a mosaic in an order that the method knows, with weights shipped for its colours."""
-
-    def takes_capture(capture: Mosaic | Measurements) -> bool:
-        if isinstance(capture, Measurements) or not is_shipped(weights_name(method, capture.layout)):
-            return False
-        try:
-            orient(capture, own_order(capture.layout))
-        except ValueError:
-            return False
-        return True
-
-    return takes_capture
+def accepts_mosaic(method: str, capture: Mosaic | Measurements) -> bool:
+    """True for a mosaic in an order that the method knows, with weights shipped for its colours."""
+    if isinstance(capture, Measurements) or not is_shipped(weights_name(method, capture.layout)):
+        return False
+    try:
+        orient(capture, own_order(capture.layout))
+    except ValueError:
+        return False
+    return True
 
 
 def own_order(layout: Layout) -> Layout:
@@ -110,7 +102,7 @@ def own_order(layout: Layout) -> Layout:
     return Layout(bayer=None) if layout.bayer is None else Layout()
 
 
-def run_joint(network: Joint, mosaic: Mosaic, resolution: Resolution) -> Separation:
+def run_joint(network: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
     """A mosaic ``[..., H, W]`` through a network; negative light is cut to 0.
 
     The polarization is that of the network's linear filter, at half resolution. ``valid`` is False near cells of
@@ -118,35 +110,33 @@ def run_joint(network: Joint, mosaic: Mosaic, resolution: Resolution) -> Separat
     Sony's in any orientation.
     """
     orientation = orient(mosaic, own_order(mosaic.layout))
-    if resolution == "half" and not orientation.keeps_cells:  # then the network's cells are not the frame's
-        return _halve(run_joint(network, mosaic, "full"))
+    if not full and not orientation.keeps_cells:  # then the network's cells are not the frame's
+        return _halve(run_joint(network, mosaic, full=True))
     raw, clipped = (orientation.turn(x) for x in (mosaic.linear().float(), mosaic.clipped()))
     batch, (height, width) = raw.shape[:-2], raw.shape[-2:]
     raw, clipped = (x.reshape(-1, 1, height, width) for x in (raw, clipped))
-    look = _look_full if resolution == "full" else _look_half
     parts = []
     for first, last in cut_rows((height, width), PERIOD * network.net.grid):
         top, bottom = max(first - MARGIN, 0), min(last + MARGIN, height)
         with torch.no_grad():
-            seen = look(network, raw[..., top:bottom, :], clipped[..., top:bottom, :])
-        parts.append([_rows(x, (first - top, last - top), bottom - top) for x in seen])
+            images = _images(network, raw[..., top:bottom, :], clipped[..., top:bottom, :], full)
+        parts.append([_rows(x, (first - top, last - top), bottom - top) for x in images])
     joined = (torch.cat(strips, dim=-2) for strips in zip(*parts, strict=True))
     images = [image.reshape(*batch, *image.shape[1:]) for image in joined]
     return _as_separation(images, _cells(clipped).reshape(*batch, 2, height // 2, width // 2), orientation)
 
 
-def _halve(found: Separation) -> Separation:
-    """Means over 2x2 cells of a separation at full resolution; masks hold where one of the four does not."""
-    diffuse, specular, valid = (
-        mean_cells(found.diffuse),
-        mean_cells(found.specular),
-        mean_cells(found.valid.float()) == 1,
-    )
-    clipped = None if found.clipped is None else mean_cells(found.clipped.float()) > 0
-    residual, expected_error = (None if x is None else mean_cells(x) for x in (found.residual, found.expected_error))
-    stokes = found.stokes.map(mean_cells)
-    return Separation(
-        diffuse, specular, valid, stokes, residual=residual, clipped=clipped, expected_error=expected_error
+def _halve(separation: Separation) -> Separation:
+    """Means over 2x2 cells of a separation at full resolution; a cell is valid if all of its pixels are."""
+    return replace(
+        separation,
+        diffuse=mean_cells(separation.diffuse),
+        specular=mean_cells(separation.specular),
+        valid=mean_cells(separation.valid.float()) == 1,
+        stokes=separation.stokes.map(mean_cells),
+        residual=None if separation.residual is None else mean_cells(separation.residual),
+        clipped=None if separation.clipped is None else mean_cells(separation.clipped.float()) > 0,
+        expected_error=None if separation.expected_error is None else mean_cells(separation.expected_error),
     )
 
 
@@ -158,18 +148,11 @@ def cut_rows(size: tuple[int, int], grid: int) -> Iterator[tuple[int, int]]:
         yield first, min(first + rows, height)
 
 
-def _look_half(network: Joint, raw: Tensor, clipped: Tensor) -> list[Tensor]:
-    """Diffuse, specular, s1, s2, the standard deviations of the errors of both, and the misfit, of a strip."""
-    return _as_list(network.half_resolution(raw, clipped))
-
-
-def _look_full(network: Joint, raw: Tensor, clipped: Tensor) -> list[Tensor]:
-    return _as_list(network(raw, clipped)[0])
-
-
-def _as_list(images: Images) -> list[Tensor]:
-    diffuse, specular, error = limit(images)
-    return [diffuse, specular, images.s1, images.s2, error, _repeat(images.misfit, 2)]
+def _images(network: Joint, raw: Tensor, clipped: Tensor, full: bool) -> list[Tensor]:
+    """Diffuse, specular, s1, s2, the standard deviations of the errors of both, and the fit residual, of a strip."""
+    output = network(raw, clipped)[0] if full else network.half_resolution(raw, clipped)
+    diffuse, specular, error = limit(output)
+    return [diffuse, specular, output.s1, output.s2, error, _repeat(output.fit_residual, 2)]
 
 
 def _repeat(image: Tensor, times: int) -> Tensor:

@@ -13,7 +13,7 @@ import numpy as np
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, THIRD, TWO, ZERO, compiled
 from polsep.compute.rows import fill
-from polsep.networks.joint import PERIOD
+from polsep.networks.channels import PERIOD
 from polsep.sensor.camera import Layout
 from polsep.separation.color_affine import MIN_EIGENVALUE
 

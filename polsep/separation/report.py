@@ -1,4 +1,4 @@
-"""What a separation says of its frame: images, exposure, the light's polarizer, how well the model fits.
+"""A separated frame and its report: images, exposure, the light's polarizer, how well the model fits.
 
 Statistics come from sums over pixels (`Tally`), so that a frame may be tallied in parts. All are of white light, that
 is before the light's colour is multiplied back, and polarization is that of all colours together.
@@ -7,16 +7,18 @@ is before the light's colour is multiplied back, and polarization is that of all
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from polsep.physics.stokes import Stokes, dolp
+from polsep.physics.stokes import MAX_DOLP, Measurements, Stokes, aolp, dolp
+from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import Separation, light_polarizer_angle
-from polsep.separation.images import Tally
+from polsep.separation.images import FrameImages, Tally
 
 #: Below this concentration of AoLP there is no single polarized light. Real frames: 0.76 to 0.97 where one light or one
 #: reflecting surface polarizes, 0.31 to 0.50 in the open; test sets under one light, by `joint`: 0.57 to 0.99.
@@ -57,31 +59,70 @@ def grey(stokes: Stokes) -> Stokes:
     return stokes.map(lambda image: image.mean(dim=-3, keepdim=True))
 
 
-def tally(found: Separation) -> Tally:
+def tally(separation: Separation) -> Tally:
     """Sums over all pixels of a separation."""
-    mean = grey(found.stokes)
+    mean = grey(separation.stokes)
     p1, p2 = (image.double() for image in (mean.s1[..., 0, :, :], mean.s2[..., 0, :, :]))
-    diffuse, specular = (image.mean(dim=-3).double() for image in (found.diffuse, found.specular))
-    if found.diffuse_polarization is not None:
-        p1, p2 = (p - found.diffuse_polarization[..., i, :, :] * diffuse for i, p in enumerate((p1, p2)))
+    diffuse, specular = (image.mean(dim=-3).double() for image in (separation.diffuse, separation.specular))
+    slope, errors = separation.diffuse_polarization, separation.expected_error
+    if slope is not None:
+        p1, p2 = (p - slope[..., i, :, :] * diffuse for i, p in enumerate((p1, p2)))
     strength = torch.hypot(p1, p2)
     # Networks find specular light where |p| is mostly the diffuse's; in closed forms both are the same.
-    weight = strength if found.expected_error is None else specular
-    doubt = (None, None) if found.expected_error is None else found.expected_error.double().unbind(dim=-3)
-    variances = (None if deviation is None else float((deviation**2).sum()) for deviation in doubt)
+    weight = strength if errors is None else specular
+    deviations = (None, None) if errors is None else errors.double().unbind(dim=-3)
+    variances = (None if deviation is None else float((deviation**2).sum()) for deviation in deviations)
     return Tally(
-        found.valid.numel(),
-        0 if found.clipped is None else int(found.clipped.sum()),
-        int(found.valid.sum()),
+        separation.valid.numel(),
+        0 if separation.clipped is None else int(separation.clipped.sum()),
+        int(separation.valid.sum()),
         int((dolp(mean) > 1).sum()),
         float((diffuse + specular).sum()),
         float(specular.sum()),
         float((weight * strength).sum()),
         float((weight * p1).sum()),
         float((weight * p2).sum()),
-        None if found.residual is None else float(found.residual.double().sum()),
-        None if found.noise is None else float(found.noise.double().sum()),
+        None if separation.residual is None else float(separation.residual.double().sum()),
+        None if separation.noise is None else float(separation.noise.double().sum()),
         *variances,
+    )
+
+
+def under_white_light(capture: Mosaic | Measurements, light: tuple[float, ...]) -> Mosaic | Measurements:
+    """The capture as it would be in white light: the light's colour divided out of every sample."""
+    if isinstance(capture, Mosaic):
+        return replace(capture, light_color=light)
+    gain = torch.tensor(light, dtype=torch.float64).to(capture.data).view(-1, 1, 1)
+    return replace(capture, data=capture.data / gain)
+
+
+def in_light(separation: Separation, light: tuple[float, ...]) -> Separation:
+    """The twin of `under_white_light`: the light's colour multiplied back into diffuse and specular, not Stokes.
+
+    Expected errors are over all colours, so the mean of the colour multiplies them.
+    """
+    gain = torch.tensor(light, dtype=torch.float64).to(separation.diffuse).view(-1, 1, 1)
+    error = None if separation.expected_error is None else separation.expected_error * gain.mean()
+    return replace(
+        separation, diffuse=separation.diffuse * gain, specular=separation.specular * gain, expected_error=error
+    )
+
+
+def images_of(white: Separation, lit: Separation) -> FrameImages:
+    """One frame as NumPy arrays, channels last: images of ``lit``, polarization and tally of ``white``, its twin."""
+
+    def image(x: Tensor) -> NDArray[np.float32]:
+        return np.ascontiguousarray(x.detach().float().cpu().movedim(-3, -1).numpy())
+
+    mean = grey(white.stokes)
+    return FrameImages(
+        image(lit.diffuse),
+        image(lit.specular),
+        white.valid.cpu().numpy(),
+        image(dolp(mean).clamp(max=MAX_DOLP))[..., 0],
+        image(aolp(mean))[..., 0],
+        tally(white),
+        None if lit.expected_error is None else image(lit.expected_error),
     )
 
 
@@ -94,16 +135,16 @@ def dominant_angle(sums: Tally) -> tuple[float, float]:
     return angle, math.hypot(sums.along, sums.across) / sums.power if sums.power > 0 else 0.0
 
 
-def describe(sums: Tally) -> dict[str, Any]:
+def describe(sums: Tally, expects_errors: bool) -> dict[str, Any]:
     """Statistics and warnings of a frame for its report, without what its method does not measure.
 
-    docs/conventions.md lists them all.
+    ``expects_errors``: as of the `Method`. docs/conventions.md lists all statistics.
     """
     pixels = max(sums.pixels, 1)
     angle, concentration = dominant_angle(sums)
     brightness = sums.s0 / pixels
     remarks = []
-    least = MIN_CONCENTRATION_CLOSED if sums.diffuse_variance is None else MIN_CONCENTRATION
+    least = MIN_CONCENTRATION if expects_errors else MIN_CONCENTRATION_CLOSED
     if brightness > 1e-3 and concentration < least:
         remarks.append(
             f"polarized light of one angle was expected, found many (concentration {concentration:.2f}): "

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from polsep.networks.joint import Images, Pose, predict_samples
+from polsep.networks.joint import JointOutput, Polarization, predict_samples
 from polsep.train.joint_views import JointSeen, find_clipped
 from polsep.train.losses import diffuse_loss
 
@@ -62,9 +62,9 @@ class Goal:
     data: float = DATA_WEIGHT
 
 
-def joint_loss(found: tuple[Images, Pose], seen: JointSeen, goal: Goal) -> Tensor:
+def joint_loss(found: tuple[JointOutput, Polarization], seen: JointSeen, goal: Goal) -> Tensor:
     """The loss of the module's text; ``found`` at full resolution."""
-    images, pose = found
+    images, polarization = found
     weight = seen.weight * (1 - BACKGROUND) + BACKGROUND
     half_weight = avg_pool2d(weight, 2)
     diffuse, specular = avg_pool2d(images.diffuse, 2), avg_pool2d(images.specular, 2)
@@ -73,9 +73,9 @@ def joint_loss(found: tuple[Images, Pose], seen: JointSeen, goal: Goal) -> Tenso
     full = differ(images.diffuse, seen.full_diffuse, weight) + differ(images.specular, seen.full_specular, weight)
     beyond = beyond_white(diffuse, seen.diffuse, half_weight) + beyond_white(specular, seen.specular, half_weight)
     # Also when it weighs nothing: the budget stays the same, and every parameter has a gradient.
-    loss = half + FULL_WEIGHT * full + BEYOND_WEIGHT * beyond + goal.data * sample_misfit(images, pose, seen)
+    loss = half + FULL_WEIGHT * full + BEYOND_WEIGHT * beyond + goal.data * sample_misfit(images, polarization, seen)
     errors = (diffuse - seen.diffuse, specular - seen.specular)
-    return LOSS_SCALE * (loss + doubt_loss(images, errors, half_weight))
+    return LOSS_SCALE * (loss + variance_loss(images, errors, half_weight))
 
 
 def beyond_white(found: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
@@ -84,21 +84,21 @@ def beyond_white(found: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
     return _mean_logarithm(squared, weight)
 
 
-def sample_misfit(images: Images, pose: Pose, seen: JointSeen) -> Tensor:
+def sample_misfit(images: JointOutput, polarization: Polarization, seen: JointSeen) -> Tensor:
     """How far the samples that images explain lie from those that did not clip: a mean of Huber's over `DATA_SCALE`."""
-    misfit = (predict_samples(images, pose, seen.layout) - seen.raw) / DATA_SCALE
+    misfit = (predict_samples(images, polarization, seen.layout) - seen.raw) / DATA_SCALE
     size = misfit.abs()
     robust = torch.where(size < 1, 0.5 * misfit**2, size - 0.5)
     kept = ~find_clipped(seen.raw)
     return (robust * kept).sum() / kept.sum().clamp(min=1)
 
 
-def doubt_loss(images: Images, errors: tuple[Tensor, Tensor], weight: Tensor) -> Tensor:
+def variance_loss(images: JointOutput, errors: tuple[Tensor, Tensor], weight: Tensor) -> Tensor:
     """Minus the Gaussian log likelihood of the errors, relative to the light around; moves nothing but the doubt."""
-    light = interpolate(images.light, scale_factor=2.0)
+    light = interpolate(images.local_brightness, scale_factor=2.0)
     squared = [(error.detach() ** 2).mean(dim=1, keepdim=True) / light**2 for error in errors]
     # The logarithm of the squared error in variances; beyond `SURPRISE` it counts itself, so that one pixel cannot
     # outweigh a batch: it once did, by a factor of 1e13.
-    excess = torch.log(torch.cat(squared, dim=1) + 1e-7) - images.doubt - math.log(SURPRISE)
+    excess = torch.log(torch.cat(squared, dim=1) + 1e-7) - images.log_variance - math.log(SURPRISE)
     surprise = SURPRISE * (torch.exp(excess.clamp(max=0)) + excess.clamp(min=0))
-    return (0.5 * (images.doubt + surprise) * weight).mean()
+    return (0.5 * (images.log_variance + surprise) * weight).mean()

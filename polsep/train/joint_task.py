@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d, pad, pixel_unshuffle, unfold
 
 from polsep.demosaic.bilinear import demosaic_bilinear_half
-from polsep.networks.joint import INPUTS, Demosaicker, Joint, bilinear_filter
+from polsep.networks.channels import INPUTS
+from polsep.networks.joint import Demosaicker, Joint, bilinear_filter
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Measurements, Stokes
 from polsep.sensor.camera import Layout, Mosaic
@@ -61,7 +62,7 @@ ABLATIONS = {
     "paper-loss": Ablation(goal=Goal(paper_difference)),
 }
 #: What can be trained alone: which parameters of a network it is, by the beginning of their names.
-PARTS = {"all": "", "details": "details.", "doubt": "doubt."}
+PARTS = {"all": "", "details": "details.", "doubt": "log_variance."}
 #: How examples are seen, and in how many colours.
 VIEWS = {"mosaic": (see_raw, 3), "mono": (see_raw_mono, 1)}
 

@@ -30,7 +30,7 @@ from polsep.io.raw.sequences import DamagedFrame, FrameSequence, open_sequence
 from polsep.io.results.previews import exposure_of, srgb
 from polsep.io.results.sequences import PART, Part, Picture, Sequence, SequenceKind, State
 from polsep.methods import Capture, find_method
-from polsep.pipeline import LightColor, find_device, separate_capture, separate_known, to_device
+from polsep.pipeline import LightColor, find_device, make_frame, separate_capture, to_device
 from polsep.sensor.camera import Mosaic
 from polsep.video.panels_kernel import STEPS, make_panels
 from polsep.video.temporal import Images, TemporalState, filter_frame, steady_images
@@ -285,7 +285,8 @@ def separate_one(job: tuple[Capture, Look, torch.device]) -> Found:
     """One frame by the method, and under the light, that the first one settled."""
     data, look, device = job
     data = to_device(data, device)
-    frame = separate_known(data, find_method(look.method, data), look.light)
+    method = find_method(look.method, data)
+    frame = make_frame(method.run(data, look.light, False), method, data, look.light)
     return Found((frame.diffuse, frame.specular), frame.report)
 
 

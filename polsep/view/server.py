@@ -15,7 +15,6 @@ import torch
 
 from polsep.io.store.temporary import make_temporary_folders, remove_folder
 from polsep.methods import find_method
-from polsep.pipeline import separate_known
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.view.guard import LOOPBACK, Guard
 from polsep.view.session import Sessions
@@ -132,4 +131,4 @@ def _launch(page, options: ViewOptions) -> str:  # type: ignore[no-untyped-def]
 def warm_up(method: str) -> None:
     """Do what the first separation would wait for: load kernels and weights, and make an engine of the usual size."""
     mosaic = Mosaic(torch.zeros(2048, 2448), Layout(), 0.0, 1.0)
-    separate_known(mosaic, find_method(method, mosaic), (1.0, 1.0, 1.0))
+    find_method(method, mosaic).run(mosaic, (1.0, 1.0, 1.0), False)

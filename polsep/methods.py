@@ -35,7 +35,7 @@ Light = tuple[float, ...]
 
 
 class Reference(Protocol):
-    """A method in torch: any capture, batches, all devices; a `Separation` in white light at half or full resolution."""
+    """A method in torch: any capture, batches, all devices; a `Separation` in white light."""
 
     def __call__(self, capture: Capture, full: bool = False) -> Separation:
         """Separate a capture."""

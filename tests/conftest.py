@@ -12,8 +12,7 @@ from hypothesis import settings
 
 from polsep.io.store import weights
 from polsep.methods import METHODS
-from polsep.networks import paper as learned
-from polsep.networks import run as mosaic_network
+from polsep.networks import paper, run
 from polsep.sensor.camera import Layout, Mosaic
 
 settings.register_profile("polsep", derandomize=True, deadline=None, max_examples=40)
@@ -46,7 +45,7 @@ def shared() -> Path:
 def compiled() -> None:
     """Every engine's kernels are compiled on disk: programs that tests start then never stop to compile, nor say so."""
     for method in METHODS.values():
-        method.engine(Mosaic(torch.eye(32), Layout(), 0.0, 1.0))
+        method.run(Mosaic(torch.eye(32), Layout(), 0.0, 1.0), (1.0, 1.0, 1.0), False)
 
 
 @pytest.fixture
@@ -59,9 +58,9 @@ def ship(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             raise ValueError("not shipped")
         return path
 
-    for room in (weights, learned, mosaic_network):
+    for room in (weights, paper, run):
         monkeypatch.setattr(room, "shipped_weights", find)
-    caches = (learned._shipped_refinement, mosaic_network._shipped_joint)
+    caches = (paper._shipped_refinement, run._shipped_joint)
     for cache in caches:
         cache.cache_clear()
     yield tmp_path

@@ -8,17 +8,20 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from polsep.methods import METHODS
+from polsep.compute import warm_up
+from polsep.methods import METHODS, run_reference
+from polsep.networks.engines import run_engine
 from polsep.networks.run import NAMES
 from polsep.physics.stokes import Measurements
-from polsep.pipeline import SeparatedFrame, resolve_light_color, separate_capture, separate_in_engine, separate_in_torch
+from polsep.pipeline import SeparatedFrame, make_frame, resolve_light_color, separate_capture
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.separation import engine
+from polsep.separation import analytic_kernel, color_affine_kernel
 
 SONY = ((90, 45), (135, 0))
 COLOR, MONO = Layout(), Layout(bayer=None)
@@ -48,9 +51,9 @@ def capture(layout: Layout, shape: tuple[int, int] = (96, 120), light: tuple[flo
 def both(mosaic: Mosaic, method: str, light: tuple[float, ...]) -> tuple[SeparatedFrame, SeparatedFrame]:
     """The frame by the engine and by torch."""
     chosen, (light, _) = METHODS[method], resolve_light_color(light, mosaic)
-    found = separate_in_engine(mosaic, chosen, light)
-    assert found is not None
-    return found, separate_in_torch(mosaic, chosen, light, full=False)
+    by_torch = run_reference(chosen.reference, mosaic, light, False)
+    images = (chosen.run(mosaic, light, False), by_torch)
+    return tuple(make_frame(each, chosen, mosaic, light) for each in images)  # type: ignore[return-value]
 
 
 @pytest.mark.parametrize(
@@ -99,46 +102,66 @@ def test_dolp_aolp_and_statistics_are_of_white_light(method: str, full: bool) ->
     )
 
 
-@pytest.mark.parametrize("method", METHODS)
+KERNELS = {"analytic": "separate_analytic_half", "color-affine": "separate_color_affine_half"}
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the kernels that ran."""
+    names: list[str] = []
+    for module, name in (
+        (analytic_kernel, "separate_analytic_half"),
+        (color_affine_kernel, "separate_color_affine_half"),
+    ):
+        kernel = getattr(module, name)
+
+        def record(*given: Any, kernel: Any = kernel, name: str = name) -> Any:
+            names.append(name)
+            return kernel(*given)
+
+        monkeypatch.setattr(module, name, record)
+    return names
+
+
+@pytest.mark.parametrize("method", KERNELS)
+@pytest.mark.parametrize("data", [torch.rand(2, 32, 32), torch.rand(32, 32).double()], ids=["batch", "double"])
+def test_kernels_leave_other_frames_to_torch(method: str, data: torch.Tensor, calls: list[str]) -> None:
+    """Batches and double precision."""
+    METHODS[method].run(Mosaic(data, COLOR, 0.0, 1.0), WHITE, False)
+    assert calls == []
+
+
+@pytest.mark.parametrize("full", [False, True])
 @pytest.mark.parametrize(
     "data", [torch.zeros(2, 32, 32), torch.zeros(32, 32).double(), torch.zeros(32, 32, device="meta")], ids=str
 )
-def test_engines_leave_what_they_cannot_take(method: str, data: torch.Tensor) -> None:
-    """Batches, double precision and other devices are left to torch."""
-    assert METHODS[method].engine(Mosaic(data, COLOR, 0.0, 1.0)) is None
+def test_the_engine_leaves_other_frames_to_torch(data: torch.Tensor, full: bool) -> None:
+    """Batches, double precision and other devices."""
+    assert run_engine("joint", Mosaic(data, COLOR, 0.0, 1.0), full) is None
 
 
-def test_small_and_mono_frames_of_color_affine_are_left_to_torch() -> None:
-    """Where guided demosaicking falls back to bilinear, and mono frames, which the kernel does not take."""
-    assert engine.run_color_affine(Mosaic(torch.zeros(14, 64), COLOR, 0.0, 1.0)) is None
-    assert engine.run_color_affine(Mosaic(torch.zeros(64, 64), MONO, 0.0, 1.0)) is None
+def test_small_and_mono_frames_of_color_affine_are_left_to_torch(calls: list[str]) -> None:
+    """Frames on which guided demosaicking falls back to bilinear, and mono frames, which the kernel does not accept."""
     for layout, shape in ((COLOR, (14, 64)), (MONO, (64, 64)), (COLOR, (4, 4))):
         out = separate_capture(Mosaic(torch.full(shape, 0.5), layout, 0.0, 1.0), "color-affine", device="cpu")
         assert out.diffuse.shape == (shape[0] // 2, shape[1] // 2, layout.channels)
+    assert calls == []
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_every_resolution_has_its_engine_and_measurements_are_torchs(
-    method: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No kernel runs for co-sited measurements; what an engine leaves goes to torch."""
-    half: list[Mosaic] = []
-    full: list[Mosaic] = []
-    monkeypatch.setitem(METHODS, method, replace(METHODS[method], engine=half.append, full_engine=full.append))
+@pytest.mark.parametrize("method", KERNELS)
+def test_kernels_make_half_resolution_and_torch_the_rest(method: str, calls: list[str]) -> None:
+    """No kernel runs for co-sited measurements, nor at full resolution."""
     mosaic = capture(COLOR, (32, 32))
-    co_sited = Measurements(torch.rand(4, 3, 16, 16), COLOR.angles)
-    if METHODS[method].accepts(co_sited):
-        separate_capture(co_sited, method, device="cpu")
-    assert not half and not full
+    separate_capture(Measurements(torch.rand(4, 3, 16, 16), COLOR.angles), method, device="cpu")
     separate_capture(mosaic, method, full=True, device="cpu")
-    assert not half and len(full) == 1
+    assert calls == []
     separate_capture(mosaic, method, device="cpu")
-    assert len(half) == 1 and len(full) == 1
+    assert calls == [KERNELS[method]]
 
 
 def test_slow_compilation_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     """What is ready soon says nothing; what takes longer says so in one line, and not again."""
-    monkeypatch.setattr(engine, "PATIENCE", 0.05)
+    monkeypatch.setattr(warm_up, "PATIENCE", 0.05)
 
     def quick() -> None:
         pass
@@ -147,10 +170,10 @@ def test_slow_compilation_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: 
         time.sleep(0.3)
 
     with caplog.at_level(logging.WARNING, "polsep"):
-        engine.make_ready(quick)
+        warm_up.make_ready(quick)
         assert caplog.messages == []
-        engine.make_ready(slow)
-        engine.make_ready(slow)
+        warm_up.make_ready(slow)
+        warm_up.make_ready(slow)
     assert len(caplog.messages) == 1 and "compiling this method" in caplog.messages[0]
 
 

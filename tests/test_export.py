@@ -60,7 +60,7 @@ def test_exported_graphs_agree(
         raw = generator.integers(100, 5000, shape).clip(max=4095).astype(np.uint16)
         given = {"raw": raw, "black_level": np.float32([64]), "white_level": np.float32([4095])}
         diffuse, specular, error = session.run(["diffuse", "specular", "error"], given)
-        found = run_joint(network, Mosaic(torch.from_numpy(raw), Layout(), 64.0, 4095.0), resolution)  # type: ignore[arg-type]
+        found = run_joint(network, Mosaic(torch.from_numpy(raw), Layout(), 64.0, 4095.0), resolution == "full")
         assert found.expected_error is not None
         assert_within(torch.from_numpy(diffuse).movedim(-1, -3), found.diffuse, ROUNDED)
         assert_within(torch.from_numpy(specular).movedim(-1, -3).expand_as(found.specular), found.specular, ROUNDED)

@@ -15,7 +15,7 @@ from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import demosaic_guided_half
 from polsep.networks.joint import (
     INPUTS,
-    MAX_DOUBT,
+    MAX_LOG_VARIANCE,
     PERIOD,
     Demosaicker,
     Joint,
@@ -222,7 +222,7 @@ def test_exposure_scales_the_separation(layout: Layout) -> None:
     one, two = (net.half_resolution(x, nothing_clipped(raw)) for x in (raw, 0.5 * raw))
     assert_within(two.diffuse, 0.5 * one.diffuse, FLOORED)
     assert_within(two.specular, 0.5 * one.specular, FLOORED)
-    assert_within(two.light, 0.5 * one.light, FLOORED + 1e-3)
+    assert_within(two.local_brightness, 0.5 * one.local_brightness, FLOORED + 1e-3)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
@@ -366,7 +366,9 @@ def test_crop_and_frame_agree_away_from_the_border(layout: Layout, make: Callabl
             crop(piece, reach)[..., :16, :16],
             whole[..., start:, start:][..., reach:-reach, reach:-reach][..., :16, :16],
         )
-    assert_close(crop(cut.doubt, reach // 2), frame.doubt[..., start // 2 :, start // 2 :][..., 32:-32, 32:-32])
+    assert_close(
+        crop(cut.log_variance, reach // 2), frame.log_variance[..., start // 2 :, start // 2 :][..., 32:-32, 32:-32]
+    )
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
@@ -379,8 +381,8 @@ def test_any_multiple_of_four_goes_in(layout: Layout, shape: tuple[int, int]) ->
     cells, packed = tuple(n // 2 for n in shape), tuple(n // 4 for n in shape)
     assert images.diffuse.shape == (1, layout.channels, *shape)
     assert half.diffuse.shape == half.s1.shape == half.s2.shape == (1, layout.channels, *cells)
-    assert half.doubt.shape == (1, 2, *cells)
-    assert half.light.shape == (1, 1, *packed)
+    assert half.log_variance.shape == (1, 2, *cells)
+    assert half.local_brightness.shape == (1, 1, *packed)
     assert polarization.diffuse.shape == polarization.specular.shape == (1, 2, *packed)
     assert_finite(*images, *polarization, *half)
 
@@ -415,11 +417,11 @@ def test_networks_see_the_maps_they_were_asked_to_see(layout: Layout) -> None:
     single = [Joint(layout.channels, SIZE, (name,)).closed_form(half, planes, masks) for name in INPUTS]
     whole = Joint(layout.channels, SIZE).closed_form(half, planes, masks)
     assert torch.equal(
-        whole.maps, torch.cat([*(guess.maps[:, :-1] for guess in single), torch.log(whole.light)], dim=1)
+        whole.inputs, torch.cat([*(guess.inputs[:, :-1] for guess in single), torch.log(whole.local_brightness)], dim=1)
     )
     for name, guess in zip(INPUTS, single, strict=True):
         net = random_net(layout, tuple(other for other in INPUTS if other != name))
-        assert net.closed_form(half, planes, masks).maps.shape[1] == whole.maps.shape[1] - guess.maps.shape[1] + 1
+        assert net.closed_form(half, planes, masks).inputs.shape[1] == whole.inputs.shape[1] - guess.inputs.shape[1] + 1
         assert bool(net(pixel_shuffle(planes, 4), pixel_shuffle(masks, 4))[0].diffuse.any())
 
 
@@ -436,7 +438,7 @@ def test_random_weights_do_something(layout: Layout) -> None:
     """Or else what is claimed of them here says nothing."""
     raw = random_raw(1, 16, 16)
     (one, polarization), (other, own) = (net(layout)(raw, raw > 0.85) for net in (untrained, random_net))
-    for a, b in zip((*one[:2], one.doubt, *polarization), (*other[:2], other.doubt, *own), strict=True):
+    for a, b in zip((*one[:2], one.log_variance, *polarization), (*other[:2], other.log_variance, *own), strict=True):
         assert float((a - b).detach().abs().mean()) > 0.02
 
 
@@ -451,7 +453,7 @@ def test_half_precision_is_kept_out_of_the_closed_form(layout: Layout) -> None:
             with torch.autocast("cpu", torch.bfloat16):
                 coarse, coarse_half = net(raw, raw > 0.85)[0], net.half_resolution(raw, raw > 0.85)
         for one, other in ((exact, coarse), (half, coarse_half)):
-            assert other.diffuse.dtype == other.specular.dtype == other.doubt.dtype == torch.float32
+            assert other.diffuse.dtype == other.specular.dtype == other.log_variance.dtype == torch.float32
             assert_within(other.diffuse, one.diffuse, tolerance)
             assert_within(other.specular, one.specular, tolerance)
             assert torch.equal(other.s1, one.s1)
@@ -460,7 +462,7 @@ def test_half_precision_is_kept_out_of_the_closed_form(layout: Layout) -> None:
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
 def test_directions_are_unit_vectors(layout: Layout) -> None:
     raw = random_raw(1, 16, 16)
-    direction = random_net(layout)(raw, nothing_clipped(raw))[1].direction
+    direction = random_net(layout)(raw, nothing_clipped(raw))[1].specular
     assert_within(torch.linalg.vector_norm(direction, dim=1), 1.0, 1e-3)
 
 
@@ -481,7 +483,7 @@ def test_expected_errors_stay_finite() -> None:
     torch.nn.init.constant_(net.log_variance[2].bias, 1e6)  # type: ignore[arg-type]
     with torch.no_grad():
         images = net.half_resolution(raw, nothing_clipped(raw))
-    assert images.log_variance.amin(dim=(0, 2, 3)).tolist() == list(MAX_DOUBT)
+    assert images.log_variance.amin(dim=(0, 2, 3)).tolist() == list(MAX_LOG_VARIANCE)
     assert_finite(*limit(images))
 
 
@@ -489,9 +491,9 @@ def test_expected_errors_stay_finite() -> None:
 def test_distrust_moves_the_closed_form_s_specular_light_to_the_diffuse(layout: Layout) -> None:
     net, raw = untrained(layout), random_raw(1, 16, 16)
     clipped = nothing_clipped(raw)
-    assert net.trust is not None
+    assert net.closed_form_gain is not None
     believed = net.half_resolution(raw, clipped), net(raw, clipped)[0]
-    torch.nn.init.constant_(net.trust.bias, -1.0)  # type: ignore[arg-type]
+    torch.nn.init.constant_(net.closed_form_gain.bias, -1.0)  # type: ignore[arg-type]
     refused = net.half_resolution(raw, clipped), net(raw, clipped)[0]
     for before, after in zip(believed, refused, strict=True):
         assert bool((before.specular > 0).any())

@@ -26,17 +26,16 @@ from polsep.networks import run as mosaic_network
 from polsep.networks.channels import INPUTS, PERIOD
 from polsep.networks.engines import run_engine
 from polsep.networks.joint import Demosaicker, Joint
-from polsep.networks.openvino_engine import FullEngine, OpenVinoEngine
-from polsep.networks.run import Resolution, own_order, run_joint
+from polsep.networks.openvino_engine import OpenVinoEngine
+from polsep.networks.run import own_order, run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import MAX_DOLP, aolp, dolp
-from polsep.pipeline import in_light
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation
 from polsep.sensor.unpack_kernel import as_samples
 from polsep.separation.analytic import Separation
 from polsep.separation.images import FrameImages, Tally
-from polsep.separation.report import tally
+from polsep.separation.report import in_light, tally
 
 COLOR, MONO = Layout(), Layout(bayer=None)
 LAYOUTS = [COLOR, MONO]
@@ -48,7 +47,6 @@ BLACK, WHITE = 100.0, 4000.0
 NOISE, SUMMED = 1e-4, 1e-4
 #: Single pixels of guided demosaicking in float32, whose divisions the means over cells hide.
 DIVIDED = 1e-4
-RESOLUTIONS: list[Resolution] = ["half", "full"]
 #: What bfloat16 changes in corrections of a few percent, rms: 8 bits, a few times over.
 ROUNDED = 1e-3
 
@@ -78,13 +76,13 @@ def random_frame(height: int, width: int, layout: Layout, most: int = 4095) -> M
     )
 
 
-def in_torch(net: Joint, mosaic: Mosaic, resolution: Resolution = "half") -> Separation:
-    return in_light(run_joint(net, mosaic, resolution), mosaic.light_color)
+def in_torch(net: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
+    return in_light(run_joint(net, mosaic, full), mosaic.light_color)
 
 
-def in_engine(net: Joint, mosaic: Mosaic, precision: str = "f32", resolution: Resolution = "half") -> FrameImages:
+def in_engine(net: Joint, mosaic: Mosaic, precision: str = "f32", full: bool = False) -> FrameImages:
     height, width = mosaic.data.shape
-    engine = (FullEngine if resolution == "full" else OpenVinoEngine)(net, (height, width), precision)
+    engine = OpenVinoEngine(net, (height, width), full, precision)
     return engine.run(mosaic.data.numpy(), (mosaic.black_level, mosaic.white_level), mosaic.light_color)
 
 
@@ -119,18 +117,18 @@ def test_full_resolution_is_what_torch_makes_of_it(
     layout: Layout, demosaicker: Demosaicker, size: tuple[int, int]
 ) -> None:
     net, mosaic = random_net(layout, INPUTS, demosaicker), random_frame(*size, layout)
-    found, expected = in_engine(net, mosaic, resolution="full"), in_torch(net, mosaic, "full")
+    found, expected = in_engine(net, mosaic, full=True), in_torch(net, mosaic, True)
     assert found.diffuse.shape == (*size, layout.channels)
     assert_same(found, expected, run_joint(net, mosaic, full=True), DIVIDED if demosaicker == "guided" else 0.0)
 
 
 @pytest.mark.parametrize("left_out", INPUTS)
-@pytest.mark.parametrize("resolution", RESOLUTIONS)
-def test_networks_that_see_less_are_shown_less(left_out: str, resolution: Resolution) -> None:
+@pytest.mark.parametrize("full", [False, True])
+def test_networks_that_see_less_are_shown_less(left_out: str, full: bool) -> None:
     net = random_net(COLOR, tuple(name for name in INPUTS if name != left_out))
     mosaic = random_frame(32, 48, COLOR)
-    found = in_engine(net, mosaic, resolution=resolution)
-    assert_same(found, in_torch(net, mosaic, resolution), run_joint(net, mosaic, resolution))
+    found = in_engine(net, mosaic, full=full)
+    assert_same(found, in_torch(net, mosaic, full), run_joint(net, mosaic, full))
 
 
 @pytest.mark.parametrize("cell", [(0, 0), (5, 6), (15, 23)])
@@ -154,24 +152,22 @@ def test_a_frame_without_clipped_samples_is_valid_everywhere() -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.spec)
-@pytest.mark.parametrize("resolution", RESOLUTIONS)
-def test_bfloat16_rounds_corrections_only(layout: Layout, resolution: Resolution) -> None:
+@pytest.mark.parametrize("full", [False, True])
+def test_bfloat16_rounds_corrections_only(layout: Layout, full: bool) -> None:
     net, mosaic = random_net(layout), random_frame(64, 96, layout)
-    found, expected = in_engine(net, mosaic, "bf16", resolution), in_torch(net, mosaic, resolution)
+    found, expected = in_engine(net, mosaic, "bf16", full), in_torch(net, mosaic, full)
     for image, wanted in ((found.diffuse, expected.diffuse), (found.specular, expected.specular)):
         error = torch.from_numpy(image).movedim(-1, 0) - wanted
         assert 0 < float(error.square().mean().sqrt()) < ROUNDED
-    assert_within(
-        torch.from_numpy(found.aolp), torch.from_numpy(in_engine(net, mosaic, resolution=resolution).aolp), 0.0
-    )
+    assert_within(torch.from_numpy(found.aolp), torch.from_numpy(in_engine(net, mosaic, full=full).aolp), 0.0)
 
 
-@pytest.mark.parametrize("kind", [OpenVinoEngine, FullEngine])
-def test_threads_and_frames_before_change_no_bit(kind: type[OpenVinoEngine]) -> None:
-    """The room for what lies between is used again and again; strips of rows overlap."""
+@pytest.mark.parametrize("full", [False, True])
+def test_threads_and_frames_before_change_no_bit(full: bool) -> None:
+    """Buffers are used again and again; strips of rows overlap."""
     net, threads = random_net(COLOR), get_threads()
     frames = [random_frame(320, 48, COLOR, most) for most in (4095, 2000)]
-    engine = kind(net, (320, 48), "f32")
+    engine = OpenVinoEngine(net, (320, 48), full, "f32")
     runs = []
     try:
         for count in (1, 3):
@@ -194,18 +190,20 @@ def test_a_thread_writes_no_row_of_another(
     """Not even the same numbers: who reads them in between would see half of them."""
     height, piece = 48, (3, 6)
     net, mosaic = random_net(layout, INPUTS, demosaicker), random_frame(height, 64, layout)
-    engine = FullEngine(net, (height, 64), "f32")
-    engine._maps.base.fill(math.nan)
-    engine._maps.details.fill(math.nan)
-    engine._maps.clipped.fill(12345)
+    engine = OpenVinoEngine(net, (height, 64), True, "f32")
+    *planes, clipped = engine._maps.closed
+    for plane in (*planes, engine._maps.details):
+        plane.fill(math.nan)
+    clipped.fill(12345)
     monkeypatch.setattr("polsep.compute.threads.share", lambda work, rows, step: work(piece))
-    engine._fill_maps(as_samples(mosaic.data.numpy()), read_pattern((height, 64), layout, BLACK, WHITE, LIGHT))
+    engine._fill_inputs(as_samples(mosaic.data.numpy()), read_pattern((height, 64), layout, BLACK, WHITE, LIGHT))
     others = np.ones(height // PERIOD, np.bool_)
     others[slice(*piece)] = False
-    assert np.isnan(engine._maps.base[others]).all() and np.isfinite(engine._maps.base[~others]).all()
+    for plane in planes:
+        assert np.isnan(plane[others]).all() and np.isfinite(plane[~others]).all()
     assert np.isnan(engine._maps.details[others.repeat(2)]).all()
     assert np.isfinite(engine._maps.details[~others.repeat(2)]).all()
-    assert (engine._maps.clipped[others] == 12345).all() and (engine._maps.clipped[~others] != 12345).all()
+    assert (clipped[others] == 12345).all() and (clipped[~others] != 12345).all()
 
 
 @pytest.fixture
@@ -217,8 +215,7 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
     joint_engine.ENGINES.clear()
     monkeypatch.setattr(joint_engine, "find_joint", find)
-    for kind in (OpenVinoEngine, FullEngine):
-        monkeypatch.setattr(joint_engine, kind.__name__, partial(kind, precision="f32"))
+    monkeypatch.setattr(joint_engine, "OpenVinoEngine", partial(OpenVinoEngine, precision="f32"))
     yield
     joint_engine.ENGINES.clear()
 
@@ -234,13 +231,13 @@ TURNS: dict[str, Callable[[Layout], Layout]] = {
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.spec)
 @pytest.mark.parametrize("turn", TURNS)
-@pytest.mark.parametrize("resolution", RESOLUTIONS)
-def test_frames_of_any_orientation_and_side(layout: Layout, turn: str, resolution: Resolution, shipped: None) -> None:
+@pytest.mark.parametrize("full", [False, True])
+def test_frames_of_any_orientation_and_side(layout: Layout, turn: str, full: bool, shipped: None) -> None:
     """Sides that are no multiples of the period, filters mirrored, transposed or cropped."""
     mosaic = random_frame(50, 62, TURNS[turn](layout))
-    found = run_engine("joint", resolution, mosaic)
+    found = run_engine("joint", mosaic, full)
     assert found is not None
-    white = run_joint(random_net(layout), mosaic, resolution)
+    white = run_joint(random_net(layout), mosaic, full)
     for image, wanted in ((found.diffuse, in_light(white, mosaic.light_color).diffuse), (found.valid, white.valid)):
         turned = torch.from_numpy(image)
         assert_close((turned.movedim(-1, 0) if turned.ndim == 3 else turned).float(), wanted.float())
@@ -267,11 +264,11 @@ def test_threads_with_engines_of_their_own_find_the_same(shipped: None) -> None:
 
     def separate(frame: Mosaic) -> FrameImages:
         with own_threads(1):
-            found = run_engine("joint", "half", frame)
+            found = run_engine("joint", frame, False)
         assert found is not None
         return found
 
-    alone = [run_engine("joint", "half", frame) for frame in frames]
+    alone = [run_engine("joint", frame, False) for frame in frames]
     with ThreadPoolExecutor(2) as pool:
         together = list(pool.map(separate, frames * 3))
     for found, expected in zip(together, alone * 3, strict=True):
@@ -283,27 +280,27 @@ def test_threads_with_engines_of_their_own_find_the_same(shipped: None) -> None:
 def test_what_it_does_not_take_is_left_to_torch(shipped: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Batches, other dtypes, cells half a cell off, and machines without OpenVINO."""
     mosaic = random_frame(32, 48, COLOR)
-    assert run_engine("joint", "half", mosaic) is not None
+    assert run_engine("joint", mosaic, False) is not None
     batch = Mosaic(mosaic.data.float()[None], COLOR, BLACK, WHITE)
     double = Mosaic(mosaic.data.double(), COLOR, BLACK, WHITE)
     half_off = random_frame(32, 48, MONO.rolled(1, 0))
-    assert [run_engine("joint", "half", frame) for frame in (batch, double, half_off)] == [None] * 3
+    assert [run_engine("joint", frame, False) for frame in (batch, double, half_off)] == [None] * 3
     monkeypatch.setattr(joint_engine, "find_spec", lambda name: None)
-    assert run_engine("joint", "half", mosaic) is None
+    assert run_engine("joint", mosaic, False) is None
 
 
-@pytest.mark.parametrize("resolution", RESOLUTIONS)
+@pytest.mark.parametrize("full", [False, True])
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.spec)
 def test_huge_frames_are_separated_in_strips(
-    layout: Layout, resolution: Resolution, shipped: None, monkeypatch: pytest.MonkeyPatch
+    layout: Layout, full: bool, shipped: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same as whole ones, by engines for two heights at most; also where the height is no multiple of strips."""
     mosaic = random_frame(1452, 36, layout)
-    whole = run_engine("joint", resolution, mosaic)
+    whole = run_engine("joint", mosaic, full)
     monkeypatch.setattr(mosaic_network, "MAX_PIXELS", 36 * 720)
-    heights = {strip.seen[1] - strip.seen[0] for strip in joint_engine._strips((1452, 36), 16)}
+    heights = {bottom - top for (top, bottom), _ in joint_engine._strips((1452, 36), 16)}
     assert len(heights) == 2 and max(heights) <= 720 + 16
-    parts = run_engine("joint", resolution, mosaic)
+    parts = run_engine("joint", mosaic, full)
     assert whole is not None and parts is not None
     assert np.array_equal(parts.valid, whole.valid)
     for name in ("diffuse", "specular", "error", "dolp"):
@@ -323,7 +320,7 @@ def test_layers_are_read_once_for_all_sizes(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(openvino_engine, "_as_model", count)
     frames = [random_frame(32, width, COLOR) for width in (32, 48)]
     for frame in frames:
-        engine = OpenVinoEngine(network, (32, frame.data.shape[1]), "f32")
+        engine = OpenVinoEngine(network, (32, frame.data.shape[1]), precision="f32")
         found = engine.run(frame.data.numpy(), (BLACK, WHITE), LIGHT)
         expected = run_joint(network, frame).specular[0]
         assert_close(torch.from_numpy(found.specular[..., 0]), LIGHT[0] * expected, 4.0)

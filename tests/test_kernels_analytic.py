@@ -21,11 +21,10 @@ from polsep.io.raw.genicam import pack_frame
 from polsep.kernels import AnalyticImages, AnalyticOptions, PackedFrame, separate_analytic_half
 from polsep.methods import compose
 from polsep.physics.stokes import Stokes
-from polsep.pipeline import in_light, to_numpy
 from polsep.sensor.camera import BAYER_ORDERS, CLIP_MARGIN, Layout, Mosaic
 from polsep.separation import analytic_kernel as analytic
 from polsep.separation.analytic import Separation, separate_analytic
-from polsep.separation.report import tally
+from polsep.separation.report import images_of, in_light, tally
 
 SONY = ((90, 45), (135, 0))
 PERMUTED = ((0, 135), (45, 90))
@@ -150,7 +149,9 @@ def test_dolp_and_aolp_agree_with_the_pipeline(layout: Layout) -> None:
     """DoLP and AoLP of the mean over colours in white light; AoLP where it is defined to more than rounding."""
     light, raw = (0.8, 1.0, 1.3), random_codes((40, 60))
     images = separate_analytic_half(raw, layout, 0, 65535, AnalyticOptions(light, in_light=True, report=True))
-    expected = to_numpy(twin(raw, layout, 0.0, 65535.0, light), {})
+    white = twin(raw, layout, 0.0, 65535.0, light)
+    expected = images_of(white, white)
+    assert expected.dolp is not None and expected.aolp is not None
     assert images.dolp is not None and images.aolp is not None
     assert_within(torch.from_numpy(images.dolp), torch.from_numpy(expected.dolp), 1e-5)
     assert images.aolp.min() >= 0 and images.aolp.max() < np.float32(math.pi)

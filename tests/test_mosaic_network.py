@@ -16,7 +16,7 @@ from polsep.methods import METHODS, find_method
 from polsep.networks import run as mosaic_network
 from polsep.networks.channels import INPUTS
 from polsep.networks.joint import Joint
-from polsep.networks.run import cut_rows, load_joint, run_joint, separate_mosaic, takes, weights_name
+from polsep.networks.run import accepts_mosaic, cut_rows, load_joint, run_joint, separate_joint, weights_name
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
@@ -81,18 +81,16 @@ def test_mono_cells_of_other_frames_are_their_own() -> None:
     assert half.clipped is not None and half.clipped.shape == half.valid.shape == (24, 32)
 
 
-@pytest.mark.parametrize("resolution", ["half", "full"])
+@pytest.mark.parametrize("full", [False, True])
 @pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
-def test_strips_are_the_whole_frame(
-    layout: Layout, resolution: mosaic_network.Resolution, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_strips_are_the_whole_frame(layout: Layout, full: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     network, mosaic = random_network(layout), random_mosaic(layout, 720, 36)
-    whole = run_joint(network, mosaic, resolution)
+    whole = run_joint(network, mosaic, full)
     monkeypatch.setattr(mosaic_network, "MAX_PIXELS", 36 * 600)
     assert len(list(cut_rows((720, 36), 16))) > 5
-    parts = run_joint(network, mosaic, resolution)
+    parts = run_joint(network, mosaic, full)
     assert torch.equal(parts.valid, whole.valid)
-    for name in ("diffuse", "specular", "doubt"):
+    for name in ("diffuse", "specular", "expected_error"):
         assert_close(getattr(parts, name), getattr(whole, name), 4.0)
 
 
@@ -126,17 +124,17 @@ def write_network(path: Path, layout: Layout, changed: dict[str, str] | None = N
 
 def test_methods_take_what_they_have_weights_for(ship: Path) -> None:
     mosaic = random_mosaic(COLOR, 32, 40)
-    assert not takes("joint")(mosaic)
+    assert not accepts_mosaic("joint", mosaic)
     network = write_network(ship / f"{weights_name('joint', COLOR)}.safetensors", COLOR)
-    assert takes("joint")(mosaic)
-    assert not takes("joint")(random_mosaic(MONO, 32, 40))
-    assert not takes("joint")(random_mosaic(Layout(((0, 60), (120, 30))), 32, 40))
-    found = separate_mosaic("joint", "half")(mosaic)
+    assert accepts_mosaic("joint", mosaic)
+    assert not accepts_mosaic("joint", random_mosaic(MONO, 32, 40))
+    assert not accepts_mosaic("joint", random_mosaic(Layout(((0, 60), (120, 30))), 32, 40))
+    found = separate_joint("joint", mosaic)
     assert_within(found.diffuse, run_joint(network, mosaic).diffuse, 0.01)  # weights in half precision
     co_sited = Measurements(torch.rand(4, 3, 8, 8), COLOR.angles)
-    assert not takes("joint")(co_sited)
+    assert not accepts_mosaic("joint", co_sited)
     with pytest.raises(ValueError, match="expected a mosaic for the method joint, found four co-sited angle images"):
-        separate_mosaic("joint", "half")(co_sited)
+        separate_joint("joint", co_sited)
 
 
 def test_auto_takes_the_closed_form_where_no_network_does() -> None:

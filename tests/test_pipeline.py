@@ -8,19 +8,19 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
-from typing import Any, Literal
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from polsep.separation.engine import run_nothing
 from tolerances import assert_close
 from torch.nn.functional import interpolate
 
 import polsep
 from polsep.demosaic.bilinear import demosaic_bilinear_half
-from polsep.methods import BEST, FASTEST, METHODS, Method, find_method
+from polsep.methods import BEST, FASTEST, METHODS, Capture, Method, find_method, run_reference
 from polsep.networks.joint import MIN_BRIGHTNESS, Joint
 from polsep.networks.run import NAMES, run_joint
 from polsep.networks.unet import ResidualSize
@@ -114,7 +114,7 @@ def test_shapes_and_types(method: str, full: bool, layout: Layout | None) -> Non
 def test_auto_is_the_best_that_takes_a_frame(layout: Layout | None, choice: str, choices: tuple[Method, ...]) -> None:
     """And the report says which method ran."""
     mosaic = Mosaic(torch.zeros(SIZE, SIZE), layout or Layout(), 0.0, 1.0)
-    best = next(method.name for method in choices if method.takes(mosaic))
+    best = next(method.name for method in choices if method.accepts(mosaic))
     auto, named = (quietly(raw_frame(layout=layout), method=name, layout=layout) for name in (choice, best))
     assert auto.report["method"] == best
     assert np.array_equal(auto.specular, named.specular) is True
@@ -222,26 +222,25 @@ def doubting(monkeypatch: pytest.MonkeyPatch) -> Joint:
     """A random network that expects errors, installed as the method ``joint``."""
     torch.manual_seed(3)
     network = Joint(3, ResidualSize(4, (0, 1, 1))).eval()
-    for weight in network.doubt.parameters():
+    for weight in network.log_variance.parameters():
         torch.nn.init.normal_(weight, std=0.5)
 
-    def half(mosaic: Mosaic) -> Separation:
-        return run_joint(network, mosaic)
+    def reference(capture: Capture, full: bool = False) -> Separation:
+        assert isinstance(capture, Mosaic)
+        return run_joint(network, capture, full)
 
-    def full(mosaic: Mosaic) -> Separation:
-        return run_joint(network, mosaic, full=True)
-
-    method = replace(METHODS["analytic"], name="joint", half=half, full=full, engine=run_nothing)
+    run = partial(run_reference, reference)
+    method = replace(METHODS["analytic"], name="joint", reference=reference, run=run, expects_errors=True)
     monkeypatch.setitem(METHODS, "joint", method)
     return network
 
 
-@pytest.mark.parametrize("resolution", ["half", "full"])
-def test_expected_errors_reach_their_owner(doubting: Joint, resolution: Literal["half", "full"]) -> None:
+@pytest.mark.parametrize("full", [False, True])
+def test_expected_errors_reach_their_owner(doubting: Joint, full: bool) -> None:
     """The frame holds what the method expects, and the report their rms; other methods have neither."""
-    raw, full = raw_frame("float32"), resolution == "full"
+    raw = raw_frame("float32")
     out = quietly(raw, method="joint", full=full)
-    expected = run_joint(doubting, Mosaic(torch.from_numpy(raw), Layout(), 0.0, 1.0), resolution).expected_error
+    expected = run_joint(doubting, Mosaic(torch.from_numpy(raw), Layout(), 0.0, 1.0), full).expected_error
     assert expected is not None and out.error is not None
     assert out.error.shape == (*out.valid.shape, 2) and out.error.dtype == np.float32
     assert out.error.flags.c_contiguous and float(out.error.min()) > 0 and float(np.ptp(out.error)) > 0

@@ -24,7 +24,6 @@ from polsep.physics.stokes import (
     measure,
     transpose,
 )
-from polsep.pipeline import in_light, under_white_light
 from polsep.render.distances import ball, plain
 from polsep.render.sphere_tracing import Part, PinholeCamera, PointLight, render
 from polsep.separation.analytic import (
@@ -35,7 +34,7 @@ from polsep.separation.analytic import (
     separate_analytic_unclipped,
 )
 from polsep.separation.color_affine import MAX_DIFFUSE_DOLP, separate_color_affine, white_specular
-from polsep.separation.report import dominant_angle, tally
+from polsep.separation.report import dominant_angle, in_light, tally, under_white_light
 
 SONY = tuple(math.radians(t) for t in (0, 45, 90, 135))
 Split = Callable[[Measurements], Separation]

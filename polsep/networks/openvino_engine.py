@@ -130,7 +130,7 @@ class OpenVinoEngine:
         """
         from polsep.compute.threads import share
         from polsep.demosaic.bilinear_kernel import read_pattern
-        from polsep.networks.details_kernel import write_pixels
+        from polsep.networks.details_kernel import emit_details, find_beyond, write_pixels
         from polsep.networks.images_kernel import Targets, write_rows
         from polsep.sensor.unpack_kernel import as_samples
 
@@ -140,8 +140,11 @@ class OpenVinoEngine:
         targets, gains = Targets.empty((h, w), self._colors), np.array(light[: self._colors], np.float32)
         with self._lock:
             self._fill_inputs(samples, pattern)
+            rows, closed, beyond = shape[0] // PERIOD, self._maps.closed, self._maps.details
+            if self._full:
+                share(lambda piece: find_beyond(closed, self._details.smooth, beyond, piece), rows, _ROWS)
+                share(lambda piece: emit_details(beyond, closed, self._detail_input, piece), rows, _ROWS)
             self._request.infer()
-            rows = shape[0] // PERIOD
             if self._full:
                 share(lambda piece: write_pixels(self._outputs, self._details, gains, targets, piece), rows, _ROWS)
             else:
@@ -154,7 +157,6 @@ class OpenVinoEngine:
         """The layers' inputs, and the closed form, of a frame."""
         from polsep.compute.threads import get_threads, share
         from polsep.demosaic.cells_kernel import Source, read_grid
-        from polsep.networks.details_kernel import emit_details, find_beyond
         from polsep.networks.maps_kernel import map_guided_rows, map_rows
 
         h, taps, maps = pattern.h // 2, self._taps, self._maps
@@ -165,10 +167,6 @@ class OpenVinoEngine:
             source = Source(samples, pattern, read_grid(pattern, angles, stokes_inverse(angles).float().numpy()))
             # A strip begins with rows that the one before has too, many of them: one for each thread.
             share(lambda piece: map_guided_rows(source, maps, piece), h, -(-h // get_threads()))
-        if self._full:
-            closed, beyond = maps.closed, maps.details
-            share(lambda piece: find_beyond(closed, self._details.smooth, beyond, piece), h, _ROWS)
-            share(lambda piece: emit_details(beyond, closed, self._detail_input, piece), h, _ROWS)
 
 
 def _model_of(network: Joint, layers: type[Layers], channels: tuple[int, ...]) -> Any:

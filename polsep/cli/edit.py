@@ -10,53 +10,55 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from polsep.cli.app import DIR, app, say
+from polsep.cli.app import DIR, FILE, OVERWRITE, app, print_note
 
 if TYPE_CHECKING:
     from polsep.edit.files import EditTarget, Work
     from polsep.edit.recipe import Recipe
 
-FILE = click.Path(path_type=Path, dir_okay=False)
-
 
 @app.command()
 @click.argument("inputs", nargs=-1, type=click.Path(path_type=Path), metavar="IN...")
-@click.option("-o", "--output", type=DIR, default=Path("polsep-edited"), metavar="DIR", help="Where results go.")
-@click.option("--recipe", "recipe_file", type=FILE, metavar="FILE", help="Edits from a file, in its order.")
-@click.option("--save-recipe", type=FILE, metavar="FILE", help="Keep the edits of this call for others.")
+@click.option("-o", "--output", type=DIR, default=Path("polsep-edited"), metavar="DIR", help="Folder of the results.")
+@click.option("--recipe", "recipe_file", type=FILE, metavar="FILE", help="Apply the edits of a file, in its order.")
+@click.option("--save-recipe", type=FILE, metavar="FILE", help="Save the edits of this call to a file.")
 @click.option("--mask", metavar="FILE", help="Edit only where this grey image is white.")
-@click.option("--recolor", metavar="R,G,B", help="The material in this linear colour, its shading kept.")
+@click.option("--recolor", metavar="R,G,B", help="Give the material this linear colour and keep its shading.")
 @click.option("--recolor-amount", type=float, metavar="X", help="0 to 1.  [default: 1]")
-@click.option("--texture", metavar="FILE", help="A pattern on the material, under its highlights.")
+@click.option("--texture", metavar="FILE", help="Put a texture on the material, under its highlights.")
 @click.option("--texture-amount", type=float, metavar="X", help="0 to 1.  [default: 1]")
 @click.option("--texture-repeats", type=float, metavar="X", help="Repeats across the image.  [default: 1]")
-@click.option("--texture-normals", metavar="FILE", help="Normals by which the texture follows the shape.")
-@click.option("--diffuse-gain", type=float, metavar="X", help="Times the diffuse light.")
+@click.option("--texture-normals", metavar="FILE", help="Normal map along which the texture follows the shape.")
+@click.option("--diffuse-gain", type=float, metavar="X", help="Multiply the diffuse light.")
 @click.option(
-    "--rougher", type=float, metavar="PX", help="Blur highlights by this sigma; the paper's matte look is 10."
+    "--rougher", type=float, metavar="PX", help="Blur highlights by this sigma; 10 is the paper's matte appearance."
 )
-@click.option("--sharper", type=float, metavar="PX", help="Undo such a blur of highlights, as far as that goes.")
-@click.option("--metallic", type=float, metavar="X", help="0 to 1: metal of the object's colour.")
-@click.option("--metallic-gain", type=float, metavar="X", help="Times the specular light.  [default: 45]")
-@click.option("--specular-gain", type=float, metavar="X", help="Times the specular light.")
-@click.option("--remove-highlights", type=float, metavar="X", help="0 to 1: less specular light; 1 none.")
-@click.option("--isolate-highlights", type=float, metavar="X", help="0 to 1: less diffuse light; 1 none.")
-@click.option("--tint", metavar="R,G,B", help="Times the light's colours.")
-@click.option("--compression", default="none", metavar="none|zip|piz", help="Of a sequence's EXR files.")
-@click.option("--preview/--no-preview", default=True, help="A film of a sequence to watch; needs the extra video.")
-@click.option("--rate", type=float, default=25.0, metavar="N", help="Frames per second of that film.")
-@click.option("--damaged", default="stop", metavar="stop|skip", help="What to do at a sequence's missing frame.")
-@click.option("--overwrite", is_flag=True, help="Replace results that exist.")
-@click.option("--list", "listing", is_flag=True, help="List the edits with their ranges, and stop.")
+@click.option("--sharper", type=float, metavar="PX", help="Undo such a blur of highlights, as far as possible.")
+@click.option("--metallic", type=float, metavar="X", help="Metal of the object's colour, 0 to 1.")
+@click.option("--metallic-gain", type=float, metavar="X", help="Multiply the specular light of metal.  [default: 45]")
+@click.option("--specular-gain", type=float, metavar="X", help="Multiply the specular light.")
+@click.option("--remove-highlights", type=float, metavar="X", help="Remove specular light; 0 none, 1 all of it.")
+@click.option("--isolate-highlights", type=float, metavar="X", help="Remove diffuse light; 0 none, 1 all of it.")
+@click.option("--tint", metavar="R,G,B", help="Multiply the colour of the light.")
+@click.option("--compression", default="none", metavar="none|zip|piz", help="Compression of a sequence's EXR files.")
+@click.option(
+    "--preview/--no-preview", default=True, help="Write a video of a sequence to watch; needs the extra video."
+)
+@click.option("--rate", type=float, default=25.0, metavar="N", help="Frames per second of that video.")
+@click.option(
+    "--damaged", default="stop", metavar="stop|skip", help="Stop at a missing frame of a sequence, or skip it."
+)
+@OVERWRITE
+@click.option("--list", "listing", is_flag=True, help="List the edits with their ranges and exit.")
 def edit(inputs: tuple[Path, ...], **options: Any) -> None:
-    """Change how separated objects look: metal, matte, texture, highlights, light.
+    """Change the appearance of separated objects: metal, matte, texture, highlights, light.
 
     IN is a frame of 'polsep separate' (.exr, .npz) or a folder of 'polsep video'. A frame gives DIR/STEM.exr (layers
-    diffuse, specular and combined), DIR/STEM.png to look at, and DIR/STEM.json with the recipe and what it did to the
-    light. A folder gives STEM_000123.exr for every frame, a film to watch and STEM.json; a run that was stopped goes on
-    when the same command is given again.
+    diffuse, specular and combined), DIR/STEM.png to look at, and DIR/STEM.json with the recipe and its effect on the
+    light. A folder gives STEM_000123.exr for every frame, a video to watch and STEM.json. Run the same command again to
+    resume a sequence that was stopped.
 
-    Edits given as options act in the order of this list; a recipe has its own order. File names in a recipe are
+    Edits given as options are applied in the order of this list; a recipe has its own order. File names in a recipe are
     relative to it.
 
     \b
@@ -72,48 +74,45 @@ def edit(inputs: tuple[Path, ...], **options: Any) -> None:
         _list()
         return
     keep_memory()
-    try:
-        if not inputs:
-            raise ValueError("expected a separated frame or a folder of them, found nothing to edit")
-        recipe, folder = _find_recipe(options)
-        work = load_work(recipe, folder)
-        kind = SequenceKind("exr", options["compression"], options["preview"], options["rate"])
-        target = EditTarget(options["output"], options["overwrite"], kind, options["damaged"])
-        if options["save_recipe"] is not None:
-            _save_recipe(recipe, folder, options["save_recipe"], options["overwrite"])
-        failures = _edit_all(inputs, work, target)
-    except (ValueError, RuntimeError) as error:
-        raise click.ClickException(str(error)) from None
+    if not inputs:
+        raise ValueError("expected a separated frame or a folder of them, found nothing to edit")
+    recipe, folder = _find_recipe(options)
+    work = load_work(recipe, folder)
+    kind = SequenceKind("exr", options["compression"], options["preview"], options["rate"])
+    target = EditTarget(options["output"], options["overwrite"], kind, options["damaged"])
+    if options["save_recipe"] is not None:
+        _save_recipe(recipe, folder, options["save_recipe"], options["overwrite"])
+    failures = _edit_all(inputs, work, target)
     if failures:
         sys.exit(2)
 
 
 def _edit_all(inputs: tuple[Path, ...], work: Work, target: EditTarget) -> int:
-    """Single frames, then folders; how many of all frames failed."""
+    """Edit single frames, then folders; return how many frames failed."""
     from polsep.edit.files import edit_files, edit_sequence
 
     files = [path for path in inputs if not path.is_dir()]
     for caution in work.recipe.cautions() if files else ():
-        say(caution)
+        print_note(caution)
     failures = 0
-    for done in edit_files(files, work, target):
-        if done.error is not None:
-            say(f"error: {done.error}")
+    for outcome in edit_files(files, work, target):
+        if outcome.error is not None:
+            print_note(f"error: {outcome.error}")
             failures += 1
         else:
-            print(f"{done.source} -> {', '.join(map(str, done.written))}")
-    for folder in (path for path in inputs if path.is_dir()):
-        for step in edit_sequence(folder, work, target):
+            print(f"{outcome.source} -> {', '.join(map(str, outcome.written))}")
+    for path in (path for path in inputs if path.is_dir()):
+        for step in edit_sequence(path, work, target):
             if step.warning is not None:
-                say(step.warning)
+                print_note(step.warning)
             failures += step.damaged
-            for path in step.written:
-                print(path)
+            for written in step.written:
+                print(written)
     return failures
 
 
 def _find_recipe(options: dict[str, Any]) -> tuple[Recipe, Path]:
-    """The edits asked for, and the folder that their files are relative to."""
+    """Return the edits of the options, and the folder that their files are relative to."""
     from polsep.edit.files import read_recipe
     from polsep.edit.recipe import Recipe, make_edit
 
@@ -129,7 +128,7 @@ def _find_recipe(options: dict[str, Any]) -> tuple[Recipe, Path]:
 
 
 def _given_edits(options: dict[str, Any]) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Each edit that options ask for, with its values: --NAME gives the first, --NAME-VALUE others, --mask the mask."""
+    """Yield each edit of the options with its values: --NAME is the first, --NAME-VALUE are others, --mask the mask."""
     from polsep.edit.edits import EDITS
 
     for name, kind in EDITS.items():
@@ -147,16 +146,16 @@ def _given_edits(options: dict[str, Any]) -> Iterator[tuple[Any, dict[str, Any]]
 
 
 def _parse_color(name: str, text: str) -> tuple[float, ...]:
-    """``R,G,B``."""
+    """Three numbers from ``R,G,B``."""
     try:
-        red, green, blue = (float(part) for part in text.split(","))
+        red, green, blue = map(float, text.split(","))
     except ValueError:
         raise ValueError(f"expected --{name} R,G,B like 0.8,0.1,0.05, found {text!r}") from None
-    return (red, green, blue)
+    return red, green, blue
 
 
 def _save_recipe(recipe: Recipe, folder: Path, path: Path, overwrite: bool) -> None:
-    """Write the recipe with file names relative to where it lies."""
+    """Write the recipe with file names relative to its own folder."""
     from polsep.edit.recipe import recipe_as_text, rename_images
     from polsep.io.results.edited import write_recipe_text
 
@@ -166,7 +165,7 @@ def _save_recipe(recipe: Recipe, folder: Path, path: Path, overwrite: bool) -> N
 
 
 def _list() -> None:
-    """Every edit, its values and what it does to light."""
+    """Print every edit, its parameters and its effect on light."""
     from polsep.edit.edits import EDITS
 
     for name, kind in EDITS.items():

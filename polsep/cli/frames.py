@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 import polsep
-from polsep.cli.app import DIR, app, parse_size, say
+from polsep.cli.app import (
+    BLACK_LEVEL,
+    DEVICE,
+    DIR,
+    FILE,
+    LIGHT_COLOR,
+    OVERWRITE,
+    PIXEL_FORMAT,
+    SIZE,
+    WHITE_LEVEL,
+    app,
+    print_note,
+    progress_bar,
+    read_options,
+)
 
 if TYPE_CHECKING:
     from polsep.batch import Outcome
@@ -18,38 +32,38 @@ if TYPE_CHECKING:
 
 @app.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@click.option("-o", "--output", type=DIR, default=Path("polsep-out"), metavar="DIR", help="Where results go.")
-@click.option("--method", default="auto", metavar="NAME", help="See 'polsep methods'; auto is the best one installed.")
-@click.option("--layout", metavar="color|mono|SPEC", default="color", help="The sensor's filters; see below.")
-@click.option("--black-level", type=float, default=0.0, metavar="N", help="Sample value of no light.")
+@click.option("-o", "--output", type=DIR, default=Path("polsep-out"), metavar="DIR", help="Folder of the results.")
 @click.option(
-    "--white-level", type=float, metavar="N", help="Sample value where the sensor clips.  [default: the type's largest]"
+    "--method", default="auto", metavar="NAME", help="Method, see 'polsep methods'; auto is the best one installed."
 )
-@click.option("--light-color", default="1,1,1", metavar="R,G,B", help="Camera RGB of the light, or 'estimate'.")
+@click.option("--layout", metavar="color|mono|SPEC", default="color", help="Filter layout of the sensor; see above.")
+@BLACK_LEVEL
+@WHITE_LEVEL
+@LIGHT_COLOR
 @click.option(
     "--format",
     type=click.Choice(["exr", "npz", "tiff", "png"]),
     default="exr",
-    help="A PNG preview always comes along.",
+    help="Format of the images; a PNG preview is always written.",
 )
 @click.option("--full", is_flag=True, help="Full resolution instead of one pixel per 2x2 cell.")
-@click.option("--size", metavar="WxH", help="Size of headerless raw, like 2448x2048.")
-@click.option("--pixel-format", metavar="NAME", help="GenICam pixel format of headerless raw, like BayerRG12p.")
+@SIZE
+@PIXEL_FORMAT
 @click.option(
     "--pages",
     type=click.Choice(["frames", "angles"]),
     default="frames",
     help="Pages of one file: single frames, or every four are the angles 0, 45, 90, 135.",
 )
-@click.option("--overwrite", is_flag=True, help="Replace results that exist.")
-@click.option("--device", default="auto", metavar="NAME", help="auto, cpu or cuda.")
+@OVERWRITE
+@DEVICE
 def separate(files: tuple[str, ...], **options: Any) -> None:
     """Separate raw frames of a polarization camera into diffuse and specular images.
 
-    FILE is PNG, TIFF, NPY, NPZ, PGM or headerless raw; 'shot_{angle}.png' names four images at 0, 45, 90 and 135
-    degrees. For every frame, DIR/STEM.exr gets the layers diffuse.R/G/B, specular.R/G/B, dolp.Y, aolp.Y [radians] and
-    valid.Y (networks also write error.diffuse and error.specular, how far off they expect to be), DIR/STEM.png is a
-    preview, and DIR/STEM.json tells settings and statistics.
+    FILE is PNG, TIFF, NPY, NPZ, PGM or headerless raw; 'shot_{angle}.png' is four images at 0, 45, 90 and 135 degrees.
+    For every frame, DIR/STEM.exr gets the layers diffuse.R/G/B, specular.R/G/B, dolp.Y, aolp.Y [radians] and valid.Y
+    (networks also write their expected errors, error.diffuse and error.specular), DIR/STEM.png is a preview, and
+    DIR/STEM.json holds settings and statistics.
 
     \b
     polsep separate shot.png -o out                   Sony colour mosaic, 8 or 16 bit
@@ -64,75 +78,54 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     --layout SPEC    2x2 angles in reading order and the Bayer order, like 90,45,135,0/RGGB or 0,45,90,135/mono
     """
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
-    from polsep.io.raw.frames import ReadOptions
     from polsep.methods import check_method
     from polsep.pipeline import find_device, parse_light_color
-    from polsep.sensor.camera import Layout
 
-    try:
-        given = click.get_current_context().get_parameter_source("layout") == click.core.ParameterSource.COMMANDLINE
-        read = ReadOptions(
-            Layout.parse(options["layout"]) if given else None,
-            options["black_level"],
-            options["white_level"],
-            parse_size(options["size"]),
-            options["pixel_format"],
-            options["pages"],
-        )
-        check_method(options["method"])
-        find_device(options["device"])
-        light = parse_light_color(options["light_color"])
-        run = SeparateOptions(options["method"], light, options["device"], options["full"])
-        write = WriteOptions(options["output"], options["format"], options["overwrite"])
-        outcomes = separate_files(files, read, run, write)
-        failures = sum(_report(outcome) for outcome in _with_progress(outcomes, len(files)))
-    except ValueError as error:
-        raise click.ClickException(str(error)) from None
+    if click.get_current_context().get_parameter_source("layout") != click.core.ParameterSource.COMMANDLINE:
+        options["layout"] = None  # files that say their own layout are read by it
+    read = read_options(options)
+    check_method(options["method"])
+    find_device(options["device"])
+    light = parse_light_color(options["light_color"])
+    run = SeparateOptions(options["method"], light, options["device"], options["full"])
+    write = WriteOptions(options["output"], options["format"], options["overwrite"])
+    failures, sources = 0, set[str]()
+    with progress_bar() if len(files) > 1 else nullcontext() as progress:
+        task = None if progress is None else progress.add_task("separating", total=len(files), speed="")
+        for outcome in separate_files(files, read, run, write):
+            sources.add(outcome.source)
+            if progress is not None and task is not None:
+                progress.update(task, completed=len(sources), description=outcome.source)
+            failures += _report(outcome)
     if failures:
         sys.exit(2)
 
 
 def _report(outcome: Outcome) -> int:
-    """Print what became of a frame; 1 if it failed."""
+    """Print the outcome of a frame; 1 if it failed."""
     if outcome.error is not None:
-        say(f"error: {outcome.error}")
+        print_note(f"error: {outcome.error}")
         return 1
     for warning in outcome.warnings:
-        say(f"{outcome.source}: {warning}")
+        print_note(f"{outcome.source}: {warning}")
     print(f"{outcome.source} -> {', '.join(str(path) for path in outcome.written)}")
     return 0
 
 
-def _with_progress(outcomes: Iterator[Outcome], files: int) -> Iterator[Outcome]:
-    """The same outcomes under a progress bar over files, where there are several and someone watches."""
-    if files < 2 or not sys.stderr.isatty():
-        yield from outcomes
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("separating", total=files)
-        seen: set[str] = set()
-        for outcome in outcomes:
-            seen.add(outcome.source)
-            progress.update(task, completed=len(seen), description=outcome.source)
-            yield outcome
-
-
 @app.command()
 @click.argument("method")
-@click.option("-o", "--output", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="FILE.onnx")
+@click.option("-o", "--output", type=FILE, required=True, metavar="FILE.onnx")
 @click.option("--mono", is_flag=True, help="For cameras without colour filters.")
 @click.option("--full", is_flag=True, help="Images of the mosaic's own resolution.")
-@click.option("--weights", type=click.Path(path_type=Path), metavar="FILE", help="Of polsep train; default: shipped.")
-@click.option("--overwrite", is_flag=True, help="Replace a file that exists.")
+@click.option(
+    "--weights", type=click.Path(path_type=Path), metavar="FILE", help="Weights of 'polsep train'.  [default: shipped]"
+)
+@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def export(method: str, output: Path, weights: Path | None, **options: bool) -> None:
     """Write joint or joint-fast as one ONNX file: raw uint16 frames in, diffuse, specular and expected error out.
 
-    It runs in onnxruntime and its like without polsep. Frames [N, H, W] are in Sony's order with sides that are
-    multiples of 4; black_level and white_level are in their units. Needs the extra export.
+    The file runs in onnxruntime and similar programs without polsep. Frames [N, H, W] are in Sony's order with sides
+    that are multiples of 4; black_level and white_level are in their units. Needs the extra export.
     """
     from polsep.io.store.atomic import refuse_existing
     from polsep.io.store.onnx import write_onnx
@@ -140,19 +133,16 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     from polsep.networks.run import find_joint
     from polsep.sensor.camera import Layout
 
-    try:
-        refuse_existing(output.parent, [output], options["overwrite"])
-        network, metadata = find_joint(method, Layout(bayer=None) if options["mono"] else Layout(), weights)
-        say(f"writing the graph of {method}, which takes a minute or a few")
-        write_onnx(output, Graph(network, options["full"]), OUTPUT_NAMES, metadata)
-    except ValueError as error:
-        raise click.ClickException(str(error)) from None
+    refuse_existing(output.parent, [output], options["overwrite"])
+    network, metadata = find_joint(method, Layout(bayer=None) if options["mono"] else Layout(), weights)
+    print_note(f"exporting {method}, which takes a minute or a few")
+    write_onnx(output, Graph(network, options["full"]), OUTPUT_NAMES, metadata)
     print(output)
 
 
 @app.command()
 def methods() -> None:
-    """List the separation methods that this installation has."""
+    """List the installed separation methods."""
     from polsep.methods import BEST, METHODS
 
     for method in METHODS.values():
@@ -161,12 +151,12 @@ def methods() -> None:
 
 
 @app.command()
-@click.option("-o", "--output", type=DIR, default=Path("polsep-demo"), metavar="DIR", help="Where results go.")
+@click.option("-o", "--output", type=DIR, default=Path("polsep-demo"), metavar="DIR", help="Folder of the results.")
 def demo(output: Path) -> None:
-    """Separate the capture that comes with polsep, with every method, and say what to look at.
+    """Separate the example frame of polsep with every method, and print what to compare.
 
-    The capture is a 2448x2048 12-bit colour mosaic that polsep rendered itself: seven objects under one light polarized
-    at an angle that the methods are not told.
+    The frame is a rendered 2448x2048 12-bit colour mosaic: seven objects under one polarized light, whose angle the
+    methods do not know.
     """
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
     from polsep.io.raw.frames import ReadOptions
@@ -178,15 +168,12 @@ def demo(output: Path) -> None:
         for outcome in separate_files([str(capture)], ReadOptions(white_level=4095.0), SeparateOptions(name), write):
             if _report(outcome):
                 sys.exit(2)
-            _print_demo(name, outcome.report["statistics"])
-    print(f"Look at {output / 'joint' / 'still_life.png'} beside {output / 'analytic' / 'still_life.png'}:")
+            statistics = outcome.report["statistics"]
+            print(
+                f"  {name}: {statistics['clipped_fraction']:.2%} of the pixels hold clipped samples, "
+                f"light polarizer about {statistics['light_polarizer_deg']:.0f} deg (25 deg in the scene)"
+            )
+    print(f"Compare {output / 'joint' / 'still_life.png'} with {output / 'analytic' / 'still_life.png'}:")
     print("  in 'specular', the analytic split leaves coloured rims of the objects, and holes where highlights clip;")
     print("  the network removes the rims and fills most of the holes. The EXR files hold the linear images for")
     print("  Blender, Nuke or Python.")
-
-
-def _print_demo(name: str, statistics: dict[str, Any]) -> None:
-    print(
-        f"  {name}: {statistics['clipped_fraction']:.2%} of the pixels hold clipped samples, "
-        f"light polarizer about {statistics['light_polarizer_deg']:.0f} deg (25 deg in the scene)"
-    )

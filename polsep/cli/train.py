@@ -1,0 +1,92 @@
+"""The command that trains networks: train."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from polsep.cli.app import DIR, app, extra_needed
+
+
+@app.command()
+@click.argument("rung")
+@click.option("-o", "--output", type=DIR, required=True, metavar="DIR", help="New directory, or one to resume.")
+@click.option(
+    "--data",
+    default="mosaic",
+    metavar="NAME",
+    help="mosaic: noisy colour frames; mono: no colour filters; co-sited: all samples at one place, as in the paper.",
+)
+@click.option(
+    "--looks",
+    default="varied",
+    metavar="NAME",
+    help="Rendered scenes; varied, or usual: as in the paper, without glare and relief.",
+)
+@click.option("--width", type=int, metavar="N", help="Channels of the network's first level; 32 on the ladder.")
+@click.option("--levels", type=int, default=3, metavar="N", help="How often a ladder network halves the resolution.")
+@click.option("--fold", type=int, default=2, metavar="N", help="Fold N x N pixels into channels; 1 folds none.")
+@click.option("--blocks", metavar="N,N,...", help="Residual blocks per level of a joint network.")
+@click.option(
+    "--entry", type=int, metavar="N", help="Channels after a joint network's first layer; 0 keeps all inputs."
+)
+@click.option("--ablation", default="none", metavar="NAME", help="Ablation of a joint network.")
+@click.option("--part", default="all", metavar="NAME", help="Part of a joint network to train: all, details or doubt.")
+@click.option("--input", "seen", default="separated", metavar="NAME", help="material: unseparated, separated, perfect.")
+@click.option("--examples", type=int, default=768, metavar="N", help="material: number of training examples.")
+@click.option("--cues", metavar="NAME,...", help="material: inputs beside the images, such as details.")
+@click.option("--folder", type=DIR, metavar="DIR", help="material: folder of the examples.  [default: DIR/../examples]")
+@click.option("--steps", type=int, default=20_000, metavar="N", help="Batches of 8 crops, or of 4 materials.")
+@click.option("--until", type=int, metavar="N", help="material: end at this step of the schedule.")
+@click.option("--rate", type=float, default=1e-3, metavar="X", help="Peak learning rate.")
+@click.option("--seed", type=int, default=0, metavar="N", help="Random seed of the weights and of the data.")
+@click.option("--workers", type=int, default=1, metavar="N", help="Rendering processes per device.")
+@click.option("--devices", type=int, default=1, metavar="N", help="Number of GPUs, where there are any.")
+@click.option(
+    "--start",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="FILE",
+    help="Weights to start from; the mean of several.",
+)
+@click.option("--refit", is_flag=True, help="Fit the linear filter of a joint network again after --start.")
+@click.option("--precision", default="bf16-mixed", metavar="NAME", help="bf16-mixed or 32-true.")
+def train(rung: str, output: Path, data: str, **options: Any) -> None:
+    """Train joint, joint-fast, material or a rung of the paper's ladder: paper, unpolarized, polarized, shared,
+    signed, no-angle, stokes.
+
+    Data are rendered while training, from seeds that no test uses. Run the same command again to resume a run that was
+    stopped. 'tensorboard --logdir DIR' shows its curves. Needs the extra train.
+
+    \b
+    polsep train joint -o runs/joint
+    polsep train paper --data mono -o runs/mono                           for cameras without colour filters
+    polsep train paper --width 64 --levels 4 --fold 1 -o runs/unet64      the classic U-Net
+    polsep train material --input separated --steps 2000 -o runs/separated
+    """
+    with extra_needed("train"):
+        from polsep.train.command import choose_options, plan_run, train_weights
+        from polsep.train.loop import Run, Schedule
+        from polsep.train.material_command import choose_material, train_material
+        from polsep.train.stream import StreamOptions
+    shared = {name: options[name] for name in ("workers", "devices", "start", "refit")}
+    if rung == "material":
+        material, schedule = choose_material(options)
+        folder = options["folder"] or output.parent / "examples"
+        run = Run(output, schedule=schedule, until=options["until"], **shared)
+        path = train_material(material, run, folder, _print_log)
+    else:
+        network = choose_options(rung, data, options)
+        schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])
+        run = Run(output, stream=StreamOptions(looks=options["looks"]), schedule=schedule, **shared)
+        path = train_weights(network, plan_run(run, network), _print_log)
+    print(path)
+
+
+def _print_log(line: dict[str, Any]) -> None:
+    """Print one line of the training log on stderr."""
+    values = (f"{name} {value:.4g}" for name, value in line.items())
+    print(", ".join(values), file=sys.stderr, flush=True)

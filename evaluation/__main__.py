@@ -6,28 +6,43 @@ from pathlib import Path
 
 import click
 
-from evaluation.benches import BENCHES
-from polsep.bench.run import Folders, list_benches, run_bench
+from evaluation.benches import BENCHES, MEASURES
+from polsep.bench.run import Folders, fill_tables_of_docs, run_bench
 
 DIR = click.Path(file_okay=False, path_type=Path)
+RESULTS = click.Option(["-o", "--output"], type=DIR, default=Path("results"), metavar="DIR", help="Of NAME.jsonl.")
+OPTIONS = (
+    click.Option(["--data"], type=DIR, envvar="POLSEP_DATA", metavar="DIR", help="Captures and truth; or POLSEP_DATA."),
+    click.Option(["--quick"], is_flag=True, help="A part of it in minutes, to DIR/NAME-quick.jsonl."),
+    click.Option(["--images"], type=DIR, metavar="DIR", help="Where pictures go.  [default: docs/images/NAME]"),
+    RESULTS,
+)
 
 
-@click.command()
-@click.argument("name", metavar="NAME", default="list")
-@click.option("--data", type=DIR, default=Path("../shared/data"), metavar="DIR", help="Captures and ground truth.")
-@click.option("-o", "--output", type=DIR, default=Path("results"), metavar="DIR", help="Where NAME.jsonl goes.")
-@click.option("--quick", is_flag=True, help="A part of it in minutes, to DIR/NAME-quick.jsonl.")
-@click.option("--images", type=DIR, metavar="DIR", help="Where pictures go.  [default: docs/images/NAME]")
-def main(name: str, data: Path, output: Path, quick: bool, images: Path | None) -> None:
-    """Measure NAME; without NAME, list what can be measured."""
-    if name == "list":
-        print("\n".join(list_benches(BENCHES)))
-        return
+class InputFailure(click.ClickException):
+    """Something that cannot be measured here: one line, exit status 2."""
+
+    exit_code = 2
+
+
+def measure(data: Path | None, output: Path, quick: bool, images: Path | None) -> None:
+    """Run the benchmark that the command is called after."""
+    name = click.get_current_context().info_name or ""
     try:
         run_bench(BENCHES, name, "python -m evaluation", Folders(data, output, images), quick)
     except ValueError as error:
-        raise click.UsageError(str(error)) from None
+        raise InputFailure(str(error)) from None
 
+
+def fill_tables(output: Path) -> None:
+    """Make the tables of README.md and docs anew, and say below them which are older than the code."""
+    fill_tables_of_docs(output, MEASURES)
+
+
+app = click.Group(help=__doc__)
+app.add_command(click.Command("readme", callback=fill_tables, params=[RESULTS], help=fill_tables.__doc__))
+for name, bench in BENCHES.items():
+    app.add_command(click.Command(name, callback=measure, params=list(OPTIONS), help=bench.run.__doc__))
 
 if __name__ == "__main__":
-    main()
+    app()

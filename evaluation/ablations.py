@@ -47,9 +47,9 @@ def ablation_entry(name: str, path: Path) -> Entry:
 def bench_ablations(data: Path) -> Iterator[Row]:
     """Scores of the ablated networks on the test sets, noisy mosaics, and on the validation views of their training.
 
-    Raises ValueError without the extras render and bench, and on a scene that does not come out as recorded.
+    Raises ValueError as `evaluation.sets.bench_sets` does.
     """
-    sets, found = load_sets(), find_ablations()
+    sets, found = load_sets(data), find_ablations()
     for name, path in found.items():
         for metric, value in json.loads(read_weights(path)[1]["validation"]).items():
             yield Row("ablations", "validation views", name, metric, value, "dB")

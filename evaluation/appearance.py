@@ -8,7 +8,6 @@ such frame. `draw_gallery_real` does the same with frames of real cameras; their
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -90,13 +89,13 @@ def expose_scene(title: str, scene: Scene, normals: Floats | None = None) -> Tak
     return Taken(title, expose(exposed.diffuse + exposed.specular, Layout(), IMX250, generator), exposed, normals)
 
 
-def take_spot(data: Path) -> Taken | None:
+def take_spot(data: Path) -> Taken:
     """Spot, clouded in two warm colours."""
     skin = Skin(((0.66, 0.2, 0.07),), ((0.8, 0.55, 0.22),), CLOUDS, 0.35, 0.3)
     return _take_model("spot", data / "meshes/spot.obj", (140.0, 14.0), skin)
 
 
-def take_fish(data: Path) -> Taken | None:
+def take_fish(data: Path) -> Taken:
     """The fish, striped."""
     skin = Skin(((0.05, 0.3, 0.42),), ((0.62, 0.48, 0.14),), STRIPES, 0.25, 0.26)
     return _take_model("fish", data / "meshes/fish.obj", (65.0, 12.0), skin)
@@ -156,13 +155,10 @@ def _materials(skin: Skin, slots: int) -> Materials:
     return Materials(first, skin.roughness * one, one, textures)
 
 
-def _take_model(title: str, path: Path, pose: tuple[float, float], skin: Skin) -> Taken | None:
+def _take_model(title: str, path: Path, pose: tuple[float, float], skin: Skin) -> Taken:
     from polsep.io.assets.objects import read_mesh
     from polsep.render.raycast import MeshScene
 
-    if not path.is_file():
-        print(f"polsep: {title} is left out: expected {path}, found none", file=sys.stderr)
-        return None
     return _render(title, MeshScene(read_mesh(path)), pose, skin)
 
 
@@ -208,7 +204,7 @@ def make_cloth(side: int = 512) -> Floats:
     return image.astype(np.float32)
 
 
-SUBJECTS: tuple[Callable[[Path], Taken | None], ...] = (take_spot, take_fish, take_gourd)
+SUBJECTS: tuple[Callable[[Path], Taken], ...] = (take_spot, take_fish, take_gourd)
 #: The edits of the gallery by title.
 EDITS: tuple[tuple[str, tuple[Edit, ...]], ...] = (
     ("metallic, gain 45 as the paper's", (Metallic(),)),
@@ -240,13 +236,13 @@ def bench_gallery(data: Path) -> Iterator[Row]:
 
 @cache
 def separate_all(data: Path) -> tuple[tuple[Taken, SeparatedFrame], ...]:
-    """The captures that can be made here, separated. Raises ValueError without Embree."""
+    """The captures, separated. Raises ValueError without Embree."""
     try:
         import polsep.render.raycast  # noqa: F401
     except ImportError as error:
         raise ValueError(f"expected the extra render, found no {error.name}") from None
-    taken = [made for make in SUBJECTS if (made := make(data)) is not None]
-    return tuple((capture, capture.separate()) for capture in taken)
+    captures = [make(data) for make in SUBJECTS]
+    return tuple((capture, capture.separate()) for capture in captures)
 
 
 def draw_gallery(_rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
@@ -315,11 +311,10 @@ def bench_gallery_real(data: Path) -> Iterator[Row]:
 
 
 def take_real(data: Path) -> Iterator[Taken]:
-    """Frames of real cameras that there are in the data folder."""
+    """Frames of real cameras from the data folder."""
     for name, title, white in REAL:
-        if (data / name.format(angle=0)).is_file():
-            frame = next(read_frames(data / name, ReadOptions(Layout(bayer=None), white_level=white)))
-            yield Taken(title, frame.data)
+        frame = next(read_frames(data / name, ReadOptions(Layout(bayer=None), white_level=white)))
+        yield Taken(title, frame.data)
 
 
 def draw_gallery_real(_rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:

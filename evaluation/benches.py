@@ -2,34 +2,79 @@
 
 from __future__ import annotations
 
+import polsep.bench
 from evaluation.ablations import bench_ablations
 from evaluation.appearance import bench_gallery, bench_gallery_real, draw_gallery, draw_gallery_real
 from evaluation.calibration import bench_calibration
 from evaluation.dynamic import bench_dynamic, bench_dynamic_quick
-from evaluation.gallery import draw_paper
+from evaluation.gallery import REAL, draw_paper
 from evaluation.geometry import bench_geometry, bench_geometry_quick, draw_geometry
 from evaluation.joint import bench_joint
-from evaluation.material import bench_material, bench_material_quick
+from evaluation.material import PUBLISHED, bench_material, bench_material_quick
 from evaluation.material_gallery import draw_material
 from evaluation.paper import bench_paper, bench_paper_quick
 from evaluation.rendering import bench_rendering
 from evaluation.sets import bench_sets
 from evaluation.video import bench_video, bench_video_quick
 from evaluation.viewing import bench_view
+from polsep.bench import FORMULAS, SEPARATION
 from polsep.bench.run import Bench
 
+#: Data of the test sets, below the data folder.
+SET_DATA = ("crossed_polarizers", "diligent_normals", "meshes")
+SETS = (*SEPARATION, "polsep/render", "polsep/metrics.py", "evaluation/testsets", "evaluation/scoring.py")
+SWEEP = (*SEPARATION, "polsep/render", "evaluation/calibration.py")
+
 BENCHES: dict[str, Bench] = {
-    "rendering": Bench(bench_rendering),
-    "sets": Bench(bench_sets),
-    "joint": Bench(bench_joint),
-    "ablations": Bench(bench_ablations),
-    "dynamic": Bench(bench_dynamic, bench_dynamic_quick),
-    "calibration": Bench(bench_calibration),
-    "material": Bench(bench_material, bench_material_quick, draw_material),
-    "video": Bench(bench_video, bench_video_quick),
-    "geometry": Bench(bench_geometry, bench_geometry_quick, draw_geometry),
-    "view": Bench(bench_view),
-    "gallery": Bench(bench_gallery, draw=draw_gallery),
-    "gallery_real": Bench(bench_gallery_real, draw=draw_gallery_real),
-    "paper": Bench(bench_paper, bench_paper_quick, draw_paper),
+    "rendering": Bench(bench_rendering, measures=("polsep/render", "polsep/datasets", "polsep/train/stream.py")),
+    "sets": Bench(bench_sets, data=SET_DATA, measures=SETS),
+    "joint": Bench(bench_joint, data=SET_DATA, measures=(*SETS, "evaluation/joint.py")),
+    "ablations": Bench(bench_ablations, data=SET_DATA, measures=(*SETS, "evaluation/weights/ablations")),
+    "dynamic": Bench(
+        bench_dynamic,
+        bench_dynamic_quick,
+        measures=(*SEPARATION, "polsep/video", "polsep/render", "evaluation/testsets", "evaluation/dynamic.py"),
+    ),
+    "calibration": Bench(bench_calibration, measures=SWEEP),
+    "material": Bench(
+        bench_material,
+        bench_material_quick,
+        draw_material,
+        data=(PUBLISHED,),
+        measures=(*SEPARATION, "polsep/material", "evaluation/weights/material", "evaluation/material.py"),
+    ),
+    "video": Bench(
+        bench_video, bench_video_quick, measures=(*SEPARATION, "polsep/compute", "polsep/video", "polsep/io")
+    ),
+    "geometry": Bench(
+        bench_geometry,
+        bench_geometry_quick,
+        draw_geometry,
+        data=("diligent_normals", "meshes"),
+        measures=(*SEPARATION, "polsep/geometry", "evaluation/six_lights.py", "evaluation/shape_scores.py"),
+    ),
+    "view": Bench(bench_view, measures=("polsep/view", "polsep/edit", "evaluation/viewing.py")),
+    "gallery": Bench(
+        bench_gallery,
+        draw=draw_gallery,
+        data=("meshes/spot.obj", "meshes/fish.obj"),
+        measures=(*SEPARATION, "polsep/render", "evaluation/appearance.py"),
+    ),
+    "gallery_real": Bench(
+        bench_gallery_real, draw=draw_gallery_real, data=tuple(name.format(angle=0) for name, _, _ in REAL)
+    ),
+    "paper": Bench(
+        bench_paper,
+        bench_paper_quick,
+        draw_paper,
+        data=SET_DATA,
+        measures=(*SETS, "evaluation/calibration.py", "evaluation/ladder.py", "evaluation/weights/ladder"),
+    ),
+}
+
+#: Paths that the numbers of every results file speak of; evaluation/peers writes what is not of a benchmark.
+MEASURES = {name: bench.measures for name, bench in (polsep.bench.BENCHES | BENCHES).items()} | {
+    "polanalyser": (*FORMULAS, "polsep/compute"),
+    "blender": ("polsep/geometry", "polsep/material", "polsep/io/assets"),
+    "materialx": ("polsep/material", "polsep/io/assets"),
 }

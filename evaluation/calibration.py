@@ -19,7 +19,6 @@ import math
 import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
@@ -100,7 +99,7 @@ class Seen:
     captures: tuple[Measurements, Measurements]
 
 
-def bench_calibration(_data: Path | None = None) -> Iterator[Row]:
+def bench_calibration() -> Iterator[Row]:
     """PSNR of every method over the error of the light's polarizer. Needs the extra render."""
     yield from measure_sweep("calibration", Sweep(), snapshot_entries(ladder_entries(CO_SITED, ("paper",))))
 

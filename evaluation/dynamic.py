@@ -14,7 +14,6 @@ import statistics
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -83,18 +82,16 @@ class Tally:
                 yield region, f"{output} flicker", "white", math.sqrt(sum(squares) / cells)
 
 
-def bench_dynamic(data: Path) -> Iterator[Row]:
+def bench_dynamic() -> Iterator[Row]:
     """Flicker and PSNR on the dynamic test set with and without the temporal filter, and what a frame of it takes.
 
     Raises ValueError without the extra render, and on a frame that does not come out as recorded.
     """
-    del data
     yield from _bench(range(_load_films()[1]))
 
 
-def bench_dynamic_quick(data: Path) -> Iterator[Row]:
+def bench_dynamic_quick() -> Iterator[Row]:
     """The same on ten frames of each film."""
-    del data
     yield from _bench(QUICK)
 
 
@@ -142,10 +139,10 @@ def _compare(film: str, method: str, alone: Tally, variants: dict[str, Tally]) -
     """Rows of one method, and how the variants differ from it: PSNR in dB, flicker as a ratio."""
     before = {(region, metric): (unit, value) for region, metric, unit, value in alone.scores()}
     for (region, metric), (unit, value) in before.items():
-        yield Row("dynamic", f"{film}, {region}", method, metric, value, unit)
+        yield Row("dynamic/films", f"{film}, {region}", method, metric, value, unit)
     for variant, tally in variants.items():
         for region, metric, unit, value in tally.scores():
-            yield Row("dynamic", f"{film}, {region}", f"{method}, {variant}", metric, value, unit)
+            yield Row("dynamic/films", f"{film}, {region}", f"{method}, {variant}", metric, value, unit)
             old, ratio = before[region, metric][1], metric.endswith("flicker")
             change, unit = (value / old, "1") if ratio else (value - old, unit)
             if (region, metric.split()[-1]) in SHOWN:

@@ -43,7 +43,5 @@ def _measure(data: Path, names: Sequence[str] | None) -> Iterator[Row]:
     except ImportError as error:
         raise ValueError(f"expected the extra bench, found no {error.name}") from None
     require_matplotlib()
-    if not (data / "diligent_normals").is_dir() or not (data / "meshes").is_dir():
-        raise ValueError(f"expected diligent_normals and meshes in {data}, found none")
     yield from measure_depth(data)
     yield from measure_normals(data, names)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from evaluation.scoring import Entry, Protocol, Truth, find_absent, score_sets, see_noisy
+from evaluation.scoring import Entry, Protocol, Truth, score_sets, see_noisy
 from evaluation.sets import load_sets
 from polsep.bench.rows import Row
 from polsep.methods import METHODS, Capture
@@ -41,16 +41,15 @@ BINS = 10
 def bench_joint(data: Path) -> Iterator[Row]:
     """On the test sets: scores at full resolution and of mono frames, reliability, engines against torch.
 
-    Raises ValueError without the extras render and bench, and on a scene that does not come out as recorded.
+    Raises ValueError as `evaluation.sets.bench_sets` does.
     """
-    sets = load_sets()
+    sets = load_sets(data)
     mono = tuple(Entry(name, METHODS[name].reference) for name in MONO)
     protocols = [Protocol("full", see_full, full_entries()), Protocol("mono", see_mono, mono)]
     yield from score_sets("joint", sets, data, protocols)
     for name, recipes in sets.items():
-        if find_absent(recipes, data) is None:
-            yield from measure_reliability(name, recipes, data)
-            yield from measure_engines(name, recipes, data)
+        yield from measure_reliability(name, recipes, data)
+        yield from measure_engines(name, recipes, data)
 
 
 def see_full(case: Case) -> tuple[Capture, Truth]:

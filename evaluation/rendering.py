@@ -35,7 +35,7 @@ SHAPES, VIEWS, PAPER_IMAGES = 10, 20, 10_000
 CROPS, BATCHES, FIRST_BATCHES = (128, 256), 500, 20
 
 
-def bench_rendering(_data: Path | None = None) -> Iterator[Row]:
+def bench_rendering() -> Iterator[Row]:
     """Rendering beside Mitsuba 3, a whole set, and streamed crops. Needs the extras train and mitsuba, and LLVM.
 
     Raises ValueError, before anything is measured, where one of them is missing.

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evaluation.scoring import Protocol, own_entries, score_sets, see_clean, see_co_sited, see_noisy
+from evaluation.scoring import Protocol, find_absent, own_entries, score_sets, see_clean, see_co_sited, see_noisy
 from polsep.bench.rows import Row
 from polsep.metrics import require_flip
 
@@ -18,21 +18,28 @@ if TYPE_CHECKING:
 
 
 def bench_sets(data: Path) -> Iterator[Row]:
-    """Scores of all methods on the sets of `evaluation.testsets`, of which those that ``data`` lacks are left out.
+    """Scores of all methods on the sets of `evaluation.testsets`.
 
-    Raises ValueError without the extras render and bench, and on a scene that does not come out as recorded.
+    Raises ValueError without the extras render and bench, without the sets' files in ``data``, and on a scene that does
+    not come out as recorded.
     """
-    sets = load_sets()
+    sets = load_sets(data)
     protocols = [Protocol(name, see, own_entries(True)) for name, see in (("noisy", see_noisy), ("clean", see_clean))]
     protocols.append(Protocol("co-sited", see_co_sited, own_entries(False)))
     yield from score_sets("sets", sets, data, protocols)
 
 
-def load_sets() -> dict[str, tuple[Recipe, ...]]:
-    """`testsets.SETS`. Raises ValueError, before anything is measured, without what scenes and scores need."""
+def load_sets(data: Path | None = None) -> dict[str, tuple[Recipe, ...]]:
+    """`testsets.SETS`. Raises ValueError, before anything is measured, without what scenes and scores need.
+
+    With ``data``, every file of the sets must be in that folder.
+    """
     require_flip()
     try:
         from evaluation import testsets
     except ImportError as error:
         raise ValueError(f"expected the extra render, found no {error.name}") from None
+    absent = find_absent([recipe for recipes in testsets.SETS.values() for recipe in recipes], data) if data else None
+    if absent is not None:
+        raise ValueError(f"expected {absent} (docs/testsets.md says where to get it), found none")
     return testsets.SETS

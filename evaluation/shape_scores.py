@@ -50,6 +50,7 @@ def measure_normals(data: Path, names: Sequence[str] | None) -> Iterator[Row]:
     for method, mean in base.items():
         case = f"{len(errors[method])} objects"
         yield Row("geometry/normals", case, method, "mean angular error", mean, "deg")
+        yield Row("geometry/worst", case, method, "mean angular error of an object", max(errors[method]), "deg")
         for plain in ("s0, least squares", "s0, robust"):
             yield Row("geometry/normals", case, method, f"change against {plain}", 100 * (mean / base[plain] - 1), "%")
 

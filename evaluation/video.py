@@ -41,7 +41,7 @@ KINDS = {
 }
 
 
-def bench_video(_data: Path | None = None) -> Iterator[Row]:
+def bench_video() -> Iterator[Row]:
     """1000 frames of 2448x2048 by joint-fast, 60 by joint and in other formats: rates against the method alone, memory.
 
     The recording is a headerless BayerRG12p stream in a folder for temporary files; 23 GB of it are needed.
@@ -49,7 +49,7 @@ def bench_video(_data: Path | None = None) -> Iterator[Row]:
     yield from measure_recordings(LONG, SHORT)
 
 
-def bench_video_quick(_data: Path | None = None) -> Iterator[Row]:
+def bench_video_quick() -> Iterator[Row]:
     """The same with 60 frames at most."""
     yield from measure_recordings(SHORT, DISTINCT)
 

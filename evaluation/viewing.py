@@ -108,7 +108,7 @@ class Page:
         return said
 
 
-def bench_view(_data: Path | None = None) -> Iterator[Row]:
+def bench_view() -> Iterator[Row]:
     """Seconds from opening a frame to its picture, answers to sliders, and edits beside plain NumPy.
 
     Raises ValueError without the extra view.

@@ -118,7 +118,9 @@ def test_real_captures_make_rows(tmp_path: Path) -> None:
     means = [row for row in rows if row.bench == "frontend/real"]
     assert {row.metric for row in means} == set(frontend.UNITS)
     assert {row.method for row in means} == set(frontend.DEMOSAICKERS)
-    assert len(rows) == 2 * len(means)
+    assert len(rows) == 3 * len(means)
+    worst = {(row.case, row.method, row.metric): row.value for row in rows if row.bench == "frontend/worst"}
+    assert worst == {(row.case, row.method, row.metric): row.value for row in means}
     assert all(math.isfinite(row.value) and row.unit == frontend.UNITS[row.metric] for row in rows)
     assert min(row.value for row in means if row.metric == "analysers PSNR") > 30
 
@@ -126,14 +128,14 @@ def test_real_captures_make_rows(tmp_path: Path) -> None:
 def test_missing_pictures_are_one_line(tmp_path: Path) -> None:
     """Without the data folder the benchmark refuses before it measures anything."""
     with pytest.raises(ValueError, match=r"\Aexpected folders of four-angle captures in [^\n]+, found none\Z"):
-        next(iter(frontend.bench_frontend(tmp_path)))
+        next(frontend.bench_frontend_quick(tmp_path))
 
 
-def test_peers_are_named_or_left_out(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """No python named: none, and said; one that is not there: refused."""
+def test_peers_are_named_and_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No python named, or one that is not there: refused, as rows without peers are another table."""
     monkeypatch.delenv(PEERS_VARIABLE, raising=False)
-    assert find_peers() is None
-    assert "peers are left out" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"expected the peers' python in POLSEP_PEERS .*, found none"):
+        find_peers()
     monkeypatch.setenv(PEERS_VARIABLE, "/nowhere/python")
     with pytest.raises(ValueError, match="found no /nowhere/python"):
         find_peers()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from click import ClickException
+from click.testing import CliRunner
 from torch import nn
 
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
@@ -22,6 +22,7 @@ pytest.importorskip("matplotlib", reason="figures need the extra 'bench'")
 from PIL import Image
 
 from evaluation import gallery, ladder, paper, testsets
+from evaluation.__main__ import app as laboratory
 from evaluation.benches import BENCHES
 from evaluation.calibration import Sweep
 from evaluation.figures import (
@@ -50,7 +51,7 @@ from evaluation.testsets import Recipe
 from polsep.bench.rows import Row
 from polsep.cli import app
 from polsep.io.store.image_codecs import write_jpeg
-from polsep.io.store.rows import fill_tables, read_rows
+from polsep.io.store.rows import read_rows
 from polsep.io.store.weights import write_weights
 from polsep.networks.paper import RUNGS, Refinement
 from polsep.networks.unet import Size
@@ -303,9 +304,11 @@ def test_the_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: P
 
 def test_the_command_measures_and_draws(weights: Path, tiny_sets: None, tmp_path: Path) -> None:
     """Rows and pictures of a quick run lie together, away from those of the full one."""
-    app(["bench", "paper", "--quick", "--data", str(tmp_path), "-o", str(tmp_path / "out")], standalone_mode=False)
+    laboratory(["paper", "--quick", "--data", str(tmp_path), "-o", str(tmp_path / "out")], standalone_mode=False)
     rows = read_rows(tmp_path / "out" / "paper-quick.jsonl")
-    assert {row["command"] for row in rows} == {"polsep bench paper --quick"}
+    assert {row["command"] for row in rows} == {"python -m evaluation paper --quick"}
+    assert {row["bench"] for row in read_rows(tmp_path / "out" / "scenes" / "paper-quick.jsonl")} == {"paper/scenes"}
+    assert not any(row["bench"] == "paper/scenes" for row in rows)
     assert (tmp_path / "out" / "paper-quick" / "fig5.jpg").is_file()
 
 
@@ -313,7 +316,19 @@ def test_benches_without_a_quick_version_say_so() -> None:
     names = "dynamic, material, video, geometry, paper"
     expected = rf"expected a benchmark with a quick version for --quick \({names}\), found 'sets'"
     with pytest.raises(ClickException, match=expected):
-        app(["bench", "sets", "--quick"], standalone_mode=False)
+        laboratory(["sets", "--quick"], standalone_mode=False)
+
+
+@pytest.mark.parametrize("name", [name for name, bench in BENCHES.items() if bench.data])
+def test_missing_data_are_one_line_and_keep_what_was_measured(name: str, tmp_path: Path) -> None:
+    """Without a folder, and with one that lacks a part; exit status 2, and the rows from before stay."""
+    before = tmp_path / f"{name}.jsonl"
+    before.write_text("measured before\n", encoding="utf-8")
+    for data, expected in (("", "expected --data DIR or POLSEP_DATA"), (str(tmp_path), f"expected {tmp_path}/")):
+        done = CliRunner(env={"POLSEP_DATA": data}).invoke(laboratory, [name, "-o", str(tmp_path)])
+        assert done.exit_code == 2
+        assert expected in done.output and len(done.output.splitlines()) == 1
+        assert before.read_text(encoding="utf-8") == "measured before\n"
 
 
 def test_readme_fills_all_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -324,13 +339,3 @@ def test_readme_fills_all_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     app(["bench", "readme"], standalone_mode=False)
     for page in ("README.md", "docs/joint.md", "docs/paper.md"):
         assert "Not measured yet: `polsep bench paper`." in (tmp_path / page).read_text(encoding="utf-8")
-
-
-def test_tables_of_the_page_are_the_results() -> None:
-    """docs/paper.md is what the committed results make of it, and every picture that it shows is there."""
-    page = (ROOT / "docs/paper.md").read_text(encoding="utf-8")
-    assert page.count("<!-- table: paper/") >= 6
-    assert fill_tables(page, ROOT / "results") == page
-    shown = re.findall(r"!\[[^]]*\]\(([^)]+)\)", page)
-    assert len(shown) >= 6
-    assert all((ROOT / "docs" / name).is_file() for name in shown)

@@ -8,16 +8,25 @@ paper's evaluation and the test sets are measured by ``python -m evaluation`` in
 from __future__ import annotations
 
 from polsep.bench.exactness import bench_exactness
-from polsep.bench.frontend import bench_frontend
+from polsep.bench.frontend import bench_frontend, bench_frontend_quick
 from polsep.bench.real import bench_real
 from polsep.bench.resources import bench_resources
 from polsep.bench.run import Bench
 from polsep.bench.separation import bench_separation
 
+#: Code that formulas consist of, and that every method does.
+FORMULAS = ("polsep/physics", "polsep/sensor", "polsep/demosaic", "polsep/separation")
+SEPARATION = (*FORMULAS, "polsep/networks", "polsep/methods.py", "polsep/weights")
+
 BENCHES: dict[str, Bench] = {
-    "separation": Bench(bench_separation),
-    "exactness": Bench(bench_exactness),
-    "real": Bench(bench_real),
-    "resources": Bench(bench_resources),
-    "frontend": Bench(bench_frontend),
+    "separation": Bench(bench_separation, measures=(*SEPARATION, "polsep/render", "polsep/bench/separation.py")),
+    "exactness": Bench(bench_exactness, measures=("polsep/physics", "polsep/separation", "polsep/bench/exactness.py")),
+    "real": Bench(bench_real, data=("raw",), measures=("polsep/sensor", "polsep/demosaic", "polsep/bench/real.py")),
+    "resources": Bench(bench_resources, measures=(*SEPARATION, "polsep/compute", "polsep/pipeline.py")),
+    "frontend": Bench(
+        bench_frontend,
+        bench_frontend_quick,
+        data=("four_angle",),
+        measures=(*FORMULAS, "polsep/compute", "polsep/bench/frontend.py", "polsep/bench/speed.py"),
+    ),
 }

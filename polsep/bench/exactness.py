@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
 import torch
 
@@ -14,7 +13,7 @@ from polsep.physics.stokes import Measurements, Stokes, fit_stokes_unclipped, me
 from polsep.sensor.camera import Layout
 
 
-def bench_exactness(_data: Path | None = None) -> Iterator[Row]:
+def bench_exactness() -> Iterator[Row]:
     """Largest errors of what must be exact: the analytic formula, and Stokes vectors with one clipped analyser."""
     generator = torch.Generator().manual_seed(2900)
     s0 = 0.4 + 1.4 * torch.rand(3, 64, 64, generator=generator)

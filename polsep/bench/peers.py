@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,12 +26,13 @@ SCRIPT = Path(__file__).parents[2] / "evaluation" / "peers" / "frontend_peers.py
 TWO_THREADS = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "2")
 
 
-def find_peers() -> str | None:
-    """The peers' python; None, said on stderr, where none is named. Raises ValueError when it is not there."""
+def find_peers() -> str:
+    """The peers' python. Raises ValueError where none is named, and when it is not there."""
     python = os.environ.get(PEERS_VARIABLE)
     if not python:
-        print(f"polsep: peers are left out: {PEERS_VARIABLE} names no python, see evaluation/peers/", file=sys.stderr)
-        return None
+        raise ValueError(
+            f"expected the peers' python in {PEERS_VARIABLE} (see evaluation/peers; --quick: no peers), found none"
+        )
     for path in (Path(python), SCRIPT):
         if not path.is_file():
             raise ValueError(f"expected the peers' python in {PEERS_VARIABLE} and {SCRIPT.name}, found no {path}")

@@ -49,7 +49,7 @@ print(json.dumps({"first": times[0], "best": min(times), "peak": peak, "rate": m
 """
 
 
-def bench_resources(_data: Path | None = None) -> Iterator[Row]:
+def bench_resources() -> Iterator[Row]:
     """Seconds and peak memory of `polsep.separate` on the 2448x2048 demo capture, each method in processes of its own.
 
     The first call loads compiled kernels, and does not compile them. Memory is that of the whole process. The rate is

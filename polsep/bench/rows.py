@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import json
 import platform
-import subprocess
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
+
+from polsep.bench.history import ask_git
+from polsep.io.store.atomic import replace_text
+
+#: Tables of single scenes, objects and points of curves, "NAME/PART", which are too long for the repository.
+SCENE_PARTS = ("scenes", "objects", "curve", "films")
 
 
 @dataclass(frozen=True)
@@ -24,21 +30,30 @@ class Row:
 
 
 def provenance(command: str) -> dict[str, str]:
-    """What made the rows: command, commit (with "+" if the tree had changes) and machine."""
-
-    def git(*arguments: str) -> str:
-        done = subprocess.run(
-            ["git", *arguments], capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2]
-        )
-        return done.stdout.strip() if done.returncode == 0 else ""
-
-    changed = git("status", "--porcelain", "--untracked-files=no", "--", "polsep")
-    commit = (git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")
+    """The command, the commit (with "+" if the tree had changes) and the machine that made rows."""
+    changed = ask_git("status", "--porcelain", "--untracked-files=no", "--", "polsep", "evaluation")
+    commit = (ask_git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")
     machine = f"{torch.get_num_threads()} threads, {platform.machine()}, torch {torch.__version__}"
     return {"command": command, "commit": commit, "machine": machine}
 
 
-def to_jsonl(rows: list[Row], made_by: dict[str, str]) -> str:
-    """Rows as JSON lines, numbers with six significant digits."""
-    lines = [asdict(row) | {"value": float(f"{row.value:.6g}")} | made_by for row in rows]
+def to_jsonl(rows: Sequence[Row], made_by: dict[str, str]) -> str:
+    """A line that says what made the rows, then a line for each row; numbers with six significant digits."""
+    lines = [made_by, *(asdict(row) | {"value": float(f"{row.value:.6g}")} for row in rows)]
     return "".join(json.dumps(line) + "\n" for line in lines)
+
+
+def write_rows(folder: Path, name: str, rows: Sequence[Row], command: str) -> None:
+    """Replace ``folder``/NAME.jsonl, and ``folder``/scenes/NAME.jsonl with the rows of `SCENE_PARTS`, not committed.
+
+    Raises ValueError where there are no rows, so that nothing replaces what was measured before.
+    """
+    if not rows:
+        raise ValueError(f"expected rows of {name}, found none: {folder / name}.jsonl stays as it is")
+    made_by = provenance(command)
+    tables: dict[Path, list[Row]] = {}
+    for row in rows:
+        single = row.bench.partition("/")[2] in SCENE_PARTS
+        tables.setdefault((folder / "scenes" if single else folder) / f"{name}.jsonl", []).append(row)
+    for path, lines in tables.items():
+        replace_text(path, to_jsonl(lines, made_by))

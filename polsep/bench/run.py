@@ -6,30 +6,35 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from polsep.bench.rows import Row, provenance, to_jsonl
-from polsep.io.store.atomic import replace_text
-from polsep.io.store.rows import fill_readme
+from polsep.bench.history import find_changes
+from polsep.bench.rows import Row, write_rows
+from polsep.io.store.rows import fill_page
 
-Measure = Callable[[Path], Iterator[Row]]
+#: Yields rows; called with the data folder where the benchmark needs one, else without.
+Measure = Callable[..., Iterator[Row]]
 
 
 @dataclass(frozen=True)
 class Bench:
-    """A benchmark: ``run`` yields rows from a data folder, ``quick`` those of a part of it, in minutes.
+    """A benchmark: ``run`` yields rows, ``quick`` those of a part of it, in minutes.
 
-    ``draw`` writes pictures, from rows and the data folder into a folder, and yields their paths.
+    ``draw`` writes pictures, from rows and the data folder into a folder, and yields their paths. ``data``: paths below
+    the data folder that are needed; ``quick`` leaves out what is absent. ``measures``: paths of the repository whose
+    code the numbers speak of.
     """
 
     run: Measure
     quick: Measure | None = None
     draw: Callable[[list[Row], Path, Path], Iterator[Path]] | None = None
+    data: tuple[str, ...] = ()
+    measures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Folders:
     """``data``: captures and ground truth; ``output``: where NAME.jsonl goes; ``images``: pictures, None = by name."""
 
-    data: Path
+    data: Path | None
     output: Path
     images: Path | None = None
 
@@ -40,16 +45,22 @@ def list_benches(benches: Mapping[str, Bench]) -> Iterator[str]:
         yield f"{name}: {(bench.run.__doc__ or '').splitlines()[0]}"
 
 
-def fill_tables_of_docs(output: Path) -> None:
-    """Make the tables of README.md and docs/ from the rows in ``output``."""
+def fill_tables_of_docs(output: Path, measures: Mapping[str, tuple[str, ...]]) -> None:
+    """Make the tables of README.md and docs/ from the rows in ``output``.
+
+    Tables of what ``measures`` names, paths by benchmark, say whether they are older than the code.
+    """
     for page in (Path("README.md"), *sorted(Path("docs").rglob("*.md"))):
-        fill_readme(page, output)
+        fill_page(
+            page, output, lambda name, commits: find_changes(commits, measures[name]) if name in measures else None
+        )
 
 
 def run_bench(benches: Mapping[str, Bench], name: str, command: str, folders: Folders, quick: bool) -> None:
     """Measure ``name``, print its rows and write them to NAME.jsonl with the ``command`` that made them.
 
-    Raises ValueError on a name that is not in ``benches``, and with ``quick`` where there is no quick version.
+    Nothing is written unless all is measured. Raises ValueError on a name that is not in ``benches``, on data that are
+    not there, and with ``quick`` where there is no quick version.
     """
     if name not in benches:
         raise ValueError(f"expected a benchmark of {', '.join(benches)}, found {name!r}")
@@ -58,13 +69,26 @@ def run_bench(benches: Mapping[str, Bench], name: str, command: str, folders: Fo
     if measure is None:
         known = ", ".join(n for n, entry in benches.items() if entry.quick)
         raise ValueError(f"expected a benchmark with a quick version for --quick ({known}), found {name!r}")
+    data = find_data(bench, folders.data, quick)
     stem = f"{name}-quick" if quick else name
     rows = []
-    for row in measure(folders.data):
+    for row in measure(data) if bench.data else measure():
         print(f"{row.case:48} {row.method:20} {row.metric:28} {row.value:10.4g} {row.unit}", flush=True)
         rows.append(row)
-    made_by = provenance(f"{command} {name}{' --quick' if quick else ''}")
-    replace_text(folders.output / f"{stem}.jsonl", to_jsonl(rows, made_by))
+    write_rows(folders.output, stem, rows, f"{command} {name}{' --quick' if quick else ''}")
     images = folders.images or (folders.output / stem if quick else Path("docs/images") / name)
-    for path in bench.draw(rows, folders.data, images) if bench.draw else ():
+    for path in bench.draw(rows, data, images) if bench.draw else ():
         print(path, flush=True)
+
+
+def find_data(bench: Bench, data: Path | None, quick: bool) -> Path:
+    """The data folder. Raises ValueError where what a benchmark needs is not there, and not ``quick``."""
+    where = "docs/testsets.md says where to get it"
+    if bench.data and data is None:
+        needed = ", ".join(bench.data)
+        raise ValueError(f"expected --data DIR or POLSEP_DATA, a folder with {needed} ({where}), found neither")
+    folder = data or Path()
+    for path in () if quick else bench.data:
+        if not (folder / path).exists():
+            raise ValueError(f"expected {folder / path} ({where}), found none")
+    return folder

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterator
-from pathlib import Path
 
 from polsep.bench.rows import Row
 from polsep.bench.truth import SCENE_SEEDS, captures, render_scene
@@ -12,7 +11,7 @@ from polsep.methods import METHODS
 from polsep.metrics import psnr
 
 
-def bench_separation(_data: Path | None = None) -> Iterator[Row]:
+def bench_separation() -> Iterator[Row]:
     """PSNR of every method on co-sited, noisy and mosaicked captures of coloured and of grey scenes."""
     for case, saturation in (("colour", 1.0), ("desaturated", 0.3), ("grey", 0.0)):
         scores: dict[tuple[str, str, str], list[float]] = {}

@@ -11,7 +11,7 @@ from polsep.cli.app import DIR, app
 
 @app.command()
 @click.argument("name", metavar="NAME", default="list")
-@click.option("--data", type=DIR, default=Path("../shared/data"), metavar="DIR", help="Data sets of real and frontend.")
+@click.option("--data", type=DIR, envvar="POLSEP_DATA", metavar="DIR", help="Data of real, frontend.  [env: POLSEP_DATA]")
 @click.option("-o", "--output", type=DIR, default=Path("results"), metavar="DIR", help="Folder of NAME.jsonl.")
 @click.option("--quick", is_flag=True, help="Measure a part in minutes, to DIR/NAME-quick.jsonl.")
 @click.option(
@@ -20,7 +20,7 @@ from polsep.cli.app import DIR, app
     metavar="DIR",
     help="Folder of NAME's pictures.  [default: docs/images/NAME; beside the rows with --quick]",
 )
-def bench(name: str, data: Path, output: Path, quick: bool, images: Path | None) -> None:
+def bench(name: str, data: Path | None, output: Path, quick: bool, images: Path | None) -> None:
     """Measure NAME, print its rows and write them to DIR/NAME.jsonl; without NAME, list what can be measured.
 
     'polsep bench readme' writes the tables of README.md and docs from DIR. The paper's evaluation runs in a checkout
@@ -32,7 +32,7 @@ def bench(name: str, data: Path, output: Path, quick: bool, images: Path | None)
     if name == "list":
         print("\n".join(list_benches(BENCHES)))
     elif name == "readme":
-        fill_tables_of_docs(output)
+        fill_tables_of_docs(output, {bench: entry.measures for bench, entry in BENCHES.items()})
     else:
         try:
             run_bench(BENCHES, name, "polsep bench", Folders(data, output, images), quick)

@@ -6,7 +6,7 @@ import json
 import os
 import re
 import resource
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,25 @@ from polsep.io.store.atomic import replace_text
 #: A table in a Markdown file stands between these two comments.
 _TABLE = re.compile(
     r"(<!-- table: (?P<name>\w+)(?P<part>/\w+)?( only (?P<metric>\w+))?(?P<turned> by method)? -->\n)"
-    r".*?(?P<end><!-- end -->)",
+    r"(?P<before>.*?)(?P<end><!-- end -->)",
     re.DOTALL,
 )
+#: The last line of a table whose numbers are older than the code.
+_OLDER = re.compile(r"Measured at commit (?P<commit>\w+), before the last change of .*\n")
+#: The paths measured by a benchmark, by its name, that changed after commits; None: unknown.
+FindChanges = Callable[[str, set[str]], tuple[str, ...] | None]
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Rows of a results file in JSON lines."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    """Rows of a results file in JSON lines, each with what made it: the last line above it without a measurement."""
+    made_by, rows = dict[str, Any](), list[dict[str, Any]]()
+    for line in path.read_text(encoding="utf-8").splitlines():
+        entry = json.loads(line)
+        if "bench" in entry:
+            rows.append(entry | made_by)
+        else:
+            made_by = entry
+    return rows
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
@@ -65,12 +76,13 @@ def read_peak_memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def fill_tables(markdown: str, results: Path) -> str:
+def fill_tables(markdown: str, results: Path, find_changes: FindChanges = lambda *_: None) -> str:
     """The Markdown text with every table between its comments made anew from ``results``/NAME.jsonl.
 
     ``table: NAME/PART`` selects the rows of bench NAME/PART, ``only PSNR`` those whose metric is PSNR, alone or of an
     output ("diffuse PSNR"), and ``by method`` turns the table. A table without results yet names the command that
-    measures them.
+    measures them. One that is older than the code says so below; where ``find_changes`` does not know, the line about
+    it stays as it was.
     """
 
     def table(match: re.Match[str]) -> str:
@@ -79,15 +91,23 @@ def fill_tables(markdown: str, results: Path) -> str:
         if metric := match["metric"]:
             rows = [row for row in rows if row["metric"] in (metric, f"diffuse {metric}", f"specular {metric}")]
         if not rows:
-            return f"{match[1]}Not measured yet: `polsep bench {match['name']}`.\n{match['end']}"
-        return match[1] + (method_table(rows) if match["turned"] else markdown_table(rows)) + match["end"]
+            return f"{match[1]}Not measured yet: `polsep bench {match['name']}`.\n{match["end"]}"
+        made = method_table(rows) if match["turned"] else markdown_table(rows)
+        changed = find_changes(match["name"], {row["commit"] for row in rows})
+        older = _OLDER.search(match["before"])
+        if changed:
+            paths = ", ".join(f"`{path.removeprefix('polsep/')}`" for path in changed)
+            made += f"Measured at commit {rows[0]['commit']}, before the last change of {paths}.\n"
+        elif changed is None and older and older["commit"] == rows[0]["commit"]:
+            made += older[0]
+        return match[1] + made + match["end"]
 
     return _TABLE.sub(table, markdown)
 
 
-def fill_readme(readme: Path, results: Path) -> None:
-    """`fill_tables` on a file, replaced as a whole."""
-    replace_text(readme, fill_tables(readme.read_text(encoding="utf-8"), results))
+def fill_page(page: Path, results: Path, find_changes: FindChanges) -> None:
+    """Replace a Markdown file by what `fill_tables` makes of it."""
+    replace_text(page, fill_tables(page.read_text(encoding="utf-8"), results, find_changes))
 
 
 def markdown_table(rows: list[dict[str, Any]]) -> str:

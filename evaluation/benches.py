@@ -22,54 +22,37 @@ from polsep.bench.run import Bench
 
 #: Data of the test sets, below the data folder.
 SET_DATA = ("crossed_polarizers", "diligent_normals", "meshes")
-SETS = (*SEPARATION, "polsep/render", "polsep/metrics.py", "evaluation/testsets", "evaluation/scoring.py")
-SWEEP = (*SEPARATION, "polsep/render", "evaluation/calibration.py")
+#: What separates rendered scenes and scores what it separated.
+SCENES = (*SEPARATION, "polsep/render", "polsep/metrics.py")
 
 BENCHES: dict[str, Bench] = {
     "rendering": Bench(bench_rendering, measures=("polsep/render", "polsep/datasets", "polsep/train/stream.py")),
-    "sets": Bench(bench_sets, data=SET_DATA, measures=SETS),
-    "joint": Bench(bench_joint, data=SET_DATA, measures=(*SETS, "evaluation/joint.py")),
-    "ablations": Bench(bench_ablations, data=SET_DATA, measures=(*SETS, "evaluation/weights/ablations")),
-    "dynamic": Bench(
-        bench_dynamic,
-        bench_dynamic_quick,
-        measures=(*SEPARATION, "polsep/video", "polsep/render", "evaluation/testsets", "evaluation/dynamic.py"),
-    ),
-    "calibration": Bench(bench_calibration, measures=SWEEP),
+    "sets": Bench(bench_sets, data=SET_DATA, measures=SCENES),
+    "joint": Bench(bench_joint, data=SET_DATA, measures=SCENES),
+    "ablations": Bench(bench_ablations, data=SET_DATA, measures=(*SCENES, "evaluation/weights/ablations")),
+    "dynamic": Bench(bench_dynamic, bench_dynamic_quick, measures=(*SCENES, "polsep/video")),
+    "calibration": Bench(bench_calibration, measures=SCENES),
     "material": Bench(
         bench_material,
         bench_material_quick,
         draw_material,
-        data=(PUBLISHED,),
-        measures=(*SEPARATION, "polsep/material", "evaluation/weights/material", "evaluation/material.py"),
+        (PUBLISHED,),
+        (*SEPARATION, "polsep/material", "evaluation/weights/material"),
     ),
-    "video": Bench(
-        bench_video, bench_video_quick, measures=(*SEPARATION, "polsep/compute", "polsep/video", "polsep/io")
-    ),
+    "video": Bench(bench_video, bench_video_quick, measures=(*SEPARATION, "polsep/compute", "polsep/video")),
     "geometry": Bench(
         bench_geometry,
         bench_geometry_quick,
         draw_geometry,
-        data=("diligent_normals", "meshes"),
-        measures=(*SEPARATION, "polsep/geometry", "evaluation/six_lights.py", "evaluation/shape_scores.py"),
+        ("diligent_normals", "meshes"),
+        (*SEPARATION, "polsep/geometry"),
     ),
-    "view": Bench(bench_view, measures=("polsep/view", "polsep/edit", "evaluation/viewing.py")),
-    "gallery": Bench(
-        bench_gallery,
-        draw=draw_gallery,
-        data=("meshes/spot.obj", "meshes/fish.obj"),
-        measures=(*SEPARATION, "polsep/render", "evaluation/appearance.py"),
-    ),
+    "view": Bench(bench_view, measures=("polsep/view", "polsep/edit")),
+    "gallery": Bench(bench_gallery, None, draw_gallery, ("meshes/spot.obj", "meshes/fish.obj"), SCENES),
     "gallery_real": Bench(
         bench_gallery_real, draw=draw_gallery_real, data=tuple(name.format(angle=0) for name, _, _ in REAL)
     ),
-    "paper": Bench(
-        bench_paper,
-        bench_paper_quick,
-        draw_paper,
-        data=SET_DATA,
-        measures=(*SETS, "evaluation/calibration.py", "evaluation/ladder.py", "evaluation/weights/ladder"),
-    ),
+    "paper": Bench(bench_paper, bench_paper_quick, draw_paper, SET_DATA, (*SCENES, "evaluation/weights/ladder")),
 }
 
 #: Paths that the numbers of every results file speak of; evaluation/peers writes what is not of a benchmark.

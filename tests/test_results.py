@@ -35,7 +35,7 @@ def test_readme_has_one_table_of_quality_and_one_of_speed() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=label)
 def test_tables_are_the_results(page: Path) -> None:
-    """Every table of the README and of docs is what the committed results make of it, and has results; pictures are there."""
+    """Every table of the README and of docs is what the committed results make of it, and every picture is there."""
     text = page.read_text(encoding="utf-8")
     assert fill_tables(text, ROOT / "results") == text
     assert "Not measured yet" not in text

@@ -19,14 +19,14 @@ FORMULAS = ("polsep/physics", "polsep/sensor", "polsep/demosaic", "polsep/separa
 SEPARATION = (*FORMULAS, "polsep/networks", "polsep/methods.py", "polsep/weights")
 
 BENCHES: dict[str, Bench] = {
-    "separation": Bench(bench_separation, measures=(*SEPARATION, "polsep/render", "polsep/bench/separation.py")),
-    "exactness": Bench(bench_exactness, measures=("polsep/physics", "polsep/separation", "polsep/bench/exactness.py")),
-    "real": Bench(bench_real, data=("raw",), measures=("polsep/sensor", "polsep/demosaic", "polsep/bench/real.py")),
+    "separation": Bench(bench_separation, measures=(*SEPARATION, "polsep/render")),
+    "exactness": Bench(bench_exactness, measures=("polsep/physics", "polsep/separation")),
+    "real": Bench(bench_real, data=("raw",), measures=("polsep/sensor", "polsep/demosaic")),
     "resources": Bench(bench_resources, measures=(*SEPARATION, "polsep/compute", "polsep/pipeline.py")),
     "frontend": Bench(
         bench_frontend,
         bench_frontend_quick,
         data=("four_angle",),
-        measures=(*FORMULAS, "polsep/compute", "polsep/bench/frontend.py", "polsep/bench/speed.py"),
+        measures=(*FORMULAS, "polsep/compute"),
     ),
 }

@@ -91,7 +91,7 @@ def fill_tables(markdown: str, results: Path, find_changes: FindChanges = lambda
         if metric := match["metric"]:
             rows = [row for row in rows if row["metric"] in (metric, f"diffuse {metric}", f"specular {metric}")]
         if not rows:
-            return f"{match[1]}Not measured yet: `polsep bench {match['name']}`.\n{match["end"]}"
+            return f"{match[1]}Not measured yet: `polsep bench {match['name']}`.\n{match['end']}"
         made = method_table(rows) if match["turned"] else markdown_table(rows)
         changed = find_changes(match["name"], {row["commit"] for row in rows})
         older = _OLDER.search(match["before"])

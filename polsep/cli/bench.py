@@ -11,7 +11,9 @@ from polsep.cli.app import DIR, app
 
 @app.command()
 @click.argument("name", metavar="NAME", default="list")
-@click.option("--data", type=DIR, envvar="POLSEP_DATA", metavar="DIR", help="Data of real, frontend.  [env: POLSEP_DATA]")
+@click.option(
+    "--data", type=DIR, envvar="POLSEP_DATA", metavar="DIR", help="Data of real, frontend.  [env: POLSEP_DATA]"
+)
 @click.option("-o", "--output", type=DIR, default=Path("results"), metavar="DIR", help="Folder of NAME.jsonl.")
 @click.option("--quick", is_flag=True, help="Measure a part in minutes, to DIR/NAME-quick.jsonl.")
 @click.option(

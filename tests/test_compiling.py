@@ -32,14 +32,14 @@ CALLING = """
 from __future__ import annotations
 from typing import Any
 from polsep.compute.compiling import compiled, entry
-from tiny.called import Pair, scale
+from tiny.called import Pair as Argument, scale
 
 @compiled
 def _apply(x: Any) -> Any:
     return scale(x)
 
 @entry
-def run(pair: Pair) -> Any:
+def run(pair: Argument) -> Any:
     return _apply(pair.first)
 """
 
@@ -60,9 +60,9 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Path
         for name in [name for name in sys.modules if name.split(".")[0] == "tiny"]:
             del sys.modules[name]
         importlib.invalidate_caches()
-        run = importlib.import_module("tiny.calling").run
-        result = run(importlib.import_module("tiny.called").Pair(5, 7))
-        return result, bool(run.stats.cache_hits)
+        calling = importlib.import_module("tiny.calling")
+        result = calling.run(calling.Argument(5, 7))
+        return result, bool(calling.run.stats.cache_hits)
 
     monkeypatch.syspath_prepend(str(folder.parent))
     assert load() == (15, False)
@@ -96,6 +96,14 @@ def test_a_change_of_what_a_kernel_calls_is_compiled(
     replace(folder / f"{module}.py", old, new)
     assert load() == (result, False)
     assert load() == (result, True)
+
+
+def test_a_renamed_type_of_an_argument_is_compiled(tiny: tuple[Path, Load]) -> None:
+    folder, load = tiny
+    replace(folder / "called.py", "class Pair", "class Numbers")
+    replace(folder / "calling.py", "Pair as", "Numbers as")
+    assert load() == (15, False)
+    assert load() == (15, True)
 
 
 def test_comments_and_moved_lines_are_not_compiled(tiny: tuple[Path, Load]) -> None:

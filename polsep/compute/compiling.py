@@ -52,6 +52,16 @@ def entry(function: Compilable) -> Compilable:
     return result
 
 
+class _CacheFile(IndexDataCacheFile):
+    """Numba's file of one function; one that names types which are gone is of other code, like one of another stamp."""
+
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()  # type: ignore[no-untyped-call]
+        except (AttributeError, ImportError):
+            return {}
+
+
 class _Cache(FunctionCache):
     """Numba's cache of one function, in numba's folder, that is valid for one `fingerprint`."""
 
@@ -60,7 +70,7 @@ class _Cache(FunctionCache):
         name = f"{self._py_func.__module__.rpartition('.')[2]}.{self._py_func.__qualname__}"
         name = f"{name.replace('<', '').replace('>', '')}.py{sys.version_info[0]}{sys.version_info[1]}"
         stamp = fingerprint(self._py_func)
-        self._cache_file = IndexDataCacheFile(self._cache_path, name, stamp)  # type: ignore[no-untyped-call]
+        self._cache_file = _CacheFile(self._cache_path, name, stamp)  # type: ignore[no-untyped-call]
         return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:

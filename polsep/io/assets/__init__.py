@@ -1,1 +1,1 @@
-"""Meshes, textures and maps of other programs."""
+"""Files for and from other programs: meshes, textures, maps and materials."""

@@ -1,8 +1,8 @@
 """Raw frames from files of any supported kind, lazily, as `Mosaic` or `Measurements`.
 
-Supported: PNG, TIFF, NPY, NPZ, binary PGM, lossless grey video, headerless dumps of a named size and pixel format,
-recordings of a camera by their ``recording.json``, and four angle images through a path with ``{angle}`` in it. The
-extension decides which is expected, the content must agree.
+`READERS` says which reader reads which file name extension. A new raw format is one module with a reader and one line
+there. Besides, a path with ``{angle}`` in it names four angle images, and headerless dumps need a size and a pixel
+format from the caller. The extension decides which format is expected, the content must agree.
 
 Four angle images are co-sited `Measurements` when they are RGB, or gray without a colour layout;
 LUCID's four planes, and gray ones under a colour layout, are samples of one mosaic and go back to it.
@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from polsep.io.raw.headerless import headerless_page, read_headerless
 from polsep.io.raw.npy import read_npy, read_npz, stack_angles
@@ -31,40 +32,52 @@ from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
 
-__all__ = ["Frame", "InputError", "ReadOptions", "decode_frame", "output_stem", "read_frames", "read_pages"]
+__all__ = ["READERS", "Frame", "InputError", "ReadOptions", "decode_frame", "output_stem", "read_frames", "read_pages"]
 
-_READERS: dict[str, Callable[[Path], Iterator[Page]]] = {
-    ".png": read_png,
-    ".npy": read_npy,
-    ".npz": read_npz,
-    ".pgm": read_pgm,
+
+class Reader(NamedTuple):
+    """A format: its ``name`` in messages, and ``read(path, first)``, which yields its pictures in order.
+
+    ``first`` is the number of the first picture wanted; a reader may yield earlier ones too, which are dropped.
+    ``single``: a file of one frame as a rule, so that a folder of such files is a sequence.
+    """
+
+    name: str
+    read: Callable[[Path, int], Iterator[Page]]
+    single: bool = True
+
+
+#: The reader of each file name extension.
+READERS: dict[str, Reader] = {
+    ".png": Reader("PNG", read_png),
+    ".tif": Reader("TIFF", read_tiff),
+    ".tiff": Reader("TIFF", read_tiff),
+    ".npy": Reader("NPY", read_npy),
+    ".npz": Reader("NPZ", read_npz),
+    ".pgm": Reader("PGM", read_pgm),
+    ".mkv": Reader("a lossless video", read_video, single=False),
+    ".avi": Reader("a lossless video", read_video, single=False),
+    ".mov": Reader("a lossless video", read_video, single=False),
+    ".nut": Reader("a lossless video", read_video, single=False),
+    ".json": Reader("a recording.json", read_recording, single=False),
 }
-#: Readers that begin at any picture.
-_SEEKING: dict[str, Callable[[Path, int], Iterator[Page]]] = {
-    ".tif": read_tiff,
-    ".tiff": read_tiff,
-    ".mkv": read_video,
-    ".avi": read_video,
-    ".mov": read_video,
-    ".nut": read_video,
-    ".json": read_recording,
-}
-_HEADLESS = (".raw", ".bin")
-#: Files of single frames, as folders of recordings hold them.
-FRAME_FILES = (*_READERS, ".tif", ".tiff", *_HEADLESS)
+_HEADERLESS = (".raw", ".bin")
+#: Extensions of files that a folder of frames may hold.
+FRAME_FILES = (*(suffix for suffix, reader in READERS.items() if reader.single), *_HEADERLESS)
 _LOSSY = {".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".heic": "HEIC", ".mp4": "video"}
 _ANGLES = (0, 45, 90, 135)
-_PLACE = "{angle}"
+_PLACEHOLDER = "{angle}"
 
+#: Every supported format, for messages.
 SUPPORTED = (
-    "PNG, TIFF, NPY, NPZ, PGM, a lossless video, a recording.json, "
-    "or headerless raw (.raw, .bin) with a size and pixel format"
+    ", ".join(dict.fromkeys(reader.name for reader in READERS.values()))
+    + ", or headerless raw (.raw, .bin) with a size and pixel format"
 )
 
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How to read what files don't say. Levels are in the units of the samples; None is explained above.
+    """What files don't say of themselves. Levels are in the units of the samples; None: see the module.
 
     ``size`` (width, height) and ``pixel_format`` (a GenICam name) describe headerless raw. ``pages``: several pages of
     a file are separate "frames", or every four are the "angles" 0, 45, 90, 135. Raises ValueError on anything else.
@@ -88,7 +101,7 @@ class ReadOptions:
 class Frame:
     """One frame of a file: ``stem`` names its outputs, ``notes`` are one-line remarks for the user.
 
-    It is number ``index`` of ``count`` (about, where a film does not say).
+    It is number ``index`` of ``count`` (approximate where a video does not say).
     """
 
     stem: str
@@ -106,12 +119,12 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
     read; frames before a damaged one have been yielded by then.
     """
     options = ReadOptions() if options is None else options
-    if _PLACE in str(path):
+    if _PLACEHOLDER in str(path):
         pages: Iterator[Page] = iter([_read_template(str(path), options)])
     elif options.pages == "angles":
         pages = _group_angles(Path(path), options)
     else:
-        pages = _read_pages(Path(path), options, first)
+        pages = read_pages(Path(path), options, first)
     for page in pages:
         if page.index < first:
             continue
@@ -122,19 +135,38 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
         yield Frame(name, data, page.notes + notes, page.index, page.count)
 
 
-def read_pages(path: Path) -> Iterator[Page]:
-    """The pictures of one file that describes itself, as codes: not yet light. Raises InputError as `read_frames`."""
-    return _read_pages(path, ReadOptions())
+def read_pages(path: Path, options: ReadOptions | None = None, first: int = 0) -> Iterator[Page]:
+    """The pictures of one file as codes, not yet light, by its extension. Raises InputError as `read_frames`.
+
+    Readers that can skip pictures leave out those before ``first``.
+    """
+    options = ReadOptions() if options is None else options
+    with naming(path):
+        if path.is_dir():
+            raise ValueError("expected a file, found a directory")
+        suffix = path.suffix.lower()
+        if suffix in READERS:
+            described = options.size is not None or options.pixel_format is not None
+            notes = ("the size and pixel format given are for headerless raw: the file's own header is used",)
+            for page in READERS[suffix].read(path, first):
+                yield replace(page, notes=page.notes + notes) if described else page
+        elif suffix in _HEADERLESS or (options.pixel_format is not None and suffix not in _LOSSY):
+            for page in read_headerless(path, *_headerless_format(options), first):
+                yield _noting_layout(page, options)
+        elif suffix in _LOSSY:
+            raise ValueError(f"expected {SUPPORTED}, found {_LOSSY[suffix]}: lossy compression and gamma spoil samples")
+        else:
+            with path.open("rb") as stream:
+                found = describe(stream.read(64))
+            raise ValueError(f"expected {SUPPORTED}, found extension {path.suffix!r} and {found}")
 
 
 def decode_frame(payload: bytes, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
-    """One frame from the bytes a camera sent, and notes, exactly as `read_frames` takes it from a file of them.
+    """One frame from the bytes a camera sent, and notes, exactly as `read_frames` reads it from a file of them.
 
     ``options`` say size and pixel format. Raises ValueError when they do not or the bytes do not fit them.
     """
-    if options.size is None or options.pixel_format is None:
-        raise ValueError(_missing_notes(options))
-    page = next(_noting_layout(iter([headerless_page(payload, options.size, options.pixel_format)]), options))
+    page = _noting_layout(headerless_page(payload, *_headerless_format(options)), options)
     data, notes = _convert(page, options)
     return data, page.notes + notes
 
@@ -144,11 +176,11 @@ def output_stem(path: str | Path) -> str:
     if Path(path).name == RECORD:
         return Path(path).absolute().parent.name or "recording"
     stem = Path(path).stem
-    return stem if _PLACE not in stem else stem.replace(_PLACE, "").strip("_-. ") or "angles"
+    return stem if _PLACEHOLDER not in stem else stem.replace(_PLACEHOLDER, "").strip("_-. ") or "angles"
 
 
 def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
-    """Samples to light, by the rules of the module."""
+    """Codes to light, by the rules of the module; and notes."""
     layout = page.layout if options.layout is None else options.layout
     white = page.white_level if options.white_level is None else options.white_level
     array = page.array
@@ -162,59 +194,31 @@ def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, t
     return as_measurements(array, options.black_level, white)
 
 
-def _read_pages(path: Path, options: ReadOptions, first: int = 0) -> Iterator[Page]:
-    """The pictures of one file, by its extension; where that saves time, those before ``first`` are left out."""
-    with naming(path):
-        if path.is_dir():
-            raise ValueError("expected a file, found a directory")
-        suffix = path.suffix.lower()
-        if suffix in _READERS or suffix in _SEEKING:
-            notes = _ignored_notes(options)
-            reader = _SEEKING[suffix](path, first) if suffix in _SEEKING else _READERS[suffix](path)
-            for page in reader:
-                yield replace(page, notes=page.notes + notes)
-        elif suffix in _HEADLESS or (options.pixel_format is not None and suffix not in _LOSSY):
-            if options.size is None or options.pixel_format is None:
-                raise ValueError(_missing_notes(options))
-            yield from _noting_layout(read_headerless(path, options.size, options.pixel_format, first), options)
-        elif suffix in _LOSSY:
-            raise ValueError(f"expected {SUPPORTED}, found {_LOSSY[suffix]}: lossy compression and gamma spoil samples")
-        else:
-            with path.open("rb") as stream:
-                found = describe(stream.read(64))
-            raise ValueError(f"expected {SUPPORTED}, found extension {path.suffix!r} and {found}")
-
-
-def _ignored_notes(options: ReadOptions) -> tuple[str, ...]:
-    """Said when a container describes itself and the caller describes it too."""
-    if options.size is None and options.pixel_format is None:
-        return ()
-    return ("the size and pixel format said are for headerless raw: the file's own header is used",)
-
-
-def _missing_notes(options: ReadOptions) -> str:
-    """What headerless raw lacks."""
+def _headerless_format(options: ReadOptions) -> tuple[tuple[int, int], str]:
+    """Size and pixel format of headerless raw. Raises ValueError where the caller did not give both."""
+    if options.size is not None and options.pixel_format is not None:
+        return options.size, options.pixel_format
     found = "only the size" if options.size else "only the pixel format" if options.pixel_format else "neither"
-    return f"expected the size and pixel format of headerless raw, such as 2448x2048 and BayerRG12p, found {found}"
+    raise ValueError(
+        f"expected the size and pixel format of headerless raw, such as 2448x2048 and BayerRG12p, found {found}"
+    )
 
 
-def _noting_layout(pages: Iterator[Page], options: ReadOptions) -> Iterator[Page]:
-    """Pages of a named pixel format, with a note where the caller's layout has other colours than the name."""
-    for page in pages:
-        said, named = options.layout, page.layout
-        if said is None or named is None:
-            yield page
-        elif said.bayer == named.bayer:
-            yield replace(page, notes=())
-        else:
-            note = f"layout {said.spec} is used although {options.pixel_format} says {named.bayer or 'mono'}"
-            yield replace(page, notes=(note,))
+def _noting_layout(page: Page, options: ReadOptions) -> Page:
+    """A page of a named pixel format, with a note where the caller's layout has other colours than the name."""
+    given, named = options.layout, page.layout
+    if given is None or named is None:
+        return page
+    if given.bayer == named.bayer:
+        return replace(page, notes=())
+    note = f"layout {given.spec} is used although {options.pixel_format} says {named.bayer or 'mono'}"
+    return replace(page, notes=(note,))
 
 
 def _group_angles(path: Path, options: ReadOptions) -> Iterator[Page]:
     """Every four pages of a file as one page of angles; pages that are angles already pass."""
     group: list[Page] = []
-    for page in _read_pages(path, options):
+    for page in read_pages(path, options):
         if page.angles:
             yield page
             continue
@@ -230,9 +234,8 @@ def _group_angles(path: Path, options: ReadOptions) -> Iterator[Page]:
 def _read_template(template: str, options: ReadOptions) -> Page:
     """The four images of a path with ``{angle}`` as one page of angles."""
     group: list[Page] = []
-    paths = [Path(template.replace(_PLACE, str(angle))) for angle in _ANGLES]
-    for path in paths:
-        page = next(_read_pages(path, options))
+    for path in (Path(template.replace(_PLACEHOLDER, str(angle))) for angle in _ANGLES):
+        page = next(read_pages(path, options))
         if page.count != 1 or page.angles:
             raise input_error(path, f"expected one image of one angle, found {4 if page.angles else page.count}")
         group.append(page)

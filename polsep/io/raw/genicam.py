@@ -15,6 +15,7 @@ LUCID's ``PolarizedAngles_0d_45d_90d_135d_*`` hold four samples per pixel, the a
 their width and height are those of ONE angle image, half the sensor's. ``Bayer`` names hold the order of the first
 2x2 colours (of 2x2 cells on polarization sensors); all other names are mono.
 
+Note: imagecodecs unpacks big-endian bit streams only (`packints_decode`); these are little-endian.
 Source: EMVA, GenICam Pixel Format Naming Convention 2.4 (byte, word, lsb); AIA, GigE Vision 2.0 (gige); FLIR Spinnaker
 ``PixelFormatEnums`` (Polarized8, BayerRGPolarized8 and on); LUCID Arena SDK, "Polarization, Angles" example and PFNC
 values 0x8220000F (Mono8, 32 bits per pixel), 0x8230001F (Mono12p, 48), 0x8240002F (Mono16, 64).
@@ -40,7 +41,7 @@ BLOCK = 1 << 16
 
 @dataclass(frozen=True)
 class PixelFormat:
-    """How one frame's bytes hold its pixels: ``bits`` per code, ``packing``, ``planes`` (1, or 4 angles), ``bayer``."""
+    """Layout of one frame's bytes: ``bits`` per code, ``packing``, ``planes`` (1, or 4 angles), ``bayer``."""
 
     name: str
     bits: int

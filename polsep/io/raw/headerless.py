@@ -31,18 +31,19 @@ def read_headerless(path: Path, size: tuple[int, int], pixel_format: str, first:
     with path.open("rb") as stream:
         stream.seek(first * frame)
         for index in range(first, total // frame):
-            yield headerless_page(stream.read(frame), size, pixel_format, (index, total // frame))
+            yield headerless_page(stream.read(frame), size, pixel_format, index, total // frame)
 
 
-def headerless_page(payload: bytes, size: tuple[int, int], pixel_format: str, place: tuple[int, int] = (0, 1)) -> Page:
-    """One frame of (width, height) pixels from the bytes a camera sent; ``place``: its index, of how many.
+def headerless_page(payload: bytes, size: tuple[int, int], pixel_format: str, index: int = 0, count: int = 1) -> Page:
+    """One frame of (width, height) pixels from the bytes a camera sent.
 
     Raises ValueError as `genicam.unpack_frame` does.
     """
     fmt = find_pixel_format(pixel_format)
     return Page(
         unpack_frame(payload, *size, pixel_format),
-        *place,
+        index,
+        count,
         white_level=fmt.white_level if 8 < fmt.bits < 16 else None,  # 8 and 16 bits: that of the dtype
         layout=Layout(bayer=fmt.bayer),
         angles=fmt.planes > 1,

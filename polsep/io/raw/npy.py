@@ -1,7 +1,8 @@
 """NPY and NPZ arrays without pickles: one mosaic, several frames, or four angle images.
 
 A 2-D array is one frame, ``[N, H, W]`` are N frames, ``[H, W, C]`` with C of 1, 3 or 4 is one picture, and
-``[N, H, W, C]`` are N of them. Headers are read first, so that no size is believed before the bytes are there.
+``[N, H, W, C]`` are N of them. NumPy parses the headers, which are checked against the bytes of the file before any
+array is made.
 Source: NumPy, numpy.lib.format (NPY 1.0 and 2.0; 3.0 differs only for structured types, which are no images).
 """
 
@@ -30,8 +31,8 @@ _ANGLE_KEYS = [tuple(f"{prefix}{angle}" for angle in (0, 45, 90, 135)) for prefi
 _MOSAIC_KEYS = ("raw", "mosaic")
 
 
-def read_npy(path: Path) -> Iterator[Page]:
-    """The frames of an NPY file, mapped, not loaded. Raises ValueError."""
+def read_npy(path: Path, first: int = 0) -> Iterator[Page]:
+    """The frames of an NPY file from ``first`` on, mapped, not loaded. Raises ValueError."""
     with path.open("rb") as stream:
         require_signature(stream, (MAGIC,), "an NPY")
         shape, dtype = _read_header(stream)
@@ -39,22 +40,22 @@ def read_npy(path: Path) -> Iterator[Page]:
     with decoding("NPY"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    yield from _split(array)
+    yield from _split(array, first)
 
 
-def read_npz(path: Path) -> Iterator[Page]:
+def read_npz(path: Path, first: int = 0) -> Iterator[Page]:
     """The frames of an NPZ archive: its only one, one named raw or mosaic, or four named by angle."""
     with path.open("rb") as stream, _open_archive(stream) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist()]
         arrays = {name: _read_member(archive, name) for name in _choose(names)}
     if len(arrays) == 1:
-        yield from _split(next(iter(arrays.values())))
+        yield from _split(next(iter(arrays.values())), first)
         return
     yield Page(stack_angles(arrays), angles=True)
 
 
 def read_arrays(path: Path, wanted: Container[str]) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """The arrays of an NPZ archive that are wanted and there, and the names of all. Raises ValueError."""
+    """The arrays of an NPZ archive with the names ``wanted``, and the names of all arrays. Raises ValueError."""
     with path.open("rb") as stream, _open_archive(stream) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist()]
         return {name: _read_member(archive, name) for name in names if name in wanted}, names
@@ -76,7 +77,7 @@ def stack_angles(images: dict[str, NDArray[Any]]) -> NDArray[Any]:
 
 
 def _choose(names: list[str]) -> list[str]:
-    """The names to read of an archive: one, or four in the order 0, 45, 90, 135."""
+    """The names to read of an archive: one, or four in the order 0, 45, 90, 135. Raises ValueError."""
     folded = {name.lower(): name for name in names}
     for keys in _ANGLE_KEYS:
         if all(key in folded for key in keys):
@@ -140,10 +141,10 @@ def _is_picture(shape: tuple[int, ...]) -> bool:
     return len(shape) == 2 or (len(shape) == 3 and shape[-1] in (1, 3, 4))
 
 
-def _split(array: NDArray[Any]) -> Iterator[Page]:
+def _split(array: NDArray[Any], first: int) -> Iterator[Page]:
     """The pictures of an array, one by one."""
     if _is_picture(array.shape):
         yield Page(array)
         return
-    for index, picture in enumerate(array):
+    for index, picture in enumerate(array[first:], first):
         yield Page(picture, index, len(array))

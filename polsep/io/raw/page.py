@@ -1,7 +1,8 @@
 """`Page`, the type that every reader of raw files yields.
 
-A reader takes a path and yields one `Page` per picture, lazily; it raises ValueError, in one line, on what it can't
-read. Before it decodes, it makes the checks of `io.store.header_checks`.
+A reader takes a path and the number of the first picture wanted, and yields one `Page` per picture, lazily; files of
+one picture ignore the number. It raises ValueError, in one line, on what it can't read. Before it decodes, it makes the
+checks of `io.store.header_checks`.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from polsep.sensor.camera import Layout
 class Page:
     """One picture of a file: ``array`` ``[H, W]`` or ``[H, W, C]``; with ``angles`` a leading axis of 0, 45, 90, 135.
 
-    ``index`` of ``count`` pictures. ``white_level`` and ``layout`` are what the file itself says, None where it says
-    nothing. ``sampled`` angle planes were taken from one mosaic: their pixels lie at different points.
+    ``index`` of ``count`` pictures. ``white_level`` and ``layout`` are those that the file itself names, or None.
+    ``sampled``: the angle planes were taken from one mosaic, so their pixels lie at different points.
     """
 
     array: NDArray[Any]

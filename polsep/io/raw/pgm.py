@@ -19,7 +19,7 @@ _GAP = rb"(?:\s|#[^\n]*\n)+"
 _PGM_HEADER = re.compile(rb"P5" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})\s")
 
 
-def read_pgm(path: Path) -> Iterator[Page]:
+def read_pgm(path: Path, first: int = 0) -> Iterator[Page]:
     """The one picture of a binary PGM: ``[H, W]`` uint8, or uint16 when maxval exceeds 255. Raises ValueError."""
     with path.open("rb") as stream:
         require_signature(stream, (b"P5",), "a binary PGM (P5)")

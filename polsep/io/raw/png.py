@@ -1,7 +1,9 @@
 """PNG of 8 and 16 bits, gray (a mosaic) or RGB (one analyser's picture), exact.
 
-Every chunk is checked before decoding, because decoders return pictures of damaged files without complaint. Ancillary
-chunks are left out: gamma, colour profiles and transparency say nothing about linear samples.
+Every chunk is checked before decoding, and ancillary chunks are left out: gamma, colour profiles and transparency say
+nothing about linear samples.
+Note: a decoder alone does not do. imagecodecs turns transparency into a channel and returns files without their end as
+if they were complete; Pillow reads 16-bit RGB as 8 bits.
 Source: W3C, Portable Network Graphics (PNG) Specification, 3rd edition, sections 5 and 11.2.
 """
 
@@ -26,7 +28,7 @@ _COLORS = {0: "gray", 2: "RGB", 3: "palette", 4: "gray with alpha", 6: "RGB with
 _CHANNELS = {0: 1, 2: 3}
 
 
-def read_png(path: Path) -> Iterator[Page]:
+def read_png(path: Path, first: int = 0) -> Iterator[Page]:
     """The one picture of a PNG file: ``[H, W]`` or ``[H, W, 3]``, uint8 or uint16. Raises ValueError."""
     with path.open("rb") as stream:
         require_signature(stream, (SIGNATURE,), "a PNG")
@@ -42,7 +44,7 @@ def read_png(path: Path) -> Iterator[Page]:
 
 
 def _parse_header(head: bytes) -> tuple[tuple[int, ...], np.dtype[np.uint8] | np.dtype[np.uint16]]:
-    """Shape and dtype that the IHDR chunk promises; ValueError when it is no picture that we read."""
+    """Shape and dtype by the IHDR chunk. Raises ValueError on kinds of PNG that hold no raw samples."""
     if len(head) < 33:
         raise ValueError(f"expected a PNG header of 33 bytes, found {len(head)}")
     if head[8:16] != b"\0\0\0\x0dIHDR" or zlib.crc32(head[12:29]) != struct.unpack(">I", head[29:33])[0]:
@@ -58,7 +60,7 @@ def _parse_header(head: bytes) -> tuple[tuple[int, ...], np.dtype[np.uint8] | np
 
 
 def _critical_chunks(data: bytes) -> bytes:
-    """The file with critical chunks only, once every chunk is whole; ValueError at the first that is not."""
+    """The file with critical chunks only. Raises ValueError at the first chunk that is cut or has a wrong checksum."""
     view = memoryview(data)
     kept: list[bytes | memoryview] = [SIGNATURE]
     position = len(SIGNATURE)

@@ -1,4 +1,4 @@
-"""A camera's frames on disk exactly as they came, and the record of how they came.
+"""Recordings of `polsep capture`: a camera's frames on disk exactly as it sent them, and a record of them.
 
 A recording is a folder:
 
@@ -7,8 +7,9 @@ A recording is a folder:
   frames that the wire lost just before it, and for how long the camera was away);
 * ``recording.json``  size, pixel format, layout, camera, settings, counters, interruptions.
 
-A payload is written before its line, and both before the next frame: whenever the program is killed, every whole frame
-can be read. ``recording.json`` is there from the start with ``finished`` false, and is replaced as a whole at the end.
+A payload is written before its line, and both before the next frame: whenever the program is killed, every complete
+frame can be read. ``recording.json`` exists from the start with ``finished`` false, and is replaced atomically at the
+end.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ RAW, INDEX, RECORD, PICTURE = "frames.raw", "frames.jsonl", "recording.json", "l
 
 @dataclass(frozen=True)
 class Header:
-    """What is the same for all frames. ``layout``: a layout's spec where somebody said one, else None.
+    """Properties that all frames share. ``layout``: the spec of a layout where the user gave one, else None.
 
     ``width`` and ``height`` are those of the pixel format (of ONE angle image for LUCID's angles); ``settings`` are
     the camera's, as it reported them. Raises ValueError on an unknown pixel format, or a size that no frame has.
@@ -60,7 +61,7 @@ class Header:
 
 @dataclass(frozen=True)
 class RawImage:
-    """One whole frame: the bytes as the camera sent them, and what the camera says of them.
+    """One complete frame: the bytes as the camera sent them, and its number, time and losses.
 
     ``lost_before``: how many frames the wire lost between the one before and this one. ``away_s``: how long the camera
     had been away, for the first frame after an interruption.
@@ -74,10 +75,10 @@ class RawImage:
 
 
 class RecordingWriter:
-    """Appends frames to a recording; to be closed. After a failure the frames before it are whole and readable."""
+    """Writer that appends frames to a recording; to be closed. After a failure the frames before it stay readable."""
 
     def __init__(self, directory: Path, header: Header, overwrite: bool = False) -> None:
-        """Make the folder and start its files. Raises OutputError where a recording is and ``overwrite`` is False."""
+        """Make the folder and its files. Raises OutputError where a recording exists and ``overwrite`` is False."""
         refuse_recording(directory, overwrite)
         directory.mkdir(parents=True, exist_ok=True)
         self.directory, self.header, self.frames = directory, header, 0
@@ -87,7 +88,7 @@ class RecordingWriter:
         self.note({}, finished=False)
 
     def append(self, image: RawImage) -> None:
-        """Write one frame. Raises ValueError on a payload of another size, OSError when the disk does not take it."""
+        """Write one frame. Raises ValueError on a payload of another size, OSError when the disk is full."""
         expected = self.header.frame_bytes
         if len(image.payload) != expected:
             raise ValueError(f"expected a payload of {expected} bytes, found {len(image.payload)}")
@@ -103,7 +104,7 @@ class RecordingWriter:
             _write_all(self._raw, image.payload)
             _write_all(self._index, (json.dumps(line) + "\n").encode())
         except OSError:
-            with suppress(OSError):  # a disk that takes no bytes may still give some up
+            with suppress(OSError):  # a full disk may still shrink a file
                 self._raw.truncate(self.frames * expected)
             raise
         self.frames += 1
@@ -127,18 +128,18 @@ class RecordingWriter:
         replace_text(self.directory / RECORD, json.dumps(record, indent=2, allow_nan=False) + "\n")
 
     def close(self) -> None:
-        """Close the files; what they hold is on its way to the disk."""
+        """Close the files."""
         self._raw.close()
         self._index.close()
 
 
 def refuse_recording(directory: Path, overwrite: bool) -> None:
-    """Raise OutputError rather than replace an earlier recording unasked; to call before any work."""
+    """Raise OutputError where an earlier recording would be replaced without ``overwrite``. Call it first."""
     refuse_existing(directory, [directory / name for name in (RAW, INDEX, RECORD, PICTURE)], overwrite)
 
 
 def read_header(path: Path) -> Header:
-    """The header of a ``recording.json``. Raises ValueError when it is another file or lacks something."""
+    """The header of a ``recording.json``. Raises ValueError when it is another file or incomplete."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError):
@@ -156,7 +157,7 @@ def read_header(path: Path) -> Header:
 
 
 def read_images(path: Path, first: int = 0) -> Iterator[RawImage]:
-    """The frames of a ``recording.json`` as the camera sent them, from ``first`` to the last whole one.
+    """The frames of a ``recording.json`` as the camera sent them, from ``first`` to the last complete one.
 
     Frames without a line in the index, as the last one of a killed recording may be, have their own number as id.
     Raises ValueError when there is none, or a payload differs from the checksum that was taken of it.
@@ -178,29 +179,29 @@ def read_images(path: Path, first: int = 0) -> Iterator[RawImage]:
 
 
 def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
-    """The frames of a ``recording.json``, from ``first`` to the last whole one. Raises ValueError as `read_images`."""
+    """The frames of a ``recording.json`` from ``first`` on, as pages. Raises ValueError as `read_images`."""
     header = read_header(path)
     count, rest = divmod(path.with_name(RAW).stat().st_size, header.frame_bytes)
     notes = (f"{RAW} ends within a frame: {rest} bytes after frame {count - 1} are left out",) if rest else ()
     size = (header.width, header.height)
     for index, image in enumerate(read_images(path, first), first):
-        page = headerless_page(image.payload, size, header.pixel_format, (index, count))
+        page = headerless_page(image.payload, size, header.pixel_format, index, count)
         if header.layout is not None:
             page = replace(page, layout=Layout.parse(header.layout), notes=())
         yield replace(page, notes=page.notes + notes)
 
 
 def _read_index(path: Path) -> dict[int, dict[str, Any]]:
-    """The lines of the index by frame; a last line without an end was being written and is left out."""
-    whole = [line for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")]
+    """The lines of the index by frame, without a last line that was cut short."""
+    lines = [line for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")]
     try:
-        return {int(line["index"]): line for line in map(json.loads, whole)}
+        return {int(line["index"]): line for line in map(json.loads, lines)}
     except (json.JSONDecodeError, KeyError, TypeError, ValueError):
         raise ValueError(f"expected a JSON object with an index in every line of {INDEX}, found another") from None
 
 
 def _write_all(stream: BinaryIO, data: bytes) -> None:
-    """Write every byte: an unbuffered stream may take a part."""
+    """Write every byte: an unbuffered stream may write fewer than asked."""
     left = memoryview(data)
     while left:
         left = left[stream.write(left) :]

@@ -1,9 +1,8 @@
-"""Recordings as sequences of frames that can be begun anywhere: folders of files, and files of many frames.
+"""Recordings as sequences of frames that can be read from any frame on: folders of files, and files of many frames.
 
-A folder with a ``recording.json`` is what `polsep capture` wrote, and one recording.
-
-A folder's frames are its files of one kind, in natural order (frame2 before frame10). What cannot be read is a
-`DamagedFrame` frame in its place; the frames after it come all the same where the file allows that.
+A folder's frames are its files of one kind, in natural order (frame2 before frame10); a folder with a
+``recording.json`` is a recording of `polsep capture`. A frame that cannot be read becomes a `DamagedFrame` in its
+place, and reading continues after it where the file allows that.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _NUMBER = re.compile(r"(\d+)")
 
 @dataclass(frozen=True)
 class DamagedFrame:
-    """A frame that could not be read, and why, in one line that names the file."""
+    """A frame that could not be read, and the reason in one line that names the file."""
 
     index: int
     reason: str
@@ -31,7 +30,7 @@ class DamagedFrame:
 
 @dataclass(frozen=True)
 class FrameSequence:
-    """A recording: ``begin(first)`` gives its frames from number ``first`` on, about ``count`` in all.
+    """A recording: ``begin(first)`` yields its frames from number ``first`` on, about ``count`` in all.
 
     ``stem`` names its outputs.
     """
@@ -45,16 +44,16 @@ def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
     """The frames of a folder or of a file. Raises InputError where there are none, or none can be read."""
     path = path / RECORD if (path / RECORD).is_file() else path
     if path.is_dir():
-        files = _files_of(path)
+        files = _frame_files(path)
         return FrameSequence(path.resolve().name, len(files), lambda first: _read_files(files, options, first))
     start = next(read_frames(path, options), None)
     if start is None:
         raise input_error(path, "expected frames, found none")
-    return FrameSequence(output_stem(path), start.count, lambda first: _read_stack(path, options, (first, start.count)))
+    return FrameSequence(output_stem(path), start.count, lambda first: _read_stack(path, options, first, start.count))
 
 
-def _files_of(folder: Path) -> list[Path]:
-    """The frames of a folder in natural order; InputError unless they are of one kind."""
+def _frame_files(folder: Path) -> list[Path]:
+    """The files of a folder's frames in natural order; InputError unless they are of one kind."""
     files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.suffix.lower() in FRAME_FILES]
     kinds = Counter(p.suffix.lower() for p in files)
     if not files:
@@ -84,15 +83,14 @@ def _read_files(files: list[Path], options: ReadOptions, first: int) -> Iterator
         yield Frame(frames[0].stem, frames[0].data, frames[0].notes, index, len(files))
 
 
-def _read_stack(path: Path, options: ReadOptions, numbers: tuple[int, int]) -> Iterator[Frame | DamagedFrame]:
-    """The frames of one file from the first of these ``numbers`` on; behind a damaged one it is begun anew."""
-    at, count = numbers
-    while at < count:
+def _read_stack(path: Path, options: ReadOptions, first: int, count: int) -> Iterator[Frame | DamagedFrame]:
+    """The frames of one file of about ``count`` from ``first`` on; reading starts anew behind a damaged one."""
+    while first < count:
         try:
-            for frame in read_frames(path, options, at):
-                at, count = frame.index + 1, frame.count
+            for frame in read_frames(path, options, first):
+                first, count = frame.index + 1, frame.count
                 yield frame
             return
         except (ValueError, OSError) as error:
-            yield DamagedFrame(at, " ".join(str(error).split()))
-            at += 1
+            yield DamagedFrame(first, " ".join(str(error).split()))
+            first += 1

@@ -1,7 +1,7 @@
 """TIFF of any lossless compression: 8 to 16 bits (packed too) and floats, one picture or many.
 
-tifffile tolerates much damage with a log message; what matters for measurements is checked here: that the chain of
-pictures is whole, that every strip lies inside the file, and that zero means dark. Orientation tags are not applied.
+tifffile tolerates much damage with a log message. Checks here refuse what would spoil measurements: a broken chain of
+pictures, strips outside the file, and files in which zero is not dark. Orientation tags are not applied.
 Source: Adobe, TIFF Revision 6.0; Adobe, Digital Negative Specification 1.7 (photometric 32803, 34892).
 """
 

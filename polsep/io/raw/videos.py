@@ -1,7 +1,7 @@
 """Lossless grey video files by PyAV (extra ``video``).
 
-A mosaic survives in a video only as grey samples without loss: FFV1, HuffYUV, raw video, PNG frames and the like, in 8
-to 16 bits. Colour or compressed for the eye, it would be another measurement; such files are refused.
+A video keeps the samples of a mosaic only as lossless grey: FFV1, HuffYUV, raw video, PNG frames and the like, in 8 to
+16 bits. Colour and lossy videos change samples, so they are refused.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from polsep.io.raw.page import Page
 from polsep.io.store.errors import InputError, decoding
 from polsep.io.store.header_checks import require_size
 
-#: Pixel formats that hold a mosaic: gray, gray10le, ...
+#: FFmpeg's pixel formats that hold a mosaic: gray, gray10le, ...; the number of bits is 8 unless named.
 _GREY = re.compile(r"gray(\d*)(?:le|be)?")
 
 
@@ -33,29 +33,34 @@ def load_library() -> Any:
 
 def read_video(path: Path, first: int = 0) -> Iterator[Page]:
     """The frames of a lossless grey video from ``first`` on: uint8 or uint16 ``[H, W]``. Raises ValueError."""
-    path.open("rb").close()  # files that are not there are said so, not as damage
+    path.open("rb").close()  # a missing file is reported as such, not as damage
     av = load_library()
     with decoding("video"):
         container = av.open(str(path))
     with container:
-        stream = _grey_stream(container)
-        bits, count = _bits(stream.codec_context.pix_fmt), _count(container, stream)
-        stream.thread_type = "SLICE"  # so that each packet gives its own frame
-        index, whole = None, False
-        for number, packet in _needed(container.demux(stream), first):
+        stream, bits = _grey_stream(container)
+        # 10 and 12 bits have their own white level, 8 and 16 that of the dtype.
+        white = None if bits in (8, 16) else float(2**bits - 1)
+        duration = (container.duration or 0) / 1_000_000
+        count = max(int(stream.frames), round(duration * float(stream.average_rate or 0)), 2)  # approximate
+        stream.thread_type = "SLICE"  # each packet then yields its own frame
+        index, intact = None, False
+        for number, packet in _packets_from_key_frame(container.demux(stream), first):
             index = number if index is None else index
             frames, damage = _decode(av, packet)
-            whole = damage is None and (whole or packet.is_keyframe or not packet.size)
+            intact = damage is None and (intact or packet.is_keyframe or not packet.size)
             if frames or damage:
-                if index >= first and not whole:
+                if index >= first and not intact:
                     raise ValueError(f"expected frame {index} intact, found {damage or 'one before it damaged'}")
                 if index >= first:
-                    yield _page(frames[0], bits, (index, max(count, index + 1)))
+                    with decoding("video"):
+                        array: NDArray[Any] = frames[0].to_ndarray()
+                    yield Page(array, index, max(count, index + 1), white_level=white)
                 index += 1
 
 
 def _decode(av: Any, packet: Any) -> tuple[list[Any], str | None]:
-    """The frames of a packet, and what is wrong with them: FFmpeg often only says so in its log."""
+    """The frames of a packet, and the damage found in it; FFmpeg often reports damage only in its log."""
     before = av.logging.get_level()
     av.logging.set_level(av.logging.ERROR)
     try:
@@ -68,7 +73,7 @@ def _decode(av: Any, packet: Any) -> tuple[list[Any], str | None]:
     return frames, log[0][2].strip() if log else None
 
 
-def _needed(packets: Iterator[Any], first: int) -> Iterator[tuple[int, Any]]:
+def _packets_from_key_frame(packets: Iterator[Any], first: int) -> Iterator[tuple[int, Any]]:
     """Packets with their numbers, from the last key frame that is not after ``first`` on."""
     held: list[tuple[int, Any]] = []
     for number in count_from(0):
@@ -84,37 +89,21 @@ def _needed(packets: Iterator[Any], first: int) -> Iterator[tuple[int, Any]]:
             held = []
 
 
-def _grey_stream(container: Any) -> Any:
-    """The one video stream, lossless and grey; checksums are looked at. Raises ValueError on any other."""
+def _grey_stream(container: Any) -> tuple[Any, int]:
+    """The one video stream, which checks its checksums, and its bits per sample.
+
+    Raises ValueError unless it is lossless and grey.
+    """
     streams = container.streams.video
     if len(streams) != 1:
         raise InputError(f"expected one video stream, found {len(streams)}")
     stream = streams[0]
     context = stream.codec_context
-    if context.pix_fmt is None or _GREY.fullmatch(context.pix_fmt) is None:
+    grey = _GREY.fullmatch(context.pix_fmt or "")
+    if grey is None:
         raise InputError(f"expected a mosaic as grey samples, found pixels {context.pix_fmt} of {context.name}")
     if context.codec.lossy or not context.codec.lossless:
         raise InputError(f"expected a lossless codec such as FFV1, found {context.name}")
     require_size((context.height, context.width))
     context.options = {"err_detect": "crccheck+explode"}
-    return stream
-
-
-def _bits(pixels: str) -> int:
-    """8 for gray, 12 for gray12le."""
-    match = _GREY.fullmatch(pixels)
-    assert match is not None
-    return int(match[1] or 8)
-
-
-def _count(container: Any, stream: Any) -> int:
-    """How many frames there are, about: containers tell, or their duration does; at least 2."""
-    duration = (container.duration or 0) / 1_000_000
-    return max(int(stream.frames), round(duration * float(stream.average_rate or 0)), 2)
-
-
-def _page(frame: Any, bits: int, place: tuple[int, int]) -> Page:
-    """A decoded frame as samples; 10 and 12 bits have their white level, 8 and 16 that of the dtype."""
-    with decoding("video"):
-        array: NDArray[Any] = frame.to_ndarray()
-    return Page(array, *place, white_level=float(2**bits - 1) if bits not in (8, 16) else None)
+    return stream, int(grey[1] or 8)

@@ -1,1 +1,1 @@
-"""Writers and readers of what polsep makes: separations, films, edits, materials, shapes, rendered sets."""
+"""Writers and readers of polsep's own images: separations, films, edits, rendered sets, and previews of them."""

@@ -1,12 +1,12 @@
 """Films by PyAV (extra ``video``): lossless ones to measure in, and ones to watch.
 
-Films are written in parts, each a whole file that begins with a key frame, and joined without decoding. So a film that
-was made with interruptions has the bytes of one that was not: containers are written without dates and random numbers.
+A film is written in parts, each a complete file that begins with a key frame, and the parts are joined without
+decoding. Containers have no dates and no random numbers. So a film of an interrupted and resumed run is byte-identical
+to that of an uninterrupted one.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -22,31 +22,31 @@ from polsep.io.raw.videos import load_library
 
 #: Containers by suffix.
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska"}
-#: No dates and random numbers in them.
+#: FFmpeg's options for containers without dates and random numbers.
 _EXACTLY = {"fflags": "+bitexact"}
 
 
 @dataclass(frozen=True)
 class FilmKind:
-    """How a film is kept: ``codec``, ``pixels`` and ``options`` as FFmpeg names them; ``given``: callers' pixels."""
+    """A kind of film: ``codec``, ``pixels``, ``options`` as FFmpeg names them; ``input_pixels``: those of callers."""
 
     suffix: str
     codec: str
     pixels: str
-    given: str
+    input_pixels: str
     options: tuple[tuple[str, str], ...]
 
 
-_EXACT = (("level", "3"), ("slicecrc", "1"), ("slices", "4"), ("g", "1"))
+_FFV1 = (("level", "3"), ("slicecrc", "1"), ("slices", "4"), ("g", "1"))
 #: To watch: H.264 that every player knows, of ``uint8 [H, W, 3]`` with even sides.
 WATCHABLE = FilmKind(".mp4", "libx264", "yuv420p", "rgb24", (("preset", "superfast"), ("crf", "18")))
-#: To measure: every bit as given, with a checksum in each slice; ``uint16 [H, W, 3]``, and ``[H, W, 1]``.
-LOSSLESS = FilmKind(".mkv", "ffv1", "gbrp16le", "gbrp16le", _EXACT)
-LOSSLESS_GREY = FilmKind(".mkv", "ffv1", "gray16le", "gray16le", _EXACT)
+#: To measure: every bit is kept, with a checksum in each slice; ``uint16 [H, W, 3]``, and ``[H, W, 1]``.
+LOSSLESS = FilmKind(".mkv", "ffv1", "gbrp16le", "gbrp16le", _FFV1)
+LOSSLESS_GREY = FilmKind(".mkv", "ffv1", "gray16le", "gray16le", _FFV1)
 
 
 class Film:
-    """A film that is being written: frames in, a whole file after `close`. Raises ValueError without PyAV.
+    """A film that is being written; its file is complete after `close`. Raises ValueError without PyAV.
 
     State: the encoder. ``rate`` in frames per second.
     """
@@ -65,12 +65,12 @@ class Film:
         self._rate = fraction
 
     def write(self, image: NDArray[Any]) -> None:
-        """One more frame, in the pixels that the kind is given."""
+        """Append a frame, in the kind's input pixels."""
         import av
 
         image = image[..., 0] if image.shape[-1] == 1 else image
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=self._kind.given)
-        if self._kind.given != self._kind.pixels:
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=self._kind.input_pixels)
+        if self._kind.input_pixels != self._kind.pixels:
             frame = frame.reformat(format=self._kind.pixels)
         frame.pts, frame.time_base = self._count, 1 / self._rate
         self._count += 1
@@ -78,7 +78,7 @@ class Film:
             self._container.mux(packet)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the frames that the encoder still holds, and end the file."""
         if self._count:
             for packet in self._stream.encode():
                 self._container.mux(packet)
@@ -98,29 +98,24 @@ def encode_film(images: Iterable[NDArray[Any]], kind: FilmKind, rate: float) -> 
 
 
 def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -> None:
-    """One film of several of one ``kind`` and ``rate``, in their order, by copying what is encoded."""
+    """Join films of one ``kind`` and ``rate`` in their order by copying the encoded packets."""
     av = load_library()
-    stream, shown = None, 0
+    stream, frames = None, 0
     with closing(av.open(str(path), "w", format=_FORMATS[kind.suffix], options=_EXACTLY)) as output:
         for part in parts:
             with av.open(str(part)) as source:
-                given = source.streams.video[0]
-                stream = stream or output.add_stream_from_template(given)
-                packets = [packet for packet in source.demux(given) if packet.size]
+                template = source.streams.video[0]
+                stream = stream or output.add_stream_from_template(template)
+                packets = [packet for packet in source.demux(template) if packet.size]
                 for packet in packets:
                     # Every part counts its frames from 0.
-                    later = round(shown / (Fraction(rate).limit_denominator(1001) * packet.time_base))
-                    packet.pts, packet.dts, packet.stream = packet.pts + later, packet.dts + later, stream
+                    offset = round(frames / (Fraction(rate).limit_denominator(1001) * packet.time_base))
+                    packet.pts, packet.dts, packet.stream = packet.pts + offset, packet.dts + offset, stream
                     output.mux(packet)
-                shown += len(packets)
+                frames += len(packets)
 
 
 def as_codes(image: NDArray[np.float32], white: float) -> NDArray[np.uint16]:
-    """Linear light as 16-bit codes, 65535 = ``white``, limited."""
+    """Linear light as 16-bit codes: 65535 stands for ``white``; values outside are limited."""
     scaled: NDArray[np.float32] = image * np.float32(65535 / white)
     return np.rint(np.clip(scaled, 0, 65535, out=scaled), out=scaled).astype(np.uint16)
-
-
-def even_side(length: float) -> int:
-    """The next even number of pixels, at least 2."""
-    return max(2, 2 * math.ceil(length / 2))

@@ -1,1 +1,1 @@
-"""What polsep keeps for itself: whole files, weights, checkpoints, rows of results."""
+"""Atomic files, checks and codecs for the other rooms, and files that polsep keeps for itself."""

@@ -1,7 +1,7 @@
-"""Files in, files out: read every frame of every file, separate it, write it, and go on after a failure.
+"""Files in, files out: read every frame of every file, separate it, write it, and continue after a failure.
 
-A frame's outputs appear whole or not at all. Inputs are never overwritten. Nothing in an output depends on the time or
-on the order of files, so the same command on the same files writes the same bytes.
+A frame's outputs appear together or not at all. Inputs are never overwritten. Outputs do not depend on the time or on
+the order of files, so the same command on the same files writes the same bytes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from polsep.pipeline import LightColor, separate_capture
 
 @dataclass(frozen=True)
 class SeparateOptions:
-    """How frames are separated; the fields are arguments of `pipeline.separate`."""
+    """Arguments of `pipeline.separate` for every frame."""
 
     method: str = "auto"
     light_color: LightColor | str = (1.0, 1.0, 1.0)
@@ -31,7 +31,7 @@ class SeparateOptions:
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """Where and how results are written; ``format`` is one of `io.results.separation_writer.FORMATS`."""
+    """Directory and ``format`` of the results, one of `io.results.separation_writer.FORMATS`."""
 
     directory: Path = Path("polsep-out")
     format: str = "exr"
@@ -40,7 +40,7 @@ class WriteOptions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one frame, or of a file that could not be read: the files written, or the error in one line."""
+    """Result of one frame, or of a file that could not be read: the files written, or the error in one line."""
 
     source: str
     written: tuple[Path, ...] = ()
@@ -52,37 +52,37 @@ class Outcome:
 def separate_files(
     paths: Sequence[str], read: ReadOptions, options: SeparateOptions, write: WriteOptions
 ) -> Iterator[Outcome]:
-    """Separate every frame of the files, one outcome per frame; a bad file is one with an error, and the rest go on.
+    """Separate every frame of the files and yield one outcome per frame, or one with an error for a bad file.
 
     Raises OutputError before any work when two inputs have one name. A frame whose outputs would replace an input, or
-    what another frame has just given, is refused, also with ``overwrite``.
+    one of another frame, is refused, also with ``overwrite``.
     """
     _refuse_equal_names(paths)
     angles = ("0", "45", "90", "135")
-    taken = {realpath(path.replace("{angle}", angle)): "is an input" for path in paths for angle in angles}
+    claimed = {realpath(path.replace("{angle}", angle)): "is an input" for path in paths for angle in angles}
     for path in paths:
         try:
             for frame in read_frames(path, read):
                 outputs = planned_outputs(write.directory, frame.stem, write.format)
-                if clash := sorted({realpath(output) for output in outputs} & taken.keys()):
-                    raise OutputError(f"{path}: expected outputs of its own, found that {clash[0]} {taken[clash[0]]}")
+                if clash := sorted({realpath(output) for output in outputs} & claimed.keys()):
+                    raise OutputError(f"{path}: expected outputs of its own, found that {clash[0]} {claimed[clash[0]]}")
                 refuse_existing(write.directory, outputs, write.overwrite)
                 outcome = _separate_frame(path, frame, read, options, write)
-                taken |= {realpath(output): f"is of {path}" for output in outcome.written}
+                claimed |= {realpath(output): f"is of {path}" for output in outcome.written}
                 yield outcome
         except (ValueError, OSError, MemoryError, RuntimeError) as error:
-            yield Outcome(path, error=_one_line(error))
+            yield Outcome(path, error=" ".join(str(error).split())[:500] or type(error).__name__)
 
 
 def _separate_frame(
     path: str, frame: Frame, read: ReadOptions, options: SeparateOptions, write: WriteOptions
 ) -> Outcome:
     try:
-        found = separate_capture(frame.data, options.method, options.light_color, options.device, options.full)
+        separated = separate_capture(frame.data, options.method, options.light_color, options.device, options.full)
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: {error}") from error
-    found.report["source"] = Path(path).name
-    found.report["settings"] = {
+    separated.report["source"] = Path(path).name
+    separated.report["settings"] = {
         "layout": read.layout.spec if read.layout else None,
         "black_level": read.black_level,
         "white_level": read.white_level,
@@ -90,13 +90,9 @@ def _separate_frame(
         "pixel_format": read.pixel_format,
         "pages": read.pages,
     }
-    found.report["warnings"] = [*frame.notes, *found.report["warnings"]]
-    written = write_separation(found, write.directory, frame.stem, write.format, write.overwrite)
-    return Outcome(path, tuple(written), tuple(found.report["warnings"]), found.report)
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:500] or type(error).__name__
+    separated.report["warnings"] = [*frame.notes, *separated.report["warnings"]]
+    written = write_separation(separated, write.directory, frame.stem, write.format, write.overwrite)
+    return Outcome(path, tuple(written), tuple(separated.report["warnings"]), separated.report)
 
 
 def _refuse_equal_names(paths: Sequence[str]) -> None:

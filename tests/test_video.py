@@ -26,7 +26,7 @@ from polsep import cli
 from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.raw.sequences import DamagedFrame, natural_order, open_sequence
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.sequences import FILM_WHITE, PART, Picture, Sequence, SequenceKind, write_exr
+from polsep.io.results.sequences import FILM_WHITE, PART, Picture, SequenceKind, SequenceWriter, write_exr
 from polsep.io.store.atomic import OutputError
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
@@ -289,10 +289,10 @@ def test_a_run_that_a_damaged_frame_stopped_goes_on_without_it(
     (folder / f"shot{PART + 3}.png").write_bytes(b"no picture")
     assert run(monkeypatch, *command(folder, out)) == 2
     first = (out / "run_000000.exr").stat().st_ino
-    finish = Sequence.finish
-    monkeypatch.setattr(Sequence, "finish", interrupt)
+    finish = SequenceWriter.finish
+    monkeypatch.setattr(SequenceWriter, "finish", interrupt)
     assert run(monkeypatch, *command(folder, out, "--damaged", "skip")) == 130
-    monkeypatch.setattr(Sequence, "finish", finish)
+    monkeypatch.setattr(SequenceWriter, "finish", finish)
     assert run(monkeypatch, *command(folder, out, "--damaged", "skip")) == 2
     assert (out / "run_000000.exr").stat().st_ino == first
     report = json.loads((out / "run.json").read_text())

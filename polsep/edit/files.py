@@ -25,10 +25,9 @@ from polsep.edit.recipe import Recipe, apply, recipe_as_data, recipe_from_text
 from polsep.io.assets.maps import hash_map, read_map
 from polsep.io.results.edited import EditedFrame, read_recipe_text, write_edited, write_preview
 from polsep.io.results.previews import exposure_of, toned
-from polsep.io.results.separation_reader import Numbered, find_numbered, read_separated
+from polsep.io.results.separation_reader import NumberedFiles, find_numbered, read_separated
 from polsep.io.results.separation_writer import planned_outputs
-from polsep.io.results.sequences import PART, Part, Picture, SequenceKind
-from polsep.io.results.sequences import Sequence as Writer
+from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter
 from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import InputError, input_error
 from polsep.video.recordings import ON_DAMAGE, Progress, draw_panels
@@ -169,7 +168,7 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
         "colors": size[2],
     }
     _refuse_frames(folder, found, target)
-    writer = Writer(target.directory, found.stem, target.kind, settings, target.overwrite)
+    writer = SequenceWriter(target.directory, found.stem, target.kind, settings, target.overwrite)
     count = len(found.files)
     for caution in work.recipe.cautions():
         yield Progress(writer.first, count, caution)
@@ -183,7 +182,7 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
     yield Progress(count, count, written=(preview, *writer.finish(report)))
 
 
-def _first_frame(found: Numbered, work: Work, on_damage: str) -> tuple[SeparatedImages, SeparatedImages]:
+def _first_frame(found: NumberedFiles, work: Work, on_damage: str) -> tuple[SeparatedImages, SeparatedImages]:
     """The first frame before and after the edits; with "skip", the first that can be read."""
     failed: ValueError | None = None
     for path in found.files:
@@ -198,7 +197,7 @@ def _first_frame(found: Numbered, work: Work, on_damage: str) -> tuple[Separated
     raise failed
 
 
-def _refuse_frames(folder: Path, found: Numbered, target: EditTarget) -> None:
+def _refuse_frames(folder: Path, found: NumberedFiles, target: EditTarget) -> None:
     """Raise OutputError rather than write over inputs, or over frames of another run unasked."""
     if realpath(folder) == realpath(target.directory):
         raise OutputError(f"expected another directory than that of the input, found {target.directory}")
@@ -209,41 +208,23 @@ def _refuse_frames(folder: Path, found: Numbered, target: EditTarget) -> None:
     refuse_existing(target.directory, [*frames, target.directory / f"{found.stem}.png"], overwrite=False)
 
 
-def _run(found: Numbered, work: Work, writer: Writer, look: tuple[float, Any, str]) -> Iterator[Progress]:
+def _run(found: NumberedFiles, work: Work, writer: SequenceWriter, look: tuple[float, Any, str]) -> Iterator[Progress]:
     """The frames that are not done, part after part."""
     gain, size, on_damage = look
-    begin, part = writer.first, None
+    begin = writer.first
     job = _picture_job(found, work, (gain, size, writer.kind.preview))
-    with closing(map_ahead(job, range(begin, len(found.files)), AT_ONCE)) as pictures:
-        try:
-            for place, picture in enumerate(pictures, begin):
-                part = part or writer.begin_part()
-                reason = picture.line.get("damaged")
-                if reason is None:
-                    part.write(found.first + place, picture)
-                elif on_damage == "stop":
-                    raise InputError(reason)
-                else:
-                    part.show(picture)
-                warning = None if reason is None else f"frame {found.first + place} is left out: {reason}"
-                yield Progress(place + 1, len(found.files), warning, damaged=reason is not None)
-                if len(part) == PART:
-                    writer.end_part(part, {})
-                    part = None
-            _end(writer, part)
-            part = None
-        finally:
-            if part is not None:
-                part.close()
+    with closing(writer), closing(map_ahead(job, range(begin, len(found.files)), AT_ONCE)) as pictures:
+        for place, picture in enumerate(pictures, begin):
+            reason = picture.line.get("damaged")
+            if reason is not None and on_damage == "stop":
+                raise InputError(reason)
+            writer.append(found.first + place, picture)
+            warning = None if reason is None else f"frame {found.first + place} is left out: {reason}"
+            yield Progress(place + 1, len(found.files), warning, damaged=reason is not None)
+        writer.end_part()
 
 
-def _end(writer: Writer, part: Part | None) -> None:
-    """Let a last, short part count."""
-    if part is not None:
-        writer.end_part(part, {})
-
-
-def _picture_job(found: Numbered, work: Work, look: tuple[float, Any, bool]) -> Callable[[int], Picture]:
+def _picture_job(found: NumberedFiles, work: Work, look: tuple[float, Any, bool]) -> Callable[[int], Picture]:
     """What makes the edited frame at a place of the sequence; a black one, with the reason, where it can't."""
     gain, size, preview = look
 

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,7 +29,7 @@ from polsep.compute.workers import DEPTH, ahead, map_ahead
 from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.raw.sequences import DamagedFrame, FrameSequence, open_sequence
 from polsep.io.results.previews import exposure_of, srgb
-from polsep.io.results.sequences import PART, Part, Picture, Sequence, SequenceKind, State
+from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWriter, State
 from polsep.methods import Capture, find_method
 from polsep.pipeline import LightColor, find_device, make_frame, separate_capture, to_device
 from polsep.sensor.camera import Mosaic
@@ -156,7 +157,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
         "colors": look.size[2],
         "device": str(find_device(options.device)),
     }
-    sequence = Sequence(target.directory, footage.stem, target.kind, settings, target.overwrite)
+    sequence = SequenceWriter(target.directory, footage.stem, target.kind, settings, target.overwrite)
     for warning in look.warnings:
         yield Progress(sequence.first, count, warning)
     yield Progress(sequence.first, count)
@@ -185,35 +186,25 @@ def look_at(footage: FrameSequence, options: VideoOptions) -> Look:
     raise ValueError(f"expected a frame that can be read, found {reason}")
 
 
-def _run(footage: FrameSequence, options: VideoOptions, look: Look, sequence: Sequence) -> Iterator[Progress]:
+def _run(footage: FrameSequence, options: VideoOptions, look: Look, sequence: SequenceWriter) -> Iterator[Progress]:
     """The frames that are not done, into the sequence, part after part."""
     kept = sequence.state()
     images: Images | None = tuple(kept.pop(name) for name in IMAGES) if set(IMAGES) <= set(kept) else None
     start = sequence.first, TemporalState.from_arrays(kept) if kept else None
-    part: Part | None = None
-    with closing(ENGINES[options.engine](footage, options, look, start)) as ready:
-        try:
-            for frame in ready:
-                part = part or sequence.begin_part()
-                warning = None
-                if isinstance(frame.found, DamagedFrame):
-                    if options.damaged == "stop":
-                        raise ValueError(frame.found.reason)
-                    part.show(_missing(frame.found, look, sequence.kind.preview))
-                    warning = f"frame {frame.index} is left out: {frame.found.reason}"
-                else:
-                    images = _steady(frame.found.images, images, frame.state)
-                    part.write(frame.index, as_picture(frame, images, look, sequence.kind.preview))
-                yield Progress(frame.index + 1, 0, warning, damaged=warning is not None)
-                if len(part) == PART:
-                    sequence.end_part(part, _as_arrays(frame.state, images))
-                    part = None
-            if part is not None:
-                sequence.end_part(part, {})
-                part = None
-        finally:
-            if part is not None:
-                part.close()
+    with closing(sequence), closing(ENGINES[options.engine](footage, options, look, start)) as ready:
+        for frame in ready:
+            warning = None
+            if isinstance(frame.found, DamagedFrame):
+                if options.damaged == "stop":
+                    raise ValueError(frame.found.reason)
+                picture = _missing(frame.found, look, sequence.kind.preview)
+                warning = f"frame {frame.index} is left out: {frame.found.reason}"
+            else:
+                images = _steady(frame.found.images, images, frame.state)
+                picture = as_picture(frame, images, look, sequence.kind.preview)
+            sequence.append(frame.index, picture, partial(_as_arrays, frame.state, images))
+            yield Progress(frame.index + 1, 0, warning, damaged=warning is not None)
+        sequence.end_part()
 
 
 def _steady(images: Images, before: Images | None, state: TemporalState | None) -> Images:

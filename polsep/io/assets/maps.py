@@ -1,9 +1,8 @@
-"""Images that edits name: textures, masks and normals, as files of any program.
+"""Textures, masks and normal maps that edits name, as files of any program.
 
-8-bit PNG and JPEG hold display values, as all programs write them: textures are decoded from sRGB to linear light.
-16-bit PNG and TIFF, EXR and NPY are taken as linear: integers run to 1 at their largest value. Masks are never
-decoded: 0 is 0, the largest value 1. Normals in PNG and TIFF are 2 c - 1 for c in [0, 1] (x right, y up, z to the
-camera), in EXR and NPY the vectors themselves.
+Textures in 8-bit PNG and JPEG are decoded from sRGB to linear light; 16-bit PNG and TIFF, EXR and NPY are linear
+already. Integers are scaled so that their largest value is 1. Masks are never decoded. Normals in PNG and TIFF are
+2 c - 1 for c in [0, 1] (x right, y up, z to the camera), in EXR and NPY the vectors themselves.
 """
 
 from __future__ import annotations
@@ -28,14 +27,14 @@ Floats = NDArray[np.float32]
 _PAGED, _PHOTOS = (".png", ".tif", ".tiff", ".npy"), (".jpg", ".jpeg")
 #: Files that hold an image.
 SUFFIXES = (*_PAGED, *_PHOTOS, ".exr")
-#: Shortest normal that is one: half floats and 8 bits leave no less.
+#: Shortest vector that counts as a normal: 8 bits and half floats change unit vectors less.
 _SHORTEST = 0.5
 
 
 def read_map(path: Path, kind: str) -> Floats:
     """The ``texture [h, w, C]``, ``mask [h, w]`` or ``normals [h, w, 3]`` of a file, float32, read-only.
 
-    Normals are made unit vectors; shorter ones than half of that, and those away from the camera, become 0. Raises
+    Normals become unit vectors; vectors shorter than half of that, or pointing away from the camera, become 0. Raises
     InputError.
     """
     suffix = path.suffix.lower()

@@ -97,7 +97,7 @@ def _encoded_files(material: MaterialFiles, name: str, scale: float) -> Iterator
 
 
 def specular_scale(specular: Floats) -> float:
-    """The reflectance at normal incidence that white in the specular texture stands for: the largest one."""
+    """The reflectance at normal incidence of white in the specular texture: the largest one, at least `DIELECTRIC`."""
     return max(float(specular.max()), DIELECTRIC)
 
 
@@ -115,7 +115,7 @@ def texture_pixels(maps: Mapping[str, Floats]) -> dict[str, Pixels]:
 def encode_glb(textures: Mapping[str, Pixels], scale: float, name: str) -> bytes:
     """A GLB file of a square of side 2 in the plane z = 0 that faces +z, with a material of these textures.
 
-    ``scale``: the reflectance that white in the specular texture stands for.
+    ``scale``: the reflectance of white in the specular texture.
     Note: trimesh knows neither specular textures nor tangents. The specular texture is given to it as the one of
     occlusion, tangents as an attribute of their own, and both are renamed in the document.
     """
@@ -190,7 +190,7 @@ def encode_materialx(files: Mapping[str, str], scale: float, name: str) -> str:
 
 
 def read_panels(path: Path) -> tuple[Tensor, ...]:
-    """Normal, diffuse, roughness and specular ``[C, H, W]`` of a picture of five square panels, as `svbrdf` has them.
+    """Normal, diffuse, roughness and specular ``[C, H, W]`` of a picture of five square panels, for `Svbrdf`.
 
     Normals are encoded from -1 to 1; albedos and roughness are linear, whose rendering resembles the first panel.
     Raises InputError on other pictures.

@@ -1,4 +1,4 @@
-"""Readers of what test scenes are made of: triangle meshes, normal maps, depths, masks and linear photographs.
+"""Readers of the files of test scenes: triangle meshes, normal maps, depths, masks and linear photographs.
 
 Every reader takes a path and returns arrays in the frame of `polsep.render.sphere_tracing`: x right, y up, z toward the
 viewer. Rows of images grow downward. All raise ValueError, in one line, on what they cannot read. Needs the extra
@@ -20,7 +20,7 @@ from polsep.io.raw.png import read_png
 from polsep.io.store.errors import decoding
 from polsep.render.shapes import Floats, Mesh
 
-#: Connected parts of a scan with fewer of its triangles than this share are loose fragments and left out.
+#: Connected parts of a scan with less than this share of its triangles are loose fragments, which are dropped.
 SMALLEST_PART = 0.01
 #: Vertices closer than this share of the mesh's radius are one vertex.
 SAME_VERTEX = 1e-6
@@ -41,7 +41,7 @@ def read_mesh(path: Path) -> Mesh:
     """A mesh file as one material slot, centred on its bounding box and scaled into the unit sphere; no (u, v).
 
     Vertices at one place are one vertex, so that normals are smooth over the seams of a texture; normals are means over
-    triangles by area. Loose fragments (`SMALLEST_PART`) are left out. The file's axes stay.
+    triangles by area. Loose fragments (`SMALLEST_PART`) are dropped. The file's axes are kept.
     """
     with decoding(path.suffix.lstrip(".").upper()):
         loaded: Any = trimesh.load(path, force="mesh", process=False)
@@ -63,7 +63,7 @@ def read_mesh(path: Path) -> Mesh:
 def _without_fragments(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     """The triangles of connected parts that are large enough."""
     part = np.arange(faces.max() + 1)
-    while True:  # every vertex takes the smallest number around it until all of a part agree
+    while True:  # every vertex gets the smallest number around it until all of a part agree
         smallest = part.copy()
         least = part[faces].min(axis=1)
         for k in range(3):

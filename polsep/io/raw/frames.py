@@ -77,7 +77,7 @@ SUPPORTED = (
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What files don't say of themselves. Levels are in the units of the samples; None: see the module.
+    """Facts that files may not contain. Levels are in the units of the samples; None: see the module.
 
     ``size`` (width, height) and ``pixel_format`` (a GenICam name) describe headerless raw. ``pages``: several pages of
     a file are separate "frames", or every four are the "angles" 0, 45, 90, 135. Raises ValueError on anything else.

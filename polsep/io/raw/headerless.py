@@ -1,6 +1,6 @@
 """Raw camera dumps without a header.
 
-A headerless file is any whole number of frames of one size and pixel format, one after the other; the caller names
+A headerless file is a number of complete frames of one size and pixel format, one after the other. The caller names
 both.
 """
 

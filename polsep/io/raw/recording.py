@@ -174,8 +174,8 @@ def read_images(path: Path, first: int = 0) -> Iterator[RawImage]:
             found, expected = zlib.crc32(data), line.get("crc32")
             if expected is not None and found != expected:
                 raise ValueError(f"expected frame {index} of {RAW} with checksum {expected}, found {found}: damage")
-            said = {name: line[name] for name in ("lost_before", "away_s") if name in line}
-            yield RawImage(data, line.get("frame_id", index), line.get("timestamp_ns", 0), **said)
+            losses = {name: line[name] for name in ("lost_before", "away_s") if name in line}
+            yield RawImage(data, line.get("frame_id", index), line.get("timestamp_ns", 0), **losses)
 
 
 def read_recording(path: Path, first: int = 0) -> Iterator[Page]:

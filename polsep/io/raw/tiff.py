@@ -46,7 +46,7 @@ def read_tiff(path: Path, first: int = 0) -> Iterator[Page]:
 
 
 def _count_pages(tif: tifffile.TiffFile, stream: BinaryIO) -> int:
-    """Number of pictures; InputError when the chain of directories breaks or one directory stands for many pictures."""
+    """Number of pictures; InputError when the chain of directories breaks or one directory describes many pictures."""
     with decoding("TIFF"):
         count = len(tif.pages)
         if count:
@@ -55,7 +55,7 @@ def _count_pages(tif: tifffile.TiffFile, stream: BinaryIO) -> int:
     if count == 0:
         raise InputError("expected a TIFF with a picture, found no readable directory: it is truncated or damaged")
     if len(rest) < tif.tiff.offsetsize or any(rest):
-        raise InputError(f"expected a whole chain of TIFF directories, found it broken after {count}: it is truncated")
+        raise InputError(f"expected a complete chain of TIFF directories, found {count} of them: it is truncated")
     if count == 1:
         with decoding("TIFF"):
             page, series = tif.pages[0], tif.series[0]

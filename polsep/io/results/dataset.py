@@ -1,15 +1,15 @@
-"""The files of a rendered set: one raw frame, one truth and one record per view, and what holds them together.
+"""Files of a rendered set: a raw frame, its ground truth and a record per view, and a manifest of all.
 
-    DIR/options.json             what was asked for, and the versions of what made it
+    DIR/options.json             the options of the set, and the versions of the libraries that made it
     DIR/STEM.png                 the raw mosaic, 16-bit words that hold 12-bit codes (white level 4095)
     DIR/STEM.exr or .npz         the truth at raw resolution in half floats: `LAYERS` and the mask
     DIR/STEM.json                camera, light, exposure, seeds, and size and sha256 of the two files before
     DIR/manifest.jsonl           options, then name, size and sha256 of every file above, in order of views
-    DIR/contact.png              a sample of the views to look at
+    DIR/contact.png              pictures of some of the views
 
 Units are those of `separation_writer`: linear light, 1.0 is one measurement at the white level. A view's files are
 written in a hidden directory and renamed into place, its record last: a view with a record is complete, whenever the
-program was killed. Nothing in a file depends on the time, the machine's name or who wrote it.
+program was killed. No file depends on the time, the machine's name or the user.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ def view_stem(shape: int, view: int) -> str:
 
 
 def begin_dataset(directory: Path, options: Mapping[str, Any]) -> None:
-    """Make the directory of a set, or go on with one that the same options and versions began.
+    """Make the directory of a set, or resume one that was begun with the same options and versions.
 
-    Raises OutputError when it was begun with others, or holds what is no set.
+    Raises OutputError when it was begun with others, or holds other files.
     """
     path = directory / OPTIONS
     if os.path.lexists(directory) and not directory.is_dir():
@@ -70,13 +70,13 @@ def begin_dataset(directory: Path, options: Mapping[str, Any]) -> None:
 
 
 def find_finished(directory: Path, stems: Sequence[str]) -> set[str]:
-    """Those of the views whose record is there, and all of whose files have the sizes that it says."""
+    """The views that are complete: their record exists, and all files have the sizes in it."""
     sizes = {entry.name: entry.stat().st_size for entry in os.scandir(directory) if entry.is_file()}
-    return {stem for stem in stems if f"{stem}.json" in sizes and _is_whole(directory / f"{stem}.json", sizes)}
+    return {stem for stem in stems if f"{stem}.json" in sizes and _is_complete(directory / f"{stem}.json", sizes)}
 
 
-def _is_whole(record: Path, sizes: Mapping[str, int]) -> bool:
-    """False for a record that a crash of the machine left empty or torn, too."""
+def _is_complete(record: Path, sizes: Mapping[str, int]) -> bool:
+    """True unless a file is missing or cut short, or the record itself, as after a crash of the machine."""
     try:
         files = json.loads(record.read_bytes())["files"]
         return all(sizes.get(file["name"]) == file["bytes"] for file in files)
@@ -116,7 +116,7 @@ def read_view(directory: Path, stem: str) -> dict[str, NDArray[Any]]:
 
 
 def finish_dataset(directory: Path, stems: Sequence[str], options: Mapping[str, Any]) -> None:
-    """Write contact sheet and manifest of a whole set, and remove what was left unfinished."""
+    """Write contact sheet and manifest of a complete set, and remove unfinished views."""
     count = min(len(stems), SHEET_ROWS * SHEET_COLS)
     shown = [stems[k * len(stems) // count] for k in range(count)]
     sheet = contact_sheet(read_view(directory, stem) for stem in shown)
@@ -131,12 +131,12 @@ def finish_dataset(directory: Path, stems: Sequence[str], options: Mapping[str, 
 
 
 def read_fingerprint(directory: Path) -> str:
-    """The sha256 of a set's manifest, which stands for every byte of it."""
+    """The sha256 of a set's manifest, which lists the sha256 of every file."""
     return hashlib.sha256((directory / MANIFEST).read_bytes()).hexdigest()
 
 
 def remove_unfinished(directory: Path) -> None:
-    """Remove what programs that were killed had begun to write."""
+    """Remove the unfinished files of programs that were killed."""
     shutil.rmtree(directory / UNFINISHED, ignore_errors=True)
 
 

@@ -37,15 +37,15 @@ def read_recipe_text(path: Path) -> str:
 
 
 def write_recipe_text(path: Path, text: str, overwrite: bool) -> None:
-    """Write a recipe as a whole. Raises OutputError where one is there and ``overwrite`` is False."""
+    """Write a recipe atomically. Raises OutputError where the file exists and ``overwrite`` is False."""
     refuse_existing(path.parent, [path], overwrite)
     replace_text(path, text)
 
 
 def write_recipe(folder: Path, stem: str, text: str, images: Mapping[str, Path]) -> Path:
-    """Write a recipe into a new folder, with the images that it names beside it; a ZIP archive of all if there are any.
+    """Write a recipe into a new folder: a JSON file, or a ZIP archive of it and the images that it names.
 
-    Unpacked anywhere, `polsep edit --recipe` finds them.
+    `polsep edit --recipe` finds the images beside the unpacked recipe.
     """
     if not images:
         replace_text(folder / f"{stem}.json", text)
@@ -82,5 +82,5 @@ def _encoded_files(frame: EditedFrame, stem: str, units: Mapping[str, str]) -> I
 
 
 def write_preview(path: Path, pixels: NDArray[np.uint8]) -> None:
-    """Write sRGB ``uint8 [h, w, 3]`` as PNG, replaced as a whole."""
+    """Write sRGB ``uint8 [h, w, 3]`` as PNG, atomically."""
     replace_bytes(path, encode_png(pixels))

@@ -2,7 +2,7 @@
 
 Pure functions on arrays; nothing here reads or writes a file, and nothing measured should be read off a preview.
 
-Conventions: images come in as linear light ``[H, W, C]`` (C = 3 or 1) and leave as sRGB ``uint8 [h, w, 3]``. Angles
+Conventions: inputs are linear light ``[H, W, C]`` (C = 3 or 1), results are sRGB ``uint8 [h, w, 3]``. Angles
 are radians in [0, pi) from image-right toward image-UP; rows grow downward, so a direction (d_row, d_col) has the
 angle atan2(-d_row, d_col). Shrinking averages light, and polarization as Stokes vectors, before any tone curve.
 """
@@ -35,7 +35,7 @@ NOT_VALID, ABOVE_RANGE, ABOVE_ONE = (213, 94, 0), (86, 180, 233), (240, 228, 66)
 
 
 class Flag(NamedTuple):
-    """One kind of pixel to point out: where ``[H, W]``, in which colour, under which name."""
+    """A kind of pixel that the mask panel marks: a mask ``where [H, W]``, its colour and its name."""
 
     where: NDArray[np.bool_]
     color: tuple[int, int, int]
@@ -68,7 +68,7 @@ def linear_from_srgb(display: ArrayLike) -> NDArray[np.float32]:
 def exposure_of(image: Values, percentile: float = 99.5) -> float:
     """The gain that shows ``percentile`` of the samples of a linear image at 0.9; one gain serves all its parts.
 
-    The brightest sample takes over where that percentile is dark, and an image without light has gain 1.
+    Where that percentile is 0, the brightest sample is shown at 0.9; an image without light has gain 1.
     """
     level = float(np.percentile(image, percentile))
     level = level if level > 0 else float(np.max(image))
@@ -117,7 +117,7 @@ def contact_sheet(frame: SeparatedFrame) -> Pixels:
 
     Input is diffuse + specular; the three share one gain, printed on them. Panels keep the aspect ratio, at most
     `PANEL` pixels on the longer side; frames smaller than half of that show every pixel as 2x2.
-    The mask points out pixels that are not valid, sums above the measurable 2, and DoLP above 1, with their shares.
+    The mask marks pixels that are not valid, sums above the measurable 2, and DoLP above 1, with their shares.
     """
     total = np.maximum(frame.diffuse, 0) + np.maximum(frame.specular, 0)
     flags = _flags(frame, total)
@@ -140,7 +140,7 @@ def contact_sheet(frame: SeparatedFrame) -> Pixels:
 
 
 def live_sheet(frame: SeparatedFrame) -> Pixels:
-    """Input, diffuse and specular side by side, ``uint8 [h, w, 3]``, with one gain: what is quick enough to be live."""
+    """Input, diffuse and specular side by side, ``uint8 [h, w, 3]``, with one gain; fast enough for a live view."""
     diffuse, specular = (_shrunk(np.maximum(image, 0)) for image in (frame.diffuse, frame.specular))
     total = diffuse + specular
     gain = exposure_of(total)
@@ -195,7 +195,7 @@ def _shrunk_polarization(frame: SeparatedFrame, s0: Values) -> tuple[NDArray[np.
 
 
 def _flags(frame: SeparatedFrame, total: Values) -> list[Flag]:
-    """What the mask panel points out, later ones drawn over earlier ones."""
+    """The flags of the mask panel; later ones are drawn over earlier ones."""
     return [
         Flag(frame.dolp > 1, ABOVE_ONE, "DoLP above 1"),
         Flag(np.max(total, axis=-1) > 2, ABOVE_RANGE, "above the measurable range"),

@@ -1,7 +1,7 @@
-"""Separated frames as polsep wrote them, read back: EXR by layers, NPZ, and numbered sequences of them.
+"""Reader of separated frames that polsep wrote: EXR by layers, NPZ, and numbered sequences of them.
 
-The twin of `outputs` and `sequences`. Half floats become float32. TIFF and PNG sets and lossless films are not read:
-PNG limits light, and sets are many files for one frame.
+The twin of `separation_writer` and `sequences`. Half floats become float32. TIFF and PNG sets and lossless films are
+not read: PNG limits light, and sets are many files for one frame.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ _NUMBERED = re.compile(r"(?P<stem>.+)_(?P<number>\d{4,})\.(exr|npz)")
 
 
 @dataclass(frozen=True)
-class Numbered:
-    """A sequence of separated frames: ``stem``, and for each number from ``first`` on its file, None where it lacks."""
+class NumberedFiles:
+    """A sequence of separated frames: ``stem``, and the file of each number from ``first`` on, None where missing."""
 
     stem: str
     first: int
     files: tuple[Path | None, ...]
 
     def missing(self) -> list[int]:
-        """The numbers in between that have no file."""
+        """The numbers that have no file."""
         return [number for number, path in enumerate(self.files, self.first) if path is None]
 
 
 def read_separated(path: Path) -> SeparatedFrame:
-    """The frame of a file that polsep wrote, bit for bit, but for its report.
+    """The frame in a file of polsep, bit for bit, without its report.
 
     Files of diffuse and specular alone, as of `polsep video` and `polsep edit`, are valid everywhere and of DoLP and
-    AoLP 0. Raises InputError, also for values that no separation has: below 0, infinite, not a number; for too large
-    ones by their header.
+    AoLP 0. Raises InputError, also on values that no separation has (below 0, infinite, not a number) and on too large
+    sizes in the header.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -72,7 +72,7 @@ def holds_separated(path: Path) -> bool:
 
 
 def _from_layers(planes: Mapping[str, NDArray[Any]]) -> Images:
-    """Images from channels by their full names; whatever else the file has is left."""
+    """Images from channels by their full names; other channels are ignored."""
     images = {}
     for layer in ("diffuse", "specular"):
         channels = next((c for c in ("RGB", "Y") if all(f"{layer}.{color}" in planes for color in c)), None)
@@ -101,7 +101,7 @@ def _from_archive(path: Path) -> Images:
 
 
 def _as_frame(images: Images, source: str) -> SeparatedFrame:
-    """The frame of images by name, once they are believed."""
+    """The frame of images by name, once shapes and values are checked."""
     diffuse, specular = images["diffuse"], images["specular"]
     if diffuse.shape != specular.shape:
         shapes = f"{list(diffuse.shape)} and {list(specular.shape)}"
@@ -121,7 +121,7 @@ def _as_frame(images: Images, source: str) -> SeparatedFrame:
     return SeparatedFrame(diffuse, specular, valid, dolp, aolp, report, images.get("error"))
 
 
-def find_numbered(folder: Path) -> Numbered:
+def find_numbered(folder: Path) -> NumberedFiles:
     """The sequence in a folder, as `polsep video` writes it: STEM_000123.exr. Raises InputError unless there is one."""
     found: dict[str, dict[int, Path]] = {}
     for path in sorted(folder.iterdir()):
@@ -139,4 +139,4 @@ def find_numbered(folder: Path) -> Numbered:
         raise input_error(folder, f"expected one sequence, found {len(found)}: {', '.join(found)}")
     ((name, frames),) = found.items()
     first, last = min(frames), max(frames)
-    return Numbered(Path(name).stem, first, tuple(frames.get(number) for number in range(first, last + 1)))
+    return NumberedFiles(Path(name).stem, first, tuple(frames.get(number) for number in range(first, last + 1)))

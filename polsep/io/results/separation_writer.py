@@ -42,7 +42,7 @@ ERROR = "error"
 
 #: The unit of images.
 LIGHT = "linear light, 1.0 = one measurement at the white level (an unclipped s0 = diffuse + specular reaches 2)"
-#: What the numbers in EXR, NPZ and TIFF files mean.
+#: Meaning of the numbers in EXR, NPZ and TIFF files.
 UNITS = {
     "diffuse": LIGHT,
     "specular": f"{LIGHT}; may exceed 2 where highlights were clipped",
@@ -52,7 +52,7 @@ UNITS = {
     ERROR: "expected standard deviation of the error of diffuse and of specular, over all colours, in their unit",
     "combined": f"{LIGHT}; the sum of diffuse and specular, as edited",
 }
-#: What the codes in the PNG set mean.
+#: Meaning of the codes in the PNG set.
 PNG_UNITS = {
     "diffuse": "16 bit, LINEAR (no gamma): 65535 = 2.0; 1.0 = one measurement at the white level",
     "specular": "16 bit, LINEAR (no gamma): 65535 = 2.0; 1.0 = one measurement at the white level",
@@ -61,7 +61,7 @@ PNG_UNITS = {
     "valid": "8 bit: 255 where the separation is trustworthy, else 0",
     ERROR: "16 bit, LINEAR: 65535 = 2.0; expected standard deviation of the error, red: of diffuse, green: of specular",
 }
-#: The value that code 65535 stands for in the PNG set.
+#: The value of code 65535 in the PNG set.
 PNG_WHITE = {"diffuse": 2.0, "specular": 2.0, "dolp": 1.0, ERROR: 2.0}
 
 
@@ -114,7 +114,7 @@ def write_separation(
 
 
 def _check_frame(frame: SeparatedFrame) -> None:
-    """Hold the frame to its contract, so that no file carries a surprise."""
+    """Raise OutputError unless the frame has the shapes, types and values of its contract."""
     size = frame.valid.shape
     if len(size) != 2 or 0 in size or frame.valid.dtype != np.bool_:
         raise OutputError(f"expected valid as bool [H, W], found {frame.valid.dtype} {list(size)}")
@@ -192,7 +192,7 @@ def _encode_tiff(frame: SeparatedFrame, layer: str) -> bytes:
 def _png_codes(frame: SeparatedFrame, layer: str) -> NDArray[np.uint16] | NDArray[np.uint8]:
     """One layer in the integer codes of `PNG_UNITS`, values outside the scale limited to its ends.
 
-    The error gets a third colour of zeros: PNG would take the second of two channels for opacity.
+    The error gets a third colour of zeros, because the second of two channels is opacity in PNG.
     """
     if layer == "valid":
         return np.where(frame.valid, 255, 0).astype(np.uint8)
@@ -206,7 +206,7 @@ def _png_codes(frame: SeparatedFrame, layer: str) -> NDArray[np.uint16] | NDArra
 
 
 def _limited_samples(frame: SeparatedFrame) -> dict[str, dict[str, int]]:
-    """How many samples of each layer `_png_codes` limits: below 0 and above the value of code 65535."""
+    """Counts of samples that `_png_codes` limits, per layer: below 0 and above the value of code 65535."""
     return {
         layer: {
             "below": int(np.count_nonzero(getattr(frame, layer) < 0)),

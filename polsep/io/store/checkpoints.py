@@ -1,4 +1,4 @@
-"""What a training keeps on disk: its state and its log, replaced by renaming, so a kill leaves the last whole one."""
+"""Files of a training: its state and its log, replaced atomically, so that a kill leaves the last complete ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from polsep.io.store.atomic import atomic_path, replace_text
 
 
 def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write a state of tensors, numbers and strings, whole or not at all."""
+    """Write a state of tensors, numbers and strings atomically."""
     with atomic_path(path) as part, part.open("wb") as file:
         torch.save(state, file)
         file.flush()
@@ -20,7 +20,7 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any] | None:
-    """The state in ``path``, or None where there is no file. Raises ValueError on a file that is none of ours."""
+    """The state in ``path``, or None where there is no file. Raises ValueError on any other file."""
     if not path.exists():
         return None
     try:
@@ -40,12 +40,12 @@ def append_line(path: Path, line: str) -> None:
 
 
 def read_lines(path: Path) -> list[str]:
-    """The lines of a log; none without a file. A last one that a kill cut short does not count."""
+    """The lines of a log; none without a file. A last line that was cut short is left out."""
     if not path.exists():
         return []
     return path.read_bytes().decode("utf-8", errors="replace").split("\n")[:-1]
 
 
 def write_lines(path: Path, lines: list[str]) -> None:
-    """Replace a log as a whole."""
+    """Replace a log atomically."""
     replace_text(path, "".join(line + "\n" for line in lines))

@@ -1,7 +1,7 @@
-"""`InputError`, and how whatever a codec raises becomes one.
+"""`InputError`, and the conversion of other errors to it.
 
-Readers of one format raise ValueError (or InputError, from inside `decoding`) without naming the file; whoever knows
-the path wraps them, once, in `naming`.
+Readers of one format raise ValueError (or InputError, from inside `decoding`) without naming the file; the caller
+that knows the path wraps them, once, in `naming`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 class InputError(ValueError):
-    """A file that can't be read as asked; the message is one line: what was expected, what was found."""
+    """A file that can't be read as asked; its message is one line, "expected ..., found ..."."""
 
 
 def input_error(path: str | Path, reason: object) -> InputError:
@@ -22,7 +22,7 @@ def input_error(path: str | Path, reason: object) -> InputError:
 
 @contextmanager
 def naming(path: str | Path) -> Iterator[None]:
-    """ValueError and OSError raised inside leave as an `InputError` that names the file."""
+    """Turn ValueError and OSError raised inside into an `InputError` that names the file."""
     try:
         yield
     except ValueError as error:
@@ -35,10 +35,10 @@ def naming(path: str | Path) -> Iterator[None]:
 
 @contextmanager
 def decoding(kind: str) -> Iterator[None]:
-    """Whatever a codec raises on damaged bytes leaves as one ValueError; no codec documents all that it raises."""
+    """Turn whatever a codec raises on damaged bytes into one ValueError; no codec documents all that it raises."""
     try:
         yield
-    except InputError:  # already in our words
+    except InputError:  # has its message already
         raise
     except Exception as error:
         raise ValueError(f"expected an intact {kind} file, found damage: {error or type(error).__name__}") from error

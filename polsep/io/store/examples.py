@@ -1,4 +1,4 @@
-"""Examples of materials on disk: one array per file, in half precision, whole or not at all."""
+"""Examples of materials on disk: one array per file, in half precision, written atomically."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from polsep.io.store.atomic import atomic_path
 
 
 def write_example(path: Path, planes: Tensor) -> None:
-    """Write planes ``[K, h, w]``; what half precision does not hold becomes its largest number."""
+    """Write planes ``[K, h, w]``; values beyond half precision become its largest number."""
     largest = float(np.finfo(np.float16).max)
     with atomic_path(path) as part, part.open("wb") as file:
         np.save(file, planes.clamp(-largest, largest).half().numpy())

@@ -1,6 +1,6 @@
 """Checks of a file's first bytes and sizes, made before it is decoded.
 
-Sizes in headers are believed only up to `MAX_SAMPLES`, before any memory is allocated for them.
+Sizes in headers above `MAX_SAMPLES` are refused before any memory is allocated for them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from polsep.io.store.errors import InputError
 
-#: Samples of one frame beyond which a header is not believed: fifty 5-megapixel sensors, or 1 GiB as float32.
+#: Largest number of samples in a frame: fifty 5-megapixel sensors, or 1 GiB as float32.
 MAX_SAMPLES = 2**28
 
 _most_samples: ContextVar[int] = ContextVar("most_samples", default=MAX_SAMPLES)
@@ -36,7 +36,7 @@ _SIGNATURES = (
 
 
 def describe(head: bytes) -> str:
-    """What a file seems to be, from its first bytes."""
+    """The kind of a file, by its first bytes."""
     if not head:
         return "an empty file"
     for signature, name in _SIGNATURES:
@@ -48,7 +48,7 @@ def describe(head: bytes) -> str:
 
 
 def require_signature(stream: BinaryIO, signatures: tuple[bytes, ...], name: str) -> None:
-    """Raise InputError unless the stream starts with one of ``signatures``; leaves it at its start."""
+    """Raise InputError unless the stream starts with one of ``signatures``; rewinds it."""
     head = stream.read(64)
     stream.seek(0)
     if not head.startswith(signatures):
@@ -56,7 +56,7 @@ def require_signature(stream: BinaryIO, signatures: tuple[bytes, ...], name: str
 
 
 def require_size(shape: tuple[int, ...]) -> None:
-    """Raise InputError for a frame without samples, or with more than are allowed, `MAX_SAMPLES` or fewer."""
+    """Raise InputError for a frame without samples, or with more than `at_most` allows."""
     size = "x".join(str(n) for n in shape)
     if min(shape, default=0) < 1:
         raise InputError(f"expected an image with at least one pixel, found {size}")
@@ -66,7 +66,7 @@ def require_size(shape: tuple[int, ...]) -> None:
 
 @contextmanager
 def at_most(samples: int) -> Iterator[None]:
-    """Inside the block, headers are believed only up to so many samples of a frame: for files of strangers."""
+    """Lower the largest number of samples in a frame inside the block, as for files that strangers upload."""
     token = _most_samples.set(min(samples, MAX_SAMPLES))
     try:
         yield

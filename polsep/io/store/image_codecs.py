@@ -24,7 +24,7 @@ def encode_png(pixels: NDArray[np.uint8 | np.uint16], level: int | None = None) 
 
 
 def encode_jpeg(pixels: NDArray[np.uint8]) -> bytes:
-    """The JPEG file of ``pixels`` (uint8, sRGB, ``[h, w, 3]``), as small as it gets. Raises ValueError on others."""
+    """The JPEG file of ``pixels`` (uint8, sRGB, ``[h, w, 3]``), optimized for size. Raises ValueError on others."""
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
         raise ValueError(f"expected pixels uint8 [h, w, 3], found {pixels.dtype} {pixels.shape}")
     stream = BytesIO()
@@ -33,7 +33,7 @@ def encode_jpeg(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def encode_jpeg_quickly(pixels: NDArray[np.uint8]) -> bytes:
-    """The JPEG file of ``pixels`` (uint8, sRGB, ``[h, w, 3]``), in 3 ms at screen size where PNG takes 20 to 50."""
+    """The JPEG file of ``pixels`` (uint8, sRGB, ``[h, w, 3]``), in 3 ms at screen size, where PNG needs 20 to 50."""
     return bytes(imagecodecs.jpeg8_encode(np.ascontiguousarray(pixels), level=LIVE_QUALITY, subsampling="444"))
 
 

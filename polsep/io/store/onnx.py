@@ -1,4 +1,4 @@
-"""Graphs as ONNX files, which run without polsep and without torch."""
+"""Exported networks as ONNX files, which run without polsep and without torch."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from torch import nn
 
 from polsep.io.store.atomic import atomic_path
 
-#: What a graph is given, in order.
+#: Inputs of an exported network, in order.
 INPUTS = ("raw", "black_level", "white_level")
 #: The oldest set of operators that torch's exporter writes.
 OPERATORS = 18
-#: Frames that the exporter traces; any batch and any multiple of 4 can follow. A batch of 1 would stay one.
+#: Frames that the exporter traces; the network accepts any batch and sides of any multiple of 4. Traced with a batch of
+#: 1, it would accept no other.
 EXAMPLE = (2, 64, 96)
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Inside, torch does not speak about its own parts, such as a library that is not needed here."""
+    """Silence torch's remarks about its own parts, such as a library that is not needed here."""
     log = logging.getLogger("torch.onnx")
     before = log.level
     log.setLevel(logging.ERROR)
@@ -35,8 +36,8 @@ def _quiet() -> Iterator[None]:
         log.setLevel(before)
 
 
-def write_onnx(path: Path, graph: nn.Module, outputs: tuple[str, ...], metadata: dict[str, str]) -> None:
-    """Write what maps uint16 frames, black and white level to ``outputs``, whole or not at all.
+def write_onnx(path: Path, network: nn.Module, outputs: tuple[str, ...], metadata: dict[str, str]) -> None:
+    """Write a network that maps uint16 frames, black and white level to ``outputs``, atomically.
 
     Raises ValueError where the extra ``export`` is missing.
     """
@@ -49,7 +50,7 @@ def write_onnx(path: Path, graph: nn.Module, outputs: tuple[str, ...], metadata:
     free = torch.export.Dim.DYNAMIC
     with _quiet():
         program = torch.onnx.export(
-            graph,
+            network,
             arguments,
             dynamo=True,
             verbose=False,

@@ -1,6 +1,6 @@
-"""Temporary folders of a server: one for what arrives and is fetched, and one per session that nobody else can name.
+"""Temporary folders of a server: one for uploads and downloads, and one per session with a secret name.
 
-Everything lies below one root, made with permissions for its owner alone and removed as a whole at the end.
+All are below one root, which only its owner can read and which is removed at the end.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from polsep.io.store.errors import InputError
 
 @dataclass(frozen=True)
 class TemporaryFolders:
-    """``root`` holds ``exchange``, whose files a server hands out by name, and ``kept``, whose files it does not."""
+    """``root`` holds ``exchange``, whose files the server sends by name, and ``kept``, whose files it does not."""
 
     root: Path
 
     @property
     def exchange(self) -> Path:
-        """Uploads, and results to be fetched."""
+        """Uploads and downloads."""
         return self.root / "exchange"
 
     @property
     def kept(self) -> Path:
-        """What sessions work on."""
+        """Working files of the sessions."""
         return self.root / "kept"
 
 
@@ -41,7 +41,7 @@ def make_temporary_folders() -> TemporaryFolders:
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder and all that is in it, as far as that can be done."""
+    """Remove a folder and its contents, as far as possible."""
     shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -53,19 +53,19 @@ def remove_file(path: Path) -> None:
 
 
 def random_name() -> str:
-    """A name that nobody guesses."""
+    """A secret name."""
     return secrets.token_urlsafe(24)
 
 
 def make_folder(parent: Path, name: str) -> Path:
-    """A folder for its owner alone; it may be there already."""
+    """Make a folder that only its owner can read; it may exist."""
     folder = parent / name
     folder.mkdir(mode=0o700, exist_ok=True)
     return folder
 
 
 def clear_folder(folder: Path) -> Path:
-    """An empty folder for its owner alone."""
+    """Make or empty a folder that only its owner can read."""
     remove_folder(folder)
     return make_folder(folder.parent, folder.name)
 
@@ -76,10 +76,10 @@ def file_size(path: Path) -> int:
 
 
 def find_upload(scratch: TemporaryFolders, claimed: object, most_bytes: int) -> Path:
-    """The file of an upload that a client names; only what lies in ``exchange`` exists for it.
+    """The file of an upload that a client names, which must be in ``exchange``.
 
-    Raises InputError for any other path, for links and for folders, without saying whether they are there, and for
-    files of more than ``most_bytes``.
+    Raises InputError on any other path, link or folder, with the same message whether it exists or not, and on files of
+    more than ``most_bytes``.
     """
     refused = InputError("expected a file that this page uploaded, found another path")
     if not isinstance(claimed, str) or not claimed or "\0" in claimed:
@@ -93,7 +93,7 @@ def find_upload(scratch: TemporaryFolders, claimed: object, most_bytes: int) -> 
 
 
 def link_upload(path: Path, folder: Path, name: str) -> Path:
-    """The same file under a ``name`` of ours in a session's folder."""
+    """Link or copy an upload to ``name`` in a session's folder."""
     kept = folder / name
     try:
         os.link(path, kept)

@@ -16,7 +16,7 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.sax.saxutils import quoteattr
+from xml.etree import ElementTree
 
 import numpy as np
 import torch
@@ -159,34 +159,36 @@ def encode_glb(textures: Mapping[str, Pixels], scale: float, name: str) -> bytes
 
 def encode_materialx(files: Mapping[str, str], scale: float, name: str) -> str:
     """A MaterialX document with the node gltf_pbr and an image node for each of `TEXTURES`' ``files``."""
+    root = ElementTree.Element("materialx", version="1.38", colorspace="lin_rec709")
 
-    def image(texture: str, kind: str, space: str) -> str:
-        file = f'<input name="file" type="filename" value={quoteattr(files[texture])}{space} />'
-        return f'  <image name="{texture}_image" type="{kind}">\n    {file}\n  </image>\n'
+    def node(kind: str, node_name: str, type: str, *inputs: dict[str, str]) -> None:
+        element = ElementTree.SubElement(root, kind, name=node_name, type=type)
+        for given in inputs:
+            ElementTree.SubElement(element, "input", given)
 
-    encoded = ' colorspace="srgb_texture"'
-    factor = scale / DIELECTRIC
-    return (
-        '<?xml version="1.0"?>\n<materialx version="1.38" colorspace="lin_rec709">\n'
-        + image("diffuse", "color3", encoded)
-        + image("roughness", "float", "")
-        + image("specular", "color3", encoded)
-        + image("normal", "vector3", "")
-        + '  <normalmap name="normal_map" type="vector3">\n'
-        '    <input name="in" type="vector3" nodename="normal_image" />\n  </normalmap>\n'
-        '  <multiply name="specular_color" type="color3">\n'
-        '    <input name="in1" type="color3" nodename="specular_image" />\n'
-        f'    <input name="in2" type="float" value="{factor:.6g}" />\n  </multiply>\n'
-        '  <gltf_pbr name="shader" type="surfaceshader">\n'
-        '    <input name="base_color" type="color3" nodename="diffuse_image" />\n'
-        '    <input name="metallic" type="float" value="0" />\n'
-        '    <input name="roughness" type="float" nodename="roughness_image" />\n'
-        '    <input name="normal" type="vector3" nodename="normal_map" />\n'
-        '    <input name="specular_color" type="color3" nodename="specular_color" />\n  </gltf_pbr>\n'
-        f'  <surfacematerial name={quoteattr(name)} type="material">\n'
-        '    <input name="surfaceshader" type="surfaceshader" nodename="shader" />\n  </surfacematerial>\n'
-        "</materialx>\n"
+    def link(input_name: str, type: str, target: str) -> dict[str, str]:
+        return {"name": input_name, "type": type, "nodename": target}
+
+    for texture, type in (("diffuse", "color3"), ("roughness", "float"), ("specular", "color3"), ("normal", "vector3")):
+        encoding = {"colorspace": "srgb_texture"} if type == "color3" else {}
+        file = {"name": "file", "type": "filename", "value": files[texture], **encoding}
+        node("image", f"{texture}_image", type, file)
+    node("normalmap", "normal_map", "vector3", link("in", "vector3", "normal_image"))
+    factor = {"name": "in2", "type": "float", "value": f"{scale / DIELECTRIC:.6g}"}
+    node("multiply", "specular_color", "color3", link("in1", "color3", "specular_image"), factor)
+    node(
+        "gltf_pbr",
+        "shader",
+        "surfaceshader",
+        link("base_color", "color3", "diffuse_image"),
+        {"name": "metallic", "type": "float", "value": "0"},
+        link("roughness", "float", "roughness_image"),
+        link("normal", "vector3", "normal_map"),
+        link("specular_color", "color3", "specular_color"),
     )
+    node("surfacematerial", name, "material", link("surfaceshader", "surfaceshader", "shader"))
+    ElementTree.indent(root)
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def read_panels(path: Path) -> tuple[Tensor, ...]:

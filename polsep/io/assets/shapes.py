@@ -20,7 +20,7 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.exchange.ply import export_ply
 from trimesh.visual import ColorVisuals
 
-from polsep.io.results.exr import encode_exr
+from polsep.io.results.exr import as_planes, encode_exr
 from polsep.io.results.previews import srgb
 from polsep.io.results.sidecars import require_finite, require_stem, version_text, write_with_sidecar
 from polsep.io.store.atomic import OutputError
@@ -77,8 +77,7 @@ def write_shape(shape: ShapeFiles, targets: Sequence[Path]) -> None:
 def _encoded_files(shape: ShapeFiles) -> Iterator[bytes | memoryview]:
     """Contents of the files in the order of `shape_targets`."""
     planes: dict[str, NDArray[Any]] = {f"normal.{axis}": shape.normals[..., k] for k, axis in enumerate("XYZ")}
-    colors = "RGB" if shape.albedo.shape[2] == 3 else "Y"
-    planes |= {f"albedo.{color}": shape.albedo[..., k] for k, color in enumerate(colors)}
+    planes |= as_planes({"albedo": shape.albedo})
     planes |= {"depth.Z": np.where(shape.mask, shape.depth, 0), "mask.Y": shape.mask.astype(np.float64)}
     require_finite(planes)
     notes = {"polsepVersion": version_text(), **{f"{layer}Units": unit for layer, unit in UNITS.items()}}

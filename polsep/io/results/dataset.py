@@ -28,10 +28,11 @@ import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.io.results.exr import encode_exr, read_exr_layers
+from polsep.io.results.exr import as_planes, encode_exr, read_exr_layers
 from polsep.io.results.previews import srgb
 from polsep.io.results.sidecars import require_same_settings
-from polsep.io.store.atomic import OutputError, write_checked
+from polsep.io.store.atomic import OutputError, replace_bytes, write_checked
+from polsep.io.store.image_codecs import encode_png
 
 FORMATS = ("exr", "npz")
 #: RGB images of the truth; s1 and s2 are of the light on the sensor, whose s0 is diffuse + specular.
@@ -63,10 +64,10 @@ def begin_dataset(directory: Path, options: Mapping[str, Any]) -> None:
     if path.is_file():
         require_same_settings(path, options, f"the set in {directory}")
         return
-    if directory.is_dir() and (others := sorted(set(os.listdir(directory)) - {UNFINISHED})):
+    others = sorted(path.name for path in directory.glob("[!.]*"))
+    if others:
         raise OutputError(f"expected {directory} empty, new, or a set begun before, found {others[0]!r} in it")
-    directory.mkdir(parents=True, exist_ok=True)
-    _write_whole(path, _as_json(options))
+    replace_bytes(path, _as_json(options))
 
 
 def find_finished(directory: Path, stems: Sequence[str]) -> set[str]:
@@ -87,8 +88,7 @@ def _is_complete(record: Path, sizes: Mapping[str, int]) -> bool:
 def write_view(directory: Path, stem: str, images: Images, record: Mapping[str, Any], format: str) -> None:
     """Write one view: ``mosaic`` uint16 ``[H, W]``, `LAYERS` float16 ``[H, W, 3]``, ``mask`` bool ``[H, W]``."""
     encode = {"exr": _encode_exr, "npz": _encode_npz}[format]
-    mosaic = bytes(imagecodecs.png_encode(np.ascontiguousarray(images["mosaic"]), level=PNG_LEVEL))
-    contents = {f"{stem}.png": mosaic, f"{stem}.{format}": encode(images)}
+    contents = {f"{stem}.png": encode_png(images["mosaic"], PNG_LEVEL), f"{stem}.{format}": encode(images)}
     contents[f"{stem}.json"] = _as_json({**record, "files": [_entry(*item) for item in contents.items()]})
     hidden = directory / UNFINISHED
     hidden.mkdir(exist_ok=True)
@@ -120,13 +120,13 @@ def finish_dataset(directory: Path, stems: Sequence[str], options: Mapping[str, 
     count = min(len(stems), SHEET_ROWS * SHEET_COLS)
     shown = [stems[k * len(stems) // count] for k in range(count)]
     sheet = contact_sheet(read_view(directory, stem) for stem in shown)
-    _write_whole(directory / SHEET, bytes(imagecodecs.png_encode(sheet)))
+    replace_bytes(directory / SHEET, encode_png(sheet))
     lines = [json.dumps({"options": options, "views": len(stems)})]
     for stem in stems:
         data = (directory / f"{stem}.json").read_bytes()
         files = [*json.loads(data)["files"], _entry(f"{stem}.json", data)]
         lines.append(json.dumps({"view": stem, "files": files}))
-    _write_whole(directory / MANIFEST, "".join(f"{line}\n" for line in lines).encode())
+    replace_bytes(directory / MANIFEST, "".join(f"{line}\n" for line in lines).encode())
     remove_unfinished(directory)
 
 
@@ -179,8 +179,7 @@ def _thumbnail(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 def _encode_exr(images: Images) -> bytes:
     """One part of half floats, ZIP compressed, as every reader of EXR knows it."""
-    planes = {f"{layer}.{c}": images[layer][..., k] for layer in LAYERS for k, c in enumerate("RGB")}
-    planes["mask.Y"] = images["mask"]
+    planes = {**as_planes({layer: images[layer] for layer in LAYERS}), "mask.Y": images["mask"]}
     notes = {"units": "linear light, 1.0 = one measurement at the white level: s0 = diffuse + specular = 2"}
     return bytes(encode_exr({name: plane.astype(np.float16) for name, plane in planes.items()}, notes))
 
@@ -199,12 +198,3 @@ def _entry(name: str, data: bytes) -> dict[str, Any]:
 
 def _as_json(record: Mapping[str, Any]) -> bytes:
     return (json.dumps(record, indent=1, allow_nan=False) + "\n").encode()
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    """Replace a file as a whole: written in the hidden directory, then renamed."""
-    hidden = path.parent / UNFINISHED
-    hidden.mkdir(exist_ok=True)
-    beside = hidden / f"{path.name}.{os.getpid()}"
-    write_checked(beside, data)
-    os.replace(beside, path)

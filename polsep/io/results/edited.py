@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.io.results.exr import encode_exr
+from polsep.io.results.exr import as_planes, encode_exr
 from polsep.io.results.separation_writer import UNITS, planned_outputs
 from polsep.io.results.sidecars import EncodedFile, require_finite, version_text, write_with_sidecar
 from polsep.io.store.atomic import refuse_existing, replace_bytes, replace_text
@@ -72,12 +72,7 @@ def write_edited(frame: EditedFrame, directory: Path, stem: str, overwrite: bool
 def _encoded_files(frame: EditedFrame, stem: str, units: Mapping[str, str]) -> Iterator[EncodedFile]:
     """The EXR file and the preview."""
     notes = {"polsepVersion": version_text(), **{f"{layer}Units": unit for layer, unit in units.items()}}
-    planes = {
-        f"{layer}.{color}": image[..., k]
-        for layer, image in frame.layers.items()
-        for k, color in enumerate("RGB" if image.shape[2] == 3 else "Y")
-    }
-    yield f"{stem}.exr", encode_exr(planes, notes)
+    yield f"{stem}.exr", encode_exr(as_planes(frame.layers), notes)
     yield f"{stem}.png", encode_png(frame.preview)
 
 

@@ -13,7 +13,7 @@ import io
 import struct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import OpenEXR  # a bare extension module without stubs
@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 
 from polsep.io.store.errors import InputError, decoding, naming
 from polsep.io.store.header_checks import require_signature, require_size
+
+Number = TypeVar("Number", bound=np.generic)
 
 COMPRESSIONS = {
     "none": OpenEXR.NO_COMPRESSION,
@@ -74,19 +76,23 @@ def encode_exr(planes: Mapping[str, NDArray[Any]], notes: Mapping[str, str], com
     return stream.getbuffer()
 
 
-def as_half_planes(images: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float16]]:
-    """Layers, float32 ``[H, W, 3]`` as name.R, name.G, name.B or ``[H, W, 1]`` as name.Y; views of half floats.
+def as_planes(layers: Mapping[str, NDArray[Number]]) -> dict[str, NDArray[Number]]:
+    """Channels of layers by name, views: name.R, name.G and name.B of ``[H, W, 3]``, name.Y of ``[H, W, 1]``."""
+    return {
+        f"{name}.{color}": image[..., k]
+        for name, image in layers.items()
+        for k, color in enumerate("RGB" if image.shape[2] == 3 else "Y")
+    }
 
-    Light above the largest half float becomes that.
-    """
-    planes: dict[str, NDArray[np.float16]] = {}
-    for name, image in images.items():
+
+def as_half_planes(layers: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float16]]:
+    """`as_planes` in half floats. Light above the largest half float becomes that."""
+    halves: dict[str, NDArray[np.float16]] = {}
+    for name, image in layers.items():
         writable = np.require(image, requirements="W")  # arrays of other processes are read-only
         # PyTorch converts ten times as fast as NumPy.
-        halves = torch.from_numpy(writable).half().clamp_(max=LARGEST_HALF).numpy()
-        colors = "RGB" if image.shape[2] == 3 else "Y"
-        planes |= {f"{name}.{color}": halves[..., k] for k, color in enumerate(colors)}
-    return planes
+        halves[name] = torch.from_numpy(writable).half().clamp_(max=LARGEST_HALF).numpy()
+    return as_planes(halves)
 
 
 def write_exr_halves(path: Path, planes: Mapping[str, NDArray[np.float16]], notes: Mapping[str, str]) -> None:

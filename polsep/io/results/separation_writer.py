@@ -25,7 +25,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from polsep.io.results.exr import encode_exr
+from polsep.io.results.exr import as_planes, encode_exr
 from polsep.io.results.previews import contact_sheet
 from polsep.io.results.sidecars import EncodedFile, require_finite, require_stem, version_text, write_with_sidecar
 from polsep.io.store.atomic import OutputError, refuse_existing
@@ -149,14 +149,12 @@ def _encoded_files(frame: SeparatedFrame, stem: str, format: str) -> Iterator[En
 
 def _encode_exr(frame: SeparatedFrame) -> memoryview:
     """One part of float32 channels, ZIP compressed, with the units as header attributes."""
-    planes = {"dolp.Y": frame.dolp, "aolp.Y": frame.aolp, "valid.Y": frame.valid}
-    for layer, image in (("diffuse", frame.diffuse), ("specular", frame.specular)):
-        for k, color in enumerate("RGB" if image.shape[-1] == 3 else "Y"):
-            planes[f"{layer}.{color}"] = image[..., k]
+    planes = as_planes({"diffuse": frame.diffuse, "specular": frame.specular})
+    planes |= {"dolp.Y": frame.dolp, "aolp.Y": frame.aolp, "valid.Y": frame.valid.astype(np.float32)}
     if frame.error is not None:
         planes |= {f"{ERROR}.{image}": frame.error[..., k] for k, image in enumerate(("diffuse", "specular"))}
     notes = {"polsepVersion": version_text(), **{f"{layer}Units": UNITS[layer] for layer in _layers(frame)}}
-    return encode_exr({name: plane.astype(np.float32) for name, plane in planes.items()}, notes)
+    return encode_exr(planes, notes)
 
 
 def _encode_npz(frame: SeparatedFrame) -> bytes:

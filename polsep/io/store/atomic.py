@@ -73,6 +73,13 @@ def refuse_existing(directory: Path, targets: Sequence[Path], overwrite: bool) -
             raise OutputError(f"expected no {target}, found one from before; --overwrite replaces it")
 
 
+def refuse_inputs(targets: Sequence[Path], inputs: Sequence[Path]) -> None:
+    """Raise OutputError where an output would replace an input. Call it first."""
+    clash = {os.path.realpath(path) for path in targets} & {os.path.realpath(path) for path in inputs}
+    if clash:
+        raise OutputError(f"expected outputs apart from inputs, found that {min(clash)} is an input")
+
+
 def write_set(targets: Sequence[Path], name: str, write: Callable[[Path], None]) -> None:
     """Write a set of files atomically: ``write(folder)`` makes them, then they move to ``targets`` of the same names.
 

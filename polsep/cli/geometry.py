@@ -62,12 +62,11 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
             find_shape,
             read_object,
             read_views,
-            refuse_inputs,
             shrink,
         )
     from polsep.geometry.lights import parse_lights
     from polsep.io.assets.shapes import shape_targets, write_shape
-    from polsep.io.store.atomic import refuse_existing
+    from polsep.io.store.atomic import refuse_existing, refuse_inputs
     from polsep.methods import check_method
 
     asked = Asked(options["mesh"], options["fov"], options["integration"], options["turntable"])

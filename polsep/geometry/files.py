@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from os.path import realpath
 from pathlib import Path
 from typing import Any
 
@@ -256,10 +255,3 @@ def _cell(picture: Pixels, mask: Mask) -> Pixels:
     top, left = (CELL - height) // 2, (CELL - width) // 2
     cell[top : top + height, left : left + width] = cut[at[0]][:, at[1]]
     return cell
-
-
-def refuse_inputs(targets: Sequence[Path], inputs: Sequence[Path]) -> None:
-    """Raise InputError where an output would replace an input."""
-    clash = {realpath(path) for path in targets} & {realpath(path) for path in inputs}
-    if clash:
-        raise InputError(f"expected outputs apart from inputs, found that {sorted(clash)[0]} is an input")

@@ -16,7 +16,7 @@ from polsep.io.assets.materials import MaterialFiles, material_targets, write_ma
 from polsep.io.raw.frames import ReadOptions, output_stem, read_frames
 from polsep.io.results.previews import Panel, Pixels, titled_sheet, toned
 from polsep.io.results.separation_reader import read_separated
-from polsep.io.store.atomic import OutputError, refuse_existing
+from polsep.io.store.atomic import refuse_existing, refuse_inputs
 from polsep.io.store.errors import InputError, input_error
 from polsep.material.estimate import load_estimator
 from polsep.material.shots import CAMERA_HEIGHT, MAP_SIZE
@@ -77,7 +77,7 @@ def estimate_files(
     directory, name, overwrite = target
     name = output_stem(paths[0]) if name is None else name
     refuse_existing(directory, targets := material_targets(directory, name), overwrite)
-    _refuse_inputs(paths, targets)
+    refuse_inputs(targets, [Path(path) for path in paths])
     estimator = load_estimator(options.input, options.weights)
     photographs = read_photographs(paths, options)
     white = find_white(photographs.views, options.white)
@@ -97,14 +97,6 @@ def estimate_files(
     arrays = {kind: np.ascontiguousarray(x.movedim(0, -1).numpy()) for kind, x in vars(maps).items()}
     files = MaterialFiles(arrays, draw_material(maps, views), said)
     return write_material(files, directory, name, overwrite), notes
-
-
-def _refuse_inputs(paths: Sequence[str], targets: Sequence[Path]) -> None:
-    """Raise OutputError where an output would replace an input."""
-    inputs = {Path(path).resolve() for path in paths}
-    clash = [path for path in targets if path.resolve() in inputs]
-    if clash:
-        raise OutputError(f"expected outputs apart from inputs, found that {clash[0]} is an input")
 
 
 def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photographs:

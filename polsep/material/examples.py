@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from polsep.io.store.examples import has_example, read_example, write_example
+from polsep.io.store.examples import read_example, write_example
 from polsep.material.shots import INPUTS, Example, random_example
 from polsep.material.svbrdf import STACKED
 
@@ -24,7 +24,7 @@ def make_examples(folder: Path, split: str, seed: int, count: int, views: int) -
     """Make those of the first ``count`` examples that are not there yet; yields how many are, after each."""
     for number in range(count):
         path = example_path(folder, split, seed, number)
-        if not has_example(path):
+        if not path.is_file():
             example = random_example(split, seed, number, views)
             write_example(path, torch.cat([example.views.flatten(0, 1), example.maps]))
         yield number + 1

@@ -25,7 +25,6 @@ from polsep.io.store.errors import InputError
 from polsep.io.store.temporary import (
     TemporaryFolders,
     clear_folder,
-    file_size,
     find_upload,
     link_upload,
     make_folder,
@@ -263,7 +262,7 @@ class Sessions:
         if not 0 < len(sent) <= MAX_FILES:
             raise InputError(f"expected 1 to {MAX_FILES} files, found {len(sent)}")
         paths = [find_upload(self.scratch, claimed, self.most_bytes) for claimed, _ in sent]
-        if (size := sum(file_size(path) for path in paths)) > self.most_bytes:
+        if (size := sum(path.stat().st_size for path in paths)) > self.most_bytes:
             most = self.most_bytes / 2**20
             raise InputError(f"expected files of at most {most:.0f} MB together, found {size / 2**20:.0f} MB")
         names = [plain_name(name) for _, name in sent]

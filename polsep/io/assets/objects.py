@@ -15,6 +15,8 @@ import numpy as np
 import scipy.io
 import trimesh
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from polsep.io.raw.png import read_png
 from polsep.io.store.errors import decoding
@@ -62,19 +64,12 @@ def read_mesh(path: Path) -> Mesh:
 
 def _without_fragments(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     """The triangles of connected parts that are large enough."""
-    part = np.arange(faces.max() + 1)
-    while True:  # every vertex gets the smallest number around it until all of a part agree
-        smallest = part.copy()
-        least = part[faces].min(axis=1)
-        for k in range(3):
-            np.minimum.at(smallest, faces[:, k], least)
-        smallest = smallest[smallest]
-        if (smallest == part).all():
-            break
-        part = smallest
-    owner = part[faces[:, 0]]
-    share = np.bincount(owner, minlength=len(part)) / len(faces)
-    return faces[share[owner] >= SMALLEST_PART]
+    start, end = np.concatenate([faces[:, :2], faces[:, 1:]]).T  # two edges connect the corners of a triangle
+    size = int(faces.max()) + 1
+    edges = coo_array((np.ones(len(start), np.bool_), (start, end)), shape=(size, size))
+    part: NDArray[np.int32] = connected_components(edges, directed=False)[1][faces[:, 0]]
+    share = np.bincount(part) / len(faces)
+    return faces[share[part] >= SMALLEST_PART]
 
 
 def smooth_normals(vertices: Floats, faces: NDArray[np.int64]) -> Floats:

@@ -27,8 +27,3 @@ def read_example(path: Path) -> Tensor:
     if planes.dtype != np.float16 or planes.ndim != 3:
         raise ValueError(f"expected planes [K, h, w] of float16 in {path}, found {planes.dtype} {planes.shape}")
     return torch.from_numpy(planes)
-
-
-def has_example(path: Path) -> bool:
-    """Whether the file is there."""
-    return path.is_file()

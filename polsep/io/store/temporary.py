@@ -70,11 +70,6 @@ def clear_folder(folder: Path) -> Path:
     return make_folder(folder.parent, folder.name)
 
 
-def file_size(path: Path) -> int:
-    """Bytes of a file."""
-    return path.stat().st_size
-
-
 def find_upload(scratch: TemporaryFolders, claimed: object, most_bytes: int) -> Path:
     """The file of an upload that a client names, which must be in ``exchange``.
 

@@ -6,6 +6,7 @@ import ast
 import re
 import shlex
 import warnings
+from importlib import import_module
 from pathlib import Path
 
 import click
@@ -101,9 +102,21 @@ def test_commands_parse(page: Path) -> None:
 
 @every_page
 def test_python_parses(page: Path) -> None:
-    """Every Python block is valid Python."""
+    """Every Python block is valid Python, and the names that it imports from polsep exist."""
     for code in blocks(page, "python"):
-        ast.parse(code)
+        for node in ast.walk(ast.parse(code)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "polsep":
+                module = import_module(str(node.module))
+                assert not [name.name for name in node.names if not hasattr(module, name.name)]
+
+
+@every_page
+def test_named_files_exist(page: Path) -> None:
+    """Every file of the repository that a page names in code is there; what git does not keep is exempt."""
+    named = re.findall(
+        r"`((?:polsep|tests|evaluation|examples|results)/[\w./-]+\.\w+)`", page.read_text(encoding="utf-8")
+    )
+    assert not [name for name in named if not (ROOT / name).is_file()]
 
 
 def test_the_site_names_every_page() -> None:

@@ -60,4 +60,5 @@ MEASURES = {name: bench.measures for name, bench in (polsep.bench.BENCHES | BENC
     "polanalyser": (*FORMULAS, "polsep/compute"),
     "blender": ("polsep/geometry", "polsep/material", "polsep/io/assets"),
     "materialx": ("polsep/material", "polsep/io/assets"),
+    "house": (),  # of the commit that it names, and of no other
 }

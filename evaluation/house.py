@@ -49,7 +49,7 @@ separate()
 """
 
 
-def measure_house(repo: Path, case: str) -> Iterator[Row]:
+def measure_house(repo: Path, name: str) -> Iterator[Row]:
     """Rows of a checkout."""
     package = repo / "polsep"
     lines = {path: count_lines(path) for path in sorted(package.rglob("*.py"))}
@@ -77,14 +77,14 @@ def measure_house(repo: Path, case: str) -> Iterator[Row]:
         "rooms without a rank": len(rooms - ranks.keys()),
     }
     for metric, count in counts.items():
-        yield Row("house", case, "polsep", metric, count, "1")
-    yield Row("house", case, "polsep", "wheel", measure_wheel(repo) / 1e6, "MB")
+        yield Row("house", "polsep", name, metric, count, "1")
+    yield Row("house", "polsep", name, "wheel", measure_wheel(repo) / 1e6, "MB")
     times = [float(run(repo, sys.executable, "-c", IMPORT)) for _ in range(IMPORTS)]
-    yield Row("house", case, "polsep", f"import, median of {IMPORTS}", 1000 * statistics.median(times), "ms")
+    yield Row("house", "polsep", name, f"import, median of {IMPORTS}", 1000 * statistics.median(times), "ms")
     for method in ("analytic", "joint"):
         depth, *names = run(repo, sys.executable, "-c", PATH, method).splitlines()[-1].split()
         print(f"{method}: {' > '.join(names)}")
-        yield Row("house", case, "polsep", f"functions from separate to the mathematics, {method}", int(depth), "1")
+        yield Row("house", "polsep", name, f"functions from separate to the mathematics, {method}", int(depth), "1")
 
 
 def imports(tree: ast.Module) -> Iterator[str]:
@@ -128,18 +128,18 @@ def run(repo: Path, *command: str) -> str:
 
 @click.command()
 @click.option("--repo", type=click.Path(exists=True, path_type=Path), default=Path(), metavar="DIR", help="Checkout.")
-@click.option("--case", default="after", metavar="NAME", help="Name of its rows; those of other names stay.")
+@click.option("--case", default="after", metavar="NAME", help="Column of its rows; those of others stay.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("results"), help="Of house.jsonl.")
 def house(repo: Path, case: str, output: Path) -> None:
     """Measure the structure of a checkout: size, rooms, imports, wheel, the way from a call to the mathematics."""
     rows = list(measure_house(repo, case))
     for row in rows:
-        print(f"{row.case:8} {row.metric:56} {row.value:10.4g} {row.unit}")
+        print(f"{row.method:8} {row.metric:56} {row.value:10.4g} {row.unit}")
     path, tables = output / "house.jsonl", dict[str, list[dict[str, Any]]]()
     commit = run(repo, "git", "rev-parse", "--short", "HEAD").strip()
     made_by = provenance(f"python -m evaluation house --case {case}") | {"commit": commit}
     for old in read_rows(path) if path.is_file() else ():
-        tables.setdefault(old["case"], []).append(old)
+        tables.setdefault(old["method"], []).append(old)
     tables[case] = [dataclasses.asdict(row) | made_by for row in rows]
     fields = [field.name for field in dataclasses.fields(Row)]
     text = "".join(

@@ -77,12 +77,12 @@ def _bench_stream(crop: int) -> Iterator[Row]:
     from torch.utils.data import DataLoader
 
     from polsep.datasets.rendered import default_workers
-    from polsep.train.loop import take_one_core
+    from polsep.train.loop import use_one_thread
     from polsep.train.stream import ExampleStream, StreamOptions
 
     options, workers = StreamOptions(crop=crop), default_workers()
     stream = ExampleStream(options)
-    batches = iter(DataLoader(stream, batch_size=None, num_workers=workers, worker_init_fn=take_one_core))
+    batches = iter(DataLoader(stream, batch_size=None, num_workers=workers, worker_init_fn=use_one_thread))
     for _ in itertools.islice(batches, FIRST_BATCHES):
         pass
     start = time.perf_counter()

@@ -32,6 +32,7 @@ from polsep.train import command, loop
 from polsep.train import joint_task as module
 from polsep.train.command import JointOptions, train_weights
 from polsep.train.digest import digest_examples
+from polsep.train.inputs import JointInputs, find_clipped, joint_inputs, joint_mono_inputs
 from polsep.train.joint_losses import (
     DATA_SCALE,
     MIN_ERROR,
@@ -41,20 +42,19 @@ from polsep.train.joint_losses import (
     joint_loss,
     mean_decibels,
     paper_difference,
-    sample_misfit,
+    sample_residual,
     variance_loss,
 )
 from polsep.train.joint_task import (
     ABLATIONS,
     FIT_LANE,
     FIT_REACH,
+    JOINT_VARIANTS,
     SIZES,
-    VIEWS,
     fit_filter,
     joint_task,
     reach_of_filter,
 )
-from polsep.train.joint_views import JointSeen, find_clipped, see_raw, see_raw_mono
 from polsep.train.loop import Run, Schedule, train
 from polsep.train.losses import diffuse_loss
 from polsep.train.stream import Examples, StreamOptions, stream_lane
@@ -82,12 +82,12 @@ def batches() -> list[Examples]:
     return list(itertools.islice(stream_lane(replace(STREAM, batch=4, pool=4), 0, 0), 4))
 
 
-def small_task(ablation: str = "none", variant: str = "mosaic") -> Task[JointSeen]:
+def small_task(ablation: str = "none", variant: str = "mosaic") -> Task[JointInputs]:
     torch.manual_seed(1)
     return joint_task(variant, TINY, ABLATIONS[ablation])
 
 
-def truth_of(seen: JointSeen) -> JointOutput:
+def truth_of(seen: JointInputs) -> JointOutput:
     """True light as the network would give it, with doubts about nothing."""
     s1, s2 = avg_pool2d(seen.polarized, 2).chunk(2, dim=1)
     count, _, height, width = seen.raw.shape
@@ -95,7 +95,7 @@ def truth_of(seen: JointSeen) -> JointOutput:
     return JointOutput(seen.full_diffuse, seen.full_specular, s1, s2, doubt, light, torch.zeros_like(light))
 
 
-def explained(layout: Layout) -> tuple[JointOutput, Polarization, JointSeen]:
+def explained(layout: Layout) -> tuple[JointOutput, Polarization, JointInputs]:
     """Images, the polarization of their light, and an example without noise that they explain, part of it clipped."""
     generator, c = torch.Generator().manual_seed(5), layout.channels
     diffuse, specular = (3 * torch.rand(2, n, 16, 16, generator=generator) ** 2 for n in (c, 1))
@@ -105,7 +105,7 @@ def explained(layout: Layout) -> tuple[JointOutput, Polarization, JointSeen]:
     half = [avg_pool2d(x, 2) for x in (diffuse, specular)]
     polarized = torch.cat([light.s1, light.s2], dim=1)
     ones = torch.ones(2, 1, 16, 16)
-    seen = JointSeen(raw, *half, ones[:, 0, ::2, ::2] > 0, layout, diffuse, specular, ones, polarized)
+    seen = JointInputs(raw, *half, ones[:, 0, ::2, ::2] > 0, layout, diffuse, specular, ones, polarized)
     polarization = Polarization(*(x.view(1, 2, 1, 1).expand(2, 2, 4, 4) for x in (a, e)))
     return truth_of(seen), polarization, seen
 
@@ -114,9 +114,9 @@ def as_variable(images: JointOutput) -> JointOutput:
     return JointOutput(*(x.detach().clone().requires_grad_() for x in images))
 
 
-@pytest.mark.parametrize("see", [see_raw, see_raw_mono])
+@pytest.mark.parametrize("see", [joint_inputs, joint_mono_inputs])
 def test_examples_hold_raw_samples_and_the_truth_behind_them(
-    batches: list[Examples], see: Callable[[Examples], JointSeen]
+    batches: list[Examples], see: Callable[[Examples], JointInputs]
 ) -> None:
     """The truth, through the camera, is the samples up to noise; half resolution is the mean of full."""
     seen = see(batches[0])
@@ -215,11 +215,11 @@ def test_the_truth_explains_all_samples_that_did_not_clip(layout: Layout) -> Non
     """The misfit is 0 although a part of the frame clips, and not where anything else is claimed."""
     images, polarization, seen = explained(layout)
     assert 0.02 < float(find_clipped(seen.raw).float().mean()) < 0.5
-    assert float(sample_misfit(images, polarization, seen)) < 1e-8
+    assert float(sample_residual(images, polarization, seen)) < 1e-8
     darker = images._replace(diffuse=0.9 * images.diffuse)
     turned = polarization._replace(direction=polarization.specular.flip(1))
-    assert float(sample_misfit(darker, polarization, seen)) > 0.1
-    assert float(sample_misfit(images, turned, seen)) > 0.1
+    assert float(sample_residual(darker, polarization, seen)) > 0.1
+    assert float(sample_residual(images, turned, seen)) > 0.1
 
 
 def test_clipped_samples_have_no_misfit() -> None:
@@ -227,12 +227,12 @@ def test_clipped_samples_have_no_misfit() -> None:
     images, polarization, seen = explained(MONO)
     clipped = find_clipped(seen.raw)
     variable = as_variable(images._replace(diffuse=images.diffuse + 0.5))
-    sample_misfit(variable, polarization, seen).backward()
+    sample_residual(variable, polarization, seen).backward()
     gradient = variable.diffuse.grad
     assert gradient is not None
     assert not bool(gradient[clipped].any())
     assert bool((gradient[~clipped] != 0).all())
-    assert float(sample_misfit(images, polarization, seen._replace(raw=torch.ones_like(seen.raw)))) == 0
+    assert float(sample_residual(images, polarization, seen._replace(raw=torch.ones_like(seen.raw)))) == 0
 
 
 def test_misfit_is_quadratic_for_noise_and_linear_beyond() -> None:
@@ -242,7 +242,7 @@ def test_misfit_is_quadratic_for_noise_and_linear_beyond() -> None:
 
     def misfit(sample: float) -> float:
         level = torch.full_like(images.diffuse, 2 * sample * DATA_SCALE)
-        return float(sample_misfit(images._replace(diffuse=level, specular=0 * level), flat, nothing))
+        return float(sample_residual(images._replace(diffuse=level, specular=0 * level), flat, nothing))
 
     assert misfit(0.5) == pytest.approx(0.125)
     assert misfit(1.0) == pytest.approx(0.5)
@@ -264,7 +264,7 @@ def test_nothing_is_better_than_the_truth(layout: Layout) -> None:
             assert float(joint_loss((other._replace(doubt=doubt), polarization), seen, Goal())) > float(best) + 1
 
 
-def known_views(layout: Layout, weight: Tensor) -> list[JointSeen]:
+def known_views(layout: Layout, weight: Tensor) -> list[JointInputs]:
     """Random samples, whose truth is what a packed filter makes of them."""
     generator, c = torch.Generator().manual_seed(2), layout.channels
     views = []
@@ -276,7 +276,7 @@ def known_views(layout: Layout, weight: Tensor) -> list[JointSeen]:
         diffuse, specular = pixel_shuffle(s0, 4), torch.zeros_like(raw)
         mask = torch.ones(2, 32, 32, dtype=torch.bool)
         views.append(
-            JointSeen(
+            JointInputs(
                 raw,
                 avg_pool2d(diffuse, 2),
                 specular[..., ::2, ::2],
@@ -371,10 +371,10 @@ def test_what_examples_leave_open_stays_bilinear() -> None:
         fit_filter([])
 
 
-@pytest.mark.parametrize("variant", VIEWS)
+@pytest.mark.parametrize("variant", JOINT_VARIANTS)
 def test_the_fitted_filter_beats_bilinear_on_other_examples(variant: str) -> None:
     """s0 where nothing clips, relative to its brightness, of scenes that it was not fitted to."""
-    see, colors = VIEWS[variant]
+    see, colors = JOINT_VARIANTS[variant]
     options = replace(STREAM, batch=8, pool=8)
     fitted = fit_filter(see(batch) for batch in itertools.islice(stream_lane(options, FIT_LANE, 0), 10))
     net = Joint(colors, TINY)
@@ -384,7 +384,7 @@ def test_the_fitted_filter_beats_bilinear_on_other_examples(variant: str) -> Non
     assert relative_error(net, views) < 0.9 * before
 
 
-def relative_error(net: Joint, views: list[JointSeen]) -> float:
+def relative_error(net: Joint, views: list[JointInputs]) -> float:
     """Mean squared error of s0 over the squared light around, where nothing near clips."""
     total, count = 0.0, 0
     for seen in views:
@@ -405,7 +405,7 @@ def test_sizes_and_ablations_are_told_apart() -> None:
     assert parameters["joint"] > 4 * parameters["joint-fast"]
 
 
-@pytest.mark.parametrize("variant", VIEWS)
+@pytest.mark.parametrize("variant", JOINT_VARIANTS)
 @pytest.mark.parametrize("ablation", ABLATIONS)
 def test_every_ablation_learns(ablation: str, variant: str, batches: list[Examples]) -> None:
     """It sees what it says, a step has finite gradients of every parameter, and changes what it separates."""
@@ -420,7 +420,7 @@ def test_every_ablation_learns(ablation: str, variant: str, batches: list[Exampl
         optimizer.step()
     after = task.separate(seen)
     for one, other in ((before.diffuse, after.diffuse), (before.specular, after.specular)):
-        assert one.shape == other.shape == (4, VIEWS[variant][1], 16, 16)
+        assert one.shape == other.shape == (4, JOINT_VARIANTS[variant][1], 16, 16)
         assert float(other.min()) >= 0
         assert float((one - other).abs().mean()) > 1e-4
 
@@ -437,10 +437,10 @@ def test_gradients_are_finite_on_black_and_clipped_frames(ablation: str) -> None
         assert_finite(*(p.grad for p in task.network.parameters()))
 
 
-@pytest.mark.parametrize("variant", VIEWS)
+@pytest.mark.parametrize("variant", JOINT_VARIANTS)
 def test_ablations_differ_in_what_they_see_or_in_what_they_minimize(variant: str, batches: list[Examples]) -> None:
     """Never in both, and in nothing else: at the beginning all separate alike."""
-    seen = VIEWS[variant][0](batches[0])
+    seen = JOINT_VARIANTS[variant][0](batches[0])
     whole = small_task("none", variant)
     for ablation, (inputs, goal) in ABLATIONS.items():
         assert (inputs != INPUTS) + (goal != Goal()) == (ablation != "none")
@@ -451,7 +451,7 @@ def test_ablations_differ_in_what_they_see_or_in_what_they_minimize(variant: str
         assert torch.equal(task.separate(seen).specular, whole.separate(seen).specular)
 
 
-@pytest.mark.parametrize("variant", VIEWS)
+@pytest.mark.parametrize("variant", JOINT_VARIANTS)
 def test_training_ends_in_weights_that_say_all(variant: str, tmp_path: Path, shortened: None) -> None:
     options = JointOptions("joint-fast", variant, TINY)
     run = Run(tmp_path, "a test", STREAM, SCHEDULE, workers=0)
@@ -463,7 +463,7 @@ def test_training_ends_in_weights_that_say_all(variant: str, tmp_path: Path, sho
     known = {"method": "joint-fast", "ablation": "none", "variant": variant, "seed": "0", "data": data}
     assert known.items() <= metadata.items()
     colors = int(metadata["colors"])
-    assert colors == VIEWS[variant][1]
+    assert colors == JOINT_VARIANTS[variant][1]
     assert json.loads(metadata["inputs"]) == list(INPUTS)
     assert json.loads(metadata["size"]) == {"width": 4, "blocks": [0, 1], "entry": 0}
     last = [round(lines[-1][f"{image} PSNR"], 3) for image in ("diffuse", "specular")]
@@ -476,7 +476,7 @@ def test_training_ends_in_weights_that_say_all(variant: str, tmp_path: Path, sho
     network.load_state_dict({name: value.float() for name, value in weights.items()})
     assert metadata["parameters"] == str(count_parameters(network))
     examples = itertools.islice(stream_lane(STREAM, FIT_LANE, 0), 4)
-    fitted = fit_filter(VIEWS[variant][0](batch) for batch in examples)
+    fitted = fit_filter(JOINT_VARIANTS[variant][0](batch) for batch in examples)
     assert torch.equal(network.demosaic, fitted.half().float())
 
 

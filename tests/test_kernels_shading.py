@@ -13,7 +13,15 @@ from torch import Tensor
 from polsep.physics.optics import dot, normalize
 from polsep.render import shading_kernel as shading
 from polsep.render.materials import Materials, look_up, random_materials
-from polsep.render.shading_kernel import BLOCK, CHANNELS, Points, material_table, shade_pixels, spread_pixels
+from polsep.render.shading_kernel import (
+    BLOCK,
+    CHANNELS,
+    Points,
+    build_beams,
+    material_table,
+    shade_pixels,
+    spread_pixels,
+)
 from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, shade
 
 CAMERA, LIGHT = PinholeCamera((0.4, 0.8, 6.0)), PointLight((2.0, 1.0, 5.0), 30.0, 0.7)
@@ -52,7 +60,7 @@ def by_torch(hits: Points, materials: Materials, light: PointLight, dtype: torch
 def assert_agrees(hits: Points, materials: Materials, light: PointLight) -> None:
     """As exact as the twin in float32 is, or to `AGREEMENT`, against the twin in float64."""
     image = np.zeros((hits.slot.size, CHANNELS), np.float32)
-    shade_pixels(replace_pixels(hits), material_table(materials), CAMERA, light, image)
+    shade_pixels(replace_pixels(hits), material_table(materials), build_beams(CAMERA, light), image)
     exact, single = by_torch(hits, materials, light, torch.float64), by_torch(hits, materials, light, torch.float32)
     for lobe in (slice(0, 9), slice(9, 12)):
         peak = float(exact[:, lobe].abs().max())
@@ -109,7 +117,7 @@ def test_pixels_sum_their_hits(generator: torch.Generator) -> None:
     materials = random_materials(SLOTS, generator)
     points = as_points(position, normal, slot, pixel.numpy(), lit)
     image = np.zeros((900, CHANNELS), np.float32)
-    shade_pixels(points, material_table(materials), CAMERA, LIGHT, image)
+    shade_pixels(points, material_table(materials), build_beams(CAMERA, LIGHT), image)
     expected = torch.zeros(900, CHANNELS, dtype=torch.float64)
     expected.index_add_(0, pixel, by_torch(points, materials, LIGHT, torch.float64))
     for lobe in (slice(0, 9), slice(9, 12)):
@@ -127,12 +135,12 @@ def test_a_pixel_may_fill_a_block(generator: torch.Generator) -> None:
     materials = random_materials(SLOTS, generator)
     points = as_points(position, normal, slot, np.full(hits, 1), torch.ones(hits, dtype=torch.bool))
     image = np.zeros((3, CHANNELS), np.float32)
-    shade_pixels(points, material_table(materials), CAMERA, LIGHT, image)
+    shade_pixels(points, material_table(materials), build_beams(CAMERA, LIGHT), image)
     expected = by_torch(points, materials, LIGHT, torch.float64).sum(dim=0)
     np.testing.assert_allclose(image[1], expected.numpy(), rtol=0, atol=AGREEMENT * float(expected.max()))
     none = Points(*(x[..., :0] for x in points))
     empty = np.zeros((3, CHANNELS), np.float32)
-    shade_pixels(none, material_table(materials), CAMERA, LIGHT, empty)
+    shade_pixels(none, material_table(materials), build_beams(CAMERA, LIGHT), empty)
     assert float(np.abs(empty).max()) == float(np.abs(image[[0, 2]]).max()) == 0
 
 
@@ -143,7 +151,7 @@ def test_the_specular_is_fully_polarized_and_the_diffuse_by_fresnel(generator: t
     slot = torch.randint(SLOTS, (HITS,), generator=generator)
     points = as_points(position, normal, slot, np.arange(HITS), torch.ones(HITS, dtype=torch.bool))
     image = np.zeros((HITS, CHANNELS), np.float32)
-    shade_pixels(points, material_table(materials), CAMERA, LIGHT, image)
+    shade_pixels(points, material_table(materials), build_beams(CAMERA, LIGHT), image)
     specular = image[:, 9:]
     polarized, peak = np.hypot(specular[:, 1], specular[:, 2]), float(specular[:, 0].max())
     np.testing.assert_allclose(polarized, specular[:, 0], rtol=1e-3, atol=AGREEMENT * peak)

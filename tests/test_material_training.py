@@ -40,7 +40,7 @@ def test_a_turned_material_looks_turned(ways: tuple[bool, bool, bool]) -> None:
     light, camera = place(0.9, -0.4, 1.7), place(0.0, 0.0, 2.5)
     picture = relight(unstack(maps), points, camera, light)
     colors = torch.tensor([2, 0, 1])
-    turned = turn_example(MaterialBatch(picture[:, None], maps), ways, colors)
+    turned = turn_example(MaterialBatch(picture[:, None], maps), *ways, colors)
     x, y = 0.9 * (1 - 2 * ways[0]), -0.4 * (1 - 2 * ways[1])
     x, y = (-y, -x) if ways[2] else (x, y)
     again = relight(unstack(turned.maps), points, camera, place(x, y, 1.7))

@@ -8,15 +8,14 @@ from torch import Tensor, nn
 
 from polsep.material.network import MaterialNetwork, MaterialSize
 from polsep.networks.joint import Joint
-from polsep.networks.paper import Refinement
+from polsep.networks.paper import RUNGS, Refinement
 from polsep.networks.unet import ResidualSize, ResidualUNet, Size, UNet
 from polsep.train.optimizers import WEIGHT_DECAY, Optimizers, as_matrix, hidden_weights
-from polsep.train.tasks import find_rung
 
 RATE = 1e-3
 NETWORKS = {
     "joint": lambda: Joint(3, ResidualSize(16, (0, 1, 1), 16), demosaicker="linear"),
-    "paper": lambda: Refinement(find_rung("paper"), 3, Size(16, 2)),
+    "paper": lambda: Refinement(RUNGS["paper"], 3, Size(16, 2)),
 }
 
 

@@ -85,14 +85,14 @@ def test_specular_loss_is_eq_21() -> None:
     proxy = proxy_diffuse(logarithm, diffuse + specular)
     assert_close(proxy, diffuse + specular - (torch.exp(logarithm) - 1))
     expected = 0.2 + 50 * 0.1 + float(diffuse_loss(proxy, diffuse))
-    assert_close(specular_loss(logarithm, (diffuse, specular)), expected, scale=10)
+    assert_close(specular_loss(logarithm, diffuse, specular), expected, scale=10)
 
 
 def test_losses_vanish_at_the_truth_only() -> None:
     diffuse, specular = torch.rand(2, 1, 3, 8, 8)
     assert_close(diffuse_loss(diffuse, diffuse), 0.0)
-    assert float(specular_loss(torch.log1p(specular), (diffuse, specular))) < 1e-4
-    assert float(specular_loss(torch.log1p(specular) + 0.1, (diffuse, specular))) > 0.1
+    assert float(specular_loss(torch.log1p(specular), diffuse, specular)) < 1e-4
+    assert float(specular_loss(torch.log1p(specular) + 0.1, diffuse, specular)) > 0.1
 
 
 @pytest.mark.parametrize("rung", [rung for rung in RUNGS.values() if rung.basis], ids=lambda rung: rung.name)

@@ -26,7 +26,7 @@ from polsep.train.stream import (
     GLARING_SHARE,
     LEVEL_SHARE,
     LEVELS,
-    LOOKS,
+    LIGHTS,
     LOWEST_QUANTILE,
     MIN_LEVEL,
     QUANTILES,
@@ -34,7 +34,7 @@ from polsep.train.stream import (
     VIEWS,
     Examples,
     ExampleStream,
-    Pooled,
+    PooledScene,
     StreamOptions,
     add_gaussian_noise,
     pool_scenes,
@@ -82,8 +82,8 @@ def test_workers_are_lanes_in_turn(start: int) -> None:
 
 
 def test_scenes_follow_their_number() -> None:
-    whole = list(itertools.islice(pool_scenes(SMALL, 0, 0), VIEWS * LOOKS + 2))
-    later = next(pool_scenes(SMALL, 0, VIEWS * LOOKS + 1))
+    whole = list(itertools.islice(pool_scenes(SMALL, 0, 0), VIEWS * LIGHTS + 2))
+    later = next(pool_scenes(SMALL, 0, VIEWS * LIGHTS + 1))
     assert torch.equal(whole[-1].diffuse, later.diffuse)
 
 
@@ -122,7 +122,7 @@ def test_exposures_clip_what_was_drawn() -> None:
     """
     ranks = torch.linspace(LOWEST_QUANTILE, 1, QUANTILES)
     nothing = torch.zeros(0)
-    scene = Pooled(nothing, nothing, nothing, nothing, nothing, ranks, 2.0)
+    scene = PooledScene(nothing, nothing, nothing, nothing, nothing, ranks, 2.0)
     gains = [random_gain(scene, torch.Generator().manual_seed(k)) for k in range(500)]
     leveled = [gain for gain in gains if gain < BRIGHTEST[0]]
     assert LEVELS[0] / 2 <= min(leveled) <= max(leveled) <= LEVELS[1] / 2
@@ -146,7 +146,7 @@ def test_some_crops_are_about_the_brightest_pixels() -> None:
     mask = torch.ones(size, size, dtype=torch.bool)
     light, bright = torch.zeros(3, size, size), torch.tensor([[40, 90]])
     light[0, 40, 90] = 1
-    scene = Pooled(torch.zeros(9, size, size), light, mask, mask.nonzero(), bright, torch.ones(QUANTILES), 0.5)
+    scene = PooledScene(torch.zeros(9, size, size), light, mask, mask.nonzero(), bright, torch.ones(QUANTILES), 0.5)
     crops = [random_crop(deque([scene]), crop, torch.Generator().manual_seed(k)) for k in range(draws)]
     about = sum(bool(drawn.light[9].any()) for drawn in crops)
     expected = BRIGHT_SHARE + (1 - BRIGHT_SHARE) * (crop / size) ** 2
@@ -156,7 +156,9 @@ def test_some_crops_are_about_the_brightest_pixels() -> None:
 def test_glaring_scenes_are_mostly_exposed_for_the_rest() -> None:
     """Where the brightest are far above the median, most exposures let them clip."""
     nothing = torch.zeros(0)
-    glaring = Pooled(nothing, nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 0.01)
+    glaring = PooledScene(
+        nothing, nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 0.01
+    )
     gains = [random_gain(glaring, torch.Generator().manual_seed(k)) for k in range(300)]
     leveled = [gain for gain in gains if gain > 2 * MIN_LEVEL / 0.01]
     assert LEVELS[0] / 0.01 <= min(leveled) <= max(leveled) <= LEVELS[1] / 0.01
@@ -165,7 +167,7 @@ def test_glaring_scenes_are_mostly_exposed_for_the_rest() -> None:
 
 def test_dark_scenes_are_exposed_to_the_floor() -> None:
     nothing = torch.zeros(0)
-    dark = Pooled(nothing, nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 1e-4)
+    dark = PooledScene(nothing, nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 1e-4)
     assert all(random_gain(dark, torch.Generator().manual_seed(k)) >= MIN_LEVEL / 1e-4 for k in range(20))
 
 

@@ -43,6 +43,7 @@ from polsep.train.command import (
     train_weights,
 )
 from polsep.train.digest import digest_examples, find_sources
+from polsep.train.inputs import LadderInputs, co_sited_inputs, mono_inputs, mosaic_inputs
 from polsep.train.log import open_log, read_log
 from polsep.train.loop import Run, Schedule, train
 from polsep.train.losses import FIRST_WEIGHT, first_specular_loss
@@ -50,23 +51,18 @@ from polsep.train.stream import Examples, StreamOptions, stream_lane
 from polsep.train.tasks import (
     FIRST_SHARE,
     VARIANTS,
-    Seen,
     Task,
-    find_rung,
     ladder_task,
-    see_co_sited,
-    see_mono,
-    see_mosaic,
 )
-from polsep.train.validation import score, score_references, validate, validation_batches
+from polsep.train.validation import score, score_averaged, score_references, validation_batches
 
 STREAM = StreamOptions(batch=2, crop=32, size=64, pool=2, uses=1)
 SCHEDULE = Schedule(steps=6, warm_up=2, checkpoint_every=3, validate_every=100, precision="32-true")
 
 
-def small_task() -> Task[Seen]:
+def small_task() -> Task[LadderInputs]:
     torch.manual_seed(1)
-    return ladder_task(find_rung("paper"), "mosaic", Size(4, 1, 1))
+    return ladder_task(RUNGS["paper"], "mosaic", Size(4, 1, 1))
 
 
 def run_in(folder: Path, schedule: Schedule = SCHEDULE) -> Run:
@@ -148,7 +144,7 @@ def test_a_log_begins_with_methods_without_training(
 ) -> None:
     """Also one that another version began without them; its other lines stay."""
     lines = killed[2]
-    views = [see_mosaic(batch) for batch in validation_batches(STREAM)]
+    views = [mosaic_inputs(batch) for batch in validation_batches(STREAM)]
     assert lines[0] == {"step": 0} | score_references(small_task(), views)
     analytic = score(lambda seen: METHODS["analytic"].reference(seen[0]), views)
     assert {f"analytic {name}": value for name, value in analytic.items()}.items() <= lines[0].items()
@@ -261,12 +257,12 @@ def plan(given: dict[str, Any]) -> tuple[Options, Run]:
 def test_mono_sees_the_green_light_behind_every_pixel() -> None:
     """Noise apart, the measurements are those of the green light; the same batch is seen alike again."""
     examples = next(stream_lane(replace(STREAM, batch=16), 0, 0))
-    measurements, diffuse, specular, mask = see_mono(examples)
+    measurements, diffuse, specular, mask = mono_inputs(examples)
     assert measurements.data.shape == (16, 4, 1, 16, 16)
     assert diffuse.shape == specular.shape == (16, 1, 16, 16)
-    assert torch.equal(mask, see_mosaic(examples)[3])
-    assert torch.equal(diffuse, see_mosaic(examples)[1][:, 1:2])
-    assert torch.equal(measurements.data, see_mono(examples)[0].data)
+    assert torch.equal(mask, mosaic_inputs(examples)[3])
+    assert torch.equal(diffuse, mosaic_inputs(examples)[1][:, 1:2])
+    assert torch.equal(measurements.data, mono_inputs(examples)[0].data)
     light = Stokes(diffuse + specular, *(avg_pool2d(examples.polarized[:, k : k + 1].float(), 2) for k in (1, 4)))
     error = measurements.data - measure(light, measurements.angles).data
     unclipped = torch.ones_like(error, dtype=torch.bool) if measurements.clipped is None else ~measurements.clipped
@@ -297,7 +293,7 @@ def test_networks_are_shown_samples_as_they_are(tmp_path: Path) -> None:
     task.network.register_forward_pre_hook(lambda _, given: shown.append(given[0].clone()))
     expected = task.prepare(next(stream_lane(STREAM, 0, 0)))
     train(task, run_in(tmp_path, replace(SCHEDULE, steps=1, precision="bf16-mixed")), lambda _: None)
-    maps = find_rung("paper").inputs(expected[0])
+    maps = RUNGS["paper"].inputs(expected[0])
     assert any(torch.equal(x, maps) for x in shown)
 
 
@@ -346,11 +342,11 @@ def test_rate_warms_up_and_falls_as_a_cosine() -> None:
     assert schedule.rate_at(1000) == pytest.approx(0.02)
 
 
-@pytest.mark.parametrize("see", [see_mosaic, see_co_sited])
-def test_a_net_learns_a_picture_by_heart(see: Callable[[Examples], Seen]) -> None:
+@pytest.mark.parametrize("see", [mosaic_inputs, co_sited_inputs])
+def test_a_net_learns_a_picture_by_heart(see: Callable[[Examples], LadderInputs]) -> None:
     """One 32 x 32 example that hardly clips, 200 steps: both outputs reach 40 dB, from an analytic split below 30."""
     torch.manual_seed(0)
-    task = ladder_task(find_rung("paper"), "mosaic", Size(12, 2, 1))
+    task = ladder_task(RUNGS["paper"], "mosaic", Size(12, 2, 1))
     for examples in stream_lane(replace(STREAM, batch=1, looks="usual", seed=2), 0, 0):
         seen = see(examples)
         everywhere = [(*seen[:3], torch.ones_like(seen[3]))]
@@ -372,7 +368,7 @@ def test_a_net_learns_a_picture_by_heart(see: Callable[[Examples], Seen]) -> Non
 @pytest.mark.parametrize("rung", RUNGS)
 def test_gradients_are_finite(rung: str) -> None:
     """On black, on unpolarized and on wholly clipped frames."""
-    task = ladder_task(find_rung(rung), "co-sited", Size(4, 1, 1))
+    task = ladder_task(RUNGS[rung], "co-sited", Size(4, 1, 1))
     for level in (0.0, 0.5, 3.0):
         light, nothing = torch.full((1, 3, 8, 8), level), torch.zeros(1, 1, 8, 8)
         mask = torch.ones(1, 8, 8, dtype=torch.bool)
@@ -387,7 +383,8 @@ def test_validation_uses_the_average_and_gives_the_weights_back() -> None:
     own = {name: value.clone() for name, value in task.network.state_dict().items()}
     average = {name: torch.zeros_like(value) for name, value in own.items()}
     batch = next(stream_lane(STREAM, 0, 0))
-    scores = validate(task, average, [task.prepare(batch)])
+    views = [task.prepare(batch)]
+    scores = score_averaged(task.network, average, lambda _: score(task.separate, views))
     assert set(scores) == {"diffuse PSNR", "specular PSNR"}
     assert all(math.isfinite(score) for score in scores.values())
     assert equal(own, task.network.state_dict())
@@ -395,7 +392,7 @@ def test_validation_uses_the_average_and_gives_the_weights_back() -> None:
 
 def test_unknown_rungs_are_refused() -> None:
     with pytest.raises(ValueError, match="expected a rung of paper"):
-        find_rung("none")
+        TrainOptions("none")
 
 
 def test_without_tensorboard_the_extra_is_named(
@@ -459,7 +456,7 @@ def test_rungs_without_a_first_guess_begin_with_squared_errors(rung: str) -> Non
     specular = torch.rand(1, 3, 4, 4)
     assert float(first_specular_loss(torch.log1p(specular), specular)) == 0
     assert float(first_specular_loss(torch.log1p(specular) - 0.2, specular)) == pytest.approx(FIRST_WEIGHT * 0.04)
-    task = ladder_task(find_rung(rung), "mosaic", Size(4, 1, 1))
+    task = ladder_task(RUNGS[rung], "mosaic", Size(4, 1, 1))
     seen = task.prepare(next(stream_lane(STREAM, 0, 0)))
     with torch.no_grad():
         early, late, last = (float(task.loss(task.network, seen, done)) for done in (0.0, FIRST_SHARE, 1.0))

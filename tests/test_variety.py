@@ -42,10 +42,10 @@ from polsep.train.variety import (
     UNPOLARIZED_SHARE,
     WHITE,
     WHITE_SHARE,
-    Look,
-    find_sheen,
+    LitView,
     random_sensor,
     relight,
+    render_sheen,
     vary_colors,
     vary_gloss,
     vary_normals,
@@ -128,7 +128,7 @@ def test_shots_keep_the_size_or_enlarge(shots: list[Shot], varied: list[Shot]) -
     expect_share(sum(m > 1 for m in magnifications), len(shots), CLOSE_SHARE)
 
 
-def test_close_ups_look_at_a_lit_point(shape: MeshScene, shots: list[Shot], varied: list[Shot]) -> None:
+def test_close_ups_render_view_a_lit_point(shape: MeshScene, shots: list[Shot], varied: list[Shot]) -> None:
     """All that a field of view of a hundredth of a degree shows lies on the object and in the light."""
     close = [after for before, after in zip(shots, varied, strict=True) if after.camera != before.camera]
     assert close
@@ -261,8 +261,8 @@ def test_sheens_are_polarized_light_that_knows_no_material(shape: MeshScene, sho
     view = find_view(shape, shots[0].camera, (48, 48))
     light = shots[0].light
     lit = find_lit(shape, view, light)
-    looks = [Look(view, random_materials(shape.mesh.slot_count, seeded(k)), light, lit) for k in range(2)]
-    found, other = (find_sheen(look, 0.7) for look in looks)
+    looks = [LitView(view, random_materials(shape.mesh.slot_count, seeded(k)), light, lit) for k in range(2)]
+    found, other = (render_sheen(look, 0.7) for look in looks)
     assert torch.equal(found.s0, other.s0)
     reached = shade_view(*looks[0]).diffuse.s0[:1] > 0
     assert float(found.s0[~reached].abs().max()) == 0

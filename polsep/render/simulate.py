@@ -32,9 +32,14 @@ class Capture:
 
 
 def half_resolution(scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
-    """Diffuse, specular ``[C, H/2, W/2]`` and mask ``[H/2, W/2]``: means over each 2x2 cell, whole in the mask."""
+    """Return true diffuse, specular ``[C, H/2, W/2]`` and mask ``[H/2, W/2]``: means over 2x2 cells, `whole_cells`."""
     diffuse, specular = avg_pool2d(scene.diffuse.s0, 2), avg_pool2d(scene.specular.s0, 2)
-    return diffuse, specular, avg_pool2d(scene.mask[None].float(), 2)[0] == 1
+    return diffuse, specular, whole_cells(scene.mask[None])[0]
+
+
+def whole_cells(mask: Tensor) -> Tensor:
+    """Return the cells of 2x2 pixels ``[B, h, w]`` of which all are in the mask ``[B, H, W]``."""
+    return avg_pool2d(mask.float(), 2) == 1
 
 
 def blur(scene: Scene, sigma: float) -> Scene:

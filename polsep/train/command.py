@@ -1,4 +1,4 @@
-"""`polsep train`: a rung of the ladder, or the joint network, from options to a file of weights."""
+"""`polsep train` of a rung of the ladder or of the joint network: from options to a file of weights."""
 
 from __future__ import annotations
 
@@ -10,31 +10,28 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from polsep.io.store.weights import write_weights
 from polsep.networks.joint import Demosaicker
+from polsep.networks.paper import RUNGS
 from polsep.networks.unet import ResidualSize, Size, count_parameters
 from polsep.train.digest import digest_examples
-from polsep.train.joint_task import ABLATIONS, DEMOSAICKERS, PARTS, SIZES, VIEWS, hold_others, joint_task
-from polsep.train.joint_views import JointSeen
+from polsep.train.inputs import JointInputs, LadderInputs
+from polsep.train.joint_task import ABLATIONS, DEMOSAICKERS, JOINT_VARIANTS, PARTS, SIZES, freeze_others, joint_task
 from polsep.train.log import curve_of, read_log, references_of
 from polsep.train.loop import Run, train
-from polsep.train.tasks import VARIANTS, Seen, Task, find, find_rung, ladder_task
-from polsep.train.validation import validate, validation_batches
+from polsep.train.tasks import VARIANTS, Task, find, ladder_task
+from polsep.train.validation import score, score_averaged, validation_batches
 
-#: What a laptop trains in an hour or two.
+#: A size that a laptop trains in an hour or two.
 SMALL = Size()
-#: Those without a scale of the loss, which checkpoints would have to hold.
+#: Precisions without loss scaling, whose state checkpoints do not hold.
 PRECISIONS = ("bf16-mixed", "32-true")
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """What is trained: a ``rung`` of `paper.RUNGS` on a ``variant`` of the data, of which size, from which seed.
-
-    Raises ValueError on a rung or variant that there is not.
-    """
+    """Options of a ``rung`` of `paper.RUNGS` on a ``variant`` of the data. Raises ValueError on unknown names."""
 
     rung: str
     variant: str = "mosaic"
@@ -42,20 +39,20 @@ class TrainOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        find_rung(self.rung)
+        find(RUNGS, "a rung", self.rung)
         find(VARIANTS, "a variant", self.variant)
 
-    def task(self) -> Task[Seen]:
-        """The rung's."""
-        return ladder_task(find_rung(self.rung), self.variant, self.size)
+    def task(self) -> Task[LadderInputs]:
+        """Return the rung's task."""
+        return ladder_task(RUNGS[self.rung], self.variant, self.size)
 
     def metadata(self) -> dict[str, str]:
-        """What whoever loads the weights needs."""
+        """Return what is needed to load the weights."""
         return {"method": "paper", "rung": self.rung, "colors": str(VARIANTS[self.variant].colors)}
 
     @property
     def name(self) -> str:
-        """The rung's."""
+        """The name of the rung."""
         return self.rung
 
     @property
@@ -66,10 +63,10 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class JointOptions:
-    """The joint network to train, by ``name`` of `joint_task.SIZES`; ``variant``: for colour (mosaic) or mono frames.
+    """Options of a joint network by ``name`` of `joint_task.SIZES`; ``variant``: for colour (mosaic) or mono frames.
 
-    ``ablation``: what of `joint_task.ABLATIONS` differs. ``part``: what of `joint_task.PARTS` is trained, others held.
-    Raises ValueError on names that there are not.
+    ``ablation``: one of `joint_task.ABLATIONS`. ``part``: one of `joint_task.PARTS`; the others are frozen. Raises
+    ValueError on unknown names.
     """
 
     name: str
@@ -81,26 +78,26 @@ class JointOptions:
 
     def __post_init__(self) -> None:
         find(SIZES, "a joint network", self.name)
-        find(VIEWS, "a variant", self.variant)
+        find(JOINT_VARIANTS, "a variant", self.variant)
         find(ABLATIONS, "an ablation", self.ablation)
         find(PARTS, "a part", self.part)
         if self.size is None:
             object.__setattr__(self, "size", SIZES[self.name])
 
-    def task(self) -> Task[JointSeen]:
-        """That of the network and its ablation."""
+    def task(self) -> Task[JointInputs]:
+        """Return the task of the network and its ablation."""
         task = joint_task(self.variant, self.size or SIZES[self.name], ABLATIONS[self.ablation], self.demosaicker)
-        hold_others(task.network, self.part)
+        freeze_others(task.network, self.part)
         return task
 
     @property
     def demosaicker(self) -> Demosaicker:
-        """Where the network's Stokes images come from."""
+        """Source of the network's Stokes images."""
         return DEMOSAICKERS[self.name] if self.variant == "mosaic" else "linear"
 
     def metadata(self) -> dict[str, str]:
-        """What whoever loads the weights needs."""
-        inputs, colors = json.dumps(ABLATIONS[self.ablation].inputs), str(VIEWS[self.variant][1])
+        """Return what is needed to load the weights."""
+        inputs, colors = json.dumps(ABLATIONS[self.ablation].inputs), str(JOINT_VARIANTS[self.variant][1])
         named = {"method": self.name, "ablation": self.ablation, "demosaicker": self.demosaicker}
         return named | {"inputs": inputs, "colors": colors}
 
@@ -110,30 +107,32 @@ class JointOptions:
         return 256
 
 
-#: What can be trained.
 Options = TrainOptions | JointOptions
 
 
 def train_weights(options: Options, run: Run, report: Callable[[dict[str, Any]], None]) -> Path:
-    """Train to the end, going on where a run in ``run.out`` stopped; returns the file of the averaged weights.
+    """Train to the end, resuming a run in ``run.out``, and return the file of the averaged weights.
 
-    The weights are in half precision; the scores in their metadata are of these on the validation views, beside the
-    log's: ``curve``, a list of [step, diffuse PSNR, specular PSNR], and ``reference``, both PSNRs of methods without
-    training.
+    The weights are in half precision. Their metadata holds their scores on the validation views, the log's scores
+    (``curve``, a list of [step, diffuse PSNR, specular PSNR]) and those of methods without training (``reference``).
     """
     torch.manual_seed(options.seed)
     data = digest_examples(asdict(run.stream), "polsep.train.stream")
     path = run.out / f"{options.name}-{options.variant}.safetensors"
-    trained = _train(options.task(), run, report)
-    if trained is None:
+    task: Task[Any] = options.task()
+    average = train(task, run, report)
+    if average is None:  # not the first of several processes
         return path
-    weights, scores, parameters = trained
+    task.network.cpu()  # where the validation views are
+    weights = {name: value.cpu().half().float() for name, value in average.items()}
+    views = [task.prepare(batch) for batch in validation_batches(run.stream)]
+    scores = score_averaged(task.network, weights, lambda _: score(task.separate, views))
     lines = read_log(run.out)
     metadata = options.metadata() | {
         "variant": options.variant,
         "size": json.dumps(asdict(options.size)),  # type: ignore[arg-type]
         "seed": str(options.seed),
-        "parameters": str(parameters),
+        "parameters": str(count_parameters(task.network)),
         "schedule": json.dumps(asdict(run.schedule)),
         "stream": json.dumps(asdict(run.stream)),
         "data": data,
@@ -146,22 +145,8 @@ def train_weights(options: Options, run: Run, report: Callable[[dict[str, Any]],
     return path
 
 
-def _train(
-    task: Task[Seen] | Task[JointSeen], run: Run, report: Callable[[dict[str, Any]], None]
-) -> tuple[dict[str, Tensor], dict[str, float], int] | None:
-    """Averaged weights as they will be read again, their scores, and how many there are; None but in one process."""
-    anything: Task[Any] = task
-    average = train(anything, run, report)
-    if average is None:
-        return None
-    task.network.cpu()  # where the validation views are
-    halves = {name: value.cpu().half().float() for name, value in average.items()}
-    scores = validate(anything, halves, [task.prepare(batch) for batch in validation_batches(run.stream)])
-    return halves, scores, count_parameters(task.network)
-
-
 def describe_command(options: Options, run: Run) -> str:
-    """The command line that trains this again."""
+    """Return the command line that repeats the training."""
     schedule = run.schedule
     asked: dict[str, object] = {"data": options.variant, "looks": run.stream.looks}
     if isinstance(options, TrainOptions):
@@ -184,14 +169,14 @@ def describe_command(options: Options, run: Run) -> str:
 
 
 def describe_start(run: Run) -> list[str]:
-    """The options that say what a training begins with."""
+    """Return the options ``--start`` and ``--refit`` of a run."""
     return [word for path in run.start for word in ("--start", path.name)] + ["--refit"] * run.refit
 
 
 def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:
-    """Options of a rung or of a joint network from those of the command line; see `polsep train`.
+    """Return the options of a rung or a joint network from those of the command line; see `polsep train`.
 
-    Raises ValueError on names and sizes that there are not.
+    Raises ValueError on unknown names and invalid sizes.
     """
     width = asked["width"]
     if name not in SIZES:
@@ -208,9 +193,9 @@ def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:
 
 
 def plan_run(run: Run, options: Options) -> Run:
-    """The same with what is trained and the stream that it needs.
+    """Return the run with the description of its options and with their stream.
 
-    Raises ValueError as `check_run`, and where there is no filter to fit anew.
+    Raises ValueError as `check_run`, and on ``refit`` of a network without a linear filter.
     """
     check_run(run)
     if run.refit and not (isinstance(options, JointOptions) and options.demosaicker == "linear"):
@@ -222,7 +207,7 @@ def plan_run(run: Run, options: Options) -> Run:
 
 
 def check_run(run: Run) -> None:
-    """Raise ValueError on what would only fail later, or train nothing."""
+    """Raise ValueError on a run that would fail later or train nothing."""
     out, schedule = run.out, run.schedule
     if out.exists() and not out.is_dir():
         raise ValueError(f"expected a directory to write into, found a file: {out}")

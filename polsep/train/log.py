@@ -1,7 +1,7 @@
-"""The log of a training: ``log.jsonl``, a line per validation, and the same as curves for TensorBoard.
+"""The log of a training: ``log.jsonl``, one line per validation, and the same as curves for TensorBoard.
 
-The first line is of step 0 and says what methods without training reach. A training that was killed has logged more
-than its last checkpoint knows of; when it goes on, that is taken back, so no step has two lines.
+The first line, of step 0, holds the scores of methods without training. An interrupted training may have logged steps
+after its last checkpoint; when it resumes, these lines are removed, so that no step has two lines.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from polsep.train.validation import REFERENCES
 Line = dict[str, Any]
 Report = Callable[[Line], None]
 
-#: Steps whose mean loss is a point of TensorBoard's curve.
+#: Steps averaged in one point of TensorBoard's curve of the loss.
 PLOT_EVERY = 50
 
 
 class Log:
-    """An open log: its lines go to ``path``, to TensorBoard's ``events`` and to ``report``.
+    """An open log that writes to ``path``, to TensorBoard's ``events`` and to ``report``.
 
-    It remembers the losses since the last line, and since when it counts steps.
+    State: the losses since the last line, the number of steps and their start time.
     """
 
     def __init__(self, path: Path, events: EventWriter, report: Report) -> None:
@@ -37,14 +37,14 @@ class Log:
         self.steps, self.started = 0, time.monotonic()
 
     def note(self, step: int, loss: float, rate: float) -> None:
-        """A step is done; every `PLOT_EVERY` of them make a point of TensorBoard's curves."""
+        """Record a step; every `PLOT_EVERY` steps make a point of TensorBoard's curves."""
         self.steps += 1
         self.losses.append(loss)
         if len(self.losses) % PLOT_EVERY == 0:
             self._plot(step, PLOT_EVERY, rate)
 
     def add_scores(self, step: int, rate: float, scores: dict[str, float]) -> None:
-        """A line of the mean loss since the last one, the learning rate, scores and speed."""
+        """Write a line: mean loss since the last line, learning rate, scores and speed."""
         rest = len(self.losses) % PLOT_EVERY
         if rest:
             self._plot(step, rest, rate)
@@ -56,15 +56,15 @@ class Log:
         self.report(line | scores | speed)
 
     def _plot(self, step: int, count: int, rate: float) -> None:
-        """A point of loss and rate, the mean of the last ``count`` losses."""
+        """Write a point of the rate and of the mean of the last ``count`` losses."""
         add_events(self.events, step, {"loss": statistics.fmean(self.losses[-count:]), "rate": rate})
 
 
 @contextmanager
 def open_log(folder: Path, step: int, report: Report, first: Callable[[], dict[str, float]]) -> Iterator[Log]:
-    """The log in ``folder`` of a training that goes on after ``step``, 0 for a new one.
+    """Open the log in ``folder`` of a training that resumes after ``step``, 0 for a new one.
 
-    Lines of later steps are dropped. Where there is no line of step 0, ``first`` gives its scores.
+    Lines of later steps are removed. If there is no line of step 0, ``first`` returns its scores.
     """
     path = folder / "log.jsonl"
     lines = [line for line in read_log(folder) if line["step"] <= step]
@@ -79,29 +79,26 @@ def open_log(folder: Path, step: int, report: Report, first: Callable[[], dict[s
 
 
 def read_log(folder: Path) -> list[Line]:
-    """The lines of the log in a training's folder; none where there is no log yet.
-
-    Raises ValueError on a file that is no log.
-    """
+    """Return the lines of the log in a training's folder, none without a log. Raises ValueError on another file."""
     path = folder / "log.jsonl"
     try:
         lines = [json.loads(text) for text in read_lines(path)]
-        whole = all(isinstance(line["step"], int) for line in lines)
+        valid = all(isinstance(line["step"], int) for line in lines)
     except (ValueError, TypeError, KeyError):
-        whole = False
-    if not whole:
+        valid = False
+    if not valid:
         raise ValueError(f"expected the log of a training in {path}, found something else")
     return lines
 
 
 def curve_of(lines: list[Line]) -> list[list[float]]:
-    """Step, diffuse and specular PSNR [dB] of every validation of a log; step 0 is one where it began with weights."""
+    """Return step, diffuse and specular PSNR [dB] of every validation of a log; of step 0 only after ``--start``."""
     names = ("step", "diffuse PSNR", "specular PSNR")
     rows = [[line[name] for name in names] for line in lines if names[1] in line]
     return [[step, round(diffuse, 3), round(specular, 3)] for step, diffuse, specular in rows]
 
 
 def references_of(lines: list[Line]) -> dict[str, list[float]]:
-    """Diffuse and specular PSNR [dB] of the methods without training, by name, from the first line of a log."""
+    """Return diffuse and specular PSNR [dB] of the methods without training, by name, from a log's first line."""
     first = lines[0]
     return {name: [round(first[f"{name} {image} PSNR"], 3) for image in ("diffuse", "specular")] for name in REFERENCES}

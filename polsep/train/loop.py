@@ -1,7 +1,7 @@
-"""The one training loop: warm-up and cosine, clipped gradients, a moving average of the weights, checkpoints.
+"""The training loop: warm-up and cosine schedule, clipped gradients, averaged weights, checkpoints.
 
-A training that is killed goes on from its last checkpoint and ends with the same bits as one that was not: the state
-holds all that a step depends on, and the stream starts at any batch.
+An interrupted training resumes from its last checkpoint and ends with the same bits as an uninterrupted one: the
+checkpoint holds the whole state of a step, and the stream of examples can start at any batch.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,15 +24,16 @@ from torch.utils.data import DataLoader
 from polsep.compute.threads import set_threads
 from polsep.io.store.checkpoints import read_checkpoint, write_checkpoint
 from polsep.io.store.weights import read_weights
+from polsep.train.inputs import Inputs
 from polsep.train.log import Report, open_log
 from polsep.train.optimizers import Optimizers
 from polsep.train.stream import Examples, ExampleStream, StreamOptions
-from polsep.train.tasks import Task, View
+from polsep.train.tasks import Task
 from polsep.train.validation import score, score_averaged, score_references, validation_batches
 
 #: The learning rate ends at this share of its peak.
 LAST_SHARE = 0.01
-#: Norm of a network's gradient at most. Usual ones are 13 to 42, so only outliers are cut.
+#: Largest norm of a network's gradient. Usual ones are 13 to 42, so only outliers are clipped.
 MAX_GRADIENT = 100.0
 #: A batch: a named tuple of tensors.
 Batch = TypeVar("Batch", bound=tuple[Any, ...])
@@ -39,9 +41,9 @@ Batch = TypeVar("Batch", bound=tuple[Any, ...])
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long and how: ``steps``, peak learning ``rate``, steps of ``warm_up``, decay of the moving ``average``.
+    """Schedule of a training: ``steps``, peak learning ``rate``, steps of ``warm_up``, decay of the moving ``average``.
 
-    ``checkpoint_every`` and ``validate_every`` count steps. ``precision``: as lightning-fabric names it.
+    ``checkpoint_every`` and ``validate_every`` count steps. ``precision``: a name of lightning-fabric.
     """
 
     steps: int = 20_000
@@ -53,24 +55,24 @@ class Schedule:
     precision: str = "bf16-mixed"
 
     def rate_at(self, step: int) -> float:
-        """Linear warm-up, then half a cosine down to `LAST_SHARE` of the peak."""
+        """Return the learning rate: linear warm-up, then half a cosine down to `LAST_SHARE` of the peak."""
         if step < self.warm_up:
             return self.rate * (step + 1) / self.warm_up
         done = (step - self.warm_up) / max(1, self.steps - self.warm_up)
         return self.rate * (LAST_SHARE + (1 - LAST_SHARE) * (1 + math.cos(math.pi * min(done, 1))) / 2)
 
     def is_due(self, step: int, every: int) -> bool:
-        """Whether what is done ``every`` so many steps, and after the last one, is to be done now."""
+        """Return True at multiples of ``every`` and at the last step."""
         return step % every == 0 or step == self.steps
 
 
 @dataclass(frozen=True)
 class Run:
-    """Where a training writes, ``what`` it trains, on which data; ``workers`` render, ``devices`` train.
+    """One run of a training into the folder ``out``; ``workers`` render, ``devices`` train.
 
-    ``start``: files of weights whose mean it begins with, instead of random ones; a schedule of 0 steps writes and
-    scores that. ``refit``: what is fitted instead of trained is fitted anew before. ``until``: a step of the schedule
-    to end at; a later run goes on from its last checkpoint.
+    ``what``: JSON of the options, compared on resuming. ``start``: files of weights whose mean replaces the random
+    initial weights; a schedule of 0 steps writes and scores that mean. ``refit``: fit again, before training, what is
+    fitted and not trained. ``until``: step of the schedule to stop at; a later run resumes from the last checkpoint.
     """
 
     out: Path
@@ -85,27 +87,28 @@ class Run:
 
     @property
     def last(self) -> int:
-        """The step after which it ends."""
+        """The step at which this run ends."""
         return self.schedule.steps if self.until is None else min(self.until, self.schedule.steps)
 
 
 class ExactInputs(MixedPrecision):
-    """Mixed precision in which what a network is given stays as it is.
+    """Mixed precision that leaves a network's inputs in float32.
 
-    Lightning rounds it to bfloat16, whose steps at white are 16 of a 12-bit camera's.
+    Lightning rounds them to bfloat16, whose steps at white are 16 of a 12-bit camera's.
     """
 
     def convert_input(self, data: Any) -> Any:
-        """The data themselves; autocast rounds where a layer computes in bfloat16."""
+        """Return the data unchanged; autocast rounds them where a layer computes in bfloat16."""
         return data
 
 
 @dataclass(frozen=True)
-class Course:
-    """What the loop trains: a ``network``, ``batches`` from a step on for one process of so many, and their ``loss``.
+class Training:
+    """A ``network``, its ``batches`` from a step on for process (rank, count), and their ``loss``.
 
-    Batches are named tuples of tensors; the loss is told which share of the training is done. ``score`` of a network
-    is what a line of the log says; ``begin`` is called before the first step, ``references`` for the log's first line.
+    Batches are named tuples of tensors; the third argument of the loss is the completed share of the training.
+    ``score``: the scores of a network in a line of the log; ``begin``: called before the first step; ``references``:
+    scores in the log's first line.
     """
 
     network: nn.Module
@@ -116,67 +119,71 @@ class Course:
     references: Callable[[], dict[str, float]] = field(default=dict)
 
 
-def train(task: Task[View], run: Run, report: Report) -> dict[str, Tensor] | None:
-    """Train a task on streamed examples; see `train_course`."""
-    views: list[View] = []
+def train(task: Task[Inputs], run: Run, report: Report) -> dict[str, Tensor] | None:
+    """Train a task on streamed examples; see `run_training`."""
 
-    def look() -> list[View]:
-        """Validation views, prepared where the network is when they are first asked for."""
-        if not views:
-            device = next(task.network.parameters()).device
-            views.extend(task.prepare(_to(device, batch)) for batch in validation_batches(run.stream))
-        return views
+    @cache
+    def views() -> list[Inputs]:
+        """Validation views on the network's device, prepared on first use."""
+        device = next(task.network.parameters()).device
+        return [task.prepare(_to(device, batch)) for batch in validation_batches(run.stream)]
 
-    def batches(step: int, lane: tuple[int, int]) -> Iterator[Examples]:
-        stream = ExampleStream(run.stream, step, lane)
-        return iter(DataLoader(stream, batch_size=None, num_workers=run.workers, worker_init_fn=take_one_core))
+    def batches(step: int, process: tuple[int, int]) -> Iterator[Examples]:
+        stream = ExampleStream(run.stream, step, process)
+        return iter(DataLoader(stream, batch_size=None, num_workers=run.workers, worker_init_fn=use_one_thread))
 
-    course = Course(
+    training = Training(
         task.network,
         batches,
         lambda network, batch, done: task.loss(network, task.prepare(batch), done),
-        lambda _: score(task.separate, look()),
+        lambda _: score(task.separate, views()),
         lambda: task.begin(run.stream),
-        lambda: score_references(task, look()) | (score(task.separate, look()) if run.start else {}),
+        lambda: score_references(task, views()) | (score(task.separate, views()) if run.start else {}),
     )
-    return train_course(course, run, report)
+    return run_training(training, run, report)
 
 
-def train_course(course: Course, run: Run, report: Report) -> dict[str, Tensor] | None:
-    """Train to the end, from the last checkpoint if there is one; returns the averaged weights.
+def run_training(training: Training, run: Run, report: Report) -> dict[str, Tensor] | None:
+    """Train to the end, from the last checkpoint if there is one, and return the averaged weights.
 
-    ``report`` is called with every line of the log. Of several processes only the first one writes and reports, and
-    the others return None. Raises ValueError when the checkpoint is of another training.
+    ``report`` is called with every line of the log. Of several processes only the first one writes and reports; the
+    others return None. Raises ValueError on a checkpoint of another training.
     """
-    fabric = _fabric(run)
+    if run.schedule.precision == "bf16-mixed":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+        fabric = Fabric(accelerator=device, devices=run.devices, plugins=[ExactInputs("bf16-mixed", device)])
+    else:
+        fabric = Fabric(devices=run.devices, precision=run.schedule.precision)  # type: ignore[arg-type]
     fabric.launch()
-    network = course.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = training.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     state = read_checkpoint(run.out / "checkpoint.pt")
     if state is None:
-        begin_at(run.start, network)
+        load_mean(run.start, network)
         if run.refit or not run.start:
-            course.begin()
+            training.begin()
     wrapped = fabric.setup_module(network)
     optimizer = Optimizers(network)
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
-    step = _restore(state, run, (network, optimizer, average))
-    batches = course.batches(step, (fabric.global_rank, fabric.world_size)) if step < run.last else iter(())
+    step = _restore(state, run, network, optimizer, average)
+    batches = training.batches(step, (fabric.global_rank, fabric.world_size)) if step < run.last else iter(())
     with ExitStack() as stack:
-        log = stack.enter_context(open_log(run.out, step, report, course.references)) if fabric.is_global_zero else None
+        log = (
+            stack.enter_context(open_log(run.out, step, report, training.references)) if fabric.is_global_zero else None
+        )
         while step < run.last:
             rate = run.schedule.rate_at(step)
-            loss = course.loss(wrapped, _to(fabric.device, next(batches)), step / run.schedule.steps)
+            loss = training.loss(wrapped, _to(fabric.device, next(batches)), step / run.schedule.steps)
             fabric.backward(loss)
             for net in _parts(network):
                 nn.utils.clip_grad_norm_(net.parameters(), MAX_GRADIENT)
             optimizer.step(rate)
             step += 1
-            follow(average, network, min(run.schedule.average, (1 + step) / (10 + step)))
+            update_average(average, network, min(run.schedule.average, (1 + step) / (10 + step)))
             if log is None:
                 continue
             log.note(step, float(loss.detach()), run.schedule.rate_at(step))
             if run.schedule.is_due(step, run.schedule.validate_every):
-                scores = score_averaged(network, average, course.score)
+                scores = score_averaged(network, average, training.score)
                 log.add_scores(step, run.schedule.rate_at(step), scores)
             if run.schedule.is_due(step, run.schedule.checkpoint_every):
                 state = {"step": step, "run": _describe(run), "network": network.state_dict()}
@@ -185,16 +192,8 @@ def train_course(course: Course, run: Run, report: Report) -> dict[str, Tensor] 
     return average if fabric.is_global_zero else None
 
 
-def _fabric(run: Run) -> Fabric:
-    """Where it trains, and how precisely."""
-    if run.schedule.precision != "bf16-mixed":
-        return Fabric(devices=run.devices, precision=run.schedule.precision)  # type: ignore[arg-type]
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    return Fabric(accelerator=device, devices=run.devices, plugins=[ExactInputs("bf16-mixed", device)])
-
-
-def begin_at(paths: Sequence[Path], network: nn.Module) -> None:
-    """Fill in the mean of files of weights, where there are any. Raises ValueError on those of another network."""
+def load_mean(paths: Sequence[Path], network: nn.Module) -> None:
+    """Load the mean of files of weights, if any, into a network. Raises ValueError on weights of another network."""
     mean: dict[str, Tensor] = {}
     for count, path in enumerate(paths, start=1):
         tensors, _ = read_weights(path)
@@ -215,20 +214,21 @@ def _to(device: torch.device, batch: Batch) -> Batch:
 
 
 def _describe(run: Run) -> str:
-    """What must be the same for a checkpoint to go on."""
+    """JSON of all that must be equal for a training to resume from a checkpoint."""
     described: dict[str, Any] = {"what": run.what, "stream": asdict(run.stream), "schedule": asdict(run.schedule)}
     described |= {"start": [path.name for path in run.start]} if run.start else {}
     described |= {"refit": True} if run.refit else {}
     return json.dumps(described | {"workers": run.workers, "devices": run.devices})
 
 
-def _restore(state: dict[str, Any] | None, run: Run, into: tuple[nn.Module, Optimizers, dict[str, Tensor]]) -> int:
-    """Fill network, optimizer and average from a checkpoint; the step it was made at, 0 without one."""
+def _restore(
+    state: dict[str, Any] | None, run: Run, network: nn.Module, optimizer: Optimizers, average: dict[str, Tensor]
+) -> int:
+    """Load network, optimizer and average from a checkpoint, and return its step; 0 without a checkpoint."""
     if state is None:
         return 0
     if state["run"] != _describe(run):
         raise ValueError(f"expected the checkpoint of {_describe(run)}, found one of {state['run']}")
-    network, optimizer, average = into
     network.load_state_dict(state["network"])
     optimizer.load_state_dict(state["optimizer"])
     for name, value in average.items():
@@ -237,19 +237,19 @@ def _restore(state: dict[str, Any] | None, run: Run, into: tuple[nn.Module, Opti
 
 
 def _parts(network: nn.Module) -> list[nn.Module]:
-    """Networks that are trained independently have their gradients clipped so."""
+    """Independent networks of one task, whose gradients are clipped separately."""
     nets = getattr(network, "nets", None)
     return [*nets, network.linear] if nets is not None else [network]  # type: ignore[list-item]
 
 
-def take_one_core(worker: int) -> None:
-    """Rendering workers are as many as there are cores to give."""
+def use_one_thread(worker: int) -> None:
+    """Initialize a rendering worker: parallelism comes from the number of workers."""
     del worker
     set_threads(1)
 
 
-def follow(average: dict[str, Tensor], network: nn.Module, decay: float) -> None:
-    """Move the average of the weights a step toward the network's."""
+def update_average(average: dict[str, Tensor], network: nn.Module, decay: float) -> None:
+    """Move the averaged weights a step toward the network's."""
     with torch.no_grad():
         for name, value in network.state_dict().items():
             average[name].lerp_(value.detach(), 1 - decay)

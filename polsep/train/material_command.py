@@ -1,4 +1,4 @@
-"""`polsep train material`: the network for materials, from options to a file of weights."""
+"""`polsep train material`: from options to a file of weights of the network for materials."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from polsep.networks.unet import count_parameters
 from polsep.train.command import check_run, describe_start
 from polsep.train.digest import digest_examples
 from polsep.train.log import read_log
-from polsep.train.loop import Run, Schedule, train_course
-from polsep.train.material_task import MaterialOptions, material_course
+from polsep.train.loop import Run, Schedule, run_training
+from polsep.train.material_task import MaterialOptions, material_training
 
-#: Steps of warm-up, and decay of the moving average: of shorter trainings than others.
+#: Steps of warm-up, and decay of the moving average; trainings are shorter than those of separation.
 WARM_UP, AVERAGE = 50, 0.99
 
 
 def choose_material(asked: dict[str, Any]) -> tuple[MaterialOptions, Schedule]:
-    """What is trained, and how long, from options of the command line; see `polsep train`."""
+    """Return options and schedule from those of the command line; see `polsep train`."""
     cues = tuple(asked["cues"].split(",")) if asked["cues"] else ()
     size = replace(MaterialSize(), cues=cues) if asked["width"] is None else MaterialSize(asked["width"], cues=cues)
     options = MaterialOptions(asked["seen"], size, asked["seed"], examples=asked["examples"])
@@ -35,10 +35,10 @@ def choose_material(asked: dict[str, Any]) -> tuple[MaterialOptions, Schedule]:
 
 
 def train_material(options: MaterialOptions, run: Run, folder: Path, report: Callable[[dict[str, Any]], None]) -> Path:
-    """Make the examples that ``folder`` lacks, train to the end, go on where a run in ``run.out`` stopped.
+    """Make the examples that ``folder`` lacks and train to the end, resuming a run in ``run.out``.
 
-    Returns the file of the averaged weights, in half precision; the scores in their metadata are of these. Raises
-    ValueError on what cannot be trained.
+    Returns the file of the averaged weights, in half precision, with their scores in the metadata. Raises ValueError on
+    a run that cannot be trained.
     """
     check_run(run)
     if run.refit:
@@ -48,27 +48,27 @@ def train_material(options: MaterialOptions, run: Run, folder: Path, report: Cal
             if made % 100 == 0:
                 report({f"{split} examples": made})
     torch.manual_seed(options.seed)
-    course = material_course(options, folder)
+    training = material_training(options, folder)
     run = replace(run, what=json.dumps(asdict(options)))
-    average = train_course(course, run, report)
+    average = run_training(training, run, report)
     path = run.out / f"material-{options.input}.safetensors"
     if average is None:
         return path
     halves = {name: value.cpu().half().float() for name, value in average.items()}
-    course.network.cpu().load_state_dict(halves)
+    training.network.cpu().load_state_dict(halves)
     counts = [options.seed, options.examples, options.views, options.validation]
     metadata = {
         "method": "material",
         "input": options.input,
         "size": json.dumps(asdict(options.size)),
         "seed": str(options.seed),
-        "parameters": str(count_parameters(course.network)),
+        "parameters": str(count_parameters(training.network)),
         "schedule": json.dumps(asdict(run.schedule)),
         "options": json.dumps(asdict(options)),
         "data": digest_examples(counts, "polsep.material.examples"),
         "steps": str(run.last),
         "command": describe_command(options, run),
-        "validation": json.dumps(course.score(course.network)),
+        "validation": json.dumps(training.score(training.network)),
         "curve": json.dumps([[line["step"], round(line["loss"], 5)] for line in read_log(run.out) if line["step"]]),
     }
     write_weights(path, halves, metadata)
@@ -76,7 +76,7 @@ def train_material(options: MaterialOptions, run: Run, folder: Path, report: Cal
 
 
 def describe_command(options: MaterialOptions, run: Run) -> str:
-    """The command line that trains this again."""
+    """Return the command line that repeats the training."""
     asked = {"input": options.input, "width": options.size.width, "steps": run.schedule.steps}
     asked |= {"rate": run.schedule.rate, "seed": options.seed, "examples": options.examples}
     asked |= {"devices": run.devices, "precision": run.schedule.precision, "output": run.out.name}

@@ -1,6 +1,6 @@
-"""The training of the network for materials: examples from a folder, turned and mirrored, one to all of their views.
+"""Training of the network for materials, on examples from a folder: rotated, mirrored, with one to all of their views.
 
-Batch number n follows from the options and n, so a training that goes on sees what one without a break would.
+Batch number n depends on the options and n alone, so that a resumed training uses the same batches.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from polsep.material.examples import example_path, load_example
 from polsep.material.network import MaterialNetwork, MaterialSize
 from polsep.material.shots import INPUTS, Example
 from polsep.material.svbrdf import unstack
-from polsep.train.loop import Course
+from polsep.train.loop import Training
 from polsep.train.material_losses import (
     maps_loss,
     material_loss,
@@ -28,17 +29,17 @@ from polsep.train.material_losses import (
 )
 from polsep.train.tasks import find
 
-#: The seed of validation's pictures, and how many of them there are, anywhere and mirrored.
+#: Seed and numbers of validation's configurations: random ones and mirror ones.
 VALIDATION_SEED, VALIDATION_PICTURES = 2026, (3, 6)
-#: Steps times this plus the rank seed a batch.
+#: A batch's seed is its step times this, plus the rank of the process.
 RANKS = 1024
 
 
 @dataclass(frozen=True)
 class MaterialOptions:
-    """What a training for materials sees: ``input`` of `shots.INPUTS`, of the first ``examples`` of ``seed``.
+    """Options of a training for materials: ``input`` of `shots.INPUTS`, from the first ``examples`` of ``seed``.
 
-    ``views`` that examples are made with; a batch has 1 to all of them. Raises ValueError on inputs that there are not.
+    ``views``: of every example; a batch has 1 to all of them. Raises ValueError on unknown inputs and counts below 1.
     """
 
     input: str
@@ -62,12 +63,11 @@ class MaterialBatch(NamedTuple):
     maps: Tensor
 
 
-def turn_example(example: MaterialBatch, ways: tuple[bool, bool, bool], colors: Tensor) -> MaterialBatch:
-    """Mirrored across, mirrored down, transposed, colours permuted; normals turn with their picture.
+def turn_example(example: MaterialBatch, across: bool, down: bool, transposed: bool, colors: Tensor) -> MaterialBatch:
+    """Return an example mirrored across, mirrored down, transposed and with permuted colours; normals turn with it.
 
-    Images without polarization and their maps are as likely in all these ways.
+    Images without polarization and their maps are equally likely in all these orientations.
     """
-    across, down, transposed = ways
     views, maps = example
     x, y = maps[..., 0:1, :, :], maps[..., 1:2, :, :]
     x, y = (-x if across else x), (-y if down else y)
@@ -83,50 +83,50 @@ def turn_example(example: MaterialBatch, ways: tuple[bool, bool, bool], colors: 
     return MaterialBatch(views, maps)
 
 
-def batches(options: MaterialOptions, folder: Path, step: int, lane: tuple[int, int]) -> Iterator[MaterialBatch]:
-    """Batches from ``step`` on, for the process of that number among so many."""
+def batches(options: MaterialOptions, folder: Path, step: int, process: tuple[int, int]) -> Iterator[MaterialBatch]:
+    """Yield batches from ``step`` on, for process (rank, count)."""
     while True:
-        generator = torch.Generator().manual_seed((options.seed << 24) ^ (step * RANKS + lane[0]))
+        generator = torch.Generator().manual_seed((options.seed << 24) ^ (step * RANKS + process[0]))
         count = 1 + int(torch.randint(options.views, (1,), generator=generator))
-        found = []
+        turned = []
         for number in torch.randint(options.examples, (options.batch,), generator=generator).tolist():
             example = load_example(example_path(folder, "train", options.seed, number))
             chosen = torch.randperm(options.views, generator=generator)[:count]
-            seen = MaterialBatch(example.views[chosen, INPUTS[options.input]], example.maps)
-            ways = tuple(bool(w) for w in torch.randint(2, (3,), generator=generator))
-            found.append(turn_example(seen, (ways[0], ways[1], ways[2]), torch.randperm(3, generator=generator)))
-        views, maps = (torch.stack(x).float() for x in zip(*found, strict=True))
-        yield MaterialBatch(views, maps)
+            views = MaterialBatch(example.views[chosen, INPUTS[options.input]], example.maps)
+            across, down, transposed = (bool(way) for way in torch.randint(2, (3,), generator=generator))
+            colors = torch.randperm(3, generator=generator)
+            turned.append(turn_example(views, across, down, transposed, colors))
+        yield MaterialBatch(*(torch.stack(x).float() for x in zip(*turned, strict=True)))
         step += 1
 
 
 def score_maps(estimate: Callable[[Tensor], Tensor], examples: Sequence[Example], part: slice) -> dict[str, float]:
-    """Mean losses of what is estimated from one view and from all: "relit, 1 view", "maps, 3 views" and their like."""
+    """Return mean losses of estimates from one view and from all: "relit, 1 view", "maps, 3 views" and so on."""
     scores: dict[str, float] = {}
     generator = torch.Generator().manual_seed(VALIDATION_SEED)
-    seen = random_configurations(*VALIDATION_PICTURES, generator)
+    configurations = random_configurations(*VALIDATION_PICTURES, generator)
     for count in (1, len(examples[0].views)):
         relit, maps = [], []
         for example in examples:
-            found = unstack(estimate(example.views[None, :count, part].float()))
+            estimated = unstack(estimate(example.views[None, :count, part].float()))
             truth = unstack(example.maps[None].float())
-            relit.append(float(rendering_loss(found, truth, seen)))
-            maps.append(float(maps_loss(found, truth)))
+            relit.append(float(rendering_loss(estimated, truth, configurations)))
+            maps.append(float(maps_loss(estimated, truth)))
         name = f"{count} view{'s' if count > 1 else ''}"
         scores |= {f"relit, {name}": statistics.fmean(relit), f"maps, {name}": statistics.fmean(maps)}
     return scores
 
 
-def material_course(options: MaterialOptions, folder: Path) -> Course:
-    """The training of a network for one input, on examples that are there already."""
+def material_training(options: MaterialOptions, folder: Path) -> Training:
+    """Return the training of a network for one input, on examples that were made before."""
     part = INPUTS[options.input]
     network = MaterialNetwork(part.stop - part.start, options.size)
 
     def loss(net: nn.Module, batch: MaterialBatch, done: float) -> Tensor:
-        seed = int(done * 2**31)  # a share of the training: the same for every input
-        found = net(batch.views)
-        total = material_loss(found, batch.maps, torch.Generator().manual_seed(seed))
-        return total + slopes_loss(found, batch.maps) if options.size.cues else total
+        seed = int(done * 2**31)  # from the completed share of the training: the same for every input
+        stacked = net(batch.views)
+        total = material_loss(stacked, batch.maps, torch.Generator().manual_seed(seed))
+        return total + slopes_loss(stacked, batch.maps) if options.size.cues else total
 
     def score(net: nn.Module) -> dict[str, float]:
         device = next(net.parameters()).device
@@ -134,4 +134,4 @@ def material_course(options: MaterialOptions, folder: Path) -> Course:
         with torch.no_grad():
             return score_maps(lambda x: net(x.to(device)).cpu(), [load_example(path) for path in paths], part)
 
-    return Course(network, lambda step, lane: batches(options, folder, step, lane), loss, score)
+    return Training(network, partial(batches, options, folder), loss, score)

@@ -1,10 +1,10 @@
-"""What moves the weights: Muon for the convolutions inside networks, AdamW for all others.
+"""Optimizers: Muon for the convolutions inside networks, AdamW for all other weights.
 
-Muon (Jordan et al. 2024, kellerjordan.github.io/posts/muon) takes the momentum of a layer's matrix to the nearest
-orthogonal one, so that all directions of a layer learn alike; AdamW drowns rare ones in frequent ones. The joint
-network is after a third of the steps where AdamW takes it (docs/experiments.md). Steps have the root mean square of
-AdamW's (Liu et al. 2025, arXiv 2502.16982, Sec. 2.2), so that both share one learning rate. First guesses, output
-layers and biases are no maps between features; they are left to AdamW.
+Muon (Jordan et al. 2024, kellerjordan.github.io/posts/muon) replaces the momentum of a layer's matrix by the nearest
+orthogonal matrix, so that all directions of a layer learn at one pace, also those with rare gradients. The joint
+network needs a third of the steps of AdamW (docs/experiments.md). Steps have the root mean square of AdamW's (Liu et
+al. 2025, arXiv 2502.16982, Sec. 2.2), so that both share one learning rate. Closed forms, output layers and biases do
+not map features to features; AdamW optimizes them.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from polsep.material.network import MaterialNetwork
 from polsep.networks.unet import ResidualUNet, UNet
 
 WEIGHT_DECAY, BETAS = 1e-4, (0.9, 0.99)
-#: Smaller matrices are nearly all directions that matter; AdamW serves them as well.
+#: Smallest side of a matrix for Muon; on smaller ones AdamW does as well.
 MIN_SIDE = 16
 
 
 class Optimizers:
-    """Both, for those weights of a ``network``, which is where it will stay, that are to be trained.
+    """Both optimizers, for the trainable weights of a ``network`` that is on its device already.
 
-    State: that of both. Muon takes matrices alone, so it has twins of the convolutions that share their memory.
+    State: that of both. Muon accepts matrices only, so it has twins of the convolutions that share their memory.
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -41,7 +41,7 @@ class Optimizers:
             self._muon = torch.optim.Muon(matrices, lr=0.0, weight_decay=WEIGHT_DECAY, adjust_lr_fn="match_rms_adamw")
 
     def step(self, rate: float) -> None:
-        """Move all weights along their gradients, which are forgotten, at a learning ``rate``."""
+        """Update all weights at a learning ``rate`` and clear their gradients."""
         for optimizer in self._both():
             for group in optimizer.param_groups:
                 group["lr"] = rate
@@ -53,7 +53,7 @@ class Optimizers:
             optimizer.zero_grad(set_to_none=True)
 
     def state_dict(self) -> list[dict[str, Any]]:
-        """What a checkpoint needs."""
+        """Return the state of both optimizers for a checkpoint."""
         return [optimizer.state_dict() for optimizer in self._both()]
 
     def load_state_dict(self, states: list[dict[str, Any]]) -> None:
@@ -66,7 +66,7 @@ class Optimizers:
 
 
 def hidden_weights(network: nn.Module) -> Iterator[Tensor]:
-    """The convolutions of a network that map features to features."""
+    """Yield the convolutions of a network that map features to features."""
     for module in network.modules():
         if isinstance(module, (UNet, ResidualUNet, MaterialNetwork)):
             last = set() if isinstance(module, ResidualUNet) else {id(weight) for weight in module.last.parameters()}
@@ -76,9 +76,9 @@ def hidden_weights(network: nn.Module) -> Iterator[Tensor]:
 
 
 def as_matrix(weight: Tensor, like: Tensor | None = None) -> Tensor:
-    """Weights ``[n, m, k, k]`` as a matrix ``[n, m k k]``, of which the columns' order is that of ``like`` in memory.
+    """Return weights ``[n, m, k, k]`` as a matrix ``[n, m k k]`` whose columns have the order of ``like`` in memory.
 
-    A view, where ``weight`` lies in memory as ``like`` does.
+    A view, if both have the same memory layout.
     """
     last = not (weight if like is None else like).is_contiguous()
     return (weight.permute(0, 2, 3, 1) if last else weight).reshape(weight.shape[0], -1)

@@ -1,9 +1,8 @@
-"""Training examples without end: random views rendered in the background, cut, exposed and measured anew every time.
+"""Endless training examples: random crops of rendered scenes, with a random exposure, camera and noise each.
 
-A lane is one worker's stream. It keeps a pool of rendered scenes; example number n is a random crop of one of them,
-mirrored and turned at random, with its colours permuted and its own exposure, camera and noise. After every few
-examples the oldest scene gives way to a new one. Everything follows from the options, the lane and n, so a stream that
-starts at any batch gives what one from the beginning would.
+A lane is the stream of one worker. It keeps a pool of rendered scenes; example number n is a random crop of one of
+them, randomly mirrored and transposed, with permuted colours and its own exposure, camera and noise. Every few examples
+the oldest scene is replaced. Examples depend on the options, the lane and n alone, so a stream can start at any batch.
 
 Conventions: images at raw resolution, linear, 1 = the white level of one measurement.
 """
@@ -29,12 +28,12 @@ from polsep.render.raycast import MeshScene, find_lit, find_view, shade_view
 from polsep.render.simulate import HEADROOM, blur, filter_light
 from polsep.render.sphere_tracing import Scene
 from polsep.render.views import MIN_LEVEL, random_shot, scene_seed, seeded_shape
-from polsep.sensor.camera import IMX250, Layout, Mosaic, Sensor
+from polsep.sensor.camera import IMX250, Layout, Sensor
 from polsep.train.variety import (
-    Look,
-    find_sheen,
+    LitView,
     random_sensor,
     relight,
+    render_sheen,
     vary_colors,
     vary_gloss,
     vary_normals,
@@ -43,30 +42,29 @@ from polsep.train.variety import (
     vary_shot,
 )
 
-#: Views of a shape, and lights with materials of their own under which each is seen.
-VIEWS, LOOKS = 2, 3
-#: Brightness of object samples is kept at so many quantiles above this share, for exposures that clip the rest.
+#: Views of a shape; lights, each with new materials, per view.
+VIEWS, LIGHTS = 2, 3
+#: The brightest object samples of a scene are kept as quantiles: from this share on, and how many.
 LOWEST_QUANTILE, QUANTILES = 0.94, 601
-#: Share of the examples in which nothing is to clip; there the brightest sample lies between these shares of white.
+#: Share of examples without clipping, and the range of their brightest sample, as a share of white.
 UNCLIPPED_SHARE, BRIGHTEST = 0.25, (0.4, HEADROOM)
-#: Shares of the object's samples that clip in the others: least and most, small ones more often (a square's law).
+#: Range of the share of object samples that clip in the others; density falls with the inverse square root.
 CLIPPED = (0.0005, 0.06)
-#: Share of the examples that are exposed for what they show instead, whatever clips, and of those with glaring
-#: highlights: the brightest 0.3 % of the object exceed the median of the lit samples so many times. That median lies
-#: between these shares of white then.
+#: Share of examples exposed for their median instead, whatever clips, in general and with glaring highlights. Glaring:
+#: the brightest 0.3 % of the object's samples exceed the median of the lit ones by this factor. Range of that median,
+#: as a share of white.
 LEVEL_SHARE, GLARING_SHARE, GLARING, LEVELS = 0.2, 0.8, (0.003, 10.0), (0.05, 0.4)
-#: Share of the crops that are about one of the brightest of the object's pixels, and what share of it these are: there
-#: highlights and white surfaces clip, which must be told apart.
+#: Share of crops centred on one of the brightest object pixels, and the share of these pixels: highlights and white
+#: surfaces clip there, which the networks must learn to distinguish.
 BRIGHT_SHARE, BRIGHT_PIXELS = 0.3, 0.02
-#: A crop is drawn anew, at most so many times, while less than this share of it is on objects.
+#: Least share of a crop on objects, and most draws to reach it.
 MIN_COVERED, MAX_DRAWS = 0.6, 4
 
-
-#: Light at most, in white levels, so that half precision holds it.
+#: Largest light, in white levels: half precision holds it.
 MAX_LIGHT = 2.0**14
 
-#: What examples show: all that `variety` has; or, as the paper's training data, smooth surfaces of usual gloss whose
-#: diffuse light is as polarized as Fresnel says, without what keeps the lamp's polarization.
+#: Kinds of scenes: "varied" has all of `variety`; "usual", as the paper's training data, has smooth surfaces of usual
+#: gloss, diffuse light polarized by Fresnel transmission, and none that keeps the lamp's polarization.
 LOOK_KINDS = ("varied", "usual")
 #: Sony's order without colours.
 MONO = Layout(bayer=None)
@@ -76,11 +74,11 @@ ANGLES = Layout().angles
 
 @dataclass(frozen=True)
 class StreamOptions:
-    """What a stream gives: ``batch`` crops of ``crop`` x ``crop`` raw pixels from views of ``size`` x ``size``.
+    """Options of a stream: ``batch`` crops of ``crop`` x ``crop`` raw pixels from views of ``size`` x ``size``.
 
-    ``pool``: scenes to draw from, per lane; ``uses``: how often a scene's pixels are taken, on average, before it is
-    replaced; 0 for one crop of each. ``samples``: rays along a pixel's side. ``looks``: of `LOOK_KINDS`. Raises
-    ValueError when crops do not fit or are no multiples of the mosaic's period.
+    ``pool``: scenes per lane; ``uses``: mean number of times that a scene's pixels are used before it is replaced; 0
+    for one crop of each. ``samples``: rays along a pixel's side. ``looks``: one of `LOOK_KINDS`. Raises ValueError when
+    crops do not fit or are no multiples of the mosaic's period.
     """
 
     split: str = "train"
@@ -122,12 +120,12 @@ class Examples(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Pooled:
-    """A scene in half precision, with the ``places [N, 2]`` and the ``brightness`` quantiles of its object's pixels.
+class PooledScene:
+    """A scene of the pool, in half precision, scaled so that the brightest object sample is 1.
 
-    ``level``: the median of the lit ones; ``bright [M, 2]``: places of the brightest ones.
-
-    ``diffuse [9, H, W]``: s0, s1, s2 of three colours each; ``specular [3, H, W]``: of white light.
+    ``diffuse [9, H, W]``: s0, s1, s2 of three colours each; ``specular [3, H, W]``: of white light. ``places [N, 2]``:
+    all object pixels; ``bright [M, 2]``: the brightest ones; ``brightness``: quantiles of the object's samples;
+    ``level``: median of the lit ones.
     """
 
     diffuse: Tensor
@@ -142,7 +140,7 @@ class Pooled:
 class ExampleStream(IterableDataset[Examples]):
     """Batches from number ``start`` on, for a `DataLoader` without batching; its workers are the lanes.
 
-    ``process``: which of how many processes that train together this one is; each has lanes of its own.
+    ``process``: rank and number of the processes that train together; each has its own lanes.
     """
 
     def __init__(self, options: StreamOptions, start: int = 0, process: tuple[int, int] = (0, 1)) -> None:
@@ -150,7 +148,7 @@ class ExampleStream(IterableDataset[Examples]):
         self.options, self.start, self.process = options, start, process
 
     def __iter__(self) -> Iterator[Examples]:
-        """Batches ``start``, ``start`` + 1, ... of which every lane makes its share."""
+        """Yield batches ``start``, ``start`` + 1, ... of which every lane makes its share."""
         worker = get_worker_info()
         lane, lanes = (worker.id, worker.num_workers) if worker else (0, 1)
         # The loader asks its first worker first, wherever the stream starts.
@@ -160,9 +158,9 @@ class ExampleStream(IterableDataset[Examples]):
 
 
 def stream_lane(options: StreamOptions, lane: int, first: int) -> Iterator[Examples]:
-    """Batches of one lane, from its own number ``first`` on."""
+    """Yield the batches of one lane from its number ``first`` on."""
     scenes = pool_scenes(options, lane, first * options.batch // options.reuse)
-    pool: deque[Pooled] = deque(maxlen=options.pool)
+    pool: deque[PooledScene] = deque(maxlen=options.pool)
     newest = first * options.batch // options.reuse - 1
     while len(pool) < options.pool:
         pool.append(next(scenes))
@@ -184,46 +182,46 @@ def _generator(options: StreamOptions, lane: int, number: int, use: str = "crop"
     return torch.Generator().manual_seed(int.from_bytes(hashlib.sha256(label.encode()).digest()[:8]) >> 1)
 
 
-def pool_scenes(options: StreamOptions, lane: int, first: int) -> Iterator[Pooled]:
-    """Scenes of a lane from number ``first`` on: shape after shape, `VIEWS` of each, `LOOKS` of each view."""
-    per_shape = VIEWS * LOOKS
+def pool_scenes(options: StreamOptions, lane: int, first: int) -> Iterator[PooledScene]:
+    """Yield the scenes of a lane from number ``first`` on: `VIEWS` of every shape, each under `LIGHTS` lights."""
+    per_shape = VIEWS * LIGHTS
     number = first - first % per_shape
     while True:
         # Lanes take shapes from ranges of their own.
         shape_number = lane * 2**24 + number // per_shape
         shape = seeded_shape(options.split, options.seed, shape_number)
         for view in range(VIEWS):
-            if number + LOOKS > first:
+            if number + LIGHTS > first:
                 generator = torch.Generator().manual_seed(scene_seed(options.split, options.seed, shape_number, view))
-                looks = _look_at(shape, options, generator)
-                yield from looks[max(first - number, 0) :]
-            number += LOOKS
+                scenes = _render_view(shape, options, generator)
+                yield from scenes[max(first - number, 0) :]
+            number += LIGHTS
 
 
-def _look_at(shape: MeshScene, options: StreamOptions, generator: torch.Generator) -> list[Pooled]:
-    """One view of a shape under several lights, with other materials under each."""
+def _render_view(shape: MeshScene, options: StreamOptions, generator: torch.Generator) -> list[PooledScene]:
+    """A view of a shape under several lights, with new materials under each."""
     shot = vary_shot(shape, random_shot(shape, generator), generator)
     view = find_view(shape, shot.camera, (options.size, options.size), options.samples)
     varied = options.looks == "varied"
     if varied:
         view = vary_normals(view, generator)
     light = shot.light
-    looks = []
-    for _ in range(LOOKS):
+    scenes = []
+    for _ in range(LIGHTS):
         materials = vary_colors(random_materials(shape.mesh.slot_count, generator, shape.size), generator)
         if varied:
             materials = vary_gloss(materials, generator)
-        look = Look(view, materials, light, find_lit(shape, view, light))
-        scene = blur(shade_view(*look), shot.blur)
+        lit_view = LitView(view, materials, light, find_lit(shape, view, light))
+        scene = blur(shade_view(*lit_view), shot.blur)
         if varied:
-            scene = vary_retention(vary_polarization(scene, generator), partial(find_sheen, look), generator)
-        looks.append(_as_pooled(scene))
+            scene = vary_retention(vary_polarization(scene, generator), partial(render_sheen, lit_view), generator)
+        scenes.append(_as_pooled(scene))
         light = relight(shape, shot, generator)
-    return looks
+    return scenes
 
 
-def _as_pooled(scene: Scene) -> Pooled:
-    """A scene for the pool, scaled so that its brightest object sample is 1."""
+def _as_pooled(scene: Scene) -> PooledScene:
+    """The scene for the pool."""
     signal = filter_light(scene.diffuse + scene.specular, Layout(), IMX250)
     samples = signal[scene.mask]
     lowest = int(LOWEST_QUANTILE * (samples.numel() - 1))
@@ -235,7 +233,7 @@ def _as_pooled(scene: Scene) -> Pooled:
     level = gain * float(lit.median()) if lit.numel() else 1.0
     white = scene.specular.map(lambda s: s[:1])
     diffuse, specular = (torch.cat([s.s0, s.s1, s.s2]).mul_(gain).half() for s in (scene.diffuse, white))
-    return Pooled(diffuse, specular, scene.mask, scene.mask.nonzero(), bright, brightness * gain, level)
+    return PooledScene(diffuse, specular, scene.mask, scene.mask.nonzero(), bright, brightness * gain, level)
 
 
 class Crop(NamedTuple):
@@ -249,10 +247,10 @@ class Crop(NamedTuple):
     mask: Tensor
 
 
-def random_crop(pool: deque[Pooled], crop: int, generator: torch.Generator) -> Crop:
-    """A random crop of one of the scenes, mirrored, turned, its colours permuted; see the module.
+def random_crop(pool: deque[PooledScene], crop: int, generator: torch.Generator) -> Crop:
+    """Return a random crop of one of the scenes, randomly mirrored and transposed, with permuted colours.
 
-    Mirroring turns the sign of s2, transposing that of s1 (`stokes.flip_horizontal`, `stokes.transpose`).
+    Mirroring changes the sign of s2, transposing that of s1 (`stokes.flip_horizontal`, `stokes.transpose`).
     """
     scene = pool[_integer(len(pool), generator)]
     rows, cols = _random_place(scene, crop, generator)
@@ -270,7 +268,7 @@ def random_crop(pool: deque[Pooled], crop: int, generator: torch.Generator) -> C
 
 
 def expose_crops(crops: list[Crop], generator: torch.Generator) -> Examples:
-    """A batch of crops as the sensor records them, and the truth."""
+    """Return a batch of crops as the sensor records them, and the truth."""
     factors = torch.stack([crop.factors for crop in crops])[..., None, None]
     light = (torch.stack([crop.light for crop in crops]).float() * factors).clamp(-MAX_LIGHT, MAX_LIGHT)
     diffuse, specular = light[:, :3], light[:, 9:10]
@@ -285,8 +283,8 @@ def _integer(limit: int, generator: torch.Generator) -> int:
     return int(torch.randint(limit, (1,), generator=generator))
 
 
-def _random_place(scene: Pooled, crop: int, generator: torch.Generator) -> tuple[slice, slice]:
-    """A crop about a random pixel of the object, as far as the frame allows, with much of the object in it."""
+def _random_place(scene: PooledScene, crop: int, generator: torch.Generator) -> tuple[slice, slice]:
+    """Rows and columns of a crop around a random object pixel, moved into the frame, with much of the object in it."""
     bright = float(torch.rand(1, generator=generator)) < BRIGHT_SHARE
     places = scene.bright if bright else scene.places
     for _ in range(MAX_DRAWS):
@@ -298,10 +296,10 @@ def _random_place(scene: Pooled, crop: int, generator: torch.Generator) -> tuple
     return rows, cols
 
 
-def random_gain(scene: Pooled, generator: torch.Generator) -> float:
-    """A gain at which a random share of the samples clips, or none, or that exposes the median; see the constants.
+def random_gain(scene: PooledScene, generator: torch.Generator) -> float:
+    """Return a gain at which a random share of the samples clips, or none, or at which the median has a random level.
 
-    The floor is that of `views.capture_shot`.
+    At least that of `views.capture_shot`.
     """
     none, place, level = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
     glaring = float(scene.brightness[_rank(GLARING[0])]) > GLARING[1] * scene.level
@@ -316,14 +314,15 @@ def random_gain(scene: Pooled, generator: torch.Generator) -> float:
 
 
 def _rank(share: float) -> int:
-    """Which of a scene's quantiles this share of its object's samples exceeds."""
+    """Index of the quantile that this share of the object's samples exceeds."""
     return round((1 - share - LOWEST_QUANTILE) / (1 - LOWEST_QUANTILE) * (QUANTILES - 1))
 
 
 def add_gaussian_noise(signal: Tensor, sensor: Sensor, generator: torch.Generator) -> Tensor:
-    """A frame of ``signal``, white = 1: noise, clipping and quantization, a Gaussian for shot and read noise together.
+    """Return a frame of ``signal``, white = 1, with Gaussian noise for shot and read noise, clipped and quantized.
 
-    Ten times faster than `camera.add_noise`, and the same but for the few electrons of black pixels.
+    Ten times faster than the Poisson noise of `camera.add_noise`, and the same except for the few electrons of black
+    pixels.
     """
     source = np.random.default_rng(_integer(2**31, generator))
     noise = torch.from_numpy(source.standard_normal(signal.shape, np.float32))
@@ -333,9 +332,9 @@ def add_gaussian_noise(signal: Tensor, sensor: Sensor, generator: torch.Generato
 
 
 def expose_mono(examples: Examples) -> Examples:
-    """Examples as a camera without colour filters records their green light; one colour, single precision.
+    """Return examples as a camera without colour filters records their green light: one colour, single precision.
 
-    Their noise and sensors are drawn from a seed that the colour frames give, so a batch is always seen alike.
+    The seed of noise and sensors is a checksum of the colour frames, so that a batch always gives the same frames.
     """
     diffuse, specular, polarized = (x.float().cpu() for x in examples[1:4])
     diffuse, polarized = diffuse[:, 1:2], polarized[:, 1::3]
@@ -345,8 +344,3 @@ def expose_mono(examples: Examples) -> Examples:
     device = examples.raw.device
     raw, diffuse, specular, polarized = (x.to(device) for x in (raw, diffuse, specular, polarized))
     return Examples(raw, diffuse, specular, polarized, examples.mask)
-
-
-def as_mosaic(raw: Tensor) -> Mosaic:
-    """Raw frames of a batch for the demosaickers."""
-    return Mosaic(raw, Layout(), 0.0, 1.0)

@@ -1,7 +1,7 @@
-"""How well a training separates views that it never sees, and what methods that learn nothing make of the same views.
+"""Validation: scores of networks in training, and of methods without training, on the same unseen views.
 
 Scores are mean PSNR [dB] of diffuse and specular inside the objects' masks, as in `metrics`. The views are the first of
-the validation split, the same for every training with crops of one size, and seen as the task sees its examples.
+the validation split, the same for every training with crops of one size.
 """
 
 from __future__ import annotations
@@ -17,19 +17,20 @@ from polsep.metrics import psnr
 from polsep.physics.stokes import Measurements
 from polsep.separation.analytic import Separation, separate_analytic
 from polsep.separation.color_affine import separate_color_affine
+from polsep.train.inputs import Inputs
 from polsep.train.stream import Examples, ExampleStream, StreamOptions
-from polsep.train.tasks import Task, View
+from polsep.train.tasks import Task
 
-#: Methods without training that every log begins with, on the measurements that the networks get.
+#: Methods without training, with whose scores every log begins.
 REFERENCES: dict[str, Callable[[Measurements], Separation]] = {
     "analytic": separate_analytic,
     "color-affine": separate_color_affine,
 }
 
 
-@lru_cache(maxsize=1)  # a training asks when it begins and when it has ended
+@lru_cache(maxsize=1)  # used before the first step and after the last one
 def validation_batches(stream: StreamOptions, count: int = 8) -> tuple[Examples, ...]:
-    """The first batches of the validation split, of which every example is of a scene of its own."""
+    """Return the first batches of the validation split; every example is of a scene of its own."""
     options = StreamOptions(
         "validation", 0, 8, stream.crop, stream.size, stream.samples, pool=1, uses=0, looks=stream.looks
     )
@@ -37,25 +38,21 @@ def validation_batches(stream: StreamOptions, count: int = 8) -> tuple[Examples,
     return tuple(next(batches) for _ in range(count))
 
 
-def score(separate: Callable[[View], Separation], views: list[View]) -> dict[str, float]:
-    """Scores of whatever separates ``views``: "diffuse PSNR" and "specular PSNR"."""
+def score(separate: Callable[[Inputs], Separation], views: list[Inputs]) -> dict[str, float]:
+    """Return the scores of separations of ``views``: "diffuse PSNR" and "specular PSNR"."""
     scores: dict[str, list[float]] = {"diffuse": [], "specular": []}
-    for seen in views:
-        found = separate(seen)
-        for name, images, truth in (("diffuse", found.diffuse, seen[1]), ("specular", found.specular, seen[2])):
-            scores[name] += [psnr(x, t, m) for x, t, m in zip(images, truth, seen[3], strict=True) if bool(m.any())]
+    for view in views:
+        separation = separate(view)
+        pairs = {"diffuse": (separation.diffuse, view.diffuse), "specular": (separation.specular, view.specular)}
+        for name, (images, truth) in pairs.items():
+            scores[name] += [psnr(x, t, m) for x, t, m in zip(images, truth, view.mask, strict=True) if bool(m.any())]
     return {f"{name} PSNR": statistics.fmean(values) for name, values in scores.items()}
-
-
-def validate(task: Task[View], average: dict[str, Tensor], views: list[View]) -> dict[str, float]:
-    """Scores of the task's network with the averaged weights; it has its own again afterwards."""
-    return score_averaged(task.network, average, lambda _: score(task.separate, views))
 
 
 def score_averaged(
     network: nn.Module, average: dict[str, Tensor], measure: Callable[[nn.Module], dict[str, float]]
 ) -> dict[str, float]:
-    """Scores of a network with averaged weights; it has its own again afterwards."""
+    """Return the scores of a network with averaged weights; its own weights are restored afterwards."""
     own = {name: value.detach().clone() for name, value in network.state_dict().items()}
     network.load_state_dict(average)
     scores = measure(network)
@@ -63,11 +60,11 @@ def score_averaged(
     return scores
 
 
-def score_references(task: Task[View], views: list[View]) -> dict[str, float]:
-    """Scores of `REFERENCES` under names like "analytic diffuse PSNR"."""
-    found: dict[str, float] = {}
+def score_references(task: Task[Inputs], views: list[Inputs]) -> dict[str, float]:
+    """Return the scores of `REFERENCES` under names like "analytic diffuse PSNR"."""
+    scores: dict[str, float] = {}
     for method, separate in REFERENCES.items():
         with torch.no_grad():
-            scores = score(lambda seen, separate=separate: separate(task.measure(seen)), views)  # type: ignore[misc]
-        found |= {f"{method} {name}": value for name, value in scores.items()}
-    return found
+            own = score(lambda view, separate=separate: separate(task.measure(view)), views)  # type: ignore[misc]
+        scores |= {f"{method} {name}": value for name, value in own.items()}
+    return scores

@@ -1,6 +1,6 @@
-"""What training examples have beyond `render.views`: close-ups, relief, grey, plain, matte and rough objects, cameras.
+"""Variations of training examples beyond `render.views`: close-ups, relief, colours, gloss, polarization, cameras.
 
-Whoever uses a trained network photographs more than objects that fill the frame, by one camera. Draws take a generator.
+Users photograph more than objects that fill the frame, and with more than one camera. All draws take a generator.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,46 +22,51 @@ from polsep.render.sphere_tracing import PointLight, Scene, pixel_side
 from polsep.render.views import MIN_LIT, PREVIEW_SIZE, Shot, lit_share, random_light
 from polsep.sensor.camera import IMX250, Sensor
 
-#: Share of the views that show a part of the object, and how many times larger than the whole, log-uniform.
+#: Share of close-ups among the views, and their magnification, log-uniform.
 CLOSE_SHARE, MAGNIFICATIONS = 0.5, (1.0, 5.0)
-#: Shares of the looks of which all is near-grey, of those on near-white ground, as painted and printed things have, and
-#: of those without textures.
+#: Shares of frames that are near-grey, that have a near-white ground, as painted and printed things have, and that have
+#: no textures.
 GREY_SHARE, WHITE_SHARE, PLAIN_SHARE = 0.3, 0.25, 0.2
-#: Share of the looks that are matte: what is left of their specular light, log-uniform for every material. Photographs
-#: of painted, dusty or paper things have half a percent of it, which random materials rarely have.
+#: Share of matte frames, and the factor on their specular strength, log-uniform for every material. Photographs of
+#: painted, dusty or paper things have half a percent of the usual strength, which random materials rarely have.
 MATTE_SHARE, MATTE_STRENGTH = 0.4, (0.005, 1.0)
-#: Share of the looks whose highlights clip all analysers over an area, as mirror images of lamps do, which points of
-#: light do not make. How bright their middle is against the diffuse light, log-uniform; roughness from which on it is
-#: less.
+#: Share of frames whose highlights clip all analysers over an area, as mirror images of lamps do and those of point
+#: lights do not. Brightness of their middle over the diffuse light, log-uniform; roughness above which it is less.
 GLARE_SHARE, GLARES, GLARE_ROUGHNESS = 0.25, (30.0, 3000.0), 0.4
-#: Share of the looks whose diffuse light is less polarized than Fresnel's transmission says, as behind rough surfaces,
-#: and the share of those whose diffuse light is not polarized at all; the others keep a uniform share of it.
+#: Share of frames whose diffuse light is less polarized than by Fresnel transmission, as behind rough surfaces, and the
+#: share of these whose diffuse light is unpolarized; the others keep a uniform share of the polarization.
 DEPOLARIZED_SHARE, UNPOLARIZED_SHARE = 0.4, 0.3
-#: Share of the looks in which a part of the diffuse light keeps the polarization of the lamp, as light that was
-#: scattered once does (Ma et al. 2007), and how much of it, log-uniform. Crossed polarizers count it as specular; on
-#: matte photographs it is most of what they measure.
+#: Share of frames in which a part of the diffuse light keeps the polarization of the lamp, as single scattering does
+#: (Ma et al. 2007), and that part, log-uniform. Crossed polarizers count it as specular; on matte photographs it is
+#: most of what they measure.
 RETAINING_SHARE, RETAINED = 0.6, (0.002, 0.03)
-#: Share of these in which how much is kept follows a rough lobe over the surface instead of being the same everywhere,
-#: as on painted and paper things. The lobe's roughness, and its most over its median.
+#: Share of these in which that part follows a rough specular lobe instead of being constant, as on painted and paper
+#: things; the lobe's roughness, and its maximum over its median.
 SHEEN_SHARE, SHEEN_ROUGHNESS, MAX_SHEEN = 0.6, (0.5, 1.0), 4.0
-#: Saturation that near-grey and near-white looks keep, at most; the largest albedo of white ground at least.
+#: Largest factor on the saturation of near-grey and near-white frames; smallest albedo maximum of white ground.
 GREY_SATURATION, WHITE = 0.15, 0.6
-#: Standard deviation of the lens's point spread in raw pixels: that of `views.BLURS` and, slightly defocused, more.
+#: Standard deviation of the lens's point spread in raw pixels: from that of `views.BLURS` to slight defocus.
 BLURS = (0.3, 1.2)
-#: Electrons at the white level, log-uniform: a gain of 12 to 0 dB on cameras like the IMX250, and larger pixels.
+#: Electrons at the white level, log-uniform: cameras like the IMX250 with a gain of 12 to 0 dB, and larger pixels.
 FULL_WELLS = (2_600.0, 21_000.0)
 #: Bits of the converter, and their shares.
 BITS, BITS_SHARES = (8, 10, 12), (0.15, 0.15, 0.7)
-#: Share of the views with fine relief. Pixels along its largest cells and tangent of its tilt, log-uniform; octaves at
-#: most, while the finest cells are no smaller than the limit.
+#: Share of views with fine relief. Size of its largest cells in pixels and tangent of its tilt, log-uniform; most
+#: octaves, as long as the finest cells reach the least size in pixels.
 RELIEF_SHARE, RELIEF_PIXELS, RELIEF_TILTS = 0.5, (3.0, 60.0), (0.05, 0.6)
 MAX_OCTAVES, MIN_CELL = 3, 2.5
-#: Lights are drawn anew, at most so many times, while they leave most of a view dark.
+#: Most draws of a light that leaves most of a view dark.
 MAX_DRAWS = 10
 
 
-class Look(NamedTuple):
-    """What `render.raycast.shade_view` takes: a view, its materials, a light, and what that reaches."""
+def log_between(interval: tuple[float, float], share: Tensor | float) -> Any:
+    """Return the value at a ``share`` in [0, 1] of the interval on a logarithmic scale."""
+    low, high = interval
+    return low * (high / low) ** share
+
+
+class LitView(NamedTuple):
+    """Arguments of `render.raycast.shade_view`: a view, its materials, a light, and the hits that it reaches."""
 
     view: View
     materials: Materials
@@ -70,24 +75,23 @@ class Look(NamedTuple):
 
 
 def vary_shot(shape: MeshScene, shot: Shot, generator: torch.Generator) -> Shot:
-    """A shot of the whole object, or of the surroundings of a lit point of it, through another lens."""
+    """Return a shot of the whole object, or a close-up around a lit point, through another lens."""
     close, magnification, softness = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
-    shot = replace(shot, blur=BLURS[0] * (BLURS[1] / BLURS[0]) ** softness)
+    shot = replace(shot, blur=log_between(BLURS, softness))
     if close >= CLOSE_SHARE:
         return shot
     view = find_view(shape, shot.camera, PREVIEW_SIZE)
     lit = find_lit(shape, view, shot.light)
-    points = [band.hits.position[:, seen[0, :, 0], 0] for band, seen in zip(view.bands, lit, strict=True)]
-    places = torch.cat(points, dim=1)
-    target = places[:, int(torch.randint(places.shape[1], (1,), generator=generator))]
-    larger = MAGNIFICATIONS[0] * (MAGNIFICATIONS[1] / MAGNIFICATIONS[0]) ** magnification
+    points = torch.cat([band.hits.position[:, x[0, :, 0], 0] for band, x in zip(view.bands, lit, strict=True)], dim=1)
+    target = points[:, int(torch.randint(points.shape[1], (1,), generator=generator))]
+    larger = log_between(MAGNIFICATIONS, magnification)
     fov = 2 * math.degrees(math.atan(math.tan(math.radians(shot.camera.fov_deg) / 2) / larger))
     x, y, z = (round(c, 6) for c in target.tolist())
     return replace(shot, camera=replace(shot.camera, target=(x, y, z), fov_deg=round(fov, 6)))
 
 
 def relight(shape: MeshScene, shot: Shot, generator: torch.Generator) -> PointLight:
-    """Another light for a shot, one that reaches much of what is seen."""
+    """Return another light for a shot, one that reaches much of the visible surface."""
     for _ in range(MAX_DRAWS):
         light = random_light(shot.camera, shape.size / 2, generator)
         if lit_share(shape, replace(shot, light=light)) >= MIN_LIT:
@@ -96,7 +100,7 @@ def relight(shape: MeshScene, shot: Shot, generator: torch.Generator) -> PointLi
 
 
 def vary_normals(view: View, generator: torch.Generator) -> View:
-    """The same view, or one of a surface with fine relief: its normals are tilted, nothing else differs."""
+    """Return the view, or the same with normals tilted by fine relief."""
     wanted, width, tilt, octaves = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
     seed = int(torch.randint(2**31, (1,), generator=generator))
     positions = [band.hits.position[..., 0] for band in view.bands]
@@ -104,11 +108,11 @@ def vary_normals(view: View, generator: torch.Generator) -> View:
         return view
     eye = torch.tensor(view.camera.position, dtype=torch.float32)
     distance = float((torch.cat(positions, dim=1) - eye[:, None]).norm(dim=0).median())
-    pixels = RELIEF_PIXELS[0] * (RELIEF_PIXELS[1] / RELIEF_PIXELS[0]) ** width
+    pixels = log_between(RELIEF_PIXELS, width)
     most = 1 + int(math.log2(pixels / MIN_CELL))
     relief = Relief(
         frequency=1 / (pixels * distance * pixel_side(view.camera, view.size[0])),
-        strength=RELIEF_TILTS[0] * (RELIEF_TILTS[1] / RELIEF_TILTS[0]) ** tilt,
+        strength=log_between(RELIEF_TILTS, tilt),
         octaves=min(most, 1 + int(MAX_OCTAVES * octaves)),
         seed=seed,
     )
@@ -122,22 +126,21 @@ def vary_normals(view: View, generator: torch.Generator) -> View:
 
 
 def vary_gloss(materials: Materials, generator: torch.Generator) -> Materials:
-    """The same, or matte, or glaring."""
+    """Return the materials, or matte ones, or ones with glaring highlights."""
     matte, glare = torch.rand(2, generator=generator).tolist()
     places = torch.rand(materials.specular.shape, generator=generator)
     if matte < MATTE_SHARE:
-        left = MATTE_STRENGTH[0] * (MATTE_STRENGTH[1] / MATTE_STRENGTH[0]) ** places
-        return replace(materials, specular=materials.specular * left)
+        return replace(materials, specular=materials.specular * log_between(MATTE_STRENGTH, places))
     if matte < MATTE_SHARE + GLARE_SHARE:
         # The lobe's peak over an albedo of a half: F / (4 pi r^4) over 0.5 / pi, for F = 0.04.
         narrow = materials.roughness.clamp(max=GLARE_ROUGHNESS) ** 4
-        stronger = GLARES[0] * (GLARES[1] / GLARES[0]) ** glare * narrow / 0.02
+        stronger = log_between(GLARES, glare) * narrow / 0.02
         return replace(materials, specular=materials.specular * stronger.clamp(min=1))
     return materials
 
 
 def vary_colors(materials: Materials, generator: torch.Generator) -> Materials:
-    """The same, near-grey, on near-white ground or without textures at random."""
+    """Return the materials, at random near-grey, on near-white ground or without textures."""
     grey, plain, saturation = torch.rand(3, generator=generator).tolist()
     if plain < PLAIN_SHARE:
         materials = replace(materials, textures=None)
@@ -154,7 +157,7 @@ def vary_colors(materials: Materials, generator: torch.Generator) -> Materials:
 
 
 def vary_polarization(scene: Scene, generator: torch.Generator) -> Scene:
-    """The same, or with less polarized diffuse light."""
+    """Return the scene, or the same with less polarized diffuse light."""
     wanted, none, kept = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
     if wanted >= DEPOLARIZED_SHARE:
         return scene
@@ -164,14 +167,14 @@ def vary_polarization(scene: Scene, generator: torch.Generator) -> Scene:
 
 
 def vary_retention(scene: Scene, sheen: Callable[[float], Stokes], generator: torch.Generator) -> Scene:
-    """The same, or with a share of the diffuse light added as white light.
+    """Return the scene, or the same with a share of the diffuse light added as white specular light.
 
-    It is polarized at the AoLP of all highlights together, or as ``sheen`` of a roughness says (`find_sheen`).
+    That is polarized at the AoLP of all highlights together, or as ``sheen`` of a roughness (`render_sheen`).
     """
     wanted, place, shaped, rough = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
     if wanted >= RETAINING_SHARE:
         return scene
-    share = RETAINED[0] * (RETAINED[1] / RETAINED[0]) ** place
+    share = log_between(RETAINED, place)
     specular = scene.specular
     kept = share * scene.diffuse.s0.mean(dim=0, keepdim=True)
     if shaped < SHEEN_SHARE:
@@ -182,14 +185,14 @@ def vary_retention(scene: Scene, sheen: Callable[[float], Stokes], generator: to
     return replace(scene, specular=more)
 
 
-def find_sheen(look: Look, roughness: float) -> Stokes:
-    """Specular light ``[1, H, W]`` of an even ``roughness``, relative to the diffuse light of white, 1 in the median.
+def render_sheen(view: LitView, roughness: float) -> Stokes:
+    """Return the specular light ``[1, H, W]`` of a constant ``roughness`` over the diffuse light of white.
 
-    At most `MAX_SHEEN`, and 0 where no light falls.
+    Scaled to a median of 1, limited to `MAX_SHEEN`, 0 where no light falls.
     """
-    slots = look.materials.roughness.numel()
+    slots = view.materials.roughness.numel()
     white = Materials(torch.ones(slots, 3), torch.full((slots,), roughness), torch.ones(slots))
-    scene = shade_view(look.view, white, look.light, look.lit)
+    scene = shade_view(view.view, white, view.light, view.lit)
     lobe, diffuse = scene.specular.map(lambda s: s[:1]), scene.diffuse.s0.mean(dim=0, keepdim=True)
     lit = diffuse > 0
     ratio = torch.where(lit, lobe.s0 / diffuse.clamp(min=torch.finfo(diffuse.dtype).tiny), 0.0)
@@ -200,13 +203,13 @@ def find_sheen(look: Look, roughness: float) -> Stokes:
 
 
 def _desaturate(albedo: Tensor, saturation: float) -> Tensor:
-    """Albedos ``[S, 3]`` with this share of their own saturation, as bright as before."""
+    """Albedos ``[S, 3]`` with their saturation times a factor and their largest channel unchanged."""
     value = albedo.amax(dim=1, keepdim=True)
     return value + saturation * (albedo - value)
 
 
 def random_sensor(generator: torch.Generator) -> Sensor:
-    """The IMX250's filters and read noise with another full well and converter."""
+    """Return a camera with the filters and read noise of the IMX250 and a random full well and bit depth."""
     place = float(torch.rand(1, generator=generator, dtype=torch.float64))
     bits = BITS[int(torch.multinomial(torch.tensor(BITS_SHARES), 1, generator=generator))]
-    return replace(IMX250, full_well=FULL_WELLS[0] * (FULL_WELLS[1] / FULL_WELLS[0]) ** place, bits=bits)
+    return replace(IMX250, full_well=log_between(FULL_WELLS, place), bits=bits)

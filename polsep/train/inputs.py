@@ -1,0 +1,103 @@
+"""Inputs of the networks, and the truth, from a batch of training examples.
+
+Conventions: linear light, 1 = the white level of one measurement; true diffuse and specular are s0; a half-resolution
+truth is the mean over each cell of 2 x 2 pixels, and a cell is in the mask if all of its pixels are.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeVar
+
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.physics.stokes import Measurements, Stokes, measure
+from polsep.render.simulate import whole_cells
+from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
+from polsep.train.stream import ANGLES, MONO, Examples, expose_mono
+
+
+class LadderInputs(NamedTuple):
+    """Co-registered analysers for the paper's networks, true images ``[B, C, h, w]`` and the ``mask [B, h, w]``."""
+
+    measurements: Measurements
+    diffuse: Tensor
+    specular: Tensor
+    mask: Tensor
+
+
+class JointInputs(NamedTuple):
+    """Samples ``raw [B, 1, H, W]`` behind the filters of ``layout``, white = 1, and the truth.
+
+    ``diffuse [B, C, H/2, W/2]``, ``specular [B, 1, H/2, W/2]`` and the ``mask`` are what is scored; ``full_diffuse``,
+    ``full_specular`` and ``weight [B, 1, H, W]``, 1 on objects, are the same at full resolution. ``polarized``: s1 and
+    s2 ``[B, 2 C, H, W]``.
+    """
+
+    raw: Tensor
+    diffuse: Tensor
+    specular: Tensor
+    mask: Tensor
+    layout: Layout
+    full_diffuse: Tensor
+    full_specular: Tensor
+    weight: Tensor
+    polarized: Tensor
+
+
+Inputs = TypeVar("Inputs", bound=LadderInputs | JointInputs)
+
+
+def mosaic_inputs(examples: Examples) -> LadderInputs:
+    """Return noisy mosaics, demosaicked bilinearly to half resolution, and the mean truth of every cell."""
+    diffuse, specular = (avg_pool2d(x.float(), 2).expand(-1, 3, -1, -1) for x in (examples.diffuse, examples.specular))
+    measurements = demosaic_bilinear_half(Mosaic(examples.raw, Layout(), 0.0, 1.0))
+    return LadderInputs(measurements, diffuse, specular, whole_cells(examples.mask))
+
+
+def mono_inputs(examples: Examples) -> LadderInputs:
+    """Return `mosaic_inputs` of a camera without colour filters."""
+    mono = expose_mono(examples)
+    diffuse, specular = (avg_pool2d(x, 2) for x in (mono.diffuse, mono.specular))
+    measurements = demosaic_bilinear_half(Mosaic(mono.raw, MONO, 0.0, 1.0))
+    return LadderInputs(measurements, diffuse, specular, whole_cells(mono.mask))
+
+
+def co_sited_inputs(examples: Examples) -> LadderInputs:
+    """Return the paper's protocol: every analyser and colour at every pixel, clipped at 1, no noise (Eqs. 12, 13)."""
+    diffuse, specular, polarized = (x.float() for x in (examples.diffuse, examples.specular, examples.polarized))
+    specular = specular.expand(-1, 3, -1, -1)
+    light = Stokes(diffuse + specular, polarized[:, :3], polarized[:, 3:])
+    exact = measure(light, ANGLES).data
+    return LadderInputs(Measurements(exact.clamp(max=1), ANGLES, exact >= 1), diffuse, specular, examples.mask)
+
+
+def joint_inputs(examples: Examples) -> JointInputs:
+    """Return noisy colour mosaics as they are, for the joint network."""
+    diffuse, specular, polarized = (x.float() for x in examples[1:4])
+    return _joint_inputs(Examples(examples.raw, diffuse, specular, polarized, examples.mask), Layout())
+
+
+def joint_mono_inputs(examples: Examples) -> JointInputs:
+    """Return noisy mosaics of a camera without colour filters, for the joint network."""
+    return _joint_inputs(expose_mono(examples), MONO)
+
+
+def _joint_inputs(examples: Examples, layout: Layout) -> JointInputs:
+    return JointInputs(
+        examples.raw[:, None],
+        avg_pool2d(examples.diffuse, 2),
+        avg_pool2d(examples.specular, 2),
+        whole_cells(examples.mask),
+        layout,
+        examples.diffuse,
+        examples.specular,
+        examples.mask[:, None].float(),
+        examples.polarized,
+    )
+
+
+def find_clipped(raw: Tensor) -> Tensor:
+    """Return True for samples at the white level, 1."""
+    return raw >= 1 - CLIP_MARGIN

@@ -11,7 +11,7 @@ import torch
 from tolerances import assert_close, assert_same_angle, assert_within
 
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
-pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
+pytest.importorskip("scipy", reason="meshes need the extra 'render'")
 
 from evaluation.calibration import (
     DEBEVEC,

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from torch import nn
 
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
-pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
+pytest.importorskip("scipy", reason="meshes need the extra 'render'")
 pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 pytest.importorskip("matplotlib", reason="figures need the extra 'bench'")
 from PIL import Image

@@ -10,7 +10,7 @@ import torch
 from tolerances import assert_close
 
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
-pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
+pytest.importorskip("scipy", reason="meshes need the extra 'render'")
 pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 
 from evaluation import testsets

@@ -11,7 +11,7 @@ import torch
 from tolerances import SIGMAS, assert_close
 
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
-pytest.importorskip("trimesh", reason="meshes need the extra 'render'")
+pytest.importorskip("scipy", reason="meshes need the extra 'render'")
 
 from evaluation.dynamic import APART, Tally, find_regions, score_film
 from evaluation.testsets import dynamic

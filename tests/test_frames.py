@@ -180,7 +180,7 @@ def mosaic_planes(mosaic: Array, layout: Layout) -> Array:
     return planes
 
 
-def test_a_layout_said_wins_over_the_pixel_format(tmp_path: Path) -> None:
+def test_a_layout_given_wins_over_the_pixel_format(tmp_path: Path) -> None:
     path = tmp_path / "shot.bin"
     path.write_bytes(pack_frame(random_codes("uint16", top=4095), "BayerRG12p"))
     frame = only(path, size=(16, 12), pixel_format="BayerRG12p", layout=Layout(bayer=None))
@@ -188,7 +188,7 @@ def test_a_layout_said_wins_over_the_pixel_format(tmp_path: Path) -> None:
     assert any("is used although BayerRG12p says RGGB" in note for note in frame.notes)
 
 
-def test_size_said_for_a_container_is_noted(tmp_path: Path) -> None:
+def test_size_given_for_a_container_is_noted(tmp_path: Path) -> None:
     write_png(tmp_path / "shot.png", random_codes("uint8"))
     assert "own header is used" in only(tmp_path / "shot.png", size=(8, 8)).notes[0]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import struct
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,6 @@ from test_cli import Run, assert_refused, contents, run_here
 
 pytest.importorskip("scipy")
 pytest.importorskip("embreex")
-pytest.importorskip("trimesh")
 
 import trimesh
 from test_geometry import SIX, cap, dielectric, slope_of
@@ -175,6 +175,25 @@ def test_meshes_come_back_through_trimesh() -> None:
         encode_glb(*arrays[:3], surface.faces + len(surface.vertices))
     with pytest.raises(ValueError, match="finite"):
         encode_ply(surface.vertices * np.nan, *arrays[1:])
+
+
+def test_a_glb_keeps_linear_colours_exactly() -> None:
+    """COLOR_0 holds float32, not 8 bits; the material is rough, no metal, and seen from both sides."""
+    _, surface = ball()
+    colors = np.random.default_rng(0).random(surface.colors.shape)
+    data = encode_glb(surface.vertices, surface.normals, colors, surface.faces)
+    (length,) = struct.unpack_from("<I", data, 12)
+    document, start = json.loads(data[20 : 20 + length]), 20 + length + 8
+    (primitive,) = document["meshes"][0]["primitives"]
+    for name, expected in (("POSITION", surface.vertices), ("NORMAL", surface.normals), ("COLOR_0", colors)):
+        accessor = document["accessors"][primitive["attributes"][name]]
+        assert (accessor["componentType"], accessor["type"], accessor["count"]) == (5126, "VEC3", len(expected))
+        at = start + document["bufferViews"][accessor["bufferView"]]["byteOffset"] + accessor.get("byteOffset", 0)
+        stored = np.frombuffer(data, "<f4", expected.size, at).reshape(expected.shape)
+        np.testing.assert_array_equal(stored, expected.astype(np.float32))
+    assert sorted(primitive["attributes"]) == ["COLOR_0", "NORMAL", "POSITION"]
+    shading = document["materials"][primitive["material"]]
+    assert shading == {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}, "doubleSided": True}
 
 
 def test_a_surface_is_centred_and_has_its_shape() -> None:

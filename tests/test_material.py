@@ -8,11 +8,14 @@ import struct
 import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from evaluation.material import novel_lights, score_failure, score_maps, score_relit
@@ -200,7 +203,6 @@ def test_textures_hold_the_maps() -> None:
 
 def test_a_glb_is_one_textured_square() -> None:
     """Its chunks have the lengths they say, and trimesh finds two triangles with the textures on them."""
-    trimesh = pytest.importorskip("trimesh")
     maps = some_maps()
     data = encode_glb(texture_pixels(maps), specular_scale(maps["specular"]), "stone")
     magic, version, length = struct.unpack_from("<4sII", data)
@@ -209,8 +211,23 @@ def test_a_glb_is_one_textured_square() -> None:
     document = json.loads(data[20 : 20 + size])
     specular = document["materials"][0]["extensions"]["KHR_materials_specular"]
     assert specular["specularColorFactor"][0] == pytest.approx(specular_scale(maps["specular"]) / DIELECTRIC)
-    from io import BytesIO
-
+    (shading,), (primitive,) = document["materials"], document["meshes"][0]["primitives"]
+    assert sorted(primitive["attributes"]) == ["NORMAL", "POSITION", "TANGENT", "TEXCOORD_0"]
+    assert set(shading) & {"occlusionTexture", "emissiveTexture"} == set()
+    textures = {
+        "diffuse": shading["pbrMetallicRoughness"]["baseColorTexture"],
+        "roughness": shading["pbrMetallicRoughness"]["metallicRoughnessTexture"],
+        "normal": shading["normalTexture"],
+        "specular": specular["specularColorTexture"],
+    }
+    for name, texture in textures.items():
+        entry = document["textures"][texture["index"]]
+        view = document["bufferViews"][document["images"][entry["source"]]["bufferView"]]
+        assert document["samplers"][entry["sampler"]]["wrapS"] == 33071  # clamped to the edge
+        start = 20 + size + 8 + view["byteOffset"]
+        pixels = imagecodecs.png_decode(data[start : start + view["byteLength"]])
+        expected = texture_pixels(maps)[name] * np.array([0, 1, 0] if name == "roughness" else [1, 1, 1], np.uint8)
+        np.testing.assert_array_equal(pixels, expected)
     scene = trimesh.load(BytesIO(data), file_type="glb")
     (mesh,) = scene.geometry.values()
     assert mesh.faces.shape == (2, 3) and mesh.area == pytest.approx(4)

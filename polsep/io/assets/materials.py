@@ -31,7 +31,7 @@ from trimesh.visual.material import PBRMaterial
 from polsep.io.raw.png import read_png
 from polsep.io.results.exr import encode_exr
 from polsep.io.results.previews import srgb
-from polsep.io.results.sidecars import EncodedFile, require_finite, require_stem, version_text, write_with_sidecar
+from polsep.io.results.sidecars import EncodedFile, exr_notes, require_finite, require_stem, write_with_sidecar
 from polsep.io.store.atomic import refuse_existing
 from polsep.io.store.errors import naming
 from polsep.io.store.image_codecs import encode_png
@@ -85,8 +85,7 @@ def _encoded_files(material: MaterialFiles, name: str, scale: float) -> Iterator
     """Every file but the sidecar."""
     maps = material.maps
     planes = {f"{kind}.{c}": maps[kind][..., k] for kind, names in CHANNELS.items() for k, c in enumerate(names)}
-    notes = {"polsepVersion": version_text(), **{f"{kind}Units": unit for kind, unit in UNITS.items()}}
-    yield f"{name}.exr", encode_exr(planes, notes)
+    yield f"{name}.exr", encode_exr(planes, exr_notes(UNITS))
     textures, plain = texture_pixels(maps), re.sub(r"\W", "_", name)
     files = {texture: f"{name}_{texture}.png" for texture in TEXTURES}
     for texture, pixels in textures.items():

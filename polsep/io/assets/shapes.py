@@ -22,7 +22,7 @@ from trimesh.visual import ColorVisuals
 
 from polsep.io.results.exr import as_planes, encode_exr
 from polsep.io.results.previews import srgb
-from polsep.io.results.sidecars import require_finite, require_stem, version_text, write_with_sidecar
+from polsep.io.results.sidecars import exr_notes, require_finite, require_stem, write_with_sidecar
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.image_codecs import encode_png
 
@@ -80,8 +80,7 @@ def _encoded_files(shape: ShapeFiles) -> Iterator[bytes | memoryview]:
     planes |= as_planes({"albedo": shape.albedo})
     planes |= {"depth.Z": np.where(shape.mask, shape.depth, 0), "mask.Y": shape.mask.astype(np.float64)}
     require_finite(planes)
-    notes = {"polsepVersion": version_text(), **{f"{layer}Units": unit for layer, unit in UNITS.items()}}
-    yield encode_exr({name: plane.astype(np.float32) for name, plane in planes.items()}, notes)
+    yield encode_exr({name: plane.astype(np.float32) for name, plane in planes.items()}, exr_notes(UNITS))
     yield encode_png(np.rint((shape.normals + 1) / 2 * 65535).astype(np.uint16))
     yield shape.mesh
     yield encode_png(shape.preview)

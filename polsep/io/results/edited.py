@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polsep.io.results.exr import as_planes, encode_exr
 from polsep.io.results.separation_writer import UNITS, planned_outputs
-from polsep.io.results.sidecars import EncodedFile, require_finite, version_text, write_with_sidecar
+from polsep.io.results.sidecars import EncodedFile, exr_notes, require_finite, write_with_sidecar
 from polsep.io.store.atomic import refuse_existing, replace_bytes, replace_text
 from polsep.io.store.errors import naming
 from polsep.io.store.image_codecs import encode_png
@@ -71,8 +71,7 @@ def write_edited(frame: EditedFrame, directory: Path, stem: str, overwrite: bool
 
 def _encoded_files(frame: EditedFrame, stem: str, units: Mapping[str, str]) -> Iterator[EncodedFile]:
     """The EXR file and the preview."""
-    notes = {"polsepVersion": version_text(), **{f"{layer}Units": unit for layer, unit in units.items()}}
-    yield f"{stem}.exr", encode_exr(as_planes(frame.layers), notes)
+    yield f"{stem}.exr", encode_exr(as_planes(frame.layers), exr_notes(units))
     yield f"{stem}.png", encode_png(frame.preview)
 
 

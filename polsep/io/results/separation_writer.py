@@ -27,7 +27,14 @@ from numpy.typing import NDArray
 
 from polsep.io.results.exr import as_planes, encode_exr
 from polsep.io.results.previews import contact_sheet
-from polsep.io.results.sidecars import EncodedFile, require_finite, require_stem, version_text, write_with_sidecar
+from polsep.io.results.sidecars import (
+    EncodedFile,
+    exr_notes,
+    require_finite,
+    require_stem,
+    version_text,
+    write_with_sidecar,
+)
 from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.image_codecs import encode_png
 
@@ -153,8 +160,7 @@ def _encode_exr(frame: SeparatedFrame) -> memoryview:
     planes |= {"dolp.Y": frame.dolp, "aolp.Y": frame.aolp, "valid.Y": frame.valid.astype(np.float32)}
     if frame.error is not None:
         planes |= {f"{ERROR}.{image}": frame.error[..., k] for k, image in enumerate(("diffuse", "specular"))}
-    notes = {"polsepVersion": version_text(), **{f"{layer}Units": UNITS[layer] for layer in _layers(frame)}}
-    return encode_exr(planes, notes)
+    return encode_exr(planes, exr_notes({layer: UNITS[layer] for layer in _layers(frame)}))
 
 
 def _encode_npz(frame: SeparatedFrame) -> bytes:

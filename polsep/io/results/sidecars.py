@@ -81,6 +81,11 @@ def _flat_names(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
     return flat
 
 
+def exr_notes(units: Mapping[str, str]) -> dict[str, str]:
+    """Attributes of an EXR file: the polsep version and the unit of each layer."""
+    return {"polsepVersion": version_text(), **{f"{layer}Units": unit for layer, unit in units.items()}}
+
+
 def version_text() -> str:
     """The version of the installed polsep."""
     try:

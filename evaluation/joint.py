@@ -23,9 +23,9 @@ from polsep.bench.rows import Row
 from polsep.methods import METHODS, Capture
 from polsep.metrics import psnr, reliability
 from polsep.networks.engines import run_engine
-from polsep.networks.run import NAMES
 from polsep.sensor.camera import IMX250, Layout, Mosaic, expose
 from polsep.separation.analytic import Separation
+from polsep.shipped import NAMES, shipped_joint, weights_name
 
 if TYPE_CHECKING:
     from evaluation.testsets import Case, Recipe
@@ -129,7 +129,8 @@ def measure_engines(name: str, recipes: Sequence[Recipe], data: Path) -> Iterato
             mosaic, (*truth, mask) = see(case)
             assert isinstance(mosaic, Mosaic)
             for method in NAMES:
-                images, exact = run_engine(method, mosaic, full), METHODS[method].reference(mosaic, full)
+                network = shipped_joint(weights_name(method, mosaic.layout), mosaic.data.device)
+                images, exact = run_engine(network, mosaic, full), METHODS[method].reference(mosaic, full)
                 if images is None:
                     raise ValueError("expected the engine of OpenVINO, found none")
                 pairs = ((images.diffuse, exact.diffuse), (images.specular, exact.specular))

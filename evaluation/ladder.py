@@ -23,12 +23,13 @@ from polsep.bench.rows import Row
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
 from polsep.methods import METHODS, compose
-from polsep.networks.paper import PAPER, RUNGS, Refinement, load_refinement, separate_refined
+from polsep.networks.paper import RUNGS, Refinement, separate_refined
 from polsep.networks.unet import count_parameters
 from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import separate_analytic
 from polsep.separation.color_affine import separate_color_affine
 from polsep.separation.multi_capture import separate_extremes
+from polsep.shipped import PAPER, load_refinement
 
 #: What networks were trained on, as `train.tasks.VARIANTS` names it.
 MOSAIC, CO_SITED = "mosaic", "co-sited"

@@ -19,14 +19,13 @@ from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import MIN_CELLS, demosaic_guided, demosaic_guided_half
 from polsep.io.store.weights import is_shipped
 from polsep.networks.engines import run_engine
-from polsep.networks.paper import separate_paper
-from polsep.networks.run import NAMES, accepts_mosaic, separate_joint, weights_name
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.analytic import Separation, separate_analytic
 from polsep.separation.color_affine import separate_color_affine
 from polsep.separation.images import FrameImages
 from polsep.separation.report import images_of, in_light, under_white_light
+from polsep.shipped import NAMES, accepts_mosaic, separate_joint, separate_paper, shipped_joint, weights_name
 
 #: A raw frame, or co-sited samples.
 Capture = Mosaic | Measurements
@@ -127,8 +126,12 @@ def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
 
 def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameImages:
     """The joint network of that name: kernels and OpenVINO, else torch."""
-    images = run_engine(name, replace(capture, light_color=light), full) if isinstance(capture, Mosaic) else None
-    return run_reference(partial(separate_joint, name), capture, light, full) if images is None else images
+    if isinstance(capture, Mosaic) and capture.data.device.type == "cpu":
+        network = shipped_joint(weights_name(name, capture.layout), capture.data.device)
+        images = run_engine(network, replace(capture, light_color=light), full)
+        if images is not None:
+            return images
+    return run_reference(partial(separate_joint, name), capture, light, full)
 
 
 def _is_plain(mosaic: Mosaic) -> bool:

@@ -10,9 +10,9 @@ import pytest
 import torch
 from hypothesis import settings
 
+from polsep import shipped
 from polsep.io.store import weights
 from polsep.methods import METHODS
-from polsep.networks import paper, run
 from polsep.sensor.camera import Layout, Mosaic
 
 settings.register_profile("polsep", derandomize=True, deadline=None, max_examples=40)
@@ -58,9 +58,9 @@ def ship(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             raise ValueError("not shipped")
         return path
 
-    for room in (weights, paper, run):
+    for room in (weights, shipped):
         monkeypatch.setattr(room, "shipped_weights", find)
-    caches = (paper._shipped_refinement, run._shipped_joint)
+    caches = (shipped._read_refinement, shipped._read_joint)
     for cache in caches:
         cache.cache_clear()
     yield tmp_path

@@ -24,11 +24,11 @@ from polsep.demosaic.bilinear import demosaic_bilinear_half, mean_cells
 from polsep.io.store.weights import read_weights
 from polsep.methods import METHODS, compose
 from polsep.metrics import psnr, reliability
-from polsep.networks.run import NAMES
 from polsep.physics.stokes import Measurements, Stokes
 from polsep.render.sphere_tracing import Scene
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.analytic import Separation, separate_analytic
+from polsep.shipped import NAMES
 
 
 def make_grey(_paths: list[Path], _generator: torch.Generator) -> Scene:

@@ -29,9 +29,9 @@ from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.separation_writer import FORMATS, LAYERS
 from polsep.methods import BEST, METHODS
-from polsep.networks.run import NAMES
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import IDEAL, Layout, expose
+from polsep.shipped import NAMES
 
 COLOR_LAYERS = {f"{image}.{color}" for image in ("diffuse", "specular") for color in "RGB"}
 MAPS = {"dolp.Y", "aolp.Y", "valid.Y"}

@@ -17,11 +17,11 @@ import torch
 from polsep.compute import warm_up
 from polsep.methods import METHODS, run_reference
 from polsep.networks.engines import run_engine
-from polsep.networks.run import NAMES
 from polsep.physics.stokes import Measurements
 from polsep.pipeline import SeparatedFrame, make_frame, resolve_light_color, separate_capture
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation import analytic_kernel, color_affine_kernel
+from polsep.shipped import NAMES, shipped_joint
 
 SONY = ((90, 45), (135, 0))
 COLOR, MONO = Layout(), Layout(bayer=None)
@@ -137,7 +137,8 @@ def test_kernels_leave_other_frames_to_torch(method: str, data: torch.Tensor, ca
 )
 def test_the_engine_leaves_other_frames_to_torch(data: torch.Tensor, full: bool) -> None:
     """Batches, double precision and other devices."""
-    assert run_engine("joint", Mosaic(data, COLOR, 0.0, 1.0), full) is None
+    network = shipped_joint("joint-mosaic", torch.device("cpu"))
+    assert run_engine(network, Mosaic(data, COLOR, 0.0, 1.0), full) is None
 
 
 def test_small_and_mono_frames_of_color_affine_are_left_to_torch(calls: list[str]) -> None:

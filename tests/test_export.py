@@ -22,9 +22,10 @@ from polsep.io.store.weights import write_weights
 from polsep.networks.channels import INPUTS
 from polsep.networks.export import Graph
 from polsep.networks.joint import Joint
-from polsep.networks.run import load_joint, run_joint
+from polsep.networks.run import run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.sensor.camera import Layout, Mosaic
+from polsep.shipped import load_joint
 
 SIZE = ResidualSize(4, (0, 1))
 #: Rounding through two dozen layers, in white levels.

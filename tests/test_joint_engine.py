@@ -20,14 +20,13 @@ from tolerances import assert_close, assert_same_angle, assert_within
 from polsep.compute.threads import own_threads
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.kernels import get_threads, set_threads
-from polsep.networks import engines as joint_engine
-from polsep.networks import openvino_engine
+from polsep.networks import engines, openvino_engine
 from polsep.networks import run as mosaic_network
 from polsep.networks.channels import INPUTS, PERIOD
 from polsep.networks.engines import run_engine
 from polsep.networks.joint import Demosaicker, Joint
 from polsep.networks.openvino_engine import OpenVinoEngine
-from polsep.networks.run import own_order, run_joint
+from polsep.networks.run import run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import MAX_DOLP, aolp, dolp
 from polsep.sensor.camera import Layout, Mosaic
@@ -63,6 +62,10 @@ def random_net(layout: Layout, inputs: tuple[str, ...] = INPUTS, demosaicker: De
     if net.demosaic is not None:
         net.demosaic += 0.002 * torch.randn(net.demosaic.shape)
     return net.eval()
+
+
+#: Networks for colour and mono frames.
+NETS = {layout.channels: random_net(layout) for layout in (COLOR, MONO)}
 
 
 def random_frame(height: int, width: int, layout: Layout, most: int = 4095) -> Mosaic:
@@ -207,17 +210,12 @@ def test_a_thread_writes_no_row_of_another(
 
 
 @pytest.fixture
-def shipped(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Random networks stand for the shipped ones."""
-
-    def find(method: str, layout: Layout, path: None) -> tuple[Joint, dict[str, str]]:
-        return random_net(own_order(layout)), {}
-
-    joint_engine.ENGINES.clear()
-    monkeypatch.setattr(joint_engine, "find_joint", find)
-    monkeypatch.setattr(joint_engine, "OpenVinoEngine", partial(OpenVinoEngine, precision="f32"))
+def exact(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Engines compute in float32."""
+    engines.ENGINES.clear()
+    monkeypatch.setattr(engines, "OpenVinoEngine", partial(OpenVinoEngine, precision="f32"))
     yield
-    joint_engine.ENGINES.clear()
+    engines.ENGINES.clear()
 
 
 TURNS: dict[str, Callable[[Layout], Layout]] = {
@@ -232,10 +230,10 @@ TURNS: dict[str, Callable[[Layout], Layout]] = {
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.spec)
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize("full", [False, True])
-def test_frames_of_any_orientation_and_side(layout: Layout, turn: str, full: bool, shipped: None) -> None:
+def test_frames_of_any_orientation_and_side(layout: Layout, turn: str, full: bool, exact: None) -> None:
     """Sides that are no multiples of the period, filters mirrored, transposed or cropped."""
     mosaic = random_frame(50, 62, TURNS[turn](layout))
-    found = run_engine("joint", mosaic, full)
+    found = run_engine(NETS[mosaic.layout.channels], mosaic, full)
     assert found is not None
     white = run_joint(random_net(layout), mosaic, full)
     for image, wanted in ((found.diffuse, in_light(white, mosaic.light_color).diffuse), (found.valid, white.valid)):
@@ -253,22 +251,22 @@ def test_angles_that_were_turned_back_stay_below_pi(turned: dict[str, bool]) -> 
     for near in (0, np.pi / 2):
         aolp = np.nextafter(np.float32(near), np.float32(4)) * one
         images = FrameImages(colors, colors, one > 0, one, aolp, Tally(), colors[..., :2])
-        found = joint_engine._turn_back(images, Orientation(4, 4, **turned), 1).aolp
+        found = engines._turn_back(images, Orientation(4, 4, **turned), 1).aolp
         assert found.min() >= 0 and found.max() < np.pi
 
 
-def test_threads_with_engines_of_their_own_find_the_same(shipped: None) -> None:
+def test_threads_with_engines_of_their_own_find_the_same(exact: None) -> None:
     """Frames of two sizes by two threads at once, one engine each, are those of one thread after another."""
     sizes = [(32, 48), (48, 32), (32, 48), (32, 48)]
     frames = [random_frame(*size, COLOR, most) for size, most in zip(sizes, (4095, 4095, 2000, 1000), strict=True)]
 
     def separate(frame: Mosaic) -> FrameImages:
         with own_threads(1):
-            found = run_engine("joint", frame, False)
+            found = run_engine(NETS[frame.layout.channels], frame, False)
         assert found is not None
         return found
 
-    alone = [run_engine("joint", frame, False) for frame in frames]
+    alone = [run_engine(NETS[frame.layout.channels], frame, False) for frame in frames]
     with ThreadPoolExecutor(2) as pool:
         together = list(pool.map(separate, frames * 3))
     for found, expected in zip(together, alone * 3, strict=True):
@@ -277,30 +275,30 @@ def test_threads_with_engines_of_their_own_find_the_same(shipped: None) -> None:
             assert one == other if field.name == "tally" else np.array_equal(one, other)
 
 
-def test_what_it_does_not_take_is_left_to_torch(shipped: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_it_does_not_take_is_left_to_torch(exact: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Batches, other dtypes, cells half a cell off, and machines without OpenVINO."""
     mosaic = random_frame(32, 48, COLOR)
-    assert run_engine("joint", mosaic, False) is not None
+    assert run_engine(NETS[mosaic.layout.channels], mosaic, False) is not None
     batch = Mosaic(mosaic.data.float()[None], COLOR, BLACK, WHITE)
     double = Mosaic(mosaic.data.double(), COLOR, BLACK, WHITE)
     half_off = random_frame(32, 48, MONO.rolled(1, 0))
-    assert [run_engine("joint", frame, False) for frame in (batch, double, half_off)] == [None] * 3
-    monkeypatch.setattr(joint_engine, "find_spec", lambda name: None)
-    assert run_engine("joint", mosaic, False) is None
+    assert [run_engine(NETS[frame.layout.channels], frame, False) for frame in (batch, double, half_off)] == [None] * 3
+    monkeypatch.setattr(engines, "find_spec", lambda name: None)
+    assert run_engine(NETS[mosaic.layout.channels], mosaic, False) is None
 
 
 @pytest.mark.parametrize("full", [False, True])
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.spec)
 def test_huge_frames_are_separated_in_strips(
-    layout: Layout, full: bool, shipped: None, monkeypatch: pytest.MonkeyPatch
+    layout: Layout, full: bool, exact: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same as whole ones, by engines for two heights at most; also where the height is no multiple of strips."""
     mosaic = random_frame(1452, 36, layout)
-    whole = run_engine("joint", mosaic, full)
+    whole = run_engine(NETS[mosaic.layout.channels], mosaic, full)
     monkeypatch.setattr(mosaic_network, "MAX_PIXELS", 36 * 720)
-    heights = {bottom - top for (top, bottom), _ in joint_engine._strips((1452, 36), 16)}
+    heights = {bottom - top for (top, bottom), _ in engines._strips((1452, 36), 16)}
     assert len(heights) == 2 and max(heights) <= 720 + 16
-    parts = run_engine("joint", mosaic, full)
+    parts = run_engine(NETS[mosaic.layout.channels], mosaic, full)
     assert whole is not None and parts is not None
     assert np.array_equal(parts.valid, whole.valid)
     for name in ("diffuse", "specular", "error", "dolp"):

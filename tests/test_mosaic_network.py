@@ -16,11 +16,12 @@ from polsep.methods import METHODS, find_method
 from polsep.networks import run as mosaic_network
 from polsep.networks.channels import INPUTS
 from polsep.networks.joint import Joint
-from polsep.networks.run import accepts_mosaic, cut_rows, load_joint, run_joint, separate_joint, weights_name
+from polsep.networks.run import cut_rows, run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import orient
+from polsep.shipped import accepts_mosaic, load_joint, separate_joint, weights_name
 
 SIZE = ResidualSize(4, (0, 1, 1))
 COLOR, MONO = Layout(), Layout(bayer=None)

@@ -22,12 +22,13 @@ import polsep
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.methods import BEST, FASTEST, METHODS, Capture, Method, find_method, run_reference
 from polsep.networks.joint import MIN_BRIGHTNESS, Joint
-from polsep.networks.run import NAMES, run_joint
+from polsep.networks.run import run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Measurements, Stokes, measure
 from polsep.pipeline import estimate_light_color, find_device, separate_capture
 from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
 from polsep.separation.analytic import Separation
+from polsep.shipped import NAMES
 
 SIZE = 96
 #: What layers in bfloat16 make of other inputs by rounding.

@@ -14,7 +14,7 @@ PATIENCE = 6.0
 @lru_cache
 def make_ready(warm_up: Callable[[], object]) -> None:
     """Load or compile what a method needs by ``warm_up``, the first time only; log a warning once it takes long."""
-    import polsep.kernels  # noqa: F401  # its import is not what takes long
+    import numba  # noqa: F401  # its import is not what takes long
 
     notice = threading.Timer(
         PATIENCE,

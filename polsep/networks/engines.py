@@ -25,8 +25,8 @@ from polsep.compute.warm_up import make_ready
 from polsep.networks.channels import PERIOD
 from polsep.networks.joint import Joint
 from polsep.networks.openvino_engine import OpenVinoEngine
-from polsep.networks.run import MARGIN, cut_rows, find_joint, own_order
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.networks.run import MARGIN, cut_rows, own_order
+from polsep.sensor.camera import Mosaic
 from polsep.sensor.orient import Orientation, orient
 from polsep.separation.images import FrameImages
 
@@ -37,9 +37,8 @@ KEPT = 2
 class _Job(NamedTuple):
     """A kind of work that an engine is made for."""
 
-    method: str
+    network: Joint
     full: bool
-    colors: int
     shape: tuple[int, int]
     threads: int
 
@@ -47,20 +46,11 @@ class _Job(NamedTuple):
 class _Engines:
     """Engines, each for one frame at a time. State: idle ones, the last used at the end, and how many are busy.
 
-    As many are kept as were ever busy at once, and all networks that they were made of.
+    As many are kept as were ever busy at once.
     """
 
     def __init__(self) -> None:
         self._lock, self._idle, self._busy, self._kept = threading.Lock(), list[tuple[_Job, OpenVinoEngine]](), 0, KEPT
-        self._networks = dict[tuple[str, int], Joint]()
-
-    def network(self, method: str, colors: int) -> Joint:
-        """The network of a method."""
-        with self._lock:
-            if (method, colors) not in self._networks:
-                layout = Layout() if colors == 3 else Layout(bayer=None)
-                self._networks[method, colors] = find_joint(method, layout, None)[0]
-            return self._networks[method, colors]
 
     @contextmanager
     def borrow(self, job: _Job) -> Iterator[OpenVinoEngine]:
@@ -82,9 +72,9 @@ class _Engines:
                 del self._idle[: -self._kept]
 
     def clear(self) -> None:
-        """Forget idle engines and networks."""
+        """Forget idle engines."""
         with self._lock:
-            self._idle, self._networks = [], {}
+            self._idle = []
 
 
 ENGINES = _Engines()
@@ -94,9 +84,8 @@ _MAKING = threading.Lock()
 def _make_engine(job: _Job) -> OpenVinoEngine:
     """One at a time: torch cannot trace two modules at once."""
     with _MAKING:
-        network = ENGINES.network(job.method, job.colors)
-        logging.getLogger("polsep").debug("compiling %s for frames of %dx%d", job.method, *job.shape)
-        return OpenVinoEngine(network, job.shape, job.full)
+        logging.getLogger("polsep").debug("compiling a network for frames of %dx%d", *job.shape)
+        return OpenVinoEngine(job.network, job.shape, job.full)
 
 
 def _warm_up() -> None:
@@ -111,8 +100,8 @@ def _warm_up_full() -> None:
     details_kernel.warm_up()
 
 
-def run_engine(method: str, mosaic: Mosaic, full: bool) -> FrameImages | None:
-    """A method's images of one frame in its light, or None: batches, other devices, no OpenVINO.
+def run_engine(network: Joint, mosaic: Mosaic, full: bool) -> FrameImages | None:
+    """A network's images of one frame in its light, or None: batches, other devices, no OpenVINO.
 
     Frames in other orientations than the network's are turned before and after, as in `run.run_joint`. Huge frames are
     cut into strips, all of one height, since an engine is for one size.
@@ -128,10 +117,9 @@ def run_engine(method: str, mosaic: Mosaic, full: bool) -> FrameImages | None:
         make_ready(_warm_up_full)
     as_it_is = orientation == Orientation(*data.shape) and not any(n % PERIOD for n in data.shape)
     turned = data if as_it_is else orientation.turn(data.float()).contiguous()
-    colors, cells, parts = mosaic.layout.channels, 1 if full else 2, []
-    grid = PERIOD * ENGINES.network(method, colors).net.grid
-    for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), grid):
-        job = _Job(method, full, colors, (bottom - top, turned.shape[1]), get_threads())
+    cells, parts = 1 if full else 2, []
+    for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), PERIOD * network.net.grid):
+        job = _Job(network, full, (bottom - top, turned.shape[1]), get_threads())
         raw, levels = turned[top:bottom].numpy(), (mosaic.black_level, mosaic.white_level)
         with ENGINES.borrow(job) as engine:
             rows = slice(*((row - top) // cells for row in kept))

@@ -7,94 +7,26 @@ so that they agree with the whole frame.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from polsep.demosaic.bilinear import mean_cells
-from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
 from polsep.networks.channels import PERIOD
 from polsep.networks.joint import Joint, limit
-from polsep.networks.unet import ResidualSize
-from polsep.physics.stokes import Measurements, Stokes
+from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation, orient
 from polsep.separation.analytic import Separation
 
 #: Raw pixels of a frame, or of a strip with its margins, that are seen at once: some 250 bytes of memory each.
 MAX_PIXELS = 6_000_000
-#: Methods of the joint network.
-NAMES = ("joint", "joint-fast")
 #: Raw rows that a strip sees beyond its own, farther than the network does (a test measures that).
 MARGIN = 256
-
-
-def load_joint(path: Path, device: torch.device) -> Joint:
-    """The network from a file of weights. Raises ValueError when the file is damaged or of another network."""
-    tensors, metadata = read_weights(path)
-    try:
-        size = json.loads(metadata["size"])
-        size = ResidualSize(size["width"], tuple(size["blocks"]), size.get("entry", 0))
-        demosaicker: Any = metadata.get("demosaicker", "linear")  # what weights without a word on it were trained with
-        network = Joint(int(metadata["colors"]), size, tuple(json.loads(metadata["inputs"])), demosaicker)
-        network.load_state_dict(tensors)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"expected weights of a joint network in {path}, found {type(error).__name__}") from None
-    return network.to(device, torch.float32).eval()
-
-
-@lru_cache(maxsize=4)
-def _shipped_joint(name: str, device: torch.device) -> Joint:
-    return load_joint(shipped_weights(name), device)
-
-
-def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[Joint, dict[str, str]]:
-    """A method's network for frames of a layout, shipped or from a file of weights, and the weights' metadata.
-
-    Raises ValueError on methods without such a network, and on weights for other frames.
-    """
-    if method not in NAMES:
-        raise ValueError(f"expected a method of {', '.join(NAMES)}, found {method!r}")
-    path = path or shipped_weights(weights_name(method, layout))
-    network, metadata = load_joint(path, torch.device("cpu")), read_weights(path)[1]
-    if network.colors != layout.channels:
-        raise ValueError(f"expected weights for {layout.channels} colours in {path}, found {network.colors}")
-    return network, metadata
-
-
-def weights_name(method: str, layout: Layout) -> str:
-    """The name of a method's weights for frames of a layout."""
-    return f"{method}-{'mono' if layout.bayer is None else 'mosaic'}"
-
-
-def separate_joint(method: str, capture: Mosaic | Measurements, full: bool = False) -> Separation:
-    """Separate a mosaic by the method ``joint`` or ``joint-fast`` in torch, with shipped weights.
-
-    Raises ValueError on co-sited measurements, and on layouts that are not Sony's in any orientation.
-    """
-    if isinstance(capture, Measurements):
-        raise ValueError(f"expected a mosaic for the method {method}, found four co-sited angle images")
-    network = _shipped_joint(weights_name(method, capture.layout), capture.data.device)
-    return run_joint(network, capture, full)
-
-
-def accepts_mosaic(method: str, capture: Mosaic | Measurements) -> bool:
-    """True for a mosaic in an order that the method knows, with weights shipped for its colours."""
-    if isinstance(capture, Measurements) or not is_shipped(weights_name(method, capture.layout)):
-        return False
-    try:
-        orient(capture, own_order(capture.layout))
-    except ValueError:
-        return False
-    return True
 
 
 def own_order(layout: Layout) -> Layout:

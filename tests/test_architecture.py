@@ -38,7 +38,7 @@ RANKS = {
     "cli": 13,
 }
 #: Rooms inside of io, which has the same rule.
-IO_RANKS = {"store": 0, "raw": 1, "assets": 2, "results": 3}
+IO_RANKS = {"store": 0, "raw": 1, "results": 2, "assets": 3}
 #: Libraries that only one room may use.
 HOMES = {
     "imagecodecs": "io",
@@ -74,8 +74,12 @@ HOMES = {
 FILE_CALLS = {"open", "read_bytes", "write_bytes", "read_text", "write_text", "imread", "imwrite", "fromfile", "tofile"}
 FILE_CALLS |= {"save", "savez", "savez_compressed", "mkdir", "unlink", "rmdir", "rename", "touch"}
 #: How the names of calls begin that raise when a claim fails.
-CLAIMS = ("assert_", "raises", "warns", "gradcheck")
+CLAIMS = ("assert_", "raises", "warns", "gradcheck", "fail")
 MAX_LINES = 450
+#: Parameters of public functions at most; kernels and the public contract may have eight.
+MAX_PARAMETERS = 5
+#: Rooms and files whose parameters others fix: the public contract, and the options of commands.
+CONTRACTS = ("pipeline", "cli")
 
 
 def modules() -> list[Path]:
@@ -206,7 +210,7 @@ def test_public_functions_have_few_parameters() -> None:
     """More than five are a frozen dataclass; kernels may have eight, which the linter checks."""
     wrong = []
     for path in modules():
-        if path.name.endswith("_kernel.py") or room(path) in CONTRACTS or path.name in CONTRACTS:
+        if path.name.endswith("_kernel.py") or room(path) in CONTRACTS:
             continue
         for name, node in public_definitions(path):
             if isinstance(node, ast.FunctionDef):

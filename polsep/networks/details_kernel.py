@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from polsep.compute.compiling import ONE, ZERO, compiled, entry
 from polsep.compute.rows import AT_ONCE, add_product, add_up, average, copy, emit, fill, filter_rows, sum_three, weave
 from polsep.compute.threads import Piece
+from polsep.networks.buffers import ClosedFormRows, LayerInput
 from polsep.networks.channels import DETAIL_MAPS, PERIOD
 from polsep.networks.details import MIN_DETAIL
 from polsep.networks.images_kernel import LayerOutputs, Targets, add_polarization, mark_clipped, spread
-from polsep.networks.maps_kernel import ClosedFormRows, LayerInput
 from polsep.separation.polarization_kernel import polarize
 
 Floats = NDArray[np.float32]

@@ -16,8 +16,9 @@ from polsep.compute.rows import AT_ONCE, add_product, add_up, copy
 from polsep.compute.threads import Piece
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
+from polsep.networks.buffers import ClosedFormRows, LayerInput, Maps, Taps
 from polsep.networks.channels import PERIOD, input_channels
-from polsep.networks.maps_kernel import ClosedFormRows, LayerInput, Maps, Taps, map_guided_rows, map_rows
+from polsep.networks.maps_kernel import map_guided_rows, map_rows
 from polsep.physics.stokes import stokes_inverse
 from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import as_samples

@@ -32,7 +32,8 @@ from polsep.compute.threads import Piece
 from polsep.demosaic.bilinear_kernel import Pattern
 from polsep.demosaic.cells_kernel import Source
 from polsep.demosaic.guided_kernel import Stream, demosaic_rows, open_stream
-from polsep.networks.channels import PERIOD, InputChannels
+from polsep.networks.buffers import ClosedFormRows, Maps, Taps
+from polsep.networks.channels import PERIOD
 from polsep.networks.closed_form_kernel import SUMMED, find_slope, limit, misfit, offset, pool, white_specular
 from polsep.networks.joint import MIN_BRIGHTNESS, MIN_CONTRAST, WINDOWS
 from polsep.networks.unclip_kernel import leave_clipped_out, unclip
@@ -49,77 +50,6 @@ _CONTRAST_WIDE, _CONTRAST_NARROW = (np.float32(least) for least in MIN_CONTRAST)
 _MIN_BRIGHTNESS, _TINY = np.float32(MIN_BRIGHTNESS), np.float32(1e-12)
 #: Rows of scratch, the last five of them for what clipping hid.
 _ROWS = 17
-
-
-class Taps(NamedTuple):
-    """The linear filter at half resolution, and its ``colors``.
-
-    ``weight [4, 3 C, K]``: of 4 cells, s0, s1, s2 of C colours, and ``[4, 6 C, K]`` with the details of s0; ``row``,
-    ``place [4, K]``: of the samples that a cell's outputs see, their packed row, 0 to 2, and their place in rows
-    ``[16, w + 2]``; K is a multiple of `rows.AT_ONCE`.
-    """
-
-    weight: Floats
-    row: NDArray[np.int64]
-    place: NDArray[np.int64]
-    colors: int
-
-
-class ClosedFormRows(NamedTuple):
-    """The closed form of every packed pixel, planar: ``diffuse [h, 4 C, w]``, ``specular``, ``s1``, ``s2 [h, 4, w]``.
-
-    s1 and s2 are means over colours. ``brightness``, ``fit_residual [h, w]``: as in `joint.ClosedForm`; ``clipped
-    [h, w]``: a bit per sample of a packed pixel.
-    """
-
-    diffuse: Floats
-    specular: Floats
-    s1: Floats
-    s2: Floats
-    brightness: Floats
-    fit_residual: Floats
-    clipped: NDArray[np.uint16]
-
-    @classmethod
-    def empty(cls, colors: int, h: int, w: int) -> ClosedFormRows:
-        """Buffers for ``[h, w]`` packed pixels."""
-        diffuse, specular, s1, s2 = (np.empty((h, n, w), np.float32) for n in (4 * colors, 4, 4, 4))
-        brightness, residual = (np.empty((h, w), np.float32) for _ in range(2))
-        return cls(diffuse, specular, s1, s2, brightness, residual, np.empty((h, w), np.uint16))
-
-
-class Maps(NamedTuple):
-    """The first pass's outputs. ``floats`` or ``halves [h, w, n]``: the network's input; the other is empty.
-
-    ``halves``: bfloat16 as its bits. ``channels``: where each map lies. ``closed``: the closed form. ``details
-    [2 h, 3 C, 2 w]``: of s0, three of every colour; or empty.
-    """
-
-    floats: Floats
-    halves: NDArray[np.uint16]
-    channels: InputChannels
-    closed: ClosedFormRows
-    details: Floats
-
-
-class LayerInput(NamedTuple):
-    """An input of the layers, channels last ``[h, w, n]``, as float32 or as bits of bfloat16; the other is empty."""
-
-    floats: Floats
-    halves: NDArray[np.uint16]
-
-    @classmethod
-    def empty(cls, shape: tuple[int, int, int], halves: bool) -> LayerInput:
-        """A buffer in one of the two precisions."""
-        nothing = (0, 0, 0)
-        return cls(
-            np.empty(nothing if halves else shape, np.float32), np.empty(shape if halves else nothing, np.uint16)
-        )
-
-    @property
-    def filled(self) -> NDArray[Any]:
-        """The array that is not empty."""
-        return self.floats if self.floats.size else self.halves
 
 
 class _Rings(NamedTuple):

@@ -28,7 +28,7 @@ from polsep.separation.images import FrameImages, Tally
 
 if TYPE_CHECKING:
     from polsep.demosaic.bilinear_kernel import Pattern
-    from polsep.networks.maps_kernel import Taps
+    from polsep.networks.buffers import Taps
     from polsep.sensor.unpack_kernel import RawFrame, Samples
 
 Floats = NDArray[np.float32]
@@ -95,9 +95,9 @@ class OpenVinoEngine:
     def __init__(
         self, network: Joint, shape: tuple[int, int], full: bool = False, precision: str | None = None
     ) -> None:
+        from polsep.networks.buffers import ClosedFormRows, LayerInput, Maps
         from polsep.networks.details_kernel import DetailOutputs, read_smooth
         from polsep.networks.images_kernel import LayerOutputs
-        from polsep.networks.maps_kernel import ClosedFormRows, LayerInput, Maps
 
         self._lock, self._colors, self._full = threading.Lock(), network.colors, full
         self._layout = Layout() if network.colors == 3 else Layout(bayer=None)
@@ -249,7 +249,7 @@ def make_taps(network: Joint, width: int, details: bool = False) -> Taps:
     ``details``: with those of s0.
     """
     from polsep.compute.rows import AT_ONCE
-    from polsep.networks.maps_kernel import Taps
+    from polsep.networks.buffers import Taps
 
     assert network.demosaic is not None
     s0 = 16 * network.colors

@@ -43,7 +43,7 @@ def write_constant(path: Path, colors: int = 3, value: float = 0.25, changed: di
     """Networks whose images are ``value`` everywhere, with other metadata where those are ``changed``."""
     network = Refinement(RUNGS["paper"], colors, SIZE)
     for net in network.nets:
-        torch.nn.init.constant_(net.corrections.bias, value)  # type: ignore[union-attr, arg-type]
+        torch.nn.init.constant_(net.last.bias, value)  # type: ignore[union-attr, arg-type]
     torch.nn.init.zeros_(network.linear.weight)
     torch.nn.init.zeros_(network.linear.bias)  # type: ignore[arg-type]
     metadata = {"method": "paper", "rung": "paper", "colors": str(colors), "size": json.dumps(asdict(SIZE))}

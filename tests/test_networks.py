@@ -15,7 +15,7 @@ def random_net(size: Size = SIZES[0]) -> UNet:
     """A net of 3 channels in and 2 out whose last layer is not zero, as after training."""
     torch.manual_seed(0)
     net = UNet(3, 2, size)
-    torch.nn.init.normal_(net.corrections.weight, std=0.3)
+    torch.nn.init.normal_(net.last.weight, std=0.3)
     return net.eval()
 
 

@@ -41,7 +41,7 @@ def test_every_rung_sees_and_separates(rung: Rung) -> None:
     assert len(network.nets) == (1 if rung.share else 2)
     assert rung.inputs(seen()).shape == (1, 3 * rung.per_color, 12, 12)
     for net in network.nets:
-        torch.nn.init.constant_(net.corrections.bias, 0.25)  # type: ignore[union-attr, arg-type]
+        torch.nn.init.constant_(net.last.bias, 0.25)  # type: ignore[union-attr, arg-type]
     torch.nn.init.zeros_(network.linear.weight)
     torch.nn.init.zeros_(network.linear.bias)  # type: ignore[arg-type]
     found = separate_refined(seen(), rung, network)

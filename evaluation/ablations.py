@@ -1,7 +1,7 @@
-"""What each idea of the joint network is worth: networks of one size and one training that go without one of them.
+"""The worth of each idea of the joint network: networks of one size and one training that lack one of them.
 
 Their weights are those of ``polsep train joint-fast --ablation NAME``, in ``evaluation/weights/ablations``: from
-one seed, on the same examples, for as many steps. "none" goes without nothing.
+one seed, on the same examples, for as many steps. "none" lacks nothing.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from evaluation import WEIGHTS
-from evaluation.scoring import Entry, Protocol, score_sets, see_noisy
+from evaluation.scoring import Entry, Protocol, capture_noisy, score_sets
 from evaluation.sets import load_sets
 from polsep.bench.rows import Row
 from polsep.io.store.weights import read_weights
@@ -28,7 +28,7 @@ TABLED = ("diffuse PSNR", "specular PSNR", "diffuse PSNR, highlights", "specular
 
 
 def find_ablations() -> dict[str, Path]:
-    """Files of weights by what their network goes without; "none" first."""
+    """Files of weights by the idea that their network lacks; "none" first."""
     paths = sorted((WEIGHTS / "ablations").glob("*.safetensors"))
     found = {read_weights(path)[1]["ablation"]: path for path in paths}
     return {name: found[name] for name in sorted(found, key=lambda name: (name != "none", name))}
@@ -55,6 +55,6 @@ def bench_ablations(data: Path) -> Iterator[Row]:
         for metric, value in json.loads(read_weights(path)[1]["validation"]).items():
             yield Row("ablations", "validation views", name, metric, value, "dB")
     entries = tuple(ablation_entry(name, path) for name, path in found.items())
-    for row in score_sets("ablations", sets, data, [Protocol("noisy", see_noisy, entries)]):
+    for row in score_sets("ablations", sets, data, [Protocol("noisy", capture_noisy, entries)]):
         if row.bench == "ablations/noisy" and row.metric in TABLED:
             yield Row("ablations", row.case.partition(",")[0], row.method, row.metric, row.value, row.unit)

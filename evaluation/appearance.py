@@ -1,7 +1,7 @@
-"""The gallery of docs/gallery.md, after the paper's Figs. 6 to 8: captures, what they become, what edits make of them.
+"""The gallery of docs/gallery.md, after the paper's Figs. 6 to 8: captures, separations and edits.
 
 Captures are renders of known truth: spot and fish by Keenan Crane (public domain, from the data folder) and a shape of
-this project, in 12 bits with the noise of the IMX250. Every picture is of what `separate` found in one
+this project, in 12 bits with the noise of the IMX250. Every picture is made from the separation of one
 such frame. `draw_gallery_real` does the same with frames of real cameras; their pictures are not part of the project.
 """
 
@@ -63,7 +63,7 @@ THRESHOLD_AND_EDGE = {CLOUDS: (0.0, 0.3), STRIPES: (0.5, 0.2)}
 
 
 @dataclass(frozen=True)
-class Taken:
+class GalleryCapture:
     """One capture: its ``title``, the raw ``mosaic``; of renders, true ``scene`` and ``normals [h, w, 3]`` of the half
     resolution (x right, y up, z to the camera, 0 without a surface)."""
 
@@ -78,30 +78,32 @@ class Taken:
         return half_resolution(self.scene)
 
     def separate(self) -> SeparatedFrame:
-        """What the default method finds."""
+        """The separation by the default method."""
         return separate_capture(self.mosaic, "auto")
 
 
-def expose_scene(title: str, scene: Scene, normals: Floats | None = None) -> Taken:
+def expose_scene(title: str, scene: Scene, normals: Floats | None = None) -> GalleryCapture:
     """A scene as 12 bits of an IMX250, its brightest samples clipped."""
     exposed = expose_to_clip(scene, CLIPPED, Layout(), IMX250)
     generator = torch.Generator().manual_seed(SEED)
-    return Taken(title, expose(exposed.diffuse + exposed.specular, Layout(), IMX250, generator), exposed, normals)
+    return GalleryCapture(
+        title, expose(exposed.diffuse + exposed.specular, Layout(), IMX250, generator), exposed, normals
+    )
 
 
-def take_spot(data: Path) -> Taken:
+def render_spot(data: Path) -> GalleryCapture:
     """Spot, clouded in two warm colours."""
     skin = Skin(((0.66, 0.2, 0.07),), ((0.8, 0.55, 0.22),), CLOUDS, 0.35, 0.3)
-    return _take_model("spot", data / "meshes/spot.obj", (140.0, 14.0), skin)
+    return _render_model("spot", data / "meshes/spot.obj", (140.0, 14.0), skin)
 
 
-def take_fish(data: Path) -> Taken:
+def render_fish(data: Path) -> GalleryCapture:
     """The fish, striped."""
     skin = Skin(((0.05, 0.3, 0.42),), ((0.62, 0.48, 0.14),), STRIPES, 0.25, 0.26)
-    return _take_model("fish", data / "meshes/fish.obj", (65.0, 12.0), skin)
+    return _render_model("fish", data / "meshes/fish.obj", (65.0, 12.0), skin)
 
 
-def take_gourd(_data: Path) -> Taken:
+def render_gourd(_data: Path) -> GalleryCapture:
     """A glazed gourd of this page's own, clouded."""
     from polsep.render.raycast import MeshScene
 
@@ -155,14 +157,14 @@ def _materials(skin: Skin, slots: int) -> Materials:
     return Materials(first, skin.roughness * one, one, textures)
 
 
-def _take_model(title: str, path: Path, pose: tuple[float, float], skin: Skin) -> Taken:
+def _render_model(title: str, path: Path, pose: tuple[float, float], skin: Skin) -> GalleryCapture:
     from polsep.io.assets.objects import read_mesh
     from polsep.render.raycast import MeshScene
 
     return _render(title, MeshScene(read_mesh(path)), pose, skin)
 
 
-def _render(title: str, model: MeshScene, pose: tuple[float, float], skin: Skin) -> Taken:
+def _render(title: str, model: MeshScene, pose: tuple[float, float], skin: Skin) -> GalleryCapture:
     """A mesh from azimuth and elevation [degrees], lit from above the camera, through its lens."""
     from evaluation.testsets.casting import LENS_BLUR, SAMPLES, look_at
     from polsep.render.raycast import render_scene
@@ -204,7 +206,7 @@ def make_cloth(side: int = 512) -> Floats:
     return image.astype(np.float32)
 
 
-SUBJECTS: tuple[Callable[[Path], Taken], ...] = (take_spot, take_fish, take_gourd)
+SUBJECTS: tuple[Callable[[Path], GalleryCapture], ...] = (render_spot, render_fish, render_gourd)
 #: The edits of the gallery by title.
 EDITS: tuple[tuple[str, tuple[Edit, ...]], ...] = (
     ("metallic, gain 45 as the paper's", (Metallic(),)),
@@ -223,19 +225,19 @@ EDITS: tuple[tuple[str, tuple[Edit, ...]], ...] = (
 
 
 def bench_gallery(data: Path) -> Iterator[Row]:
-    """How near the separations of the gallery's captures come to the truth; draws docs/gallery.md's pictures.
+    """PSNR of the separations of the gallery's captures, and the pictures of docs/gallery.md.
 
     Raises ValueError without the extras render and bench.
     """
-    for taken, found in separate_all(data):
-        diffuse, specular, mask = taken.truth()
+    for capture, found in separate_all(data):
+        diffuse, specular, mask = capture.truth()
         for name, image, truth in (("diffuse", found.diffuse, diffuse), ("specular", found.specular, specular)):
             value = psnr(torch.from_numpy(image).permute(2, 0, 1), truth, mask)
-            yield Row("gallery", taken.title, found.report["method"], f"{name} PSNR", value, "dB")
+            yield Row("gallery", capture.title, found.report["method"], f"{name} PSNR", value, "dB")
 
 
 @cache
-def separate_all(data: Path) -> tuple[tuple[Taken, SeparatedFrame], ...]:
+def separate_all(data: Path) -> tuple[tuple[GalleryCapture, SeparatedFrame], ...]:
     """The captures, separated. Raises ValueError without Embree."""
     try:
         import polsep.render.raycast  # noqa: F401
@@ -248,10 +250,10 @@ def separate_all(data: Path) -> tuple[tuple[Taken, SeparatedFrame], ...]:
 def draw_gallery(_rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
     """Write the pictures of docs/gallery.md into ``folder`` and give their paths."""
     all_of_them = separate_all(data)
-    separations = [_separation_row(taken, found) for taken, found in all_of_them]
+    separations = [_separation_row(capture, found) for capture, found in all_of_them]
     yield _written(folder / "separated.jpg", draw_grid(separations, "One 12-bit frame each", CELL))
-    for taken, found in all_of_them:
-        yield _written(folder / f"edits-{taken.title}.jpg", draw_edits(taken, found))
+    for capture, found in all_of_them:
+        yield _written(folder / f"edits-{capture.title}.jpg", draw_edits(capture, found))
 
 
 def _written(path: Path, pixels: Pixels) -> Path:
@@ -259,38 +261,38 @@ def _written(path: Path, pixels: Pixels) -> Path:
     return path
 
 
-def _frame_of(taken: Taken, image: Floats) -> Floats:
+def _frame_of(capture: GalleryCapture, image: Floats) -> Floats:
     """An image around its object, or all of it where that is unknown."""
-    if taken.scene is None:
+    if capture.scene is None:
         return image
-    around = crop(torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1), taken.truth()[2])
+    around = crop(torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1), capture.truth()[2])
     return around.permute(1, 2, 0).numpy()
 
 
-def _separation_row(taken: Taken, found: SeparatedFrame) -> list[Panel]:
+def _separation_row(capture: GalleryCapture, found: SeparatedFrame) -> list[Panel]:
     """Input, diffuse and specular, and the truth of both where it is known."""
     light = found.diffuse + found.specular
     gain = exposure_of(light)
-    images = [(f"{taken.title}: input", light), ("diffuse", found.diffuse), ("specular x 2", 2 * found.specular)]
-    if taken.scene is not None:
-        diffuse, specular = (image.float().permute(1, 2, 0).numpy() for image in taken.truth()[:2])
+    images = [(f"{capture.title}: input", light), ("diffuse", found.diffuse), ("specular x 2", 2 * found.specular)]
+    if capture.scene is not None:
+        diffuse, specular = (image.float().permute(1, 2, 0).numpy() for image in capture.truth()[:2])
         images += [("true diffuse", diffuse), ("true specular x 2", 2 * specular)]
-    return [Panel(title, toned(_frame_of(taken, image), gain)) for title, image in images]
+    return [Panel(title, toned(_frame_of(capture, image), gain)) for title, image in images]
 
 
-def draw_edits(taken: Taken, found: SeparatedFrame) -> Pixels:
+def draw_edits(capture: GalleryCapture, found: SeparatedFrame) -> Pixels:
     """The input and every edit of `EDITS` that the frame has colours for, at the input's exposure, five in a row."""
     maps = {"cloth": make_cloth()}
-    if taken.scene is not None and taken.normals is not None:
-        maps |= {"normals": taken.normals, "object": taken.truth()[2].float().numpy()}
+    if capture.scene is not None and capture.normals is not None:
+        maps |= {"normals": capture.normals, "object": capture.truth()[2].float().numpy()}
     light = found.diffuse + found.specular
     gain = exposure_of(light)
-    panels = [Panel(f"{taken.title}: input", toned(_frame_of(taken, light), gain))]
+    panels = [Panel(f"{capture.title}: input", toned(_frame_of(capture, light), gain))]
     for name, edits in EDITS:
         if found.diffuse.shape[2] == 1 and any(edit.needs_color for edit in edits):
             continue
         recipe = Recipe(tuple(_fitting(edit, maps) for edit in edits))
-        panels.append(Panel(name, toned(_frame_of(taken, apply(found, recipe, maps).combined), gain)))
+        panels.append(Panel(name, toned(_frame_of(capture, apply(found, recipe, maps).combined), gain)))
     rows = [panels[first : first + 5] for first in range(0, len(panels), 5)]
     return draw_grid(rows, "Edits of one separated frame, at its exposure", CELL)
 
@@ -303,24 +305,24 @@ def _fitting(edit: Edit, maps: Maps) -> Edit:
 
 
 def bench_gallery_real(data: Path) -> Iterator[Row]:
-    """How much of the light of real frames is specular; draws them and their edits, for looking at only."""
-    for taken in take_real(data):
-        found = taken.separate()
+    """Share of specular light in real frames, and pictures of them and their edits, which are not published."""
+    for capture in read_real(data):
+        found = capture.separate()
         share = float(found.specular.mean() / max(float((found.diffuse + found.specular).mean()), 1e-9))
-        yield Row("gallery_real", taken.title, found.report["method"], "specular light", 100 * share, "%")
+        yield Row("gallery_real", capture.title, found.report["method"], "specular light", 100 * share, "%")
 
 
-def take_real(data: Path) -> Iterator[Taken]:
+def read_real(data: Path) -> Iterator[GalleryCapture]:
     """Frames of real cameras from the data folder."""
     for name, title, white in REAL:
         frame = next(read_frames(data / name, ReadOptions(Layout(bayer=None), white_level=white)))
-        yield Taken(title, frame.data)
+        yield GalleryCapture(title, frame.data)
 
 
 def draw_gallery_real(_rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
     """Write pictures of real frames, which are not part of the project, into ``folder``."""
-    for taken in take_real(data):
-        found = taken.separate()
-        stem = taken.title.replace(", ", "-").replace(" ", "-")
-        yield _written(folder / f"{stem}.jpg", draw_grid([_separation_row(taken, found)], taken.title, CELL))
-        yield _written(folder / f"{stem}-edits.jpg", draw_edits(taken, found))
+    for capture in read_real(data):
+        found = capture.separate()
+        stem = capture.title.replace(", ", "-").replace(" ", "-")
+        yield _written(folder / f"{stem}.jpg", draw_grid([_separation_row(capture, found)], capture.title, CELL))
+        yield _written(folder / f"{stem}-edits.jpg", draw_edits(capture, found))

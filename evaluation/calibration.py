@@ -1,4 +1,4 @@
-"""What a light polarizer that is not at its nominal angle costs every method (Fig. 5 of Dave et al. 2022).
+"""PSNR of every method when the light's polarizer is not at its nominal angle (Fig. 5 of Dave et al. 2022).
 
 Random objects of the test split, the paper's protocol: co-sited samples, clipped at 1, no noise. A calibrated rig has
 its light's polarizer at a nominal angle, and at right angles to it in the second capture of Ding 2021; each time it is
@@ -56,7 +56,7 @@ Truth = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Sweep:
-    """How much is measured: so many ``views``, each at all of `NOMINAL_DEG`, and errors of ``errors_deg``.
+    """Extent of a sweep: so many ``views``, each at all of `NOMINAL_DEG`, and errors of ``errors_deg``.
 
     Raises ValueError where 0 is not among the errors.
     """
@@ -87,8 +87,8 @@ class TurnableScene:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A view as every method sees it: the scenes under both lights, and the photographs and captures of them.
+class Captures:
+    """A view as every method captures it: the scenes under both lights, and their photographs and captures.
 
     ``photographs``: ``[3, H, W]`` of the first scene, parallel and crossed to the nominal highlights. ``captures``: one
     per scene.
@@ -126,8 +126,10 @@ def measure_sweep(bench: str, sweep: Sweep, entries: Sequence[Entry]) -> Iterato
         deviates = normal_deviates(index)
         for degrees in sweep.errors_deg:
             for nominal in NOMINAL_DEG:
-                seen = see_with_errors(scene, math.radians(nominal), [math.radians(degrees) * d for d in deviates])
-                for method, output, value in score_seen(seen, entries):
+                captured = capture_with_errors(
+                    scene, math.radians(nominal), [math.radians(degrees) * d for d in deviates]
+                )
+                for method, output, value in score_captures(captured, entries):
                     by_angle = scores.setdefault((degrees, method, f"{output} PSNR"), {})
                     by_angle.setdefault(nominal, []).append(value)
     yield from _error_rows(bench, scores)
@@ -198,12 +200,12 @@ def _mixed(terms: Sequence[tuple[Scene, float]]) -> Scene:
     return Scene(diffuse, specular, first.mask)
 
 
-def see_with_errors(scene: TurnableScene, nominal: float, errors: Sequence[float]) -> Seen:
+def capture_with_errors(scene: TurnableScene, nominal: float, errors: Sequence[float]) -> Captures:
     """A view whose light should be at ``nominal`` and at right angles to it, but is off by two ``errors`` [rad]."""
     first, second = (scene.under(nominal + k * math.pi / 2 + error) for k, error in enumerate(errors))
     parallel = find_aolp(scene.under(nominal).specular)
     both = measure(first.diffuse + first.specular, (parallel, parallel + math.pi / 2)).data.clamp(max=1)
-    return Seen((first, second), (both[0], both[1]), (_capture(first), _capture(second)))
+    return Captures((first, second), (both[0], both[1]), (_capture(first), _capture(second)))
 
 
 def find_aolp(light: Stokes) -> float:
@@ -216,20 +218,20 @@ def _capture(scene: Scene) -> Measurements:
     return Measurements(exact.data.clamp(max=1), exact.angles, exact.data >= 1)
 
 
-def separate_seen(seen: Seen, entries: Sequence[Entry]) -> Iterator[tuple[str, Separation, Truth]]:
-    """What every method makes of what it sees, and the truth that it is scored against."""
-    (one, other), (first, second) = seen.scenes, seen.captures
+def separate_captures(captured: Captures, entries: Sequence[Entry]) -> Iterator[tuple[str, Separation, Truth]]:
+    """Name of every method, its separation of its captures, and the truth that it is scored against."""
+    (one, other), (first, second) = captured.scenes, captured.captures
     truth = (one.diffuse.s0, one.specular.s0)
     mean = ((truth[0] + other.diffuse.s0) / 2, (truth[1] + other.specular.s0) / 2)
-    yield DEBEVEC, separate_debevec2000(*seen.photographs), truth
+    yield DEBEVEC, separate_debevec2000(*captured.photographs), truth
     yield DING, separate_ding2021(first, second), mean
     for entry in entries:
         yield entry.name, entry.separate(first), truth
 
 
-def score_seen(seen: Seen, entries: Sequence[Entry]) -> Iterator[tuple[str, str, float]]:
+def score_captures(captured: Captures, entries: Sequence[Entry]) -> Iterator[tuple[str, str, float]]:
     """Method, output and PSNR [dB] inside the mask."""
-    mask = seen.scenes[0].mask
-    for method, found, (diffuse, specular) in separate_seen(seen, entries):
+    mask = captured.scenes[0].mask
+    for method, found, (diffuse, specular) in separate_captures(captured, entries):
         yield method, "diffuse", psnr(found.diffuse, diffuse, mask)
         yield method, "specular", psnr(found.specular, specular, mask)

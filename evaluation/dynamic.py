@@ -51,7 +51,7 @@ Pair = tuple[Tensor, Tensor]
 
 
 class Tally:
-    """What adds up over the frames of a film: PSNR by output and region, squared flicker by output and region."""
+    """Sums over the frames of a film: PSNR by output and region, squared flicker by output and region."""
 
     def __init__(self) -> None:
         self.psnr: dict[tuple[str, str], list[float]] = {}

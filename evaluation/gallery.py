@@ -1,6 +1,6 @@
 """The pictures of the paper's figures, made anew: Figs. 3, 4 and 6 from scenes, Fig. 5 and the curves from numbers.
 
-Columns are the methods that there are: a rung without weights is left out. What is meant by "paper" is the rung of the
+Columns are the available methods: a rung without weights is left out. "paper" means the rung of the
 ladder, which has the size and the training of the networks beside it, and the shipped method only where that is absent.
 """
 
@@ -20,9 +20,9 @@ from evaluation.calibration import (
     DEBEVEC,
     DING,
     SEED,
+    capture_with_errors,
     make_turnable,
-    see_with_errors,
-    separate_seen,
+    separate_captures,
     snapshot_entries,
 )
 from evaluation.figures import (
@@ -38,7 +38,7 @@ from evaluation.figures import (
     tone,
 )
 from evaluation.ladder import CO_SITED, MOSAIC, SHIPPED, ladder_entries, read_curves, rung_of
-from evaluation.scoring import Entry, find_absent, see_noisy
+from evaluation.scoring import Entry, capture_noisy, find_missing
 from evaluation.sets import load_sets
 from polsep.bench.rows import Row
 from polsep.demosaic.bilinear import demosaic_bilinear_half
@@ -106,7 +106,7 @@ def find_scene(name: str, data: Path) -> Case:
     from evaluation.testsets import build_case
 
     recipes: dict[str, Recipe] = {recipe.name: recipe for recipes in load_sets().values() for recipe in recipes}
-    there = find_absent([recipes[name]], data) is None
+    there = find_missing([recipes[name]], data) is None
     return build_case(recipes[name if there else STAND_IN], data)
 
 
@@ -125,7 +125,7 @@ def shown_of(names: Iterable[str], there: Container[str]) -> list[str]:
 
 def draw_fig3(case: Case) -> Pixels:
     """Diffuse and specular of a rendered scene by every method, from its noisy mosaic, and their absolute errors."""
-    capture, (diffuse, specular, mask) = see_noisy(case)
+    capture, (diffuse, specular, mask) = capture_noisy(case)
     found = [(title, entry.separate(capture)) for title, entry in columns_of(ladder_entries(MOSAIC))]
     gains = (_gain(diffuse), _gain(specular))
     unseparated = Panel("unseparated, truth", tone(crop(diffuse + specular, mask), gains[0]))
@@ -148,10 +148,10 @@ def draw_fig4() -> Pixels:
 
     generator = torch.Generator().manual_seed(scene_seed("test", SEED, VIEW, 0))
     scene = make_turnable(seeded_shape("test", SEED, VIEW), VIEW_SIZE, generator)
-    seen = see_with_errors(scene, math.radians(22.5), (0.0, 0.0))
+    captured = capture_with_errors(scene, math.radians(22.5), (0.0, 0.0))
     entries = snapshot_entries(ladder_entries(CO_SITED))
-    found = {name: (separation, truth) for name, separation, truth in separate_seen(seen, entries)}
-    truth, mask = seen.scenes[0].specular.s0, seen.scenes[0].mask
+    found = {name: (separation, truth) for name, separation, truth in separate_captures(captured, entries)}
+    truth, mask = captured.scenes[0].specular.s0, captured.scenes[0].mask
     gain = _gain(truth)
     images, errors = [], []
     for name in shown_of(PLOTTED, found):
@@ -251,7 +251,7 @@ def _error(image: Tensor, truth: Tensor, mask: Tensor) -> Panel:
 
 
 def _scale(like: Panel) -> Panel:
-    """What the colours of the errors mean, of the size of a panel that has pixels."""
+    """The scale of the error colours, of the size of a panel that has pixels."""
     assert like.pixels is not None
     return Panel(f"absolute error, 0 to {LARGEST_ERROR:g}", error_scale(*like.pixels.shape[:2]))
 

@@ -1,4 +1,4 @@
-"""Shape from six lights: what separation is worth for normals, and what integration makes of true normals."""
+"""Shape from six lights: normals with and without separation, and integration of true normals."""
 
 from __future__ import annotations
 

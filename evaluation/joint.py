@@ -1,4 +1,4 @@
-"""The joint networks on the fixed test sets: full resolution, mono frames, whether they know their errors, engines.
+"""The joint networks on the fixed test sets: full resolution, mono frames, expected errors, engines.
 
 Full resolution is scored against the truth of every pixel of the noisy mosaic. Methods that give half-resolution images
 only have theirs enlarged, linearly between the cells' centres.
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from evaluation.scoring import Entry, Protocol, Truth, score_sets, see_noisy
+from evaluation.scoring import Entry, Protocol, Truth, capture_noisy, score_sets
 from evaluation.sets import load_sets
 from polsep.bench.rows import Row
 from polsep.methods import METHODS, Capture
@@ -45,19 +45,19 @@ def bench_joint(data: Path) -> Iterator[Row]:
     """
     sets = load_sets(data)
     mono = tuple(Entry(name, METHODS[name].reference) for name in MONO)
-    protocols = [Protocol("full", see_full, full_entries()), Protocol("mono", see_mono, mono)]
+    protocols = [Protocol("full", capture_full, full_entries()), Protocol("mono", capture_mono, mono)]
     yield from score_sets("joint", sets, data, protocols)
     for name, recipes in sets.items():
         yield from measure_reliability(name, recipes, data)
         yield from measure_engines(name, recipes, data)
 
 
-def see_full(case: Case) -> tuple[Capture, Truth]:
+def capture_full(case: Case) -> tuple[Capture, Truth]:
     """A 12-bit mosaic with noise, and the truth at its own resolution."""
     return case.noisy, (case.scene.diffuse.s0, case.scene.specular.s0, case.scene.mask)
 
 
-def see_mono(case: Case) -> tuple[Capture, Truth]:
+def capture_mono(case: Case) -> tuple[Capture, Truth]:
     """A 12-bit mosaic with noise of a camera without colour filters on which the green light falls, in half."""
     light = (case.scene.diffuse + case.scene.specular).map(lambda s: s[1:2])
     mosaic = expose(light, Layout(bayer=None), IMX250, torch.Generator().manual_seed(MONO_SEED))
@@ -100,7 +100,7 @@ def measure_reliability(name: str, recipes: Sequence[Recipe], data: Path) -> Ite
 
     seen: dict[tuple[str, str], list[tuple[Tensor, Tensor, Tensor]]] = {}
     for case in build_cases(recipes, data):
-        capture, (diffuse, specular, mask) = see_noisy(case)
+        capture, (diffuse, specular, mask) = capture_noisy(case)
         for method in NAMES:
             found = METHODS[method].reference(capture)
             assert found.expected_error is not None and found.clipped is not None
@@ -120,12 +120,12 @@ def measure_reliability(name: str, recipes: Sequence[Recipe], data: Path) -> Ite
 
 
 def measure_engines(name: str, recipes: Sequence[Recipe], data: Path) -> Iterator[Row]:
-    """How far an engine, in bfloat16 where the processor has it, is from torch: in PSNR of a set, and of a scene."""
+    """Difference of an engine, in bfloat16 where the processor has it, from torch: in PSNR of a set, and of a scene."""
     from evaluation.testsets import build_cases
 
     changes: dict[tuple[str, str], list[float]] = {}
     for case in build_cases(recipes, data):
-        for see, full in ((see_noisy, False), (see_full, True)):
+        for see, full in ((capture_noisy, False), (capture_full, True)):
             mosaic, (*truth, mask) = see(case)
             assert isinstance(mosaic, Mosaic)
             for method in NAMES:

@@ -1,4 +1,4 @@
-"""The ladder of the paper's Tables 2 and 3 as entries: formulas, networks by what they see, and what each costs.
+"""The ladder of the paper's Tables 2 and 3 as entries: formulas, networks by their inputs, and the cost of each.
 
 All rungs have networks of one size, trained on the same data for as many steps; their weights are
 ``evaluation/weights/ladder/RUNG-VARIANT``. A rung without weights is left out, which one line on stderr says.
@@ -41,7 +41,7 @@ COUNTED_SIDE = 128
 
 @dataclass(frozen=True)
 class Weights:
-    """Where a rung's weights lie, and the ``name`` of the rung as trained on them."""
+    """The file of a rung's weights, and the ``name`` that says what it was trained on."""
 
     rung: str
     name: str

@@ -48,7 +48,7 @@ MIN_SPECULAR = 0.01
 
 
 def bench_material(data: Path) -> Iterator[Row]:
-    """Maps of held-out materials and what they look like relit, by input; single and several lights.
+    """Errors of the maps of held-out materials and of their relit pictures, by input; single and several lights.
 
     Raises ValueError without the extra bench.
     """
@@ -163,7 +163,7 @@ def score_failure(found: Svbrdf, truth: Svbrdf) -> Iterator[Score]:
 
 
 def detail(normal: Tensor) -> Tensor:
-    """What of the normals' x and y, ``[2, H, W]``, differs from the mean around."""
+    """Difference of the normals' x and y, ``[2, H, W]``, from their local mean."""
     size = 2 * DETAIL_RADIUS + 1
     padded = pad(normal[None, :2], (DETAIL_RADIUS,) * 4, mode="reflect")
     return normal[:2] - avg_pool2d(padded, size, 1)[0]
@@ -174,7 +174,7 @@ def score_relit(found: Svbrdf, truth: Svbrdf) -> Iterator[Score]:
     whole = torch.ones(truth.roughness.shape[-2:], dtype=torch.bool)
     differences, ratios, flips = list[float](), list[float](), list[float]()
     for number, light in enumerate(novel_lights()):
-        a, b = (see_under(maps, light) for maps in (found, truth))
+        a, b = (photograph_under(maps, light) for maps in (found, truth))
         differences.append(float((torch.log(a + FLOOR) - torch.log(b + FLOOR)).abs().mean()))
         ratios.append(psnr(a, b, whole))
         if number % FLIP_EVERY == 0:
@@ -196,7 +196,7 @@ def novel_lights() -> list[Tensor]:
     return [position[:, None, None] for position in positions]
 
 
-def see_under(maps: Svbrdf, light: Tensor) -> Tensor:
+def photograph_under(maps: Svbrdf, light: Tensor) -> Tensor:
     """The picture ``[3, H, W]`` of maps from the photographs' own place."""
     points = plane_points(*maps.roughness.shape[-2:])
     return relight(maps, points, torch.tensor([0.0, 0.0, CAMERA_HEIGHT])[:, None, None], light)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from evaluation.figures import Panel, Pixels, draw_grid, tone
-from evaluation.material import load_estimators, novel_lights, see_under
+from evaluation.material import load_estimators, novel_lights, photograph_under
 from polsep.bench.rows import Row
 from polsep.io.store.image_codecs import write_jpeg
 from polsep.material.shots import INPUTS, Example, random_example
@@ -54,7 +54,7 @@ def _row(name: str, seen: Tensor, maps: Svbrdf) -> list[Panel]:
         Panel("diffuse", tone(maps.diffuse, 1.0)),
         Panel("roughness", _plain(maps.roughness.expand(3, -1, -1))),
         Panel("specular", tone(maps.specular, 1 / WHITE_SPECULAR)),
-        Panel("under another light", tone(see_under(maps, light), 1.0)),
+        Panel("under another light", tone(photograph_under(maps, light), 1.0)),
     ]
 
 

@@ -11,15 +11,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import polsep
 from evaluation.calibration import Sweep, measure_sweep, snapshot_entries
 from evaluation.figures import require_matplotlib
 from evaluation.ladder import CO_SITED, MOSAIC, ladder_entries, measure_costs, rung_of
-from evaluation.scoring import Protocol, score_sets, see_co_sited, see_noisy
+from evaluation.scoring import Protocol, capture_co_sited, capture_noisy, score_sets
 from evaluation.sets import load_sets
 from polsep.bench.rows import Row
-from polsep.io.raw.frames import ReadOptions, read_frames
-from polsep.sensor.camera import Mosaic
+from polsep.bench.truth import read_demo_capture
 
 #: Rungs that leave something out of the paper's method (Table 2); all others are baselines (Table 3).
 ABLATIONS = ("shared", "signed", "no-angle", "stokes")
@@ -29,7 +27,7 @@ TABLED = ("diffuse PSNR", "specular PSNR")
 
 @dataclass(frozen=True)
 class Extent:
-    """How much is measured: the first scenes of each set (None: all), the sweep, and how often a frame is timed."""
+    """Extent of a measurement: the first scenes of each set (None: all), the sweep, and how often a frame is timed."""
 
     scenes: dict[str, int | None] = field(default_factory=dict)
     sweep: Sweep = field(default_factory=Sweep)
@@ -59,7 +57,7 @@ def measure_paper(data: Path, extent: Extent) -> Iterator[Row]:
     require_matplotlib()
     sets = {name: recipes[: extent.scenes.get(name)] for name, recipes in load_sets().items()}
     mosaic, co_sited = ladder_entries(MOSAIC), ladder_entries(CO_SITED)
-    protocols = [Protocol(MOSAIC, see_noisy, mosaic), Protocol(CO_SITED, see_co_sited, co_sited)]
+    protocols = [Protocol(MOSAIC, capture_noisy, mosaic), Protocol(CO_SITED, capture_co_sited, co_sited)]
     yield from measure_costs(mosaic, read_demo_capture(), extent.runs)
     for row in score_sets("paper", sets, data, protocols):
         yield from table_rows(row)
@@ -79,11 +77,3 @@ def table_rows(row: Row) -> Iterator[Row]:
         if not ablation:
             yield replace(row, bench=f"paper/baselines{suffix}")
     yield replace(row, bench=f"paper/metrics{suffix}")
-
-
-def read_demo_capture() -> Mosaic:
-    """The 2448x2048 frame that comes with polsep."""
-    path = Path(polsep.__file__).parent / "data" / "still_life.png"
-    frame = next(read_frames(path, ReadOptions(white_level=4095.0))).data
-    assert isinstance(frame, Mosaic)
-    return frame

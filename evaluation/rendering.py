@@ -120,7 +120,7 @@ def _stacked(stokes: Stokes) -> Tensor:
 
 
 def _build_renderers(seed: int) -> dict[str, Callable[[], tuple[Stokes, Stokes]]]:
-    """What renders the diffuse and specular images of a random shape, by name."""
+    """Renderers of the diffuse and specular images of a random shape, by name."""
     from polsep.render.materials import random_materials
     from polsep.render.pathtrace import FAST_VARIANT, PathOptions, build_path_model, trace_paths
     from polsep.render.raycast import MeshScene, render_scene

@@ -1,7 +1,7 @@
 """One way to score on the test sets, for everything that is compared: entries under protocols, scene by scene.
 
-A protocol says how a scene is seen: noisy mosaics and clean ones are to be separated into half-resolution images, and
-co-sited samples, as the paper has them, into images of their own resolution. Scores are those of `polsep.metrics`.
+A protocol says how a scene is captured: noisy and clean mosaics are separated into half-resolution images, and co-sited
+samples, as the paper has them, into images of their own resolution. Scores are those of `polsep.metrics`.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class Entry:
 
 @dataclass(frozen=True)
 class Protocol:
-    """How the ``entries`` of a comparison ``see`` a case, and what they are to find there."""
+    """A way to ``capture`` a case, with the truth of that capture, and the ``entries`` that are compared on it."""
 
     name: str
-    see: Callable[[Case], tuple[Capture, Truth]]
+    capture: Callable[[Case], tuple[Capture, Truth]]
     entries: tuple[Entry, ...]
 
 
@@ -68,17 +68,17 @@ def own_entries(mosaics: bool) -> tuple[Entry, ...]:
     return tuple(Entry(m.name, m.reference) for m in METHODS.values() if mosaics or not m.reads_mosaic)
 
 
-def see_noisy(case: Case) -> tuple[Capture, Truth]:
+def capture_noisy(case: Case) -> tuple[Capture, Truth]:
     """A 12-bit mosaic with noise."""
     return case.noisy, case.half_truth()
 
 
-def see_clean(case: Case) -> tuple[Capture, Truth]:
+def capture_clean(case: Case) -> tuple[Capture, Truth]:
     """A mosaic of an ideal sensor."""
     return case.clean, case.half_truth()
 
 
-def see_co_sited(case: Case) -> tuple[Capture, Truth]:
+def capture_co_sited(case: Case) -> tuple[Capture, Truth]:
     """The paper's protocol: all analysers and colours at every pixel, clipped, no noise."""
     return case.co_sited, (case.scene.diffuse.s0, case.scene.specular.s0, case.scene.mask)
 
@@ -94,7 +94,7 @@ def score_sets(
     from evaluation.testsets import build_cases, check_case
 
     for name, recipes in sets.items():
-        absent = find_absent(recipes, data)
+        absent = find_missing(recipes, data)
         if absent is not None:
             print(f"polsep: the set {name} is left out: expected {absent}, found none", file=sys.stderr)
             continue
@@ -113,8 +113,8 @@ def score_sets(
                 yield Row(table, title, method, f"{metric}, worst tenth", worst_mean(values), unit)
 
 
-def find_absent(recipes: Sequence[Recipe], data: Path) -> Path | None:
-    """The first file of a set that is not there; None when all are."""
+def find_missing(recipes: Sequence[Recipe], data: Path) -> Path | None:
+    """The first missing file of a set; None when all are there."""
     paths = (data / name for recipe in recipes for name in recipe.files)
     return next((path for path in paths if not path.is_file()), None)
 
@@ -122,7 +122,7 @@ def find_absent(recipes: Sequence[Recipe], data: Path) -> Path | None:
 def score_case(case: Case, protocols: Sequence[Protocol]) -> Iterator[Score]:
     """Every metric of every entry of every protocol on one scene."""
     for protocol in protocols:
-        capture, truth = protocol.see(case)
+        capture, truth = protocol.capture(case)
         for entry in protocol.entries:
             for metric, unit, value in score_images(entry.separate(capture), truth):
                 yield Score(protocol.name, entry.name, metric, unit, value)

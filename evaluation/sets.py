@@ -9,7 +9,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evaluation.scoring import Protocol, find_absent, own_entries, score_sets, see_clean, see_co_sited, see_noisy
+from evaluation.scoring import (
+    Protocol,
+    capture_clean,
+    capture_co_sited,
+    capture_noisy,
+    find_missing,
+    own_entries,
+    score_sets,
+)
 from polsep.bench.rows import Row
 from polsep.metrics import require_flip
 
@@ -24,8 +32,10 @@ def bench_sets(data: Path) -> Iterator[Row]:
     not come out as recorded.
     """
     sets = load_sets(data)
-    protocols = [Protocol(name, see, own_entries(True)) for name, see in (("noisy", see_noisy), ("clean", see_clean))]
-    protocols.append(Protocol("co-sited", see_co_sited, own_entries(False)))
+    protocols = [
+        Protocol(name, see, own_entries(True)) for name, see in (("noisy", capture_noisy), ("clean", capture_clean))
+    ]
+    protocols.append(Protocol("co-sited", capture_co_sited, own_entries(False)))
     yield from score_sets("sets", sets, data, protocols)
 
 
@@ -39,7 +49,7 @@ def load_sets(data: Path | None = None) -> dict[str, tuple[Recipe, ...]]:
         from evaluation import testsets
     except ImportError as error:
         raise ValueError(f"expected the extra render, found no {error.name}") from None
-    absent = find_absent([recipe for recipes in testsets.SETS.values() for recipe in recipes], data) if data else None
+    absent = find_missing([recipe for recipes in testsets.SETS.values() for recipe in recipes], data) if data else None
     if absent is not None:
         raise ValueError(f"expected {absent} (docs/testsets.md says where to get it), found none")
     return testsets.SETS

@@ -56,7 +56,7 @@ def measure_normals(data: Path, names: Sequence[str] | None) -> Iterator[Row]:
 
 
 def appearances_of(shoot: Shoot) -> Iterator[tuple[str, Appearance]]:
-    """What every input gives, by name."""
+    """Name and appearance from every input."""
     directions, mask = np.array(list(NAMED.values())), shoot.mask
     for method in METHODS:
         views = views_of([separate_capture(mosaic, method) for mosaic in shoot.mosaics])

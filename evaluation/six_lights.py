@@ -51,7 +51,7 @@ SEED = 9000
 
 @dataclass(frozen=True)
 class Subject:
-    """What is photographed: a mesh around the origin, its camera, the colours and the roughness of its skin."""
+    """A subject of photographs: a mesh around the origin, its camera, the colours and the roughness of its skin."""
 
     name: str
     mesh: MeshScene

@@ -1,4 +1,4 @@
-"""How fast recordings go through `polsep video`, against the method alone, and whether memory stays as it is."""
+"""Frame rates of `polsep video` on recordings against those of the method alone, and the growth of its memory."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-import polsep
 from polsep.bench.rows import Row
+from polsep.bench.truth import read_demo_capture
 from polsep.compute.workers import keep_memory
-from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.frames import ReadOptions
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.sequences import SequenceKind
 from polsep.io.store.rows import read_memory, write_chunks
@@ -105,7 +105,6 @@ def _rate_alone(method: str, frames: list[NDArray[np.uint16]]) -> float:
 
 
 def _frames() -> list[NDArray[np.uint16]]:
-    """The demo capture, moved."""
-    capture = Path(polsep.__file__).parent / "data" / "still_life.png"
-    raw = next(read_frames(capture, ReadOptions(white_level=4095.0))).data.data.numpy().astype(np.uint16)
+    """The demo capture, shifted by whole periods of its filters."""
+    raw = read_demo_capture().data.numpy().astype(np.uint16)
     return [np.roll(raw, (8 * k, 16 * k), (0, 1)) for k in range(DISTINCT)]

@@ -1,4 +1,4 @@
-"""How long a user of `polsep view` waits, and how long edits take: through the page's own server, without a browser.
+"""Response times of `polsep view` through the page's own server, without a browser, and the time of every edit.
 
 Waiting is from a request to its whole answer, as a browser on this machine makes it: what the browser adds to draw the
 picture, some 10 ms at screen size, is not in it. Every number is the median of `TIMES` after a first one, but for the
@@ -47,7 +47,7 @@ Floats = NDArray[np.float32]
 
 
 class Event(NamedTuple):
-    """What a user does: the part of the page, and the value that it has then."""
+    """An action of a user: the part of the page, the name of its event, and the new value."""
 
     part: str
     name: str
@@ -55,7 +55,7 @@ class Event(NamedTuple):
 
 
 class Page:
-    """One open page of a viewer at an address: State: what its parts hold, as a browser would."""
+    """One open page of a viewer at an address. State: the values of its parts, as a browser holds them."""
 
     def __init__(self, address: str, key: str) -> None:
         self._host, self._key = urlsplit(address).netloc, key
@@ -65,20 +65,20 @@ class Page:
         self._ids = {str(part["props"].get("elem_id")): number for number, part in parts.items()}
 
     def send(self, name: str, data: bytes) -> Any:
-        """Upload a file; what the page then holds for it."""
+        """Upload a file, and return the page's record of it."""
         head = f'--x\r\nContent-Disposition: form-data; name="files"; filename="{name}"\r\n\r\n'
         body = head.encode() + data + b"\r\n--x--\r\n"
         (path,) = json.loads(self._ask("POST", "/gradio_api/upload", body, "multipart/form-data; boundary=x"))
         return {"path": path, "orig_name": name, "meta": {"_type": "gradio.FileData"}}
 
     def do(self, event: Event) -> bytes:
-        """Do it, and wait for the answer. Raises ValueError where that says that something went wrong."""
+        """Fire an event, and return the answer. Raises ValueError where the answer reports a failure."""
         number = self._ids[event.part]
         self._values[number] = event.value
         return self._fire(number, event.name)
 
     def tick(self) -> bytes:
-        """What the page's clock does, when it runs."""
+        """Fire the page's clock."""
         (number,) = (part["id"] for part in self._config["components"] if part["type"] == "timer")
         return self._fire(number, "tick")
 
@@ -122,7 +122,7 @@ def bench_view() -> Iterator[Row]:
 
 
 def _bench_page(address: str) -> Iterator[Row]:
-    """Waiting, as users have it."""
+    """Rows of the times that a user waits."""
     page = Page(address, "bench")
     data = read_bytes(DEMO)
 
@@ -156,7 +156,7 @@ def _bench_page(address: str) -> Iterator[Row]:
 
 
 def _show(page: Page, count: int) -> None:
-    """Wait for so many frames of what plays."""
+    """Wait until ``count`` frames of the playing sequence were shown."""
     while count > 0:
         count -= b"ps-stage" in page.tick()
 

@@ -1,4 +1,4 @@
-"""What the gallery and `polsep bench view` are made of: plain NumPy twins of the edits, pictures, normals."""
+"""Parts of the gallery and of `python -m evaluation view`: plain NumPy twins of the edits, pictures, normals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from polsep.separation.report import SeparatedFrame
 
 @pytest.mark.parametrize("name", EDITS)
 def test_edits_agree_with_plain_numpy(name: str) -> None:
-    """What is timed against each other computes the same, to rounding."""
+    """Edits and their timed twins compute the same, to rounding."""
     images, kind = random_images(size=(40, 56)), EDITS[name]
     texture = np.random.default_rng(1).random((64, 64, 3), dtype=np.float32)
     edit = make_edit(kind, VALUES.get(name, {}))
@@ -36,12 +36,12 @@ def frame_of(images: SeparatedImages) -> SeparatedFrame:
 def test_the_gallery_shows_every_edit_that_fits(colors: int, rows: int) -> None:
     """Ten pictures of a colour frame, in fives; of a grey one, those that need no colours."""
     pytest.importorskip("matplotlib", reason="needs the extra bench")
-    from evaluation.appearance import CELL, Taken, draw_edits
+    from evaluation.appearance import CELL, GalleryCapture, draw_edits
     from evaluation.figures import GAP, TITLE
 
     size = (30, 30)
-    taken = Taken("a frame", Mosaic(torch.zeros(60, 60), Layout(), 0.0, 1.0))
-    pixels = draw_edits(taken, frame_of(random_images(size=size, colors=colors)))
+    capture = GalleryCapture("a frame", Mosaic(torch.zeros(60, 60), Layout(), 0.0, 1.0))
+    pixels = draw_edits(capture, frame_of(random_images(size=size, colors=colors)))
     assert pixels.shape == (rows * (CELL + TITLE + GAP) + TITLE + GAP, 5 * (CELL + GAP) + GAP, 3)
 
 

@@ -19,13 +19,13 @@ from evaluation.calibration import (
     NOMINAL_DEG,
     Sweep,
     TurnableScene,
+    capture_with_errors,
     find_aolp,
     make_turnable,
     measure_sweep,
     normal_deviates,
-    score_seen,
-    see_with_errors,
-    separate_seen,
+    score_captures,
+    separate_captures,
 )
 from evaluation.scoring import Entry
 from polsep.demosaic.bilinear import demosaic_bilinear_half
@@ -62,8 +62,8 @@ def test_a_turned_polarizer_is_a_sum_of_three(scene: TurnableScene) -> None:
 
 def test_lights_are_crossed_without_error(scene: TurnableScene) -> None:
     """The specular of crossed lights is polarized at right angles, summed over the picture nearly so."""
-    seen = see_with_errors(scene, 0.3, (0.0, 0.0))
-    one, other = (find_aolp(found.specular) for found in seen.scenes)
+    captured = capture_with_errors(scene, 0.3, (0.0, 0.0))
+    one, other = (find_aolp(found.specular) for found in captured.scenes)
     assert_same_angle(one + math.pi / 2, other, math.radians(15))
 
 
@@ -76,8 +76,8 @@ def test_photographs_are_parallel_and_crossed_to_the_highlights(scene: TurnableS
 
 
 def test_errors_do_not_touch_the_exposure_the_mask_or_the_analysers(scene: TurnableScene) -> None:
-    """What is off is the light: another truth, the same camera."""
-    right, wrong = (see_with_errors(scene, 0.3, (error, 0.0)) for error in (0.0, 0.2))
+    """Errors change the light and the truth, not the camera."""
+    right, wrong = (capture_with_errors(scene, 0.3, (error, 0.0)) for error in (0.0, 0.2))
     assert torch.equal(right.scenes[0].mask, wrong.scenes[0].mask)
     assert_close(right.scenes[1].specular.s0, wrong.scenes[1].specular.s0)
     assert right.captures[0].angles == wrong.captures[0].angles
@@ -89,12 +89,12 @@ def test_errors_do_not_touch_the_exposure_the_mask_or_the_analysers(scene: Turna
 
 
 def test_methods_are_scored_against_what_they_saw(scene: TurnableScene) -> None:
-    seen = see_with_errors(scene, 0.0, (0.1, -0.3))
-    truths = {name: truth for name, _, truth in separate_seen(seen, [ANALYTIC])}
-    one, other = seen.scenes
+    captured = capture_with_errors(scene, 0.0, (0.1, -0.3))
+    truths = {name: truth for name, _, truth in separate_captures(captured, [ANALYTIC])}
+    one, other = captured.scenes
     assert_close(truths[DING][1], (one.specular.s0 + other.specular.s0) / 2)
     assert_close(truths["analytic"][0], one.diffuse.s0)
-    scores = {name: value for name, output, value in score_seen(seen, [ANALYTIC]) if output == "diffuse"}
+    scores = {name: value for name, output, value in score_captures(captured, [ANALYTIC]) if output == "diffuse"}
     assert scores[DING] > scores[DEBEVEC] + 5
 
 
@@ -102,8 +102,10 @@ def test_a_full_set_of_lights_does_not_change_when_it_turns(scene: TurnableScene
     """Mean scores of a method without calibration are the same for every error; those of single lights are not."""
 
     def scores(error: float) -> list[float]:
-        seen = (see_with_errors(scene, math.radians(nominal), (error, 0.0)) for nominal in NOMINAL_DEG)
-        return [v for s in seen for name, out, v in score_seen(s, [ANALYTIC]) if (name, out) == ("analytic", "diffuse")]
+        seen = (capture_with_errors(scene, math.radians(nominal), (error, 0.0)) for nominal in NOMINAL_DEG)
+        return [
+            v for s in seen for name, out, v in score_captures(s, [ANALYTIC]) if (name, out) == ("analytic", "diffuse")
+        ]
 
     right, wrong = scores(0.0), scores(math.radians(13.0))
     assert abs(statistics.fmean(wrong) - statistics.fmean(right)) < 0.02

@@ -80,7 +80,7 @@ def test_angles_are_circular(found: float, truth: float, error: float) -> None:
 
 
 def test_unpolarized_light_has_no_angle() -> None:
-    """Where the true DoLP is below the bound the found angle does not count."""
+    """Below the bound of the true DoLP, angles do not count."""
     truth = Stokes(torch.ones(1, 4, 4), torch.full((1, 4, 4), 0.04), torch.zeros(1, 4, 4))
     assert score_stokes(polarized_at(50), truth, torch.ones(4, 4, dtype=torch.bool))[1] == 0
 

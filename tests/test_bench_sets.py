@@ -15,9 +15,17 @@ pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 
 from evaluation import testsets
 from evaluation.ablations import ablation_entry, find_ablations
-from evaluation.joint import BINS, enlarge, full_entries, measure_engines, measure_reliability, see_full, see_mono
+from evaluation.joint import (
+    BINS,
+    capture_full,
+    capture_mono,
+    enlarge,
+    full_entries,
+    measure_engines,
+    measure_reliability,
+)
 from evaluation.rendering import bench_rendering
-from evaluation.scoring import Entry, Protocol, score_case, score_sets, see_clean, see_co_sited, see_noisy
+from evaluation.scoring import Entry, Protocol, capture_clean, capture_co_sited, capture_noisy, score_case, score_sets
 from evaluation.sets import bench_sets
 from evaluation.testsets import Recipe, build_case
 from polsep.demosaic.bilinear import demosaic_bilinear_half, mean_cells
@@ -47,7 +55,8 @@ def make_step(_paths: list[Path], _generator: torch.Generator) -> Scene:
 GREY, STEP = Recipe("grey", 1, (), make_grey), Recipe("step", 1, (), make_step)
 ANALYTIC = Entry("analytic", compose(demosaic_bilinear_half, separate_analytic))
 PROTOCOLS = [
-    Protocol(n, s, (ANALYTIC,)) for n, s in (("noisy", see_noisy), ("clean", see_clean), ("all", see_co_sited))
+    Protocol(n, s, (ANALYTIC,))
+    for n, s in (("noisy", capture_noisy), ("clean", capture_clean), ("all", capture_co_sited))
 ]
 
 
@@ -114,21 +123,21 @@ def test_half_resolution_is_enlarged_about_the_centres_of_cells() -> None:
 def test_full_resolution_is_scored_at_full_resolution() -> None:
     """Every method, the ones that give half-resolution images enlarged."""
     case = build_case(GREY)
-    capture, (diffuse, _, mask) = see_full(case)
+    capture, (diffuse, _, mask) = capture_full(case)
     found = {entry.name: entry.separate(capture) for entry in full_entries()}
     assert set(found) == {"joint", "joint-fast", "color-affine", "analytic", "paper, enlarged"}
     assert all(images.diffuse.shape == diffuse.shape for images in found.values())
-    scores = list(score_case(case, [Protocol("full", see_full, full_entries())]))
+    scores = list(score_case(case, [Protocol("full", capture_full, full_entries())]))
     value = {score.method: score.value for score in scores if score.metric == "diffuse PSNR"}
     assert value["analytic"] == psnr(found["analytic"].diffuse, diffuse, mask)
 
 
 def test_mono_frames_are_scored_in_one_colour() -> None:
     """The analytic split of a mono frame is exact, but for noise, and knows neither FLIP nor chroma."""
-    scores = {s.metric: s.value for s in score_case(build_case(GREY), [Protocol("mono", see_mono, (ANALYTIC,))])}
+    scores = {s.metric: s.value for s in score_case(build_case(GREY), [Protocol("mono", capture_mono, (ANALYTIC,))])}
     assert {"diffuse PSNR", "specular SSIM"} <= set(scores)
     assert not [metric for metric in scores if "FLIP" in metric or "chroma" in metric]
-    capture, (diffuse, specular, mask) = see_mono(build_case(GREY))
+    capture, (diffuse, specular, mask) = capture_mono(build_case(GREY))
     assert isinstance(capture, Mosaic) and capture.layout == Layout(bayer=None)
     assert diffuse.shape == specular.shape == (1, *mask.shape)
     colored = {s.metric: s.value for s in score_case(build_case(GREY), PROTOCOLS[:1])}
@@ -187,6 +196,6 @@ def test_ablations_differ_in_what_they_go_without_alone() -> None:
         assert len({record[key] for record in records}) == 1, key
     case = build_case(GREY)
     entries = tuple(ablation_entry(name, path) for name, path in found.items())
-    scores = list(score_case(case, [Protocol("noisy", see_noisy, entries)]))
+    scores = list(score_case(case, [Protocol("noisy", capture_noisy, entries)]))
     psnrs = [score.value for score in scores if score.metric == "specular PSNR"]
     assert len(set(psnrs)) == len(found)

@@ -1,4 +1,4 @@
-"""Whether Blender opens what `polsep geometry` and `polsep material` write, and sees the same numbers in it.
+"""Check that Blender opens the files of `polsep geometry` and `polsep material` and reads the same numbers.
 
     python3.11 -m venv blender && blender/bin/pip install bpy==5.0.1
     polsep geometry --srgb 196CANON/[0-5].JPG --mask 196CANON/mask.png --integration smooth -o out
@@ -49,7 +49,7 @@ print("FOUND " + json.dumps({
 
 
 def ask_blender(blender: Path, path: Path) -> dict[str, Any]:
-    """What Blender says of a file."""
+    """Blender's report on a file."""
     done = subprocess.run([blender, "-c", INSIDE, path], capture_output=True, text=True, check=True)
     line = next(line for line in done.stdout.splitlines() if line.startswith("FOUND "))
     found: dict[str, Any] = json.loads(line.removeprefix("FOUND "))

@@ -1,4 +1,4 @@
-"""What users demosaick colour polarization mosaics with today, for `polsep bench frontend`; run by the peers' python.
+"""Colour polarization demosaickers of other packages, for `polsep bench frontend`; run by the peers' python.
 
     frontend_peers.py demosaic IN OUT     every IN/STEM.npy by every peer: OUT/METHOD/STEM.npy, and OUT/timing.json
     frontend_peers.py chains              the names of the chains that can be timed, as JSON
@@ -114,7 +114,7 @@ def separate_opencv(raw: Array) -> tuple[Array, Array]:
 
 
 def chains() -> dict[str, Callable[[Array], Any]]:
-    """What is timed by name: 12-bit raw to whatever the name says."""
+    """Timed chains by name: 12-bit raw to the result that the name says."""
     polanalyser, opencv = f"polanalyser {version('polanalyser')}", f"OpenCV {version('opencv-python-headless')}"
     eari, colour = f"eari-demosaic {version('eari-demosaic')}", f"colour-demosaicing {version('colour-demosaicing')}"
     return {

@@ -1,4 +1,4 @@
-"""Whether MaterialX reads what `polsep material` writes, finds its textures, and makes a shader of it.
+"""Check that MaterialX reads the files of `polsep material`, finds their textures and generates a shader.
 
     python3 -m venv materialx && materialx/bin/pip install materialx==1.39.5
     polsep material polsep/data/still_life.png --white-level 4095 -o out
@@ -48,7 +48,7 @@ print(json.dumps({
 
 
 def ask(python: Path, path: Path) -> dict[str, Any]:
-    """What MaterialX says of a file."""
+    """MaterialX's report on a file."""
     done = subprocess.run([python, "-c", INSIDE, path], capture_output=True, text=True, check=True)
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +20,8 @@ from recorded import record
 
 import polsep
 from polsep.bench.rows import Row
+from polsep.bench.truth import read_demo_capture
 from polsep.demosaic.bilinear import demosaic_bilinear
-from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.physics.stokes import Measurements, fit_stokes
 from polsep.sensor.camera import Layout
 from polsep.separation.analytic import separate_analytic
@@ -47,8 +46,7 @@ def peer_chain(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def main() -> None:
     """Measure parity and time, and record the rows."""
-    capture = Path(polsep.__file__).parent / "data" / "still_life.png"
-    mosaic = next(read_frames(capture, ReadOptions(white_level=4095.0))).data
+    mosaic = read_demo_capture()
     raw = mosaic.data.numpy().astype(np.uint16)
     images = pa.demosaicing(raw, pa.COLOR_PolarRGB)
     data = torch.from_numpy(np.stack(images).astype(np.float64) / 4095).permute(0, 3, 1, 2)

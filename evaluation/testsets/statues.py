@@ -50,7 +50,7 @@ DILIGENT_FILES = ("normal_map.png", "mask.png", "depth_gt.npz", "K.txt")
 
 @dataclass(frozen=True)
 class Pose:
-    """How to look at a scan: which of its axes points up, the camera's azimuth and elevation [degrees]."""
+    """Pose of a scan: which of its axes points up, the camera's azimuth and elevation [degrees]."""
 
     up: str
     azimuth_deg: float

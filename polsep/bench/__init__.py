@@ -1,4 +1,4 @@
-"""What users measure: separation, exactness, the front end, time and memory, real frames; rows in results/*.jsonl.
+"""Benchmarks for users: separation, exactness, the front end, time and memory, real frames; rows in results/*.jsonl.
 
 Every row says what was measured (`bench`, `case`, `method`, `metric`, `value`, `unit`) and by what (`command`,
 `commit`, `machine`). The tables of README and docs are made from these rows by `io.store.rows.fill_tables`. The

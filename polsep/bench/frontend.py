@@ -1,4 +1,4 @@
-"""Demosaickers, and what the separation makes of them, beside what users pick instead.
+"""Demosaickers and the separation after them, beside the packages that users choose instead.
 
 Real captures are the four-angle pictures of ``data``/four_angle, taken at full resolution behind a turning polarizer:
 they are mosaicked by Sony's layout without noise. Rendered ones are 12-bit mosaics with noise and clipping; their truth
@@ -192,12 +192,12 @@ def demosaic_case(case: Case, theirs: dict[str, dict[str, Tensor]]) -> Found:
 
 
 def ask_peers(cases: list[Case], peers: str | None) -> dict[str, dict[str, Tensor]]:
-    """What the peers make of the cases, by method and case; nothing without peers."""
+    """The peers' images of the cases, by method and case; empty without peers."""
     return demosaic_by_peers(peers, {case.name: case.mosaic.linear() for case in cases}) if peers else {}
 
 
 def score_cases(bench: str, title: str, cases: Iterable[tuple[Case, Found]]) -> Iterator[Row]:
-    """All metrics of what was found for every case, their means over the cases, and the worst of them."""
+    """All metrics of every case, their means over the cases, and the worst of them."""
     scores: dict[tuple[str, str, str], list[float]] = {}
     for case, found in cases:
         for (resolution, method), images in found.items():

@@ -1,4 +1,4 @@
-"""What others demosaick with, measured in a virtual environment of their own that `POLSEP_PEERS` names.
+"""Demosaickers of other packages, run in a virtual environment of their own that `POLSEP_PEERS` names.
 
 evaluation/peers/frontend_peers.py does the work there; evaluation/peers/requirements.txt says what to install.
 """
@@ -40,7 +40,7 @@ def find_peers() -> str:
 
 
 def run_json(*command: str) -> Any:
-    """What a program prints as JSON, run with two threads. Raises ValueError with its last line when it fails."""
+    """Run a program with two threads and return its JSON. Raises ValueError with its last line when it fails."""
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | TWO_THREADS)
     if done.returncode:
         raise ValueError(f"{Path(command[0]).name} failed: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")

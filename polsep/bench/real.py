@@ -56,7 +56,7 @@ def _reference_angles(mosaic: Mosaic) -> Iterator[Row]:
 
 
 def _layout_verdicts(mosaic: Mosaic) -> Iterator[bool]:
-    """Whether the check is right about a frame: under all 24 orders, transposed, mirrored, cropped, mono for colour.
+    """Verdicts of the check, right or wrong: all 24 orders, transposed, mirrored, cropped, mono for colour.
 
     Right is silence under the true layout and under those that no frame can tell from it (see `layout_check`), and a
     warning whose fitting layouts hold the true one otherwise.

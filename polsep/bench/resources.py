@@ -11,9 +11,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-import polsep
 from polsep.bench.rows import Row
-from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.bench.truth import read_demo_capture
 from polsep.io.store.rows import write_array
 from polsep.kernels import warm_up
 from polsep.methods import METHODS
@@ -57,11 +56,10 @@ def bench_resources() -> Iterator[Row]:
     runs in torch (`paper`) shares torch's own threads.
     """
     warm_up()
-    capture = Path(polsep.__file__).parent / "data" / "still_life.png"
-    frame = next(read_frames(capture, ReadOptions(white_level=4095.0))).data
+    raw = read_demo_capture().data.numpy().astype(np.uint16)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "raw.npy"
-        write_array(path, frame.data.numpy().astype(np.uint16))
+        write_array(path, raw)
         for name in METHODS:
             found, full = (_measure(name, path, resolution) for resolution in ("half", "full"))
             yield Row("resources", CASE, name, "seconds, first call", found["first"], "s")
@@ -73,7 +71,7 @@ def bench_resources() -> Iterator[Row]:
 
 
 def _measure(method: str, path: Path, resolution: str) -> dict[str, float]:
-    """What a process of its own says of one method."""
+    """Seconds, MiB and frames/s of one method, measured by a process of its own."""
     command = [sys.executable, "-c", _RESOURCE_SCRIPT, method, str(path), resolution]
     found: dict[str, float] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     return found

@@ -15,7 +15,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
-from importlib import import_module
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,20 +24,28 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-import polsep
 from polsep.bench.peers import run_json, time_peers
 from polsep.bench.rows import Row
+from polsep.bench.truth import DEMO_WHITE as WHITE_LEVEL
+from polsep.bench.truth import read_demo_capture
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.demosaic.guided import demosaic_guided_half
-from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.store.rows import read_array, read_peak_memory, write_array
+from polsep.kernels import (
+    AnalyticImages,
+    AnalyticOptions,
+    ColorAffineImages,
+    ColorAffineOptions,
+    separate_analytic_half,
+    separate_color_affine_half,
+    set_threads,
+)
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.analytic import Separation, separate_analytic
 from polsep.separation.color_affine import separate_color_affine
 
 CASE = "2448x2048 colour frame"
-WHITE_LEVEL = 4095.0
 #: Every chain is timed in so many processes, in turns, each time so often or so long; the best time counts.
 ROUNDS, MAX_RUNS, MAX_SECONDS = 2, 40, 4.0
 #: Threads of every chain.
@@ -52,43 +60,37 @@ def _compose(demosaic: Callable[[Mosaic], Measurements], separate: Callable[[Mea
     return lambda raw: separate(demosaic(Mosaic(torch.from_numpy(raw), Layout(), 0.0, WHITE_LEVEL)))
 
 
-#: polsep's chains in torch, and fused ones by the function in `polsep.kernels`, its classes and options.
+def _stream(images: Any, options: Callable[..., Any], separate: Callable[..., Any]) -> Chain:
+    """The chain of a function of `polsep.kernels` with its options, into the same images frame after frame."""
+    buffers: dict[tuple[int, ...], Any] = {}
+
+    def chain(raw: Raw) -> Any:
+        if raw.shape not in buffers:
+            buffers[raw.shape] = images.empty(raw.shape, Layout())
+        return separate(raw, Layout(), 0.0, WHITE_LEVEL, options(out=buffers[raw.shape]))
+
+    return chain
+
+
+#: polsep's chains in torch, and those of `polsep.kernels`.
 CHAINS: dict[str, Chain] = {
     "polsep analytic, bilinear": _compose(demosaic_bilinear_half, separate_analytic),
     "polsep analytic, guided": _compose(demosaic_guided_half, separate_analytic),
     "polsep color-affine, bilinear": _compose(demosaic_bilinear_half, separate_color_affine),
     "polsep color-affine, guided": _compose(demosaic_guided_half, separate_color_affine),
 }
-KERNELS: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "polsep analytic, bilinear, kernel": ("separate_analytic_half", "Analytic", {}),
-    "polsep color-affine, bilinear, kernel": ("separate_color_affine_half", "ColorAffine", {}),
-    "polsep color-affine, guided, kernel": ("separate_color_affine_half", "ColorAffine", {"guided": True}),
+KERNELS: dict[str, Chain] = {
+    "polsep analytic, bilinear, kernel": _stream(AnalyticImages, AnalyticOptions, separate_analytic_half),
+    "polsep color-affine, bilinear, kernel": _stream(ColorAffineImages, ColorAffineOptions, separate_color_affine_half),
+    "polsep color-affine, guided, kernel": _stream(
+        ColorAffineImages, partial(ColorAffineOptions, guided=True), separate_color_affine_half
+    ),
 }
-
-
-def find_chain(name: str) -> Chain:
-    """polsep's chain of that name; only kernels import numba."""
-    if name in CHAINS:
-        return CHAINS[name]
-    kernels = import_module("polsep.kernels")
-    function, prefix, fields = KERNELS[name]
-    separate, images, options = (getattr(kernels, n) for n in (function, f"{prefix}Images", f"{prefix}Options"))
-    room: dict[tuple[int, int], Any] = {}
-
-    def chain(raw: Raw) -> Any:
-        """Fills the same images frame after frame, as a stream does."""
-        if raw.shape not in room:
-            room[raw.shape] = images.empty(raw.shape, Layout())
-        return separate(raw, Layout(), 0.0, WHITE_LEVEL, options(out=room[raw.shape], **fields))
-
-    return chain
 
 
 def bench_speed(peers: str | None) -> Iterator[Row]:
     """Milliseconds, frames/s, memory and share of the roofline of every chain, and ratios to the peers' of this run."""
-    capture = Path(polsep.__file__).parent / "data" / "still_life.png"
-    frame = next(read_frames(capture, ReadOptions(white_level=WHITE_LEVEL))).data
-    raw = frame.data.numpy().astype(np.uint16)
+    raw = read_demo_capture().data.numpy().astype(np.uint16)
     with TemporaryDirectory() as folder:
         path, unclipped = Path(folder) / "raw.npy", Path(folder) / "unclipped.npy"
         write_array(path, raw)
@@ -138,9 +140,8 @@ def print_time(name: str, path: str) -> None:
     Printed as JSON.
     """
     torch.set_num_threads(THREADS)
-    raw, chain = read_array(Path(path)), find_chain(name)
-    if name in KERNELS:
-        import_module("polsep.kernels").set_threads(THREADS)
+    raw, chain = read_array(Path(path)), (CHAINS | KERNELS)[name]
+    set_threads(THREADS)
     before = read_peak_memory()
     chain(raw)
     times: list[float] = []

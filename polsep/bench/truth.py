@@ -1,13 +1,16 @@
-"""Scenes of known truth as every benchmark takes them: rendered and exposed."""
+"""Inputs that benchmarks share: rendered and exposed scenes of known truth, and the demo capture."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+import polsep
+from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.physics.stokes import Measurements, measure
 from polsep.render.distances import random_light, random_parts
 from polsep.render.sphere_tracing import PinholeCamera, Scene, render
@@ -16,6 +19,16 @@ from polsep.sensor.camera import IMX250, Layout, Mosaic, add_noise, expose
 #: Seeds of the benchmark's scenes; nothing is ever tuned or trained on seeds from 2000 to 2999.
 SCENE_SEEDS = tuple(range(2000, 2008))
 SCENE_SIZE = (384, 384)
+#: White level of the demo capture.
+DEMO_WHITE = 4095.0
+
+
+def read_demo_capture() -> Mosaic:
+    """The 2448x2048 colour frame of 12 bits that comes with polsep."""
+    path = Path(polsep.__file__).parent / "data" / "still_life.png"
+    frame = next(read_frames(path, ReadOptions(white_level=DEMO_WHITE))).data
+    assert isinstance(frame, Mosaic)
+    return frame
 
 
 def render_scene(seed: int, saturation: float, size: tuple[int, int] = SCENE_SIZE) -> Scene:

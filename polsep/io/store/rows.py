@@ -51,7 +51,7 @@ def read_array(path: Path) -> NDArray[Any]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """What a file holds."""
+    """The bytes of a file."""
     return path.read_bytes()
 
 

@@ -1,4 +1,4 @@
-"""Weights of networks in safetensors files: no code in them, whole or refused.
+"""Weights of networks in safetensors files: no code in them, and damaged files are refused.
 
 A file's metadata says which network it is of and how it came about; ``sha256`` there is that of the tensors' names,
 shapes and bytes, so that a damaged file is told from a good one. Shipped weights lie in ``polsep/weights``.
@@ -30,7 +30,7 @@ def digest_tensors(tensors: Tensors) -> str:
 
 
 def write_weights(path: Path, tensors: Tensors, metadata: dict[str, str]) -> None:
-    """Write tensors in half precision, whole or not at all."""
+    """Write tensors in half precision, atomically."""
     halves = {name: tensor.detach().cpu().half().contiguous() for name, tensor in tensors.items()}
     with atomic_path(path) as part:
         save_file(halves, part, metadata | {"sha256": digest_tensors(halves)})
@@ -53,7 +53,7 @@ def read_weights(path: Path) -> tuple[Tensors, dict[str, str]]:
 
 
 def shipped_weights(name: str) -> Path:
-    """Where the weights of that name lie in the installed package. Raises ValueError when they are not shipped."""
+    """The file of shipped weights of that name. Raises ValueError when they are not in the package."""
     path = Path(str(files("polsep") / "weights" / f"{name}.safetensors"))
     if not path.exists():
         raise ValueError(f"expected the weights {name!r} in {path.parent}, found none of that name")
@@ -61,7 +61,7 @@ def shipped_weights(name: str) -> Path:
 
 
 def is_shipped(name: str) -> bool:
-    """Whether weights of that name are installed."""
+    """Return True when weights of that name are in the package."""
     try:
         shipped_weights(name)
     except ValueError:

@@ -142,3 +142,4 @@ def test_worked_examples_run(name: str, tmp_path: Path, monkeypatch: pytest.Monk
                 exec(compile(code, f"{name}.md", "exec"), names)
     finally:
         METHODS.pop("minimum", None)
+    assert len(names) > 2

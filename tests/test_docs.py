@@ -15,6 +15,7 @@ import pytest
 import evaluation.benches
 import polsep.bench
 from polsep.cli import app
+from tests.test_architecture import RANKS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
@@ -124,6 +125,13 @@ def test_the_site_names_every_page() -> None:
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:\n")[2]
     named = re.findall(r"([\w/-]+\.md)$", navigation, re.MULTILINE)
     assert sorted(named) == [page.relative_to(ROOT / "docs").as_posix() for page in DOCS]
+
+
+def test_contributing_has_the_ranks_of_the_architecture() -> None:
+    """The table of rooms in CONTRIBUTING.md is what test_architecture enforces."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| ([^|]*) \|", text, re.MULTILINE)
+    assert {room: int(rank) for rank, rooms in rows for room in re.findall(r"`(\w+)`", rooms)} == RANKS
 
 
 @pytest.mark.parametrize("name", ["extending", "python"])

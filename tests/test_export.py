@@ -20,7 +20,7 @@ import onnxruntime
 from polsep import cli
 from polsep.io.store.weights import write_weights
 from polsep.networks.channels import INPUTS
-from polsep.networks.export import Graph
+from polsep.networks.export import ExportedNetwork
 from polsep.networks.joint import Joint
 from polsep.networks.run import run_joint
 from polsep.networks.unet import ResidualSize
@@ -71,7 +71,7 @@ def test_exported_graphs_agree(
 
 def test_what_graphs_do_otherwise_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """A guided network's filters are written as convolutions; whole graphs of that kind take minutes to write."""
-    graph = Graph(Joint(3, SIZE, INPUTS, "guided"), full=True)
+    graph = ExportedNetwork(Joint(3, SIZE, INPUTS, "guided"), full=True)
     raw = torch.randint(100, 4095, (1, 40, 56), generator=torch.Generator().manual_seed(4)).to(torch.uint16)
     levels = torch.tensor([64.0]), torch.tensor([4095.0])
     with torch.no_grad():

@@ -129,14 +129,14 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     """
     from polsep.io.store.atomic import refuse_existing
     from polsep.io.store.onnx import write_onnx
-    from polsep.networks.export import OUTPUT_NAMES, Graph
+    from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork
     from polsep.sensor.camera import Layout
     from polsep.shipped import find_joint
 
     refuse_existing(output.parent, [output], options["overwrite"])
     network, metadata = find_joint(method, Layout(bayer=None) if options["mono"] else Layout(), weights)
     print_note(f"exporting {method}, which takes a minute or a few")
-    write_onnx(output, Graph(network, options["full"]), OUTPUT_NAMES, metadata)
+    write_onnx(output, ExportedNetwork(network, options["full"]), OUTPUT_NAMES, metadata)
     print(output)
 
 

@@ -1,8 +1,8 @@
-"""The joint network as one graph from raw numbers to images, for engines other than torch.
+"""The joint network as one exportable module from raw samples to images, for engines other than torch.
 
-A graph takes a batch of raw frames ``[N, H, W]`` in Sony's order, H and W multiples of 4, with their black and white
-level, and gives ``[N, h, w, ...]`` images: what `networks.run.run_joint` makes of such frames, without turning them.
-It knows no file format: `io.store.onnx` writes it.
+It accepts a batch of raw frames ``[N, H, W]`` in Sony's order, H and W multiples of 4, with their black and white
+level, and returns ``[N, h, w, ...]`` images, those of `networks.run.run_joint` for such frames. `io.store.onnx` writes
+it to a file.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from polsep.networks.joint import Joint, limit
 from polsep.sensor.camera import CLIP_MARGIN
 
-#: Names of a graph's outputs, in order.
+#: Names of the outputs, in order.
 OUTPUT_NAMES = ("diffuse", "specular", "error")
 
 
-class Graph(nn.Module):
+class ExportedNetwork(nn.Module):
     """``raw [N, H, W]`` integers or floats, ``black_level [1]``, ``white_level [1]`` to images, channels last.
 
     ``diffuse [N, h, w, C]``, ``specular [N, h, w, 1]`` white, not negative; ``error [N, h/k, w/k, 2]``: expected

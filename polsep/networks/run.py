@@ -1,8 +1,8 @@
-"""Methods of the joint network: any mosaic in, a separation out, with shipped weights and in bounded memory.
+"""The joint network in torch on frames of any size and orientation, in bounded memory.
 
-Frames are turned into the order of filters that the network knows (`orient`), cut into overlapping strips of rows where
-they are large, and turned back. Strips begin at multiples of the network's own grid and overlap by more than it sees,
-so that they agree with the whole frame.
+Frames are turned into the order of filters that the network was trained on (`orient`), cut into overlapping strips of
+rows where they are large, and turned back. Strips begin at multiples of the network's grid and overlap by more than its
+receptive field, so that they agree with the whole frame.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation, orient
 from polsep.separation.analytic import Separation
 
-#: Raw pixels of a frame, or of a strip with its margins, that are seen at once: some 250 bytes of memory each.
+#: Raw pixels of a frame, or of a strip with its margins, that are processed at once: some 250 bytes of memory each.
 MAX_PIXELS = 6_000_000
-#: Raw rows that a strip sees beyond its own, farther than the network does (a test measures that).
+#: Raw rows of margin around a strip, more than the network's receptive field (a test measures that).
 MARGIN = 256
 
 
 def own_order(layout: Layout) -> Layout:
-    """Sony's order, in colour or mono as the layout is: what networks are trained on."""
+    """Sony's order, in colour or mono as the layout is, on which networks are trained."""
     return Layout(bayer=None) if layout.bayer is None else Layout()
 
 
@@ -93,7 +93,7 @@ def _repeat(image: Tensor, times: int) -> Tensor:
 
 
 def _rows(image: Tensor, rows: tuple[int, int], height: int) -> Tensor:
-    """Some raw rows of an image of a strip of ``height`` raw rows, at whatever resolution."""
+    """Raw ``rows`` of an image of a strip of ``height`` raw rows, at any resolution."""
     first, last = (row * image.shape[-2] // height for row in rows)
     return image[..., first:last, :]
 
@@ -112,9 +112,9 @@ def _as_separation(images: list[Tensor], cells: Tensor, orientation: Orientation
     """Turn everything back to the frame's own orientation, and the masks and Stokes images to the images' size."""
     diffuse, specular = images[0], images[1].expand_as(images[0])
     scale = 2 if diffuse.shape[-1] > cells.shape[-1] else 1
-    s1, s2, error, misfit, cells = (_repeat(x, scale) for x in (*images[2:], cells))
+    s1, s2, error, residual, cells = (_repeat(x, scale) for x in (*images[2:], cells))
     stokes = Stokes(diffuse + specular, s1, s2)
-    turned = [orientation.turn_back(x, scale) for x in (diffuse, specular, cells, error, math.sqrt(2) * misfit)]
+    turned = [orientation.turn_back(x, scale) for x in (diffuse, specular, cells, error, math.sqrt(2) * residual)]
     diffuse, specular, cells, error, residual = turned
     valid, clipped = ~cells[..., 1, :, :], cells[..., 0, :, :]
     stokes = orientation.turn_back_stokes(stokes, scale)

@@ -1,4 +1,4 @@
-"""The learned parts as plain modules: no files, no optimizer, no statistics of whole images, so crop and frame agree.
+"""U-Nets as plain modules: no files, no optimizer, no statistics of whole images, so crop and frame agree.
 
 Conventions: images ``[N, C, H, W]``, linear light; any H and W (padded by mirror inside to what the levels need).
 """
@@ -34,7 +34,7 @@ class Size:
     """Size of a `UNet`: ``width`` channels at the top, doubled at each of ``levels`` halvings.
 
     ``fold`` x ``fold`` pixels are folded into channels first and unfolded at last (Shi et al. 2016), which makes small
-    networks several times faster. 64, 4 and 1 are the classic one, `UNET64`. Raises ValueError on what is below 1.
+    networks several times faster. 64, 4 and 1 are the classic one, `UNET64`. Raises ValueError on numbers below 1.
     """
 
     width: int = 32
@@ -69,7 +69,7 @@ class UNet(nn.Module):
         nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
-        """Images of any size; what pads them to a multiple of fold 2^levels is cut off again."""
+        """Images of any size; their padding to a multiple of fold 2^levels is cut off again."""
         height, width = x.shape[-2:]
         x = pixel_unshuffle(pad_to_multiple(x, self.size.fold * 2**self.size.levels), self.size.fold)
         skips = []
@@ -88,7 +88,7 @@ class ResidualSize:
     """Size of a `ResidualUNet`: ``width`` channels at the top, doubled at every further level; ``blocks`` per level.
 
     ``entry``: channels to which a 1x1 convolution brings the inputs first, 0 for none; where there are many inputs and
-    few channels, most of the time goes into the first 3x3 convolution. Raises ValueError on what cannot be built.
+    few channels, most of the time goes into the first 3x3 convolution. Raises ValueError on sizes that cannot be built.
     """
 
     width: int = 32
@@ -181,5 +181,5 @@ def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:
 
 
 def count_parameters(module: nn.Module) -> int:
-    """How many numbers training sets."""
+    """Number of trained parameters."""
     return sum(p.numel() for p in module.parameters())

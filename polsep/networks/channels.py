@@ -63,7 +63,7 @@ def seen_maps(inputs: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def input_channels(colors: int, inputs: tuple[str, ...]) -> InputChannels:
-    """Where each map begins among the channels of a network's input."""
+    """The first channel of every map among the channels of a network's input."""
     sizes, first, total = map_sizes(colors), dict.fromkeys(map_sizes(colors), -1), 0
     for name in seen_maps(inputs):
         first[name] = total

@@ -1,7 +1,7 @@
-"""Twin of `details.Details` around the network: what the pixels of a cell have beyond a smooth image, and full images.
+"""Kernels of `details.Details` around the network: details of s0 beyond a smooth image, and full images.
 
-Three passes over the frame, each needs rows around that the one before has finished: the details of s0 beyond what is
-guessed from its means (`find_beyond`), how large they are around (`show_details`), and, after the network, the images
+Three passes over the frame, each on finished rows of the one before: details of s0 less those interpolated from its
+means (`find_beyond`), their size around each cell (`emit_details`), and, after the network, the images
 (`write_pixels`). Rows of cells are planar; the order of details is that of `details.HAAR`.
 """
 
@@ -33,7 +33,7 @@ _PIXELS = PERIOD * math.sqrt(2)
 
 
 class Smooth(NamedTuple):
-    """What guesses details from means: ``weight [3, 30]`` of cells in ``row`` and ``place [30]`` of five rows."""
+    """Interpolation of details from means: ``weight [3, 30]`` of cells in ``row`` and ``place [30]`` of five rows."""
 
     weight: Floats
     row: NDArray[np.int64]
@@ -81,7 +81,7 @@ def _close(row: Any) -> None:
 
 @compiled
 def _starts(y: int, h: int, size: int, starts: Any) -> None:
-    """Where the five rows around row ``y`` of ``h`` begin in a ring of as many; the border's are repeated."""
+    """Starts of the five rows around row ``y`` of ``h`` in a ring of as many; the border's are repeated."""
     for k in range(_SIDE):
         starts[k] = min(max(y - 2 + k, 0), h - 1) % _SIDE * size
 
@@ -291,7 +291,7 @@ def _write_image(image: int, pixels: Any, gains: Any, targets: Targets, y: int, 
 
 @compiled
 def _write_masks(closed: ClosedFormRows, y: int, targets: Targets, valid: Any, near: Any) -> None:
-    """Where two rows are valid, how many of their pixels are near clipped samples, and their misfit."""
+    """Validity of two rows, and sums of their pixels near clipped samples and of their fit residual."""
     clipped = mark_clipped(closed.clipped, y, valid, near)
     for row in range(2 * y, 2 * y + 2):
         out, sums = targets.valid[row], targets.sums[row]

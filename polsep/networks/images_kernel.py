@@ -1,6 +1,6 @@
-"""Twin of what follows the network in `joint.Joint.half_resolution`: corrections and closed form become images.
+"""Kernels after the network of `joint.Joint.half_resolution`: corrections and closed form become images.
 
-Row after row of packed pixels, of which each makes two rows of images; see `networks.maps_kernel`.
+They run row after row of packed pixels, each of which makes two rows of images; see `maps_kernel` for those before.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from polsep.separation.polarization_kernel import polarize
 
 Floats = NDArray[np.float32]
 
-#: Columns of ``sums``: s0, specular, DoLP above 1, power, power along and across, variance of diffuse and of specular
-#: that is expected, pixels near clipped ones, misfit.
+#: Columns of ``sums``: s0, specular, DoLP above 1, power, power along and across, expected variance of diffuse and of
+#: specular, pixels near clipped ones, fit residual.
 SUMS = 10
 #: Bits of the samples of a packed pixel's first cell.
 _CELL = 0b110011
@@ -57,7 +57,7 @@ class LayerOutputs(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """What is filled: colours ``[2 h, 2 w C]``, ``error [2 h, 2 w 2]``, others ``[2 h, 2 w]``; ``sums [2 h, 10]``."""
+    """Images to fill: colours ``[2 h, 2 w C]``, ``error [2 h, 2 w 2]``, others ``[2 h, 2 w]``; ``sums [2 h, 10]``."""
 
     diffuse: Floats
     specular: Floats
@@ -78,7 +78,7 @@ class Targets(NamedTuple):
 
 @compiled
 def _correct(closed: Any, change: Any, light: Any, moved: Any, image: Any) -> None:
-    """The closed form, more by ``moved``, with its correction, not below 0."""
+    """The closed form plus ``moved`` plus its correction, not below 0."""
     for j in range(image.size):
         value = closed[j] + moved[j] + change[j] * light[j]
         image[j] = value if value > ZERO else ZERO
@@ -86,7 +86,7 @@ def _correct(closed: Any, change: Any, light: Any, moved: Any, image: Any) -> No
 
 @compiled
 def spread(row: Any, gain: Any, place: int, image: Any) -> None:
-    """A row to every so many numbers of an image row, from ``place`` on; as many as make its size."""
+    """Write a row to an image row with a stride, from ``place`` on; the stride follows from the sizes."""
     step = image.size // row.size
     for j in range(row.size):
         image[step * j + place] = gain * row[j]

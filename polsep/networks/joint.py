@@ -1,14 +1,14 @@
-"""The joint network: a raw mosaic in, diffuse and specular out; demosaicking, closed form and refinement in one graph.
+"""The joint network: a raw mosaic in, diffuse and specular out, with demosaicking and the closed form inside.
 
 A mosaic is packed to quarter resolution: the 16 samples of a period become channels, so every pixel of the network
 sees the same filters. Stokes images come from the intensity guide (`guided.guide_once`) or, in less time, from a linear
 filter fitted to examples. The colour-affine closed form (`color_affine`) with windows of two sizes makes a first
-separation of these, with what clipping hid of highlights as far as unclipped samples tell. A U-Net of residual blocks,
-which sees samples, clip masks and the closed form, says how much of that one's specular light to believe and adds what
-is missing. The specular light is white by construction. Diffuse and specular sum to the network's own s0. Full
-resolution is half resolution with `details`.
+separation of these, and restores clipped highlights as far as unclipped samples determine them. A U-Net of residual
+blocks sees samples, clip masks and the closed form, scales the closed form's specular light and adds corrections. The
+specular light is white by construction. Diffuse and specular sum to the network's own s0. Full resolution is half
+resolution with `details`.
 
-Inputs and corrections are relative to the brightness around, so that a darker exposure of a scene gives a darker image
+Inputs and corrections are relative to the local brightness, so that a darker exposure of a scene gives a darker image
 of the same separation, as far as noise and clipping allow. There are no statistics of whole images: crop and frame
 agree away from the border.
 
@@ -230,7 +230,7 @@ class Joint(nn.Module):
         return ClosedForm(diffuse, specular, polarized, brightness, residual, polarization, clipped_s0, inputs)
 
     def _cells_of_colors(self) -> list[list[int]]:
-        """Which of a packed pixel's four cells, in reading order, are of each colour."""
+        """The cells of each colour among the four of a packed pixel, in reading order."""
         found = [min(self.layout.filter_at(2 * (k // 2), 2 * (k % 2))[1], self.colors - 1) for k in range(4)]
         return [[k for k in range(4) if found[k] == c] for c in range(self.colors)]
 
@@ -240,7 +240,7 @@ class Joint(nn.Module):
         return [1 - cells[own].amax(dim=0) for own in self._cells_of_colors()]
 
     def unclip(self, planes: Tensor, masks: Tensor, diffuse_polarization: Tensor) -> tuple[Tensor, Tensor]:
-        """What clipping hid: of the offset b ``[N, 2, h, w]``, and of every colour's s0 ``[N, C, h, w]``.
+        """Light that clipping hid: of the offset b ``[N, 2, h, w]``, and of every colour's s0 ``[N, C, h, w]``.
 
         In a packed pixel of four cells the samples that did not clip determine b and the cells' s0 for a given
         diffuse polarization
@@ -271,10 +271,10 @@ def _by_analyser(packed: Tensor) -> Tensor:
 
 
 def find_moments(stokes: tuple[tuple[Tensor, ...], ...], whole: list[Tensor]) -> Tensor:
-    """How the colours' s0 vary with their s1, s2 and s0, and how both of these do: means ``[N, 4, h, w]`` over cells.
+    """Covariances of the colours' s0 with their s1, s2 and s0, and variances of s1, s2: means ``[N, 4, h, w]`` over cells.
 
-    ``stokes``: s0, s1, s2, of every colour ``[N, 4, h, w]``; ``whole``: the colours that count, of every colour
-    ``[N, 1, h, w]``. They vary around their own mean, so one colour alone does not vary.
+    ``stokes``: s0, s1, s2, of every colour ``[N, 4, h, w]``; ``whole``: 1 for colours that count, of every colour
+    ``[N, 1, h, w]``. Deviations are from the mean over the colours, so one colour alone has none.
     """
     s0, s1, s2 = (_deviations(values, whole) for values in stokes)
     products = [[x * y for x, y in zip(s0, values, strict=True)] for values in (s1, s2, s0)]
@@ -283,7 +283,7 @@ def find_moments(stokes: tuple[tuple[Tensor, ...], ...], whole: list[Tensor]) ->
 
 
 def _deviations(values: tuple[Tensor, ...], whole: list[Tensor]) -> list[Tensor]:
-    """What whole colours differ from their mean; 0 for the others."""
+    """Deviations of whole colours from their mean; 0 for the others."""
     count = (_mean(whole) * len(whole)).clamp(min=1)
     mean = _mean([x * one for x, one in zip(values, whole, strict=True)]) * (len(whole) / count)
     return [(x - mean) * one for x, one in zip(values, whole, strict=True)]

@@ -1,9 +1,8 @@
-"""Twin of what surrounds the network in `joint.Joint.half_resolution`: from raw rows to its maps, and on to images.
+"""Kernels before the network of `joint.Joint`: from raw rows to the closed form and the network's inputs.
 
-One pass makes the network's input, the closed form of its module, row after row of packed pixels: rings hold the rows
-that windows look back on. Another adds the network's corrections and writes images and what a report takes. Words are
-those of `polsep.networks.joint`; rows are planar, ``[..., w]``, w packed pixels. Rows depend on nothing but the frame,
-so the number of threads changes no bit.
+One pass over the rows of packed pixels; ring buffers hold the rows that windows need. Names are those of `joint` and
+`channels`; rows are planar, ``[..., w]``, w packed pixels. A row depends only on the frame, so the number of threads
+changes no bit. `images_kernel` writes the images after the network.
 """
 
 from __future__ import annotations
@@ -41,24 +40,24 @@ from polsep.sensor.unpack_kernel import Samples, read_row
 
 Floats = NDArray[np.float32]
 
-#: Rows that rings keep: those from a row to the last one it waits for.
+#: Rows that rings keep: those from a row to the last one that it depends on.
 KEPT = 8
-#: How many rows behind the newest one a row is left: the light around, and half of the widest window.
+#: Rows between the newest one and the one that is finished: brightness around, and half of the widest window.
 REACH = 1 + WINDOWS[0] // 2
 _WIDE, _NARROW = (window // 2 for window in WINDOWS)
 _CONTRAST_WIDE, _CONTRAST_NARROW = (np.float32(least) for least in MIN_CONTRAST)
 _MIN_BRIGHTNESS, _TINY = np.float32(MIN_BRIGHTNESS), np.float32(1e-12)
-#: Rows of scratch, the last five of them for what clipping hid.
+#: Rows of scratch, the last five of them for light that clipping hid.
 _ROWS = 17
 
 
 class _Rings(NamedTuple):
-    """Rows on their way, by row number modulo `KEPT` or `SUMMED`; ``planes`` have a column more on both sides.
+    """Ring buffers of rows, by row number modulo `KEPT` or `SUMMED`; ``planes`` have a column more on both sides.
 
-    ``s0 [8, 4 C, w]``, ``cosine``, ``sine [8, 4, w]``: means over colours; ``moments [8, 4, w]``: of the colours'
-    deviations, s0 with s0, s1, s2 and what s1, s2 have. ``luminance``, ``light``, ``free [8, w]``; ``sums [16, 3, w]``.
-    ``room [channels, w]``: a row of the maps as bfloat16. ``clipped [8, w]``: as in `Maps`, of rows beyond the piece as
-    well, which another thread may be writing there.
+    ``s0 [8, 4 C, w]``; ``cosine``, ``sine [8, 4, w]``: means over colours; ``moments [8, 4, w]``: covariances of the
+    colours' s0 with s0, s1, s2, and the variance of s1, s2. ``luminance``, ``light``, ``free [8, w]``; ``sums [16, 3, w]``.
+    ``room [channels, w]``: a row of the maps as bfloat16. ``clipped [8, w]``: as in `Maps`, also of rows that
+    another thread writes there.
     """
 
     planes: Floats
@@ -122,7 +121,7 @@ def _enter(source: tuple[Samples, Pattern], u: int, piece: Piece, rings: _Rings,
 
 @compiled
 def _starts(u: int, h: int, size: int) -> Any:
-    """Where the rows around packed row ``u`` begin in a ring of rows of ``size``; the border's are repeated."""
+    """Starts of the rows around packed row ``u`` in a ring of rows of ``size``; the border's are repeated."""
     starts = np.empty(3, np.int64)
     for k in range(3):
         starts[k] = min(max(u - 1 + k, 0), h - 1) % KEPT * size
@@ -178,7 +177,7 @@ def _take_apart(rows: Any, s0: Any, polarized: Any) -> None:
 
 @compiled
 def _describe(colors: int, u: int, rings: _Rings, polarized: Any, spare: Any) -> None:
-    """What is kept of row ``u``: means over colours, the colours' moments, and the brightness."""
+    """Means over colours, the colours' moments, and the brightness of row ``u``, to their rings."""
     slot = u % KEPT
     moments = rings.moments[slot]
     for k in range(4):

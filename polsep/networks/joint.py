@@ -271,7 +271,7 @@ def _by_analyser(packed: Tensor) -> Tensor:
 
 
 def find_moments(stokes: tuple[tuple[Tensor, ...], ...], whole: list[Tensor]) -> Tensor:
-    """Covariances of the colours' s0 with their s1, s2 and s0, and variances of s1, s2: means ``[N, 4, h, w]`` over cells.
+    """Covariances of the colours' s0 with their s1, s2, s0, and variance of s1, s2; means over cells ``[N, 4, h, w]``.
 
     ``stokes``: s0, s1, s2, of every colour ``[N, 4, h, w]``; ``whole``: 1 for colours that count, of every colour
     ``[N, 1, h, w]``. Deviations are from the mean over the colours, so one colour alone has none.

@@ -55,7 +55,8 @@ class _Rings(NamedTuple):
     """Ring buffers of rows, by row number modulo `KEPT` or `SUMMED`; ``planes`` have a column more on both sides.
 
     ``s0 [8, 4 C, w]``; ``cosine``, ``sine [8, 4, w]``: means over colours; ``moments [8, 4, w]``: covariances of the
-    colours' s0 with s0, s1, s2, and the variance of s1, s2. ``luminance``, ``light``, ``free [8, w]``; ``sums [16, 3, w]``.
+    colours' s0 with s0, s1, s2, and the variance of s1, s2. ``luminance``, ``light``, ``free [8, w]``;
+    ``sums [16, 3, w]``.
     ``room [channels, w]``: a row of the maps as bfloat16. ``clipped [8, w]``: as in `Maps`, also of rows that
     another thread writes there.
     """

@@ -16,7 +16,7 @@ from polsep.bench.separation import bench_separation
 
 #: Code that formulas consist of, and that every method does.
 FORMULAS = ("polsep/physics", "polsep/sensor", "polsep/demosaic", "polsep/separation")
-SEPARATION = (*FORMULAS, "polsep/networks", "polsep/methods.py", "polsep/weights")
+SEPARATION = (*FORMULAS, "polsep/networks", "polsep/shipped.py", "polsep/methods.py", "polsep/weights")
 
 BENCHES: dict[str, Bench] = {
     "separation": Bench(bench_separation, measures=(*SEPARATION, "polsep/render")),

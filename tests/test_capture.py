@@ -396,7 +396,7 @@ def test_a_full_disk_is_said_and_whole_frames_stay(tmp_path: Path, monkeypatch: 
         self._raw = FullDisk(directory / RAW, int(2.5 * HEADER.frame_bytes))
 
     monkeypatch.setattr(RecordingWriter, "__init__", on_small_disk)
-    with pytest.raises(OutputError, match=r"expected to go on recording into .*, found: No space left on device"):
+    with pytest.raises(OutputError, match=r"expected to keep recording into .*, found: No space left on device"):
         run(Scripted([image(k) for k in range(9)]), CapturePlan(tmp_path, None))
     record = record_of(tmp_path)
     count = record["counters"]
@@ -422,7 +422,7 @@ def test_a_run_counts_what_the_wire_lost(tmp_path: Path) -> None:
     status, said = run(Scripted([*events, EndOfFrames()]), CapturePlan(tmp_path, None))
     assert status.counters == Counters(received=4, lost=2 + 2 + 2 + 1, recorded=4)
     assert [line["lost_before"] for line in index_of(tmp_path)] == [0, 2, 2, 2]
-    assert said[1:] == ["lost on the wire: a frame came incomplete; further losses are only counted"]
+    assert said[1:] == ["lost in transfer: a frame came incomplete; further losses are only counted"]
 
 
 def test_a_slow_disk_drops_the_oldest_and_counts_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -191,4 +191,4 @@ def test_frames_that_fail_are_counted(tmp_path: Path) -> None:
     assert status.counters.received == 5 and status.counters.lost >= 3  # the emulator skips ids when it is late
     lost_before = sum(line["lost_before"] for line in index_of(tmp_path / "take"))
     assert status.counters.lost == lost_before
-    assert any("lost on the wire: a frame came incomplete" in line for line in said)
+    assert any("lost in transfer: a frame came incomplete" in line for line in said)

@@ -1,39 +1,37 @@
-"""GenICam cameras through Aravis: GigE Vision and USB3 Vision of every vendor, without the vendor's software.
+"""GenICam cameras through Aravis: GigE Vision and USB3 Vision of every vendor, without vendor software.
 
-Aravis keeps the control channel alive and receives packets in threads of its own, outside Python; a frame is copied
-once, from its buffer into bytes. Tested with Aravis 0.8.26 (Debian 12).
+Aravis keeps the control channel alive and receives packets in its own threads, outside Python; a frame is copied once,
+from its buffer into bytes. Tested with Aravis 0.8.26 (Debian 12).
 """
 
 from __future__ import annotations
 
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
 from polsep.capture.sources import (
-    PATIENCE,
     CameraError,
     CameraInfo,
     CameraLost,
     CameraSettings,
     FrameIds,
     Loss,
+    SoftwareTrigger,
 )
-from polsep.io.raw.genicam import find_pixel_format
 from polsep.io.raw.recording import RawImage
 
 #: Buffers that Aravis fills while Python is busy: 1.6 s at 10 frames per second.
 BUFFERS = 16
-#: Longest time in microseconds that Aravis waits for the missing packets of a frame; its own 200 ms are short on a
-#: machine that is busy.
+#: Longest time in microseconds that Aravis waits for the missing packets of a frame; its default of 200 ms is too
+#: short on a busy machine.
 RETENTION_US = 1_000_000
 
 
 def load_aravis() -> tuple[Any, type[Exception]]:
-    """The library and the exception that it raises. Raises CameraError, with what to install, where it is missing."""
+    """The library and the exception that it raises. Raises CameraError that says what to install."""
     try:
         import gi
 
@@ -48,15 +46,15 @@ def load_aravis() -> tuple[Any, type[Exception]]:
 
 
 def list_aravis() -> list[tuple[str, str]]:
-    """Name and description of every camera that Aravis finds; takes about a second. Raises CameraError."""
+    """Id and description of every camera that Aravis finds, in about a second. Raises CameraError."""
     aravis, _ = load_aravis()
     aravis.update_device_list()
-    found = []
+    cameras = []
     for k in range(aravis.get_n_devices()):
         vendor, model = aravis.get_device_vendor(k), aravis.get_device_model(k)
         serial, address = aravis.get_device_serial_nbr(k), aravis.get_device_address(k)
-        found.append((aravis.get_device_id(k), f"{vendor} {model}, serial {serial}, at {address}"))
-    return found
+        cameras.append((aravis.get_device_id(k), f"{vendor} {model}, serial {serial}, at {address}"))
+    return cameras
 
 
 class AravisSource:
@@ -69,12 +67,17 @@ class AravisSource:
 
     @contextmanager
     def connect(self) -> Iterator[_AravisCamera]:
-        """Connect, set, and hand over; the camera stops and is let go of on the way out."""
+        """Connect and apply the settings; stop and release the camera on exit."""
         try:
             camera = _AravisCamera(self._aravis, self._error, self._aravis.Camera.new(self._name), self._settings)
         except (ValueError, self._error) as error:
-            traceback.clear_frames(error.__traceback__)  # a camera that lives on there would refuse the next connection
-            raise CameraError(f"{self._name}: {_refused(error)}") from None
+            traceback.clear_frames(error.__traceback__)  # a camera kept alive there would refuse the next connection
+            reason = (
+                str(error)
+                if isinstance(error, ValueError)
+                else f"expected a camera that does as asked, found: {_line(error)}"
+            )
+            raise CameraError(f"{self._name}: {reason}") from None
         try:
             yield camera
         finally:
@@ -89,15 +92,12 @@ class _AravisCamera:
         self._device, self._stream = device, None
         self._ids, self._gone = FrameIds(), threading.Event()
         _apply(aravis, device, settings)
-        self._software = settings.trigger == "Software"
-        self._period, self._due = 1 / (settings.frame_rate_hz or 1.0), 0.0
+        self._trigger = SoftwareTrigger(settings)
         self._code = device.get_pixel_format()
         self.info = _describe(device, settings)
-        fmt = find_pixel_format(self.info.pixel_format)
-        self._bytes = fmt.frame_bytes(self.info.width, self.info.height)
 
     def start(self) -> None:
-        """Make the stream and begin to acquire."""
+        """Create the stream and start acquisition."""
         gone = self._gone
         try:
             self._stream = stream = self._device.create_stream(None, None)
@@ -110,61 +110,52 @@ class _AravisCamera:
             self._device.get_device().connect("control-lost", lambda _: gone.set())
             self._device.start_acquisition()
         except self._error as error:
-            raise CameraLost(_say(error)) from None
-        self._due = time.monotonic()
+            raise CameraLost(_line(error)) from None
+        self._trigger.start()
 
     def read(self, timeout_s: float) -> RawImage | Loss | None:
-        """The next frame that Aravis has finished with, whole or not."""
+        """The next frame from Aravis, complete or not."""
         assert self._stream is not None, "expected a camera that was started"
         if self._gone.is_set():
             raise CameraLost("the control channel is closed")
-        if self._software:
-            self._trigger()
+        if self._trigger.is_due():
+            try:
+                self._device.software_trigger()
+            except self._error as error:
+                raise CameraLost(_line(error)) from None
         buffer = self._stream.timeout_pop_buffer(int(timeout_s * 1e6))
         if buffer is None:
             return None
         try:
-            return self._take(buffer)
+            return self._read_buffer(buffer)
         finally:
             self._stream.push_buffer(buffer)
 
     def stop(self) -> None:
-        """Stop, and let go of the camera, which may be gone already."""
+        """Stop and release the camera, which may be gone already."""
         with suppress(self._error):
             self._device.stop_acquisition()
         self._stream = None
         self._device = None
 
-    def _trigger(self) -> None:
-        """A software trigger, when one is due."""
-        if time.monotonic() < self._due:
-            return
-        self._due = max(self._due + self._period, time.monotonic())
-        try:
-            self._device.software_trigger()
-        except self._error as error:
-            raise CameraLost(_say(error)) from None
-
-    def _take(self, buffer: Any) -> RawImage | Loss:
-        """What a buffer holds."""
+    def _read_buffer(self, buffer: Any) -> RawImage | Loss:
+        """The frame in a buffer."""
         frame_id, status = buffer.get_frame_id(), buffer.get_status()
         if status != self._aravis.BufferStatus.SUCCESS:
             return Loss(f"a frame came incomplete ({status.value_nick})")
-        width, height = buffer.get_image_width(), buffer.get_image_height()
-        code, data = buffer.get_image_pixel_format(), buffer.get_image_data()
-        if (width, height, code) != (self.info.width, self.info.height, self._code) or len(data) < self._bytes:
-            raise CameraError(
-                f"expected frames of {self.info.width}x{self.info.height} {self.info.pixel_format} ({self._bytes} "
-                f"bytes), found {width}x{height} in format 0x{code:08X} ({len(data)} bytes)"
-            )
-        if any(buffer.get_image_padding()):
-            raise CameraError("expected rows without padding, found padded ones: choose a width in whole bytes")
+        code = buffer.get_image_pixel_format()
+        name = self.info.pixel_format if code == self._code else f"in format 0x{code:08X}"
+        found, padded = (
+            f"{buffer.get_image_width()}x{buffer.get_image_height()} {name}",
+            any(buffer.get_image_padding()),
+        )
+        payload = self.info.take_payload(buffer.get_image_data(), found, padded)
         stamp = buffer.get_timestamp() or buffer.get_system_timestamp()
-        return RawImage(data[: self._bytes], frame_id, stamp, self._ids.lost_before(frame_id))
+        return RawImage(payload, frame_id, stamp, self._ids.lost_before(frame_id))
 
 
 def _apply(aravis: Any, device: Any, settings: CameraSettings) -> None:
-    """Set what was asked for, in an order in which later settings do not undo earlier ones."""
+    """Apply the settings, in an order in which later ones do not undo earlier ones."""
     device.set_range_check_policy(aravis.RangeCheckPolicy.ENABLE)
     device.set_acquisition_mode(aravis.AcquisitionMode.CONTINUOUS)
     for name, value in settings.features:
@@ -191,7 +182,7 @@ def _apply(aravis: Any, device: Any, settings: CameraSettings) -> None:
 
 
 def _set_trigger(device: Any, trigger: str) -> None:
-    """Free running, or frames that wait for a source by the camera's name for it."""
+    """Set free running, or a trigger source by the camera's name for it."""
     device.clear_triggers()
     if trigger == "off":
         return
@@ -202,7 +193,7 @@ def _set_trigger(device: Any, trigger: str) -> None:
 
 
 def _set_within(name: str, unit: str, value: float, bounds: Any, put: Callable[[float], None]) -> None:
-    """Set a number; Aravis itself does not mind one that the camera cannot take."""
+    """Set a number after a check of its range, which Aravis itself does not make."""
     low, high = bounds
     if not low <= value <= high:
         raise CameraError(f"expected {name} in {low:g} .. {high:g} {unit}, found {value:g}")
@@ -212,26 +203,18 @@ def _set_within(name: str, unit: str, value: float, bounds: Any, put: Callable[[
 def _describe(device: Any, settings: CameraSettings) -> CameraInfo:
     """The camera as it is now."""
     region = device.get_region()
-    asked: dict[str, Any] = {"trigger": settings.trigger, "features": dict(settings.features)}
+    reported: dict[str, Any] = {"trigger": settings.trigger, "features": dict(settings.features)}
     if device.is_exposure_time_available():
-        asked["exposure_us"] = device.get_exposure_time()
+        reported["exposure_us"] = device.get_exposure_time()
     if device.is_gain_available():
-        asked["gain_db"] = device.get_gain()
+        reported["gain_db"] = device.get_gain()
     if device.is_frame_rate_available():
-        asked["frame_rate_hz"] = device.get_frame_rate()
-    period = 1 / (settings.frame_rate_hz or asked.get("frame_rate_hz") or 1.0)
-    patience = float("inf") if settings.triggered else PATIENCE + period + asked.get("exposure_us", 0.0) * 1e-6
+        reported["frame_rate_hz"] = device.get_frame_rate()
+    patience_s = settings.patience_s(reported.get("frame_rate_hz"), reported.get("exposure_us"))
     name = " ".join((device.get_vendor_name(), device.get_model_name(), device.get_device_serial_number()))
-    return CameraInfo(name, region.width, region.height, device.get_pixel_format_as_string(), asked, patience)
+    return CameraInfo(name, region.width, region.height, device.get_pixel_format_as_string(), reported, patience_s)
 
 
-def _refused(error: Exception) -> str:
-    """Why a camera could not be had, or not as asked."""
-    if isinstance(error, ValueError):
-        return str(error)
-    return f"expected a camera that does as asked, found: {_say(error)}"
-
-
-def _say(error: Exception) -> str:
-    """What GLib says, in one line."""
+def _line(error: Exception) -> str:
+    """The message of GLib in one line."""
     return " ".join(str(getattr(error, "message", error)).split())

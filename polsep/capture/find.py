@@ -1,4 +1,4 @@
-"""Which camera is meant: names on the command line to sources, and the list of what there is."""
+"""Camera sources by their names on the command line, and the list of connected cameras."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BACKENDS = {"aravis": Backend(list_aravis, AravisSource), "pylon": Backend(list_
 
 
 class Listing(NamedTuple):
-    """What was found: cameras by name (``aravis:ID``) with a description, and backends with why they found none."""
+    """Cameras by name (``aravis:ID``) with a description, and unusable backends with the reason."""
 
     cameras: dict[str, str]
     missing: dict[str, str]
@@ -63,7 +63,7 @@ def find_source(name: str | None, settings: CameraSettings) -> CameraSource:
 
 
 def _expected(name: str | None, found: Listing) -> str:
-    """Why no camera was chosen."""
+    """The message that no camera, or more than one, matches."""
     there = ", ".join(found.cameras) or "none"
     without = "".join(f"; {backend} is not usable: {reason}" for backend, reason in found.missing.items())
     if name is None:

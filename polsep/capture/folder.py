@@ -18,9 +18,9 @@ from polsep.io.raw.recording import RECORD, RawImage, read_header, read_images
 from polsep.io.raw.sequences import natural_order
 from polsep.io.store.errors import input_error, naming
 
-#: Kinds of files that describe themselves, so that their codes can be sent without being told anything.
+#: Extensions of files that describe themselves, so that their codes need no settings.
 KINDS = (".png", ".tif", ".tiff", ".npy", ".pgm")
-#: Frames per second where no rate is said.
+#: Frames per second without a rate in the settings.
 RATE_HZ = 10.0
 
 
@@ -28,18 +28,18 @@ class FolderSource:
     """Frames of files as `read_pages` finds them, in natural order (2 before 10), or of a recording, byte for byte.
 
     Codes of 8 bits become BayerRG8, wider ones BayerRG10, 12 or 16 by the file's white level; the settings' pixel
-    format, which may be a packed one, goes before. All frames must have one size. Files have no exposure to set.
+    format, which may be a packed one, overrides this. All frames must have one size. Files have no exposure to set.
     """
 
     def __init__(self, path: Path, settings: CameraSettings, loop: bool = False) -> None:
-        """Look at what is there. Raises CameraError when it holds no frames or a setting is a camera's own."""
-        asked = {
+        """List the files. Raises CameraError if there are no frames, or on settings that only cameras have."""
+        camera_only = {
             "exposure": settings.exposure_us,
             "gain": settings.gain_db,
             "trigger": settings.trigger,
             "features": settings.features or None,
         }
-        for name, value in asked.items():
+        for name, value in camera_only.items():
             if value is not None:
                 raise CameraError(f"{path}: expected a camera to set its {name}, found files")
         self._path, self._settings, self._loop = path, settings, loop
@@ -47,7 +47,7 @@ class FolderSource:
 
     @contextmanager
     def connect(self) -> Iterator[_Files]:
-        """A camera that starts at the first frame."""
+        """Connect a camera that starts at the first frame."""
         yield _Files(self._path.name or str(self._path), self._frames(), self._settings.frame_rate_hz or RATE_HZ)
 
     def _frames(self) -> Iterator[tuple[bytes, CameraInfo]]:
@@ -82,11 +82,11 @@ class _Files:
         self._count, self._due = 0, 0.0
 
     def start(self) -> None:
-        """The first frame is due now."""
+        """Make the first frame due now."""
         self._due = time.monotonic()
 
     def read(self, timeout_s: float) -> RawImage | None:
-        """The next frame, no sooner than it is due. Files that are slower than the rate just come later."""
+        """The next frame, not before it is due; later where reading is slower than the rate."""
         wait = self._due - time.monotonic()
         if wait > timeout_s:
             time.sleep(timeout_s)
@@ -95,9 +95,9 @@ class _Files:
         if self._next is None:
             raise EndOfFrames
         (payload, info), self._next = self._next, None
-        found, expected = (f"{i.width}x{i.height} {i.pixel_format}" for i in (info, self.info))
-        if found != expected:
-            raise input_error(info.name, f"expected {expected} as in the frames before, found {found}")
+        if info.describe() != self.info.describe():
+            expected = f"expected {self.info.describe()} as in the frames before"
+            raise input_error(info.name, f"{expected}, found {info.describe()}")
         image = RawImage(payload, self._count, time.time_ns())
         self._count += 1
         self._due = max(self._due + self._period, time.monotonic())
@@ -120,14 +120,14 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def _recorded(path: Path) -> Iterator[tuple[bytes, CameraInfo]]:
-    """The payloads of a recording."""
+    """Frames of a recording."""
     header = read_header(path)
     for image in read_images(path):
         yield image.payload, CameraInfo(str(path), header.width, header.height, header.pixel_format)
 
 
 def _pixel_format(page: Page) -> str:
-    """The colour format that holds a page's codes."""
+    """The colour pixel format for the codes of a page."""
     if page.array.dtype == np.uint8:
         return "BayerRG8"
     return {1023.0: "BayerRG10", 4095.0: "BayerRG12"}.get(page.white_level or 0.0, "BayerRG16")

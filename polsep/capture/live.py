@@ -1,6 +1,6 @@
-"""The newest frame, separated and shown as a picture, as fast as the machine has time for it.
+"""The live view: the newest frame, separated and drawn, as often as the machine can.
 
-What is shown comes from the same functions as `polsep separate` uses on the recording, so both agree sample by sample.
+The same functions separate here and in `polsep separate`, so both agree sample by sample.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout
 from polsep.separation.report import SeparatedFrame
 
-#: Added to the live view's nice value on Linux: receiving and recording go before it.
+#: Added to the nice value of the live view on Linux: receiving and recording have priority.
 NICENESS = 5
 
 
 @dataclass(frozen=True)
 class Shown:
-    """The latest picture: a JPEG file's bytes, the frame's id, the light's polarizer [degrees], what is remarkable."""
+    """The latest picture: bytes of a JPEG file, id of the frame, angle of the light's polarizer [degrees], remarks."""
 
     jpeg: bytes
     frame_id: int
@@ -38,7 +38,7 @@ class Shown:
 
 
 class LiveView:
-    """Separates frames one at a time and keeps the latest picture, in memory and, where there is one, in a file."""
+    """Separation of one frame at a time; the latest picture is kept in memory and, if given, in a file."""
 
     def __init__(self, method: str, layout: Layout | None = None, picture: Path | None = None) -> None:
         self._method, self._layout, self._picture = method, layout, picture
@@ -46,20 +46,20 @@ class LiveView:
         self.latest: Shown | None = None
 
     def warm_up(self, info: CameraInfo) -> None:
-        """Do what the first frame would wait for, on a black one. Raises ValueError when the method cannot take it."""
+        """Separate a black frame, to compile and load. Raises ValueError if the method does not fit the frames."""
         lower_priority()
         self._options = ReadOptions(self._layout, size=(info.width, info.height), pixel_format=info.pixel_format)
         self.separate(bytes(find_pixel_format(info.pixel_format).frame_bytes(info.width, info.height)))
 
     def separate(self, payload: bytes) -> tuple[SeparatedFrame, tuple[str, ...]]:
-        """One frame, and what is remarkable about it."""
+        """One separated frame, and remarks on it."""
         data, notes = decode_frame(payload, self._options)
         frame = separate_capture(data, self._method)
         remarks = (*notes, *frame.report["warnings"])
         return frame, tuple(advise(remark, self._options.pixel_format or "") for remark in remarks)
 
     def show(self, image: RawImage) -> Shown:
-        """Separate a frame and replace the picture, as a whole."""
+        """Separate a frame and replace the picture atomically."""
         frame, remarks = self.separate(image.payload)
         light = float(frame.report["statistics"]["light_polarizer_deg"])
         shown = Shown(encode_jpeg(live_sheet(frame)), image.frame_id, light, remarks)
@@ -70,18 +70,18 @@ class LiveView:
 
 
 def advise(remark: str, pixel_format: str) -> str:
-    """A remark that advises a white level, which cameras do not have: it is that of a pixel format with other bits."""
+    """Advise a pixel format where a remark advises a white level, which cameras do not have."""
     found = re.fullmatch(r"(.*); say --white-level (\d+) if so", remark)
     if found is None:
         return remark
     bits = int(found[2]).bit_length()
-    if int(found[2]) != 2**bits - 1:  # codes in the upper bits, which no format's name says
+    if int(found[2]) != 2**bits - 1:  # codes in the upper bits: no format has such a name
         return found[1]
     return f"{found[1]}; say --pixel-format {re.sub(r'[0-9]+[a-z]*$', str(bits), pixel_format)} if so"
 
 
 def lower_priority() -> None:
-    """Let other threads go before this one and those it starts, where the system can do that for one thread."""
+    """Lower the priority of this thread and of those it starts, on Linux."""
     if sys.platform == "linux":
         thread = threading.get_native_id()
         nice = os.getpriority(os.PRIO_PROCESS, thread)

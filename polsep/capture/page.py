@@ -1,7 +1,7 @@
-"""A page for this machine's own browser: the live picture, made anew as soon as there is another.
+"""A page with the live picture for a browser on this machine.
 
-The server listens on 127.0.0.1 alone and answers requests that name it so, which keeps other machines, and other
-sites' scripts in the same browser, away. It reads no files.
+The server listens on 127.0.0.1 only and requires that name in requests, which keeps out other machines, and scripts of
+other sites in the same browser. It reads no files.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ look();
 
 @contextmanager
 def serve_page(port: int, latest: Callable[[], Shown | None], line: Callable[[], str]) -> Iterator[str]:
-    """Serve the page while the block runs, and give its address; port 0 takes a free one.
+    """Serve the page inside the block and yield its address; port 0 picks a free one.
 
-    Raises CameraError when the port is taken.
+    Raises CameraError if the port is in use.
     """
 
     class Handler(BaseHTTPRequestHandler):
-        """Answers for the page, its picture and its state."""
+        """Responses for the page, its picture and its state."""
 
         def do_GET(self) -> None:
-            """One of three things."""
+            """Send the page, the state or the picture."""
             name = self.path.partition("?")[0]
             shown = latest()
             if self.headers.get("Host", "").rpartition(":")[0] not in (HOST, "localhost"):
@@ -75,7 +75,7 @@ def serve_page(port: int, latest: Callable[[], Shown | None], line: Callable[[],
             self.wfile.write(body)
 
         def log_message(self, format: str, *args: Any) -> None:
-            """Say nothing: the terminal is for the capture."""
+            """Log nothing: the terminal shows the capture."""
 
     try:
         server = ThreadingHTTPServer((HOST, port), Handler)

@@ -1,8 +1,8 @@
-"""Basler's cameras, and its camera emulator, through pypylon.
+"""Basler cameras, and Basler's camera emulator, through pypylon.
 
-With PYLON_CAMEMU=N in the environment there are N emulated cameras and nothing else is looked for, so that no network
-is searched. The emulator replays image files: features ImageFileMode=On, ImageFilename=FOLDER, TestImageSelector=Off.
-Codes of formats of 10 or 12 bits it takes from the high bits of 16-bit files. Tested with pypylon 26.9.
+With PYLON_CAMEMU=N in the environment there are N emulated cameras and no network is searched. The emulator replays
+image files: features ImageFileMode=On, ImageFilename=FOLDER, TestImageSelector=Off. For formats of 10 or 12 bits it
+reads the high bits of 16-bit files. Tested with pypylon 26.9.
 """
 
 from __future__ import annotations
@@ -15,26 +15,25 @@ from contextlib import contextmanager
 from typing import Any
 
 from polsep.capture.sources import (
-    PATIENCE,
     CameraError,
     CameraInfo,
     CameraLost,
     CameraSettings,
     FrameIds,
     Loss,
+    SoftwareTrigger,
 )
-from polsep.io.raw.genicam import find_pixel_format
 from polsep.io.raw.recording import RawImage
 
 #: Buffers that pylon fills while Python is busy.
 BUFFERS = 16
-#: Names of one feature in the Standard Features Naming Convention and before it.
+#: Names of each feature in the Standard Features Naming Convention and before it.
 EXPOSURE, GAIN = ("ExposureTime", "ExposureTimeAbs"), ("Gain",)
 RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
 
 
 def load_pylon() -> tuple[Any, Any]:
-    """The modules pylon and genicam. Raises CameraError, with what to install, where they are missing."""
+    """The modules pylon and genicam. Raises CameraError that says what to install."""
     try:
         with warnings.catch_warnings():  # its types warn on Python 3.11, and crash where warnings are errors
             warnings.simplefilter("ignore")
@@ -52,7 +51,7 @@ def list_pylon() -> list[tuple[str, str]]:
     try:
         return [(info.GetSerialNumber(), f"{info.GetFriendlyName()}, {info.GetDeviceClass()}") for info in _find(pylon)]
     except genicam.GenericException as error:
-        raise CameraError(f"expected pylon to list cameras, found: {_say(error)}") from None
+        raise CameraError(f"expected pylon to list cameras, found: {_line(error)}") from None
 
 
 class PylonSource:
@@ -65,7 +64,7 @@ class PylonSource:
 
     @contextmanager
     def connect(self) -> Iterator[_PylonCamera]:
-        """Connect, set, and hand over; the camera stops and is let go of on the way out."""
+        """Connect and apply the settings; stop and release the camera on exit."""
         device = None
         try:
             found = [info for info in _find(self._pylon) if info.GetSerialNumber() == self._name]
@@ -77,7 +76,7 @@ class PylonSource:
         except self._genicam.GenericException as error:
             if device is not None:
                 device.Close()
-            raise CameraError(f"{self._name}: expected a camera, found: {_say(error)}") from None
+            raise CameraError(f"{self._name}: expected a camera, found: {_line(error)}") from None
         try:
             yield camera
         finally:
@@ -92,53 +91,43 @@ class _PylonCamera:
         self._ids = FrameIds()
         nodes = device.GetNodeMap()
         _apply(genicam, nodes, settings)
-        self._software = settings.trigger == "Software"
-        self._period, self._due = 1 / (settings.frame_rate_hz or 1.0), 0.0
+        self._trigger = SoftwareTrigger(settings)
         self.info = _describe(genicam, device, settings)
-        fmt = find_pixel_format(self.info.pixel_format)
-        self._bytes = fmt.frame_bytes(self.info.width, self.info.height)
 
     def start(self) -> None:
-        """Begin to acquire, every frame in its turn."""
+        """Start acquisition of every frame in order."""
         try:
             self._device.MaxNumBuffer.SetValue(BUFFERS)
             self._device.StartGrabbing(self._pylon.GrabStrategy_OneByOne)
         except self._genicam.GenericException as error:
-            raise CameraLost(_say(error)) from None
-        self._due = time.monotonic()
+            raise CameraLost(_line(error)) from None
+        self._trigger.start()
 
     def read(self, timeout_s: float) -> RawImage | Loss | None:
-        """The next frame that pylon has finished with, whole or not."""
+        """The next frame from pylon, complete or not."""
         try:
             if self._device.IsCameraDeviceRemoved():
                 raise CameraLost("the camera was removed")
-            if self._software and time.monotonic() >= self._due:
-                self._due = max(self._due + self._period, time.monotonic())
+            if self._trigger.is_due():
                 self._device.ExecuteSoftwareTrigger()
             with self._device.RetrieveResult(int(timeout_s * 1000), self._pylon.TimeoutHandling_Return) as result:
-                return self._take(result) if result.IsValid() else None
+                return self._read_result(result) if result.IsValid() else None
         except self._genicam.GenericException as error:
-            raise CameraLost(_say(error)) from None
+            raise CameraLost(_line(error)) from None
 
-    def _take(self, result: Any) -> RawImage | Loss:
-        """What a grab result holds."""
+    def _read_result(self, result: Any) -> RawImage | Loss:
+        """The frame in a grab result."""
         if not result.GrabSucceeded():
             return Loss(f"a frame came incomplete ({' '.join(result.GetErrorDescription().split())})")
-        width, height, data = result.GetWidth(), result.GetHeight(), bytes(result.GetBuffer())
-        if (width, height) != (self.info.width, self.info.height) or len(data) < self._bytes:
-            raise CameraError(
-                f"expected frames of {self.info.width}x{self.info.height} {self.info.pixel_format} ({self._bytes} "
-                f"bytes), found {width}x{height} ({len(data)} bytes)"
-            )
-        if result.GetPaddingX():
-            raise CameraError("expected rows without padding, found padded ones: choose a width in whole bytes")
+        found = f"{result.GetWidth()}x{result.GetHeight()} {self.info.pixel_format}"
+        payload = self.info.take_payload(bytes(result.GetBuffer()), found, result.GetPaddingX() > 0)
         stamp = result.GetTimeStamp() or time.time_ns()  # the emulator has no clock
         frame_id = result.GetBlockID()
-        return RawImage(data[: self._bytes], frame_id, stamp, self._ids.lost_before(frame_id))
+        return RawImage(payload, frame_id, stamp, self._ids.lost_before(frame_id))
 
 
 def _find(pylon: Any) -> list[Any]:
-    """Every camera, or the emulated ones alone where there are any."""
+    """Every camera, or only the emulated ones where there are any."""
     factory = pylon.TlFactory.GetInstance()
     if not os.environ.get("PYLON_CAMEMU"):
         return list(factory.EnumerateDevices())
@@ -148,7 +137,7 @@ def _find(pylon: Any) -> list[Any]:
 
 
 def _apply(genicam: Any, nodes: Any, settings: CameraSettings) -> None:
-    """Set what was asked for."""
+    """Apply the settings."""
     for name, value in settings.features:
         _set(genicam, nodes, (name,), value)
     if settings.pixel_format is not None:
@@ -168,7 +157,7 @@ def _apply(genicam: Any, nodes: Any, settings: CameraSettings) -> None:
 
 
 def _set(genicam: Any, nodes: Any, names: tuple[str, ...], value: float | str) -> None:
-    """Set the first of the features that the camera has. Raises CameraError when it has none or takes no such value."""
+    """Set the first of the features that the camera has. Raises CameraError if it has none or refuses the value."""
     node = next((node for node in map(nodes.GetNode, names) if node is not None and genicam.IsWritable(node)), None)
     if node is None:
         raise CameraError(f"expected a camera with the feature {names[0]}, found none that can be set")
@@ -178,11 +167,8 @@ def _set(genicam: Any, nodes: Any, names: tuple[str, ...], value: float | str) -
         else:
             node.SetValue(value)
     except genicam.GenericException as error:
-        raise CameraError(f"expected a camera that takes {names[0]} {_text(value)}, found: {_say(error)}") from None
-
-
-def _text(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.12g}"
+        text = value if isinstance(value, str) else f"{value:.12g}"
+        raise CameraError(f"expected a camera that takes {names[0]} {text}, found: {_line(error)}") from None
 
 
 def _read(genicam: Any, nodes: Any, names: tuple[str, ...]) -> float | None:
@@ -197,15 +183,14 @@ def _describe(genicam: Any, device: Any, settings: CameraSettings) -> CameraInfo
     """The camera as it is now."""
     nodes = device.GetNodeMap()
     exposure, rate = _read(genicam, nodes, EXPOSURE), _read(genicam, nodes, RATE)
-    asked = {"trigger": settings.trigger, "features": dict(settings.features), "exposure_us": exposure}
-    asked |= {"gain_db": _read(genicam, nodes, GAIN), "frame_rate_hz": rate}
-    period = 1 / (settings.frame_rate_hz or rate or 1.0)
-    patience = float("inf") if settings.triggered else PATIENCE + period + (exposure or 0.0) * 1e-6
+    reported = {"trigger": settings.trigger, "features": dict(settings.features), "exposure_us": exposure}
+    reported |= {"gain_db": _read(genicam, nodes, GAIN), "frame_rate_hz": rate}
+    patience_s = settings.patience_s(rate, exposure)
     width, height = (int(nodes.GetNode(side).GetValue()) for side in ("Width", "Height"))
     pixel_format = nodes.GetNode("PixelFormat").ToString()
-    return CameraInfo(device.GetDeviceInfo().GetFriendlyName(), width, height, pixel_format, asked, patience)
+    return CameraInfo(device.GetDeviceInfo().GetFriendlyName(), width, height, pixel_format, reported, patience_s)
 
 
-def _say(error: Exception) -> str:
-    """What GenApi says, in one line, without the place in its source."""
+def _line(error: Exception) -> str:
+    """The message of GenApi in one line, without the place in its source."""
     return " ".join(str(error).split()).partition(" : ")[0]

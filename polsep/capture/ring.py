@@ -10,9 +10,9 @@ Item = TypeVar("Item")
 
 
 class Ring(Generic[Item]):
-    """Keeps the newest ``capacity`` items in order; putting into a full ring drops the oldest and counts it.
+    """The newest ``capacity`` items in order; a full ring drops its oldest item and counts it.
 
-    At any time put = taken + dropped + waiting. A capacity of 1 is "the newest one". Raises ValueError on less.
+    At any time put = taken + dropped + waiting. A capacity of 1 holds the newest item. Raises ValueError on less.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -23,7 +23,7 @@ class Ring(Generic[Item]):
         self._changed = threading.Condition()
 
     def put(self, item: Item) -> None:
-        """Append an item, never waiting. Raises ValueError when the ring is closed."""
+        """Append an item without waiting. Raises ValueError if the ring is closed."""
         with self._changed:
             if self._closed:
                 raise ValueError("expected an open ring, found it closed")
@@ -34,29 +34,29 @@ class Ring(Generic[Item]):
             self._changed.notify()
 
     def take(self, timeout_s: float) -> Item | None:
-        """The oldest item; None when none comes in that time or the ring is `finished`."""
+        """Remove and return the oldest item; None if none comes in that time or the ring is `finished`."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._closed, timeout_s)
             return self._items.popleft() if self._items else None
 
     def close(self) -> None:
-        """No more items will be put; those that wait can still be taken."""
+        """Accept no more items; those in the ring can still be taken."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     @property
     def finished(self) -> bool:
-        """True when the ring is closed and empty: there is nothing left to wait for."""
+        """True if the ring is closed and empty."""
         with self._changed:
             return self._closed and not self._items
 
     @property
     def waiting(self) -> int:
-        """Items that are in the ring."""
+        """Number of items in the ring."""
         return len(self._items)
 
     @property
     def dropped(self) -> int:
-        """Items that left it unseen."""
+        """Number of items dropped."""
         return self._dropped

@@ -1,11 +1,11 @@
-"""One run of a camera: three threads that never wait for each other, and what they count.
+"""One run of a camera: three threads that never wait for each other, and their counters.
 
     camera -> acquisition -+-> ring of N frames -> recorder -> DIR/frames.raw
                            +-> ring of 1 frame  -> live view -> DIR/live.jpg, page
 
-The acquisition puts every frame into both rings. The recorder's drops its oldest frame when the disk is slower than the
-camera for longer than N frames; the live view's always holds the newest. In the end received = recorded + dropped.
-A camera that is lost is asked for every second, and the same recording goes on when it is back.
+The acquisition puts every frame into both rings. The recorder's ring drops its oldest frame when the disk is slower
+than the camera for longer than N frames; the ring of the live view always holds the newest. At the end received =
+recorded + dropped. After a camera is lost, connecting is tried every second, and the same recording continues.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from polsep.io.raw.recording import PICTURE, Header, RawImage, RecordingWriter, 
 from polsep.io.store.atomic import OutputError
 from polsep.sensor.camera import Layout
 
-#: Seconds between attempts to connect to a camera that was lost.
+#: Seconds between attempts to connect to a lost camera.
 RETRY_S = 1.0
-#: Longest wait of a thread before it looks whether it should stop.
+#: Longest wait of a thread before it checks whether to stop.
 TICK_S = 0.2
 
 
 @dataclass(frozen=True)
 class Limits:
-    """When a run ends, by itself: after so many seconds of acquisition or frames received, whichever is first; or when
-    a lost camera is not back within ``timeout_s``. ``ring``: frames kept while the disk is busy. ValueError otherwise.
+    """Limits of a run: seconds of acquisition or frames received, whichever is first; or a camera lost for
+    ``timeout_s``. ``ring``: frames buffered while the disk is busy. Raises ValueError on numbers of 0 or less.
     """
 
     seconds: float | None = None
@@ -54,9 +54,9 @@ class Limits:
 
 @dataclass(frozen=True)
 class CapturePlan:
-    """What to do with the frames: record into ``output``, separate with ``method``, serve a page on ``port``.
+    """What is done with the frames: record into ``output``, separate with ``method``, serve a page on ``port``.
 
-    None leaves each of them out. ``layout``: of the mosaic, None for what the pixel format's name says.
+    None leaves each of them out. ``layout``: of the mosaic; None derives it from the name of the pixel format.
     """
 
     output: Path | None = None
@@ -68,7 +68,7 @@ class CapturePlan:
 
 @dataclass
 class Counters:
-    """Frames received whole, lost on the wire, dropped by a full ring, recorded, shown; interruptions and their time.
+    """Frames received complete, lost in transfer, dropped by a full ring, recorded, shown; interruptions.
 
     Each number is written by one thread only.
     """
@@ -84,7 +84,7 @@ class Counters:
 
 @dataclass(frozen=True)
 class Status:
-    """Where a run stands: seconds of acquisition, frames per second of late, counters, the light's polarizer."""
+    """State of a run: seconds of acquisition, recent frames per second, counters, angle of the light's polarizer."""
 
     seconds: float
     rate_hz: float
@@ -92,7 +92,7 @@ class Status:
     light_deg: float | None = None
 
     def line(self) -> str:
-        """All of it for the terminal."""
+        """The status as one line for the terminal."""
         count = self.counters
         light = "" if self.light_deg is None else f", light {self.light_deg:.0f} deg"
         away = f", {count.interruptions} interruptions ({count.away_s:.1f} s)" if count.interruptions else ""
@@ -103,13 +103,13 @@ class Status:
 
 
 class Session:
-    """The state that the threads of one run share; `run` is all there is to call."""
+    """The state that the threads of one run share; callers only use `run`, `stop` and `status`."""
 
-    def __init__(self, source: CameraSource, plan: CapturePlan, limits: Limits, say: Callable[[str], None]) -> None:
-        """``say`` takes lines for the user. Raises OutputError where a recording would be replaced unasked."""
+    def __init__(self, source: CameraSource, plan: CapturePlan, limits: Limits, notify: Callable[[str], None]) -> None:
+        """``notify`` receives lines for the user. Raises OutputError if a recording exists and may not be replaced."""
         if plan.output is not None:
             refuse_recording(plan.output, plan.overwrite)
-        self._source, self._plan, self._limits, self._say = source, plan, limits, say
+        self._source, self._plan, self._limits, self._notify = source, plan, limits, notify
         picture = plan.output / PICTURE if plan.output is not None else None
         self._live = LiveView(plan.method, plan.layout, picture) if plan.method is not None else None
         self._to_disk: Ring[RawImage] = Ring(limits.ring)
@@ -120,30 +120,30 @@ class Session:
         self._writer: RecordingWriter | None = None
         self._counters, self._interruptions = Counters(), list[dict[str, Any]]()
         self._started, self._last, self._away_since = 0.0, 0.0, 0.0
-        self._incomplete = 0  # frames that came incomplete since the last whole one
-        self._unwritten = 0  # frames that waited for a recorder that failed
+        self._incomplete = 0  # incomplete frames since the last complete one
+        self._unwritten = 0  # frames queued for a recorder that failed
         self._began, self._line, self._reason = "", "waiting for the camera", ""
         self._recent: list[tuple[float, int]] = []
 
-    def run(self, tell: Callable[[Status], None], every_s: float = 0.5) -> Status:
-        """Capture until the limits, the end of the source or `stop`; ``tell`` hears where it stands.
+    def run(self, report: Callable[[Status], None], every_s: float = 0.5) -> Status:
+        """Capture until the limits, the end of the source or `stop`; ``report`` receives the status regularly.
 
-        Ctrl-C and SIGTERM are `stop`, a second one is at once. Raises CameraError when the camera is not there or does
-        not come back, OutputError when the disk takes no more, ValueError when the method cannot take the frames; what
-        was recorded until then is whole.
+        Ctrl-C and SIGTERM call `stop`; the second one ends the program. Raises CameraError if the camera is missing or
+        does not come back, OutputError if the disk is full, ValueError if the method does not fit the frames. The
+        recording up to then is complete.
         """
         port = self._plan.port
         page = nullcontext("") if port is None else serve_page(port, self._shown, lambda: self._line)
         with page as address, _stopping(self.stop):
             if address:
-                self._say(f"live view at {address}")
+                self._notify(f"live view at {address}")
             acquisition, recorder = self._thread(self._acquire), self._thread(self._record)
             view = self._thread(self._view)
             while acquisition.is_alive():
                 acquisition.join(every_s)
                 status = self.status()
                 self._line = status.line()
-                tell(status)
+                report(status)
             recorder.join()
             view.join()
         self._finish()
@@ -151,12 +151,12 @@ class Session:
         return replace(ended, rate_hz=(ended.counters.received - 1) / ended.seconds if ended.seconds > 0 else 0.0)
 
     def _finish(self) -> None:
-        """Finish the record, and raise what went wrong first."""
+        """Finish the record, and raise the first error."""
         if self._writer is not None:
-            if self._failures:  # a recorder that failed leaves frames behind
+            if self._failures:  # a failed recorder leaves frames in its ring
                 self._unwritten = self._counters.received - self._counters.recorded - self._to_disk.dropped
             try:
-                self._note(finished=not self._failures)
+                self._update_record(finished=not self._failures)
             except OSError as error:
                 self._failures.append(OutputError(f"expected to finish the record, found: {error}"))
             self._writer.close()
@@ -164,11 +164,11 @@ class Session:
             raise self._failures[0]
 
     def stop(self) -> None:
-        """End the run in good order."""
+        """End the run after the frames received so far."""
         self._stop.set()
 
     def status(self) -> Status:
-        """Where the run stands."""
+        """The state of the run."""
         counters = replace(self._counters, dropped=self._to_disk.dropped + self._unwritten)
         now = time.monotonic()
         recent = [*(point for point in self._recent if now - point[0] < 3), (now, counters.received)]
@@ -197,7 +197,7 @@ class Session:
         return thread
 
     def _acquire(self) -> None:
-        """Connect, deliver, and connect again after a loss, until the run is over."""
+        """Connect, deliver frames, and connect again after a loss, until the run is over."""
         try:
             while True:
                 with ExitStack() as stack:
@@ -221,7 +221,7 @@ class Session:
             self._to_view.close()
 
     def _connect(self, stack: ExitStack) -> Camera | None:
-        """The camera; after a loss it is tried for until the timeout. None when the run ends meanwhile."""
+        """The connected camera; after a loss, retry until the timeout. None if the run ends meanwhile."""
         limit = self._limits.timeout_s
         while True:
             if self._away_since:
@@ -237,25 +237,24 @@ class Session:
                 self._reason = str(error)
 
     def _prepare(self, info: CameraInfo) -> None:
-        """Make ready for frames of this kind; after an interruption, see that they are of the same kind."""
+        """Prepare for frames of this format; after an interruption, check that it is the same format."""
         if self._info is not None:
-            found, expected = (f"{i.width}x{i.height} {i.pixel_format}" for i in (info, self._info))
-            if found != expected:
-                raise CameraError(f"expected the camera back with {expected}, found {found}")
+            if info.describe() != self._info.describe():
+                raise CameraError(f"expected the camera back with {self._info.describe()}, found {info.describe()}")
             return
         layout = self._plan.layout.spec if self._plan.layout is not None else None
         header = Header(info.width, info.height, info.pixel_format, info.name, info.settings, layout)
         self._info = info
-        while self._live is not None and not self._view_ready.wait(TICK_S):  # this once the view goes first
+        while self._live is not None and not self._view_ready.wait(TICK_S):  # only here the recorder waits for the view
             if self._stop.is_set():
                 return
         if self._plan.output is not None:
             self._writer = RecordingWriter(self._plan.output, header, self._plan.overwrite)
         self._began = datetime.now(UTC).isoformat(timespec="milliseconds")
-        self._say(f"{info.name}: {info.width}x{info.height} {info.pixel_format}")
+        self._notify(f"{info.name}: {info.describe()}")
 
     def _pump(self, camera: Camera) -> None:
-        """Deliver frames until the run is over. Raises CameraLost when a camera has nothing more to say."""
+        """Deliver frames until the run is over. Raises CameraLost when no frame comes for too long."""
         quiet_since = time.monotonic()
         while not self._over():
             event = camera.read(TICK_S)
@@ -272,23 +271,23 @@ class Session:
                 self._deliver(event, now)
 
     def _over(self) -> bool:
-        """True when the run should end."""
+        """True if the run should end."""
         limits, now = self._limits, time.monotonic()
         late = limits.seconds is not None and self._started > 0 and now - self._started >= limits.seconds
         enough = limits.frames is not None and self._counters.received >= limits.frames
         return self._stop.is_set() or late or enough
 
     def _deliver(self, image: RawImage, now: float) -> None:
-        """Count a frame and hand it to recorder and live view."""
+        """Count a frame and pass it to the recorder and the live view."""
         lost = max(image.lost_before, self._incomplete)
-        if lost > self._incomplete:  # those that came incomplete are counted already
+        if lost > self._incomplete:  # incomplete frames are already counted
             self._count_lost(lost - self._incomplete, f"ids are missing before frame {image.frame_id}")
         self._incomplete, image = 0, replace(image, lost_before=lost)
         if self._away_since:
             away, self._away_since = now - self._away_since, 0.0
             self._counters.away_s += away
             self._interruptions.append({"received_before": self._counters.received, "seconds": round(away, 3)})
-            self._say(f"camera back after {away:.1f} s, frames in between are not counted as lost")
+            self._notify(f"camera back after {away:.1f} s, frames in between are not counted as lost")
             image = replace(image, away_s=away)
         self._counters.received += 1
         self._last = now
@@ -298,22 +297,22 @@ class Session:
             self._to_view.put(image)
 
     def _count_lost(self, frames: int, reason: str) -> None:
-        """Count frames that the wire lost; the first time is worth a line."""
+        """Count frames lost in transfer; notify the user the first time."""
         if not self._counters.lost:
-            self._say(f"lost on the wire: {reason}; further losses are only counted")
+            self._notify(f"lost in transfer: {reason}; further losses are only counted")
         self._counters.lost += frames
 
     def _note_loss(self, error: CameraLost) -> None:
-        """The camera went: say so once per interruption."""
+        """Notify the user of a lost camera, once per interruption."""
         self._reason = str(error)
         if self._away_since:
             return
         self._away_since = self._last or time.monotonic()
         self._counters.interruptions += 1
-        self._say(f"camera lost: {error}; trying again every second for {self._limits.timeout_s:g} s")
+        self._notify(f"camera lost: {error}; trying again every second for {self._limits.timeout_s:g} s")
 
     def _record(self) -> None:
-        """The recorder's thread: every frame of its ring to the disk."""
+        """Write every frame of the recorder's ring to the disk, in the recorder's thread."""
         while not self._to_disk.finished:
             image = self._to_disk.take(TICK_S)
             if image is None:
@@ -323,11 +322,11 @@ class Session:
                 self._writer.append(image)
             except OSError as error:
                 reason = error.strerror or str(error)
-                raise OutputError(f"expected to go on recording into {self._plan.output}, found: {reason}") from None
+                raise OutputError(f"expected to keep recording into {self._plan.output}, found: {reason}") from None
             self._counters.recorded += 1
 
     def _view(self) -> None:
-        """The live view's thread: the newest frame, again and again."""
+        """Show the newest frame repeatedly, in the live view's thread."""
         if self._live is None:
             return
         while self._info is None:
@@ -340,21 +339,21 @@ class Session:
             self._show_frames(self._live)
         except (ValueError, RuntimeError, OSError) as error:
             self._failures.append(ValueError(f"expected to show every frame, found: {error}"))
-            self._say(f"the live view has ended, the recording goes on: {error}")
+            self._notify(f"the live view has ended, the recording continues: {error}")
 
     def _show_frames(self, live: LiveView) -> None:
-        """The newest frame until there are no more; what is remarkable about the first is worth a line."""
+        """Show the newest frame until there are no more; notify the user of remarks on the first."""
         while not self._to_view.finished:
             image = self._to_view.take(TICK_S)
             if image is None:
                 continue
             shown = live.show(image)
             for remark in shown.remarks if not self._counters.shown else ():
-                self._say(f"frame {image.frame_id}: {remark}")
+                self._notify(f"frame {image.frame_id}: {remark}")
             self._counters.shown += 1
 
-    def _note(self, finished: bool) -> None:
-        """Bring the record up to date."""
+    def _update_record(self, finished: bool) -> None:
+        """Update the record."""
         if self._writer is not None:
             counters = asdict(self.status().counters)
             counters["away_s"] = round(counters["away_s"], 3)
@@ -364,14 +363,14 @@ class Session:
 
 @contextmanager
 def _stopping(stop: Callable[[], None]) -> Iterator[None]:
-    """Ctrl-C and SIGTERM call ``stop`` while the block runs; the second time they do what they did before."""
+    """Call ``stop`` on Ctrl-C and SIGTERM inside the block; a second signal has its usual effect."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
-    def caught(number: int, place: FrameType | None) -> None:
-        del place
+    def caught(number: int, frame: FrameType | None) -> None:
+        del frame
         signal.signal(number, before[signal.Signals(number)])
         stop()
 

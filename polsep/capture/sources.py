@@ -1,8 +1,8 @@
-"""What a camera is to polsep: something that connects, and then gives raw frames or says what was lost.
+"""The interface of cameras: connect, then read raw frames and reports of lost ones; and what its backends share.
 
 A backend is a `CameraSource`: ``connect`` is a context manager of a `Camera`, and may be called again after the camera
-was lost. Nothing is lost in silence: a frame that arrives incomplete is a `Loss` at once, and every frame between two
-whole ones is a gap in their ids (`FrameIds`) and in `RawImage.lost_before`, whether anything of it arrived or not.
+was lost. No loss is silent: an incomplete frame is a `Loss` at once, and every frame missing between two complete ones
+is a gap in their ids (`FrameIds`) and in `RawImage.lost_before`, whether any of it arrived or not.
 
 Units: exposure in microseconds, gain in decibels, rates in Hz, as in GenICam's Standard Features Naming Convention.
 """
@@ -10,36 +10,38 @@ Units: exposure in microseconds, gain in decibels, rates in Hz, as in GenICam's 
 from __future__ import annotations
 
 import math
+import time
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from polsep.io.raw.genicam import find_pixel_format
 from polsep.io.raw.recording import RawImage
 from polsep.io.store.errors import InputError
 
-#: Seconds without a frame after which a camera that runs by itself is taken for lost; exposure and period come on top.
-PATIENCE = 5.0
+#: Seconds without a frame after which a free-running camera counts as lost; exposure and period are added.
+PATIENCE_S = 5.0
 
 
 class CameraError(InputError):
-    """A camera, a setting or a library that is not there: one line of what was expected and what was found."""
+    """A missing camera, setting or library: one line of what was expected and what was found."""
 
 
 class CameraLost(ConnectionError):
-    """A camera that was connected no longer answers, or gives nothing: worth connecting again."""
+    """A connected camera no longer answers or sends frames; connecting again may help."""
 
 
 class EndOfFrames(Exception):
-    """The source has no more frames and never will."""
+    """The source has no more frames."""
 
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What to ask of a camera; None leaves a setting as the camera has it.
+    """Settings to apply to a camera; None keeps the camera's own.
 
     ``trigger``: "off" for free running, else the trigger's source by the camera's name for it, such as "Line0" or
     "Software"; with "Software" polsep triggers ``frame_rate_hz`` times a second. ``features``: further GenICam features
-    by name, set in this order before the others. Raises CameraError on numbers that no camera has.
+    by name, set in this order before the others. Raises CameraError on impossible numbers.
     """
 
     exposure_us: float | None = None
@@ -59,63 +61,84 @@ class CameraSettings:
         if self.trigger == "Software" and self.frame_rate_hz is None:
             raise CameraError("expected a frame rate for software triggers, found none")
 
+    def patience_s(self, frame_rate_hz: float | None, exposure_us: float | None) -> float:
+        """Seconds without a frame after which the camera counts as lost, with the rate and exposure that it reports."""
+        if self.triggered:
+            return math.inf
+        return PATIENCE_S + 1 / (self.frame_rate_hz or frame_rate_hz or 1.0) + (exposure_us or 0.0) * 1e-6
+
     @property
     def triggered(self) -> bool:
-        """True where frames wait for a trigger from outside, however long it takes."""
+        """True if frames wait for an external trigger, for any time."""
         return self.trigger not in (None, "off", "Software")
 
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """A connected camera: size and pixel format of its frames, and its settings as it reports them."""
+    """A connected camera: size and pixel format of its frames, and the settings that it reports."""
 
     name: str
     width: int
     height: int
     pixel_format: str
     settings: dict[str, Any] = field(default_factory=dict)
-    patience_s: float = PATIENCE
+    patience_s: float = PATIENCE_S
+
+    def take_payload(self, data: bytes, found: str, padded: bool) -> bytes:
+        """The bytes of one frame. Raises CameraError on other frames (``found`` says which) and on padded rows."""
+        count = find_pixel_format(self.pixel_format).frame_bytes(self.width, self.height)
+        if found != self.describe() or len(data) < count:
+            raise CameraError(
+                f"expected frames of {self.describe()} ({count} bytes), found {found} ({len(data)} bytes)"
+            )
+        if padded:
+            raise CameraError("expected rows without padding, found padded ones: choose a width in whole bytes")
+        return data[:count]
+
+    def describe(self) -> str:
+        """Size and pixel format for messages."""
+        return f"{self.width}x{self.height} {self.pixel_format}"
 
 
 @dataclass(frozen=True)
 class Loss:
-    """A frame that did not arrive whole, and why. The ids of the whole frames around it will tell of it again.
+    """A frame that arrived incomplete, and why. It also shows as a gap in the ids of the complete frames around it.
 
-    Its own id says nothing: without the packet that holds it, a buffer still has that of the frame before.
+    Its own id means nothing: without the packet that holds it, a buffer keeps the id of the frame before.
     """
 
     reason: str
 
 
 class Camera(Protocol):
-    """A camera that is connected."""
+    """A connected camera."""
 
     @property
     def info(self) -> CameraInfo:
-        """What the camera says of itself."""
+        """The camera as it describes itself."""
 
     def start(self) -> None:
-        """Begin to acquire. Raises CameraError when the camera refuses, CameraLost when it is gone."""
+        """Start acquisition. Raises CameraError when the camera refuses, CameraLost when it is gone."""
 
     def read(self, timeout_s: float) -> RawImage | Loss | None:
-        """The next frame, in order; None when nothing comes in that time. Raises CameraLost, EndOfFrames."""
+        """The next frame, in order; None if there is none in that time. Raises CameraLost, EndOfFrames."""
 
 
 class CameraSource(Protocol):
-    """Where frames come from."""
+    """A source of frames."""
 
     def connect(self) -> AbstractContextManager[Camera]:
-        """Connect and apply the settings; leaving stops and disconnects.
+        """Connect and apply the settings; stop and disconnect on exit.
 
-        Raises CameraError when it is not there or refuses a setting.
+        Raises CameraError when the camera is missing or refuses a setting.
         """
 
 
 class FrameIds:
-    """Which frames are missing, from the ids of those that came.
+    """Count of missing frames, from the ids of those that arrived.
 
-    Ids count up by one. GigE Vision 1.x has 16 bits for them and skips 0, so 65535 is followed by 1. An id that goes
-    back otherwise is a camera that began anew: how many it lost nobody knows, and none is counted.
+    Ids count up by one. GigE Vision 1.x has 16 bits for them and skips 0, so 65535 is followed by 1. Any other id that
+    goes back is a restarted camera: its losses are unknown, and none is counted.
     """
 
     _WRAP = 65535
@@ -124,7 +147,7 @@ class FrameIds:
         self._last: int | None = None
 
     def lost_before(self, frame_id: int) -> int:
-        """How many ids lie between the one before and this one; 0 for the first."""
+        """Number of ids between the one before and this one; 0 for the first."""
         last, self._last = self._last, frame_id
         if last is None:
             return 0
@@ -132,3 +155,26 @@ class FrameIds:
         if step <= 0 and last <= self._WRAP and 0 < step + self._WRAP < self._WRAP // 2:
             step += self._WRAP
         return max(step - 1, 0)
+
+
+class SoftwareTrigger:
+    """A schedule of software triggers, where the settings ask for them.
+
+    State: when the next trigger is due.
+    """
+
+    def __init__(self, settings: CameraSettings) -> None:
+        self._used = settings.trigger == "Software"
+        self._period_s, self._due_s = 1 / (settings.frame_rate_hz or 1.0), 0.0
+
+    def start(self) -> None:
+        """Make the first trigger due now."""
+        self._due_s = time.monotonic()
+
+    def is_due(self) -> bool:
+        """True if a trigger is due; the next one is then due a period later."""
+        now = time.monotonic()
+        if not self._used or now < self._due_s:
+            return False
+        self._due_s = max(self._due_s + self._period_s, now)
+        return True

@@ -1,7 +1,11 @@
 """Symmetric separable filters of images, mirrored at the border: ``d c b a | a b c d | d c b a``.
 
-Rows are filtered in one pass, first down, then along, while they are in the cache. Matrix products of a library take as
-long, and ten times that where other programs are busy. A twin in NumPy is in tests/test_edit.py.
+Rows are filtered in one pass, first down, then along, while they are in the cache. A twin in NumPy is in
+tests/test_edit.py.
+
+Why not a library: a blur of 1224x1024 colours by sigma 10 takes 0.12 s here on two threads, 0.74 s with
+scipy.ndimage.correlate1d, which also is not in the bare install, and 2.3 s with torch's conv2d; videos and the viewer's
+sliders filter every frame. The results agree to 1e-6 of white.
 """
 
 from __future__ import annotations
@@ -14,20 +18,20 @@ from numpy.typing import NDArray
 from polsep.compute.compiling import compiled, entry
 from polsep.compute.threads import Piece, share
 
-#: Rows that a thread takes at a time.
+#: Rows per task of a thread.
 _ROWS = 8
 
 
 @compiled
-def _mirrored(place: int, count: int) -> int:
-    """Where a place inside or outside of ``range(count)`` is after reflections at both ends."""
-    place %= 2 * count
-    return place if place < count else 2 * count - 1 - place
+def _mirrored(index: int, count: int) -> int:
+    """The index in ``range(count)`` of any index, after reflections at both ends."""
+    index %= 2 * count
+    return index if index < count else 2 * count - 1 - index
 
 
 @compiled
 def _add_pairs(total: Any, near: tuple[Any, Any], far: tuple[Any, Any], weights: tuple[Any, Any]) -> None:
-    """Add two pairs of rows with their weights; two at a time, because sums then stay in registers for longer."""
+    """Add two pairs of rows with their weights; two at a time, so that sums stay in registers longer."""
     a, b = near
     c, d = far
     one, two = weights

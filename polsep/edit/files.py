@@ -9,14 +9,12 @@ Previews show the input's exposure, or less where edits add light; in sequences,
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from os.path import realpath
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from polsep.compute.workers import map_ahead
 from polsep.edit.images import Maps, SeparatedImages
@@ -30,7 +28,7 @@ from polsep.io.results.separation_writer import planned_outputs
 from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter
 from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import InputError, input_error
-from polsep.video.recordings import ON_DAMAGE, Progress, draw_panels
+from polsep.video.recordings import ON_DAMAGE, Progress, black_picture, draw_panels, write_pictures
 
 #: Frames that are read and edited at once.
 AT_ONCE = 2
@@ -173,7 +171,9 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
     for caution in work.recipe.cautions():
         yield Progress(writer.first, count, caution)
     yield Progress(writer.first, count)
-    yield from _run(found, work, writer, (gain, size, target.damaged))
+    pictures = _SequenceEdit(found, work, gain, size, target.kind.preview).picture
+    with closing(map_ahead(pictures, range(writer.first, count), AT_ONCE)) as edited:
+        yield from write_pictures(writer, ((picture, {}) for picture in edited), target.damaged, count)
     preview = target.directory / f"{found.stem}.png"
     write_preview(preview, toned(after.combined, gain))
     lines = writer.lines()
@@ -208,45 +208,31 @@ def _refuse_frames(folder: Path, found: NumberedFiles, target: EditTarget) -> No
     refuse_existing(target.directory, [*frames, target.directory / f"{found.stem}.png"], overwrite=False)
 
 
-def _run(found: NumberedFiles, work: Work, writer: SequenceWriter, look: tuple[float, Any, str]) -> Iterator[Progress]:
-    """The frames that are not done, part after part."""
-    gain, size, on_damage = look
-    begin = writer.first
-    job = _picture_job(found, work, (gain, size, writer.kind.preview))
-    with closing(writer), closing(map_ahead(job, range(begin, len(found.files)), AT_ONCE)) as pictures:
-        for place, picture in enumerate(pictures, begin):
-            reason = picture.line.get("damaged")
-            if reason is not None and on_damage == "stop":
-                raise InputError(reason)
-            writer.append(found.first + place, picture)
-            warning = None if reason is None else f"frame {found.first + place} is left out: {reason}"
-            yield Progress(place + 1, len(found.files), warning, damaged=reason is not None)
-        writer.end_part()
+@dataclass(frozen=True)
+class _SequenceEdit:
+    """A sequence and its edits; ``gain`` and ``size [h, w, C]`` are those of the first frame."""
 
+    frames: NumberedFiles
+    work: Work
+    gain: float
+    size: tuple[int, ...]
+    preview: bool
 
-def _picture_job(found: NumberedFiles, work: Work, look: tuple[float, Any, bool]) -> Callable[[int], Picture]:
-    """What makes the edited frame at a place of the sequence; a black one, with the reason, where it can't."""
-    gain, size, preview = look
-
-    def black(place: int, reason: str) -> Picture:
-        dark = np.zeros(size, np.float32)
-        panels = draw_panels(dark, dark, 1.0) if preview else None
-        return Picture(dark, dark, panels, {"frame": found.first + place, "damaged": reason})
-
-    def make(place: int) -> Picture:
-        path = found.files[place]
+    def picture(self, index: int) -> Picture:
+        """The edited frame at an index of the sequence; a black one, with the reason, where it cannot be edited."""
+        path, number = self.frames.files[index], self.frames.first + index
         if path is None:
-            return black(place, "there is no file of this number")
-        try:
-            before, after = _edit(path, work)
-        except (ValueError, OSError) as error:
-            return black(place, " ".join(str(error).split()))
-        if before.diffuse.shape != size:
-            return black(
-                place, f"{path}: expected {list(size)} as in the first frame, found {list(before.diffuse.shape)}"
+            return black_picture(
+                self.size, self.preview, {"frame": number, "damaged": "there is no file of this number"}
             )
-        panels = draw_panels(after.diffuse, after.specular, gain) if preview else None
-        line = {"frame": found.first + place, "light": _light(before, after)}
+        try:
+            before, after = _edit(path, self.work)
+            if before.diffuse.shape != self.size:
+                size = list(before.diffuse.shape)
+                raise InputError(f"{path}: expected {list(self.size)} as in the first frame, found {size}")
+        except (ValueError, OSError) as error:
+            line = {"frame": number, "damaged": " ".join(str(error).split())}
+            return black_picture(self.size, self.preview, line)
+        panels = draw_panels(after.diffuse, after.specular, self.gain) if self.preview else None
+        line = {"frame": number, "light": _light(before, after)}
         return Picture(after.diffuse, after.specular, panels, line, after.combined)
-
-    return make

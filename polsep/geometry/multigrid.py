@@ -2,8 +2,13 @@
 
 Unknowns are the pixels of a mask; neighbours that differ little by the matrix's own weights are gathered in blocks of
 3 x 3, level by level. Prolongation is constant on a block and smoothed once by the matrix, so it does not reach across
-weak links: a jump of depth stays one on the coarse levels. The matrix may have free constants (parts of the mask that
-nothing links): they stay what the first guess has.
+weak links: a jump of depth stays one on the coarse levels. The matrix may have free constants (unlinked parts of the
+mask), which keep their value at the start; SciPy's cg would divide by zero there.
+
+Why not a library: `integrate_bilateral` on 512x512 pixels with a jump takes 3.7 s of CPU time here, 9.4 s with
+pyamg's smoothed_aggregation_solver (5.4.1) as the preconditioner, and 19.5 s and 400 MB more with SciPy's splu (1.17).
+As each round is solved roughly, another solver also gives another depth, by 1e-4 to 0.2 of its range. ``python -m
+evaluation geometry`` measures conjugate gradients with this preconditioner and with Jacobi's.
 Source: Vanek, Mandel, Brezina 1996, Algebraic multigrid by smoothed aggregation, doi:10.1007/BF02238511.
 Needs the extra ``render``.
 """
@@ -38,7 +43,7 @@ SHIFT = 1e-8
 
 @dataclass(frozen=True)
 class _Level:
-    """A matrix, the inverse of its diagonal times `DAMPING`, and the way to the next level, all of float32."""
+    """A matrix, the inverse of its diagonal times `DAMPING`, restriction and prolongation, all float32."""
 
     matrix: Any
     damped: Singles
@@ -56,7 +61,7 @@ class Multigrid:
             diagonal = matrix.diagonal()
             inverse = np.where(diagonal > 0, 1 / np.where(diagonal > 0, diagonal, 1), 0)
             owner, rows, cols = _gather(matrix, diagonal, rows // BLOCK, cols // BLOCK)
-            if rows.size == diagonal.size:  # nothing left to gather
+            if rows.size == diagonal.size:  # no more pixels to gather
                 break
             count = diagonal.size
             tentative = scipy.sparse.csr_array((np.ones(count), owner, np.arange(count + 1)), (count, rows.size))
@@ -70,7 +75,7 @@ class Multigrid:
         self.coarsest = scipy.sparse.linalg.splu((matrix + shift * scipy.sparse.eye_array(diagonal.size)).tocsc())
 
     def __call__(self, residual: Floats) -> Floats:
-        """One V-cycle from zero, in single precision: what conjugate gradients ask of it is a direction."""
+        """One V-cycle from zero, in single precision, which is enough for a search direction."""
         scale = float(np.abs(residual).max(initial=0.0)) or 1.0
         return scale * self._descend(0, (residual / scale).astype(np.float32)).astype(np.float64)
 
@@ -86,9 +91,9 @@ class Multigrid:
 
 
 def _gather(matrix: Any, diagonal: Floats, rows: Integers, cols: Integers) -> tuple[Integers, Integers, Integers]:
-    """Which unknown of the next level each one belongs to, and the blocks' rows and cols.
+    """The unknown of the next level of each unknown, and rows and cols of these.
 
-    ``rows``, ``cols``: the block of each. Unknowns of one belong together where strong links join them inside it.
+    ``rows``, ``cols``: the block of each. Unknowns of a block are joined where strong links connect them inside it.
     """
     links = matrix.tocoo()
     first, second = links.coords
@@ -105,9 +110,9 @@ def _gather(matrix: Any, diagonal: Floats, rows: Integers, cols: Integers) -> tu
 def solve(
     matrix: Any, right: Floats, start: Floats, precondition: Callable[[Floats], Floats], limit: tuple[float, int]
 ) -> tuple[Floats, int]:
-    """Conjugate gradients: what they find, and in how many steps.
+    """Conjugate gradients: the solution and the number of steps.
 
-    ``limit``: the residual relative to that of ``start`` that is small enough, and how many steps there are at most.
+    ``limit``: the residual to reach, relative to that of ``start``, and the largest number of steps.
     """
     found = start.copy()
     residual = right - matrix @ found

@@ -1,12 +1,12 @@
-"""A recording in, a separated one out: reading, separating and writing overlap, memory is bounded, kills do no harm.
+"""A recording in, a separated sequence out: reading, separating and writing overlap, memory is bounded, runs resume.
 
-Frames go through three threads: one reads and unpacks, one separates, the caller's writes; queues between them are
-short, so that the slowest sets the pace. What decides about the bytes of a run are its settings and its frames alone,
-not how often it was interrupted (`io.results.sequences`) and not where frames were separated (`engine`).
+Frames go through three threads: one reads and unpacks, one separates, the caller's thread writes. Queues between them
+are short, so that the slowest sets the pace. The output bytes depend on the settings and the frames alone, not on
+interruptions (`io.results.sequences`) and not on where frames are separated (``engine``).
 
-Where nothing moves, raw samples and images are averaged over frames (`temporal`), whose state is part of a run's.
-What is estimated of a scene, its light's colour and the exposure of the film to watch, is so from its first frame, and
-then fixed: pictures do not flicker because of it.
+Where nothing moves, raw samples and images are averaged over frames (`temporal`); that state is saved with the run.
+The light's colour and the exposure of the preview are estimated from the first frame and then fixed, so that they
+cause no flicker.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from collections import deque
 from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +30,7 @@ from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.raw.sequences import DamagedFrame, FrameSequence, open_sequence
 from polsep.io.results.previews import exposure_of, srgb
 from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWriter, State
+from polsep.io.store.errors import InputError
 from polsep.methods import Capture, find_method
 from polsep.pipeline import LightColor, find_device, make_frame, separate_capture, to_device
 from polsep.sensor.camera import Mosaic
@@ -37,28 +38,27 @@ from polsep.video.panels_kernel import STEPS, make_panels
 from polsep.video.temporal import Images, TemporalState, filter_frame, steady_images
 
 Floats = NDArray[np.float32]
-Item = TypeVar("Item")
 
-#: Frames that are separated at once by this process, at most: each takes the memory of its method.
+#: Largest number of frames that this process separates at once: each needs the memory of its method.
 AT_ONCE = 4
-#: Names under which steady images are kept for the next part.
+#: Names of the averaged images in the saved state.
 IMAGES = ("diffuse", "specular")
-#: Widest panel of the film to watch.
+#: Largest side of a panel of the preview.
 PANEL = 640
-#: The tone curve by equal steps of the root of linear light.
+#: The tone curve at equal steps of the square root of linear light.
 _TONES = np.rint(255 * srgb((np.arange(STEPS + 1) / STEPS) ** 2)).astype(np.uint8)
-#: What is done against flicker.
+#: Filters against flicker.
 FILTERS = ("temporal", "none")
-#: What becomes of a run with a damaged frame.
+#: Ways to treat a damaged frame.
 ON_DAMAGE = ("stop", "skip")
 
 
 @dataclass(frozen=True)
 class VideoOptions:
-    """How frames are separated, as in `pipeline.separate`; at most ``frames`` of them; ``damaged``: of `ON_DAMAGE`.
+    """Options of the separation, as in `pipeline.separate`; at most ``frames`` of them; ``damaged``: of `ON_DAMAGE`.
 
-    ``engine``: of `ENGINES`, where frames are separated, which changes no byte. ``filter``: of `FILTERS`; "temporal"
-    averages raw samples and images where nothing moves (`temporal`).
+    ``engine``: of `ENGINES`, which changes no byte. ``filter``: of `FILTERS`; "temporal" averages raw samples and
+    images where nothing moves (`temporal`).
     """
 
     method: str = "auto"
@@ -90,10 +90,10 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Look:
-    """What the first frame says of all: colour of the ``light``, ``gain`` of the film to watch, ``size`` of the images.
+class FirstFrame:
+    """Values that the first frame fixes for all: colour of the ``light``, ``gain`` of the preview, ``size`` of images.
 
-    ``size`` counts colours too. ``shape``: of raw frames. ``warnings``: what the owner should know.
+    ``size`` includes colours. ``shape``: of raw frames. ``warnings``: for the user.
     """
 
     method: str
@@ -105,8 +105,8 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Found:
-    """What is kept of a separated frame: diffuse and specular images, and its ``report``."""
+class Result:
+    """Diffuse and specular images of a separated frame, and its ``report``."""
 
     images: Images
     report: dict[str, Any]
@@ -114,18 +114,18 @@ class Found:
 
 @dataclass(frozen=True)
 class Separated:
-    """A frame that was separated, or is damaged, and the state of the filter behind it, if there is one."""
+    """The result of a frame, or its damage, and the state of the temporal filter after it, if there is one."""
 
     index: int
-    found: Found | DamagedFrame
+    result: Result | DamagedFrame
     state: TemporalState | None
 
 
 @dataclass(frozen=True)
 class Progress:
-    """``done`` of ``count`` frames; ``warning``: a line for the user; ``written``: the files of a run that is done.
+    """``done`` of ``count`` frames; ``warning``: a line for the user; ``written``: the files of a complete run.
 
-    ``damaged``: this frame is missing or, of a run that is done, some frame is, also where an earlier run left it out.
+    ``damaged``: this frame is missing or, for a complete run, some frame is, also where an earlier run left it out.
     """
 
     done: int
@@ -136,210 +136,201 @@ class Progress:
 
 
 def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target: Target) -> Iterator[Progress]:
-    """Separate a recording and say how far it is, frame after frame, beginning with what an earlier run did.
+    """Separate a recording and yield the progress after every frame, from where an earlier run ended.
 
-    Raises ValueError on what cannot be read or written and, with ``damaged`` "stop", at the first damaged frame; what
-    was done by then stays, and the same call goes on there.
+    Raises ValueError on what cannot be read or written and, with ``damaged`` "stop", at the first damaged frame;
+    frames done by then stay, and the same call resumes there.
     """
-    footage = open_sequence(path, read)
-    count = footage.count if options.frames is None else min(footage.count, options.frames)
-    look = look_at(footage, options)
+    recording = open_sequence(path, read)
+    count = recording.count if options.frames is None else min(recording.count, options.frames)
+    first = separate_first(recording, options)
     settings = {
         "source": path.name,
         "frames": options.frames,
         "read": {**asdict(read), "layout": read.layout.spec if read.layout else None},
         "filter": options.filter,
         "kind": asdict(target.kind),
-        "method": look.method,
-        "light_color": list(look.light),
-        "gain": look.gain,
-        "shape": list(look.shape),
-        "colors": look.size[2],
+        "method": first.method,
+        "light_color": list(first.light),
+        "gain": first.gain,
+        "shape": list(first.shape),
+        "colors": first.size[2],
         "device": str(find_device(options.device)),
     }
-    sequence = SequenceWriter(target.directory, footage.stem, target.kind, settings, target.overwrite)
-    for warning in look.warnings:
+    sequence = SequenceWriter(target.directory, recording.stem, target.kind, settings, target.overwrite)
+    for warning in first.warnings:
         yield Progress(sequence.first, count, warning)
     yield Progress(sequence.first, count)
     last = sequence.first
-    for step in _run(footage, options, look, sequence):
-        last = step.done
-        yield replace(step, count=max(count, step.done))
+    with closing(_pictures(recording, options, first, sequence)) as pictures:
+        for step in write_pictures(sequence, pictures, options.damaged, count):
+            last = step.done
+            yield step
     lines = sequence.lines()
-    report = _report({**settings, "damaged": options.damaged}, look, lines)
+    report = _report({**settings, "damaged": options.damaged}, first, lines)
     yield Progress(last, last, damaged=bool(report["damaged"]), written=tuple(sequence.finish(report)))
 
 
-def look_at(footage: FrameSequence, options: VideoOptions) -> Look:
-    """Separate the first frame that is whole. Raises ValueError where there is none among those of one part."""
+def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFrame:
+    """Separate the first undamaged frame. Raises ValueError if there is none among those of one part."""
     reason = "none at all"
-    for _, frame in zip(range(PART), footage.begin(0), strict=False):
+    for _, frame in zip(range(PART), recording.begin(0), strict=False):
         if isinstance(frame, DamagedFrame):
             reason = frame.reason
             continue
-        found = separate_capture(frame.data, options.method, options.light_color, options.device)
-        gain = exposure_of(found.diffuse + found.specular)
-        light = tuple(float(c) for c in found.report["light_color"])
-        size = (found.diffuse.shape[0], found.diffuse.shape[1], found.diffuse.shape[2])
-        notes = (*frame.notes, *found.report["warnings"])
-        return Look(found.report["method"], light, gain, size, tuple(frame.data.data.shape), notes)
+        separated = separate_capture(frame.data, options.method, options.light_color, options.device)
+        gain = exposure_of(separated.diffuse + separated.specular)
+        light = tuple(float(c) for c in separated.report["light_color"])
+        size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
+        notes = (*frame.notes, *separated.report["warnings"])
+        return FirstFrame(separated.report["method"], light, gain, size, tuple(frame.data.data.shape), notes)
     raise ValueError(f"expected a frame that can be read, found {reason}")
 
 
-def _run(footage: FrameSequence, options: VideoOptions, look: Look, sequence: SequenceWriter) -> Iterator[Progress]:
-    """The frames that are not done, into the sequence, part after part."""
-    kept = sequence.state()
-    images: Images | None = tuple(kept.pop(name) for name in IMAGES) if set(IMAGES) <= set(kept) else None
-    start = sequence.first, TemporalState.from_arrays(kept) if kept else None
-    with closing(sequence), closing(ENGINES[options.engine](footage, options, look, start)) as ready:
-        for frame in ready:
-            warning = None
-            if isinstance(frame.found, DamagedFrame):
-                if options.damaged == "stop":
-                    raise ValueError(frame.found.reason)
-                picture = _missing(frame.found, look, sequence.kind.preview)
-                warning = f"frame {frame.index} is left out: {frame.found.reason}"
-            else:
-                images = _steady(frame.found.images, images, frame.state)
-                picture = as_picture(frame, images, look, sequence.kind.preview)
-            sequence.append(frame.index, picture, partial(_as_arrays, frame.state, images))
-            yield Progress(frame.index + 1, 0, warning, damaged=warning is not None)
+def write_pictures(
+    sequence: SequenceWriter, pictures: Iterator[tuple[Picture, State]], on_damage: str, count: int
+) -> Iterator[Progress]:
+    """Write pictures, each with the state behind it, part after part; ``count``: expected frames of the sequence.
+
+    Pictures with ``damaged`` in their line are black frames of videos only. Raises InputError at the first of them with
+    ``on_damage`` "stop".
+    """
+    with closing(sequence):
+        for done, (picture, state) in enumerate(pictures, sequence.first + 1):
+            number, reason = picture.line["frame"], picture.line.get("damaged")
+            if reason is not None and on_damage == "stop":
+                raise InputError(reason)
+            sequence.append(number, picture, state)
+            warning = None if reason is None else f"frame {number} is left out: {reason}"
+            yield Progress(done, max(count, done), warning, damaged=reason is not None)
         sequence.end_part()
 
 
-def _steady(images: Images, before: Images | None, state: TemporalState | None) -> Images:
-    """A frame's images, steadier where nothing has moved, if there is a filter."""
-    return images if state is None else steady_images(images, before, state)
-
-
-def _as_arrays(state: TemporalState | None, images: Images | None) -> State:
-    """What the next part depends on."""
-    if state is None:
-        return {}
-    return state.to_arrays() | (dict(zip(IMAGES, images, strict=True)) if images else {})
+def _pictures(
+    recording: FrameSequence, options: VideoOptions, first: FirstFrame, sequence: SequenceWriter
+) -> Generator[tuple[Picture, State], None, None]:
+    """The frames that an earlier run has not written, each with the state that the next part depends on."""
+    saved = sequence.state()
+    before: Images | None = tuple(saved.pop(name) for name in IMAGES) if set(IMAGES) <= set(saved) else None
+    state = TemporalState.from_arrays(saved) if saved else None
+    preview = sequence.kind.preview
+    with closing(ENGINES[options.engine](recording, options, first, sequence.first, state)) as frames:
+        for frame in frames:
+            if isinstance(frame.result, DamagedFrame):
+                picture = black_picture(first.size, preview, {"frame": frame.index, "damaged": frame.result.reason})
+            else:
+                images, report = frame.result.images, frame.result.report
+                if frame.state is not None:
+                    images = steady_images(images, before, frame.state)
+                before = images
+                line = {"frame": frame.index, **report["statistics"]}
+                if report["warnings"]:
+                    line["warnings"] = report["warnings"]
+                diffuse, specular = images
+                panels = draw_panels(diffuse, specular, first.gain) if preview else None
+                picture = Picture(diffuse, specular, panels, line)
+            kept: State = {}
+            if frame.state is not None:
+                kept = frame.state.to_arrays() | (dict(zip(IMAGES, before, strict=True)) if before else {})
+            yield picture, kept
 
 
 def separate_here(
-    footage: FrameSequence, options: VideoOptions, look: Look, start: tuple[int, TemporalState | None]
+    recording: FrameSequence, options: VideoOptions, first: FirstFrame, begin: int, state: TemporalState | None
 ) -> Generator[Separated, None, None]:
-    """Frames from number ``start[0]`` on, in order, by threads of this process: each separates a frame by itself.
+    """Separate frames from number ``begin`` on, in order, in threads of this process, one thread per frame.
 
-    That keeps all cores busy whatever else runs; threads that share a frame would wait for the slowest one.
+    That keeps all cores busy; threads that share a frame would wait for the slowest one. ``state``: of the temporal
+    filter before the first of these frames.
     """
     device, cores = find_device(options.device), get_threads()
     workers = min(cores, AT_ONCE)
 
     def separate(ready: tuple[Frame | DamagedFrame, TemporalState | None]) -> Separated:
-        frame, state = ready
+        frame, after = ready
         if isinstance(frame, DamagedFrame):
-            return Separated(frame.index, frame, state)
+            return Separated(frame.index, frame, after)
         with own_threads(cores // workers):
-            return Separated(frame.index, separate_one((frame.data, look, device)), state)
+            return Separated(frame.index, separate_one((frame.data, first, device)), after)
 
-    with closing(ahead(_prepared(footage, options, look, start), 1)) as frames:
+    with closing(ahead(_prepared(recording, options, first, begin, state), 1)) as frames:
         yield from map_ahead(separate, frames, workers)
 
 
 def separate_on_ray(
-    footage: FrameSequence, options: VideoOptions, look: Look, start: tuple[int, TemporalState | None]
+    recording: FrameSequence, options: VideoOptions, first: FirstFrame, begin: int, state: TemporalState | None
 ) -> Generator[Separated, None, None]:
-    """The same by a Ray cluster; this process reads and writes."""
+    """`separate_here` on a Ray cluster; this process reads and writes."""
     workers, device = get_threads(), find_device(options.device)
-    asked: deque[tuple[int | DamagedFrame, TemporalState | None]] = deque()
+    submitted: deque[tuple[int | DamagedFrame, TemporalState | None]] = deque()
 
-    def whole_frames() -> Iterator[tuple[Capture, Look, torch.device]]:
-        for frame, state in frames:
-            asked.append((frame if isinstance(frame, DamagedFrame) else frame.index, state))
+    def jobs() -> Iterator[tuple[Capture, FirstFrame, torch.device]]:
+        for frame, after in frames:
+            submitted.append((frame if isinstance(frame, DamagedFrame) else frame.index, after))
             if not isinstance(frame, DamagedFrame):
-                yield frame.data, look, device
+                yield frame.data, first, device
 
-    def waiting() -> Iterator[Separated]:
-        while asked and isinstance(asked[0][0], DamagedFrame):
-            damaged, state = asked.popleft()
+    def damaged_frames() -> Iterator[Separated]:
+        while submitted and isinstance(submitted[0][0], DamagedFrame):
+            damaged, after = submitted.popleft()
             assert isinstance(damaged, DamagedFrame)
-            yield Separated(damaged.index, damaged, state)
+            yield Separated(damaged.index, damaged, after)
 
-    with closing(ahead(_prepared(footage, options, look, start))) as frames:
-        for found in map_ordered(separate_one, whole_frames(), workers, DEPTH * workers):
-            yield from waiting()
-            index, state = asked.popleft()
+    with closing(ahead(_prepared(recording, options, first, begin, state))) as frames:
+        for result in map_ordered(separate_one, jobs(), workers, DEPTH * workers):
+            yield from damaged_frames()
+            index, after = submitted.popleft()
             assert isinstance(index, int)
-            yield Separated(index, found, state)
-        yield from waiting()
+            yield Separated(index, result, after)
+        yield from damaged_frames()
 
 
-#: Where frames are separated.
+#: The places where frames can be separated.
 ENGINES = {"local": separate_here, "ray": separate_on_ray}
 
 
-def separate_one(job: tuple[Capture, Look, torch.device]) -> Found:
-    """One frame by the method, and under the light, that the first one settled."""
-    data, look, device = job
+def separate_one(job: tuple[Capture, FirstFrame, torch.device]) -> Result:
+    """Separate one frame with the method and the light colour of the first one."""
+    data, first, device = job
     data = to_device(data, device)
-    method = find_method(look.method, data)
-    frame = make_frame(method.run(data, look.light, False), method, data, look.light)
-    return Found((frame.diffuse, frame.specular), frame.report)
+    method = find_method(first.method, data)
+    frame = make_frame(method.run(data, first.light, False), method, data, first.light)
+    return Result((frame.diffuse, frame.specular), frame.report)
 
 
 def _prepared(
-    footage: FrameSequence, options: VideoOptions, look: Look, start: tuple[int, TemporalState | None]
+    recording: FrameSequence, options: VideoOptions, first: FirstFrame, begin: int, state: TemporalState | None
 ) -> Iterator[tuple[Frame | DamagedFrame, TemporalState | None]]:
-    """Frames from number ``start[0]`` on as they are to be separated, each with the state behind it."""
-    first, state = start
-    for frame in limited(footage.begin(first), first, options.frames):
-        frame = whole(frame, look)
+    """Frames from number ``begin`` on, temporally filtered where asked, each with the state after it."""
+    count = None if options.frames is None else max(options.frames - begin, 0)
+    for frame in islice(recording.begin(begin), count):
+        if not isinstance(frame, DamagedFrame) and tuple(frame.data.data.shape) != first.shape:
+            wanted, found = ("x".join(map(str, reversed(shape))) for shape in (first.shape, frame.data.data.shape))
+            reason = f"frame {frame.index}: expected {wanted} samples as in the first one, found {found}"
+            frame = DamagedFrame(frame.index, reason)
         if options.filter == "temporal" and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
             data, state = filter_frame(frame.data, state)
             frame = replace(frame, data=data)
         yield frame, state
 
 
-def whole(frame: Frame | DamagedFrame, look: Look) -> Frame | DamagedFrame:
-    """The frame, or why it does not belong to the recording: its size."""
-    if isinstance(frame, DamagedFrame) or tuple(frame.data.data.shape) == look.shape:
-        return frame
-    wanted, found = ("x".join(map(str, reversed(shape))) for shape in (look.shape, tuple(frame.data.data.shape)))
-    return DamagedFrame(
-        frame.index, f"frame {frame.index}: expected {wanted} samples as in the first one, found {found}"
-    )
-
-
-def limited(frames: Iterator[Item], first: int, count: int | None) -> Iterator[Item]:
-    """Frames from number ``first`` on, but none from number ``count`` on."""
-    for number, frame in enumerate(frames, first):
-        if count is not None and number >= count:
-            return
-        yield frame
-
-
-def as_picture(frame: Separated, images: Images, look: Look, preview: bool) -> Picture:
-    """What is kept of a separated frame and its steady ``images``."""
-    assert isinstance(frame.found, Found)
-    report, (diffuse, specular) = frame.found.report, images
-    line = {"frame": frame.index, **report["statistics"]}
-    if report["warnings"]:
-        line["warnings"] = report["warnings"]
-    return Picture(diffuse, specular, draw_panels(diffuse, specular, look.gain) if preview else None, line)
-
-
 def draw_panels(diffuse: Floats, specular: Floats, gain: float) -> NDArray[np.uint8]:
-    """Input, diffuse and specular ``[h, w, C]`` to watch, sRGB ``uint8 [h', 3 w', 3]``, at a ``gain``."""
+    """Panels of input, diffuse and specular ``[h, w, C]`` as sRGB ``uint8 [h', 3 w', 3]``, at a ``gain``."""
     return make_panels((diffuse, specular), gain, _TONES, PANEL)
 
 
-def _missing(damaged: DamagedFrame, look: Look, preview: bool) -> Picture:
-    """A black picture."""
-    black = np.zeros(look.size, np.float32)
-    panels = draw_panels(black, black, 1.0) if preview else None
-    return Picture(black, black, panels, {"frame": damaged.index, "damaged": damaged.reason})
+def black_picture(size: tuple[int, ...], preview: bool, line: dict[str, Any]) -> Picture:
+    """A black picture in place of a missing frame; ``line``: for the log."""
+    black = np.zeros(size, np.float32)
+    return Picture(black, black, draw_panels(black, black, 1.0) if preview else None, line)
 
 
-def _report(settings: dict[str, Any], look: Look, lines: list[dict[str, Any]]) -> dict[str, Any]:
-    """What is said of a run: settings, how many frames, which are missing, what frames warned of and how often."""
+def _report(settings: dict[str, Any], first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """The report of a run: settings, number of frames, the damaged ones, and how often frames gave each warning."""
     warnings: dict[str, int] = {}
     for line in lines:
         for warning in line.get("warnings", ()):
             warnings[warning] = warnings.get(warning, 0) + 1
     damaged = [line for line in lines if "damaged" in line]
     counts = {"frames": len(lines), "damaged": damaged}
-    return {**counts, "settings": settings, "first_frame_warnings": list(look.warnings), "warnings": warnings}
+    return {**counts, "settings": settings, "first_frame_warnings": list(first.warnings), "warnings": warnings}

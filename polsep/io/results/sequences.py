@@ -15,7 +15,6 @@ import glob
 import io
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -140,10 +139,10 @@ class SequenceWriter:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
 
-    def append(self, index: int, picture: Picture, state: Callable[[], State] = dict) -> None:
+    def append(self, index: int, picture: Picture, state: State | None = None) -> None:
         """Write a frame: number ``index`` names its EXR file, which a missing frame has not.
 
-        ``state`` is asked for at the end of a part: what the next part depends on.
+        ``state``: what the next part depends on; it is written at the end of a part.
         """
         if self.kind.format == "exr" and "damaged" not in picture.line:
             write_exr(self._exr_path(index), picture, self.kind.compression)
@@ -156,7 +155,7 @@ class SequenceWriter:
             self._films[image].write(pixels)
         self._log.append(picture.line)
         if len(self._log) == PART:
-            self.end_part(state())
+            self.end_part(state)
 
     def end_part(self, state: State | None = None) -> None:
         """Complete the part that is being written, if any; to call behind the last frame."""

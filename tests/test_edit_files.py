@@ -445,4 +445,4 @@ def test_work_names_its_files(tmp_path: Path) -> None:
     png(tmp_path / "t.png", np.zeros((2, 2), np.uint8))
     work = load_work(Recipe((Texture(image="t.png"),)), tmp_path)
     assert work.maps["t.png"].shape == (2, 2, 1)
-    assert len(work.said()["images"]["t.png"]) == 64
+    assert len(work.as_data()["images"]["t.png"]) == 64

@@ -1,7 +1,7 @@
-"""Gaussian blur that keeps the sum of light, and its inverse as far as there is one.
+"""Gaussian blur that keeps the sum of light, and its approximate inverse.
 
 Blurring is y = G x with G_ij = g(i - j) and all mirror images of j beyond the border (``d c b a | a b c d | d c b a``)
-added. That G is symmetric and its rows sum to 1, so its columns do: no light is lost, and uniform light stays uniform.
+added. That G is symmetric and its rows sum to 1, so its columns do too: the sum and uniform light are kept.
 g is exp(-k^2 / 2 sigma^2), normalised, to 6 sigma, beyond which it is below the last bit of float32.
 
 With a mask m, light stays inside it: y = (1 - m) x + A (m x), A = diag(m) G diag(1 / G m), whose columns sum to 1
@@ -22,11 +22,11 @@ from polsep.edit.blur_kernel import filter_image
 
 Floats = NDArray[np.float32]
 
-#: Where g ends, in sigmas.
+#: Radius of g in sigmas.
 REACH = 6.0
-#: Less light than this is none.
+#: Light below this counts as zero.
 _DARK = np.float32(1e-30)
-#: Steps of Richardson and Lucy. Each halves errors of broad shapes, about, and adds noise.
+#: Steps of Richardson-Lucy deconvolution. Each about halves the error of broad shapes and adds noise.
 STEPS = 4
 
 
@@ -46,34 +46,34 @@ def deblur(image: Floats, sigma: float, mask: Floats | None = None) -> Floats:
     """Undo a blur of ``sigma`` pixels by `STEPS` steps of Richardson-Lucy deconvolution; the sum is kept.
 
     x <- x Aᵀ(y / (A x)) from x = y: never negative, hence without dark rims, and of the sum of y at every step, since
-    columns of A sum to 1. Detail that a blur took below the noise does not return; the noise grows.
+    columns of A sum to 1. Detail below the noise is not restored; the noise grows.
     Source: Richardson 1972, doi 10.1364/JOSA.62.000055; Lucy 1974, doi 10.1086/111605.
     """
     weights = gaussian_weights(sigma)
     if mask is None:
         return _richardson_lucy(image, lambda x: filter_image(x, weights), lambda x: filter_image(x, weights))
     inside, reached = _inside(image, mask, weights)
-    found = _richardson_lucy(
+    sharpened = _richardson_lucy(
         inside * image,
         lambda x: inside * filter_image(x / reached, weights),
         lambda x: filter_image(inside * x, weights) / reached,
     )
-    return (1 - inside) * image + found
+    return (1 - inside) * image + sharpened
 
 
 def _richardson_lucy(
     measured: Floats, blurred: Callable[[Floats], Floats], transposed: Callable[[Floats], Floats]
 ) -> Floats:
-    """The image that ``blurred`` maps to ``measured``, about; ``transposed``: its adjoint."""
-    found = measured
+    """An image that ``blurred`` maps approximately to ``measured``; ``transposed``: its adjoint."""
+    estimate = measured
     for _ in range(STEPS):
-        seen: Floats = np.maximum(blurred(found), _DARK)
-        found = found * transposed(measured / seen)
-    return found
+        predicted: Floats = np.maximum(blurred(estimate), _DARK)
+        estimate = estimate * transposed(measured / predicted)
+    return estimate
 
 
 def _inside(image: Floats, mask: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """m and G m, for every colour ``[h, w, C]``; G m is 1 where it would be 0, so that one may divide by it."""
+    """m and G m, for every colour ``[h, w, C]``; G m is 1 instead of 0, so that it can be a divisor."""
     share = filter_image(mask[..., None], weights)
     reached = np.where(share > 0, share, np.float32(1))
     # Repeated, because NumPy multiplies by the same number for three colours at a sixth of the speed.
@@ -81,7 +81,7 @@ def _inside(image: Floats, mask: Floats, weights: Floats) -> tuple[Floats, Float
 
 
 def gaussian_weights(sigma: float) -> Floats:
-    """g at the distances 0, 1, ..., normalised over both sides; 1 alone where neighbours would get nothing."""
+    """g at the distances 0, 1, ..., normalised over both sides."""
     places = np.arange(math.ceil(REACH * sigma) + 1, dtype=np.float64)
     with np.errstate(over="ignore", under="ignore"):
         weights = np.exp(-0.5 * (places / sigma) ** 2) if sigma > 0 else np.ones(1)

@@ -1,9 +1,9 @@
-"""The edits: small values that say what is changed, each with the pure function that changes it.
+"""The edits: small values, each with the pure function that applies it.
 
-Conventions: linear light throughout, so what an edit does to light is a sum that can be checked (`Edit.light`).
-Every edit is continuous in its parameters and hands the same arrays on at its neutral value. A ``mask`` says where it
-acts: 0 nowhere, 1 fully. Edits of the diffuse image never touch the specular one, and the other way round, but for the
-colour of the light, which is in both.
+Conventions: light is linear throughout, so the effect of an edit on light is a sum that can be checked (`Edit.light`).
+Every edit is continuous in its parameters and returns the same arrays at its neutral value. A ``mask`` limits it: 0
+nowhere, 1 fully. Edits of the diffuse image never change the specular one, and the reverse, except the colour of the
+light, which is in both.
 
 Source: Dave et al. 2022, doi 10.1364/OE.460984, "Appearance editing application" and Fig. 8.
 """
@@ -24,9 +24,9 @@ from polsep.edit.texture import texture_of
 
 @dataclass(frozen=True, kw_only=True)
 class Edit(ABC):
-    """What all edits have: a name, a mask, and what is said of them. Raises EditError on values out of range.
+    """The base of all edits: a name, a mask, and descriptions. Raises EditError on values out of range.
 
-    ``title``: for people. ``light``: what the edit does to the sum of light. ``caution``: what it cannot do honestly.
+    ``title``: for the page. ``light``: effect on the sum of light. ``caution``: its physical limits.
     ``needs_color``: images of one colour are refused.
     """
 
@@ -36,7 +36,7 @@ class Edit(ABC):
     caution: ClassVar[str] = ""
     needs_color: ClassVar[bool] = False
 
-    mask: str | None = image_field("mask", "Where the edit acts, from 0 to 1; everywhere without one.")
+    mask: str | None = image_field("mask", "Mask of the edit, from 0 to 1; without one it acts everywhere.")
 
     def __post_init__(self) -> None:
         for parameter in self.parameters():
@@ -44,12 +44,11 @@ class Edit(ABC):
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
-        """The parameters, the one that names the edit at the command line first, the mask last."""
-        found = parameters_of(cls)
-        return tuple(sorted(found, key=lambda parameter: parameter.kind == "mask"))
+        """The parameters: first that of the option with the edit's own name, last the mask."""
+        return tuple(sorted(parameters_of(cls), key=lambda parameter: parameter.kind == "mask"))
 
     def is_neutral(self) -> bool:
-        """True where the edit is the identity."""
+        """True if the edit is the identity."""
         return any(p.neutral is not None and getattr(self, p.name) == p.neutral for p in self.parameters())
 
     def images(self) -> list[tuple[str, str]]:
@@ -57,9 +56,9 @@ class Edit(ABC):
         return [(p.kind, name) for p in self.parameters() if isinstance(name := getattr(self, p.name), str)]
 
     def change(self, images: SeparatedImages, maps: Maps) -> SeparatedImages:
-        """The images after the edit; those that it does not change are the same arrays. Raises EditError.
+        """The images after the edit; unchanged ones are the same arrays. Raises EditError.
 
-        ``maps`` has the images that the edit names.
+        ``maps``: the images that the edit names.
         """
         if self.is_neutral():
             return images
@@ -70,11 +69,11 @@ class Edit(ABC):
 
     @abstractmethod
     def _changed(self, images: SeparatedImages, mask: Floats | None, maps: Maps) -> SeparatedImages:
-        """The images after an edit that is not neutral; ``mask`` is that of the edit."""
+        """The images after an edit that is not neutral, within its ``mask``."""
 
 
 def within(mask: Floats | None, before: Floats, after: Floats) -> Floats:
-    """``after`` where the mask is 1, ``before`` where it is 0, both bit for bit, and shares of both between."""
+    """``after`` where the mask is 1 and ``before`` where it is 0, both bit for bit; a mixture between."""
     if mask is None:
         return after
     share = np.repeat(mask[..., None], before.shape[2], axis=2)  # sixfold faster than broadcasting
@@ -87,7 +86,7 @@ def scaled(mask: Floats | None, light: Floats, factor: float) -> Floats:
 
 
 def mean_of_colors(light: Floats) -> Floats:
-    """The mean over colours ``[h, w, 1]``: the measure by which edits keep light."""
+    """The mean over colours ``[h, w, 1]``: the light that edits keep."""
     colors = light.shape[2]
     return light if colors == 1 else (light[..., :1] + light[..., 1:2] + light[..., 2:]) / np.float32(colors)
 
@@ -99,7 +98,7 @@ def largest_color(light: Floats) -> Floats:
 
 
 def recolored(diffuse: Floats, target: tuple[float, ...]) -> Floats:
-    """Light of the colour ``target``, as much in each pixel as there was (mean over colours)."""
+    """Light of the colour ``target``, with the same mean over colours in each pixel."""
     total = sum(target)
     if total <= 0:
         raise EditError(f"expected a colour that is not black, found {', '.join(f'{c:g}' for c in target)}")
@@ -107,10 +106,10 @@ def recolored(diffuse: Floats, target: tuple[float, ...]) -> Floats:
 
 
 def metallic(diffuse: Floats, specular: Floats) -> Floats:
-    """The specular image in the diffuse one's hue and saturation; its value V, the largest colour, stays.
+    """The specular image with hue and saturation of the diffuse one; its value V, the largest colour, is kept.
 
-    In HSV a colour of hue and saturation as d, and of value v, is v d / max(d). Where d = 0 it has no hue: grey.
-    Note: the paper names no colour space; HSV is the one in which "hue and saturation" leave an intensity.
+    In HSV the colour with the hue and saturation of d and the value v is v d / max(d); d = 0 gives grey.
+    Note: the paper names no colour space; in HSV, hue and saturation are separate from intensity.
     """
     largest = largest_color(diffuse)
     hue = np.divide(diffuse, largest, out=np.ones_like(diffuse), where=largest > 0)
@@ -119,14 +118,14 @@ def metallic(diffuse: Floats, specular: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class Recolor(Edit):
-    """The diffuse light in one colour; shading, and each pixel's light, stay."""
+    """Diffuse light of one colour; shading, and the light of each pixel, are kept."""
 
     name: ClassVar[str] = "recolor"
     title: ClassVar[str] = "Recolour the material"
     light: ClassVar[str] = "keeps each pixel's diffuse light (mean over colours) and the specular light"
     needs_color: ClassVar[bool] = True
 
-    color: tuple[float, float, float] = color_field((0.8, 0.1, 0.05), 1.0, "The material's new colour, linear.")
+    color: tuple[float, float, float] = color_field((0.8, 0.1, 0.05), 1.0, "New linear colour of the material.")
     amount: float = number_field(1.0, (0.0, 1.0), "From the old colour to the new one.", neutral=0.0)
 
     def _changed(self, images: SeparatedImages, mask: Floats | None, maps: Maps) -> SeparatedImages:
@@ -136,16 +135,16 @@ class Recolor(Edit):
 
 @dataclass(frozen=True, kw_only=True)
 class Texture(Edit):
-    """A pattern on the material: the diffuse light times the texture; highlights stay as they are (Fig. 8f)."""
+    """A texture on the material: the diffuse light times the texture; highlights are unchanged (Fig. 8f)."""
 
     name: ClassVar[str] = "texture"
     title: ClassVar[str] = "Texture under the highlights"
     light: ClassVar[str] = "multiplies the diffuse light by the texture, and keeps the specular light"
 
-    image: str = image_field("texture", "The texture: reflectance, 1 leaves light as it is.", required=True)
-    amount: float = number_field(1.0, (0.0, 1.0), "From no texture to all of it.", neutral=0.0)
-    repeats: float = number_field(1.0, (0.1, 50.0), "How often the texture fits into the image's width.")
-    normals: str | None = image_field("normals", "Surface normals, by which the texture follows the shape.")
+    image: str = image_field("texture", "The texture: reflectance, 1 changes nothing.", required=True)
+    amount: float = number_field(1.0, (0.0, 1.0), "From no texture to the full texture.", neutral=0.0)
+    repeats: float = number_field(1.0, (0.1, 50.0), "Repeats of the texture across the image.")
+    normals: str | None = image_field("normals", "Surface normals along which the texture follows the shape.")
 
     def _changed(self, images: SeparatedImages, mask: Floats | None, maps: Maps) -> SeparatedImages:
         texture = find_map(maps, "texture", self.image, images)
@@ -157,7 +156,7 @@ class Texture(Edit):
 
 @dataclass(frozen=True, kw_only=True)
 class Rougher(Edit):
-    """A matte look: the specular image, blurred by a Gaussian (Fig. 8e: sigma 10)."""
+    """A matte surface: the specular image, blurred by a Gaussian (Fig. 8e: sigma 10)."""
 
     name: ClassVar[str] = "rougher"
     title: ClassVar[str] = "Rougher"
@@ -171,14 +170,14 @@ class Rougher(Edit):
 
 @dataclass(frozen=True, kw_only=True)
 class Sharper(Edit):
-    """A glossier look: the specular image with a blur of ``sigma`` undone, as far as that is possible."""
+    """A glossier surface: the specular image with a blur of ``sigma`` undone, as far as possible."""
 
     name: ClassVar[str] = "sharper"
     title: ClassVar[str] = "Glossier"
     light: ClassVar[str] = "keeps the sum of the specular light: highlights get smaller and brighter"
     caution: ClassVar[str] = (
         "sharper undoes blur only as far as the camera resolved it: noise grows, highlights that clipped stay broad, "
-        "and reflections that the rough surface averaged do not come back"
+        "and reflections that the rough surface averaged are not restored"
     )
 
     sigma: float = number_field(
@@ -198,11 +197,11 @@ class Metallic(Edit):
 
     name: ClassVar[str] = "metallic"
     title: ClassVar[str] = "Metallic"
-    light: ClassVar[str] = "multiplies the specular light by gain x (colour / its largest part); light is not kept"
+    light: ClassVar[str] = "multiplies the specular light by gain x (colour / its largest component); light is not kept"
     needs_color: ClassVar[bool] = True
 
     amount: float = number_field(1.0, (0.0, 1.0), "From the specular image to its metallic one.", neutral=0.0)
-    gain: float = number_field(45.0, (0.0, 200.0), "How much brighter metals mirror; the paper's is 45.")
+    gain: float = number_field(45.0, (0.0, 200.0), "Factor of the specular light of metal; 45 in the paper.")
 
     def _changed(self, images: SeparatedImages, mask: Floats | None, maps: Maps) -> SeparatedImages:
         metal = np.float32(self.gain) * metallic(images.diffuse, images.specular)
@@ -240,11 +239,11 @@ class DiffuseGain(Edit):
 
 @dataclass(frozen=True, kw_only=True)
 class RemoveHighlights(Edit):
-    """The scene without what its surfaces mirror."""
+    """The scene with less specular light, or without it."""
 
     name: ClassVar[str] = "remove-highlights"
     title: ClassVar[str] = "Remove highlights"
-    light: ClassVar[str] = "takes the share amount of the specular light away"
+    light: ClassVar[str] = "removes the share amount of the specular light"
 
     amount: float = number_field(1.0, (0.0, 1.0), "Share of the specular light that is removed.", neutral=0.0)
 
@@ -254,11 +253,11 @@ class RemoveHighlights(Edit):
 
 @dataclass(frozen=True, kw_only=True)
 class IsolateHighlights(Edit):
-    """What surfaces mirror, and nothing else."""
+    """The scene with less diffuse light, or without it."""
 
     name: ClassVar[str] = "isolate-highlights"
     title: ClassVar[str] = "Highlights alone"
-    light: ClassVar[str] = "takes the share amount of the diffuse light away"
+    light: ClassVar[str] = "removes the share amount of the diffuse light"
 
     amount: float = number_field(1.0, (0.0, 1.0), "Share of the diffuse light that is removed.", neutral=0.0)
 
@@ -272,7 +271,7 @@ class Tint(Edit):
 
     name: ClassVar[str] = "tint"
     title: ClassVar[str] = "Colour of the light"
-    light: ClassVar[str] = "multiplies each colour of both images by its part of color"
+    light: ClassVar[str] = "multiplies each colour of both images by its factor in color"
     needs_color: ClassVar[bool] = True
 
     color: tuple[float, float, float] = color_field(
@@ -286,12 +285,12 @@ class Tint(Edit):
 
 
 def mix(before: Floats, after: Floats, amount: float) -> Floats:
-    """Shares of both; all of ``after``, bit for bit, at amount 1."""
+    """A mixture of both; ``after``, bit for bit, at amount 1."""
     return np.float32(1 - amount) * before + np.float32(amount) * after
 
 
-#: Every edit by its name, in the order in which options of the command line act: the material, then how it mirrors,
-#: then the light. Metal comes behind roughness, because a rough metal blurs what it mirrors, not its own colour.
+#: Every edit by its name, in the order in which options of the command line are applied: the material, then its
+#: reflection, then the light. Metal follows roughness, because a rough metal blurs its reflections, not its colour.
 EDITS: dict[str, type[Edit]] = {
     kind.name: kind
     for kind in (

@@ -1,9 +1,9 @@
 """Edits on files: separated frames in, edited frames out, single ones and sequences.
 
-Nothing is skipped silently: a frame that is missing or damaged ends a sequence, or is named and left out. Inputs are
-never overwritten. The same recipe on the same files writes the same bytes, however often a run was stopped.
+Nothing is skipped silently: a missing or damaged frame ends a sequence, or is reported and left out. Inputs are never
+overwritten. The same recipe on the same files writes the same bytes, however often a run was stopped.
 
-Previews show the input's exposure, or less where edits add light; in sequences, that of the first frame.
+Previews have the exposure of the input, or less where edits add light; in sequences, that of the first frame.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import InputError, input_error
 from polsep.video.recordings import ON_DAMAGE, Progress, black_picture, draw_panels, write_pictures
 
-#: Frames that are read and edited at once.
+#: Number of frames that are read and edited at once.
 AT_ONCE = 2
 
 
@@ -42,14 +42,14 @@ class Work:
     maps: Maps = field(default_factory=dict)
     hashes: dict[str, str] = field(default_factory=dict)
 
-    def said(self) -> dict[str, Any]:
-        """What sidecars say of it."""
+    def as_data(self) -> dict[str, Any]:
+        """Recipe and hashes for sidecars."""
         return {"recipe": recipe_as_data(self.recipe), "images": self.hashes}
 
 
 @dataclass(frozen=True)
 class EditTarget:
-    """Where edited frames go; ``kind``: of sequences; ``damaged``: of `ON_DAMAGE`, what becomes of one with gaps."""
+    """The folder of edited frames; ``kind``: of sequences; ``damaged``: of `ON_DAMAGE`, for sequences with gaps."""
 
     directory: Path
     overwrite: bool = False
@@ -65,7 +65,7 @@ class EditTarget:
 
 @dataclass(frozen=True)
 class Edited:
-    """What became of one file: the files written, or the error in one line."""
+    """The outcome of one file: the files written, or the error in one line."""
 
     source: Path
     written: tuple[Path, ...] = ()
@@ -88,9 +88,9 @@ def load_work(recipe: Recipe, folder: Path) -> Work:
 
 
 def edit_files(paths: Sequence[Path], work: Work, target: EditTarget) -> Iterator[Edited]:
-    """Edit single frames; a bad file is an outcome with an error, and the rest go on.
+    """Edit single frames; a bad file gives an outcome with an error, and the rest are edited.
 
-    Raises OutputError before any work when two inputs have one name.
+    Raises OutputError before any work if two inputs have one name.
     """
     stems = Counter(path.stem for path in paths)
     repeated = [path for path in paths if stems[path.stem] > 1]
@@ -114,9 +114,9 @@ def _edited_frame(path: Path, work: Work) -> EditedFrame:
     """One file's frame, edited, and its preview."""
     before, after = _edit(path, work)
     gain = _exposure(before, after)
-    said = {"source": path.name, **work.said(), "light": _light(before, after), "exposure": gain}
+    sidecar = {"source": path.name, **work.as_data(), "light": _light(before, after), "exposure": gain}
     layers = {"diffuse": after.diffuse, "specular": after.specular, "combined": after.combined}
-    return EditedFrame(layers, toned(after.combined, gain), {**said, "warnings": work.recipe.cautions()})
+    return EditedFrame(layers, toned(after.combined, gain), {**sidecar, "warnings": work.recipe.cautions()})
 
 
 def _edit(path: Path, work: Work) -> tuple[SeparatedImages, SeparatedImages]:
@@ -136,25 +136,27 @@ def _exposure(before: SeparatedImages, after: SeparatedImages) -> float:
 
 
 def _light(before: SeparatedImages, after: SeparatedImages) -> dict[str, Any]:
-    """What the edits did to the mean light of each image."""
+    """Mean light of each image before and after the edits."""
     return {"before": before.light(), "after": after.light()}
 
 
 def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Progress, None, None]:
-    """Edit a sequence as `polsep video` writes it, and say how far it is; a stopped run goes on with the same bytes.
+    """Edit a sequence of `polsep video` and yield the progress; a stopped run resumes and writes the same bytes.
 
-    Writes STEM_000123.exr (half floats, layers diffuse, specular, combined), STEM.png of the first frame, a film to
-    watch if ``kind`` has one, STEM.jsonl and STEM.json. Raises ValueError on what can't be read or written and, with
-    ``damaged`` "stop", at the first missing or damaged frame; what was done by then stays.
+    Writes STEM_000123.exr (half floats, layers diffuse, specular, combined), STEM.png of the first frame, a preview
+    video if ``kind`` has one, STEM.jsonl and STEM.json. Raises ValueError on what cannot be read or written and, with
+    ``damaged`` "stop", at the first missing or damaged frame; frames done by then stay.
     """
     found = find_numbered(folder)
     if (missing := found.missing()) and target.damaged == "stop":
         some = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
-        raise input_error(folder, f"expected frames without gaps, found none of number {some}; --damaged skip goes on")
+        raise input_error(
+            folder, f"expected frames without gaps, found none of number {some}; --damaged skip continues"
+        )
     before, after = _first_frame(found, work, target.damaged)
     gain, size = _exposure(before, after), before.diffuse.shape
     settings = {
-        **work.said(),
+        **work.as_data(),
         "source": folder.resolve().name,
         "first": found.first,
         "count": len(found.files),
@@ -183,7 +185,7 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
 
 
 def _first_frame(found: NumberedFiles, work: Work, on_damage: str) -> tuple[SeparatedImages, SeparatedImages]:
-    """The first frame before and after the edits; with "skip", the first that can be read."""
+    """The first frame before and after the edits; with "skip", the first that can be edited."""
     failed: ValueError | None = None
     for path in found.files:
         try:
@@ -198,7 +200,7 @@ def _first_frame(found: NumberedFiles, work: Work, on_damage: str) -> tuple[Sepa
 
 
 def _refuse_frames(folder: Path, found: NumberedFiles, target: EditTarget) -> None:
-    """Raise OutputError rather than write over inputs, or over frames of another run unasked."""
+    """Raise OutputError instead of overwriting inputs, or frames of another run without ``overwrite``."""
     if realpath(folder) == realpath(target.directory):
         raise OutputError(f"expected another directory than that of the input, found {target.directory}")
     if target.overwrite or (target.directory / f".polsep-{found.stem}").exists():

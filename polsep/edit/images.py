@@ -1,4 +1,4 @@
-"""`SeparatedImages`: what edits take and make, and the images beside them that they name.
+"""`SeparatedImages`, the input and output of edits, and the images that edits name.
 
 Images are linear light ``[h, w, C]``, float32, C = 3 or 1, 1.0 = one measurement at the white level.
 """
@@ -48,7 +48,7 @@ class SeparatedImages:
 
     @property
     def combined(self) -> Floats:
-        """What a camera would see: diffuse + specular."""
+        """The image of a camera: diffuse + specular."""
         return self.diffuse + self.specular
 
     @property
@@ -57,12 +57,12 @@ class SeparatedImages:
         return int(self.diffuse.shape[2])
 
     def light(self) -> dict[str, float]:
-        """Mean light of each image, over pixels and colours: what `edits` change or keep."""
+        """Mean light of each image over pixels and colours, which `edits` change or keep."""
         return {name: float(getattr(self, name).mean(dtype=np.float64)) for name in ("diffuse", "specular")}
 
 
 def find_map(maps: Maps, kind: str, name: str, images: SeparatedImages) -> Floats:
-    """The image that an edit names, held to its kind: a texture, a mask or normals. Raises EditError."""
+    """The image that an edit names, checked for its kind: texture, mask or normals. Raises EditError."""
     if name not in maps:
         raise EditError(f"expected an image {name!r} as {kind}, found {', '.join(map(repr, maps)) or 'none'}")
     found = maps[name]

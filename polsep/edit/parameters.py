@@ -1,7 +1,6 @@
-"""Values of edits as data: what a recipe may hold, and what a slider, an option or a test needs to know of each.
+"""Parameters of edits as data, for recipes, sliders, options and tests.
 
-A field of an edit is declared by `number_field`, `color_field` or `image_field`, which say in its metadata what makes
-a `Parameter`.
+A field of an edit is declared by `number_field`, `color_field` or `image_field`; its metadata make a `Parameter`.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ KINDS = ("number", "color", *IMAGES)
 
 
 class EditError(ValueError):
-    """An edit, a recipe or an image that can't be used as asked: one line of what was expected and what was found."""
+    """An unusable edit, recipe or image: one line of what was expected and what was found."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +26,8 @@ class Parameter:
     """One value of an edit.
 
     ``kind``: of `KINDS`: a number from ``low`` to ``high``, a colour of three such numbers (linear, camera RGB), or the
-    name of an image. ``neutral``: the value at which the edit is the identity, whatever its other values; None where
-    this one does not decide that. ``required``: there is no ``default``.
+    name of an image. ``neutral``: the value at which the edit is the identity, whatever its other values; None if
+    there is none. ``required``: there is no ``default``.
     """
 
     name: str
@@ -69,17 +68,17 @@ class Parameter:
 def number_field(
     default: float, limits: tuple[float, float], text: str, unit: str = "", neutral: float | None = None
 ) -> Any:
-    """A field that holds a number within ``limits``."""
+    """A field for a number within ``limits``."""
     return field(default=default, metadata=_about("number", limits, text, unit, neutral))
 
 
 def color_field(default: tuple[float, float, float], high: float, text: str, neutral: Value = None) -> Any:
-    """A field that holds a linear colour of three numbers from 0 to ``high``."""
+    """A field for a linear colour of three numbers from 0 to ``high``."""
     return field(default=default, metadata=_about("color", (0.0, high), text, "", neutral))
 
 
 def image_field(kind: str, text: str, required: bool = False) -> Any:
-    """A field that holds the name of an image of a ``kind`` of `IMAGES`."""
+    """A field for the name of an image of a ``kind`` of `IMAGES`."""
     about = _about(kind, (0.0, 1.0), text, "", None)
     return field(metadata=about) if required else field(default=None, metadata=about)
 

@@ -1,9 +1,9 @@
-"""Recipes: edits in order, kept as small JSON files that can be replayed on other frames.
+"""Recipes: edits in order, stored as small JSON files that can be applied to other frames.
 
     {"polsep_recipe": 1, "edits": [{"edit": "rougher", "sigma": 10.0}, {"edit": "metallic", "gain": 45.0}]}
 
-Values that a file leaves out are the defaults; what is written has them all. Anything else than that is refused in one
-line. Images stand in a recipe by name: file names, relative to the recipe, at the command line.
+Missing values are defaults; a written recipe has all values. Anything else is refused in one line. Images are named in
+a recipe: by file names relative to the recipe, at the command line.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ class Recipe:
                     raise EditError(f"expected an image for each use, found {name!r} as {kinds[name]} and as {kind}")
 
     def images(self) -> dict[str, str]:
-        """The names of all images, and of which kind each is."""
+        """The kind of each image by its name."""
         return {name: kind for edit in self.edits for kind, name in edit.images()}
 
     def cautions(self) -> list[str]:
-        """What the edits, where they do anything, cannot do honestly: a line each."""
+        """The limits of the edits that are not neutral, a line each."""
         return list(dict.fromkeys(edit.caution for edit in self.edits if edit.caution and not edit.is_neutral()))
 
 
 def rename_images(recipe: Recipe, renaming: Callable[[str], str]) -> Recipe:
-    """The same recipe with other names of its images."""
+    """The recipe with other names of its images."""
     return Recipe(tuple(_renamed(edit, renaming) for edit in recipe.edits))
 
 
@@ -55,19 +55,19 @@ def _renamed(edit: Edit, renaming: Callable[[str], str]) -> Edit:
 
 
 def apply(images: Separated, recipe: Recipe, maps: Maps | None = None) -> SeparatedImages:
-    """The edits of a recipe on one frame, one after the other; ``maps`` has the images that they name.
+    """The edits of a recipe on one frame, one after the other; ``maps``: the images that they name.
 
     ``images``: a `SeparatedFrame`, or anything with diffuse and specular images as float32 ``[h, w, 3 or 1]``, linear,
-    0 or more. The frame itself is never changed; images that no edit changes are the very same arrays.
-    Raises EditError, naming the edit, where one doesn't fit the images.
+    0 or more. The frame itself is never changed; images that no edit changes are the same arrays.
+    Raises EditError, naming the edit, if one does not fit the images.
     """
-    found = SeparatedImages(images.diffuse, images.specular)
+    edited = SeparatedImages(images.diffuse, images.specular)
     for place, edit in enumerate(recipe.edits, 1):
         try:
-            found = edit.change(found, maps or {})
+            edited = edit.change(edited, maps or {})
         except EditError as error:
             raise EditError(f"edit {place}, {edit.name}: {error}") from error
-    return found
+    return edited
 
 
 def recipe_as_data(recipe: Recipe) -> dict[str, Any]:

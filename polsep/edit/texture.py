@@ -3,10 +3,10 @@
 Texture coordinates are in pixels of the image, x to the right and y down, and repeat with the texture. Flat, they are
 the pixels' own. Over a surface z(x, y) seen from far away, whose gradient is g, the surface between neighbouring pixels
 is longer than a pixel: by the root of its metric I + g gᵀ, which is J = I + g gᵀ / (1 + 1 / n_z). Coordinates (u, v)
-whose gradients are nearest to J, in least squares over the image, follow the shape; they solve Poisson's equation.
+whose gradients are nearest to J in least squares over the image follow the shape; they solve Poisson's equation.
 
-Normals: unit vectors ``[h, w, 3]``, x right, y UP, z to the camera; where n_z <= 0 (as zeros) nothing is known, and the
-surface is taken to be flat.
+Normals: unit vectors ``[h, w, 3]``, x right, y UP, z to the camera; where n_z <= 0 (as zeros) they are unknown, and the
+surface is taken as flat.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 
-#: Surfaces steeper than this n_z (78 degrees) are taken to be so steep, or a pixel would span many repeats.
+#: Least n_z of a surface (78 degrees); steeper ones are limited to it, or a pixel would span many repeats.
 STEEPEST = 0.2
 
 
@@ -40,7 +40,7 @@ def flat_coordinates(size: tuple[int, int]) -> tuple[Floats, Floats]:
 
 
 def coordinates_on(normals: Floats) -> tuple[Floats, Floats]:
-    """`unfold`, kept for the next call where the same normals, read-only, come again: in videos, and under sliders."""
+    """`unfold`, cached while the same read-only normals are used again: in videos, and under sliders."""
     if normals.flags.writeable:
         return unfold(normals)
     kept = _Last.kept  # read once: threads share it
@@ -52,7 +52,7 @@ def coordinates_on(normals: Floats) -> tuple[Floats, Floats]:
 
 
 class _Last:
-    """State: the normals that were unfolded last, as long as anyone else keeps them, and what was found."""
+    """State: the normals that were unfolded last, while others hold them, and their coordinates."""
 
     kept: tuple[ref[Floats], tuple[Floats, Floats]] | None = None
 
@@ -60,8 +60,8 @@ class _Last:
 def unfold(normals: Floats) -> tuple[Floats, Floats]:
     """Coordinates along the surface in pixels, each ``[h, w]``, that are on average those of the pixels.
 
-    One pair for the whole image: across a jump in depth, or the outline of an object, they go on steadily, and
-    within some pixels of it stretch less than the surface does.
+    One pair for the whole image: they are continuous across a jump in depth or the outline of an object, and within
+    some pixels of it stretch less than the surface.
     """
     known = normals[..., 2] > 0
     n_z = np.where(known, np.maximum(normals[..., 2], np.float32(STEEPEST)), np.float32(1))
@@ -69,7 +69,7 @@ def unfold(normals: Floats) -> tuple[Floats, Floats]:
     down = np.where(known, normals[..., 1] / n_z, np.float32(0))
     steep = 1 + np.sqrt(1 + across**2 + down**2)  # 1 + 1 / n_z, also of normals that are not quite unit vectors
     mixed = across * down / steep
-    # u and v at once, as the real and imaginary part; what is solved for is the difference to the flat ones.
+    # u and v at once, as real and imaginary part; the unknown is the difference to the flat ones.
     found = _integrate(across**2 / steep + 1j * mixed, mixed + 1j * down**2 / steep)
     x, y = flat_coordinates((normals.shape[0], normals.shape[1]))
     return x + found.real, y + found.imag
@@ -78,8 +78,8 @@ def unfold(normals: Floats) -> tuple[Floats, Floats]:
 def _integrate(across: NDArray[np.complex64], down: NDArray[np.complex64]) -> NDArray[np.complex64]:
     """The image, of mean 0, whose differences to the right and down are nearest to these, by least squares.
 
-    Mirrored at the border, Poisson's equation is solved by one Fourier transform and back; PyTorch's takes a fourth of
-    the time of NumPy's.
+    Mirrored at the border, Poisson's equation is solved by one Fourier transform and back; PyTorch's takes a quarter
+    of the time of NumPy's.
     Source: Frankot and Chellappa 1988, doi 10.1109/34.3909; the mirror: Simchony et al. 1990, doi 10.1109/34.55103.
     """
     height, width = across.shape

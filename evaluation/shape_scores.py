@@ -24,7 +24,7 @@ from polsep.geometry.integration import Equations, find_slopes, integrate_bilate
 from polsep.geometry.lights import NAMED
 from polsep.geometry.multigrid import Multigrid, solve
 from polsep.geometry.photometric import Appearance, fit_lambertian, fit_robust
-from polsep.geometry.polarization import Polarized, find_slope, normals_of_slope
+from polsep.geometry.polarization import Polarized, find_diffuse_polarization, normals_from_polarization
 from polsep.io.assets.objects import read_depth, read_intrinsics, read_mask, read_normal_map
 from polsep.pipeline import separate_capture
 
@@ -76,7 +76,7 @@ def appearances_of(shoot: Shoot) -> Iterator[tuple[str, Appearance]]:
 
 def _with_cue(views: Views, directions: Floats, mask: Mask) -> Appearance:
     assert views.polarized is not None
-    cue = normals_of_slope(find_slope(views.polarized, mask))
+    cue = normals_from_polarization(find_diffuse_polarization(views.polarized, mask))
     return fit_robust(views.images, directions, mask, cue)
 
 

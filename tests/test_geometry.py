@@ -17,7 +17,7 @@ from polsep.geometry.integration import SHARPNESS, Equations, find_slopes, integ
 from polsep.geometry.lights import NAMED, parse_lights
 from polsep.geometry.multigrid import Multigrid, solve
 from polsep.geometry.photometric import fit_lambertian, fit_robust
-from polsep.geometry.polarization import Polarized, find_slope, normals_of_slope
+from polsep.geometry.polarization import Polarized, find_diffuse_polarization, normals_from_polarization
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -101,12 +101,12 @@ def test_normals_turn_with_the_camera(turns: int) -> None:
     """Images, lights and polarization turned by 90 degrees give normals that are turned."""
     normals, mask = cap(32, 70)
     images = dielectric(normals, SIX, np.full((32, 32, 3), 0.4))
-    found = fit_robust(images, SIX, mask, normals_of_slope(slope_of(normals)))
+    found = fit_robust(images, SIX, mask, normals_from_polarization(slope_of(normals)))
     turned = np.rot90(images, turns, axes=(1, 2))
     c, s = (round(f(turns * math.pi / 2)) for f in (math.cos, math.sin))
     rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
     slope = np.rot90(slope_of(normals), turns) * (-1.0) ** turns
-    again = fit_robust(turned, SIX @ rotation.T, np.rot90(mask, turns), normals_of_slope(slope))
+    again = fit_robust(turned, SIX @ rotation.T, np.rot90(mask, turns), normals_from_polarization(slope))
     assert np.abs(again.normals - np.rot90(found.normals, turns) @ rotation.T).max() < 1e-3
 
 
@@ -116,14 +116,14 @@ def test_polarization_says_what_shading_leaves_open() -> None:
     images = dielectric(normals, SIX, np.full((48, 48, 1), 0.4))
     dark = mask & (normals @ SIX[5] < 0)
     alone = angles(fit_robust(images, SIX, mask).normals, normals, dark)
-    helped = angles(fit_robust(images, SIX, mask, normals_of_slope(slope_of(normals))).normals, normals, dark)
+    helped = angles(fit_robust(images, SIX, mask, normals_from_polarization(slope_of(normals))).normals, normals, dark)
     assert helped.mean() < 2.0 and helped.mean() < 0.3 * alone.mean()
 
 
 def test_a_slope_has_two_normals_half_a_turn_apart() -> None:
-    """`normals_of_slope` undoes the Fresnel curve; the other normal has the opposite azimuth."""
+    """`normals_from_polarization` undoes the Fresnel curve; the other normal has the opposite azimuth."""
     normals, mask = cap(32, 80)
-    cue = normals_of_slope(slope_of(normals))
+    cue = normals_from_polarization(slope_of(normals))
     nearer = np.minimum(angles(cue.first, normals, mask), angles(cue.second, normals, mask))
     assert nearer[nearer.size // 4 :].max() < 0.5
     assert np.allclose(cue.first[mask] * np.array([-1.0, -1.0, 1.0]), cue.second[mask])
@@ -139,7 +139,7 @@ def test_slopes_ignore_the_frames_whose_light_is_specular() -> None:
     specular[2] = 0.3
     both = slope * diffuse + specular * np.exp(0.4j)
     frames = Polarized(diffuse, specular, both.real, both.imag, np.ones_like(diffuse))
-    found = find_slope(frames, np.ones((24, 24), np.bool_))
+    found = find_diffuse_polarization(frames, np.ones((24, 24), np.bool_))
     assert np.abs(found - slope).max() < 1e-3
 
 

@@ -25,7 +25,7 @@ from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
 from polsep.io.store.weights import write_weights
 from polsep.material.estimate import load_estimator
-from polsep.material.network import MaterialNetwork, MaterialSize, see_details, see_with_places
+from polsep.material.network import MaterialNetwork, MaterialSize, detail_cues, encode_images
 from polsep.material.procedural import halve, random_svbrdf
 from polsep.material.shots import CAMERA, INPUTS, photograph, random_example, random_flash
 from polsep.material.svbrdf import Svbrdf, plane_points, relight, unstack
@@ -154,7 +154,7 @@ def test_what_the_network_says_is_a_material() -> None:
 
 def test_places_count_as_the_plane_does() -> None:
     """The last two channels that the network sees are x and y: left is -1, the top row 1."""
-    seen = see_with_places(torch.ones(1, 3, 4, 6))
+    seen = encode_images(torch.ones(1, 3, 4, 6))
     assert float(seen[0, 3, 0, 0]) == -1 and float(seen[0, 4, 0, 0]) == 1
     assert float(seen[0, 3, 0, -1]) == 1 and float(seen[0, 4, -1, 0]) == -1
     torch.testing.assert_close(seen[0, :3], torch.ones(3, 4, 6))
@@ -368,7 +368,7 @@ def test_details_are_slopes_of_a_glossy_bump() -> None:
     glossy = replace(maps, diffuse=torch.full((3, 64, 64), 0.02), roughness=torch.full((1, 64, 64), 0.4))
     above = torch.tensor([0.0, 0.0, 2.75]).view(3, 1, 1)
     photograph = relight(glossy, plane_points(64, 64), above, above)
-    cue, true = see_details(photograph[None])[0], maps.normal[:2]
+    cue, true = detail_cues(photograph[None])[0], maps.normal[:2]
     along = float((cue * true).sum()) / float(cue.norm() * true.norm())
     across = float((cue * true.flip(0)).sum()) / float(cue.norm() * true.norm())
     assert along < -0.25 and abs(across) < 0.5 * abs(along)

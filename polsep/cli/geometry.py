@@ -56,7 +56,7 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     """
     with extra_needed("render"):
         from polsep.geometry.files import (
-            Asked,
+            ShapeOptions,
             Source,
             find_object,
             find_shape,
@@ -69,13 +69,13 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     from polsep.io.store.atomic import refuse_existing, refuse_inputs
     from polsep.methods import check_method
 
-    asked = Asked(options["mesh"], options["fov"], options["integration"], options["turntable"])
+    shape_options = ShapeOptions(options["mesh"], options["fov"], options["integration"], options["turntable"])
     directions = parse_lights(options["lights"])
     if len(files) != len(directions):
         raise ValueError(f"expected {len(directions)} files, one per light of --lights, found {len(files)}")
     check_method(options["method"])
     read = read_options(options)
-    targets = shape_targets(options["output"], options["name"], options["mesh"], asked.turntable)
+    targets = shape_targets(options["output"], options["name"], options["mesh"], options["turntable"])
     refuse_inputs(targets, [*files, *([options["mask"]] if options["mask"] else [])])
     refuse_existing(options["output"], targets, options["overwrite"])
     views = read_views(files, Source("photographs" if options["srgb"] else "frames", read, options["method"]))
@@ -84,6 +84,6 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     if options["longest"] < 1:
         raise ValueError(f"expected --size of 1 or more, found {options['longest']}")
     views, mask = shrink(views, mask, options["longest"])
-    write_shape(find_shape(views, directions, mask, asked), targets)
+    write_shape(find_shape(views, directions, mask, shape_options), targets)
     for path in targets:
         print(path)

@@ -75,8 +75,7 @@ def material(files: tuple[str, ...], **options: Any) -> None:
         options["network_input"],
         options["weights"],
     )
-    target = (options["output"], options["name"], options["overwrite"])
-    written, notes = estimate_files(files, settings, target)
+    written, notes = estimate_files(files, settings, options["output"], options["name"], options["overwrite"])
     for note in notes:
         print_note(note)
     for path in written:

@@ -1,7 +1,7 @@
-"""From files of six lights to normals, albedo, depth and a mesh, as files.
+"""Files of frames under several lights in, normals, albedo, depth and a mesh out.
 
 Inputs are separated EXR files of `polsep separate`, raw frames, which are separated first, or photographs of an
-ordinary camera, which are taken as they are: they have no polarization to help.
+ordinary camera, which have no polarization.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polsep.geometry.integration import integrate_bilateral, integrate_smooth
 from polsep.geometry.photometric import Appearance, fit_robust
-from polsep.geometry.polarization import Polarized, find_slope, normals_of_slope
+from polsep.geometry.polarization import Polarized, find_diffuse_polarization, normals_from_polarization
 from polsep.geometry.surface import Surface, draw_views, relight, span_surface
 from polsep.io.assets.maps import read_map
 from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
@@ -34,14 +34,14 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Pixels = NDArray[np.uint8]
 
-#: Without a mask, the object is where the brightest of the frames exceeds this share of what it exceeds in 1 %.
+#: Without a mask, the object is where the brightest frame exceeds this share of its 99th percentile.
 OBJECT_SHARE = 0.06
-#: Side of the preview's pictures, and from where its meshes are seen: azimuth and elevation [degrees].
+#: Side of the pictures of the preview, and the views of its meshes: azimuth and elevation [degrees].
 CELL = 360
 VIEWS = ((-50.0, 5.0), (-20.0, 10.0), (20.0, 10.0), (50.0, 5.0))
-#: A turntable: how far it swings to both sides and up [degrees], its pictures, and how many of them a second has.
+#: A turntable: its swing to both sides and up [degrees], number of pictures, and pictures per second.
 SWING, TURN_PICTURES, TURN_RATE = (60.0, 12.0), 96, 24.0
-#: How normals become depth: with jumps, or as one smooth surface.
+#: Integration of normals to depth: with jumps, or as one smooth surface.
 INTEGRATIONS = {"bilateral": integrate_bilateral, "smooth": integrate_smooth}
 #: Colour around the object in previews.
 GREY = 40
@@ -49,7 +49,7 @@ GREY = 40
 
 @dataclass(frozen=True)
 class Views:
-    """Linear ``images [L, H, W, C]`` under different lights, and their polarization where there is some."""
+    """Linear ``images [L, H, W, C]`` under different lights, and their polarization if known."""
 
     images: Floats
     polarized: Polarized | None
@@ -57,7 +57,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Source:
-    """How files are read: ``kind`` is "photographs" or "frames"; raw frames by ``options`` and ``method``."""
+    """Options of reading: ``kind`` is "photographs" or "frames"; ``options`` and ``method`` are for raw frames."""
 
     kind: str
     options: ReadOptions
@@ -65,9 +65,9 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """The format of the ``mesh``, the vertical field of view [degrees] or None for an orthographic camera, and one of
-    `INTEGRATIONS`; whether there is a film of the mesh. Raises ValueError."""
+class ShapeOptions:
+    """Format of the ``mesh``, vertical field of view [degrees] (None: orthographic), one of `INTEGRATIONS`, and whether
+    to draw a ``turntable``. Raises ValueError."""
 
     mesh: str = "glb"
     fov_deg: float | None = None
@@ -78,11 +78,11 @@ class Asked:
         if self.integration not in INTEGRATIONS:
             raise ValueError(f"expected an integration of {' or '.join(INTEGRATIONS)}, found {self.integration!r}")
         if self.turntable:
-            load_library()  # says at once that it is absent
+            load_library()  # reports at once that it is missing
 
 
 def read_views(paths: Sequence[Path], source: Source) -> Views:
-    """Read, and separate where needed. Raises InputError, also on images of different shapes."""
+    """Read files, and separate raw frames. Raises InputError, also on images of different shapes."""
     if source.kind == "photographs":
         images = [read_map(path, "texture") for path in paths]
         _require_one_shape(paths, images)
@@ -94,14 +94,12 @@ def read_views(paths: Sequence[Path], source: Source) -> Views:
 
 def views_of(frames: Sequence[SeparatedFrame]) -> Views:
     """Separated frames of one size with their polarization."""
-    diffuse, specular = (np.stack([getattr(f, name) for f in frames]).astype(np.float64) for name in _LOBES)
+    names = ("diffuse", "specular", "dolp", "aolp", "valid")
+    stacks = (np.stack([getattr(frame, name) for frame in frames]).astype(np.float64) for name in names)
+    diffuse, specular, dolp, aolp, valid = stacks
     grey, highlight = diffuse.mean(axis=-1), specular.mean(axis=-1)
-    dolp, aolp, valid = (np.stack([getattr(f, name) for f in frames]).astype(np.float64) for name in _STATES)
     strength = dolp * (grey + highlight)
     return Views(diffuse, Polarized(grey, highlight, strength * np.cos(2 * aolp), strength * np.sin(2 * aolp), valid))
-
-
-_LOBES, _STATES = ("diffuse", "specular"), ("dolp", "aolp", "valid")
 
 
 def _read_frame(path: Path, source: Source) -> SeparatedFrame:
@@ -141,7 +139,7 @@ def read_object(path: Path, size: tuple[int, int]) -> Mask:
 
 
 def shrink(views: Views, mask: Mask, longest: int) -> tuple[Views, Mask]:
-    """Means over blocks of so many pixels that no side exceeds ``longest``; pixels on the object wholly stay in it."""
+    """Means over square blocks, so that no side exceeds ``longest``; the mask keeps blocks entirely on the object."""
     factor = -(-max(mask.shape) // longest)
     if factor == 1:
         return views, mask
@@ -160,7 +158,7 @@ def shrink(views: Views, mask: Mask, longest: int) -> tuple[Views, Mask]:
 
 
 def find_object(views: Views) -> Mask:
-    """Where some light reaches: a guess for objects before a dark background. Raises InputError where nothing is."""
+    """Estimate the mask of an object before a dark background, from where light falls. Raises InputError."""
     brightest = views.images.mean(axis=-1).max(axis=0)
     mask: Mask = brightest > OBJECT_SHARE * np.percentile(brightest, 99)
     if not mask.any():
@@ -168,36 +166,38 @@ def find_object(views: Views) -> Mask:
     return mask
 
 
-def find_shape(views: Views, directions: Floats, mask: Mask, asked: Asked) -> ShapeFiles:
+def find_shape(views: Views, directions: Floats, mask: Mask, options: ShapeOptions) -> ShapeFiles:
     """Normals, albedo, depth, mesh and preview. Raises ValueError."""
     cue = None
     if views.polarized is not None:
-        cue = normals_of_slope(find_slope(views.polarized, mask))
+        cue = normals_from_polarization(find_diffuse_polarization(views.polarized, mask))
     found = fit_robust(views.images, directions, mask, cue)
-    intrinsics = None if asked.fov_deg is None else intrinsics_of(asked.fov_deg, mask.shape)
-    depth = INTEGRATIONS[asked.integration](found.normals, mask, intrinsics)
+    intrinsics = None if options.fov_deg is None else intrinsics_of(options.fov_deg, mask.shape)
+    depth = INTEGRATIONS[options.integration](found.normals, mask, intrinsics)
     gain = 1 / max(float(np.percentile(found.albedo[mask], 99.5)), 1e-9)
     shown = Appearance(found.normals, np.minimum(found.albedo * gain, 1), mask)
     surface = span_surface(shown, depth, intrinsics)
-    encode = encode_glb if asked.mesh == "glb" else encode_ply
+    encode = encode_glb if options.mesh == "glb" else encode_ply
     mesh = encode(surface.vertices, surface.normals, surface.colors, surface.faces)
-    said = {
+    sidecar = {
         "lights": directions.round(6).tolist(),
         "polarization": cue is not None,
-        "field_of_view_deg": asked.fov_deg,
-        "integration": asked.integration,
+        "field_of_view_deg": options.fov_deg,
+        "integration": options.integration,
         "triangles": len(surface.faces),
         "albedo_of_mesh": f"albedo x {gain:.6g}, limited to 1",
     }
     sheet, film = draw_sheet(views, shown, surface), None
-    if asked.turntable:
+    if options.turntable:
         film = encode_film(draw_turntable(surface), WATCHABLE, TURN_RATE)
-        said |= {"turntable": f"seen from {SWING[0]:g} degrees left to {SWING[0]:g} right, the light beside the camera"}
-    return ShapeFiles(found.normals, found.albedo, depth, mask, mesh, sheet, film, said)
+        sidecar |= {
+            "turntable": f"seen from {SWING[0]:g} degrees left to {SWING[0]:g} right, the light beside the camera"
+        }
+    return ShapeFiles(found.normals, found.albedo, depth, mask, mesh, sheet, film, sidecar)
 
 
 def intrinsics_of(fov_deg: float, size: tuple[int, ...]) -> Floats:
-    """The camera matrix of a vertical field of view, centred. Raises ValueError unless it is in (0, 120]."""
+    """The centred camera matrix of a vertical field of view. Raises ValueError unless it is in (0, 120] degrees."""
     if not 0 < fov_deg <= 120:
         raise ValueError(f"expected a field of view in (0, 120] degrees, found {fov_deg:g}")
     focal = size[0] / 2 / math.tan(math.radians(fov_deg) / 2)
@@ -205,7 +205,7 @@ def intrinsics_of(fov_deg: float, size: tuple[int, ...]) -> Floats:
 
 
 def draw_sheet(views: Views, shown: Appearance, surface: Surface) -> Pixels:
-    """Two rows of pictures: brightest frame, normals, albedo, another light; and the mesh from four sides."""
+    """Two rows of pictures: brightest frame, normals, albedo, another light; then the mesh from four sides."""
     mask = shown.mask
     front = views.images[int(views.images.sum(axis=(1, 2, 3)).argmax())]
     relit = relight(shown)
@@ -223,9 +223,9 @@ def draw_sheet(views: Views, shown: Appearance, surface: Surface) -> Pixels:
 
 
 def draw_turntable(surface: Surface) -> Iterator[Pixels]:
-    """`TURN_PICTURES` pictures of a mesh that swings to both sides and back, so that a player can repeat them.
+    """`TURN_PICTURES` pictures of a mesh that swings to both sides and back, so that a player can loop.
 
-    Nobody saw it from behind, so it does not turn around.
+    Its back is not known, so it does not turn around.
     """
     turns = 2 * np.pi * np.arange(TURN_PICTURES) / TURN_PICTURES
     places = [(SWING[0] * math.sin(turn), SWING[1] * math.cos(turn)) for turn in turns]
@@ -236,13 +236,13 @@ def draw_turntable(surface: Surface) -> Iterator[Pixels]:
 
 
 def _on_grey(picture: Floats, gain: float) -> Pixels:
-    """A picture of `draw_views`, as bright as ``gain`` says, before grey."""
+    """A picture of `draw_views` with a ``gain``, on grey."""
     there = picture.sum(axis=-1, keepdims=True) > 0
     return np.where(there, toned(picture, gain), GREY).astype(np.uint8)
 
 
 def _cell(picture: Pixels, mask: Mask) -> Pixels:
-    """A picture around its object, in `CELL` x `CELL` pixels; the nearest pixels, on grey."""
+    """A picture cropped to its object, resized to `CELL` x `CELL` nearest pixels, on grey."""
     rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     cut = np.where(mask[..., None], picture, GREY)[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
     scale = (CELL - 20) / max(cut.shape[:2])

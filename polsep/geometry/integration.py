@@ -1,4 +1,4 @@
-"""From normals to depth: bilateral normal integration, which keeps jumps, and plain least squares to compare with.
+"""Depth from normals: bilateral normal integration, which keeps jumps, and plain least squares for comparison.
 
 Normals ``[H, W, 3]`` have x right, y up, z to the camera, as in `polsep.render.sphere_tracing`. Depth counts away from
 the camera along its axis: in pixels around a mean of 0 for an orthographic camera, relative to a mean of 1 for a
@@ -8,11 +8,11 @@ pinhole. In either case q dz/du = a and q dz/dv = b (u right, v down) with
 * pinhole: z = log(depth), q = -f_u n.r, a = n_x, b = -n_y f_u / f_v, r = ((u - c_u) / f_u, (c_v - v) / f_v, -1) the
   pixel's ray.
 
-Every pixel has such an equation toward each of its four neighbours. Bilateral weights ask, along u and along v, which
-of the two sides is smooth: w = sigmoid(k ((q dz-)^2 - (q dz+)^2)) of the forward side and 1 - w of the other.
+Every pixel has such an equation toward each of its four neighbours. Bilateral weights prefer, along u and along v, the
+smooth one of the two sides: w = sigmoid(k ((q dz-)^2 - (q dz+)^2)) of the forward side and 1 - w of the other.
 Source: Cao, Santo, Shi, Okura, Matsushita 2022, Bilateral normal integration, ECCV, Eqs. 12-18, arXiv:2207.05063.
-Note: where a pixel has one neighbour only along an axis its equation has weight 1. The paper takes the absent
-difference for 0, so that slopes at the outline lose weight.
+Note: where a pixel has only one neighbour along an axis, its equation has weight 1. The paper sets the missing
+difference to 0, so that slopes at the outline lose weight.
 Needs the extra ``render``.
 """
 
@@ -25,21 +25,21 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from polsep.geometry.integration_kernel import DOWN, LEFT, RIGHT, UP, Places, Wanted, fill_system, fill_weights
 from polsep.geometry.multigrid import Multigrid, solve
-from polsep.geometry.slopes_kernel import DOWN, LEFT, RIGHT, UP, Places, Wanted, fill_system, fill_weights
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 #: Steepness k of the bilateral weights. Source: Cao et al. 2022, Sec. 5.
 SHARPNESS = 2.0
-#: Rounds at most, and the relative change of the energy that ends them. Source: the same, with 150 and 1e-4.
+#: Largest number of rounds, and the relative change of the energy that ends them. Source: the same, with 150 and 1e-4.
 MAX_ROUNDS, MIN_CHANGE = 100, 1e-4
-#: Residual of each round's linear system relative to where it starts, and its steps at most.
+#: Residual of each round's linear system relative to that at its start, and the largest number of its steps.
 TOLERANCE, MAX_STEPS = 0.2, 60
-#: Steps after which a multigrid made for the weights of an earlier round is made anew.
+#: A multigrid for the weights of an earlier round is rebuilt after more steps than this.
 STALE = 6
-#: Normals that are seen at a more grazing angle are taken for this one: q >= this cosine.
+#: Least cosine q; more grazing normals are limited to it.
 MIN_COSINE = 0.02
 
 
@@ -54,7 +54,7 @@ class Slopes:
 
 
 def find_slopes(normals: Floats, mask: Mask, intrinsics: Floats | None = None) -> Slopes:
-    """What normals say of the depth; ``intrinsics [3, 3]`` in pixels, None for an orthographic camera."""
+    """The equations of normals; ``intrinsics [3, 3]`` in pixels, None for an orthographic camera."""
     x, y, z = np.moveaxis(normals, -1, 0)
     if intrinsics is None:
         cosine, ratio, scale = z, 1.0, 1.0
@@ -91,7 +91,7 @@ def integrate_smooth(normals: Floats, mask: Mask, intrinsics: Floats | None = No
 
 
 class Equations:
-    """The equations between neighbours along both axes, and the Laplacian that weights make of them."""
+    """The equations between neighbours along both axes, and their weighted Laplacian."""
 
     def __init__(self, slopes: Slopes) -> None:
         if not slopes.mask.any():
@@ -110,7 +110,7 @@ class Equations:
         self.multigrid: Multigrid | None = None
 
     def even_weights(self) -> Floats:
-        """The first guess ``[2, N]``: half of each side, all of the only one."""
+        """The first weights ``[2, N]``: 1/2 for each of two sides, 1 for a single one."""
         there = self.places.near >= 0
         behind, ahead = there[:, [LEFT, UP]].T, there[:, [RIGHT, DOWN]].T
         return np.where(behind & ahead, 0.5, ahead.astype(float))
@@ -125,19 +125,19 @@ class Equations:
         matrix, right = self.assemble(weights)
         if self.multigrid is None:
             self.multigrid = Multigrid(matrix, *self.pixels)
-        found, steps = solve(matrix, right, start, self.multigrid, (tolerance, MAX_STEPS))
+        depth, steps = solve(matrix, right, start, self.multigrid, (tolerance, MAX_STEPS))
         if steps > STALE:
             self.multigrid = None
-        return found
+        return depth
 
     def assemble(self, weights: Floats) -> tuple[Any, Floats]:
-        """The symmetric matrix and the right side whose solution that is."""
+        """The symmetric matrix and the right side of that depth."""
         entries, right = np.empty(self.indices.size), np.empty(self.count)
         fill_system(self.places, self.wanted, weights, entries, right)
         return scipy.sparse.csr_array((entries, self.indices, self.places.starts), (self.count, self.count)), right
 
     def as_image(self, depth: Floats, logarithmic: bool) -> Floats:
-        """The solution as depth in an image."""
+        """The solution as a depth image."""
         image = np.full(self.mask.shape, np.nan)
         centred = depth - depth.mean()
         if logarithmic:

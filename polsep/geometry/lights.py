@@ -1,9 +1,9 @@
-"""The light directions that photometric stereo is told: six named ones, or three numbers each.
+"""Light directions of photometric stereo: six named ones, or three numbers each.
 
 Directions point from the object to the light, in the camera's frame: x right, y up, z to the camera.
 Source of the six: Lichy, Wu, Sengupta, Jacobs 2021, Shape and material capture at home, CVPR, Sec. 3: right,
-front-right, front (beside the camera), front-left, left, above. Note: angles here are this project's, what a hand with
-a flash does about an object on a table.
+front-right, front (beside the camera), front-left, left, above. Note: the angles are this project's, those of a
+hand-held flash around an object on a table.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 
 def _direction(right_deg: float, up_deg: float) -> tuple[float, float, float]:
-    """A unit vector so far to the right of the camera, and above it."""
+    """A unit vector at these angles to the right of the camera and above it."""
     right, up = math.radians(right_deg), math.radians(up_deg)
     return (math.sin(right) * math.cos(up), math.sin(up), math.cos(right) * math.cos(up))
 

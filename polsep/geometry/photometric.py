@@ -1,14 +1,14 @@
-"""Photometric stereo: normals and albedo from photographs under some lights of roughly known direction.
+"""Photometric stereo: normals and albedo from photographs under lights of roughly known direction.
 
 Images ``[L, H, W, C]`` are linear light, one camera, one light each; ``directions [L, 3]`` are unit vectors toward the
 lights, with x right, y up, z to the camera, and lights are far and equally bright. Normals ``[H, W, 3]`` are in the
 same frame and face the camera; albedo ``[H, W, C]`` is relative: the light of a surface that faces light and camera.
 Outside the mask both are 0. `fit_lambertian` is plain least squares (Woodham 1980, doi:10.1117/12.7972479).
-`fit_robust` knows what that lacks: shadows, highlights, the Fresnel transmission that dims grazing diffuse light,
-lights that are off by degrees, and, where it is given, the polarization of the diffuse light.
+`fit_robust` also models shadows, highlights, the Fresnel transmission that dims grazing diffuse light, lights that are
+off by degrees, and, if given, the polarization of the diffuse light.
 
-Note: five of the six lights of `lights.NAMED` lie in one plane, and the sixth, above, leaves half of an object in the
-dark. There nothing but the shadow itself and polarization says how far a normal is tilted up or down.
+Note: five of the six lights of `lights.NAMED` lie in one plane, and the sixth, above, leaves half of an object dark.
+There only the shadow itself and polarization show how far a normal is tilted up or down.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from polsep.physics.optics import fresnel
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: A sample darker than this share of its pixel's brightest, or than that much of the white level, is in shadow.
+#: A sample below this share of its pixel's brightest, or below this share of the white level, is in shadow.
 SHADOW, DARK = 0.03, 0.004
 #: Deviation of a sample from the model, relative to it and to the albedo: lights off by degrees, near and uneven.
 RELATIVE, ABSOLUTE = 0.08, 0.03
-#: Deviation of the cosine toward a light that leaves a pixel dark, from 0 or less: other things cast shadows too.
+#: Deviation from 0 of the cosine toward a light that leaves a pixel dark: cast shadows make it positive.
 SHADOW_DEVIATION = 0.5
-#: Weight of b = 0, which only decides what nothing else does.
+#: Weight of b = 0, which only fixes what the samples leave open.
 RIDGE = 1e-4
-#: Rounds of reweighting, and residuals in deviations that lose half of their weight.
+#: Rounds of reweighting, and the residual, in deviations, that has half weight.
 ROUNDS, OUTLYING = 12, 2.0
-#: Pixels (sigma) that choose together which of a cue's normals is meant.
+#: Pixels (sigma) over which the choice between a cue's normals is averaged.
 NEIGHBOURS = 2.0
-#: Least cosine toward the camera: what is seen at more than 84 degrees is a pixel wide and mixed with what is behind.
+#: Least cosine toward the camera: surfaces beyond 84 degrees are a pixel wide and mixed with the background.
 MIN_COSINE = 0.1
 
 
@@ -107,7 +107,7 @@ class _Frames:
         return cosines
 
     def around(self, values: Floats) -> Floats:
-        """Means ``[L, P]`` over the lit samples around each one: what is wrong of one is wrong of its neighbours."""
+        """Means ``[L, P]`` over the lit samples around each one: neighbours have similar errors."""
         means = np.zeros_like(values)
         for number, (row, lit) in enumerate(zip(values, self.lit, strict=True)):
             image, share = np.zeros(self.mask.shape), np.zeros(self.mask.shape)
@@ -136,7 +136,7 @@ class _Frames:
 def _choose(
     frames: _Frames, even: Floats, weight: Floats, choices: tuple[Floats, Floats, Floats]
 ) -> tuple[Floats, Floats]:
-    """Of the cue's two normals the one under which light and shadows are more likely, and its deviation."""
+    """The one of the cue's two normals with the more likely light and shadows, and its deviation."""
     first, second, deviation = choices
     costs = []
     for normals in (first, second):
@@ -151,7 +151,7 @@ def _choose(
 
 
 def _vote(preference: Floats, first: Floats, mask: Mask) -> Floats:
-    """How much a pixel and those around it prefer the side to which ``first`` leans, ``[P]``."""
+    """The preference ``[P]`` of a pixel and those around it for the side to which ``first`` leans."""
     votes = np.zeros(mask.shape)
     total = np.zeros(len(first))
     for axis in (0, 1):
@@ -171,7 +171,7 @@ def _albedo(even: Floats, weight: Floats, cosines: Floats) -> Floats:
 def _transmission(normals: Floats, directions: Floats) -> Floats:
     """Fresnel transmission into and out of the surface ``[L, P]``, relative to normal incidence.
 
-    Note: that a polarized light enters better or worse with its angle, which nobody knows, is left out: a few percent.
+    Note: the angle of a polarized light, which is unknown, changes this by a few percent; that is left out.
     """
     inward = _through(np.clip(directions @ normals.T, 0.05, 1))
     outward = _through(np.clip(normals[:, 2], 0.05, 1))
@@ -185,7 +185,7 @@ def _through(cosines: Floats) -> Floats:
 
 
 def _facing(vectors: Floats) -> Floats:
-    """Unit normals along ``vectors [P, 3]`` that face the camera; straight at it where a vector is 0."""
+    """Unit normals along ``vectors [P, 3]`` that face the camera; (0, 0, 1) where a vector is 0."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     unit = np.where(length > 0, vectors / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
     unit[:, 2] = np.maximum(unit[:, 2], MIN_COSINE)
@@ -194,7 +194,7 @@ def _facing(vectors: Floats) -> Floats:
 
 
 def _appearance(images: Floats, mask: Mask, normals: Floats, model: tuple[Floats, Floats]) -> Appearance:
-    """Images of what was found; ``model``: shading and weight of every sample."""
+    """Normals and the albedo that fits them, as images; ``model``: shading and weight of every sample."""
     shading, weight = model
     power = np.maximum((weight * shading**2).sum(axis=0), 1e-6)
     colors = np.einsum("lp,lp,lpc->pc", weight, shading, images[:, mask]) / power[:, None]

@@ -1,8 +1,8 @@
-"""What the polarization of diffuse light says of normals: azimuth up to half a turn, and zenith.
+"""Normals from the polarization of diffuse light: azimuth up to half a turn, and zenith.
 
 Diffuse light that leaves a dielectric has its AoLP along the projected normal and the DoLP `optics.diffuse_dolp` of the
-zenith, whatever light there is. So (s1, s2) of the diffuse image is the same multiple of its s0 in every frame: the
-slope. It is found where the frames agree on it: samples under specular light, which is polarized by itself, count less.
+zenith under any light. So (s1, s2) of the diffuse image is the same multiple of its s0 in every frame: the diffuse
+polarization. Its estimate is robust: samples under specular light, which is polarized by itself, have less weight.
 Angles count from image-right toward image-up.
 Source: Atkinson and Hancock 2006, Recovery of surface orientation from diffuse polarization, TIP 15(6); Eqs. 4-6 of
 Dave et al. 2022.
@@ -23,15 +23,15 @@ from polsep.physics.optics import diffuse_dolp
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: Deviation of polarized light [white level] that noise and demosaicking leave.
+#: Standard deviation of polarized light [white level] from noise and demosaicking.
 NOISE = 0.01
-#: How many times its strength a specular image may be wrong about what is polarized of it.
-DOUBT = 2.0
-#: Pixels (sigma) that share one slope, and rounds of reweighting.
+#: Error of the polarized part of a specular image, relative to the image.
+SPECULAR_ERROR = 2.0
+#: Pixels (sigma) over which the polarization is averaged, and rounds of reweighting.
 REACH, ROUNDS = 1.0, 5
-#: Deviation of slopes as found on four test objects: 0.004 to 0.017 (docs/experiments.md).
-SLOPE_DEVIATION = 0.015
-#: Least deviation of a normal by polarization [rad].
+#: Standard deviation of the estimate; measured on four test objects: 0.004 to 0.017 (docs/experiments.md).
+POLARIZATION_DEVIATION = 0.015
+#: Least standard deviation of a normal from polarization [rad].
 MIN_DEVIATION = 0.04
 
 
@@ -39,7 +39,7 @@ MIN_DEVIATION = 0.04
 class Polarized:
     """Frames under different lights, all ``[L, H, W]``: grey ``diffuse`` and ``specular``, and their sum's ``s1, s2``.
 
-    ``valid``: 1 where a separation is trustworthy, else 0.
+    ``valid``: 1 where the separation is valid, else 0.
     """
 
     diffuse: Floats
@@ -51,43 +51,43 @@ class Polarized:
 
 @dataclass(frozen=True)
 class Cue:
-    """Two normals ``first`` and ``second`` ``[H, W, 3]``, half a turn apart, of ``deviation [H, W]`` [rad]."""
+    """Two normals ``first`` and ``second`` ``[H, W, 3]``, half a turn apart, with ``deviation [H, W]`` [rad]."""
 
     first: Floats
     second: Floats
     deviation: Floats
 
 
-def find_slope(frames: Polarized, mask: Mask) -> NDArray[np.complex128]:
+def find_diffuse_polarization(frames: Polarized, mask: Mask) -> NDArray[np.complex128]:
     """DoLP exp(2 i AoLP) of the diffuse light ``[H, W]``, by robust least squares over all frames."""
-    trust = frames.valid / (NOISE**2 + (DOUBT * frames.specular) ** 2) * mask
+    certainty = frames.valid / (NOISE**2 + (SPECULAR_ERROR * frames.specular) ** 2) * mask
     polarized = frames.s1 + 1j * frames.s2
-    weight = trust
-    slope = np.zeros(mask.shape, np.complex128)
+    weight = certainty
+    polarization = np.zeros(mask.shape, np.complex128)
     for _ in range(ROUNDS):
         product = (weight * frames.diffuse * polarized).sum(axis=0)
         power = gaussian_filter((weight * frames.diffuse**2).sum(axis=0), REACH)
         smooth = gaussian_filter(product.real, REACH) + 1j * gaussian_filter(product.imag, REACH)
-        slope = np.where(power > 0, smooth / np.where(power > 0, power, 1), 0)
-        weight = trust / (1 + (np.abs(polarized - slope * frames.diffuse) / NOISE) ** 2)
-    return slope
+        polarization = np.where(power > 0, smooth / np.where(power > 0, power, 1), 0)
+        weight = certainty / (1 + (np.abs(polarized - polarization * frames.diffuse) / NOISE) ** 2)
+    return polarization
 
 
-def normals_of_slope(slope: NDArray[np.complex128]) -> Cue:
-    """The two normals that have a slope, and how far off they may be.
+def normals_from_polarization(polarization: NDArray[np.complex128]) -> Cue:
+    """The two normals of a diffuse polarization, and their standard deviation.
 
-    Slopes beyond the curve's end are taken for its end, at 89.5 degrees.
+    Values beyond the end of the curve, at 89.5 degrees, are limited to it.
     """
     zeniths = np.linspace(0, math.radians(89.5), 500)
     curve = diffuse_dolp(torch.from_numpy(np.cos(zeniths))).numpy()
-    strength = np.minimum(np.abs(slope), curve[-1])
-    zenith, azimuth = np.interp(strength, curve, zeniths), np.angle(slope) / 2
+    strength = np.minimum(np.abs(polarization), curve[-1])
+    zenith, azimuth = np.interp(strength, curve, zeniths), np.angle(polarization) / 2
     first = np.stack(
         [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)],
         axis=-1,
     )
     steepness = np.interp(zenith, zeniths, np.gradient(curve, zeniths))
-    along = np.minimum(SLOPE_DEVIATION / np.maximum(steepness, 1e-6), 1)
-    across = np.minimum(np.sin(zenith) * SLOPE_DEVIATION / np.maximum(2 * strength, 1e-6), 1)
+    along = np.minimum(POLARIZATION_DEVIATION / np.maximum(steepness, 1e-6), 1)
+    across = np.minimum(np.sin(zenith) * POLARIZATION_DEVIATION / np.maximum(2 * strength, 1e-6), 1)
     deviation = np.sqrt((along**2 + across**2) / 2 + MIN_DEVIATION**2)
     return Cue(first, first * np.array([-1.0, -1.0, 1.0]), deviation)

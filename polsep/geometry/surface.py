@@ -1,7 +1,7 @@
-"""From depth to a mesh with colours, and pictures of what was found: under another light, and from around.
+"""A mesh with colours from depth, and its pictures under another light and from other sides.
 
 Meshes have x right, y up, z to the camera, are centred and have a largest extent of 1. Where the depth jumps by more
-than normals say, triangles are left out: nobody saw what is there. Needs the extra ``render``.
+than the normals explain, triangles are left out: the surface there is not known. Needs the extra ``render``.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from polsep.render.sphere_tracing import PinholeCamera
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-#: A rise between neighbours that differs from the one of their normals by this many pixels, and by this share, jumps.
+#: A rise between neighbours is a jump if it differs from that of their normals by this many pixels and this share.
 JUMP, JUMP_SHARE = 1.5, 1.5
-#: Rises of more pixels than this are guessed, not seen; parts with fewer of the triangles than this share are loose.
+#: Larger rises [pixels] count as jumps; connected parts with a smaller share of the triangles are removed.
 MAX_RISE, SMALLEST_PART = 8.0, 0.01
-#: The field of view of pictures of a mesh [degrees], and its camera's distance in extents.
+#: Field of view [degrees] of pictures of a mesh, and the distance of their camera in extents.
 FOV_DEG, DISTANCE = 24.0, 2.9
-#: Toward the light of pictures, in the camera's frame.
+#: Direction toward the light of pictures, in the camera's frame.
 PICTURE_LIGHT = (-0.45, 0.55, 0.7)
 #: Light that reaches surfaces that face away.
 AMBIENT = 0.06
@@ -71,7 +71,7 @@ def span_surface(appearance: Appearance, depth: Floats, intrinsics: Floats | Non
 
 
 def _steady_links(normals: Floats, depth: Floats, mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ...]:
-    """Links to the right ``[H, W-1]`` and down ``[H-1, W]`` across which the depth, in pixels, goes on as it should."""
+    """Links to the right ``[H, W-1]`` and down ``[H-1, W]`` across which the depth [pixels] is continuous."""
     cosine = np.maximum(normals[..., 2], MIN_COSINE)
     steady = []
     for slope, first, second in (
@@ -82,8 +82,8 @@ def _steady_links(normals: Floats, depth: Floats, mask: NDArray[np.bool_]) -> tu
         largest = np.maximum(np.abs(slope[first]), np.abs(slope[second]))
         with np.errstate(invalid="ignore"):
             rise = depth[second] - depth[first]
-            goes_on = (np.abs(rise - expected) <= JUMP + JUMP_SHARE * largest) & (np.abs(rise) <= MAX_RISE)
-        steady.append(mask[first] & mask[second] & goes_on)
+            continuous = (np.abs(rise - expected) <= JUMP + JUMP_SHARE * largest) & (np.abs(rise) <= MAX_RISE)
+        steady.append(mask[first] & mask[second] & continuous)
     return tuple(steady)
 
 
@@ -103,7 +103,7 @@ def _triangles(mask: NDArray[np.bool_], links: tuple[NDArray[np.bool_], ...]) ->
 
 
 def _without_fragments(faces: Integers) -> Integers:
-    """The triangles of parts that are large enough."""
+    """The triangles of connected parts that are large enough."""
     if not len(faces):
         return faces
     links = (np.ones(2 * len(faces)), (np.repeat(faces[:, 0], 2), faces[:, 1:].reshape(-1)))
@@ -115,7 +115,7 @@ def _without_fragments(faces: Integers) -> Integers:
 
 
 def relight(appearance: Appearance, direction: tuple[float, float, float] = PICTURE_LIGHT) -> Floats:
-    """The image ``[H, W, C]`` under a far light from there, without cast shadows."""
+    """The image ``[H, W, C]`` under a far light in a ``direction``, without cast shadows."""
     toward = np.array(direction) / math.hypot(*direction)
     shading = np.maximum(appearance.normals @ toward, 0) + AMBIENT
     image: Floats = appearance.albedo * shading[..., None]
@@ -123,9 +123,9 @@ def relight(appearance: Appearance, direction: tuple[float, float, float] = PICT
 
 
 def draw_views(surface: Surface, size: int, views: Sequence[tuple[float, float]]) -> Iterator[Floats]:
-    """Linear pictures ``[size, size, 3]`` of a mesh from (azimuth, elevation) [degrees]; the light comes along.
+    """Linear pictures ``[size, size, 3]`` of a mesh from (azimuth, elevation) [degrees]; the light moves along.
 
-    Where there is no mesh they are 0. Faces that were seen from behind are drawn too.
+    They are 0 outside the mesh. Back faces are drawn too.
     """
     count = len(surface.faces)
     flat = np.zeros((len(surface.vertices), 2))

@@ -1,1 +1,1 @@
-"""Materials of flat samples from one or several captures: made at random, photographed, estimated, written."""
+"""Materials of flat samples: random ones, photographs of them, estimates from one or several captures, files."""

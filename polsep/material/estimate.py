@@ -17,7 +17,7 @@ from polsep.material.svbrdf import Svbrdf, unstack
 
 @dataclass(frozen=True)
 class Estimator:
-    """A trained ``network`` and which ``input`` of `shots.INPUTS` it sees."""
+    """A trained ``network`` and its ``input``, of `shots.INPUTS`."""
 
     network: MaterialNetwork
     input: str
@@ -36,7 +36,7 @@ class Estimator:
 def load_estimator(name: str = "separated", path: Path | None = None) -> Estimator:
     """The shipped network for an input, or the one in a file of `polsep train material`.
 
-    Raises ValueError on inputs and files that there are not, and on weights of something else.
+    Raises ValueError on unknown inputs, missing files and weights of another network.
     """
     if path is None and name not in INPUTS:
         raise ValueError(f"expected an input of {', '.join(INPUTS)}, found {name!r}")
@@ -45,9 +45,9 @@ def load_estimator(name: str = "separated", path: Path | None = None) -> Estimat
     if metadata["method"] != "material":
         raise ValueError(f"expected weights of a network for materials in {source}, found {metadata['method']!r}")
     size = json.loads(metadata["size"])
-    part = INPUTS[metadata["input"]]
+    channels = INPUTS[metadata["input"]]
     network = MaterialNetwork(
-        part.stop - part.start, MaterialSize(size["width"], tuple(size["growth"]), tuple(size.get("cues", ())))
+        channels.stop - channels.start, MaterialSize(size["width"], tuple(size["growth"]), tuple(size.get("cues", ())))
     )
     network.load_state_dict(tensors)
     return Estimator(network.eval(), metadata["input"])

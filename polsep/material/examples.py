@@ -1,4 +1,4 @@
-"""A folder of examples: made once, in any number of goes, read by every training and measurement."""
+"""A folder of training examples: rendered once, possibly in several runs, read by trainings and measurements."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ PLANES = max(part.stop for part in INPUTS.values())
 
 
 def example_path(folder: Path, split: str, seed: int, number: int) -> Path:
-    """Where an example lies."""
+    """The file of an example."""
     return folder / f"{split}-{seed}-{number:06d}.npy"
 
 
 def make_examples(folder: Path, split: str, seed: int, count: int, views: int) -> Iterator[int]:
-    """Make those of the first ``count`` examples that are not there yet; yields how many are, after each."""
+    """Render the missing ones of the first ``count`` examples; yield how many exist, after each."""
     for number in range(count):
         path = example_path(folder, split, seed, number)
         if not path.is_file():
@@ -31,7 +31,7 @@ def make_examples(folder: Path, split: str, seed: int, count: int, views: int) -
 
 
 def load_example(path: Path) -> Example:
-    """An example in half precision. Raises ValueError on a file that holds none."""
+    """An example in half precision. Raises ValueError on other files."""
     planes = read_example(path)
     if len(planes) <= STACKED or (len(planes) - STACKED) % PLANES:
         raise ValueError(f"expected views of {PLANES} planes and {STACKED} maps in {path}, found {len(planes)} planes")

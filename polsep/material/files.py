@@ -1,4 +1,4 @@
-"""`polsep material`: photographs of one flat material as files in, its maps as files out."""
+"""`polsep material`: files of photographs of one flat material in, files of its maps out."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from polsep.pipeline import LightColor, separate_capture
 
 Floats = NDArray[np.float32]
 
-#: Median of the separated diffuse images of training, 1 = white paper: what an unknown exposure is taken for.
+#: Median of the separated diffuse images of training, 1 = white paper: assumed where the exposure is unknown.
 USUAL_DIFFUSE = 0.29
-#: Sides that maps may have.
+#: Smallest and largest side of maps.
 MIN_SIZE, LARGEST_SIZE = 32, 1024
-#: Where the lights of the preview are, and the side of its pictures in pixels.
+#: Positions of the lights of the preview, and the side of its pictures in pixels.
 PREVIEW_LIGHTS = ((0.0, 0.0, 2.75), (-1.2, 0.8, 1.8), (1.3, 0.9, 1.5), (1.0, -1.3, 1.2), (-1.6, -0.6, 0.9))
 PREVIEW_SIDE = 256
 
 
 @dataclass(frozen=True)
 class MaterialOptions:
-    """How photographs are read and seen: see `polsep material`.
+    """Options of `polsep material`.
 
     ``white``: s0 of white paper in the middle of each photograph, or one number for all; empty: unknown. ``size``: side
     of the maps. ``weights``: a file instead of the shipped ones. Raises ValueError on numbers out of range.
@@ -59,7 +59,7 @@ class MaterialOptions:
 
 @dataclass(frozen=True)
 class Photographs:
-    """Separated views ``[V, 6, size, size]`` of one material and what each came from; ``notes`` for the user."""
+    """Separated views ``[V, 6, size, size]`` of one material and their source files; ``notes`` for the user."""
 
     views: Tensor
     sources: tuple[str, ...]
@@ -67,14 +67,13 @@ class Photographs:
 
 
 def estimate_files(
-    paths: Sequence[str], options: MaterialOptions, target: tuple[Path, str | None, bool]
+    paths: Sequence[str], options: MaterialOptions, directory: Path, name: str | None = None, overwrite: bool = False
 ) -> tuple[list[Path], list[str]]:
-    """Estimate a material from all photographs in the files and write it; the paths written, and notes for the user.
+    """Estimate a material from all photographs in the files and write it; return the paths and notes for the user.
 
-    ``target``: directory, name (None: that of the first file) and whether results from before are replaced. Raises
-    ValueError, in one line, on what cannot be read or written.
+    ``name``: of the results, None for that of the first file. Raises ValueError, in one line, on what cannot be read or
+    written.
     """
-    directory, name, overwrite = target
     name = output_stem(paths[0]) if name is None else name
     refuse_existing(directory, targets := material_targets(directory, name), overwrite)
     refuse_inputs(targets, [Path(path) for path in paths])
@@ -82,12 +81,11 @@ def estimate_files(
     photographs = read_photographs(paths, options)
     white = find_white(photographs.views, options.white)
     views = photographs.views / torch.tensor(white)[:, None, None, None]
-    seen = views[:, :3] + views[:, 3:] if estimator.input == "unseparated" else views
-    maps = estimator.estimate(seen)
+    maps = estimator.estimate(views[:, :3] + views[:, 3:] if estimator.input == "unseparated" else views)
     notes = list(photographs.notes)
     if not options.white:
         notes.append("the level of white paper is not known (--white): the diffuse map's brightness is a guess")
-    said = {
+    sidecar = {
         "sources": list(photographs.sources),
         "input": estimator.input,
         "method": options.method,
@@ -95,24 +93,24 @@ def estimate_files(
         "warnings": notes,
     }
     arrays = {kind: np.ascontiguousarray(x.movedim(0, -1).numpy()) for kind, x in vars(maps).items()}
-    files = MaterialFiles(arrays, draw_material(maps, views), said)
+    files = MaterialFiles(arrays, draw_material(maps, views), sidecar)
     return write_material(files, directory, name, overwrite), notes
 
 
 def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photographs:
-    """Every frame of the files, separated, its middle square at the maps' size. Raises InputError."""
+    """Separate every frame of the files and resize its middle square to the maps. Raises InputError."""
     views, sources, notes = [], [], list[str]()
     for path in paths:
-        found: list[tuple[Floats, Floats]] = []
+        lobes: list[tuple[Floats, Floats]] = []
         if Path(path).suffix.lower() == ".exr":
             frame = read_separated(Path(path))
-            found.append((frame.diffuse, frame.specular))
+            lobes.append((frame.diffuse, frame.specular))
         else:
             for raw in read_frames(path, options.read):
-                done = separate_capture(raw.data, options.method, options.light_color)
-                found.append((done.diffuse, done.specular))
-                notes += [f"{path}: {note}" for note in (*raw.notes, *done.report["warnings"])]
-        for pair in found:
+                frame = separate_capture(raw.data, options.method, options.light_color)
+                lobes.append((frame.diffuse, frame.specular))
+                notes += [f"{path}: {note}" for note in (*raw.notes, *frame.report["warnings"])]
+        for pair in lobes:
             planes = [torch.from_numpy(x).movedim(-1, 0).expand(3, -1, -1) for x in pair]
             view = torch.cat([_middle_square(x, options.size) for x in planes])
             if not float(view.sum()) > 0:
@@ -125,7 +123,7 @@ def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photogra
 
 
 def _middle_square(image: Tensor, size: int) -> Tensor:
-    """The largest square in the middle of an image, by area averages where it shrinks."""
+    """The largest square in the middle of an image, resized; by area averages where it shrinks."""
     height, width = image.shape[-2:]
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
@@ -136,9 +134,9 @@ def _middle_square(image: Tensor, size: int) -> Tensor:
 
 
 def find_white(views: Tensor, given: tuple[float, ...]) -> tuple[float, ...]:
-    """The level of white paper for each view ``[V, 6, h, w]``: as given, or so that materials are as bright as usual.
+    """The level of white paper for each view ``[V, 6, h, w]``: as given, or for a material of `USUAL_DIFFUSE`.
 
-    Raises ValueError where the numbers given are neither one nor one for each view.
+    Raises ValueError unless there is one number, or one for each view.
     """
     count = len(views)
     if given and len(given) not in (1, count):
@@ -150,7 +148,7 @@ def find_white(views: Tensor, given: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def draw_material(maps: Svbrdf, views: Tensor) -> Pixels:
-    """A sheet for people: photograph and maps, and what the material looks like under other lights."""
+    """A preview sheet: photograph, maps, and the material under other lights."""
     first = views[0, :3] + views[0, 3:]
     scale = max(float(maps.specular.max()), 1e-6)
     pictures = [
@@ -160,24 +158,21 @@ def draw_material(maps: Svbrdf, views: Tensor) -> Pixels:
         Panel("Roughness", "", _shown_linear(maps.roughness.expand(3, -1, -1))),
         Panel("Specular", f"white {scale:.2g}", _shown(maps.specular / scale)),
     ]
-    relit = [Panel("Relit", "light {:g} {:g} {:g}".format(*at), _shown(see_under(maps, at))) for at in PREVIEW_LIGHTS]
+    points, camera = plane_points(*maps.roughness.shape[-2:]), torch.tensor((0.0, 0.0, CAMERA_HEIGHT))[:, None, None]
+    relit = []
+    for position in PREVIEW_LIGHTS:
+        image = relight(maps, points, camera, torch.tensor(position)[:, None, None])
+        relit.append(Panel("Relit", "light {:g} {:g} {:g}".format(*position), _shown(image)))
     return titled_sheet([pictures, relit])
 
 
-def see_under(maps: Svbrdf, light: tuple[float, float, float]) -> Tensor:
-    """The picture ``[3, h, w]`` of maps from the photographs' own place, under a light there."""
-    points = plane_points(*maps.roughness.shape[-2:])
-    camera, place = (torch.tensor(p)[:, None, None] for p in ((0.0, 0.0, CAMERA_HEIGHT), light))
-    return relight(maps, points, camera, place)
-
-
 def _shown(image: Tensor) -> Pixels:
-    """Linear light ``[3, h, w]`` as sRGB of the preview's size."""
+    """Linear light ``[3, h, w]`` as an sRGB picture of the preview."""
     return toned(_enlarged(image), 1.0)
 
 
 def _shown_linear(image: Tensor) -> Pixels:
-    """Numbers ``[3, h, w]`` from 0 to 1 as they are."""
+    """Numbers ``[3, h, w]`` from 0 to 1 as a picture without a tone curve."""
     return np.rint(np.clip(_enlarged(image), 0, 1) * 255).astype(np.uint8)
 
 

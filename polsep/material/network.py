@@ -1,17 +1,17 @@
 """The network that estimates the maps of a flat material from one or several photographs of it, in any order.
 
-An encoder and decoder with skips sees every photograph by itself; what is found is pooled by its maximum over the
-photographs, so their number and order are free. Beside the images runs a global track, a vector to which every layer
-gives the means of its channels and from which it takes, so that every pixel knows of the whole image.
+An encoder and decoder with skips processes every photograph by itself; the features are pooled by their maximum over
+the photographs, so their number and order are free. Parallel to the images runs a global track, a vector that every
+layer updates with the means of its channels and adds to its features, so that every pixel depends on the full image.
 
 Conventions are those of `polsep.material.svbrdf`; images are linear, 1 = white paper under the same light, the first
-three channels those that albedo shows in: the photograph, or its diffuse part. Source: Deschaintre et al. 2018,
+three channels those that show albedo: the photograph, or its diffuse part. Source: Deschaintre et al. 2018,
 doi:10.1145/3197517.3201378 (network, global track); Deschaintre et al. 2019, doi:10.1111/cgf.13765 (pooling over
-views). Notes, all of which make a training of an hour on a CPU possible where the source's takes days on a GPU: widths
+views). Notes, which allow training in an hour on a CPU where the source's takes days on a GPU: widths
 are a quarter of the source's; the decoder's convolutions are 3x3, one before and one after it enlarges, instead of two
-of 4x4, its last one sees the photograph again, and the last layers its mean and minimum over the views; there is no
-instance normalization, which takes colours away and learns slowly to bring them back; the diffuse map is what is said
-beyond the mean photograph, and albedos are squares of what the network says, as most of them are small.
+of 4x4, its last one has the photograph as another input, and the last layers its mean and minimum over the views; there
+is no instance normalization, which removes colours and is slow to learn them again; the diffuse map is a difference to
+the mean photograph, and albedos are squares of outputs, as most of them are small.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from polsep.material.svbrdf import STACKED, Svbrdf
 from polsep.networks.unet import pad_to_multiple
 from polsep.physics.optics import normalize
 
-#: What is added to images before their logarithm is taken, which is scaled to 0 to 1 for 0 to 1.
+#: Added to images before their logarithm, which is scaled to 0 to 1 for 0 to 1.
 FLOOR = 0.01
-#: Slopes of normals at most, along each axis.
+#: Largest slope of normals along each axis.
 LARGEST_SLOPE = 3.0
 #: Slope of the rectifier below 0.
 LEAK = 0.2
-#: What an untrained network says: flat, as bright as the photograph, roughness 0.4, reflectance 0.04.
+#: Output of an untrained network: flat, as bright as the photograph, roughness 0.4, reflectance 0.04.
 USUAL = (0.0, 0.0, 0.0, 0.0, 0.0, -0.2, -0.6, -0.6, -0.6)
-#: Pixels around over which the mean of brightness is taken; squared way from a highlight that counts as near.
+#: Radius of the mean of brightness in pixels; squared distance from a highlight that counts as near.
 DETAIL_RADIUS, NEAR = 4, 0.05
-#: Light below which a photograph's root is no longer steep.
-MIN_SEEN = 1e-4
-#: Standard deviation of the weights by which layers take from the global track.
+#: Least light of a photograph under the square root, whose slope is unbounded at 0.
+MIN_LIGHT = 1e-4
+#: Standard deviation of the weights from the global track to the layers.
 TAKEN = 0.1
 
 
@@ -47,7 +47,7 @@ TAKEN = 0.1
 class MaterialSize:
     """``width`` channels at half resolution, multiplied as ``growth`` says at every further halving.
 
-    ``cues``: what of `CUES` it sees of every image beside the image. Raises ValueError on what cannot be built.
+    ``cues``: of `CUES`, further inputs of every image. Raises ValueError on sizes that cannot be built.
     """
 
     width: int = 16
@@ -67,7 +67,7 @@ class MaterialSize:
 
 
 class Stage(nn.Module):
-    """A convolution with its part of the global track: ``before`` numbers come, one per channel go."""
+    """A convolution and its layer of the global track: ``before`` numbers in, one per channel out."""
 
     def __init__(self, conv: nn.Conv2d, before: int) -> None:
         super().__init__()
@@ -88,7 +88,7 @@ class Stage(nn.Module):
 
 
 class MaterialNetwork(nn.Module):
-    """Photographs ``[N, V, inputs, H, W]`` to maps ``[N, 9, H, W]`` of `svbrdf.Svbrdf.stack`; see `read_maps`."""
+    """Photographs ``[N, V, inputs, H, W]`` to maps ``[N, 9, H, W]`` of `svbrdf.Svbrdf.stack`; see `decode_maps`."""
 
     def __init__(self, inputs: int, size: MaterialSize) -> None:
         super().__init__()
@@ -125,7 +125,7 @@ class MaterialNetwork(nn.Module):
         """Maps of each material; V and the sides are free."""
         count, height, width = views.shape[1], *views.shape[-2:]
         images = views.flatten(0, 1)
-        seen = torch.cat([see_with_places(images), *(CUES[cue](images) for cue in self.size.cues)], dim=1)
+        seen = torch.cat([encode_images(images), *(CUES[cue](images) for cue in self.size.cues)], dim=1)
         x = pad_to_multiple(seen, self.multiple).contiguous(memory_format=torch.channels_last)
         track = x.new_zeros(len(x), self.size.width)
         skips = []
@@ -138,11 +138,11 @@ class MaterialNetwork(nn.Module):
         x, track = (y.view(-1, count, *y.shape[1:]).amax(dim=1) for y in (x[..., :height, :width], track))
         levels = seen[:, : self.inputs].view(-1, count, self.inputs, height, width)
         x, _ = self.first(torch.cat([x, levels.mean(dim=1), levels.amin(dim=1)], dim=1), track)
-        return stack_maps(torch.tanh(self.last(x).float()), views[:, :, :3].mean(dim=1))
+        return decode_maps(torch.tanh(self.last(x).float()), views[:, :, :3].mean(dim=1))
 
 
-def see_with_places(images: Tensor) -> Tensor:
-    """Images ``[N, C, H, W]`` in a logarithmic scale, -1 for black and 1 for white, and x and y of every pixel."""
+def encode_images(images: Tensor) -> Tensor:
+    """Images ``[N, C, H, W]`` on a logarithmic scale, -1 for black and 1 for white, and x and y of every pixel."""
     scaled = (torch.log(images.clamp(min=0) + FLOOR) - math.log(FLOOR)) / (math.log(1 + FLOOR) - math.log(FLOOR))
     height, width = images.shape[-2:]
     y, x = (torch.linspace(-1, 1, n).to(images) for n in (height, width))
@@ -150,12 +150,12 @@ def see_with_places(images: Tensor) -> Tensor:
     return torch.cat([2 * scaled - 1, places.expand(len(images), -1, -1, -1)], dim=1)
 
 
-def see_details(images: Tensor) -> Tensor:
-    """Details of each image's brightness times the way from its highlight, ``[N, 2 C / 3, H, W]``.
+def detail_cues(images: Tensor) -> Tensor:
+    """Details of each image's brightness times the direction from its highlight, ``[N, 2 C / 3, H, W]``.
 
-    Facets that lean toward the middle between light and camera are brighter than what is around them, on whichever side
-    of it they lie: so details times the direction from there are, to first order, slopes. The middle is where the last
-    three channels are bright.
+    Facets that lean toward the middle between light and camera are brighter than their surroundings, on either side of
+    it: so details times the direction from there are slopes to first order. The middle is where the last three channels
+    are bright.
     """
     height, width = images.shape[-2:]
     y, x = (torch.linspace(-1, 1, n).to(images) for n in (height, width))
@@ -172,16 +172,16 @@ def see_details(images: Tensor) -> Tensor:
     return torch.cat(found, dim=1)
 
 
-#: What the network may see beside images, by name: of images ``[N, C, H, W]``, two channels for every three.
-CUES = {"details": see_details}
+#: Further inputs of the network by name: of images ``[N, C, H, W]``, two channels for every three.
+CUES = {"details": detail_cues}
 
 
-def stack_maps(said: Tensor, seen: Tensor) -> Tensor:
-    """Maps ``[N, 9, H, W]`` of what a network says, -1 to 1, beyond a photograph ``seen [N, 3, H, W]``.
+def decode_maps(output: Tensor, photograph: Tensor) -> Tensor:
+    """Maps ``[N, 9, H, W]`` of a network's output, -1 to 1, and the mean ``photograph [N, 3, H, W]``.
 
-    That is: slopes, what the diffuse map's root exceeds the photograph's by, roughness, and the specular map's root.
+    The output: slopes, difference of the diffuse map's root to the photograph's, roughness, the specular map's root.
     """
-    slopes, rest = LARGEST_SLOPE * said[:, :2], (said[:, 5:] + 1) / 2
+    slopes, rest = LARGEST_SLOPE * output[:, :2], (output[:, 5:] + 1) / 2
     normal = normalize(torch.cat([slopes, torch.ones_like(slopes[:, :1])], dim=1))
-    root = (seen.float().clamp(MIN_SEEN, 1).sqrt() + said[:, 2:5]).clamp(0, 1)
+    root = (photograph.float().clamp(MIN_LIGHT, 1).sqrt() + output[:, 2:5]).clamp(0, 1)
     return Svbrdf(normal, root**2, rest[:, :1], rest[:, 1:] ** 2).stack()

@@ -1,6 +1,6 @@
 """Random materials of a plane: layers of `render.materials` under random masks, with heights of the same patterns.
 
-Everything is drawn from one generator, on every machine alike. No photograph and no library of materials is in it.
+Everything is drawn from one generator, the same on every machine. No photographs or material libraries are used.
 Source: the idea of mixing procedural materials is Deschaintre et al. 2018, Sec. 4.1; these are this project's own.
 """
 
@@ -17,19 +17,19 @@ from polsep.physics.optics import fresnel, normalize
 from polsep.render.materials import random_materials
 from polsep.render.textures import PLAIN, pattern_weight
 
-#: Layers of a material, and how often there are 1, 2, 3; each has a texture of its own, and a mask.
+#: Largest number of layers, and probabilities of 1, 2, 3; each layer has its own texture and mask.
 LAYERS, LAYER_SHARES = 3, (0.3, 0.4, 0.3)
 #: Reflectance at normal incidence of strength 1: glass of index 1.5, as `optics` has it.
 GLASS = 0.04
-#: By what the specular strength of a layer, 0.5 to 1, is multiplied; log-uniform: indices of refraction of 1.3 to 1.9.
+#: Factor of the specular strength of a layer, 0.5 to 1; log-uniform: indices of refraction of 1.3 to 1.9.
 GAINS = (0.5, 2.5)
-#: Roughness at least: below it, the mirror image of a small flash is no more than a point.
+#: Least roughness: below it, the reflection of a small flash is a point.
 MIN_ROUGHNESS = 0.12
 #: Share of flat materials; rms slope of the others, log-uniform; no slope is steeper than the last number.
 FLAT_SHARE, SLOPES, STEEPEST = 0.08, (0.03, 0.45), 2.0
-#: How often a pattern that colours the material has height, too, and how many patterns have nothing but height.
+#: Probability that a pattern of colour also has height, and number of patterns with height only.
 RAISED_SHARE, RELIEFS = 0.6, 2
-#: Slots that are drawn: layers, their masks, and some to find reliefs among.
+#: Random materials drawn: for layers, masks, and candidates for reliefs.
 SLOTS = 2 * LAYERS + 8
 
 
@@ -96,6 +96,6 @@ def _normals(height: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def halve(maps: Svbrdf) -> Svbrdf:
-    """Means over 2x2 pixels, which is what a half-resolution image shows."""
+    """Means over 2x2 pixels, as in a half-resolution image."""
     small = [torch.nn.functional.avg_pool2d(x[None], 2)[0] for x in vars(maps).values()]
     return replace(Svbrdf(*small), normal=normalize(small[0]))

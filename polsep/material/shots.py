@@ -1,9 +1,9 @@
-"""Photographs of flat materials by a polarization camera with a polarized flash, and what the networks see of them.
+"""Photographs of flat materials by a polarization camera with a polarized flash, and the networks' inputs from them.
 
 The camera looks straight down at the plane of `polsep.material.svbrdf`, whose sides fill the frame; a point light
 behind a polarizer is near the lens, as a flash is, or anywhere above. Light follows `optics`, the frame the camera
-model with noise, and the frame is separated by `METHOD`. Images are divided by what white paper in the middle would
-show, as a photograph of white paper under the same light tells: 1 is white.
+model with noise, and the frame is separated by `METHOD`. Images are divided by the level of white paper in the
+middle, as measured in a photograph of white paper under the same light: 1 is white.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Sce
 from polsep.render.views import BLURS, scene_seed
 from polsep.sensor.camera import IMX250, Layout, Mosaic
 
-#: How high the camera is above a plane of sides 2.
+#: Height of the camera above a plane of sides 2.
 CAMERA_HEIGHT = 2.75
 CAMERA = PinholeCamera((0.0, 0.0, CAMERA_HEIGHT), (0.0, 0.0, 0.0), 2 * math.degrees(math.atan(1 / CAMERA_HEIGHT)))
-#: How far a flash is from the lens at most, along every axis, and where a light that is moved may be.
+#: Largest distance of a flash from the lens along each axis, and the range of other lights: sides, heights.
 FLASH, AROUND, HEIGHTS = 0.15, 1.4, (1.8, 3.2)
-#: Shares of the samples that clip at most, and the least level of the median one, white at 1.
+#: Largest share of clipped samples, and the least level of the median sample, white at 1.
 LARGEST_CLIPPED, MIN_LEVEL = 0.03, 0.06
-#: What separates the frames: the best method that polsep ships.
+#: Method that separates the frames: the best that polsep ships.
 METHOD = "joint"
-#: Log of what the level of white paper is off by, standard deviation.
+#: Standard deviation of the logarithm of the error of the level of white paper.
 WHITE_ERROR = 0.05
-#: What each input shows, by name: its channels of the 15 of an example's views.
+#: Channels of each input, by name, among the 15 of an example's views.
 INPUTS: dict[str, slice] = {"unseparated": slice(0, 3), "separated": slice(3, 9), "perfect": slice(9, 15)}
 #: Raw pixels along the side of a frame, and pixels of the maps, to which images are averaged, as frames of real
 #: cameras are.
@@ -93,24 +93,24 @@ def photograph(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> t
     return capture(exposed, Layout(), IMX250, generator).mosaic, exposed, white
 
 
-def see_unseparated(mosaic: Mosaic) -> Tensor:
-    """What a camera without analysers shows, ``[3, h, w]``: s0, every sample at face value."""
+def unseparated_image(mosaic: Mosaic) -> Tensor:
+    """The image of a camera without analysers, ``[3, h, w]``: s0, with clipped samples as they are."""
     return 2 * demosaic_guided_half(mosaic).data.mean(dim=-4)
 
 
-def see_separated(mosaic: Mosaic) -> Tensor:
+def separated_images(mosaic: Mosaic) -> Tensor:
     """Diffuse and specular image of `METHOD`, ``[6, h, w]``."""
     images = METHODS[METHOD].run(mosaic, (1.0, 1.0, 1.0), False)
     planes = (torch.from_numpy(x).movedim(-1, 0) for x in (images.diffuse, images.specular))
     return torch.cat([x.expand(3, -1, -1) for x in planes])
 
 
-def see(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> Tensor:
-    """Everything that networks may see of one photograph, ``[15, h, w]``; see `INPUTS`."""
+def random_view(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> Tensor:
+    """All inputs of networks from one photograph, ``[15, h, w]``; see `INPUTS`."""
     mosaic, scene, white = photograph(maps, light, generator)
     diffuse, specular, _ = half_resolution(scene)
     off = math.exp(WHITE_ERROR * float(torch.randn(1, generator=generator, dtype=torch.float64)))
-    return torch.cat([see_unseparated(mosaic), see_separated(mosaic), diffuse, specular]) / (white * off)
+    return torch.cat([unseparated_image(mosaic), separated_images(mosaic), diffuse, specular]) / (white * off)
 
 
 def make_example(maps: Svbrdf, views: int, generator: torch.Generator) -> Example:
@@ -120,14 +120,14 @@ def make_example(maps: Svbrdf, views: int, generator: torch.Generator) -> Exampl
     twice that times a power of 2.
     """
     place: list[Callable[[torch.Generator], PointLight]] = [random_flash, *[random_light] * (views - 1)]
-    seen = torch.stack([see(maps, draw(generator), generator) for draw in place])
+    seen = torch.stack([random_view(maps, draw(generator), generator) for draw in place])
     while maps.roughness.shape[-1] > MAP_SIZE:
         maps = halve(maps)
     return Example(avg_pool2d(seen, seen.shape[-1] // MAP_SIZE), maps.stack())
 
 
 def random_example(split: str, seed: int, number: int, views: int, size: int = RAW_SIZE) -> Example:
-    """Example ``number`` of a split, in frames of ``size`` raw pixels along a side, which depends on nothing else.
+    """Example ``number`` of a split, in frames of ``size`` raw pixels along a side; depends only on these numbers.
 
     Raises ValueError on a split not in `views.SPLITS`.
     """

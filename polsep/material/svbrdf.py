@@ -1,4 +1,4 @@
-"""Materials that vary over a plane as maps, and what light makes of them: the renderer that networks learn through.
+"""Materials that vary over a plane, as maps, and their differentiable renderer.
 
 Conventions: the plane is x, y in [-1, 1] at z = 0, x right, y up, z toward the camera; maps are ``[..., C, H, W]``,
 row 0 at y = 1. ``diffuse`` and ``specular`` are linear RGB in [0, 1], the latter the reflectance at normal incidence,
@@ -20,9 +20,9 @@ from polsep.physics.optics import dot, normalize
 
 #: Exponents of Schlick's term as a power of two (Karis 2013).
 SCHLICK = (-5.55473, -6.98316)
-#: Roughness and cosines from which on shading is computed.
+#: Least roughness and cosine of the shading.
 MIN_ROUGHNESS, MIN_COSINE = 0.03, 1e-3
-#: Channels of maps that are stacked: normal x and y, diffuse, roughness, specular.
+#: Channels of stacked maps: normal x and y, diffuse, roughness, specular.
 STACKED = 9
 
 
@@ -82,8 +82,8 @@ def reflect(maps: Svbrdf, to_camera: Tensor, to_light: Tensor) -> Tensor:
 
 
 def relight(maps: Svbrdf, points: Tensor, camera: Tensor, light: Tensor) -> Tensor:
-    """What a camera at ``camera`` sees of the plane under a light at ``light``, both ``[..., 3, 1, 1]``.
+    """The image of the plane for a camera at ``camera`` and a light at ``light``, both ``[..., 3, 1, 1]``.
 
-    The light is as strong at every point: white paper that faces it shows 1.
+    The light is equally strong at every point: white paper that faces it shows 1.
     """
     return math.pi * reflect(maps, normalize(camera - points), normalize(light - points))

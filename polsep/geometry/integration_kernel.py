@@ -1,7 +1,7 @@
 """One round of bilateral normal integration on the pixels of a mask: weights, their energy, and the linear system.
 
 Pixels are numbered row by row; `Places.near` ``[N, 4]`` has the numbers of those above, left, right and below, or -1.
-That is the order of a row of the matrix too, with the pixel itself in the middle. See `polsep.geometry.integration` for
+A row of the matrix has the same order, with the pixel itself in the middle. See `polsep.geometry.integration` for
 the equations; tests/test_geometry.py has them in NumPy.
 """
 
@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 
 class Places(NamedTuple):
-    """Neighbours ``near [N, 4]``, and where each row of the matrix starts ``starts [N + 1]``."""
+    """Neighbours ``near [N, 4]``, and the start of each row of the matrix ``starts [N + 1]``."""
 
     near: NDArray[np.int32]
     starts: NDArray[np.int32]

@@ -41,7 +41,7 @@ from polsep.view.pictures import (
     stage,
     tone,
 )
-from polsep.view.playing import Ahead
+from polsep.view.playback import Prefetcher
 from polsep.view.readout import read_pixel, readout_panel
 from polsep.view.session import Session, Sessions
 
@@ -85,7 +85,7 @@ def png(codes: np.ndarray[Any, Any]) -> bytes:
     return bytes(imagecodecs.png_encode(codes))
 
 
-def opened(sessions: Sessions, key: str = "a", **said: Any) -> opening.Found:
+def opened(sessions: Sessions, key: str = "a", **said: Any) -> opening.OpenedFrame:
     """A small raw frame, uploaded and separated by the closed form."""
     sent = upload(sessions, "shot 1.png", png(mosaic_codes()))
     sessions.open_upload(key, [(str(sent), sent.name)])
@@ -219,7 +219,7 @@ def test_sessions_are_apart_and_leave_nothing(sessions: Sessions) -> None:
     for key in ("a", "b"):
         sessions.open_upload(key, [(str(sent), sent.name)])
         sessions.find(key).separate(parse_settings({"method": "analytic", "white": "4095"}))
-    assert sessions.find("a").found is not sessions.find("b").found
+    assert sessions.find("a").opened is not sessions.find("b").opened
     with pytest.raises(ValueError, match="expected an opened file"):
         sessions.find("c").separate(Settings())
     sessions.find("a").write("exr")
@@ -404,7 +404,7 @@ def test_edits_are_shown_small_and_written_large(sessions: Sessions) -> None:
     np.testing.assert_array_equal(layers["combined.G"], truth.combined[..., 1])
     assert json.loads(page.write("recipe").read_text())["edits"][0]["edit"] == "rougher"
     page.edit(Recipe())
-    assert page.found.small.edited is None
+    assert page.opened.small.edited is None
 
 
 def test_requests_name_this_machine() -> None:
@@ -480,7 +480,7 @@ def test_messages_pass_whole_or_not_at_all() -> None:
 
 def test_a_session_without_a_file_says_so(tmp_path: Path) -> None:
     """Nothing to separate, nothing to fetch."""
-    page = Session(tmp_path, tmp_path, Ahead())
+    page = Session(tmp_path, tmp_path, Prefetcher())
     with pytest.raises(ValueError, match="expected an opened file"):
         page.separate(Settings())
     with pytest.raises(ValueError, match="expected a separated frame"):

@@ -31,7 +31,7 @@ from polsep.view import images
 from polsep.view.edits import edit_small
 from polsep.view.opening import Settings, find_sources, parse_settings
 from polsep.view.pictures import Small, shrink, shrink_frame
-from polsep.view.playing import Ahead, Reel, pack, unpack
+from polsep.view.playback import Prefetcher, Reel, pack, unpack
 from polsep.view.session import Session, Sessions
 
 COUNT = 4
@@ -86,7 +86,7 @@ def test_a_stack_plays_in_order_and_around(sessions: Sessions) -> None:
         until(page.play)
         assert page.place == place and page.shown is not None
         np.testing.assert_allclose(page.shown.specular, truth_of(place).specular, rtol=1e-3, atol=1e-6)
-    assert page.found is not None and page.found.index == 0
+    assert page.opened is not None and page.opened.index == 0
     assert page.separate(parse_settings({**ANALYTIC, "index": 1})).stem == "stack_0001"
     until(page.play)
     assert page.place == 2
@@ -161,7 +161,7 @@ def test_results_of_both_formats_are_opened(sessions: Sessions, tmp_path: Path, 
 def test_what_is_kept_is_bounded() -> None:
     """Frames seen longest ago go first; a frame that cannot be made says why, once it is its turn."""
     size = pack(small_frame(0.0)).size
-    ahead, reel = Ahead(3 * size), Reel()
+    ahead, reel = Prefetcher(3 * size), Reel()
     for place in range(6):
         ahead.want(reel, [place], lambda place: small_frame(place / 8))
         until(lambda place=place: ahead.frame(reel, place))
@@ -177,7 +177,7 @@ def test_what_is_kept_is_bounded() -> None:
 
 def test_a_dropped_sequence_keeps_nothing() -> None:
     """A frame that was being made when its page closed is not kept."""
-    ahead, reel, begun, go = Ahead(), Reel(), threading.Event(), threading.Event()
+    ahead, reel, begun, go = Prefetcher(), Reel(), threading.Event(), threading.Event()
 
     def make(place: int) -> Small:
         begun.set()

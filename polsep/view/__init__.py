@@ -1,5 +1,5 @@
-"""The viewer: raw frames and results in a browser, on this machine, with nothing from outside.
+"""The viewer: raw frames and results in a browser, on this machine, without network.
 
-`session` opens and separates, `pictures` and `readout` make what is seen, `guard` keeps strangers out, and `page`
-lays it out with Gradio (extra ``view``). Only `page` and `server` import Gradio.
+`session` opens and separates, `pictures` and `readout` draw, `guard` refuses foreign requests, `page` lays out the
+page with Gradio (extra ``view``), and `events` updates it. Only `page`, `events` and `server` import Gradio.
 """

@@ -1,7 +1,6 @@
-"""Edits as controls: what the registry of `polsep.edit` says of each, made into values of a page and back.
+"""Edits as controls: from the registry of `polsep.edit` to controls of a page, and from their values to recipes.
 
-The panel is generated: an edit that is added to `EDITS` appears by itself. Every control starts where its edit is the
-identity.
+The panel is generated: an edit in `EDITS` appears by itself. Every control starts where its edit is the identity.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from polsep.view.pictures import Floats, Small
 
 @dataclass(frozen=True)
 class Control:
-    """One value of an edit on the page; ``start``: where it stands at first."""
+    """The control of one parameter of an edit; ``start``: its first value."""
 
     edit: type[Edit]
     parameter: Parameter
@@ -29,13 +28,13 @@ class Control:
 
     @property
     def label(self) -> str:
-        """The parameter for people, with its unit."""
+        """The parameter's name with its unit."""
         name = self.parameter.name.capitalize()
         return f"{name} [{self.parameter.unit}]" if self.parameter.unit else name
 
 
 def list_controls() -> tuple[Control, ...]:
-    """The controls of every edit, in the order in which edits act. Images are no controls: they are sent."""
+    """The controls of every edit, in the order in which edits are applied. Images are uploaded instead."""
     return tuple(
         Control(kind, parameter, _start(parameter))
         for kind in EDITS.values()
@@ -53,10 +52,10 @@ def _start(parameter: Parameter) -> float | str:
 
 
 def recipe_of(values: Sequence[Any], images: Mapping[str, str] | None = None) -> Recipe:
-    """The recipe that the controls stand for, in the order of `list_controls`, without edits that do nothing.
+    """The recipe of values of the controls, in the order of `list_controls`, without neutral edits.
 
-    ``images``: names of what was sent, by kind; the mask is that of all edits, as with `polsep edit --mask`. Edits
-    whose image was not sent are left out. Raises ValueError on values out of range.
+    ``images``: names of uploaded images, by kind; the mask is that of all edits, as with `polsep edit --mask`. Edits
+    without their image are left out. Raises ValueError on values out of range.
     """
     sent = images or {}
     said: dict[type[Edit], dict[str, Any]] = {}
@@ -70,7 +69,7 @@ def recipe_of(values: Sequence[Any], images: Mapping[str, str] | None = None) ->
 
 
 def _color(text: object) -> tuple[float, ...]:
-    """Linear light of ``#rrggbb`` or ``rgba(r, g, b, a)``, which are what browsers say."""
+    """Linear light of ``#rrggbb`` or ``rgba(r, g, b, a)``, the formats of browsers."""
     said = str(text)
     if (found := re.fullmatch(r"#([0-9a-fA-F]{6})", said)) is not None:
         codes = [float(code) for code in bytes.fromhex(found[1])]
@@ -90,7 +89,7 @@ def edit_small(small: Small, recipe: Recipe, maps: Maps | None = None) -> Floats
 
 
 def at_scale(recipe: Recipe, step: int) -> Recipe:
-    """The recipe for images of which one pixel is ``step`` of the frame's."""
+    """The recipe for images whose pixels are ``step`` pixels of the frame wide."""
     return Recipe(tuple(_at_scale(edit, step) for edit in recipe.edits))
 
 

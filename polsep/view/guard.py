@@ -1,8 +1,8 @@
-"""What a request must be before the page's own server sees it.
+"""Checks of requests before the page's server receives them.
 
 Gradio fetches addresses that a client names as files, and proxies them; it reads uploads of any announced size up to
-its limit. A viewer has no use for either. Requests that name another host are other sites' scripts in the user's
-browser, which a name of theirs led to this machine.
+its limit. A viewer needs neither. Requests that name another host come from scripts of other sites in the user's
+browser, whose host name was resolved to this machine (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
-#: Bytes of the largest message of a page that is no upload.
+#: Bytes of the largest message that is no upload.
 MAX_JSON = 1 << 20
-#: What stands around the file in an upload.
+#: Bytes around the file in an upload.
 _AROUND = 1 << 16
 #: Names of this machine.
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-#: The parts of Gradio that the page uses, by how their paths begin; "/" is the page itself.
+#: Beginnings of the paths of Gradio that the page uses; "/" is the page itself.
 READ = (
     *("/assets/", "/static/", "/svelte/", "/theme.css", "/config", "/favicon.ico", "/manifest.json", "/heartbeat/"),
     *("/queue/data", "/file=", "/upload_progress", "/startup-events", "/app_id"),
@@ -33,13 +33,13 @@ SENT = ("/queue/join", "/run/", "/upload", "/cancel", "/reset")
 
 
 class Guard:
-    """Answers 403 and 413 in the server's place; ``hosts``: names that requests may use, None for any."""
+    """ASGI middleware that answers 403 and 413; ``hosts``: allowed host names, None for any."""
 
     def __init__(self, app: App, hosts: tuple[str, ...] | None, most_bytes: int) -> None:
         self._app, self._hosts, self._most_bytes = app, hosts, most_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Check and pass on one request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -53,7 +53,7 @@ class Guard:
             await self._app(scope, receive, send)
 
     def _refusal(self, headers: dict[str, str], verb: str, path: str) -> tuple[int, str] | None:
-        """Status and text for what is refused by its head alone."""
+        """Status and text if the headers alone require a refusal."""
         if self._hosts is not None and host_name(headers.get("host", "")) not in self._hosts:
             return 403, "expected a request to this machine by its own name"
         used = {"POST": SENT, "GET": READ, "HEAD": READ}.get(verb, ())
@@ -65,7 +65,7 @@ class Guard:
         return None
 
     async def _pass_message(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Read a whole message, and pass it on unless it names files elsewhere."""
+        """Read a complete message, and pass it on unless it names files elsewhere."""
         body = b""
         more = True
         while more:
@@ -100,7 +100,7 @@ def host_name(host: str) -> str:
 
 
 def names_address(body: bytes) -> bool:
-    """True where a JSON message has a file whose path is an address, which Gradio would fetch."""
+    """True if a JSON message has a file whose path is an address, which Gradio would fetch."""
     try:
         waiting: list[Any] = [json.loads(body)] if body else []
     except (ValueError, RecursionError):

@@ -1,7 +1,6 @@
-"""Images that edits name, sent to a page: textures, masks and normals, at screen size; the files wait for downloads.
+"""Uploaded images of edits: textures, masks and normals at screen size; the files are kept for downloads.
 
-Textures are of any size. Masks and normals are of the separated frame's, pixel by pixel, and hold for all frames of
-that size.
+Textures have any size. Masks and normals have the size of the separated frame and apply to all frames of that size.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ from polsep.io.store.header_checks import at_most
 from polsep.view.opening import MAX_SAMPLES, plain_name
 from polsep.view.pictures import Floats, shrink
 
-#: Kinds of images in the order of the page.
+#: Kinds of images, in the order of the page.
 KINDS = ("texture", "normals", "mask")
 #: Longest side of a texture at screen size: twice the picture's.
 TEXTURE = 1280
 
 
 @dataclass(frozen=True)
-class Sent:
+class EditImage:
     """An image of a page: its ``name`` in recipes, the file, its ``size`` (height, width), and ``small``, read-only.
 
     ``step``: pixels of the frame on a side of one of ``small``; of textures, nothing depends on it.
@@ -40,11 +39,11 @@ class Sent:
 
 
 def image_name(name: str) -> tuple[str, str]:
-    """Stem and extension of an image's name, harmless in any path. Raises InputError for what is no image."""
+    """Stem and extension of an image's name, safe in any path. Raises InputError for other files."""
     return plain_name(name, SUFFIXES, "an image as PNG, JPEG, TIFF, NPY or EXR")
 
 
-def read_image(kind: str, name: str, path: Path, frame: tuple[int, int], step: int) -> Sent:
+def read_image(kind: str, name: str, path: Path, frame: tuple[int, int], step: int) -> EditImage:
     """An image of a page for a frame of the size ``frame`` (height, width), shown at ``step``. Raises InputError."""
     try:
         with at_most(MAX_SAMPLES):
@@ -61,8 +60,8 @@ def read_image(kind: str, name: str, path: Path, frame: tuple[int, int], step: i
     else:
         small = shrink(found, -(-max(size) // TEXTURE))
     small = np.ascontiguousarray(small)
-    small.flags.writeable = False  # normals are then unfolded once
-    return Sent(kind, name, path, size, step, small)
+    small.flags.writeable = False  # so that normals are unfolded once
+    return EditImage(kind, name, path, size, step, small)
 
 
 def require_fit(kind: str, name: str, size: tuple[int, int], frame: tuple[int, int]) -> None:

@@ -1,4 +1,4 @@
-"""What a page opens: raw frames, results, and sequences of either; how they are read, and what is found in them.
+"""Opening of files on a page: raw frames, results, and sequences of either.
 
 A sequence is one file of several frames, or several files of one frame each.
 """
@@ -28,15 +28,15 @@ if TYPE_CHECKING:
 #: The capture that comes with polsep, and its white level.
 DEMO = Path(__file__).resolve().parents[1] / "data" / "still_life.png"
 DEMO_WHITE = 4095.0
-#: Samples of the largest frame that is opened: four times a 16-megapixel sensor.
+#: Largest number of samples of a frame: four times a 16-megapixel sensor.
 MAX_SAMPLES = 2**26
-#: What the page calls "nothing said": the file, or the type of its samples, decides.
+#: The value of unset fields: the file, or the type of its samples, decides.
 UNSAID = "from file"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How a file is read and separated: `ReadOptions` and arguments of `pipeline.separate`, and which frame of it."""
+    """Settings of reading and separating, as in `ReadOptions` and `pipeline.separate`, and the frame's ``index``."""
 
     read: ReadOptions = field(default_factory=ReadOptions)
     method: str = "auto"
@@ -47,7 +47,7 @@ class Settings:
 def parse_settings(said: Mapping[str, Any]) -> Settings:
     """Settings from the fields of the page: layout, black, white, light, method, size, pixel_format, index.
 
-    Raises ValueError, in one line, on what they cannot mean.
+    Raises ValueError, in one line, on values without meaning.
     """
     method = str(said.get("method") or "auto")
     check_method(method)
@@ -87,7 +87,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 @dataclass(frozen=True)
 class Source:
-    """One file: where it is kept, its name for people without extension, and whether it holds a separated frame."""
+    """One file: its path, its name without extension for display, and whether it holds a separated frame."""
 
     path: Path
     stem: str
@@ -95,7 +95,7 @@ class Source:
 
 
 def as_source(path: Path, stem: str) -> Source:
-    """A file under a name."""
+    """A file as a source with a display name."""
     separated = path.suffix.lower() == ".exr" or (path.suffix.lower() == ".npz" and holds_separated(path))
     return Source(path, stem, separated)
 
@@ -107,11 +107,11 @@ def find_sources(path: Path) -> tuple[Source, ...]:
 
 
 @dataclass(frozen=True)
-class Found:
-    """One separated frame and all that is shown of it. ``mosaic`` and ``histogram`` are None without a raw frame.
+class OpenedFrame:
+    """One separated frame and its display data. ``mosaic`` and ``histogram`` are None without a raw frame.
 
-    It is number ``index`` of ``count``; ``remarks`` are lines for the user; ``seconds``: how long reading and
-    separating took.
+    It is number ``index`` of ``count``; ``remarks`` are lines for the user; ``seconds``: time of reading and
+    separating.
     """
 
     frame: SeparatedFrame
@@ -133,7 +133,7 @@ class Found:
 
 
 def read_source(sources: tuple[Source, ...], read: ReadOptions, index: int) -> Frame | SeparatedFrame:
-    """Frame number ``index`` of a sequence, as its file has it. Raises InputError, in one line that names the file."""
+    """Read frame number ``index`` of a sequence. Raises InputError, in one line that names the file."""
     several = len(sources) > 1
     source = sources[min(index, len(sources) - 1)]
     with at_most(MAX_SAMPLES), _renamed(source):
@@ -147,11 +147,11 @@ def read_source(sources: tuple[Source, ...], read: ReadOptions, index: int) -> F
     return replace(frame, index=index, count=len(sources)) if several else frame
 
 
-def find_frame(sources: tuple[Source, ...], settings: Settings, read: Frame | SeparatedFrame) -> Found:
-    """What is shown of a frame that was read: separated under the settings, or as it is."""
+def open_frame(sources: tuple[Source, ...], settings: Settings, read: Frame | SeparatedFrame) -> OpenedFrame:
+    """Display data of a frame that was read: separated with the settings, or as it is."""
     stem = sources[min(settings.index, len(sources) - 1)].stem
     if isinstance(read, SeparatedFrame):
-        return Found(read, shrink_frame(read), None, None, (), stem, settings.index, len(sources))
+        return OpenedFrame(read, shrink_frame(read), None, None, (), stem, settings.index, len(sources))
     frame = separate_capture(read.data, settings.method, settings.light_color)
     frame.report["source"] = stem
     frame.report["warnings"] = [*read.notes, *frame.report["warnings"]]
@@ -159,11 +159,11 @@ def find_frame(sources: tuple[Source, ...], settings: Settings, read: Frame | Se
     remarks = tuple(remark.replace("say --white-level", "set White level to") for remark in frame.report["warnings"])
     counted = None if mosaic is None else histogram(mosaic)
     stem = stem if len(sources) > 1 or read.count == 1 else f"{stem}_{read.index:04d}"
-    return Found(frame, shrink_frame(frame), mosaic, counted, remarks, stem, read.index, read.count)
+    return OpenedFrame(frame, shrink_frame(frame), mosaic, counted, remarks, stem, read.index, read.count)
 
 
-def find_small(sources: tuple[Source, ...], settings: Settings) -> Small:
-    """The copy at screen size of a frame, and nothing else of it."""
+def open_small(sources: tuple[Source, ...], settings: Settings) -> Small:
+    """A frame at screen size only."""
     read = read_source(sources, settings.read, settings.index)
     if isinstance(read, SeparatedFrame):
         return shrink_frame(read)
@@ -172,7 +172,7 @@ def find_small(sources: tuple[Source, ...], settings: Settings) -> Small:
 
 @contextmanager
 def _renamed(source: Source) -> Iterator[None]:
-    """ValueErrors inside speak of the user's file, not of where it is kept."""
+    """Replace the path of the stored file by the user's file name in ValueErrors inside."""
     try:
         yield
     except ValueError as error:

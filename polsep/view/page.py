@@ -1,7 +1,7 @@
-"""The page: its parts, and which function of `answers` answers when one is used. Nothing is computed here.
+"""The page: its components, and the function of `events` for each of their events. Nothing is computed here.
 
-Reading and separating wait in one queue and run one at a time, whoever asked; pictures of what is already separated do
-not wait. A panel that a colleague's registry fills, such as `_edit_panel`, is generated from data.
+Reading and separating share one queue for all pages and run one at a time; pictures of separated frames are not queued.
+`_edit_panel` is generated from the registry of edits.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import gradio as gr
 from polsep.io.assets.maps import SUFFIXES
 from polsep.io.raw.genicam import PIXEL_FORMATS
 from polsep.methods import METHODS
-from polsep.view.answers import HINT, IMAGES, Answers, Parts, Start
 from polsep.view.edits import list_controls
+from polsep.view.events import HINT, IMAGES, Components, Events, Start
 from polsep.view.images import KINDS
 from polsep.view.opening import UNSAID
 from polsep.view.pictures import VIEWS
-from polsep.view.session import WANTED, Sessions
+from polsep.view.session import DOWNLOADS, Sessions
 from polsep.view.style import EMPTY, FETCH, STAGE
 
-#: Pages that may wait for a separation; one more is told so.
+#: Largest number of pages in the queue; one more gets an error.
 MAX_WAITING = 64
-#: Gradio removes files that no page ended for, looking every so many seconds, when they are so old.
+#: Seconds between Gradio's removals of old files, and the age of files that it removes.
 SWEEP_S = (600, 7200)
-#: Seconds between frames that are played, at least.
+#: Least number of seconds between played frames.
 TICK_S = 0.08
 _SEPARATE: dict[str, Any] = {"concurrency_id": "separate", "concurrency_limit": 1, "show_progress_on": None}
 _AT_ONCE: dict[str, Any] = {"queue": False, "show_progress": "hidden", "trigger_mode": "always_last"}
@@ -35,13 +35,13 @@ _AT_ONCE: dict[str, Any] = {"queue": False, "show_progress": "hidden", "trigger_
 def build_page(sessions: Sessions, start: Start) -> Any:
     """The page as Gradio blocks, ready to be launched."""
     with gr.Blocks(title="polsep", analytics_enabled=False, delete_cache=SWEEP_S, fill_width=True) as page:
-        parts = _lay_out(start)
-        _connect(page, parts, Answers(sessions, parts, start))
+        components = _lay_out(start)
+        _connect(page, components, Events(sessions, components, start))
     page.queue(max_size=MAX_WAITING, default_concurrency_limit=4, api_open=False)
     return page
 
 
-def _lay_out(start: Start) -> Parts:
+def _lay_out(start: Start) -> Components:
     with gr.Row(equal_height=False):
         with gr.Column(scale=0, min_width=330, elem_id="ps-side"):
             gr.HTML("<b>polsep</b><p>Diffuse and specular from one raw frame</p>", elem_id="ps-title")
@@ -72,14 +72,14 @@ def _lay_out(start: Start) -> Parts:
                 with gr.Tab("Confidence"):
                     confidence = gr.HTML(EMPTY)
     panels = (polarization, counted, confidence)
-    return Parts(
+    return Components(
         settings, file, demo, suggest, status, left, right, stops, picture, strip, play, timer, readout, panels,
         controls, images, neutral, fetch, link,
     )  # fmt: skip
 
 
 def _strip() -> tuple[Any, Any, Any]:
-    """What sequences have below the picture: play, and which frame."""
+    """Controls of sequences below the picture: play, and the frame number."""
     with gr.Row(visible=False, equal_height=True, elem_id="ps-strip") as strip:
         play = gr.Button("Play", scale=0, min_width=90, elem_id="ps-play")
         index = gr.Slider(0, 1, 0, step=1, label="Frame", scale=4, elem_id="ps-index")
@@ -87,11 +87,11 @@ def _strip() -> tuple[Any, Any, Any]:
 
 
 def _settings(start: Start) -> dict[str, Any]:
-    """How files are read and separated."""
-    said = start.settings
+    """Settings of reading and separating."""
+    values = start.settings
 
     def choice(name: str, label: str, choices: list[str], **more: Any) -> Any:
-        value = said.get(name) or choices[0]
+        value = values.get(name) or choices[0]
         known = choices if value in choices else [*choices, value]
         return gr.Dropdown(known, value=value, label=label, elem_id=f"ps-{name}", **more)
 
@@ -102,14 +102,17 @@ def _settings(start: Start) -> dict[str, Any]:
         found["white"] = choice("white", "White level", [UNSAID, "255", "1023", "4095", "16383", "65535"], **free)
         found["black"] = choice("black", "Black level", ["0", "16", "64", "256"], **free)
     found["light"] = choice("light", "Light colour R,G,B", ["white", "estimate", "1,0.9,0.7"], **free)
-    with gr.Accordion("Headless raw (.raw, .bin)", open=bool(said.get("size") or said.get("pixel_format"))), gr.Row():
-        found["size"] = gr.Textbox(said.get("size", ""), label="Size", placeholder="2448x2048", elem_id="ps-size")
+    with (
+        gr.Accordion("Headerless raw (.raw, .bin)", open=bool(values.get("size") or values.get("pixel_format"))),
+        gr.Row(),
+    ):
+        found["size"] = gr.Textbox(values.get("size", ""), label="Size", placeholder="2448x2048", elem_id="ps-size")
         found["pixel_format"] = choice("pixel_format", "Pixel format", [UNSAID, *PIXEL_FORMATS], **free)
     return found
 
 
 def _picture_row() -> tuple[Any, Any, Any]:
-    """Which pictures are compared, and how bright."""
+    """Choice of the compared pictures, and their exposure."""
     with gr.Row(equal_height=True):
         left = gr.Dropdown(list(VIEWS), value="Input", label="Left", min_width=110, elem_id="ps-left")
         right = gr.Dropdown(list(VIEWS), value="Diffuse", label="Right", min_width=110, elem_id="ps-right")
@@ -118,7 +121,7 @@ def _picture_row() -> tuple[Any, Any, Any]:
 
 
 def _edit_panel() -> tuple[tuple[Any, ...], dict[str, Any], Any]:
-    """A control for every value of every edit, a button for every kind of image, and one that sets all back."""
+    """A control for every parameter of every edit, a button for every kind of image, and one to undo all."""
     made, images = [], {}
     controls = list_controls()
     neutral = gr.Button("Undo all edits", size="sm", elem_id="ps-neutral")
@@ -146,46 +149,50 @@ def _control(control: Any) -> Any:
 
 
 def _fetch_panel() -> tuple[dict[str, Any], Any]:
-    """A button for everything that can be fetched; the link they use is out of sight."""
+    """A button for every download; the link that they use is hidden."""
     titles = {"exr": "EXR", "png": "Overview PNG", "edited": "Edited EXR", "recipe": "Edits as recipe"}
     buttons = {}
     gr.HTML('<p class="ps-hint">Download</p>')
-    for pair in (WANTED[:2], WANTED[2:]):
+    for pair in (DOWNLOADS[:2], DOWNLOADS[2:]):
         with gr.Row():
             for kind in pair:
                 buttons[kind] = gr.Button(titles[kind], size="sm", min_width=120, elem_id=f"ps-get-{kind}")
     return buttons, gr.DownloadButton("fetch", elem_id="ps-fetch")
 
 
-def _connect(page: Any, parts: Parts, answers: Answers) -> None:
-    """Which answer follows which event."""
-    settings, picture = set(parts.settings.values()), set(parts.picture())
+def _connect(page: Any, components: Components, events: Events) -> None:
+    """Connect events to their functions."""
+    settings, picture = set(components.settings.values()), set(components.picture())
     everything = settings | picture
-    opened = [*parts.shown(), parts.settings["white"], parts.file]  # the place for files is empty again for the next
-    parts.file.upload(answers.open_upload, {parts.file, *everything}, opened, preprocess=False, **_SEPARATE)
-    parts.demo.click(answers.open_demo, everything, opened, **_SEPARATE)
-    parts.suggest.click(answers.use_white, everything, opened, **_SEPARATE)
-    if start_file := answers.start.file:
-        page.load(lambda said, request: answers.open_own(start_file, said, request), everything, opened, **_SEPARATE)
-    for name, part in parts.settings.items():
-        listen = part.release if name == "index" else part.submit if name == "size" else part.input
-        listen(answers.separate, everything, parts.shown(), **_SEPARATE)
-    for part in (parts.left, parts.right, parts.stops):
-        part.input(answers.draw, picture, parts.stage, **_AT_ONCE)
-    parts.stage.click(answers.point, picture, [parts.stage, parts.readout], **_AT_ONCE)
-    controls = {*parts.controls, *picture}
-    for control in parts.controls:
-        control.input(answers.edit, controls, parts.edited(), **_AT_ONCE)
-    images = list(parts.images.values())
-    amount = parts.control("texture", "amount")
-    for kind, button in parts.images.items():
-        changed = [*parts.edited(), *images, amount]
-        button.upload(answers.add_image(kind), {button, *controls}, changed, preprocess=False, **_SEPARATE)
-    parts.neutral.click(answers.undo, picture, [*parts.edited(), *images, *parts.controls], **_AT_ONCE)
-    played = parts.play.click(answers.toggle, None, [parts.play, parts.timer], **_AT_ONCE)
-    played.then(answers.settle, everything, parts.shown(), **{**_SEPARATE, "show_progress": "hidden"})
-    parts.timer.tick(answers.advance, picture, parts.played(), **{**_AT_ONCE, "trigger_mode": "once"})
-    for kind, button in parts.fetch.items():
-        written = button.click(answers.write(kind), None, [parts.link, parts.status], **_SEPARATE)
+    opened = [
+        *components.shown(),
+        components.settings["white"],
+        components.file,
+    ]  # the file field is emptied for the next upload
+    components.file.upload(events.open_upload, {components.file, *everything}, opened, preprocess=False, **_SEPARATE)
+    components.demo.click(events.open_demo, everything, opened, **_SEPARATE)
+    components.suggest.click(events.use_white, everything, opened, **_SEPARATE)
+    if start_file := events.start.file:
+        page.load(lambda values, request: events.open_own(start_file, values, request), everything, opened, **_SEPARATE)
+    for name, component in components.settings.items():
+        listen = component.release if name == "index" else component.submit if name == "size" else component.input
+        listen(events.separate, everything, components.shown(), **_SEPARATE)
+    for component in (components.left, components.right, components.stops):
+        component.input(events.draw, picture, components.stage, **_AT_ONCE)
+    components.stage.click(events.point, picture, [components.stage, components.readout], **_AT_ONCE)
+    controls = {*components.controls, *picture}
+    for control in components.controls:
+        control.input(events.edit, controls, components.edited(), **_AT_ONCE)
+    images = list(components.images.values())
+    amount = components.control("texture", "amount")
+    for kind, button in components.images.items():
+        changed = [*components.edited(), *images, amount]
+        button.upload(events.add_image(kind), {button, *controls}, changed, preprocess=False, **_SEPARATE)
+    components.neutral.click(events.undo, picture, [*components.edited(), *images, *components.controls], **_AT_ONCE)
+    played = components.play.click(events.toggle, None, [components.play, components.timer], **_AT_ONCE)
+    played.then(events.settle, everything, components.shown(), **{**_SEPARATE, "show_progress": "hidden"})
+    components.timer.tick(events.advance, picture, components.played(), **{**_AT_ONCE, "trigger_mode": "once"})
+    for kind, button in components.fetch.items():
+        written = button.click(events.write(kind), None, [components.link, components.status], **_SEPARATE)
         written.success(None, None, None, js=FETCH)
-    page.unload(answers.leave)
+    page.unload(events.leave)

@@ -1,7 +1,7 @@
-"""What the viewer shows of a separated frame: small linear copies, and pictures of them at any exposure.
+"""Pictures of the viewer: small linear copies of a separated frame, drawn at any exposure.
 
-A copy is made once per separation; moving the exposure slider only passes it through a table. Light is averaged before
-any tone curve, and polarization as Stokes vectors. Pictures are sRGB ``uint8 [h, w, 3]``.
+A copy is made once per separation; the exposure slider only changes the lookup in a table. Light is averaged before any
+tone curve, and polarization as Stokes vectors. Pictures are sRGB ``uint8 [h, w, 3]``.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ Pixels = NDArray[np.uint8]
 
 #: Longest side of a picture in pixels.
 SCREEN = 640
-#: Steps of the tone table: fine enough that no step skips a code of 8 bits, anywhere on the curve.
+#: Steps of the tone table: fine enough that no step skips an 8-bit code.
 _STEPS = 1 << 14
-#: Exposure of error pictures over that of light: errors are small.
+#: Exposure of pictures of errors relative to that of light: errors are small.
 _ERROR_GAIN = 8.0
 _COLORS = {"R": "#ff6b6b", "G": "#63d471", "B": "#6ea8fe", "Y": "#d0d0d4"}
 
 
 @dataclass(frozen=True)
 class Small:
-    """A frame at screen size, linear: ``step`` pixels of the frame on a side are one here; ``gain`` shows it well.
+    """A linear frame at screen size: ``step`` pixels of the frame wide is one pixel; ``gain``: exposure that fits it.
 
     ``diffuse``, ``specular``: ``[h, w, C]``; ``dolp``, ``aolp``: ``[h, w]``; ``error``: ``[h, w, 2]`` or None;
     ``edited``: ``[h, w, C]`` after edits, None without.
@@ -85,7 +85,7 @@ def shrink(image: Floats, step: int) -> Floats:
 
 @cache
 def _tones() -> Pixels:
-    """8-bit sRGB codes of the squares of `_STEPS` even steps from 0 to 1: codes want fine steps in the dark."""
+    """8-bit sRGB codes of the squares of `_STEPS` even steps from 0 to 1: finer steps in the dark."""
     return np.rint(255 * srgb((np.arange(_STEPS) / (_STEPS - 1)) ** 2)).astype(np.uint8)
 
 
@@ -96,7 +96,7 @@ def tone(image: Floats, gain: float) -> Pixels:
     return codes if codes.shape[2] == 3 else codes.repeat(3, axis=2)
 
 
-#: Every picture that can be compared, by name: of a copy and a gain.
+#: Pictures that can be compared, by name: functions of a copy and a gain.
 VIEWS: dict[str, Callable[[Small, float], Pixels]] = {
     "Input": lambda small, gain: tone(small.diffuse + small.specular, gain),
     "Diffuse": lambda small, gain: tone(small.diffuse, gain),
@@ -115,7 +115,7 @@ def draw(small: Small, view: str, stops: float) -> Pixels:
 
 
 def draw_error(small: Small) -> tuple[Pixels, Pixels] | None:
-    """The errors that the method expects, of diffuse and of specular, `_ERROR_GAIN` times as bright as the frame."""
+    """Expected errors of diffuse and of specular, `_ERROR_GAIN` times as bright as the frame."""
     if small.error is None:
         return None
     gain = np.float32(small.gain * _ERROR_GAIN)
@@ -123,12 +123,12 @@ def draw_error(small: Small) -> tuple[Pixels, Pixels] | None:
 
 
 def error_at_white(small: Small) -> float:
-    """The error that the brightest colour of `draw_error` stands for, in the images' unit."""
+    """The error at the brightest colour of `draw_error`, in the images' unit."""
     return 1 / (small.gain * _ERROR_GAIN)
 
 
 def as_url(pixels: Pixels) -> str:
-    """A picture as text that stands where a page expects an address: it never becomes a file.
+    """A picture as a data URL, without a file.
 
     Note: JPEG of high quality, unlike the PNG previews in files, because it must follow a slider. Numbers are read from
     the frame (`readout`), never from here.
@@ -137,12 +137,12 @@ def as_url(pixels: Pixels) -> str:
 
 
 def scale_url(pixels: Pixels) -> str:
-    """A legend or scale as such text, without loss."""
+    """A legend or scale as a data URL, lossless."""
     return f"data:image/png;base64,{b64encode(encode_png(pixels)).decode('ascii')}"
 
 
 def stage(small: Small, views: tuple[str, str], stops: float, mark: tuple[int, int] | None = None) -> str:
-    """The page's element that compares two pictures; ``mark``: row and column of a pixel to point out."""
+    """The page's element that compares two pictures; ``mark``: row and column of a marked pixel."""
     with ThreadPoolExecutor(2) as pool:
         left, right = pool.map(lambda view: as_url(draw(small, view, stops)), views)
     height, width = small.size
@@ -177,7 +177,7 @@ def polarization_panel(small: Small) -> str:
 
 
 def confidence_panel(frame: SeparatedFrame, small: Small) -> str:
-    """What error the method expects, pixel by pixel, and how much of the frame is assumption."""
+    """Expected errors per pixel, and the share of valid pixels."""
     valid = f"{float(frame.valid.mean()):.2%} of the pixels are valid: clipping left nothing of them to assumption."
     drawn = draw_error(small)
     if drawn is None:
@@ -222,7 +222,7 @@ class Histogram:
 
 
 def histogram(mosaic: Mosaic, bins: int = 128) -> Histogram:
-    """How raw samples are spread over the range from black to white; those beyond count into the last bins."""
+    """Histogram of raw samples from black to white; samples beyond count in the first and last bins."""
     samples, clipped = mosaic.linear().numpy(), mosaic.clipped().numpy()
     layout, period = mosaic.layout, mosaic.layout.period
     count = np.zeros((layout.channels, bins))

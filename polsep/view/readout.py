@@ -1,4 +1,4 @@
-"""The numbers behind one pixel: raw samples of its 2x2 cell, their Stokes vector, and what the separation made of it.
+"""The numbers of one pixel: raw samples of its 2x2 cell, their Stokes vector, and its separation.
 
 Coordinates are those of the separated images, row and column from the upper left; the cell of pixel (r, c) starts at
 raw pixel (2r, 2c), after the layout's origin. Angles are in degrees, from image-right toward image-up.
@@ -27,7 +27,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Readout:
-    """What is known of one pixel; ``samples``, ``color`` and ``stokes`` are empty where there is no raw frame.
+    """The numbers of one pixel; ``samples``, ``color`` and ``stokes`` are empty where there is no raw frame.
 
     ``stokes``: s0, s1, s2 of the cell's own four samples, linear, of the one colour that covers it. ``error``: of
     diffuse and specular, or None.

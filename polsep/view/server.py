@@ -1,4 +1,4 @@
-"""The viewer's server: this machine alone unless told otherwise, folders that end with it, nothing asked of others."""
+"""The viewer's server: for this machine only by default, with temporary folders, without requests to others."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from polsep.view.style import CSS, FONTS, MONOSPACE, ON_LOAD
 
 #: Upload limit: 24 frames of 2448x2048 in 16 bits.
 MAX_MB = 240
-#: Addresses that stand for all of a machine's.
+#: Addresses that mean all addresses of a machine.
 ANY_HOST = ("0.0.0.0", "::")
 
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Where the viewer listens and what it starts with: ``settings`` by the names of `session.parse_settings`.
+    """The viewer's address and first state: ``settings`` by the names of `opening.parse_settings`.
 
     ``port`` None: the first free one from 7860 on. ``most_mb``: of an upload.
     """
@@ -42,9 +42,9 @@ class ViewOptions:
 
 @contextmanager
 def serve(options: ViewOptions) -> Iterator[str]:
-    """Serve the viewer while the block runs, and give its address.
+    """Serve the viewer inside the block and yield its address.
 
-    Raises ModuleNotFoundError without Gradio, and OSError when the port is taken.
+    Raises ModuleNotFoundError without Gradio, and OSError if the port is in use.
     """
     if find_spec("gradio") is None:
         raise ModuleNotFoundError("No module named 'gradio'", name="gradio")
@@ -60,7 +60,7 @@ def serve(options: ViewOptions) -> Iterator[str]:
     finally:
         if page is not None and page.is_running:
             page.close(verbose=False)
-        warm.join()  # a program must not end while a network is being compiled
+        warm.join()  # the program must not end while a network is compiled
         sessions.close()
         remove_folder(scratch.root)
         for name, value in kept.items():
@@ -71,7 +71,7 @@ def serve(options: ViewOptions) -> Iterator[str]:
 
 
 def _environment(root: Path) -> dict[str, str]:
-    """What Gradio reads from there: no analytics, and every file of its below ``root``."""
+    """Environment variables for Gradio: no analytics, and all its files below ``root``."""
     return {
         "GRADIO_ANALYTICS_ENABLED": "False",
         "HF_HUB_DISABLE_TELEMETRY": "1",
@@ -82,10 +82,10 @@ def _environment(root: Path) -> dict[str, str]:
 
 
 def _build(options: ViewOptions, sessions: Sessions):  # type: ignore[no-untyped-def]  # Gradio has no types for us
-    """Import Gradio where it is used first: it takes seconds, and its dependencies warn."""
+    """Build the page; imports Gradio only here, as that takes seconds and its dependencies warn."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        from polsep.view.answers import Start
+        from polsep.view.events import Start
         from polsep.view.page import build_page
 
         return build_page(sessions, Start(options.settings, options.file))
@@ -129,6 +129,6 @@ def _launch(page, options: ViewOptions) -> str:  # type: ignore[no-untyped-def]
 
 
 def warm_up(method: str) -> None:
-    """Do what the first separation would wait for: load kernels and weights, and make an engine of the usual size."""
+    """Load kernels and weights, and build an engine of the usual size, before the first separation."""
     mosaic = Mosaic(torch.zeros(2048, 2448), Layout(), 0.0, 1.0)
     find_method(method, mosaic).run(mosaic, (1.0, 1.0, 1.0), False)

@@ -1,6 +1,6 @@
-"""What one open page works on: its files, the frame read from them, and the separation, all of them its own.
+"""Sessions: the files, the frame read from them and its separation, separately for each open page.
 
-A `Session` is the state behind one page. It ends with the page, and with it everything that came from its user.
+A `Session` is the state of one page. It ends with the page, and its user's files are then deleted.
 """
 
 from __future__ import annotations
@@ -34,102 +34,102 @@ from polsep.io.store.temporary import (
 )
 from polsep.separation.report import SeparatedFrame
 from polsep.view.edits import edit_small
-from polsep.view.images import Sent, image_name, read_image, require_fit
+from polsep.view.images import EditImage, image_name, read_image, require_fit
 from polsep.view.opening import (
-    Found,
+    OpenedFrame,
     Settings,
     Source,
     as_source,
-    find_frame,
-    find_small,
     find_sources,
+    open_frame,
+    open_small,
     plain_name,
     read_source,
 )
 from polsep.view.pictures import Small
-from polsep.view.playing import AHEAD, Ahead, Reel
+from polsep.view.playback import AHEAD, Prefetcher, Reel
 
-#: Pages that are open at once; beyond, the one idle for longest ends.
+#: Largest number of open pages; beyond it, the one idle for longest ends.
 MAX_SESSIONS = 32
-#: Files that a page opens at once.
+#: Largest number of files that a page opens at once.
 MAX_FILES = 1000
-#: What can be fetched: the separation, its contact sheet, the edited frame, the edits as a file.
-WANTED = ("exr", "png", "edited", "recipe")
+#: Files to download: the separation, its contact sheet, the edited frame, the edits as a file.
+DOWNLOADS = ("exr", "png", "edited", "recipe")
 
 
 class Session:
-    """What one page has opened. Its methods may be called from several threads; one at a time works.
+    """The state of one page. Its methods may be called from several threads and exclude each other.
 
-    ``kept`` and ``fetched`` are folders of its own: for the files it works on, and for results to be fetched.
+    ``kept`` and ``downloads`` are its own folders: for its files, and for results to download.
     ``found`` is the frame whose numbers and files the page has, ``shown`` what it sees: the same, or a frame that
     is being played.
     """
 
-    def __init__(self, kept: Path, fetched: Path, ahead: Ahead) -> None:
-        self.kept, self.fetched = kept, fetched
+    def __init__(self, kept: Path, downloads: Path, ahead: Prefetcher) -> None:
+        self.kept, self.downloads = kept, downloads
         self.lock = threading.Lock()
-        self.found: Found | None = None
+        self.opened: OpenedFrame | None = None
         self.shown: Small | None = None
         self.place, self.playing = 0, False
         self.mark: tuple[int, int] | None = None
         self.recipe = Recipe()
-        self.images: dict[str, Sent] = {}
+        self.images: dict[str, EditImage] = {}
         self._ahead, self._reel = ahead, Reel()
         self._sources: tuple[Source, ...] = ()
         self._read: tuple[ReadOptions, int, Frame | SeparatedFrame] | None = None
         self._settings: Settings | None = None
 
     def begin(self, sources: tuple[Source, ...]) -> None:
-        """Work on other files; what was found in those before is forgotten."""
+        """Open other files and drop the state of the ones before."""
         with self.lock:
             self._forget()
             self._sources = sources
 
     def begin_own(self, path: Path) -> None:
-        """Work on the owner's own file, or folder of separated frames. Raises InputError."""
+        """Open the owner's file, or folder of separated frames. Raises InputError."""
         self.begin(find_sources(path))
 
     def forget(self) -> None:
-        """Work on no file, as after one that could not be opened."""
+        """Close all files, as after one that could not be opened."""
         with self.lock:
             self._forget()
 
     def _forget(self) -> None:
         self._drop_reel()
         self._sources, self.place, self.playing = (), 0, False
-        self._read = self.found = self.shown = self.mark = self._settings = None
+        self._read = self.opened = self.shown = self.mark = self._settings = None
 
     def _drop_reel(self) -> None:
         self._ahead.drop(self._reel)
         self._reel = Reel()
 
-    def separate(self, settings: Settings) -> Found:
-        """The opened file under these settings. Raises ValueError, in one line that names the file."""
+    def separate(self, settings: Settings) -> OpenedFrame:
+        """Separate the opened file with these settings. Raises ValueError, in one line that names the file."""
         with self.lock:
             if not self._sources:
                 raise ValueError("expected an opened file, found none: choose one, or the demo capture")
-            if self.found is None or settings != self._settings:
+            if self.opened is None or settings != self._settings:
                 if self._settings is None or replace(settings, index=0) != replace(self._settings, index=0):
                     self._drop_reel()
-                self.mark = self.mark if self.found is not None and self.found.index == settings.index else None
+                self.mark = self.mark if self.opened is not None and self.opened.index == settings.index else None
                 begin = time.perf_counter()
-                found = find_frame(self._sources, settings, self._frame(settings))
+                found = open_frame(self._sources, settings, self._frame(settings))
                 found = replace(found, remarks=found.remarks + self._drop_unfit(found))
-                self.found = replace(found, seconds=time.perf_counter() - begin)
+                self.opened = replace(found, seconds=time.perf_counter() - begin)
                 self._settings, self.place = settings, found.index
-            self.place = self.found.index
-            self.shown = self._edited(self.found.small)
-            return self.found
+            self.place = self.opened.index
+            self.shown = self._edited(self.opened.small)
+            return self.opened
 
     def _frame(self, settings: Settings) -> Frame | SeparatedFrame:
-        """The frame as its file has it, read anew only where the file or how it is read has changed."""
+        """The frame of the file, read again only if the file or the reading options have changed."""
         if self._read is None or self._read[:2] != (settings.read, settings.index):
             frame = read_source(self._sources, settings.read, settings.index)
             self._read = (settings.read, settings.index, frame)
         return self._read[2]
 
-    def _drop_unfit(self, found: Found) -> tuple[str, ...]:
-        """Remarks on masks and normals that do not fit the frame, which are left then."""
+    def _drop_unfit(self, found: OpenedFrame) -> tuple[str, ...]:
+        """Drop masks and normals that do not fit the frame, and return remarks on them."""
         remarks = []
         height, width = found.frame.valid.shape
         for sent in list(self.images.values()):
@@ -141,24 +141,24 @@ class Session:
         return tuple(remarks)
 
     def _drop_image(self, kind: str) -> None:
-        """Have no image of this kind any more, and no edit that names it."""
+        """Remove the image of a kind, and the edits that name it."""
         sent = self.images.pop(kind, None)
         if sent is not None:
             edits = (edit for edit in self.recipe.edits if sent.name not in (name for _, name in edit.images()))
             self.recipe = Recipe(tuple(edits))
 
     def play(self) -> bool:
-        """Show the next frame of the sequence if it is ready, and have those behind it made; True if it was.
+        """Show the next frame of the sequence if it is ready, and request those after it; True if it was ready.
 
-        Raises ValueError where there is no sequence, or a frame of it can't be read.
+        Raises ValueError if there is no sequence, or a frame of it cannot be read.
         """
         with self.lock:
-            found, settings = self.found, self._settings
+            found, settings = self.opened, self._settings
             if found is None or settings is None or found.count < 2:
                 raise ValueError("expected a sequence to play, found none")
             places = [(self.place + 1 + k) % found.count for k in range(min(AHEAD, found.count))]
             sources = self._sources
-            self._ahead.want(self._reel, places, lambda place: find_small(sources, replace(settings, index=place)))
+            self._ahead.want(self._reel, places, lambda place: open_small(sources, replace(settings, index=place)))
             small = self._ahead.frame(self._reel, places[0])
             if small is None:
                 return False
@@ -167,7 +167,7 @@ class Session:
             return True
 
     def edit(self, recipe: Recipe) -> None:
-        """Show the frame with these edits from now on. Raises EditError where they do not fit it."""
+        """Show the frame with these edits from now on. Raises EditError if they do not fit it."""
         with self.lock:
             before, self.recipe = self.recipe, recipe
             try:
@@ -184,17 +184,17 @@ class Session:
     def add_image(self, kind: str, path: Path, said: tuple[str, str]) -> None:
         """Have an image, of which the name's two parts are ``said``, for edits. Raises ValueError."""
         with self.lock:
-            if self.found is None:
+            if self.opened is None:
                 raise ValueError(f"expected a separated frame before its {kind}, found none: open a file first")
             self._drop_image(kind)
             name = "".join(said)
             if any(sent.name == name for sent in self.images.values() if sent.kind != kind):
                 name = f"{kind}-{name}"
-            height, width = self.found.frame.valid.shape
-            self.images[kind] = read_image(kind, name, path, (height, width), self.found.small.step)
+            height, width = self.opened.frame.valid.shape
+            self.images[kind] = read_image(kind, name, path, (height, width), self.opened.small.step)
 
     def drop_images(self) -> None:
-        """Have no images any more, and no edits that name them."""
+        """Remove all images, and the edits that name them."""
         with self.lock:
             for kind in list(self.images):
                 self._drop_image(kind)
@@ -202,24 +202,24 @@ class Session:
                 self.shown = self._edited(self.shown)
 
     def write(self, kind: str) -> Path:
-        """Write what the user wants to fetch, one of `WANTED`, into a folder of its own. Raises ValueError."""
+        """Write a download, one of `DOWNLOADS`, into a new folder. Raises ValueError."""
         with self.lock:
-            if self.found is None:
+            if self.opened is None:
                 raise ValueError("expected a separated frame, found none: open a file first")
-            folder = make_folder(self.fetched, random_name())
-            stem = self.found.stem
+            folder = make_folder(self.downloads, random_name())
+            stem = self.opened.stem
             if kind in ("exr", "png"):
-                write_separation(self.found.frame, folder, stem, "exr")
+                write_separation(self.opened.frame, folder, stem, "exr")
                 return folder / f"{stem}.{kind}"
             if kind == "recipe":
                 named = self.recipe.images()
                 files = {sent.name: sent.path for sent in self.images.values() if sent.name in named}
                 return write_recipe(folder, f"{stem}_recipe", recipe_as_text(self.recipe), files)
-            write_edited(self._edited_frame(self.found), folder, f"{stem}_edited", False)
+            write_edited(self._edited_frame(self.opened), folder, f"{stem}_edited", False)
             return folder / f"{stem}_edited.exr"
 
-    def _edited_frame(self, found: Found) -> EditedFrame:
-        """The frame at its own size under the recipe, as `polsep edit` writes it."""
+    def _edited_frame(self, found: OpenedFrame) -> EditedFrame:
+        """The frame at full size with the recipe, as `polsep edit` writes it."""
         paths = {sent.name: sent.path for sent in self.images.values()}
         maps = {name: read_map(paths[name], kind) for name, kind in self.recipe.images().items()}
         after = apply(found.frame, self.recipe, maps)
@@ -229,25 +229,25 @@ class Session:
 
 
 class Sessions:
-    """All open pages by the key that the browser drew for each; a key that is not here has nothing.
+    """All open pages, by the key that each browser page drew.
 
     At most `MAX_SESSIONS` are kept: beyond, the one idle for longest ends. ``most_bytes``: of what a page opens.
     """
 
     def __init__(self, scratch: TemporaryFolders, most_bytes: int) -> None:
         self.scratch, self.most_bytes = scratch, most_bytes
-        self._ahead = Ahead()
+        self._ahead = Prefetcher()
         self._lock = threading.Lock()
         self._open: OrderedDict[str, Session] = OrderedDict()
         self._uploads: dict[Path, set[str]] = {}
 
     def find(self, key: str) -> Session:
-        """The session of a page, made when it asks first."""
+        """The session of a page, created at its first request."""
         with self._lock:
             if key not in self._open:
                 name = random_name()
-                kept, fetched = (make_folder(parent, name) for parent in (self.scratch.kept, self.scratch.exchange))
-                self._open[key] = Session(kept, fetched, self._ahead)
+                kept, downloads = (make_folder(parent, name) for parent in (self.scratch.kept, self.scratch.exchange))
+                self._open[key] = Session(kept, downloads, self._ahead)
             self._open.move_to_end(key)
             oldest = next(iter(self._open)) if len(self._open) > MAX_SESSIONS else None
         if oldest is not None:
@@ -255,9 +255,9 @@ class Sessions:
         return self._open[key]
 
     def open_upload(self, key: str, sent: Sequence[tuple[object, str]]) -> None:
-        """Let a page work on the files that it uploaded, in the order of their names; ``sent``: claimed path and name.
+        """Open the files that a page uploaded, in the order of their names; ``sent``: claimed path and name.
 
-        Raises InputError for what is no upload, or no frame or result.
+        Raises InputError for files that are no uploads, or no frames or results.
         """
         if not 0 < len(sent) <= MAX_FILES:
             raise InputError(f"expected 1 to {MAX_FILES} files, found {len(sent)}")
@@ -274,7 +274,7 @@ class Sessions:
         session.begin(tuple(as_source(path, stem) for path, stem in kept))
 
     def add_image(self, key: str, kind: str, claimed: object, name: str) -> None:
-        """Let a page's edits use an image that it uploaded. Raises ValueError for what is no upload, or no image."""
+        """Use an uploaded image for a page's edits. Raises ValueError for files that are no uploads, or no images."""
         path = find_upload(self.scratch, claimed, self.most_bytes)
         said = image_name(name)
         session = self.find(key)
@@ -282,13 +282,13 @@ class Sessions:
         session.add_image(kind, self._keep(key, path, folder, said[1]), said)
 
     def _keep(self, key: str, path: Path, folder: Path, suffix: str) -> Path:
-        """The file of an upload under a name of ours; the upload goes with the last page that has it."""
+        """Link an upload under a new name; the upload is deleted with the last page that uses it."""
         with self._lock:
             self._uploads.setdefault(path, set()).add(key)
         return link_upload(path, folder, f"{random_name()}{suffix}")
 
     def end(self, key: str) -> None:
-        """Forget a page, and remove its files."""
+        """End a session and delete its files."""
         with self._lock:
             session = self._open.pop(key, None)
             for users in self._uploads.values():
@@ -300,20 +300,20 @@ class Sessions:
             remove_file(path)
         if session is not None:
             session.forget()
-            for folder in (session.kept, session.fetched):
+            for folder in (session.kept, session.downloads):
                 remove_folder(folder)
 
     def close(self) -> None:
-        """End all pages, and wait for the frame that is being made ahead."""
+        """End all sessions, and wait for the frame in progress."""
         for key in list(self._open):
             self.end(key)
         self._ahead.close()
 
     def __len__(self) -> int:
-        """How many are open."""
+        """Number of open pages."""
         return len(self._open)
 
 
 def _in_numbers(name: str) -> list[tuple[int, str]]:
-    """A key that sorts names as people number them: shot2 before shot10."""
+    """A key that sorts numbered names by number: shot2 before shot10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

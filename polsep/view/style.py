@@ -1,7 +1,7 @@
-"""The page's looks and what runs in the browser: plain text that `page` hands to Gradio.
+"""Style and scripts of the page: plain text for Gradio.
 
 Fonts are the system's, and nothing is fetched from elsewhere. The picture is on neutral grey, because colours around
-it change how it is seen.
+it change its appearance.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from __future__ import annotations
 FONTS = ["system-ui", "Segoe UI", "Roboto", "Helvetica Neue", "sans-serif"]
 MONOSPACE = ["ui-monospace", "Menlo", "Consolas", "monospace"]
 
-#: Always dark, as pictures want it; Gradio would follow the system.
+#: Always the dark theme, for pictures; Gradio would follow the system.
 ON_LOAD = """() => {
   const keep = () => document.body.classList.contains('dark') || document.body.classList.add('dark');
   new MutationObserver(keep).observe(document.body, {attributes: true, attributeFilter: ['class']});
   keep();
 }"""
 
-#: Fetch what a hidden link holds, if what was asked for could be written.
+#: Download the target of the hidden link, after the file was written.
 FETCH = "() => { const link = document.querySelector('#ps-fetch'); (link.querySelector('a') ?? link).click(); }"
 
 #: A drag moves the line between the two pictures, a click names the pixel under it.

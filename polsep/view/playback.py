@@ -1,7 +1,7 @@
-"""Frames of sequences that are being played: separated ahead by one thread for all pages, kept at screen size.
+"""Playback of sequences: one thread for all pages separates frames in advance and caches them at screen size.
 
-What is kept is half floats, at most `MAX_BYTES` of all pages together, those that nobody saw for longest going first:
-memory does not depend on how long sequences are. A sequence that fits plays from memory from its second turn on.
+The cache holds half floats, at most `MAX_BYTES` for all pages, and drops the least recently used frames: memory does
+not depend on the length of sequences. A sequence that fits plays from memory from its second round on.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from polsep.view.pictures import Small
 
-#: Bytes of all frames that are kept: 90 colour frames, about.
+#: Bytes of all cached frames: about 90 colour frames.
 MAX_BYTES = 512 << 20
-#: Frames that are made before they are shown.
+#: Number of frames separated in advance.
 AHEAD = 12
-#: Seconds for which a page that asks no more is still served.
+#: Seconds without a request after which no more frames are separated for a page.
 PATIENCE_S = 2.0
 
 Make = Callable[[int], Small]
@@ -43,35 +43,35 @@ class Packed:
 
 
 def pack(small: Small) -> Packed:
-    """The frame in half floats; the largest of those stands for more."""
+    """The frame in half floats, limited to their largest value."""
     images = (small.diffuse, small.specular, small.dolp, small.aolp)
     largest = np.finfo(np.float16).max
     return Packed(small.step, small.gain, tuple(np.minimum(image, largest).astype(np.float16) for image in images))
 
 
 def unpack(packed: Packed) -> Small:
-    """The frame as pictures are drawn of it."""
+    """The frame in float32, for drawing."""
     diffuse, specular, dolp, aolp = (image.astype(np.float32) for image in packed.images)
     return Small(packed.step, diffuse, specular, dolp, aolp, None, packed.gain)
 
 
 class Reel:
-    """One sequence under one set of settings: what `Ahead` knows it by. Only its identity counts."""
+    """Key of one sequence with one set of settings; compared by identity."""
 
 
-class Ahead:
-    """State: frames that are kept, and who waits for which. Its methods may be called from several threads."""
+class Prefetcher:
+    """State: cached frames, and the requests of sequences. Its methods may be called from several threads."""
 
     def __init__(self, most_bytes: int = MAX_BYTES) -> None:
         self._most_bytes = most_bytes
         self._lock = threading.Lock()
         self._kept: OrderedDict[tuple[Reel, int], Packed | Exception] = OrderedDict()
-        self._asked: dict[Reel, tuple[Sequence[int], Make, float]] = {}
+        self._requests: dict[Reel, tuple[Sequence[int], Make, float]] = {}
         self._busy: set[Reel] = set()
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="polsep-ahead")
 
     def frame(self, reel: Reel, place: int) -> Small | None:
-        """The frame at a place, None where it is not made yet. Raises what its making raised."""
+        """The frame at a place, None if it is not ready. Raises the error of its separation."""
         with self._lock:
             found = self._kept.get((reel, place))
             if found is not None:
@@ -81,32 +81,32 @@ class Ahead:
         return None if found is None else unpack(found)
 
     def want(self, reel: Reel, places: Sequence[int], make: Make) -> None:
-        """Have the frames at these places made, the first of them first, one after the other."""
+        """Request the frames at these places, in this order."""
         with self._lock:
-            self._asked[reel] = (places, make, time.monotonic())
+            self._requests[reel] = (places, make, time.monotonic())
         self._next(reel)
 
     def drop(self, reel: Reel) -> None:
-        """Forget a sequence."""
+        """Drop a sequence and its frames."""
         with self._lock:
-            self._asked.pop(reel, None)
+            self._requests.pop(reel, None)
             for key in [key for key in self._kept if key[0] is reel]:
                 del self._kept[key]
 
     def close(self) -> None:
-        """Make nothing more, and wait for what is being made."""
+        """Drop all requests, and wait for the frame in progress."""
         with self._lock:
-            self._asked.clear()
+            self._requests.clear()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def __len__(self) -> int:
-        """How many frames are kept."""
+        """Number of cached frames."""
         return len(self._kept)
 
     def _next(self, reel: Reel) -> None:
-        """Begin the first frame that is asked for and not there, unless one of the same sequence is being made."""
+        """Start the first requested frame that is missing, unless one of the same sequence is in progress."""
         with self._lock:
-            places, make, when = self._asked.get(reel, ((), None, 0.0))
+            places, make, when = self._requests.get(reel, ((), None, 0.0))
             place = next((p for p in places if (reel, p) not in self._kept), None)
             if make is None or place is None or reel in self._busy or time.monotonic() - when > PATIENCE_S:
                 return
@@ -117,11 +117,11 @@ class Ahead:
         found: Packed | Exception
         try:
             found = pack(make(place))
-        except Exception as error:  # raised where it is asked for
+        except Exception as error:  # raised again by `frame`
             found = error
         with self._lock:
             self._busy.discard(reel)
-            if reel in self._asked:
+            if reel in self._requests:
                 self._kept[reel, place] = found
                 self._drop_oldest()
         self._next(reel)

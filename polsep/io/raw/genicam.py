@@ -175,16 +175,9 @@ def _unpack_lsb(data: NDArray[np.uint8], count: int, bits: int) -> NDArray[np.ui
 
 
 def _pack_lsb(codes: NDArray[np.uint16], bits: int) -> NDArray[np.uint8]:
-    """Twin of `_unpack_lsb`, padded to whole groups."""
-    pixels, size = (4, 5) if bits == 10 else (2, 3)
-    groups = _groups(codes, pixels)
-    out = np.zeros((len(groups), size), np.uint8)
-    for k in range(pixels):
-        byte, shift = divmod(k * bits, 8)
-        word = groups[:, k] << shift  # 10 + 6 and 12 + 4 bits both fit in 16
-        out[:, byte] |= (word & 255).astype(np.uint8)
-        out[:, byte + 1] |= (word >> 8).astype(np.uint8)
-    return out
+    """Twin of `_unpack_lsb`."""
+    words = codes.astype("<u2").view(np.uint8).reshape(-1, 2)
+    return np.packbits(np.unpackbits(words, axis=1, count=bits, bitorder="little"), bitorder="little")
 
 
 def _unpack_gige(data: NDArray[np.uint8], count: int, bits: int) -> NDArray[np.uint16]:

@@ -381,7 +381,7 @@ def test_missing_extras_are_named(
     """One line that says what to install."""
     monkeypatch.setitem(sys.modules, package, None)
     if extra == "render":
-        for module in ("dataset", "views", "raycast"):
+        for module in ("datasets.rendered", "render.views", "render.raycast"):
             monkeypatch.delitem(sys.modules, f"polsep.{module}")
     options = ["--shapes", "1", "--views", "1", "-o", str(tmp_path / "set"), "--engine", "ray"]
     monkeypatch.setattr(sys, "argv", ["polsep", "render", *options])

@@ -51,6 +51,7 @@ def mistakes(raw: np.ndarray) -> Image.Image:
     colors = np.array([[layout.filter_at(row, col).channel for col in range(4)] for row in range(4)])
     lamp = np.array([0.55, 1.0, 0.7], np.float32)  # a white lamp's raw RGB
     tinted = raw * lamp[np.tile(colors, (raw.shape[0] // 4, raw.shape[1] // 4))]
+    tinted = np.where(raw >= 4090, white, tinted)  # what clips goes on clipping
     captures = {
         "correct": (raw, 1.0),
         "lamp's colour not stated": (tinted, 1 / lamp),

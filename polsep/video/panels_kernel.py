@@ -1,4 +1,4 @@
-"""Small sRGB pictures of large linear images, fast enough for every frame of a stream.
+"""Small sRGB pictures of large linear images, for every frame of a stream.
 
 Pixels are means over squares, times a gain, through a table of the tone curve; `io.results.previews` draws the
 pictures for reading, with more care.
@@ -16,7 +16,7 @@ from polsep.compute.threads import Piece, share
 
 #: Steps of the tone curve's table.
 STEPS = 4096
-#: Rows of a panel that a thread takes at a time.
+#: Rows of a panel per task.
 _ROWS = 16
 
 

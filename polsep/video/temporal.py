@@ -1,23 +1,23 @@
 """Less flicker in video: where nothing moves, raw samples are averaged over frames before any method sees them.
 
 The filter works on blocks of 4x4 samples, one period of any layout, with the noise that `noise` measures in the stream.
-Whether a block has changed is asked of the differences of its samples to their means, in standard deviations, which
-are 0 on average and 1 in square if nothing has:
+Changes of a block are detected in the differences of its samples to their means, in standard deviations; without a
+change, these have mean 0 and mean square 1:
 
-* sudden: the mean square of one block exceeds `SUDDEN`. It and the blocks around it begin anew.
-* slow: over 5x5 blocks, differences behind the same filter have one sign (light that fades, soft highlights on their
-  way). What they exceed their noise by is the lag of the means, squared, in variances of a sample.
-* rough: the mean square over 3x3 blocks exceeds `ROUGH` (fine texture that creeps); the excess counts as lag too.
+* sudden: the mean square of one block exceeds `SUDDEN`. It and the blocks around it restart.
+* slow: over 5x5 blocks, differences behind the same filter have one sign (fading light, soft moving highlights). Their
+  excess over the noise is the lag of the means, squared, in variances of a sample.
+* rough: the mean square over 3x3 blocks exceeds `ROUGH` (fine texture that moves slowly); the excess counts as lag too.
 
 A block that has averaged ``n`` frames has averaged min(1 + 1 / (1/n + lag), `FRAMES`) with the next: the optimal weight
-(Kalman 1960) of a mean that is off by the lag. Beyond `LAG` it begins anew: where something moves, the current frame's
-samples are handed on as they are, bit for bit, so that no highlight leaves a trace. A sample that clips is handed on as
-it is too; its mean, of values that clipping has limited, is only what later ones are compared with.
+(Kalman 1960) of a mean that is off by the lag. Beyond `LAG` it restarts: where something moves, the samples of the
+current frame are returned unchanged, bit for bit, so that no highlight leaves a trace. A clipped sample is returned
+unchanged too; its mean, of clipped values, is only a reference for later frames.
 
-What moves also disturbs the separated images of what stands still near it, through the windows of demosaickers, methods
+Moving objects also disturb the separated images of still ones near them, through the windows of demosaickers, methods
 and networks. `steady_images` averages those too, over fewer frames.
 
-All that a stream carries on is its `TemporalState`, a value: the same state and frame give the same bytes.
+The only state of a stream is its `TemporalState`, a value: the same state and frame give the same bytes.
 """
 
 from __future__ import annotations
@@ -35,33 +35,33 @@ from polsep.sensor.noise import BLOCK, Floats, Levels, Noise, blocks_of, estimat
 if TYPE_CHECKING:
     from polsep.video.temporal_kernel import Rules
 
-#: Diffuse, specular, or whatever else a method finds, ``[h, w, C]`` each.
+#: Diffuse, specular, or other images of a method, ``[h, w, C]`` each.
 Images = tuple[Floats, ...]
 
-#: Frames that are averaged at most.
+#: Largest number of averaged frames.
 FRAMES = 16.0
-#: Frames over which separated images are averaged at most: what disturbs them is not noise, but has its own motion.
+#: Largest number of averaged frames of separated images: their disturbances are not noise, but move.
 IMAGE_FRAMES = 4.0
 #: Mean square of the 16 differences of a block from which it has changed: 5 blocks in 100 000 of a still picture.
 SUDDEN = 3.0
 #: Mean square of the signed sums over 5x5 blocks, and of the differences of 3x3 blocks, up to which lag is 0.
 SLOW, ROUGH = 1.75, 1.5
-#: Squared lag from which a block begins anew, in variances of a sample: a quarter of its standard deviation.
+#: Squared lag from which a block restarts, in variances of a sample: a quarter of its standard deviation.
 LAG = 0.05
-#: Blocks on either side that make up the windows of slow and of rough changes, and that begin anew with a sudden one.
+#: Blocks on either side that make up the windows of slow and of rough changes, and that restart with a sudden one.
 SLOW_REACH, REACH = 2, 1
-#: The noise is measured in each of so many frames at first, then in every fourth; estimates that are averaged.
+#: The noise is measured in each of the first frames, then in every fourth; number of averaged estimates.
 FIRST_FRAMES, EVERY, ESTIMATES = 8, 4, 16
-#: Codes are whole numbers where white is at least this far above black.
+#: Samples can be integer codes if white is at least this far above black.
 MIN_SPAN = 100.0
 
 
 @dataclass(frozen=True)
 class TemporalState:
-    """What a stream carries from frame to frame.
+    """The state of a stream between frames.
 
-    ``mean [H, W]`` float32, in the unit of the samples, of clipped ones as they come. ``count [H/4, W/4]`` float32: how
-    many frames each block's mean is of. ``noise``: as measured so far, from ``estimates`` of it. ``frames`` so far.
+    ``mean [H, W]`` float32, in the unit of the samples, including clipped ones. ``count [H/4, W/4]`` float32: number
+    of frames in each block's mean. ``noise``: measured so far, from ``estimates`` of it. ``frames`` so far.
     ``levels``: black and white.
     """
 
@@ -73,14 +73,14 @@ class TemporalState:
     levels: tuple[float, float]
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """The state as arrays, which an npz file holds exactly."""
+        """The state as arrays for an npz file, exactly."""
         numbers = (self.noise.gain, self.noise.floor, *self.levels)
         counts = np.array([self.estimates, self.frames], np.int64)
         return {"mean": self.mean, "count": self.count, "numbers": np.array(numbers, np.float64), "counts": counts}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> TemporalState:
-        """The twin of `to_arrays`. Raises ValueError on arrays of another kind."""
+        """The inverse of `to_arrays`. Raises ValueError on other arrays."""
         expected = {
             "mean": (np.float32, 2),
             "count": (np.float32, 2),
@@ -100,8 +100,8 @@ def filter_frame(mosaic: Mosaic, state: TemporalState | None = None) -> tuple[Mo
     """The next raw frame of a stream with less noise where nothing moves, and the state for the one after it.
 
     The frame is ``[H, W]``, of any layout; the filtered one is float32 in the same unit. ``state`` None: the stream
-    begins, and the frame is handed on as it is. Nothing is changed in place, and frames share memory with states:
-    neither is to be written to. Raises ValueError on a batch, and on a frame of another size or other levels.
+    begins, and the frame is returned unchanged. Nothing is changed in place. Frames share memory with states: write to
+    neither. Raises ValueError on a batch, and on a frame of another size or other levels.
     """
     from polsep.video import temporal_kernel as temporal
 
@@ -116,8 +116,8 @@ def filter_frame_reference(mosaic: Mosaic, state: TemporalState | None = None) -
 def steady_images(images: Images, before: Images | None, state: TemporalState) -> Images:
     """Separated images ``[h, w, C]`` of a filtered frame, steadier where its blocks have been still for frames.
 
-    The images are of half or full resolution; ``before``: what this returned for the frame before, None at first;
-    ``state``: as `filter_frame` returned it with the frame. A block that began anew is handed on as it is. Raises
+    The images are of half or full resolution; ``before``: the result for the frame before, None at first;
+    ``state``: as `filter_frame` returned it with the frame. A restarted block is returned unchanged. Raises
     ValueError on images of another size than before, or of neither resolution.
     """
     if before is None:
@@ -130,7 +130,7 @@ def steady_images(images: Images, before: Images | None, state: TemporalState) -
 
 
 def _sides(images: Images, before: Images, frame: tuple[int, ...]) -> list[int]:
-    """How many pixels of each image a block of the frame has along its side."""
+    """The side of a block of the frame in pixels of each image."""
     shapes, old = ([image.shape for image in some] for some in (images, before))
     if shapes != old:
         raise ValueError(f"expected images of {old} as before, found {shapes}")
@@ -161,7 +161,7 @@ def _filter(mosaic: Mosaic, state: TemporalState | None, apply: Any) -> tuple[Mo
 
 
 def _raw_samples(mosaic: Mosaic, state: TemporalState | None) -> NDArray[Any]:
-    """A frame's samples as the kernel takes them. Raises ValueError where they do not go on with the stream."""
+    """The samples of a frame for the kernel. Raises ValueError if they do not continue the stream."""
     data, levels = mosaic.data, (float(mosaic.black_level), float(mosaic.white_level))
     if data.ndim != 2 or min(data.shape) < BLOCK:
         raise ValueError(f"expected one raw frame [H, W] of at least {BLOCK}x{BLOCK}, found {tuple(data.shape)}")
@@ -184,7 +184,7 @@ def _blocks(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _padded(image: NDArray[Any]) -> NDArray[Any]:
-    """The image up to whole blocks: what is missing is repeated from one period before, behind the same filters."""
+    """The image padded to complete blocks, with samples one period before, behind the same filters."""
     for axis in (0, 1):
         missing = -image.shape[axis] % BLOCK
         if missing:
@@ -194,7 +194,7 @@ def _padded(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _levels_of(mosaic: Mosaic, samples: NDArray[Any]) -> Levels:
-    """Levels of a frame; codes are told from other numbers by a row of them."""
+    """Levels of a frame; a row of samples shows whether they are integer codes."""
     black, white = float(mosaic.black_level), float(mosaic.white_level)
     row = samples[samples.shape[0] // 2]
     whole = white - black >= MIN_SPAN and bool((row == np.floor(row)).all())
@@ -217,7 +217,7 @@ def _next_noise(
 
 
 def make_rules(noise: Noise, levels: Levels) -> Rules:
-    """The numbers that a frame is filtered by."""
+    """The parameters of the filter for a frame."""
     from polsep.video.temporal_kernel import Rules
 
     numbers = (noise.gain, noise.floor, levels.black, levels.clip, FRAMES, SUDDEN, SLOW, ROUGH, LAG)
@@ -239,7 +239,7 @@ def filter_samples(raw: NDArray[Any], before: tuple[Floats, Floats], rules: Rule
 
 
 def find_changes(samples: Floats, before: tuple[Floats, Floats], rules: Rules) -> tuple[NDArray[np.bool_], Floats]:
-    """Which blocks ``[H/4, W/4]`` begin anew, and the squared lag of their means in variances."""
+    """The blocks ``[H/4, W/4]`` that restart, and the squared lag of their means in variances."""
     mean, count = before
     variance = rules.gain * np.maximum(mean - rules.black, 0) + rules.floor
     score = (samples - mean) / np.sqrt(variance * _per_sample(1 + 1 / count))

@@ -19,7 +19,7 @@ from polsep.sensor.unpack_kernel import Samples, as_samples, read_row
 #: Samples along the side of a block; block rows on either side that a row depends on, and rows of the ring.
 BLOCK, REACH = 4, 2
 SLOTS = 2 * REACH + 1
-#: Block rows that a thread takes at least.
+#: Least number of block rows of a task.
 STEP = 16
 
 _SIXTEENTH = np.float32(1 / 16)
@@ -87,7 +87,7 @@ def blend_images(images: tuple[Any, Any], weight: NDArray[Any], side: int) -> ND
 
 
 def warm_up() -> None:
-    """Compile what a stream needs, or load it from numba's cache."""
+    """Compile the kernels of a stream, or load them from numba's cache."""
     raw, count = np.zeros((8, 8)), np.ones((2, 2), np.float32)
     rules = Rules(*(np.float32(1) for _ in Rules._fields))
     for dtype in (np.uint16, np.float32):
@@ -165,7 +165,7 @@ def _sum_periods(x: Any, total: Any) -> None:
 
 @compiled
 def _enter(source: tuple[Samples, Any], rules: Any, at: tuple[int, int], ring: Any, spare: tuple[Any, ...]) -> None:
-    """Fill the slot of a block row; beyond the frame it is empty."""
+    """Fill the slot of a block row; with zeros beyond the frame."""
     (samples, frames), (r, slot) = source, at
     rows, cols = frames.number.shape
     if r < 0 or r >= rows:

@@ -1,8 +1,8 @@
-"""How far an image is from the truth: ``[C, h, w]``, linear light, 1 = the white level of one measurement.
+"""Errors of an image from the truth: ``[C, h, w]``, linear light, 1 = the white level of one measurement.
 
 PSNR: peak 1, both images limited to [0, 1] unless said, inside the object mask, 120 dB at most. An s0 reaches 2,
 so limited scores are blind above half of that; `psnr_unlimited` is not, and highlights dominate it. `flip` needs the
-extra ``bench``, and says so where it is not installed: scores are never left out quietly.
+extra ``bench`` and raises ValueError without it.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ FLIP_REACH = 20
 HIGHLIGHT = 0.2
 #: Share of scenes that count as the worst.
 WORST_SHARE = 0.1
-#: Errors below this, a PSNR of 120 dB, count as this where ratios are taken.
+#: Errors below this, a PSNR of 120 dB, count as this in ratios.
 MIN_DEVIATION = 1e-6
 
 
 class Reliability(NamedTuple):
-    """Which errors were ``expected`` and ``found`` ``[bins]``, rms, by rising expectation; and by how much they differ.
+    """Rms errors ``expected`` and ``found`` ``[bins]``, by rising expectation, and their difference.
 
     ``miss`` is the rms over bins of log2(found / expected): 0 for a calibrated expectation, 1 for one that is wrong by
     a factor of two everywhere, in either direction.
@@ -40,7 +40,7 @@ class Reliability(NamedTuple):
 
 
 def psnr(found: Tensor, truth: Tensor, mask: Tensor) -> float:
-    """PSNR in dB of images ``[C, h, w]`` inside ``mask [h, w]``, as the module says; at most 120.
+    """Return the PSNR in dB of images ``[C, h, w]``, limited to [0, 1], inside ``mask [h, w]``; at most 120.
 
     Raises ValueError where the mask is empty or the error is not a number.
     """
@@ -48,7 +48,7 @@ def psnr(found: Tensor, truth: Tensor, mask: Tensor) -> float:
 
 
 def psnr_unlimited(found: Tensor, truth: Tensor, mask: Tensor) -> float:
-    """`psnr` of the values as they are."""
+    """Return the PSNR of the values as they are; see `psnr`."""
     error = float(((found - truth) ** 2).mean(dim=0)[mask].mean())
     if math.isnan(error):
         raise ValueError(f"expected numbers inside a mask, found NaN in {int(mask.sum())} pixels")
@@ -56,10 +56,10 @@ def psnr_unlimited(found: Tensor, truth: Tensor, mask: Tensor) -> float:
 
 
 def ssim(found: Tensor, truth: Tensor, mask: Tensor) -> float:
-    """Mean structural similarity inside ``mask`` of images limited to [0, 1], every colour by itself.
+    """Return the mean structural similarity of images limited to [0, 1], inside ``mask``.
 
-    Gaussian windows, of which those that reach beyond the border are left out. Source: Wang, Bovik, Sheikh, Simoncelli
-    2004, doi:10.1109/TIP.2003.819861. Raises ValueError when no window of the mask fits.
+    Every colour by itself; Gaussian windows, of which those that reach beyond the border are left out. Source: Wang,
+    Bovik, Sheikh, Simoncelli 2004, doi:10.1109/TIP.2003.819861. Raises ValueError when no window of the mask fits.
     """
     radius = SSIM_RADIUS
     kept = mask.clone()
@@ -77,7 +77,7 @@ def ssim(found: Tensor, truth: Tensor, mask: Tensor) -> float:
 
 
 def _around(mask: Tensor, margin: int) -> tuple[slice, slice]:
-    """Rows and columns that hold a mask ``[h, w]`` and ``margin`` pixels around it: all that its scores depend on."""
+    """Rows and columns of a mask ``[h, w]`` with ``margin`` pixels around it, on which its scores depend."""
     rows, cols = (torch.nonzero(mask.any(dim=dim)).flatten() for dim in (1, 0))
     top, left = max(0, int(rows[0]) - margin), max(0, int(cols[0]) - margin)
     return slice(top, int(rows[-1]) + 1 + margin), slice(left, int(cols[-1]) + 1 + margin)
@@ -96,10 +96,10 @@ def _window_mean(image: Tensor) -> Tensor:
 
 
 def flip(found: Tensor, truth: Tensor, mask: Tensor) -> float:
-    """Mean LDR-FLIP inside ``mask``: 0 for equal images, 1 at most, the smaller the better.
+    """Return the mean LDR-FLIP inside ``mask``: 0 for equal images, 1 at most.
 
-    Images ``[3, h, w]`` or ``[1, h, w]``, limited to [0, 1] and shown in sRGB at 67 pixels per degree of the view; what
-    an observer sees who flips between both whole frames. Source: Andersson et al. 2020, doi:10.1145/3406183, by the
+    Images ``[3, h, w]`` or ``[1, h, w]``, limited to [0, 1] and shown in sRGB at 67 pixels per degree: the difference
+    that an observer sees who flips between both frames. Source: Andersson et al. 2020, doi:10.1145/3406183, by the
     authors' own library. Raises ValueError without the extra bench, and where the mask is empty.
     """
     evaluator = require_flip()
@@ -108,13 +108,13 @@ def flip(found: Tensor, truth: Tensor, mask: Tensor) -> float:
     around = _around(mask, FLIP_REACH)
     limited = (x[..., *around].clamp(0, 1).expand(3, -1, -1) for x in (truth, found))
     images = (x.permute(1, 2, 0).float().contiguous().numpy() for x in limited)
-    # Told that they are not sRGB, it takes linear values, as if they had been encoded and decoded again.
+    # With inputsRGB=False the library accepts linear values.
     errors, _, _ = evaluator.evaluate(*images, "LDR", inputsRGB=False, applyMagma=False, computeMeanError=False)
     return float(torch.from_numpy(errors)[..., 0][mask[around]].double().mean())
 
 
 def require_flip() -> ModuleType:
-    """The library that `flip` needs. Raises ValueError where it is not installed."""
+    """Return the library of `flip`. Raises ValueError where it is not installed."""
     try:
         import flip_evaluator
     except ImportError:
@@ -124,25 +124,25 @@ def require_flip() -> ModuleType:
 
 
 def highlights(specular: Tensor, mask: Tensor) -> Tensor:
-    """The pixels of ``mask`` whose true specular light exceeds `HIGHLIGHT` in every colour."""
+    """Return the pixels of ``mask`` whose true specular light exceeds `HIGHLIGHT` in every colour."""
     return mask & (specular.amin(dim=0) > HIGHLIGHT)
 
 
 def chroma(specular: Tensor, mask: Tensor) -> float:
-    """Mean of (largest - smallest) / mean colour inside ``mask``: 0 for white light; 0 where the mask is empty."""
+    """Return the mean of (largest - smallest) / mean colour inside ``mask``: 0 for white light or an empty mask."""
     inside = specular[:, mask]
     mean = inside.mean(dim=0)
     return float(((inside.amax(dim=0) - inside.amin(dim=0)) / mean.clamp(min=1e-6)).mean()) if inside.numel() else 0.0
 
 
 def reliability(error: Tensor, expected: Tensor, mask: Tensor, bins: int) -> Reliability:
-    """The reliability curve of expected errors: whether they are as large as the true ones.
+    """Return the reliability curve of expected errors against the true ones.
 
     ``error [C, h, w]``: found - truth; ``expected [h, w]``: its standard deviation over all colours. The pixels of
     ``mask [h, w]`` are sorted into ``bins`` of equal count by what was expected. Means are of squares on both sides, so
-    that bins may be wide. What n independent errors per bin leave of ``miss`` when calibrated is 1 / sqrt(n), not 0.
-    Raises ValueError on fewer pixels than bins, on errors that are no numbers and on deviations below 0.
-    Source: Levi, Gispan, Giladi, Fetaya 2022, doi:10.3390/s22155540 (their ENCE takes differences, not logarithms).
+    that bins may be wide. With n independent errors per bin, ``miss`` of a calibrated expectation is 1 / sqrt(n), not
+    0. Raises ValueError on fewer pixels than bins, on errors that are no numbers and on deviations below 0. Source:
+    Levi, Gispan, Giladi, Fetaya 2022, doi:10.3390/s22155540 (their ENCE takes differences, not logarithms).
     """
     squared, sigma = (error.double() ** 2).mean(dim=0)[mask], expected.double()[mask]
     if not 0 < bins <= sigma.numel():
@@ -158,6 +158,6 @@ def reliability(error: Tensor, expected: Tensor, mask: Tensor, bins: int) -> Rel
 
 
 def worst_mean(values: list[float]) -> float:
-    """The mean of the smallest tenth of values, at least of one."""
+    """Return the mean of the smallest tenth of values, of at least one."""
     count = max(1, round(WORST_SHARE * len(values)))
     return sum(sorted(values)[:count]) / count

@@ -217,7 +217,7 @@ def test_the_truth_explains_all_samples_that_did_not_clip(layout: Layout) -> Non
     assert 0.02 < float(find_clipped(seen.raw).float().mean()) < 0.5
     assert float(sample_residual(images, polarization, seen)) < 1e-8
     darker = images._replace(diffuse=0.9 * images.diffuse)
-    turned = polarization._replace(direction=polarization.specular.flip(1))
+    turned = polarization._replace(specular=polarization.specular.flip(1))
     assert float(sample_residual(darker, polarization, seen)) > 0.1
     assert float(sample_residual(images, turned, seen)) > 0.1
 
@@ -254,14 +254,15 @@ def test_nothing_is_better_than_the_truth(layout: Layout) -> None:
     """The whole loss, with the doubts that go with each."""
     images, polarization, seen = explained(layout)
     floor = math.log(1e-7)
-    best = joint_loss((images._replace(doubt=torch.full_like(images.log_variance, floor)), polarization), seen, Goal())
+    known = images._replace(log_variance=torch.full_like(images.log_variance, floor))
+    best = joint_loss((known, polarization), seen, Goal())
     for change in (-0.05, 0.05):
         for other in (
             images._replace(diffuse=images.diffuse + change),
             images._replace(specular=images.specular + change),
         ):
             doubt = torch.full_like(images.log_variance, 2 * math.log(abs(change)))
-            assert float(joint_loss((other._replace(doubt=doubt), polarization), seen, Goal())) > float(best) + 1
+            assert float(joint_loss((other._replace(log_variance=doubt), polarization), seen, Goal())) > float(best) + 1
 
 
 def known_views(layout: Layout, weight: Tensor) -> list[JointInputs]:

@@ -350,7 +350,7 @@ def test_a_net_learns_a_picture_by_heart(see: Callable[[Examples], LadderInputs]
     task = ladder_task(RUNGS["paper"], "mosaic", Size(12, 2, 1))
     for examples in stream_lane(replace(STREAM, batch=1, looks="usual", seed=2), 0, 0):
         seen = see(examples)
-        everywhere = [(*seen[:3], torch.ones_like(seen[3]))]
+        everywhere = [seen._replace(mask=torch.ones_like(seen.mask))]
         before = score(task.separate, everywhere)
         within = float((examples.diffuse + examples.specular).max()) < 2
         if within and min(before.values()) > 20 and max(before.values()) < 30:  # so that 40 dB are 10 to learn

@@ -1,10 +1,11 @@
-"""The runner of `polsep render`: which views a set has, who renders them, and how it goes on after a kill.
+"""`polsep render`: the views of a set, the workers that render them, and resuming.
 
-A set is a list of views, each a function of its numbers alone (`polsep.render.views`). Views of one shape are rendered
-a few at a time by one worker, which builds the shape once; which worker does what, and when, leaves no trace in the
-files. Files that are whole are never rendered again; `polsep.io.results.dataset` says which are.
+A set is a list of views, each a function of its numbers alone (`polsep.render.views`). A worker renders a few views of
+one shape at a time and builds the shape once; files do not depend on the number and order of workers. Complete files
+are not rendered again (`polsep.io.results.dataset`).
 
-Engines take jobs and say how many views are done: processes of this machine, or tasks of a Ray cluster (extra ``ray``).
+An engine runs jobs and yields how many views are done: processes of this machine, or tasks of a Ray cluster (extra
+``ray``).
 """
 
 from __future__ import annotations
@@ -46,17 +47,17 @@ from polsep.render.raycast import MeshScene
 from polsep.render.simulate import Capture
 from polsep.render.views import SPLITS, Shot, capture_shot, random_shot, scene_seed, seeded_shape
 
-#: Views of one shape that a worker renders before it says so.
-VIEWS_AT_ONCE = 4
-#: Packages whose versions decide about the last bit of what is rendered.
+#: Views of one shape in a job.
+VIEWS_PER_JOB = 4
+#: Packages whose versions may change the last bits of a set.
 MAKERS = ("polsep", "torch", "numpy", "numba", "llvmlite", "embreex", "imagecodecs", "OpenEXR")
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What decides about every byte of a set. ``size``: pixels of a side; ``samples`` x ``samples`` rays per pixel.
+    """Options that determine every byte of a set. ``size``: pixels of a side; ``samples`` x ``samples`` rays per pixel.
 
-    The paper's set is 500 shapes of 20 views at 1024 pixels. Raises ValueError on what is out of range.
+    The paper's set is 500 shapes of 20 views at 1024 pixels. Raises ValueError on values out of range.
     """
 
     shapes: int
@@ -80,13 +81,13 @@ class RenderOptions:
 
     @property
     def stems(self) -> list[str]:
-        """Names of all views, in order."""
+        """File stems of all views, in order."""
         return [view_stem(shape, view) for shape in range(self.shapes) for view in range(self.views)]
 
 
 @dataclass(frozen=True)
 class Job:
-    """Some views of one shape, and where their files go."""
+    """Some ``views`` of one ``shape``, written into ``directory``."""
 
     options: RenderOptions
     directory: str
@@ -94,30 +95,30 @@ class Job:
     views: tuple[int, ...]
 
 
-#: How jobs are done: yields how many views are done with each job, in any order.
+#: Runs jobs with a number of workers; yields the number of views of every finished job, in any order.
 Engine = Callable[[Sequence[Job], int], Generator[int, None, None]]
 
 
 def default_workers() -> int:
-    """The cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def plan_jobs(options: RenderOptions, directory: Path, finished: set[str]) -> list[Job]:
-    """Jobs for all views that are not finished, by shape."""
+    """Return jobs for all views that are not finished, by shape."""
     jobs = []
     for shape in range(options.shapes):
         missing = [view for view in range(options.views) if view_stem(shape, view) not in finished]
-        for first in range(0, len(missing), VIEWS_AT_ONCE):
-            jobs.append(Job(options, str(directory), shape, tuple(missing[first : first + VIEWS_AT_ONCE])))
+        for first in range(0, len(missing), VIEWS_PER_JOB):
+            jobs.append(Job(options, str(directory), shape, tuple(missing[first : first + VIEWS_PER_JOB])))
     return jobs
 
 
 def render_dataset(options: RenderOptions, directory: Path, workers: int, engine: str = "local") -> Iterator[int]:
-    """Render what is missing of a set; yields how many views are there, first those of earlier runs.
+    """Render the missing views of a set; yields how many exist, first those of earlier runs.
 
-    Raises ValueError on bad arguments or a directory of something else, OSError when a file cannot be written,
-    RuntimeError when a worker dies; what is finished stays, and the same call goes on.
+    Raises ValueError on bad arguments or another set's directory, OSError when a file cannot be written, RuntimeError
+    when a worker dies. Finished views stay, and the same call resumes.
     """
     if engine not in ENGINES:
         raise ValueError(f"expected an engine of {', '.join(ENGINES)}, found {engine!r}")
@@ -146,7 +147,7 @@ def _shape(split: str, seed: int, shape: int) -> MeshScene:
 
 
 def render_job(job: Job) -> int:
-    """Render and write the views of a job; how many they are."""
+    """Render and write the views of a job; return their number."""
     torch.set_num_threads(1)  # workers share the cores already
     set_threads(1)
     options = job.options
@@ -155,42 +156,42 @@ def render_job(job: Job) -> int:
         seed = scene_seed(options.split, options.seed, job.shape, index)
         generator = torch.Generator().manual_seed(seed)
         shot = random_shot(shape, generator)
-        found = capture_shot(shape, shot, options.size, options.samples, generator)
+        frame = capture_shot(shape, shot, options.size, options.samples, generator)
         record = {"split": options.split, "seed": options.seed, "shape": job.shape, "view": index, "view_seed": seed}
         record["shape_seed"] = scene_seed(options.split, options.seed, job.shape)
-        record |= describe_shot(shot, found)
-        write_view(Path(job.directory), view_stem(job.shape, index), images_of(found), record, options.format)
+        record |= describe_shot(shot, frame)
+        write_view(Path(job.directory), view_stem(job.shape, index), images_of(frame), record, options.format)
     return len(job.views)
 
 
-def describe_shot(shot: Shot, found: Capture) -> dict[str, Any]:
-    """The numbers of a view and what its exposure made of them; angles in degrees, lengths in scene units."""
+def describe_shot(shot: Shot, frame: Capture) -> dict[str, Any]:
+    """Return the record of a view: camera, light and exposure; angles in degrees, lengths in scene units."""
     light = asdict(shot.light)
     light["polarizer_deg"] = round(math.degrees(light.pop("polarizer")), 6)
-    inside = found.scene.mask
+    inside = frame.scene.mask
     return {
         "camera": asdict(shot.camera),
         "light": light,
         "blur": shot.blur,
         "clip": shot.clip,
-        "clipped": round(float(found.mosaic.clipped()[inside].double().mean()), 6),
+        "clipped": round(float(frame.mosaic.clipped()[inside].double().mean()), 6),
         "covered": round(float(inside.double().mean()), 6),
-        "layout": found.mosaic.layout.spec,
-        "black_level": found.mosaic.black_level,
-        "white_level": found.mosaic.white_level,
+        "layout": frame.mosaic.layout.spec,
+        "black_level": frame.mosaic.black_level,
+        "white_level": frame.mosaic.white_level,
     }
 
 
-def images_of(found: Capture) -> dict[str, NDArray[Any]]:
-    """A capture as `io.results.dataset.write_view` takes it."""
-    scene = found.scene
+def images_of(frame: Capture) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a capture for `io.results.dataset.write_view`."""
+    scene = frame.scene
     light = scene.diffuse + scene.specular
 
     def half(image: Tensor) -> NDArray[np.float16]:
         return np.asarray(image.permute(1, 2, 0).clamp(-LARGEST_HALF, LARGEST_HALF).numpy().astype(np.float16))
 
     return {
-        "mosaic": found.mosaic.data.numpy().astype(np.uint16),
+        "mosaic": frame.mosaic.data.numpy().astype(np.uint16),
         "diffuse": half(scene.diffuse.s0),
         "specular": half(scene.specular.s0),
         "s1": half(light.s1),
@@ -200,13 +201,13 @@ def images_of(found: Capture) -> dict[str, NDArray[Any]]:
 
 
 def run_in_processes(jobs: Sequence[Job], workers: int) -> Generator[int, None, None]:
-    """Jobs done by so many processes of this machine, which end with this one, however it ends."""
+    """Run jobs in processes of this machine, which end with this one, however it ends."""
     if not jobs:
         return
     before = set(multiprocessing.active_children())
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(jobs)), context, _follow_parent)
-    with _keyboard_ignored():
+    pool = ProcessPoolExecutor(min(workers, len(jobs)), context, _exit_with_parent)
+    with _sigint_ignored():
         futures = [pool.submit(render_job, job) for job in jobs]
     try:
         for future in as_completed(futures):
@@ -214,7 +215,7 @@ def run_in_processes(jobs: Sequence[Job], workers: int) -> Generator[int, None, 
     except BrokenProcessPool as error:
         raise RuntimeError(f"expected workers to live, found one dead, as when memory runs out ({error})") from error
     except BaseException:
-        # Whatever they are at is either renamed into place or as good as never begun: no need to wait for it.
+        # Files are renamed into place when complete, so workers can be killed at any time.
         for process in set(multiprocessing.active_children()) - before:
             process.kill()
         raise
@@ -223,8 +224,8 @@ def run_in_processes(jobs: Sequence[Job], workers: int) -> Generator[int, None, 
 
 
 @contextlib.contextmanager
-def _keyboard_ignored() -> Iterator[None]:
-    """Programs started inside leave Ctrl-C to this one, which looks away itself for so long."""
+def _sigint_ignored() -> Iterator[None]:
+    """Ignore SIGINT inside, so that processes started here inherit that and leave Ctrl-C to this one."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -235,10 +236,10 @@ def _keyboard_ignored() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _follow_parent() -> None:
-    """End this worker when its parent is gone.
+def _exit_with_parent() -> None:
+    """Watch the parent process and end this worker when it is gone.
 
-    A pool's workers wait for jobs on a pipe of which they hold both ends, so they would never learn of a killed parent.
+    A pool's workers hold both ends of the pipe on which they wait for jobs, so they would not notice a killed parent.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -251,9 +252,9 @@ def _follow_parent() -> None:
 
 
 def run_on_ray(jobs: Sequence[Job], workers: int) -> Generator[int, None, None]:
-    """Jobs as tasks of a Ray cluster (`cluster`); every node must see the directory of the set under one path."""
+    """Run jobs as tasks of a Ray cluster; the directory of the set must have one path on all nodes."""
     yield from map_unordered(render_job, jobs, workers)
 
 
-#: Engines by the name that the command line has for them.
+#: Engines by their names on the command line.
 ENGINES: dict[str, Engine] = {"local": run_in_processes, "ray": run_on_ray}

@@ -1,4 +1,4 @@
-"""Scenes made of signed distances and procedural albedo: the demo's still life, and random ones for tests.
+"""Scenes of signed distances and procedural albedo: the demo's still life, and random scenes for tests.
 
 Conventions: local coordinates ``[3, N, 1]`` in scene units; albedo is linear RGB in [0, 1]. Random draws take a
 generator and are the same on every machine.
@@ -18,12 +18,12 @@ Field = Callable[[Tensor], Tensor]
 
 
 def ball(radius: float) -> Field:
-    """Distance to a sphere."""
+    """Return the signed distance to a sphere."""
     return lambda p: torch.sqrt((p * p).sum(0, keepdim=True)) - radius
 
 
 def rounded_box(half: Vector, rounding: float) -> Field:
-    """Distance to a box of half sizes ``half`` whose edges have radius ``rounding``."""
+    """Return the signed distance to a box of half sizes ``half`` whose edges have radius ``rounding``."""
 
     def distance(p: Tensor) -> Tensor:
         q = p.abs() - torch.tensor(half).to(p).view(3, 1, 1) + rounding
@@ -34,7 +34,7 @@ def rounded_box(half: Vector, rounding: float) -> Field:
 
 
 def torus(major: float, minor: float) -> Field:
-    """Distance to a torus about the local z axis."""
+    """Return the signed distance to a torus about the local z axis."""
 
     def distance(p: Tensor) -> Tensor:
         ring = torch.sqrt(p[:1] ** 2 + p[1:2] ** 2) - major
@@ -44,7 +44,7 @@ def torus(major: float, minor: float) -> Field:
 
 
 def floor(height: float) -> Field:
-    """Distance to the half space below y = height."""
+    """Return the signed distance to the half space below y = height."""
     return lambda p: p[1:2] - height
 
 
@@ -63,7 +63,7 @@ def _rgb(color: Vector, like: Tensor) -> Tensor:
 
 
 def plain(color: Vector) -> Field:
-    """One colour."""
+    """Return a field of one colour."""
     return lambda p: _rgb(color, p).expand_as(p)
 
 

@@ -1,4 +1,4 @@
-"""Random materials of mesh slots, as wide as what users photograph: colourful, near-grey, dark and glossy, textured.
+"""Random materials of mesh slots: colourful, near-grey, dark, glossy and textured ones, as in users' photographs.
 
 Conventions: albedo is linear RGB; roughness is GGX sqrt(alpha); ``specular`` scales the Fresnel lobe. Random draws take
 a generator and are the same on every machine. Source: Dave et al. 2022, Sec. 5 (albedo and roughness random per face);
@@ -22,9 +22,9 @@ from polsep.render.textures import (
     pattern_weight,
 )
 
-#: Shares of slots that are near-grey, dark, and very glossy; drawn independently of each other.
+#: Shares of near-grey, dark and very glossy slots, drawn independently.
 GREY_SHARE, DARK_SHARE, GLOSSY_SHARE = 0.25, 0.15, 0.1
-#: Saturation of near-grey slots at most, and of all others.
+#: Largest saturation of near-grey slots, and range for all others.
 GREY_SATURATION, SATURATIONS = 0.08, (0.2, 1.0)
 #: Largest albedo channel of dark slots, and of all others.
 DARK_VALUES, VALUES = (0.01, 0.08), (0.15, 0.95)
@@ -32,17 +32,17 @@ DARK_VALUES, VALUES = (0.01, 0.08), (0.15, 0.95)
 GLOSSY_ROUGHNESS, ROUGHNESS = (0.08, 0.15), (0.15, 0.7)
 #: Strength of the Fresnel lobe.
 STRENGTH = (0.5, 1.0)
-#: How often each pattern is drawn, in the order of `polsep.render.textures`.
+#: Probability of each pattern, in the order of `polsep.render.textures`.
 PATTERN_WEIGHTS = (0.3, 0.12, 0.07, 0.09, 0.2, 0.12, 0.06, 0.04)
-#: Shares of textured slots of one roughness, of one hue, and with cells as long in all directions.
+#: Shares of textured slots with one roughness, with one hue, and with isotropic cells.
 EVEN_SHARE, SAME_HUE_SHARE, ROUND_SHARE = 0.4, 0.5, 0.6
-#: How far the second material lies from the first, and how far apart in turns hues count as one.
+#: Contrast between the materials of a slot, and largest difference of hues, in turns, that count as one hue.
 CONTRAST, HUE_STEP = (0.15, 1.0), 0.08
-#: Size of a cell relative to the object, log-uniform, and how much longer than wide it may be.
+#: Size of a cell relative to the object, log-uniform, and its largest stretch.
 CELL_SIZES, LONGEST = (1 / 80, 1 / 2), 4.0
 #: The extent of an average random shape, in scene units.
 USUAL_SIZE = 5.0
-#: Per pattern: where weights change and over which width, least and largest, log-uniform; see `Textures`.
+#: Ranges per pattern of `Textures`: threshold, uniform, and edge, log-uniform.
 THRESHOLDS = ((0, 0), (0, 0), (0.03, 0.12), (0.25, 0.5), (-0.25, 0.25), (0.3, 0.7), (0.3, 0.7), (0, 0))
 EDGES = ((1, 1), (0.04, 0.3), (0.05, 0.2), (0.05, 0.3), (0.08, 1.2), (0.08, 0.9), (0.1, 0.9), (0.06, 0.2))
 
@@ -51,10 +51,10 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Materials:
-    """A material per slot: linear RGB ``albedo [S, 3]``, ``roughness`` and ``specular [S]`` as in `render.Part`.
+    """A material per slot: linear RGB ``albedo [S, 3]``, ``roughness`` and ``specular [S]``, as `sphere_tracing.Part`.
 
-    With ``textures`` albedo and roughness vary in space toward a second material; `look_up` says where.
-    Raises ValueError when the counts differ.
+    With ``textures``, albedo and roughness vary in space toward a second material. Raises ValueError when the counts
+    differ.
     """
 
     albedo: Tensor
@@ -72,9 +72,9 @@ class Materials:
 
 
 def look_up(materials: Materials, slot: Tensor, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Albedo ``[3, M, 1]``, roughness and specular ``[1, M, 1]`` of slots ``[M]`` at positions ``[3, M, 1]``.
+    """Return albedo ``[3, M, 1]``, roughness and specular ``[1, M, 1]`` of slots ``[M]`` at positions ``[3, M, 1]``.
 
-    Positions are in the coordinates of the mesh. Twin of what `polsep.render.shading_kernel` does.
+    Positions are in the coordinates of the mesh. `polsep.render.shading_kernel` is the twin.
     """
     albedo, roughness, specular = _per_hit(materials.albedo, materials.roughness, materials.specular, slot=slot)
     if materials.textures is None:
@@ -85,12 +85,12 @@ def look_up(materials: Materials, slot: Tensor, position: Tensor) -> tuple[Tenso
 
 
 def _per_hit(*values: Tensor, slot: Tensor) -> list[Tensor]:
-    """Values ``[S, C]`` or ``[S]`` of slots ``[M]``, ``[C, M, 1]``."""
+    """Values ``[S, C]`` or ``[S]`` at slots ``[M]``, as ``[C, M, 1]``."""
     return [value[slot].reshape(slot.numel(), -1).T[..., None] for value in values]
 
 
 def random_materials(slots: int, generator: torch.Generator, size: float = USUAL_SIZE) -> Materials:
-    """Independent materials for so many slots of an object of ``size`` scene units; see the constants."""
+    """Return independent materials for a number of slots of an object of ``size`` scene units."""
     grey, dark, glossy = (_draw(slots, (0, 1), generator) < share for share in (GREY_SHARE, DARK_SHARE, GLOSSY_SHARE))
     hue = _draw(slots, (0, 1), generator)
     albedo = _random_albedo(hue, grey, dark, generator)
@@ -110,7 +110,7 @@ def _random_albedo(hue: Tensor, grey: Tensor, dark: Tensor, generator: torch.Gen
 
 
 def _random_textures(albedo: Tensor, roughness: Tensor, size: float, generator: torch.Generator) -> Textures:
-    """A pattern for each of these second materials."""
+    """Random patterns of the second materials."""
     slots = roughness.numel()
     pattern = torch.multinomial(torch.tensor(PATTERN_WEIGHTS), slots, replacement=True, generator=generator)
     low, high = (size * share for share in CELL_SIZES)
@@ -119,7 +119,7 @@ def _random_textures(albedo: Tensor, roughness: Tensor, size: float, generator: 
     stretch = torch.where(round_cells[:, None], 1.0, stretch)
     scale = 1 / (_log_draw(slots, torch.tensor([low, high]), generator)[:, None] * stretch)
     offset = _draw(3 * slots, (-64, 64), generator).view(slots, 3, 1)
-    # Rings are about the origin of pattern space, which is to lie inside or near the object.
+    # Rings surround the origin of pattern space, which must lie inside or near the object.
     offset = torch.where((pattern == RINGS)[:, None, None], offset / 64, offset)
     rotation = _random_rotations(slots, generator)
     seed = torch.randint(2**31, (slots,), generator=generator)
@@ -154,7 +154,7 @@ def _random_rotations(count: int, generator: torch.Generator) -> Tensor:
 
 
 def rgb_from_hsv(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
-    """Colours ``[S, 3]`` of hue (in turns), saturation and value ``[S]``, all in [0, 1] (Smith 1978)."""
+    """Return colours ``[S, 3]`` of hue (in turns), saturation and value ``[S]``, all in [0, 1] (Smith 1978)."""
     offsets = torch.tensor([5.0, 3.0, 1.0]).to(hue)
     k = (offsets + 6 * hue[:, None]) % 6
     return value[:, None] * (1 - saturation[:, None] * torch.minimum(k, 4 - k).clamp(0, 1))
@@ -175,7 +175,7 @@ def _either(special: Tensor, interval: Interval, otherwise: Interval, generator:
 def _log_draw(count: int, interval: Tensor, generator: torch.Generator) -> Tensor:
     """Log-uniform between the two values, or the two rows, of ``interval``.
 
-    In double precision, whose last bits, different on other machines, rounding takes away; so do rotations.
+    In double precision, like rotations: its last bits differ between machines, and rounding to float32 removes them.
     """
     low, high = interval.double().log()
     return torch.exp(low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)).float()

@@ -25,9 +25,9 @@ Integers = NDArray[np.int64]
 COUNT_WEIGHTS = (1, 2, 3, 7, 10, 7, 3, 2, 1)
 #: Semi-axes of primitives, and the largest height relative to twice the smallest of them.
 SMALLEST_AXIS, LARGEST_AXIS, LARGEST_HEIGHT = 0.25, 2.0, 0.2
-#: Share of faces that stay flat.
+#: Share of flat faces.
 FLAT_SHARE = 0.1
-#: Samples of the height field's random grid, of its smooth version, and of the table that is looked up.
+#: Sides of the height field's random grid, of its smooth version, and of its table.
 COARSE, SMOOTH, FINE = 5, 30, 36
 #: Cells of the grids of an ellipsoid, of one face of a box, of a cylinder's side and of its caps; a cap's rim has as
 #: many cells as the side has columns.
@@ -49,12 +49,12 @@ class Mesh:
 
     @property
     def slot_count(self) -> int:
-        """How many material slots there are."""
+        """Number of material slots."""
         return int(self.slots.max()) + 1
 
 
 def random_mesh(generator: torch.Generator) -> Mesh:
-    """A random shape, centred; see the module. Source: Xu et al. 2018, with the order of draws of this project."""
+    """Return a random centred shape. Source: Xu et al. 2018, with the order of draws of this project."""
     weights = torch.tensor(COUNT_WEIGHTS, dtype=torch.float64)
     count = 1 + int(torch.multinomial(weights, 1, generator=generator))
     shape: Mesh | None = None
@@ -69,12 +69,12 @@ def random_mesh(generator: torch.Generator) -> Mesh:
 
 
 def random_axes(generator: torch.Generator) -> Floats:
-    """Three semi-axes, uniform between `SMALLEST_AXIS` and `LARGEST_AXIS`."""
+    """Return three semi-axes, uniform between `SMALLEST_AXIS` and `LARGEST_AXIS`."""
     return _uniform(3, SMALLEST_AXIS, LARGEST_AXIS, generator)
 
 
 def random_primitive(axes: Floats, generator: torch.Generator) -> Mesh:
-    """An ellipsoid, box or cylinder of these semi-axes with random height fields."""
+    """Return an ellipsoid, box or cylinder of these semi-axes with random height fields."""
     build = (ellipsoid, box, cylinder)[int(torch.randint(3, (1,), generator=generator))]
     largest = 2 * LARGEST_HEIGHT * float(axes.min())
     heights = [random_heights(h, generator) for h in _uniform(6, 0.0, largest, generator)]
@@ -82,7 +82,7 @@ def random_primitive(axes: Floats, generator: torch.Generator) -> Mesh:
 
 
 def random_heights(largest: float, generator: torch.Generator) -> Floats:
-    """A height field ``[36, 36]`` over (u, v), smooth, at most about ``largest``, zero at the border; or a flat one."""
+    """Return a random height field ``[36, 36]`` over (u, v): at most about ``largest``, 0 at the border; or flat."""
     flat = float(torch.rand(1, generator=generator, dtype=torch.float64)) < FLAT_SHARE
     coarse = torch.from_numpy(_uniform(COARSE * COARSE, -largest, largest, generator)).view(1, 1, COARSE, COARSE)
     if flat:
@@ -94,14 +94,14 @@ def random_heights(largest: float, generator: torch.Generator) -> Floats:
 
 
 def look_up(heights: Floats, uv: Floats) -> Floats:
-    """A height field at points ``uv [..., 2]``, bilinear; u runs along its rows."""
+    """Return a height field at points ``uv [..., 2]``, bilinear; u runs along its rows."""
     points = torch.from_numpy(2 * uv.reshape(1, -1, 1, 2)[..., ::-1] - 1)
     table = torch.from_numpy(heights)[None, None]
     return grid_sample(table, points, align_corners=True, padding_mode="border")[0, 0].numpy().reshape(uv.shape[:-1])
 
 
 def ellipsoid(axes: Floats, heights: list[Floats]) -> Mesh:
-    """An ellipsoid, one slot; u is the polar angle from +y, v the azimuth."""
+    """Return an ellipsoid, one slot; u is the polar angle from +y, v the azimuth."""
     uv = _grid(*ELLIPSOID_GRID)
     polar, azimuth = math.pi * uv[..., 0], 2 * math.pi * uv[..., 1]
     sine = np.sin(polar)
@@ -110,7 +110,7 @@ def ellipsoid(axes: Floats, heights: list[Floats]) -> Mesh:
 
 
 def box(axes: Floats, heights: list[Floats]) -> Mesh:
-    """A box of half sizes ``axes``, one slot per face in the order +x, -x, +y, -y, +z, -z."""
+    """Return a box of half sizes ``axes``, one slot per face in the order +x, -x, +y, -y, +z, -z."""
     uv = _grid(*FACE_GRID)
     patches = []
     for face, height in enumerate(heights[:6]):
@@ -125,7 +125,7 @@ def box(axes: Floats, heights: list[Floats]) -> Mesh:
 
 
 def cylinder(axes: Floats, heights: list[Floats]) -> Mesh:
-    """An elliptic cylinder about y, three slots: side, upper and lower cap. u of the side runs downward."""
+    """Return an elliptic cylinder about y, three slots: side, upper and lower cap. u of the side runs downward."""
     uv = _grid(*SIDE_GRID)
     azimuth = 2 * math.pi * uv[..., 1]
     around = np.stack([np.cos(azimuth), np.zeros_like(azimuth), -np.sin(azimuth)], axis=-1)
@@ -141,7 +141,7 @@ def cylinder(axes: Floats, heights: list[Floats]) -> Mesh:
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """All meshes as one, their slots numbered on."""
+    """Return all meshes as one, with consecutive slots."""
     first_vertex = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     first_slot = np.cumsum([0, *(mesh.slot_count for mesh in meshes)])
     return Mesh(
@@ -154,7 +154,7 @@ def join(*meshes: Mesh) -> Mesh:
 
 
 def moved(mesh: Mesh, rotation: Floats, translation: Floats) -> Mesh:
-    """The mesh rotated by a matrix ``[3, 3]`` about the origin, then moved."""
+    """Return the mesh rotated by a matrix ``[3, 3]`` about the origin, then moved."""
     vertices = mesh.vertices @ rotation.T + translation
     return Mesh(vertices, mesh.normals @ rotation.T, mesh.uv, mesh.faces, mesh.slots)
 

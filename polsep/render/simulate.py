@@ -1,7 +1,7 @@
-"""From exact lobes to what a polarization camera records of them, and what a separation is to find in it.
+"""Simulation of a frame from exact lobes: lens, exposure and sensor, in this order.
 
-In physical order: the lens blurs the light, the exposure scales it so that a given share of the object's samples clips,
-the sensor of `camera` measures it behind its mosaic of filters. The truth goes through lens and exposure with it.
+The lens blurs the light, the exposure scales it so that a given share of the object's samples clips, and the sensor of
+`camera` measures it behind its mosaic of filters. The truth of a frame has lens and exposure applied as well.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from polsep.physics.stokes import Stokes
 from polsep.render.sphere_tracing import Scene
 from polsep.sensor.camera import Layout, Mosaic, Sensor, add_noise, measure_with_analysers
 
-#: Brightest sample of an object, as a share of the white level, where none is to clip.
+#: Brightest object sample, as a share of the white level, in exposures without clipping.
 HEADROOM = 0.95
-#: Rows that the lens blurs together.
+#: Rows blurred together.
 ROWS_AT_ONCE = 64
 
 
@@ -43,7 +43,7 @@ def whole_cells(mask: Tensor) -> Tensor:
 
 
 def blur(scene: Scene, sigma: float) -> Scene:
-    """The scene behind a lens whose point spread is a Gaussian of ``sigma`` raw pixels; the mask stays."""
+    """Return the scene behind a lens with a Gaussian point spread of ``sigma`` raw pixels; the mask is unchanged."""
     if sigma == 0:
         return scene
     radius = math.ceil(3 * sigma)
@@ -52,7 +52,7 @@ def blur(scene: Scene, sigma: float) -> Scene:
     taps = [weight / total for weight in weights]
 
     def smooth(image: Tensor) -> Tensor:
-        if image.stride(0) == 0:  # white light, whose colours share memory
+        if image.stride(0) == 0:  # white light: its colours share memory
             return _smooth_plane(image[0], taps).expand_as(image)
         return torch.stack([_smooth_plane(plane, taps) for plane in image])
 
@@ -62,7 +62,7 @@ def blur(scene: Scene, sigma: float) -> Scene:
 def _smooth_plane(plane: Tensor, taps: list[float]) -> Tensor:
     """A plane ``[H, W]`` through a symmetric filter along both axes; ``taps`` from the middle on, borders mirrored.
 
-    Band by band, so that what is added up stays in the cache: ten times faster than `conv2d` of one channel.
+    Band by band, so that sums stay in the cache: ten times faster than `conv2d` of one channel.
     """
     reach, (height, width) = len(taps) - 1, plane.shape
     padded = pad(plane[None], (reach, reach, reach, reach), mode="reflect")[0]
@@ -76,7 +76,7 @@ def _smooth_plane(plane: Tensor, taps: list[float]) -> Tensor:
 
 
 def _weighted_sum(shifted: list[Tensor], taps: list[float]) -> Tensor:
-    """The sum of 2 n - 1 tensors with weights that are the same on both sides of the middle one."""
+    """Weighted sum of 2 n - 1 tensors; weights are symmetric about the middle one."""
     middle = len(taps) - 1
     total = shifted[middle] * taps[0]
     for k, tap in enumerate(taps[1:], 1):
@@ -85,7 +85,7 @@ def _weighted_sum(shifted: list[Tensor], taps: list[float]) -> Tensor:
 
 
 def expose_to_clip(scene: Scene, share: float, layout: Layout, sensor: Sensor) -> Scene:
-    """The scene scaled so that ``share`` of the object's samples clips; none, and `HEADROOM`, for 0.
+    """Return the scene scaled so that ``share`` of the object's samples clips; for 0, the brightest is at `HEADROOM`.
 
     Raises ValueError when the mask is empty or nothing in it is lit.
     """
@@ -99,7 +99,7 @@ def expose_to_clip(scene: Scene, share: float, layout: Layout, sensor: Sensor) -
 
 
 def expose_to_level(scene: Scene, level: float, layout: Layout, sensor: Sensor) -> Scene:
-    """The scene, scaled up where the median of the object's lit samples is below ``level`` (white at 1), to that."""
+    """Return the scene, scaled up to ``level`` (white = 1) if the median of the object's lit samples is below it."""
     samples = filter_light(scene.diffuse + scene.specular, layout, sensor)[scene.mask]
     lit = samples[samples > 0]
     gain = level / float(lit.median()) if lit.numel() else 1.0
@@ -107,7 +107,7 @@ def expose_to_level(scene: Scene, level: float, layout: Layout, sensor: Sensor) 
 
 
 def capture(scene: Scene, layout: Layout, sensor: Sensor, generator: torch.Generator | None = None) -> Capture:
-    """One raw frame of an exposed scene: `camera.expose`, with one measurement per pixel instead of twelve."""
+    """Return a raw frame of an exposed scene: `camera.expose`, with one measurement per pixel instead of twelve."""
     signal = filter_light(scene.diffuse + scene.specular, layout, sensor)
     codes = add_noise(signal, sensor, generator).clamp(0, 1)
     if sensor.bits is not None:
@@ -116,9 +116,9 @@ def capture(scene: Scene, layout: Layout, sensor: Sensor, generator: torch.Gener
 
 
 def filter_light(light: Stokes, layout: Layout, sensor: Sensor) -> Tensor:
-    """What the filters of a layout let through of ``light [..., C, H, W]``, noise-free ``[..., H, W]``, white at 1.
+    """Return ``light [..., C, H, W]`` behind the filters of a layout: noise-free samples ``[..., H, W]``, white = 1.
 
-    The samples that `camera.sample_mosaic` takes of `camera.measure_with_analysers`, without those it does not take.
+    Equal to `camera.sample_mosaic` of `camera.measure_with_analysers`, without computing unused samples.
     """
     out, period = torch.empty_like(light.s0[..., 0, :, :]), layout.period
     losses = sensor.diattenuation

@@ -1,4 +1,4 @@
-"""From a scene to exact diffuse and specular Stokes images: sphere tracing, shadows, shading by `optics`.
+"""Exact diffuse and specular Stokes images of a scene: sphere tracing, shadows, shading by `optics`.
 
 Conventions: world axes are x right, y up, z toward the viewer; lengths are in scene units. Pixel (row, col) of an
 H x W image looks through the centre of its square. Shading is exact per point: the diffuse and the specular lobe are
@@ -20,12 +20,12 @@ from polsep.physics.stokes import Stokes
 
 Vector = tuple[float, float, float]
 
-#: Sphere tracing (Hart 1996): steps at most, and the distance in scene units that counts as a hit.
+#: Sphere tracing (Hart 1996): largest number of steps, and distance in scene units that counts as a hit.
 MAX_STEPS = 160
 HIT_DISTANCE = 2e-4
-#: Rays that go this many times the camera's distance from its target miss.
+#: Length of rays, relative to the camera's distance from its target; longer ones miss.
 FAR = 4.0
-#: Rays that are traced together, to bound memory.
+#: Rays traced together, which bounds memory.
 RAYS_AT_ONCE = 250_000
 
 
@@ -56,7 +56,7 @@ class PinholeCamera:
 
 @dataclass(frozen=True)
 class PointLight:
-    """A fully linearly polarized point light; ``polarizer`` [rad] counts in its beam's frame with up = world +y."""
+    """A fully linearly polarized point light; ``polarizer`` [rad] is in its beam's frame with up = world +y."""
 
     position: Vector = (1.0, 2.0, 8.0)
     intensity: float = 100.0
@@ -65,7 +65,7 @@ class PointLight:
 
 @dataclass(frozen=True)
 class GBuffer:
-    """What each ray hit: position and normal ``[3, H, W]``, material maps and the mask of hits ``[1, H, W]``."""
+    """First hits of rays: position and normal ``[3, H, W]``, material maps and the mask of hits ``[1, H, W]``."""
 
     position: Tensor
     normal: Tensor
@@ -79,8 +79,8 @@ class GBuffer:
 class Scene:
     """Exact lobes on the sensor: ``diffuse``, ``specular`` ``[C, H, W]`` and the object ``mask [H, W]``.
 
-    The mask holds the pixels that objects cover wholly. Lobes are in the light's units until an exposure scales them so
-    that 1 is the white level of one measurement; then their s0 are what a separation is to find.
+    The mask holds the pixels that objects cover completely. Lobes are in the light's units until an exposure scales
+    them so that 1 is the white level of one measurement; then their s0 are the truth of a separation.
     """
 
     diffuse: Stokes
@@ -89,7 +89,7 @@ class Scene:
 
 
 def rotation_matrix(angles: Vector) -> Tensor:
-    """Rz Ry Rx for angles about x, y, z [rad], [3, 3]."""
+    """Return Rz Ry Rx ``[3, 3]`` for angles about x, y, z [rad]."""
     (sx, cx), (sy, cy), (sz, cz) = ((math.sin(a), math.cos(a)) for a in angles)
     rx = torch.tensor([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     ry = torch.tensor([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -103,12 +103,12 @@ def _local(part: Part, points: Tensor) -> Tensor:
 
 
 def scene_distance(parts: tuple[Part, ...], points: Tensor) -> Tensor:
-    """Signed distance ``[1, N, 1]`` of world points ``[3, N, 1]`` to the union of the parts."""
+    """Return the signed distance ``[1, N, 1]`` of world points ``[3, N, 1]`` to the union of the parts."""
     return torch.stack([part.distance(_local(part, points)) for part in parts]).amin(dim=0)
 
 
 def trace(parts: tuple[Part, ...], origin: Tensor, direction: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
-    """March rays ``[3, N, 1]`` to the first surface: distance and hit mask ``[1, N, 1]``; misses end at ``limit``."""
+    """March rays ``[3, N, 1]`` to the first surface or ``limit``; return distance and hit mask ``[1, N, 1]``."""
     travelled = torch.full_like(direction[:1], 2e-3)
     hit = torch.zeros_like(travelled, dtype=torch.bool)
     active = torch.arange(travelled.numel(), device=travelled.device)
@@ -125,7 +125,7 @@ def trace(parts: tuple[Part, ...], origin: Tensor, direction: Tensor, limit: Ten
 
 
 def surface_normal(parts: tuple[Part, ...], points: Tensor) -> Tensor:
-    """Unit normals ``[3, N, 1]`` by central differences of the signed distance."""
+    """Return unit normals ``[3, N, 1]`` by central differences of the signed distance."""
     step = 1e-3
     axes = torch.eye(3, dtype=points.dtype, device=points.device)
     gradient = [
@@ -136,7 +136,7 @@ def surface_normal(parts: tuple[Part, ...], points: Tensor) -> Tensor:
 
 
 def camera_axes(camera: PinholeCamera) -> Tensor:
-    """Unit vectors right, up and forward ``[3, 3]``. Raises ValueError for a camera that looks straight up or down."""
+    """Return unit vectors right, up and forward ``[3, 3]``. Raises ValueError for a vertical direction of view."""
     if math.hypot(camera.position[0] - camera.target[0], camera.position[2] - camera.target[2]) < 1e-6:
         raise ValueError("expected a camera that does not look straight up or down, its up vector is world +y")
     eye, target = torch.tensor(camera.position, dtype=torch.float32), torch.tensor(camera.target, dtype=torch.float32)
@@ -146,12 +146,12 @@ def camera_axes(camera: PinholeCamera) -> Tensor:
 
 
 def pixel_side(camera: PinholeCamera, height: int) -> float:
-    """The side of a pixel of an image of that height, at distance 1 from the camera."""
+    """Return the side of a pixel of an image of that height, at distance 1 from the camera."""
     return 2 * math.tan(math.radians(camera.fov_deg) / 2) / height
 
 
 def camera_rays(camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Origin ``[3, 1, 1]`` and unit directions ``[3, N, 1]`` through points (rows, cols) of an H x W image."""
+    """Return origin ``[3, 1, 1]`` and unit directions ``[3, N, 1]`` of rays through points of an H x W image."""
     height, width = size
     right, up, forward = camera_axes(camera)
     scale = pixel_side(camera, height)
@@ -161,7 +161,7 @@ def camera_rays(camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[i
 
 
 def cast(parts: tuple[Part, ...], camera: PinholeCamera, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> GBuffer:
-    """G-buffer ``[*, N, 1]`` of the image points (rows, cols), one ray each."""
+    """Return the G-buffer ``[*, N, 1]`` of the image points (rows, cols), one ray each."""
     origin, direction = camera_rays(camera, rows, cols, size)
     origin = origin.expand_as(direction)
     far = FAR * math.dist(camera.position, camera.target)
@@ -177,7 +177,7 @@ def cast(parts: tuple[Part, ...], camera: PinholeCamera, rows: Tensor, cols: Ten
 
 
 def is_lit(parts: tuple[Part, ...], buffer: GBuffer, light: PointLight) -> Tensor:
-    """Whether the points of a G-buffer see the light, ``[1, N, 1]``; False where nothing was hit."""
+    """Return True for points of a G-buffer that are not in shadow, ``[1, N, 1]``; False without a hit."""
     to_light = torch.tensor(light.position, dtype=torch.float32).to(buffer.position).view(3, 1, 1) - buffer.position
     distance = torch.sqrt(dot(to_light, to_light))
     _, shadowed = trace(parts, buffer.position + 4e-3 * buffer.normal, to_light / distance, distance)
@@ -185,7 +185,7 @@ def is_lit(parts: tuple[Part, ...], buffer: GBuffer, light: PointLight) -> Tenso
 
 
 def shade(buffer: GBuffer, camera: PinholeCamera, light: PointLight, lit: Tensor) -> tuple[Stokes, Stokes]:
-    """Diffuse and specular Stokes images ``[3, N, 1]`` of a G-buffer under one light, black where not ``lit``."""
+    """Return diffuse and specular Stokes images ``[3, N, 1]`` of a G-buffer, black where not ``lit``."""
     position, normal = buffer.position, buffer.normal
     up = torch.tensor([0.0, 1.0, 0.0]).to(position).view(3, 1, 1)
     to_light = torch.tensor(light.position, dtype=torch.float32).to(position).view(3, 1, 1) - position
@@ -202,7 +202,7 @@ def shade(buffer: GBuffer, camera: PinholeCamera, light: PointLight, lit: Tensor
 def render(
     parts: tuple[Part, ...], camera: PinholeCamera, light: PointLight, size: tuple[int, int], samples: int = 1
 ) -> tuple[Stokes, Stokes]:
-    """Diffuse and specular Stokes images ``[3, H, W]``, the mean of ``samples`` x ``samples`` rays per pixel."""
+    """Return diffuse and specular Stokes images ``[3, H, W]``, means of ``samples`` x ``samples`` rays."""
 
     def shade_points(rows: Tensor, cols: Tensor) -> tuple[Stokes, Stokes]:
         buffer = cast(parts, camera, rows, cols, size)
@@ -214,9 +214,9 @@ def render(
 def render_points(
     shade_points: Callable[[Tensor, Tensor], tuple[Stokes, Stokes]], size: tuple[int, int], samples: int
 ) -> tuple[Stokes, Stokes]:
-    """Images ``[3, H, W]`` from what shades image points (rows, cols) ``[N]`` to ``[3, N, 1]``, band by band.
+    """Return images ``[3, H, W]`` of a function that shades image points (rows, cols) ``[N]`` to ``[3, N, 1]``.
 
-    A pixel is the mean over ``samples`` x ``samples`` points.
+    A pixel is the mean over ``samples`` x ``samples`` points. Works band by band.
     """
     height, width = size
     rows_at_once = max(1, RAYS_AT_ONCE // (width * samples**2))
@@ -229,10 +229,7 @@ def render_points(
         for lobe, band in zip(lobes, shade_points(grid_rows, grid_cols), strict=True):
             lobe.append(band.map(lambda s, n=count: avg_pool2d(s.view(1, 3, n, -1), samples)[0]))  # type: ignore[misc]
     diffuse, specular = (
-        Stokes(*(torch.cat(rows, dim=1) for rows in zip(*map(_parts, lobe), strict=True))) for lobe in lobes
+        Stokes(*(torch.cat([getattr(band, name) for band in lobe], dim=1) for name in ("s0", "s1", "s2")))
+        for lobe in lobes
     )
     return diffuse, specular
-
-
-def _parts(stokes: Stokes) -> tuple[Tensor, Tensor, Tensor]:
-    return stokes.s0, stokes.s1, stokes.s2

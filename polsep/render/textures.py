@@ -1,8 +1,8 @@
-"""Solid textures: how a slot's material varies in space between two, by procedural patterns of the position.
+"""Solid textures: procedural patterns of the position that mix the two materials of a slot.
 
-A pattern is a weight in [0, 1] of every point of object space, so it has no seams, whatever the (u, v). Patterns are
-built from an integer hash of lattice cells and from correctly rounded operations alone: the same bits on every machine
-and from the compiled twin `polsep.render.patterns_kernel`, in float32.
+A pattern is a weight in [0, 1] of every point of object space, so it has no seams. Patterns use only an integer hash of
+lattice cells and correctly rounded operations: they have the same bits on every machine and in the compiled twin
+`polsep.render.patterns_kernel`, in float32.
 
 Sources: Worley 1996, A cellular texture basis function; Perlin 2002, Improving noise; Perlin 1985, An image synthesizer
 (sums of octaves, bent stripes); the hash is lowbias32 of C. Wellons 2018, Prospecting for hash functions.
@@ -17,12 +17,12 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-#: What a pattern looks like: none; cells of their own shade; cells and what lies between them; dots; smooth noise;
-#: layers; rings about an axis; cubes.
+#: Patterns: none; cells of their own shade; cells and the cracks between them; dots; smooth noise; layers; rings about
+#: an axis; cubes.
 PLAIN, PATCHES, CRACKS, DOTS, CLOUDS, STRIPES, RINGS, CHECKER = range(8)
-#: Octaves at most, and how much higher each is in frequency and lower in amplitude.
+#: Most octaves, and ratios of frequency and amplitude of successive ones.
 MAX_OCTAVES, LACUNARITY, GAIN = 4, 2.0, 0.5
-#: Brings noise to a standard deviation of about 0.3.
+#: Scales noise to a standard deviation of about 0.3.
 NOISE_GAIN = 1.5
 #: Odd multipliers of lattice coordinates and of octaves (Teschner et al. 2003; the golden ratio), and of the hash.
 PRIMES, OCTAVE_STEP, MIXERS = (73856093, 19349663, 83492791), 0x9E3779B9, (0x7FEB352D, 0x846CA68B)
@@ -32,12 +32,12 @@ MASK = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class Textures:
-    """The second material of S slots, and the pattern that chooses it: weight 0 is the first material, 1 this one.
+    """The second material of S slots and the pattern of its weight: 0 is the first material, 1 the second one.
 
     ``albedo [S, 3]``, ``roughness [S]``. ``pattern [S]``: one of the constants above. ``transform [S, 3, 4]``: from
-    positions to pattern space, whose unit is a cell. ``seed [S]``: 31 bits. ``octaves [S]`` of noise; ``warp [S]``: how
-    far it bends layers and rings, in cells. ``threshold``, ``edge [S]``: where weights change, over which width.
-    Raises ValueError when the counts differ or an edge is not above 0.
+    positions to pattern space, whose unit is a cell. ``seed [S]``: 31 bits. ``octaves [S]`` of noise; ``warp [S]``: by
+    how many cells noise bends layers and rings. ``threshold``, ``edge [S]``: position and width of the transition
+    between weights. Raises ValueError when the counts differ or an edge is not above 0.
     """
 
     albedo: Tensor
@@ -62,7 +62,7 @@ class Textures:
 
 
 def pattern_weight(textures: Textures, slot: Tensor, position: Tensor) -> Tensor:
-    """Weight of the second material ``[1, M, 1]`` at positions ``[3, M, 1]`` of slots ``[M]``, in [0, 1]."""
+    """Return the weight of the second material ``[1, M, 1]`` at positions ``[3, M, 1]`` of slots ``[M]``, in [0, 1]."""
     weight = torch.zeros_like(position[0, :, 0])
     pattern = textures.pattern[slot]
     for which in range(PATCHES, CHECKER + 1):
@@ -95,30 +95,30 @@ def _weigh(which: int, textures: Textures, slot: Tensor, position: Tensor) -> Te
 
 
 def _transform(transform: Tensor, position: Tensor) -> Tensor:
-    """Points ``[3, N]`` in pattern space, summed in a fixed order: a fused product would move them across borders."""
+    """Points ``[3, N]`` in pattern space, summed in a fixed order: fused products may round into other cells."""
     x, y, z = position
     rows = [t[:, 0] * x + t[:, 1] * y + t[:, 2] * z + t[:, 3] for t in transform.unbind(1)]
     return torch.stack(rows)
 
 
 def root(x: Tensor) -> Tensor:
-    """The correctly rounded square root: torch's own, in float32, is off by a bit where it uses vector libraries."""
+    """Return the correctly rounded square root; torch's in float32 may be off by a bit."""
     return torch.sqrt(x.double()).to(x.dtype)
 
 
 def ramp(x: Tensor) -> Tensor:
-    """0 below 0, 1 above 1, smooth between (the cubic 3x² - 2x³)."""
+    """Return 0 below 0, 1 above 1, and the cubic 3x² - 2x³ between."""
     x = x.clamp(0, 1)
     return x * x * (3 - 2 * x)
 
 
 def wave(x: Tensor) -> Tensor:
-    """A triangle wave of period 1 in [0, 1]: 1 at whole numbers, 0 between them."""
+    """Return a triangle wave of period 1 in [0, 1]: 1 at whole numbers, 0 between them."""
     return (2 * (x - torch.floor(x)) - 1).abs()
 
 
 def hash_cell(lattice: Tensor, seed: Tensor) -> Tensor:
-    """32 random bits, int64 ``[N]``, of lattice points ``[3, N]``."""
+    """Return 32 random bits, int64 ``[N]``, of lattice points ``[3, N]``."""
     h = (lattice[0] * PRIMES[0] ^ lattice[1] * PRIMES[1] ^ lattice[2] * PRIMES[2] ^ seed) & MASK
     h = h ^ (h >> 16)
     h = (h * MIXERS[0]) & MASK
@@ -129,15 +129,15 @@ def hash_cell(lattice: Tensor, seed: Tensor) -> Tensor:
 
 
 def hash_fractions(h: Tensor, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Three fractions in [0, 1] of ten bits each."""
+    """Return three fractions in [0, 1] of ten bits each."""
     x, y, z = ((h >> shift & 1023).to(like.dtype) * (1 / 1024) for shift in (0, 10, 20))
     return x, y, z
 
 
 def cells(point: Tensor, seed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Distances to the nearest and second nearest of the random centres, one per lattice cell, and the shades of both.
+    """Return distances to the nearest and second nearest of random centres, one per lattice cell, and their shades.
 
-    ``point [3, N]``; everything ``[N]``, shades in [0, 1). Source: Worley 1996.
+    ``point [3, N]``; results ``[N]``, shades in [0, 1). Source: Worley 1996.
     """
     base = torch.floor(point)
     inside, lattice = point - base, base.long()
@@ -156,7 +156,7 @@ def cells(point: Tensor, seed: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def octave_noise(point: Tensor, seed: Tensor, octaves: Tensor) -> Tensor:
-    """The sum of `gradient_noise` over octaves, about -1 to 1; points ``[3, N]`` to ``[N]``."""
+    """Return the sum of `gradient_noise` over octaves, about -1 to 1; points ``[3, N]`` to ``[N]``."""
     total = torch.zeros_like(point[0])
     for octave in range(MAX_OCTAVES):
         layer = gradient_noise(point * LACUNARITY**octave, seed + octave * OCTAVE_STEP & MASK)
@@ -165,7 +165,7 @@ def octave_noise(point: Tensor, seed: Tensor, octaves: Tensor) -> Tensor:
 
 
 def gradient_noise(point: Tensor, seed: Tensor) -> Tensor:
-    """Noise ``[N]`` that is 0 at the lattice and has random gradients there; points ``[3, N]``. Source: Perlin 2002."""
+    """Return noise ``[N]`` of points ``[3, N]``: 0 at the lattice, with random gradients. Source: Perlin 2002."""
     base = torch.floor(point)
     inside, lattice = point - base, base.long()
     corners: list[Tensor] = []

@@ -1,7 +1,7 @@
-"""Random views of a shape: where the camera and the light are, how the frame is exposed, and the frame itself.
+"""Random views of a shape: camera, light, exposure, and the frame itself.
 
-All draws of a view come from one generator, whose seed `scene_seed` makes of four numbers: the split of the data, the
-user's seed, and which shape and view it is. So a view never depends on what was rendered before it, or where.
+All draws of a view come from one generator, seeded by `scene_seed` from the split of the data, the user's seed, and the
+numbers of shape and view. So a view does not depend on what was rendered before it, or on which machine.
 
 Conventions are those of `polsep.render.sphere_tracing`; shapes are centred on the origin. Source: Dave et al. 2022,
 Sec. 4.4, which varies the light's "position and polarization angle for each data point" and leaves the rest open. Note:
@@ -24,32 +24,32 @@ from polsep.render.simulate import Capture, blur, capture, expose_to_clip, expos
 from polsep.render.sphere_tracing import PinholeCamera, PointLight, Vector
 from polsep.sensor.camera import IMX250, Layout
 
-#: Whom data are for; the position is part of every seed.
+#: Splits of the data; the index is part of every seed.
 SPLITS = ("train", "validation", "test")
-#: Cameras stay this far from the vertical: their up vector is world +y.
+#: Largest elevation of cameras, whose up vector is world +y.
 LARGEST_ELEVATION = math.radians(75)
 #: Vertical field of view [degrees], and the share of the frame that the object fills along its longer side.
 FIELDS_OF_VIEW, FILLS = (15.0, 50.0), (0.6, 1.0)
-#: The light lies within this angle of the camera, seen from the object: beyond it most of what is seen is unlit.
+#: Largest angle between light and camera at the object: beyond it most visible points are unlit.
 LARGEST_PHASE = math.radians(60)
-#: Distance of the light from the object's centre, and the least one of the camera, in radii of the object.
+#: Range of the light's distance from the object's centre, and least distance of the camera, in radii of the object.
 LIGHT_DISTANCES, MIN_DISTANCE = (2.0, 8.0), 1.5
-#: Share of the views in which nothing clips, and the largest share of object samples that clips in the others.
+#: Share of views without clipping, and the largest share of object samples that clip in the others.
 UNCLIPPED_SHARE, LARGEST_CLIPPED = 1 / 3, 0.05
-#: Median of the lit samples at least, white at 1: exposed for a mirror-like highlight alone, a frame would be black.
-#: Where it applies, more samples clip than asked.
+#: Least median of the lit samples, white = 1: exposed for a mirror-like highlight alone, a frame would be black. Where
+#: it applies, more samples clip than drawn.
 MIN_LEVEL = 0.02
 #: Standard deviation of the lens's point spread in raw pixels: 0.42 wavelength x f-number (Zhang, Zerubia and
 #: Olivo-Marin 2007, doi:10.1364/AO.46.001819) over pixels of 3.45 um is 0.3 at f/4.5 and 0.8 at f/12 for 550 nm.
 BLURS = (0.3, 0.8)
-#: A view is drawn anew when less than this share of the object's pixels is lit, seen in a small picture; at most so
-#: many times.
+#: Least share of the object's pixels that are lit in a small preview, else a view is drawn again; the preview's size;
+#: most draws.
 MIN_LIT, PREVIEW_SIZE, MAX_DRAWS = 0.4, (48, 48), 100
 
 
 @dataclass(frozen=True)
 class Shot:
-    """What of a picture of a shape is random besides its materials; ``clip`` is the share of samples that clips."""
+    """Random properties of a view, besides its materials; ``clip``: share of object samples that clip."""
 
     camera: PinholeCamera
     light: PointLight
@@ -58,11 +58,11 @@ class Shot:
 
 
 def scene_seed(split: str, seed: int, shape: int, view: int | None = None) -> int:
-    """The seed of a view, or of the shape itself for None: a number below 2^32.
+    """Return the seed of a view, or of the shape itself for None: a number below 2^32.
 
-    The two highest bits are the split's, so no two splits share a seed; the others are SHA-256 of the four numbers.
-    Not more bits, because torch's CPU generator is a Mersenne twister that takes 32 of its seed and drops the rest.
-    Raises ValueError on a split not in `SPLITS`.
+    The two highest bits are the split's, so no two splits share a seed; the others come from SHA-256 of the four
+    values. Torch's CPU generator, a Mersenne twister, uses only 32 bits of a seed. Raises ValueError on a split not in
+    `SPLITS`.
     """
     if split not in SPLITS:
         raise ValueError(f"expected a split of {', '.join(SPLITS)}, found {split!r}")
@@ -71,14 +71,14 @@ def scene_seed(split: str, seed: int, shape: int, view: int | None = None) -> in
 
 
 def seeded_shape(split: str, seed: int, shape: int) -> MeshScene:
-    """Random shape number ``shape`` of a split."""
+    """Return random shape number ``shape`` of a split."""
     return MeshScene(random_mesh(torch.Generator().manual_seed(scene_seed(split, seed, shape))))
 
 
 def random_camera(vertices: Floats, generator: torch.Generator) -> PinholeCamera:
-    """A camera that looks at the middle of what it sees of points ``[V, 3]`` about the origin, from any side.
+    """Return a camera in a random direction, aimed at the middle of the projection of points ``[V, 3]``.
 
-    The distance is the one at which they fill a share in `FILLS` of a square frame.
+    At its distance the points, which surround the origin, fill a share in `FILLS` of a square frame.
     """
     azimuth = _uniform((0.0, 2 * math.pi), generator)
     limit = math.sin(LARGEST_ELEVATION)
@@ -97,9 +97,9 @@ def random_camera(vertices: Floats, generator: torch.Generator) -> PinholeCamera
 
 
 def random_light(camera: PinholeCamera, radius: float, generator: torch.Generator) -> PointLight:
-    """A light within `LARGEST_PHASE` of the camera, at a random distance and behind a random polarizer.
+    """Return a light within `LARGEST_PHASE` of the camera, at a random distance and behind a random polarizer.
 
-    Its irradiance at the origin is 1; the exposure comes later. ``radius``: of the object.
+    Its irradiance at the origin is 1; `expose_to_clip` sets the exposure. ``radius``: of the object.
     """
     away = np.array(camera.position) - np.array(camera.target)
     away /= math.hypot(*away)
@@ -114,17 +114,14 @@ def random_light(camera: PinholeCamera, radius: float, generator: torch.Generato
 
 
 def random_clip(generator: torch.Generator) -> float:
-    """The share of an object's samples that is to clip: 0 for `UNCLIPPED_SHARE` of the draws."""
+    """Return a random share of object samples that clip: 0 for `UNCLIPPED_SHARE` of the draws."""
     some = _uniform((0.0, 1.0), generator) >= UNCLIPPED_SHARE
     share = _uniform((0.0, LARGEST_CLIPPED), generator)
     return round(share, 6) if some else 0.0
 
 
 def random_shot(shape: MeshScene, generator: torch.Generator) -> Shot:
-    """A view that shows enough of the lit side of a shape: others are drawn anew, by `MIN_LIT`.
-
-    Raises ValueError when none of `MAX_DRAWS` does.
-    """
+    """Return a view of a shape of which at least `MIN_LIT` is lit. Raises ValueError when none of `MAX_DRAWS` is."""
     for _ in range(MAX_DRAWS):
         camera = random_camera(shape.mesh.vertices, generator)
         light = random_light(camera, _radius(shape.mesh.vertices), generator)
@@ -135,16 +132,16 @@ def random_shot(shape: MeshScene, generator: torch.Generator) -> Shot:
 
 
 def lit_share(shape: MeshScene, shot: Shot) -> float:
-    """The share of a shape's pixels that the light reaches, in a picture of `PREVIEW_SIZE`."""
+    """Return the share of a shape's pixels that are lit, in a preview of `PREVIEW_SIZE`."""
     view = find_view(shape, shot.camera, PREVIEW_SIZE)
     lit = torch.cat([found[0, :, 0] for found in find_lit(shape, view, shot.light)])
     return float(lit.float().mean()) if lit.numel() else 0.0
 
 
 def capture_shot(shape: MeshScene, shot: Shot, size: int, samples: int, generator: torch.Generator) -> Capture:
-    """A ``size`` x ``size`` frame of a shape with random materials by the camera `camera.IMX250`, and its truth.
+    """Return a ``size`` x ``size`` frame of a shape with random materials by `camera.IMX250`, and its truth.
 
-    Raises ValueError when the light reaches no pixel that the shape covers wholly.
+    Raises ValueError when no pixel that the shape covers completely is lit.
     """
     materials = random_materials(shape.mesh.slot_count, generator, shape.size)
     scene = render_scene((shape, materials), shot.camera, shot.light, (size, size), samples)
@@ -158,7 +155,7 @@ def _radius(vertices: Floats) -> float:
 
 
 def _along(points: Floats, axis: Floats) -> Floats:
-    """Coordinates of points ``[..., 3]`` along a unit vector; no matrix product, whose last bit is the machine's."""
+    """Coordinates of points ``[..., 3]`` along a unit vector; a matrix product would round differently by machine."""
     along: Floats = points[..., 0] * axis[0] + points[..., 1] * axis[1] + points[..., 2] * axis[2]
     return along
 
@@ -169,6 +166,6 @@ def _uniform(interval: tuple[float, float], generator: torch.Generator) -> float
 
 
 def _rounded(point: Floats) -> Vector:
-    """A point as it is printed, so that what is read in a file is what was rendered, on every machine."""
+    """A point rounded to six decimals, as in the record, so that the record describes exactly what was rendered."""
     x, y, z = (round(float(c), 6) for c in point)
     return (x, y, z)

@@ -45,7 +45,7 @@ def test_demo_works_offline(
         assert str(tmp_path / "o" / method / "still_life.png") in said.out
         match = re.search(rf"{method}: .*light polarizer about (\d+) deg \((\d+) deg in the scene\)", said.out)
         assert match is not None
-    assert "Look at" in said.out
+    assert "Compare " in said.out
 
 
 def test_embedded_capture_is_a_12_bit_frame() -> None:

@@ -63,7 +63,7 @@ LIGHTS = ((0, 0, 1), (0.5, 0, 0.9), (-0.5, 0, 0.9), (0, 0.6, 0.8), (0.4, -0.4, 0
 
 
 class Golden:
-    """What was measured, by name: texts, and hashes of arrays and files; arrays too, unless told not to keep them."""
+    """Measured outputs by name: texts, and hashes of arrays and files; arrays too, unless told not to keep them."""
 
     def __init__(self) -> None:
         self.entries, self.arrays = dict[str, dict[str, Any]](), dict[str, Array]()

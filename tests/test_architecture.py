@@ -206,6 +206,18 @@ def test_public_names_are_documented_and_typed() -> None:
     assert missing == []
 
 
+def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
+    """They say what a thing is or does, and do not ask."""
+    asking = ("What", "How", "Where", "Which", "Whether", "When", "Who")
+    wrong = []
+    for path in [*modules(), *sorted((ROOT / "evaluation").rglob("*.py"))]:
+        for node in ast.walk(tree(path)):
+            if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+                words = (ast.get_docstring(node) or "").split()
+                wrong += [f"{label(path)}: {' '.join(words[:6])}"] if words and words[0] in asking else []
+    assert wrong == []
+
+
 def test_public_functions_have_few_parameters() -> None:
     """More than five are a frozen dataclass; kernels may have eight, which the linter checks."""
     wrong = []

@@ -1,4 +1,4 @@
-"""What a test set hands out: exposed scenes with three captures each, and how they are recorded.
+"""Cases of a test set: exposed scenes with three captures each, and their records.
 
 Records compare numbers, not bytes: ray casts and powers differ by rounding between machines, and a hash over floats,
 however coarsely rounded, flips where a value lies at a rounding step. So `fingerprint` is eight weighted means per
@@ -33,7 +33,7 @@ UNIT, TOLERANCE = 1e-6, 50
 
 @dataclass(frozen=True)
 class Recipe:
-    """How to make one scene: its ``seed``, input ``files`` below the data folder, and what makes a `Scene` of them.
+    """Recipe of one scene: its ``seed``, input ``files`` below the data folder, and what makes a `Scene` of them.
 
     ``make`` takes the paths of the files and a generator of that seed; its scene needs no exposure.
     """

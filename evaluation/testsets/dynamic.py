@@ -49,7 +49,7 @@ Look = tuple[Model, PointLight]
 
 @dataclass(frozen=True)
 class Film:
-    """How to make a film: ``stage`` takes a generator of the ``seed`` and gives the look of every frame."""
+    """Recipe of a film: ``stage`` takes a generator of the ``seed`` and gives the look of every frame."""
 
     name: str
     seed: int
@@ -109,7 +109,7 @@ def check_frame(film: Film, frame: FilmFrame) -> None:
 
 
 def _shoot(film: Film) -> Callable[[int], Scene]:
-    """What makes the exposed scene of a frame; the exposure is that of the middle one."""
+    """Function that makes the exposed scene of a frame; the exposure is that of the middle one."""
     look, size = film.stage(torch.Generator().manual_seed(film.seed)), (FILM_SIDE, FILM_SIDE)
 
     def render_frame(number: int) -> Scene:

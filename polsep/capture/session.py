@@ -54,7 +54,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class CapturePlan:
-    """What is done with the frames: record into ``output``, separate with ``method``, serve a page on ``port``.
+    """Plan of a capture: record into ``output``, separate with ``method``, serve a page on ``port``.
 
     None leaves each of them out. ``layout``: of the mosaic; None derives it from the name of the pixel format.
     """

@@ -72,7 +72,7 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 
 
 def read_options(options: Mapping[str, Any]) -> ReadOptions:
-    """How to read raw frames, from the options of a command. Raises ValueError."""
+    """Options of reading raw frames, from the options of a command. Raises ValueError."""
     from polsep.io.raw.frames import ReadOptions
     from polsep.sensor.camera import Layout
 

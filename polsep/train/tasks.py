@@ -40,7 +40,7 @@ class Task(Generic[Inputs]):
 
 
 class Variant(NamedTuple):
-    """How a training ``prepare``s its examples, in how many ``colors``, from crops of how many raw pixels a side."""
+    """Preparation of a training's examples by ``prepare``, in how many ``colors``, from crops of how many raw pixels a side."""
 
     prepare: Callable[[Examples], LadderInputs]
     colors: int

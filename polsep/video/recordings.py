@@ -82,7 +82,7 @@ class VideoOptions:
 
 @dataclass(frozen=True)
 class Target:
-    """Where and how results are written."""
+    """Place and format in which results are written."""
 
     directory: Path
     kind: SequenceKind = field(default_factory=SequenceKind)

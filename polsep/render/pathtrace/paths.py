@@ -77,7 +77,7 @@ class _Task:
 
 
 class _Way(NamedTuple):
-    """Where a path goes on, the probability per solid angle of its direction, and whether it does."""
+    """The next direction of a path, its probability per solid angle, and whether the path continues."""
 
     origin: Any
     direction: Any

@@ -178,7 +178,7 @@ def white_lobes(model: PathModel, vertex: Vertex, direction: Any) -> tuple[Matri
 
 
 def _linear_part(matrix: Any) -> Matrix:
-    """What Mitsuba's matrix does to s0, s1 and s2, of its first wavelength."""
+    """The part of Mitsuba's matrix on s0, s1 and s2, of its first wavelength."""
     a, b, c = ((matrix[k, 0][0], matrix[k, 1][0], matrix[k, 2][0]) for k in range(3))
     return a, b, c
 

@@ -1,4 +1,4 @@
-"""Which of Mitsuba's compiled variants runs here, and working in one of them.
+"""Choice of one of Mitsuba's compiled variants, and work inside it.
 
 In the fast one a number is an array over all paths, and Python only records what is compiled; in the slow one it is a
 float, and each path runs in Python. The same code serves both, but for a path that ends: see `is_over`.
@@ -73,12 +73,12 @@ def only_errors() -> Iterator[None]:
 
 
 def is_fast() -> bool:
-    """Whether the numbers of the current variant are arrays."""
+    """True if the numbers of the current variant are arrays."""
     return bool(dr.is_jit_v(mi.Float))
 
 
 def is_over(active: Any) -> bool:
-    """Whether nothing is left to do: of a single path only, as one of many never ends for all."""
+    """True if nothing is left to do: of a single path only, as one of many never ends for all."""
     return active is False
 
 

@@ -40,7 +40,7 @@ class Task(Generic[Inputs]):
 
 
 class Variant(NamedTuple):
-    """Preparation of a training's examples by ``prepare``, in how many ``colors``, from crops of how many raw pixels a side."""
+    """Inputs of a training: ``prepare``d examples, number of ``colors``, side of the crops in raw pixels."""
 
     prepare: Callable[[Examples], LadderInputs]
     colors: int

@@ -12,9 +12,13 @@ from polsep.networks import images_kernel as joint_images
 from polsep.sensor.unpack_kernel import PackedFrame
 from polsep.separation import analytic_kernel as analytic
 from polsep.separation import color_affine_kernel as color_affine
-from polsep.separation.analytic_kernel import AnalyticImages, AnalyticOptions, separate_analytic_half
-from polsep.separation.color_affine_kernel import ColorAffineImages, ColorAffineOptions, separate_color_affine_half
+from polsep.separation.analytic_kernel import AnalyticOptions, separate_analytic_half
+from polsep.separation.color_affine_kernel import ColorAffineOptions, separate_color_affine_half
+from polsep.separation.images import FrameImages
 from polsep.video import temporal_kernel as temporal
+
+#: The images of a frame, as streams of either method name them.
+AnalyticImages = ColorAffineImages = FrameImages
 
 __all__ = [
     "AnalyticImages",

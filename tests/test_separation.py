@@ -33,7 +33,8 @@ from polsep.separation.analytic import (
     separate_analytic,
     separate_analytic_unclipped,
 )
-from polsep.separation.color_affine import MAX_DIFFUSE_DOLP, separate_color_affine, white_specular
+from polsep.separation.closed_form import MAX_DIFFUSE_DOLP, white_specular
+from polsep.separation.color_affine import separate_color_affine
 from polsep.separation.report import dominant_angle, in_light, tally, under_white_light
 
 SONY = tuple(math.radians(t) for t in (0, 45, 90, 135))

@@ -58,6 +58,13 @@ def sum_three(x: Any, y: Any, z: Any, total: Any) -> None:
 
 
 @compiled
+def add_rows(x: Any, y: Any, z: Any, factor: Any, total: Any) -> None:
+    """``total = factor (x + y + z)``."""
+    for j in range(total.size):
+        total[j] = factor * (x[j] + y[j] + z[j])
+
+
+@compiled
 def add_up(row: Any) -> float:
     """The sum of a row in double precision, by eight sums that a processor can make at once."""
     a, b, c, d, e, f, g, h = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

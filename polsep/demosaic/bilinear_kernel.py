@@ -23,7 +23,7 @@ from polsep.compute.compiling import HALF, ONE, QUARTER, ZERO, compiled
 from polsep.sensor.camera import CLIP_MARGIN, Layout
 from polsep.sensor.unpack_kernel import Samples, read_row
 
-#: Room on each side of a phase for its repeated border sample; a cache line, so that phases stay aligned.
+#: Elements on each side of a phase for its repeated border sample; a cache line, so that phases stay aligned.
 PAD = 16
 
 #: Slots of a window: the rows that one cell row needs of each half, by row number modulo 4.
@@ -142,7 +142,7 @@ def make_window(pattern: Pattern) -> Window:
 
 @compiled
 def make_analysers(pattern: Pattern) -> Any:
-    """Room ``[4, C, n]`` float32 for one cell row of all analysers and colours; n >= w, the rest is undefined."""
+    """A buffer ``[4, C, n]`` float32 for one cell row of all analysers and colours; n >= w, the rest is undefined."""
     return np.empty((4, pattern.channels, pattern.w + -pattern.w % PAD), np.float32)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, ZERO, compiled
+from polsep.compute.rows import fill
 from polsep.demosaic import guided as twin
 from polsep.demosaic.bilinear_kernel import Pattern
 from polsep.sensor.unpack_kernel import Samples, read_row
@@ -83,7 +84,7 @@ def reflect(places: NDArray[np.int64], count: int) -> NDArray[np.int64]:
 
 @compiled
 def load_cells(source: Source, r: int, row: Any, planes: Any) -> None:
-    """The samples of the frame's cell row ``r`` to ``planes [4, n]``, linear; ``row``: room for a sensor row."""
+    """The samples of the frame's cell row ``r`` to ``planes [4, n]``, linear; ``row``: a buffer for a sensor row."""
     samples, pattern, grid = source
     gains = grid.gains[r % 2, EDGE:]
     for i in range(2):
@@ -120,12 +121,16 @@ def detail_cells(planes: Any, details: Any) -> None:
 
 
 @compiled
-def _vertical(rows: tuple[Any, Any, Any, Any], other: Any, room: Any) -> None:
-    """Vertical part of `demosaic_bilinear_half` for one analyser: the row's own red or blue, the next row's, green."""
-    own, near, back, far = rows[0][GUARD:], rows[1][GUARD:], rows[2][GUARD:], rows[3][GUARD:]
-    own_left, own_right = rows[0][GUARD - 1 :], rows[0][GUARD + 1 :]
-    near_left, near_right = rows[1][GUARD - 1 :], rows[1][GUARD + 1 :]
-    first, second, green, here = room[0, GUARD:], room[1, GUARD:], room[2, GUARD:], other[GUARD:]
+def _interpolate_down(own_row: Any, near_row: Any, back_row: Any, far_row: Any, other: Any, out: Any) -> None:
+    """Vertical part of `demosaic_bilinear_half` for one analyser, ``out [3, n]``.
+
+    The row's own red or blue, the next row's, and green, from the row itself, the one that the analyser is nearest to,
+    the one on the other side, and the one behind the nearest.
+    """
+    own, near, back, far = own_row[GUARD:], near_row[GUARD:], back_row[GUARD:], far_row[GUARD:]
+    own_left, own_right = own_row[GUARD - 1 :], own_row[GUARD + 1 :]
+    near_left, near_right = near_row[GUARD - 1 :], near_row[GUARD + 1 :]
+    first, second, green, here = out[0, GUARD:], out[1, GUARD:], out[2, GUARD:], other[GUARD:]
     for j in range(other.size - 2 * GUARD):
         first[j] = _OWN * own[j] + _FAR * far[j]
         second[j] = _BACK * back[j] + _NEAR * near[j]
@@ -135,12 +140,11 @@ def _vertical(rows: tuple[Any, Any, Any, Any], other: Any, room: Any) -> None:
 
 
 @compiled
-def _add_horizontal(q: Any, present: Any, step: int, weights: tuple[Any, Any], sums: tuple[Any, Any]) -> None:
-    """Horizontal part for red or blue, ``present`` where that colour is; times the ``weights`` onto s1 and s2."""
+def _add_red_or_blue(q: Any, present: Any, step: int, w1: Any, w2: Any, s1_row: Any, s2_row: Any) -> None:
+    """Horizontal part for red or blue, ``present`` where that colour is; times ``w1``, ``w2`` onto s1 and s2."""
     own, far = q[GUARD:], q[GUARD + 2 * step :]
     back, near, here = q[GUARD - step :], q[GUARD + step :], present[GUARD:]
-    s1, s2 = sums[0][GUARD:], sums[1][GUARD:]
-    w1, w2 = weights
+    s1, s2 = s1_row[GUARD:], s2_row[GUARD:]
     for j in range(q.size - 2 * GUARD):
         at_own, between = _OWN * own[j] + _FAR * far[j], _BACK * back[j] + _NEAR * near[j]
         value = here[j] * at_own + (ONE - here[j]) * between
@@ -149,10 +153,9 @@ def _add_horizontal(q: Any, present: Any, step: int, weights: tuple[Any, Any], s
 
 
 @compiled
-def _add_green(q: Any, step: int, weights: tuple[Any, Any], sums: tuple[Any, Any]) -> None:
+def _add_green(q: Any, step: int, w1: Any, w2: Any, s1_row: Any, s2_row: Any) -> None:
     """Horizontal part for green."""
-    own, near, s1, s2 = q[GUARD:], q[GUARD + step :], sums[0][GUARD:], sums[1][GUARD:]
-    w1, w2 = weights
+    own, near, s1, s2 = q[GUARD:], q[GUARD + step :], s1_row[GUARD:], s2_row[GUARD:]
     for j in range(q.size - 2 * GUARD):
         value = _HERE * own[j] + _THERE * near[j]
         s1[j] += w1 * value
@@ -160,43 +163,38 @@ def _add_green(q: Any, step: int, weights: tuple[Any, Any], sums: tuple[Any, Any
 
 
 @compiled
-def polarize_row(ring: Any, r: int, grid: Grid, room: Any, sums: Any) -> None:
+def polarize_row(ring: Any, r: int, grid: Grid, buffer: Any, sums: Any) -> None:
     """s1 and s2 of row ``r`` to ``sums [2, 3, n]``, bilinear, from a ring of planes with rows r - 2 to r + 2.
 
-    ``room [3, n]``: for rows. Twin: `fit_stokes` of `interpolate_analysers_half`.
+    ``buffer [3, n]``. Twin: `fit_stokes` of `interpolate_analysers_half`.
     """
     length, parity = ring.shape[0], r % 2
     other, green = grid.others[parity], grid.others[1 - parity]
     for i in range(2):
         for c in range(3):
-            _clear(sums[i, c])
+            fill(ZERO, sums[i, c])
     for place in range(4):
         d, step = 1 - 2 * (place // 2), 1 - 2 * (place % 2)
         own, near = ring[r % length, place], ring[(r + d) % length, place]
         back, far = ring[(r - d) % length, place], ring[(r + 2 * d) % length, place]
-        _vertical((own, near, back, far), other, room)
-        weights = (grid.inverse[1, place], grid.inverse[2, place])
+        _interpolate_down(own, near, back, far, other, buffer)
+        w1, w2 = grid.inverse[1, place], grid.inverse[2, place]
         first, second = grid.colors[parity], grid.colors[1 - parity]
-        _add_horizontal(room[0], other, step, weights, (sums[0, first], sums[1, first]))
-        _add_horizontal(room[1], green, step, weights, (sums[0, second], sums[1, second]))
-        _add_green(room[2], step, weights, (sums[0, 1], sums[1, 1]))
+        _add_red_or_blue(buffer[0], other, step, w1, w2, sums[0, first], sums[1, first])
+        _add_red_or_blue(buffer[1], green, step, w1, w2, sums[0, second], sums[1, second])
+        _add_green(buffer[2], step, w1, w2, sums[0, 1], sums[1, 1])
 
 
 @compiled
-def _clear(x: Any) -> None:
-    for j in range(x.size):
-        x[j] = ZERO
-
-
-@compiled
-def blur_pixels_down(above: Any, here: Any, below: Any, out: Any) -> None:
-    """(1/4, 1/2, 1/4) along the columns of pixels: rows ``[4, n]`` of cells to a row."""
+def blur_pixels_down(above: Any, here: Any, below: Any, side: Any, out: Any) -> None:
+    """(``side``, 1 - 2 ``side``, ``side``) along the columns of pixels: rows ``[4, n]`` of cells to a row."""
+    middle = ONE - side - side
     for j in range(2):
         before, first, second, after = above[2 + j], here[j], here[2 + j], below[j]
         upper, lower = out[j], out[2 + j]
         for x in range(first.size):
-            upper[x] = QUARTER * (before[x] + second[x]) + HALF * first[x]
-            lower[x] = QUARTER * (first[x] + after[x]) + HALF * second[x]
+            upper[x] = middle * first[x] + side * (before[x] + second[x])
+            lower[x] = middle * second[x] + side * (first[x] + after[x])
 
 
 @compiled
@@ -229,26 +227,12 @@ def sum_three(x: Any, out: Any) -> None:
 
 
 @compiled
-def add_rows(a: Any, b: Any, c: Any, scale: Any, out: Any) -> None:
-    """``scale (a + b + c)``."""
-    for j in range(out.size):
-        out[j] = scale * (a[j] + b[j] + c[j])
-
-
-@compiled
-def subtract(x: Any, y: Any, out: Any) -> None:
-    """``x - y``."""
-    for j in range(out.size):
-        out[j] = x[j] - y[j]
-
-
-@compiled
 def blur_gently(x: Any, out: Any) -> None:
     """(1/8, 3/4, 1/8) along a row of cells."""
-    a, b, c, found = x[GUARD - 1 :], x[GUARD:], x[GUARD + 1 :], out[GUARD:]
+    a, b, c, blurred = x[GUARD - 1 :], x[GUARD:], x[GUARD + 1 :], out[GUARD:]
     eighth = QUARTER * HALF
     for j in range(x.size - 2 * GUARD):
-        found[j] = _HERE * b[j] + eighth * (a[j] + c[j])
+        blurred[j] = _HERE * b[j] + eighth * (a[j] + c[j])
 
 
 @compiled

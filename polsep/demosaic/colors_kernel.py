@@ -1,7 +1,7 @@
 """Red and blue at every pixel from green, rows of cells in and out: twin of `guided._fill_from_green`.
 
-The rows, counted back from the newest one of green: linear functions 4 (`LINES`), smoothed over 3x3 cells 5, guesses
-and their residual 6 (`GUESS`), red and blue 8 (`FILLED`). Index 0 is red and 1 is blue wherever there are two.
+The rows, counted back from the newest one of green: linear functions 4 (`LINES`), smoothed over 3x3 cells 5, estimates
+and their residual 6 (`ESTIMATE`), red and blue 8 (`FILLED`). Index 0 is red and 1 is blue wherever there are two.
 """
 
 from __future__ import annotations
@@ -12,20 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, QUARTER, ZERO, compiled
+from polsep.compute.rows import add_rows, subtract
 from polsep.demosaic import guided as twin
 from polsep.demosaic.cells_kernel import (
     GUARD,
     Grid,
-    add_rows,
     enlarge_down,
     mean_cells,
     reciprocal,
-    subtract,
     sum_three,
 )
 from polsep.demosaic.green_kernel import prior_slope
 
-LINES, GUESS, FILLED = 4, 6, 8
+LINES, ESTIMATE, FILLED = 4, 6, 8
 
 # Binomial (1, 8, 28, 56, 70, 56, 28, 8, 1) where only every second cell has the colour: its own ones, or the others.
 _B0, _B2, _B4 = (np.float32(k / 128) for k in (70, 28, 1))
@@ -41,14 +40,14 @@ class Colors(NamedTuple):
     the last of them zero.
 
     ``moments``: means along a row of green, the row's other colour, their product and green's square. ``lines``: slope
-    and offset of red and of blue, over 3 cells; ``smooth``: over 3x3. ``guess``: four planes of red, four of blue.
+    and offset of red and of blue, over 3 cells; ``smooth``: over 3x3. ``estimates``: four planes of red, four of blue.
     ``residual``: of the row's other colour, interpolated along the row, and behind it that colour itself.
     """
 
     moments: NDArray[np.float32]
     lines: NDArray[np.float32]
     smooth: NDArray[np.float32]
-    guess: NDArray[np.float32]
+    estimates: NDArray[np.float32]
     residual: NDArray[np.float32]
     rows: NDArray[np.float32]
 
@@ -117,7 +116,7 @@ def _find_line(rows: Any) -> None:
 
 
 @compiled
-def _guess(slope: Any, offset: Any, green: Any, out: Any) -> None:
+def _estimate(slope: Any, offset: Any, green: Any, out: Any) -> None:
     """``slope green + offset`` for one row of pixels ``[2, n]``; both are of cells, interpolated along the row."""
     a_before, a, a_after = slope[GUARD - 1 :], slope[GUARD:], slope[GUARD + 1 :]
     b_before, b, b_after = offset[GUARD - 1 :], offset[GUARD:], offset[GUARD + 1 :]
@@ -163,11 +162,10 @@ def _interpolate_down(ring: Any, r: int, k: int, own: bool, out: Any) -> None:
 
 
 @compiled
-def _fill(mosaic: Any, guess: Any, rows: tuple[Any, Any], present: Any, out: Any) -> None:
-    """One plane: the mosaic's own values where ``present``, else the guess and its residual, not below its floor."""
-    residual, plain = rows
+def _fill(mosaic: Any, estimate: Any, residual: Any, plain: Any, present: Any, out: Any) -> None:
+    """One plane: the mosaic's own values where ``present``, else the estimate and its residual, not below its floor."""
     for j in range(out.size):
-        value, least = guess[j] + residual[j], _MIN_SHARE * plain[j]
+        value, least = estimate[j] + residual[j], _MIN_SHARE * plain[j]
         value = value if value >= least else least
         out[j] = present[j] * mosaic[j] + (ONE - present[j]) * value
 
@@ -189,9 +187,9 @@ def _find_lines(p: int, grid: Grid, state: Colors) -> None:
 
 
 @compiled
-def _guess_row(here: Any, green: Any, p: int, grid: Grid, state: Colors) -> None:
-    """Guesses of row ``p`` from its green, and what they miss of its mosaic, ``here``, interpolated along the row."""
-    rows, guess = state.rows, state.guess[p % 3]
+def _estimate_row(here: Any, green: Any, p: int, grid: Grid, state: Colors) -> None:
+    """Estimates of row ``p`` from its green; what its mosaic ``here`` differs from them, along the row."""
+    rows, estimates = state.rows, state.estimates[p % 3]
     above, middle, below = state.smooth[(p - 1) % 3], state.smooth[p % 3], state.smooth[(p + 1) % 3]
     for color in range(2):
         for k in range(2):
@@ -199,10 +197,10 @@ def _guess_row(here: Any, green: Any, p: int, grid: Grid, state: Colors) -> None
             enlarge_down(above[line], middle[line], below[line], rows[2 * k : 2 * k + 2])
         for i in range(2):
             first = 4 * color + 2 * i
-            _guess(rows[i], rows[2 + i], green[2 * i : 2 * i + 2], guess[first : first + 2])
+            _estimate(rows[i], rows[2 + i], green[2 * i : 2 * i + 2], estimates[first : first + 2])
     first = 4 * (grid.colors[p % 2] // 2)
     for k in range(4):
-        subtract(here[k], guess[first + k], rows[4 + k])
+        subtract(here[k], estimates[first + k], rows[4 + k])
     other, residual = grid.others[p % 2], state.residual[p % 5]
     for i in range(2):
         _interpolate_along(rows[4 + 2 * i : 6 + 2 * i], other, residual[2 * i : 2 * i + 2])
@@ -221,16 +219,16 @@ def _fill_row(here: Any, p: int, grid: Grid, state: Colors, out: Any) -> None:
             _interpolate_down(state.residual, p, 4 + j, own, rows[2:4])
             for i in range(2):
                 k = 2 * i + j
-                _fill(here[k], state.guess[p % 3, 4 * color + k], (rows[i], rows[2 + i]), present, out[4 * color + k])
+                estimate = state.estimates[p % 3, 4 * color + k]
+                _fill(here[k], estimate, rows[i], rows[2 + i], present, out[4 * color + k])
 
 
 @compiled
-def fill_colors_row(rings: tuple[Any, Any, Any], r: int, grid: Grid, state: Colors) -> None:
-    """Take row ``r`` of green and of the mosaic; fill row ``r - FILLED`` of red and blue.
+def fill_colors_row(mosaic: Any, green: Any, r: int, grid: Grid, state: Colors, filled: Any) -> None:
+    """Read row ``r`` of green and of the mosaic; fill row ``r - FILLED`` of red and blue.
 
-    ``rings``: mosaic and green ``[length, 4, n]``, and ``[length, 8, n]`` for four planes of red and four of blue.
+    Rings: ``mosaic``, ``green [length, 4, n]``, and ``filled [length, 8, n]``, four planes of red and four of blue.
     """
-    mosaic, green, filled = rings
     rows, length = state.rows, mosaic.shape[0]
     here = mosaic[r % length]
     _products(green[r % green.shape[0]], here, rows)
@@ -238,7 +236,7 @@ def fill_colors_row(rings: tuple[Any, Any, Any], r: int, grid: Grid, state: Colo
     for k in range(4):
         _mean_along(rows[k], grid.others[r % 2], state.moments[r % 9, k])
     _find_lines(r - LINES, grid, state)
-    p = r - GUESS
-    _guess_row(mosaic[p % length], green[p % green.shape[0]], p, grid, state)
+    p = r - ESTIMATE
+    _estimate_row(mosaic[p % length], green[p % green.shape[0]], p, grid, state)
     p = r - FILLED
     _fill_row(mosaic[p % length], p, grid, state, filled[p % filled.shape[0]])

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, THIRD, TWO, ZERO, compiled
+from polsep.compute.rows import add_rows
 from polsep.demosaic import guided as twin
-from polsep.demosaic.cells_kernel import GUARD, Grid, add_rows, mean_cells, reciprocal, sum_three
+from polsep.demosaic.cells_kernel import GUARD, Grid, blur_pixels_down, mean_cells, reciprocal, sum_three
 
 GRADIENTS, DIRECTIONS, DIFFERENCE, SMOOTH, GREEN = 2, 4, 7, 11, 15
 
@@ -33,7 +34,7 @@ class Green(NamedTuple):
 
     ``sums``: of products and s0 over 3 and over 2 cells of a row. ``raw``: differences down the columns, ``along`` and
     ``down``: smoothed ones. ``rough``: squared derivatives of both and squared detail of both, over 3 cells.
-    ``found``: the weighted difference. ``means``: it, its error and its variance, over 5 cells. ``smooth``.
+    ``differences``: the weighted ones. ``means``: it, its error and its variance, over 5 cells. ``smooth``.
     """
 
     sums: NDArray[np.float32]
@@ -41,10 +42,26 @@ class Green(NamedTuple):
     along: NDArray[np.float32]
     down: NDArray[np.float32]
     rough: NDArray[np.float32]
-    found: NDArray[np.float32]
+    differences: NDArray[np.float32]
     means: NDArray[np.float32]
     smooth: NDArray[np.float32]
     rows: NDArray[np.float32]
+
+
+class Samples(NamedTuple):
+    """Six rows of samples along a row or column A A B B of the mosaic, about one pixel of a pair.
+
+    ``own``: the pixel, and the other one of its pair, ``partner``. ``near``: the other colour's nearest sample, next to
+    the pixel; ``near2``: the sample of its own colour behind that. ``far``, ``far2``: the same on the other side, 2 and
+    4 away.
+    """
+
+    own: NDArray[np.float32]
+    partner: NDArray[np.float32]
+    near: NDArray[np.float32]
+    near2: NDArray[np.float32]
+    far: NDArray[np.float32]
+    far2: NDArray[np.float32]
 
 
 def make_green(n: int) -> Green:
@@ -63,9 +80,8 @@ def make_green(n: int) -> Green:
 
 
 @compiled
-def _multiply(rows: tuple[Any, Any, Any, Any, Any], products: Any) -> None:
+def _multiply_derivatives(above2: Any, above: Any, here: Any, below: Any, below2: Any, products: Any) -> None:
     """Products of the derivatives of the other colour and of the cells' own: along the row, then down the columns."""
-    above2, above, here, below, below2 = rows
     left2, left = here[GUARD - 2 :], here[GUARD - 1 :]
     right, right2 = here[GUARD + 1 :], here[GUARD + 2 :]
     up2, up, down, down2 = above2[GUARD:], above[GUARD:], below[GUARD:], below2[GUARD:]
@@ -90,19 +106,10 @@ def _sum_alternate(x: Any, three: Any, two: Any) -> None:
 
 
 @compiled
-def _sum_own(sums: Any, r: int, k: int, out: Any) -> None:
-    """The sum over the 13 cells of a 5x5 window that are of the middle one's kind."""
-    a, b, c = sums[(r - 2) % 5, k], sums[(r - 1) % 5, 5 + k], sums[r % 5, k]
-    d, e = sums[(r + 1) % 5, 5 + k], sums[(r + 2) % 5, k]
-    for j in range(out.size):
-        out[j] = ((a[j] + b[j]) + c[j]) + (d[j] + e[j])
-
-
-@compiled
-def _sum_others(sums: Any, r: int, k: int, out: Any) -> None:
-    """The sum over the 12 other cells."""
-    a, b, c = sums[(r - 2) % 5, 5 + k], sums[(r - 1) % 5, k], sums[r % 5, 5 + k]
-    d, e = sums[(r + 1) % 5, k], sums[(r + 2) % 5, 5 + k]
+def _sum_kind(sums: Any, r: int, own: int, other: int, out: Any) -> None:
+    """The sum over the cells of one kind in a 5x5 window: rows ``own`` of sums in even steps, ``other`` in odd ones."""
+    a, b, c = sums[(r - 2) % 5, own], sums[(r - 1) % 5, other], sums[r % 5, own]
+    d, e = sums[(r + 1) % 5, other], sums[(r + 2) % 5, own]
     for j in range(out.size):
         out[j] = ((a[j] + b[j]) + c[j]) + (d[j] + e[j])
 
@@ -131,19 +138,16 @@ def _find_slopes(rows: Any, slopes: Any) -> None:
 
 
 @compiled
-def _difference(own: tuple[Any, Any], before: tuple[Any, Any], after: tuple[Any, Any], row: Any, out: Any) -> None:
-    """Green minus the other colour of a row or column at one pixel of a pair, and its detail, times a quarter added up.
+def _difference(samples: Samples, other: Any, slope: Any, difference: Any, detail: Any) -> None:
+    """Green minus the other colour of a row or column at one pixel of a pair, and onto ``detail`` a quarter of its own.
 
-    ``own``: the pixel and the other one of its pair. ``before``: the nearest sample of the other colour, which is next
-    to the pixel, and the one of its own colour behind that. ``after``: the same on the far side, 2 and 4 away. ``row``:
-    1 at red and blue, and the slope. ``out``: rows of the difference and the detail.
+    ``other``: 1 at red and blue; ``slope``: at which the other colour follows the pixel's own.
     """
-    x, partner, near, near2, far, far2 = own[0], own[1], before[0], before[1], after[0], after[1]
-    sign, slope, difference, detail = row[0], row[1], out[0], out[1]
+    x, partner, near, near2, far, far2 = samples
     for j in range(x.size):
         second = _FIVE_NINTHS * x[j] - _TWO_NINTHS * (near2[j] + partner[j]) - HALF * _TWO_NINTHS * far2[j]
         value = (_TWO_THIRDS * near[j] + THIRD * far[j]) + slope[j] * second - x[j]
-        difference[j] = (TWO * sign[j] - ONE) * value
+        difference[j] = (TWO * other[j] - ONE) * value
         detail[j] += QUARTER * second
 
 
@@ -154,18 +158,20 @@ def _compare_along(planes: Any, other: Any, slope: Any, out: Any, detail: Any) -
     x0, x1 = planes[0, GUARD:inner], planes[1, GUARD:inner]
     x0_after, x0_after2 = planes[0, GUARD + 1 : inner + 1], planes[0, GUARD + 2 : inner + 2]
     x1_before, x1_before2 = planes[1, GUARD - 1 : inner - 1], planes[1, GUARD - 2 : inner - 2]
-    row, mean = (other[GUARD:inner], slope[GUARD:inner]), detail[GUARD:inner]
-    _difference((x0, x1), (x1_before, x1_before2), (x0_after, x0_after2), row, (out[0, GUARD:inner], mean))
-    _difference((x1, x0), (x0_after, x0_after2), (x1_before, x1_before2), row, (out[1, GUARD:inner], mean))
+    first, second = Samples(x0, x1, x1_before, x1_before2, x0_after, x0_after2), (x1, x0, x0_after, x0_after2)
+    at, a, mean = other[GUARD:inner], slope[GUARD:inner], detail[GUARD:inner]
+    _difference(first, at, a, out[0, GUARD:inner], mean)
+    _difference(Samples(*second, x1_before, x1_before2), at, a, out[1, GUARD:inner], mean)
 
 
 @compiled
-def _compare_down(rows: tuple[Any, Any, Any, Any, Any], other: Any, slope: Any, out: Any, detail: Any) -> None:
-    """The same down a column: rows r - 2 to r + 2 of both planes of that column, 0 and 2, and of ``out``."""
-    above2, above, here, below, below2 = rows
-    before, after, row = (above[2], above2[2]), (below[0], below2[0]), (other, slope)
-    _difference((here[0], here[2]), before, after, row, (out[0], detail))
-    _difference((here[2], here[0]), after, before, row, (out[2], detail))
+def _compare_down(mosaic: Any, r: int, j: int, other: Any, slope: Any, out: Any, detail: Any) -> None:
+    """The same down column ``j`` of the cells of row ``r``; ``mosaic``, ``out``: four planes."""
+    n = mosaic.shape[0]
+    here, below, below2 = mosaic[r % n], mosaic[(r + 1) % n, j], mosaic[(r + 2) % n, j]
+    above, above2 = mosaic[(r - 1) % n, 2 + j], mosaic[(r - 2) % n, 2 + j]
+    _difference(Samples(here[j], here[2 + j], above, above2, below, below2), other, slope, out[j], detail)
+    _difference(Samples(here[2 + j], here[j], below, below2, above, above2), other, slope, out[2 + j], detail)
 
 
 @compiled
@@ -180,16 +186,6 @@ def _smooth_along(raw: Any, out: Any, rough: Any) -> None:
     for j in range(raw.shape[1] - 2 * GUARD):
         first, second = d1[j] - before[j], after[j] - d0[j]
         total[j] += QUARTER * (first * first + second * second)
-
-
-@compiled
-def _smooth_down(above: Any, here: Any, below: Any, out: Any) -> None:
-    """(1/8, 3/4, 1/8) down the columns of pixels, rows ``[4, n]``."""
-    for j in range(2):
-        before, x0, x1, after, d0, d1 = above[2 + j], here[j], here[2 + j], below[j], out[j], out[2 + j]
-        for x in range(x0.size):
-            d0[x] = _THREE_QUARTERS * x0[x] + _EIGHTH * (before[x] + x1[x])
-            d1[x] = _THREE_QUARTERS * x1[x] + _EIGHTH * (x0[x] + after[x])
 
 
 @compiled
@@ -227,9 +223,9 @@ def _combine(along: Any, down: Any, rows: Any, out: Any) -> None:
     """The weighted difference, planes ``[4, n]``."""
     a, b = rows[0], rows[1]
     for k in range(4):
-        x, y, found = along[k], down[k], out[k]
+        x, y, both = along[k], down[k], out[k]
         for j in range(a.size):
-            found[j] = a[j] * x[j] + b[j] * y[j]
+            both[j] = a[j] * x[j] + b[j] * y[j]
 
 
 @compiled
@@ -256,9 +252,9 @@ def _mean_of_window(means: Any, r: int, k: int, out: Any) -> None:
 
 
 @compiled
-def _variance(found: Any, smooth: Any, out: Any) -> None:
+def _variance(x: Any, smooth: Any, out: Any) -> None:
     """Mean squared deviation of a cell's differences ``[4, n]`` from the smooth one."""
-    a, b, c, d = found[0], found[1], found[2], found[3]
+    a, b, c, d = x[0], x[1], x[2], x[3]
     for j in range(out.size):
         e, f, g, h = a[j] - smooth[j], b[j] - smooth[j], c[j] - smooth[j], d[j] - smooth[j]
         out[j] = QUARTER * ((e * e + f * f) + (g * g + h * h))
@@ -273,21 +269,19 @@ def _kept_share(variance: Any, error: Any) -> None:
 
 
 @compiled
-def _beside(cells: tuple[Any, Any, Any], out: Any) -> None:
+def _least_green(above: Any, here: Any, below: Any, out: Any) -> None:
     """`MIN_SHARE` of the mean of the four cells next to each."""
-    up, down = cells[0][GUARD:], cells[2][GUARD:]
-    left, right, least = cells[1][GUARD - 1 :], cells[1][GUARD + 1 :], out[GUARD:]
+    up, down = above[GUARD:], below[GUARD:]
+    left, right, least = here[GUARD - 1 :], here[GUARD + 1 :], out[GUARD:]
     for j in range(out.size - 2 * GUARD):
         least[j] = QUARTER * _MIN_SHARE * ((up[j] + down[j]) + (left[j] + right[j]))
 
 
 @compiled
-def _add_difference(mosaic: Any, difference: tuple[Any, Any, Any], row: tuple[Any, Any], green: Any) -> None:
-    """One plane of green. ``difference``: found, smooth, and the share of detail that is kept."""
-    found, smooth, kept = difference
-    other, least = row
+def _add_difference(mosaic: Any, difference: Any, smooth: Any, kept: Any, other: Any, least: Any, green: Any) -> None:
+    """One plane of green; ``kept``: the share of the detail that the ``difference`` has beyond the ``smooth`` one."""
     for j in range(green.size):
-        value = mosaic[j] + (smooth[j] + kept[j] * (found[j] - smooth[j]))
+        value = mosaic[j] + (smooth[j] + kept[j] * (difference[j] - smooth[j]))
         value = value if value > least[j] else least[j]
         green[j] = other[j] * value + (ONE - other[j]) * mosaic[j]
 
@@ -295,41 +289,37 @@ def _add_difference(mosaic: Any, difference: tuple[Any, Any, Any], row: tuple[An
 @compiled
 def _compare(mosaic: Any, r: int, other: Any, state: Green) -> None:
     """Differences of row ``r`` along both directions, and their detail."""
-    rows, length = state.rows, mosaic.shape[0]
+    rows = state.rows
     for k in range(5):
-        _sum_own(state.sums, r, k, rows[k])
-    _sum_others(state.sums, r, 4, rows[5])
+        _sum_kind(state.sums, r, k, 5 + k, rows[k])  # 13 cells of the middle one's kind
+    _sum_kind(state.sums, r, 9, 4, rows[5])  # the 12 others
     _find_slopes(rows, rows[6:8])
     rough = state.rough[r % 5]
     for j in range(rough.shape[1]):
         rows[0, j], rows[1, j], rows[2, j] = ZERO, ZERO, ZERO
-    here, along, raw = mosaic[r % length], state.along[r % 4], state.raw[r % 3]
+    here, along, raw = mosaic[r % mosaic.shape[0]], state.along[r % 4], state.raw[r % 3]
     for i in range(2):
         _compare_along(here[2 * i : 2 * i + 2], other, rows[6], rows[8:10], rows[1])
         _smooth_along(rows[8:10], along[2 * i : 2 * i + 2], rows[0])
     sum_three(rows[0], rough[0])
     _square(rows[1])
     sum_three(rows[1], rough[2])
-    above2, above = mosaic[(r - 2) % length], mosaic[(r - 1) % length]
-    below, below2 = mosaic[(r + 1) % length], mosaic[(r + 2) % length]
     for j in range(2):
-        column = (above2[j:], above[j:], here[j:], below[j:], below2[j:])
-        _compare_down(column, other, rows[7], raw[j:], rows[2])
+        _compare_down(mosaic, r, j, other, rows[7], raw, rows[2])
     _square(rows[2])
     sum_three(rows[2], rough[3])
 
 
 @compiled
-def fill_green_row(rings: tuple[Any, Any, Any], r: int, grid: Grid, state: Green) -> None:
-    """Take row ``r`` of a mosaic and of its cells' means; fill row ``r - GREEN`` of green.
+def fill_green_row(mosaic: Any, cells: Any, r: int, grid: Grid, state: Green, green: Any) -> None:
+    """Read row ``r`` of a mosaic and of its cells' means; fill row ``r - GREEN`` of green.
 
-    ``rings``: mosaic ``[length, 4, n]``, means ``[length, n]``, green ``[length, 4, n]``.
+    Rings: ``mosaic``, ``green [length, 4, n]``, ``cells [length, n]``.
     """
-    mosaic, cells, green = rings
     rows, length = state.rows, cells.shape[0]
     p = r - GRADIENTS
     above2, above, middle = cells[(p - 2) % length], cells[(p - 1) % length], cells[p % length]
-    _multiply((above2, above, middle, cells[(p + 1) % length], cells[(p + 2) % length]), rows)
+    _multiply_derivatives(above2, above, middle, cells[(p + 1) % length], cells[(p + 2) % length], rows)
     sums = state.sums[p % 5]
     for k in range(4):
         _sum_alternate(rows[k], sums[k], sums[5 + k])
@@ -337,30 +327,31 @@ def fill_green_row(rings: tuple[Any, Any, Any], r: int, grid: Grid, state: Green
 
     p = r - DIRECTIONS
     _compare(mosaic, p, grid.others[p % 2], state)
-    _smooth_down(state.raw[(p - 2) % 3], state.raw[(p - 1) % 3], state.raw[p % 3], state.down[(p - 1) % 3])
+    above, middle, below = state.raw[(p - 2) % 3], state.raw[(p - 1) % 3], state.raw[p % 3]
+    blur_pixels_down(above, middle, below, _EIGHTH, state.down[(p - 1) % 3])
     _roughness_down(state.down[p % 3], state.down[(p - 2) % 3], state.down[(p - 1) % 3], rows[0])
     sum_three(rows[0], state.rough[(p - 2) % 5, 1])
 
     p = r - DIFFERENCE
     _weigh(state.rough, p, rows)
-    found, means = state.found[p % 9], state.means[p % 13]
-    _combine(state.along[p % 4], state.down[p % 3], rows, found)
+    differences, means = state.differences[p % 9], state.means[p % 13]
+    _combine(state.along[p % 4], state.down[p % 3], rows, differences)
     _sum_five(rows[2], means[1])
-    mean_cells(found, rows[3])
+    mean_cells(differences, rows[3])
     _sum_five(rows[3], means[0])
 
     p = r - SMOOTH
     smooth = state.smooth[p % 5, 0]
     _mean_of_window(state.means, p, 0, smooth)
-    _variance(state.found[p % 9], smooth, rows[0])
+    _variance(state.differences[p % 9], smooth, rows[0])
     _sum_five(rows[0], state.means[p % 13, 2])
 
     p = r - GREEN
     _mean_of_window(state.means, p, 2, rows[0])
     _mean_of_window(state.means, p, 1, rows[1])
     _kept_share(rows[0], rows[1])
-    _beside((cells[(p - 1) % length], cells[p % length], cells[(p + 1) % length]), rows[2])
+    _least_green(cells[(p - 1) % length], cells[p % length], cells[(p + 1) % length], rows[2])
     here, out = mosaic[p % mosaic.shape[0]], green[p % green.shape[0]]
+    smooth, other = state.smooth[p % 5, 0], grid.others[p % 2]
     for k in range(4):
-        difference = (state.found[p % 9, k], state.smooth[p % 5, 0], rows[0])
-        _add_difference(here[k], difference, (grid.others[p % 2], rows[2]), out[k])
+        _add_difference(here[k], state.differences[p % 9, k], smooth, rows[0], other, rows[2], out[k])

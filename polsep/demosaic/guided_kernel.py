@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, THIRD, TWO, ZERO, compiled, entry
+from polsep.compute.rows import add_product, add_rows, copy, fill, subtract
 from polsep.compute.threads import Piece
 from polsep.demosaic import guided as twin
 from polsep.demosaic.cells_kernel import (
@@ -21,7 +22,6 @@ from polsep.demosaic.cells_kernel import (
     GUARD,
     Grid,
     Source,
-    add_rows,
     blur_gently,
     blur_gently_down,
     blur_pixels_along,
@@ -32,7 +32,6 @@ from polsep.demosaic.cells_kernel import (
     mean_cells,
     polarize_row,
     reciprocal,
-    subtract,
 )
 from polsep.demosaic.colors_kernel import FILLED, Colors, fill_colors_row, make_colors
 from polsep.demosaic.green_kernel import GREEN, Green, fill_green_row, make_green
@@ -60,8 +59,8 @@ class Stream(NamedTuple):
     ``raw``: samples. ``sums``: s1 and s2 of three colours, over the cells of a row's window; ``smooth``: over all.
     ``mosaic``: s0 of each pixel's colour. ``means [length, n]``: its cells'. ``green``, ``filled``: s0. ``total``: cell
     means of red, green, blue, and the details of all three where asked for. ``tent``, ``detail``: of the guide.
-    ``residual``: samples minus half the guide. ``found``: s1 and s2, means over colours or of each. ``sensor_row``:
-    room for one. ``rows``: for others. ``first``: row of the frame that the stream begins with, an even one. ``pushed
+    ``residual``: samples minus half the guide. ``polarized``: s1 and s2, means over colours or of each.
+    ``sensor_row``, ``rows``: buffers. ``first``: row of the frame that the stream begins with, an even one. ``pushed
     [1]``: rows so far.
     """
 
@@ -76,7 +75,7 @@ class Stream(NamedTuple):
     tent: NDArray[np.float32]
     detail: NDArray[np.float32]
     residual: NDArray[np.float32]
-    found: NDArray[np.float32]
+    polarized: NDArray[np.float32]
     sensor_row: NDArray[np.float32]
     rows: NDArray[np.float32]
     for_green: Green
@@ -135,19 +134,21 @@ def _mean_nine(ring: Any, r: int, k: int, out: Any) -> None:
 
 
 @compiled
-def _enlarge_own(rows: tuple[Any, Any], color: int, out: Any) -> None:
-    """One colour's cells, of this row and of the next one above or below, to a row of pixels' height."""
-    here, beside = rows[0][color], rows[1][color]
+def _enlarge_own(here: Any, beside: Any, out: Any) -> None:
+    """Cells of this row and of the next one above or below to a row of pixels' height."""
     for j in range(out.size):
         out[j] = _THREE_QUARTERS * here[j] + QUARTER * beside[j]
 
 
 @compiled
-def _take_out(passed: tuple[Any, Any], other: Any, weight: Any, place: int, mosaic: Any) -> None:
-    """Subtract ``weight`` times one of two rows of cells, interpolated along the row, from one plane of the mosaic."""
+def _subtract_polarization(color: Any, green: Any, other: Any, weight: Any, place: int, mosaic: Any) -> None:
+    """Subtract ``weight`` times one of two rows of cells, interpolated along the row, from one plane of the mosaic.
+
+    ``color`` where ``other`` is 1, at red and blue, else ``green``.
+    """
     step = 1 if place % 2 else -1
-    yes, yes_beside = passed[0][GUARD:], passed[0][GUARD + step :]
-    no, no_beside = passed[1][GUARD:], passed[1][GUARD + step :]
+    yes, yes_beside = color[GUARD:], color[GUARD + step :]
+    no, no_beside = green[GUARD:], green[GUARD + step :]
     here, plane = other[GUARD:], mosaic[GUARD:]
     for j in range(mosaic.size - 2 * GUARD):
         at_other = _THREE_QUARTERS * yes[j] + QUARTER * yes_beside[j]
@@ -156,25 +157,20 @@ def _take_out(passed: tuple[Any, Any], other: Any, weight: Any, place: int, mosa
 
 
 @compiled
-def _double(x: Any, out: Any) -> None:
-    for j in range(out.size):
-        out[j] = TWO * x[j]
-
-
-@compiled
 def _intensity_row(stream: Stream, r: int, grid: Grid) -> None:
     """Row ``r`` of the mosaic of s0. Twin: `guided._intensity_mosaic`."""
     rows, raw, mosaic = stream.rows, stream.raw[r % stream.raw.shape[0]], stream.mosaic[r % stream.mosaic.shape[0]]
     other = grid.others[r % 2]
     for k in range(4):
-        _double(raw[k], mosaic[k])
-        beside = stream.smooth[(r + (1 if k // 2 else -1)) % 3]
-        both = (stream.smooth[r % 3], beside)
+        fill(ZERO, mosaic[k])
+        add_product(raw[k], TWO, mosaic[k])
+        cells, beside = stream.smooth[r % 3], stream.smooth[(r + (1 if k // 2 else -1)) % 3]
         for s, weight in enumerate((grid.cosines[k], grid.sines[k])):
             if weight != ZERO:
-                _enlarge_own(both, 3 * s + grid.colors[r % 2], rows[0])
-                _enlarge_own(both, 3 * s + 1, rows[1])
-                _take_out((rows[0], rows[1]), other, weight, k, mosaic[k])
+                color, green = 3 * s + grid.colors[r % 2], 3 * s + 1
+                _enlarge_own(cells[color], beside[color], rows[0])
+                _enlarge_own(cells[green], beside[green], rows[1])
+                _subtract_polarization(rows[0], rows[1], other, weight, k, mosaic[k])
     mean_cells(mosaic, stream.means[r % stream.means.shape[0]])
 
 
@@ -184,9 +180,9 @@ def _tent_row(stream: Stream, r: int, grid: Grid) -> None:
     rows, tent, detail = stream.rows, stream.tent[r % 2], stream.detail[r % 3]
     length, first = stream.green.shape[0], 4 * (grid.colors[r % 2] // 2)
     above, here, below = stream.green[(r - 1) % length], stream.green[r % length], stream.green[(r + 1) % length]
-    blur_pixels_down(above, here, below, rows[0:4])
+    blur_pixels_down(above, here, below, QUARTER, rows[0:4])
     above, here, below = stream.filled[(r - 1) % 3], stream.filled[r % 3], stream.filled[(r + 1) % 3]
-    blur_pixels_down(above[first:], here[first:], below[first:], rows[4:8])
+    blur_pixels_down(above[first:], here[first:], below[first:], QUARTER, rows[4:8])
     blur_pixels_along(rows[0:4], rows[8:12])
     blur_pixels_along(rows[4:8], rows[12:16])
     mosaic = stream.mosaic[r % stream.mosaic.shape[0]]
@@ -200,7 +196,7 @@ def _residual_row(stream: Stream, r: int) -> None:
     """Row ``r`` of the samples minus half their guide. Twin: `guided._residual_mosaic`."""
     rows, tent, residual = stream.rows, stream.tent[r % 2], stream.residual[r % 5]
     above, here, below = stream.detail[(r - 1) % 3], stream.detail[r % 3], stream.detail[(r + 1) % 3]
-    blur_pixels_down(above, here, below, rows[0:4])
+    blur_pixels_down(above, here, below, QUARTER, rows[0:4])
     blur_pixels_along(rows[0:4], rows[4:8])
     raw = stream.raw[r % stream.raw.shape[0]]
     for k in range(4):
@@ -215,25 +211,18 @@ def _repolarize_row(stream: Stream, r: int, grid: Grid) -> None:
     rows = stream.rows
     sums = rows[0:6].reshape(2, 3, grid.n)
     polarize_row(stream.residual, r, grid, rows[6:9], sums)
-    if stream.found.shape[1] == 6:
+    if stream.polarized.shape[1] == 6:
         for k in range(6):
-            blur_gently(rows[k], stream.found[r % 3, k])
+            blur_gently(rows[k], stream.polarized[r % 3, k])
         return
     for s in range(2):
         add_rows(sums[s, 0], sums[s, 1], sums[s, 2], THIRD, rows[9])
-        blur_gently(rows[9], stream.found[r % 3, s])
-
-
-@compiled
-def _copy_inside(x: Any, out: Any) -> None:
-    inside = x[EDGE:]
-    for j in range(out.size):
-        out[j] = inside[j]
+        blur_gently(rows[9], stream.polarized[r % 3, s])
 
 
 @compiled
 def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
-    """Put a row in as the stream's ``u``-th, mirrored into the frame, and take the row `REACH` above it out."""
+    """Read a row as the stream's ``u``-th, mirrored into the frame, and write the row `REACH` above it."""
     rows, grid, last = stream.rows, source.grid, source.pattern.h - 1
     mirrored = last - abs((stream.first + u) % (2 * last) - last)
     load_cells(source, mirrored, stream.sensor_row, stream.raw[u % stream.raw.shape[0]])
@@ -248,10 +237,10 @@ def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
 
     r = u - _INTENSITY
     _intensity_row(stream, r, grid)
-    fill_green_row((stream.mosaic, stream.means, stream.green), r, grid, stream.for_green)
+    fill_green_row(stream.mosaic, stream.means, r, grid, stream.for_green, stream.green)
 
     r = u - _GREEN
-    fill_colors_row((stream.mosaic, stream.green, stream.filled), r, grid, stream.for_colors)
+    fill_colors_row(stream.mosaic, stream.green, r, grid, stream.for_colors, stream.filled)
 
     r = u - _FILLED
     total = stream.total[r % stream.total.shape[0]]
@@ -270,13 +259,13 @@ def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
     r = u - REACH
     total = stream.total[r % stream.total.shape[0]]
     for c in range(3):
-        _copy_inside(total[c], out[c])
-    above, here, below = stream.found[(r - 1) % 3], stream.found[r % 3], stream.found[(r + 1) % 3]
+        copy(total[c][EDGE:], out[c])
+    above, here, below = stream.polarized[(r - 1) % 3], stream.polarized[r % 3], stream.polarized[(r + 1) % 3]
     for s in range(above.shape[0]):
         blur_gently_down(above[s], here[s], below[s], rows[0])
-        _copy_inside(rows[0], out[3 + s])
+        copy(rows[0][EDGE:], out[3 + s])
     for k in range(3, total.shape[0]):
-        _copy_inside(total[k], out[above.shape[0] + k])
+        copy(total[k][EDGE:], out[above.shape[0] + k])
 
 
 @entry

@@ -19,8 +19,9 @@ from polsep.compute.threads import Piece
 from polsep.networks.buffers import ClosedFormRows, LayerInput
 from polsep.networks.channels import DETAIL_MAPS, PERIOD
 from polsep.networks.details import MIN_DETAIL
-from polsep.networks.images_kernel import LayerOutputs, Targets, add_polarization, mark_clipped, spread
-from polsep.separation.polarization_kernel import polarize
+from polsep.networks.images_kernel import LayerOutputs, Targets, mark_clipped, spread
+from polsep.physics.stokes_kernel import polarize
+from polsep.separation.tally_kernel import add_polarization, count_above_one
 
 Floats = NDArray[np.float32]
 
@@ -269,10 +270,8 @@ def _write_polarization(closed: ClosedFormRows, y: int, s0: Any, tau: Any, targe
         sums = targets.sums[2 * y + row]
         sums[0] += add_up(s0[row])
         sums[1] += add_up(tau[row])
-        for j in range(dolp.size):
-            dolp[j] = ONE if dolp[j] > ONE else ZERO
-        sums[2] += add_up(dolp)
-        add_polarization((tau[row], s1, s2), aolp, sums[3:6])
+        sums[2] += count_above_one(dolp, aolp)
+        add_polarization(tau[row], s1, s2, aolp, sums[3:6])
 
 
 @compiled

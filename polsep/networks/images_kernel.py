@@ -20,9 +20,10 @@ from polsep.networks.buffers import ClosedFormRows, LayerInput, Maps, Taps
 from polsep.networks.channels import PERIOD, input_channels
 from polsep.networks.maps_kernel import map_guided_rows, map_rows
 from polsep.physics.stokes import stokes_inverse
+from polsep.physics.stokes_kernel import polarize
 from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import as_samples
-from polsep.separation.polarization_kernel import polarize
+from polsep.separation.tally_kernel import add_polarization, count_above_one
 
 Floats = NDArray[np.float32]
 
@@ -128,25 +129,8 @@ def _write_cells(outputs: LayerOutputs, t: int, cell: int, gains: Any, targets: 
         sums[6 + kind] += add_up(image)
     sums[0] += add_up(s0)
     sums[1] += add_up(tau)
-    for j in range(dolp.size):
-        moved[j] = ONE if dolp[j] > ONE else ZERO
-    sums[2] += add_up(moved)
-    add_polarization((tau, s1, s2), image, sums[3:6])
-
-
-@compiled
-def add_polarization(rows: tuple[Any, Any, Any], room: Any, sums: Any) -> None:
-    """Add power, and power along and across, of the polarization ``rows[1:]`` where there is specular light."""
-    tau, p1, p2 = rows
-    for j in range(room.size):
-        room[j] = tau[j] * np.sqrt(p1[j] * p1[j] + p2[j] * p2[j])
-    sums[0] += add_up(room)
-    for j in range(room.size):
-        room[j] = tau[j] * p1[j]
-    sums[1] += add_up(room)
-    for j in range(room.size):
-        room[j] = tau[j] * p2[j]
-    sums[2] += add_up(room)
+    sums[2] += count_above_one(dolp, moved)
+    add_polarization(tau, s1, s2, image, sums[3:6])
 
 
 @compiled

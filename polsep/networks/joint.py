@@ -34,7 +34,7 @@ from polsep.networks.details import Details
 from polsep.networks.unet import ResidualSize, ResidualUNet
 from polsep.physics.stokes import fit_stokes
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.separation.color_affine import MAX_DIFFUSE_DOLP, fit_unclipped
+from polsep.separation.closed_form import fit_unclipped, limit_dolp, white_specular
 
 #: Local brightness that counts as black: below it inputs and corrections fade.
 MIN_BRIGHTNESS = 0.01
@@ -204,7 +204,7 @@ class Joint(nn.Module):
         clipped_offset, clipped_s0 = self.unclip(planes, masks, polarizations[-1])
         b1, b2 = b1 + clipped_offset[:, :1], b2 + clipped_offset[:, 1:]
         s0 = tuple(x + clipped_s0[:, c : c + 1] for c, x in enumerate(s0))
-        specular = white_specular((b1, b2), (a1, a2)).clamp(min=0)
+        specular = white_specular((b1, b2), (a1, a2), 1e-12).clamp(min=0)
         specular = torch.minimum(specular, reduce(torch.minimum, s0).clamp(min=0))
         diffuse = torch.cat([color - specular for color in s0], dim=1)
         # p - a d = b + a s is the specular polarization.
@@ -243,10 +243,10 @@ class Joint(nn.Module):
         """Light that clipping hid: of the offset b ``[N, 2, h, w]``, and of every colour's s0 ``[N, C, h, w]``.
 
         In a packed pixel of four cells the samples that did not clip determine b and the cells' s0 for a given
-        diffuse polarization
-        (`color_affine.fit_unclipped`). What that differs from a fit to all samples as they are is missing from images
-        that took them so. Zero where nothing clips, or where too few samples are left; and for one colour, whose cells
-        clip behind the same analysers: it gained nothing there (docs/experiments.md).
+        diffuse polarization (`closed_form.fit_unclipped`). What that differs from a fit to all samples as they
+        are is missing from images that took them so. Zero where nothing clips, or where too few samples are
+        left; and for one colour, whose cells clip behind the same analysers: it gained nothing there
+        (docs/experiments.md).
         """
         if self.colors == 1:
             return torch.zeros_like(diffuse_polarization), torch.zeros_like(diffuse_polarization[:, :1])
@@ -299,8 +299,7 @@ def fit_diffuse_polarization(moments: Tensor, brightness: Tensor) -> tuple[list[
     for window, least in zip(WINDOWS, MIN_CONTRAST, strict=True):
         pooled = avg_pool2d(sums, window, 1, window // 2, count_include_pad=False)
         polarization = (pooled[:, :2] + least * polarization) / (pooled[:, 2:] + least)
-        size = torch.sqrt(polarization[:, :1] ** 2 + polarization[:, 1:] ** 2 + 1e-12)
-        polarization = polarization * (MAX_DIFFUSE_DOLP / size.clamp(min=MAX_DIFFUSE_DOLP))
+        polarization = limit_dolp(polarization)
         all_windows.append(polarization)
     return all_windows, torch.sqrt(pooled[:, 2:] + 1e-12)
 
@@ -356,14 +355,6 @@ def _from_names_in_files(module: nn.Module, state: dict[str, Any], prefix: str, 
     for ours, theirs in NAMES_IN_FILES.items():
         for name in [name for name in state if name.startswith(f"{prefix}{theirs}.")]:
             state[f"{prefix}{ours}.{name.removeprefix(f'{prefix}{theirs}.')}"] = state.pop(name)
-
-
-def white_specular(offset: tuple[Tensor, Tensor], diffuse_polarization: tuple[Tensor, Tensor]) -> Tensor:
-    """The positive root of (|a|^2 - 1) tau^2 + 2 Re(b a*) tau + |b|^2 = 0, diffuse polarization a, offset b."""
-    a1, a2 = diffuse_polarization
-    real = offset[0] * a1 + offset[1] * a2
-    free = 1 - a1**2 - a2**2
-    return (real + torch.sqrt(real**2 + free * (offset[0] ** 2 + offset[1] ** 2) + 1e-12)) / free
 
 
 def bilinear_filter(layout: Layout) -> Tensor:

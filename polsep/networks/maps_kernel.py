@@ -33,10 +33,11 @@ from polsep.demosaic.cells_kernel import Source
 from polsep.demosaic.guided_kernel import Stream, demosaic_rows, open_stream
 from polsep.networks.buffers import ClosedFormRows, Maps, Taps
 from polsep.networks.channels import PERIOD
-from polsep.networks.closed_form_kernel import SUMMED, find_slope, limit, misfit, offset, pool, white_specular
+from polsep.networks.closed_form_kernel import SUMMED, fit_residual, pool, steady_diffuse_polarization
 from polsep.networks.joint import MIN_BRIGHTNESS, MIN_CONTRAST, WINDOWS
 from polsep.networks.unclip_kernel import leave_clipped_out, unclip
 from polsep.sensor.unpack_kernel import Samples, read_row
+from polsep.separation.closed_form_kernel import limit_specular_row, offset_row, white_specular_row
 
 Floats = NDArray[np.float32]
 
@@ -249,11 +250,11 @@ def _fit_polarization(t: int, h: int, sums: Any, spare: Any) -> None:
     fill(ZERO, wide[0])
     fill(ZERO, wide[1])
     pool(t, h, _WIDE, sums, pooled)
-    find_slope(pooled, _CONTRAST_WIDE, wide[0], wide[1])
+    steady_diffuse_polarization(pooled, _CONTRAST_WIDE, wide[0], wide[1])
     copy(wide[0], narrow[0])
     copy(wide[1], narrow[1])
     pool(t, h, _NARROW, sums, pooled)
-    find_slope(pooled, _CONTRAST_NARROW, narrow[0], narrow[1])
+    steady_diffuse_polarization(pooled, _CONTRAST_NARROW, narrow[0], narrow[1])
 
 
 @compiled
@@ -268,16 +269,16 @@ def _split(t: int, slot: int, rings: _Rings, closed: ClosedFormRows, spare: Any)
         fill(ZERO, mean)
         for c in range(colors):
             add_product(rings.s0[slot, 4 * c + cell], share, mean)
-        offset(cosine, a1, mean, b1)
-        offset(sine, a2, mean, b2)
+        offset_row(cosine, a1, mean, b1)
+        offset_row(sine, a2, mean, b2)
         if clips:
             add_product(lacking[0], ONE, b1)
             add_product(lacking[1], ONE, b2)
             for c in range(colors):
                 add_product(lacking[2 + c], ONE, rings.s0[slot, 4 * c + cell])
-        white_specular(b1, b2, a1, a2, tau)
+        white_specular_row(b1, b2, a1, a2, _TINY, tau)
         for c in range(colors):
-            limit(rings.s0[slot, 4 * c + cell], tau)
+            limit_specular_row(rings.s0[slot, 4 * c + cell], tau)
         for c in range(colors):
             subtract(rings.s0[slot, 4 * c + cell], tau, closed.diffuse[t, 4 * c + cell])
         copy(cosine, closed.s1[t, cell])
@@ -324,7 +325,7 @@ def _finish_row(t: int, rings: _Rings, maps: Maps, spare: Any) -> None:
     _fit_polarization(t, closed.clipped.shape[0], rings.sums, spare)
     _split(t, slot, rings, closed, spare)
     copy(light, closed.brightness[t])
-    misfit(rings.moments[slot], (spare[6], spare[7]), closed.fit_residual[t])
+    fit_residual(rings.moments[slot], spare[6], spare[7], closed.fit_residual[t])
     _emit_samples(t, slot, rings, maps, spare)
     for cell in range(4):
         if channels.cosine >= 0:

@@ -15,14 +15,15 @@ from polsep.compute.compiling import HALF, ONE, QUARTER, THIRD, TWO, ZERO, compi
 from polsep.compute.rows import fill
 from polsep.networks.channels import PERIOD
 from polsep.sensor.camera import Layout
-from polsep.separation.color_affine import MIN_EIGENVALUE
+from polsep.separation.closed_form import MIN_EIGENVALUE
+from polsep.separation.closed_form_kernel import fit_unclipped
 
 #: Places of a cell's four samples, and the colour of every cell of a colour frame.
 _PLACES = np.array([[PERIOD * row + col for row in (r, r + 1) for col in (c, c + 1)] for r in (0, 2) for c in (0, 2)])
 _COLORS = np.array([Layout().filter_at(r, c)[1] for r in (0, 2) for c in (0, 2)])
 _TURNS = [2 * math.radians(angle) for row in Layout().polarizer for angle in row]
 _COSINES, _SINES = np.cos(_TURNS).astype(np.float32), np.sin(_TURNS).astype(np.float32)
-_MIN_EIGENVALUE, _SINGULAR = np.float32(MIN_EIGENVALUE), np.float32(1e-6)
+_MIN_EIGENVALUE = np.float32(MIN_EIGENVALUE)
 
 
 @compiled
@@ -78,44 +79,6 @@ def _add_moments(whole: Any, stokes: tuple[Any, Any, Any], moments: Any) -> None
 
 
 @compiled
-def _fit(samples: Any, bits: Any, slope: tuple[Any, Any], found: Any) -> Any:
-    """Offset and s0 of four cells to ``found [6]``, by the samples ``[16]`` that ``bits`` leave, for a given slope.
-
-    The least eigenvalue of the equations comes back. Twin: `color_affine.fit_unclipped`.
-    """
-    a1, a2 = slope
-    m00, m01, m11, r0, r1 = ZERO, ZERO, ZERO, ZERO, ZERO
-    sums = np.zeros((4, 4), np.float32)
-    for cell in range(4):
-        gg, gy, gu, gv = ZERO, ZERO, ZERO, ZERO
-        for k in range(4):
-            if not _clips(bits, cell, k):
-                g, y = ONE + _COSINES[k] * a1 + _SINES[k] * a2, TWO * samples[_PLACES[cell, k]]
-                gg += g * g
-                gy += g * y
-                gu += g * _COSINES[k]
-                gv += g * _SINES[k]
-        gg = gg if gg > _SINGULAR else _SINGULAR
-        for k in range(4):
-            if not _clips(bits, cell, k):
-                g, y = ONE + _COSINES[k] * a1 + _SINES[k] * a2, TWO * samples[_PLACES[cell, k]]
-                p, q = _COSINES[k] - g * gu / gg, _SINES[k] - g * gv / gg
-                m00 += p * p
-                m01 += p * q
-                m11 += q * q
-                r0 += p * y
-                r1 += q * y
-        sums[cell, 0], sums[cell, 1], sums[cell, 2], sums[cell, 3] = gg, gy, gu, gv
-    det = m00 * m11 - m01 * m01
-    det = det if det > _SINGULAR else _SINGULAR
-    b1, b2 = (m11 * r0 - m01 * r1) / det, (m00 * r1 - m01 * r0) / det
-    found[0], found[1] = b1, b2
-    for cell in range(4):
-        found[2 + cell] = (sums[cell, 1] - sums[cell, 2] * b1 - sums[cell, 3] * b2) / sums[cell, 0]
-    return HALF * (m00 + m11) - np.sqrt(QUARTER * (m00 - m11) * (m00 - m11) + m01 * m01)
-
-
-@compiled
 def unclip(planes: Any, bits: Any, slopes: Any, lacking: Any) -> bool:
     """What clipping hid of a row of packed pixels, ``lacking [5, w]``: of the offset, and of three colours' s0.
 
@@ -127,25 +90,26 @@ def unclip(planes: Any, bits: Any, slopes: Any, lacking: Any) -> bool:
     if some:
         for k in range(lacking.shape[0]):
             fill(ZERO, lacking[k])
-        room = np.empty((2, 6), np.float32)
+        y, kept, s0 = np.empty((4, 4), np.float32), np.empty((4, 4), np.bool_), np.empty((2, 4), np.float32)
         for j in range(bits.size):
             if bits[j] != 0:
-                _unclip_one(planes[:, j], bits[j], (slopes[0, j], slopes[1, j]), (room, lacking[:, j]))
+                for cell in range(4):
+                    for k in range(4):
+                        y[cell, k], kept[cell, k] = TWO * planes[_PLACES[cell, k], j], not _clips(bits[j], cell, k)
+                _unclip_one(y, kept, slopes[0, j], slopes[1, j], s0, lacking[:, j])
     return some
 
 
 @compiled
-def _unclip_one(samples: Any, bits: Any, slope: tuple[Any, Any], results: tuple[Any, Any]) -> None:
-    """What one packed pixel is ``lacking [5]``; nothing where too few samples are left."""
-    room, lacking = results
-    left, seen = room[0], room[1]
-    if _fit(samples, bits, slope, left) <= _MIN_EIGENVALUE:
+def _unclip_one(y: Any, kept: Any, a1: Any, a2: Any, s0: Any, lacking: Any) -> None:
+    """What one packed pixel is ``lacking [5]``; nothing where too few samples are ``kept [4, 4]``."""
+    left, as_is = s0[0], s0[1]
+    b1, b2, eigenvalue = fit_unclipped(y, kept, _COSINES, _SINES, a1, a2, left)
+    if eigenvalue <= _MIN_EIGENVALUE:
         return
-    _fit(samples, np.uint16(0), slope, seen)
-    lacking[0], lacking[1] = left[0] - seen[0], left[1] - seen[1]
+    c1, c2, _ = fit_unclipped(y, np.ones((4, 4), np.bool_), _COSINES, _SINES, a1, a2, as_is)
+    lacking[0], lacking[1] = b1 - c1, b2 - c2
     for cell in range(4):
-        some_left, c = False, _COLORS[cell]
-        for k in range(4):
-            some_left |= not _clips(bits, cell, k)
-        if some_left and left[2 + cell] > seen[2 + cell]:
-            lacking[2 + c] += (left[2 + cell] - seen[2 + cell]) * (HALF if c == 1 else ONE)
+        c = _COLORS[cell]
+        if kept[cell].any() and left[cell] > as_is[cell]:
+            lacking[2 + c] += (left[cell] - as_is[cell]) * (HALF if c == 1 else ONE)

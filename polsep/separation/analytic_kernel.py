@@ -7,7 +7,6 @@ independently of each other, so the number of threads (`set_threads`) does not c
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -15,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.compiling import ONE, THIRD, ZERO, compiled, entry
+from polsep.compute.compiling import THIRD, ZERO, compiled, entry
+from polsep.compute.rows import add_rows, copy
 from polsep.compute.threads import Piece, share
 from polsep.demosaic.bilinear_kernel import (
     Pattern,
@@ -28,18 +28,15 @@ from polsep.demosaic.bilinear_kernel import (
     read_pattern,
 )
 from polsep.physics.stokes import stokes_inverse
+from polsep.physics.stokes_kernel import fit_stokes_row, polarize
 from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import RawFrame, Samples, as_samples
-from polsep.separation.images import FrameImages, Tally
-from polsep.separation.images_kernel import check_images, interleave_colors
-from polsep.separation.polarization_kernel import polarize
+from polsep.separation.images import FrameImages
+from polsep.separation.images_kernel import check_images, interleave
+from polsep.separation.tally_kernel import RESIDUAL, make_tally, tally_row
 
 #: Least cell rows that a thread computes at a time: few enough to share the work, many enough to reuse loaded rows.
 STRIP = 32
-
-
-#: The images of a frame, as streams of this method name them.
-AnalyticImages = FrameImages
 
 
 @dataclass(frozen=True)
@@ -54,13 +51,13 @@ class AnalyticOptions:
     light_color: tuple[float, ...] = (1.0, 1.0, 1.0)
     in_light: bool = False
     report: bool = False
-    out: AnalyticImages | None = None
+    out: FrameImages | None = None
 
 
 class _Targets(NamedTuple):
-    """Images as the kernel takes them: colours ``[h, w C]``; the last three are empty when no report is wanted.
+    """Images as the kernel fills them: colours ``[h, w C]``; the last three are empty when no report is wanted.
 
-    ``sums [h, 6]``: over every row, of s0, specular, DoLP above 1, power, power along and across, as in `Tally`.
+    ``sums [h, 6]``: over every row, see `tally_kernel`.
     """
 
     diffuse: NDArray[np.float32]
@@ -71,20 +68,13 @@ class _Targets(NamedTuple):
     sums: NDArray[np.float64]
 
 
-class _Conversion(NamedTuple):
-    """From analysers to Stokes vectors: ``inverse [3, 4]``, and the light's ``gains [C]`` to multiply back."""
-
-    inverse: NDArray[np.float32]
-    gains: NDArray[np.float32]
-
-
 def separate_analytic_half(
     raw: RawFrame,
     layout: Layout,
     black_level: float,
     white_level: float,
     options: AnalyticOptions | None = None,
-) -> AnalyticImages:
+) -> FrameImages:
     """Diffuse and specular of one raw mosaic, at half resolution, by the paper's first estimate.
 
     ``raw``: ``[H, W]`` uint8, uint16, float32, or a `PackedFrame`; levels in its units. Images are ``[h, w, C]`` with
@@ -94,41 +84,24 @@ def separate_analytic_half(
     Source: Dave et al. 2022, Eqs. 15-18.
     """
     options = AnalyticOptions() if options is None else options
-    samples = as_samples(raw)
-    pattern = read_pattern((raw.shape[0], raw.shape[1]), layout, black_level, white_level, options.light_color)
-    out = options.out
-    if out is None:
-        out = AnalyticImages.empty((raw.shape[0], raw.shape[1]), layout, options.report)
-    targets = _as_targets(out, (pattern.h, pattern.w, pattern.channels), options.report)
-    gains = options.light_color[: pattern.channels] if options.in_light else (1.0,) * pattern.channels
-    conversion = _Conversion(_inverse(layout), np.array(gains, np.float32))
-    share(partial(_separate_rows, samples, pattern, conversion, targets), pattern.h, STRIP)
-    return replace(out, tally=_tally(out, targets.sums)) if options.report else out
+    samples, shape = as_samples(raw), (raw.shape[0], raw.shape[1])
+    pattern = read_pattern(shape, layout, black_level, white_level, options.light_color)
+    out = FrameImages.empty(shape, layout, options.report) if options.out is None else options.out
+    dolp, aolp = check_images(out, (pattern.h, pattern.w, pattern.channels), options.report)
+    rows, sums = (pattern.h, pattern.w * pattern.channels), np.zeros((dolp.shape[0], RESIDUAL))
+    targets = _Targets(out.diffuse.reshape(rows), out.specular.reshape(rows), out.valid, dolp, aolp, sums)
+    gains = np.array(options.light_color if options.in_light else (1, 1, 1), np.float32)[: pattern.channels]
+    share(partial(_separate_rows, samples, pattern, _inverse(layout), gains, targets), pattern.h, STRIP)
+    if not options.report:
+        return out
+    valid = int(np.count_nonzero(out.valid))
+    return replace(out, tally=make_tally(out.valid.size, out.valid.size - valid, valid, sums))
 
 
 @lru_cache(maxsize=8)
 def _inverse(layout: Layout) -> NDArray[np.float32]:
     """The matrix ``[3, 4]`` of `fit_stokes`."""
     return stokes_inverse(layout.angles).float().numpy()
-
-
-def _as_targets(out: AnalyticImages, shape: tuple[int, int, int], report: bool) -> _Targets:
-    """The images of ``out``, checked. Raises ValueError on a wrong shape or dtype, gaps, or no room for a report."""
-    check_images(out.arrays(), shape)
-    dolp = aolp = np.empty((0, 0), np.float32)
-    if report:
-        if out.dolp is None or out.aolp is None:
-            raise ValueError("expected room for dolp and aolp, which a report needs, found none")
-        dolp, aolp = out.dolp, out.aolp
-    rows, sums = (shape[0], shape[1] * shape[2]), np.zeros((dolp.shape[0], 6))
-    return _Targets(out.diffuse.reshape(rows), out.specular.reshape(rows), out.valid, dolp, aolp, sums)
-
-
-def _tally(out: AnalyticImages, sums: NDArray[np.float64]) -> Tally:
-    """The frame's tally from its rows' sums, in one order whatever the threads."""
-    s0, specular, above_one, power, along, across = (float(x) for x in sums.sum(axis=0))
-    valid = int(np.count_nonzero(out.valid))
-    return Tally(out.valid.size, out.valid.size - valid, valid, int(above_one), s0, specular, power, along, across)
 
 
 def warm_up() -> None:
@@ -138,96 +111,23 @@ def warm_up() -> None:
 
 
 @compiled
-def _split_row(m: Any, c: int, inverse: Any) -> None:
-    """Eqs. 15-18 for colour ``c`` of a row ``m [4, C, n]``: it becomes (specular, diffuse, -, -).
-
-    In place, because LLVM gives up on loops over so many arrays of which each might overlap each.
-    """
-    i00, i01, i02, i03 = inverse[0, 0], inverse[0, 1], inverse[0, 2], inverse[0, 3]
-    i10, i11, i12, i13 = inverse[1, 0], inverse[1, 1], inverse[1, 2], inverse[1, 3]
-    i20, i21, i22, i23 = inverse[2, 0], inverse[2, 1], inverse[2, 2], inverse[2, 3]
-    m0, m1, m2, m3 = m[0, c], m[1, c], m[2, c], m[3, c]
-    for j in range(m0.size):
-        s0 = i00 * m0[j] + i01 * m1[j] + i02 * m2[j] + i03 * m3[j]
-        s1 = i10 * m0[j] + i11 * m1[j] + i12 * m2[j] + i13 * m3[j]
-        s2 = i20 * m0[j] + i21 * m1[j] + i22 * m2[j] + i23 * m3[j]
-        total = s0 if s0 > ZERO else ZERO
-        polarized = math.sqrt(s1 * s1 + s2 * s2)
-        specular = polarized if polarized < total else total
-        m0[j] = specular
-        m1[j] = total - specular
-
-
-@compiled
-def _fit_row(m: Any, inverse: Any) -> None:
-    """Stokes vectors of a row, in place: ``m [4, n]`` becomes (s0, s1, s2, -)."""
-    i00, i01, i02, i03 = inverse[0, 0], inverse[0, 1], inverse[0, 2], inverse[0, 3]
-    i10, i11, i12, i13 = inverse[1, 0], inverse[1, 1], inverse[1, 2], inverse[1, 3]
-    i20, i21, i22, i23 = inverse[2, 0], inverse[2, 1], inverse[2, 2], inverse[2, 3]
-    m0, m1, m2, m3 = m[0], m[1], m[2], m[3]
-    for j in range(m0.size):
-        s0 = i00 * m0[j] + i01 * m1[j] + i02 * m2[j] + i03 * m3[j]
-        s1 = i10 * m0[j] + i11 * m1[j] + i12 * m2[j] + i13 * m3[j]
-        s2 = i20 * m0[j] + i21 * m1[j] + i22 * m2[j] + i23 * m3[j]
-        m0[j] = s0
-        m1[j] = s1
-        m2[j] = s2
+def _split_row(s: Any, specular: Any, diffuse: Any) -> None:
+    """Eqs. 16-18 for one colour of a row of Stokes vectors ``s [3, n]``. Twin: `analytic.separate_analytic`."""
+    s0, s1, s2 = s[0], s[1], s[2]
+    for j in range(specular.size):
+        total = s0[j] if s0[j] > ZERO else ZERO
+        polarized = np.sqrt(s1[j] * s1[j] + s2[j] * s2[j])
+        specular[j] = polarized if polarized < total else total
+        diffuse[j] = total - specular[j]
 
 
 @compiled
 def _mean_color(planes: Any, mean: Any) -> None:
     """Mean over colours of ``planes [C, n]``, to ``mean [n]``."""
     if planes.shape[0] == 1:
-        _scale(planes[0], ONE, mean)
+        copy(planes[0], mean)
     else:
-        red, green, blue = planes[0], planes[1], planes[2]
-        for j in range(mean.size):
-            mean[j] = THIRD * (red[j] + green[j] + blue[j])
-
-
-@compiled
-def _polarize_row(m: Any, mean: Any, inverse: Any, r: int, targets: _Targets) -> None:
-    """DoLP and AoLP of row ``r`` of analysers ``m [4, C, n]``; ``mean [4, n]`` becomes (s0, s1, s2, -)."""
-    for k in range(4):
-        _mean_color(m[k], mean[k])
-    _fit_row(mean, inverse)
-    polarize(mean[0], mean[1], mean[2], targets.dolp[r], targets.aolp[r])
-
-
-@compiled
-def _sum_row(m: Any, mean: Any, dolp: Any, sums: Any) -> None:
-    """Sums over a row in double precision; ``m [4, C, n]`` is (specular, diffuse, -, -), ``mean`` from the above."""
-    _mean_color(m[0], mean[0])
-    _mean_color(m[1], mean[3])
-    s, s1, s2, d = mean[0], mean[1], mean[2], mean[3]
-    specular, diffuse, above_one, power, along, across = 0.0, 0.0, 0, 0.0, 0.0, 0.0
-    for j in range(dolp.size):
-        specular += s[j]
-        diffuse += d[j]
-        above_one += dolp[j] > ONE
-        square = s1[j] * s1[j] + s2[j] * s2[j]
-        weight = math.sqrt(square)
-        power += square
-        along += weight * s1[j]
-        across += weight * s2[j]
-    sums[0], sums[1], sums[2] = specular + diffuse, specular, above_one
-    sums[3], sums[4], sums[5] = power, along, across
-
-
-@compiled
-def _scale(row: Any, gain: Any, image: Any) -> None:
-    """The first values of ``row`` times ``gain``."""
-    for j in range(image.size):
-        image[j] = gain * row[j]
-
-
-@compiled
-def _interleave(planes: Any, gains: Any, image: Any) -> None:
-    """Channels last, in the light's colour: ``planes [C, n]`` to a row ``image [w C]``."""
-    if planes.shape[0] == 1:
-        _scale(planes[0], gains[0], image)
-    else:
-        interleave_colors((planes[0], planes[1], planes[2]), gains, image)
+        add_rows(planes[0], planes[1], planes[2], THIRD, mean)
 
 
 @compiled
@@ -242,15 +142,19 @@ def _clear_flagged(flags: Any, valid: Any) -> None:
 
 @entry
 def _separate_rows(
-    samples: Samples, pattern: Pattern, conversion: _Conversion, targets: _Targets, piece: Piece
+    samples: Samples, pattern: Pattern, inverse: Any, gains: Any, targets: _Targets, piece: Piece
 ) -> None:
-    """A piece of the frame's cell rows."""
-    inverse, gains = conversion.inverse, conversion.gains
-    first, stop = piece
+    """Some of the frame's cell rows, first to last; every thread calls it for others."""
     window, m = make_window(pattern), make_analysers(pattern)
-    mean = np.empty((4, m.shape[2]), np.float32)
-    open_window(samples, pattern, window, first)
-    for r in range(first, stop):
+    n = m.shape[2]
+    mean, s, split = (
+        np.empty((4, 1, n), np.float32),
+        np.empty((3, n), np.float32),
+        np.empty((2, gains.size, n), np.float32),
+    )
+    none_skipped = np.empty(0, np.uint16)
+    open_window(samples, pattern, window, piece[0])
+    for r in range(piece[0], piece[1]):
         flagged = advance_window(samples, pattern, window, r)
         valid = targets.valid[r]
         for j in range(valid.size):
@@ -259,11 +163,17 @@ def _separate_rows(
             flag_row(pattern, window, r, m)
             _clear_flagged(m, valid)
         interpolate_row(pattern, window, r, m)
+        for c in range(gains.size):
+            fit_stokes_row(m, c, inverse, s[0], s[1], s[2])
+            _split_row(s, split[0, c], split[1, c])
+        interleave(split[0], gains, targets.specular[r])
+        interleave(split[1], gains, targets.diffuse[r])
         if targets.dolp.size:
-            _polarize_row(m, mean, inverse, r, targets)
-        for c in range(pattern.channels):
-            _split_row(m, c, inverse)
-        if targets.dolp.size:
-            _sum_row(m, mean, targets.dolp[r], targets.sums[r])
-        _interleave(m[0], gains, targets.specular[r])
-        _interleave(m[1], gains, targets.diffuse[r])
+            for k in range(4):
+                _mean_color(m[k], mean[k, 0])
+            fit_stokes_row(mean, 0, inverse, s[0], s[1], s[2])
+            polarize(s[0], s[1], s[2], targets.dolp[r], targets.aolp[r])
+            w, specular, diffuse = valid.size, mean[0, 0], mean[1, 0]
+            _mean_color(split[0], specular)
+            _mean_color(split[1], diffuse)
+            tally_row(specular[:w], diffuse[:w], s[1, :w], s[2, :w], targets.dolp[r], none_skipped, targets.sums[r])

@@ -29,9 +29,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from polsep.physics.stokes import Measurements, Stokes, analyser_residual, fit_stokes_unclipped
 from polsep.separation.analytic import Separation, box_mean, separate_analytic_unclipped
-
-#: Largest possible |slope|: DoLP of diffuse light at grazing exit for eta = 1.5 (`optics.diffuse_dolp` at 90 degrees).
-MAX_DIFFUSE_DOLP = 0.3847
+from polsep.separation.closed_form import fit_unclipped, limit_dolp, white_specular
 
 #: Windows of the slope, widest first: radius in pixels and how far the slope may stray from the next wider window's
 #: (standard deviation per component). The widest one is held toward zero, the paper's unpolarized diffuse.
@@ -63,9 +61,6 @@ FREEDOM_FLOOR = 1e-6
 #: Least weight of the specular light around as a prior, far below that of any sample and above rounding.
 MIN_PRIOR = 1e-6
 
-#: Least eigenvalue of the normal equations of b, 6 without clipping, above which b counts as determined.
-MIN_EIGENVALUE = 0.3
-
 
 def separate_color_affine(measurements: Measurements) -> Separation:
     """Diffuse and white specular of colour samples ``[..., 4, 3, h, w]`` by the closed form above.
@@ -90,7 +85,8 @@ def separate_color_affine(measurements: Measurements) -> Separation:
     if measurements.clipped is not None:
         valid = valid & ~measurements.clipped.all(dim=-4).any(dim=-3)
     total = stokes.s0.clamp(min=0)
-    specular = torch.minimum(white_specular(offset, slope), total.amin(dim=-3, keepdim=True)).expand_as(total)
+    specular = white_specular(offset.chunk(2, dim=-3), slope.chunk(2, dim=-3))
+    specular = torch.minimum(specular, total.amin(dim=-3, keepdim=True)).expand_as(total)
     found = Separation(total - specular, specular, valid, stokes, slope, residual, torch.sqrt(sample))
     return found if bool(valid.all()) else _fill(found, measurements, offset, determined)
 
@@ -157,8 +153,7 @@ def color_slope(
         counted = ((contrast - noise) / (contrast + floor)).clamp(min=0)
         held = noise / CONTRAST_MARGIN / (spread**2 * samples) + floor
         slope = (moment * counted + held * slope) / (contrast + held)
-    size = torch.sqrt((slope * slope).sum(dim=-3, keepdim=True))
-    return slope * (MAX_DIFFUSE_DOLP / size.clamp(min=MAX_DIFFUSE_DOLP))
+    return limit_dolp(slope)
 
 
 def _pool(moments: Tensor, weight: Tensor, radius: int) -> tuple[Tensor, Tensor]:
@@ -188,17 +183,6 @@ def _pool_to_edges(moments: Tensor, weight: Tensor, edges: Tensor) -> tuple[Tens
             sums[here] += weighted[there] * torch.cat([near.expand_as(weighted[there][..., 1:, :, :]), near * near], -3)
     total, squares = sums[..., -2:-1, :, :].clamp(min=1e-12), sums[..., -1:, :, :].clamp(min=1e-20)
     return sums[..., :-2, :, :] / total, (total * total / squares).clamp(min=1)
-
-
-def white_specular(offset: Tensor, slope: Tensor) -> Tensor:
-    """tau_s ``[..., 1, h, w]`` from b = tau_s (exp(2i phi_s) - a).
-
-    The positive root of (|a|^2 - 1) t^2 + 2 Re(b conj a) t + |b|^2 = 0, unique because |a| < 1; |b| where a = 0.
-    """
-    ba = (offset * slope).sum(dim=-3, keepdim=True)
-    bb = (offset * offset).sum(dim=-3, keepdim=True)
-    aa = (slope * slope).sum(dim=-3, keepdim=True)
-    return (ba + torch.sqrt(ba * ba + (1 - aa) * bb)) / (1 - aa)
 
 
 def _offset(stokes: Stokes, slope: Tensor) -> tuple[Tensor, Tensor]:
@@ -233,27 +217,6 @@ def _solve_clipped(
     offset = offset.movedim(-3, 0).clone()
     offset[:, touched] = b
     return Stokes(*(s.movedim(0, -3) for s in solved)), offset.movedim(0, -3), determined
-
-
-def fit_unclipped(y: Tensor, kept: Tensor, a: Tensor, angles: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Solve y = g s0 + u . b over N pixels: b ``[2, N]``, s0 ``[C, N]``, and where b is determined.
-
-    ``y``, twice the samples, and the weights ``kept`` are ``[K, C, N]``, ``a`` is ``[2, N]``.
-    """
-    t = 2 * torch.tensor(angles).to(y)
-    u = torch.stack([torch.cos(t), torch.sin(t)])[:, :, None, None]
-    g = 1 + u[0] * a[0] + u[1] * a[1]
-    gg = (kept * g * g).sum(0).clamp(min=1e-6)
-    gy = (kept * g * y).sum(0)
-    gu = [(kept * g * u[i]).sum(0) for i in (0, 1)]
-    projected = [u[i] - g * gu[i] / gg for i in (0, 1)]
-    m00, m01, m11 = ((kept * projected[i] * projected[j]).sum((0, 1)) for i, j in ((0, 0), (0, 1), (1, 1)))
-    r0, r1 = ((kept * projected[i] * y).sum((0, 1)) for i in (0, 1))
-    smallest = (m00 + m11) / 2 - torch.sqrt(((m00 - m11) / 2) ** 2 + m01**2)  # hypot is not known to ONNX
-    det = (m00 * m11 - m01 * m01).clamp(min=1e-6)
-    b = torch.stack([m11 * r0 - m01 * r1, m00 * r1 - m01 * r0]) / det
-    s0 = (gy - gu[0] * b[0] - gu[1] * b[1]) / gg
-    return b, s0, smallest > MIN_EIGENVALUE
 
 
 def _fill(found: Separation, measurements: Measurements, offset: Tensor, determined: Tensor) -> Separation:

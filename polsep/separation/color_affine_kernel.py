@@ -17,44 +17,31 @@ import torch
 from numpy.typing import NDArray
 
 from polsep.compute.threads import get_threads, share
-from polsep.demosaic.bilinear_kernel import Pattern, read_pattern
+from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
 from polsep.physics.stokes import Measurements, analyser_residual, stokes_inverse, unclipped_inverse
 from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import RawFrame, as_samples
 from polsep.separation.clipped_kernel import (
     ALL_CLIPPED,
-    Analysers,
     Pixels,
     fill_pixels,
     make_pixels,
     raise_cores,
     solve_pixels,
+    tally_pixels,
 )
 from polsep.separation.fill_kernel import halve_separation, halve_specular, interpolate_holes
 from polsep.separation.images import FrameImages, Tally
 from polsep.separation.images_kernel import check_images
 from polsep.separation.moments_kernel import Conversion
-from polsep.separation.polarization_kernel import polarize_pixels
-from polsep.separation.strips_kernel import (
-    SUMS,
-    Frame,
-    Targets,
-    collect,
-    find_clipped,
-    rows_clip,
-    separate_guided_piece,
-    separate_piece,
-)
+from polsep.separation.strips_kernel import Targets, collect, rows_clip, separate_guided_piece, separate_piece
+from polsep.separation.tally_kernel import NOISE, make_tally
 
 #: Fewest cell rows of a strip that is worth a thread.
 MIN_ROWS = 64
-#: Pixels with clipped samples that one thread takes at a time.
+#: Pixels with clipped samples that one thread solves at a time.
 PIXELS = 1024
-
-
-#: The images of a frame, as streams of this method name them.
-ColorAffineImages = FrameImages
 
 
 @dataclass(frozen=True)
@@ -68,7 +55,7 @@ class ColorAffineOptions:
 
     light_color: tuple[float, ...] = (1.0, 1.0, 1.0)
     in_light: bool = False
-    out: ColorAffineImages | None = None
+    out: FrameImages | None = None
     guided: bool = False
     report: bool = False
 
@@ -79,7 +66,7 @@ def separate_color_affine_half(
     black_level: float,
     white_level: float,
     options: ColorAffineOptions | None = None,
-) -> ColorAffineImages:
+) -> FrameImages:
     """Diffuse and white specular of one raw colour mosaic, at half resolution, by the colour-affine closed form.
 
     ``raw``: ``[H, W]`` uint8, uint16, float32, or a `PackedFrame`; levels in its units. Images are ``[h, w, 3]`` with
@@ -91,27 +78,30 @@ def separate_color_affine_half(
     options = ColorAffineOptions() if options is None else options
     if layout.channels != 3:
         raise ValueError(f"expected a colour layout, found {layout.spec!r}; mono frames have separate_analytic_half")
-    samples = as_samples(raw)
-    pattern = read_pattern((raw.shape[0], raw.shape[1]), layout, black_level, white_level, options.light_color)
-    out = options.out
-    if out is None:
-        out = ColorAffineImages.empty((raw.shape[0], raw.shape[1]), layout, options.report)
-    height = strip_height(pattern.h)
-    clips = any(share(partial(rows_clip, samples, pattern), pattern.h, height))
-    targets = _as_targets(out, pattern, clips, options.report)
+    samples, shape = as_samples(raw), (raw.shape[0], raw.shape[1])
+    pattern = read_pattern(shape, layout, black_level, white_level, options.light_color)
+    out = FrameImages.empty(shape, layout, options.report) if options.out is None else options.out
+    h, w = pattern.h, pattern.w
+    dolp, aolp = check_images(out, (h, w, 3), options.report)
+    height = strip_height(h)
+    clips = any(share(partial(rows_clip, samples, pattern), h, height))
+    lines, clipped = (
+        np.empty((4, h, w) if clips else (4, 0, 0), np.float32),
+        np.zeros((h, w) if clips else (0, 0), np.uint16),
+    )
+    diffuse, specular = (image.reshape(h, 3 * w) for image in (out.diffuse, out.specular))
+    targets = Targets(diffuse, specular, lines, clipped, dolp, aolp, np.zeros((dolp.shape[0], NOISE + 1)))
     gains = np.array(options.light_color[:3] if options.in_light else (1, 1, 1), np.float32)
     # Filling compares colours with each other, so with clipped samples the light waits until it is done.
     conversion = Conversion(*_matrices(layout), np.ones(3, np.float32) if clips else gains)
-    grid = read_grid(pattern, layout.angles, conversion.inverses[0])
-    frame = Frame(Source(samples, pattern, grid), conversion)
-    share(partial(separate_guided_piece if options.guided else separate_piece, frame, targets), pattern.h, height)
+    source = Source(samples, pattern, read_grid(pattern, layout.angles, conversion.inverses[0]))
+    separate_strip = separate_guided_piece if options.guided else separate_piece
+    share(partial(separate_strip, source, conversion, targets), h, height)
     out.valid[:] = True
-    places = find_clipped(targets.clipped)
-    tally = _sum_rows(targets, pattern.h * pattern.w - places.size)
+    places = np.flatnonzero(clipped)
+    tally = make_tally(h * w - places.size, 0, h * w - places.size, targets.sums)
     if places.size:
-        doubled = 2 * np.array(layout.angles)
-        analysers = Analysers(np.cos(doubled).astype(np.float32), np.sin(doubled).astype(np.float32), conversion)
-        tally += _complete((frame, analysers), targets, places, out)
+        tally += _complete(source, layout, conversion.inverses, targets, places, out)
     if clips and options.in_light:
         out.diffuse[...] *= gains
         out.specular[...] *= gains
@@ -127,27 +117,6 @@ def warm_up() -> None:
 def strip_height(rows: int) -> int:
     """Cell rows of a strip, an even number: a share of all for each thread, as every strip starts with rows twice."""
     return max(MIN_ROWS, (-(-rows // get_threads()) + 1) // 2 * 2)
-
-
-def _as_targets(out: ColorAffineImages, pattern: Pattern, clips: bool, report: bool) -> Targets:
-    """Where the kernel writes. Raises ValueError on images of a wrong shape or dtype, or missing for a report."""
-    shape = (pattern.h, pattern.w)
-    images = {name: image for name, image in vars(out).items() if image is not None and name != "tally"}
-    check_images(images, (*shape, 3))
-    if report and (out.dolp is None or out.aolp is None):
-        raise ValueError("expected room for dolp and aolp, which a report needs, found none")
-    nothing = np.empty((0, 0), np.float32)
-    room = shape if clips else (0, 0)
-    rows = (pattern.h, 3 * pattern.w)
-    return Targets(
-        out.diffuse.reshape(rows),
-        out.specular.reshape(rows),
-        np.empty((4, *room), np.float32),
-        np.zeros(room, np.uint16),
-        nothing if out.dolp is None or not report else out.dolp,
-        nothing if out.aolp is None or not report else out.aolp,
-        np.zeros((pattern.h if report else 0, SUMS)),
-    )
 
 
 @lru_cache(maxsize=8)
@@ -166,65 +135,44 @@ def _matrices(layout: Layout) -> tuple[NDArray[np.float32], NDArray[np.bool_], N
 
 
 def _complete(
-    given: tuple[Frame, Analysers], targets: Targets, places: NDArray[np.int64], out: ColorAffineImages
+    source: Source,
+    layout: Layout,
+    inverses: NDArray[np.float32],
+    targets: Targets,
+    places: NDArray[np.int64],
+    out: FrameImages,
 ) -> Tally:
     """Solve and fill the N pixels ``places`` with clipped samples, into ``out``; their sums."""
-    (frame, analysers), lines = given, targets.lines.reshape(4, -1)
+    doubled, lines = 2 * np.array(layout.angles), targets.lines.reshape(4, -1)
+    cosines, sines = np.cos(doubled).astype(np.float32), np.sin(doubled).astype(np.float32)
     pixels = make_pixels(targets.clipped.reshape(-1)[places], np.ascontiguousarray(lines[:, places]))
-    share(partial(collect, frame.source, places, pixels.samples), places.size, PIXELS)
-    share(partial(solve_pixels, pixels, analysers), places.size, PIXELS)
+    share(partial(collect, source, places, pixels.samples), places.size, PIXELS)
+    share(partial(solve_pixels, pixels, cosines, sines, inverses), places.size, PIXELS)
     lines[2:, places] = pixels.lines[2:]
     out.valid.reshape(-1)[places] = pixels.valid
     _write(pixels, places, out)
     if not pixels.valid.all():
-        _fill(pixels, analysers, targets, places, out)
-    if out.dolp is None or out.aolp is None or not targets.sums.size:
-        return Tally()
-    degree, angle = np.empty(places.size, np.float32), np.empty(places.size, np.float32)
-    polarize_pixels(pixels.stokes, degree, angle)
-    out.dolp.reshape(-1)[places], out.aolp.reshape(-1)[places] = degree, angle
-    diffuse = pixels.diffuse.mean(axis=0)
-    p1, p2 = (pixels.stokes[1 + i] - pixels.lines[i] * diffuse for i in range(2))
-    power = np.hypot(p1, p2).astype(np.float64)
-    return Tally(
-        places.size,
-        places.size,
-        int(pixels.valid.sum()),
-        int((degree > 1).sum()),
-        float(diffuse.sum(dtype=np.float64) + pixels.specular.sum(dtype=np.float64)),
-        float(pixels.specular.sum(dtype=np.float64)),
-        float((power * power).sum()),
-        float((power * p1).sum()),
-        float((power * p2).sum()),
-        float(pixels.residual.sum(dtype=np.float64)),
-    )
-
-
-def _fill(
-    pixels: Pixels, analysers: Analysers, targets: Targets, places: NDArray[np.int64], out: ColorAffineImages
-) -> None:
-    """Complete the pixels that clipping left undetermined from what is around them."""
-    h, w = out.valid.shape
-    holes = np.flatnonzero(~pixels.valid)
-    level = halve_separation(out.diffuse, out.specular, targets.lines, out.valid)
-    fill_pixels(pixels, analysers, holes, interpolate_holes(level, (h, w), places[holes]))
-    _write(pixels, places, out)
-    core = pixels.clipped == ALL_CLIPPED
-    if core.any():
-        outside = np.ones((h, w), np.bool_)
-        outside.reshape(-1)[places[core]] = False
-        rim = interpolate_holes(halve_specular(out.specular, outside), (h, w), places[core])
-        raise_cores(pixels, np.flatnonzero(core), rim[0])
+        h, w = out.valid.shape
+        holes = np.flatnonzero(~pixels.valid)
+        level = halve_separation(out.diffuse, out.specular, targets.lines, out.valid)
+        fill_pixels(pixels, cosines, sines, holes, interpolate_holes(level, (h, w), places[holes]))
         _write(pixels, places, out)
+        core = pixels.clipped == ALL_CLIPPED
+        if core.any():
+            outside = np.ones((h, w), np.bool_)
+            outside.reshape(-1)[places[core]] = False
+            rim = interpolate_holes(halve_specular(out.specular, outside), (h, w), places[core])
+            raise_cores(pixels, np.flatnonzero(core), rim[0])
+            _write(pixels, places, out)
+    if not targets.sums.size:
+        return Tally()
+    dolp, aolp, sums = np.empty(places.size, np.float32), np.empty(places.size, np.float32), np.zeros((1, NOISE))
+    tally_pixels(pixels, dolp, aolp, sums)
+    targets.dolp.reshape(-1)[places], targets.aolp.reshape(-1)[places] = dolp, aolp
+    return make_tally(places.size, places.size, int(pixels.valid.sum()), sums)
 
 
-def _write(pixels: Pixels, places: NDArray[np.int64], out: ColorAffineImages) -> None:
+def _write(pixels: Pixels, places: NDArray[np.int64], out: FrameImages) -> None:
     """Put the colours of N pixels into the frame."""
     out.diffuse.reshape(-1, 3)[places] = pixels.diffuse.T
     out.specular.reshape(-1, 3)[places] = pixels.specular[:, None]
-
-
-def _sum_rows(targets: Targets, pixels: int) -> Tally:
-    """The sums of the rows' ``pixels`` that hold no clipped sample, and the noise of all."""
-    s0, specular, above_one, power, along, across, residual, noise = targets.sums.sum(axis=0).tolist()
-    return Tally(pixels, 0, pixels, int(above_one), s0, specular, power, along, across, residual, noise)

@@ -14,12 +14,12 @@ import numpy as np
 from polsep.compute.compiling import ONE, ZERO, compiled
 from polsep.demosaic.bilinear_kernel import PAD, Pattern
 from polsep.separation import color_affine as twin
+from polsep.separation.closed_form_kernel import limit_dolp_row
 from polsep.separation.edges_kernel import sum_alike
 from polsep.separation.moments_kernel import KEPT, MIDDLE, NARROW, WIDEST, Rings, Rows, rows_around
 
 _FLOOR = np.float32(np.finfo(np.float32).eps * 1e-2)
 _MARGIN = np.float32(twin.CONTRAST_MARGIN)
-_MAX_SLOPE = np.float32(twin.MAX_DIFFUSE_DOLP)
 _SPREAD_WIDEST, _SPREAD_MIDDLE, _SPREAD_NARROW, _SPREAD_PIXEL = (np.float32(s) for _, s in twin.SLOPE_SCALES)
 _MIN_WEIGHT, _MIN_SQUARE = np.float32(1e-12), np.float32(1e-20)
 
@@ -121,10 +121,8 @@ def _own_pixel(x: Any, w: int, slope: Any) -> None:
         counted = surplus / (x0[j] + floor)
         below = ONE / (x0[j] + held)
         first, second = (x1[j] * counted + held * a1[j]) * below, (x2[j] * counted + held * a2[j]) * below
-        size = np.sqrt(first * first + second * second)
-        limit = _MAX_SLOPE / (size if size > _MAX_SLOPE else _MAX_SLOPE)
-        a1[j] = first * limit
-        a2[j] = second * limit
+        a1[j], a2[j] = first, second
+    limit_dolp_row(a1[:w], a2[:w])
 
 
 @compiled
@@ -141,9 +139,8 @@ def first_weighed(start: int) -> int:
 
 
 @compiled
-def find_slope(pattern: Pattern, t: int, start: int, scratch: tuple[Rows, Rings]) -> None:
+def find_slope(pattern: Pattern, t: int, start: int, rows: Rows, rings: Rings) -> None:
     """The slope of row ``t``, into ``rows.slope``; before ``start`` it only fills blocks."""
-    rows, rings = scratch
     rows.slope[:] = ZERO
     blocks = (rings.wide, rings.middle, rings.narrow)
     spreads = (_SPREAD_WIDEST, _SPREAD_MIDDLE, _SPREAD_NARROW)
@@ -154,7 +151,7 @@ def find_slope(pattern: Pattern, t: int, start: int, scratch: tuple[Rows, Rings]
             continue
         if radius == MIDDLE and rings.edges.size:
             if t >= start:
-                sum_alike(pattern, t, scratch)
+                sum_alike(pattern, t, rows, rings)
                 _steady((rows.sums, rows.nothing), (rows.ones, ONE), spreads[i], pattern.w, rows.slope)
             continue
         row = _push(rings.weighted[(t + radius) % KEPT], radius, t + radius, rows.fours, block)

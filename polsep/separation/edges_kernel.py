@@ -33,9 +33,8 @@ def _light_of(stokes: Any, w: int, light: Any) -> None:
 
 
 @compiled
-def enter_light(pattern: Pattern, flagged: bool, t: int, scratch: tuple[Rows, Rings]) -> None:
+def enter_light(pattern: Pattern, flagged: bool, t: int, rows: Rows, rings: Rings) -> None:
     """Mean Stokes values of row ``t``, which has just entered the rings; zero where samples are clipped."""
-    rows, rings = scratch
     light = rings.light[t % 4]
     _light_of(rings.stokes[t % 16], pattern.w, light)
     if flagged:
@@ -63,9 +62,8 @@ def _ratios(sums: Any, per_column: Any, counts: Any, edges: Any) -> None:
 
 
 @compiled
-def measure_edges(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
+def measure_edges(pattern: Pattern, t: int, rows: Rows, rings: Rings) -> None:
     """Ratios of mean Stokes values about row ``t`` of the frame. Twin: `polarization_edges`."""
-    rows, rings = scratch
     if not 0 <= t < pattern.h:
         return
     outside = rows.nothing
@@ -105,9 +103,8 @@ def _square(near: Any) -> None:
 
 
 @compiled
-def sum_alike(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
+def sum_alike(pattern: Pattern, t: int, rows: Rows, rings: Rings) -> None:
     """Sums over the middle window about row ``t`` as far as edges allow, into ``rows.sums``. Twin: `_pool_to_edges`."""
-    rows, rings = scratch
     rows.sums[:] = ZERO
     here, w = rings.edges[t % KEPT], pattern.w
     for row in range(t - MIDDLE, t + MIDDLE + 1, _STEP):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, QUARTER, THIRD, TWO, ZERO, compiled
 from polsep.demosaic.bilinear_kernel import PAD, Pattern, make_analysers
+from polsep.physics.stokes_kernel import fit_stokes_row, fit_stokes_unclipped
 from polsep.separation import color_affine as twin
 
 #: Radii of the slope's windows, `color_affine.SLOPE_SCALES` without the pixel itself, and of `sample_variance`'s.
@@ -43,13 +44,13 @@ class Conversion(NamedTuple):
 class Rings(NamedTuple):
     """Rows of a strip on their way, by row number modulo the ring's length; ``n`` is the width with a `PAD` each side.
 
-    ``stokes [16, 5, n]``: s0 of three colours, s1, s2. ``moments [4, 4, n]``: of `_contrast`, and 1 where usable.
-    ``noise [7, 2, n]``: squared residuals and their weights, summed along rows. ``bright [4, n]``. ``missed [3, n]``:
-    squared second differences, summed along rows. ``weighted [20, 6, n]``: weighted moments, error, weight and its
-    square. ``spread [16, 4, n]``: moments of `_contrast` and the spread of s1 and s2, for a report. ``wide``,
-    ``middle``, ``narrow`` ``[L + 1, 6, n]``: rows of one block of window sums of length L, behind it the sum of the
-    block so far. ``light [4, 3, n]``: mean s0, s1, s2 of pixels without clipped samples, ``edges [20, 2, n]``: their
-    ratios in 3x3 pixels; both empty where windows do not end at edges.
+    ``stokes [16, 5, n]``: s0 of three colours, s1, s2. ``moments [16, 5, n]``: of the colours' deviations from
+    their mean, s0 s0, s0 s1, s0 s2; 1 where these are usable; s1 s1 + s2 s2. ``noise [7, 2, n]``: squared residuals and
+    their weights, summed along rows. ``bright [4, n]``: mean s0. ``missed [3, n]``: squared second differences of it,
+    summed along rows. ``weighted [20, 6, n]``: weighted moments, error, weight and its square. ``wide``, ``middle``,
+    ``narrow [L + 1, 6, n]``: rows of one block of window sums of length L, behind it the sum of the block so far.
+    ``light [4, 3, n]``: mean s0, s1, s2 of pixels without clipped samples, ``edges [20, 2, n]``: their ratios in
+    3x3 pixels; both empty where windows do not end at edges.
     """
 
     stokes: NDArray[np.float32]
@@ -58,7 +59,6 @@ class Rings(NamedTuple):
     bright: NDArray[np.float32]
     missed: NDArray[np.float32]
     weighted: NDArray[np.float32]
-    spread: NDArray[np.float32]
     wide: NDArray[np.float32]
     middle: NDArray[np.float32]
     narrow: NDArray[np.float32]
@@ -96,12 +96,11 @@ def make_rings(w: int, edges: int) -> Rings:
     n += -n % PAD
     return Rings(
         np.zeros((16, 5, n), np.float32),
-        np.zeros((4, 4, n), np.float32),
+        np.zeros((16, 5, n), np.float32),
         np.zeros((7, 2, n), np.float32),
         np.zeros((4, n), np.float32),
         np.zeros((3, n), np.float32),
         np.zeros((KEPT, 6, n), np.float32),
-        np.zeros((16, 4, n), np.float32),
         np.zeros((2 * WIDEST + 2, 6, n), np.float32),
         np.zeros((2 * MIDDLE + 2, 6, n), np.float32),
         np.zeros((2 * NARROW + 2, 6, n), np.float32),
@@ -140,20 +139,6 @@ def make_rows(pattern: Pattern) -> Rows:
 
 
 @compiled
-def _stokes_of(m: Any, inverse: Any, c: int, w: int, s: Any) -> None:
-    """Stokes vectors of colour ``c`` of a row, ``m [4, 3, w]``, to ``s [9, n]``."""
-    i00, i01, i02, i03 = inverse[0, 0], inverse[0, 1], inverse[0, 2], inverse[0, 3]
-    i10, i11, i12, i13 = inverse[1, 0], inverse[1, 1], inverse[1, 2], inverse[1, 3]
-    i20, i21, i22, i23 = inverse[2, 0], inverse[2, 1], inverse[2, 2], inverse[2, 3]
-    m0, m1, m2, m3 = m[0, c], m[1, c], m[2, c], m[3, c]
-    s0, s1, s2 = s[c, PAD:], s[3 + c, PAD:], s[6 + c, PAD:]
-    for j in range(w):
-        s0[j] = i00 * m0[j] + i01 * m1[j] + i02 * m2[j] + i03 * m3[j]
-        s1[j] = i10 * m0[j] + i11 * m1[j] + i12 * m2[j] + i13 * m3[j]
-        s2[j] = i20 * m0[j] + i21 * m1[j] + i22 * m2[j] + i23 * m3[j]
-
-
-@compiled
 def _residual_of(m: Any, null: Any, squared: Any, bright: Any) -> None:
     """Mean squared residual of a row and mean brightness, ``m [4, 3, w]``."""
     n0, n1, n2, n3 = null[0], null[1], null[2], null[3]
@@ -171,11 +156,11 @@ def _residual_of(m: Any, null: Any, squared: Any, bright: Any) -> None:
 
 @compiled
 def _contrast(s: Any, w: int, moments: Any, stokes: Any) -> None:
-    """Moments of the colours' deviations from their mean: s0 s0, s0 s1, s0 s2; and the means of s1 and s2."""
+    """Moments of the colours' deviations from their mean, and the means of s1 and s2: rows of `Rings`."""
     r0, g0, b0 = s[0, PAD:], s[1, PAD:], s[2, PAD:]
     r1, g1, b1 = s[3, PAD:], s[4, PAD:], s[5, PAD:]
     r2, g2, b2 = s[6, PAD:], s[7, PAD:], s[8, PAD:]
-    contrast, first, second = moments[0, PAD:], moments[1, PAD:], moments[2, PAD:]
+    contrast, first, second, total = moments[0, PAD:], moments[1, PAD:], moments[2, PAD:], moments[4, PAD:]
     red, green, blue, mean1, mean2 = stokes[0, PAD:], stokes[1, PAD:], stokes[2, PAD:], stokes[3, PAD:], stokes[4, PAD:]
     for j in range(w):
         a0 = THIRD * (r0[j] + g0[j] + b0[j])
@@ -184,8 +169,10 @@ def _contrast(s: Any, w: int, moments: Any, stokes: Any) -> None:
         red[j], green[j], blue[j] = r0[j], g0[j], b0[j]
         dr, dg, db = r0[j] - a0, g0[j] - a0, b0[j] - a0
         contrast[j] = dr * dr + dg * dg + db * db
-        first[j] = dr * (r1[j] - a1) + dg * (g1[j] - a1) + db * (b1[j] - a1)
-        second[j] = dr * (r2[j] - a2) + dg * (g2[j] - a2) + db * (b2[j] - a2)
+        dr1, dg1, db1, dr2, dg2, db2 = r1[j] - a1, g1[j] - a1, b1[j] - a1, r2[j] - a2, g2[j] - a2, b2[j] - a2
+        first[j] = dr * dr1 + dg * dg1 + db * db1
+        second[j] = dr * dr2 + dg * dg2 + db * db2
+        total[j] = (dr1 * dr1 + dg1 * dg1 + db1 * db1) + (dr2 * dr2 + dg2 * dg2 + db2 * db2)
         mean1[j] = a1
         mean2[j] = a2
 
@@ -205,23 +192,16 @@ def _clip_bits(flags: Any, clipped: Any) -> None:
 def _leave_out_clipped(rows: Rows, conversion: Conversion, moments: Any) -> None:
     """Residuals and moments of a row's pixels with clipped samples, from what the unclipped ones determine."""
     _clip_bits(rows.flags, rows.clipped)
-    exact = np.zeros(3, np.bool_)
+    exact, stokes = np.zeros(3, np.bool_), rows.s.reshape(3, 3, rows.s.shape[1])
     for j in range(rows.clipped.size):
         bits = rows.clipped[j]
         if bits == 0:
             continue
         rows.squared[:, PAD + j] = ZERO
+        s = stokes[:, :, PAD + j]
         for c in range(3):
-            code = 0
-            for k in range(4):
-                code |= (bits >> (3 * k + c) & 1) << k
-            exact[c] = conversion.exact[code]
-            for i in range(3):
-                value = ZERO
-                for k in range(4):
-                    value += conversion.inverses[code, i, k] * rows.m[k, c, j]
-                rows.s[3 * i + c, PAD + j] = value
-        _moments_of_exact(rows.s[:, PAD + j], exact, moments[:, PAD + j])
+            exact[c] = conversion.exact[fit_stokes_unclipped(rows.m[:, :, j], bits, conversion.inverses, c, s)]
+        _moments_of_exact(s, exact, moments[:, PAD + j])
 
 
 @compiled
@@ -235,10 +215,10 @@ def _moments_of_exact(s: Any, exact: Any, moments: Any) -> None:
     for i in range(3):
         mean0, mean = ZERO, ZERO
         for c in range(3):
-            mean0 += exact[c] * s[c] / colors
-            mean += exact[c] * s[3 * i + c] / colors
+            mean0 += exact[c] * s[0, c] / colors
+            mean += exact[c] * s[i, c] / colors
         for c in range(3):
-            moments[i] += exact[c] * (s[c] - mean0) * (s[3 * i + c] - mean)
+            moments[i] += exact[c] * (s[0, c] - mean0) * (s[i, c] - mean)
 
 
 @compiled
@@ -299,14 +279,13 @@ def _weigh(moments: Any, w: int, weighted: Any) -> None:
 
 
 @compiled
-def enter_row(pattern: Pattern, conversion: Conversion, flagged: bool, t: int, scratch: tuple[Rows, Rings]) -> None:
+def enter_row(pattern: Pattern, conversion: Conversion, flagged: bool, t: int, rows: Rows, rings: Rings) -> None:
     """Stokes vectors, moments, residuals and brightness of row ``t``, whose analysers are in ``rows.m``."""
-    rows, rings = scratch
     m, s, w = rows.m, rows.s, pattern.w
     inside = slice(PAD, PAD + w)
-    stokes, moments, bright = rings.stokes[t % 16], rings.moments[t % 4], rings.bright[t % 4]
+    stokes, moments, bright = rings.stokes[t % 16], rings.moments[t % 16], rings.bright[t % 4]
     for c in range(3):
-        _stokes_of(m, conversion.inverses[0], c, w, s)
+        fit_stokes_row(m, c, conversion.inverses[0], s[c, inside], s[3 + c, inside], s[6 + c, inside])
     _residual_of(m, conversion.null, rows.squared[0, inside], bright[inside])
     bright[PAD - 1], bright[PAD + w] = bright[PAD], bright[PAD + w - 1]
     _contrast(s, w, moments, stokes)
@@ -316,32 +295,6 @@ def enter_row(pattern: Pattern, conversion: Conversion, flagged: bool, t: int, s
         _leave_out_clipped(rows, conversion, moments)
     for i in range(2):
         _sum_seven(rows.squared[i, PAD - NOISE :], rings.noise[t % 7, i, inside])
-
-
-@compiled
-def _spread(s: Any, w: int, out: Any) -> None:
-    """Moments of the colours' deviations from their means: s0 s0, s0 s1, s0 s2, and s1 s1 + s2 s2."""
-    r0, g0, b0 = s[0, PAD:], s[1, PAD:], s[2, PAD:]
-    r1, g1, b1 = s[3, PAD:], s[4, PAD:], s[5, PAD:]
-    r2, g2, b2 = s[6, PAD:], s[7, PAD:], s[8, PAD:]
-    contrast, first, second, total = out[0, PAD:], out[1, PAD:], out[2, PAD:], out[3, PAD:]
-    for j in range(w):
-        a0 = THIRD * (r0[j] + g0[j] + b0[j])
-        a1 = THIRD * (r1[j] + g1[j] + b1[j])
-        a2 = THIRD * (r2[j] + g2[j] + b2[j])
-        x, y, z = r0[j] - a0, g0[j] - a0, b0[j] - a0
-        dr1, dg1, db1, dr2, dg2, db2 = r1[j] - a1, g1[j] - a1, b1[j] - a1, r2[j] - a2, g2[j] - a2, b2[j] - a2
-        contrast[j] = x * x + y * y + z * z
-        first[j] = x * dr1 + y * dg1 + z * db1
-        second[j] = x * dr2 + y * dg2 + z * db2
-        total[j] = (dr1 * dr1 + dg1 * dg1 + db1 * db1) + (dr2 * dr2 + dg2 * dg2 + db2 * db2)
-
-
-@compiled
-def measure_spread(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
-    """What a report takes of row ``t``, which has just been entered: how far its colours miss the model."""
-    rows, rings = scratch
-    _spread(rows.s, pattern.w, rings.spread[t % 16])
 
 
 @compiled
@@ -358,9 +311,8 @@ def sum_noise(pattern: Pattern, noise: Any) -> float:
 
 
 @compiled
-def measure_misses(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
+def measure_misses(pattern: Pattern, t: int, rows: Rows, rings: Rings) -> None:
     """What the mean of its four neighbours misses of row ``t``'s brightness; nothing outside the frame."""
-    rows, rings = scratch
     inside = slice(PAD, PAD + pattern.w)
     if not 0 <= t < pattern.h:
         rings.missed[t % 3] = ZERO
@@ -377,9 +329,8 @@ def rows_around(t: int, radius: int, h: int) -> Any:
 
 
 @compiled
-def weigh_row(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
+def weigh_row(pattern: Pattern, t: int, rows: Rows, rings: Rings) -> None:
     """Weighted moments of row ``t``, zero outside the frame."""
-    rows, rings = scratch
     weighted = rings.weighted[t % KEPT]
     if not 0 <= t < pattern.h:
         weighted[:] = ZERO
@@ -387,4 +338,4 @@ def weigh_row(pattern: Pattern, t: int, scratch: tuple[Rows, Rings]) -> None:
     inside = slice(PAD, PAD + pattern.w)
     per_column = rows_around(t, 1, pattern.h)
     _errors(rings.noise, rings.missed, per_column, rows.counts[3], weighted[3, inside])
-    _weigh(rings.moments[t % 4], pattern.w, weighted)
+    _weigh(rings.moments[t % 16], pattern.w, weighted)

@@ -12,7 +12,7 @@ from polsep.kernels import ColorAffineImages, ColorAffineOptions, get_threads, s
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import BAYER_ORDERS, IDEAL, IMX250, Layout, Mosaic, Sensor, expose
 from polsep.separation.analytic import Separation
-from polsep.separation.color_affine import SLOPE_SCALES, separate_color_affine
+from polsep.separation.color_affine import SCALES, separate_color_affine
 from polsep.separation.moments_kernel import MIDDLE, NARROW, WIDEST
 
 #: Of white: the largest and the median difference that float32 sums of another order may leave.
@@ -143,7 +143,7 @@ def test_light_color_comes_back(brightness: float, generator: torch.Generator) -
 
 def test_scales_are_the_kernels() -> None:
     """The kernel is written for these windows; their spreads it takes from the twin."""
-    assert [radius for radius, _ in SLOPE_SCALES] == [WIDEST, MIDDLE, NARROW, 0]
+    assert [radius for radius, _ in SCALES] == [WIDEST, MIDDLE, NARROW, 0]
 
 
 def test_refuses_what_it_cannot_separate() -> None:

@@ -1,1 +1,1 @@
-"""Compiling, threads, workers, cluster, filters: nothing here knows of light."""
+"""Compiling, row arithmetic, threads, workers, a cluster: nothing here depends on optics."""

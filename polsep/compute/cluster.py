@@ -1,6 +1,6 @@
-"""A Ray cluster (extra ``ray``): work in other processes, on this machine or many, and retried when one of them dies.
+"""A Ray cluster (extra ``ray``): tasks in other processes, on this machine or many, retried when a worker dies.
 
-Every node must have polsep; what comes back is in the order of what was asked, and no more waits than is said.
+Every node must have polsep.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from typing import Any, TypeVar
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-#: How often Ray gives the work of a worker that died to another one.
+#: Times that Ray repeats the task of a worker that died.
 RETRIES = 5
 
 
 @contextmanager
 def cluster(workers: int) -> Iterator[Any]:
-    """Ray, connected to the cluster that RAY_ADDRESS names, or else to one of ``workers`` started on this machine.
+    """Connect Ray to the cluster that RAY_ADDRESS names, or else to ``workers`` processes started on this machine.
 
-    Raises what tasks raise, as they raise it, and RuntimeError when the cluster itself fails.
+    Raises the exceptions of tasks unchanged, and RuntimeError when the cluster itself fails.
     """
     import ray
 
@@ -48,7 +48,7 @@ def cluster(workers: int) -> Iterator[Any]:
 def map_unordered(
     function: Callable[[Item], Result], items: Iterable[Item], workers: int
 ) -> Generator[Result, None, None]:
-    """Results as they come."""
+    """Yield results in the order in which tasks end."""
     with cluster(workers) as ray:
         task = ray.remote(num_cpus=1, max_retries=RETRIES)(function)
         pending = [task.remote(item) for item in items]
@@ -60,7 +60,7 @@ def map_unordered(
 def map_ordered(
     function: Callable[[Item], Result], items: Iterable[Item], workers: int, waiting: int
 ) -> Generator[Result, None, None]:
-    """Results in the order of the items, of which at most ``waiting`` are with the cluster at once."""
+    """Yield results in the order of the items, at most ``waiting`` of which are queued or running at once."""
     with cluster(workers) as ray:
         task = ray.remote(num_cpus=1, max_retries=RETRIES)(function)
         pending: deque[Any] = deque()

@@ -1,4 +1,4 @@
-"""Loops over rows of float32 for kernels, each over so few arrays that LLVM vectorises it."""
+"""Arithmetic on rows of float32 for kernels; every loop is over so few arrays that LLVM vectorises it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from polsep.compute.compiling import ONE, ZERO, compiled
 
-#: Samples that a filter takes at a time.
+#: Samples that `filter_rows` reads at once.
 AT_ONCE = 6
 
 _ROUND, _ODD, _SIXTEEN = np.uint32(0x7FFF), np.uint32(1), np.uint32(16)
@@ -17,14 +17,14 @@ _SHIFTS = (np.uint64(16), np.uint64(32), np.uint64(48))
 
 @compiled
 def fill(value: Any, row: Any) -> None:
-    """Every number of a row is set to a value."""
+    """Set every number of a row to a value."""
     for j in range(row.size):
         row[j] = value
 
 
 @compiled
 def copy(x: Any, row: Any) -> None:
-    """The first numbers of ``x``."""
+    """Copy the first numbers of ``x`` to a row."""
     for j in range(row.size):
         row[j] = x[j]
 
@@ -66,7 +66,7 @@ def add_rows(x: Any, y: Any, z: Any, factor: Any, total: Any) -> None:
 
 @compiled
 def add_up(row: Any) -> float:
-    """The sum of a row in double precision, by eight sums that a processor can make at once."""
+    """Return the sum of a row in double precision, by eight sums that a processor adds at once."""
     a, b, c, d, e, f, g, h = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     whole = row.size - row.size % 8
     for j in range(0, whole, 8):
@@ -98,13 +98,12 @@ def average(row: Any, window: int, rows: Any) -> None:
 
 
 @compiled
-def filter_rows(weight: Any, taps: tuple[Any, Any], near: tuple[Any, Any], found: tuple[Any, Any, Any]) -> None:
-    """Three correlations with the same samples around, each of which is read once for all three.
+def filter_rows(weight: Any, rows: Any, places: Any, x: Any, start: Any, first: Any, second: Any, third: Any) -> None:
+    """Three correlations ``first``, ``second``, ``third`` with the same samples, each of which is read once.
 
-    ``weight [3, K]``; ``taps``: the row, 0 to 2, and the place in it, of what is weighed. ``near``: all samples, and
-    where each of the three rows begins.
+    ``weight [3, K]``; ``rows``, ``places [K]``: the row of each weighted sample and its place in it. ``x``: all
+    samples; ``start``: the index at which each row begins.
     """
-    (rows, places), (x, start), (first, second, third) = taps, near, found
     u, v, w, n = weight[0], weight[1], weight[2], first.size
     fill(ZERO, first)
     fill(ZERO, second)
@@ -125,23 +124,24 @@ def filter_rows(weight: Any, taps: tuple[Any, Any], near: tuple[Any, Any], found
 
 
 @compiled
-def emit(row: Any, target: tuple[Any, Any, int, int]) -> None:
-    """A row to a channel of maps, ``(floats, room, channel, row)``: to ``floats [h, w, channels]`` or, where these are
-    empty, as bfloat16 to ``room [channels, w]``, which `weave` takes on."""
-    floats, room, channel, t = target
+def emit(row: Any, floats: Any, halves: Any, channel: int, t: int) -> None:
+    """Write a row to a channel of ``floats [h, w, channels]``, row ``t``.
+
+    Where these are empty, as bfloat16 to ``halves [channels, w]``, which `weave` puts in order.
+    """
     if floats.size:
         out = floats[t, :, channel]
         for j in range(row.size):
             out[j] = row[j]
     else:
-        bits, half = row.view(np.uint32), room[channel]
+        bits, half = row.view(np.uint32), halves[channel]
         for j in range(row.size):
             half[j] = np.uint16((bits[j] + _ROUND + ((bits[j] >> _SIXTEEN) & _ODD)) >> _SIXTEEN)
 
 
 @compiled
 def weave(planes: Any, row: Any) -> None:
-    """Channels ``planes [n, w]`` of 16 bits to a row with channels last, ``[w, n]``; four at a time where they fit."""
+    """Write ``planes [n, w]`` of 16 bits to a row with channels last, ``[w, n]``; four at once where they fit."""
     n, w = planes.shape
     if n % 4:
         for k in range(n):
@@ -158,16 +158,16 @@ def weave(planes: Any, row: Any) -> None:
 
 
 @compiled
-def emit_product(x: Any, factor: Any, target: tuple[Any, Any, int, int], spare: Any) -> None:
-    """``x factor`` to a channel."""
+def emit_product(x: Any, factor: Any, floats: Any, halves: Any, channel: int, t: int, spare: Any) -> None:
+    """`emit` for ``x factor``; ``spare``: a buffer."""
     for j in range(spare.size):
         spare[j] = x[j] * factor[j]
-    emit(spare, target)
+    emit(spare, floats, halves, channel, t)
 
 
 @compiled
-def emit_bits(bits: Any, k: int, target: tuple[Any, Any, int, int], spare: Any) -> None:
-    """Whether bit ``k`` is set to a channel, 1 or 0."""
+def emit_bits(bits: Any, k: int, floats: Any, halves: Any, channel: int, t: int, spare: Any) -> None:
+    """`emit` for 1 where bit ``k`` is set, else 0; ``spare``: a buffer."""
     for j in range(spare.size):
         spare[j] = ONE if bits[j] >> k & 1 else ZERO
-    emit(spare, target)
+    emit(spare, floats, halves, channel, t)

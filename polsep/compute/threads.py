@@ -1,8 +1,8 @@
-"""Threads that share the strips of a frame.
+"""Threads that divide the rows of a frame between them.
 
-Kernels run without the interpreter's lock, so Python's own threads are enough: each takes more strips when it is done
-with some, and the calling thread works too. Unlike numba's parallel loops this keeps a busy core from holding up the
-others, works in forked children and from several threads at once, and takes less time to compile.
+Kernels run without the interpreter's lock, so Python's own threads are enough. Rows are handed out strip by strip, and
+the calling thread works too. Unlike numba's parallel loops, one busy core does not delay the others, forked children
+and several calling threads work, and compilation takes less time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Piece = tuple[int, int]
 
 
 def _default_threads() -> int:
-    """The cores that this process may use, or fewer if one of two environment variables says so."""
+    """Number of cores that this process may use, or fewer if one of two environment variables limits them."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
         limit = os.environ.get(name, "").split(",")[0].strip()  # OpenMP takes a list, one number per nesting level
@@ -31,7 +31,7 @@ def _default_threads() -> int:
 
 
 class _State:
-    """What changes: the number of threads, and a pool of ``helpers`` beside the callers, made when first needed."""
+    """State of the module: the number of threads, and a pool of ``helpers`` beside the callers, made on first use."""
 
     threads: int = _default_threads()
     lock = threading.Lock()
@@ -40,7 +40,7 @@ class _State:
 
 
 class _Own(threading.local):
-    """What one thread was told about its ``threads``."""
+    """Number of ``threads`` that `own_threads` set for one thread."""
 
     threads: int | None = None
 
@@ -49,7 +49,7 @@ _OWN = _Own()
 
 
 def _forget_pool() -> None:
-    """In a forked child: the pool's threads have stayed behind, and the lock may have been held by one of them."""
+    """Start a forked child afresh: it has none of the pool's threads, one of which may have held the lock."""
     _State.lock, _State.pool, _State.helpers = threading.Lock(), None, 0
 
 
@@ -58,11 +58,11 @@ if hasattr(os, "register_at_fork"):
 
 
 def get_threads() -> int:
-    """How many threads a kernel uses, the calling one among them.
+    """Return the number of threads that a kernel uses, the calling one included.
 
-    At first the number of cores that this process may use (its affinity mask, not the machine), but no more than
+    The default is the number of cores that this process may use (its affinity mask, not the machine), but no more than
     ``NUMBA_NUM_THREADS`` and ``OMP_NUM_THREADS`` where these are set when kernels are imported. Quotas of CPU time, as
-    containers have them, are not seen.
+    containers have them, are not taken into account.
     """
     return _OWN.threads or _State.threads
 
@@ -88,7 +88,7 @@ def own_threads(count: int) -> Iterator[None]:
 
 
 def _start_helpers(work: Callable[[], None], count: int) -> list[Future[None]]:
-    """Let ``count`` threads of the pool call ``work``; a pool that is too small is replaced and ends when idle."""
+    """Call ``work`` in ``count`` threads of the pool; a pool that is too small is replaced and ends when idle."""
     if count < 1:
         return []
     with _State.lock:
@@ -100,11 +100,11 @@ def _start_helpers(work: Callable[[], None], count: int) -> list[Future[None]]:
 
 
 def share(work: Callable[[Piece], Result], rows: int, step: int) -> list[Result]:
-    """Call ``work`` on `Piece` after piece of ``range(rows)``, in `get_threads` threads; its results in no fixed order.
+    """Call ``work`` on consecutive ranges of ``range(rows)`` in `get_threads` threads; results in no fixed order.
 
-    A piece starts at a multiple of ``step``, the rows of a strip. Returns when all is done. Several threads may call
-    this at once, and ``work`` may too: a caller never waits for helpers that have not begun. The first exception ends
-    the handing out and is raised here.
+    A range starts at a multiple of ``step``, the rows of a strip. Returns when all rows are done. Several threads may
+    call this at once, and so may ``work``: a caller never waits for helpers that have not started. After an exception
+    no more rows are handed out; it is raised here.
     """
     strips = -(-rows // step)
     threads = max(1, min(get_threads(), strips))
@@ -112,7 +112,7 @@ def share(work: Callable[[Piece], Result], rows: int, step: int) -> list[Result]
     results: list[Result] = []
 
     def take() -> Piece:
-        """The next strips: a share of those left, so that calls are few and all threads end together."""
+        """Return the next strips: a part of the rest, so that calls are few and all threads end together."""
         nonlocal taken
         with lock:
             first, left = taken, strips - taken

@@ -1,4 +1,4 @@
-"""Threads of this process that work in advance, in order, with little waiting in between; and the memory they use."""
+"""Background threads that prepare items in advance, in order; and the memory that streams reuse."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from typing import Any, TypeVar
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-#: Items that wait between two threads.
+#: Items queued between two threads.
 DEPTH = 2
-#: Of glibc's mallopt: what is set, and to what. No block can be kept that is larger than 32 MiB.
+#: Options of glibc's mallopt and their values; it cannot keep blocks of more than 32 MiB.
 _KEEPING = ((-8, 1), (-3, 32 * 2**20), (-1, 2**31 - 1))
 
 
 def keep_memory() -> None:
-    """Let this program keep what large arrays free for the next ones, on Linux: the same memory for every frame.
+    """Keep the memory that large arrays free for the next ones, on Linux, so that every frame reuses it.
 
-    Otherwise the system gives and takes pages all the time, which it clears first, and a stream's memory grows and
-    shrinks by what happens to wait. It is the program's decision, so no function of the library does it.
+    Otherwise the system clears new pages for every frame, and a stream's memory varies with its queues. Programs call
+    this, never the library.
     """
     if sys.platform == "linux":
         library = ctypes.CDLL(None)
@@ -34,13 +34,13 @@ def keep_memory() -> None:
 
 
 class _Ahead:
-    """What `ahead` shares between its two threads. State: items that wait, and whether anyone still wants them."""
+    """State that the two threads of `ahead` share: a queue of items, and a flag once the reader is ``gone``."""
 
     def __init__(self, items: Iterable[Any], depth: int) -> None:
         self.items, self.ready, self.gone = items, queue.Queue[tuple[bool, Any]](depth), threading.Event()
 
     def put(self, more: bool, item: Any) -> bool:
-        """Wait for room; False when nobody waits for the item any more."""
+        """Queue an item when there is space; False if the reader has gone."""
         while not self.gone.is_set():
             with suppress(queue.Full):
                 self.ready.put((more, item), timeout=0.1)
@@ -48,7 +48,7 @@ class _Ahead:
         return False
 
     def work(self) -> None:
-        """The making thread."""
+        """Queue all items; runs in the background thread."""
         try:
             if all(self.put(True, item) for item in self.items):
                 self.put(False, None)
@@ -60,7 +60,7 @@ class _Ahead:
 
 
 def ahead(items: Iterable[Item], depth: int = DEPTH) -> Generator[Item, None, None]:
-    """The items, made by a thread of their own, up to ``depth`` in advance; what is raised there is raised here.
+    """Yield the items, made by a background thread up to ``depth`` in advance; its exceptions are raised here.
 
     Closing this generator ends the thread, and closes ``items`` where that can be closed.
     """
@@ -82,9 +82,9 @@ def ahead(items: Iterable[Item], depth: int = DEPTH) -> Generator[Item, None, No
 
 
 def map_ahead(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Generator[Result, None, None]:
-    """What ``function`` makes of each item, in order, by so many threads; one more item than these is in advance.
+    """Yield ``function`` of each item, in order, computed by ``workers`` threads, at most one item more in advance.
 
-    What is raised there is raised here. Closing this generator waits for the threads' last items.
+    Exceptions of the threads are raised here. Closing this generator waits for the threads' last items.
     """
     waiting: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(workers, "polsep-worker") as pool:

@@ -1,4 +1,4 @@
-"""Twin of `demosaic.demosaic_bilinear_half`, one row of polarizer cells at a time, from sensor rows kept in a window.
+"""Twin of `bilinear.demosaic_bilinear_half`, one row of polarizer cells at a time, from sensor rows kept in a window.
 
 Words: a cell row r holds sensor rows 2r and 2r + 1 (from the layout's origin); an analyser sits in one of them, its
 ``half`` 0 or 1, and in one column of the cell. On colour sensors the samples of one analyser and one Bayer column are
@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, ZERO, compiled
-from polsep.sensor.camera import CLIP_MARGIN, Layout
+from polsep.sensor.camera import CLIP_MARGIN, Layout, check_frame
 from polsep.sensor.unpack_kernel import Samples, read_row
 
 #: Elements on each side of a phase for its repeated border sample; a cache line, so that phases stay aligned.
 PAD = 16
 
-#: Slots of a window: the rows that one cell row needs of each half, by row number modulo 4.
+#: Rows of each half that one cell row needs, by row number modulo 4.
 SLOTS = 4
 
 _OWN, _FAR = np.float32(0.875), np.float32(0.125)
@@ -35,7 +35,7 @@ _THREE_QUARTERS = np.float32(0.75)
 
 
 class Pattern(NamedTuple):
-    """Which filter covers which sample, and what a code means, as kernels take it.
+    """Filters and levels of a mosaic, as kernels read them.
 
     ``h``, ``w``: rows and columns of cells. ``top``, ``left``: sensor row and column of the first one. ``channels``: 3
     or 1. ``places [4, 2]``: row and column in the cell of each analyser, in the order of `Layout.angles_deg`.
@@ -72,15 +72,11 @@ class Window(NamedTuple):
 def read_pattern(
     shape: tuple[int, int], layout: Layout, black_level: float, white_level: float, light_color: tuple[float, ...]
 ) -> Pattern:
-    """The `Pattern` of a frame of that shape; gains divide the light's colour out, as `Mosaic.linear` does.
+    """Return the `Pattern` of a frame of that shape; gains divide the light's colour out, as `Mosaic.linear` does.
 
     Raises ValueError as `Mosaic` does, when white is not above black or the frame is smaller than one period.
     """
-    rows, cols = (layout.period + start for start in layout.origin)
-    if shape[0] < rows or shape[1] < cols:
-        raise ValueError(f"expected a mosaic [H, W] of at least {rows}x{cols}, found {tuple(shape)}")
-    if not white_level > black_level:
-        raise ValueError(f"white_level must be above black_level, found {white_level} and {black_level}")
+    check_frame(shape, layout, black_level, white_level)
     if len(light_color) < layout.channels or not all(gain > 0 for gain in light_color):
         raise ValueError(f"expected a light colour of {layout.channels} positive numbers, found {light_color!r}")
     cell = {float(layout.polarizer[row][col]): (row, col) for row in (0, 1) for col in (0, 1)}
@@ -147,10 +143,9 @@ def make_analysers(pattern: Pattern) -> Any:
 
 
 @compiled
-def _spread_phases(row: Any, black: Any, gains: tuple[Any, Any], phases: Any) -> None:
-    """A sensor row of codes as linear phases ``[4, n]``."""
+def _spread_phases(row: Any, black: Any, g0: Any, g1: Any, phases: Any) -> None:
+    """A sensor row of codes as linear phases ``[4, n]``; ``g0``, ``g1``: gains of even and odd Bayer columns."""
     p0, p1, p2, p3 = phases[0, PAD:], phases[1, PAD:], phases[2, PAD:], phases[3, PAD:]
-    g0, g1 = gains
     for t in range(row.size // 4):
         p0[t] = (row[4 * t] - black) * g0
         p1[t] = (row[4 * t + 1] - black) * g0
@@ -182,18 +177,18 @@ def _repeat_borders(phases: Any, cols: int) -> None:
 
 
 @compiled
-def _spread(pattern: Pattern, row: Any, black: Any, gains: tuple[Any, Any], phases: Any) -> None:
+def _spread(pattern: Pattern, row: Any, black: Any, g0: Any, g1: Any, phases: Any) -> None:
     """``(row - black) gain`` by phase, borders repeated."""
     if pattern.channels == 1:
-        _spread_halves(row, black, gains[0], phases)
+        _spread_halves(row, black, g0, phases)
     else:
-        _spread_phases(row, black, gains, phases)
+        _spread_phases(row, black, g0, g1, phases)
     _repeat_borders(phases, pattern.w)
 
 
 @compiled
 def any_clipped(row: Any, clip_at: Any) -> bool:
-    """Whether a row of codes has a clipped one."""
+    """True if a row of codes has a clipped one."""
     clipped = False
     for x in range(row.size):
         clipped |= row[x] >= clip_at
@@ -205,18 +200,19 @@ def _load(samples: Samples, pattern: Pattern, window: Window, r: int, half: int)
     """Bring one sensor row of cell row ``r`` into the window."""
     slot, row = r % SLOTS, window.row
     read_row(samples, pattern.top + 2 * r + half, pattern.left, row)
-    _spread(pattern, row, pattern.black, (pattern.gains[r % 2, 0], pattern.gains[r % 2, 1]), window.values[half, slot])
+    gains = pattern.gains[r % 2]
+    _spread(pattern, row, pattern.black, gains[0], gains[1], window.values[half, slot])
     clipped = any_clipped(row, pattern.clip_at)
     if clipped or window.flagged[half, slot]:
         for x in range(row.size):
             row[x] = ONE if row[x] >= pattern.clip_at else ZERO
-        _spread(pattern, row, ZERO, (ONE, ONE), window.flags[half, slot])
+        _spread(pattern, row, ZERO, ONE, ONE, window.flags[half, slot])
     window.flagged[half, slot] = clipped
 
 
 @compiled
 def open_window(samples: Samples, pattern: Pattern, window: Window, r: int) -> None:
-    """Load what cell row ``r`` shares with the one before it; `advance_window` then goes on from ``r``."""
+    """Load what cell row ``r`` shares with the one before it; `advance_window` continues from ``r``."""
     for half in range(2):
         for k in range(r - 1 - half, r + 2 - half):
             if 0 <= k < pattern.h:
@@ -258,13 +254,15 @@ def _interpolate_color(q: Any, p: int, step: int, out: Any) -> None:
 
 
 @compiled
-def _interpolate_green(a: tuple[Any, Any], q: Any, weights: tuple[Any, Any], step: int, out: Any) -> None:
-    """Quarter step of (1/4, 1/2, 1/4) * a + q / 2 along a row; even and odd Bayer columns of green are two phases."""
-    w, v = weights
-    a0, a0_far = a[0][PAD:], a[0][PAD + step :]
-    a1, a1_far = a[1][PAD:], a[1][PAD + step :]
-    a1_back, a1_near = a[1][PAD - (step > 0) :], a[1][PAD - (step < 0) :]
-    a0_back, a0_near = a[0][PAD + (step < 0) :], a[0][PAD + (step > 0) :]
+def _interpolate_green(even_a: Any, odd_a: Any, q: Any, w: Any, v: Any, step: int, out: Any) -> None:
+    """Quarter step of (1/4, 1/2, 1/4) * a + q / 2 along a row.
+
+    Even and odd Bayer columns of green are two phases, with weights ``w`` and ``v``.
+    """
+    a0, a0_far = even_a[PAD:], even_a[PAD + step :]
+    a1, a1_far = odd_a[PAD:], odd_a[PAD + step :]
+    a1_back, a1_near = odd_a[PAD - (step > 0) :], odd_a[PAD - (step < 0) :]
+    a0_back, a0_near = even_a[PAD + (step < 0) :], even_a[PAD + (step > 0) :]
     q0, q0_near, q1, q1_near = q[0, PAD:], q[0, PAD + (step > 0) :], q[1, PAD:], q[1, PAD - (step < 0) :]
     w_own, w_far, w_back, w_near = w * HALF * _OWN, w * HALF * _FAR, w * HALF * _BACK, w * HALF * _NEAR
     v_own, v_far, v_back, v_near = v * HALF * _OWN, v * HALF * _FAR, v * HALF * _BACK, v * HALF * _NEAR
@@ -273,14 +271,6 @@ def _interpolate_green(a: tuple[Any, Any], q: Any, weights: tuple[Any, Any], ste
         odd = v_own * a1[t] + v_far * a1_far[t] + w_back * a0_back[t] + w_near * a0_near[t]
         out[2 * t] = even + _BACK * q0[t] + _FAR * q1_near[t]
         out[2 * t + 1] = odd + _BACK * q1[t] + _FAR * q0_near[t]
-
-
-@compiled
-def _green_at_edge(a: tuple[Any, Any], q: Any, weights: tuple[Any, Any], j: int, inside: int) -> Any:
-    """Green of column ``j`` where the quarter step repeats the edge; ``inside`` is the column next to it."""
-    here = weights[j % 2] * a[j % 2][PAD + j // 2]
-    there = weights[inside % 2] * a[inside % 2][PAD + inside // 2]
-    return HALF * (here + there + q[j % 2, PAD + j // 2])
 
 
 @compiled
@@ -306,11 +296,13 @@ def _interpolate_colors(pattern: Pattern, rows: Any, q: Any, r: int, out: Any) -
             channel = pattern.bayer[(r + 1) % 2 if in_own_row else r % 2, p]
             _interpolate_color(q[2], p, step, out[k, channel])
         even, odd = (own, near) if green_first else (near, own)
-        weights = (w_own, w_near) if green_first else (w_near, w_own)
-        a = (rows[half, even, place], rows[half, odd, 2 + place])
-        _interpolate_green(a, q, weights, step, out[k, 1])
-        j = cols - 1 if step > 0 else 0
-        out[k, 1, j] = _green_at_edge(a, q, weights, j, j - step)
+        w, v = (w_own, w_near) if green_first else (w_near, w_own)
+        even_a, odd_a = rows[half, even, place], rows[half, odd, 2 + place]
+        _interpolate_green(even_a, odd_a, q, w, v, step, out[k, 1])
+        j = cols - 1 if step > 0 else 0  # the quarter step repeats the edge: green is a mean over two columns
+        i = (j if j % 2 == 0 else j - step) // 2
+        both = w * even_a[PAD + i] + v * odd_a[PAD + (j if j % 2 else j - step) // 2]
+        out[k, 1, j] = HALF * (both + q[j % 2, PAD + j // 2])
 
 
 @compiled
@@ -350,7 +342,7 @@ def interpolate_row(pattern: Pattern, window: Window, r: int, out: Any) -> None:
 
 @compiled
 def flag_row(pattern: Pattern, window: Window, r: int, out: Any) -> None:
-    """Like `interpolate_row`, the weight of clipped samples in each value: above 0 where any had a part in it."""
+    """The weight of clipped samples in each value of `interpolate_row`: above 0 where any contributed."""
     if pattern.channels == 1:
         _interpolate_mono(pattern, window.flags, r, out)
     else:

@@ -1,8 +1,8 @@
-"""Rows of polarizer cells, as the guided demosaicking takes them: four planes a row, one per place in the cell.
+"""Rows of polarizer cells for guided demosaicking: four planes a row, one per place in the cell.
 
 A row of cells is ``[4, n]``: plane 2 i + j holds the samples of sensor row i and column j of every cell. Rows are
-continued by `EDGE` mirrored cells on each side, and every function leaves `GUARD` values at both ends as they are, so
-that filters need no borders: what is wrong there never reaches the frame. Colours alternate along a row: ``other [n]``
+continued by `EDGE` mirrored cells on each side. No function computes the outermost `GUARD` values at both ends, so that
+filters need no borders: the errors there never reach the frame. Colours alternate along a row: ``other [n]``
 is 1 where a cell is red or blue (whichever the row has) and 0 where it is green. Loops multiply by it, exactly, because
 conditions keep them from being vectorised.
 
@@ -32,7 +32,7 @@ _GREEN_OWN, _GREEN_FAR, _GREEN_BACK, _GREEN_NEAR = (np.float32(k / 16) for k in 
 
 
 class Grid(NamedTuple):
-    """What all rows of a frame share. ``n``: length of a row, ``w`` cells and `EDGE` more on each side.
+    """Constants of all rows of a frame. ``n``: length of a row, ``w`` cells and `EDGE` more on each side.
 
     ``others [2, n]``: 1 where a cell of an even, an odd row is red or blue. ``colors [2]``: which of both (0 or 2).
     ``gains [2, n]``: of the samples. ``sources [2 EDGE]``: column of the frame behind each mirrored one.

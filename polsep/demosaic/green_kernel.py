@@ -30,7 +30,7 @@ _MARGIN, _MIN_SHARE = np.float32(twin.DIFFERENCE_MARGIN), np.float32(twin.MIN_SH
 
 
 class Green(NamedTuple):
-    """Rings on the way to green, as long as they are looked back on; all ``[length, k, n]`` but the single ``rows``.
+    """Rings of the steps to green, as long as later steps need; all ``[length, k, n]`` but the single ``rows``.
 
     ``sums``: of products and s0 over 3 and over 2 cells of a row. ``raw``: differences down the columns, ``along`` and
     ``down``: smoothed ones. ``rough``: squared derivatives of both and squared detail of both, over 3 cells.
@@ -262,7 +262,7 @@ def _variance(x: Any, smooth: Any, out: Any) -> None:
 
 @compiled
 def _kept_share(variance: Any, error: Any) -> None:
-    """How much of the detail of the difference counts, into ``variance``. Twin: `guided._without_error`."""
+    """Share of the detail of the difference that counts, into ``variance``. Twin: `guided._without_error`."""
     for j in range(variance.size):
         share = (variance[j] - _MARGIN * error[j]) / (variance[j] + _ERROR_FLOOR)
         variance[j] = share if share > ZERO else ZERO

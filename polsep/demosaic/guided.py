@@ -20,8 +20,8 @@ The idea of an intensity guide for polarization mosaics is Morimatsu et al. 2020
 10.1109/ICIP40778.2020.9191062); the steps are this project's, see docs/experiments.md.
 
 Exact on uniform fields to the border, which is continued by mirroring whole cells, and on linear fields inside.
-Estimates of different colours are no longer blurred alike, which invents relations between them. Those who relate
-colours find the bilinear samples in `Measurements.uniform`. Pixels touched by clipping keep the bilinear samples.
+Estimates of different colours are no longer blurred alike, which invents relations between them. Methods that relate
+colours use the bilinear samples in `Measurements.uniform`. Pixels touched by clipping keep the bilinear samples.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def fill_colors(mosaic: Tensor, layout: Layout) -> Tensor:
 
 
 def color_masks(mosaic: Tensor, layout: Layout, block: int) -> Tensor:
-    """Where each colour is: ``[C, n, m]`` of 0 and 1 per pixel of a mosaic (``block`` 2) or per cell (``block`` 1)."""
+    """Masks of the colours: ``[C, n, m]`` of 0 and 1 per pixel of a mosaic (``block`` 2) or per cell (``block`` 1)."""
     colors = torch.tensor(["RGB".index(color) for color in layout.bayer or "RRRR"], device=mosaic.device).view(2, 2)
     own = (colors == torch.arange(layout.channels, device=mosaic.device)[:, None, None]).to(mosaic.dtype)
     return repeat_tile(own, mosaic if block == 2 else mosaic[..., ::2, ::2], block)

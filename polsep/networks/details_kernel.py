@@ -90,8 +90,8 @@ def _starts(y: int, h: int, size: int, starts: Any) -> None:
 @compiled
 def _interpolate(smooth: Smooth, ring: Any, starts: Any, found: Any) -> None:
     """Three details ``found [3, n]`` of a row from a ring ``[5, n + 4]`` of means."""
-    near = (ring.reshape(-1), starts)
-    filter_rows(smooth.weight, (smooth.row, smooth.place), near, (found[0], found[1], found[2]))
+    x = ring.reshape(-1)
+    filter_rows(smooth.weight, smooth.row, smooth.place, x, starts, found[0], found[1], found[2])
 
 
 @compiled
@@ -174,7 +174,7 @@ def emit_details(details: Floats, closed: ClosedFormRows, inputs: LayerInput, pi
                 x = around[k, side:]
                 for j in range(row.size):
                     row[j] = np.log(x[2 * j] / (light[j] * light[j]) + _LEAST)
-                emit(row, (inputs.floats, room, 4 * k + 2 * (y % 2) + side, y // 2))
+                emit(row, inputs.floats, room, 4 * k + 2 * (y % 2) + side, y // 2)
         if inputs.halves.size and y % 2:
             weave(room, inputs.halves[y // 2])
 

@@ -133,7 +133,7 @@ def _starts(u: int, h: int, size: int) -> Any:
 @compiled
 def _filter_samples(taps: Taps, u: int, h: int, rings: _Rings, polarized: Any) -> None:
     """Stokes images of row ``u`` by the linear filter: s0 to its ring, s1 and s2 to ``polarized [8 C, w]``."""
-    near = (rings.planes.reshape(-1), _starts(u, h, rings.planes[0].size))
+    x, starts = rings.planes.reshape(-1), _starts(u, h, rings.planes[0].size)
     s0, colors = rings.s0[u % KEPT], taps.colors
     for cell in range(4):
         for k in range(0, 3 * colors, 3):
@@ -143,18 +143,18 @@ def _filter_samples(taps: Taps, u: int, h: int, rings: _Rings, polarized: Any) -
                 _stokes_row(4 * k + 8 + cell, s0, polarized),
             )
             weight = taps.weight[cell, k : k + 3]
-            filter_rows(weight, (taps.row[cell], taps.place[cell]), near, (first, second, third))
+            filter_rows(weight, taps.row[cell], taps.place[cell], x, starts, first, second, third)
 
 
 @compiled
 def _filter_details(taps: Taps, u: int, h: int, rings: _Rings, work: tuple[Any, Any]) -> None:
     """Details of s0 of row ``u`` by the linear filter."""
     details, spare = work
-    near = (rings.planes.reshape(-1), _starts(u, h, rings.planes[0].size))
+    x, starts = rings.planes.reshape(-1), _starts(u, h, rings.planes[0].size)
     for cell in range(4):
         for k in range(0, 3 * taps.colors, 3):
             weight = taps.weight[cell, 3 * taps.colors + k : 3 * taps.colors + k + 3]
-            filter_rows(weight, (taps.row[cell], taps.place[cell]), near, (spare[0], spare[1], spare[2]))
+            filter_rows(weight, taps.row[cell], taps.place[cell], x, starts, spare[0], spare[1], spare[2])
             for i in range(3):
                 row, out = spare[i], details[2 * u + cell // 2, k + i, cell % 2 :]
                 for j in range(row.size):
@@ -291,11 +291,11 @@ def _emit_samples(t: int, slot: int, rings: _Rings, maps: Maps, spare: Any) -> N
     channels, inverse, row = maps.channels, spare[0], spare[11]
     if channels.samples >= 0:
         for k in range(16):
-            emit_product(rings.planes[slot, k, 1:], inverse, (maps.floats, rings.room, channels.samples + k, t), row)
+            emit_product(rings.planes[slot, k, 1:], inverse, maps.floats, rings.room, channels.samples + k, t, row)
     if channels.clipped >= 0:
         for k in range(16):
-            emit_bits(maps.closed.clipped[t], k, (maps.floats, rings.room, channels.clipped + k, t), row)
-        emit(rings.free[slot], (maps.floats, rings.room, channels.unclipped_around, t))
+            emit_bits(maps.closed.clipped[t], k, maps.floats, rings.room, channels.clipped + k, t, row)
+        emit(rings.free[slot], maps.floats, rings.room, channels.unclipped_around, t)
 
 
 @compiled
@@ -303,16 +303,16 @@ def _emit_closed_form(t: int, rings: _Rings, maps: Maps, spare: Any) -> None:
     """The closed form of row ``t`` to its maps."""
     channels, closed, inverse, row, contrast = maps.channels, maps.closed, spare[0], spare[11], spare[3]
     for k in range(closed.diffuse.shape[1]):
-        emit_product(closed.diffuse[t, k], inverse, (maps.floats, rings.room, channels.diffuse + k, t), row)
+        emit_product(closed.diffuse[t, k], inverse, maps.floats, rings.room, channels.diffuse + k, t, row)
     for k in range(4):
-        emit_product(closed.specular[t, k], inverse, (maps.floats, rings.room, channels.specular + k, t), row)
+        emit_product(closed.specular[t, k], inverse, maps.floats, rings.room, channels.specular + k, t, row)
     for k in range(2):
-        emit(spare[4 + k], (maps.floats, rings.room, channels.wide + k, t))
-        emit(spare[6 + k], (maps.floats, rings.room, channels.narrow + k, t))
+        emit(spare[4 + k], maps.floats, rings.room, channels.wide + k, t)
+        emit(spare[6 + k], maps.floats, rings.room, channels.narrow + k, t)
     for j in range(row.size):
         row[j] = np.sqrt(contrast[j] + _TINY)
-    emit(row, (maps.floats, rings.room, channels.contrast, t))
-    emit_product(closed.fit_residual[t], inverse, (maps.floats, rings.room, channels.fit_residual, t), row)
+    emit(row, maps.floats, rings.room, channels.contrast, t)
+    emit_product(closed.fit_residual[t], inverse, maps.floats, rings.room, channels.fit_residual, t, row)
 
 
 @compiled
@@ -329,14 +329,14 @@ def _finish_row(t: int, rings: _Rings, maps: Maps, spare: Any) -> None:
     _emit_samples(t, slot, rings, maps, spare)
     for cell in range(4):
         if channels.cosine >= 0:
-            emit_product(rings.cosine[slot, cell], inverse, (maps.floats, rings.room, channels.cosine + cell, t), row)
+            emit_product(rings.cosine[slot, cell], inverse, maps.floats, rings.room, channels.cosine + cell, t, row)
         if channels.sine >= 0:
-            emit_product(rings.sine[slot, cell], inverse, (maps.floats, rings.room, channels.sine + cell, t), row)
+            emit_product(rings.sine[slot, cell], inverse, maps.floats, rings.room, channels.sine + cell, t, row)
     if channels.diffuse >= 0:
         _emit_closed_form(t, rings, maps, spare)
     for j in range(row.size):
         row[j] = np.log(light[j])
-    emit(row, (maps.floats, rings.room, channels.log_brightness, t))
+    emit(row, maps.floats, rings.room, channels.log_brightness, t)
     if maps.halves.size:
         weave(rings.room, maps.halves[t])
 

@@ -1,1 +1,1 @@
-"""What light does: Stokes vectors, Mueller matrices, Fresnel, microfacets."""
+"""The physics of polarized light: Stokes vectors, Mueller matrices, Fresnel, microfacets."""

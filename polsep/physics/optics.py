@@ -1,4 +1,4 @@
-"""What surfaces and filters do to polarized light: Mueller matrices, Fresnel, GGX, the polarimetric BRDF.
+"""Surfaces and filters in polarized light: Mueller matrices, Fresnel, GGX, the polarimetric BRDF.
 
 Conventions:
 
@@ -134,7 +134,7 @@ def _camera_and_light_beams(g: Geometry) -> tuple[Beam, Beam]:
 
 
 def _lit(g: Geometry) -> tuple[Tensor, Tensor, Tensor]:
-    """cos at the light, cos at the camera, and where both see the surface's front."""
+    """cos at the light, cos at the camera, and 1 where both face the surface's front."""
     cos_i, cos_o = dot(g.normal, g.to_light), dot(g.normal, g.to_camera)
     return cos_i.clamp(0, 1), cos_o.clamp(0, 1), ((cos_i > 0) & (cos_o > 0)).to(cos_i)
 

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-#: DoLP of separated frames at most: what least squares make of one bright analyser among four. Methods whose s0 comes
+#: Largest DoLP of separated frames: that of least squares with one bright analyser among four. Methods whose s0 comes
 #: from other samples than their s1 and s2 would have any number in the dark.
 MAX_DOLP = 2.0
 
@@ -57,7 +57,7 @@ class Stokes:
 
 @dataclass(frozen=True)
 class Measurements:
-    """What K analysers saw at the same points: ``data`` and ``clipped`` are ``[..., K, C, H, W]``.
+    """Samples behind K analysers at the same points: ``data`` and ``clipped`` are ``[..., K, C, H, W]``.
 
     ``angles`` are the K analyser angles in radians. ``clipped`` marks samples that are only known to be at least as
     bright as their value; it may be None when nothing clips. ``variance [..., 1, H, W]`` is the variance of colour
@@ -86,7 +86,7 @@ def analyser_matrix(angles: Sequence[float]) -> Tensor:
 
 
 def _analyser_rows(angles: Sequence[float]) -> list[list[float]]:
-    """`analyser_matrix` as numbers, which whoever traces a computation takes for constants."""
+    """`analyser_matrix` as numbers, which are constants to whoever traces a computation."""
     return [[0.5, 0.5 * math.cos(2 * t), 0.5 * math.sin(2 * t)] for t in angles]
 
 
@@ -187,7 +187,7 @@ def unclipped_inverse(angles: tuple[float, ...], code: int) -> tuple[Tensor | No
 
 
 def analyser_residual(measurements: Measurements) -> Tensor:
-    """How far four analysers miss being a Stokes vector: the component of m outside the range of P, ``[..., C, H, W]``.
+    """Contradiction of four analysers: the component of m outside the range of P, ``[..., C, H, W]``.
 
     With 0/45/90/135 degrees it is ``(m0 - m45 + m90 - m135) / 2``: zero without noise, clipping or misregistration,
     and of the same standard deviation as one sample's noise otherwise. Raises ValueError unless four analysers

@@ -1,1 +1,1 @@
-"""What the sensor does: layouts, levels, noise, orientation, packed samples."""
+"""The polarization sensor: layouts, levels, noise, orientation, packed samples."""

@@ -1,7 +1,7 @@
-"""The forward sensor: which filter sits on which pixel, and what a sample of light becomes in a file.
+"""The forward sensor: from light on the pixels to the samples of a raw frame.
 
-`Layout` says which analyser and colour filter covers each pixel, `Sensor` what exposure does to the light, and
-`Mosaic` is one raw frame. `demosaic` is the inverse of this module.
+`Layout` gives the analyser and colour filter of each pixel, `Sensor` its noise, clipping and converter, and `Mosaic` is
+one raw frame. `demosaic` is the inverse of this module.
 
 Conventions: rows grow downward. A layout's polarizer angles are in DEGREES, as printed in camera manuals, because
 they are data that people type; everything computed from them is in radians. Sony's IMX250MZR/MYR and relatives have
@@ -33,7 +33,7 @@ Cell = tuple[tuple[float, float], tuple[float, float]]
 
 
 class Filter(NamedTuple):
-    """What covers one pixel: the analyser angle [degrees] and the colour channel (0, 1, 2; 0 on mono sensors)."""
+    """The filters on one pixel: the analyser angle [degrees] and the colour channel (0, 1, 2; 0 on mono sensors)."""
 
     angle_deg: float
     channel: int
@@ -41,7 +41,7 @@ class Filter(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """Which filters cover which pixel of a mosaic; data, never a global.
+    """Order of the filters on a mosaic; data, never a global.
 
     ``polarizer``: 2x2 analyser angles in degrees, four different ones. ``bayer``: the colours of a 2x2 block of such
     cells in reading order, or None for mono sensors. ``origin``: row and column (0 or 1) of the first whole cell,
@@ -167,6 +167,15 @@ class Layout:
         return Layout.from_table([[turned[col][row] for col in range(4)] for row in range(4)])
 
 
+def check_frame(shape: tuple[int, ...], layout: Layout, black_level: float, white_level: float) -> None:
+    """Raise ValueError when white is not above black or a frame ``[..., H, W]`` is smaller than one period."""
+    rows, cols = (layout.period + start for start in layout.origin)
+    if len(shape) < 2 or shape[-2] < rows or shape[-1] < cols:
+        raise ValueError(f"expected a mosaic [..., H, W] of at least {rows}x{cols}, found {shape}")
+    if not white_level > black_level:
+        raise ValueError(f"white_level must be above black_level, found {white_level} and {black_level}")
+
+
 @dataclass(frozen=True)
 class Mosaic:
     """One raw frame (or a batch): linear sensor values ``data [..., H, W]`` with what is needed to read them.
@@ -183,11 +192,7 @@ class Mosaic:
     light_color: tuple[float, ...] = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
-        rows, cols = (self.layout.period + start for start in self.layout.origin)
-        if self.data.ndim < 2 or self.data.shape[-2] < rows or self.data.shape[-1] < cols:
-            raise ValueError(f"expected a mosaic [..., H, W] of at least {rows}x{cols}, found {tuple(self.data.shape)}")
-        if not self.white_level > self.black_level:
-            raise ValueError(f"white_level must be above black_level, found {self.white_level} and {self.black_level}")
+        check_frame(tuple(self.data.shape), self.layout, self.black_level, self.white_level)
 
     def linear(self) -> Tensor:
         """Samples with black at 0 and white at 1, under white light; float32 (float64 for float64 data)."""
@@ -212,7 +217,7 @@ class Mosaic:
 
 @dataclass(frozen=True)
 class Sensor:
-    """What a pixel does to light. Signals are fractions of ``full_well``, which maps to the white level.
+    """Properties of a pixel. Signals are fractions of ``full_well``, which maps to the white level.
 
     ``full_well``: electrons at the white level (inf: no shot noise). ``read_noise``: electrons rms.
     ``bits``: depth of the converter, None for none. ``diattenuation``: D = (ER - 1) / (ER + 1) of the analysers for
@@ -256,7 +261,7 @@ IDEAL = Sensor()
 def sample_mosaic(measurements: Measurements, layout: Layout) -> Tensor:
     """The mosaic ``[..., H, W]`` of angle images ``[..., 4, C, H, W]``: of each pixel the sample behind its filter.
 
-    The twin of every demosaicker. Channels beyond the layout's colours are not looked at. Raises ValueError when the
+    The twin of every demosaicker. Channels beyond the layout's colours are ignored. Raises ValueError when the
     measurements lack an analyser of the layout.
     """
     data = measurements.data

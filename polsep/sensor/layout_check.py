@@ -1,12 +1,12 @@
-"""Does a frame agree with the layout it is read with? A check from the identity m0 + m90 = m45 + m135.
+"""Check that a frame agrees with its layout, by the identity m0 + m90 = m45 + m135.
 
 Four analysers 45 degrees apart obey the identity whatever the light. In a 2x2 cell it fixes which samples are crossed
 pairs: those on the diagonals (Sony's order and all its shifts, mirrors and rotations), in the rows, or in the columns.
 Colour sensors show more: the colour changes from cell to cell, which gives the cells' alignment, and the two greens lie
 on one diagonal of the Bayer block.
 
-What no frame can tell: 0 and 90 swapped, 45 and 135 swapped, or the two pairs swapped obey the same identity, and so do
-red and blue. A mirrored, rotated or transposed MONO frame therefore looks in order. The check never warns of those.
+No frame can show these: 0 and 90 swapped, 45 and 135 swapped, or the two pairs swapped obey the same identity, and so
+do red and blue. A mirrored, rotated or transposed MONO frame therefore looks in order. The check never warns of those.
 
 All statistics are means over blocks of 16x16 pixels, first-order corrected for the brightness gradient, without blocks
 that hold a clipped sample, in units of the mean brightness. The light's colour is left in: what is compared are the
@@ -25,7 +25,7 @@ from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
 
 Floats = NDArray[np.float32]
 
-#: Mean contradiction of a layout, relative to brightness, above which it is doubted at all.
+#: Mean contradiction of a layout, relative to brightness, below which it is never called wrong.
 MIN_CONTRADICTION = 0.006
 #: Analysers' gains may differ: a contradiction that is this share of the brightness everywhere is not counted. Real
 #: IMX250MZR frames show 2 %.
@@ -50,10 +50,10 @@ _ORDERS = {"diagonals": ((90, 45), (135, 0)), "rows": ((0, 90), (45, 135)), "col
 
 @dataclass(frozen=True)
 class LayoutCheck:
-    """What a frame says of its layout. ``warning`` is one line, or None when nothing contradicts the layout.
+    """Result of the check. ``warning`` is one line, or None when nothing contradicts the layout.
 
     ``pairs``: which samples of a cell are crossed ("diagonals", "rows", "columns"), None if the light is too little
-    polarized to say. ``color``: True, False, or None if grey. ``fits``: layouts that agree with the frame.
+    polarized. ``color``: True, False, or None if grey. ``fits``: layouts that agree with the frame.
     """
 
     warning: str | None
@@ -63,7 +63,7 @@ class LayoutCheck:
 
 
 def crossed_pairs(layout: Layout) -> str | None:
-    """Where a layout's crossed analysers lie in the cell; None when its angles are not 45 degrees apart."""
+    """Position of a layout's crossed analysers in the cell; None when its angles are not 45 degrees apart."""
     (a, b), (c, d) = layout.polarizer
     for name, (first, second) in {
         "diagonals": (a - d, b - c),
@@ -76,9 +76,9 @@ def crossed_pairs(layout: Layout) -> str | None:
 
 
 def _strips(mosaic: Mosaic) -> list[Floats]:
-    """The first frame's samples; of a large one `STRIPS` of them: as sure, in an eighth of the time.
+    """The first frame's samples; of a large one `STRIPS` of them: as reliable, in an eighth of the time.
 
-    All that follows is NumPy's, in this thread: torch would wake its others for every step, which takes less than that.
+    Everything else is NumPy, in this thread: waking torch's threads would take longer than a step.
     """
     frame = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0]
     height = frame.shape[0]
@@ -153,7 +153,7 @@ def _contradictions(cells: Floats) -> dict[str, float]:
 
 
 def _color_contrast(cells: Floats) -> tuple[float, float]:
-    """How much neighbouring cells differ relative to brightness; +1 for greens on the antidiagonal, -1 on the other."""
+    """Difference of neighbouring cells relative to brightness; +1 for greens on the antidiagonal, -1 on the other."""
     brightness = cells.mean(1)
     diagonal, rows, columns = (signs @ brightness / 4 for signs in _PAIRINGS.values())
     contrast = (np.abs(diagonal) + np.abs(rows) + np.abs(columns)) / np.maximum(brightness.mean(0), 1e-9)
@@ -184,7 +184,7 @@ def check_layout(mosaic: Mosaic) -> LayoutCheck:
 
 
 def _find_color(phases: Floats, texture: Floats, layout: Layout) -> tuple[bool | None, tuple[int, int], float]:
-    """Whether cells differ in colour, at which alignment they differ most, and the greens' diagonal (0: unknown)."""
+    """Return if cells differ in colour, the alignment where they differ most, and the greens' diagonal (0: unknown)."""
     brightness = phases.mean((0, 1))
     bright = brightness > 0.1 * brightness.mean()
     phases, least = phases[..., bright], max(MIN_COLOR, 1.5 * float(np.median(texture[bright])))

@@ -1,11 +1,11 @@
-"""From arrays of any origin to `Mosaic` and `Measurements`: which samples are accepted, where black and white lie.
+"""From arrays of any origin to `Mosaic` and `Measurements`: accepted samples, black and white levels.
 
 Conventions, shared by Python callers and by files:
 
 * Samples are uint8, uint16, float32 or float64, finite, one value per pixel; they become float32, in which 8- and
   16-bit codes are exact. Signed integers, booleans and complex numbers are refused.
 * A white level of None means the largest code of the dtype: 255, 65535, or 1.0 for floats. Nothing else is ever
-  assumed: what the values look like (12 bits in 16, for example) is said in a note, a one-line remark for the user.
+  assumed: the likely bit depth (12 bits in 16, for example) is reported in a note, one line for the user.
 * Samples above the white level are kept and count as clipped; samples below the black level are kept.
 * Everything refused raises ValueError with one line: what was expected, what was found.
 """
@@ -103,7 +103,7 @@ def interleave_planes(planes: NDArray[Any], layout: Layout) -> NDArray[Any]:
 
 
 def level_notes(samples: NDArray[Any], black_level: float, white_level: float | None) -> Notes:
-    """What the values say about exposure and bit depth, one line each; ``white_level`` None was not said by anyone."""
+    """Notes on exposure and bit depth, one line each; ``white_level`` None means that the caller gave none."""
     white = WHITE_LEVELS[samples.dtype.name] if white_level is None else white_level
     low, high = float(samples.min()), float(samples.max())
     if high <= black_level:
@@ -126,7 +126,7 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
 
 
 def _depth_notes(samples: NDArray[Any], high: int) -> Notes:
-    """What uint16 values look like when nobody has said their white level. Left-justified codes have idle low bits."""
+    """The likely bit depth of uint16 values of unknown white level. Left-justified codes have idle low bits."""
     used = int(np.bitwise_or.reduce(samples, axis=None))
     idle = (used & -used).bit_length() - 1
     left = next((bits for bits in _NARROW_BITS if idle >= 16 - bits), None)
@@ -186,7 +186,7 @@ def _one_channel(array: NDArray[Any]) -> tuple[NDArray[Any], Notes]:
 
 
 def _white_level(samples: NDArray[Any], black_level: float, white_level: float | None) -> float:
-    """The white level said, or that of the dtype. Raises ValueError unless it is finite and above black."""
+    """The given white level, or that of the dtype. Raises ValueError unless it is finite and above black."""
     white = WHITE_LEVELS[samples.dtype.name] if white_level is None else white_level
     for name, level in (("black", black_level), ("white", white)):
         if not isinstance(level, Real):

@@ -1,4 +1,4 @@
-"""How noisy a stream of raw frames is, measured from the stream itself: variance = gain x signal + floor.
+"""Noise of a stream of raw frames, measured from the stream itself: variance = gain x signal + floor.
 
 Photons make the noise of a sample grow with its light (shot noise), the converter adds the same to all (read noise and
 rounding). Two differences show both: of a sample to the same sample's mean over the frames before, where nothing moves,
@@ -6,7 +6,7 @@ and to its neighbours behind the same filter, where the picture is smooth. Motio
 at each brightness the smaller one counts, and of each the median over blocks of 4x4 samples after blocks that differ by
 far more than most are left out: a minority that moves does not matter, nor does a pan over a scene with smooth parts.
 
-Unit: that of the samples (codes), black included where it says sample, taken off where it says signal.
+Unit: that of the samples (codes); a sample includes the black level, a signal does not.
 Source: the linear model is Janesick 2007 (Photon transfer, doi:10.1117/3.725073) and Foi et al. 2008
 (doi:10.1109/TIP.2008.2001399); the estimator is this project's.
 """
@@ -24,7 +24,7 @@ Doubles = NDArray[np.float64]
 
 #: Samples along the side of a block: one period of any layout's filters.
 BLOCK = 4
-#: Blocks that an estimate looks at, about; most and fewest bins of brightness, blocks per bin, and the fewest of one.
+#: Approximate number of blocks of an estimate; most and fewest bins of brightness, blocks per bin, the fewest of one.
 BLOCKS, MAX_BINS, FEWEST_BINS, BLOCKS_PER_BIN, MIN_BLOCKS = 6144, 64, 6, 48, 24
 #: Quarter and median of chi-squared over its degrees, of 12: a block's 16 samples are not of one brightness.
 QUARTER, MEDIAN = 8.438 / 12, 11.34 / 12
@@ -37,7 +37,7 @@ ROUNDING = 2.0**-20
 #: Rounds of the robust fit, and the deviation of a bin of one block, relative to its variance: of a median of
 #: chi-squared, 1.25 sqrt(2 / 16). Bins off by more count less, those above the line least: motion and texture only add.
 ROUNDS, DEVIATION = 16, 0.44
-#: What neighbours say is a limit with this margin: the smaller of two guesses is too small on average.
+#: Factor on the estimate from neighbours, an upper limit: the smaller of two estimates is too small on average.
 MARGIN = 1.15
 
 
@@ -80,10 +80,10 @@ def blocks_of(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def estimate_noise(now: NDArray[Any], before: tuple[Floats, Floats] | None, levels: Levels, turn: int) -> Noise | None:
-    """The noise of samples ``now [H, W]``; None where too few blocks can say.
+    """The noise of samples ``now [H, W]``; None if too few blocks are usable.
 
-    ``before``: means ``[H, W]`` and of how many frames, per block; None in the first frame, when only neighbours
-    speak. ``turn`` chooses which rows of blocks are looked at in large frames. H and W are multiples of 4.
+    ``before``: means ``[H, W]`` and their numbers of frames, per block; None in the first frame, when only
+    neighbours count. ``turn`` chooses the rows of blocks that are used in large frames. H and W are multiples of 4.
     """
     rows, cols = (n // BLOCK for n in now.shape)
     step = max(1, rows * cols // BLOCKS)
@@ -132,7 +132,7 @@ def _by_brightness(signal: Floats, changes: list[Floats], span: float) -> Double
 
 
 def _central(values: Floats) -> float:
-    """The variance of which blocks' mean squares ``values`` are samples, most of them; inf where too few are finite."""
+    """The variance that explains most of the blocks' mean squares ``values``; inf if too few are finite."""
     values = values[np.isfinite(values)]
     if values.size < MIN_BLOCKS:
         return float("inf")

@@ -1,8 +1,8 @@
-"""Frames of any orientation and crop as a network knows them: filters in one order, sides in whole periods.
+"""Frames of any orientation and crop as a network expects them: filters in one order, sides in whole periods.
 
-A mosaic whose filters are in another order by a mirror, a transposition or an odd crop is turned and continued until
-they are in the wanted one; images made of it are turned and cropped back. Mosaics are continued by whole periods, so
-that every added sample lies behind its own filter. Signs of Stokes images follow `Layout.flipped_horizontal`.
+A mosaic whose filters are in another order, by a mirror, a transposition or an odd crop, is turned and continued until
+they are in the wanted one; its images are turned and cropped back. Mosaics are continued by whole periods, so that
+every added sample lies behind its own filter. Signs of Stokes images follow `Layout.flipped_horizontal`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PERIOD = 4
 
 @dataclass(frozen=True)
 class Orientation:
-    """How a frame of ``height`` x ``width`` becomes a wanted one: transposed, mirrored, then continued.
+    """Steps from a frame of ``height`` x ``width`` to a wanted one: transposed, mirrored, then continued.
 
     ``top``, ``left``: samples added there, of the turned frame; below and at the right it is continued to multiples of
     `PERIOD`. ``origin``: first whole cell of the frame as it is, as in `Layout`.
@@ -47,7 +47,7 @@ class Orientation:
 
     @property
     def keeps_cells(self) -> bool:
-        """Whether cells of the turned frame are those of the frame.
+        """True if cells of the turned frame are those of the frame.
 
         Always in colour. Mono frames cropped at an odd offset have cells of their own, half a cell apart: there
         images of half resolution are best made of full ones that were turned back.
@@ -85,7 +85,7 @@ class Orientation:
 
 
 def _span(count: int, origin: int, before: int, mirrored: bool) -> tuple[int, int]:
-    """Where whole cells of a side of ``count`` samples lie behind ``before`` more, mirrored or not, and how many."""
+    """First whole cell of a side of ``count`` samples behind ``before`` more, mirrored or not, and how many samples."""
     whole = (count - origin) // 2 * 2
     return before + (count - origin - whole if mirrored else origin), whole
 

@@ -1,4 +1,4 @@
-"""Rows of raw samples, whatever they are stored as: 8 and 16 bits, float32, and two pixels of 12 bits in three bytes.
+"""Rows of raw samples in any storage: 8 and 16 bits, float32, and two pixels of 12 bits in three bytes.
 
 A kernel reads one sensor row at a time, so a packed frame never becomes a full frame of words. Packings, as GenICam
 names them and `polsep.io.raw.genicam` defines them:
@@ -70,7 +70,7 @@ RawFrame = NDArray[Any] | PackedFrame
 
 
 class Samples(NamedTuple):
-    """A frame as kernels take it: all its samples in the one array of their type, the other two arrays being empty.
+    """A frame as kernels read it: all its samples in the one array of their type, the other two arrays being empty.
 
     ``stored``: one of the constants above. Row y starts at element ``y row_size`` and, in packed frames, at the pixel
     ``y row_pixels`` from there. One type for all frames, so that kernels are compiled once.
@@ -85,7 +85,7 @@ class Samples(NamedTuple):
 
 
 def as_samples(raw: RawFrame) -> Samples:
-    """What kernels read of a raw mosaic ``[H, W]`` (uint8, uint16, float32) or packed frame.
+    """Return the samples of a raw mosaic ``[H, W]`` (uint8, uint16, float32) or packed frame.
 
     A view, or a copy if there are gaps between the rows or samples, or they are not aligned. Raises ValueError on
     another dtype or shape.

@@ -25,10 +25,11 @@ class Separation:
     """A diffuse and a specular image ``[..., C, h, w]`` with ``valid [..., h, w]`` and the `stokes` they came from.
 
     ``diffuse_polarization [..., 2, h, w]``: (beta_d cos 2 phi_d, beta_d sin 2 phi_d) that the method
-    found, or None. ``residual``, ``[..., 1, h, w]``: rms distance of the polarization over colours from its model, or
-    None. ``noise``, ``[..., 1, h, w]``: standard deviation of one sample as the analysers' own contradiction shows it.
-    ``clipped [..., h, w]``: pixels to which a clipped sample contributed, None where nobody looked. ``expected_error``,
-    ``[..., 2, h, w]``: standard deviation of the error of diffuse and specular as the method expects it, or None.
+    estimated, or None. ``residual``, ``[..., 1, h, w]``: rms distance of the polarization over colours from its model,
+    or None. ``noise``, ``[..., 1, h, w]``: standard deviation of one sample as the analysers' own contradiction shows
+    it. ``clipped [..., h, w]``: pixels to which a clipped sample contributed, None if not determined.
+    ``expected_error``, ``[..., 2, h, w]``: standard deviation of the error of diffuse and specular as the method
+    expects it, or None.
     """
 
     diffuse: Tensor
@@ -43,7 +44,7 @@ class Separation:
 
 
 def _split(stokes: Stokes, specular: Tensor, valid: Tensor) -> Separation:
-    """Diffuse is what of s0 the specular leaves; both stay non-negative."""
+    """Diffuse is s0 minus specular; both stay non-negative."""
     total = stokes.s0.clamp(min=0)
     specular = torch.minimum(specular, total)
     return Separation(total - specular, specular, valid, stokes)

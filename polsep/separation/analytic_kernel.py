@@ -41,7 +41,7 @@ STRIP = 32
 
 @dataclass(frozen=True)
 class AnalyticOptions:
-    """What a stream of frames has in common beside its layout and levels.
+    """Options that all frames of a stream share, besides layout and levels.
 
     ``light_color``: one gain per channel, divided out of every sample, as in `Mosaic`. ``in_light``: multiply it back
     into diffuse and specular, as the pipeline does. ``report``: also make DoLP, AoLP and the frame's tally. ``out``:

@@ -63,7 +63,7 @@ def _read_pixel(pixels: Pixels, n: int, y: Any, kept: Any) -> None:
 
 @compiled
 def _residual(s: Any, a1: Any, a2: Any) -> Any:
-    """How far the colours of ``s [3, 3]`` are from one line of slope a, rms. Twin: `color_affine._offset`."""
+    """Rms distance of the colours of ``s [3, 3]`` from p = a s0 + b. Twin: `color_affine._offset`."""
     total = ZERO
     for i, a in ((1, a1), (2, a2)):
         mean = THIRD * ((s[i, 0] - a * s[0, 0]) + (s[i, 1] - a * s[0, 1]) + (s[i, 2] - a * s[0, 2]))

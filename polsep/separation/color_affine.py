@@ -6,11 +6,11 @@ The specular light of a dielectric is white and fully polarized, so in every pix
     p_c = a tau_d,c + tau_s exp(2i phi_s)   and   s0_c = tau_d,c + tau_s   give   p_c = a s0_c + b,
     b = tau_s (exp(2i phi_s) - a).
 
-The slope a follows from how p varies with s0 over the three colours, b from the mean, and |exp(2i phi_s)| = 1 leaves
-one positive tau_s. No light angle, no calibration, no training. Where there is no colour contrast the slope tends to
-zero and the result to the paper's analytic split.
+a follows from how p varies with s0 over the three colours, b from the mean, and |exp(2i phi_s)| = 1 leaves one
+positive tau_s. No light angle, no calibration, no training. Where there is no colour contrast a tends to zero and the
+result to the paper's analytic split.
 
-With the slope known, every unclipped sample is linear in (s0_R, s0_G, s0_B, b): a highlight that clips some analysers
+With a known, every unclipped sample is linear in (s0_R, s0_G, s0_B, b): a highlight that clips some analysers
 in some colours is still solved by least squares over the samples that are left (`_solve_clipped`).
 
 Derivation, related work (Nayar, Fang, Boult 1997; Kajiyama et al., WACV 2023) and tests: docs/conventions.md.
@@ -31,10 +31,10 @@ from polsep.physics.stokes import Measurements, Stokes, analyser_residual, fit_s
 from polsep.separation.analytic import Separation, box_mean, separate_analytic_unclipped
 from polsep.separation.closed_form import fit_unclipped, limit_dolp, white_specular
 
-#: Windows of the slope, widest first: radius in pixels and how far the slope may stray from the next wider window's
-#: (standard deviation per component). The widest one is held toward zero, the paper's unpolarized diffuse.
+#: Windows of the diffuse polarization, widest first: radius in pixels, and standard deviation per component from the
+#: next wider window's. The widest one is held toward zero, the paper's unpolarized diffuse.
 #: Chosen on random scenes outside every test set; see docs/experiments.md.
-SLOPE_SCALES = ((12, 0.1), (6, 0.04), (2, 0.01), (0, 0.005))
+SCALES = ((12, 0.1), (6, 0.04), (2, 0.01), (0, 0.005))
 
 #: The window that ends at edges, where they are known: every third pixel of the one of this radius.
 EDGE_RADIUS, EDGE_STEP = 6, 3
@@ -75,19 +75,19 @@ def separate_color_affine(measurements: Measurements) -> Separation:
     stokes, exact = fit_stokes_unclipped(even)
     sample = sample_variance(even)
     edges = None if even is measurements else polarization_edges(even, stokes)
-    slope = color_slope((stokes, exact), sample, even.variance, edges)
-    offset, residual = _offset(stokes, slope)
+    a = fit_diffuse_polarization((stokes, exact), sample, even.variance, edges)
+    offset, residual = _offset(stokes, a)
     if even is not measurements:
         stokes = fit_stokes_unclipped(measurements)[0]
-        offset, _ = _offset(stokes, slope)
-    stokes, offset, determined = _solve_clipped(measurements, stokes, slope, offset)
+        offset, _ = _offset(stokes, a)
+    stokes, offset, determined = _solve_clipped(measurements, stokes, a, offset)
     valid = determined
     if measurements.clipped is not None:
         valid = valid & ~measurements.clipped.all(dim=-4).any(dim=-3)
     total = stokes.s0.clamp(min=0)
-    specular = white_specular(offset.chunk(2, dim=-3), slope.chunk(2, dim=-3))
+    specular = white_specular(offset.chunk(2, dim=-3), a.chunk(2, dim=-3))
     specular = torch.minimum(specular, total.amin(dim=-3, keepdim=True)).expand_as(total)
-    found = Separation(total - specular, specular, valid, stokes, slope, residual, torch.sqrt(sample))
+    found = Separation(total - specular, specular, valid, stokes, a, residual, torch.sqrt(sample))
     return found if bool(valid.all()) else _fill(found, measurements, offset, determined)
 
 
@@ -120,14 +120,14 @@ def polarization_edges(measurements: Measurements, stokes: Stokes) -> Tensor:
     return light[..., 1:, :, :] / (light[..., :1, :, :] + EDGE_FLOOR)
 
 
-def color_slope(
+def fit_diffuse_polarization(
     known: tuple[Stokes, Tensor], sample: Tensor, interpolation: Tensor | None, edges: Tensor | None = None
 ) -> Tensor:
-    """Slope a ``[..., 2, h, w]`` from how p varies with s0 over colours; |a| at most `MAX_DIFFUSE_DOLP`.
+    """Diffuse polarization a ``[..., 2, h, w]`` from how p varies with s0 over colours; |a| at most `MAX_DIFFUSE_DOLP`.
 
     Fitted to deviations from each pixel's own mean over colours, in which white specular light cancels exactly. Wide
     windows steady narrow ones, down to the single pixel, each in the proportion of its noise to its colour contrast (a
-    Gaussian prior per scale). Noise in s0 would pull the slope toward p/s0 and so erase the specular of grey surfaces:
+    Gaussian prior per scale). Noise in s0 would pull a toward p/s0 and so erase the specular of grey surfaces:
     contrast that noise explains is not counted, and pixels at colour edges, where demosaicking invents contrast, weigh
     less. ``known``: Stokes images and ``exact [..., C, h, w]``, the colours that clipping leaves known, of which a
     pixel needs two. ``sample``, ``interpolation``: variances of a sample. ``edges``: `polarization_edges`, if any.
@@ -142,9 +142,9 @@ def color_slope(
         error = error + interpolation
     weight = usable.to(error) * VARIANCE_FLOOR / (error + VARIANCE_FLOOR)
     moments = torch.cat([d.sum(dim=-3, keepdim=True) for d in (d0 * d0, d0 * d1, d0 * d2)] + [error], dim=-3)
-    slope = torch.zeros_like(moments[..., :2, :, :])
+    a = torch.zeros_like(moments[..., :2, :, :])
     floor = torch.finfo(error.dtype).eps * 1e-2
-    for radius, spread in SLOPE_SCALES:
+    for radius, spread in SCALES:
         if radius == EDGE_RADIUS and edges is not None:
             pooled, samples = _pool_to_edges(moments, weight, edges)
         else:
@@ -152,8 +152,8 @@ def color_slope(
         contrast, moment, noise = pooled[..., :1, :, :], pooled[..., 1:3, :, :], pooled[..., 3:, :, :]
         counted = ((contrast - noise) / (contrast + floor)).clamp(min=0)
         held = noise / CONTRAST_MARGIN / (spread**2 * samples) + floor
-        slope = (moment * counted + held * slope) / (contrast + held)
-    return limit_dolp(slope)
+        a = (moment * counted + held * a) / (contrast + held)
+    return limit_dolp(a)
 
 
 def _pool(moments: Tensor, weight: Tensor, radius: int) -> tuple[Tensor, Tensor]:
@@ -185,21 +185,21 @@ def _pool_to_edges(moments: Tensor, weight: Tensor, edges: Tensor) -> tuple[Tens
     return sums[..., :-2, :, :] / total, (total * total / squares).clamp(min=1)
 
 
-def _offset(stokes: Stokes, slope: Tensor) -> tuple[Tensor, Tensor]:
+def _offset(stokes: Stokes, a: Tensor) -> tuple[Tensor, Tensor]:
     """b of p_c = a s0_c + b, the mean over colours ``[..., 2, h, w]``, and the rms it leaves ``[..., 1, h, w]``."""
-    lines = [s - slope[..., k : k + 1, :, :] * stokes.s0 for k, s in enumerate((stokes.s1, stokes.s2))]
+    lines = [s - a[..., k : k + 1, :, :] * stokes.s0 for k, s in enumerate((stokes.s1, stokes.s2))]
     offset = torch.cat([_color_mean(line) for line in lines], dim=-3)
     left = sum(((line - _color_mean(line)) ** 2).sum(dim=-3, keepdim=True) for line in lines)
     return offset, torch.sqrt(torch.as_tensor(left) / 3)
 
 
 def _solve_clipped(
-    measurements: Measurements, stokes: Stokes, slope: Tensor, offset: Tensor
+    measurements: Measurements, stokes: Stokes, diffuse_polarization: Tensor, offset: Tensor
 ) -> tuple[Stokes, Tensor, Tensor]:
     """Stokes and b of pixels with clipped samples by least squares over the others, and where those determine b.
 
     For given a, twice a sample is g_k s0_c + u_k . b with u_k = (cos 2t_k, sin 2t_k) and g_k = 1 + u_k . a. The s0 of
-    each colour is eliminated, which leaves 2x2 normal equations for b. What they leave open is for `_fill`.
+    each colour is eliminated, which leaves 2x2 normal equations for b. `_fill` completes what they leave open.
     """
     determined = torch.ones_like(stokes.s0[..., 0, :, :], dtype=torch.bool)
     if measurements.clipped is None or not bool(measurements.clipped.any()):
@@ -208,7 +208,7 @@ def _solve_clipped(
     touched = clipped.any(dim=0).any(dim=0)
     kept = ~clipped[:, :, touched]
     samples = measurements.data.movedim((-4, -3), (0, 1))[:, :, touched]
-    a = slope.movedim(-3, 0)[:, touched]
+    a = diffuse_polarization.movedim(-3, 0)[:, touched]
     b, s0, determined[touched] = fit_unclipped(2 * samples, kept.to(samples), a, measurements.angles)
     solved = [s.movedim(-3, 0).clone() for s in (stokes.s0, stokes.s1, stokes.s2)]
     partly = kept.any(dim=0) & ~kept.all(dim=0)
@@ -222,9 +222,9 @@ def _solve_clipped(
 def _fill(found: Separation, measurements: Measurements, offset: Tensor, determined: Tensor) -> Separation:
     """Complete pixels that clipping left undetermined, with the valid pixels around as a weak prior.
 
-    Where b is not ``determined`` the specular has the phase of its surroundings and fits the unclipped samples. What
-    clipped samples lack to clip is light of the lobe that varies more freely: specular beside a highlight, diffuse on a
-    bright matte surface. Where everything clips the specular is at least as bright as around. Of a colour without
+    Where b is not ``determined`` the specular has the phase of its surroundings and fits the unclipped samples. The
+    light that clipped samples are missing is of the lobe that varies more freely: specular beside a highlight, diffuse
+    on a bright matte surface. Where everything clips the specular is at least as bright as around. Of a colour without
     unclipped samples the diffuse follows from around and from what makes it clip.
     """
     assert measurements.clipped is not None
@@ -265,7 +265,7 @@ def specular_freedom(nearby: Tensor, around: Tensor) -> Tensor:
 
 
 class _Sums(NamedTuple):
-    """_Sums over unclipped samples of 2 m = g tau_d + p tau_s and the prior tau_d = around, each ``[..., C, h, w]``."""
+    """Sums over unclipped samples of 2 m = g tau_d + p tau_s and the prior tau_d = around, each ``[..., C, h, w]``."""
 
     gg: Tensor
     gp: Tensor
@@ -274,14 +274,14 @@ class _Sums(NamedTuple):
     py: Tensor
 
 
-def _sum_unclipped(measurements: Measurements, slope: Tensor, phase: Tensor, around: Tensor) -> _Sums:
-    """`_Sums` for a given slope and phase of the specular light ``[..., 2, h, w]`` and the diffuse light ``around``."""
+def _sum_unclipped(measurements: Measurements, a: Tensor, phase: Tensor, around: Tensor) -> _Sums:
+    """`_Sums` for given diffuse polarization, specular phase ``[..., 2, h, w]`` and diffuse light ``around``."""
     assert measurements.clipped is not None
     gg, gy = torch.full_like(around, PRIOR_WEIGHT), PRIOR_WEIGHT * around
     gp, pp, py = torch.zeros_like(around), torch.zeros_like(around), torch.zeros_like(around)
     for k, t in enumerate(measurements.angles):
         kept = ~measurements.clipped[..., k, :, :, :]
-        g, p, y = _transmitted(slope, t) * kept, _transmitted(phase, t) * kept, 2 * measurements.data[..., k, :, :, :]
+        g, p, y = _transmitted(a, t) * kept, _transmitted(phase, t) * kept, 2 * measurements.data[..., k, :, :, :]
         gg, gp, pp, gy, py = gg + g * g, gp + g * p, pp + p * p, gy + g * y, py + p * y
     return _Sums(gg, gp, pp, gy, py)
 
@@ -301,19 +301,19 @@ def _fit_diffuse(sums: _Sums, specular: Tensor) -> Tensor:
 
 
 def _raise_specular(measurements: Measurements, lit: tuple[Tensor, ...], freedom: Tensor) -> Tensor:
-    """tau_s ``[..., 1, h, w]`` with its share of what every clipped sample lacks: 2 m = g tau_d + p tau_s >= 2.
+    """tau_s ``[..., 1, h, w]`` with its share of the light that clipped samples lack: 2 m = g tau_d + p tau_s >= 2.
 
-    Never more than the unclipped samples allow, except those nearly crossed with it. ``lit``: slope and phase, tau_d
-    and tau_s so far.
+    Never more than the unclipped samples allow, except those nearly crossed with it. ``lit``: diffuse polarization,
+    phase, tau_d and tau_s so far.
     """
     assert measurements.clipped is not None
-    slope, phase, diffuse, specular = lit
+    a, phase, diffuse, specular = lit
     raised, most = specular, torch.full_like(specular, torch.inf)
     for k, t in enumerate(measurements.angles):
-        g, p, clipped = _transmitted(slope, t), _transmitted(phase, t), measurements.clipped[..., k, :, :, :]
+        g, p, clipped = _transmitted(a, t), _transmitted(phase, t), measurements.clipped[..., k, :, :, :]
         y = 2 * measurements.data[..., k, :, :, :]
-        lack = torch.where(clipped, (y - g * diffuse - p * specular).clamp(min=0), 0.0).amax(dim=-3, keepdim=True)
-        raised = torch.maximum(raised, specular + lack * p * freedom / (p * p * freedom + g * g))
+        missing = torch.where(clipped, (y - g * diffuse - p * specular).clamp(min=0), 0.0).amax(dim=-3, keepdim=True)
+        raised = torch.maximum(raised, specular + missing * p * freedom / (p * p * freedom + g * g))
         allowed = torch.where(clipped | (p <= 0.5), torch.inf, y / p.clamp(min=0.5)).amin(dim=-3, keepdim=True)
         most = torch.minimum(most, allowed)
     return torch.minimum(raised, most.clamp(min=0))

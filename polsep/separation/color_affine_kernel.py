@@ -2,9 +2,9 @@
 
 With ``guided`` it is the twin of ``separate_color_affine(demosaic_guided_half(mosaic))``, which the pipeline uses.
 
-Pixels with clipped samples are few: `separation.strips_kernel` leaves them out of the slope as the twin does, and
-`separation.clipped_kernel` solves them afterwards. Strips are computed independently of each other, so the number of
-threads (`set_threads`) does not change a bit.
+Pixels with clipped samples are few: `separation.strips_kernel` leaves them out of the diffuse polarization as the twin
+does, and `separation.clipped_kernel` solves them afterwards. Strips are computed independently of each other, so the
+number of threads (`set_threads`) does not change a bit.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from polsep.separation.fill_kernel import halve_separation, halve_specular, inte
 from polsep.separation.images import FrameImages, Tally
 from polsep.separation.images_kernel import check_images
 from polsep.separation.moments_kernel import Conversion
-from polsep.separation.strips_kernel import Targets, collect, rows_clip, separate_guided_piece, separate_piece
+from polsep.separation.strips_kernel import Targets, collect, rows_clip, separate_guided_strip, separate_strip
 from polsep.separation.tally_kernel import NOISE, make_tally
 
 #: Fewest cell rows of a strip that is worth a thread.
@@ -46,7 +46,7 @@ PIXELS = 1024
 
 @dataclass(frozen=True)
 class ColorAffineOptions:
-    """What a stream of frames has in common beside its layout and levels.
+    """Options that all frames of a stream share, besides layout and levels.
 
     ``light_color``: one gain per channel, divided out of every sample, as in `Mosaic`. ``in_light``: multiply it back
     into diffuse and specular, as the pipeline does. ``out``: images to fill. ``guided``: demosaic as
@@ -92,11 +92,11 @@ def separate_color_affine_half(
     diffuse, specular = (image.reshape(h, 3 * w) for image in (out.diffuse, out.specular))
     targets = Targets(diffuse, specular, lines, clipped, dolp, aolp, np.zeros((dolp.shape[0], NOISE + 1)))
     gains = np.array(options.light_color[:3] if options.in_light else (1, 1, 1), np.float32)
-    # Filling compares colours with each other, so with clipped samples the light waits until it is done.
+    # Filling compares colours with each other, so with clipped samples the light is multiplied back afterwards.
     conversion = Conversion(*_matrices(layout), np.ones(3, np.float32) if clips else gains)
     source = Source(samples, pattern, read_grid(pattern, layout.angles, conversion.inverses[0]))
-    separate_strip = separate_guided_piece if options.guided else separate_piece
-    share(partial(separate_strip, source, conversion, targets), h, height)
+    run = separate_guided_strip if options.guided else separate_strip
+    share(partial(run, source, conversion, targets), h, height)
     out.valid[:] = True
     places = np.flatnonzero(clipped)
     tally = make_tally(h * w - places.size, 0, h * w - places.size, targets.sums)

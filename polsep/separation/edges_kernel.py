@@ -1,4 +1,4 @@
-"""The window of `color_affine`'s slope that ends at edges: pixels count as far as their polarization is alike.
+"""The window of `color_affine` that ends at edges: pixels count as far as their polarization is alike.
 
 Two rows after a row has entered its ring, ratios of mean Stokes values in 3x3 pixels are made of it (twin:
 `polarization_edges`); the window about a row then sums every third pixel by itself (twin: `_pool_to_edges`).
@@ -76,7 +76,7 @@ def measure_edges(pattern: Pattern, t: int, rows: Rows, rings: Rings) -> None:
 
 @compiled
 def _likeness(there: Any, here: Any, w: int, near: Any) -> None:
-    """How alike pixels of two rows of edges are, ``near [5, w]``: one row for every step along the window."""
+    """Likeness of the pixels of two rows of edges, ``near [5, w]``: one row for every step along the window."""
     first, second = here[0, PAD:], here[1, PAD:]
     for i in range(_TAPS):
         other1, other2, out = there[0, PAD - MIDDLE + _STEP * i :], there[1, PAD - MIDDLE + _STEP * i :], near[i]

@@ -5,21 +5,17 @@ Only the pyramid, a third of the frame, is ever made; of the frame itself nothin
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, ZERO, compiled, entry
-from polsep.compute.threads import Piece, share
 
 #: Means and, in the last plane, weights of one level of a pyramid: ``[K + 1, h, w]``.
 Level = NDArray[np.float32]
 
 _MIN_WEIGHT = np.float32(1e-12)
-#: Rows of a frame that one thread halves, an even number.
-_PIECE = 64
 
 
 def interpolate_holes(finest: Level, shape: tuple[int, int], places: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -36,72 +32,31 @@ def interpolate_holes(finest: Level, shape: tuple[int, int], places: NDArray[np.
     return values
 
 
-def _room(planes: int, h: int, w: int) -> Level:
-    return np.zeros((planes + 1, (h + 1) // 2, (w + 1) // 2), np.float32)
-
-
 def halve_separation(
     diffuse: NDArray[np.float32], specular: NDArray[np.float32], lines: NDArray[np.float32], valid: NDArray[np.bool_]
 ) -> Level:
     """The first level of the specular polarization (two planes) and of the diffuse light (three), where ``valid``.
 
-    ``diffuse``, ``specular [h, w, 3]``, ``lines [4, h, w]``: slope and offset.
+    ``diffuse``, ``specular [h, w, 3]``, ``lines [4, h, w]``: a and b of p = a s0 + b.
     """
-    level = _room(5, *valid.shape)
-    share(partial(_halve_separation, (diffuse, specular, lines), valid, level), valid.shape[0], _PIECE)
-    return level
+    tau = specular[..., 0]
+    p1, p2 = lines[2] + lines[0] * tau, lines[3] + lines[1] * tau
+    scale = tau / np.maximum(np.sqrt(p1 * p1 + p2 * p2), _MIN_WEIGHT)
+    planes = np.stack([scale * p1, scale * p2, *np.moveaxis(diffuse, -1, 0), np.ones_like(tau)])
+    return _halve(np.where(valid, planes, ZERO))
 
 
 def halve_specular(specular: NDArray[np.float32], outside: NDArray[np.bool_]) -> Level:
     """The first level of a white specular image ``[h, w, 3]``, ``outside`` of its holes."""
-    level = _room(1, *outside.shape)
-    share(partial(_halve_specular, specular, outside, level), outside.shape[0], _PIECE)
-    return level
+    return _halve(np.where(outside, np.stack([specular[..., 0], np.ones_like(specular[..., 0])]), ZERO))
 
 
 def _halve(level: Level) -> Level:
     """The next level: means over 2x2 of totals and weights."""
-    coarse = _room(level.shape[0] - 1, *level.shape[1:])
+    planes, h, w = level.shape
+    coarse = np.zeros((planes, (h + 1) // 2, (w + 1) // 2), np.float32)
     _halve_planes(level, coarse)
     return coarse
-
-
-@compiled
-def _share(y: int, x: int, h: int, w: int) -> Any:
-    """1 / the number of pixels of a 2x2 block, at an odd border fewer than 4."""
-    count = (2 if 2 * y + 1 < h else 1) * (2 if 2 * x + 1 < w else 1)
-    return ONE / np.float32(count)
-
-
-@entry
-def _halve_separation(images: tuple[Any, Any, Any], valid: Any, level: Any, piece: Piece) -> None:
-    diffuse, specular, lines = images
-    h, w = valid.shape
-    for i in range(piece[0], piece[1]):
-        for j in range(w):
-            if not valid[i, j]:
-                continue
-            y, x = i // 2, j // 2
-            share, tau = _share(y, x, h, w), specular[i, j, 0]
-            p1, p2 = lines[2, i, j] + lines[0, i, j] * tau, lines[3, i, j] + lines[1, i, j] * tau
-            size = np.sqrt(p1 * p1 + p2 * p2)
-            scale = share * tau / (size if size > _MIN_WEIGHT else _MIN_WEIGHT)
-            level[0, y, x] += scale * p1
-            level[1, y, x] += scale * p2
-            for c in range(3):
-                level[2 + c, y, x] += share * diffuse[i, j, c]
-            level[5, y, x] += share
-
-
-@entry
-def _halve_specular(specular: Any, outside: Any, level: Any, piece: Piece) -> None:
-    h, w = outside.shape
-    for i in range(piece[0], piece[1]):
-        for j in range(w):
-            if outside[i, j]:
-                share = _share(i // 2, j // 2, h, w)
-                level[0, i // 2, j // 2] += share * specular[i, j, 0]
-                level[1, i // 2, j // 2] += share
 
 
 @entry
@@ -110,7 +65,8 @@ def _halve_planes(level: Any, coarse: Any) -> None:
     for k in range(planes):
         for i in range(h):
             for j in range(w):
-                coarse[k, i // 2, j // 2] += _share(i // 2, j // 2, h, w) * level[k, i, j]
+                count = (2 if i // 2 * 2 + 1 < h else 1) * (2 if j // 2 * 2 + 1 < w else 1)  # 4, at odd borders fewer
+                coarse[k, i // 2, j // 2] += ONE / np.float32(count) * level[k, i, j]
 
 
 @compiled

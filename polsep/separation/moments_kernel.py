@@ -1,8 +1,9 @@
 """Moments of the colours along the way of `color_affine`'s strips: rows of cells in, weighted moments out.
 
-A strip of cell rows runs through a line of rings: demosaicking, Stokes vectors and noise, then moments of the colours
-three rows later, weighted by their error. Twins: `sample_variance`, `color_slope` and `bilinear_variance` of
-`polsep.separation.color_affine` and `polsep.demosaic.bilinear`, whose means over windows are sums here.
+A strip of cell rows passes through rings, each of which holds the last few rows of one step: demosaicking, Stokes
+vectors and noise, then moments of the colours three rows later, weighted by their error. Twins: `sample_variance`,
+`fit_diffuse_polarization` and `bilinear_variance` of `polsep.separation.color_affine` and `polsep.demosaic.bilinear`,
+whose means over windows are sums here.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from polsep.demosaic.bilinear_kernel import PAD, Pattern, make_analysers
 from polsep.physics.stokes_kernel import fit_stokes_row, fit_stokes_unclipped
 from polsep.separation import color_affine as twin
 
-#: Radii of the slope's windows, `color_affine.SLOPE_SCALES` without the pixel itself, and of `sample_variance`'s.
+#: Radii of the windows of `color_affine.SCALES` without the pixel itself, and of `sample_variance`'s.
 WIDEST, MIDDLE, NARROW, NOISE = 12, 6, 2, 3
-#: Rows that a pixel's slope looks up and down: the widest window and `sample_variance` of its moments.
+#: Rows up and down that a pixel depends on: the widest window and `sample_variance` of its moments.
 REACH = WIDEST + NOISE
 #: Rows of weighted moments and of edges that are kept: as far down as the widest window looks, as far up as the middle.
 KEPT = 20
@@ -79,7 +80,7 @@ class Rows(NamedTuple):
     missed: NDArray[np.float32]
     clipped: NDArray[np.uint16]
     fours: NDArray[np.float32]
-    slope: NDArray[np.float32]
+    diffuse_polarization: NDArray[np.float32]
     planes: NDArray[np.float32]
     spare: NDArray[np.float32]
     counts: NDArray[np.float32]
@@ -312,7 +313,7 @@ def sum_noise(pattern: Pattern, noise: Any) -> float:
 
 @compiled
 def measure_misses(pattern: Pattern, t: int, rows: Rows, rings: Rings) -> None:
-    """What the mean of its four neighbours misses of row ``t``'s brightness; nothing outside the frame."""
+    """Squared error of the mean of four neighbours as brightness of row ``t``; 0 outside the frame."""
     inside = slice(PAD, PAD + pattern.w)
     if not 0 <= t < pattern.h:
         rings.missed[t % 3] = ZERO

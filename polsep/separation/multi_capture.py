@@ -1,8 +1,7 @@
-"""Separations that need more than one capture, or less than all analysers: what the paper compares itself with.
+"""Separations from several captures or few analysers, with which the paper compares itself.
 
-Conventions are those of `polsep.separation.analytic`; what is behind an analyser is a measurement m, half of
-unpolarized light. Outputs are non-negative, which clipping, noise and wrong polarizer angles would not leave them by
-themselves.
+Conventions are those of `polsep.separation.analytic`; behind an analyser is a measurement m, half of
+unpolarized light. Negative outputs, from clipping, noise or wrong polarizer angles, are cut at 0.
 """
 
 from __future__ import annotations

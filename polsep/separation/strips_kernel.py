@@ -1,9 +1,9 @@
 """The strips of `separation.color_affine_kernel`: compiled code from raw rows to separated rows.
 
 A strip of cell rows runs through a line of rings (`separation.moments_kernel`): demosaicking, Stokes vectors and noise,
-moments of the colours three rows later, window sums and the slope (`separation.diffuse_polarization_kernel`) another
-twelve rows later. Guided Stokes rows (`demosaic.guided_kernel`), where asked for, take the place of the bilinear ones
-at the end, except in pixels with clipped samples.
+moments of the colours three rows later, window sums and diffuse polarization (`separation.diffuse_polarization_kernel`)
+another twelve rows later. Guided Stokes rows (`demosaic.guided_kernel`), where asked for, take the place of the
+bilinear ones at the end, except in pixels with clipped samples.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from polsep.demosaic.cells_kernel import Source
 from polsep.physics.stokes_kernel import polarize
 from polsep.sensor.unpack_kernel import Samples, read_row
 from polsep.separation.closed_form_kernel import limit_specular_row, offset_row, white_specular_row
-from polsep.separation.diffuse_polarization_kernel import find_slope, first_weighed
+from polsep.separation.diffuse_polarization_kernel import first_weighed, fit_diffuse_polarization
 from polsep.separation.edges_kernel import enter_light, measure_edges
 from polsep.separation.images_kernel import interleave
 from polsep.separation.moments_kernel import (
@@ -101,7 +101,7 @@ def _split(stokes: Any, a: Any, spare: Any, planes: Any) -> None:
 
 
 @compiled
-def _take_better(better: Any, clipped: Any, stokes: Any) -> None:
+def _replace_unclipped(better: Any, clipped: Any, stokes: Any) -> None:
     """Guided Stokes values in place of a row's bilinear ones, except in ``clipped`` pixels."""
     for k in range(5):
         x, out = better[k], stokes[k, PAD:]
@@ -129,7 +129,12 @@ def _report(strip: Strip, t: int, clipped: Any, targets: Targets) -> None:
     """DoLP and AoLP of row ``t``, and what its unclipped pixels add to the sums."""
     rows, stokes, moments = strip.rows, strip.rings.stokes[t % 16], strip.rings.moments[t % 16]
     mean, p1, p2 = rows.spare[0], rows.spare[1], rows.spare[2]
-    s1, s2, a1, a2 = stokes[3, PAD:], stokes[4, PAD:], rows.slope[0, PAD:], rows.slope[1, PAD:]
+    s1, s2, a1, a2 = (
+        stokes[3, PAD:],
+        stokes[4, PAD:],
+        rows.diffuse_polarization[0, PAD:],
+        rows.diffuse_polarization[1, PAD:],
+    )
     contrast, first, second, total = moments[0, PAD:], moments[1, PAD:], moments[2, PAD:], moments[4, PAD:]
     add_rows(stokes[0, PAD:], stokes[1, PAD:], stokes[2, PAD:], THIRD, mean)
     polarize(mean, s1, s2, targets.dolp[t], targets.aolp[t])
@@ -147,18 +152,21 @@ def _report(strip: Strip, t: int, clipped: Any, targets: Targets) -> None:
 
 @compiled
 def _write_row(gains: Any, t: int, strip: Strip, better: Any, targets: Targets) -> None:
-    """Specular and diffuse of row ``t``, whose slope is known, to the images; ``better``: its guided Stokes row."""
+    """Write specular and diffuse of row ``t``, by its diffuse polarization; ``better``: its guided Stokes row."""
     rows, stokes = strip.rows, strip.rings.stokes[t % 16]
     clipped = targets.clipped[t] if targets.clipped.size else targets.clipped[0:0].reshape(-1)
     if better.size:
-        _take_better(better, clipped, stokes)
-    _split(stokes, rows.slope, rows.spare, rows.planes)
+        _replace_unclipped(better, clipped, stokes)
+    _split(stokes, rows.diffuse_polarization, rows.spare, rows.planes)
     interleave(rows.planes[0:1], gains, targets.specular[t])
     interleave(rows.planes[1:4], gains, targets.diffuse[t])
     if targets.lines.size:
         for i in range(2):
             for j in range(targets.lines.shape[2]):
-                targets.lines[i, t, j], targets.lines[2 + i, t, j] = rows.slope[i, PAD + j], rows.spare[1 + i, j]
+                targets.lines[i, t, j], targets.lines[2 + i, t, j] = (
+                    rows.diffuse_polarization[i, PAD + j],
+                    rows.spare[1 + i, j],
+                )
     if targets.sums.size:
         _report(strip, t, clipped, targets)
 
@@ -191,7 +199,7 @@ def open_strip(source: Source, piece: Piece, edges: int) -> Strip:
 def separate_rows(
     source: Source, conversion: Conversion, targets: Targets, strip: Strip, piece: Piece, better: Any
 ) -> None:
-    """The next rows of a strip; ``better [rows, 5, w]``: their guided Stokes rows, or empty."""
+    """Separate the next rows of a strip; ``better [rows, 5, w]``: their guided Stokes rows, or empty."""
     pattern, rows, rings = source.pattern, strip.rows, strip.rings
     first = max(strip.begin - NOISE, 0)
     for t in range(piece[0] + REACH if piece[0] > strip.start else strip.begin - NOISE, piece[1] + REACH):
@@ -208,20 +216,20 @@ def separate_rows(
             weigh_row(pattern, weighed, rows, rings)
             if targets.sums.size and 0 <= weighed < pattern.h:  # neighbouring strips write the same
                 targets.sums[weighed, 7] = sum_noise(pattern, rings.noise)
-            find_slope(pattern, done, strip.start, rows, rings)
+            fit_diffuse_polarization(pattern, done, strip.start, rows, rings)
         if done >= strip.start:
             _write_row(
                 conversion.gains, done, strip, better[done - piece[0]] if better.size else better[:0, 0], targets
             )
 
 
-def separate_piece(source: Source, conversion: Conversion, targets: Targets, piece: Piece) -> None:
+def separate_strip(source: Source, conversion: Conversion, targets: Targets, piece: Piece) -> None:
     """A strip of the frame from bilinear samples."""
     nothing = np.empty((0, 5, source.pattern.w), np.float32)
     separate_rows(source, conversion, targets, open_strip(source, piece, 0), piece, nothing)
 
 
-def separate_guided_piece(source: Source, conversion: Conversion, targets: Targets, piece: Piece) -> None:
+def separate_guided_strip(source: Source, conversion: Conversion, targets: Targets, piece: Piece) -> None:
     """A strip of the frame from guided Stokes rows, a few at a time."""
     stream, strip = guided.open_stream(source, piece[0]), open_strip(source, piece, KEPT)
     better = np.empty((CHUNK, 5, source.pattern.w), np.float32)
@@ -233,7 +241,7 @@ def separate_guided_piece(source: Source, conversion: Conversion, targets: Targe
 
 @entry
 def rows_clip(samples: Samples, pattern: Pattern, piece: Piece) -> bool:
-    """Whether any sample of a piece of the frame's cell rows is clipped."""
+    """True if any sample of these cell rows of the frame is clipped."""
     row = np.empty(2 * pattern.w, np.float32)
     for y in range(2 * piece[0], 2 * piece[1]):
         read_row(samples, pattern.top + y, pattern.left, row)

@@ -44,7 +44,7 @@ def add_polarization(weight: Any, p1: Any, p2: Any, buffer: Any, sums: Any) -> N
 
 @compiled
 def count_above_one(dolp: Any, buffer: Any) -> float:
-    """How many pixels of a row have DoLP above 1."""
+    """Return the number of pixels of a row with DoLP above 1."""
     for j in range(buffer.size):
         buffer[j] = ONE if dolp[j] > ONE else ZERO
     return add_up(buffer)

@@ -191,17 +191,17 @@ def test_a_thread_writes_no_row_of_another(
     layout: Layout, demosaicker: Demosaicker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not even the same numbers: who reads them in between would see half of them."""
-    height, piece = 48, (3, 6)
+    height, row_range = 48, (3, 6)
     net, mosaic = random_net(layout, INPUTS, demosaicker), random_frame(height, 64, layout)
     engine = OpenVinoEngine(net, (height, 64), True, "f32")
     *planes, clipped = engine._maps.closed
     for plane in (*planes, engine._maps.details):
         plane.fill(math.nan)
     clipped.fill(12345)
-    monkeypatch.setattr("polsep.compute.threads.share", lambda work, rows, step: work(piece))
+    monkeypatch.setattr("polsep.compute.threads.share", lambda work, rows, step: work(row_range))
     engine._fill_inputs(as_samples(mosaic.data.numpy()), read_pattern((height, 64), layout, BLACK, WHITE, LIGHT))
     others = np.ones(height // PERIOD, np.bool_)
-    others[slice(*piece)] = False
+    others[slice(*row_range)] = False
     for plane in planes:
         assert np.isnan(plane[others]).all() and np.isfinite(plane[~others]).all()
     assert np.isnan(engine._maps.details[others.repeat(2)]).all()

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from polsep.compute.threads import Piece, _default_threads, share
+from polsep.compute.threads import RowRange, _default_threads, run_over_rows
 from polsep.kernels import get_threads, separate_analytic_half, separate_color_affine_half, set_threads
 from polsep.sensor.camera import Layout
 
@@ -48,26 +48,26 @@ def threads() -> Iterator[None]:
 @pytest.mark.parametrize("count", [1, 2, 3, 8])
 @pytest.mark.parametrize(("rows", "step"), [(1, 32), (32, 32), (33, 32), (1000, 32), (77, 1)])
 def test_every_row_is_given_out_once(count: int, rows: int, step: int) -> None:
-    """Pieces start at whole strips and cover the frame without overlap; all results come back."""
+    """Ranges start at whole strips and cover the frame without overlap; all results come back."""
     set_threads(count)
-    pieces = sorted(share(lambda piece: piece, rows, step))
+    pieces = sorted(run_over_rows(lambda row_range: row_range, rows, step))
     assert all(first % step == 0 for first, _ in pieces)
     assert [row for first, stop in pieces for row in range(first, stop)] == list(range(rows))
-    assert share(lambda piece: piece, 0, step) == []
+    assert run_over_rows(lambda row_range: row_range, 0, step) == []
 
 
 def test_threads_work_side_by_side() -> None:
-    """With n threads, n pieces are in work at once, the caller's among them."""
+    """With n threads, n ranges are in work at once, the caller's among them."""
     for count in (2, 4):
         set_threads(count)
         together = threading.Barrier(count, timeout=30)
 
-        def work(piece: Piece, together: threading.Barrier = together) -> int:
-            if piece[0] < together.parties:
+        def work(row_range: RowRange, together: threading.Barrier = together) -> int:
+            if row_range[0] < together.parties:
                 together.wait()
             return threading.get_ident()
 
-        assert threading.get_ident() in share(work, 2 * count, 1)
+        assert threading.get_ident() in run_over_rows(work, 2 * count, 1)
 
 
 @pytest.mark.parametrize("helper", [False, True], ids=["caller", "helper"])
@@ -76,24 +76,24 @@ def test_errors_reach_the_caller(helper: bool) -> None:
     caller, together = threading.get_ident(), threading.Barrier(2, timeout=30)
     begun = []
 
-    def work(piece: Piece) -> None:
-        begun.append(piece)
+    def work(row_range: RowRange) -> None:
+        begun.append(row_range)
         if len(begun) <= 2:
             together.wait()
         if (threading.get_ident() != caller) == helper:
-            raise ArithmeticError(f"rows {piece}")
+            raise ArithmeticError(f"rows {range}")
         time.sleep(0.1)
 
     with pytest.raises(ArithmeticError, match="rows"):
-        share(work, 10_000, 1)
+        run_over_rows(work, 10_000, 1)
     assert len(begun) < 10
-    assert sum(stop - first for first, stop in share(lambda piece: piece, 1000, 1)) == 1000
+    assert sum(stop - first for first, stop in run_over_rows(lambda row_range: row_range, 1000, 1)) == 1000
 
 
 def test_work_may_share_too() -> None:
     """A helper that shares its own work needs no free thread: nothing waits for itself."""
     set_threads(3)
-    inner = share(lambda outer: sum(b - a for a, b in share(lambda piece: piece, 50, 1)), 40, 1)
+    inner = run_over_rows(lambda outer: sum(b - a for a, b in run_over_rows(lambda row_range: row_range, 50, 1)), 40, 1)
     assert set(inner) == {50}
 
 

@@ -17,7 +17,7 @@ from typing import TypeVar
 Result = TypeVar("Result")
 
 #: First row and the row behind the last one.
-Piece = tuple[int, int]
+RowRange = tuple[int, int]
 
 
 def _default_threads() -> int:
@@ -99,7 +99,7 @@ def _start_helpers(work: Callable[[], None], count: int) -> list[Future[None]]:
         return [_State.pool.submit(work) for _ in range(count)]
 
 
-def share(work: Callable[[Piece], Result], rows: int, step: int) -> list[Result]:
+def run_over_rows(work: Callable[[RowRange], Result], rows: int, step: int) -> list[Result]:
     """Call ``work`` on consecutive ranges of ``range(rows)`` in `get_threads` threads; results in no fixed order.
 
     A range starts at a multiple of ``step``, the rows of a strip. Returns when all rows are done. Several threads may
@@ -111,7 +111,7 @@ def share(work: Callable[[Piece], Result], rows: int, step: int) -> list[Result]
     lock, taken = threading.Lock(), 0
     results: list[Result] = []
 
-    def take() -> Piece:
+    def take() -> RowRange:
         """Return the next strips: a part of the rest, so that calls are few and all threads end together."""
         nonlocal taken
         with lock:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, THIRD, TWO, ZERO, compiled, entry
 from polsep.compute.rows import add_product, add_rows, copy, fill, subtract
-from polsep.compute.threads import Piece
+from polsep.compute.threads import RowRange
 from polsep.demosaic import guided as twin
 from polsep.demosaic.cells_kernel import (
     EDGE,
@@ -269,13 +269,13 @@ def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
 
 
 @entry
-def demosaic_rows(source: Source, stream: Stream, piece: Piece, out: Any) -> None:
-    """The frame's cell rows of a piece, which continues the one before, to ``out [rows, 5, w]``.
+def demosaic_rows(source: Source, stream: Stream, row_range: RowRange, out: Any) -> None:
+    """The frame's cell rows of a range, which continues the one before, to ``out [rows, 5, w]``.
 
     A row is s0 of three colours and the means over colours of s1 and s2; of a stream ``apart``, each colour's s1, then
     s2, ``[rows, 9, w]``, and with details those of each colour, ``[rows, 18, w]``.
     """
-    for t in range(piece[0], piece[1]):
+    for t in range(row_range[0], row_range[1]):
         while stream.first + stream.pushed[0] <= t + REACH:
-            _push_row(source, stream.pushed[0], stream, out[t - piece[0]])
+            _push_row(source, stream.pushed[0], stream, out[t - row_range[0]])
             stream.pushed[0] += 1

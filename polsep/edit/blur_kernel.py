@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import compiled, entry
-from polsep.compute.threads import Piece, share
+from polsep.compute.threads import RowRange, run_over_rows
 
 #: Rows per task of a thread.
 _ROWS = 8
@@ -41,13 +41,13 @@ def _add_pairs(total: Any, near: tuple[Any, Any], far: tuple[Any, Any], weights:
 
 @entry
 def fill_filtered(
-    image: NDArray[np.float32], weights: NDArray[np.float32], colors: int, out: NDArray[np.float32], piece: Piece
+    image: NDArray[np.float32], weights: NDArray[np.float32], colors: int, out: NDArray[np.float32], row_range: RowRange
 ) -> None:
     """Rows of ``out [h, w C]``; ``weights [1 + 2 n]`` of the pixel itself and of those at distances up to 2 n."""
     height, size = image.shape
     reach, width = weights.size - 1, size // colors
     row, padded = np.empty(size, np.float32), np.empty(size + 2 * reach * colors, np.float32)
-    for y in range(piece[0], piece[1]):
+    for y in range(row_range[0], row_range[1]):
         center = image[y]
         for x in range(size):
             row[x] = weights[0] * center[x]
@@ -75,5 +75,5 @@ def filter_image(image: NDArray[np.float32], weights: NDArray[np.float32]) -> ND
     source = np.ascontiguousarray(image).reshape(height, width * colors)
     paired = weights if weights.size % 2 else np.append(weights, np.float32(0))
     out = np.empty_like(source)
-    share(lambda rows: fill_filtered(source, paired, colors, out, rows), height, _ROWS)
+    run_over_rows(lambda rows: fill_filtered(source, paired, colors, out, rows), height, _ROWS)
     return out.reshape(image.shape)

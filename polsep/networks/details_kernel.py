@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, ZERO, compiled, entry
 from polsep.compute.rows import AT_ONCE, add_product, add_up, average, copy, emit, fill, filter_rows, sum_three, weave
-from polsep.compute.threads import Piece
+from polsep.compute.threads import RowRange
 from polsep.networks.buffers import ClosedFormRows, LayerInput
 from polsep.networks.channels import DETAIL_MAPS, PERIOD
 from polsep.networks.details import MIN_DETAIL
@@ -112,15 +112,15 @@ def _enter_total(closed: ClosedFormRows, y: int, colors: int, rings: Any) -> Non
 
 
 @entry
-def find_beyond(closed: ClosedFormRows, smooth: Smooth, details: Floats, piece: Piece) -> None:
-    """Subtract from the details of a piece of the packed rows those of a smooth image with its means of s0."""
+def find_beyond(closed: ClosedFormRows, smooth: Smooth, details: Floats, row_range: RowRange) -> None:
+    """Subtract from the details of a range of the packed rows those of a smooth image with its means of s0."""
     h, n = details.shape[0], details.shape[2]
     colors = details.shape[1] // 3
     rings, found = np.empty((colors, _SIDE, n + 4), np.float32), np.empty((3, n), np.float32)
     starts = np.empty(_SIDE, np.int64)
-    for y in range(max(2 * piece[0] - 2, 0), min(2 * piece[0] + 2, h)):
+    for y in range(max(2 * row_range[0] - 2, 0), min(2 * row_range[0] + 2, h)):
         _enter_total(closed, y, colors, rings)
-    for y in range(2 * piece[0], 2 * piece[1]):
+    for y in range(2 * row_range[0], 2 * row_range[1]):
         if y + 2 < h:
             _enter_total(closed, y + 2, colors, rings)
         _starts(y, h, n + 4, starts)
@@ -148,8 +148,8 @@ def _enter_power(details: Any, y: int, ring: Any) -> None:
 
 
 @entry
-def emit_details(details: Floats, closed: ClosedFormRows, inputs: LayerInput, piece: Piece) -> None:
-    """Size of the details around the cells of a piece of the packed rows, relative to the local brightness."""
+def emit_details(details: Floats, closed: ClosedFormRows, inputs: LayerInput, row_range: RowRange) -> None:
+    """Size of the details around the cells of a range of the packed rows, relative to the local brightness."""
     h, n = details.shape[0], details.shape[2]
     ring, total, around = (
         np.zeros((3, 3, n + 2), np.float32),
@@ -157,9 +157,9 @@ def emit_details(details: Floats, closed: ClosedFormRows, inputs: LayerInput, pi
         np.empty((3, n), np.float32),
     )
     row, room = np.empty(n // 2, np.float32), np.empty((12, n // 2), np.uint16)
-    for y in range(max(2 * piece[0] - 1, 0), min(2 * piece[0] + 1, h)):
+    for y in range(max(2 * row_range[0] - 1, 0), min(2 * row_range[0] + 1, h)):
         _enter_power(details, y, ring)
-    for y in range(2 * piece[0], 2 * piece[1]):
+    for y in range(2 * row_range[0], 2 * row_range[1]):
         if y + 1 < h:
             _enter_power(details, y + 1, ring)
         first, last, light = max(y - 1, 0), min(y + 1, h - 1), closed.brightness[y // 2]
@@ -301,8 +301,10 @@ def _write_masks(closed: ClosedFormRows, y: int, targets: Targets, valid: Any, n
 
 
 @entry
-def write_pixels(outputs: LayerOutputs, details: DetailOutputs, gains: Floats, targets: Targets, piece: Piece) -> None:
-    """Images at full resolution of a piece of the packed rows; ``gains [C]``: the light's colour.
+def write_pixels(
+    outputs: LayerOutputs, details: DetailOutputs, gains: Floats, targets: Targets, row_range: RowRange
+) -> None:
+    """Images at full resolution of a range of the packed rows; ``gains [C]``: the light's colour.
 
     ``targets``: as of `images_kernel.write_rows`, of 4 h rows with 4 w pixels.
     """
@@ -314,9 +316,9 @@ def write_pixels(outputs: LayerOutputs, details: DetailOutputs, gains: Floats, t
     mean_gain = ZERO
     for c in range(colors):
         mean_gain += gains[c] / np.float32(colors)
-    for y in range(max(2 * piece[0] - 2, 0), min(2 * piece[0] + 2, h)):
+    for y in range(max(2 * row_range[0] - 2, 0), min(2 * row_range[0] + 2, h)):
         _enter_images(outputs, y, rings, spare)
-    for y in range(2 * piece[0], 2 * piece[1]):
+    for y in range(2 * row_range[0], 2 * row_range[1]):
         if y + 2 < h:
             _enter_images(outputs, y + 2, rings, spare)
         _starts(y, h, n + 4, starts)

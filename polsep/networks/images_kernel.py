@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, ZERO, compiled, entry
 from polsep.compute.rows import AT_ONCE, add_product, add_up, copy
-from polsep.compute.threads import Piece
+from polsep.compute.threads import RowRange
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
 from polsep.networks.buffers import ClosedFormRows, LayerInput, Maps, Taps
@@ -167,12 +167,12 @@ def mark_clipped(clipped: Any, y: int, valid: Any, near: Any) -> int:
 
 
 @entry
-def write_rows(outputs: LayerOutputs, gains: Floats, targets: Targets, piece: Piece) -> None:
-    """Images of a piece of the packed rows; ``gains [C]``: the light's colour."""
+def write_rows(outputs: LayerOutputs, gains: Floats, targets: Targets, row_range: RowRange) -> None:
+    """Images of a range of the packed rows; ``gains [C]``: the light's colour."""
     closed = outputs.closed
     w = closed.brightness.shape[1]
     spare, near = np.zeros((6, w), np.float32), np.zeros(2 * w + 2, np.uint8)
-    for t in range(piece[0], piece[1]):
+    for t in range(row_range[0], row_range[1]):
         for cell in range(4):
             _write_cells(outputs, t, cell, gains, targets, spare)
         for y in range(2 * t, 2 * t + 2):

@@ -27,7 +27,7 @@ from polsep.compute.rows import (
     sum_three,
     weave,
 )
-from polsep.compute.threads import Piece
+from polsep.compute.threads import RowRange
 from polsep.demosaic.bilinear_kernel import Pattern
 from polsep.demosaic.cells_kernel import Source
 from polsep.demosaic.guided_kernel import Stream, demosaic_rows, open_stream
@@ -94,8 +94,8 @@ def _make_rings(colors: int, maps: Maps) -> _Rings:
 
 
 @compiled
-def _enter(source: tuple[Samples, Pattern], u: int, piece: Piece, rings: _Rings, found: Any) -> None:
-    """Samples of packed row ``u``, and which of them clip, to their rings; the latter to ``found`` too in the piece."""
+def _enter(source: tuple[Samples, Pattern], u: int, row_range: RowRange, rings: _Rings, found: Any) -> None:
+    """Samples of packed row ``u``, and which of them clip, to their rings; the latter to ``found`` too in the range."""
     samples, pattern = source
     planes, clipped = rings.planes[u % KEPT], rings.clipped[u % KEPT]
     w = clipped.size
@@ -117,7 +117,7 @@ def _enter(source: tuple[Samples, Pattern], u: int, piece: Piece, rings: _Rings,
                 for j in range(w):
                     if own[PERIOD * j] >= pattern.clip_at:
                         clipped[j] |= np.uint16(1 << (PERIOD * row + col))
-    if piece[0] <= u < piece[1]:
+    if row_range[0] <= u < row_range[1]:
         copy(clipped, found[u])
 
 
@@ -342,53 +342,53 @@ def _finish_row(t: int, rings: _Rings, maps: Maps, spare: Any) -> None:
 
 
 @compiled
-def _advance(u: int, piece: Piece, rings: _Rings, maps: Maps, spare: Any) -> None:
+def _advance(u: int, row_range: RowRange, rings: _Rings, maps: Maps, spare: Any) -> None:
     """Compute what earlier rows lacked until row ``u`` was described."""
     v, h = u - 1, maps.closed.clipped.shape[0]
-    if (v > max(piece[0] - REACH, 0) or v == 0) and v < h:
+    if (v > max(row_range[0] - REACH, 0) or v == 0) and v < h:
         _look_around(v, h, rings, spare)
-    if u - REACH >= piece[0]:
+    if u - REACH >= row_range[0]:
         _finish_row(u - REACH, rings, maps, spare)
 
 
 @entry
-def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, piece: Piece) -> None:
-    """The maps and the closed form of a piece of the packed rows, by the linear filter."""
+def map_rows(samples: Samples, pattern: Pattern, taps: Taps, maps: Maps, row_range: RowRange) -> None:
+    """The maps and the closed form of a range of the packed rows, by the linear filter."""
     h, w = maps.closed.clipped.shape
     rings, spare = _make_rings(taps.colors, maps), np.zeros((_ROWS, w), np.float32)
     polarized = np.empty((8 * taps.colors, w), np.float32)
-    begin = max(piece[0] - REACH, 0)
+    begin = max(row_range[0] - REACH, 0)
     for u in range(max(begin - 1, 0), begin + 1):
-        _enter((samples, pattern), u, piece, rings, maps.closed.clipped)
-    for u in range(begin, piece[1] + REACH):
+        _enter((samples, pattern), u, row_range, rings, maps.closed.clipped)
+    for u in range(begin, row_range[1] + REACH):
         if u + 1 < h:
-            _enter((samples, pattern), u + 1, piece, rings, maps.closed.clipped)
+            _enter((samples, pattern), u + 1, row_range, rings, maps.closed.clipped)
         if u < h:
             _filter_samples(taps, u, h, rings, polarized)
-            if maps.details.size and piece[0] <= u < piece[1]:
+            if maps.details.size and row_range[0] <= u < row_range[1]:
                 _filter_details(taps, u, h, rings, (maps.details, spare))
             _describe(taps.colors, u, rings, polarized, spare)
-        _advance(u, piece, rings, maps, spare)
+        _advance(u, row_range, rings, maps, spare)
 
 
 @entry
-def _map_guided_rows(source: Source, stream: Stream, maps: Maps, piece: Piece) -> None:
+def _map_guided_rows(source: Source, stream: Stream, maps: Maps, row_range: RowRange) -> None:
     h, w = maps.closed.clipped.shape
     rings, spare, polarized = _make_rings(3, maps), np.zeros((_ROWS, w), np.float32), np.empty((24, w), np.float32)
     rows = np.empty((2, 18 if maps.details.size else 9, 2 * w), np.float32)
-    for u in range(max(piece[0] - REACH, 0), piece[1] + REACH):
+    for u in range(max(row_range[0] - REACH, 0), row_range[1] + REACH):
         if u < h:
-            _enter((source.samples, source.pattern), u, piece, rings, maps.closed.clipped)
+            _enter((source.samples, source.pattern), u, row_range, rings, maps.closed.clipped)
             demosaic_rows(source, stream, (2 * u, 2 * u + 2), rows)
             _take_apart(rows, rings.s0[u % KEPT], polarized)
-            if maps.details.size and piece[0] <= u < piece[1]:
+            if maps.details.size and row_range[0] <= u < row_range[1]:
                 for k in range(18):
                     copy(rows[k // 9, 9 + k % 9], maps.details[2 * u + k // 9, k % 9])
             _describe(3, u, rings, polarized, spare)
-        _advance(u, piece, rings, maps, spare)
+        _advance(u, row_range, rings, maps, spare)
 
 
-def map_guided_rows(source: Source, maps: Maps, piece: Piece) -> None:
-    """The maps and the closed form of a piece of the packed rows of a colour frame, by the intensity guide."""
-    stream = open_stream(source, 2 * max(piece[0] - REACH, 0), apart=True, details=maps.details.size > 0)
-    _map_guided_rows(source, stream, maps, piece)
+def map_guided_rows(source: Source, maps: Maps, row_range: RowRange) -> None:
+    """The maps and the closed form of a range of the packed rows of a colour frame, by the intensity guide."""
+    stream = open_stream(source, 2 * max(row_range[0] - REACH, 0), apart=True, details=maps.details.size > 0)
+    _map_guided_rows(source, stream, maps, row_range)

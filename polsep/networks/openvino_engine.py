@@ -128,7 +128,7 @@ class OpenVinoEngine:
 
         ``kept``: rows of the images that are wanted; others are left out, and do not count in the tally.
         """
-        from polsep.compute.threads import share
+        from polsep.compute.threads import run_over_rows
         from polsep.demosaic.bilinear_kernel import read_pattern
         from polsep.networks.details_kernel import emit_details, find_beyond, write_pixels
         from polsep.networks.images_kernel import Targets, write_rows
@@ -142,31 +142,37 @@ class OpenVinoEngine:
             self._fill_inputs(samples, pattern)
             rows, closed, beyond = shape[0] // PERIOD, self._maps.closed, self._maps.details
             if self._full:
-                share(lambda piece: find_beyond(closed, self._details.smooth, beyond, piece), rows, _ROWS)
-                share(lambda piece: emit_details(beyond, closed, self._detail_input, piece), rows, _ROWS)
+                run_over_rows(
+                    lambda row_range: find_beyond(closed, self._details.smooth, beyond, row_range), rows, _ROWS
+                )
+                run_over_rows(
+                    lambda row_range: emit_details(beyond, closed, self._detail_input, row_range), rows, _ROWS
+                )
             self._request.infer()
             if self._full:
-                share(lambda piece: write_pixels(self._outputs, self._details, gains, targets, piece), rows, _ROWS)
+                run_over_rows(
+                    lambda row_range: write_pixels(self._outputs, self._details, gains, targets, row_range), rows, _ROWS
+                )
             else:
-                share(lambda piece: write_rows(self._outputs, gains, targets, piece), rows, _ROWS)
+                run_over_rows(lambda row_range: write_rows(self._outputs, gains, targets, row_range), rows, _ROWS)
         targets = Targets._make(image[kept] for image in targets)
         diffuse, specular, error = (image.reshape(image.shape[0], w, -1) for image in targets[:3])
         return FrameImages(diffuse, specular, targets.valid, targets.dolp, targets.aolp, _tally(targets), error)
 
     def _fill_inputs(self, samples: Samples, pattern: Pattern) -> None:
         """The layers' inputs, and the closed form, of a frame."""
-        from polsep.compute.threads import get_threads, share
+        from polsep.compute.threads import get_threads, run_over_rows
         from polsep.demosaic.cells_kernel import Source, read_grid
         from polsep.networks.maps_kernel import map_guided_rows, map_rows
 
         h, taps, maps = pattern.h // 2, self._taps, self._maps
         if taps is not None:
-            share(lambda piece: map_rows(samples, pattern, taps, maps, piece), h, _ROWS)
+            run_over_rows(lambda row_range: map_rows(samples, pattern, taps, maps, row_range), h, _ROWS)
         else:
             angles = self._layout.angles
             source = Source(samples, pattern, read_grid(pattern, angles, stokes_inverse(angles).float().numpy()))
             # A strip begins with rows that the one before has too, many of them: one for each thread.
-            share(lambda piece: map_guided_rows(source, maps, piece), h, -(-h // get_threads()))
+            run_over_rows(lambda row_range: map_guided_rows(source, maps, row_range), h, -(-h // get_threads()))
 
 
 def _model_of(network: Joint, layers: type[Layers], channels: tuple[int, ...]) -> Any:

@@ -28,7 +28,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polsep.compute.threads import Piece, share
+from polsep.compute.threads import RowRange, run_over_rows
 from polsep.physics.stokes import Stokes
 from polsep.render import raster_kernel as raster
 from polsep.render import rays_kernel as rays
@@ -111,7 +111,7 @@ class Band:
     pixels of which every ray hits.
     """
 
-    pixels: Piece
+    pixels: RowRange
     hits: Hits
     pixel: Tensor
     covered: Tensor
@@ -246,7 +246,7 @@ def render_scene(
     cast, test = _band_caster(scene, camera, size, samples), _shadow_test(scene, light)
     images = _Images(materials, camera, light, size, samples)
 
-    def render_band(pixels: Piece) -> None:
+    def render_band(pixels: RowRange) -> None:
         band = cast(pixels)
         images.shade(band, test(band.hits))
 
@@ -280,7 +280,7 @@ class _Images:
         return Scene(diffuse, specular, torch.from_numpy(self.mask))
 
 
-def _split_rows(size: tuple[int, int], samples: int) -> list[Piece]:
+def _split_rows(size: tuple[int, int], samples: int) -> list[RowRange]:
     """Ranges of pixels of the bands; they do not depend on the number of threads."""
     height, width = size
     rows = max(1, RAYS_PER_BAND // (width * samples**2))
@@ -291,16 +291,16 @@ def _map_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -
     """Results of a function for all items, in their order."""
     results: dict[int, Result] = {}
 
-    def work(piece: Piece) -> None:
-        results.update((index, function(items[index])) for index in range(*piece))
+    def work(row_range: RowRange) -> None:
+        results.update((index, function(items[index])) for index in range(*row_range))
 
-    share(work, len(items), 1)
+    run_over_rows(work, len(items), 1)
     return [results[index] for index in range(len(items))]
 
 
 def _band_caster(
     scene: MeshScene, camera: PinholeCamera, size: tuple[int, int], samples: int
-) -> Callable[[Piece], Band]:
+) -> Callable[[RowRange], Band]:
     """Function that finds the hits of a band: by rasterization, or by Embree if some vertices are behind the camera."""
     if samples < 1 or samples**2 > shading.BLOCK:
         raise ValueError(f"expected 1 to {int(shading.BLOCK**0.5)} samples along a pixel's side, found {samples}")
@@ -313,13 +313,13 @@ def _band_caster(
     if in_front:
         raster.span_rows(scene.triangles, projected, height * samples, spans)
 
-    def trace(rows: Piece) -> Hits:
+    def trace(rows: RowRange) -> Hits:
         sides = (np.arange(first * samples, stop * samples) for first, stop in (rows, (0, width)))
         y, x = ((np.float32(side) + np.float32(0.5)).reshape(-1, samples) / np.float32(samples) for side in sides)
         grid_y, grid_x = np.broadcast_arrays(y[:, None, :, None], x[None, :, None, :])
         return _trace(scene, view, grid_y.flatten(), grid_x.flatten())
 
-    def rasterize(rows: Piece) -> Hits:
+    def rasterize(rows: RowRange) -> Hits:
         shape = ((rows[1] - rows[0]) * samples, width * samples)
         triangle, nearest = np.full(shape, -1, np.int32), np.zeros(shape, np.float32)
         raster.fill_triangles(scene.triangles, projected, spans, rows[0] * samples, nearest, triangle)
@@ -331,7 +331,7 @@ def _band_caster(
         hits = _interpolate(scene, view, found, directions)
         return replace(hits, rays=triangle.size, ray=torch.from_numpy(ray))
 
-    def cast_band(pixels: Piece) -> Band:
+    def cast_band(pixels: RowRange) -> Band:
         hits = (rasterize if in_front else trace)((pixels[0] // width, pixels[1] // width))
         pixel = hits.ray // samples**2
         covered = torch.bincount(pixel, minlength=pixels[1] - pixels[0]) == samples**2

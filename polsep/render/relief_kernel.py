@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, TWO, ZERO, entry
-from polsep.compute.threads import Piece, share
+from polsep.compute.threads import RowRange, run_over_rows
 from polsep.render.patterns_kernel import gradient_noise
 
 Floats = NDArray[np.float32]
@@ -22,7 +22,7 @@ _STEP = np.float32(1 / 32)
 _GAIN, _MIN_COSINE = np.float32(0.7), np.float32(0.02)
 #: Difference between the seeds of octaves.
 _KEY_STEP = np.uint32(77)
-#: Points per piece of work of a thread.
+#: Points per range of work of a thread.
 _POINTS_AT_ONCE = 1 << 14
 
 
@@ -39,17 +39,17 @@ def roughen_normals(positions: Floats, normals: Floats, eye: Floats, relief: Rel
     """Tilt unit ``normals [3, M]`` at ``positions [3, M]`` in place, except those that would face away from the eye."""
     frequency, strength, seed = np.float32(relief.frequency), np.float32(relief.strength), np.uint32(relief.seed)
 
-    def roughen(piece: Piece) -> None:
-        _roughen(positions, normals, eye, frequency, strength, relief.octaves, seed, piece)
+    def roughen(row_range: RowRange) -> None:
+        _roughen(positions, normals, eye, frequency, strength, relief.octaves, seed, row_range)
 
-    share(roughen, positions.shape[1], _POINTS_AT_ONCE)
+    run_over_rows(roughen, positions.shape[1], _POINTS_AT_ONCE)
 
 
 @entry
 def _roughen(
-    positions: Any, normals: Any, eye: Any, frequency: Any, strength: Any, octaves: int, seed: Any, piece: Any
+    positions: Any, normals: Any, eye: Any, frequency: Any, strength: Any, octaves: int, seed: Any, row_range: Any
 ) -> None:
-    for m in range(piece[0], piece[1]):
+    for m in range(row_range[0], row_range[1]):
         x, y, z = positions[0, m] * frequency, positions[1, m] * frequency, positions[2, m] * frequency
         gx, gy, gz, gain, key = ZERO, ZERO, ZERO, strength / _STEP, seed
         for _ in range(octaves):

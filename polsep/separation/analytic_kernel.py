@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.compiling import THIRD, ZERO, compiled, entry
 from polsep.compute.rows import add_rows, copy
-from polsep.compute.threads import Piece, share
+from polsep.compute.threads import RowRange, run_over_rows
 from polsep.demosaic.bilinear_kernel import (
     Pattern,
     advance_window,
@@ -91,7 +91,7 @@ def separate_analytic_half(
     rows, sums = (pattern.h, pattern.w * pattern.channels), np.zeros((dolp.shape[0], RESIDUAL))
     targets = _Targets(out.diffuse.reshape(rows), out.specular.reshape(rows), out.valid, dolp, aolp, sums)
     gains = np.array(options.light_color if options.in_light else (1, 1, 1), np.float32)[: pattern.channels]
-    share(partial(_separate_rows, samples, pattern, _inverse(layout), gains, targets), pattern.h, STRIP)
+    run_over_rows(partial(_separate_rows, samples, pattern, _inverse(layout), gains, targets), pattern.h, STRIP)
     if not options.report:
         return out
     valid = int(np.count_nonzero(out.valid))
@@ -142,7 +142,7 @@ def _clear_flagged(flags: Any, valid: Any) -> None:
 
 @entry
 def _separate_rows(
-    samples: Samples, pattern: Pattern, inverse: Any, gains: Any, targets: _Targets, piece: Piece
+    samples: Samples, pattern: Pattern, inverse: Any, gains: Any, targets: _Targets, row_range: RowRange
 ) -> None:
     """Some of the frame's cell rows, first to last; every thread calls it for others."""
     window, m = make_window(pattern), make_analysers(pattern)
@@ -153,8 +153,8 @@ def _separate_rows(
         np.empty((2, gains.size, n), np.float32),
     )
     none_skipped = np.empty(0, np.uint16)
-    open_window(samples, pattern, window, piece[0])
-    for r in range(piece[0], piece[1]):
+    open_window(samples, pattern, window, row_range[0])
+    for r in range(row_range[0], row_range[1]):
         flagged = advance_window(samples, pattern, window, r)
         valid = targets.valid[r]
         for j in range(valid.size):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, THIRD, TWO, ZERO, compiled, entry
 from polsep.compute.rows import add_rows, add_up
-from polsep.compute.threads import Piece
+from polsep.compute.threads import RowRange
 from polsep.physics.stokes_kernel import fit_stokes_unclipped, polarize
 from polsep.separation import color_affine as twin
 from polsep.separation.closed_form import MIN_EIGENVALUE
@@ -74,14 +74,14 @@ def _residual(s: Any, a1: Any, a2: Any) -> Any:
 
 
 @entry
-def solve_pixels(pixels: Pixels, cosines: Any, sines: Any, inverses: Any, piece: Piece) -> None:
+def solve_pixels(pixels: Pixels, cosines: Any, sines: Any, inverses: Any, row_range: RowRange) -> None:
     """Diffuse, specular and offset of pixels from their unclipped samples, and which of them are determined.
 
     ``cosines``, ``sines [4]`` of twice the analysers' angles; ``inverses [16, 3, 4]`` by which of them are clipped.
     """
     s, s0, total = np.empty((3, 3), np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
     y, kept = np.empty((3, 4), np.float32), np.empty((3, 4), np.bool_)
-    for n in range(piece[0], piece[1]):
+    for n in range(row_range[0], row_range[1]):
         a1, a2 = pixels.lines[0, n], pixels.lines[1, n]
         _read_pixel(pixels, n, y, kept)
         for c in range(3):

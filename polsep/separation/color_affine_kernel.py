@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from polsep.compute.threads import get_threads, share
+from polsep.compute.threads import get_threads, run_over_rows
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
 from polsep.physics.stokes import Measurements, analyser_residual, stokes_inverse, unclipped_inverse
@@ -84,7 +84,7 @@ def separate_color_affine_half(
     h, w = pattern.h, pattern.w
     dolp, aolp = check_images(out, (h, w, 3), options.report)
     height = strip_height(h)
-    clips = any(share(partial(rows_clip, samples, pattern), h, height))
+    clips = any(run_over_rows(partial(rows_clip, samples, pattern), h, height))
     lines, clipped = (
         np.empty((4, h, w) if clips else (4, 0, 0), np.float32),
         np.zeros((h, w) if clips else (0, 0), np.uint16),
@@ -96,7 +96,7 @@ def separate_color_affine_half(
     conversion = Conversion(*_matrices(layout), np.ones(3, np.float32) if clips else gains)
     source = Source(samples, pattern, read_grid(pattern, layout.angles, conversion.inverses[0]))
     run = separate_guided_strip if options.guided else separate_strip
-    share(partial(run, source, conversion, targets), h, height)
+    run_over_rows(partial(run, source, conversion, targets), h, height)
     out.valid[:] = True
     places = np.flatnonzero(clipped)
     tally = make_tally(h * w - places.size, 0, h * w - places.size, targets.sums)
@@ -146,8 +146,8 @@ def _complete(
     doubled, lines = 2 * np.array(layout.angles), targets.lines.reshape(4, -1)
     cosines, sines = np.cos(doubled).astype(np.float32), np.sin(doubled).astype(np.float32)
     pixels = make_pixels(targets.clipped.reshape(-1)[places], np.ascontiguousarray(lines[:, places]))
-    share(partial(collect, source, places, pixels.samples), places.size, PIXELS)
-    share(partial(solve_pixels, pixels, cosines, sines, inverses), places.size, PIXELS)
+    run_over_rows(partial(collect, source, places, pixels.samples), places.size, PIXELS)
+    run_over_rows(partial(solve_pixels, pixels, cosines, sines, inverses), places.size, PIXELS)
     lines[2:, places] = pixels.lines[2:]
     out.valid.reshape(-1)[places] = pixels.valid
     _write(pixels, places, out)

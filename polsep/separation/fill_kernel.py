@@ -5,17 +5,21 @@ Only the pyramid, a third of the frame, is ever made; of the frame itself nothin
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, ZERO, compiled, entry
+from polsep.compute.threads import RowRange, run_over_rows
 
 #: Means and, in the last plane, weights of one level of a pyramid: ``[K + 1, h, w]``.
 Level = NDArray[np.float32]
 
 _MIN_WEIGHT = np.float32(1e-12)
+#: Rows of a frame that one thread halves, an even number.
+_ROWS = 64
 
 
 def interpolate_holes(finest: Level, shape: tuple[int, int], places: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -39,11 +43,10 @@ def halve_separation(
 
     ``diffuse``, ``specular [h, w, 3]``, ``lines [4, h, w]``: a and b of p = a s0 + b.
     """
-    tau = specular[..., 0]
-    p1, p2 = lines[2] + lines[0] * tau, lines[3] + lines[1] * tau
-    scale = tau / np.maximum(np.sqrt(p1 * p1 + p2 * p2), _MIN_WEIGHT)
-    planes = np.stack([scale * p1, scale * p2, *np.moveaxis(diffuse, -1, 0), np.ones_like(tau)])
-    return _halve(np.where(valid, planes, ZERO))
+    h, w = valid.shape
+    level = np.zeros((6, (h + 1) // 2, (w + 1) // 2), np.float32)
+    run_over_rows(partial(_halve_separation, diffuse, specular, lines, valid, level), h, _ROWS)
+    return level
 
 
 def halve_specular(specular: NDArray[np.float32], outside: NDArray[np.bool_]) -> Level:
@@ -59,14 +62,39 @@ def _halve(level: Level) -> Level:
     return coarse
 
 
+@compiled
+def _share(i: int, j: int, h: int, w: int) -> Any:
+    """1 / the number of pixels of the 2x2 block of a pixel, at an odd border fewer than 4."""
+    count = (2 if i // 2 * 2 + 1 < h else 1) * (2 if j // 2 * 2 + 1 < w else 1)
+    return ONE / np.float32(count)
+
+
+@entry
+def _halve_separation(diffuse: Any, specular: Any, lines: Any, valid: Any, level: Any, row_range: RowRange) -> None:
+    h, w = valid.shape
+    for i in range(row_range[0], row_range[1]):
+        for j in range(w):
+            if not valid[i, j]:
+                continue
+            y, x = i // 2, j // 2
+            share, tau = _share(i, j, h, w), specular[i, j, 0]
+            p1, p2 = lines[2, i, j] + lines[0, i, j] * tau, lines[3, i, j] + lines[1, i, j] * tau
+            size = np.sqrt(p1 * p1 + p2 * p2)
+            scale = share * tau / (size if size > _MIN_WEIGHT else _MIN_WEIGHT)
+            level[0, y, x] += scale * p1
+            level[1, y, x] += scale * p2
+            for c in range(3):
+                level[2 + c, y, x] += share * diffuse[i, j, c]
+            level[5, y, x] += share
+
+
 @entry
 def _halve_planes(level: Any, coarse: Any) -> None:
     planes, h, w = level.shape
     for k in range(planes):
         for i in range(h):
             for j in range(w):
-                count = (2 if i // 2 * 2 + 1 < h else 1) * (2 if j // 2 * 2 + 1 < w else 1)  # 4, at odd borders fewer
-                coarse[k, i // 2, j // 2] += ONE / np.float32(count) * level[k, i, j]
+                coarse[k, i // 2, j // 2] += _share(i, j, h, w) * level[k, i, j]
 
 
 @compiled

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.compiling import THIRD, TWO, ZERO, compiled, entry
 from polsep.compute.rows import add_rows, add_up, copy
-from polsep.compute.threads import Piece
+from polsep.compute.threads import RowRange
 from polsep.demosaic import guided_kernel as guided
 from polsep.demosaic.bilinear_kernel import (
     PAD,
@@ -187,22 +187,22 @@ def _read_row(source: Source, conversion: Conversion, t: int, strip: Strip, targ
 
 
 @entry
-def open_strip(source: Source, piece: Piece, edges: int) -> Strip:
-    """A strip that is to separate a piece of the frame's cell rows; ``edges``: rows of edges to keep, `KEPT` or 0."""
-    pattern, begin = source.pattern, first_weighed(piece[0])
+def open_strip(source: Source, row_range: RowRange, edges: int) -> Strip:
+    """A strip that is to separate a range of the frame's cell rows; ``edges``: rows of edges to keep, `KEPT` or 0."""
+    pattern, begin = source.pattern, first_weighed(row_range[0])
     window = make_window(pattern)
     open_window(source.samples, pattern, window, max(begin - NOISE, 0))
-    return Strip(piece[0], piece[1], begin, window, make_rows(pattern), make_rings(pattern.w, edges))
+    return Strip(row_range[0], row_range[1], begin, window, make_rows(pattern), make_rings(pattern.w, edges))
 
 
 @entry
 def separate_rows(
-    source: Source, conversion: Conversion, targets: Targets, strip: Strip, piece: Piece, better: Any
+    source: Source, conversion: Conversion, targets: Targets, strip: Strip, row_range: RowRange, better: Any
 ) -> None:
     """Separate the next rows of a strip; ``better [rows, 5, w]``: their guided Stokes rows, or empty."""
     pattern, rows, rings = source.pattern, strip.rows, strip.rings
     first = max(strip.begin - NOISE, 0)
-    for t in range(piece[0] + REACH if piece[0] > strip.start else strip.begin - NOISE, piece[1] + REACH):
+    for t in range(row_range[0] + REACH if row_range[0] > strip.start else strip.begin - NOISE, row_range[1] + REACH):
         if first <= t < pattern.h:
             _read_row(source, conversion, t, strip, targets)
         elif t >= pattern.h:
@@ -219,31 +219,31 @@ def separate_rows(
             fit_diffuse_polarization(pattern, done, strip.start, rows, rings)
         if done >= strip.start:
             _write_row(
-                conversion.gains, done, strip, better[done - piece[0]] if better.size else better[:0, 0], targets
+                conversion.gains, done, strip, better[done - row_range[0]] if better.size else better[:0, 0], targets
             )
 
 
-def separate_strip(source: Source, conversion: Conversion, targets: Targets, piece: Piece) -> None:
+def separate_strip(source: Source, conversion: Conversion, targets: Targets, row_range: RowRange) -> None:
     """A strip of the frame from bilinear samples."""
     nothing = np.empty((0, 5, source.pattern.w), np.float32)
-    separate_rows(source, conversion, targets, open_strip(source, piece, 0), piece, nothing)
+    separate_rows(source, conversion, targets, open_strip(source, row_range, 0), row_range, nothing)
 
 
-def separate_guided_strip(source: Source, conversion: Conversion, targets: Targets, piece: Piece) -> None:
+def separate_guided_strip(source: Source, conversion: Conversion, targets: Targets, row_range: RowRange) -> None:
     """A strip of the frame from guided Stokes rows, a few at a time."""
-    stream, strip = guided.open_stream(source, piece[0]), open_strip(source, piece, KEPT)
+    stream, strip = guided.open_stream(source, row_range[0]), open_strip(source, row_range, KEPT)
     better = np.empty((CHUNK, 5, source.pattern.w), np.float32)
-    for start in range(piece[0], piece[1], CHUNK):
-        chunk = (start, min(start + CHUNK, piece[1]))
+    for start in range(row_range[0], row_range[1], CHUNK):
+        chunk = (start, min(start + CHUNK, row_range[1]))
         guided.demosaic_rows(source, stream, chunk, better)
         separate_rows(source, conversion, targets, strip, chunk, better)
 
 
 @entry
-def rows_clip(samples: Samples, pattern: Pattern, piece: Piece) -> bool:
+def rows_clip(samples: Samples, pattern: Pattern, row_range: RowRange) -> bool:
     """True if any sample of these cell rows of the frame is clipped."""
     row = np.empty(2 * pattern.w, np.float32)
-    for y in range(2 * piece[0], 2 * piece[1]):
+    for y in range(2 * row_range[0], 2 * row_range[1]):
         read_row(samples, pattern.top + y, pattern.left, row)
         if any_clipped(row, pattern.clip_at):
             return True
@@ -251,12 +251,12 @@ def rows_clip(samples: Samples, pattern: Pattern, piece: Piece) -> bool:
 
 
 @entry
-def collect(source: Source, places: Any, data: Any, piece: Piece) -> None:
+def collect(source: Source, places: Any, data: Any, row_range: RowRange) -> None:
     """The bilinear analysers of some pixels of ``places [N]``, flat and ascending, into ``data [4, 3, N]``."""
     samples, pattern, _ = source
     window, m = make_window(pattern), make_analysers(pattern)
     last = -2
-    for i in range(piece[0], piece[1]):
+    for i in range(row_range[0], row_range[1]):
         r, j = places[i] // pattern.w, places[i] % pattern.w
         if r != last:
             if r != last + 1:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, ZERO, compiled, entry
-from polsep.compute.threads import Piece, share
+from polsep.compute.threads import RowRange, run_over_rows
 
 #: Steps of the tone curve's table.
 STEPS = 4096
@@ -56,7 +56,7 @@ def fill_panels(
     gain: float,
     table: NDArray[np.uint8],
     out: NDArray[np.uint8],
-    piece: Piece,
+    row_range: RowRange,
 ) -> None:
     """Rows of ``out [h, 3 w, 3]``: the sum of both ``images [H, W, C]``, the first and the second."""
     height, full, colors = images[0].shape
@@ -67,7 +67,7 @@ def fill_panels(
     one, two = np.empty((width, colors), np.float32), np.empty((width, colors), np.float32)
     both = np.empty((width, colors), np.float32)
     first, second = images[0].reshape(height, -1), images[1].reshape(height, -1)
-    for y in range(piece[0], piece[1]):
+    for y in range(row_range[0], row_range[1]):
         _shrink(first, y, factor, rows, one)
         _shrink(second, y, factor, rows, two)
         for x in range(width):
@@ -88,5 +88,5 @@ def make_panels(
     height, width = images[0].shape[:2]
     factor = -(-max(height, width) // widest)
     out = np.empty((max(height // factor // 2 * 2, 2), 3 * max(width // factor // 2 * 2, 2), 3), np.uint8)
-    share(lambda rows: fill_panels(images, gain, table, out, rows), out.shape[0], _ROWS)
+    run_over_rows(lambda rows: fill_panels(images, gain, table, out, rows), out.shape[0], _ROWS)
     return out

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, ZERO, compiled, entry
-from polsep.compute.threads import Piece, share
+from polsep.compute.threads import RowRange, run_over_rows
 from polsep.sensor.unpack_kernel import Samples, as_samples, read_row
 
 #: Samples along the side of a block; block rows on either side that a row depends on, and rows of the ring.
@@ -70,7 +70,7 @@ def filter_samples(raw: NDArray[Any], before: tuple[Any, Any], rules: Rules) -> 
     """Samples ``[H, W]`` (uint8, uint16, float32) filtered, and the new means and counts, from those ``before``."""
     mean, count = before
     frames = Frames(mean, count, np.empty_like(mean), np.empty_like(count), np.empty_like(mean))
-    share(partial(_filter_strip, as_samples(raw), frames, rules), count.shape[0], STEP)
+    run_over_rows(partial(_filter_strip, as_samples(raw), frames, rules), count.shape[0], STEP)
     return frames.filtered, frames.new_mean, frames.new_number
 
 
@@ -82,7 +82,7 @@ def blend_images(images: tuple[Any, Any], weight: NDArray[Any], side: int) -> ND
     shape = images[0].shape
     now, old = (np.ascontiguousarray(x, np.float32).reshape(shape[0], -1) for x in images)
     new, sides = np.empty_like(now), (side, side * shape[2])
-    share(partial(_blend_rows, (now, old), weight, sides, new), shape[0], STEP)
+    run_over_rows(partial(_blend_rows, (now, old), weight, sides, new), shape[0], STEP)
     return new.reshape(shape)
 
 
@@ -257,7 +257,7 @@ def _average(row: Any, mean: Any, weight: Any, clip: Any, new: tuple[Any, Any]) 
 
 
 @entry
-def _filter_strip(samples: Samples, frames: Any, rules: Any, piece: Piece) -> None:
+def _filter_strip(samples: Samples, frames: Any, rules: Any, row_range: RowRange) -> None:
     cols = frames.number.shape[1]
     width = BLOCK * cols
     ring = _make_ring(cols)
@@ -265,10 +265,10 @@ def _filter_strip(samples: Samples, frames: Any, rules: Any, piece: Piece) -> No
     scores = np.empty((BLOCK, width), np.float32)
     blocks, kept = np.empty(cols, np.float32), np.empty(cols, np.float32)
     spare = (row, total, spread, scores, blocks, kept)
-    for r in range(piece[0] - REACH, piece[1] + REACH):
+    for r in range(row_range[0] - REACH, row_range[1] + REACH):
         _enter((samples, frames), rules, (r, (r + SLOTS) % SLOTS), ring, spare)
         here = r - REACH
-        if here < piece[0]:
+        if here < row_range[0]:
             continue
         _sum_windows(ring, spare)
         near = ((here - 1 + SLOTS) % SLOTS, (here + 1) % SLOTS)
@@ -282,10 +282,10 @@ def _filter_strip(samples: Samples, frames: Any, rules: Any, piece: Piece) -> No
 
 
 @entry
-def _blend_rows(images: tuple[Any, Any], weight: Any, sides: tuple[int, int], new: Any, piece: Piece) -> None:
+def _blend_rows(images: tuple[Any, Any], weight: Any, sides: tuple[int, int], new: Any, row_range: RowRange) -> None:
     """``sides``: rows, and numbers of a row, that share a weight."""
     (image, before), (down, along) = images, sides
-    for y in range(piece[0], piece[1]):
+    for y in range(row_range[0], row_range[1]):
         row, old, out, weights = image[y], before[y], new[y], weight[y // down]
         for block in range(weights.size):
             first, stop = along * block, min(along * (block + 1), out.size)

@@ -33,7 +33,7 @@ from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Stokes, fit_stokes, measure
 from polsep.sensor.camera import CLIP_MARGIN, IDEAL, Layout, Mosaic, expose, sample_mosaic
 from polsep.separation import color_affine
-from polsep.separation.color_affine import MAX_DIFFUSE_DOLP
+from polsep.separation.closed_form import MAX_DIFFUSE_DOLP
 from polsep.train.joint_task import MARGIN
 
 COLOR, MONO = Layout(), Layout(bayer=None)

@@ -101,7 +101,7 @@ def test_commands_parse(page: Path) -> None:
             pytest.fail(f"{' '.join(words)}: {error}")
 
 
-def check_imports(code: str) -> None:
+def assert_imports_exist(code: str) -> None:
     """Raise unless the code is valid Python and the names that it imports from polsep exist."""
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("polsep", "evaluation"):
@@ -113,13 +113,13 @@ def check_imports(code: str) -> None:
 def test_python_of_pages_imports_what_exists(page: Path) -> None:
     """Every Python block is valid Python, and the names that it imports exist."""
     for code in blocks(page, "python"):
-        check_imports(code)
+        assert_imports_exist(code)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem)
 def test_examples_import_what_exists(path: Path) -> None:
     """The names that examples import from polsep exist."""
-    check_imports(path.read_text(encoding="utf-8"))
+    assert_imports_exist(path.read_text(encoding="utf-8"))
 
 
 @every_page

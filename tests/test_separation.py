@@ -14,6 +14,7 @@ from tolerances import assert_close, assert_finite, assert_within
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from polsep.compute.filters import box_mean
 from polsep.physics.stokes import (
     Measurements,
     Stokes,
@@ -26,13 +27,7 @@ from polsep.physics.stokes import (
 )
 from polsep.render.distances import ball, plain
 from polsep.render.sphere_tracing import Part, PinholeCamera, PointLight, render
-from polsep.separation.analytic import (
-    Separation,
-    box_mean,
-    light_polarizer_angle,
-    separate_analytic,
-    separate_analytic_unclipped,
-)
+from polsep.separation.analytic import Separation, light_polarizer_angle, separate_analytic, separate_analytic_unclipped
 from polsep.separation.closed_form import MAX_DIFFUSE_DOLP, white_specular
 from polsep.separation.color_affine import separate_color_affine
 from polsep.separation.report import dominant_angle, in_light, tally, under_white_light

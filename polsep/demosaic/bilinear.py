@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from polsep.compute.filters import box_mean
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.separation.analytic import box_mean
 
 
 def aligned(values: Tensor, layout: Layout) -> Tensor:

@@ -32,6 +32,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from polsep.compute.filters import box_mean
 from polsep.demosaic.bilinear import (
     aligned,
     correlate,
@@ -44,7 +45,6 @@ from polsep.demosaic.bilinear import (
 )
 from polsep.physics.stokes import Measurements, Stokes, analyser_residual, fit_stokes, measure
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.separation.analytic import box_mean
 
 #: Smallest number of cells per side for the guided filters; smaller frames stay bilinear.
 MIN_CELLS = 8

@@ -80,7 +80,7 @@ def _add_moments(whole: Any, stokes: tuple[Any, Any, Any], moments: Any) -> None
 
 @compiled
 def unclip(planes: Any, bits: Any, slopes: Any, lacking: Any) -> bool:
-    """What clipping hid of a row of packed pixels, ``lacking [5, w]``: of the offset, and of three colours' s0.
+    """Light that clipping hid in a row of packed pixels, ``lacking [5, w]``: of the offset, and of three colours' s0.
 
     ``planes [16, w]``: samples, ``slopes [2, w]``. False, and nothing in ``lacking``, of rows where nothing clips.
     """
@@ -102,7 +102,7 @@ def unclip(planes: Any, bits: Any, slopes: Any, lacking: Any) -> bool:
 
 @compiled
 def _unclip_one(y: Any, kept: Any, a1: Any, a2: Any, s0: Any, lacking: Any) -> None:
-    """What one packed pixel is ``lacking [5]``; nothing where too few samples are ``kept [4, 4]``."""
+    """Light that one packed pixel is ``lacking [5]``; nothing where too few samples are ``kept [4, 4]``."""
     left, as_is = s0[0], s0[1]
     b1, b2, eigenvalue = fit_unclipped(y, kept, _COSINES, _SINES, a1, a2, left)
     if eigenvalue <= _MIN_EIGENVALUE:

@@ -27,8 +27,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
+from polsep.compute.filters import box_mean
 from polsep.physics.stokes import Measurements, Stokes, analyser_residual, fit_stokes_unclipped
-from polsep.separation.analytic import Separation, box_mean, separate_analytic_unclipped
+from polsep.separation.analytic import Separation, separate_analytic_unclipped
 from polsep.separation.closed_form import fit_unclipped, limit_dolp, white_specular
 
 #: Windows of the diffuse polarization, widest first: radius in pixels, and standard deviation per component from the

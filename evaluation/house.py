@@ -37,7 +37,7 @@ separate()  # loads what is loaded once
 def watch(frame, event, _):
     file, name = frame.f_code.co_filename, frame.f_code.co_name
     kernel = "/polsep/" in file and (file.endswith("_kernel.py") or "/polsep/kernels/" in file)
-    kernel = kernel and not file.endswith(("threads.py", "rows.py", "compiling.py"))
+    kernel = kernel and not file.endswith(("threads.py", "compiling.py"))
     if event == "call" and (kernel or name == "forward"):
         sys.setprofile(None)
         names = []

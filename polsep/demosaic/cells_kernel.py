@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, ZERO, compiled
-from polsep.compute.rows import fill
+from polsep.compute.rows_kernel import fill
 from polsep.demosaic import guided as twin
 from polsep.demosaic.bilinear_kernel import Pattern
 from polsep.sensor.unpack_kernel import Samples, read_row

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, QUARTER, ZERO, compiled
-from polsep.compute.rows import add_rows, subtract
+from polsep.compute.rows_kernel import add_rows, subtract
 from polsep.demosaic import guided as twin
 from polsep.demosaic.cells_kernel import (
     GUARD,

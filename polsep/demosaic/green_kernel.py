@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, THIRD, TWO, ZERO, compiled
-from polsep.compute.rows import add_rows
+from polsep.compute.rows_kernel import add_rows
 from polsep.demosaic import guided as twin
 from polsep.demosaic.cells_kernel import GUARD, Grid, blur_pixels_down, mean_cells, reciprocal, sum_three
 

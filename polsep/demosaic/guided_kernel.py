@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, THIRD, TWO, ZERO, compiled, entry
-from polsep.compute.rows import add_product, add_rows, copy, fill, subtract
+from polsep.compute.rows_kernel import add_product, add_rows, copy, fill, subtract
 from polsep.compute.threads import RowRange
 from polsep.demosaic import guided as twin
 from polsep.demosaic.cells_kernel import (

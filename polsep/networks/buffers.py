@@ -20,7 +20,7 @@ class Taps(NamedTuple):
 
     ``weight [4, 3 C, K]``: of 4 cells, s0, s1, s2 of C colours, and ``[4, 6 C, K]`` with the details of s0; ``row``,
     ``place [4, K]``: of the samples that a cell's outputs see, their packed row, 0 to 2, and their place in rows
-    ``[16, w + 2]``; K is a multiple of `rows.AT_ONCE`.
+    ``[16, w + 2]``; K is a multiple of `rows_kernel.AT_ONCE`.
     """
 
     weight: Floats

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from polsep.compute.compiling import HALF, ONE, TWO, ZERO, compiled
-from polsep.compute.rows import add_product, average, copy, fill, sum_three
+from polsep.compute.rows_kernel import add_product, average, copy, fill, sum_three
 from polsep.separation.closed_form_kernel import limit_dolp_row
 
 #: Rows of moments that a ring keeps: twice the widest window.

@@ -14,7 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, ZERO, compiled, entry
-from polsep.compute.rows import AT_ONCE, add_product, add_up, average, copy, emit, fill, filter_rows, sum_three, weave
+from polsep.compute.rows_kernel import (
+    AT_ONCE,
+    add_product,
+    add_up,
+    average,
+    copy,
+    emit,
+    fill,
+    filter_rows,
+    sum_three,
+    weave,
+)
 from polsep.compute.threads import RowRange
 from polsep.networks.buffers import ClosedFormRows, LayerInput
 from polsep.networks.channels import DETAIL_MAPS, PERIOD
@@ -25,7 +36,7 @@ from polsep.separation.tally_kernel import add_polarization, count_above_one
 
 Floats = NDArray[np.float32]
 
-#: Rows and columns of cells that a guess sees, and to how many taps `rows.filter_rows` brings them.
+#: Rows and columns of cells that a guess sees, and to how many taps `rows_kernel.filter_rows` brings them.
 _SIDE = 5
 _TAPS = _SIDE**2 + -(_SIDE**2) % AT_ONCE
 _LEAST = np.float32(MIN_DETAIL)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, ZERO, compiled, entry
-from polsep.compute.rows import AT_ONCE, add_product, add_up, copy
+from polsep.compute.rows_kernel import AT_ONCE, add_product, add_up, copy
 from polsep.compute.threads import RowRange
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, QUARTER, ZERO, compiled, entry
-from polsep.compute.rows import (
+from polsep.compute.rows_kernel import (
     add_product,
     average,
     copy,

@@ -254,7 +254,7 @@ def make_taps(network: Joint, width: int, details: bool = False) -> Taps:
 
     ``details``: with those of s0.
     """
-    from polsep.compute.rows import AT_ONCE
+    from polsep.compute.rows_kernel import AT_ONCE
     from polsep.networks.buffers import Taps
 
     assert network.demosaic is not None

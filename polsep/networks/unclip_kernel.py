@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from polsep.compute.compiling import HALF, ONE, QUARTER, THIRD, TWO, ZERO, compiled
-from polsep.compute.rows import fill
+from polsep.compute.rows_kernel import fill
 from polsep.networks.channels import PERIOD
 from polsep.sensor.camera import Layout
 from polsep.separation.closed_form import MIN_EIGENVALUE

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import THIRD, ZERO, compiled, entry
-from polsep.compute.rows import add_rows, copy
+from polsep.compute.rows_kernel import add_rows, copy
 from polsep.compute.threads import RowRange, run_over_rows
 from polsep.demosaic.bilinear_kernel import (
     Pattern,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, THIRD, TWO, ZERO, compiled, entry
-from polsep.compute.rows import add_rows, add_up
+from polsep.compute.rows_kernel import add_rows, add_up
 from polsep.compute.threads import RowRange
 from polsep.physics.stokes_kernel import fit_stokes_unclipped, polarize
 from polsep.separation import color_affine as twin

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from polsep.compute.compiling import ONE, ZERO, compiled
-from polsep.compute.rows import add_product
+from polsep.compute.rows_kernel import add_product
 from polsep.demosaic.bilinear_kernel import PAD, Pattern
 from polsep.separation import color_affine as twin
 from polsep.separation.closed_form_kernel import limit_dolp_row

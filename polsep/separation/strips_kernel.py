@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import THIRD, TWO, ZERO, compiled, entry
-from polsep.compute.rows import add_rows, add_up, copy
+from polsep.compute.rows_kernel import add_rows, add_up, copy
 from polsep.compute.threads import RowRange
 from polsep.demosaic import guided_kernel as guided
 from polsep.demosaic.bilinear_kernel import (

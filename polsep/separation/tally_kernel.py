@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, ZERO, compiled
-from polsep.compute.rows import add_up
+from polsep.compute.rows_kernel import add_up
 from polsep.separation.images import Tally
 
 #: Columns of ``sums [rows, 8]``.

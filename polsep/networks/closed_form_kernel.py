@@ -1,4 +1,4 @@
-"""Rows of the closed form of `joint.Joint.guess`: the diffuse polarization from windows, and the residual of the fit.
+"""Rows of `joint.Joint.closed_form`: the diffuse polarization from windows, and the residual of the fit.
 
 Its other equations are in `polsep.separation.closed_form_kernel`.
 """
@@ -43,7 +43,7 @@ def pool(t: int, h: int, window: int, sums: Any, pooled: Any) -> None:
 
 @compiled
 def steady_diffuse_polarization(pooled: Any, trust: Any, a1: Any, a2: Any) -> None:
-    """One window of `joint.find_slopes`: from ``pooled [3, w]``, drawn toward the wider window's ``a1``, ``a2``."""
+    """One window of `joint.fit_diffuse_polarization` from ``pooled [3, w]``, drawn to the wider one's ``a1, a2``."""
     p1, p2, p0 = pooled[0], pooled[1], pooled[2]
     for j in range(a1.size):
         a1[j] = (p1[j] + trust * a1[j]) / (p0[j] + trust)

@@ -1,7 +1,8 @@
-"""Packed pixels with clipped samples, one by one: twin of what `joint.Joint.guess` makes of those.
+"""Packed pixels with clipped samples, one by one: twin of what `joint.Joint.closed_form` makes of those.
 
-Colours that clip say nothing about slopes (`leave_clipped_out`); what they lack follows from the samples that are left
-(`unclip`, twin of `joint.Joint.unclip`). ``bits``: which samples clip, as in `joint.Maps`. Cells are in reading order.
+Colours that clip say nothing about the diffuse polarization (`leave_clipped_out`); what they are missing follows from
+the samples that are left (`unclip`, twin of `joint.Joint.unclip`). ``bits``: which samples clip, as in `joint.Maps`.
+Cells are in reading order.
 """
 
 from __future__ import annotations
@@ -79,37 +80,38 @@ def _add_moments(whole: Any, stokes: tuple[Any, Any, Any], moments: Any) -> None
 
 
 @compiled
-def unclip(planes: Any, bits: Any, slopes: Any, lacking: Any) -> bool:
-    """Light that clipping hid in a row of packed pixels, ``lacking [5, w]``: of the offset, and of three colours' s0.
+def unclip(planes: Any, bits: Any, a: Any, missing: Any) -> bool:
+    """Light that clipping hid in a row of packed pixels, ``missing [5, w]``: of the offset, and of three colours' s0.
 
-    ``planes [16, w]``: samples, ``slopes [2, w]``. False, and nothing in ``lacking``, of rows where nothing clips.
+    ``planes [16, w]``: samples, ``a [2, w]``: the diffuse polarization. False, and nothing in ``missing``, of rows
+    where nothing clips.
     """
     some = False
     for j in range(bits.size):
         some |= bits[j] != 0
     if some:
-        for k in range(lacking.shape[0]):
-            fill(ZERO, lacking[k])
+        for k in range(missing.shape[0]):
+            fill(ZERO, missing[k])
         y, kept, s0 = np.empty((4, 4), np.float32), np.empty((4, 4), np.bool_), np.empty((2, 4), np.float32)
         for j in range(bits.size):
             if bits[j] != 0:
                 for cell in range(4):
                     for k in range(4):
                         y[cell, k], kept[cell, k] = TWO * planes[_PLACES[cell, k], j], not _clips(bits[j], cell, k)
-                _unclip_one(y, kept, slopes[0, j], slopes[1, j], s0, lacking[:, j])
+                _unclip_one(y, kept, a[0, j], a[1, j], s0, missing[:, j])
     return some
 
 
 @compiled
-def _unclip_one(y: Any, kept: Any, a1: Any, a2: Any, s0: Any, lacking: Any) -> None:
-    """Light that one packed pixel is ``lacking [5]``; nothing where too few samples are ``kept [4, 4]``."""
+def _unclip_one(y: Any, kept: Any, a1: Any, a2: Any, s0: Any, missing: Any) -> None:
+    """Light that one packed pixel is ``missing [5]``; nothing where too few samples are ``kept [4, 4]``."""
     left, as_is = s0[0], s0[1]
     b1, b2, eigenvalue = fit_unclipped(y, kept, _COSINES, _SINES, a1, a2, left)
     if eigenvalue <= _MIN_EIGENVALUE:
         return
     c1, c2, _ = fit_unclipped(y, np.ones((4, 4), np.bool_), _COSINES, _SINES, a1, a2, as_is)
-    lacking[0], lacking[1] = b1 - c1, b2 - c2
+    missing[0], missing[1] = b1 - c1, b2 - c2
     for cell in range(4):
         c = _COLORS[cell]
         if kept[cell].any() and left[cell] > as_is[cell]:
-            lacking[2 + c] += (left[cell] - as_is[cell]) * (HALF if c == 1 else ONE)
+            missing[2 + c] += (left[cell] - as_is[cell]) * (HALF if c == 1 else ONE)

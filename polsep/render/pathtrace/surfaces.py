@@ -16,10 +16,9 @@ from polsep.render.materials import Materials, look_up
 from polsep.render.pathtrace.mueller import Matrix, turn_frames, turn_to_up
 from polsep.render.pathtrace.variants import in_variant, is_fast, only_errors
 from polsep.render.raycast import SHADOW_OFFSET, Model
+from polsep.render.rays_kernel import MIN_COSINE
 from polsep.render.shapes import Mesh
 
-#: Cosine to the viewer that a normal has at least, as in `raycast`.
-MIN_COSINE = 1e-3
 #: Roughness that surfaces after the first one have at least. No path finds the small lights that glossy ones throw on
 #: others but by chance, and then it is a spark in the image: Kaplanyan and Dachsbacher 2013, Path space regularization.
 LATER_ROUGHNESS = 0.5

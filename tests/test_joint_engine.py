@@ -198,7 +198,7 @@ def test_a_thread_writes_no_row_of_another(
     for plane in (*planes, engine._maps.details):
         plane.fill(math.nan)
     clipped.fill(12345)
-    monkeypatch.setattr("polsep.compute.threads.share", lambda work, rows, step: work(row_range))
+    monkeypatch.setattr("polsep.compute.threads.run_over_rows", lambda work, rows, step: work(row_range))
     engine._fill_inputs(as_samples(mosaic.data.numpy()), read_pattern((height, 64), layout, BLACK, WHITE, LIGHT))
     others = np.ones(height // PERIOD, np.bool_)
     others[slice(*row_range)] = False

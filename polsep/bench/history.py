@@ -10,7 +10,7 @@ from pathlib import Path
 from polsep.io.store.rows import read_bytes
 
 ROOT = Path(__file__).resolve().parents[2]
-#: A file with lines "FROM..TO": the commits after FROM up to TO moved code, and `evaluation/golden.py` found the outputs
+#: A file with lines "FROM..TO": the commits after FROM up to TO moved code, and `evaluation/golden.py` found outputs
 #: equal, to the bit or, where two copies of an equation became one, within rounding.
 UNCHANGED = "results/unchanged.txt"
 

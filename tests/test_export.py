@@ -52,7 +52,7 @@ def test_exported_graphs_agree(
     words = ["polsep", "export", "joint", "--weights", str(weights), "-o", str(target)]
     monkeypatch.setattr(sys, "argv", words + ["--full"] * (resolution == "full"))
     cli.main()
-    assert capfd.readouterr().err.splitlines() == ["polsep: writing the graph of joint, which takes a minute or a few"]
+    assert capfd.readouterr().err.splitlines() == ["polsep: exporting joint, which takes a minute or a few"]
     assert [path.name for path in target.parent.iterdir()] == ["joint.onnx"]
     session = onnxruntime.InferenceSession(target, providers=["CPUExecutionProvider"])
     network = load_joint(weights, torch.device("cpu"))

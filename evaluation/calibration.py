@@ -105,7 +105,7 @@ def bench_calibration() -> Iterator[Row]:
 
 
 def snapshot_entries(entries: Sequence[Entry]) -> tuple[Entry, ...]:
-    """Of entries for co-sited samples those that are swept: formulas, and the networks of the paper's method."""
+    """Swept entries among those for co-sited samples: formulas, and the networks of the paper's method."""
     return tuple(entry for entry in entries if entry.network is None or rung_of(entry.name) == "paper")
 
 

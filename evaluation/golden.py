@@ -345,7 +345,7 @@ PARTS = {
 
 
 def measure(target: Path, parts: list[str]) -> None:
-    """In this process, and in those of the commands, to TARGET.json and TARGET.npz."""
+    """Measure in this process and in those of the commands, into TARGET.json and TARGET.npz."""
     golden = Golden()
     for part in parts:
         PARTS[part](golden)

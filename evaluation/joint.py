@@ -92,7 +92,7 @@ def enlarge(image: Tensor) -> Tensor:
 
 
 def measure_reliability(name: str, recipes: Sequence[Recipe], data: Path) -> Iterator[Row]:
-    """Of both outputs of the joint networks, over all pixels on objects of a set: a curve, and how far it is off.
+    """Reliability of both outputs of the joint networks over all pixels on objects of a set: a curve, and its error.
 
     The latter also of the pixels near which nothing clips: the others, a few, hold most of what can be off.
     """

@@ -30,7 +30,7 @@ LightColor = Sequence[float]
 
 
 def _calm_torch() -> None:
-    """In a forked child, which torch's threads did not follow: with more than one it would wait for them for ever."""
+    """Hold torch to one thread in a forked child, where its other threads are missing and would be waited for."""
     torch.set_num_threads(1)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from polsep.bench import history
-from polsep.bench.history import ask_git, find_changes
+from polsep.bench.history import TIMED, ask_git, find_changes
 from polsep.bench.rows import Row, provenance, to_jsonl, write_rows
 from polsep.io.store.rows import fill_tables, markdown_table, read_rows
 
@@ -65,7 +65,7 @@ def test_tables_older_than_the_code_say_so(page: Path) -> None:
     unknown = set[str]()
 
     def changes(name: str, commits: set[str]) -> tuple[str, ...] | None:
-        found = find_changes(commits, measures[name], until)
+        found = find_changes(commits, measures[name], until, name in TIMED)
         unknown.update(commits if found is None else ())
         return found
 
@@ -173,6 +173,7 @@ def test_moves_that_change_no_output_are_no_changes(repository: Path) -> None:
     history._read_unchanged.cache_clear()
     assert find_changes({first}, ("new", "other")) == ("new",)
     assert find_changes({changed}, ("new", "other")) == find_changes({moved}, ("new", "other")) == ()
+    assert find_changes({changed}, ("new", "other"), timed=True) == ("new", "other")
     commit(repository, {"other/b.py": text})
     history._list_changes.cache_clear()
     assert find_changes({changed}, ("new", "other")) == ("other",)

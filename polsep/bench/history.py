@@ -13,6 +13,8 @@ ROOT = Path(__file__).resolve().parents[2]
 #: A file with lines "FROM..TO": the commits after FROM up to TO moved code, and `evaluation/golden.py` found outputs
 #: equal, to the bit or, where two copies of an equation became one, within rounding.
 UNCHANGED = "results/unchanged.txt"
+#: Benchmarks of time and memory, which code that gives the same outputs may change.
+TIMED = frozenset(("resources", "rendering", "video", "view"))
 
 
 def ask_git(*arguments: str) -> str:
@@ -24,10 +26,13 @@ def ask_git(*arguments: str) -> str:
     return done.stdout.strip() if done.returncode == 0 else ""
 
 
-def find_changes(commits: Collection[str], measured: Sequence[str], until: str = "HEAD") -> tuple[str, ...] | None:
+def find_changes(
+    commits: Collection[str], measured: Sequence[str], until: str = "HEAD", timed: bool = False
+) -> tuple[str, ...] | None:
     """The paths of ``measured`` that changed after any of ``commits``, up to ``until``.
 
-    Commits in the ranges of `UNCHANGED` do not count; files that these renamed count under their old names before.
+    Commits in the ranges of `UNCHANGED` do not count, except for what is ``timed``; files that these renamed count
+    under their old names before.
     None where the history does not reach back so far, as in a shallow clone.
     """
     if ask_git("rev-parse", "--is-shallow-repository") != "false":
@@ -38,7 +43,7 @@ def find_changes(commits: Collection[str], measured: Sequence[str], until: str =
     changed = set[str]()
     for commit in commits:
         for hash_, paths in _list_changes(commit, until):
-            if hash_ not in same:
+            if timed or hash_ not in same:
                 changed.update(moved.get(path, path) for path in paths)
     return tuple(path for path in measured if any(x == path or x.startswith(f"{path}/") for x in changed))
 

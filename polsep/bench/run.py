@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from polsep.bench.history import find_changes
+from polsep.bench.history import TIMED, find_changes
 from polsep.bench.rows import Row, write_rows
 from polsep.io.store.rows import fill_page
 
@@ -52,7 +52,11 @@ def fill_tables_of_docs(output: Path, measures: Mapping[str, tuple[str, ...]]) -
     """
     for page in (Path("README.md"), *sorted(Path("docs").rglob("*.md"))):
         fill_page(
-            page, output, lambda name, commits: find_changes(commits, measures[name]) if name in measures else None
+            page,
+            output,
+            lambda name, commits: (
+                find_changes(commits, measures[name], timed=name in TIMED) if name in measures else None
+            ),
         )
 
 

@@ -66,7 +66,7 @@ class _Cache(FunctionCache):
     """Numba's cache of one function, in numba's folder, that is valid for one `fingerprint`."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """As numba's; called before a function is compiled or saved, when all that it calls is defined."""
+        """Load as numba does; called before a function is compiled or saved, when all that it calls is defined."""
         name = f"{self._py_func.__module__.rpartition('.')[2]}.{self._py_func.__qualname__}"
         name = f"{name.replace('<', '').replace('>', '')}.py{sys.version_info[0]}{sys.version_info[1]}"
         stamp = fingerprint(self._py_func)

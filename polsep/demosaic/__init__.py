@@ -1,1 +1,1 @@
-"""From a mosaic to all analysers in all colours at common points; every kernel lies beside its torch twin."""
+"""Demosaicking: all analysers in all colours at common points; every kernel lies beside its torch twin."""

@@ -267,7 +267,7 @@ def _prior_slope(mean: Tensor, mean_guide: Tensor) -> Tensor:
 
 
 def _at_least(image: Tensor, plain: Tensor) -> Tensor:
-    """At least `MIN_SHARE` of its interpolation, which may be negative."""
+    """Raise to at least `MIN_SHARE` of its interpolation, which may be negative."""
     return torch.where(image < MIN_SHARE * plain, MIN_SHARE * plain, image)
 
 
@@ -292,7 +292,7 @@ def _fill_from_green(mosaic: Tensor, green: Tensor, mask: Tensor, mask_cells: Te
 
 
 def _own(image: Tensor, layout: Layout) -> Tensor:
-    """Of an image ``[..., C, H, W]`` the colour of each pixel's own filter ``[..., H, W]``."""
+    """The colour of each pixel's own filter ``[..., H, W]``, of an image ``[..., C, H, W]``."""
     return (image * color_masks(image, layout, 2)).sum(dim=-3)
 
 
@@ -310,7 +310,7 @@ def _repeat(cells: Tensor) -> Tensor:
 
 
 def _enlarge(image: Tensor) -> Tensor:
-    """From cells ``[..., h, w]`` to pixels ``[..., 2h, 2w]``, linearly between the cells' centres."""
+    """Enlarge cells ``[..., h, w]`` to pixels ``[..., 2h, 2w]``, linearly between the cells' centres."""
     for dim in (-2, -1):
         before, after = correlate(image, (0.25, 0.75, 0.0), dim), correlate(image, (0.0, 0.75, 0.25), dim)
         image = torch.stack((before, after), dim=dim).flatten(dim - 1, dim)

@@ -1,4 +1,4 @@
-"""From half to full resolution: the details of a cell, its pixels' differences from their mean.
+"""Full from half resolution: the details of a cell, its pixels' differences from their mean.
 
 Both images are smooth at most places, so their details are interpolated from the cells around first. Details of the
 demosaicked s0 beyond that are texture or noise, of the diffuse or of the specular light: the network says for each cell

@@ -68,14 +68,14 @@ class DetailOutputs(NamedTuple):
 
     @classmethod
     def of(cls, output: Floats, beyond: Floats, smooth: Smooth) -> DetailOutputs:
-        """From the layers' output ``[24 + 12 (C + 1), h, w]``, the first three parts one after the other."""
+        """Split the layers' output ``[24 + 12 (C + 1), h, w]``, the first three parts one after the other."""
         return cls(
             output[:DETAIL_MAPS], output[DETAIL_MAPS : 2 * DETAIL_MAPS], output[2 * DETAIL_MAPS :], beyond, smooth
         )
 
 
 def read_smooth(weight: Floats) -> Smooth:
-    """From ``[3, 1, 5, 5]``."""
+    """The interpolation of a filter ``[3, 1, 5, 5]``."""
     rows, places = np.divmod(np.arange(_TAPS), _SIDE)
     taps = np.zeros((3, _TAPS), np.float32)
     taps[:, : _SIDE**2] = weight.reshape(3, -1)

@@ -52,7 +52,7 @@ class LayerOutputs(NamedTuple):
 
     @classmethod
     def of(cls, closed: ClosedFormRows, change: Floats, deviation: Floats) -> LayerOutputs:
-        """From the layers' two outputs, ``change [4 C + 8, h, w]`` being the first three parts one after the other."""
+        """Split the layers' two outputs, ``change [4 C + 8, h, w]`` being the first three parts one after the other."""
         first = closed.diffuse.shape[1]
         return cls(closed, change[:first], change[first : first + 4], change[first + 4 :], deviation)
 

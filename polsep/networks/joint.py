@@ -178,7 +178,7 @@ class Joint(nn.Module):
         return JointOutput(diffuse, specular, s1, s2, log_variance, closed.local_brightness, closed.fit_residual)
 
     def demosaicked(self, planes: Tensor, full: bool) -> tuple[Tensor, Tensor]:
-        """Of packed samples s0, s1, s2 at half resolution ``[N, 12 C, h, w]``, and s0 at full resolution or nothing."""
+        """Packed s0, s1, s2 at half resolution ``[N, 12 C, h, w]``, and s0 at full resolution or nothing."""
         if self.demosaic is None:
             stokes, s0 = guide_once(Mosaic(pixel_shuffle(planes, PERIOD)[:, 0], self.layout, 0.0, 1.0), self.margin)
             half = torch.cat([pixel_unshuffle(s, 2) for s in (stokes.s0, stokes.s1, stokes.s2)], dim=1)

@@ -127,7 +127,7 @@ def stokes_inverse(angles: Sequence[float]) -> Tensor:
 
 @lru_cache(maxsize=32)
 def _pseudo_inverse(angles: tuple[float, ...]) -> list[list[float]]:
-    """As numbers, like `_analyser_rows`."""
+    """The numbers of `_analyser_rows`."""
     matrix = np.array(_analyser_rows(angles))
     if np.linalg.matrix_rank(matrix, tol=1e-6 * np.linalg.norm(matrix, 2)) < 3:
         degrees = [round(math.degrees(t), 3) for t in angles]

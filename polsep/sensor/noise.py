@@ -64,12 +64,12 @@ class Noise:
     floor: float
 
     def variance(self, signal: Any) -> Any:
-        """Of samples that are ``signal`` above black; float32 stays float32."""
+        """Variance at a ``signal`` above black; float32 stays float32."""
         return np.float32(self.gain) * np.maximum(signal, np.float32(0)) + np.float32(self.floor)
 
 
 def least_noise(levels: Levels) -> Noise:
-    """Of exact samples: rounding to codes, of light just between two, or to floats."""
+    """Noise of exact samples: rounding to codes, of light halfway between two, or to floats."""
     return Noise(0.0, levels.step**2 / 4 + (ROUNDING * levels.span) ** 2)
 
 

@@ -30,7 +30,7 @@ _MARGIN, _VARIANCE_FLOOR = np.float32(twin.CONTRAST_MARGIN), np.float32(twin.VAR
 
 
 class Conversion(NamedTuple):
-    """From analysers to Stokes vectors, by which of them are clipped (bit k of the code).
+    """Conversion of analysers to Stokes vectors, by which of them are clipped (bit k of the code).
 
     ``inverses [16, 3, 4]``, whether they are ``exact [16]``, the residual's ``null [4]``, and the light's ``gains [3]``
     to multiply back.

@@ -53,7 +53,7 @@ class Frames(NamedTuple):
 
 
 class Ring(NamedTuple):
-    """Of `SLOTS` block rows: sums of differences over five blocks ``signed [., 4, W]``; per block the ``[., W/4]``.
+    """Statistics of `SLOTS` block rows: sums of differences over five blocks ``signed [., 4, W]``; others ``[., W/4]``.
 
     ``square``: sums over three blocks of mean squares; ``few`` and ``many``: how many of three and of five blocks
     are counted; ``sudden``: 1 in blocks that changed by themselves.

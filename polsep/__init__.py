@@ -18,12 +18,14 @@ if TYPE_CHECKING:
     from polsep.methods import METHODS
     from polsep.physics.stokes import Measurements, Stokes
     from polsep.pipeline import PolsepWarning, separate
+    from polsep.sensor.calibration import Calibration
     from polsep.sensor.camera import Layout, Mosaic
     from polsep.separation.analytic import Separation
     from polsep.separation.report import SeparatedFrame
 
 __all__ = [
     "METHODS",
+    "Calibration",
     "Layout",
     "Measurements",
     "Mosaic",
@@ -36,6 +38,7 @@ __all__ = [
 
 _HOME = {
     "METHODS": "methods",
+    "Calibration": "sensor.calibration",
     "Layout": "sensor.camera",
     "Measurements": "physics.stokes",
     "Mosaic": "sensor.camera",

@@ -82,14 +82,7 @@ def _separate_frame(
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: {error}") from error
     separated.report["source"] = Path(path).name
-    separated.report["settings"] = {
-        "layout": read.layout.spec if read.layout else None,
-        "black_level": read.black_level,
-        "white_level": read.white_level,
-        "size": list(read.size) if read.size else None,
-        "pixel_format": read.pixel_format,
-        "pages": read.pages,
-    }
+    separated.report["settings"] = read.settings()
     separated.report["warnings"] = [*frame.notes, *separated.report["warnings"]]
     written = write_separation(separated, write.directory, frame.stem, write.format, write.overwrite)
     return Outcome(path, tuple(written), tuple(separated.report["warnings"]), separated.report)

@@ -11,15 +11,20 @@ import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.io.store.calibrations import read_calibration
 from polsep.methods import Capture, Method, find_method
 from polsep.physics.stokes import Measurements, fit_stokes_unclipped, polarized_intensity
+from polsep.sensor.calibration import Calibration, Corrections, falloff_image, mean_mosaic, subtract_ambient
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.layout_check import check_layout
 from polsep.sensor.levels import as_mosaic
@@ -51,16 +56,28 @@ def separate(
     light_color: LightColor | str = (1, 1, 1),
     device: str = "auto",
     full: bool = False,
+    calibration: Calibration | str | PathLike[str] | None = None,
+    ambient: NDArray[Any] | Sequence[NDArray[Any]] | None = None,
 ) -> SeparatedFrame:
     """Separate one raw mosaic ``[H, W]`` (uint8, uint16, float32) into diffuse and specular.
 
     Images are ``[H/2, W/2, C]``, the mean over each 2x2 polarizer cell; ``full=True`` gives ``[H, W, C]``. ``layout``
     None is Sony's colour order. ``white_level`` None is the dtype's maximum (1.0 for float): 12-bit data in uint16 need
-    4095 or 65520 said. ``light_color``: camera RGB of the light, or "estimate" to take it from the highlights. What the
-    owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises ValueError, with one line of
-    what was expected and what was found, on input that is not a mosaic.
+    4095 or 65520 said. ``calibration``: a file of `polsep calibrate`, applied first. ``ambient``: a raw frame with the
+    lamp off, or several, subtracted. ``light_color``: camera RGB of the light, or "estimate" to take it from the
+    highlights. What the owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises
+    ValueError, with one line of what was expected and what was found, on input that is not a mosaic.
     """
+    measured = calibration if isinstance(calibration, Calibration | None) else read_calibration(Path(calibration))
+    if white_level is None and measured is not None:
+        white_level = measured.white_level_of(raw)
     mosaic, notes = as_mosaic(raw, layout, black_level, white_level)
+    corrections = Corrections(measured)
+    mosaic = corrections.apply(mosaic)
+    if ambient is not None:
+        rooms = [ambient] if isinstance(ambient, np.ndarray) and ambient.ndim == 2 else list(ambient)
+        lamp_off = [corrections.apply(as_mosaic(room, layout, black_level, white_level)[0]) for room in rooms]
+        mosaic = subtract_ambient(mosaic, mean_mosaic(lamp_off))
     frame = separate_capture(mosaic, method, light_color, device, full)
     frame.report["warnings"] = [*notes, *frame.report["warnings"]]
     for note in frame.report["warnings"]:
@@ -94,8 +111,11 @@ def make_frame(
     report = describe(images.tally, method.expects_errors)
     layout = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
     report |= {"method": method.name, "light_color": list(light), "full_resolution": full, "layout": layout}
-    arrays = (images.diffuse, images.specular, images.valid, images.dolp, images.aolp)
-    return SeparatedFrame(*arrays, report, images.error)
+    diffuse, specular, error = images.diffuse, images.specular, images.error
+    if isinstance(capture, Mosaic) and capture.falloff is not None:
+        fall = falloff_image(capture.falloff, *diffuse.shape[:2])[..., None]
+        diffuse, specular, error = diffuse / fall, specular / fall, None if error is None else error / fall
+    return SeparatedFrame(diffuse, specular, images.valid, images.dolp, images.aolp, report, error)
 
 
 def find_device(name: str) -> torch.device:

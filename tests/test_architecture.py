@@ -26,6 +26,7 @@ RANKS = {
     "methods": 8,
     "pipeline": 9,
     "batch": 10,
+    "calibrate": 10,
     "video": 10,
     "capture": 10,
     "material": 10,

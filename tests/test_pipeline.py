@@ -72,6 +72,8 @@ def test_signature_is_the_contract() -> None:
         "light_color": (1, 1, 1),
         "device": "auto",
         "full": False,
+        "calibration": None,
+        "ambient": None,
     }
     assert list(parameters)[:5] == ["raw", "method", "layout", "black_level", "white_level"]
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polsep.capture.sources import CameraInfo
+from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import ReadOptions, decode_frame
 from polsep.io.raw.genicam import find_pixel_format
 from polsep.io.raw.recording import RawImage
@@ -40,15 +41,24 @@ class Shown:
 class LiveView:
     """Separation of one frame at a time; the latest picture is kept in memory and, if given, in a file."""
 
-    def __init__(self, method: str, layout: Layout | None = None, picture: Path | None = None) -> None:
+    def __init__(
+        self,
+        method: str,
+        layout: Layout | None = None,
+        picture: Path | None = None,
+        calibration: Path | None = None,
+        ambient: tuple[Path, ...] = (),
+    ) -> None:
         self._method, self._layout, self._picture = method, layout, picture
+        self._calibration, self._ambient = calibration, ambient
         self._options = ReadOptions()
         self.latest: Shown | None = None
 
     def warm_up(self, info: CameraInfo) -> None:
         """Separate a black frame, to compile and load. Raises ValueError if the method does not fit the frames."""
         lower_priority()
-        self._options = ReadOptions(self._layout, size=(info.width, info.height), pixel_format=info.pixel_format)
+        read = ReadOptions(self._layout, size=(info.width, info.height), pixel_format=info.pixel_format)
+        self._options = with_corrections(read, self._calibration, self._ambient)
         self.separate(bytes(find_pixel_format(info.pixel_format).frame_bytes(info.width, info.height)))
 
     def separate(self, payload: bytes) -> tuple[SeparatedFrame, tuple[str, ...]]:

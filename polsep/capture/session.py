@@ -57,6 +57,7 @@ class CapturePlan:
     """Plan of a capture: record into ``output``, separate with ``method``, serve a page on ``port``.
 
     None leaves each of them out. ``layout``: of the mosaic; None derives it from the name of the pixel format.
+    ``calibration`` and ``ambient``: files that correct the frames shown; recorded ones stay as the camera sent them.
     """
 
     output: Path | None = None
@@ -64,6 +65,8 @@ class CapturePlan:
     layout: Layout | None = None
     port: int | None = None
     overwrite: bool = False
+    calibration: Path | None = None
+    ambient: tuple[Path, ...] = ()
 
 
 @dataclass
@@ -111,7 +114,8 @@ class Session:
             refuse_recording(plan.output, plan.overwrite)
         self._source, self._plan, self._limits, self._notify = source, plan, limits, notify
         picture = plan.output / PICTURE if plan.output is not None else None
-        self._live = LiveView(plan.method, plan.layout, picture) if plan.method is not None else None
+        corrections = (plan.calibration, plan.ambient)
+        self._live = LiveView(plan.method, plan.layout, picture, *corrections) if plan.method is not None else None
         self._to_disk: Ring[RawImage] = Ring(limits.ring)
         self._to_view: Ring[RawImage] = Ring(1)
         self._stop, self._view_ready = threading.Event(), threading.Event()

@@ -43,6 +43,16 @@ SIZE = click.option("--size", metavar="WxH", help="Size of headerless raw frames
 PIXEL_FORMAT = click.option(
     "--pixel-format", metavar="NAME", help="GenICam pixel format of headerless raw frames, like BayerRG12p."
 )
+CALIBRATION = click.option(
+    "--calibration", type=FILE, metavar="FILE", help="Calibration of the sensor, of 'polsep calibrate'."
+)
+AMBIENT = click.option(
+    "--ambient",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="FRAME",
+    help="Frame with the lamp off, subtracted; of several (the option repeated, or in a file) their mean.",
+)
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace existing results.")
 DEVICE = click.option("--device", default="auto", metavar="NAME", help="Device: auto, cpu or cuda.")
 ENGINE = click.option(
@@ -73,10 +83,11 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 
 def read_options(options: Mapping[str, Any]) -> ReadOptions:
     """Options of reading raw frames, from the options of a command. Raises ValueError."""
+    from polsep.io.raw.corrections import with_corrections
     from polsep.io.raw.frames import ReadOptions
     from polsep.sensor.camera import Layout
 
-    return ReadOptions(
+    read = ReadOptions(
         None if options["layout"] is None else Layout.parse(options["layout"]),
         options["black_level"],
         options["white_level"],
@@ -84,6 +95,7 @@ def read_options(options: Mapping[str, Any]) -> ReadOptions:
         options.get("pixel_format"),
         options.get("pages", "frames"),
     )
+    return with_corrections(read, options.get("calibration"), options.get("ambient", ()))
 
 
 def progress_bar() -> Progress:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from polsep.cli.app import DIR, app, print_note
+from polsep.cli.app import AMBIENT, CALIBRATION, DIR, app, print_note
 
 if TYPE_CHECKING:
     from polsep.capture.session import Status
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 @click.option(
     "--show", type=int, metavar="PORT", help="Show the live view at http://127.0.0.1:PORT/; 0 picks a free port."
 )
+@CALIBRATION
+@AMBIENT
 @click.option("--timeout", type=float, default=30.0, metavar="S", help="Seconds to wait for a lost camera.")
 @click.option("--ring", type=int, default=32, metavar="N", help="Frames buffered while the disk is busy.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing recording.")
@@ -77,7 +79,8 @@ def capture(camera: str | None, listing: bool, **options: Any) -> None:
         options["pixel_format"],
         tuple(_parse_feature(text) for text in options["features"]),
     )
-    plan = CapturePlan(output, method, layout, port, options["overwrite"])
+    corrections = (options["calibration"], options["ambient"])
+    plan = CapturePlan(output, method, layout, port, options["overwrite"], *corrections)
     status_line = _StatusLine()
     session = Session(find_source(camera, settings), plan, limits, status_line.print_above)
     try:

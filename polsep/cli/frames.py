@@ -11,7 +11,9 @@ import click
 
 import polsep
 from polsep.cli.app import (
+    AMBIENT,
     BLACK_LEVEL,
+    CALIBRATION,
     DEVICE,
     DIR,
     FILE,
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
 @click.option("--layout", metavar="color|mono|SPEC", default="color", help="Filter layout of the sensor; see above.")
 @BLACK_LEVEL
 @WHITE_LEVEL
+@CALIBRATION
+@AMBIENT
 @LIGHT_COLOR
 @click.option(
     "--format",

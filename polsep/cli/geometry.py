@@ -7,7 +7,19 @@ from typing import Any
 
 import click
 
-from polsep.cli.app import BLACK_LEVEL, DIR, FILE, LAYOUT, OVERWRITE, WHITE_LEVEL, app, extra_needed, read_options
+from polsep.cli.app import (
+    AMBIENT,
+    BLACK_LEVEL,
+    CALIBRATION,
+    DIR,
+    FILE,
+    LAYOUT,
+    OVERWRITE,
+    WHITE_LEVEL,
+    app,
+    extra_needed,
+    read_options,
+)
 
 #: The order of photographs without --lights.
 ORDER = "right front-right front front-left left above"
@@ -28,6 +40,8 @@ ORDER = "right front-right front front-left left above"
 @LAYOUT
 @BLACK_LEVEL
 @WHITE_LEVEL
+@CALIBRATION
+@AMBIENT
 @click.option("--fov", type=float, metavar="DEG", help="The camera's vertical field of view.  [default: orthographic]")
 @click.option("--size", "longest", type=int, default=640, metavar="PX", help="Longer side of the maps at most.")
 @click.option(

@@ -8,7 +8,9 @@ from typing import Any
 import click
 
 from polsep.cli.app import (
+    AMBIENT,
     BLACK_LEVEL,
+    CALIBRATION,
     DIR,
     LAYOUT,
     LIGHT_COLOR,
@@ -41,6 +43,8 @@ from polsep.cli.app import (
 @LAYOUT
 @BLACK_LEVEL
 @WHITE_LEVEL
+@CALIBRATION
+@AMBIENT
 @LIGHT_COLOR
 @click.option("--frame-size", "size", metavar="WxH", help="Size of headerless raw frames, like 2448x2048.")
 @PIXEL_FORMAT

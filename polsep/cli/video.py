@@ -9,7 +9,9 @@ from typing import Any
 import click
 
 from polsep.cli.app import (
+    AMBIENT,
     BLACK_LEVEL,
+    CALIBRATION,
     DEVICE,
     DIR,
     ENGINE,
@@ -36,6 +38,8 @@ from polsep.cli.app import (
 @LAYOUT
 @BLACK_LEVEL
 @WHITE_LEVEL
+@CALIBRATION
+@AMBIENT
 @LIGHT_COLOR
 @click.option(
     "--format", default="exr", metavar="exr|ffv1|none", help="A file per frame, a lossless video, or only a preview."

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from polsep.cli.app import LAYOUT, PIXEL_FORMAT, SIZE, app, extra_needed, print_note
+from polsep.cli.app import AMBIENT, CALIBRATION, LAYOUT, PIXEL_FORMAT, SIZE, app, extra_needed, print_note
 
 
 @app.command()
@@ -23,6 +23,8 @@ from polsep.cli.app import LAYOUT, PIXEL_FORMAT, SIZE, app, extra_needed, print_
 @click.option("--black-level", metavar="N", help="Sample value without light.")
 @click.option("--white-level", metavar="N", help="Sample value at which the sensor clips.")
 @click.option("--light-color", metavar="R,G,B", help="Camera RGB of the light, or 'estimate'.")
+@CALIBRATION
+@AMBIENT
 @SIZE
 @PIXEL_FORMAT
 @click.option(
@@ -45,7 +47,7 @@ def view(file: Path | None, host: str, port: int | None, opens: bool, upload_lim
     from polsep.view.server import ViewOptions, serve
 
     names = {"black_level": "black", "white_level": "white", "light_color": "light"}
-    settings = {names.get(name, name): value for name, value in options.items() if value is not None}
+    settings = {names.get(name, name): value for name, value in options.items() if value not in (None, ())}
     parse_settings(settings)
     if file is not None and not file.exists():
         raise ValueError(f"{file}: expected a file, found nothing")

@@ -182,7 +182,9 @@ class Mosaic:
 
     ``black_level`` and ``white_level`` are in the units of ``data``. Samples within `CLIP_MARGIN` of the white level
     count as clipped. ``light_color``: one gain per channel that `linear` divides out, so that what follows sees white
-    light. Raises ValueError when white is not above black or the frame is smaller than one period.
+    light. ``falloff``: the smooth part of a calibrated sensor's flat frame (`calibration.falloff_image`), by which
+    separated images are divided. Raises ValueError when white is not above black or the frame is smaller than one
+    period.
     """
 
     data: Tensor
@@ -190,6 +192,7 @@ class Mosaic:
     black_level: float
     white_level: float
     light_color: tuple[float, ...] = (1.0, 1.0, 1.0)
+    falloff: tuple[tuple[float, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         check_frame(tuple(self.data.shape), self.layout, self.black_level, self.white_level)

@@ -147,7 +147,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     settings = {
         "source": path.name,
         "frames": options.frames,
-        "read": {**asdict(read), "layout": read.layout.spec if read.layout else None},
+        "read": read.settings(),
         "filter": options.filter,
         "kind": asdict(target.kind),
         "method": first.method,

@@ -33,8 +33,12 @@ Values = dict[Any, Any]
 class Start:
     """The first state of the page: values of its settings, and a ``file`` of the owner to open."""
 
-    settings: dict[str, str]
+    settings: dict[str, Any]
     file: Any = None
+
+    def corrections(self) -> dict[str, Any]:
+        """The settings that the command line gives and no page may: paths of files."""
+        return {name: self.settings[name] for name in ("calibration", "ambient") if name in self.settings}
 
 
 @dataclass(frozen=True)
@@ -127,9 +131,8 @@ class Events:
         """Separate the session's file with the settings of the page."""
         session = self._session(request)
         try:
-            found = session.separate(
-                parse_settings({n: values[component] for n, component in self.components.settings.items()})
-            )
+            said = {n: values[component] for n, component in self.components.settings.items()}
+            found = session.separate(parse_settings(self.start.corrections() | said))
         except FAILURES as error:
             return self._failed(error, session)
         return self._show(session, found, values)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, read_frames
 from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
 from polsep.io.store.errors import InputError
@@ -47,6 +48,8 @@ class Settings:
 def parse_settings(said: Mapping[str, Any]) -> Settings:
     """Settings from the fields of the page: layout, black, white, light, method, size, pixel_format, index.
 
+    ``calibration`` and ``ambient`` are paths that only the command line gives.
+
     Raises ValueError, in one line, on values without meaning.
     """
     method = str(said.get("method") or "auto")
@@ -59,6 +62,7 @@ def parse_settings(said: Mapping[str, Any]) -> Settings:
         _size(_text(said.get("size"))),
         _text(said.get("pixel_format")),
     )
+    read = with_corrections(read, said.get("calibration"), said.get("ambient") or ())
     light = parse_light_color(_text(said.get("light")) or "white")
     return Settings(read, method, light, int(said.get("index") or 0))
 

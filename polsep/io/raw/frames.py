@@ -14,9 +14,9 @@ layouts: what the caller says, else what the pixel format's name says, else Sony
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from polsep.io.raw.headerless import headerless_page, read_headerless
 from polsep.io.raw.npy import read_npy, read_npz, stack_angles
@@ -29,6 +29,7 @@ from polsep.io.raw.videos import read_video
 from polsep.io.store.errors import InputError, input_error, naming
 from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
+from polsep.sensor.calibration import Corrections
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
 
@@ -80,7 +81,8 @@ class ReadOptions:
     """Facts that files may not contain. Levels are in the units of the samples; None: see the module.
 
     ``size`` (width, height) and ``pixel_format`` (a GenICam name) describe headerless raw. ``pages``: several pages of
-    a file are separate "frames", or every four are the "angles" 0, 45, 90, 135. Raises ValueError on anything else.
+    a file are separate "frames", or every four are the "angles" 0, 45, 90, 135. ``corrections``: made to every mosaic,
+    by a calibration that also says the white level where nothing else does. Raises ValueError on anything else.
     """
 
     layout: Layout | None = None
@@ -89,12 +91,19 @@ class ReadOptions:
     size: tuple[int, int] | None = None
     pixel_format: str | None = None
     pages: str = "frames"
+    corrections: Corrections | None = None
 
     def __post_init__(self) -> None:
         if self.pages not in ("frames", "angles"):
             raise ValueError(f'expected pages "frames" or "angles", found {self.pages!r}')
         if self.size is not None and (len(self.size) != 2 or min(self.size) < 1):
             raise ValueError(f"expected a size of positive width and height, found {self.size}")
+
+    def settings(self) -> dict[str, Any]:
+        """The options as a report lists them."""
+        listed = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "corrections"}
+        listed |= {"layout": self.layout.spec if self.layout else None, "size": list(self.size) if self.size else None}
+        return listed | dict(self.corrections.sources if self.corrections else {})
 
 
 @dataclass(frozen=True)
@@ -180,10 +189,21 @@ def output_stem(path: str | Path) -> str:
 
 
 def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
-    """Codes to light, by the rules of the module; and notes."""
+    """Codes to light, by the rules of the module, corrected; and notes."""
+    data, notes = _to_light(page, options)
+    if options.corrections is None:
+        return data, notes
+    if isinstance(data, Measurements):
+        raise ValueError("expected a raw mosaic to calibrate or to subtract room light from, found four angle images")
+    return options.corrections.apply(data), notes
+
+
+def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
     layout = page.layout if options.layout is None else options.layout
     white = page.white_level if options.white_level is None else options.white_level
     array = page.array
+    if white is None and options.corrections is not None and options.corrections.calibration is not None:
+        white = options.corrections.calibration.white_level_of(array)
     if not page.angles:
         return as_mosaic(array, layout, options.black_level, white)
     if array.ndim == 4 and array.shape[-1] == 1:

@@ -1,0 +1,1 @@
+"""Measurement of a sensor and a lamp from raw frames, and merging of exposures."""

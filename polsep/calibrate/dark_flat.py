@@ -1,0 +1,206 @@
+"""Black levels from frames with the lens cap on, gains from frames of an evenly lit diffuser.
+
+Both are sums (products) of a level, a table over places of the period, and a map of pixels. What the frames are too
+noisy to tell is shrunk or left out: one frame shows levels and tables, several show every pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.calibrate.statistics import (
+    Doubles,
+    Floats,
+    average_frames,
+    place_means,
+    robust_deviation,
+    signal_share,
+    tile,
+)
+from polsep.sensor.calibration import Calibration, Table, falloff_image
+from polsep.sensor.camera import Layout, Mosaic
+
+#: Least deviation from black of a hot pixel, relative to white, and in robust deviations of all pixels.
+HOT, HOT_DEVIATIONS = 0.01, 12.0
+#: Least deviation of a defective pixel's gain, and in robust deviations of all pixels.
+DEAD, DEAD_DEVIATIONS = 0.25, 8.0
+#: Brightest black level that a dark frame may have, relative to white; least signal and most clipping of a flat one.
+BRIGHTEST_DARK, DARKEST_FLAT, MOST_CLIPPED = 0.25, 0.02, 0.005
+#: Largest degree of the polynomial of the falloff, and blocks of a period along a side that each degree needs.
+DEGREE, BLOCKS_PER_DEGREE = 6, 4
+#: Apparent degree of polarization of a flat frame from which its gains are not believed.
+POLARIZED_FLAT = 0.1
+
+
+def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) -> Calibration:
+    """``before`` with black level, pattern, read noise and hot pixels of frames without light.
+
+    Raises ValueError on frames that hold light.
+    """
+    dark = average_frames(frames)
+    require_same_sensor(before, dark.first)
+    mosaic, period = dark.first, dark.first.layout.period
+    level = float(np.median(dark.mean))
+    if level > BRIGHTEST_DARK * mosaic.white_level:
+        raise ValueError(
+            f"expected frames without light (lens cap on), found a median of {level:g} of white {mosaic.white_level:g}"
+        )
+    table = place_means(dark.mean, period)
+    level = float(table.mean())
+    residual = dark.mean - tile(table, dark.mean.shape)
+    spread = robust_deviation(residual)
+    hot = np.abs(residual) > max(HOT * mosaic.white_level, HOT_DEVIATIONS * spread)
+    noise = dark.noise if dark.noise is not None else spread**2
+    kept = np.where(hot, 0, residual)
+    lines = _line_offsets(kept, spread**2)
+    kept = residual - lines
+    share = 0.0 if dark.variance is None else signal_share(kept, noise / dark.count)
+    pattern = lines + np.float32(share) * kept
+    varies = bool(share or lines.any())
+    details = {
+        "frames": dark.count,
+        "black_level_error_codes": round(spread / dark.mean.size**0.5, 5),
+        "pattern_rms_codes": round(float(np.std(table)), 4),
+        "lines_rms_codes": round(float(lines.std()), 4),
+        "pixels_rms_codes": round(share**0.5 * robust_deviation(kept), 4),
+        "hot_pixels": int(hot.sum()),
+    }
+    base = _base(before, mosaic, hot)
+    return replace(
+        base,
+        black_level=level,
+        black_pattern=_as_table(table - level),
+        black_map=(tile(table, dark.mean.shape) + pattern).astype(np.float32) if varies else None,
+        read_noise=noise**0.5,
+        details={**base.details, "dark": details},
+    )
+
+
+def _line_offsets(residual: Floats, pixel_variance: float) -> Floats:
+    """Offsets of rows and columns ``[H, W]``, each shrunk by its noise."""
+    lines = np.zeros_like(residual)
+    for axis in (1, 0):
+        means = residual.mean(axis=axis, dtype=np.float64)
+        share = signal_share(means, pixel_variance / residual.shape[axis])
+        lines += np.expand_dims((share * (means - means.mean())).astype(np.float32), axis)
+    return lines
+
+
+def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) -> Calibration:
+    """``before`` with gains, falloff and dead pixels of frames of evenly lit, unpolarized white.
+
+    ``frames`` are as the camera wrote them less ``before``'s black level. Raises ValueError on dark or clipped ones.
+    """
+    flat = average_frames(frames)
+    require_same_sensor(before, flat.first)
+    mosaic, layout = flat.first, flat.first.layout
+    span = mosaic.white_level - mosaic.black_level
+    signal = flat.mean - np.float32(mosaic.black_level)
+    brightness = float(np.median(signal)) / span
+    if brightness < DARKEST_FLAT:
+        raise ValueError(f"expected flat frames near half of the white level, found {brightness:.1%} of it")
+    if flat.clipped > MOST_CLIPPED:
+        raise ValueError(f"expected flat frames without clipping, found {flat.clipped:.1%} of the samples clipped")
+    means = place_means(signal, layout.period)
+    if means.min() <= 0:
+        raise ValueError("expected light on every place of the filters' period, found none on some")
+    falloff = fit_falloff(signal / tile(means, signal.shape), layout.period)
+    even = signal / falloff_image(falloff, *signal.shape)
+    means = place_means(even, layout.period)
+    gains = means / _color_means(means, layout)
+    residual = even / tile(means, signal.shape)
+    spread = robust_deviation(residual)
+    dead = np.abs(residual - 1) > max(DEAD, DEAD_DEVIATIONS * spread)
+    share = 0.0
+    if flat.variance is not None:
+        relative = flat.variance / np.maximum(signal, 1e-6 * span) ** 2
+        limit = np.quantile(relative, 0.99)
+        share = signal_share(residual, float(relative[relative <= limit].mean()) / flat.count)
+    pixels = 1 + np.float32(share) * np.where(dead, 0, residual - 1)
+    polarized = _apparent_dolp(gains, layout)
+    details = {
+        "frames": flat.count,
+        "brightness": round(brightness, 4),
+        "pixel_gains_rms": round(share**0.5 * spread, 5),
+        "place_gains_error": round(float(spread / (signal.size / layout.period**2) ** 0.5), 6),
+        "falloff_least": round(float(falloff_image(falloff, 65, 65).min()), 4),
+        "apparent_dolp": round(polarized, 4),
+        "dead_pixels": int(dead.sum()),
+    }
+    base = _base(before, mosaic, dead)
+    return replace(
+        base,
+        gains=_as_table(gains),
+        gain_map=(tile(gains, signal.shape) * pixels).astype(np.float32) if share else None,
+        falloff=falloff,
+        details={**base.details, "flat": details},
+    )
+
+
+def fit_falloff(image: Floats, period: int) -> Table:
+    """Coefficients of `calibration.falloff_image`, largest value 1, nearest to an image of mean 1 on every place."""
+    rows, cols = (n // period for n in image.shape)
+    blocks = image[: rows * period, : cols * period].reshape(rows, period, cols, period)
+    values = np.median(blocks.swapaxes(1, 2).reshape(rows * cols, -1), axis=1).astype(np.float64)
+    degree = max(0, min(DEGREE, (min(rows, cols) - 1) // BLOCKS_PER_DEGREE))
+    centres = [(2 * np.arange(n) + 1) * period / size - 1 for n, size in zip((rows, cols), image.shape, strict=True)]
+    y, x = (np.polynomial.legendre.legvander(points, degree) for points in centres)
+    terms = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+    design = np.stack([np.outer(y[:, i], x[:, j]).reshape(-1) for i, j in terms], axis=1)
+    weights = np.ones(values.size, bool)
+    for _ in range(2):
+        solution = np.linalg.lstsq(design[weights], values[weights], rcond=None)[0]
+        residual = np.abs(values - design @ solution)
+        weights = residual <= 5 * np.median(residual) + 1e-9
+    found = np.zeros((degree + 1, degree + 1))
+    for (i, j), value in zip(terms, solution, strict=True):
+        found[i, j] = value
+    return _as_table(found / (design @ solution).max())
+
+
+def _color_means(table: Doubles, layout: Layout) -> Doubles:
+    """For each place, the mean over all places of its colour."""
+    period = layout.period
+    colors = np.array([[layout.filter_at(row, col).channel for col in range(period)] for row in range(period)])
+    means = np.zeros_like(table)
+    for color in np.unique(colors):
+        means[colors == color] = table[colors == color].mean()
+    return means
+
+
+def _apparent_dolp(gains: Doubles, layout: Layout) -> float:
+    """Degree of polarization of a flat frame's light that would make the same gains as its analysers have."""
+    period = layout.period
+    angles = [2 * np.deg2rad(layout.filter_at(row, col).angle_deg) for row in range(period) for col in range(period)]
+    design = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    found = np.linalg.lstsq(design, gains.reshape(-1) - 1, rcond=None)[0]
+    return float(np.hypot(*found))
+
+
+def _base(before: Calibration | None, mosaic: Mosaic, defects: NDArray[np.bool_]) -> Calibration:
+    """The calibration to add to: of the frames' sensor, with the union of known defects."""
+    size = (int(mosaic.data.shape[0]), int(mosaic.data.shape[1]))
+    base = Calibration(mosaic.layout, mosaic.white_level, size) if before is None else before
+    known: Any = [] if base.dead is None else base.dead
+    dead = np.union1d(known, np.flatnonzero(defects)).astype(np.int32)
+    return replace(base, size=size, dead=dead)
+
+
+def require_same_sensor(base: Calibration | None, mosaic: Mosaic) -> None:
+    """Raise ValueError where frames differ from those that a calibration was begun with."""
+    if base is None:
+        return
+    found = (mosaic.layout.spec, mosaic.white_level, (int(mosaic.data.shape[0]), int(mosaic.data.shape[1])))
+    wanted = (base.layout.spec, base.white_level, base.size or found[2])
+    for name, want, have in zip(("layout", "white level", "height and width"), wanted, found, strict=True):
+        if want != have:
+            raise ValueError(f"expected frames of {name} {want}, as in the calibration so far, found {have}")
+
+
+def _as_table(values: NDArray[np.floating]) -> Table:
+    return tuple(tuple(float(x) for x in row) for row in values)

@@ -1,0 +1,65 @@
+"""Files of frames in, a section of a calibration file out, and one line about what was found."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from polsep.io.raw.corrections import read_mosaics
+from polsep.io.raw.frames import ReadOptions
+from polsep.io.store.atomic import refuse_inputs
+from polsep.io.store.calibrations import maps_path, read_calibration, write_calibration
+from polsep.sensor.calibration import Calibration, Corrections
+from polsep.sensor.camera import Mosaic
+
+#: A measurement: frames and the calibration so far to a calibration with one more section.
+Measure = Callable[[Iterator[Mosaic], Calibration | None], Calibration]
+
+
+def calibrate_files(paths: Sequence[Path], read: ReadOptions, output: Path, kind: str, measure: Measure) -> str:
+    """Measure a ``kind`` from files of frames, write it into ``output``, and return a line about it.
+
+    Other sections of ``output`` stay, and those that come before in `ORDER` correct the frames. Raises ValueError.
+    """
+    refuse_inputs([output, maps_path(output)], paths)
+    before = read_calibration(output) if output.exists() else None
+    if before is not None and read.layout is None:
+        read = replace(read, layout=before.layout)
+    used = None if before is None else corrections_for(kind, before)
+    found = measure(read_mosaics(paths, replace(read, corrections=used)), before)
+    written = write_calibration(output, found, importlib.metadata.version("polsep"))
+    return f"{kind}: {describe(found, kind)} -> {', '.join(str(path) for path in written)}"
+
+
+def corrections_for(kind: str, before: Calibration) -> Corrections:
+    """The corrections of frames that measure a ``kind``: all that do not depend on it."""
+    used = replace(before, lamp=None, dead=None if kind in ("dark", "flat") else before.dead)
+    if kind == "dark":
+        used = replace(used, black_level=None, black_pattern=None, black_map=None)
+    if kind in ("dark", "flat"):
+        used = replace(used, gains=None, gain_map=None, falloff=None)
+    if kind != "light":
+        used = replace(used, analysers=None)
+    return Corrections(used)
+
+
+def describe(found: Calibration, kind: str) -> str:
+    """One line about a section, for people."""
+    facts = found.details[kind]
+    if kind == "dark":
+        return (
+            f"black level {found.black_level:.2f} +- {facts['black_level_error_codes']:.2g} of {found.white_level:g}, "
+            f"pattern {facts['pattern_rms_codes']:.2g} codes rms over filters, {facts['lines_rms_codes']:.2g} over "
+            f"lines, {facts['pixels_rms_codes']:.2g} over pixels, read noise {found.read_noise:.2f} codes, "
+            f"{facts['hot_pixels']} hot pixels, {facts['frames']} frames"
+        )
+    if kind == "flat":
+        gains = [gain for row in found.gains or () for gain in row]
+        return (
+            f"gains of filters {min(gains):.3f} to {max(gains):.3f} +- {facts['place_gains_error']:.2g}, of pixels "
+            f"{facts['pixel_gains_rms']:.2%} rms, falloff to {facts['falloff_least']:.2f}, {facts['dead_pixels']} dead "
+            f"pixels, {facts['frames']} frames at {facts['brightness']:.0%} of white{facts.get('remark', '')}"
+        )
+    return str(dict(facts))

@@ -1,0 +1,115 @@
+"""Robust statistics of raw frames: means over frames and over places of the period, noise, and weights of estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.sensor.camera import Mosaic
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+
+#: Standard deviations of a normal variable per median absolute deviation.
+PER_MAD = 1.4826
+#: Deviations from the median beyond which a value is left out of a mean, in robust standard deviations.
+OUTLIER = 5.0
+#: Share of the pixels that count for the noise: the most variable ones are left out.
+KEPT = 0.99
+
+
+@dataclass(frozen=True)
+class FrameMean:
+    """The mean ``[H, W]`` of ``count`` frames of one scene.
+
+    ``variance [H, W]`` over frames of one sample, None for a single frame; ``clipped``: share of clipped samples.
+    """
+
+    first: Mosaic
+    mean: Floats
+    variance: Floats | None
+    clipped: float
+    count: int
+
+    @property
+    def noise(self) -> float | None:
+        """Variance of one sample over frames, in the mean over most pixels; None for a single frame."""
+        if self.variance is None:
+            return None
+        limit = np.quantile(self.variance, KEPT)
+        return float(self.variance[self.variance <= limit].mean())
+
+
+def average_frames(frames: Iterable[Mosaic]) -> FrameMean:
+    """Mean and variance over frames, by Welford's recurrence: one frame in memory at a time.
+
+    Raises ValueError on none, or on frames of different sizes, layouts or levels.
+    """
+    first, count, clipped = None, 0, 0.0
+    mean: Floats = np.zeros((0, 0), np.float32)
+    squares: Floats = mean
+    for mosaic in frames:
+        samples = mosaic.data.cpu().numpy().astype(np.float32, copy=False)
+        count += 1
+        clipped += float(mosaic.clipped().float().mean())
+        if first is None:
+            first, mean, squares = mosaic, samples.copy(), np.zeros_like(samples)
+            continue
+        if samples.shape != mean.shape or mosaic.layout != first.layout:
+            raise ValueError(
+                f"expected frames of one size and layout, found {mean.shape[1]}x{mean.shape[0]} {first.layout.spec} "
+                f"and {samples.shape[1]}x{samples.shape[0]} {mosaic.layout.spec}"
+            )
+        if (mosaic.black_level, mosaic.white_level) != (first.black_level, first.white_level):
+            raise ValueError("expected frames of the same levels, found different ones")
+        change = samples - mean
+        mean += change / np.float32(count)
+        squares += change * (samples - mean)
+    if first is None:
+        raise ValueError("expected at least one frame, found none")
+    variance = squares / np.float32(count - 1) if count > 1 else None
+    return FrameMean(first, mean, variance, clipped / count, count)
+
+
+def robust_mean(values: NDArray[np.floating]) -> float:
+    """Mean without values that are more than `OUTLIER` robust deviations from the median."""
+    middle = np.median(values)
+    spread = PER_MAD * np.median(np.abs(values - middle))
+    kept = np.abs(values - middle) <= OUTLIER * spread
+    return float(values[kept].mean(dtype=np.float64))
+
+
+def robust_deviation(values: NDArray[np.floating]) -> float:
+    """Standard deviation without the values that `robust_mean` leaves out."""
+    middle = np.median(values)
+    spread = PER_MAD * np.median(np.abs(values - middle))
+    kept = np.abs(values - middle) <= OUTLIER * spread
+    return float(values[kept].std(dtype=np.float64))
+
+
+def place_means(image: Floats, period: int) -> Doubles:
+    """Robust mean ``[period, period]`` of an image on each place of the period."""
+    rows = range(period)
+    return np.array([[robust_mean(image[row::period, col::period]) for col in rows] for row in rows])
+
+
+def tile(table: NDArray[np.floating], shape: tuple[int, ...]) -> Floats:
+    """A table ``[period, period]`` repeated over a frame."""
+    rows, cols = (np.arange(n) % table.shape[0] for n in shape)
+    tiled: Floats = np.asarray(table, np.float32)[rows][:, cols]
+    return tiled
+
+
+def signal_share(values: NDArray[np.floating], noise_variance: float) -> float:
+    """Weight in [0, 1] of noisy estimates that makes their squared error least: signal / (signal + noise).
+
+    Source: Wiener 1949; James and Stein 1961. 0 where the values vary by no more than their noise would twice over the
+    uncertainty of their variance.
+    """
+    variance = robust_deviation(values) ** 2
+    signal = variance - noise_variance
+    uncertain = 2 * noise_variance * np.sqrt(2 / max(values.size - 1, 1))
+    return signal / variance if signal > max(uncertain, 1e-30) else 0.0

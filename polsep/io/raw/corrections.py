@@ -1,0 +1,57 @@
+"""Corrections of raw frames, from the files that hold them: a calibration, and frames with the lamp off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.sequences import DamagedFrame, open_sequence
+from polsep.io.store.calibrations import read_calibration
+from polsep.io.store.errors import InputError, input_error
+from polsep.sensor.calibration import Corrections, mean_mosaic
+from polsep.sensor.camera import Mosaic
+
+
+def with_corrections(read: ReadOptions, calibration: Path | None, ambient: Sequence[Path] = ()) -> ReadOptions:
+    """The options with the corrections of files: a calibration, and the mean of all frames of ``ambient``.
+
+    Ambient frames are read with the same options and calibrated too. Raises InputError.
+    """
+    if calibration is None and not ambient:
+        return read
+    paths = [path for path in (calibration, *ambient) if path is not None]
+    missing = [path for path in paths if not path.exists()]
+    if missing:
+        raise input_error(missing[0], "expected a file, found nothing at this path")
+    stamps = tuple(path.stat().st_mtime_ns for path in paths)
+    return _read_corrected(read, calibration, tuple(ambient), stamps)
+
+
+@lru_cache(maxsize=4)  # viewers ask with every frame
+def _read_corrected(
+    read: ReadOptions, calibration: Path | None, ambient: tuple[Path, ...], stamps: tuple[int, ...]
+) -> ReadOptions:
+    sources: dict[str, object] = {}
+    measured = None if calibration is None else read_calibration(calibration)
+    if calibration is not None:
+        sources["calibration"] = calibration.name
+    corrections = Corrections(measured, None, sources)
+    if ambient:
+        room = mean_mosaic(list(read_mosaics(ambient, replace(read, corrections=corrections))))
+        corrections = Corrections(measured, room, {**sources, "ambient": [path.name for path in ambient]})
+    return replace(read, corrections=corrections)
+
+
+def read_mosaics(paths: Sequence[Path], read: ReadOptions) -> Iterator[Mosaic]:
+    """All frames of files and folders, one after the other. Raises InputError on what is not a raw mosaic."""
+    for path in paths:
+        frames = open_sequence(path, read).begin(0) if path.is_dir() else read_frames(path, read)
+        for frame in frames:
+            if isinstance(frame, DamagedFrame):
+                raise InputError(frame.reason)
+            if not isinstance(frame.data, Mosaic):
+                raise input_error(path, "expected a raw mosaic, found four angle images")
+            yield frame.data

@@ -1,0 +1,210 @@
+"""Calibration files: JSON for people and programs, and an NPZ file of the same name beside it where there are maps.
+
+``dark``, ``flat``, ``analysers`` and ``light`` are sections of the JSON, each there once it was measured. Units are in
+the names; tables ``[period][period]`` are in the order of pixels; codes are those of ``white_level_codes``. Maps are
+kept as half floats, as offsets from the black level and from gain 1. An extinction of null is infinite.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import os
+import re
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.io.store.atomic import write_checked, write_set
+from polsep.io.store.errors import decoding, naming
+from polsep.sensor.calibration import Analyser, Calibration, LampFacts, Table
+from polsep.sensor.camera import Layout
+
+FORMAT = "polsep calibration 1"
+#: Least steps of the maps: of black in codes, and of gains.
+BLACK_STEP, GAIN_STEP = 2.0**-10, 2.0**-17
+#: Arrays of the NPZ file.
+ARRAYS = ("black_offset_codes", "gain_minus_1", "defective_pixels")
+
+
+def maps_path(path: Path) -> Path:
+    """The NPZ file beside a calibration's JSON file."""
+    return path.with_suffix(".npz")
+
+
+def write_calibration(path: Path, calibration: Calibration, version: str) -> list[Path]:
+    """Write a calibration as ``path``, and its maps beside it; both appear together or not at all. The files written.
+
+    Raises OutputError. ``version``: of polsep.
+    """
+    if path.suffix.lower() != ".json":
+        raise ValueError(f"expected a calibration file that ends in .json, found {path.name!r}")
+    arrays = _arrays(calibration)
+    targets = [maps_path(path), path]
+
+    def write(folder: Path) -> None:
+        record = _record(calibration) | {"polsep": version}
+        if arrays:
+            buffer = io.BytesIO()
+            np.savez(buffer, **arrays)  # type: ignore[arg-type]
+            data = buffer.getvalue()
+            write_checked(folder / targets[0].name, data)
+            record["maps"] = {"file": targets[0].name, "sha256": hashlib.sha256(data).hexdigest()}
+        write_checked(folder / path.name, (_to_json(record) + "\n").encode())
+
+    write_set(targets, path.stem, write)
+    return targets[::-1] if arrays else targets[1:]
+
+
+def read_calibration(path: Path) -> Calibration:
+    """The calibration of a JSON file and of the maps beside it. Raises InputError, in one line that names the file."""
+    with naming(path):
+        record = _read_record(path)
+        maps = maps_path(path)
+        stamp = os.stat(maps).st_mtime_ns if record.get("maps") and maps.exists() else 0
+        return _read(path, path.stat().st_mtime_ns, stamp)
+
+
+@lru_cache(maxsize=4)  # viewers read it with every frame
+def _read(path: Path, stamp: int, maps_stamp: int) -> Calibration:
+    record = _read_record(path)
+    try:
+        return _from_record(record, _read_maps(path, record.get("maps")))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"expected a complete calibration, found a wrong or missing {error}") from None
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        raise ValueError("expected a calibration of 'polsep calibrate', found a file that is not JSON") from None
+    if not isinstance(record, dict) or record.get("format") != FORMAT:
+        raise ValueError(f"expected a calibration with format {FORMAT!r}, found another JSON file")
+    return record
+
+
+def _read_maps(path: Path, entry: Mapping[str, Any] | None) -> dict[str, NDArray[Any]]:
+    """The arrays of the NPZ file, once its hash is the recorded one."""
+    if entry is None:
+        return {}
+    maps = maps_path(path)
+    if not maps.exists():
+        raise ValueError(f"expected its maps in {maps.name} beside it, found none")
+    data = maps.read_bytes()
+    if hashlib.sha256(data).hexdigest() != entry["sha256"]:
+        raise ValueError(f"expected the maps that it was written with in {maps.name}, found others")
+    with decoding("NPZ"), np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        return {name: archive[name] for name in ARRAYS if name in archive.files}
+
+
+def _arrays(c: Calibration) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {}
+    if c.black_map is not None:
+        arrays["black_offset_codes"] = _halves(c.black_map - np.float32(c.black_level or 0), BLACK_STEP)
+    if c.gain_map is not None:
+        arrays["gain_minus_1"] = _halves(c.gain_map - np.float32(1), GAIN_STEP)
+    if c.dead is not None and c.dead.size:
+        arrays["defective_pixels"] = c.dead
+    return arrays
+
+
+def _halves(values: NDArray[np.float32], step: float) -> NDArray[np.float16]:
+    """Half floats of multiples of a step, so that a map that is read and written again keeps its bits."""
+    steps = np.rint(values / np.float32(step)) + np.float32(0)  # no negative zeros
+    halves: NDArray[np.float16] = (steps * np.float32(step)).astype(np.float16)
+    return halves
+
+
+def _record(c: Calibration) -> dict[str, Any]:
+    """The calibration without maps, by section."""
+    details = {name: dict(value) for name, value in c.details.items()}
+    record: dict[str, Any] = {"format": FORMAT, "layout": c.layout.spec, "white_level_codes": c.white_level}
+    if c.size is not None:
+        record |= {"height": c.size[0], "width": c.size[1]}
+    if c.black_level is not None:
+        record["dark"] = {
+            "black_level_codes": c.black_level,
+            "black_pattern_codes": c.black_pattern,
+            "read_noise_codes": c.read_noise,
+        } | details.pop("dark", {})
+    if c.gains is not None:
+        record["flat"] = {"gains": c.gains, "falloff_legendre": c.falloff} | details.pop("flat", {})
+    if c.analysers is not None:
+        record["analysers"] = {
+            "angle_deg": [[a.angle_deg for a in row] for row in c.analysers],
+            "extinction": [[None if math.isinf(a.extinction) else a.extinction for a in row] for row in c.analysers],
+            "gain": [[a.gain for a in row] for row in c.analysers],
+        } | details.pop("analysers", {})
+    if c.lamp is not None:
+        lamp = {"color_rgb": c.lamp.color, "dolp": c.lamp.dolp, "aolp_deg": c.lamp.aolp_deg}
+        record["light"] = lamp | details.pop("light", {})
+    return record
+
+
+def _from_record(record: dict[str, Any], maps: dict[str, NDArray[Any]]) -> Calibration:
+    dark, flat, analysers, light = (record.get(name) for name in ("dark", "flat", "analysers", "light"))
+    size = (int(record["height"]), int(record["width"])) if "height" in record else None
+    black_map, gain_map = maps.get("black_offset_codes"), maps.get("gain_minus_1")
+    level = None if dark is None else float(dark["black_level_codes"])
+    lamp = None
+    if light is not None:
+        r, g, b = (float(x) for x in light["color_rgb"])
+        lamp = LampFacts((r, g, b), *(None if light[k] is None else float(light[k]) for k in ("dolp", "aolp_deg")))
+    return Calibration(
+        Layout.parse(record["layout"]),
+        float(record["white_level_codes"]),
+        size,
+        level,
+        _table(dark and dark["black_pattern_codes"]),
+        None if black_map is None else black_map.astype(np.float32) + np.float32(level or 0),
+        None if dark is None else float(dark["read_noise_codes"]),
+        _table(flat and flat["gains"]),
+        None if gain_map is None else gain_map.astype(np.float32) + np.float32(1),
+        _table(flat and flat["falloff_legendre"]),
+        maps.get("defective_pixels"),
+        None if analysers is None else _analysers(analysers),
+        lamp,
+        {name: _details(section) for name, section in record.items() if isinstance(section, dict) and name != "maps"},
+    )
+
+
+#: Entries of sections that are fields of `Calibration`; the others are its details.
+_FIELDS = {"black_level_codes", "black_pattern_codes", "read_noise_codes", "gains", "falloff_legendre", "angle_deg"}
+_FIELDS |= {"extinction", "gain", "color_rgb", "dolp", "aolp_deg"}
+
+
+def _details(section: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in section.items() if name not in _FIELDS}
+
+
+def _analysers(section: dict[str, Any]) -> tuple[tuple[Analyser, ...], ...]:
+    columns = [section[name] for name in ("angle_deg", "extinction", "gain")]
+    return tuple(
+        tuple(Analyser(float(t), math.inf if e is None else float(e), float(g)) for t, e, g in zip(*rows, strict=True))
+        for rows in zip(*columns, strict=True)
+    )
+
+
+def _table(rows: Any) -> Table | None:
+    return None if rows is None else tuple(tuple(float(x) for x in row) for row in rows)
+
+
+def _to_json(record: dict[str, Any]) -> str:
+    """JSON with one entry per line, one row of a table per line, and numbers of tables to six decimals."""
+    text = json.dumps(_rounded(record), indent=1, allow_nan=False)
+    return re.sub(r"\[\s+([^\[\]{}]*?)\s+\]", lambda row: f"[{' '.join(row[1].split())}]", text)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _rounded(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(entry) for entry in value]
+    return round(value, 6) if isinstance(value, float) else value

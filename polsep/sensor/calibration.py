@@ -1,0 +1,356 @@
+"""A sensor as it was measured, and raw frames corrected by it.
+
+`polsep calibrate` measures, `Calibration` holds, `correct_mosaic` applies: the black pattern is subtracted, gains are
+divided out, known dead pixels repaired, and the samples of real analysers mapped to those of ideal ones. The result is
+a float32 mosaic with the white level of the frame, which every method reads.
+
+* A sample that clipped before counts as clipped afterwards: below the white level, it is set to that. Where a gain is
+  below 1, samples just under the white level reach it; they count as clipped too, with their right value.
+* The smooth part of a flat frame (vignetting, an uneven diffuser) is not divided out of the samples, or their noise and
+  clip level would differ over the frame. `Mosaic.falloff` carries it, and separated images are divided by it.
+* Corrections that are not in the calibration change no bit.
+
+Model of a sample without noise, t its analyser's angle and D = (ER - 1) / (ER + 1) for the extinction ratio ER:
+
+    code = black + falloff gain_map gain (s0 + D (s1 cos 2t + s2 sin 2t)) / 2 (white - black_level)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
+from polsep.sensor.levels import WHITE_LEVELS
+
+Floats = NDArray[np.float32]
+#: Numbers per place of one period of filters, ``[period][period]``.
+Table = tuple[tuple[float, ...], ...]
+
+
+class Analyser(NamedTuple):
+    """The analyser on one place of the period; ``gain``: for unpolarized light, 1 in the mean of a colour."""
+
+    angle_deg: float
+    extinction: float
+    gain: float
+
+    @property
+    def vector(self) -> tuple[float, float, float]:
+        """Factors of s0, s1, s2 in a sample."""
+        d = 1.0 if math.isinf(self.extinction) else (self.extinction - 1) / (self.extinction + 1)
+        t = 2 * math.radians(self.angle_deg)
+        return 0.5 * self.gain, 0.5 * self.gain * d * math.cos(t), 0.5 * self.gain * d * math.sin(t)
+
+
+class LampFacts(NamedTuple):
+    """Camera RGB of the lamp, green = 1, its degree of linear polarization and the angle of its polarizer or AoLP."""
+
+    color: tuple[float, float, float]
+    dolp: float | None
+    aolp_deg: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Measured properties of a sensor and a lamp, each None where it was not measured.
+
+    Levels are in codes of ``white_level``. ``black_map``: code without light of each pixel ``[H, W]``, and
+    ``black_pattern`` its mean on each place of the period. ``gain_map [H, W]``: of each pixel, without the ``falloff``,
+    which is a polynomial (`falloff_image`); ``gains``: its mean on each place. ``dead``: indices of defective pixels in
+    reading order. ``details``: what each measurement found, for people, JSON-able.
+    """
+
+    layout: Layout
+    white_level: float
+    size: tuple[int, int] | None = None
+    black_level: float | None = None
+    black_pattern: Table | None = None
+    black_map: Floats | None = None
+    read_noise: float | None = None
+    gains: Table | None = None
+    gain_map: Floats | None = None
+    falloff: Table | None = None
+    dead: NDArray[np.int32] | None = None
+    analysers: tuple[tuple[Analyser, ...], ...] | None = None
+    lamp: LampFacts | None = None
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        period = self.layout.period
+        for name in ("black_pattern", "gains", "analysers"):
+            table = getattr(self, name)
+            if table is not None and [len(row) for row in table] != [period] * period:
+                raise ValueError(f"expected {name} of {period}x{period} places, found {[len(row) for row in table]}")
+        for name in ("black_map", "gain_map"):
+            values = getattr(self, name)
+            if values is not None and values.shape != self.size:
+                raise ValueError(f"expected a {name} of the size {self.size}, found {values.shape}")
+
+    def white_level_of(self, array: NDArray[Any]) -> float | None:
+        """The calibrated white level for raw frames that do not say theirs; None where their type cannot hold it."""
+        fits = self.white_level <= WHITE_LEVELS.get(getattr(array, "dtype", np.dtype(bool)).name, 0.0)
+        return self.white_level if fits else None
+
+
+def correct_mosaic(mosaic: Mosaic, calibration: Calibration) -> Mosaic:
+    """One raw frame ``[H, W]`` as a sensor without the measured errors would give it; see the module.
+
+    Raises ValueError on a frame of another size, layout or white level than the calibration's.
+    """
+    _check_match(mosaic, calibration)
+    raw = mosaic.data.detach().cpu().numpy()
+    samples, black = raw, mosaic.black_level
+    unit = (mosaic.white_level / calibration.white_level) if calibration.black_level is not None else 1.0
+    if calibration.black_level is not None:
+        black = float(np.float32(calibration.black_level * unit))
+        offset = _offsets(calibration, raw.shape)
+        if offset is not None:
+            samples = samples - (offset if unit == 1 else offset * np.float32(unit))
+    gain = calibration.gain_map if calibration.gain_map is not None else _tiled(calibration.gains, raw.shape)
+    if gain is not None:
+        samples = (samples - np.float32(black)) / gain + np.float32(black)
+    if calibration.dead is not None and calibration.dead.size:
+        samples = repair_known(samples if samples is not raw else raw.copy(), calibration.dead, mosaic.layout.period)
+    if calibration.analysers is not None:
+        samples = correct_analysers(samples, black, calibration)
+    if samples is not raw:
+        clipped = mosaic.clipped().cpu().numpy()
+        if calibration.dead is not None:
+            clipped.flat[calibration.dead] = False  # as its neighbours are
+        samples = _keep_clipped(samples, clipped, (black, mosaic.white_level))
+    data = mosaic.data if samples is raw else torch.from_numpy(samples).to(mosaic.data.device)
+    light = mosaic.light_color if calibration.lamp is None else calibration.lamp.color
+    return replace(mosaic, data=data, black_level=black, light_color=light, falloff=calibration.falloff)
+
+
+def subtract_ambient(mosaic: Mosaic, ambient: Mosaic) -> Mosaic:
+    """A frame less the light of the room: a frame, or the mean of several, of the same exposure with the lamp off.
+
+    A sample that is clipped in either counts as clipped. The noise of both adds up: the mean of n frames adds 1 / n of
+    its variance. Raises ValueError on another size, layout or levels.
+    """
+    for name in ("layout", "black_level", "white_level"):
+        wanted, found = getattr(mosaic, name), getattr(ambient, name)
+        if wanted != found:
+            wanted, found = (x.spec if isinstance(x, Layout) else f"{x:g}" for x in (wanted, found))
+            raise ValueError(f"expected an ambient frame with the frame's {name} {wanted}, found {found}")
+    if mosaic.data.shape[-2:] != ambient.data.shape[-2:]:
+        raise ValueError(f"expected an ambient frame of {_size(mosaic)} as the frame, found {_size(ambient)}")
+    clipped = mosaic.clipped() | ambient.clipped()
+    data = mosaic.data - (ambient.data.to(mosaic.data) - mosaic.black_level)
+    least = mosaic.black_level + (1 - CLIP_MARGIN) * (mosaic.white_level - mosaic.black_level)
+    return replace(mosaic, data=torch.where(clipped & (data < least), mosaic.white_level, data))
+
+
+def mean_mosaic(mosaics: list[Mosaic]) -> Mosaic:
+    """The mean of frames of one exposure; a sample is clipped where any frame's is. Raises ValueError on mixed ones."""
+    first = mosaics[0]
+    for other in mosaics[1:]:
+        if (other.layout, other.black_level, other.white_level) != (first.layout, first.black_level, first.white_level):
+            raise ValueError("expected frames of one layout and of the same levels, found different ones")
+        if other.data.shape != first.data.shape:
+            raise ValueError(f"expected frames of one size, found {_size(first)} and {_size(other)}")
+    if len(mosaics) == 1:
+        return first
+    total, clipped = first.data.double(), first.clipped()
+    for other in mosaics[1:]:
+        total, clipped = total + other.data, clipped | other.clipped()
+    mean = (total / len(mosaics)).float()
+    return replace(first, data=torch.where(clipped, mean.clamp(min=first.white_level), mean))
+
+
+def falloff_image(coefficients: Table, height: int, width: int) -> Floats:
+    """The smooth part of a flat frame ``[height, width]``, 1 at the brightest place of the sensor.
+
+    Sum of ``coefficients[i][j]`` P_i(y) P_j(x) over Legendre polynomials of the pixel's place, -1 to 1 over the frame.
+    """
+    c = np.asarray(coefficients, np.float64)
+    rows, cols = (_legendre(n, k) for n, k in zip((height, width), c.shape, strict=True))
+    image: Floats = (rows @ c @ cols.T).astype(np.float32)
+    return image
+
+
+def _legendre(count: int, terms: int) -> NDArray[np.float64]:
+    """Values ``[count, terms]`` of Legendre polynomials at the centres of ``count`` pixels."""
+    values = np.polynomial.legendre.legvander((2 * np.arange(count) + 1) / count - 1, terms - 1)
+    return np.asarray(values, np.float64)
+
+
+def repair_known(samples: Floats, dead: NDArray[np.int32], period: int) -> Floats:
+    """Samples ``[H, W]`` with each dead one replaced, in place, by the mean of its sound neighbours of the same kind.
+
+    These are the ones a ``period`` away along rows and columns; then those along diagonals; else it stays.
+    """
+    height, width = samples.shape
+    mask = np.zeros(samples.shape, bool)
+    mask.flat[dead] = True
+    rows, cols = np.divmod(dead, width)
+    fixed = samples[rows, cols].copy()
+    todo = np.ones(dead.size, bool)
+    for steps in (((0, 1), (1, 0), (0, -1), (-1, 0)), ((1, 1), (1, -1), (-1, 1), (-1, -1))):
+        total, count = np.zeros(dead.size, np.float64), np.zeros(dead.size, np.int64)
+        for down, right in steps:
+            y, x = rows + down * period, cols + right * period
+            inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+            y, x = np.where(inside, y, 0), np.where(inside, x, 0)
+            sound = inside & ~mask[y, x]
+            total += np.where(sound, samples[y, x], 0)
+            count += sound
+        now = todo & (count > 0)
+        fixed[now] = (total[now] / count[now]).astype(np.float32)
+        todo &= ~now
+    samples[rows, cols] = fixed
+    return samples
+
+
+class Neighbours(NamedTuple):
+    """For each row (or column): the nearest one, and the one on the other side, of the cell's other analyser.
+
+    Both behind the same colour; ``weight`` of the nearest in linear interpolation.
+    """
+
+    near: NDArray[np.int64]
+    far: NDArray[np.int64]
+    weight: Floats
+
+
+def correct_analysers(samples: Floats, black: float, calibration: Calibration) -> Floats:
+    """Samples ``[H, W]`` as ideal analysers at the layout's angles would give them.
+
+    Behind each pixel the Stokes vector is solved from its own sample and those of the three other analysers of its
+    colour, interpolated there from both sides; the difference between the ideal and the measured analyser, times that
+    vector, is added. Exact where light changes linearly.
+    """
+    from polsep.sensor.calibration_kernel import mix_neighbours
+
+    return _mix(samples, black, calibration, mix_neighbours)
+
+
+def correct_analysers_reference(samples: Floats, black: float, calibration: Calibration) -> Floats:
+    """`correct_analysers` by the readable `mix_neighbours` instead of compiled code; the same to rounding."""
+    return _mix(samples, black, calibration, mix_neighbours)
+
+
+def _mix(samples: Floats, black: float, calibration: Calibration, mix: Any) -> Floats:
+    layout = calibration.layout
+    rows, cols = (neighbours(n, o, layout.period) for n, o in zip(samples.shape, layout.origin, strict=True))
+    mixed: Floats = mix(np.ascontiguousarray(samples, np.float32), np.float32(black), rows, cols, mixing(calibration))
+    return mixed
+
+
+def mix_neighbours(samples: Floats, black: Any, rows: Neighbours, cols: Neighbours, weights: Floats) -> Floats:
+    """Weighted sums of each sample and of those of the three other analysers of its colour, interpolated at its place.
+
+    ``samples [H, W]``; ``weights [period, period, 4]``: own, other column, other row, both. Twin of the kernel.
+    """
+    x = samples - black
+
+    def across(image: Floats) -> Floats:
+        return cols.weight * image[:, cols.near] + (1 - cols.weight) * image[:, cols.far]
+
+    vertical = rows.weight[:, None] * x[rows.near] + (1 - rows.weight[:, None]) * x[rows.far]
+    w = _tiled(weights, samples.shape)
+    mixed: Floats = w[..., 0] * x + w[..., 1] * across(x) + w[..., 2] * vertical + w[..., 3] * across(vertical) + black
+    return mixed
+
+
+def neighbours(count: int, origin: int, period: int) -> Neighbours:
+    """The neighbours of each of ``count`` rows or columns, the first whole cell of which is at ``origin``.
+
+    The nearest is in the own cell, the other as many pixels beyond the own place as fill the period: 1 and 3 of 4 on
+    colour sensors, 1 and 1 of 2 on mono ones. At the border only one side counts.
+    """
+    place = np.arange(count)
+    step = np.where((place - origin) % 2 == 0, 1, -1)
+    near, far = place + step, place + step - step * period
+    weight = np.full(count, (period - 1) / period, np.float32)
+    weight[(far < 0) | (far >= count)] = 1
+    weight[(near < 0) | (near >= count)] = 0
+    return Neighbours(np.clip(near, 0, count - 1), np.clip(far, 0, count - 1), weight)
+
+
+def mixing(calibration: Calibration) -> Floats:
+    """Weights ``[period, period, 4]`` of `mix_neighbours` that make ideal analysers of the measured ones.
+
+    With the analysers A ``[4, 3]`` of a cell, its Stokes vector is pinv(A) m, and an ideal sample is
+    m_k + (ideal_k - A_k) pinv(A) m.
+    """
+    layout, table = calibration.layout, calibration.analysers
+    assert table is not None
+    period = layout.period
+    weights = np.zeros((period, period, 4))
+    for row in range(period):
+        for col in range(period):
+            down = 1 if (row - layout.origin[0]) % 2 == 0 else -1
+            right = 1 if (col - layout.origin[1]) % 2 == 0 else -1
+            places = [(row, col), (row, col + right), (row + down, col), (row + down, col + right)]
+            measured = np.array([table[r % period][c % period].vector for r, c in places])
+            ideal = np.array(Analyser(layout.filter_at(row, col).angle_deg, math.inf, 1.0).vector)
+            weights[row, col] = (ideal - measured[0]) @ np.linalg.pinv(measured)
+            weights[row, col, 0] += 1
+    return weights.astype(np.float32)
+
+
+def _check_match(mosaic: Mosaic, calibration: Calibration) -> None:
+    """Raise ValueError unless the frame is of the calibrated sensor."""
+    if mosaic.data.ndim != 2:
+        raise ValueError(f"expected one raw frame [H, W] to calibrate, found shape {tuple(mosaic.data.shape)}")
+    if mosaic.layout != calibration.layout:
+        wanted, found = calibration.layout.spec, mosaic.layout.spec
+        raise ValueError(f"expected frames of layout {wanted}, as calibrated, found {found}")
+    if calibration.size is not None and tuple(mosaic.data.shape) != calibration.size:
+        wanted = f"{calibration.size[1]}x{calibration.size[0]}"
+        raise ValueError(f"expected frames of {wanted}, as calibrated, found {_size(mosaic)}")
+
+
+def _size(mosaic: Mosaic) -> str:
+    return f"{mosaic.data.shape[-1]}x{mosaic.data.shape[-2]}"
+
+
+def _offsets(calibration: Calibration, shape: tuple[int, ...]) -> Floats | None:
+    """Code without light of each pixel above the black level; None where the black level is all that is known."""
+    level = np.float32(calibration.black_level or 0)
+    if calibration.black_map is not None:
+        offsets: Floats = calibration.black_map - level
+        return offsets
+    pattern: Floats | None = _tiled(calibration.black_pattern, shape)
+    return pattern
+
+
+def _tiled(table: Any, shape: tuple[int, ...]) -> Any:
+    """A table ``[period, period, ...]`` repeated over a frame, as float32; None for None."""
+    if table is None:
+        return None
+    values = np.asarray(table, np.float32)
+    rows, cols = (np.arange(n) % k for n, k in zip(shape, values.shape[:2], strict=True))
+    return values[rows][:, cols]
+
+
+def _keep_clipped(samples: Floats, clipped: NDArray[np.bool_], levels: tuple[float, float]) -> Floats:
+    """Corrected samples; those that were clipped and fell below the clip level are set to the white level."""
+    black, white = levels
+    least = np.float32(black + (1 - CLIP_MARGIN) * (white - black))
+    samples[clipped & (samples < least)] = white
+    return samples
+
+
+@dataclass(frozen=True, eq=False)
+class Corrections:
+    """Changes to every raw frame before anything else reads it; ``sources`` names their files in reports."""
+
+    calibration: Calibration | None = None
+    ambient: Mosaic | None = None
+    sources: Mapping[str, Any] = field(default_factory=dict)
+
+    def apply(self, mosaic: Mosaic) -> Mosaic:
+        """The frame calibrated and less the ambient light, which is of calibrated frames. Raises ValueError."""
+        if self.calibration is not None:
+            mosaic = correct_mosaic(mosaic, self.calibration)
+        return mosaic if self.ambient is None else subtract_ambient(mosaic, self.ambient)

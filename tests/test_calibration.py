@@ -1,0 +1,293 @@
+"""Calibration of a simulated sensor recovers what was simulated; applying it undoes it; what is not measured, stays."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from numpy.typing import NDArray
+from test_cli import Cli, Run
+from test_cli import polsep as run_polsep  # noqa: F401
+
+import polsep
+from polsep.calibrate.dark_flat import measure_dark, measure_flat
+from polsep.io.raw.corrections import with_corrections
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.store.calibrations import read_calibration, write_calibration
+from polsep.sensor.calibration import (
+    Analyser,
+    Calibration,
+    Corrections,
+    LampFacts,
+    correct_analysers,
+    correct_analysers_reference,
+    correct_mosaic,
+    falloff_image,
+    mean_mosaic,
+    subtract_ambient,
+)
+from polsep.sensor.camera import Layout, Mosaic
+
+SIZE = (128, 160)
+WHITE = 4095.0
+LEVEL = 64.0
+WELL, READ = 10_500.0, 2.4
+MONO = Layout(bayer=None)
+LAYOUTS = pytest.mark.parametrize("layout", [Layout(), MONO, Layout(origin=(1, 0))], ids=lambda x: x.spec)
+
+
+class BadSensor:
+    """A sensor with a black pattern, gains, vignetting, dead pixels and bad analysers; codes of 12 bits."""
+
+    def __init__(self, layout: Layout, seed: int = 1, dead: int = 20) -> None:
+        self.layout, self.rng = layout, np.random.default_rng(seed)
+        rng, period = self.rng, layout.period
+        rows, cols = (np.arange(n) for n in SIZE)
+        place = (rows[:, None] % period, cols[None] % period)
+        self.black = LEVEL + rng.normal(0, 8, (period, period))[place] + rng.normal(0, 2, SIZE)
+        self.black += rng.normal(0, 3, (SIZE[0], 1))
+        self.gain = 1 + rng.normal(0, 0.03, (period, period))[place] + rng.normal(0, 0.02, SIZE)
+        y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in SIZE), indexing="ij")
+        self.falloff = 1 / (1 + 0.3 * (x**2 + y**2))
+        self.dead = rng.choice(SIZE[0] * SIZE[1], dead, replace=False)
+        angles = np.array([[layout.filter_at(r, c).angle_deg for c in range(period)] for r in range(period)])
+        self.angles = angles + rng.normal(0, 2, (period, period))
+        self.angles -= (self.angles - angles).mean()
+        self.diattenuation = np.full((period, period), 29 / 31)
+
+    def sees(self, s0: NDArray[np.float64], dolp: float = 0.0, aolp: float = 0.0) -> NDArray[np.float64]:
+        """Light behind each pixel's analyser, white = 1."""
+        period = self.layout.period
+        place = np.ix_(np.arange(SIZE[0]) % period, np.arange(SIZE[1]) % period)
+        d, t = self.diattenuation[place], np.deg2rad(self.angles)[place]
+        light: NDArray[np.float64] = s0 * (1 + dolp * d * np.cos(2 * (t - aolp))) / 2
+        return light
+
+    def expose(self, light: NDArray[np.float64], noise: bool = True) -> Mosaic:
+        """One frame of light behind the analysers."""
+        signal = np.maximum(light * self.gain * self.falloff, 0)
+        if noise:
+            signal = (self.rng.poisson(signal * WELL) + self.rng.normal(0, READ, SIZE)) / WELL
+        codes = signal * (WHITE - LEVEL) + self.black
+        codes.flat[self.dead] = 0
+        codes = np.clip(np.round(codes) if noise else codes, 0, WHITE)
+        return Mosaic(torch.from_numpy(codes.astype(np.float32)), self.layout, 0.0, WHITE)
+
+    def calibration(self) -> Calibration:
+        """The truth, as a calibration."""
+        period = self.layout.period
+        table = tuple(
+            tuple(
+                Analyser(a, (1 + d) / (1 - d), 1.0)
+                for a, d in zip(self.angles[row], self.diattenuation[row], strict=True)
+            )
+            for row in range(period)
+        )
+        black = self.black.astype(np.float32)
+        dead = np.sort(self.dead).astype(np.int32)
+        gains = self.gain.astype(np.float32)
+        ones = ((1.0,) * period,) * period
+        return Calibration(
+            self.layout, WHITE, SIZE, LEVEL, None, black, 1.0, ones, gains, ((1.0,),), dead, table, None, {}
+        )
+
+
+@LAYOUTS
+def test_dark_and_flat_recover_a_sensor(layout: Layout) -> None:
+    """Ten frames of each give black within a third of a code, gains within 0.5 %, vignetting within 0.3 %."""
+    sensor = BadSensor(layout)
+    sound = np.ones(SIZE, bool)
+    sound.flat[sensor.dead] = False
+    unlit = np.zeros(SIZE)
+    dark = measure_dark(sensor.expose(unlit) for _ in range(10))
+    assert dark.black_map is not None and dark.read_noise is not None and dark.black_level is not None
+    assert np.std((dark.black_map - sensor.black)[sound]) < 0.35
+    assert abs(dark.black_level - sensor.black.mean()) < 0.2
+    assert dark.read_noise == pytest.approx(math.hypot(READ * (WHITE - LEVEL) / WELL, 12**-0.5), rel=0.05)
+    used = Corrections(replace(dark, dead=None))
+    light = sensor.sees(np.full(SIZE, 1.0))
+    flat = measure_flat((used.apply(sensor.expose(light)) for _ in range(10)), dark)
+    assert flat.gain_map is not None and flat.falloff is not None and flat.dead is not None
+    product = flat.gain_map * falloff_image(flat.falloff, *SIZE) / (sensor.gain * sensor.falloff)
+    assert np.std(product[sound] / product[sound].mean()) < 0.006
+    assert np.abs(falloff_image(flat.falloff, *SIZE) / sensor.falloff - 1).max() < 0.02
+    assert set(sensor.dead) <= set(flat.dead.tolist()) and len(flat.dead) == len(sensor.dead)
+    assert flat.black_map is dark.black_map
+
+
+def test_one_frame_gives_tables_and_no_map() -> None:
+    """Where noise hides the pixels, no pixel is corrected: a single flat frame changes filters and vignetting only."""
+    sensor = BadSensor(Layout(), dead=0)
+    flat = measure_flat([replace(sensor.expose(sensor.sees(np.full(SIZE, 1.0))), black_level=LEVEL)])
+    assert flat.gain_map is None and flat.gains is not None
+    ideal = measure_dark([Mosaic(torch.full(SIZE, LEVEL), Layout(), 0.0, WHITE)] * 3)
+    assert ideal.black_map is None and ideal.black_level == LEVEL and ideal.read_noise == 0
+
+
+@LAYOUTS
+def test_applying_undoes_the_sensor(layout: Layout) -> None:
+    """Even polarized light through a bad sensor without noise comes out as ideal analysers measure it."""
+    sensor = BadSensor(layout)
+    ideal = BadSensor(layout, dead=0)
+    ideal.angles = np.array(
+        [[layout.filter_at(r, c).angle_deg for c in range(layout.period)] for r in range(layout.period)]
+    )
+    ideal.diattenuation = np.ones_like(ideal.angles)
+    sensor.falloff = np.ones(SIZE)
+    s0 = np.full(SIZE, 0.8)
+    found = correct_mosaic(sensor.expose(sensor.sees(s0, 0.5, 0.4), noise=False), sensor.calibration())
+    assert found.falloff == ((1.0,),)
+    torch.testing.assert_close(
+        found.linear(), torch.from_numpy(ideal.sees(s0, 0.5, 0.4).astype(np.float32)), atol=2e-5, rtol=0
+    )
+
+
+def test_kernel_and_reference_of_analysers_agree() -> None:
+    """Compiled and readable mixing of neighbours are the same to rounding, to the border."""
+    for layout in (Layout(), MONO, Layout(origin=(1, 1))):
+        sensor = BadSensor(layout)
+        samples = sensor.rng.random(SIZE).astype(np.float32)
+        pair = [f(samples, 0.1, sensor.calibration()) for f in (correct_analysers, correct_analysers_reference)]
+        np.testing.assert_allclose(*pair, atol=1e-6)
+
+
+def identity(layout: Layout, black: float) -> Calibration:
+    """A calibration of a sensor without errors."""
+    period = range(layout.period)
+    table = tuple(tuple(Analyser(layout.filter_at(r, c).angle_deg, math.inf, 1.0) for c in period) for r in period)
+    ones = tuple(tuple(1.0 for _ in period) for _ in period)
+    maps = np.full(SIZE, black, np.float32), np.ones(SIZE, np.float32)
+    none = np.zeros(0, np.int32)
+    return Calibration(layout, WHITE, SIZE, black, None, maps[0], 1.0, ones, maps[1], None, none, table)
+
+
+@LAYOUTS
+def test_identity_changes_no_bit(layout: Layout) -> None:
+    """Calibrations of perfect sensors, empty ones, and ambient frames without light return the frame's bits."""
+    codes = torch.randint(0, 4096, SIZE).float()
+    mosaic = Mosaic(codes, layout, LEVEL, WHITE)
+    for calibration in (Calibration(layout, WHITE), identity(layout, LEVEL)):
+        assert torch.equal(correct_mosaic(mosaic, calibration).data, codes)
+    unlit = replace(mosaic, data=torch.full(SIZE, LEVEL))
+    assert torch.equal(subtract_ambient(mosaic, unlit).data, codes)
+    assert torch.equal(subtract_ambient(mosaic, mean_mosaic([unlit] * 3)).data, codes)
+
+
+def test_clipped_samples_stay_clipped() -> None:
+    """A sample at the white level is clipped after any correction, and one far below it is not."""
+    sensor = BadSensor(Layout())
+    light = np.full(SIZE, 0.4)
+    light[40:60, 40:60] = 3.0
+    light[80:90] = 1.5
+    frame = sensor.expose(light, noise=False)
+    found = correct_mosaic(frame, sensor.calibration())
+    sound = np.ones(SIZE, bool)
+    sound.flat[sensor.dead] = False
+    was, now = (x.clipped().numpy()[sound] for x in (frame, found))
+    assert (now[was]).all() and not now[(light < 0.5)[sound]].any()
+    room = replace(frame, data=torch.where(torch.from_numpy(light) > 2, WHITE, 900.0))
+    less = subtract_ambient(frame, room)
+    assert torch.equal(less.clipped(), frame.clipped() | room.clipped())
+
+
+def test_ambient_light_is_subtracted() -> None:
+    """A frame of lamp and room less one of the room is the lamp's; of four frames their mean."""
+    rng = np.random.default_rng(3)
+    lamp, room = rng.uniform(0, 1500, SIZE), rng.uniform(0, 800, SIZE)
+
+    def frame(light: NDArray[np.float64]) -> Mosaic:
+        return Mosaic(torch.from_numpy((light + LEVEL).astype(np.float32)), Layout(), LEVEL, WHITE)
+
+    less = subtract_ambient(frame(lamp + room), mean_mosaic([frame(room * k) for k in (0.8, 0.9, 1.1, 1.2)]))
+    np.testing.assert_allclose(less.data.numpy(), lamp + LEVEL, atol=1e-3)
+
+
+def test_files_return_what_was_written(tmp_path: Path) -> None:
+    """A calibration survives its file, maps to the precision of half floats; files are the same bytes each time."""
+    sensor = BadSensor(Layout())
+    written = replace(
+        sensor.calibration(), lamp=LampFacts((0.5, 1.0, 0.6), 0.98, None), details={"dark": {"frames": 9}}
+    )
+    paths = write_calibration(tmp_path / "rig.json", written, "0")
+    assert [p.name for p in paths] == ["rig.json", "rig.npz"]
+    bytes_before = [p.read_bytes() for p in paths]
+    found = read_calibration(tmp_path / "rig.json")
+    assert found.black_map is not None and found.gain_map is not None
+    np.testing.assert_allclose(found.black_map, written.black_map, atol=0.02)
+    np.testing.assert_allclose(found.gain_map, written.gain_map, atol=1e-4)
+    for name in ("layout", "white_level", "size", "black_level", "read_noise", "gains", "falloff", "lamp"):
+        assert getattr(found, name) == getattr(written, name)
+    assert found.analysers is not None and written.analysers is not None
+    np.testing.assert_allclose(found.analysers, written.analysers, atol=1e-6)
+    assert found.details["dark"] == {"frames": 9}
+    write_calibration(tmp_path / "rig.json", found, "0")
+    assert [p.read_bytes() for p in paths] == bytes_before
+    (tmp_path / "rig.npz").unlink()
+    with pytest.raises(ValueError, match=r"expected its maps in rig\.npz beside it, found none"):
+        read_calibration(tmp_path / "rig.json")
+
+
+def save(path: Path, mosaic: Mosaic) -> Path:
+    """A frame as a 16-bit TIFF."""
+    tifffile.imwrite(path, mosaic.data.numpy().astype(np.uint16))
+    return path
+
+
+def test_commands_measure_and_apply(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
+    """Dark and flat build one file; with it, levels need not be typed; the same as in Python; bad input is one line."""
+    sensor = BadSensor(Layout())
+    rig = tmp_path / "rig.json"
+    caps = [save(tmp_path / f"cap{i}.tiff", sensor.expose(np.zeros(SIZE))) for i in range(4)]
+    paper = [save(tmp_path / f"paper{i}.tiff", sensor.expose(sensor.sees(np.full(SIZE, 1.0)))) for i in range(4)]
+    shot = save(tmp_path / "shot.tiff", sensor.expose(sensor.sees(np.full(SIZE, 0.7), 0.2, 1.0)))
+    room = save(tmp_path / "room.tiff", sensor.expose(sensor.sees(np.full(SIZE, 0.1))))
+    done = run_polsep("calibrate", "dark", *caps, "--white-level", 4095, "-o", rig)
+    assert done.status == 0 and done.out.count("\n") == 1 and "read noise" in done.out
+    done = run_polsep("calibrate", "flat", *paper, "-o", rig)
+    assert done.status == 0 and "20 dead pixels" in done.out
+    assert set(json.loads(rig.read_text())) >= {"dark", "flat", "maps"}
+    done = run_polsep(
+        *("separate", shot, "--calibration", rig, "--ambient", room, "--method", "analytic"),
+        *("-o", tmp_path / "out", "--format", "npz"),
+    )
+    assert done.status == 0
+    assert json.loads((tmp_path / "out" / "shot.json").read_text())["report"]["settings"]["calibration"] == "rig.json"
+    with np.load(tmp_path / "out" / "shot.npz") as written:
+        diffuse = written["diffuse"]
+    raws = [tifffile.imread(path) for path in (shot, room)]
+    with pytest.warns(polsep.PolsepWarning, match="no colour pattern"):
+        out = polsep.separate(raws[0], "analytic", calibration=rig, ambient=raws[1])
+    np.testing.assert_array_equal(diffuse, out.diffuse)
+    assert abs(float((out.diffuse + out.specular).mean()) - 0.6) < 0.01
+    save(tmp_path / "small.tiff", replace(sensor.expose(np.zeros(SIZE)), data=torch.zeros(64, 64)))
+    for arguments, expected in (
+        (("separate", tmp_path / "small.tiff", "--calibration", rig), "expected frames of 160x128, as calibrated"),
+        (("separate", shot, "--calibration", tmp_path / "none.json"), "expected a file, found nothing"),
+        (("separate", shot, "--calibration", shot), "expected a calibration of 'polsep calibrate'"),
+        (("separate", shot, "--ambient", tmp_path / "small.tiff"), "expected an ambient frame of 160x128"),
+        (("calibrate", "dark", *paper, "--white-level", 800, "-o", rig), "expected frames of white level 4095.0"),
+        (("calibrate", "flat", *caps, "-o", rig), "expected flat frames near half of the white level"),
+    ):
+        failed: Run = (
+            run_polsep(*arguments, "-o", tmp_path / "none") if arguments[0] == "separate" else run_polsep(*arguments)
+        )
+        assert failed.status == 2 and failed.err.count("\n") == 1 and expected in failed.err, failed
+
+
+def test_recordings_are_corrected(tmp_path: Path) -> None:
+    """Every frame of a file is corrected as it is read, ambient frames too."""
+    sensor = BadSensor(Layout())
+    write_calibration(tmp_path / "rig.json", sensor.calibration(), "0")
+    frames = [sensor.expose(sensor.sees(np.full(SIZE, 0.5))) for _ in range(3)]
+    codes = np.stack([frame.data.numpy().astype(np.uint16) for frame in frames])
+    np.save(tmp_path / "film.npy", codes)
+    np.save(tmp_path / "room.npy", codes)
+    read = with_corrections(ReadOptions(), tmp_path / "rig.json", [tmp_path / "room.npy"])
+    total = sum(frame.data.linear().double() for frame in read_frames(tmp_path / "film.npy", read))  # type: ignore[union-attr]
+    assert float(total.abs().max()) < 2e-3  # type: ignore[union-attr]

@@ -10,6 +10,8 @@ from __future__ import annotations
 from polsep.bench.exactness import bench_exactness
 from polsep.bench.frontend import bench_frontend, bench_frontend_quick
 from polsep.bench.real import bench_real
+from polsep.bench.reality import bench_reality
+from polsep.bench.reality_plot import draw_reality
 from polsep.bench.resources import bench_resources
 from polsep.bench.run import Bench
 from polsep.bench.separation import bench_separation
@@ -22,6 +24,9 @@ BENCHES: dict[str, Bench] = {
     "separation": Bench(bench_separation, measures=(*SEPARATION, "polsep/render")),
     "exactness": Bench(bench_exactness, measures=("polsep/physics", "polsep/separation")),
     "real": Bench(bench_real, data=("raw",), measures=("polsep/sensor", "polsep/demosaic")),
+    "reality": Bench(
+        bench_reality, bench_reality, draw_reality, measures=(*SEPARATION, "polsep/datasets", "polsep/pipeline.py")
+    ),
     "resources": Bench(bench_resources, measures=(*SEPARATION, "polsep/compute", "polsep/pipeline.py")),
     "frontend": Bench(
         bench_frontend,

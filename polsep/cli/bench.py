@@ -22,7 +22,21 @@ from polsep.cli.app import DIR, app
     metavar="DIR",
     help="Folder of NAME's pictures.  [default: docs/images/NAME; beside the rows with --quick]",
 )
-def bench(name: str, data: Path | None, output: Path, quick: bool, images: Path | None) -> None:
+@click.option("--rows", metavar="A;B", help="Only these rows, of 'reality'; implies --quick.")
+@click.option("--methods", metavar="A,B", help="Only these methods, of 'reality'; implies --quick.")
+@click.option(
+    "--split", metavar="NAME", help="Split that 'reality' draws scenes from: test, or validation for choices."
+)
+def bench(
+    name: str,
+    data: Path | None,
+    output: Path,
+    quick: bool,
+    images: Path | None,
+    rows: str | None,
+    methods: str | None,
+    split: str | None,
+) -> None:
     """Measure NAME, print its rows and write them to DIR/NAME.jsonl; without NAME, list what can be measured.
 
     'polsep bench readme' writes the tables of README.md and docs from DIR. The paper's evaluation runs in a checkout
@@ -37,9 +51,23 @@ def bench(name: str, data: Path | None, output: Path, quick: bool, images: Path 
         fill_tables_of_docs(output, {bench: entry.measures for bench, entry in BENCHES.items()})
     else:
         try:
-            run_bench(BENCHES, name, "polsep bench", Folders(data, output, images), quick)
+            benches = BENCHES
+            if name == "reality":
+                from polsep.bench.reality import RealityOptions, select_reality
+
+                options = RealityOptions(split or "test", _words(rows, ";"), _words(methods, ","))
+                quick = quick or options != RealityOptions()
+                benches = BENCHES | {name: select_reality(BENCHES[name], options, data)}
+            elif rows or methods or split:
+                raise ValueError(f"expected --rows, --methods and --split with reality, found them with {name!r}")
+            run_bench(benches, name, "polsep bench", Folders(data, output, images), quick)
         except ValueError as error:
             raise click.ClickException(f"{error}{_evaluation_hint(name)}") from None
+
+
+def _words(text: str | None, separator: str) -> tuple[str, ...]:
+    """The words of an option, none without it."""
+    return tuple(word.strip() for word in text.split(separator)) if text else ()
 
 
 def _evaluation_hint(name: str) -> str:

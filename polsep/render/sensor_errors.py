@@ -30,8 +30,9 @@ class SensorErrors:
     ``angles_deg``: standard deviation of the analysers' angles within a period [degrees] (IMX250: below 1). ``gains``:
     standard deviation of the pixels' gains (0.01). ``period_gains``: the same of the pixels of one period, that all
     periods share (0.02 where a polarizer's transmittance differs). ``cross_talk``: share of a pixel's light that its
-    four neighbours receive (0.02; Hagen et al. 2019). ``black``: what is added to samples after noise, as a share of
-    white (240 codes of 4095: 0.059). ``defects``: share of defective pixels.
+    four neighbours receive (0.02; Hagen et al. 2019). ``black``: sample without light, as a share of white (240
+    codes of 4095: 0.059). ``defects``: share of defective pixels. ``specimen``: number of the sensor, which
+    fixes its errors for all its frames.
     """
 
     angles_deg: float = 0.0
@@ -40,19 +41,20 @@ class SensorErrors:
     cross_talk: float = 0.0
     black: float = 0.0
     defects: float = 0.0
+    specimen: int = 0
 
 
 def record(light: Stokes, layout: Layout, sensor: Sensor, errors: SensorErrors, seed: int) -> Mosaic:
     """Return a raw frame of ``light [..., C, H, W]`` by a sensor with errors; without any it is `camera.expose`.
 
-    Noise and each error draw from generators of their own that ``seed`` fixes, so that twins with and without an error
-    share their noise.
+    ``seed`` fixes the noise alone, so that twins with and without an error share it.
     """
-    noise, angles, gains, defects = (torch.Generator().manual_seed(4 * seed + k) for k in range(4))
+    noise = torch.Generator().manual_seed(seed)
+    angles, gains, defects = (torch.Generator().manual_seed(3 * errors.specimen + k) for k in range(3))
     samples = filter_with_errors(light, layout, sensor, random_analyser_angles(layout, errors.angles_deg, angles))
     samples = cross_talk(samples, errors.cross_talk)
     samples = vary_gains(samples, layout, (errors.gains, errors.period_gains), gains)
-    samples = (add_noise(samples, sensor, noise) + errors.black).clamp(0, 1)
+    samples = (errors.black + (1 - errors.black) * add_noise(samples, sensor, noise)).clamp(0, 1)
     samples = add_defects(samples, errors.defects, defects)
     if sensor.bits is not None:
         samples = torch.round(samples * sensor.white_level)

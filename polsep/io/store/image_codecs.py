@@ -37,6 +37,11 @@ def encode_jpeg_quickly(pixels: NDArray[np.uint8]) -> bytes:
     return bytes(imagecodecs.jpeg8_encode(np.ascontiguousarray(pixels), level=LIVE_QUALITY, subsampling="444"))
 
 
+def through_jpeg(mosaic: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    """A mosaic ``[H, W]`` of 8 bits after a grey JPEG file of that ``quality``, 1 to 100: what lossy cameras give."""
+    return np.asarray(imagecodecs.jpeg8_decode(imagecodecs.jpeg8_encode(np.ascontiguousarray(mosaic), level=quality)))
+
+
 def write_jpeg(path: Path, pixels: NDArray[np.uint8]) -> None:
     """Write ``pixels`` (uint8, sRGB, ``[h, w, 3]``) as a JPEG file atomically; makes its folder."""
     replace_bytes(path, encode_jpeg(pixels))

@@ -1,0 +1,195 @@
+"""The cost of a world unlike the ideal model: paired twins of `datasets.reality`, the same scene and noise.
+
+Loss: PSNR of the ideal twin, whose white lamp is told, less that of the disturbed frame, of images over its ``unit``.
+Both at half resolution by `polsep.separate` with its defaults, nothing told; "told" rows name what differs. Thresholds
+are chosen on the split "validation" (``--split``); the tables are of "test".
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import statistics
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polsep.bench.period import bench_period
+from polsep.bench.rows import Row
+from polsep.bench.run import Bench
+from polsep.io.store.image_codecs import through_jpeg
+from polsep.methods import METHODS
+from polsep.metrics import psnr
+from polsep.pipeline import PolsepWarning, separate
+
+if TYPE_CHECKING:
+    from polsep.datasets.reality import Frame, Stage
+
+#: Methods in the order of the tables.
+ORDER = ("analytic", "color-affine", "paper", "joint", "joint-fast")
+#: Quality of JPEG files, and the loss against `analytic` that counts as worse than it [dB].
+JPEG_QUALITY, WORSE = 95, 1.0
+#: Ending of the rows that are told what differs.
+TOLD = ", told"
+
+
+@dataclass(frozen=True)
+class RealityOptions:
+    """Measured parts: ``rows`` and ``methods`` by name, empty for all; ``scenes``: at most so many of each kind.
+
+    ``size``: of frames; corners, which take long, have half of it.
+    """
+
+    split: str = "test"
+    rows: tuple[str, ...] = ()
+    methods: tuple[str, ...] = ()
+    scenes: int = 8
+    size: int = 512
+
+
+class Kind(NamedTuple):
+    """Stages of one kind: what builds one, how many there are, their ideal twin, and the disturbances they show."""
+
+    name: str
+    build: Callable[[str, int, int], Stage]
+    stages: int
+    ideal: Callable[[Stage], Frame]
+    rows: Mapping[str, Callable[[Stage], Frame]]
+
+
+class Score(NamedTuple):
+    """PSNR of both images [dB], and the warnings of the frame's report."""
+
+    diffuse: float
+    specular: float
+    warnings: tuple[str, ...]
+
+
+@lru_cache(maxsize=1)
+def find_kinds() -> tuple[Kind, ...]:
+    """Return all kinds of stages. Raises ValueError without the extra render."""
+    try:
+        from polsep.datasets import corners, reality
+    except ImportError as error:
+        raise ValueError(f"expected the extra render (pip install 'polsep[render]'), found no {error.name}") from None
+
+    def compress(stage: Stage) -> Frame:
+        frame = reality.DISTURBANCES["8 bits"](stage)
+        return replace(frame, raw=through_jpeg(frame.raw, JPEG_QUALITY))
+
+    def build_corner(split: str, number: int, size: int) -> Stage:
+        return corners.build_corner(split, number, size // 2)
+
+    objects = reality.DISTURBANCES | {f"8 bits, JPEG {JPEG_QUALITY}": compress}
+    corner = {"inter-reflections": corners.corner_frame} if importlib.util.find_spec("mitsuba") else {}
+    return (
+        Kind("objects", reality.build_stage, 8, reality.ideal_frame, objects),
+        Kind("mannequins", reality.build_mannequin, 4, reality.ideal_mannequin, reality.SHEENS),
+        Kind("corners", build_corner, 3, reality.ideal_frame, corner),
+    )
+
+
+def bench_reality(options: RealityOptions | None = None, data: Path | None = None) -> Iterator[Row]:
+    """Loss of every method by what real lamps, rooms, surfaces and sensors differ in, nothing told and told.
+
+    With ``data``, a folder with raw frames, also the mosaic's pattern in their outputs. Inter-reflections need the
+    extra mitsuba. Raises ValueError without the extra render, and on names of rows or methods that there are not.
+    """
+    options = options or RealityOptions()
+    rows = tuple(name for kind in find_kinds() for name in kind.rows)
+    for what, known in (("rows", rows), ("methods", tuple(METHODS))):
+        unknown = [name for name in getattr(options, what) if name not in known]
+        if unknown:
+            raise ValueError(f"expected {what} of {'; '.join(known)}, found {'; '.join(unknown)}")
+    methods = options.methods or tuple(name for name in ORDER if name in METHODS)
+    for kind in find_kinds():
+        chosen = {name: make for name, make in kind.rows.items() if name in (options.rows or rows)}
+        if chosen:
+            yield from _bench_kind(kind._replace(rows=chosen), methods, options)
+    if data is not None and (data / "raw").is_dir() and not options.rows:
+        yield from bench_period(data, methods)
+
+
+def select_reality(bench: Bench, options: RealityOptions, data: Path | None) -> Bench:
+    """Return the benchmark with these options and the raw frames of ``data``; quickly: two scenes of each kind."""
+    few = options if options.rows else replace(options, scenes=2)
+    return replace(bench, run=partial(bench_reality, options, data), quick=partial(bench_reality, few))
+
+
+def _bench_kind(kind: Kind, methods: Sequence[str], options: RealityOptions) -> Iterator[Row]:
+    ideal: dict[str, list[Score]] = {}
+    found: dict[tuple[str, str], list[Score]] = {}
+    wanted = tuple(dict.fromkeys(("analytic", *methods)))
+    for number in range(min(kind.stages, options.scenes)):
+        stage = kind.build(options.split, number, options.size)
+        twin = kind.ideal(stage)
+        for method in wanted:
+            ideal.setdefault(method, []).append(score(twin, method, True))
+        for name, make in kind.rows.items():
+            frame = make(stage)
+            for told in (False,) if frame.told is None or name == "white lamp" else (False, True):
+                for method in wanted:
+                    found.setdefault((name + TOLD * told, method), []).append(score(frame, method, told))
+    for method in methods:
+        yield from _means("reality/ideal", f"{kind.name}, undisturbed", method, "PSNR", ideal[method])
+    for (name, method), scores in found.items():
+        if method in methods:
+            yield from _summarize(name, method, (ideal[method], scores, found[name, "analytic"]))
+
+
+def _summarize(name: str, method: str, scores: tuple[list[Score], list[Score], list[Score]]) -> Iterator[Row]:
+    """Rows of one disturbance and method from its ideal, its disturbed and the formula's scores."""
+    ideal, found, formula = scores
+    part = "told" if name.endswith(TOLD) else "loss"
+    losses = [
+        Score(a.diffuse - b.diffuse, a.specular - b.specular, b.warnings) for a, b in zip(ideal, found, strict=True)
+    ]
+    yield from _means(f"reality/{part}", name, method, "loss", losses)
+    yield from _means(f"reality/{part}_psnr", name, method, "PSNR", found)
+    for output in ("diffuse", "specular"):
+        worst = max(getattr(loss, output) for loss in losses)
+        yield Row(f"reality/{part}_worst", name, method, f"{output} loss, worst scene", worst, "dB")
+    for k, loss in enumerate(losses):
+        for output in ("diffuse", "specular"):
+            yield Row("reality/scenes", f"{name}, scene {k}", method, f"{output} loss", getattr(loss, output), "dB")
+    behind = [min(a.diffuse - b.diffuse, a.specular - b.specular) < -WORSE for a, b in zip(found, formula, strict=True)]
+    if method != "analytic":
+        yield Row(f"reality/{part}_below", name, method, "frames below analytic", 100 * statistics.fmean(behind), "%")
+    warned = [bool(one.warnings) for one in found]
+    yield Row(f"reality/{part}_warned", name, method, "frames warned", 100 * statistics.fmean(warned), "%")
+
+
+def _means(bench: str, case: str, method: str, metric: str, scores: list[Score]) -> Iterator[Row]:
+    for output in ("diffuse", "specular"):
+        yield Row(bench, case, method, f"{output} {metric}", statistics.fmean(getattr(s, output) for s in scores), "dB")
+
+
+def score(frame: Frame, method: str, told: bool) -> Score:
+    """Return the scores of a method on a frame, whose differences are ``told`` or not."""
+    options = dict(frame.told or {}) if told else {}
+    raw = frame.raw
+    if "ambient" in options and "ambient" not in _known_options():
+        dark = options.pop("ambient").astype(np.float32)
+        raw = np.where(raw >= frame.white_level, frame.white_level, raw - dark).astype(np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PolsepWarning)
+        out = separate(raw, method, white_level=frame.white_level, **options)
+
+    def compare(image: NDArray[np.float32], truth: Tensor) -> float:
+        return psnr(torch.from_numpy(image).permute(2, 0, 1) / frame.unit, truth / frame.unit, frame.mask)
+
+    diffuse, specular = compare(out.diffuse, frame.diffuse), compare(out.specular, frame.specular)
+    return Score(diffuse, specular, tuple(out.report["warnings"]))
+
+
+@lru_cache(maxsize=1)
+def _known_options() -> Any:
+    return inspect.signature(separate).parameters

@@ -16,6 +16,7 @@ from test_cli import Cli, Run
 from test_cli import polsep as run_polsep  # noqa: F401
 
 import polsep
+from polsep.calibrate.analysers import measure_analysers
 from polsep.calibrate.dark_flat import measure_dark, measure_flat
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import ReadOptions, read_frames
@@ -119,6 +120,51 @@ def test_dark_and_flat_recover_a_sensor(layout: Layout) -> None:
     assert np.abs(falloff_image(flat.falloff, *SIZE) / sensor.falloff - 1).max() < 0.02
     assert set(sensor.dead) <= set(flat.dead.tolist()) and len(flat.dead) == len(sensor.dead)
     assert flat.black_map is dark.black_map
+
+
+@pytest.mark.parametrize("layout", [Layout(), MONO], ids=lambda x: x.spec)
+@pytest.mark.parametrize("flat", [True, False])
+def test_a_turned_polarizer_shows_the_analysers(layout: Layout, flat: bool) -> None:
+    """Ten frames at unknown angles, with light that varies by 1 %, give angles within 0.4 degrees (0.1 after a flat
+    frame) and extinction ratios of 30 within 1.5; the same frames in another order give the same."""
+    sensor = BadSensor(layout, dead=0)
+    truth = sensor.calibration()
+    known = replace(truth, gains=truth.gains if flat else None, gain_map=truth.gain_map if flat else None)
+    used = Corrections(replace(known, analysers=None))
+    aolps = np.linspace(0, np.pi, 10, endpoint=False) + sensor.rng.normal(0, 0.1, 10)
+    levels = 0.8 * (1 + sensor.rng.normal(0, 0.01, 10))
+    frames = [
+        used.apply(sensor.expose(sensor.sees(np.full(SIZE, level), 1.0, aolp)))
+        for level, aolp in zip(levels, aolps, strict=True)
+    ]
+    found = measure_analysers(frames, replace(known, analysers=None))
+    assert found.analysers is not None and truth.analysers is not None
+    off = np.array(found.analysers) - np.array(truth.analysers)
+    angles = (off[..., 0] + 90) % 180 - 90
+    assert np.abs(angles).max() < (0.1 if flat else 0.4)
+    assert np.abs(off[..., 1]).max() < 1.5
+    assert abs(angles.mean()) < 0.02
+    again = measure_analysers(frames[::-1], replace(known, analysers=None))
+    np.testing.assert_allclose(np.array(again.analysers), np.array(found.analysers), rtol=1e-4)
+    imperfect = measure_analysers(frames, replace(known, analysers=None), polarizer_extinction=50.0)
+    assert imperfect.details["analysers"]["diattenuation"] > found.details["analysers"]["diattenuation"]
+
+
+def test_frames_that_show_no_turned_polarizer_are_refused() -> None:
+    """Too few frames, frames of one angle and unpolarized ones are a line each."""
+    sensor = BadSensor(Layout(), dead=0)
+
+    def frames(aolps: list[float], dolp: float = 1.0) -> list[Mosaic]:
+        return [replace(sensor.expose(sensor.sees(np.full(SIZE, 0.8), dolp, t)), black_level=LEVEL) for t in aolps]
+
+    for some, expected in (
+        ([], "found none"),
+        (frames([0.0, 1.0]), "at least 5 frames behind a turned polarizer, found 2"),
+        (frames([0.0, 0.1, 0.2, 0.1, 0.0]), "expected polarizer angles spread over 180 degrees"),
+        (frames([0.0, 1.0, 2.0, 1.5, 0.4], dolp=0.1), "expected frames behind a linear polarizer"),
+    ):
+        with pytest.raises(ValueError, match=expected):
+            measure_analysers(some)
 
 
 def test_one_frame_gives_tables_and_no_map() -> None:

@@ -62,4 +62,12 @@ def describe(found: Calibration, kind: str) -> str:
             f"{facts['pixel_gains_rms']:.2%} rms, falloff to {facts['falloff_least']:.2f}, {facts['dead_pixels']} dead "
             f"pixels, {facts['frames']} frames at {facts['brightness']:.0%} of white{facts.get('remark', '')}"
         )
+    if kind == "analysers":
+        ratios = sorted(a.extinction for row in found.analysers or () for a in row)
+        return (
+            f"angles off by {facts['angle_off_rms_deg']:.2f} deg rms, {facts['angle_off_largest_deg']:.2f} at most "
+            f"(+- {facts['angle_error_deg']:.2f}), extinction {ratios[0]:.0f} to {ratios[-1]:.0f} (diattenuation "
+            f"{facts['diattenuation']:.4f} +- {facts['diattenuation_error']:.2g}), gains +- {facts['gain_error']:.2g}, "
+            f"{facts['frames']} frames that differ by {facts['residual_rms']:.2%} from the model"
+        )
     return str(dict(facts))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,3 +69,26 @@ def flat(files: tuple[Path, ...], output: Path, **options: Any) -> None:
     from polsep.calibrate.files import calibrate_files
 
     print(calibrate_files(files, read_options(options), output, "flat", measure_flat))
+
+
+@calibrate.command()
+@frame_options
+@click.option(
+    "--polarizer-extinction",
+    type=float,
+    metavar="N",
+    help="Extinction ratio of the turned polarizer.  [default: perfect]",
+)
+def analysers(files: tuple[Path, ...], output: Path, polarizer_extinction: float | None, **options: Any) -> None:
+    """Angle, extinction ratio and gain of each analyser, from frames behind a polarizer that is turned by hand.
+
+    Hold a good linear polarizer before the lens, look at evenly lit white paper, and take ten frames, each with the
+    polarizer turned by some 20 degrees more. Its angles need not be known; lamp, exposure and paper stay as they are.
+    The middle of the frames is used. Measure flat before: it makes this more exact.
+    """
+    from polsep.calibrate.analysers import measure_analysers
+    from polsep.calibrate.files import calibrate_files
+
+    extinction = math.inf if polarizer_extinction is None else polarizer_extinction
+    measure = partial(measure_analysers, polarizer_extinction=extinction)
+    print(calibrate_files(files, read_options(options), output, "analysers", measure))

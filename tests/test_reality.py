@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -25,7 +26,7 @@ from polsep.datasets.reality import (
     light_room,
     light_stage,
 )
-from polsep.physics.stokes import Stokes, dolp
+from polsep.physics.stokes import Stokes
 from polsep.render.disturbances import LAMPS, add_scenes, specular_angle
 from polsep.render.sphere_tracing import Scene
 
@@ -80,13 +81,14 @@ def test_what_is_told_is_true() -> None:
 
 
 def test_rooms_are_diffuse_and_have_their_share() -> None:
-    """Specular truth is that of the lamp; the room's light is little polarized."""
+    """Specular truth is that of the lamp; the room's polarization has nothing of the lamp's."""
     lamp, room = light_stage(stage()), light_room(stage(), 0.3)
     assert float(room.specular.s0.abs().max()) == 0
     share = room.diffuse.s0[:, room.mask].mean() / lamp.diffuse.s0[:, lamp.mask].mean()
     assert 0.3 < float(share) < 0.6  # its mirror image comes on top
-    mean = Stokes(*(getattr(room.diffuse, s)[:, room.mask].mean().view(1, 1, 1) for s in ("s0", "s1", "s2")))
-    assert float(dolp(mean)) < 0.15
+    turned = light_room(replace(stage(), light=replace(stage().light, polarizer=1.0)), 0.3).diffuse
+    scale = room.diffuse.s0.sum() / turned.s0.sum()
+    torch.testing.assert_close(turned.s1 * scale, room.diffuse.s1, rtol=1e-4, atol=1e-6)
     with_room = frame("room light 30 %")
     torch.testing.assert_close(with_room.specular / with_room.unit, frame("white lamp").specular, rtol=1e-4, atol=1e-5)
 
@@ -135,7 +137,7 @@ def test_patterns_of_the_period_are_found() -> None:
     generator = torch.Generator().manual_seed(1)
     image = 0.5 + 0.02 * torch.randn(3, 256, 256, generator=generator)
     clean = measure_pattern(image, 2)
-    assert abs(clean.whole) < 1.5
+    assert -4 < clean.whole < 1
     rows, cols = torch.meshgrid(torch.arange(32), torch.arange(32), indexing="ij")
     image[:, 64:96, 128:160] += 0.05 * (1 - 2.0 * ((rows + cols) % 2))
     found = measure_pattern(image, 2)

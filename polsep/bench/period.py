@@ -44,15 +44,17 @@ def measure_pattern(image: Tensor, period: int) -> Pattern:
     power = torch.fft.fft2(tiles * window * window[:, None]).abs() ** 2
     step = TILE // period
     at = [(y * step, x * step) for y in range(period) for x in range(period) if (y, x) != (0, 0)]
+    far = torch.ones(2 * AROUND + 1, 2 * AROUND + 1, dtype=torch.bool)
+    far[AROUND - NEAR : AROUND + NEAR + 1, AROUND - NEAR : AROUND + NEAR + 1] = False
     peaks, floors = [], []
     for y, x in at:
         rows, cols = ((torch.arange(k - AROUND, k + AROUND + 1)) % TILE for k in (y, x))
         near = power[..., rows[:, None], cols]
-        far = torch.ones(2 * AROUND + 1, 2 * AROUND + 1, dtype=torch.bool)
-        far[AROUND - NEAR : AROUND + NEAR + 1, AROUND - NEAR : AROUND + NEAR + 1] = False
         peaks.append(power[..., y, x])
+        # Edges along the mosaic have power at all frequencies across them, so rows and columns count by themselves.
+        around = (near[..., far], near[..., AROUND, far[AROUND]], near[..., far[:, AROUND], AROUND])
         # The median of exponentially distributed powers is ln 2 of their mean.
-        floors.append(near[..., far].median(dim=-1).values / math.log(2))
+        floors.append(torch.stack([x.median(dim=-1).values for x in around]).amax(dim=0) / math.log(2))
     peak, floor = torch.stack(peaks), torch.stack(floors)
     least = 1e-12 * float(power.mean()) + 1e-30
     whole = 10 * math.log10((float(peak.mean()) + least) / (float(floor.mean()) + least))

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import lru_cache, reduce
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,7 @@ BAD = SensorErrors(angles_deg=1.5, gains=0.03, period_gains=0.02, cross_talk=0.0
 RIG = SensorErrors(angles_deg=1.0, gains=0.01, cross_talk=0.02)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stage:
     """A view of surfaces with materials under a lamp, all that a frame needs but the disturbance.
 
@@ -166,29 +167,30 @@ def light_room(stage: Stage, share: float) -> Scene:
     `ROOM_LIGHTS` distant lights all around, brighter on one side, of one colour. ``share``: mean of the light that
     they reflect diffusely over that of the lamp, on the mask.
     """
-    generator = stage.draw(2)
-    bright, tint = (
-        torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0),
-        torch.rand(2, generator=generator),
-    )
+    room = _light_from_around(stage)
+    mask = room.mask
+    gain = share * light_stage(stage).diffuse.s0[:, mask].mean() / room.diffuse.s0[:, mask].mean()
     low, high = ROOM_COLORS
-    red, blue = (low + (high - low) * x for x in tint.tolist())
+    red, blue = (low + (high - low) * torch.rand(2, generator=stage.draw(2))).tolist()
+    lit = scale_light(room, gain * as_color((red, 1.0, blue)))
+    return Scene(lit.diffuse + lit.specular, lit.specular * 0.0, mask)
+
+
+@lru_cache(maxsize=1)
+def _light_from_around(stage: Stage) -> Scene:
+    """The stage under white lights all around, without a lamp; each is two lamps with crossed polarizers."""
+    bright = torch.nn.functional.normalize(torch.randn(3, generator=stage.draw(6)), dim=0)
     materials = replace(stage.materials, roughness=stage.materials.roughness.clamp(min=ROOM_ROUGHNESS))
     if materials.textures is not None:
         rough = materials.textures.roughness.clamp(min=ROOM_ROUGHNESS)
         materials = replace(materials, textures=replace(materials.textures, roughness=rough))
-    far, total = 50 * stage.shape.size, None
+    far, scenes = 50 * stage.shape.size, []
     for direction in _spiral(ROOM_LIGHTS):
         strength = 1 + ROOM_CONTRAST * float(direction @ bright)
         x, y, z = (far * direction).tolist()
-        for polarizer in (0.0, math.pi / 2):
-            scene = light_stage(stage, PointLight((x, y, z), strength * far**2, polarizer), materials)
-            total = scene if total is None else add_scenes(total, scene)
-    assert total is not None
-    mask = total.mask
-    gain = share * light_stage(stage).diffuse.s0[:, mask].mean() / total.diffuse.s0[:, mask].mean()
-    lit = scale_light(total, gain * as_color((red, 1.0, blue)))
-    return Scene(lit.diffuse + lit.specular, lit.specular * 0.0, mask)
+        light = PointLight((x, y, z), strength * far**2, 0.0)
+        scenes += [light_stage(stage, light, materials), light_stage(stage, _turned(light), materials)]
+    return reduce(add_scenes, scenes)
 
 
 def _spiral(count: int) -> Tensor:

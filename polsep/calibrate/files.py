@@ -7,10 +7,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from polsep.calibrate.exposures import merge_exposures
 from polsep.io.raw.corrections import read_mosaics
-from polsep.io.raw.frames import ReadOptions
-from polsep.io.store.atomic import refuse_inputs
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.tiff import write_merged
+from polsep.io.store.atomic import refuse_existing, refuse_inputs
 from polsep.io.store.calibrations import maps_path, read_calibration, write_calibration
+from polsep.io.store.errors import input_error
 from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Mosaic
 
@@ -31,6 +34,44 @@ def calibrate_files(paths: Sequence[Path], read: ReadOptions, output: Path, kind
     found = measure(read_mosaics(paths, replace(read, corrections=used)), before)
     written = write_calibration(output, found, importlib.metadata.version("polsep"))
     return f"{kind}: {describe(found, kind)} -> {', '.join(str(path) for path in written)}"
+
+
+def merge_files(
+    paths: Sequence[Path], read: ReadOptions, output: Path, times: Sequence[float] | None, overwrite: bool
+) -> tuple[str, tuple[str, ...]]:
+    """Merge the frames of files into a float TIFF; a line about it, and notes. Times: as stated, else of the files.
+
+    Raises ValueError.
+    """
+    if output.suffix.lower() not in (".tif", ".tiff"):
+        raise ValueError(f"expected an output that ends in .tiff, found {output.name!r}")
+    refuse_inputs([output], paths)
+    refuse_existing(output.parent, [output], overwrite)
+    frames, notes = list[Mosaic](), list[str]()
+    recorded = list[float | None]()
+    for path in paths:
+        for frame in read_frames(path, read):
+            if not isinstance(frame.data, Mosaic):
+                raise input_error(path, "expected a raw mosaic, found four angle images")
+            frames.append(frame.data)
+            recorded.append(frame.exposure)
+            notes += [f"{frame.stem}: {note}" for note in frame.notes]
+    known = [time for time in recorded if time is not None]
+    said = "as stated" if times is not None else "of the files" if len(known) == len(frames) else "found in the frames"
+    merged = merge_exposures(frames, known if times is None and len(known) == len(frames) else times)
+    facts = {
+        "exposure_times": [float(f"{time:.6g}") for time in merged.times],
+        "noise_gain": merged.noise.gain,
+        "noise_floor": merged.noise.floor,
+    }
+    write_merged(output, merged.mosaic, facts)
+    shortest, longest = min(merged.times), max(merged.times)
+    line = (
+        f"{len(frames)} frames, exposure times {', '.join(f'{time:.4g}' for time in merged.times)} ({said}), range "
+        f"{longest / shortest:.3g}, {float(merged.mosaic.clipped().float().mean()):.2%} of the samples clipped in the "
+        f"shortest -> {output}"
+    )
+    return line, (*notes, *merged.notes)
 
 
 def corrections_for(kind: str, before: Calibration) -> Corrections:

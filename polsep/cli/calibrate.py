@@ -1,4 +1,4 @@
-"""Measuring a sensor and a lamp: calibrate, with one command per kind."""
+"""Measuring a sensor and a lamp: calibrate, with one command per kind; and merging exposures: merge."""
 
 from __future__ import annotations
 
@@ -10,7 +10,19 @@ from typing import Any
 
 import click
 
-from polsep.cli.app import BLACK_LEVEL, FILE, LAYOUT, PIXEL_FORMAT, SIZE, WHITE_LEVEL, app, read_options
+from polsep.cli.app import (
+    BLACK_LEVEL,
+    CALIBRATION,
+    FILE,
+    LAYOUT,
+    OVERWRITE,
+    PIXEL_FORMAT,
+    SIZE,
+    WHITE_LEVEL,
+    app,
+    print_note,
+    read_options,
+)
 
 FRAMES = click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FRAMES...")
 OUTPUT = click.option(
@@ -92,3 +104,42 @@ def analysers(files: tuple[Path, ...], output: Path, polarizer_extinction: float
     extinction = math.inf if polarizer_extinction is None else polarizer_extinction
     measure = partial(measure_analysers, polarizer_extinction=extinction)
     print(calibrate_files(files, read_options(options), output, "analysers", measure))
+
+
+@app.command()
+@FRAMES
+@click.option("-o", "--output", type=FILE, required=True, metavar="OUT.tiff", help="The merged frame.")
+@click.option(
+    "--times", metavar="T,...", help="Exposure time of each frame in any unit.  [default: of the files, or the frames]"
+)
+@LAYOUT
+@BLACK_LEVEL
+@WHITE_LEVEL
+@CALIBRATION
+@SIZE
+@PIXEL_FORMAT
+@OVERWRITE
+def merge(files: tuple[Path, ...], output: Path, times: str | None, overwrite: bool, **options: Any) -> None:
+    """Merge frames of one still scene at different exposure times into one, without clipping and with less noise.
+
+    The camera, the lamp and its polarizer must not move between the frames. OUT is a float TIFF, which every command
+    reads without further options: black at 0, and white at 1, where the shortest exposure clips.
+
+    \b
+    polsep merge short.png middle.png long.png --white-level 4095 --black-level 64 -o merged.tiff
+    polsep merge exposures/*.tiff --times 1,4,16 --calibration rig.json -o merged.tiff
+    """
+    from polsep.calibrate.files import merge_files
+
+    line, notes = merge_files(files, read_options(options), output, _parse_times(times), overwrite)
+    for note in notes:
+        print_note(note)
+    print(line)
+
+
+def _parse_times(text: str | None) -> list[float] | None:
+    """Exposure times from ``T,T,...``; None for None."""
+    try:
+        return None if text is None else [float(time) for time in text.split(",")]
+    except ValueError:
+        raise ValueError(f"expected --times T,T,... like 1,4,16, found {text!r:.40}") from None

@@ -186,28 +186,38 @@ def _legendre(count: int, terms: int) -> NDArray[np.float64]:
 def repair_known(samples: Floats, dead: NDArray[np.int32], period: int) -> Floats:
     """Samples ``[H, W]`` with each dead one replaced, in place, by the mean of its sound neighbours of the same kind.
 
-    These are the ones a ``period`` away along rows and columns; then those along diagonals; else it stays.
+    These are the ones a ``period`` away along rows and columns; where none is sound, along diagonals; else it stays.
     """
-    height, width = samples.shape
-    mask = np.zeros(samples.shape, bool)
-    mask.flat[dead] = True
-    rows, cols = np.divmod(dead, width)
-    fixed = samples[rows, cols].copy()
-    todo = np.ones(dead.size, bool)
-    for steps in (((0, 1), (1, 0), (0, -1), (-1, 0)), ((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        total, count = np.zeros(dead.size, np.float64), np.zeros(dead.size, np.int64)
-        for down, right in steps:
-            y, x = rows + down * period, cols + right * period
-            inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-            y, x = np.where(inside, y, 0), np.where(inside, x, 0)
-            sound = inside & ~mask[y, x]
-            total += np.where(sound, samples[y, x], 0)
-            count += sound
-        now = todo & (count > 0)
-        fixed[now] = (total[now] / count[now]).astype(np.float32)
-        todo &= ~now
-    samples[rows, cols] = fixed
+    sound = np.ones(samples.shape, bool)
+    sound.flat[dead] = False
+    beside, count = _same_kind(samples, sound, dead, (period, _BESIDE))
+    across, more = _same_kind(samples, sound, dead, (period, _DIAGONAL))
+    own = samples.flat[dead]
+    samples.flat[dead] = np.where(count > 0, beside, np.where(more > 0, across, own))
     return samples
+
+
+#: Steps to the neighbours of the same kind, in periods down and right.
+_BESIDE, _DIAGONAL = ((0, 1), (1, 0), (0, -1), (-1, 0)), ((1, 1), (1, -1), (-1, 1), (-1, -1))
+
+
+def _same_kind(
+    samples: Floats, sound: NDArray[np.bool_], places: NDArray[Any], steps: tuple[int, tuple[tuple[int, int], ...]]
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Mean of the ``sound`` neighbours of samples at ``places``, 0 without any, and their number."""
+    period, directions = steps
+    height, width = samples.shape
+    rows, cols = np.divmod(places, width)
+    total, count = np.zeros(places.size, np.float32), np.zeros(places.size, np.int64)
+    for down, right in directions:
+        y, x = rows + down * period, cols + right * period
+        inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+        y, x = np.where(inside, y, 0), np.where(inside, x, 0)
+        used = inside & sound[y, x]
+        total += np.where(used, samples[y, x], np.float32(0))
+        count += used
+    mean: Floats = total / np.maximum(count, 1).astype(np.float32)
+    return mean, count
 
 
 class Neighbours(NamedTuple):

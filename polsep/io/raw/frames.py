@@ -110,7 +110,8 @@ class ReadOptions:
 class Frame:
     """One frame of a file: ``stem`` names its outputs, ``notes`` are one-line remarks for the user.
 
-    It is number ``index`` of ``count`` (approximate where a video does not say).
+    It is number ``index`` of ``count`` (approximate where a video does not say). ``exposure``: its time in seconds,
+    where the file says it.
     """
 
     stem: str
@@ -118,6 +119,7 @@ class Frame:
     notes: tuple[str, ...]
     index: int = 0
     count: int = 1
+    exposure: float | None = None
 
 
 def read_frames(path: str | Path, options: ReadOptions | None = None, first: int = 0) -> Iterator[Frame]:
@@ -141,7 +143,7 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
             data, notes = _convert(page, options)
         stem = output_stem(path)
         name = stem if page.count == 1 else f"{stem}_{page.index:04d}"
-        yield Frame(name, data, page.notes + notes, page.index, page.count)
+        yield Frame(name, data, page.notes + notes, page.index, page.count, page.exposure)
 
 
 def read_pages(path: Path, options: ReadOptions | None = None, first: int = 0) -> Iterator[Page]:
@@ -191,6 +193,10 @@ def output_stem(path: str | Path) -> str:
 def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
     """Codes to light, by the rules of the module, corrected; and notes."""
     data, notes = _to_light(page, options)
+    if page.merged is not None and isinstance(data, Mosaic):
+        if options.corrections is not None and options.corrections.calibration is not None:
+            raise ValueError("expected --calibration with 'polsep merge', found it with a frame that is merged already")
+        data = replace(data, light_color=page.merged.light_color, falloff=page.merged.falloff)
     if options.corrections is None:
         return data, notes
     if isinstance(data, Measurements):

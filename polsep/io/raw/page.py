@@ -8,17 +8,25 @@ checks of `io.store.header_checks`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
 from polsep.sensor.camera import Layout
 
 
+class MergedFacts(NamedTuple):
+    """Properties of a frame of `polsep merge`, which nothing may correct again: fields of `Mosaic`."""
+
+    light_color: tuple[float, ...]
+    falloff: tuple[tuple[float, ...], ...] | None
+
+
 @dataclass(frozen=True)
 class Page:
     """One picture of a file: ``array`` ``[H, W]`` or ``[H, W, C]``; with ``angles`` a leading axis of 0, 45, 90, 135.
 
+    ``exposure``: its time in seconds. ``merged``: facts of a frame of `polsep merge`.
     ``index`` of ``count`` pictures. ``white_level`` and ``layout`` are those that the file itself names, or None.
     ``sampled``: the angle planes were taken from one mosaic, so their pixels lie at different points.
     """
@@ -31,3 +39,5 @@ class Page:
     angles: bool = False
     sampled: bool = False
     notes: tuple[str, ...] = ()
+    exposure: float | None = None
+    merged: MergedFacts | None = None

@@ -184,11 +184,13 @@ def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
     count, rest = divmod(path.with_name(RAW).stat().st_size, header.frame_bytes)
     notes = (f"{RAW} ends within a frame: {rest} bytes after frame {count - 1} are left out",) if rest else ()
     size = (header.width, header.height)
+    exposure_us = header.settings.get("exposure_us")
+    exposure = exposure_us * 1e-6 if isinstance(exposure_us, int | float) and exposure_us > 0 else None
     for index, image in enumerate(read_images(path, first), first):
         page = headerless_page(image.payload, size, header.pixel_format, index, count)
         if header.layout is not None:
             page = replace(page, layout=Layout.parse(header.layout), notes=())
-        yield replace(page, notes=page.notes + notes)
+        yield replace(page, notes=page.notes + notes, exposure=exposure)
 
 
 def _read_index(path: Path) -> dict[int, dict[str, Any]]:

@@ -7,18 +7,24 @@ Source: Adobe, TIFF Revision 6.0; Adobe, Digital Negative Specification 1.7 (pho
 
 from __future__ import annotations
 
+import json
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import tifffile
 
-from polsep.io.raw.page import Page
+from polsep.io.raw.page import MergedFacts, Page
+from polsep.io.store.atomic import atomic_path
 from polsep.io.store.errors import InputError, decoding
 from polsep.io.store.header_checks import require_signature, require_size
+from polsep.sensor.camera import Layout, Mosaic
+
+#: Format of the description of merged frames.
+MERGED = "polsep merged mosaic 1"
 
 #: Photometric interpretations in which larger means brighter and samples are the data themselves.
 _PHOTOMETRIC = {1: "black is zero", 2: "RGB", 32803: "colour filter array", 34892: "linear raw"}
@@ -73,9 +79,54 @@ def _read_page(page: tifffile.TiffPage | tifffile.TiffFrame, size: int, index: i
         array = np.moveaxis(array, 0, -1)
     bits = page.bitspersample
     white = 2.0**bits - 1 if array.dtype == np.uint16 and bits < 16 else None
+    facts = _merged_facts(page)
+    if facts is not None:
+        return Page(array, index, count, 1.0, Layout.parse(facts["layout"]), merged=_as_merged(facts))
     orientation = page.tags.valueof(274, default=1)
     notes = () if orientation == 1 else (f"TIFF orientation {orientation} is not applied: pixels stay as stored",)
-    return Page(array, index, count, white_level=white, notes=notes)
+    return Page(array, index, count, white_level=white, notes=notes, exposure=_exposure_time(page))
+
+
+def _exposure_time(page: tifffile.TiffPage) -> float | None:
+    """Exposure time in seconds, of the tag ExposureTime in the directory or in its EXIF; None without one."""
+    exif = page.tags.valueof(34665)
+    found = page.tags.valueof(33434) or (exif.get("ExposureTime") if isinstance(exif, dict) else None)
+    if isinstance(found, tuple) and len(found) == 2 and found[1]:
+        found = found[0] / found[1]
+    return float(found) if isinstance(found, int | float) and 0 < found < math.inf else None
+
+
+def _merged_facts(page: tifffile.TiffPage) -> dict[str, Any] | None:
+    """The facts that `write_merged` put into the description; None in other files."""
+    text = page.tags.valueof(270)
+    if not isinstance(text, str) or not text.startswith('{"format": "' + MERGED):
+        return None
+    facts = json.loads(text)
+    return facts if isinstance(facts, dict) else None
+
+
+def _as_merged(facts: dict[str, Any]) -> MergedFacts:
+    falloff = facts["falloff_legendre"]
+    falloff = None if falloff is None else tuple(tuple(float(x) for x in row) for row in falloff)
+    return MergedFacts(tuple(float(x) for x in facts["light_color"]), falloff)
+
+
+def write_merged(path: Path, mosaic: Mosaic, facts: Mapping[str, Any]) -> None:
+    """Write a merged float mosaic, black 0 and white 1, atomically; ``facts``: more for people. Raises OSError."""
+    text = {
+        "format": MERGED,
+        "layout": mosaic.layout.spec,
+        "black_level": 0,
+        "white_level": 1,
+        "light_color": mosaic.light_color,
+        "falloff_legendre": mosaic.falloff,
+        **facts,
+    }
+    with atomic_path(path) as part:
+        data, description = mosaic.data.cpu().numpy(), json.dumps(text, allow_nan=False)
+        tifffile.imwrite(
+            part, data, photometric="minisblack", metadata=None, software="polsep", description=description
+        )
 
 
 def _require_readable(page: tifffile.TiffPage, size: int) -> None:

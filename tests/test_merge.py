@@ -1,0 +1,126 @@
+"""Exposures merged by the inverse of their variance: unbiased, less noise, clipping resolved, nothing to type after."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from numpy.typing import NDArray
+from test_cli import Cli
+from test_cli import polsep as run_polsep  # noqa: F401
+
+from polsep.calibrate.exposures import merge_exposures
+from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.sensor.camera import Layout, Mosaic
+
+SIZE = (128, 128)
+WHITE, BLACK, WELL, READ = 4095.0, 64.0, 10_500.0, 2.4
+
+
+def light(seed: int = 0) -> NDArray[np.float64]:
+    """A smooth scene in which the brightest part is twenty times above the darkest."""
+    rng = np.random.default_rng(seed)
+    rows, cols = np.meshgrid(*(np.linspace(0, 1, n) for n in SIZE), indexing="ij")
+    tint = rng.uniform(0.5, 1, (4, 4))[np.ix_(*(np.arange(n) % 4 for n in SIZE))]
+    return np.asarray(0.03 * 30**rows * (0.8 + 0.2 * cols) * tint)
+
+
+def expose(scene: NDArray[np.float64], time: float, seed: int) -> Mosaic:
+    """One frame of 12 bits."""
+    rng = np.random.default_rng(seed)
+    electrons = rng.poisson(scene * time * WELL) + rng.normal(0, READ, SIZE)
+    codes = np.clip(np.round(electrons / WELL * (WHITE - BLACK) + BLACK), 0, WHITE)
+    return Mosaic(torch.from_numpy(codes.astype(np.float32)), Layout(), BLACK, WHITE)
+
+
+def test_one_frame_stays_itself() -> None:
+    """Merging a single frame returns its samples, in units of the white level, to the bit."""
+    frame = expose(light(), 2.0, 1)
+    merged = merge_exposures([frame]).mosaic
+    assert torch.equal(merged.linear(), frame.linear()) and torch.equal(merged.clipped(), frame.clipped())
+
+
+def test_equal_exposures_average() -> None:
+    """k frames of one time have 1 / sqrt(k) of the noise of one."""
+    scene = light() * 0.8
+    for count in (4, 9):
+        merged = merge_exposures([expose(scene, 1.0, seed) for seed in range(count)], [5.0] * count).mosaic
+        single = (expose(scene, 1.0, 99).linear().numpy() - scene).std()
+        assert (merged.linear().numpy() - scene).std() == pytest.approx(single / count**0.5, rel=0.05)
+
+
+@pytest.mark.parametrize("times", [None, [1.0, 4.0, 16.0], [0.25, 1.0, 4.0]])
+def test_exposures_extend_the_range(times: list[float] | None) -> None:
+    """Three exposures, in any order: nothing is biased, dark parts lose noise as photons add up, only what clips in the
+    shortest one is clipped; times are found within 1 % where none are said."""
+    scene = light()
+    scene[100:110, 40:60] = 1.4
+    frames = [expose(scene, time, seed) for seed, time in enumerate((1.0, 4.0, 16.0))]
+    found = merge_exposures(frames, times)
+    again = merge_exposures(frames[::-1], None if times is None else times[::-1])
+    torch.testing.assert_close(again.mosaic.data, found.mosaic.data, rtol=1e-5, atol=1e-6)
+    assert found.notes == ()
+    np.testing.assert_allclose(np.array(found.times) / found.times[0], [1, 4, 16], rtol=0.01)
+    merged = found.mosaic.linear().numpy()
+    assert np.array_equal(found.mosaic.clipped().numpy(), frames[0].clipped().numpy())
+    unclipped = scene < 0.95
+    error = merged / scene - 1
+    dark = unclipped & (scene < 0.04)
+    assert abs(error[unclipped].mean()) < 0.004
+    for low in (0.05, 0.2, 0.23, 0.5, 0.8):
+        some = unclipped & (scene > low) & (scene < 1.2 * low)
+        assert abs(error[some].mean()) < 0.01
+    shortest = (frames[0].linear().numpy() / scene - 1)[dark].std()
+    assert error[dark].std() < 1.15 * shortest / (1 + 4 + 16) ** 0.5
+
+
+def test_what_does_not_fit_is_said() -> None:
+    """Wrong times, a scene that moved, other sizes and frames that share nothing are a line each."""
+    scene = light()
+    short, long = expose(scene, 1.0, 1), expose(scene, 4.0, 2)
+    (note,) = merge_exposures([short, long], [1.0, 3.0]).notes
+    assert note.startswith("exposure times of 1:3 were stated, the frames' brightness says 1:")
+    moved = replace(long, data=long.data.roll(16, 0))
+    assert any("did the scene move" in note for note in merge_exposures([short, moved], [1.0, 4.0]).notes)
+    for frames, times, expected in (
+        ([], None, "at least one frame to merge, found none"),
+        ([short, long], [1.0], "expected 2 positive exposure times"),
+        ([short, replace(long, data=long.data[:64])], None, "expected frames of one size and layout"),
+        ([short, replace(long, data=torch.full(SIZE, WHITE))], None, "say --times"),
+    ):
+        with pytest.raises(ValueError, match=expected):
+            merge_exposures(frames, times)
+
+
+def test_the_command_leaves_nothing_to_type(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
+    """The merged file says its levels and layout; times are read from TIFF files; bad input is one line, exit 2."""
+    scene = light()
+    files = []
+    for seed, time in enumerate((1, 4)):
+        files.append(tmp_path / f"shot{time}.tiff")
+        codes = expose(scene, time, seed).data.numpy().astype(np.uint16)
+        tags = [(33434, "2I", 1, (time, 100), True)]
+        tifffile.imwrite(files[-1], codes, photometric="minisblack", metadata=None, extratags=tags)
+    levels = ("--white-level", WHITE, "--black-level", BLACK, "--layout", "0,45,90,135/RGGB")
+    out = tmp_path / "merged.tiff"
+    done = run_polsep("merge", *files, *levels, "-o", out)
+    assert done.status == 0 and "exposure times 0.01, 0.04 (of the files)" in done.out and done.out.count("\n") == 1
+    (frame,) = read_frames(out, ReadOptions())
+    assert isinstance(frame.data, Mosaic) and frame.notes == ()
+    assert (frame.data.layout.spec, frame.data.black_level, frame.data.white_level) == ("0,45,90,135/RGGB", 0.0, 1.0)
+    assert float((frame.data.linear() - torch.from_numpy(scene)).abs().mean()) < 0.01
+    assert run_polsep("separate", out, "--method", "analytic", "-o", tmp_path / "out").status == 0
+    for arguments, expected in (
+        (("merge", *files, "-o", out), "--overwrite replaces it"),
+        (("merge", *files, "-o", tmp_path / "a.png"), "expected an output that ends in .tiff"),
+        (("merge", *files, "-o", tmp_path / "a.tiff", "--times", "1,x"), "expected --times T,T,..."),
+        (("merge", *files, "-o", tmp_path / "a.tiff", "--times", "1,2,3"), "expected 2 positive exposure times"),
+        (("merge", tmp_path / "none.tiff", "-o", tmp_path / "a.tiff"), "expected a file, found nothing"),
+    ):
+        failed = run_polsep(*arguments)
+        assert failed.status == 2 and failed.err.count("\n") == 1 and expected in failed.err, failed
+    assert not (tmp_path / "a.tiff").exists()

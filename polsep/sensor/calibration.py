@@ -216,8 +216,7 @@ def _same_kind(
         used = inside & sound[y, x]
         total += np.where(used, samples[y, x], np.float32(0))
         count += used
-    mean: Floats = total / np.maximum(count, 1).astype(np.float32)
-    return mean, count
+    return np.asarray(total / np.maximum(count, 1), np.float32), count
 
 
 class Neighbours(NamedTuple):

@@ -18,6 +18,7 @@ from test_cli import polsep as run_polsep  # noqa: F401
 import polsep
 from polsep.calibrate.analysers import measure_analysers
 from polsep.calibrate.dark_flat import measure_dark, measure_flat
+from polsep.calibrate.lamp import measure_lamp
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.store.calibrations import read_calibration, write_calibration
@@ -148,6 +149,37 @@ def test_a_turned_polarizer_shows_the_analysers(layout: Layout, flat: bool) -> N
     np.testing.assert_allclose(np.array(again.analysers), np.array(found.analysers), rtol=1e-4)
     imperfect = measure_analysers(frames, replace(known, analysers=None), polarizer_extinction=50.0)
     assert imperfect.details["analysers"]["diattenuation"] > found.details["analysers"]["diattenuation"]
+
+
+@pytest.mark.parametrize("card", [True, False])
+def test_the_lamp_is_found(card: bool) -> None:
+    """A black ball shows the lamp's colour within 0.3 degrees, its angle within 0.5 and its degree within 0.02; a card
+    shows the colour; a calibrated lamp's colour goes with the frame."""
+    sensor, color = BadSensor(Layout(), dead=0), np.array([0.5, 1.0, 0.7])
+    channels = np.array([[Layout().filter_at(r % 4, c % 4).channel for c in range(SIZE[1])] for r in range(SIZE[0])])
+    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in SIZE), indexing="ij")
+    s0 = color[channels] * (0.6 if card else 0.01 + 0.9 * np.exp(-8 * (x**2 + y**2)))
+    truth = sensor.calibration()
+    sensor.falloff = np.ones(SIZE)
+    frame = correct_mosaic(sensor.expose(sensor.sees(s0, 0.0 if card else 0.96, 0.5)), truth)
+    lamp = measure_lamp([frame], replace(truth, lamp=None), card).lamp
+    assert lamp is not None
+    cosine = np.array(lamp.color) @ color / np.linalg.norm(lamp.color) / np.linalg.norm(color)
+    assert math.degrees(math.acos(min(cosine, 1))) < 0.3
+    if not card:
+        assert lamp.dolp is not None and lamp.dolp == pytest.approx(0.95, abs=0.03)
+        assert lamp.aolp_deg == pytest.approx(math.degrees(0.5), abs=0.5)
+    assert correct_mosaic(frame, Calibration(Layout(), WHITE, lamp=lamp)).light_color == lamp.color
+
+
+def test_a_frame_without_the_lamp_is_refused() -> None:
+    """Unpolarized light shows no mirrored lamp, and a dark frame no card."""
+    sensor = BadSensor(Layout(), dead=0)
+    frame = correct_mosaic(sensor.expose(sensor.sees(np.full(SIZE, 0.5))), sensor.calibration())
+    with pytest.raises(ValueError, match="expected 64 unclipped pixels of polarized light"):
+        measure_lamp([frame])
+    with pytest.raises(ValueError, match="expected a lit card in the middle"):
+        measure_lamp([replace(frame, data=torch.full(SIZE, LEVEL))], card=True)
 
 
 def test_frames_that_show_no_turned_polarizer_are_refused() -> None:

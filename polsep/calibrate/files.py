@@ -111,4 +111,11 @@ def describe(found: Calibration, kind: str) -> str:
             f"{facts['diattenuation']:.4f} +- {facts['diattenuation_error']:.2g}), gains +- {facts['gain_error']:.2g}, "
             f"{facts['frames']} frames that differ by {facts['residual_rms']:.2%} from the model"
         )
-    return str(dict(facts))
+    assert kind == "light" and found.lamp is not None
+    color = ", ".join(f"{c:.3f}" for c in found.lamp.color)
+    line = f"colour {color} +- {facts['color_error_deg']:.2f} deg, from {facts['from']}"
+    if "polarizer_deg" not in facts or found.lamp.dolp is None:
+        return line
+    return (
+        f"{line}, polarizer at {facts['polarizer_deg']:.1f} deg, degree of polarization at least {found.lamp.dolp:.3f}"
+    )

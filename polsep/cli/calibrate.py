@@ -106,6 +106,21 @@ def analysers(files: tuple[Path, ...], output: Path, polarizer_extinction: float
     print(calibrate_files(files, read_options(options), output, "analysers", measure))
 
 
+@calibrate.command()
+@frame_options
+@click.option("--card", is_flag=True, help="The middle of the frames shows a grey or white card.")
+def light(files: tuple[Path, ...], output: Path, card: bool, **options: Any) -> None:
+    """Colour, polarization angle and degree of the lamp, from a shiny dark ball, a grey card, or any object under it.
+
+    Highlights must not clip: expose less than usual. A black billiard ball is best; on other objects the degree of
+    polarization is a lower bound. With --card, matte grey card or white paper shows the colour alone.
+    """
+    from polsep.calibrate.files import calibrate_files
+    from polsep.calibrate.lamp import measure_lamp
+
+    print(calibrate_files(files, read_options(options), output, "light", partial(measure_lamp, card=card)))
+
+
 @app.command()
 @FRAMES
 @click.option("-o", "--output", type=FILE, required=True, metavar="OUT.tiff", help="The merged frame.")

@@ -1,0 +1,118 @@
+"""Colour, polarization angle and degree of a lamp, from frames of an object or of a grey card under it.
+
+Mirrored light has the lamp's colour and polarization. On a shiny dark ball it is nearly all the light there is; on
+other objects the polarized part still has the lamp's colour, while its degree is a lower bound. A grey card shows the
+colour without any mirrored light.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from polsep.calibrate.dark_flat import require_same_sensor
+from polsep.calibrate.statistics import Doubles
+from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.physics.stokes import fit_stokes_unclipped
+from polsep.sensor.calibration import Calibration, LampFacts
+from polsep.sensor.camera import Mosaic
+from polsep.separation.analytic import light_polarizer_angle
+
+#: Polarized light that counts, relative to its 99.9th percentile, and its least strength, white = 1; fewest pixels.
+STRONG, LEAST, MIN_PIXELS = 0.3, 0.02, 64
+#: Share of those pixels, the most polarized ones, that show the lamp's degree of polarization.
+PURE = 0.1
+#: Parts of a frame whose colours are compared for the error.
+PARTS = 8
+#: Least brightness of a card, white = 1.
+DARKEST_CARD = 0.02
+
+
+def measure_lamp(frames: Iterable[Mosaic], before: Calibration | None = None, card: bool = False) -> Calibration:
+    """``before`` with the lamp of frames that show an object, or, with ``card``, a grey card in their middle.
+
+    ``frames`` are corrected by ``before``. Raises ValueError where too little polarized, unclipped light shows.
+    """
+    colors, polarizations, first = [], [], None
+    for mosaic in frames:
+        require_same_sensor(before, mosaic)
+        first = mosaic if first is None else first
+        if card:
+            colors += _card_colors(mosaic)
+        else:
+            found, polarization = _mirrored_colors(mosaic)
+            colors += found
+            polarizations.append(polarization)
+    if first is None:
+        raise ValueError("expected frames of the lamp's light, found none")
+    color, error = _mean_color(np.array(colors))
+    base = Calibration(first.layout, first.white_level) if before is None else before
+    lamp = LampFacts(color, None, None) if base.lamp is None else base.lamp._replace(color=color)
+    details: dict[str, object] = {"from": "card" if card else "mirrored light", "color_error_deg": round(error, 3)}
+    if polarizations:
+        pairs = np.array(polarizations)
+        vector = np.exp(2j * pairs[:, 0]).mean()
+        aolp = 0.5 * float(np.angle(vector)) % math.pi
+        lamp = lamp._replace(dolp=float(pairs[:, 1].max()), aolp_deg=math.degrees(aolp))
+        details |= {
+            "polarizer_deg": round(math.degrees(light_polarizer_angle(aolp)), 2),
+            "aolp_spread_deg": round(math.degrees(math.sqrt(max(-2 * math.log(max(abs(vector), 1e-9)), 0)) / 2), 3),
+            "dolp_is": "at least",
+        }
+    return replace(base, lamp=lamp, details={**base.details, "light": details})
+
+
+def _mirrored_colors(mosaic: Mosaic) -> tuple[list[Doubles], tuple[float, float]]:
+    """Colours of the polarized light of parts of a frame, and its AoLP [radians] and degree where it is purest."""
+    stokes, determined = fit_stokes_unclipped(demosaic_bilinear_half(mosaic))
+    s0, s1, s2 = (
+        image.double().cpu().numpy().reshape(image.shape[-3], -1) for image in (stokes.s0, stokes.s1, stokes.s2)
+    )
+    known = determined.all(dim=-3).cpu().numpy().reshape(-1)
+    p = np.hypot(s1.mean(axis=0), s2.mean(axis=0)) * known
+    strong = np.flatnonzero(p > max(STRONG * float(np.quantile(p, 0.999)), LEAST))
+    if strong.size < MIN_PIXELS:
+        raise ValueError(
+            f"expected {MIN_PIXELS} unclipped pixels of polarized light, found {strong.size}: expose so that "
+            "highlights stay below white, or show a grey card and say --card"
+        )
+    colors = []
+    for part in np.array_split(strong, PARTS):
+        samples = np.concatenate([s1[:, part], s2[:, part]], axis=1)
+        colors.append(np.abs(np.linalg.eigh(samples @ samples.T)[1][:, -1]))
+    degree = p[strong] / np.maximum(s0[:, strong].mean(axis=0), 1e-6)
+    pure = strong[degree >= np.quantile(degree, 1 - PURE)]
+    aolp = 0.5 * math.atan2(float(s2[:, pure].sum()), float(s1[:, pure].sum()))
+    return colors, (aolp, min(float(np.quantile(degree, 1 - PURE / 2)), 1.0))
+
+
+def _card_colors(mosaic: Mosaic) -> list[Doubles]:
+    """Mean colours of parts of the middle of a frame."""
+    measurements = demosaic_bilinear_half(mosaic)
+    height, width = measurements.data.shape[-2:]
+    middle = (..., slice(height // 3, height - height // 3), slice(width // 3, width - width // 3))
+    if measurements.clipped is not None and bool(measurements.clipped[middle].any()):
+        raise ValueError("expected a card without clipping in the middle of the frame, found clipped samples")
+    light = measurements.data[middle].mean(dim=-4).double().cpu().numpy()
+    if float(light.mean()) < DARKEST_CARD:
+        raise ValueError(f"expected a lit card in the middle of the frame, found {float(light.mean()):.1%} of white")
+    return [part.reshape(part.shape[0], -1).mean(axis=1) for part in np.array_split(light, PARTS, axis=1)]
+
+
+def _mean_color(colors: Doubles) -> tuple[tuple[float, float, float], float]:
+    """Colour with green = 1, and its error [degrees] from the differences of parts. ValueError where one is missing."""
+    if colors.shape[1] == 1:
+        return (1.0, 1.0, 1.0), 0.0
+    units = colors / np.linalg.norm(colors, axis=1, keepdims=True)
+    mean = units.mean(axis=0)
+    mean /= np.linalg.norm(mean)
+    if mean.min() < 0.02 * mean.max():
+        raise ValueError(
+            f"expected light of all three colours, found {', '.join(f'{c:.3f}' for c in mean / mean.max())}"
+        )
+    off = np.rad2deg(np.arccos(np.clip(units @ mean, -1, 1)))
+    r, g, b = (float(c / mean[1]) for c in mean)
+    return (r, g, b), float(np.sqrt((off**2).mean() / len(units)))

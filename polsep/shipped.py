@@ -38,7 +38,8 @@ def load_joint(path: Path, device: torch.device) -> Joint:
         size = json.loads(metadata["size"])
         size = ResidualSize(size["width"], tuple(size["blocks"]), size.get("entry", 0))
         demosaicker: Any = metadata.get("demosaicker", "linear")  # what weights without a word on it were trained with
-        network = Joint(int(metadata["colors"]), size, tuple(json.loads(metadata["inputs"])), demosaicker)
+        inputs, sees_frame = (json.loads(metadata.get(name, "false")) for name in ("inputs", "sees_frame"))
+        network = Joint(int(metadata["colors"]), size, tuple(inputs), demosaicker, sees_frame)
         network.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"expected weights of a joint network in {path}, found {type(error).__name__}") from None

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 #: Raw pixels along the side of a packed pixel.
 PERIOD = 4
+#: Brightness that counts as black: below it inputs and corrections fade.
+MIN_BRIGHTNESS = 0.01
 #: Maps that the network sees beside `log_brightness`, in order, by the groups that ablations leave out.
 GROUPS = {
     "samples": ("samples",),

@@ -9,8 +9,8 @@ specular light is white by construction. Diffuse and specular sum to the network
 resolution with `details`.
 
 Inputs and corrections are relative to the local brightness, so that a darker exposure of a scene gives a darker image
-of the same separation, as far as noise and clipping allow. There are no statistics of whole images: crop and frame
-agree away from the border.
+of the same separation, as far as noise and clipping allow. What is common to a whole frame comes from its thumbnail
+(`whole_frame`) alone: with the same thumbnail, crop and frame agree away from the border.
 
 Conventions: quarter resolution [h, w] is [H/4, W/4] of the mosaic. "Packed" images ``[N, C k^2, h, w]`` hold k x k
 pixels per period, in the order of `torch.nn.functional.pixel_unshuffle`; k = 4 at full, 2 at half resolution.
@@ -19,7 +19,7 @@ pixels per period, in the order of `torch.nn.functional.pixel_unshuffle`; k = 4 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any, Literal, NamedTuple
 
@@ -29,15 +29,14 @@ from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, pad, pixel_shuff
 
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import MARGIN, guide_once
-from polsep.networks.channels import INPUTS, PERIOD, input_channels, seen_maps
+from polsep.networks.channels import INPUTS, MIN_BRIGHTNESS, PERIOD, input_channels, seen_maps
 from polsep.networks.details import Details
 from polsep.networks.unet import ResidualSize, ResidualUNet
+from polsep.networks.whole_frame import LIGHT, WholeFrame, make_thumbnail, split_modulation
 from polsep.physics.stokes import fit_stokes
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.closed_form import fit_unclipped, limit_dolp, white_specular
 
-#: Local brightness that counts as black: below it inputs and corrections fade.
-MIN_BRIGHTNESS = 0.01
 #: Largest log variances of diffuse and specular: errors of 2 and 26 times the local brightness, the hundredth largest
 #: of the validation views (docs/experiments.md).
 MAX_LOG_VARIANCE = (1.5, 6.5)
@@ -78,7 +77,7 @@ class ClosedForm(NamedTuple):
 class Polarization(NamedTuple):
     """Polarization of the ``diffuse`` light, and the direction of the ``specular`` one's, ``[N, 2, H/4, W/4]`` each.
 
-    Both as (cos 2 phi, sin 2 phi); the diffuse one times its degree, the specular one a unit vector.
+    Both as (cos 2 phi, sin 2 phi) times their degree, which is 1 for the specular one unless a whole frame shows it.
     """
 
     diffuse: Tensor
@@ -89,7 +88,8 @@ class JointOutput(NamedTuple):
     """``diffuse [N, C, ...]`` and ``specular [N, 1, ...]``, not limited to be positive, and images at half resolution.
 
     ``s1``, ``s2 [N, C, H/2, W/2]`` as linearly demosaicked; ``log_variance [N, 2, H/2, W/2]`` of the errors of diffuse
-    and specular, relative to the squared ``local_brightness [N, 1, H/4, W/4]``; ``fit_residual [N, 1, H/4, W/4]``.
+    and specular, relative to the squared ``local_brightness [N, 1, H/4, W/4]``; ``fit_residual [N, 1, H/4, W/4]``;
+    ``light [N, 8]``: means and log variances of `whole_frame.LIGHT`, None of networks without a whole frame.
     """
 
     diffuse: Tensor
@@ -99,6 +99,7 @@ class JointOutput(NamedTuple):
     log_variance: Tensor
     local_brightness: Tensor
     fit_residual: Tensor
+    light: Tensor | None = None
 
 
 class Joint(nn.Module):
@@ -107,17 +108,25 @@ class Joint(nn.Module):
     ``inputs``: the groups of `channels.GROUPS` that it sees. ``demosaicker``: "guided" with frames continued by
     ``margin`` cells, or "linear" by the filter ``demosaic``, which gradients do not change; see `bilinear_filter`.
     ``corrections`` are added to the closed form, ``closed_form_gain`` scales its specular light, ``log_variance`` says
-    how large errors are, ``details`` makes full from half resolution.
+    how large errors are, ``details`` makes full from half resolution. ``whole_frame``: what a network that
+    ``sees_frame`` takes from a thumbnail of it.
     """
 
     demosaic: Tensor | None
     max_log_variance: Tensor
 
     def __init__(
-        self, colors: int, size: ResidualSize, inputs: tuple[str, ...] = INPUTS, demosaicker: Demosaicker = "linear"
+        self,
+        colors: int,
+        size: ResidualSize,
+        inputs: tuple[str, ...] = INPUTS,
+        demosaicker: Demosaicker = "linear",
+        sees_frame: bool = False,
     ) -> None:
         super().__init__()
         self.colors, self.size, self.inputs, self.margin = colors, size, inputs, MARGIN
+        #: Faster twin of `_guide_once`, which training on CPUs sets (`networks.guide`).
+        self.guide: Callable[[Tensor, Layout], tuple[Tensor, Tensor]] | None = None
         self.layout = Layout(bayer="RGGB" if colors == 3 else None)
         self.register_buffer("demosaic", bilinear_filter(self.layout) if demosaicker == "linear" else None)
         width = size.widths[0]
@@ -130,37 +139,59 @@ class Joint(nn.Module):
         self.register_buffer("max_log_variance", largest, persistent=False)
         self.log_variance = nn.Sequential(nn.Conv2d(width, 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 8, 1))
         self.details = Details(colors, width)
+        self.whole_frame = WholeFrame(colors, size.widths) if sees_frame else None
         self.register_state_dict_post_hook(_to_names_in_files)  # type: ignore[no-untyped-call]
         self.register_load_state_dict_pre_hook(_from_names_in_files)  # type: ignore[no-untyped-call]
 
-    def forward(self, raw: Tensor, clipped: Tensor) -> tuple[JointOutput, Polarization]:
+    def forward(
+        self, raw: Tensor, clipped: Tensor, thumbnail: Tensor | None = None
+    ) -> tuple[JointOutput, Polarization]:
         """Images at full resolution, ``[N, C, H, W]``.
 
-        ``raw``, ``clipped [N, 1, H, W]``: samples and which of them clipped, H and W multiples of 4.
+        ``raw``, ``clipped [N, 1, H, W]``: samples and which of them clipped, H and W multiples of 4. ``thumbnail``: of
+        the frames that they are crops of, see `thumbnail`; None where they are whole frames.
         """
-        total, closed, features, log_variance = self._encode(raw, clipped, full=True)
+        total, closed, features, log_variance, light = self._encode((raw, clipped), thumbnail, full=True)
         half, change = self._correct(closed, features), self.polarization(features)
         with torch.autocast(raw.device.type, enabled=False):
             diffuse, specular = (closed.polarization + change.float()).chunk(2, dim=1)
             length = torch.sqrt((specular**2).sum(dim=1, keepdim=True) + 1e-6)
+            if light is not None:
+                length = length / light[:, LIGHT.index("dolp")].float().clamp(0.3, 1)[:, None, None, None]
         full = self.details(half, total, features, closed.local_brightness)
-        return self._as_output(full, closed, log_variance), Polarization(diffuse, specular / length)
+        return self._as_output(full, closed, log_variance, light), Polarization(diffuse, specular / length)
 
-    def half_resolution(self, raw: Tensor, clipped: Tensor) -> JointOutput:
+    def half_resolution(self, raw: Tensor, clipped: Tensor, thumbnail: Tensor | None = None) -> JointOutput:
         """The means over 2x2 cells of what `forward` gives, ``[N, C, H/2, W/2]``, in less time."""
-        _, closed, features, log_variance = self._encode(raw, clipped, full=False)
-        return self._as_output(self._correct(closed, features), closed, log_variance)
+        _, closed, features, log_variance, light = self._encode((raw, clipped), thumbnail, full=False)
+        return self._as_output(self._correct(closed, features), closed, log_variance, light)
 
-    def _encode(self, raw: Tensor, clipped: Tensor, full: bool) -> tuple[Tensor, ClosedForm, Tensor, Tensor]:
-        """Packed s0 at full resolution, the closed form, the network's features and log variances."""
+    def thumbnail(self, raw: Tensor, clipped: Tensor) -> Tensor | None:
+        """`make_thumbnail` of whole frames ``[N, 1, H, W]``; None for a network that sees none."""
+        if self.whole_frame is None:
+            return None
+        planes, masks = (pixel_unshuffle(x.to(raw), PERIOD) for x in (raw, clipped))
+        return make_thumbnail(planes, masks, self.layout)
+
+    def _encode(
+        self, frames: tuple[Tensor, Tensor], thumbnail: Tensor | None, full: bool
+    ) -> tuple[Tensor, ClosedForm, Tensor, Tensor, Tensor | None]:
+        """Packed s0 at full resolution, the closed form, the network's features, log variances and the light."""
+        raw, clipped = frames
         planes, masks = pixel_unshuffle(raw, PERIOD), pixel_unshuffle(clipped.to(raw), PERIOD)
         with torch.autocast(raw.device.type, enabled=False), torch.no_grad():
             half, total = self.demosaicked(planes, full)
             closed = self.closed_form(half, planes, masks)
             total = total + closed.clipped_s0.repeat_interleave(total.shape[1] // self.colors, dim=1)
-        features = self.net(closed.inputs)
+        changes, light = [], None
+        if self.whole_frame is not None:
+            if thumbnail is None:
+                thumbnail = make_thumbnail(planes, masks, self.layout)
+            modulation, light = self.whole_frame(thumbnail)
+            changes = split_modulation(modulation, self.size.widths)
+        features = self.net(closed.inputs, changes)
         log_variance = self.log_variance(features.detach()).float()
-        return total, closed, features, pixel_shuffle(torch.minimum(log_variance, self.max_log_variance), 2)
+        return total, closed, features, pixel_shuffle(torch.minimum(log_variance, self.max_log_variance), 2), light
 
     def _correct(self, closed: ClosedForm, features: Tensor) -> Tensor:
         """Diffuse colours and specular at half resolution ``[N, C + 1, H/2, W/2]``."""
@@ -172,20 +203,28 @@ class Joint(nn.Module):
             images = torch.cat([diffuse, specular], dim=1) + change.float() * closed.local_brightness
             return pixel_shuffle(images, 2)
 
-    def _as_output(self, images: Tensor, closed: ClosedForm, log_variance: Tensor) -> JointOutput:
+    def _as_output(
+        self, images: Tensor, closed: ClosedForm, log_variance: Tensor, light: Tensor | None
+    ) -> JointOutput:
         s1, s2 = (pixel_shuffle(s, 2) for s in closed.polarized.chunk(2, dim=1))
         diffuse, specular = images[:, : self.colors], images[:, self.colors :]
-        return JointOutput(diffuse, specular, s1, s2, log_variance, closed.local_brightness, closed.fit_residual)
+        brightness, residual = closed.local_brightness, closed.fit_residual
+        return JointOutput(diffuse, specular, s1, s2, log_variance, brightness, residual, light)
 
     def demosaicked(self, planes: Tensor, full: bool) -> tuple[Tensor, Tensor]:
         """Packed s0, s1, s2 at half resolution ``[N, 12 C, h, w]``, and s0 at full resolution or nothing."""
         if self.demosaic is None:
-            stokes, s0 = guide_once(Mosaic(pixel_shuffle(planes, PERIOD)[:, 0], self.layout, 0.0, 1.0), self.margin)
-            half = torch.cat([pixel_unshuffle(s, 2) for s in (stokes.s0, stokes.s1, stokes.s2)], dim=1)
+            stokes, s0 = (self.guide or self._guide_once)(pixel_shuffle(planes, PERIOD), self.layout)
+            half = pixel_unshuffle(stokes, 2)
             return half, pixel_unshuffle(s0, PERIOD) if full else half[:, :0]
         s0_full = 16 * self.colors
         half = torch.cat([pool_outputs(self.demosaic[:s0_full]), self.demosaic[s0_full:]])
         return _filter(planes, half), _filter(planes, self.demosaic[:s0_full]) if full else planes[:, :0]
+
+    def _guide_once(self, raw: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
+        """`guided.guide_once`: s0, s1, s2 of the colours ``[N, 3 C, H/2, W/2]``, and s0 at full resolution."""
+        stokes, s0 = guide_once(Mosaic(raw[:, 0], layout, 0.0, 1.0), self.margin)
+        return torch.cat([stokes.s0, stokes.s1, stokes.s2], dim=1), s0
 
     def closed_form(self, stokes: Tensor, planes: Tensor, masks: Tensor) -> ClosedForm:
         """The closed form of packed Stokes images at half resolution; ``planes``, ``masks [N, 16, h, w]``."""

@@ -5,6 +5,7 @@ Conventions: images ``[N, C, H, W]``, linear light; any H and W (padded by mirro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -145,19 +146,27 @@ class ResidualUNet(nn.Module):
         """Pixels after which the strided convolutions repeat."""
         return 1 << len(self.downs)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Features at the input's resolution."""
-        x = self.enter(x)
+    def forward(self, x: Tensor, changes: Sequence[tuple[Tensor, Tensor]] = ()) -> Tensor:
+        """Features at the input's resolution; ``changes``: scale and shift of each level's first features, or none."""
+        x = modulate(self.enter(x), changes, 0)
         skips = []
-        for encoder, down in zip(self.encoders, self.downs, strict=False):
+        for level, (encoder, down) in enumerate(zip(self.encoders, self.downs, strict=False), start=1):
             x = encoder(x)
             skips.append(x)
-            x = down(relu(x))
+            x = modulate(down(relu(x)), changes, level)
         x = self.encoders[-1](x)
         for up, decoder, skip in zip(reversed(self.ups), reversed(self.decoders), reversed(skips), strict=True):
             x = interpolate(up(relu(x)), scale_factor=2.0)  # by nearest neighbours
             x = decoder(skip + x[..., : skip.shape[-2], : skip.shape[-1]])
         return relu(self.out(x))
+
+
+def modulate(x: Tensor, changes: Sequence[tuple[Tensor, Tensor]], level: int) -> Tensor:
+    """Features of a level, scaled by one more than a scale and shifted; unchanged without ``changes``."""
+    if not changes:
+        return x
+    scale, shift = changes[level]
+    return x * (1 + scale.to(x)) + shift.to(x)
 
 
 def _entrance(inputs: int, size: ResidualSize) -> nn.Module:

@@ -17,7 +17,16 @@ from polsep.networks.paper import RUNGS
 from polsep.networks.unet import ResidualSize, Size, count_parameters
 from polsep.train.digest import digest_examples
 from polsep.train.inputs import JointInputs, LadderInputs
-from polsep.train.joint_task import ABLATIONS, DEMOSAICKERS, JOINT_VARIANTS, PARTS, SIZES, freeze_others, joint_task
+from polsep.train.joint_task import (
+    ABLATIONS,
+    DEMOSAICKERS,
+    JOINT_VARIANTS,
+    PARTS,
+    SEES_FRAME,
+    SIZES,
+    freeze_others,
+    joint_task,
+)
 from polsep.train.log import curve_of, read_log, references_of
 from polsep.train.loop import Run, train
 from polsep.train.tasks import VARIANTS, Task, find, ladder_task
@@ -86,7 +95,8 @@ class JointOptions:
 
     def task(self) -> Task[JointInputs]:
         """Return the task of the network and its ablation."""
-        task = joint_task(self.variant, self.size or SIZES[self.name], ABLATIONS[self.ablation], self.demosaicker)
+        size, ablation = self.size or SIZES[self.name], ABLATIONS[self.ablation]
+        task = joint_task(self.variant, size, ablation, self.demosaicker, self.sees_frame)
         freeze_others(task.network, self.part)
         return task
 
@@ -95,11 +105,16 @@ class JointOptions:
         """Source of the network's Stokes images."""
         return DEMOSAICKERS[self.name] if self.variant == "mosaic" else "linear"
 
+    @property
+    def sees_frame(self) -> bool:
+        """True for a network that sees a thumbnail of the whole frame."""
+        return (self.name, self.variant) in SEES_FRAME
+
     def metadata(self) -> dict[str, str]:
         """Return what is needed to load the weights."""
         inputs, colors = json.dumps(ABLATIONS[self.ablation].inputs), str(JOINT_VARIANTS[self.variant][1])
         named = {"method": self.name, "ablation": self.ablation, "demosaicker": self.demosaicker}
-        return named | {"inputs": inputs, "colors": colors}
+        return named | {"inputs": inputs, "colors": colors, "sees_frame": json.dumps(self.sees_frame)}
 
     @property
     def crop(self) -> int:

@@ -14,7 +14,7 @@ from torch.nn.functional import avg_pool2d
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.physics.stokes import Measurements, Stokes, measure
 from polsep.render.simulate import whole_cells
-from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
+from polsep.sensor.camera import Layout, Mosaic
 from polsep.train.stream import ANGLES, MONO, Examples, expose_mono
 
 
@@ -28,14 +28,15 @@ class LadderInputs(NamedTuple):
 
 
 class JointInputs(NamedTuple):
-    """Samples ``raw [B, 1, H, W]`` behind the filters of ``layout``, white = 1, and the truth.
+    """Samples ``raw``, ``clipped [B, 1, H, W]`` behind the filters of ``layout``, white = 1, and the truth.
 
     ``diffuse [B, C, H/2, W/2]``, ``specular [B, 1, H/2, W/2]`` and the ``mask`` are what is scored; ``full_diffuse``,
     ``full_specular`` and ``weight [B, 1, H, W]``, 1 on objects, are the same at full resolution. ``polarized``: s1 and
-    s2 ``[B, 2 C, H, W]``.
+    s2 ``[B, 2 C, H, W]``. ``thumbnail``, ``light``: as in `Examples`.
     """
 
     raw: Tensor
+    clipped: Tensor
     diffuse: Tensor
     specular: Tensor
     mask: Tensor
@@ -44,6 +45,8 @@ class JointInputs(NamedTuple):
     full_specular: Tensor
     weight: Tensor
     polarized: Tensor
+    thumbnail: Tensor
+    light: Tensor
 
 
 Inputs = TypeVar("Inputs", bound=LadderInputs | JointInputs)
@@ -75,8 +78,8 @@ def co_sited_inputs(examples: Examples) -> LadderInputs:
 
 def joint_inputs(examples: Examples) -> JointInputs:
     """Return noisy colour mosaics as they are, for the joint network."""
-    diffuse, specular, polarized = (x.float() for x in examples[1:4])
-    return _joint_inputs(Examples(examples.raw, diffuse, specular, polarized, examples.mask), Layout())
+    diffuse, specular, polarized = (x.float() for x in (examples.diffuse, examples.specular, examples.polarized))
+    return _joint_inputs(examples._replace(diffuse=diffuse, specular=specular, polarized=polarized), Layout())
 
 
 def joint_mono_inputs(examples: Examples) -> JointInputs:
@@ -87,6 +90,7 @@ def joint_mono_inputs(examples: Examples) -> JointInputs:
 def _joint_inputs(examples: Examples, layout: Layout) -> JointInputs:
     return JointInputs(
         examples.raw[:, None],
+        examples.clipped[:, None],
         avg_pool2d(examples.diffuse, 2),
         avg_pool2d(examples.specular, 2),
         whole_cells(examples.mask),
@@ -95,9 +99,6 @@ def _joint_inputs(examples: Examples, layout: Layout) -> JointInputs:
         examples.specular,
         examples.mask[:, None].float(),
         examples.polarized,
+        examples.thumbnail,
+        examples.light,
     )
-
-
-def find_clipped(raw: Tensor) -> Tensor:
-    """Return True for samples at the white level, 1."""
-    return raw >= 1 - CLIP_MARGIN

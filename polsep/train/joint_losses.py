@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from polsep.networks.joint import JointOutput, Polarization, predict_samples
-from polsep.train.inputs import JointInputs, find_clipped
+from polsep.train.inputs import JointInputs
 from polsep.train.losses import diffuse_loss
 
 #: Added to mean squared errors: limits PSNR to 60 dB, which crops with hardly any specular light reach.
@@ -31,6 +31,8 @@ FULL_WEIGHT, BEYOND_WEIGHT, DATA_WEIGHT = 0.5, 0.3, 1.0
 DATA_SCALE = 0.02
 #: Squared error, in predicted variances, from which on the negative log likelihood grows as its logarithm.
 SURPRISE = 50.0
+#: Weight of the negative log likelihood of what is common to a frame, and the range of its log variances.
+LIGHT_WEIGHT, LIGHT_LOG_VARIANCES = 0.2, (-10.0, 4.0)
 #: Scales the sum, in dB, to gradients of about the size of the other networks' (`loop.MAX_GRADIENT`).
 LOSS_SCALE = 0.1
 
@@ -78,7 +80,17 @@ def joint_loss(output: tuple[JointOutput, Polarization], inputs: JointInputs, go
         half + FULL_WEIGHT * full + BEYOND_WEIGHT * beyond + goal.data * sample_residual(images, polarization, inputs)
     )
     errors = (diffuse - inputs.diffuse, specular - inputs.specular)
-    return LOSS_SCALE * (loss + variance_loss(images, errors, half_weight))
+    loss = loss + variance_loss(images, errors, half_weight)
+    if images.light is not None:
+        loss = loss + LIGHT_WEIGHT * light_loss(images.light.float(), inputs.light)
+    return LOSS_SCALE * loss
+
+
+def light_loss(predicted: Tensor, truth: Tensor) -> Tensor:
+    """Return the negative Gaussian log likelihood of `whole_frame.LIGHT`, ``truth [B, 4]``, under ``[B, 8]``."""
+    mean, log_variance = predicted.chunk(2, dim=1)
+    log_variance = log_variance.clamp(*LIGHT_LOG_VARIANCES)
+    return (0.5 * (log_variance + (truth - mean) ** 2 * torch.exp(-log_variance))).sum(dim=1).mean()
 
 
 def beyond_white(estimate: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
@@ -92,7 +104,7 @@ def sample_residual(images: JointOutput, polarization: Polarization, inputs: Joi
     residual = (predict_samples(images, polarization, inputs.layout) - inputs.raw) / DATA_SCALE
     size = residual.abs()
     robust = torch.where(size < 1, 0.5 * residual**2, size - 0.5)
-    kept = ~find_clipped(inputs.raw)
+    kept = ~inputs.clipped
     return (robust * kept).sum() / kept.sum().clamp(min=1)
 
 

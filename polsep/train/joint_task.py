@@ -13,12 +13,13 @@ from torch.nn.functional import avg_pool2d, max_pool2d, pad, pixel_unshuffle, un
 
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.networks.channels import INPUTS
+from polsep.networks.guide import guide_batch
 from polsep.networks.joint import Demosaicker, Joint, bilinear_filter
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Measurements, Stokes
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.analytic import Separation
-from polsep.train.inputs import JointInputs, find_clipped, joint_inputs, joint_mono_inputs
+from polsep.train.inputs import JointInputs, joint_inputs, joint_mono_inputs
 from polsep.train.joint_losses import Goal, joint_loss, paper_difference
 from polsep.train.stream import StreamOptions, stream_lane
 from polsep.train.tasks import Task
@@ -27,6 +28,8 @@ from polsep.train.tasks import Task
 SIZES = {"joint": ResidualSize(48, (0, 1, 1)), "joint-fast": ResidualSize(16, (0, 1, 1), 16)}
 #: Source of their Stokes images for colour frames; mono frames use a linear filter.
 DEMOSAICKERS: dict[str, Demosaicker] = {"joint": "guided", "joint-fast": "linear"}
+#: Networks that see a thumbnail of the whole frame, by name and variant.
+SEES_FRAME = {("joint", "mosaic")}
 #: Cells by which the guided demosaicker extends crops.
 MARGIN = 8
 #: Batches for the fit of the filter, size of their scene pool, and their lane, which no worker uses.
@@ -68,20 +71,26 @@ JOINT_VARIANTS = {"mosaic": (joint_inputs, 3), "mono": (joint_mono_inputs, 1)}
 
 
 def joint_task(
-    variant: str, size: ResidualSize, ablation: Ablation, demosaicker: Demosaicker = "linear"
+    variant: str,
+    size: ResidualSize,
+    ablation: Ablation,
+    demosaicker: Demosaicker = "linear",
+    sees_frame: bool = False,
 ) -> Task[JointInputs]:
     """Return the task of the joint network for colour (``mosaic``) or ``mono`` frames."""
     prepare, colors = JOINT_VARIANTS[variant]
-    network = Joint(colors, size, ablation.inputs, demosaicker)
+    network = Joint(colors, size, ablation.inputs, demosaicker, sees_frame)
     network.margin = MARGIN
+    if not torch.cuda.is_available():
+        network.guide = guide_batch
 
     def loss(net: nn.Module, inputs: JointInputs, done: float) -> Tensor:
         del done
-        return joint_loss(net(inputs.raw, find_clipped(inputs.raw)), inputs, ablation.goal)
+        return joint_loss(net(inputs.raw, inputs.clipped, seen_thumbnail(inputs)), inputs, ablation.goal)
 
     def separate(inputs: JointInputs) -> Separation:
         with torch.no_grad():
-            images = network.half_resolution(inputs.raw, find_clipped(inputs.raw))
+            images = network.half_resolution(inputs.raw, inputs.clipped, seen_thumbnail(inputs))
         diffuse, specular = images.diffuse.clamp(min=0), images.specular.clamp(min=0).expand_as(images.diffuse)
         return Separation(diffuse, specular, inputs.mask, Stokes(diffuse + specular, images.s1, images.s2))
 
@@ -95,6 +104,11 @@ def joint_task(
         network.demosaic.copy_(fit_filter(prepare(batch) for batch in batches))
 
     return Task(network, prepare, loss, separate, measure, begin)
+
+
+def seen_thumbnail(inputs: JointInputs) -> Tensor | None:
+    """Return the thumbnails of the frames that the crops are of; None where crops are whole frames."""
+    return inputs.thumbnail if inputs.thumbnail.numel() else None
 
 
 def freeze_others(network: nn.Module, part: str) -> None:
@@ -164,7 +178,7 @@ def _fit_samples(view: JointInputs) -> tuple[Tensor, Tensor]:
     half = [pixel_unshuffle(avg_pool2d(x, 2), 2) for x in view.polarized.chunk(2, dim=1)]
     wanted = torch.cat([pixel_unshuffle(view.full_diffuse + view.full_specular, 4), *half], dim=1)
     light = 2 * avg_pool2d(planes.mean(dim=1, keepdim=True), 3, 1, 1, count_include_pad=False)
-    clipped = max_pool2d(pixel_unshuffle(find_clipped(view.raw).float(), 4).amax(dim=1, keepdim=True), 3, 1, 1) > 0
+    clipped = max_pool2d(pixel_unshuffle(view.clipped.float(), 4).amax(dim=1, keepdim=True), 3, 1, 1) > 0
     inside = pixel_unshuffle(view.weight, 4).amin(dim=1, keepdim=True) > 0
     kept = (inside & ~clipped & (light > MIN_FIT)).flatten()
     size = (light.flatten()[kept] + FIT_FLOOR)[:, None]

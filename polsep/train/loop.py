@@ -35,6 +35,8 @@ from polsep.train.validation import score, score_averaged, score_references, val
 LAST_SHARE = 0.01
 #: Largest norm of a network's gradient. Usual ones are 13 to 42, so only outliers are clipped.
 MAX_GRADIENT = 100.0
+#: Parts of a network, by the prefix of their names, that weights to start with may lack.
+NEW_PARTS = ("whole_frame.",)
 #: A batch: a named tuple of tensors.
 Batch = TypeVar("Batch", bound=tuple[Any, ...])
 
@@ -198,7 +200,9 @@ def load_mean(paths: Sequence[Path], network: nn.Module) -> None:
     for count, path in enumerate(paths, start=1):
         tensors, _ = read_weights(path)
         try:
-            network.load_state_dict(tensors)
+            missing, unexpected = network.load_state_dict(tensors, strict=False)
+            if unexpected or any(not name.startswith(NEW_PARTS) for name in missing):
+                raise RuntimeError
         except RuntimeError:
             raise ValueError(
                 f"expected weights of the network to be trained in {path}, found those of another"

@@ -20,15 +20,20 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pixel_unshuffle
 from torch.utils.data import IterableDataset, get_worker_info
 
+from polsep.networks.channels import PERIOD
+from polsep.networks.whole_frame import make_thumbnail
 from polsep.physics.stokes import Stokes
 from polsep.render.materials import random_materials
 from polsep.render.raycast import MeshScene, find_lit, find_view, shade_view
+from polsep.render.sensor_errors import SensorErrors, cross_talk, filter_with_errors, random_analyser_angles, vary_gains
 from polsep.render.simulate import HEADROOM, blur, filter_light
 from polsep.render.sphere_tracing import Scene
 from polsep.render.views import MIN_LEVEL, random_shot, scene_seed, seeded_shape
-from polsep.sensor.camera import IMX250, Layout, Sensor
+from polsep.sensor.camera import CLIP_MARGIN, IMX250, Layout, Sensor
+from polsep.train.reality import RealScene, as_ideal, disturb, random_darkness, random_errors
 from polsep.train.variety import (
     LitView,
     random_sensor,
@@ -63,9 +68,10 @@ MIN_COVERED, MAX_DRAWS = 0.6, 4
 #: Largest light, in white levels: half precision holds it.
 MAX_LIGHT = 2.0**14
 
-#: Kinds of scenes: "varied" has all of `variety`; "usual", as the paper's training data, has smooth surfaces of usual
-#: gloss, diffuse light polarized by Fresnel transmission, and none that keeps the lamp's polarization.
-LOOK_KINDS = ("varied", "usual")
+#: Kinds of scenes: "real" has all of `variety` and `reality`; "varied" has all of `variety` under one perfect white
+#: lamp; "usual", as the paper's training data, has smooth surfaces of usual gloss, diffuse light polarized by Fresnel
+#: transmission, and none that keeps the lamp's polarization.
+LOOK_KINDS = ("varied", "usual", "real")
 #: Sony's order without colours.
 MONO = Layout(bayer=None)
 #: Analysers of the examples [rad].
@@ -106,30 +112,37 @@ class StreamOptions:
 
 
 class Examples(NamedTuple):
-    """A batch: noisy ``raw [B, H, W]``, clipped at 1, and the truth behind it.
+    """A batch: noisy ``raw [B, H, W]`` less the colour of the lamp that is told, ``clipped``, and the truth behind it.
 
-    ``diffuse [B, 3, H, W]``, white ``specular [B, 1, H, W]``: s0. ``polarized``: s1 and s2 of their sum
-    ``[B, 6, H, W]``. ``mask``: bool ``[B, H, W]``, on objects. Truth in half precision.
+    ``diffuse [B, 3, H, W]``, ``specular [B, 1, H, W]``: s0, the latter a mean over colours. ``polarized``: s1 and s2 of
+    their sum ``[B, 6, H, W]``. ``mask``: bool ``[B, H, W]``, on objects. Truth in half precision, less the told colour
+    too. ``thumbnail [B, K, h, w]``, ``light [B, 4]``: of the whole frame, see `networks.whole_frame`.
     """
 
     raw: Tensor
+    clipped: Tensor
     diffuse: Tensor
     specular: Tensor
     polarized: Tensor
     mask: Tensor
+    thumbnail: Tensor
+    light: Tensor
 
 
 @dataclass(frozen=True)
 class PooledScene:
     """A scene of the pool, in half precision, scaled so that the brightest object sample is 1.
 
-    ``diffuse [9, H, W]``: s0, s1, s2 of three colours each; ``specular [3, H, W]``: of white light. ``places [N, 2]``:
-    all object pixels; ``bright [M, 2]``: the brightest ones; ``brightness``: quantiles of the object's samples;
-    ``level``: median of the lit ones.
+    ``light [18, H, W]``: s0, s1, s2 of three colours each, diffuse, then specular. ``told [3]``: the lamp's colour that
+    is divided out; ``common [4]``: truth of `networks.whole_frame.LIGHT`; ``real``: whether sensors have errors.
+    ``places [N, 2]``: all object pixels; ``bright [M, 2]``: the brightest ones; ``brightness``: quantiles of the
+    object's samples; ``level``: median of the lit ones.
     """
 
-    diffuse: Tensor
-    specular: Tensor
+    light: Tensor
+    told: Tensor
+    common: Tensor
+    real: bool
     mask: Tensor
     places: Tensor
     bright: Tensor
@@ -167,18 +180,18 @@ def stream_lane(options: StreamOptions, lane: int, first: int) -> Iterator[Examp
         newest += 1
     oldest = newest - options.pool + 1
     while True:
-        crops, number = [], first * options.batch
+        examples, number = [], first * options.batch
         for k in range(options.batch):
             if (number + k) // options.reuse > oldest:
                 pool.append(next(scenes))
                 oldest += 1
-            crops.append(random_crop(pool, options.crop, _generator(options, lane, number + k)))
-        yield expose_crops(crops, _generator(options, lane, number, "noise"))
+            examples.append(random_example(pool, options.crop, _generator(options, lane, number + k)))
+        yield Examples(*(torch.stack(values) for values in zip(*examples, strict=True)))
         first += 1
 
 
-def _generator(options: StreamOptions, lane: int, number: int, use: str = "crop") -> torch.Generator:
-    label = f"{use}/{options.split}/{options.seed}/{lane}/{number}"
+def _generator(options: StreamOptions, lane: int, number: int) -> torch.Generator:
+    label = f"example/{options.split}/{options.seed}/{lane}/{number}"
     return torch.Generator().manual_seed(int.from_bytes(hashlib.sha256(label.encode()).digest()[:8]) >> 1)
 
 
@@ -202,7 +215,7 @@ def _render_view(shape: MeshScene, options: StreamOptions, generator: torch.Gene
     """A view of a shape under several lights, with new materials under each."""
     shot = vary_shot(shape, random_shot(shape, generator), generator)
     view = find_view(shape, shot.camera, (options.size, options.size), options.samples)
-    varied = options.looks == "varied"
+    varied = options.looks != "usual"
     if varied:
         view = vary_normals(view, generator)
     light = shot.light
@@ -211,17 +224,31 @@ def _render_view(shape: MeshScene, options: StreamOptions, generator: torch.Gene
         materials = vary_colors(random_materials(shape.mesh.slot_count, generator, shape.size), generator)
         if varied:
             materials = vary_gloss(materials, generator)
+        other = relight(shape, shot, generator)
         lit_view = LitView(view, materials, light, find_lit(shape, view, light))
         scene = blur(shade_view(*lit_view), shot.blur)
         if varied:
             scene = vary_retention(vary_polarization(scene, generator), partial(render_sheen, lit_view), generator)
-        scenes.append(_as_pooled(scene))
-        light = relight(shape, shot, generator)
+        if options.looks == "real":
+            real = disturb(scene, partial(_rerender, shape, lit_view._replace(light=other), shot.blur), generator)
+        else:
+            real = as_ideal(scene)
+        scenes.append(_as_pooled(real, options.looks == "real"))
+        light = other
     return scenes
 
 
-def _as_pooled(scene: Scene) -> PooledScene:
-    """The scene for the pool."""
+def _rerender(shape: MeshScene, lit_view: LitView, sigma: float, everywhere: bool) -> Scene:
+    """The view under its light, or with this light ``everywhere``, also in its shadows."""
+    lit = find_lit(shape, lit_view.view, lit_view.light)
+    if everywhere:
+        lit = tuple(torch.ones_like(band) for band in lit)
+    return blur(shade_view(*lit_view._replace(lit=lit)), sigma)
+
+
+def _as_pooled(real: RealScene, errors: bool) -> PooledScene:
+    """The scene for the pool; ``errors``: of sensors and exposures."""
+    scene = real.scene
     signal = filter_light(scene.diffuse + scene.specular, Layout(), IMX250)
     samples = signal[scene.mask]
     lowest = int(LOWEST_QUANTILE * (samples.numel() - 1))
@@ -231,52 +258,70 @@ def _as_pooled(scene: Scene) -> PooledScene:
     bright = (scene.mask & (signal >= float(brightness[_rank(BRIGHT_PIXELS)]))).nonzero()
     gain, lit = 1 / max(float(brightness[-1]), 1e-12), samples[samples > 0]
     level = gain * float(lit.median()) if lit.numel() else 1.0
-    white = scene.specular.map(lambda s: s[:1])
-    diffuse, specular = (torch.cat([s.s0, s.s1, s.s2]).mul_(gain).half() for s in (scene.diffuse, white))
-    return PooledScene(diffuse, specular, scene.mask, scene.mask.nonzero(), bright, brightness * gain, level)
+    planes = [getattr(light, name) for light in (scene.diffuse, scene.specular) for name in ("s0", "s1", "s2")]
+    light = torch.cat(planes).mul_(gain).half()
+    places, brightness = scene.mask.nonzero(), brightness * gain
+    return PooledScene(light, real.told, real.light, errors, scene.mask, places, bright, brightness, level)
 
 
-class Crop(NamedTuple):
-    """A crop before its exposure: ``light [12, h, w]``, half precision, the scene's diffuse and specular planes.
+def random_example(pool: deque[PooledScene], crop: int, generator: torch.Generator) -> Examples:
+    """Return a random crop of one of the scenes, as the sensor records it, and the truth; without a batch's dimension.
 
-    ``factors [12]`` bring them to the white level, with the signs that mirroring gives s1 and s2. ``mask [h, w]``.
-    """
-
-    light: Tensor
-    factors: Tensor
-    mask: Tensor
-
-
-def random_crop(pool: deque[PooledScene], crop: int, generator: torch.Generator) -> Crop:
-    """Return a random crop of one of the scenes, randomly mirrored and transposed, with permuted colours.
-
-    Mirroring changes the sign of s2, transposing that of s1 (`stokes.flip_horizontal`, `stokes.transpose`).
+    The whole frame is randomly mirrored and transposed, with permuted colours. Mirroring changes the sign of s2,
+    transposing that of s1 (`stokes.flip_horizontal`, `stokes.transpose`).
     """
     scene = pool[_integer(len(pool), generator)]
     rows, cols = _random_place(scene, crop, generator)
     across, down, transposed = (_integer(2, generator) for _ in range(3))
     colors = torch.randperm(3, generator=generator)
-    planes = torch.cat([colors, colors + 3, colors + 6])
-    light = torch.cat([scene.diffuse[:, rows, cols][planes], scene.specular[:, rows, cols]])
+    light = scene.light[torch.cat([colors + 3 * k for k in range(6)])]
     turned = [axis for axis, wanted in ((-1, across), (-2, down)) if wanted]
-    light, mask = light.flip(turned), scene.mask[rows, cols].flip(turned)
+    light, mask = light.flip(turned), scene.mask.flip(turned)
+    height, width = mask.shape
+    rows = slice(height - rows.stop, height - rows.start) if down else rows
+    cols = slice(width - cols.stop, width - cols.start) if across else cols
     if transposed:
-        light, mask = light.transpose(-1, -2), mask.T
+        light, mask, rows, cols = light.transpose(-1, -2), mask.T, cols, rows
     s1, s2 = 1 - 2 * transposed, (1 - 2 * across) * (1 - 2 * down)
-    signs = torch.tensor([1.0] * 3 + [s1] * 3 + [s2] * 3 + [1.0, s1, s2])
-    return Crop(light, random_gain(scene, generator) * signs, mask)
+    signs = torch.tensor([1.0] * 3 + [s1] * 3 + [s2] * 3).repeat(2)[:, None, None]
+    gain = random_gain(scene, generator) * (random_darkness(generator) if scene.real else 1.0)
+    total = ((light[:9].float() + light[9:]) * (gain * signs[:9])).clamp(-MAX_LIGHT, MAX_LIGHT)
+    codes = record(Stokes(*total.chunk(3)), scene.real, generator)
+    clipped = codes >= 1 - CLIP_MARGIN
+    told = scene.told[colors]
+    told_order = told / told[1]
+    raw = codes / spread_color(told_order, mask.shape)
+    planes, masks = (pixel_unshuffle(x[None, None].float(), PERIOD) for x in (raw, clipped))
+    thumbnail = make_thumbnail(planes, masks, Layout())[0]
+    own = (light[..., rows, cols].float() * (gain * signs)).clamp(-MAX_LIGHT, MAX_LIGHT)
+    own = (own.unflatten(0, (6, 3)) / told_order[:, None, None]).flatten(0, 1)
+    polarized = own[3:9] + own[12:18]
+    common = torch.cat([_permuted_error(scene, colors), scene.common[2:]])
+    truth = (own[:3].half(), own[9:12].mean(dim=0, keepdim=True).half(), polarized.half(), mask[rows, cols])
+    return Examples(raw[rows, cols], clipped[rows, cols], *truth, thumbnail, common)
 
 
-def expose_crops(crops: list[Crop], generator: torch.Generator) -> Examples:
-    """Return a batch of crops as the sensor records them, and the truth."""
-    factors = torch.stack([crop.factors for crop in crops])[..., None, None]
-    light = (torch.stack([crop.light for crop in crops]).float() * factors).clamp(-MAX_LIGHT, MAX_LIGHT)
-    diffuse, specular = light[:, :3], light[:, 9:10]
-    s1, s2 = light[:, 3:6] + light[:, 10:11], light[:, 6:9] + light[:, 11:12]
-    signal = filter_light(Stokes(diffuse + specular, s1, s2), Layout(), IMX250)
-    raw = torch.stack([add_gaussian_noise(x, random_sensor(generator), generator) for x in signal])
-    polarized = torch.cat([s1.half(), s2.half()], dim=1)
-    return Examples(raw, diffuse.half(), specular.half(), polarized, torch.stack([crop.mask for crop in crops]))
+def _permuted_error(scene: PooledScene, colors: Tensor) -> Tensor:
+    """The first two of `networks.whole_frame.LIGHT` after a permutation of colours."""
+    red, blue = scene.common[:2].tolist()
+    errors = torch.tensor([red, 0.0, blue])[colors]
+    return (errors - errors[1])[[0, 2]]
+
+
+def record(light: Stokes, errors: bool, generator: torch.Generator) -> Tensor:
+    """Return codes ``[H, W]`` from 0 to 1 of ``light [3, H, W]`` by a random sensor, with or without its errors."""
+    layout, wrong = Layout(), random_errors(generator) if errors else SensorErrors()
+    turned = random_analyser_angles(layout, wrong.angles_deg, generator)
+    signal = cross_talk(filter_with_errors(light, layout, IMX250, turned), wrong.cross_talk)
+    signal = vary_gains(signal, layout, (wrong.gains, wrong.period_gains), generator)
+    return add_gaussian_noise(signal, random_sensor(generator), generator, wrong.black)
+
+
+def spread_color(color: Tensor, size: tuple[int, ...]) -> Tensor:
+    """A colour ``[3]`` as the factor of every sample of a frame ``[H, W]`` of whole periods, in Sony's order."""
+    layout = Layout()
+    period = torch.stack([color[layout.filter_at(k // PERIOD, k % PERIOD).channel] for k in range(PERIOD**2)])
+    return period.view(PERIOD, PERIOD).repeat(size[-2] // PERIOD, size[-1] // PERIOD)
 
 
 def _integer(limit: int, generator: torch.Generator) -> int:
@@ -290,6 +335,7 @@ def _random_place(scene: PooledScene, crop: int, generator: torch.Generator) -> 
     for _ in range(MAX_DRAWS):
         center = places[_integer(len(places), generator)].tolist()
         starts = [min(max(c - crop // 2, 0), n - crop) for c, n in zip(center, scene.mask.shape, strict=True)]
+        starts = [start - start % PERIOD for start in starts]
         rows, cols = (slice(start, start + crop) for start in starts)
         if float(scene.mask[rows, cols].float().mean()) >= MIN_COVERED:
             break
@@ -318,8 +364,10 @@ def _rank(share: float) -> int:
     return round((1 - share - LOWEST_QUANTILE) / (1 - LOWEST_QUANTILE) * (QUANTILES - 1))
 
 
-def add_gaussian_noise(signal: Tensor, sensor: Sensor, generator: torch.Generator) -> Tensor:
+def add_gaussian_noise(signal: Tensor, sensor: Sensor, generator: torch.Generator, black: float = 0.0) -> Tensor:
     """Return a frame of ``signal``, white = 1, with Gaussian noise for shot and read noise, clipped and quantized.
+
+    ``black``: what is added after the noise.
 
     Ten times faster than the Poisson noise of `camera.add_noise`, and the same except for the few electrons of black
     pixels.
@@ -327,7 +375,7 @@ def add_gaussian_noise(signal: Tensor, sensor: Sensor, generator: torch.Generato
     source = np.random.default_rng(_integer(2**31, generator))
     noise = torch.from_numpy(source.standard_normal(signal.shape, np.float32))
     variance = signal.clamp(min=0) / sensor.full_well + (sensor.read_noise / sensor.full_well) ** 2
-    noisy = (signal + variance.sqrt() * noise).clamp(0, 1)
+    noisy = (signal + variance.sqrt() * noise + black).clamp(0, 1)
     return torch.round(noisy * sensor.white_level) / sensor.white_level
 
 
@@ -336,11 +384,17 @@ def expose_mono(examples: Examples) -> Examples:
 
     The seed of noise and sensors is a checksum of the colour frames, so that a batch always gives the same frames.
     """
-    diffuse, specular, polarized = (x.float().cpu() for x in examples[1:4])
+    diffuse, specular, polarized = (x.float().cpu() for x in (examples.diffuse, examples.specular, examples.polarized))
     diffuse, polarized = diffuse[:, 1:2], polarized[:, 1::3]
     signal = filter_light(Stokes(diffuse + specular, polarized[:, :1], polarized[:, 1:]), MONO, IMX250)
     generator = torch.Generator().manual_seed(zlib.crc32(examples.raw.cpu().numpy().tobytes()))
     raw = torch.stack([add_gaussian_noise(x, random_sensor(generator), generator) for x in signal])
+    thumbnail = make_thumbnail(
+        *(pixel_unshuffle(x[:, None].float(), PERIOD) for x in (raw, raw >= 1 - CLIP_MARGIN)), MONO
+    )
     device = examples.raw.device
     raw, diffuse, specular, polarized = (x.to(device) for x in (raw, diffuse, specular, polarized))
-    return Examples(raw, diffuse, specular, polarized, examples.mask)
+    clipped = raw >= 1 - CLIP_MARGIN
+    return examples._replace(
+        raw=raw, clipped=clipped, diffuse=diffuse, specular=specular, polarized=polarized, thumbnail=thumbnail.to(device)
+    )

@@ -1,0 +1,99 @@
+"""What is common to a whole frame: a thumbnail of it, and how that modulates the joint network.
+
+The joint network sees 88 raw pixels around a place. The lamp's colour and degree of polarization, room light and gloss
+are common to a frame, so a small network reads a thumbnail of the frame, whatever its size, and scales and shifts the
+features of the joint network (FiLM: Perez et al. 2018, arXiv 1709.07871). Strips of large frames, and crops in
+training, use the thumbnail of their own frame.
+
+The small network also predicts `LIGHT` with a variance; training supervises that.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, conv2d
+
+from polsep.networks.channels import MIN_BRIGHTNESS
+from polsep.sensor.camera import Layout
+
+#: Cells of a thumbnail along each side.
+SIDE = 64
+#: Channels of the convolutions, each of half the resolution of the one before; of what is common.
+WIDTHS, COMMON = (32, 48, 64, 96), 96
+#: What is predicted of the light: ln(red / green), ln(blue / green) of the lamp's colour relative to the one divided
+#: out; degree of polarization of its specular reflections; ln of room light's share of the diffuse light.
+LIGHT = ("red", "blue", "dolp", "room")
+
+
+def thumbnail_channels(colors: int) -> int:
+    """Channels of a thumbnail: means of s0, s1, s2, maxima of s0 and of the polarized light, clipping, brightness."""
+    return 5 * colors + 2
+
+
+def analysis_weights(layout: Layout) -> Tensor:
+    """Weights ``[3 C, 16, 1, 1]`` from the samples of a packed pixel to s0, s1, s2 of every colour, not demosaicked.
+
+    s0 = half the sum of the four analysers, s1 = m0 - m90, s2 = m45 - m135; means over the cells of a colour.
+    """
+    colors = layout.channels
+    weights = torch.zeros(3, colors, 16)
+    rows = {0.0: (0.5, 1.0, 0.0), 90.0: (0.5, -1.0, 0.0), 45.0: (0.5, 0.0, 1.0), 135.0: (0.5, 0.0, -1.0)}
+    places = [layout.filter_at(k // 4, k % 4) for k in range(16)]
+    for k, (angle_deg, channel) in enumerate(places):
+        cells = sum(other.channel == channel for other in places) / 4
+        weights[:, channel, k] = torch.tensor(rows[angle_deg % 180]) / cells
+    return weights.reshape(3 * colors, 16, 1, 1)
+
+
+def make_thumbnail(planes: Tensor, masks: Tensor, layout: Layout) -> Tensor:
+    """Thumbnails ``[N, K, SIDE, SIDE]`` of whole frames; ``planes``, ``masks [N, 16, h, w]``: samples, clipped.
+
+    Stretched to a square, relative to the frame's mean brightness, compressed by asinh.
+    """
+    stokes = conv2d(planes, analysis_weights(layout).to(planes))
+    s0, s1, s2 = stokes.chunk(3, dim=1)
+    polarized = torch.sqrt(s1 * s1 + s2 * s2)
+    means = adaptive_avg_pool2d(torch.cat([stokes, masks.mean(dim=1, keepdim=True)], dim=1), SIDE)
+    largest = adaptive_max_pool2d(torch.cat([s0, polarized], dim=1), SIDE)
+    return scale_thumbnail(means[:, :-1], largest, means[:, -1:])
+
+
+def scale_thumbnail(means: Tensor, largest: Tensor, clipped: Tensor) -> Tensor:
+    """The thumbnail of means of s0, s1, s2 and maxima of s0 and of the polarized light, in white levels."""
+    brightness = means[:, : means.shape[1] // 3].mean(dim=(1, 2, 3), keepdim=True).clamp(min=0) + MIN_BRIGHTNESS
+    light = torch.asinh(torch.cat([means, largest], dim=1) / brightness)
+    return torch.cat([light, clipped, torch.log(brightness).expand_as(clipped)], dim=1)
+
+
+class WholeFrame(nn.Module):
+    """The thumbnail of a whole frame to scales and shifts of features.
+
+    ``widths``: channels of the features that are modulated, level by level; see `split_modulation`.
+    """
+
+    def __init__(self, colors: int, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        sizes = (thumbnail_channels(colors), *WIDTHS)
+        layers: list[nn.Module] = []
+        for inputs, outputs in zip(sizes, sizes[1:], strict=False):
+            layers += [nn.Conv2d(inputs, outputs, 3, stride=2, padding=1), nn.ReLU()]
+        self.look = nn.Sequential(*layers)
+        self.common = nn.Linear(2 * WIDTHS[-1], COMMON)
+        self.light = nn.Linear(COMMON, 2 * len(LIGHT))
+        self.change = nn.Linear(COMMON, 2 * sum(widths))
+        nn.init.zeros_(self.change.weight)
+        nn.init.zeros_(self.change.bias)
+
+    def forward(self, thumbnail: Tensor) -> tuple[Tensor, Tensor]:
+        """Scales and shifts ``[N, 2 sum(widths), 1, 1]``, and means and log variances of `LIGHT` ``[N, 8]``."""
+        seen = self.look(thumbnail)
+        pooled = torch.cat([seen.mean(dim=(2, 3)), seen.amax(dim=(2, 3))], dim=1)
+        common = torch.relu(self.common(pooled))
+        return self.change(common)[..., None, None], self.light(common)
+
+
+def split_modulation(modulation: Tensor, widths: tuple[int, ...]) -> list[tuple[Tensor, Tensor]]:
+    """Scale and shift ``[N, width, 1, 1]`` of every level."""
+    pairs = torch.split(modulation, [2 * width for width in widths], dim=1)
+    return [(pair[:, :width], pair[:, width:]) for pair, width in zip(pairs, widths, strict=True)]

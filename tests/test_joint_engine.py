@@ -53,7 +53,7 @@ ROUNDED = 1e-3
 def random_net(layout: Layout, inputs: tuple[str, ...] = INPUTS, demosaicker: Demosaicker = "linear") -> Joint:
     """A net whose every layer does something, with corrections of a few percent, and a filter that is not bilinear."""
     torch.manual_seed(0)
-    net = Joint(layout.channels, ResidualSize(16, (0, 1, 1)), inputs, demosaicker)
+    net = Joint(layout.channels, ResidualSize(16, (0, 1, 1)), inputs, demosaicker, sees_frame=True)
     for name, weight in net.named_parameters():
         if name.endswith("weight"):
             torch.nn.init.normal_(weight, std=0.5 / weight[0].numel() ** 0.5)

@@ -21,7 +21,8 @@ from torch.nn.functional import interpolate
 import polsep
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.methods import BEST, FASTEST, METHODS, Capture, Method, find_method, run_reference
-from polsep.networks.joint import MIN_BRIGHTNESS, Joint
+from polsep.networks.channels import MIN_BRIGHTNESS
+from polsep.networks.joint import Joint
 from polsep.networks.run import run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Measurements, Stokes, measure

@@ -24,7 +24,7 @@ from polsep.cli.app import DIR, app, extra_needed
     "--looks",
     default="varied",
     metavar="NAME",
-    help="Rendered scenes; varied, or usual: as in the paper, without glare and relief.",
+    help="Rendered scenes: real; varied: under a perfect white lamp; usual: as in the paper, no glare or relief.",
 )
 @click.option("--width", type=int, metavar="N", help="Channels of the network's first level; 32 on the ladder.")
 @click.option("--levels", type=int, default=3, metavar="N", help="How often a ladder network halves the resolution.")

@@ -24,7 +24,7 @@ from polsep.compute.threads import get_threads
 from polsep.compute.warm_up import make_ready
 from polsep.networks.channels import PERIOD
 from polsep.networks.joint import Joint
-from polsep.networks.openvino_engine import OpenVinoEngine
+from polsep.networks.openvino_engine import OpenVinoEngine, modulation_of
 from polsep.networks.run import MARGIN, cut_rows, own_order
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.orient import Orientation, orient
@@ -117,13 +117,13 @@ def run_engine(network: Joint, mosaic: Mosaic, full: bool) -> FrameImages | None
         make_ready(_warm_up_full)
     as_it_is = orientation == Orientation(*data.shape) and not any(n % PERIOD for n in data.shape)
     turned = data if as_it_is else orientation.turn(data.float()).contiguous()
-    cells, parts = 1 if full else 2, []
+    cells, parts, levels = 1 if full else 2, [], (mosaic.black_level, mosaic.white_level)
+    modulation = modulation_of(network, turned.numpy(), levels, mosaic.light_color)
     for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), PERIOD * network.net.grid):
         job = _Job(network, full, (bottom - top, turned.shape[1]), get_threads())
-        raw, levels = turned[top:bottom].numpy(), (mosaic.black_level, mosaic.white_level)
         with ENGINES.borrow(job) as engine:
             rows = slice(*((row - top) // cells for row in kept))
-            parts.append(engine.run(raw, levels, mosaic.light_color, rows))
+            parts.append(engine.run(turned[top:bottom].numpy(), levels, mosaic.light_color, modulation, rows))
     images = _join(parts)
     return images if as_it_is else _turn_back(images, orientation, 2 if full else 1)
 

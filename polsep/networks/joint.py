@@ -203,9 +203,7 @@ class Joint(nn.Module):
             images = torch.cat([diffuse, specular], dim=1) + change.float() * closed.local_brightness
             return pixel_shuffle(images, 2)
 
-    def _as_output(
-        self, images: Tensor, closed: ClosedForm, log_variance: Tensor, light: Tensor | None
-    ) -> JointOutput:
+    def _as_output(self, images: Tensor, closed: ClosedForm, log_variance: Tensor, light: Tensor | None) -> JointOutput:
         s1, s2 = (pixel_shuffle(s, 2) for s in closed.polarized.chunk(2, dim=1))
         diffuse, specular = images[:, : self.colors], images[:, self.colors :]
         brightness, residual = closed.local_brightness, closed.fit_residual

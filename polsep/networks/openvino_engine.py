@@ -22,6 +22,7 @@ from torch.nn.functional import conv2d
 from polsep.networks.channels import DETAIL_MAPS, PERIOD, input_channels
 from polsep.networks.details import HAAR
 from polsep.networks.joint import Joint, pool_outputs
+from polsep.networks.whole_frame import split_modulation
 from polsep.physics.stokes import stokes_inverse
 from polsep.sensor.camera import Layout
 from polsep.separation.images import FrameImages, Tally
@@ -43,12 +44,14 @@ _MODELS: WeakKeyDictionary[nn.Module, dict[type[nn.Module], Any]] = WeakKeyDicti
 class Layers(nn.Module):
     """A network's layers: inputs ``[1, n, h, w]`` to corrections ``[1, 4 C + 8, h, w]``, deviations ``[1, 8, h, w]``.
 
-    Corrections are those of diffuse, specular, and the closed form's gain, see `images_kernel.LayerOutputs`.
+    Corrections are those of diffuse, specular, and the closed form's gain, see `images_kernel.LayerOutputs`. The last
+    input of networks that see a whole frame is what modulates their features, see `WholeFrame.forward`.
     """
 
     def __init__(self, network: Joint) -> None:
         super().__init__()
         self.net, self.log_variance, self.max_log_variance = network.net, network.log_variance, network.max_log_variance
+        self.widths = network.size.widths
         assert network.corrections.bias is not None
         weight, bias = network.corrections.weight, network.corrections.bias
         if network.closed_form_gain is None:
@@ -58,9 +61,14 @@ class Layers(nn.Module):
             gain = [network.closed_form_gain.weight, network.closed_form_gain.bias]
         self.weight, self.bias = nn.Parameter(torch.cat([weight, gain[0]])), nn.Parameter(torch.cat([bias, gain[1]]))
 
-    def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, inputs: Tensor, *modulation: Tensor) -> tuple[Tensor, Tensor]:
         """Relative to the local brightness and to the closed form, at half resolution."""
-        return self.correct(self.net(inputs))
+        return self.correct(self.features(inputs, *modulation))
+
+    def features(self, inputs: Tensor, *modulation: Tensor) -> Tensor:
+        """The network's features."""
+        features: Tensor = self.net(inputs, split_modulation(modulation[0], self.widths) if modulation else ())
+        return features
 
     def correct(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """The same from the network's features."""
@@ -78,9 +86,11 @@ class FullLayers(Layers):
         super().__init__(network)
         self.belief, self.change = network.details.belief, network.details.change
 
-    def forward(self, inputs: Tensor, details: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
+    def forward(  # type: ignore[override]
+        self, inputs: Tensor, details: Tensor, *modulation: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """See the class."""
-        features = self.net(inputs)
+        features = self.features(inputs, *modulation)
         shares = torch.cat([self.belief(torch.cat([features, details], dim=1)), self.change(features)], dim=1)
         return *self.correct(features), shares
 
@@ -118,15 +128,24 @@ class OpenVinoEngine:
             self._details = DetailOutputs.of(shares, beyond, smooth)
             self._detail_input = LayerInput.empty((h, w, DETAIL_MAPS), halves)
             filled, outputs = [*filled, self._detail_input.filled], [*outputs, shares]
+        self._network, self._modulation = network, np.zeros((1, 1, 2 * sum(network.size.widths)), np.float32)
+        if network.whole_frame is not None:
+            filled = [*filled, self._modulation]
         model = _model_of(network, FullLayers if full else Layers, tuple(image.shape[2] for image in filled))
         self._request = _compile(model, filled, outputs, precision)
 
     def run(
-        self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...], kept: slice = slice(None)
+        self,
+        raw: RawFrame,
+        levels: tuple[float, float],
+        light: tuple[float, ...],
+        modulation: Floats | None = None,
+        kept: slice = slice(None),
     ) -> FrameImages:
         """Images of a frame ``[H, W]`` with black and white ``levels`` and a ``light`` of one gain per colour.
 
-        ``kept``: rows of the images that are wanted; others are left out, and do not count in the tally.
+        ``modulation``: `modulation_of` the frame that this is a strip of; None where it is a whole one. ``kept``: rows
+        of the images that are wanted; others are left out, and do not count in the tally.
         """
         from polsep.compute.threads import run_over_rows
         from polsep.demosaic.bilinear_kernel import read_pattern
@@ -138,7 +157,11 @@ class OpenVinoEngine:
         pattern = read_pattern(shape, self._layout, *levels, light)
         h, w = shape if self._full else (shape[0] // 2, shape[1] // 2)
         targets, gains = Targets.empty((h, w), self._colors), np.array(light[: self._colors], np.float32)
+        if modulation is None:
+            modulation = modulation_of(self._network, raw, levels, light)
         with self._lock:
+            if modulation is not None:
+                self._modulation[0, 0] = modulation
             self._fill_inputs(samples, pattern)
             rows, closed, beyond = shape[0] // PERIOD, self._maps.closed, self._maps.details
             if self._full:
@@ -175,14 +198,32 @@ class OpenVinoEngine:
             run_over_rows(lambda row_range: map_guided_rows(source, maps, row_range), h, -(-h // get_threads()))
 
 
+def modulation_of(
+    network: Joint, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...]
+) -> Floats | None:
+    """Scales and shifts of a network's features for a whole frame ``[H, W]``; None for networks that see none."""
+    from polsep.networks.whole_frame_kernel import thumbnail_of
+
+    if network.whole_frame is None:
+        return None
+    with torch.no_grad():
+        modulation: Tensor = network.whole_frame(thumbnail_of(raw, network.layout, levels, light))[0]
+    return modulation.flatten().numpy()
+
+
 def _model_of(network: Joint, layers: type[Layers], channels: tuple[int, ...]) -> Any:
     """A copy of the OpenVINO model of a network's layers, which is read once: reading takes a second and 5 MiB."""
     known = _MODELS.setdefault(network, {})
     if layers not in known:
         known[layers] = _as_model(
-            layers(network).eval(), tuple(torch.zeros(1, n, 32, 32, dtype=torch.float32) for n in channels)
+            layers(network).eval(), tuple(torch.zeros(1, n, *_example_size(n, network)) for n in channels)
         )
     return known[layers].clone()
+
+
+def _example_size(channels: int, network: Joint) -> tuple[int, int]:
+    """Height and width of an input for tracing; modulation is for a whole frame."""
+    return (1, 1) if channels == 2 * sum(network.size.widths) else (32, 32)
 
 
 def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[Floats], precision: str | None) -> Any:

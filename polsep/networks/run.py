@@ -47,11 +47,12 @@ def run_joint(network: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
     raw, clipped = (orientation.turn(x) for x in (mosaic.linear().float(), mosaic.clipped()))
     batch, (height, width) = raw.shape[:-2], raw.shape[-2:]
     raw, clipped = (x.reshape(-1, 1, height, width) for x in (raw, clipped))
-    parts = []
+    parts, thumbnail = [], network.thumbnail(raw, clipped)
     for first, last in cut_rows((height, width), PERIOD * network.net.grid):
         top, bottom = max(first - MARGIN, 0), min(last + MARGIN, height)
         with torch.no_grad():
-            images = _images(network, raw[..., top:bottom, :], clipped[..., top:bottom, :], full)
+            strip = (raw[..., top:bottom, :], clipped[..., top:bottom, :])
+            images = _images(network, strip, thumbnail, full)
         parts.append([_rows(x, (first - top, last - top), bottom - top) for x in images])
     joined = (torch.cat(strips, dim=-2) for strips in zip(*parts, strict=True))
     images = [image.reshape(*batch, *image.shape[1:]) for image in joined]
@@ -80,9 +81,9 @@ def cut_rows(size: tuple[int, int], grid: int) -> Iterator[tuple[int, int]]:
         yield first, min(first + rows, height)
 
 
-def _images(network: Joint, raw: Tensor, clipped: Tensor, full: bool) -> list[Tensor]:
+def _images(network: Joint, strip: tuple[Tensor, Tensor], thumbnail: Tensor | None, full: bool) -> list[Tensor]:
     """Diffuse, specular, s1, s2, the standard deviations of the errors of both, and the fit residual, of a strip."""
-    output = network(raw, clipped)[0] if full else network.half_resolution(raw, clipped)
+    output = network(*strip, thumbnail)[0] if full else network.half_resolution(*strip, thumbnail)
     diffuse, specular, error = limit(output)
     return [diffuse, specular, output.s1, output.s2, error, _repeat(output.fit_residual, 2)]
 

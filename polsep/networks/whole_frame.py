@@ -1,4 +1,4 @@
-"""What is common to a whole frame: a thumbnail of it, and how that modulates the joint network.
+"""The whole frame at a glance: a thumbnail of it modulates the joint network.
 
 The joint network sees 88 raw pixels around a place. The lamp's colour and degree of polarization, room light and gloss
 are common to a frame, so a small network reads a thumbnail of the frame, whatever its size, and scales and shifts the
@@ -9,6 +9,8 @@ The small network also predicts `LIGHT` with a variance; training supervises tha
 """
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -76,7 +78,7 @@ class WholeFrame(nn.Module):
         super().__init__()
         sizes = (thumbnail_channels(colors), *WIDTHS)
         layers: list[nn.Module] = []
-        for inputs, outputs in zip(sizes, sizes[1:], strict=False):
+        for inputs, outputs in pairwise(sizes):
             layers += [nn.Conv2d(inputs, outputs, 3, stride=2, padding=1), nn.ReLU()]
         self.look = nn.Sequential(*layers)
         self.common = nn.Linear(2 * WIDTHS[-1], COMMON)

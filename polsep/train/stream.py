@@ -294,7 +294,7 @@ def random_example(pool: deque[PooledScene], crop: int, generator: torch.Generat
     planes, masks = (pixel_unshuffle(x[None, None].float(), PERIOD) for x in (raw, clipped))
     thumbnail = make_thumbnail(planes, masks, Layout())[0]
     own = (light[..., rows, cols].float() * (gain * signs)).clamp(-MAX_LIGHT, MAX_LIGHT)
-    own = (own.unflatten(0, (6, 3)) / told_order[:, None, None]).flatten(0, 1)
+    own = own / told_order.repeat(6)[:, None, None]
     polarized = own[3:9] + own[12:18]
     common = torch.cat([_permuted_error(scene, colors), scene.common[2:]])
     truth = (own[:3].half(), own[9:12].mean(dim=0, keepdim=True).half(), polarized.half(), mask[rows, cols])
@@ -389,12 +389,8 @@ def expose_mono(examples: Examples) -> Examples:
     signal = filter_light(Stokes(diffuse + specular, polarized[:, :1], polarized[:, 1:]), MONO, IMX250)
     generator = torch.Generator().manual_seed(zlib.crc32(examples.raw.cpu().numpy().tobytes()))
     raw = torch.stack([add_gaussian_noise(x, random_sensor(generator), generator) for x in signal])
-    thumbnail = make_thumbnail(
-        *(pixel_unshuffle(x[:, None].float(), PERIOD) for x in (raw, raw >= 1 - CLIP_MARGIN)), MONO
-    )
-    device = examples.raw.device
-    raw, diffuse, specular, polarized = (x.to(device) for x in (raw, diffuse, specular, polarized))
     clipped = raw >= 1 - CLIP_MARGIN
-    return examples._replace(
-        raw=raw, clipped=clipped, diffuse=diffuse, specular=specular, polarized=polarized, thumbnail=thumbnail.to(device)
-    )
+    planes, masks = (pixel_unshuffle(x[:, None].float(), PERIOD) for x in (raw, clipped))
+    mono = examples._replace(raw=raw, clipped=clipped, diffuse=diffuse, specular=specular, polarized=polarized)
+    mono = mono._replace(thumbnail=make_thumbnail(planes, masks, MONO))
+    return Examples(*(x.to(examples.raw.device) for x in mono))

@@ -96,7 +96,7 @@ def scene(layout: Layout, height: int, width: int) -> tuple[JointOutput, Polariz
     a, e = (x.repeat_interleave(PERIOD, dim=-1).repeat_interleave(PERIOD, dim=-2) for x in (slope, direction))
     light = Stokes(diffuse + specular, *(a[:, k : k + 1] * diffuse + e[:, k : k + 1] * specular for k in (0, 1)))
     nothing = torch.zeros(2, 1, 1, 1)
-    return JointOutput(diffuse, specular, *[nothing] * 5), Polarization(slope, direction), light
+    return JointOutput(diffuse, specular, *[nothing] * 6), Polarization(slope, direction), light
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
@@ -295,7 +295,7 @@ def clipping_scene(layout: Layout) -> tuple[JointOutput, Tensor, Tensor]:
     specular = torch.zeros(1, 1, 96, 96)
     specular[..., 40:56, 40:56] = 1.0
     turn = torch.tensor([0.8, 0.6]).view(1, 2, 1, 1).expand(1, 2, 24, 24)
-    images = JointOutput(diffuse, specular, *[torch.zeros(1, 1, 1, 1)] * 5)
+    images = JointOutput(diffuse, specular, *[torch.zeros(1, 1, 1, 1)] * 6)
     raw = predict_samples(images, Polarization(0.1 * turn.flip(1), turn), layout)
     return images, raw, raw.clamp(max=1)
 

@@ -32,7 +32,7 @@ from polsep.train import command, loop
 from polsep.train import joint_task as module
 from polsep.train.command import JointOptions, train_weights
 from polsep.train.digest import digest_examples
-from polsep.train.inputs import JointInputs, find_clipped, joint_inputs, joint_mono_inputs
+from polsep.train.inputs import JointInputs, joint_inputs, joint_mono_inputs
 from polsep.train.joint_losses import (
     DATA_SCALE,
     MIN_ERROR,
@@ -84,7 +84,7 @@ def batches() -> list[Examples]:
 
 def small_task(ablation: str = "none", variant: str = "mosaic") -> Task[JointInputs]:
     torch.manual_seed(1)
-    return joint_task(variant, TINY, ABLATIONS[ablation])
+    return joint_task(variant, TINY, ABLATIONS[ablation], sees_frame=True)
 
 
 def truth_of(seen: JointInputs) -> JointOutput:
@@ -92,7 +92,8 @@ def truth_of(seen: JointInputs) -> JointOutput:
     s1, s2 = avg_pool2d(seen.polarized, 2).chunk(2, dim=1)
     count, _, height, width = seen.raw.shape
     doubt, light = torch.zeros(count, 2, height // 2, width // 2), torch.ones(count, 1, height // 4, width // 4)
-    return JointOutput(seen.full_diffuse, seen.full_specular, s1, s2, doubt, light, torch.zeros_like(light))
+    nothing = torch.zeros(count, 0)
+    return JointOutput(seen.full_diffuse, seen.full_specular, s1, s2, doubt, light, torch.zeros_like(light), nothing)
 
 
 def explained(layout: Layout) -> tuple[JointOutput, Polarization, JointInputs]:
@@ -105,7 +106,9 @@ def explained(layout: Layout) -> tuple[JointOutput, Polarization, JointInputs]:
     half = [avg_pool2d(x, 2) for x in (diffuse, specular)]
     polarized = torch.cat([light.s1, light.s2], dim=1)
     ones = torch.ones(2, 1, 16, 16)
-    seen = JointInputs(raw, *half, ones[:, 0, ::2, ::2] > 0, layout, diffuse, specular, ones, polarized)
+    clipped, inside = raw >= 1 - CLIP_MARGIN, ones[:, 0, ::2, ::2] > 0
+    whole = torch.zeros(0), torch.zeros(2, 4)
+    seen = JointInputs(raw, clipped, *half, inside, layout, diffuse, specular, ones, polarized, *whole)
     polarization = Polarization(*(x.view(1, 2, 1, 1).expand(2, 2, 4, 4) for x in (a, e)))
     return truth_of(seen), polarization, seen
 
@@ -124,11 +127,11 @@ def test_examples_hold_raw_samples_and_the_truth_behind_them(
     assert_close(seen.diffuse, avg_pool2d(seen.full_diffuse, 2))
     assert_close(seen.specular, avg_pool2d(seen.full_specular, 2))
     light = Stokes(seen.full_diffuse + seen.full_specular, seen.polarized[:, :c], seen.polarized[:, c:])
-    error = (filter_light(light, seen.layout, IMX250) - seen.raw[:, 0])[~find_clipped(seen.raw)[:, 0]]
+    error = (filter_light(light, seen.layout, IMX250) - seen.raw[:, 0])[~seen.clipped[:, 0]]
     assert abs(float(error.mean())) < 2e-3
     assert float(error.abs().median()) < 1e-2
     assert torch.equal(seen.mask, avg_pool2d(seen.weight, 2)[:, 0] == 1)
-    assert torch.equal(find_clipped(seen.raw), seen.raw >= 1 - CLIP_MARGIN)
+    assert torch.equal(seen.clipped, seen.raw >= 1 - CLIP_MARGIN)  # under white light
 
 
 def test_decibels_are_minus_the_score() -> None:
@@ -177,7 +180,9 @@ def test_doubt_is_least_where_it_is_the_squared_error(share: float) -> None:
 
     def loss(doubt: Tensor) -> Tensor:
         nothing = torch.zeros(1)
-        return variance_loss(JointOutput(*[nothing] * 4, doubt, light, nothing), errors, torch.ones(1, 1, 4, 4))
+        return variance_loss(
+            JointOutput(*[nothing] * 4, doubt, light, nothing, nothing), errors, torch.ones(1, 1, 4, 4)
+        )
 
     doubt = best.clone().requires_grad_()
     loss(doubt).backward()
@@ -193,7 +198,9 @@ def test_a_pixel_that_is_far_off_does_not_outweigh_the_others() -> None:
     pulls = []
     for sure in (0.0, -math.log(2 * SURPRISE), -200.0):
         doubt = torch.full((1, 2, 4, 4), sure, requires_grad=True)
-        loss = variance_loss(JointOutput(*[nothing] * 4, doubt, light, nothing), errors, torch.ones(1, 1, 4, 4))
+        loss = variance_loss(
+            JointOutput(*[nothing] * 4, doubt, light, nothing, nothing), errors, torch.ones(1, 1, 4, 4)
+        )
         loss.backward()
         assert doubt.grad is not None
         assert_finite(loss, doubt.grad)
@@ -214,7 +221,7 @@ def test_doubt_moves_nothing_but_itself() -> None:
 def test_the_truth_explains_all_samples_that_did_not_clip(layout: Layout) -> None:
     """The misfit is 0 although a part of the frame clips, and not where anything else is claimed."""
     images, polarization, seen = explained(layout)
-    assert 0.02 < float(find_clipped(seen.raw).float().mean()) < 0.5
+    assert 0.02 < float(seen.clipped.float().mean()) < 0.5
     assert float(sample_residual(images, polarization, seen)) < 1e-8
     darker = images._replace(diffuse=0.9 * images.diffuse)
     turned = polarization._replace(specular=polarization.specular.flip(1))
@@ -225,19 +232,19 @@ def test_the_truth_explains_all_samples_that_did_not_clip(layout: Layout) -> Non
 def test_clipped_samples_have_no_misfit() -> None:
     """Their values and the light behind them change nothing and get no gradient; nor do wholly clipped frames."""
     images, polarization, seen = explained(MONO)
-    clipped = find_clipped(seen.raw)
+    clipped = seen.clipped
     variable = as_variable(images._replace(diffuse=images.diffuse + 0.5))
     sample_residual(variable, polarization, seen).backward()
     gradient = variable.diffuse.grad
     assert gradient is not None
     assert not bool(gradient[clipped].any())
     assert bool((gradient[~clipped] != 0).all())
-    assert float(sample_residual(images, polarization, seen._replace(raw=torch.ones_like(seen.raw)))) == 0
+    assert float(sample_residual(images, polarization, seen._replace(clipped=torch.ones_like(clipped)))) == 0
 
 
 def test_misfit_is_quadratic_for_noise_and_linear_beyond() -> None:
     images, polarization, seen = explained(MONO)
-    nothing = seen._replace(raw=torch.zeros_like(seen.raw))
+    nothing = seen._replace(raw=torch.zeros_like(seen.raw), clipped=torch.zeros_like(seen.clipped))
     flat = Polarization(torch.zeros_like(polarization.diffuse), polarization.specular)
 
     def misfit(sample: float) -> float:
@@ -279,6 +286,7 @@ def known_views(layout: Layout, weight: Tensor) -> list[JointInputs]:
         views.append(
             JointInputs(
                 raw,
+                torch.zeros_like(raw) > 0,
                 avg_pool2d(diffuse, 2),
                 specular[..., ::2, ::2],
                 mask,
@@ -287,6 +295,8 @@ def known_views(layout: Layout, weight: Tensor) -> list[JointInputs]:
                 specular,
                 torch.ones_like(raw),
                 polarized,
+                torch.zeros(0),
+                torch.zeros(2, 4),
             )
         )
     return views
@@ -353,7 +363,7 @@ def test_samples_near_clipped_ones_say_nothing_about_the_filter() -> None:
     weight = known_filter(COLOR)
     views = known_views(COLOR, weight)
     clipped = torch.rand(views[0].raw.shape, generator=torch.Generator().manual_seed(6)) < 0.002
-    spoilt = [view._replace(raw=torch.where(clipped, 1.0, view.raw)) for view in views]
+    spoilt = [view._replace(raw=torch.where(clipped, 1.0, view.raw), clipped=clipped) for view in views]
     assert float((fit_filter(spoilt) - weight).abs().max()) < 0.01
 
 
@@ -390,9 +400,9 @@ def relative_error(net: Joint, views: list[JointInputs]) -> float:
     total, count = 0.0, 0
     for seen in views:
         with torch.no_grad():
-            images = net(seen.raw, find_clipped(seen.raw))[0]
+            images = net(seen.raw, seen.clipped)[0]
         light = interpolate(images.local_brightness, scale_factor=4.0)
-        near = interpolate(avg_pool2d(find_clipped(seen.raw).float(), 8, 4, 2), scale_factor=4.0)[..., :32, :32]
+        near = interpolate(avg_pool2d(seen.clipped.float(), 8, 4, 2), scale_factor=4.0)[..., :32, :32]
         kept = ((seen.weight > 0) & (near == 0)).expand_as(images.diffuse)
         error = (images.diffuse + images.specular - seen.full_diffuse - seen.full_specular) / light
         total, count = total + float(error[kept].square().sum()), count + int(kept.sum())
@@ -432,7 +442,8 @@ def test_gradients_are_finite_on_black_and_clipped_frames(ablation: str) -> None
     for level in (0.0, 0.5, 3.0):
         light, nothing = torch.full((1, 3, 16, 16), level), torch.zeros(1, 1, 16, 16)
         raw, mask = torch.full((1, 16, 16), min(level / 2, 1.0)), torch.full((1, 16, 16), level > 0)
-        seen = task.prepare(Examples(raw, light, nothing, torch.zeros(1, 6, 16, 16), mask))
+        clipped, common = raw >= 1 - CLIP_MARGIN, (torch.zeros(1, 17, 64, 64), torch.zeros(1, 4))
+        seen = task.prepare(Examples(raw, clipped, light, nothing, torch.zeros(1, 6, 16, 16), mask, *common))
         task.network.zero_grad()
         task.loss(task.network, seen, 1.0).backward()
         assert_finite(*(p.grad for p in task.network.parameters()))
@@ -536,16 +547,16 @@ def test_resumed_training_ends_with_the_same_bits(tmp_path: Path, shortened: Non
 
 
 def test_it_learns_a_picture_by_heart() -> None:
-    """One 32 x 32 example, 160 steps: both outputs reach 40 dB, 15 dB above the closed form that they start at."""
-    examples = next(itertools.islice(stream_lane(replace(STREAM, batch=1), 0, 0), 1, None))
+    """One 32 x 32 example of which 1 % clips, 220 steps: both outputs reach 40 dB, 15 dB above the closed form."""
+    examples = next(itertools.islice(stream_lane(replace(STREAM, batch=1), 0, 0), 2, None))
     torch.manual_seed(0)
     task = joint_task("mosaic", ResidualSize(16, (1, 1)), ABLATIONS["none"])
     seen = task.prepare(examples)
     everywhere = [seen._replace(mask=torch.ones_like(seen.mask))]
     before = score(task.separate, everywhere)
     optimizer = torch.optim.Adam(task.network.parameters(), 3e-3)
-    falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 160)
-    for _ in range(160):
+    falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 220)
+    for _ in range(220):
         optimizer.zero_grad()
         task.loss(task.network, seen, 1.0).backward()
         optimizer.step()

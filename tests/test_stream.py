@@ -16,9 +16,10 @@ from torch.utils.data import DataLoader
 pytest.importorskip("embreex")
 
 from polsep.physics.stokes import Stokes
+from polsep.render.sensor_errors import SensorErrors
 from polsep.render.simulate import filter_light
 from polsep.sensor.camera import CLIP_MARGIN, IMX250, Layout
-from polsep.train import stream
+from polsep.train import reality, stream
 from polsep.train.stream import (
     BRIGHT_SHARE,
     BRIGHTEST,
@@ -38,7 +39,7 @@ from polsep.train.stream import (
     StreamOptions,
     add_gaussian_noise,
     pool_scenes,
-    random_crop,
+    random_example,
     random_gain,
     stream_lane,
 )
@@ -47,6 +48,12 @@ from polsep.train.variety import BLURS
 #: Light spreads this many pixels beyond the mask: the lens's three standard deviations, and a pixel half covered.
 FRINGE = math.ceil(3 * max(BLURS)) + 1
 SMALL = StreamOptions(batch=3, crop=32, size=64, pool=3, uses=1)
+
+
+def pooled(ranks: torch.Tensor, level: float) -> PooledScene:
+    """A scene without pixels, of which only the brightness is asked."""
+    nothing = torch.zeros(0)
+    return PooledScene(nothing, torch.ones(3), torch.zeros(4), False, nothing, nothing, nothing, ranks, level)
 
 
 def take(options: StreamOptions, lane: int, first: int, count: int) -> list[Examples]:
@@ -84,7 +91,7 @@ def test_workers_are_lanes_in_turn(start: int) -> None:
 def test_scenes_follow_their_number() -> None:
     whole = list(itertools.islice(pool_scenes(SMALL, 0, 0), VIEWS * LIGHTS + 2))
     later = next(pool_scenes(SMALL, 0, VIEWS * LIGHTS + 1))
-    assert torch.equal(whole[-1].diffuse, later.diffuse)
+    assert torch.equal(whole[-1].light, later.light)
 
 
 def test_raw_is_the_truth_behind_its_filters(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,6 +107,41 @@ def test_raw_is_the_truth_behind_its_filters(monkeypatch: pytest.MonkeyPatch) ->
     z = torch.cat(deviations)
     assert abs(float(z.mean())) < SIGMAS / math.sqrt(z.numel()) + 0.02  # halves round the truth by up to 2^-12
     assert abs(float(z.std()) - 1) < 0.05
+
+
+def test_real_frames_less_the_told_color_are_the_truth_behind_its_filters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As above under lamps of any colour that is told, in lit rooms, where all specular light has the lamp's colour."""
+    monkeypatch.setattr(stream, "random_sensor", lambda _: IMX250)
+    monkeypatch.setattr(stream, "random_errors", lambda _: SensorErrors())
+    monkeypatch.setattr(reality, "COLOR_ERROR_SHARES", (1.0, 0.0, 0.0, 0.0))
+    for share in ("METAL_SHARE", "RETAINING_SHARE", "INDIRECT_SHARE", "ABERRATION_SHARE"):
+        monkeypatch.setattr(reality, share, 0.0)
+    deviations, tinted = [], 0
+    for b in take(replace(SMALL, looks="real"), 0, 0, 8):
+        assert_close(b.light[:, :2], torch.zeros(SMALL.batch, 2))
+        for k in range(SMALL.batch):
+            light = Stokes(b.diffuse[k].float() + b.specular[k].float(), *b.polarized[k].float().chunk(2))
+            signal = filter_light(light, Layout(), IMX250)
+            kept = (signal > 0.05) & ~b.clipped[k]
+            tinted += float(b.raw[k][b.clipped[k]].max()) > 1.01 if bool(b.clipped[k].any()) else 0
+            deviations.append(((b.raw[k] - signal) / signal)[kept])
+    errors = torch.cat(deviations)
+    assert abs(float(errors.median())) < 2e-3
+    assert float(errors.abs().median()) < 0.03
+    assert tinted > 0
+
+
+def test_a_thumbnail_is_of_the_whole_frame() -> None:
+    """Crops of one frame have one, whatever they show."""
+    torch.manual_seed(0)
+    light, mask = torch.rand(18, 64, 64).half(), torch.ones(64, 64, dtype=torch.bool)
+    light[3:9], light[12:] = 0, 0
+    told, common, ranks = torch.ones(3), torch.zeros(4), torch.linspace(LOWEST_QUANTILE, 1, QUANTILES)
+    places = [torch.tensor([[k, k]]) for k in (8, 56)]
+    scenes = [PooledScene(light, told, common, False, mask, place, place, ranks, 0.5) for place in places]
+    one, other = (random_example(deque([scene]), 16, torch.Generator().manual_seed(1)) for scene in scenes)
+    assert torch.equal(one.thumbnail, other.thumbnail)
+    assert not torch.equal(one.raw, other.raw)
 
 
 def test_truth_is_physical(batches: list[Examples]) -> None:
@@ -121,8 +163,7 @@ def test_exposures_clip_what_was_drawn() -> None:
     The rest is exposed for the median, far below here.
     """
     ranks = torch.linspace(LOWEST_QUANTILE, 1, QUANTILES)
-    nothing = torch.zeros(0)
-    scene = PooledScene(nothing, nothing, nothing, nothing, nothing, ranks, 2.0)
+    scene = pooled(ranks, 2.0)
     gains = [random_gain(scene, torch.Generator().manual_seed(k)) for k in range(500)]
     leveled = [gain for gain in gains if gain < BRIGHTEST[0]]
     assert LEVELS[0] / 2 <= min(leveled) <= max(leveled) <= LEVELS[1] / 2
@@ -144,21 +185,19 @@ def test_some_crops_are_about_the_brightest_pixels() -> None:
     """The others are about any pixel: of one bright pixel among thousands nearly all crops that hold it mean to."""
     size, crop, draws = 128, 16, 400
     mask = torch.ones(size, size, dtype=torch.bool)
-    light, bright = torch.zeros(3, size, size), torch.tensor([[40, 90]])
-    light[0, 40, 90] = 1
-    scene = PooledScene(torch.zeros(9, size, size), light, mask, mask.nonzero(), bright, torch.ones(QUANTILES), 0.5)
-    crops = [random_crop(deque([scene]), crop, torch.Generator().manual_seed(k)) for k in range(draws)]
-    about = sum(bool(drawn.light[9].any()) for drawn in crops)
+    light, bright = torch.zeros(18, size, size), torch.tensor([[40, 90]])
+    light[9:12, 40, 90] = 1
+    told, common, ranks = torch.ones(3), torch.zeros(4), torch.ones(QUANTILES)
+    scene = PooledScene(light, told, common, False, mask, mask.nonzero(), bright, ranks, 0.5)
+    crops = [random_example(deque([scene]), crop, torch.Generator().manual_seed(k)) for k in range(draws)]
+    about = sum(bool(drawn.specular.any()) for drawn in crops)
     expected = BRIGHT_SHARE + (1 - BRIGHT_SHARE) * (crop / size) ** 2
     assert abs(about - draws * expected) < SIGMAS * math.sqrt(draws * expected * (1 - expected))
 
 
 def test_glaring_scenes_are_mostly_exposed_for_the_rest() -> None:
     """Where the brightest are far above the median, most exposures let them clip."""
-    nothing = torch.zeros(0)
-    glaring = PooledScene(
-        nothing, nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 0.01
-    )
+    glaring = pooled(torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 0.01)
     gains = [random_gain(glaring, torch.Generator().manual_seed(k)) for k in range(300)]
     leveled = [gain for gain in gains if gain > 2 * MIN_LEVEL / 0.01]
     assert LEVELS[0] / 0.01 <= min(leveled) <= max(leveled) <= LEVELS[1] / 0.01
@@ -166,8 +205,7 @@ def test_glaring_scenes_are_mostly_exposed_for_the_rest() -> None:
 
 
 def test_dark_scenes_are_exposed_to_the_floor() -> None:
-    nothing = torch.zeros(0)
-    dark = PooledScene(nothing, nothing, nothing, nothing, nothing, torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 1e-4)
+    dark = pooled(torch.linspace(LOWEST_QUANTILE, 1, QUANTILES), 1e-4)
     assert all(random_gain(dark, torch.Generator().manual_seed(k)) >= MIN_LEVEL / 1e-4 for k in range(20))
 
 
@@ -183,7 +221,7 @@ def test_fast_noise_has_the_sensors_statistics() -> None:
     assert float(add_gaussian_noise(torch.full((8, 8), 3.0), IMX250, torch.Generator()).min()) >= 1 - CLIP_MARGIN
 
 
-@pytest.mark.parametrize("wrong", [{"crop": 30}, {"crop": 128, "size": 64}, {"pool": 0}, {"batch": 0}])
+@pytest.mark.parametrize("wrong", [{"crop": 30}, {"size": 514}, {"crop": 128, "size": 64}, {"pool": 0}, {"batch": 0}])
 def test_bad_options_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="expected"):
         replace(SMALL, **wrong)
@@ -203,5 +241,5 @@ def test_usual_looks_go_without(kind: str, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_unknown_looks_are_refused() -> None:
-    with pytest.raises(ValueError, match="varied or usual, found 'odd'"):
+    with pytest.raises(ValueError, match="varied or usual or real, found 'odd'"):
         replace(SMALL, looks="odd")

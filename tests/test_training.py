@@ -206,9 +206,11 @@ def test_digests_cover_every_module_that_makes_examples() -> None:
     render = {f"polsep.render.{path.stem}" for path in Path(polsep.__file__).parent.glob("render/*.py")}
     unused = {"polsep.render.__init__", "polsep.render.distances"}  # the demo's scenes
     common = {"polsep.physics.optics", "polsep.physics.stokes", "polsep.sensor.camera"}
-    assert common | (render - unused) | {"polsep.train.variety"} <= set(drawn)
+    assert common | (render - unused) | {"polsep.train.variety", "polsep.train.reality"} <= set(drawn)
     assert common | {"polsep.material.shots", "polsep.demosaic.guided"} <= set(separated)
-    assert not {name for name in drawn if name.startswith(("polsep.networks", "polsep.separation", "polsep.train.t"))}
+    thumbnail = {"polsep.networks.channels", "polsep.networks.whole_frame"}
+    other = {name for name in drawn if name.startswith(("polsep.networks", "polsep.separation", "polsep.train.t"))}
+    assert other == thumbnail
 
 
 def test_digests_change_with_any_source(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -373,7 +375,8 @@ def test_gradients_are_finite(rung: str) -> None:
     for level in (0.0, 0.5, 3.0):
         light, nothing = torch.full((1, 3, 8, 8), level), torch.zeros(1, 1, 8, 8)
         mask = torch.ones(1, 8, 8, dtype=torch.bool)
-        seen = task.prepare(Examples(torch.zeros(1, 8, 8), light, nothing, torch.zeros(1, 6, 8, 8), mask))
+        raw, common = torch.zeros(1, 8, 8), (torch.zeros(1, 17, 64, 64), torch.zeros(1, 4))
+        seen = task.prepare(Examples(raw, raw > 0, light, nothing, torch.zeros(1, 6, 8, 8), mask, *common))
         task.network.zero_grad()
         task.loss(task.network, seen, 1.0).backward()
         assert_finite(*(p.grad for p in task.network.parameters()))

@@ -89,7 +89,7 @@ class JointOutput(NamedTuple):
 
     ``s1``, ``s2 [N, C, H/2, W/2]`` as linearly demosaicked; ``log_variance [N, 2, H/2, W/2]`` of the errors of diffuse
     and specular, relative to the squared ``local_brightness [N, 1, H/4, W/4]``; ``fit_residual [N, 1, H/4, W/4]``;
-    ``light [N, 8]``: means and log variances of `whole_frame.LIGHT`, None of networks without a whole frame.
+    ``light [N, 8]``: means and log variances of `whole_frame.LIGHT`, ``[N, 0]`` of networks that see no whole frame.
     """
 
     diffuse: Tensor
@@ -99,7 +99,7 @@ class JointOutput(NamedTuple):
     log_variance: Tensor
     local_brightness: Tensor
     fit_residual: Tensor
-    light: Tensor | None = None
+    light: Tensor
 
 
 class Joint(nn.Module):
@@ -156,7 +156,7 @@ class Joint(nn.Module):
         with torch.autocast(raw.device.type, enabled=False):
             diffuse, specular = (closed.polarization + change.float()).chunk(2, dim=1)
             length = torch.sqrt((specular**2).sum(dim=1, keepdim=True) + 1e-6)
-            if light is not None:
+            if light.shape[1]:
                 length = length / light[:, LIGHT.index("dolp")].float().clamp(0.3, 1)[:, None, None, None]
         full = self.details(half, total, features, closed.local_brightness)
         return self._as_output(full, closed, log_variance, light), Polarization(diffuse, specular / length)
@@ -175,7 +175,7 @@ class Joint(nn.Module):
 
     def _encode(
         self, frames: tuple[Tensor, Tensor], thumbnail: Tensor | None, full: bool
-    ) -> tuple[Tensor, ClosedForm, Tensor, Tensor, Tensor | None]:
+    ) -> tuple[Tensor, ClosedForm, Tensor, Tensor, Tensor]:
         """Packed s0 at full resolution, the closed form, the network's features, log variances and the light."""
         raw, clipped = frames
         planes, masks = pixel_unshuffle(raw, PERIOD), pixel_unshuffle(clipped.to(raw), PERIOD)
@@ -183,7 +183,7 @@ class Joint(nn.Module):
             half, total = self.demosaicked(planes, full)
             closed = self.closed_form(half, planes, masks)
             total = total + closed.clipped_s0.repeat_interleave(total.shape[1] // self.colors, dim=1)
-        changes, light = [], None
+        changes, light = [], raw.new_zeros(raw.shape[0], 0)
         if self.whole_frame is not None:
             if thumbnail is None:
                 thumbnail = make_thumbnail(planes, masks, self.layout)
@@ -203,7 +203,7 @@ class Joint(nn.Module):
             images = torch.cat([diffuse, specular], dim=1) + change.float() * closed.local_brightness
             return pixel_shuffle(images, 2)
 
-    def _as_output(self, images: Tensor, closed: ClosedForm, log_variance: Tensor, light: Tensor | None) -> JointOutput:
+    def _as_output(self, images: Tensor, closed: ClosedForm, log_variance: Tensor, light: Tensor) -> JointOutput:
         s1, s2 = (pixel_shuffle(s, 2) for s in closed.polarized.chunk(2, dim=1))
         diffuse, specular = images[:, : self.colors], images[:, self.colors :]
         brightness, residual = closed.local_brightness, closed.fit_residual

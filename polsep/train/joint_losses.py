@@ -81,7 +81,7 @@ def joint_loss(output: tuple[JointOutput, Polarization], inputs: JointInputs, go
     )
     errors = (diffuse - inputs.diffuse, specular - inputs.specular)
     loss = loss + variance_loss(images, errors, half_weight)
-    if images.light is not None:
+    if images.light.shape[1]:
         loss = loss + LIGHT_WEIGHT * light_loss(images.light.float(), inputs.light)
     return LOSS_SCALE * loss
 

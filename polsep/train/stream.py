@@ -98,8 +98,8 @@ class StreamOptions:
     looks: str = "varied"
 
     def __post_init__(self) -> None:
-        if self.crop % 4 or not 4 <= self.crop <= self.size:
-            raise ValueError(f"expected crops of a multiple of 4 up to {self.size} pixels, found {self.crop}")
+        if self.crop % PERIOD or self.size % PERIOD or not PERIOD <= self.crop <= self.size:
+            raise ValueError(f"expected crops and views of multiples of 4, found {self.crop} and {self.size} pixels")
         if min(self.batch, self.samples, self.pool, self.uses + 1) < 1:
             raise ValueError(f"expected batch, samples and pool of at least 1 and uses of at least 0, found {self}")
         if self.looks not in LOOK_KINDS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -16,7 +17,7 @@ from typing import Any
 import pytest
 import torch
 from tolerances import assert_finite
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 pytest.importorskip("embreex")
@@ -46,7 +47,7 @@ from polsep.train.command import (
 from polsep.train.digest import digest_examples, find_sources
 from polsep.train.inputs import LadderInputs, co_sited_inputs, mono_inputs, mosaic_inputs
 from polsep.train.log import open_log, read_log
-from polsep.train.loop import Run, Schedule, train
+from polsep.train.loop import Run, Schedule, Training, run_training, train
 from polsep.train.losses import FIRST_WEIGHT, first_specular_loss
 from polsep.train.stream import Examples, StreamOptions, stream_lane
 from polsep.train.tasks import (
@@ -392,6 +393,20 @@ def test_validation_uses_the_average_and_gives_the_weights_back() -> None:
     assert set(scores) == {"diffuse PSNR", "specular PSNR"}
     assert all(math.isfinite(score) for score in scores.values())
     assert equal(own, task.network.state_dict())
+
+
+def test_a_loss_that_is_not_finite_ends_training(tmp_path: Path) -> None:
+    """With the step in one line, before weights or a checkpoint are spoilt."""
+    task = small_task()
+
+    def loss(network: nn.Module, batch: Examples, done: float) -> torch.Tensor:
+        return task.loss(network, task.prepare(batch), done) * (math.nan if done > 0.4 else 1.0)
+
+    batch = next(stream_lane(STREAM, 0, 0))
+    training = Training(task.network, lambda *_: itertools.repeat(batch), loss, lambda _: {})
+    with pytest.raises(ValueError, match="expected a finite loss, found nan at step 3"):
+        run_training(training, Run(tmp_path, "a test", STREAM, SCHEDULE, workers=0), lambda _: None)
+    assert all(bool(torch.isfinite(weight).all()) for weight in task.network.parameters())
 
 
 def test_unknown_rungs_are_refused() -> None:

@@ -238,7 +238,10 @@ def shift_colors(scene: Scene, red: float, blue: float) -> Scene:
         planes = image.unbind(dim=-3)
         return torch.stack([_magnify(p, m) for p, m in zip(planes, (red, 0.0, blue), strict=True)], dim=-3)
 
-    return replace(scene, diffuse=scene.diffuse.map(magnify), specular=scene.specular.map(magnify))
+    # Bicubic interpolation overshoots beside highlights; light is not negative.
+    diffuse, specular = scene.diffuse.map(magnify), scene.specular.map(magnify)
+    diffuse, specular = (replace(light, s0=light.s0.clamp(min=0)) for light in (diffuse, specular))
+    return replace(scene, diffuse=diffuse, specular=specular)
 
 
 def _magnify(plane: Tensor, more: float) -> Tensor:

@@ -149,7 +149,7 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
     """Train to the end, from the last checkpoint if there is one, and return the averaged weights.
 
     ``report`` is called with every line of the log. Of several processes only the first one writes and reports; the
-    others return None. Raises ValueError on a checkpoint of another training.
+    others return None. Raises ValueError on a checkpoint of another training, and on a loss that is not finite.
     """
     if run.schedule.precision == "bf16-mixed":
         device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -175,6 +175,8 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
         while step < run.last:
             rate = run.schedule.rate_at(step)
             loss = training.loss(wrapped, _to(fabric.device, next(batches)), step / run.schedule.steps)
+            if not bool(torch.isfinite(loss)):
+                raise ValueError(f"expected a finite loss, found {float(loss)} at step {step}: resume after mending it")
             fabric.backward(loss)
             for net in _parts(network):
                 nn.utils.clip_grad_norm_(net.parameters(), MAX_GRADIENT)

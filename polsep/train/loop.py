@@ -176,7 +176,7 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
             rate = run.schedule.rate_at(step)
             loss = training.loss(wrapped, _to(fabric.device, next(batches)), step / run.schedule.steps)
             if not bool(torch.isfinite(loss)):
-                raise ValueError(f"expected a finite loss, found {float(loss.detach())} at step {step}: resume after mending it")
+                raise ValueError(f"expected a finite loss, found {float(loss.detach())} at step {step}")
             fabric.backward(loss)
             for net in _parts(network):
                 nn.utils.clip_grad_norm_(net.parameters(), MAX_GRADIENT)

@@ -26,12 +26,16 @@ from polsep.methods import Capture, Method, find_method
 from polsep.physics.stokes import Measurements, fit_stokes_unclipped, polarized_intensity
 from polsep.sensor.calibration import Calibration, Corrections, falloff_image, mean_mosaic, subtract_ambient
 from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.defects import remove_defects
 from polsep.sensor.layout_check import check_layout
 from polsep.sensor.levels import as_mosaic
 from polsep.separation.images import FrameImages
 from polsep.separation.report import SeparatedFrame, describe
 
 LightColor = Sequence[float]
+
+#: Share of pixels that are defects from which on the owner is told.
+MANY_DEFECTS = 5e-4
 
 
 def _calm_torch() -> None:
@@ -94,13 +98,32 @@ def separate_capture(
 ) -> SeparatedFrame:
     """`separate` for a frame that is already a `Mosaic`, or co-sited `Measurements` (which keep their resolution)."""
     chosen = find_method(method, capture)
-    capture = to_device(capture, find_device(device))
     check = check_layout(capture).warning if isinstance(capture, Mosaic) else None
+    capture, defects = repair_capture(capture)
+    capture = to_device(capture, find_device(device))
     light, remarks = resolve_light_color(light_color, capture)
     images = chosen.run(capture, light, full)
     frame = make_frame(images, chosen, capture, light, full)
-    frame.report["warnings"] = [*([check] if check else []), *remarks, *frame.report["warnings"]]
+    frame.report["defects"] = defects
+    remarks = [*([check] if check else []), *defect_remarks(defects, capture), *remarks]
+    frame.report["warnings"] = [*remarks, *frame.report["warnings"]]
     return frame
+
+
+def repair_capture(capture: Capture) -> tuple[Capture, int]:
+    """The capture with its dead and hot pixels repaired, and their number; only single raw frames have any."""
+    return remove_defects(capture) if isinstance(capture, Mosaic) and capture.data.ndim == 2 else (capture, 0)
+
+
+def defect_remarks(defects: int, capture: Capture) -> list[str]:
+    """A warning where many pixels were repaired."""
+    share = defects / max(capture.data.numel(), 1)
+    if share < MANY_DEFECTS:
+        return []
+    return [
+        f"{defects} dead or hot pixels were repaired ({share:.2%}): a calibration of the dark finds them more surely, "
+        "see 'polsep calibrate dark'"
+    ]
 
 
 def make_frame(

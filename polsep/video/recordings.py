@@ -5,8 +5,8 @@ are short, so that the slowest sets the pace. The output bytes depend on the set
 interruptions (`io.results.sequences`) and not on where frames are separated (``engine``).
 
 Where nothing moves, raw samples and images are averaged over frames (`temporal`); that state is saved with the run.
-The light's colour and the exposure of the preview are estimated from the first frame and then fixed, so that they
-cause no flicker.
+The light's colour and the exposure of the preview are estimated from the first frame, dead and hot pixels from the
+first few, and then fixed, so that they cause no flicker.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from polsep.io.store.errors import InputError
 from polsep.methods import Capture, find_method
 from polsep.pipeline import LightColor, find_device, make_frame, separate_capture, to_device
 from polsep.sensor.camera import Mosaic
+from polsep.sensor.defects import find_lasting_defects, repair
 from polsep.video.panels_kernel import STEPS, make_panels
 from polsep.video.temporal import Images, TemporalState, filter_frame, steady_images
 
@@ -41,6 +42,8 @@ Floats = NDArray[np.float32]
 
 #: Largest number of frames that this process separates at once: each needs the memory of its method.
 AT_ONCE = 4
+#: First frames in which dead and hot pixels are looked for.
+DEFECT_FRAMES = 8
 #: Names of the averaged images in the saved state.
 IMAGES = ("diffuse", "specular")
 #: Largest side of a panel of the preview.
@@ -93,7 +96,8 @@ class Target:
 class FirstFrame:
     """Values that the first frame fixes for all: colour of the ``light``, ``gain`` of the preview, ``size`` of images.
 
-    ``size`` includes colours. ``shape``: of raw frames. ``warnings``: for the user.
+    ``size`` includes colours. ``shape``: of raw frames. ``warnings``: for the user. ``defects``: mask ``[H, W]`` of the
+    pixels that are repaired in every frame, None where there are none.
     """
 
     method: str
@@ -102,6 +106,7 @@ class FirstFrame:
     size: tuple[int, int, int]
     shape: tuple[int, ...]
     warnings: tuple[str, ...]
+    defects: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -153,6 +158,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
         "method": first.method,
         "light_color": list(first.light),
         "gain": first.gain,
+        "defects": 0 if first.defects is None else int(np.count_nonzero(first.defects)),
         "shape": list(first.shape),
         "colors": first.size[2],
         "device": str(find_device(options.device)),
@@ -183,8 +189,16 @@ def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFram
         light = tuple(float(c) for c in separated.report["light_color"])
         size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
         notes = (*frame.notes, *separated.report["warnings"])
-        return FirstFrame(separated.report["method"], light, gain, size, tuple(frame.data.data.shape), notes)
+        shape = tuple(frame.data.data.shape)
+        return FirstFrame(separated.report["method"], light, gain, size, shape, notes, _defects_of(recording, shape))
     raise ValueError(f"expected a frame that can be read, found {reason}")
+
+
+def _defects_of(recording: FrameSequence, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+    """Mask of the defects that the first frames of a recording share; None where there are none."""
+    frames = (frame.data for frame in islice(recording.begin(0), DEFECT_FRAMES) if isinstance(frame, Frame))
+    mask = find_lasting_defects(data for data in frames if isinstance(data, Mosaic) and tuple(data.data.shape) == shape)
+    return mask if mask is not None and mask.any() else None
 
 
 def write_pictures(
@@ -308,6 +322,8 @@ def _prepared(
             wanted, found = ("x".join(map(str, reversed(shape))) for shape in (first.shape, frame.data.data.shape))
             reason = f"frame {frame.index}: expected {wanted} samples as in the first one, found {found}"
             frame = DamagedFrame(frame.index, reason)
+        if first.defects is not None and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
+            frame = replace(frame, data=repair(frame.data, first.defects))
         if options.filter == "temporal" and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
             data, state = filter_frame(frame.data, state)
             frame = replace(frame, data=data)

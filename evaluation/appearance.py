@@ -79,7 +79,7 @@ class GalleryCapture:
 
     def separate(self) -> SeparatedFrame:
         """The separation by the default method."""
-        return separate_capture(self.mosaic, "auto")
+        return separate_capture(self.mosaic, "auto", "white")
 
 
 def expose_scene(title: str, scene: Scene, normals: Floats | None = None) -> GalleryCapture:

@@ -29,7 +29,7 @@ def main(out: Path) -> None:
             frames = [frame.mosaic.data.numpy().astype(np.uint16) for frame in play(film)]
             np.save(recording, np.stack(frames))
             kind = SequenceKind("none", rate=RATE)
-            read, options = ReadOptions(white_level=4095.0), VideoOptions("joint")
+            read, options = ReadOptions(white_level=4095.0), VideoOptions("joint", "white")
             *_, end = separate_video(recording, read, options, Target(Path(folder) / "out", kind))
             copyfile(end.written[0], out / f"dynamic_{film.name}.mp4")
             with av.open(str(end.written[0])) as container:

@@ -183,7 +183,7 @@ def _separate(golden: Golden, name: str, raw: Array, options: dict[str, Any], ke
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", polsep.PolsepWarning)
         try:
-            found = polsep.separate(raw, **options)
+            found = polsep.separate(raw, **{"light_color": "white", **options})
         except ValueError as error:
             golden.text(f"{name}/refused", str(error))
             return

@@ -59,7 +59,7 @@ def appearances_of(shoot: Shoot) -> Iterator[tuple[str, Appearance]]:
     """Name and appearance from every input."""
     directions, mask = np.array(list(NAMED.values())), shoot.mask
     for method in METHODS:
-        views = views_of([separate_capture(mosaic, method) for mosaic in shoot.mosaics])
+        views = views_of([separate_capture(mosaic, method, "white") for mosaic in shoot.mosaics])
         states = views.polarized
         assert states is not None
         if method == METHODS[0]:

@@ -75,7 +75,10 @@ def _measure(path: Path, folder: Path, run: tuple[str, str, int], alone: float) 
     method, kind, count = run
     times, memory = [], []
     written, filter = KINDS[kind]
-    options, read = VideoOptions(method, frames=count, filter=filter), ReadOptions(size=SIZE, pixel_format=PIXELS)
+    options, read = (
+        VideoOptions(method, "white", frames=count, filter=filter),
+        ReadOptions(size=SIZE, pixel_format=PIXELS),
+    )
     output = folder / "out"
     for step in separate_video(path, read, options, Target(output, written)):
         times.append(time.perf_counter())

@@ -164,7 +164,7 @@ def _show(page: Page, count: int) -> None:
 def bench_edits() -> Iterator[Row]:
     """Every edit on the demo's frame, and the same in plain NumPy: time, ratio, and the largest difference."""
     frame = next(read_frames(DEMO, ReadOptions(white_level=DEMO_WHITE)))
-    found = separate_capture(frame.data, "color-affine")
+    found = separate_capture(frame.data, "color-affine", "white")
     images = SeparatedImages(found.diffuse, found.specular)
     texture = np.random.default_rng(0).random((512, 512, 3), dtype=np.float32)
     for name, kind in EDITS.items():

@@ -15,6 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from polsep.light.find import Light, find_light
     from polsep.methods import METHODS
     from polsep.physics.stokes import Measurements, Stokes
     from polsep.pipeline import PolsepWarning, separate
@@ -27,12 +28,14 @@ __all__ = [
     "METHODS",
     "Calibration",
     "Layout",
+    "Light",
     "Measurements",
     "Mosaic",
     "PolsepWarning",
     "SeparatedFrame",
     "Separation",
     "Stokes",
+    "find_light",
     "separate",
 ]
 
@@ -40,12 +43,14 @@ _HOME = {
     "METHODS": "methods",
     "Calibration": "sensor.calibration",
     "Layout": "sensor.camera",
+    "Light": "light.find",
     "Measurements": "physics.stokes",
     "Mosaic": "sensor.camera",
     "PolsepWarning": "pipeline",
     "SeparatedFrame": "separation.report",
     "Separation": "separation.analytic",
     "Stokes": "physics.stokes",
+    "find_light": "light.find",
     "separate": "pipeline",
 }
 

@@ -24,7 +24,7 @@ class SeparateOptions:
     """Arguments of `pipeline.separate` for every frame."""
 
     method: str = "auto"
-    light_color: LightColor | str = (1.0, 1.0, 1.0)
+    light_color: LightColor | str = "auto"
     device: str = "auto"
     full: bool = False
 

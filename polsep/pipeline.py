@@ -20,10 +20,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.io.store.calibrations import read_calibration
+from polsep.light.find import find_light
 from polsep.methods import Capture, Method, find_method
-from polsep.physics.stokes import Measurements, fit_stokes_unclipped, polarized_intensity
 from polsep.sensor.calibration import Calibration, Corrections, falloff_image, mean_mosaic, subtract_ambient
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.defects import remove_defects
@@ -36,6 +35,8 @@ LightColor = Sequence[float]
 
 #: Share of pixels that are defects from which on the owner is told.
 MANY_DEFECTS = 5e-4
+#: Words for the light's colour: found in the frame (two words for one thing), or white.
+LIGHT_WORDS = ("auto", "estimate", "white")
 
 
 def _calm_torch() -> None:
@@ -57,7 +58,7 @@ def separate(
     layout: Layout | None = None,
     black_level: float = 0,
     white_level: float | None = None,
-    light_color: LightColor | str = (1, 1, 1),
+    light_color: LightColor | str = "auto",
     device: str = "auto",
     full: bool = False,
     calibration: Calibration | str | PathLike[str] | None = None,
@@ -68,9 +69,9 @@ def separate(
     Images are ``[H/2, W/2, C]``, the mean over each 2x2 polarizer cell; ``full=True`` gives ``[H, W, C]``. ``layout``
     None is Sony's colour order. ``white_level`` None is the dtype's maximum (1.0 for float): 12-bit data in uint16 need
     4095 or 65520 said. ``calibration``: a file of `polsep calibrate`, applied first. ``ambient``: a raw frame with the
-    lamp off, or several, subtracted. ``light_color``: camera RGB of the light, or "estimate" to take it from the
-    highlights. What the owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises
-    ValueError, with one line of what was expected and what was found, on input that is not a mosaic.
+    lamp off, or several, subtracted. ``light_color``: "auto" finds it in the frame (`find_light`), or "white", or
+    camera RGB of the light. What the owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`.
+    Raises ValueError, with one line of what was expected and what was found, on input that is not a mosaic.
     """
     measured = calibration if isinstance(calibration, Calibration | None) else read_calibration(Path(calibration))
     if white_level is None and measured is not None:
@@ -92,7 +93,7 @@ def separate(
 def separate_capture(
     capture: Capture,
     method: str = "auto",
-    light_color: LightColor | str = (1, 1, 1),
+    light_color: LightColor | str = "auto",
     device: str = "auto",
     full: bool = False,
 ) -> SeparatedFrame:
@@ -101,11 +102,11 @@ def separate_capture(
     check = check_layout(capture).warning if isinstance(capture, Mosaic) else None
     capture, defects = repair_capture(capture)
     capture = to_device(capture, find_device(device))
-    light, remarks = resolve_light_color(light_color, capture)
+    light, facts = resolve_light(light_color, capture)
     images = chosen.run(capture, light, full)
     frame = make_frame(images, chosen, capture, light, full)
-    frame.report["defects"] = defects
-    remarks = [*([check] if check else []), *defect_remarks(defects, capture), *remarks]
+    frame.report["light"], frame.report["defects"] = facts, defects
+    remarks = [*([check] if check else []), *defect_remarks(defects, capture)]
     frame.report["warnings"] = [*remarks, *frame.report["warnings"]]
     return frame
 
@@ -161,56 +162,41 @@ def to_device(capture: Capture, device: torch.device) -> Capture:
 
 
 def parse_light_color(text: str) -> LightColor | str:
-    """The light's colour as people write it: ``R,G,B``, ``white``, or ``estimate``. Raises ValueError."""
-    if text == "estimate":
+    """The light's colour as people write it: ``R,G,B``, ``white``, ``auto`` or ``estimate``. Raises ValueError."""
+    if text in LIGHT_WORDS:
         return text
     try:
-        r, g, b = (1.0, 1.0, 1.0) if text == "white" else (float(part) for part in text.split(","))
+        r, g, b = (float(part) for part in text.split(","))
     except ValueError:
-        expected = 'expected a light colour R,G,B like 1,0.9,0.7, "white" or "estimate"'
+        expected = 'expected a light colour R,G,B like 1,0.9,0.7, "white" or "auto"'
         raise ValueError(f"{expected}, found {text!r:.40}") from None
     return (r, g, b)
 
 
-def resolve_light_color(light_color: LightColor | str, capture: Capture) -> tuple[tuple[float, ...], list[str]]:
-    """One gain per channel, and remarks; "estimate" takes the colour of the highlights. ValueError on anything else."""
+def resolve_light(light_color: LightColor | str, capture: Capture) -> tuple[tuple[float, ...], dict[str, Any]]:
+    """One gain per channel, and what the report says of the light: found in the frame, or told.
+
+    "auto" takes what a calibration says, else what the frame shows. Raises ValueError on anything but three positive
+    numbers or one of `LIGHT_WORDS`.
+    """
     channels = capture.layout.channels if isinstance(capture, Mosaic) else capture.data.shape[-3]
-    if isinstance(light_color, str):
-        if light_color != "estimate":
-            raise ValueError(f'expected a light colour of three numbers or "estimate", found {light_color!r}')
-        samples = demosaic_bilinear_half(capture) if isinstance(capture, Mosaic) else capture
-        estimated = estimate_light_color(samples)
-        if estimated is None:
-            return (1.0,) * channels, ["too few unclipped highlights to estimate the light's colour: white is assumed"]
-        return estimated, []
+    calibrated = isinstance(capture, Mosaic) and any(gain != 1 for gain in capture.light_color)
+    if isinstance(light_color, str) and light_color not in LIGHT_WORDS:
+        raise ValueError(f'expected a light colour of three numbers, "white" or "auto", found {light_color!r}')
+    if light_color in ("auto", "estimate") and not calibrated:
+        found = find_light(capture)
+        return found.color if channels == 3 else (1.0,), {"source": "found", **found.describe()}
+    told = light_color
+    if isinstance(told, str):
+        told = capture.light_color if isinstance(capture, Mosaic) and told != "white" else (1.0, 1.0, 1.0)
     try:
-        color = tuple(float(c) for c in light_color)
+        color = tuple(float(c) for c in told)
     except (TypeError, ValueError):
         color = ()
     if len(color) != 3 or not all(1e-6 < c < 1e6 for c in color):
         raise ValueError(f"expected a light colour of three positive numbers, found {light_color!r}")
-    return (color if channels == 3 else (1.0,)), []
-
-
-def estimate_light_color(measurements: Measurements) -> tuple[float, ...] | None:
-    """Camera RGB of the light, green = 1, from the brightest polarized pixels; None with fewer than 32 of them.
-
-    Highlights off dielectrics have the light's colour, and the polarized part holds little else: the first principal
-    direction of s1, s2 over colours there. Source: the idea is Nayar, Fang, Boult 1997, Sec. 4.
-    """
-    stokes, determined = fit_stokes_unclipped(measurements)
-    if stokes.s0.shape[-3] != 3:
-        return (1.0,)
-    strength = polarized_intensity(stokes).mean(dim=-3) * determined.all(dim=-3)
-    bright = strength.flatten()
-    threshold = (
-        torch.topk(bright, max(32, bright.numel() // 500)).values[-1] if bright.numel() >= 32 else bright.max() + 1
-    )
-    chosen = (strength >= threshold) & (strength > 0.05)
-    if int(chosen.sum()) < 32:
-        return None
-    samples = torch.cat([s.movedim(-3, 0)[:, chosen] for s in (stokes.s1, stokes.s2)], dim=1).double()
-    color = torch.linalg.eigh(samples @ samples.T).eigenvectors[:, -1].abs()
-    if float(color.min()) < 0.05 * float(color.max()):
-        return None
-    return tuple((color / color[1]).tolist())
+    color = color if channels == 3 else (1.0,)
+    return color, {
+        "source": "calibrated" if isinstance(light_color, str) and light_color != "white" else "told",
+        "color": list(color),
+    }

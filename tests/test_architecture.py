@@ -17,6 +17,7 @@ RANKS = {
     "metrics": 1,
     "sensor": 2,
     "demosaic": 3,
+    "light": 3,
     "separation": 4,
     "render": 4,
     "networks": 5,

@@ -19,14 +19,13 @@ from tolerances import assert_close
 from torch.nn.functional import interpolate
 
 import polsep
-from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.methods import BEST, FASTEST, METHODS, Capture, Method, find_method, run_reference
 from polsep.networks.channels import MIN_BRIGHTNESS
 from polsep.networks.joint import Joint
 from polsep.networks.run import run_joint
 from polsep.networks.unet import ResidualSize
-from polsep.physics.stokes import Measurements, Stokes, measure
-from polsep.pipeline import estimate_light_color, find_device, separate_capture
+from polsep.physics.stokes import Stokes, measure
+from polsep.pipeline import find_device, separate_capture
 from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
 from polsep.separation.analytic import Separation
 from polsep.shipped import NAMES
@@ -55,7 +54,8 @@ def raw_frame(dtype: str = "uint16", layout: Layout | None = None, **scene: Any)
 
 
 def quietly(*args: Any, **kwargs: Any) -> polsep.SeparatedFrame:
-    """`polsep.separate` without its warnings, which stay in the report."""
+    """`polsep.separate` under white light unless told, without its warnings, which stay in the report."""
+    kwargs.setdefault("light_color", "white")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", polsep.PolsepWarning)
         return polsep.separate(*args, **kwargs)
@@ -70,7 +70,7 @@ def test_signature_is_the_contract() -> None:
         "layout": None,
         "black_level": 0,
         "white_level": None,
-        "light_color": (1, 1, 1),
+        "light_color": "auto",
         "device": "auto",
         "full": False,
         "calibration": None,
@@ -211,7 +211,7 @@ def test_metals_are_reported(method: str) -> None:
     gold = 0.1 + 0.9 * light * torch.tensor([1.0, 0.78, 0.34]).view(3, 1, 1)
     frame = expose(Stokes(gold, 0.6 * gold, 0.7 * gold), Layout(), IDEAL).data.numpy()
     with pytest.warns(polsep.PolsepWarning, match="white highlights on coloured things were expected"):
-        polsep.separate(frame, method=method)
+        polsep.separate(frame, method=method, light_color="white")
 
 
 def test_statistics_are_what_a_method_measures() -> None:
@@ -368,29 +368,6 @@ def test_every_shipped_method_and_device_is_found() -> None:
     assert find_device("auto").type in ("cpu", "cuda")
 
 
-@pytest.mark.parametrize("light", [ODD_LIGHT, (0.5, 1.0, 0.7), (1.0, 1.0, 1.0)])
-def test_light_color_is_estimated_within_3_percent(light: tuple[float, ...]) -> None:
-    """The highlights tell the light's colour, relative to green, within 3 %, on a noisy 12-bit frame."""
-    mosaic = expose(lit_scene(light), Layout(), IMX250, torch.Generator().manual_seed(4))
-    found = estimate_light_color(demosaic_bilinear_half(mosaic))
-    assert found is not None
-    assert found == pytest.approx([c / light[1] for c in light], rel=0.03)
-    out = separate_capture(mosaic, light_color="estimate")
-    assert out.report["light_color"] == pytest.approx(list(found))
-
-
-def test_light_color_needs_highlights() -> None:
-    """Without polarized highlights, or on a handful of pixels, nothing is estimated, and the report says so."""
-    dark = measure(
-        Stokes(torch.full((3, 32, 32), 0.5), torch.zeros(3, 32, 32), torch.zeros(3, 32, 32)), (0, 0.8, 1.6, 2.4)
-    )
-    assert estimate_light_color(dark) is None
-    assert estimate_light_color(Measurements(dark.data[..., :4, :4], dark.angles)) is None
-    out = separate_capture(dark, light_color="estimate")
-    assert out.report["light_color"] == [1, 1, 1]
-    assert any("too few unclipped highlights" in note for note in out.report["warnings"])
-
-
 @pytest.mark.parametrize("method", ["analytic", "color-affine"])
 def test_said_light_color_undoes_the_light(method: str) -> None:
     """With the light's colour said, a scene in coloured light is the scene in white light times that colour."""
@@ -422,10 +399,10 @@ def test_thread_count_does_not_matter(method: str) -> None:
     """One thread or all: the same images within 1e-5."""
     mosaic = expose(lit_scene(exposure=1.5), Layout(), IMX250, torch.Generator().manual_seed(5))
     threads = torch.get_num_threads()
-    many = separate_capture(mosaic, method)
+    many = separate_capture(mosaic, method, "white")
     try:
         torch.set_num_threads(1)
-        one = separate_capture(mosaic, method)
+        one = separate_capture(mosaic, method, "white")
     finally:
         torch.set_num_threads(threads)
     assert float(np.abs(many.diffuse - one.diffuse).max()) < 1e-5

@@ -37,7 +37,10 @@ WHITE_LEVEL = click.option(
     help="Sample value at which the sensor clips.  [default: largest of the data type]",
 )
 LIGHT_COLOR = click.option(
-    "--light-color", default="1,1,1", metavar="R,G,B", help="Camera RGB of the light, or 'estimate'."
+    "--light-color",
+    default="auto",
+    metavar="auto|white|R,G,B",
+    help="Colour of the light: auto finds it in the frame; or camera RGB.",
 )
 SIZE = click.option("--size", metavar="WxH", help="Size of headerless raw frames, like 2448x2048.")
 PIXEL_FORMAT = click.option(

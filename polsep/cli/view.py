@@ -22,7 +22,7 @@ from polsep.cli.app import AMBIENT, CALIBRATION, LAYOUT, PIXEL_FORMAT, SIZE, app
 @LAYOUT
 @click.option("--black-level", metavar="N", help="Sample value without light.")
 @click.option("--white-level", metavar="N", help="Sample value at which the sensor clips.")
-@click.option("--light-color", metavar="R,G,B", help="Camera RGB of the light, or 'estimate'.")
+@click.option("--light-color", metavar="auto|white|R,G,B", help="Colour of the light.")
 @CALIBRATION
 @AMBIENT
 @SIZE

@@ -44,7 +44,7 @@ class MaterialOptions:
 
     read: ReadOptions = field(default_factory=ReadOptions)
     method: str = "auto"
-    light_color: LightColor | str = (1.0, 1.0, 1.0)
+    light_color: LightColor | str = "auto"
     white: tuple[float, ...] = ()
     size: int = MAP_SIZE
     input: str = "separated"

@@ -65,7 +65,7 @@ class VideoOptions:
     """
 
     method: str = "auto"
-    light_color: LightColor | str = (1.0, 1.0, 1.0)
+    light_color: LightColor | str = "auto"
     device: str = "auto"
     damaged: str = "stop"
     frames: int | None = None

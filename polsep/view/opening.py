@@ -41,7 +41,7 @@ class Settings:
 
     read: ReadOptions = field(default_factory=ReadOptions)
     method: str = "auto"
-    light_color: LightColor | str = (1.0, 1.0, 1.0)
+    light_color: LightColor | str = "auto"
     index: int = 0
 
 
@@ -63,7 +63,7 @@ def parse_settings(said: Mapping[str, Any]) -> Settings:
         _text(said.get("pixel_format")),
     )
     read = with_corrections(read, said.get("calibration"), said.get("ambient") or ())
-    light = parse_light_color(_text(said.get("light")) or "white")
+    light = parse_light_color(_text(said.get("light")) or "auto")
     return Settings(read, method, light, int(said.get("index") or 0))
 
 

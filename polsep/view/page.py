@@ -101,7 +101,7 @@ def _settings(start: Start) -> dict[str, Any]:
     with gr.Row():
         found["white"] = choice("white", "White level", [UNSAID, "255", "1023", "4095", "16383", "65535"], **free)
         found["black"] = choice("black", "Black level", ["0", "16", "64", "256"], **free)
-    found["light"] = choice("light", "Light colour R,G,B", ["white", "estimate", "1,0.9,0.7"], **free)
+    found["light"] = choice("light", "Light colour R,G,B", ["auto", "white", "1,0.9,0.7"], **free)
     with (
         gr.Accordion("Headerless raw (.raw, .bin)", open=bool(values.get("size") or values.get("pixel_format"))),
         gr.Row(),

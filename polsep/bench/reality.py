@@ -8,14 +8,13 @@ are chosen on the split "validation" (``--split``); the tables are of "test".
 from __future__ import annotations
 
 import importlib.util
-import inspect
 import statistics
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -25,6 +24,9 @@ from torch import Tensor
 from polsep.bench.period import bench_period
 from polsep.bench.rows import Row
 from polsep.bench.run import Bench
+from polsep.calibrate.analysers import measure_analysers
+from polsep.calibrate.dark_flat import measure_flat
+from polsep.calibrate.files import corrections_for
 from polsep.io.store.image_codecs import through_jpeg
 from polsep.methods import METHODS
 from polsep.metrics import psnr
@@ -85,10 +87,17 @@ def find_kinds() -> tuple[Kind, ...]:
         frame = reality.DISTURBANCES["8 bits"](stage)
         return replace(frame, raw=through_jpeg(frame.raw, JPEG_QUALITY))
 
+    def calibrate(stage: Stage) -> Frame:
+        flats, turned = reality.calibration_frames(stage)
+        flat = measure_flat(flats)
+        corrections = corrections_for("analysers", flat)
+        measured = measure_analysers((corrections.apply(frame) for frame in turned), flat)
+        return replace(reality.DISTURBANCES["bad sensor"](stage), told={"calibration": measured})
+
     def build_corner(split: str, number: int, size: int) -> Stage:
         return corners.build_corner(split, number, size // 2)
 
-    objects = reality.DISTURBANCES | {f"8 bits, JPEG {JPEG_QUALITY}": compress}
+    objects = reality.DISTURBANCES | {f"8 bits, JPEG {JPEG_QUALITY}": compress, "bad sensor": calibrate}
     corner = {"inter-reflections": corners.corner_frame} if importlib.util.find_spec("mitsuba") else {}
     return (
         Kind("objects", reality.build_stage, 8, reality.ideal_frame, objects),
@@ -135,7 +144,7 @@ def _bench_kind(kind: Kind, methods: Sequence[str], options: RealityOptions) -> 
             ideal.setdefault(method, []).append(score(twin, method, True))
         for name, make in kind.rows.items():
             frame = make(stage)
-            for told in (False,) if frame.told is None or name == "white lamp" else (False, True):
+            for told in _calls(name, frame):
                 for method in wanted:
                     found.setdefault((name + TOLD * told, method), []).append(score(frame, method, told))
     for method in methods:
@@ -143,6 +152,13 @@ def _bench_kind(kind: Kind, methods: Sequence[str], options: RealityOptions) -> 
     for (name, method), scores in found.items():
         if method in methods:
             yield from _summarize(name, method, (ideal[method], scores, found[name, "analytic"]))
+
+
+def _calls(name: str, frame: Frame) -> tuple[bool, ...]:
+    """Calls of a row: with nothing told, or told, or both. The truth of a lamp alone needs its lamp-off frame."""
+    if frame.told is None or name == "white lamp":
+        return (False,)
+    return (True,) if "ambient" in frame.told else (False, True)
 
 
 def _summarize(name: str, method: str, scores: tuple[list[Score], list[Score], list[Score]]) -> Iterator[Row]:
@@ -156,7 +172,7 @@ def _summarize(name: str, method: str, scores: tuple[list[Score], list[Score], l
     yield from _means(f"reality/{part}_psnr", name, method, "PSNR", found)
     for output in ("diffuse", "specular"):
         worst = max(getattr(loss, output) for loss in losses)
-        yield Row(f"reality/{part}_worst", name, method, f"{output} loss, worst scene", worst, "dB")
+        yield Row(f"reality/{part}_worst", name, method, f"{output} loss, worst scene", round(worst, 2), "dB")
     for k, loss in enumerate(losses):
         for output in ("diffuse", "specular"):
             yield Row("reality/scenes", f"{name}, scene {k}", method, f"{output} loss", getattr(loss, output), "dB")
@@ -169,27 +185,19 @@ def _summarize(name: str, method: str, scores: tuple[list[Score], list[Score], l
 
 def _means(bench: str, case: str, method: str, metric: str, scores: list[Score]) -> Iterator[Row]:
     for output in ("diffuse", "specular"):
-        yield Row(bench, case, method, f"{output} {metric}", statistics.fmean(getattr(s, output) for s in scores), "dB")
+        mean = statistics.fmean(getattr(score, output) for score in scores)
+        yield Row(bench, case, method, f"{output} {metric}", round(mean, 2), "dB")
 
 
 def score(frame: Frame, method: str, told: bool) -> Score:
     """Return the scores of a method on a frame, whose differences are ``told`` or not."""
     options = dict(frame.told or {}) if told else {}
-    raw = frame.raw
-    if "ambient" in options and "ambient" not in _known_options():
-        dark = options.pop("ambient").astype(np.float32)
-        raw = np.where(raw >= frame.white_level, frame.white_level, raw - dark).astype(np.float32)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PolsepWarning)
-        out = separate(raw, method, white_level=frame.white_level, **options)
+        out = separate(frame.raw, method, white_level=frame.white_level, **options)
 
     def compare(image: NDArray[np.float32], truth: Tensor) -> float:
         return psnr(torch.from_numpy(image).permute(2, 0, 1) / frame.unit, truth / frame.unit, frame.mask)
 
     diffuse, specular = compare(out.diffuse, frame.diffuse), compare(out.specular, frame.specular)
     return Score(diffuse, specular, tuple(out.report["warnings"]))
-
-
-@lru_cache(maxsize=1)
-def _known_options() -> Any:
-    return inspect.signature(separate).parameters

@@ -61,9 +61,10 @@ ROOM_COLORS = (0.75, 1.25)
 METAL_SHARE, METAL_ROUGHNESS = 0.4, 0.35
 #: Raw colour of the lamp of `SHEENS`, a bluish LED, and tint of their highlights.
 SHEEN_LAMP, SHEEN_TINT = (0.6, 1.0, 1.15), (1.0, 0.94, 0.88)
-#: A sensor with less extinction, and its errors; `RIG` is a good camera as it comes.
+#: A sensor with less extinction, and its errors; frames that calibrate it; `RIG` is a good camera as it comes.
 WORN = Sensor(10_500.0, 2.4, 12, (49 / 51, 79 / 81, 59 / 61))
 BAD = SensorErrors(angles_deg=1.5, gains=0.03, period_gains=0.02, cross_talk=0.02, defects=3e-4)
+FLATS, TURNS = 6, 8
 RIG = SensorErrors(angles_deg=1.0, gains=0.01, cross_talk=0.02)
 
 
@@ -362,6 +363,18 @@ def _mannequin(contrast: float) -> Callable[[Stage], Frame]:
 def _bad_sensor(stage: Stage) -> Frame:
     errors = replace(BAD, specimen=stage.seed % 1000)
     return expose_frame(stage, light_stage(stage), Capture(sensor=WORN, errors=errors))
+
+
+def calibration_frames(stage: Stage) -> tuple[list[Mosaic], list[Mosaic]]:
+    """Return frames of the stage's bad sensor: of even unpolarized light, and behind a polarizer turned in `TURNS`."""
+    errors, one = replace(BAD, specimen=stage.seed % 1000), torch.ones(3, *stage.view.size)
+    lights = [Stokes(one, 0 * one, 0 * one)] * FLATS
+    for turn in range(TURNS):
+        angle = 2 * math.pi * turn / TURNS
+        lights.append(Stokes(one, math.cos(angle) * one, math.sin(angle) * one))
+    # An analyser along the polarizer is near the white level.
+    found = [record(light * 0.9, Layout(), WORN, errors, stage.seed + 100 + k) for k, light in enumerate(lights)]
+    return found[:FLATS], found[FLATS:]
 
 
 #: What can differ from the ideal twin, by name.

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -107,15 +108,14 @@ def correct_mosaic(mosaic: Mosaic, calibration: Calibration) -> Mosaic:
     _check_match(mosaic, calibration)
     raw = mosaic.data.detach().cpu().numpy()
     samples, black = raw, mosaic.black_level
-    unit = (mosaic.white_level / calibration.white_level) if calibration.black_level is not None else 1.0
     if calibration.black_level is not None:
-        black = float(np.float32(calibration.black_level * unit))
-        offset = _offsets(calibration, raw.shape)
-        if offset is not None:
-            samples = samples - (offset if unit == 1 else offset * np.float32(unit))
-    gain = calibration.gain_map if calibration.gain_map is not None else _tiled(calibration.gains, raw.shape)
-    if gain is not None:
-        samples = (samples - np.float32(black)) / gain + np.float32(black)
+        black = float(np.float32(calibration.black_level * mosaic.white_level / calibration.white_level))
+    offset, factor = _prepared(calibration, black, mosaic.white_level, raw.shape)
+    if offset is not None:
+        samples = raw - offset
+        if factor is not None:
+            samples *= factor
+        samples += np.float32(black)
     if calibration.dead is not None and calibration.dead.size:
         samples = repair_known(samples if samples is not raw else raw.copy(), calibration.dead, mosaic.layout.period)
     if calibration.analysers is not None:
@@ -323,14 +323,23 @@ def _size(mosaic: Mosaic) -> str:
     return f"{mosaic.data.shape[-1]}x{mosaic.data.shape[-2]}"
 
 
-def _offsets(calibration: Calibration, shape: tuple[int, ...]) -> Floats | None:
-    """Code without light of each pixel above the black level; None where the black level is all that is known."""
-    level = np.float32(calibration.black_level or 0)
+@lru_cache(maxsize=4)  # frames of a stream are alike
+def _prepared(
+    calibration: Calibration, black: float, white: float, shape: tuple[int, int]
+) -> tuple[Floats | None, Floats | None]:
+    """Offset of each pixel in codes of the frame, and the factor that undoes its gain; None where nothing is known."""
+    offset, factor = None, None
     if calibration.black_map is not None:
-        offsets: Floats = calibration.black_map - level
-        return offsets
-    pattern: Floats | None = _tiled(calibration.black_pattern, shape)
-    return pattern
+        offset = calibration.black_map * np.float32(white / calibration.white_level)
+    elif calibration.black_pattern is not None:
+        offset = _tiled(calibration.black_pattern, shape) * np.float32(white / calibration.white_level)
+        offset += np.float32(black)
+    gain = calibration.gain_map if calibration.gain_map is not None else _tiled(calibration.gains, shape)
+    if gain is not None:
+        factor = np.float32(1) / gain
+        if offset is None:
+            offset = np.full(shape, black, np.float32)
+    return offset, factor
 
 
 def _tiled(table: Any, shape: tuple[int, ...]) -> Any:

@@ -210,7 +210,8 @@ def test_one_frame_gives_tables_and_no_map() -> None:
 
 @LAYOUTS
 def test_applying_undoes_the_sensor(layout: Layout) -> None:
-    """Even polarized light through a bad sensor without noise comes out as ideal analysers measure it."""
+    """Even polarized light through a bad sensor without noise comes out as ideal analysers measure it, except at dead
+    pixels: these are predicted."""
     sensor = BadSensor(layout)
     ideal = BadSensor(layout, dead=0)
     ideal.angles = np.array(
@@ -221,9 +222,12 @@ def test_applying_undoes_the_sensor(layout: Layout) -> None:
     s0 = np.full(SIZE, 0.8)
     found = correct_mosaic(sensor.expose(sensor.sees(s0, 0.5, 0.4), noise=False), sensor.calibration())
     assert found.falloff == ((1.0,),)
-    torch.testing.assert_close(
-        found.linear(), torch.from_numpy(ideal.sees(s0, 0.5, 0.4).astype(np.float32)), atol=2e-5, rtol=0
-    )
+    wanted = torch.from_numpy(ideal.sees(s0, 0.5, 0.4).astype(np.float32))
+    dead = torch.zeros(SIZE)
+    dead.view(-1)[torch.from_numpy(sensor.dead)] = 1
+    mixed = torch.nn.functional.max_pool2d(dead[None], 7, 1, 3)[0] > 0  # samples that dead ones are mixed into
+    torch.testing.assert_close(found.linear()[~mixed], wanted[~mixed], atol=2e-5, rtol=0)
+    assert float((found.linear() - wanted).abs().max()) < 0.02
 
 
 def test_kernel_and_reference_of_analysers_agree() -> None:

@@ -28,6 +28,7 @@ import torch
 from numpy.typing import NDArray
 
 from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
+from polsep.sensor.defects import MIN_SIZE, repair
 from polsep.sensor.levels import WHITE_LEVELS
 
 Floats = NDArray[np.float32]
@@ -116,18 +117,27 @@ def correct_mosaic(mosaic: Mosaic, calibration: Calibration) -> Mosaic:
         if factor is not None:
             samples *= factor
         samples += np.float32(black)
-    if calibration.dead is not None and calibration.dead.size:
-        samples = repair_known(samples if samples is not raw else raw.copy(), calibration.dead, mosaic.layout.period)
+    dead = calibration.dead if calibration.dead is not None and calibration.dead.size else None
+    if dead is None and calibration.analysers is None and samples is raw:
+        return _with_facts(mosaic, black, calibration)
+    clipped = mosaic.clipped().cpu().numpy()
+    if dead is not None:
+        clipped.flat[dead] = False  # as the prediction from its neighbours is
+        samples = _keep_clipped(raw.copy() if samples is raw else samples, clipped, (black, mosaic.white_level))
+        mask = np.zeros(raw.shape, np.bool_)
+        mask.flat[dead] = True
+        found = replace(mosaic, data=torch.from_numpy(samples), black_level=black)
+        samples = repair(found, mask).data.numpy() if min(raw.shape) >= MIN_SIZE else samples
     if calibration.analysers is not None:
         samples = correct_analysers(samples, black, calibration)
-    if samples is not raw:
-        clipped = mosaic.clipped().cpu().numpy()
-        if calibration.dead is not None:
-            clipped.flat[calibration.dead] = False  # as its neighbours are
-        samples = _keep_clipped(samples, clipped, (black, mosaic.white_level))
-    data = mosaic.data if samples is raw else torch.from_numpy(samples).to(mosaic.data.device)
+    data = torch.from_numpy(_keep_clipped(samples, clipped, (black, mosaic.white_level)))
+    return _with_facts(replace(mosaic, data=data.to(mosaic.data.device)), black, calibration)
+
+
+def _with_facts(mosaic: Mosaic, black: float, calibration: Calibration) -> Mosaic:
+    """The corrected frame with its black level, the calibrated lamp's colour and the falloff."""
     light = mosaic.light_color if calibration.lamp is None else calibration.lamp.color
-    return replace(mosaic, data=data, black_level=black, light_color=light, falloff=calibration.falloff)
+    return replace(mosaic, black_level=black, light_color=light, falloff=calibration.falloff)
 
 
 def subtract_ambient(mosaic: Mosaic, ambient: Mosaic) -> Mosaic:
@@ -181,42 +191,6 @@ def _legendre(count: int, terms: int) -> NDArray[np.float64]:
     """Values ``[count, terms]`` of Legendre polynomials at the centres of ``count`` pixels."""
     values = np.polynomial.legendre.legvander((2 * np.arange(count) + 1) / count - 1, terms - 1)
     return np.asarray(values, np.float64)
-
-
-def repair_known(samples: Floats, dead: NDArray[np.int32], period: int) -> Floats:
-    """Samples ``[H, W]`` with each dead one replaced, in place, by the mean of its sound neighbours of the same kind.
-
-    These are the ones a ``period`` away along rows and columns; where none is sound, along diagonals; else it stays.
-    """
-    sound = np.ones(samples.shape, bool)
-    sound.flat[dead] = False
-    beside, count = _same_kind(samples, sound, dead, (period, _BESIDE))
-    across, more = _same_kind(samples, sound, dead, (period, _DIAGONAL))
-    own = samples.flat[dead]
-    samples.flat[dead] = np.where(count > 0, beside, np.where(more > 0, across, own))
-    return samples
-
-
-#: Steps to the neighbours of the same kind, in periods down and right.
-_BESIDE, _DIAGONAL = ((0, 1), (1, 0), (0, -1), (-1, 0)), ((1, 1), (1, -1), (-1, 1), (-1, -1))
-
-
-def _same_kind(
-    samples: Floats, sound: NDArray[np.bool_], places: NDArray[Any], steps: tuple[int, tuple[tuple[int, int], ...]]
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Mean of the ``sound`` neighbours of samples at ``places``, 0 without any, and their number."""
-    period, directions = steps
-    height, width = samples.shape
-    rows, cols = np.divmod(places, width)
-    total, count = np.zeros(places.size, np.float32), np.zeros(places.size, np.int64)
-    for down, right in directions:
-        y, x = rows + down * period, cols + right * period
-        inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-        y, x = np.where(inside, y, 0), np.where(inside, x, 0)
-        used = inside & sound[y, x]
-        total += np.where(used, samples[y, x], np.float32(0))
-        count += used
-    return np.asarray(total / np.maximum(count, 1), np.float32), count
 
 
 class Neighbours(NamedTuple):

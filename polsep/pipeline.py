@@ -36,7 +36,8 @@ LightColor = Sequence[float]
 #: Share of pixels that are defects from which on the owner is told.
 MANY_DEFECTS = 5e-4
 #: Words for the light's colour: found in the frame (two words for one thing), or white.
-LIGHT_WORDS = ("auto", "estimate", "white")
+FOUND_WORDS = ("auto", "estimate")
+LIGHT_WORDS = (*FOUND_WORDS, "white")
 
 
 def _calm_torch() -> None:
@@ -173,6 +174,11 @@ def parse_light_color(text: str) -> LightColor | str:
     return (r, g, b)
 
 
+def is_calibrated(capture: Capture) -> bool:
+    """True if a calibration says the colour of the lamp."""
+    return isinstance(capture, Mosaic) and any(gain != 1 for gain in capture.light_color)
+
+
 def resolve_light(light_color: LightColor | str, capture: Capture) -> tuple[tuple[float, ...], dict[str, Any]]:
     """One gain per channel, and what the report says of the light: found in the frame, or told.
 
@@ -180,10 +186,9 @@ def resolve_light(light_color: LightColor | str, capture: Capture) -> tuple[tupl
     numbers or one of `LIGHT_WORDS`.
     """
     channels = capture.layout.channels if isinstance(capture, Mosaic) else capture.data.shape[-3]
-    calibrated = isinstance(capture, Mosaic) and any(gain != 1 for gain in capture.light_color)
     if isinstance(light_color, str) and light_color not in LIGHT_WORDS:
         raise ValueError(f'expected a light colour of three numbers, "white" or "auto", found {light_color!r}')
-    if light_color in ("auto", "estimate") and not calibrated:
+    if light_color in FOUND_WORDS and not is_calibrated(capture):
         found = find_light(capture)
         return found.color if channels == 3 else (1.0,), {"source": "found", **found.describe()}
     told = light_color

@@ -184,7 +184,8 @@ def test_kernels_are_loaded_with_the_first_frame() -> None:
     code = (
         "import sys, numpy as np, polsep;"
         "raw = np.full((32, 32), 0.5, np.float32);"
-        "polsep.separate(raw, layout=polsep.Layout(bayer=None), method='analytic', full=True, device='cpu');"
+        "polsep.separate(raw, layout=polsep.Layout(bayer=None), method='analytic', full=True, device='cpu',"
+        "light_color='white');"
         "print('numba' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)

@@ -264,7 +264,7 @@ def test_settings_are_those_of_the_library() -> None:
     assert settings.read.layout == Layout(bayer=None)
     assert (settings.read.black_level, settings.read.white_level) == (16.0, 4095.0)
     assert settings.light_color == (1.0, 0.9, 0.7) and settings.index == 3
-    plain = parse_settings({"layout": opening.UNSAID, "white": opening.UNSAID, "light": "white", "size": ""})
+    plain = parse_settings({"layout": opening.UNSAID, "white": opening.UNSAID, "light": "auto", "size": ""})
     assert plain == Settings()
     assert parse_settings({"size": "2448 x 2048"}).read.size == (2448, 2048)
 

@@ -20,10 +20,14 @@ from polsep.io.raw.recording import RawImage
 from polsep.io.results.previews import live_sheet
 from polsep.io.store.atomic import replace_bytes
 from polsep.io.store.image_codecs import encode_jpeg
-from polsep.pipeline import separate_capture
+from polsep.light.find import UNKNOWN_DEG, Light, combine, find_light
+from polsep.methods import Capture
+from polsep.pipeline import LightColor, is_calibrated, separate_capture
 from polsep.sensor.camera import Layout
 from polsep.separation.report import SeparatedFrame
 
+#: Frames that show the light's colour before it is fixed.
+LIGHT_FRAMES = 32
 #: Added to the nice value of the live view on Linux: receiving and recording have priority.
 NICENESS = 5
 
@@ -52,6 +56,7 @@ class LiveView:
         self._method, self._layout, self._picture = method, layout, picture
         self._calibration, self._ambient = calibration, ambient
         self._options = ReadOptions()
+        self._lights: list[Light] = []
         self.latest: Shown | None = None
 
     def warm_up(self, info: CameraInfo) -> None:
@@ -64,9 +69,21 @@ class LiveView:
     def separate(self, payload: bytes) -> tuple[SeparatedFrame, tuple[str, ...]]:
         """One separated frame, and remarks on it."""
         data, notes = decode_frame(payload, self._options)
-        frame = separate_capture(data, self._method)
+        frame = separate_capture(data, self._method, self._light(data))
         remarks = (*notes, *frame.report["warnings"])
         return frame, tuple(advise(remark, self._options.pixel_format or "") for remark in remarks)
+
+    def _light(self, data: Capture) -> LightColor | str:
+        """Colour of the light: the mean of what the first `LIGHT_FRAMES` frames that show something say, then fixed."""
+        if is_calibrated(data):
+            return "auto"
+        if len(self._lights) < LIGHT_FRAMES:
+            found = find_light(data)
+            if found.error_deg < UNKNOWN_DEG:
+                self._lights.append(found)
+        if not self._lights or self._lights[0].log_ratio is None:
+            return "white"
+        return combine(self._lights).color
 
     def show(self, image: RawImage) -> Shown:
         """Separate a frame and replace the picture atomically."""

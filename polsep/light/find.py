@@ -34,6 +34,8 @@ ASTRAY = ((0.642, 0.02), (-0.486, 0.02), (0.543, 0.1), (0.49, 0.03))
 ASTRAY_BIAS = -0.995
 #: Mean error of fits that went astray [degrees], and of the others: power law of the two last quantities.
 ASTRAY_DEG, GOOD = 11.3, (1.25 * math.exp(0.407), 0.081, 0.627)
+#: Colours within this many expected errors of white are white: exact where it is, and hardly wrong where it is not.
+WHITE_ERRORS = 1.5
 #: Standard deviation of log-ratios of lamps around white, toward which unsure estimates are drawn.
 DRAWN = 0.25
 
@@ -150,12 +152,14 @@ def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) 
 
 
 def _as_light(fit: ColorFit, aolp: float) -> Light:
-    """The light of a fit, drawn toward white as far as it is unsure."""
+    """The light of a fit, white where that explains it, else drawn toward white as far as it is unsure."""
     x = fit.x
     error = _expected_error(fit)
     variance = _variance_of(error)
     sure = error <= SURE_DEG
-    if not sure:
+    if angle_deg(x) <= WHITE_ERRORS * error:
+        x = np.zeros(2)
+    elif not sure:
         x = x / (1 + variance / DRAWN**2)
         variance = variance / (1 + variance / DRAWN**2)
     return Light((float(x[0]), float(x[1])), (variance, 0.0, variance), error, sure, aolp)

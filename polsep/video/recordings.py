@@ -5,8 +5,8 @@ are short, so that the slowest sets the pace. The output bytes depend on the set
 interruptions (`io.results.sequences`) and not on where frames are separated (``engine``).
 
 Where nothing moves, raw samples and images are averaged over frames (`temporal`); that state is saved with the run.
-The light's colour and the exposure of the preview are estimated from the first frame, dead and hot pixels from the
-first few, and then fixed, so that they cause no flicker.
+The exposure of the preview is estimated from the first frame, dead and hot pixels from the first few, the light's
+colour from frames spread over the first part, and then fixed, so that they cause no flicker.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ from polsep.io.raw.sequences import DamagedFrame, FrameSequence, open_sequence
 from polsep.io.results.previews import exposure_of, srgb
 from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWriter, State
 from polsep.io.store.errors import InputError
+from polsep.light.find import combine, find_light
 from polsep.methods import Capture, find_method
-from polsep.pipeline import LightColor, find_device, make_frame, separate_capture, to_device
+from polsep.pipeline import FOUND_WORDS, LightColor, find_device, is_calibrated, make_frame, separate_capture, to_device
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import find_lasting_defects, repair
 from polsep.video.panels_kernel import STEPS, make_panels
@@ -44,6 +45,8 @@ Floats = NDArray[np.float32]
 AT_ONCE = 4
 #: First frames in which dead and hot pixels are looked for.
 DEFECT_FRAMES = 8
+#: Distance of the frames of the first part that show the light's colour.
+LIGHT_STEP = 8
 #: Names of the averaged images in the saved state.
 IMAGES = ("diffuse", "specular")
 #: Largest side of a panel of the preview.
@@ -97,7 +100,7 @@ class FirstFrame:
     """Values that the first frame fixes for all: colour of the ``light``, ``gain`` of the preview, ``size`` of images.
 
     ``size`` includes colours. ``shape``: of raw frames. ``warnings``: for the user. ``defects``: mask ``[H, W]`` of the
-    pixels that are repaired in every frame, None where there are none.
+    pixels that are repaired in every frame, None where there are none. ``facts``: of the light, for the report.
     """
 
     method: str
@@ -107,6 +110,7 @@ class FirstFrame:
     shape: tuple[int, ...]
     warnings: tuple[str, ...]
     defects: NDArray[np.bool_] | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -157,6 +161,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
         "kind": asdict(target.kind),
         "method": first.method,
         "light_color": list(first.light),
+        "light": first.facts,
         "gain": first.gain,
         "defects": 0 if first.defects is None else int(np.count_nonzero(first.defects)),
         "shape": list(first.shape),
@@ -184,14 +189,33 @@ def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFram
         if isinstance(frame, DamagedFrame):
             reason = frame.reason
             continue
-        separated = separate_capture(frame.data, options.method, options.light_color, options.device)
+        told, found = _light_of(recording, options)
+        separated = separate_capture(frame.data, options.method, told, options.device)
         gain = exposure_of(separated.diffuse + separated.specular)
         light = tuple(float(c) for c in separated.report["light_color"])
         size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
         notes = (*frame.notes, *separated.report["warnings"])
-        shape = tuple(frame.data.data.shape)
-        return FirstFrame(separated.report["method"], light, gain, size, shape, notes, _defects_of(recording, shape))
+        shape, facts = tuple(frame.data.data.shape), found or separated.report["light"]
+        defects = _defects_of(recording, shape)
+        return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts)
     raise ValueError(f"expected a frame that can be read, found {reason}")
+
+
+def _light_of(recording: FrameSequence, options: VideoOptions) -> tuple[LightColor | str, dict[str, Any] | None]:
+    """Colour of the light as told, or as frames spread over the first part show it; and what was found, for the report.
+
+    None where nothing is to be found: the colour was told, or a calibration says it, or frames are mono.
+    """
+    if options.light_color not in FOUND_WORDS:
+        return options.light_color, None
+    frames = islice(recording.begin(0), 0, PART, LIGHT_STEP)
+    captures = [frame.data for frame in frames if isinstance(frame, Frame)]
+    if not captures or any(is_calibrated(capture) for capture in captures):
+        return options.light_color, None
+    found = combine([find_light(capture) for capture in captures])
+    if found.log_ratio is None:
+        return options.light_color, None
+    return found.color, {"source": "found", **found.describe()}
 
 
 def _defects_of(recording: FrameSequence, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:

@@ -25,16 +25,12 @@ from polsep.light.find import find_light
 from polsep.methods import Capture, Method, find_method
 from polsep.sensor.calibration import Calibration, Corrections, falloff_image, mean_mosaic, subtract_ambient
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.defects import remove_defects
-from polsep.sensor.layout_check import check_layout
+from polsep.sensor.checks import check_mosaic
 from polsep.sensor.levels import as_mosaic
 from polsep.separation.images import FrameImages
 from polsep.separation.report import SeparatedFrame, describe
 
 LightColor = Sequence[float]
-
-#: Share of pixels that are defects from which on the owner is told.
-MANY_DEFECTS = 5e-4
 #: Words for the light's colour: found in the frame (two words for one thing), or white.
 FOUND_WORDS = ("auto", "estimate")
 LIGHT_WORDS = (*FOUND_WORDS, "white")
@@ -100,32 +96,16 @@ def separate_capture(
 ) -> SeparatedFrame:
     """`separate` for a frame that is already a `Mosaic`, or co-sited `Measurements` (which keep their resolution)."""
     chosen = find_method(method, capture)
-    check = check_layout(capture).warning if isinstance(capture, Mosaic) else None
-    capture, defects = repair_capture(capture)
-    capture = to_device(capture, find_device(device))
+    checked = check_mosaic(capture) if isinstance(capture, Mosaic) else None
+    capture = to_device(checked.mosaic if checked else capture, find_device(device))
     light, facts = resolve_light(light_color, capture)
     images = chosen.run(capture, light, full)
     frame = make_frame(images, chosen, capture, light, full)
-    frame.report["light"], frame.report["defects"] = facts, defects
-    remarks = [*([check] if check else []), *defect_remarks(defects, capture)]
-    frame.report["warnings"] = [*remarks, *frame.report["warnings"]]
+    frame.report["light"] = facts
+    if checked:
+        frame.report.update(checked.report)
+        frame.report["warnings"] = [*checked.warnings, *frame.report["warnings"]]
     return frame
-
-
-def repair_capture(capture: Capture) -> tuple[Capture, int]:
-    """The capture with its dead and hot pixels repaired, and their number; only single raw frames have any."""
-    return remove_defects(capture) if isinstance(capture, Mosaic) and capture.data.ndim == 2 else (capture, 0)
-
-
-def defect_remarks(defects: int, capture: Capture) -> list[str]:
-    """A warning where many pixels were repaired."""
-    share = defects / max(capture.data.numel(), 1)
-    if share < MANY_DEFECTS:
-        return []
-    return [
-        f"{defects} dead or hot pixels were repaired ({share:.2%}): a calibration of the dark finds them more surely, "
-        "see 'polsep calibrate dark'"
-    ]
 
 
 def make_frame(

@@ -98,7 +98,8 @@ def test_analyser_orders(color_frame: Tensor, mono_frame: Tensor, order: tuple[i
             assert check.warning is None
         else:
             assert check.warning is not None and "contradicts layout" in check.warning
-            assert "\n" not in check.warning and truth.spec in check.warning
+            option = "--layout mono (" if truth is MONO else f"--layout {truth.spec} ("
+            assert "\n" not in check.warning and option in check.warning
             assert truth in check.fits
 
 

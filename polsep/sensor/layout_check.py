@@ -36,6 +36,9 @@ MIN_RATIO = 2.0
 #: second it is mono or sees grey. Real mono frames show up to 0.012, real colour frames 0.10 and 0.19.
 MIN_COLOR, MAX_MONO = 0.04, 0.02
 
+#: Quantile of brightness that may be a black level nobody said, and the largest share of the mean that is taken for it.
+DARK, MAX_DARK = 0.01, 0.8
+
 #: Strips of a large frame, rows of one, a multiple of the blocks' 16, and how many times that a frame has to have.
 STRIPS, STRIP, LARGE = 4, 64, 16
 
@@ -152,13 +155,25 @@ def _contradictions(cells: Floats) -> dict[str, float]:
     return found
 
 
-def _color_contrast(cells: Floats) -> tuple[float, float]:
-    """Difference of neighbouring cells relative to brightness; +1 for greens on the antidiagonal, -1 on the other."""
+def _color_contrast(cells: Floats, dark: float) -> tuple[float, float]:
+    """Difference of neighbouring cells relative to light; +1 for greens on the antidiagonal, -1 on the other.
+
+    ``dark``: brightness that all samples share, as a black level does that was not said.
+    """
     brightness = cells.mean(1)
     diagonal, rows, columns = (signs @ brightness / 4 for signs in _PAIRINGS.values())
-    contrast = (np.abs(diagonal) + np.abs(rows) + np.abs(columns)) / np.maximum(brightness.mean(0), 1e-9)
+    light = np.maximum(brightness.mean(0) - dark, 1e-9)
+    contrast = (np.abs(diagonal) + np.abs(rows) + np.abs(columns)) / light
     power = float(np.sqrt((rows**2).sum() * (columns**2).sum()))
     return float(np.median(contrast)), float((rows * columns).sum()) / max(power, 1e-12)
+
+
+def phase_cells(mosaic: Mosaic) -> Floats | None:
+    """Mean samples ``[cells, 4, blocks]`` of the polarizer cells, linear; None in frames too small for blocks."""
+    if min(mosaic.data.shape[-2:]) < 64:
+        return None
+    phases = np.concatenate([_phase_means(mosaic, strip)[0] for strip in _strips(mosaic)], -1)
+    return _cells(phases, mosaic.layout.origin)
 
 
 def check_layout(mosaic: Mosaic) -> LayoutCheck:
@@ -176,20 +191,25 @@ def check_layout(mosaic: Mosaic) -> LayoutCheck:
     layouts = tuple(fits)
     if mosaic.layout in fits:
         return LayoutCheck(None, pairs, color, layouts)
-    likely = " or ".join(f"{layout.spec} ({reason})" for layout, reason in list(fits.items())[:3])
+    likely, reason = next(iter(fits.items()))
+    option = f"--layout {'mono' if likely == Layout(bayer=None) else likely.spec} ({reason})"
     if color is False and mosaic.layout.bayer is not None:
-        said = f"the frame shows no colour pattern: unless all it shows is grey, it fits {likely}"
+        said = f"the frame shows no colour pattern: unless all it shows is grey, say {option}"
         return LayoutCheck(said, pairs, color, layouts)
-    return LayoutCheck(f"the frame contradicts layout {mosaic.layout.spec}; it fits {likely}", pairs, color, layouts)
+    return LayoutCheck(
+        f"the frame contradicts layout {mosaic.layout.spec}: it fits {option}, the likeliest", pairs, color, layouts
+    )
 
 
 def _find_color(phases: Floats, texture: Floats, layout: Layout) -> tuple[bool | None, tuple[int, int], float]:
     """Return if cells differ in colour, the alignment where they differ most, and the greens' diagonal (0: unknown)."""
     brightness = phases.mean((0, 1))
-    bright = brightness > 0.1 * brightness.mean()
+    dark = max(float(np.quantile(brightness, DARK)), 0.0) if float(brightness.min()) > 0 else 0.0
+    dark = dark if dark < MAX_DARK * float(brightness.mean()) else 0.0
+    bright = brightness - dark > 0.1 * (brightness.mean() - dark)
     phases, least = phases[..., bright], max(MIN_COLOR, 1.5 * float(np.median(texture[bright])))
     origins = [(0, 0), (0, 1), (1, 0), (1, 1)]
-    found = {origin: _color_contrast(_cells(phases, origin)) for origin in origins}
+    found = {origin: _color_contrast(_cells(phases, origin), dark) for origin in origins}
     best = max(origins, key=lambda origin: found[origin][0])
     contrast, greens = found[best]
     others = max(found[origin][0] for origin in origins if origin != best)
@@ -234,7 +254,14 @@ def _fitting(
 @lru_cache(maxsize=8)
 def _candidates(layout: Layout) -> tuple[tuple[Layout, str], ...]:
     """The layout and what common mistakes make of it; then other orders of the analysers and mono for colour."""
-    mistakes = [(layout, "as given"), *_cropped(layout)[:3], *_mirrored(layout), *_cropped(layout)[3:]]
+    sony = Layout(bayer=layout.bayer and "RGGB")
+    mistakes = [
+        (layout, "as given"),
+        (sony, "Sony's order"),
+        *_cropped(layout)[:3],
+        *_mirrored(layout),
+        *_cropped(layout)[3:],
+    ]
     for order in _ORDERS.values():
         other = Layout(order, layout.bayer)
         mistakes += [(other, "another order of analysers")]

@@ -101,6 +101,7 @@ class FirstFrame:
 
     ``size`` includes colours. ``shape``: of raw frames. ``warnings``: for the user. ``defects``: mask ``[H, W]`` of the
     pixels that are repaired in every frame, None where there are none. ``facts``: of the light, for the report.
+    ``black_level``: of raw frames.
     """
 
     method: str
@@ -111,6 +112,7 @@ class FirstFrame:
     warnings: tuple[str, ...]
     defects: NDArray[np.bool_] | None = None
     facts: dict[str, Any] = field(default_factory=dict)
+    black_level: float | None = None
 
 
 @dataclass(frozen=True)
@@ -163,6 +165,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
         "light_color": list(first.light),
         "light": first.facts,
         "gain": first.gain,
+        "black_level": first.black_level,
         "defects": 0 if first.defects is None else int(np.count_nonzero(first.defects)),
         "shape": list(first.shape),
         "colors": first.size[2],
@@ -196,8 +199,8 @@ def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFram
         size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
         notes = (*frame.notes, *separated.report["warnings"])
         shape, facts = tuple(frame.data.data.shape), found or separated.report["light"]
-        defects = _defects_of(recording, shape)
-        return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts)
+        defects, black = _defects_of(recording, shape), separated.report.get("black_level")
+        return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black)
     raise ValueError(f"expected a frame that can be read, found {reason}")
 
 
@@ -346,6 +349,8 @@ def _prepared(
             wanted, found = ("x".join(map(str, reversed(shape))) for shape in (first.shape, frame.data.data.shape))
             reason = f"frame {frame.index}: expected {wanted} samples as in the first one, found {found}"
             frame = DamagedFrame(frame.index, reason)
+        if first.black_level is not None and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
+            frame = replace(frame, data=replace(frame.data, black_level=first.black_level))
         if first.defects is not None and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
             frame = replace(frame, data=repair(frame.data, first.defects))
         if options.filter == "temporal" and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):

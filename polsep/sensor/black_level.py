@@ -1,0 +1,105 @@
+"""The black level that a frame shows by itself, compared with the one that was said.
+
+Light brings noise: a sample of light x above black has the variance gain x + floor (photon transfer). Dark parts whose
+noise is far smaller than their level asks for are dark: their level is the black level. Two laws must agree:
+
+1. Nothing lies below black but noise: the darkest samples stop at it.
+2. The variance of smooth parts falls to the converter's and the reading's own at it, on a line through brighter parts.
+
+Frames with samples near the black level that was said are never in doubt. Unit: codes, as in `Mosaic.data`.
+Source: photon transfer, Janesick 2007 (doi:10.1117/3.725073); the test is this project's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.sensor.camera import CLIP_MARGIN, Mosaic
+from polsep.sensor.noise import BLOCK, blocks_of
+
+Floats = NDArray[np.float32]
+
+#: Blocks of 4x4 samples that are looked at, about; the fewest that make a level; levels of brightness.
+BLOCKS, MIN_BLOCKS, LEVELS = 24_576, 32, 24
+#: Share of the blocks whose darkest level is black, if any is.
+DARKEST = 0.004
+#: A dark level is black if its variance is below this share of what its level asks for.
+QUIET = 0.35
+#: And below this share of what it asks for on a sensor of so many electrons at white, few of which have more.
+LEAST_NOISE, LARGEST_WELL = 0.6, 20_000.0
+#: Least black level that is told, and the least excess of one that was said, relative to white.
+LEAST, LEAST_EXCESS = 0.0015, 0.002
+#: Share of codes below black from which on too much is subtracted; corrected samples may be negative.
+BELOW = 0.002
+
+
+@dataclass(frozen=True)
+class BlackLevel:
+    """``level``: the black level that the frame shows, None if it does not; ``warning``: a line, or None."""
+
+    level: float | None
+    warning: str | None
+
+
+def check_black_level(mosaic: Mosaic) -> BlackLevel:
+    """Compare the first frame with its black level; silent where the frame does not show it."""
+    said, span = float(mosaic.black_level), float(mosaic.white_level - mosaic.black_level)
+    if min(mosaic.data.shape[-2:]) < 4 * BLOCK:
+        return BlackLevel(None, None)
+    rows = _some_rows(mosaic)
+    below = float(np.mean(rows < said - LEAST_EXCESS * span)) if float(rows.min()) >= 0 else 0.0
+    if below > BELOW:
+        excess = f"{below:.1%} of the samples lie below the black level {said:g}, which only noise should"
+        return BlackLevel(None, f"{excess}: the darkest are at {np.quantile(rows, 0.001):g}, say a lower --black-level")
+    level = _black_of(mosaic)
+    if level is None or level - said < LEAST * span:
+        return BlackLevel(None, None)
+    shown = f"black lies at {level:.4g}, not at {said:g}, as the noise of dark parts shows"
+    advice = "taken so, say" if said == 0 else "say"
+    return BlackLevel(level, f"{shown}: {advice} --black-level {level:.4g}")
+
+
+def _some_rows(mosaic: Mosaic) -> Floats:
+    """Rows of blocks, evenly spread over the first frame, about `BLOCKS` of them."""
+    x = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0].detach().float().cpu().numpy()
+    height, width = (n // BLOCK * BLOCK for n in x.shape)
+    step = max(1, height * width // BLOCK**2 // BLOCKS)
+    return np.ascontiguousarray(x[:height, :width].reshape(-1, BLOCK, width)[::step]).reshape(-1, width)
+
+
+def _black_of(mosaic: Mosaic) -> float | None:
+    """The level of the darkest parts if they are black, by their noise; None where that is not shown."""
+    said, span = float(mosaic.black_level), float(mosaic.white_level - mosaic.black_level)
+    level, variance = smooth_blocks(mosaic)
+    if level.size < 4 * MIN_BLOCKS:
+        return None
+    order = np.argsort(level)
+    level, variance = level[order], variance[order]
+    count = max(MIN_BLOCKS, int(DARKEST * level.size))
+    dark, quiet = float(np.median(level[:count])), float(np.median(variance[:count]))
+    edges = dark + (level[-1] - dark) * np.linspace(0.0, 1.0, LEVELS + 1)[1:] ** 2
+    parts = np.split(np.arange(level.size), np.searchsorted(level, edges))
+    gains = [
+        (float(np.quantile(variance[part], 0.25)) - quiet) / (float(np.median(level[part])) - dark)
+        for part in parts[1:]
+        if part.size >= MIN_BLOCKS
+    ]
+    if len(gains) < 3 or dark - said < LEAST * span:
+        return None
+    gain = float(np.quantile(gains, 0.25))
+    if quiet > (dark - said) * min(QUIET * gain, LEAST_NOISE * span / LARGEST_WELL):
+        return None
+    return float(np.median(level[level <= dark + 4 * (quiet / BLOCK**2) ** 0.5]))
+
+
+def smooth_blocks(mosaic: Mosaic) -> tuple[Floats, Floats]:
+    """Mean level and variance of unclipped blocks, without what is common to all samples of a block: texture."""
+    x = blocks_of(_some_rows(mosaic))
+    unclipped = np.all(x < mosaic.black_level + (1 - CLIP_MARGIN) * (mosaic.white_level - mosaic.black_level), axis=-1)
+    across = x[:, 1:-1] - np.float32(0.5) * (x[:, :-2] + x[:, 2:])
+    variance = across.var(axis=-1) / np.float32(1.5)
+    kept = unclipped[:, 1:-1] & unclipped[:, :-2] & unclipped[:, 2:]
+    return x.mean(axis=-1)[:, 1:-1][kept], variance[kept]

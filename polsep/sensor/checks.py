@@ -1,0 +1,51 @@
+"""All checks of one raw frame, in order: black level, encoding, filter layout, defects; and what is put right.
+
+A frame that is encoded, or whose black level is too large, contradicts every layout: then nothing is said of layouts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from polsep.sensor.black_level import check_black_level
+from polsep.sensor.camera import Mosaic
+from polsep.sensor.defects import remove_defects
+from polsep.sensor.encoding import encoding_warning
+from polsep.sensor.layout_check import check_layout
+
+#: Share of pixels that are defects from which on the owner is told.
+MANY_DEFECTS = 5e-4
+
+
+@dataclass(frozen=True)
+class CheckedMosaic:
+    """The frame, put right where it was sure; ``report``: number of defects, black level; ``warnings``, a line each."""
+
+    mosaic: Mosaic
+    report: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+def check_mosaic(mosaic: Mosaic) -> CheckedMosaic:
+    """One frame ``[H, W]`` with its defects repaired and, where 0 was said, the black level that it shows.
+
+    The same object where nothing was found. Of a batch only the layout of the first frame is checked.
+    """
+    if mosaic.data.ndim != 2:
+        warning = check_layout(mosaic).warning
+        return CheckedMosaic(mosaic, {}, (warning,) if warning else ())
+    black, encoded = check_black_level(mosaic), encoding_warning(mosaic)
+    if black.level is not None and mosaic.black_level == 0:
+        mosaic = replace(mosaic, black_level=black.level)
+    understood = encoded is None and (black.warning is None or black.level is not None)
+    layout = check_layout(mosaic).warning if understood else None
+    mosaic, count = remove_defects(mosaic)
+    share = count / mosaic.data.numel()
+    many = (
+        f"{count} dead or hot pixels were repaired ({share:.2%}): a calibration of the dark finds them more surely, "
+        "see 'polsep calibrate dark'"
+    )
+    lines = (encoded, black.warning, layout, many if share >= MANY_DEFECTS else None)
+    report = {"defects": count, "black_level": float(mosaic.black_level)}
+    return CheckedMosaic(mosaic, report, tuple(line for line in lines if line))

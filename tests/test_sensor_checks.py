@@ -1,0 +1,124 @@
+"""Black level, gamma curves and JPEG are seen in the frame, and nothing is said of linear frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import imagecodecs
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import polsep
+from polsep.physics.stokes import Stokes
+from polsep.render.simulate import filter_light
+from polsep.sensor.black_level import check_black_level
+from polsep.sensor.camera import IMX250, Layout, Mosaic, Sensor
+from polsep.sensor.checks import check_mosaic
+from polsep.sensor.encoding import block_ratio, encoding_warning, gamma_slope
+
+COLOR, MONO = Layout(), Layout(bayer=None)
+LAYOUTS = pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
+SIZE = 256
+
+
+def scene(channels: int) -> Stokes:
+    """Smooth polarized things of several colours on black."""
+    y, x = torch.meshgrid(torch.linspace(0, 1, SIZE), torch.linspace(0, 1, SIZE), indexing="ij")
+    inside = ((y - 0.5) ** 2 + (x - 0.5) ** 2 < 0.18).float()
+    s0 = torch.stack([inside * (0.25 + 0.5 * x + 0.4 * c * y) for c in range(channels)])
+    return Stokes(s0, s0 * (0.9 * x - 0.3), s0 * (0.7 * y - 0.2))
+
+
+def frame(layout: Layout, black: float = 0.0, sensor: Sensor = IMX250) -> Mosaic:
+    """A frame whose codes have ``black`` added before the converter cuts off at 0, read with a black level of 0."""
+    signal = filter_light(scene(layout.channels), layout, sensor)
+    noise = torch.from_numpy(np.random.default_rng(1).standard_normal(signal.shape, np.float32))
+    noisy = signal + sensor.noise_variance(signal).sqrt() * noise
+    codes = (noisy * (sensor.white_level - black) + black).clamp(0, sensor.white_level).round()
+    return Mosaic(codes, layout, 0.0, sensor.white_level)
+
+
+def encoded(linear: Mosaic, power: float) -> Mosaic:
+    codes = (255 * (linear.data / linear.white_level) ** power).round()
+    return Mosaic(codes, linear.layout, 0.0, 255.0)
+
+
+@LAYOUTS
+def test_linear_frames_pass_unchanged(layout: Layout) -> None:
+    """Nothing is found in a linear frame at 8 or 12 bits: it comes back as the same object."""
+    for sensor in (IMX250, replace(IMX250, bits=8)):
+        clean = frame(layout, 0.0, sensor)
+        checked = check_mosaic(clean)
+        assert checked.mosaic is clean
+        assert checked.warnings == ()
+        assert checked.report == {"defects": 0, "black_level": 0.0}
+
+
+@LAYOUTS
+@pytest.mark.parametrize("black", [16.0, 64.0, 240.0])
+def test_black_level_is_found_and_put_right(layout: Layout, black: float) -> None:
+    """The black level that nobody said is found to a code, taken, and named as an option; layouts are not blamed."""
+    checked = check_mosaic(frame(layout, black))
+    assert checked.mosaic.black_level == pytest.approx(black, abs=1.5)
+    (line,) = checked.warnings
+    assert "--black-level" in line and "layout" not in line
+
+
+@LAYOUTS
+def test_a_black_level_that_was_said_is_kept(layout: Layout) -> None:
+    """The right one passes without a word; one that is too small or too large is told but never changed."""
+    right = replace(frame(layout, 240.0), black_level=240.0)
+    assert check_black_level(right).warning is None
+    for said, true in ((64.0, 240.0), (240.0, 0.0)):
+        wrong = replace(frame(layout, true), black_level=said)
+        checked = check_mosaic(wrong)
+        assert checked.mosaic.black_level == said
+        assert any("black" in line for line in checked.warnings)
+
+
+@LAYOUTS
+def test_light_everywhere_is_no_black_level(layout: Layout) -> None:
+    """Room light on the dark parts has its own noise: it is light."""
+    light = scene(layout.channels)
+    lit = Stokes(light.s0 + 0.2, light.s1, light.s2)
+    signal = filter_light(lit, layout, IMX250)
+    noise = torch.from_numpy(np.random.default_rng(2).standard_normal(signal.shape, np.float32))
+    codes = (4095 * (signal + IMX250.noise_variance(signal).sqrt() * noise)).clamp(0, 4095).round()
+    assert check_black_level(Mosaic(codes, layout, 0.0, 4095.0)).level is None
+
+
+@LAYOUTS
+@pytest.mark.parametrize("power", [1 / 2.2, 0.5])
+def test_gamma_curves_are_seen(layout: Layout, power: float) -> None:
+    """The contradiction of the analysers measures the curve, and the line names it."""
+    bent = encoded(frame(layout), power)
+    assert gamma_slope(bent) == pytest.approx((power - 1) / power, rel=0.35)
+    assert gamma_slope(frame(layout)) == pytest.approx(0, abs=0.1)
+    assert "gamma" in (encoding_warning(bent) or "")
+
+
+@LAYOUTS
+def test_jpeg_is_seen(layout: Layout) -> None:
+    """Blocks of 8x8 show after compression, not before."""
+    plain = encoded(frame(layout), 1.0)
+    codes = imagecodecs.jpeg_encode(plain.data.numpy().astype(np.uint8), level=95)
+    rounded = replace(plain, data=torch.from_numpy(imagecodecs.jpeg_decode(codes).astype(np.float32)))
+    assert block_ratio(plain) == pytest.approx(1, abs=0.1)
+    assert "JPEG" in (encoding_warning(rounded) or "")
+
+
+def test_a_mono_frame_read_as_colour_is_told_what_to_say() -> None:
+    """One option to paste, not several."""
+    lines = check_mosaic(replace(frame(MONO), layout=COLOR)).warnings
+    assert [line for line in lines if "--layout mono (" in line]
+
+
+def test_separate_corrects_the_black_level() -> None:
+    """The default call gives with an unknown black level nearly what it gives when it is said."""
+    raw: Tensor = frame(COLOR, 240.0).data
+    said = polsep.separate(raw.numpy(), "analytic", black_level=240, white_level=4095)
+    with pytest.warns(polsep.PolsepWarning, match="--black-level"):
+        found = polsep.separate(raw.numpy(), "analytic", white_level=4095)
+    assert float(np.abs(found.diffuse - said.diffuse).max()) < 2e-3

@@ -80,14 +80,16 @@ def _black_of(mosaic: Mosaic) -> float | None:
     level, variance = level[order], variance[order]
     count = max(MIN_BLOCKS, int(DARKEST * level.size))
     dark, quiet = float(np.median(level[:count])), float(np.median(variance[:count]))
+    if dark - said < LEAST * span or not level[-1] > dark:
+        return None
     edges = dark + (level[-1] - dark) * np.linspace(0.0, 1.0, LEVELS + 1)[1:] ** 2
     parts = np.split(np.arange(level.size), np.searchsorted(level, edges))
     gains = [
         (float(np.quantile(variance[part], 0.25)) - quiet) / (float(np.median(level[part])) - dark)
         for part in parts[1:]
-        if part.size >= MIN_BLOCKS
+        if part.size >= MIN_BLOCKS and float(np.median(level[part])) > dark
     ]
-    if len(gains) < 3 or dark - said < LEAST * span:
+    if len(gains) < 3:
         return None
     gain = float(np.quantile(gains, 0.25))
     if quiet > (dark - said) * min(QUIET * gain, LEAST_NOISE * span / LARGEST_WELL):

@@ -30,6 +30,8 @@ DARKEST = 0.004
 QUIET = 0.35
 #: And below this share of what it asks for on a sensor of so many electrons at white, few of which have more.
 LEAST_NOISE, LARGEST_WELL = 0.6, 20_000.0
+#: Least noise of bright parts, over that of the same sensor; least span of integer codes.
+MIN_GAIN, MIN_SPAN = 0.5, 100.0
 #: Least black level that is told, and the least excess of one that was said, relative to white.
 LEAST, LEAST_EXCESS = 0.0015, 0.002
 #: Share of codes below black from which on too much is subtracted; corrected samples may be negative.
@@ -74,7 +76,7 @@ def _black_of(mosaic: Mosaic) -> float | None:
     """The level of the darkest parts if they are black, by their noise; None where that is not shown."""
     said, span = float(mosaic.black_level), float(mosaic.white_level - mosaic.black_level)
     level, variance = smooth_blocks(mosaic)
-    if level.size < 4 * MIN_BLOCKS:
+    if level.size < 4 * MIN_BLOCKS or not _is_codes(mosaic):
         return None
     order = np.argsort(level)
     level, variance = level[order], variance[order]
@@ -92,9 +94,17 @@ def _black_of(mosaic: Mosaic) -> float | None:
     if len(gains) < 3:
         return None
     gain = float(np.quantile(gains, 0.25))
+    if gain < MIN_GAIN * span / LARGEST_WELL:
+        return None
     if quiet > (dark - said) * min(QUIET * gain, LEAST_NOISE * span / LARGEST_WELL):
         return None
     return float(np.median(level[level <= dark + 4 * (quiet / BLOCK**2) ** 0.5]))
+
+
+def _is_codes(mosaic: Mosaic) -> bool:
+    """True for integer codes, as converters give; renderings without noise are floats and show no black level."""
+    rows = _some_rows(mosaic)
+    return mosaic.white_level - mosaic.black_level >= MIN_SPAN and bool((rows == np.floor(rows)).all())
 
 
 def smooth_blocks(mosaic: Mosaic) -> tuple[Floats, Floats]:

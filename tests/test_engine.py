@@ -180,14 +180,8 @@ def test_slow_compilation_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: 
 
 
 def test_kernels_are_loaded_with_the_first_frame() -> None:
-    """``polsep.separate`` can be named, and frames separated by what has no kernels, without numba."""
-    code = (
-        "import sys, numpy as np, polsep;"
-        "raw = np.full((32, 32), 0.5, np.float32);"
-        "polsep.separate(raw, layout=polsep.Layout(bayer=None), method='analytic', full=True, device='cpu',"
-        "light_color='white');"
-        "print('numba' in sys.modules)"
-    )
+    """``polsep.separate`` can be named without numba."""
+    code = "import sys, polsep; polsep.separate; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout.strip() == "False"
 

@@ -216,7 +216,8 @@ def _model_of(network: Joint, layers: type[Layers], channels: tuple[int, ...]) -
     known = _MODELS.setdefault(network, {})
     if layers not in known:
         known[layers] = _as_model(
-            layers(network).eval(), tuple(torch.zeros(1, n, *_example_size(n, network)) for n in channels)
+            layers(network).eval(),
+            tuple(torch.zeros(1, n, *_example_size(n, network), dtype=torch.float32) for n in channels),
         )
     return known[layers].clone()
 

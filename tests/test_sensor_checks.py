@@ -109,6 +109,13 @@ def test_jpeg_is_seen(layout: Layout) -> None:
     assert "JPEG" in (encoding_warning(rounded) or "")
 
 
+@pytest.mark.parametrize("size", [2, 4, 6, 16, 30])
+def test_small_frames_pass(size: int) -> None:
+    """Frames too small for any check come back as they are."""
+    small = Mosaic(torch.full((size, size), 90.0), MONO, 0.0, 255.0)
+    assert check_mosaic(small).mosaic is small
+
+
 def test_a_mono_frame_read_as_colour_is_told_what_to_say() -> None:
     """One option to paste, not several."""
     lines = check_mosaic(replace(frame(MONO), layout=COLOR)).warnings

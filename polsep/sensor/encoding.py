@@ -83,7 +83,12 @@ def gamma_slope(mosaic: Mosaic) -> float | None:
 
 
 def noise_exponent(mosaic: Mosaic) -> float | None:
-    """Exponent of the power of the level that the variance of smooth parts follows; None where levels are too alike."""
+    """Exponent of the power of the level that the variance of smooth parts follows; None where levels are too alike.
+
+    None for small frames, too.
+    """
+    if min(mosaic.data.shape[-2:]) < 8 * SIDE:
+        return None
     level, variance = smooth_blocks(mosaic)
     level -= np.float32(mosaic.black_level)
     kept = level > MIN_LEVEL * (mosaic.white_level - mosaic.black_level)

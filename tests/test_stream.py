@@ -114,7 +114,7 @@ def test_real_frames_less_the_told_color_are_the_truth_behind_its_filters(monkey
     monkeypatch.setattr(stream, "random_sensor", lambda _: IMX250)
     monkeypatch.setattr(stream, "random_errors", lambda _: SensorErrors())
     monkeypatch.setattr(reality, "COLOR_ERROR_SHARES", (1.0, 0.0, 0.0, 0.0))
-    for share in ("METAL_SHARE", "RETAINING_SHARE", "INDIRECT_SHARE", "ABERRATION_SHARE"):
+    for share in ("IDEAL_SHARE", "METAL_SHARE", "RETAINING_SHARE", "INDIRECT_SHARE", "ABERRATION_SHARE"):
         monkeypatch.setattr(reality, share, 0.0)
     deviations, tinted = [], 0
     for b in take(replace(SMALL, looks="real"), 0, 0, 8):

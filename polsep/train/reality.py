@@ -34,6 +34,8 @@ from polsep.render.disturbances import (
 from polsep.render.sensor_errors import SensorErrors
 from polsep.render.sphere_tracing import Scene
 
+#: Share of scenes that stay as they are: networks must not lose on clean frames what they gain on others.
+IDEAL_SHARE = 0.35
 #: Share of scenes under a lamp that is not white to the sensor; red and blue, green = 1, log-uniform.
 TINTED_SHARE, TINTS = 0.7, (0.3, 1.7)
 #: Standard deviations of ln(red / green), ln(blue / green) of the colour that is divided out, and their shares. A
@@ -47,7 +49,7 @@ ROOM_SHARE, ROOMS, ROOM_CONTRAST = 0.45, (0.01, 0.6), 0.8
 SECOND_SHARE, SECOND = 0.12, (0.1, 1.0)
 #: Share of scenes in which a part of the diffuse light keeps the lamp's polarization, beside `variety.RETAINED`; that
 #: part, log-uniform; in half of these it has the colour of the diffuse light.
-RETAINING_SHARE, RETAINED = 0.3, (0.01, 0.15)
+RETAINING_SHARE, RETAINED = 0.2, (0.01, 0.15)
 #: Share of scenes with light between coloured things; mean of its diffuse part, and of its mirrored part, log-uniform,
 #: over the direct diffuse light; share of the mirrored part that keeps the lamp's polarization.
 INDIRECT_SHARE, INDIRECT, MIRRORED, KEEPS = 0.35, (0.0, 0.4), (0.005, 0.2), (0.0, 0.3)
@@ -91,8 +93,10 @@ MIN_ROOM = 0.01
 
 
 def disturb(scene: Scene, rerender: Rerender, generator: torch.Generator) -> RealScene:
-    """Return a scene with random disturbances, in the order in which light meets them."""
+    """Return a scene with random disturbances, in the order in which light meets them, or as it is."""
     draw = _Draw(generator)
+    if draw.happens(IDEAL_SHARE):
+        return as_ideal(scene)
     if draw.happens(RETAINING_SHARE):
         scene = retain_polarization(scene, draw.log_between(RETAINED), float(draw.happens(0.5)))
     if draw.happens(METAL_SHARE):

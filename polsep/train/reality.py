@@ -35,7 +35,7 @@ from polsep.render.sensor_errors import SensorErrors
 from polsep.render.sphere_tracing import Scene
 
 #: Share of scenes that stay as they are: networks must not lose on clean frames what they gain on others.
-IDEAL_SHARE = 0.35
+IDEAL_SHARE = 0.4
 #: Share of scenes under a lamp that is not white to the sensor; red and blue, green = 1, log-uniform.
 TINTED_SHARE, TINTS = 0.7, (0.3, 1.7)
 #: Standard deviations of ln(red / green), ln(blue / green) of the colour that is divided out, and their shares. A
@@ -49,12 +49,12 @@ ROOM_SHARE, ROOMS, ROOM_CONTRAST = 0.45, (0.01, 0.6), 0.8
 SECOND_SHARE, SECOND = 0.12, (0.1, 1.0)
 #: Share of scenes in which a part of the diffuse light keeps the lamp's polarization, beside `variety.RETAINED`; that
 #: part, log-uniform; in half of these it has the colour of the diffuse light.
-RETAINING_SHARE, RETAINED = 0.2, (0.01, 0.15)
+RETAINING_SHARE, RETAINED = 0.15, (0.01, 0.15)
 #: Share of scenes with light between coloured things; mean of its diffuse part, and of its mirrored part, log-uniform,
 #: over the direct diffuse light; share of the mirrored part that keeps the lamp's polarization.
 INDIRECT_SHARE, INDIRECT, MIRRORED, KEEPS = 0.35, (0.0, 0.4), (0.005, 0.2), (0.0, 0.3)
 #: Share of scenes with patches of metal, and the share of the frame that is metal.
-METAL_SHARE, METAL_AREA = 0.08, (0.05, 0.4)
+METAL_SHARE, METAL_AREA = 0.12, (0.05, 0.4)
 #: Shares of scenes behind lenses with veiling glare and with lateral chromatic aberration, and their ranges.
 GLARE_SHARE, GLARE, ABERRATION_SHARE, ABERRATION = 0.2, (0.002, 0.04), 0.1, 0.002
 #: Share of frames exposed darker than the others, and the factor, log-uniform.

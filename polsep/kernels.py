@@ -7,7 +7,9 @@ this room imports numba; ``import polsep`` does not.
 from __future__ import annotations
 
 from polsep.compute.threads import get_threads, set_threads
+from polsep.light import color_kernel, tiles_kernel
 from polsep.networks import details_kernel, images_kernel
+from polsep.sensor import defects_kernel
 from polsep.sensor.unpack_kernel import PackedFrame
 from polsep.separation import analytic_kernel, color_affine_kernel
 from polsep.separation.analytic_kernel import AnalyticOptions, separate_analytic_half
@@ -34,5 +36,15 @@ __all__ = [
 
 def warm_up() -> None:
     """Compile every kernel, or load it from numba's cache: some two minutes the first time, then seconds."""
-    for kernel in (analytic_kernel, color_affine_kernel, images_kernel, details_kernel, temporal_kernel):
+    kernels = (
+        analytic_kernel,
+        color_affine_kernel,
+        images_kernel,
+        details_kernel,
+        temporal_kernel,
+        defects_kernel,
+        tiles_kernel,
+        color_kernel,
+    )
+    for kernel in kernels:
         kernel.warm_up()

@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from polsep import shipped
+from polsep import kernels, shipped
 from polsep.io.store import weights
 from polsep.methods import METHODS
 from polsep.sensor.camera import Layout, Mosaic
@@ -44,6 +44,7 @@ def shared() -> Path:
 @pytest.fixture(scope="session")
 def compiled() -> None:
     """Every engine's kernels are compiled on disk: programs that tests start then never stop to compile, nor say so."""
+    kernels.warm_up()
     for method in METHODS.values():
         method.run(Mosaic(torch.eye(32), Layout(), 0.0, 1.0), (1.0, 1.0, 1.0), False)
 

@@ -4,26 +4,45 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
+from typing import Any
 
-#: Loading compiled code takes less than this many seconds, also on a busy machine; compiling it takes more.
-PATIENCE = 6.0
+#: Compilation that takes less than this many seconds is not worth a word.
+PATIENCE = 2.0
 
 
 @lru_cache
 def make_ready(warm_up: Callable[[], object]) -> None:
-    """Load or compile what a method needs by ``warm_up``, the first time only; log a warning once it takes long."""
-    import numba  # noqa: F401  # its import is not what takes long
+    """Load or compile what a method needs by ``warm_up``, the first time only; log a warning if it compiles for long.
 
-    notice = threading.Timer(
-        PATIENCE,
-        logging.getLogger("polsep").warning,
-        ("compiling this method for this machine, once: up to a minute or two",),
-    )
-    notice.daemon = True
-    notice.start()
-    try:
+    Loading never warns, however busy the machine is.
+    """
+    with _watch_compiler():
         warm_up()
-    finally:
-        notice.cancel()
+
+
+@contextmanager
+def _watch_compiler() -> Iterator[None]:
+    """Log a warning `PATIENCE` seconds after the compiler starts, if the block is not done by then."""
+    from numba.core import event
+
+    text = "compiling this method for this machine, once: up to a minute or two"
+    notice = threading.Timer(PATIENCE, logging.getLogger("polsep").warning, (text,))
+    notice.daemon = True
+
+    class Start(event.Listener):
+        def on_start(self, event: Any) -> None:
+            del event
+            if notice.ident is None:
+                notice.start()
+
+        def on_end(self, event: Any) -> None:
+            del event
+
+    with event.install_listener("numba:compile", Start()):
+        try:
+            yield
+        finally:
+            notice.cancel()

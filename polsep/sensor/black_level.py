@@ -56,7 +56,7 @@ def check_black_level(mosaic: Mosaic) -> BlackLevel:
     if below > BELOW:
         excess = f"{below:.1%} of the samples lie below the black level {said:g}, which only noise should"
         return BlackLevel(None, f"{excess}: the darkest are at {np.quantile(rows, 0.001):g}, say a lower --black-level")
-    level = _black_of(mosaic)
+    level = _black_of(mosaic, rows)
     if level is None or level - said < LEAST * span:
         return BlackLevel(None, None)
     shown = f"black lies at {level:.4g}, not at {said:g}, as the noise of dark parts shows"
@@ -72,17 +72,22 @@ def _some_rows(mosaic: Mosaic) -> Floats:
     return np.ascontiguousarray(x[:height, :width].reshape(-1, BLOCK, width)[::step]).reshape(-1, width)
 
 
-def _black_of(mosaic: Mosaic) -> float | None:
+def _black_of(mosaic: Mosaic, rows: Floats) -> float | None:
     """The level of the darkest parts if they are black, by their noise; None where that is not shown."""
     said, span = float(mosaic.black_level), float(mosaic.white_level - mosaic.black_level)
-    level, variance = smooth_blocks(mosaic)
-    if level.size < 4 * MIN_BLOCKS or not _is_codes(mosaic):
+    x = blocks_of(rows)
+    kept = _usable(mosaic, x)
+    level = x.mean(axis=-1)[:, 1:-1][kept]
+    if level.size < 4 * MIN_BLOCKS or not _is_codes(mosaic, rows):
         return None
+    count = max(MIN_BLOCKS, int(DARKEST * level.size))
+    if float(np.median(np.partition(level, count - 1)[:count])) - said < LEAST * span:
+        return None
+    variance = _variance(x)[kept]
     order = np.argsort(level)
     level, variance = level[order], variance[order]
-    count = max(MIN_BLOCKS, int(DARKEST * level.size))
     dark, quiet = float(np.median(level[:count])), float(np.median(variance[:count]))
-    if dark - said < LEAST * span or not level[-1] > dark:
+    if not level[-1] > dark:
         return None
     edges = dark + (level[-1] - dark) * np.linspace(0.0, 1.0, LEVELS + 1)[1:] ** 2
     parts = np.split(np.arange(level.size), np.searchsorted(level, edges))
@@ -101,17 +106,28 @@ def _black_of(mosaic: Mosaic) -> float | None:
     return float(np.median(level[level <= dark + 4 * (quiet / BLOCK**2) ** 0.5]))
 
 
-def _is_codes(mosaic: Mosaic) -> bool:
+def _is_codes(mosaic: Mosaic, rows: Floats) -> bool:
     """True for integer codes, as converters give; renderings without noise are floats and show no black level."""
-    rows = _some_rows(mosaic)
     return mosaic.white_level - mosaic.black_level >= MIN_SPAN and bool((rows == np.floor(rows)).all())
 
 
 def smooth_blocks(mosaic: Mosaic) -> tuple[Floats, Floats]:
     """Mean level and variance of unclipped blocks, without what is common to all samples of a block: texture."""
     x = blocks_of(_some_rows(mosaic))
-    unclipped = np.all(x < mosaic.black_level + (1 - CLIP_MARGIN) * (mosaic.white_level - mosaic.black_level), axis=-1)
+    kept = _usable(mosaic, x)
+    return x.mean(axis=-1)[:, 1:-1][kept], _variance(x)[kept]
+
+
+def _usable(mosaic: Mosaic, x: Floats) -> NDArray[np.bool_]:
+    """Blocks ``x [K, N, 16]`` that are not clipped, nor their neighbours on both sides ``[K, N - 2]``."""
+    clip = np.float32(mosaic.black_level + (1 - CLIP_MARGIN) * (mosaic.white_level - mosaic.black_level))
+    unclipped = x.max(axis=-1) < clip
+    kept: NDArray[np.bool_] = unclipped[:, 1:-1] & unclipped[:, :-2] & unclipped[:, 2:]
+    return kept
+
+
+def _variance(x: Floats) -> Floats:
+    """Variance of the difference of blocks to their neighbours, over that of one sample ``[K, N - 2]``."""
     across = x[:, 1:-1] - np.float32(0.5) * (x[:, :-2] + x[:, 2:])
-    variance = across.var(axis=-1) / np.float32(1.5)
-    kept = unclipped[:, 1:-1] & unclipped[:, :-2] & unclipped[:, 2:]
-    return x.mean(axis=-1)[:, 1:-1][kept], variance[kept]
+    variance: Floats = across.var(axis=-1) / np.float32(1.5)
+    return variance

@@ -12,7 +12,7 @@ from polsep.sensor.black_level import check_black_level
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import remove_defects
 from polsep.sensor.encoding import encoding_warning
-from polsep.sensor.layout_check import check_layout
+from polsep.sensor.layout_check import check_layout, see_phases
 
 #: Share of pixels that are defects from which on the owner is told.
 MANY_DEFECTS = 5e-4
@@ -35,11 +35,13 @@ def check_mosaic(mosaic: Mosaic) -> CheckedMosaic:
     if mosaic.data.ndim != 2:
         warning = check_layout(mosaic).warning
         return CheckedMosaic(mosaic, {}, (warning,) if warning else ())
-    black, encoded = check_black_level(mosaic), encoding_warning(mosaic)
+    phases = see_phases(mosaic)
+    black, encoded = check_black_level(mosaic), encoding_warning(mosaic, phases)
     if black.level is not None and mosaic.black_level == 0:
         mosaic = replace(mosaic, black_level=black.level)
+        phases = see_phases(mosaic)
     understood = encoded is None and (black.warning is None or black.level is not None)
-    layout = check_layout(mosaic).warning if understood else None
+    layout = check_layout(mosaic, phases).warning if understood else None
     mosaic, count = remove_defects(mosaic)
     share = count / mosaic.data.numel()
     many = (

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from polsep.sensor.black_level import smooth_blocks
 from polsep.sensor.camera import Mosaic
-from polsep.sensor.layout_check import crossed_pairs, phase_cells
+from polsep.sensor.layout_check import Phases, crossed_pairs, phase_cells, see_phases
 
 Floats = NDArray[np.float32]
 
@@ -31,19 +31,20 @@ MAX_EXPONENT = 0.3
 BINS, MIN_BLOCKS, MIN_LEVEL, MIN_RANGE = 12, 32, 0.02, 0.25
 #: Strongest polarization, relative to brightness, that the second order describes; weakest that says anything.
 MAX_DOLP, MIN_DOLP = 0.9, 0.05
-#: Fewest blocks with polarized light.
-MIN_CELLS = 64
+#: Fewest blocks with polarized light, and the side of the least frame.
+MIN_CELLS, MIN_SIDE = 64, 64
 #: White level of JPEG files.
 JPEG_WHITE = 255.0
 #: Side of a block of JPEG, most blocks that are looked at, and the ratio of waves below which they were rounded.
 SIDE, BLOCKS, MAX_RATIO = 8, 8192, 0.87
 
 
-def encoding_warning(mosaic: Mosaic) -> str | None:
+def encoding_warning(mosaic: Mosaic, seen: Phases | None = None) -> str | None:
     """A line on samples that are gamma-encoded or were JPEG files, or None; the first frame of a batch."""
-    slope, rise = gamma_slope(mosaic), noise_exponent(mosaic)
+    slope = gamma_slope(mosaic, seen)
     bent = slope is not None and MIN_SLOPE < slope < MAX_SLOPE
-    if bent and rise is not None and rise < MAX_EXPONENT:
+    rise = noise_exponent(mosaic) if bent else None
+    if rise is not None and rise < MAX_EXPONENT:
         return (
             "the samples are gamma-encoded, as analysers and noise show: linear ones were expected; record with "
             "gamma off (1), or decode the frame first"
@@ -57,12 +58,12 @@ def encoding_warning(mosaic: Mosaic) -> str | None:
     return None
 
 
-def gamma_slope(mosaic: Mosaic) -> float | None:
+def gamma_slope(mosaic: Mosaic, seen: Phases | None = None) -> float | None:
     """Slope of the analysers' contradiction, (g - 1) / g for samples encoded by m^g; None where light shows none."""
     pairs = crossed_pairs(mosaic.layout)
-    cells = phase_cells(mosaic)
-    if pairs is None or cells is None:
+    if pairs is None or min(mosaic.data.shape[-2:]) < MIN_SIDE:
         return None
+    cells = phase_cells(mosaic, seen or see_phases(mosaic))
     order = {"diagonals": (0, 3, 1, 2), "rows": (0, 1, 2, 3), "columns": (0, 2, 1, 3)}[pairs]
     a, b, c, d = (cells[:, k].ravel() for k in order)
     middle = (a + b + c + d) / 4

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,20 +169,29 @@ def _color_contrast(cells: Floats, dark: float) -> tuple[float, float]:
     return float(np.median(contrast)), float((rows * columns).sum()) / max(power, 1e-12)
 
 
-def phase_cells(mosaic: Mosaic) -> Floats | None:
-    """Mean samples ``[cells, 4, blocks]`` of the polarizer cells, linear; None in frames too small for blocks."""
-    if min(mosaic.data.shape[-2:]) < 64:
-        return None
-    phases = np.concatenate([_phase_means(mosaic, strip)[0] for strip in _strips(mosaic)], -1)
-    return _cells(phases, mosaic.layout.origin)
+class Phases(NamedTuple):
+    """``means [4, 4, blocks]`` of each pixel of the 4x4 period, linear, and the ``texture [blocks]`` of the scene."""
+
+    means: Floats
+    texture: Floats
 
 
-def check_layout(mosaic: Mosaic) -> LayoutCheck:
-    """Compare a frame (the first of a batch) with its own layout; never raises, and stays silent when in doubt."""
+def see_phases(mosaic: Mosaic) -> Phases:
+    """Means that all checks of filters look at: over blocks of the first frame, of a large one some strips."""
     if min(mosaic.data.shape[-2:]) < 16:
-        return LayoutCheck(None, None, None, (mosaic.layout,))
+        return Phases(np.zeros((4, 4, 0), np.float32), np.zeros(0, np.float32))
     seen = [_phase_means(mosaic, strip) for strip in _strips(mosaic)]
-    phases, texture = np.concatenate([means for means, _ in seen], -1), np.concatenate([each for _, each in seen])
+    return Phases(*(np.concatenate(parts, -1) for parts in zip(*seen, strict=True)))
+
+
+def phase_cells(mosaic: Mosaic, phases: Phases) -> Floats:
+    """Mean samples ``[cells, 4, blocks]`` of the polarizer cells, linear."""
+    return _cells(phases.means, mosaic.layout.origin)
+
+
+def check_layout(mosaic: Mosaic, seen: Phases | None = None) -> LayoutCheck:
+    """Compare a frame (the first of a batch) with its own layout; never raises, and stays silent when in doubt."""
+    phases, texture = seen or see_phases(mosaic)
     if phases.shape[-1] < 16 or float(phases.mean()) <= 1e-4:
         return LayoutCheck(None, None, None, (mosaic.layout,))
     color, origin, greens = _find_color(phases, texture, mosaic.layout)

@@ -47,6 +47,7 @@ class Method:
     ``run(capture, light, full)``: the images of one frame in its light, by the fastest code that accepts it, at half or
     full resolution; co-sited measurements keep theirs. ``accepts``: whether it can separate a capture; others are a
     ValueError. ``expects_errors``: its images come with expected errors. ``reads_mosaic``: it needs raw mosaics.
+    ``assumes_white``: its specular light is white, so that metals need `colored_specular`.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Method:
     accepts: Callable[[Capture], bool]
     expects_errors: bool = False
     reads_mosaic: bool = False
+    assumes_white: bool = False
 
 
 def compose(
@@ -170,6 +172,7 @@ def _joint(name: str, summary: str) -> Method:
         partial(accepts_mosaic, name),
         expects_errors=True,
         reads_mosaic=True,
+        assumes_white=True,
     )
 
 

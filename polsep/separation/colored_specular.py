@@ -13,6 +13,7 @@ and dielectrics do not is the dichromatic model (Shafer 1985, doi:10.1002/col.50
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,8 +22,10 @@ from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pixel_unshu
 from polsep.demosaic.bilinear import split_analysers
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes
 from polsep.sensor.camera import Mosaic
-from polsep.separation.images import FrameImages
+from polsep.separation.images import FrameImages, Tally
 
+#: Raw pixels along the side of a period.
+PERIOD = 4
 #: Slopes from which on, and up to which, diffuse light turns into specular light.
 SLOPES = (0.4, 0.7)
 #: Side of the window in periods; evidence must hold in the window and in a single period.
@@ -33,53 +36,86 @@ MIN_CONTRAST, MIN_RELATIVE = 1e-4, 1e-3
 MIN_SHARE, MAX_GAIN = 0.002, 1.5
 
 
+class Periods(NamedTuple):
+    """Images ``[3, h, w]`` with a pixel per period of the mosaic, in white light.
+
+    ``s0``, ``polarized``: of the samples, all light and that along the lamp's polarization; ``diffuse``, ``total``: of
+    a method, the latter with its specular light.
+    """
+
+    s0: Tensor
+    polarized: Tensor
+    diffuse: Tensor
+    total: Tensor
+
+
 def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> tuple[FrameImages, float]:
     """The images of one colour frame ``[H, W]``, with coloured specular light where it is proven, and its share.
 
     ``light``: camera RGB of the lamp, which is divided out. The same object and 0 where nothing is found.
     """
-    tally = images.tally
-    if mosaic.layout.channels != 3 or mosaic.data.ndim != 2 or tally is None or min(mosaic.data.shape) < 8 * WINDOW:
+    tally, gain = images.tally, torch.tensor(light).view(-1, 1, 1)
+    if mosaic.layout.channels != 3 or mosaic.data.ndim != 2 or tally is None or min(mosaic.data.shape) < 16 * WINDOW:
         return images, 0.0
-    length = (tally.along**2 + tally.across**2) ** 0.5
-    if not length > 0:
+    row, col = mosaic.layout.origin
+    layout, data = mosaic.layout.rolled(-row, -col), mosaic.data[row:, col:].cpu()
+    white = replace(mosaic, data=data, layout=layout, light_color=light, falloff=None)
+    diffuse, specular = (torch.from_numpy(x).movedim(-1, 0) for x in (images.diffuse, images.specular))
+    # What fills 3x3 periods fills one in every third row and column: a ninth of the frame shows that there is nothing.
+    thin = replace(white, data=_thin(data, PERIOD))
+    side = 2 if 2 * diffuse.shape[-1] <= data.shape[-1] else PERIOD
+    some = _see(thin, _thin(diffuse, side) / gain, _thin(specular, side) / gain, tally)
+    if float((_part(*_sums(some)) > 0.5).float().mean()) < MIN_SHARE:
         return images, 0.0
-    gain = torch.tensor(light).view(3, 1, 1)
-    white = replace(mosaic, light_color=light)
-    stokes = period_stokes(white)
-    diffuse, specular = (torch.from_numpy(x).movedim(-1, 0) / gain for x in (images.diffuse, images.specular))
-    size = stokes.s0.shape[-2:]
-    small = [interpolate(x[None], size, mode="area")[0] for x in (diffuse, specular)]
-    total = small[0] + small[1]
-    polarized = (stokes.s1 * tally.along + stokes.s2 * tally.across) / length
-    share = find_colored(polarized, small[0], total)
+    diffuse, specular = diffuse / gain, specular / gain
+    seen = _see(white, diffuse, specular, tally)
+    share = find_colored(seen)
     if float((share > 0.5).float().mean()) < MIN_SHARE:
         return images, 0.0
-    ratio = torch.minimum(polarized.clamp(min=0), stokes.s0) / total.clamp(min=1e-4)
-    share, ratio = (_enlarge(x, diffuse.shape[-2:]) for x in (share, ratio.clamp(0, MAX_GAIN)))
+    ratio = torch.minimum(seen.polarized.clamp(min=0), seen.s0) / seen.total.clamp(min=1e-4)
+    share, ratio = (_resize(x, diffuse.shape[-2:], "bilinear") for x in (share, ratio.clamp(0, MAX_GAIN)))
     mirrored = specular + share * (ratio * (diffuse + specular) - specular)
     changed = [(x * gain).movedim(0, -1).contiguous().numpy() for x in ((1 - share) * diffuse, mirrored)]
     tally = replace(tally, specular=tally.specular + float((mirrored - specular).mean(dim=0).double().sum()))
     return replace(images, diffuse=changed[0], specular=changed[1], tally=tally), float(share.mean())
 
 
-def find_colored(polarized: Tensor, diffuse: Tensor, total: Tensor) -> Tensor:
-    """The part ``[1, h, w]``, 0 to 1, of the ``diffuse [3, h, w]`` image that is specular, per period of the mosaic.
+def _thin(image: Tensor, side: int) -> Tensor:
+    """Every third period of ``side`` pixels of an image ``[..., H, W]``, in both directions."""
+    rows, cols = (n // side for n in image.shape[-2:])
+    whole, kept = image[..., : rows * side, : cols * side], (-(-n // 3) * side for n in (rows, cols))
+    blocks = whole.reshape(-1, rows, side, cols, side)[:, ::3, :, ::3]
+    return blocks.reshape(*image.shape[:-2], *kept)
 
-    ``polarized [3, h, w]``: light along the lamp's polarization; ``total``: diffuse and specular.
-    """
-    colors = diffuse - diffuse.mean(dim=0, keepdim=True)
-    common = ((polarized - polarized.mean(dim=0, keepdim=True)) * colors).sum(dim=0, keepdim=True)
-    sums = torch.cat([common, (colors * colors).sum(dim=0, keepdim=True), total.mean(dim=0, keepdim=True)])
-    around = avg_pool2d(sums[None], WINDOW, 1, WINDOW // 2, count_include_pad=False)[0]
-    low, high = SLOPES
-    parts = []
-    for product, contrast, light in (torch.split(sums, 1), torch.split(around, 1)):
-        slope = product / (contrast + MIN_CONTRAST + MIN_RELATIVE * light**2)
-        parts.append(((slope - low) / (high - low)).clamp(0, 1))
-    part = torch.minimum(*parts)
+
+def _see(mosaic: Mosaic, diffuse: Tensor, specular: Tensor, tally: Tally) -> Periods:
+    stokes = period_stokes(mosaic)
+    length = max((tally.along**2 + tally.across**2) ** 0.5, 1e-30)
+    polarized = (stokes.s1 * tally.along + stokes.s2 * tally.across) / length
+    diffuse, specular = (_resize(x, stokes.s0.shape[-2:], "area") for x in (diffuse, specular))
+    return Periods(stokes.s0, polarized, diffuse, diffuse + specular)
+
+
+def find_colored(seen: Periods) -> Tensor:
+    """The part ``[1, h, w]``, 0 to 1, of the diffuse image that is specular."""
+    sums = _sums(seen)
+    around = [avg_pool2d(x[None], WINDOW, 1, WINDOW // 2, count_include_pad=False)[0] for x in sums]
+    part = torch.minimum(_part(*sums), _part(*around))
     solid = max_pool2d(-max_pool2d(-part[None], 3, 1, 1), 3, 1, 1)[0]
     return torch.minimum(part, solid)
+
+
+def _sums(seen: Periods) -> tuple[Tensor, Tensor, Tensor]:
+    """Covariance of the colours' diffuse and polarized light, variance of the former, brightness ``[1, h, w]``."""
+    colors = seen.diffuse - seen.diffuse.mean(dim=0, keepdim=True)
+    product = ((seen.polarized - seen.polarized.mean(dim=0, keepdim=True)) * colors).sum(dim=0, keepdim=True)
+    return product, (colors * colors).sum(dim=0, keepdim=True), seen.total.mean(dim=0, keepdim=True)
+
+
+def _part(product: Tensor, contrast: Tensor, brightness: Tensor) -> Tensor:
+    """0 to 1, as the slope is in `SLOPES`."""
+    slope = product / (contrast + MIN_CONTRAST + MIN_RELATIVE * brightness**2)
+    return ((slope - SLOPES[0]) / (SLOPES[1] - SLOPES[0])).clamp(0, 1)
 
 
 def period_stokes(mosaic: Mosaic) -> Stokes:
@@ -98,6 +134,7 @@ def period_stokes(mosaic: Mosaic) -> Stokes:
     return found.map(by_color)
 
 
-def _enlarge(image: Tensor, size: torch.Size) -> Tensor:
-    """An image ``[C, h, w]`` of periods at another resolution."""
-    return interpolate(image[None], list(size), mode="bilinear", align_corners=False)[0]
+def _resize(image: Tensor, size: torch.Size, mode: str) -> Tensor:
+    """An image ``[C, h, w]`` at another resolution."""
+    smooth = {"align_corners": False} if mode == "bilinear" else {}
+    return interpolate(image[None], list(size), mode=mode, **smooth)[0]

@@ -99,13 +99,14 @@ def separate_capture(
     chosen = find_method(method, capture)
     checked = check_mosaic(capture) if isinstance(capture, Mosaic) else None
     capture = to_device(checked.mosaic if checked else capture, find_device(device))
-    light, facts = resolve_light(light_color, capture)
+    light, facts, remarks = resolve_light(light_color, capture)
     images, colored = chosen.run(capture, light, full), 0.0
     if chosen.assumes_white and isinstance(capture, Mosaic):
         images, colored = color_specular(images, capture, light)
     frame = make_frame(images, chosen, capture, light, full)
     frame.report["light"] = facts
     frame.report["colored_specular"] = colored
+    frame.report["warnings"] = [*remarks, *frame.report["warnings"]]
     if checked:
         frame.report.update(checked.report)
         frame.report["warnings"] = [*checked.warnings, *frame.report["warnings"]]
@@ -163,8 +164,10 @@ def is_calibrated(capture: Capture) -> bool:
     return isinstance(capture, Mosaic) and any(gain != 1 for gain in capture.light_color)
 
 
-def resolve_light(light_color: LightColor | str, capture: Capture) -> tuple[tuple[float, ...], dict[str, Any]]:
-    """One gain per channel, and what the report says of the light: found in the frame, or told.
+def resolve_light(
+    light_color: LightColor | str, capture: Capture
+) -> tuple[tuple[float, ...], dict[str, Any], tuple[str, ...]]:
+    """One gain per channel, what the report says of the light, found in the frame or told, and remarks on it.
 
     "auto" takes what a calibration says, else what the frame shows. Raises ValueError on anything but three positive
     numbers or one of `LIGHT_WORDS`.
@@ -174,7 +177,7 @@ def resolve_light(light_color: LightColor | str, capture: Capture) -> tuple[tupl
         raise ValueError(f'expected a light colour of three numbers, "white" or "auto", found {light_color!r}')
     if light_color in FOUND_WORDS and not is_calibrated(capture):
         found = find_light(capture)
-        return found.color if channels == 3 else (1.0,), {"source": "found", **found.describe()}
+        return found.color if channels == 3 else (1.0,), {"source": "found", **found.describe()}, found.remarks
     told = light_color
     if isinstance(told, str):
         told = capture.light_color if isinstance(capture, Mosaic) and told != "white" else (1.0, 1.0, 1.0)
@@ -185,7 +188,5 @@ def resolve_light(light_color: LightColor | str, capture: Capture) -> tuple[tupl
     if len(color) != 3 or not all(1e-6 < c < 1e6 for c in color):
         raise ValueError(f"expected a light colour of three positive numbers, found {light_color!r}")
     color = color if channels == 3 else (1.0,)
-    return color, {
-        "source": "calibrated" if isinstance(light_color, str) and light_color != "white" else "told",
-        "color": list(color),
-    }
+    source = "calibrated" if isinstance(light_color, str) and light_color != "white" else "told"
+    return color, {"source": source, "color": list(color)}, ()

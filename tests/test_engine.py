@@ -51,7 +51,7 @@ def capture(layout: Layout, shape: tuple[int, int] = (96, 120), light: tuple[flo
 
 def both(mosaic: Mosaic, method: str, light: tuple[float, ...]) -> tuple[SeparatedFrame, SeparatedFrame]:
     """The frame by the engine and by torch."""
-    chosen, (light, _) = METHODS[method], resolve_light(light, mosaic)
+    chosen, (light, *_) = METHODS[method], resolve_light(light, mosaic)
     by_torch = run_reference(chosen.reference, mosaic, light, False)
     images = (chosen.run(mosaic, light, False), by_torch)
     return tuple(make_frame(each, chosen, mosaic, light) for each in images)  # type: ignore[return-value]

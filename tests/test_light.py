@@ -13,7 +13,7 @@ import torch
 import polsep
 from polsep.light.color import axis_of, iterate, planes_along
 from polsep.light.color_kernel import iterate_fast
-from polsep.light.find import UNKNOWN_DEG, Light, combine, find_light, find_tiles
+from polsep.light.find import UNKNOWN_DEG, Light, combine, distance_to_lamps, find_light, find_tiles
 from polsep.light.tiles import taps, tile_measurements, tile_mosaic
 from polsep.physics.stokes import Measurements, Stokes, measure
 from polsep.pipeline import separate_capture
@@ -25,8 +25,21 @@ DAYLIGHT, TUNGSTEN, WHITE = (0.55, 1.0, 0.65), (1.6, 1.0, 0.45), (1.0, 1.0, 1.0)
 DIM, GLARING = 0.35, 1.2
 
 
-def scene(light: tuple[float, ...] = WHITE, exposure: float = DIM, gloss: float = 1.0, angle: float = 0.4) -> Stokes:
-    """Balls of four colours, diffuse light polarized radially, each with a highlight polarized at ``angle``."""
+#: Shares of the lamp's light that gold, copper and aluminium mirror.
+GOLD, COPPER, ALUMINIUM = (1.0, 0.782, 0.344), (0.955, 0.638, 0.538), (0.912, 0.914, 0.92)
+
+
+def scene(
+    light: tuple[float, ...] = WHITE,
+    exposure: float = DIM,
+    gloss: float = 1.0,
+    angle: float = 0.4,
+    metal: tuple[float, ...] | None = None,
+) -> Stokes:
+    """Balls of four colours, diffuse light polarized radially, each with a highlight polarized at ``angle``.
+
+    The last of them is of ``metal``, if any.
+    """
     y, x = torch.meshgrid(torch.linspace(-1, 1, SIZE), torch.linspace(-1, 1, SIZE), indexing="ij")
     u, v = (2 * x).remainder(2) - 1, (2 * y).remainder(2) - 1
     inside = (u * u + v * v).clamp(max=0.95)
@@ -38,6 +51,10 @@ def scene(light: tuple[float, ...] = WHITE, exposure: float = DIM, gloss: float 
     half = (u - 0.3) ** 2 + (v + 0.2) ** 2
     shine = gloss * (2.5 * torch.exp(-half / 0.01) + 0.12 * torch.exp(-half / 0.2))
     shine = shine.expand(3, -1, -1)
+    if metal is not None:
+        last = (x > 0) & (y > 0)
+        rough = 2.0 * torch.exp(-half / 0.6) * torch.tensor(metal).view(3, 1, 1)
+        diffuse, shine = torch.where(last, 0, diffuse), torch.where(last, rough, shine)
     color = exposure * torch.tensor(light).view(3, 1, 1)
     return Stokes(
         (diffuse + shine) * color,
@@ -92,6 +109,51 @@ def test_angle_of_the_lamp_is_found(angle: float) -> None:
     off = (found.aolp - angle + math.pi / 2) % math.pi - math.pi / 2
     assert abs(math.degrees(off)) < 3
     assert angle_between(found.color, TUNGSTEN) < 1.5
+
+
+@pytest.mark.parametrize("metal", [GOLD, COPPER])
+@pytest.mark.parametrize("light", [WHITE, DAYLIGHT, TUNGSTEN])
+def test_coloured_metal_is_not_taken_for_the_lamp(light: tuple[float, ...], metal: tuple[float, ...]) -> None:
+    """The bodies beside it say the lamp's colour; how much metal there is is said, and remarked on in one line."""
+    found = find_light(frame(light=light, metal=metal))
+    assert angle_between(found.color, light) < 1.5
+    assert 0.1 < found.metal < 0.35
+    assert len(found.remarks) == 1 and "gold or copper" in found.remarks[0]
+    report = separate_capture(frame(light=light, metal=metal), "analytic").report
+    assert report["light"]["metal_fraction"] > 0.1 and found.remarks[0] in report["warnings"]
+
+
+@pytest.mark.parametrize("light", [WHITE, DAYLIGHT, TUNGSTEN])
+@pytest.mark.parametrize("metal", [None, ALUMINIUM])
+def test_grey_metal_and_bodies_are_no_coloured_metal(light: tuple[float, ...], metal: tuple[float, ...] | None) -> None:
+    """No remark; grey metal shows the lamp's colour."""
+    found = find_light(frame(light=light, metal=metal))
+    assert found.metal == 0 and found.remarks == ()
+    assert found.sure and angle_between(found.color, light) < 1.5
+
+
+def test_lamps_are_known_from_bodies() -> None:
+    """Raw and balanced lamps are at no distance; colours with weak green, or far along, are."""
+    for r, b in [(1, 1), (0.55, 0.65), (0.9, 0.35), (0.5, 0.8), (1.3, 0.7), (1.6, 0.5), (0.8, 1.4)]:
+        assert distance_to_lamps(np.log([r, b])) == 0
+    for r, b in [(1.6, 1.6), (3, 0.8), (0.9, 3), (0.2, 0.2)]:
+        assert distance_to_lamps(np.log([r, b])) > 0.2
+
+
+def test_white_is_assumed_where_the_fit_is_led_astray() -> None:
+    """Matte bodies of one colour under a white lamp: no colour of theirs is taken, and no word is said."""
+    color = torch.tensor([0.7, 0.5, 0.4]).view(3, 1, 1)
+    one = scene(gloss=0.0).map(lambda image: image.mean(0, keepdim=True) * color)
+    found = find_light(expose(one, Layout(), IMX250, torch.Generator().manual_seed(1)))
+    assert found.color == (1, 1, 1) and not found.sure and found.remarks == ()
+
+
+def test_raw_colours_without_balance_are_remarked_on() -> None:
+    """Green all over, as under an unbalanced lamp, and no highlight: the colour is asked for, in one line."""
+    color = torch.tensor([0.4, 1.0, 0.4]).view(3, 1, 1)
+    one = scene(gloss=0.0).map(lambda image: image.mean(0, keepdim=True) * color)
+    found = find_light(expose(one, Layout(), IMX250, torch.Generator().manual_seed(1)))
+    assert not found.sure and len(found.remarks) == 1 and "--light-color" in found.remarks[0]
 
 
 def test_frames_that_show_nothing_are_not_sure() -> None:

@@ -56,7 +56,8 @@ class ColorFit(NamedTuple):
     ``scatter``, ``regional [2, 2]``: covariance from the scatter of the votes, and from leaving out regions of the
     frame. Of the tiles, as their votes count: ``gloss``, polarized over diffuse light, ``across``, polarization across
     over along the axis. ``change [2]``: difference of x between the quarter of the tiles
-    with the clearest specular light and the others.
+    with the clearest specular light and the others. ``lean``: mean of k over its root mean square. Diffuse light is
+    polarized to all sides of a body, so a lean says that k holds specular light, or that x is wrong.
     """
 
     x: Doubles
@@ -65,6 +66,7 @@ class ColorFit(NamedTuple):
     gloss: float
     across: float
     change: Doubles
+    lean: float
 
 
 #: Log-ratios ``[2]``, weighted votes ``[T, 2, 2]`` of all tiles on them, and what pulls of theirs remain ``[T, 2]``.
@@ -162,13 +164,16 @@ def fit_color(tiles: Tiles, axis: Doubles, run: Callable[[Planes], Iterated]) ->
     best = clear > np.quantile(clear, 0.75)
     halves = [run(Planes(*(np.ascontiguousarray(values[kept]) for values in planes)))[0] for kept in (best, ~best)]
     change = halves[0] - halves[1]
-    information = _cast_votes(planes, x, np.zeros(len(clear))).information
-    values = np.linalg.eigvalsh(information).clip(0)
+    cast = _cast_votes(planes, x, np.zeros(len(clear)))
+    values = np.linalg.eigvalsh(cast.information).clip(0)
     power = (values / (1 + VOTE_ERROR**2 * values)).sum(1)
     power = power / max(float(power.sum()), 1e-12)
     gloss = math.exp(float(power @ np.log(glossy + 1e-3)))
+    k, light = cast.known / cast.certainty, np.einsum("tii,i->t", planes.dd, scale**2)
+    light = np.minimum(light, np.median(light)).clip(0)
+    lean = float(light @ k) / max(math.sqrt(float(light.sum()) * float(light @ k**2)), 1e-12)
     regional = _leave_out(_regions(tiles), votes, rest, prior)
-    return ColorFit(x, scatter, regional, gloss, float(power @ np.minimum(planes.across, 3)), change)
+    return ColorFit(x, scatter, regional, gloss, float(power @ np.minimum(planes.across, 3)), change, lean)
 
 
 def iterate(planes: Planes) -> Iterated:

@@ -8,15 +8,16 @@ log-ratios with a covariance, so that estimates of one lamp, from other frames o
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.warm_up import make_ready
-from polsep.light.color import ColorFit, axis_of, fit_color, strongest
+from polsep.light.color import ColorFit, axis_of, fit_color, planes_along, strongest
+from polsep.light.metals import MIN_MIRRORS, beside, is_metal, metal_share, only_mirrors, select
 from polsep.light.tiles import Tiles, tile_measurements, tile_mosaic
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
@@ -29,11 +30,21 @@ MIN_TILES = 6
 #: Expected error of a colour that nothing shows [degrees]: the mean distance of lamps and raw balances from white.
 UNKNOWN_DEG = 20.0
 #: Logistic model of the chance that a fit is led astray: of the logarithms of polarization across over along, of gloss,
-#: of the disagreement of clear and dull tiles [degrees] and of the scatter of votes [degrees], each with an offset.
-ASTRAY = ((0.642, 0.02), (-0.486, 0.02), (0.543, 0.1), (0.49, 0.03))
-ASTRAY_BIAS = -0.995
+#: of the disagreement of clear and dull tiles [degrees] and of the scatter of votes [degrees], each with an offset; of
+#: the lean of the diffuse polarization; and of the distance from usual lamps, up to a limit.
+ASTRAY = ((0.703, 0.02), (-0.785, 0.02), (0.753, 0.1), (0.086, 0.03))
+ASTRAY_LEAN, ASTRAY_DISTANCE, MAX_DISTANCE, ASTRAY_BIAS = 1.39, 25.0, 0.12, -2.42
+#: Log-ratios of lamps before usual sensors, least and most: of bluish LEDs to bulbs (`render.disturbances.RED, BLUE`).
+RAW_LAMPS = np.array([[-1.05, 0.13], [-1.35, 0.03]])
+#: Direction from cold to warm lamps after a white balance, how far they lie along it, and beside it.
+WARM, ALONG_WARM, BESIDE_WARM = np.array([0.524, -0.852]), 1.0, 0.1
+#: Chance above which a colour costs more than white does: it is not used.
+MAX_ASTRAY = 0.55
 #: Mean error of fits that went astray [degrees], and of the others: power law of the two last quantities.
-ASTRAY_DEG, GOOD = 11.3, (1.25 * math.exp(0.407), 0.081, 0.627)
+ASTRAY_DEG, GOOD = 11.5, (1.25 * math.exp(0.28), 0.126, 0.563)
+#: What calls for a remark: least expected error of a colour [degrees], least share of coloured metal, and, where white
+#: is assumed, largest sum of the log-ratios of the frame's mean: raw frames without white balance are that green.
+UNCERTAIN_DEG, LEAST_METAL, GREENISH = 4.0, 0.02, -1.2
 #: Colours within this many expected errors of white are white: exact where it is, and hardly wrong where it is not.
 WHITE_ERRORS = 1.5
 #: Standard deviation of log-ratios of lamps around white, toward which unsure estimates are drawn.
@@ -46,7 +57,8 @@ class Light:
 
     ``log_ratio``: (ln R/G, ln B/G) of the lamp in camera RGB, and its ``covariance`` (rr, rb, bb); None for mono.
     ``error_deg``: mean angle by which such colours are off. ``sure``: whether the colour is found rather than assumed.
-    ``aolp``: of specular light [rad, in [0, pi)], None where nothing shows it.
+    ``aolp``: of specular light [rad, in [0, pi)], None where nothing shows it. ``metal``: share of the lit frame that
+    mirrors the lamp in the colour of gold or copper. ``remarks``: what the frame's owner should know of that.
     """
 
     log_ratio: tuple[float, float] | None
@@ -54,6 +66,8 @@ class Light:
     error_deg: float
     sure: bool
     aolp: float | None = None
+    metal: float = 0.0
+    remarks: tuple[str, ...] = ()
 
     @property
     def color(self) -> tuple[float, ...]:
@@ -71,6 +85,7 @@ class Light:
             "log_ratio": None if self.log_ratio is None else [round(r, 5) for r in self.log_ratio],
             "covariance": None if self.covariance is None else [float(f"{c:.4g}") for c in self.covariance],
             "specular_aolp_deg": None if self.aolp is None else round(math.degrees(self.aolp), 2),
+            "metal_fraction": round(self.metal, 4),
         }
 
 
@@ -87,18 +102,60 @@ def find_light(
     input that is not a mosaic.
     """
     capture = raw if isinstance(raw, Mosaic | Measurements) else as_mosaic(raw, layout, black_level, white_level)[0]
-    tiles = strongest(find_tiles(capture))
+    tiles = find_tiles(capture)
     colors = (tiles.moments.shape[1] - 1) // 3
     if len(tiles.counts) < MIN_TILES:
         return unknown_light(colors)
-    axis, _ = axis_of(tiles)
-    aolp = 0.5 * math.atan2(axis[1], axis[0]) % math.pi
+    axis, _ = axis_of(strongest(tiles))
     if colors != 3:
-        return Light(None, None, 0.0, True, aolp)
+        return Light(None, None, 0.0, True, _angle_of(axis))
     make_ready(_warm_up)
+    light = _light_of_tiles(tiles, axis)
+    return replace(light, remarks=tuple(_remarks_on(light, tiles)))
+
+
+def _light_of_tiles(tiles: Tiles, axis: NDArray[np.float64]) -> Light:
+    """The light of a colour frame, that of its bodies alone where they show that it holds coloured metal."""
     from polsep.light.color_kernel import iterate_fast
 
-    return _as_light(fit_color(tiles, axis, iterate_fast), aolp)
+    fit = fit_color(strongest(tiles), axis, iterate_fast)
+    mirrors = only_mirrors(tiles, axis)
+    bodies = select(tiles, ~beside(tiles, mirrors))
+    if mirrors.sum() < MIN_MIRRORS or len(bodies.counts) < MIN_TILES:
+        return _as_light(fit, _angle_of(axis))
+    mirrored = iterate_fast(planes_along(strongest(select(tiles, mirrors)), axis))[0]
+    own_axis, _ = axis_of(strongest(bodies))
+    own = fit_color(strongest(bodies), own_axis, iterate_fast)
+    if not is_metal(mirrored - own.x):
+        return _as_light(fit, _angle_of(axis))
+    return replace(_as_light(own, _angle_of(own_axis)), metal=metal_share(tiles, own_axis, own.x))
+
+
+def _remarks_on(light: Light, tiles: Tiles) -> Iterator[str]:
+    """Remarks for the owner of a frame: metals, and a colour that may be wrong."""
+    if light.metal >= LEAST_METAL:
+        yield (
+            f"highlights of the lamp's colour were expected, found those of gold or copper on {light.metal:.0%} of the "
+            "lit frame: diffuse and specular may be wrong there; compare with --method analytic"
+        )
+    if light.sure:
+        return
+    mean = (tiles.moments[:, 0, 1:4] / tiles.moments[:, :1, 0]).mean(0)
+    if light.color != (1.0, 1.0, 1.0):
+        unclear = light.error_deg > UNCERTAIN_DEG
+    else:
+        unclear = light.error_deg > UNCERTAIN_DEG and float(mean[0] * mean[2] / mean[1] ** 2) < math.exp(GREENISH)
+    if unclear:
+        color = ",".join(f"{c:.2f}" for c in light.color)
+        yield (
+            f"highlights that show the lamp's colour were expected, found too few; {color} is assumed: show a shiny "
+            "thing, or measure a grey card and say --light-color"
+        )
+
+
+def _angle_of(axis: NDArray[np.float64]) -> float:
+    """AoLP [rad, in [0, pi)] of light along an axis of (s1, s2)."""
+    return 0.5 * math.atan2(axis[1], axis[0]) % math.pi
 
 
 def find_tiles(capture: Mosaic | Measurements) -> Tiles:
@@ -142,7 +199,7 @@ def combine(lights: Sequence[Light]) -> Light:
     distance = np.hypot(*(ratios - center).T)
     weights = weights / (1 + (distance / 0.05) ** 2)
     mean = weights @ ratios / weights.sum()
-    return Light((float(mean[0]), float(mean[1])), surest.covariance, surest.error_deg, surest.sure, surest.aolp)
+    return replace(surest, log_ratio=(float(mean[0]), float(mean[1])))
 
 
 def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
@@ -152,12 +209,12 @@ def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) 
 
 
 def _as_light(fit: ColorFit, aolp: float) -> Light:
-    """The light of a fit, white where that explains it, else drawn toward white as far as it is unsure."""
+    """The light of a fit: white where that explains it or costs less, else drawn toward white if unsure."""
     x = fit.x
-    error = _expected_error(fit)
+    error, astray = _expected_error(fit)
     variance = _variance_of(error)
     sure = error <= SURE_DEG
-    if angle_deg(x) <= WHITE_ERRORS * error:
+    if angle_deg(x) <= WHITE_ERRORS * error or astray > MAX_ASTRAY:
         x = np.zeros(2)
     elif not sure:
         x = x / (1 + variance / DRAWN**2)
@@ -165,15 +222,26 @@ def _as_light(fit: ColorFit, aolp: float) -> Light:
     return Light((float(x[0]), float(x[1])), (variance, 0.0, variance), error, sure, aolp)
 
 
-def _expected_error(fit: ColorFit) -> float:
-    """Mean angle [degrees] by which fits like this one are off."""
+def _expected_error(fit: ColorFit) -> tuple[float, float]:
+    """Mean angle [degrees] by which fits like this one are off, and the chance that it was led astray."""
     change = angle_deg(fit.change)
     scatter = _spread_deg(fit.x, fit.scatter)
     shown = (fit.across, fit.gloss, change, scatter)
     logit = ASTRAY_BIAS + sum(a * math.log(v + b) for (a, b), v in zip(ASTRAY, shown, strict=True))
+    logit += ASTRAY_LEAN * fit.lean + ASTRAY_DISTANCE * min(distance_to_lamps(fit.x), MAX_DISTANCE)
     chance = 1 / (1 + math.exp(-logit))
     good: float = GOOD[0] * (change + 0.1) ** GOOD[1] * (scatter + 0.03) ** GOOD[2]
-    return min((1 - chance) * good + chance * ASTRAY_DEG, UNKNOWN_DEG)
+    return min((1 - chance) * good + chance * ASTRAY_DEG, UNKNOWN_DEG), chance
+
+
+def distance_to_lamps(log_ratio: NDArray[np.float64]) -> float:
+    """Return how far log-ratios are from those of usual lamps: 0 among them, before or after a white balance.
+
+    Sensors are made so that green is the strongest colour of usual lamps. Colours of bodies know no such limit.
+    """
+    raw = float(np.maximum(RAW_LAMPS[:, 0] - log_ratio, log_ratio - RAW_LAMPS[:, 1]).max())
+    along, across = abs(float(log_ratio @ WARM)), abs(float(log_ratio[0] * WARM[1] - log_ratio[1] * WARM[0]))
+    return max(min(raw, math.hypot(across, max(along - ALONG_WARM, 0)) - BESIDE_WARM), 0)
 
 
 def angle_deg(log_ratio: NDArray[np.float64] | Sequence[float]) -> float:

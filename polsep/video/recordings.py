@@ -31,7 +31,7 @@ from polsep.io.raw.sequences import DamagedFrame, FrameSequence, open_sequence
 from polsep.io.results.previews import exposure_of, srgb
 from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWriter, State
 from polsep.io.store.errors import InputError
-from polsep.light.find import combine, find_light
+from polsep.light.find import Light, combine, find_light
 from polsep.methods import Capture, find_method
 from polsep.pipeline import FOUND_WORDS, LightColor, find_device, is_calibrated, make_frame, separate_capture, to_device
 from polsep.sensor.camera import Mosaic
@@ -197,14 +197,16 @@ def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFram
         gain = exposure_of(separated.diffuse + separated.specular)
         light = tuple(float(c) for c in separated.report["light_color"])
         size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
-        notes = (*frame.notes, *separated.report["warnings"])
-        shape, facts = tuple(frame.data.data.shape), found or separated.report["light"]
+        facts = separated.report["light"] if found is None else {"source": "found", **found.describe()}
+        remarks = () if found is None else found.remarks
+        notes = (*frame.notes, *remarks, *separated.report["warnings"])
+        shape = tuple(frame.data.data.shape)
         defects, black = _defects_of(recording, shape), separated.report.get("black_level")
         return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black)
     raise ValueError(f"expected a frame that can be read, found {reason}")
 
 
-def _light_of(recording: FrameSequence, options: VideoOptions) -> tuple[LightColor | str, dict[str, Any] | None]:
+def _light_of(recording: FrameSequence, options: VideoOptions) -> tuple[LightColor | str, Light | None]:
     """Colour of the light as told, or as frames spread over the first part show it; and what was found, for the report.
 
     None where nothing is to be found: the colour was told, or a calibration says it, or frames are mono.
@@ -218,7 +220,7 @@ def _light_of(recording: FrameSequence, options: VideoOptions) -> tuple[LightCol
     found = combine([find_light(capture) for capture in captures])
     if found.log_ratio is None:
         return options.light_color, None
-    return found.color, {"source": "found", **found.describe()}
+    return found.color, found
 
 
 def _defects_of(recording: FrameSequence, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:

@@ -44,7 +44,7 @@ MAX_ASTRAY = 0.55
 ASTRAY_DEG, GOOD = 11.5, (1.25 * math.exp(0.28), 0.126, 0.563)
 #: What calls for a remark: least expected error of a colour [degrees], least share of coloured metal, and, where white
 #: is assumed, largest sum of the log-ratios of the frame's mean: raw frames without white balance are that green.
-UNCERTAIN_DEG, LEAST_METAL, GREENISH = 4.0, 0.02, -1.2
+UNCERTAIN_DEG, LEAST_METAL, GREENISH = 5.5, 0.02, -1.2
 #: Colours within this many expected errors of white are white: exact where it is, and hardly wrong where it is not.
 WHITE_ERRORS = 1.5
 #: Standard deviation of log-ratios of lamps around white, toward which unsure estimates are drawn.

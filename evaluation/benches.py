@@ -17,6 +17,7 @@ from evaluation.rendering import bench_rendering
 from evaluation.sets import bench_sets
 from evaluation.video import bench_video, bench_video_quick
 from evaluation.viewing import bench_view
+from evaluation.warned import bench_warned, bench_warned_quick
 from polsep.bench import FORMULAS, SEPARATION
 from polsep.bench.run import Bench
 
@@ -48,6 +49,12 @@ BENCHES: dict[str, Bench] = {
         (*SEPARATION, "polsep/geometry"),
     ),
     "view": Bench(bench_view, measures=("polsep/view", "polsep/edit")),
+    "warned": Bench(
+        bench_warned,
+        bench_warned_quick,
+        data=("raw", "four_angle", "polarized_light", "crossed_polarizers"),
+        measures=(*SEPARATION, "polsep/light", "polsep/sensor"),
+    ),
     "gallery": Bench(bench_gallery, None, draw_gallery, ("meshes/spot.obj", "meshes/fish.obj"), SCENES),
     "gallery_real": Bench(
         bench_gallery_real, draw=draw_gallery_real, data=tuple(name.format(angle=0) for name, _, _ in REAL)

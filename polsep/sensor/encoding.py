@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from polsep.sensor.black_level import smooth_blocks
 from polsep.sensor.camera import Mosaic
-from polsep.sensor.layout_check import Phases, crossed_pairs, phase_cells, see_phases
+from polsep.sensor.layout_check import crossed_pairs, phase_cells, see_phases
 
 Floats = NDArray[np.float32]
 
@@ -39,7 +39,7 @@ JPEG_WHITE = 255.0
 SIDE, BLOCKS, MAX_RATIO = 8, 8192, 0.87
 
 
-def encoding_warning(mosaic: Mosaic, seen: Phases | None = None) -> str | None:
+def encoding_warning(mosaic: Mosaic, seen: Floats | None = None) -> str | None:
     """A line on samples that are gamma-encoded or were JPEG files, or None; the first frame of a batch."""
     slope = gamma_slope(mosaic, seen)
     bent = slope is not None and MIN_SLOPE < slope < MAX_SLOPE
@@ -58,12 +58,12 @@ def encoding_warning(mosaic: Mosaic, seen: Phases | None = None) -> str | None:
     return None
 
 
-def gamma_slope(mosaic: Mosaic, seen: Phases | None = None) -> float | None:
+def gamma_slope(mosaic: Mosaic, seen: Floats | None = None) -> float | None:
     """Slope of the analysers' contradiction, (g - 1) / g for samples encoded by m^g; None where light shows none."""
     pairs = crossed_pairs(mosaic.layout)
     if pairs is None or min(mosaic.data.shape[-2:]) < MIN_SIDE:
         return None
-    cells = phase_cells(mosaic, seen or see_phases(mosaic))
+    cells = phase_cells(mosaic, see_phases(mosaic) if seen is None else seen)
     order = {"diagonals": (0, 3, 1, 2), "rows": (0, 1, 2, 3), "columns": (0, 2, 1, 3)}[pairs]
     a, b, c, d = (cells[:, k].ravel() for k in order)
     middle = (a + b + c + d) / 4

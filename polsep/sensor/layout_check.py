@@ -33,9 +33,18 @@ MIN_CONTRADICTION = 0.006
 GAIN_TOLERANCE = 0.03
 #: A layout is only called wrong when it contradicts the data this many times more than another one.
 MIN_RATIO = 2.0
-#: Mean difference between neighbouring cells, relative to brightness: above the first a sensor shows colour, below the
-#: second it is mono or sees grey. Real mono frames show up to 0.012, real colour frames 0.10 and 0.19.
-MIN_COLOR, MAX_MONO = 0.04, 0.02
+#: Median difference between neighbouring cells, relative to brightness, from which on a sensor may show colour, and
+#: below which cells are alike, whatever their texture; below the third they are alike whatever they agree on. Real mono
+#: frames show up to 0.024, real colour frames 0.10 and more.
+MIN_COLOR, MAX_MONO, EVEN = 0.03, 0.02, 0.007
+#: Differences are those of filters where blocks agree: with their neighbours, or all of them. Rendered and real mono
+#: frames, where texture makes the differences: up to 0.21 with neighbours, and 0.09 of all; colour frames 0.34 or more
+#: of either, but for grey things and small objects, of which nothing is said.
+MIN_AGREEMENT, MAX_DISAGREEMENT, MAX_COMMON = 0.32, 0.25, 0.11
+#: Fewest blocks whose disagreement says something, and how much more than at any other alignment cells must differ.
+MIN_BLOCKS, MIN_EXCESS = 60, 1.15
+#: Ratio to the alignment where cells differ least that shows colour without agreement. Mono frames: up to 4.9.
+CLEAR = 6.0
 
 #: Quantile of brightness that may be a black level nobody said, and the largest share of the mean that is taken for it.
 DARK, MAX_DARK = 0.01, 0.8
@@ -91,8 +100,8 @@ def _strips(mosaic: Mosaic) -> list[Floats]:
     return [frame[top : top + size].detach().cpu().numpy().astype(np.float32, copy=False) for top in tops]
 
 
-def _phase_means(mosaic: Mosaic, data: Floats) -> tuple[Floats, Floats]:
-    """Means ``[4, 4, blocks]`` of each pixel of the 4x4 period over 16x16 blocks, gradients removed; `_texture`.
+def _phase_means(mosaic: Mosaic, data: Floats) -> Floats:
+    """Means ``[4, 4, blocks]`` of each pixel of the 4x4 period over 16x16 blocks, gradients removed.
 
     ``data [H, W]``: samples of the mosaic. Blocks with clipped samples are left out. Codes are pooled and their means
     made linear: no copy of the frame.
@@ -110,7 +119,8 @@ def _phase_means(mosaic: Mosaic, data: Floats) -> tuple[Floats, Floats]:
     place = np.arange(4, dtype=np.float32) - 1.5
     shift = place[:, None, None, None] * slope_y + place[None, :, None, None] * slope_x
     usable = _linear(mosaic, brightest) < 1 - CLIP_MARGIN
-    return (means - share * shift)[..., usable], _texture(mosaic, data, side)[usable]
+    corrected: Floats = (means - share * shift)[..., usable]
+    return corrected
 
 
 def _linear(mosaic: Mosaic, codes: Floats) -> Floats:
@@ -118,18 +128,6 @@ def _linear(mosaic: Mosaic, codes: Floats) -> Floats:
     span = np.float32(mosaic.white_level - mosaic.black_level)
     linear: Floats = (codes - np.float32(mosaic.black_level)) / span
     return linear
-
-
-def _texture(mosaic: Mosaic, data: Floats, side: int) -> Floats:
-    """Per block, `_color_contrast` between whole periods instead of cells: what a scene has without any filters."""
-    rows, cols = (n // side for n in data.shape)
-    if side == 4:
-        return np.zeros((rows, cols), np.float32)
-    periods = data.reshape(4 * rows, 4, -1).sum(1).reshape(4 * rows, 4 * cols, 4).sum(2) / 16
-    means = _linear(mosaic, periods).reshape(rows, 2, 2, cols, 2, 2).mean((1, 4)).transpose(1, 3, 0, 2).reshape(4, -1)
-    demodulated = np.stack(list(_PAIRINGS.values())) @ means / 4
-    contrast: Floats = np.abs(demodulated).sum(0) / np.maximum(means.mean(0), 1e-9)
-    return contrast.reshape(rows, cols)
 
 
 def _gradient(x: Floats, axis: int) -> Floats:
@@ -156,45 +154,55 @@ def _contradictions(cells: Floats) -> dict[str, float]:
     return found
 
 
-def _color_contrast(cells: Floats, dark: float) -> tuple[float, float]:
-    """Difference of neighbouring cells relative to light; +1 for greens on the antidiagonal, -1 on the other.
+class ColorPattern(NamedTuple):
+    """Difference of neighbouring cells at one alignment.
 
-    ``dark``: brightness that all samples share, as a black level does that was not said.
+    ``contrast``: its median relative to light. ``agreement``: correlation of the differences of neighbouring blocks, in
+    [-1, 1]. ``common``: median difference over the mean size, in [0, 3]. ``greens``: +1 for greens on the
+    antidiagonal, -1 on the other. ``blocks``: their number.
     """
+
+    contrast: float
+    agreement: float
+    common: float
+    greens: float
+    blocks: int
+
+
+def _color_pattern(cells: Floats, dark: float) -> ColorPattern:
+    """Difference of the cells of one alignment; ``dark``: brightness of all samples, as of a black level not said."""
     brightness = cells.mean(1)
-    diagonal, rows, columns = (signs @ brightness / 4 for signs in _PAIRINGS.values())
-    light = np.maximum(brightness.mean(0) - dark, 1e-9)
-    contrast = (np.abs(diagonal) + np.abs(rows) + np.abs(columns)) / light
+    differences = np.stack(list(_PAIRINGS.values())) @ brightness / 4
+    _, rows, columns = differences
+    parts = differences / np.maximum(brightness.mean(0) - dark, 1e-9)
+    size = np.abs(parts).sum(0)
+    contrast = float(np.median(size)) if size.size else 0.0
+    # Edges differ most, and are few: they count no more than the median.
+    limited = parts / np.maximum(np.maximum(size, contrast), 1e-9)
+    agreement = float((limited[:, 1:] * limited[:, :-1]).sum()) / max(float((limited**2).sum()), 1e-9)
+    common = float(np.abs(np.median(limited, axis=1)).sum()) if size.size else 0.0
     power = float(np.sqrt((rows**2).sum() * (columns**2).sum()))
-    return float(np.median(contrast)), float((rows * columns).sum()) / max(power, 1e-12)
+    return ColorPattern(contrast, agreement, common, float((rows * columns).sum()) / max(power, 1e-12), size.size)
 
 
-class Phases(NamedTuple):
-    """``means [4, 4, blocks]`` of each pixel of the 4x4 period, linear, and the ``texture [blocks]`` of the scene."""
-
-    means: Floats
-    texture: Floats
-
-
-def see_phases(mosaic: Mosaic) -> Phases:
-    """Means that all checks of filters look at: over blocks of the first frame, of a large one some strips."""
+def see_phases(mosaic: Mosaic) -> Floats:
+    """Means ``[4, 4, blocks]`` that all checks of filters look at: of the first frame, of a large one some strips."""
     if min(mosaic.data.shape[-2:]) < 16:
-        return Phases(np.zeros((4, 4, 0), np.float32), np.zeros(0, np.float32))
-    seen = [_phase_means(mosaic, strip) for strip in _strips(mosaic)]
-    return Phases(*(np.concatenate(parts, -1) for parts in zip(*seen, strict=True)))
+        return np.zeros((4, 4, 0), np.float32)
+    return np.concatenate([_phase_means(mosaic, strip) for strip in _strips(mosaic)], -1)
 
 
-def phase_cells(mosaic: Mosaic, phases: Phases) -> Floats:
+def phase_cells(mosaic: Mosaic, phases: Floats) -> Floats:
     """Mean samples ``[cells, 4, blocks]`` of the polarizer cells, linear."""
-    return _cells(phases.means, mosaic.layout.origin)
+    return _cells(phases, mosaic.layout.origin)
 
 
-def check_layout(mosaic: Mosaic, seen: Phases | None = None) -> LayoutCheck:
+def check_layout(mosaic: Mosaic, seen: Floats | None = None) -> LayoutCheck:
     """Compare a frame (the first of a batch) with its own layout; never raises, and stays silent when in doubt."""
-    phases, texture = seen or see_phases(mosaic)
+    phases = see_phases(mosaic) if seen is None else seen
     if phases.shape[-1] < 16 or float(phases.mean()) <= 1e-4:
         return LayoutCheck(None, None, None, (mosaic.layout,))
-    color, origin, greens = _find_color(phases, texture, mosaic.layout)
+    color, origin, greens = _find_color(phases, mosaic.layout)
     contradiction = _contradictions(_cells(phases, origin))
     pairs = _find_pairs(contradiction, mosaic.layout)
     fits = _fitting(mosaic.layout, color, origin, greens, pairs)
@@ -211,21 +219,24 @@ def check_layout(mosaic: Mosaic, seen: Phases | None = None) -> LayoutCheck:
     )
 
 
-def _find_color(phases: Floats, texture: Floats, layout: Layout) -> tuple[bool | None, tuple[int, int], float]:
+def _find_color(phases: Floats, layout: Layout) -> tuple[bool | None, tuple[int, int], float]:
     """Return if cells differ in colour, the alignment where they differ most, and the greens' diagonal (0: unknown)."""
     brightness = phases.mean((0, 1))
     dark = max(float(np.quantile(brightness, DARK)), 0.0) if float(brightness.min()) > 0 else 0.0
     dark = dark if dark < MAX_DARK * float(brightness.mean()) else 0.0
-    bright = brightness - dark > 0.1 * (brightness.mean() - dark)
-    phases, least = phases[..., bright], max(MIN_COLOR, 1.5 * float(np.median(texture[bright])))
+    phases = phases[..., brightness - dark > 0.1 * (brightness.mean() - dark)]
     origins = [(0, 0), (0, 1), (1, 0), (1, 1)]
-    found = {origin: _color_contrast(_cells(phases, origin), dark) for origin in origins}
-    best = max(origins, key=lambda origin: found[origin][0])
-    contrast, greens = found[best]
-    others = max(found[origin][0] for origin in origins if origin != best)
-    if contrast < least or contrast < 1.15 * others:
-        return (False if contrast < MAX_MONO else None), layout.origin, 0.0
-    return True, best, greens
+    found = {origin: _color_pattern(_cells(phases, origin), dark) for origin in origins}
+    best = max(origins, key=lambda origin: found[origin].contrast)
+    pattern = found[best]
+    others = [found[origin].contrast for origin in origins if origin != best]
+    sharp = pattern.contrast > MIN_EXCESS * max(others)
+    agreed = max(pattern.agreement, pattern.common if pattern.blocks > MIN_BLOCKS else 0.0) > MIN_AGREEMENT
+    if sharp and pattern.contrast > MIN_COLOR and (agreed or pattern.contrast > CLEAR * min(others)):
+        return True, best, pattern.greens
+    plain = pattern.agreement < MAX_DISAGREEMENT and pattern.common < MAX_COMMON
+    mono = plain and (pattern.contrast < MAX_MONO or (sharp and pattern.blocks > MIN_BLOCKS))
+    return (False if mono or pattern.contrast < EVEN else None), layout.origin, 0.0
 
 
 def _find_pairs(contradiction: dict[str, float], layout: Layout) -> str | None:

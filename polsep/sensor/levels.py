@@ -29,6 +29,12 @@ WHITE_LEVELS = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0, "float64": 1.
 #: Floats up to about 1 that lie below this share of the white level look as if white were 1.
 MIN_USED = 0.01
 
+#: Share of the lit samples that clip from which on a frame is overexposed, and the level from which on samples are lit,
+#: white = 1: 1 % is harmless, 5 % costs 4 to 10 dB (docs/reality.md).
+MAX_CLIPPED, LIT = 0.03, 0.02
+#: Of frames of so many rows one group of rows in some is counted.
+LARGE, ROWS, SKIPPED = 1024, 4, 4
+
 #: Order of four angle planes, as LUCID names them, in degrees.
 PLANE_ANGLES_DEG = (0.0, 45.0, 90.0, 135.0)
 
@@ -111,6 +117,11 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
     notes: Notes = ()
     if low - black_level >= (1 - CLIP_MARGIN) * (white - black_level):
         notes += (f"every sample is clipped: the smallest is {low:g} of white level {white:g}",)
+    elif high >= white and (share := clipped_share(samples, black_level, white)) > MAX_CLIPPED:
+        notes += (
+            f"overexposed: {share:.0%} of the lit samples are clipped, what they hide is estimated: expose less, "
+            "or merge several exposures (polsep merge)",
+        )
     if white_level is None and samples.dtype.kind == "f" and high > 2:
         return (*notes, f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white")
     if samples.dtype.kind == "f" and high <= 2 and high - black_level < MIN_USED * (white - black_level):
@@ -123,6 +134,17 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
     if white_level is None and samples.dtype == np.uint16:
         notes += _depth_notes(samples, int(high))
     return notes
+
+
+def clipped_share(samples: NDArray[Any], black_level: float, white: float) -> float:
+    """Share of clipped samples among those that light reaches, of a large frame among some of its rows."""
+    rows = samples.reshape(-1, samples.shape[-1])
+    height = len(rows) // ROWS * ROWS
+    every = SKIPPED if height >= LARGE else 1
+    kept = rows[:height].reshape(-1, ROWS, rows.shape[-1])[::every] if height else rows
+    span = white - black_level
+    lit = int(np.count_nonzero(kept > black_level + LIT * span))
+    return int(np.count_nonzero(kept >= black_level + (1 - CLIP_MARGIN) * span)) / max(lit, 1)
 
 
 def _depth_notes(samples: NDArray[Any], high: int) -> Notes:

@@ -38,13 +38,14 @@ MIN_RATIO = 2.0
 #: frames show up to 0.024, real colour frames 0.10 and more.
 MIN_COLOR, MAX_MONO, EVEN = 0.03, 0.02, 0.007
 #: Differences are those of filters where blocks agree: with their neighbours, or all of them. Rendered and real mono
-#: frames, where texture makes the differences: up to 0.21 with neighbours, and 0.09 of all; colour frames 0.34 or more
+#: frames, where texture makes the differences: up to 0.36 with neighbours, and 0.09 of all; colour frames 0.45 or more
 #: of either, but for grey things and small objects, of which nothing is said.
-MIN_AGREEMENT, MAX_DISAGREEMENT, MAX_COMMON = 0.32, 0.25, 0.11
+MIN_AGREEMENT, MIN_COMMON, MAX_DISAGREEMENT, MAX_COMMON = 0.4, 0.32, 0.25, 0.1
 #: Fewest blocks whose disagreement says something, and how much more than at any other alignment cells must differ.
 MIN_BLOCKS, MIN_EXCESS = 60, 1.15
-#: Ratio to the alignment where cells differ least that shows colour without agreement. Mono frames: up to 4.9.
-CLEAR = 6.0
+#: Ratio to the alignment where cells differ least: above the first it shows colour without agreement, below the second
+#: it may be mono. Mono frames: mostly 1 to 5, up to 7.1; colour frames 5.4 to 90.
+CLEAR, VAGUE = 8.0, 5.2
 
 #: Quantile of brightness that may be a black level nobody said, and the largest share of the mean that is taken for it.
 DARK, MAX_DARK = 0.01, 0.8
@@ -231,10 +232,11 @@ def _find_color(phases: Floats, layout: Layout) -> tuple[bool | None, tuple[int,
     pattern = found[best]
     others = [found[origin].contrast for origin in origins if origin != best]
     sharp = pattern.contrast > MIN_EXCESS * max(others)
-    agreed = max(pattern.agreement, pattern.common if pattern.blocks > MIN_BLOCKS else 0.0) > MIN_AGREEMENT
+    agreed = pattern.agreement > MIN_AGREEMENT or (pattern.common > MIN_COMMON and pattern.blocks > MIN_BLOCKS)
     if sharp and pattern.contrast > MIN_COLOR and (agreed or pattern.contrast > CLEAR * min(others)):
         return True, best, pattern.greens
     plain = pattern.agreement < MAX_DISAGREEMENT and pattern.common < MAX_COMMON
+    plain = plain and pattern.contrast < VAGUE * min(others)
     mono = plain and (pattern.contrast < MAX_MONO or (sharp and pattern.blocks > MIN_BLOCKS))
     return (False if mono or pattern.contrast < EVEN else None), layout.origin, 0.0
 

@@ -40,12 +40,16 @@ MIN_COLOR, MAX_MONO, EVEN = 0.03, 0.02, 0.007
 #: Differences are those of filters where blocks agree: with their neighbours, or all of them. Rendered and real mono
 #: frames, where texture makes the differences: up to 0.36 with neighbours, and 0.09 of all; colour frames 0.45 or more
 #: of either, but for grey things and small objects, of which nothing is said.
-MIN_AGREEMENT, MIN_COMMON, MAX_DISAGREEMENT, MAX_COMMON = 0.4, 0.32, 0.25, 0.1
+MIN_AGREEMENT, MIN_COMMON, MAX_DISAGREEMENT, MAX_COMMON = 0.4, 0.25, 0.25, 0.1
 #: Fewest blocks whose disagreement says something, and how much more than at any other alignment cells must differ.
 MIN_BLOCKS, MIN_EXCESS = 60, 1.15
 #: Ratio to the alignment where cells differ least: above the first it shows colour without agreement, below the second
 #: it may be mono. Mono frames: mostly 1 to 5, up to 7.1; colour frames 5.4 to 90.
-CLEAR, VAGUE = 8.0, 5.2
+CLEAR, VAGUE = 6.0, 5.2
+#: Median difference of all blocks that chance may give, times the root of their number.
+CHANCE = 1.6
+#: Ratio to all other alignments that shows colour without agreement. Mono frames: up to 2.1.
+FAR = 2.2
 
 #: Quantile of brightness that may be a black level nobody said, and the largest share of the mean that is taken for it.
 DARK, MAX_DARK = 0.01, 0.8
@@ -232,8 +236,9 @@ def _find_color(phases: Floats, layout: Layout) -> tuple[bool | None, tuple[int,
     pattern = found[best]
     others = [found[origin].contrast for origin in origins if origin != best]
     sharp = pattern.contrast > MIN_EXCESS * max(others)
-    agreed = pattern.agreement > MIN_AGREEMENT or (pattern.common > MIN_COMMON and pattern.blocks > MIN_BLOCKS)
-    if sharp and pattern.contrast > MIN_COLOR and (agreed or pattern.contrast > CLEAR * min(others)):
+    agreed = pattern.agreement > MIN_AGREEMENT or pattern.common > MIN_COMMON + CHANCE / max(pattern.blocks, 1) ** 0.5
+    clear = pattern.contrast > max(CLEAR * min(others), FAR * max(others))
+    if sharp and pattern.contrast > MIN_COLOR and (agreed or clear):
         return True, best, pattern.greens
     plain = pattern.agreement < MAX_DISAGREEMENT and pattern.common < MAX_COMMON
     plain = plain and pattern.contrast < VAGUE * min(others)

@@ -182,6 +182,16 @@ def test_a_frame_without_the_lamp_is_refused() -> None:
         measure_lamp([replace(frame, data=torch.full(SIZE, LEVEL))], card=True)
 
 
+def test_a_lamp_that_objects_do_not_show_is_refused() -> None:
+    """Polarized light of a body's own colour is not the lamp's: the frame is refused, with what to do."""
+    sensor, body = BadSensor(Layout(), dead=0), np.array([0.2, 0.3, 0.9])
+    channels = np.array([[Layout().filter_at(r % 4, c % 4).channel for c in range(SIZE[1])] for r in range(SIZE[0])])
+    y = np.linspace(-1, 1, SIZE[0])[:, None]
+    frame = correct_mosaic(sensor.expose(sensor.sees(body[channels], 0.12 * y**2, 0.5)), sensor.calibration())
+    with pytest.raises(ValueError, match=r"shows the lamp's colour to 1\.5 degrees, found .*grey card"):
+        measure_lamp([frame])
+
+
 def test_frames_that_show_no_turned_polarizer_are_refused() -> None:
     """Too few frames, frames of one angle and unpolarized ones are a line each."""
     sensor = BadSensor(Layout(), dead=0)

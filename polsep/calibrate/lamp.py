@@ -1,14 +1,14 @@
 """Colour, polarization angle and degree of a lamp, from frames of an object or of a grey card under it.
 
 Mirrored light has the lamp's colour and polarization. On a shiny dark ball it is nearly all the light there is; on
-other objects the polarized part still has the lamp's colour, while its degree is a lower bound. A grey card shows the
-colour without any mirrored light.
+other objects the colour is that of `light.find_light`, while the degree of polarization is a lower bound. A grey card
+shows the colour without any mirrored light.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from polsep.calibrate.dark_flat import require_same_sensor
 from polsep.calibrate.statistics import Doubles
 from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.light.find import SURE_DEG, Light, combine, find_light
 from polsep.physics.stokes import fit_stokes_unclipped
 from polsep.sensor.calibration import Calibration, LampFacts
 from polsep.sensor.camera import Mosaic
@@ -25,7 +26,7 @@ from polsep.separation.analytic import light_polarizer_angle
 STRONG, LEAST, MIN_PIXELS = 0.3, 0.02, 64
 #: Share of those pixels, the most polarized ones, that show the lamp's degree of polarization.
 PURE = 0.1
-#: Parts of a frame whose colours are compared for the error.
+#: Parts of a card whose colours are compared for the error.
 PARTS = 8
 #: Least brightness of a card, white = 1.
 DARKEST_CARD = 0.02
@@ -36,19 +37,18 @@ def measure_lamp(frames: Iterable[Mosaic], before: Calibration | None = None, ca
 
     ``frames`` are corrected by ``before``. Raises ValueError where too little polarized, unclipped light shows.
     """
-    colors, polarizations, first = [], [], None
+    colors, lights, polarizations, first = [], [], [], None
     for mosaic in frames:
         require_same_sensor(before, mosaic)
         first = mosaic if first is None else first
         if card:
             colors += _card_colors(mosaic)
         else:
-            found, polarization = _mirrored_colors(mosaic)
-            colors += found
-            polarizations.append(polarization)
+            polarizations.append(_mirrored_polarization(mosaic))
+            lights.append(find_light(mosaic))
     if first is None:
         raise ValueError("expected frames of the lamp's light, found none")
-    color, error = _mean_color(np.array(colors))
+    color, error = _mean_color(np.array(colors)) if card else _found_color(lights)
     base = Calibration(first.layout, first.white_level) if before is None else before
     lamp = LampFacts(color, None, None) if base.lamp is None else base.lamp._replace(color=color)
     details: dict[str, object] = {"from": "card" if card else "mirrored light", "color_error_deg": round(error, 3)}
@@ -65,8 +65,22 @@ def measure_lamp(frames: Iterable[Mosaic], before: Calibration | None = None, ca
     return replace(base, lamp=lamp, details={**base.details, "light": details})
 
 
-def _mirrored_colors(mosaic: Mosaic) -> tuple[list[Doubles], tuple[float, float]]:
-    """Colours of the polarized light of parts of a frame, and its AoLP [radians] and degree where it is purest."""
+def _found_color(lights: Sequence[Light]) -> tuple[tuple[float, float, float], float]:
+    """Colour with green = 1 that frames of one lamp show, and its expected error [degrees]."""
+    light = combine(lights)
+    if light.log_ratio is None:
+        return (1.0, 1.0, 1.0), 0.0
+    if not light.sure:
+        raise ValueError(
+            f"expected mirrored light that shows the lamp's colour to {SURE_DEG} degrees, found {light.error_deg:.1f}: "
+            "show a shiny ball, or a grey card and say --card"
+        )
+    r, g, b = light.color
+    return (r, g, b), light.error_deg
+
+
+def _mirrored_polarization(mosaic: Mosaic) -> tuple[float, float]:
+    """AoLP [radians] and degree of the polarized light of a frame where it is purest."""
     stokes, determined = fit_stokes_unclipped(demosaic_bilinear_half(mosaic))
     s0, s1, s2 = (
         image.double().cpu().numpy().reshape(image.shape[-3], -1) for image in (stokes.s0, stokes.s1, stokes.s2)
@@ -79,14 +93,10 @@ def _mirrored_colors(mosaic: Mosaic) -> tuple[list[Doubles], tuple[float, float]
             f"expected {MIN_PIXELS} unclipped pixels of polarized light, found {strong.size}: expose so that "
             "highlights stay below white, or show a grey card and say --card"
         )
-    colors = []
-    for part in np.array_split(strong, PARTS):
-        samples = np.concatenate([s1[:, part], s2[:, part]], axis=1)
-        colors.append(np.abs(np.linalg.eigh(samples @ samples.T)[1][:, -1]))
     degree = p[strong] / np.maximum(s0[:, strong].mean(axis=0), 1e-6)
     pure = strong[degree >= np.quantile(degree, 1 - PURE)]
     aolp = 0.5 * math.atan2(float(s2[:, pure].sum()), float(s1[:, pure].sum()))
-    return colors, (aolp, min(float(np.quantile(degree, 1 - PURE / 2)), 1.0))
+    return aolp, min(float(np.quantile(degree, 1 - PURE / 2)), 1.0)
 
 
 def _card_colors(mosaic: Mosaic) -> list[Doubles]:

@@ -31,7 +31,7 @@ SLOPES = (0.4, 0.7)
 #: Side of the window in periods; evidence must hold in the window and in a single period.
 WINDOW = 5
 #: Contrast of colours that counts as none: variance [white^2], and relative to the squared brightness.
-MIN_CONTRAST, MIN_RELATIVE = 1e-4, 1e-3
+MIN_CONTRAST, MIN_RELATIVE = 1e-4, 1e-2
 #: Least share of the frame, and the largest gain of an image by its samples.
 MIN_SHARE, MAX_GAIN = 0.002, 1.5
 

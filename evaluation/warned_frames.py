@@ -27,7 +27,7 @@ from polsep.render.raycast import find_view
 from polsep.render.sensor_errors import SensorErrors, encode_gamma, record
 from polsep.render.simulate import expose_to_clip, expose_to_level
 from polsep.render.sphere_tracing import PointLight, Scene
-from polsep.render.views import random_light, random_shot, scene_seed, seeded_shape
+from polsep.render.views import random_shot, scene_seed, seeded_shape
 from polsep.sensor.camera import IMX250, Layout, Mosaic
 
 #: Seed of all stages, which nothing else uses.
@@ -146,16 +146,7 @@ def _in_room(stage: Stage) -> Scene:
 
 
 def _two_lamps(degrees: float) -> Callable[[Stage], Mosaic]:
-    """Half of the light from each of two lamps whose polarizers are so many degrees apart."""
-
-    def make(stage: Stage) -> Mosaic:
-        second = random_light(stage.view.camera, stage.shape.size / 2, stage.draw(3))
-        second = replace(second, polarizer=stage.light.polarizer + math.radians(degrees))
-        first, other = light_stage(stage), light_stage(stage, second)
-        even = first.diffuse.s0.mean() / other.diffuse.s0.mean().clamp(min=1e-9)
-        return _exposed(stage, add_scenes(first, scale_light(other, even)))
-
-    return make
+    return lambda stage: _exposed(stage, reality.light_by_two(stage, degrees))
 
 
 def _by_reality(name: str) -> Callable[[Stage], Mosaic]:

@@ -35,7 +35,7 @@ __all__ = [
 
 
 def warm_up() -> None:
-    """Compile every kernel, or load it from numba's cache: some two minutes the first time, then seconds."""
+    """Compile what `separate` and streams use, or load it from numba's cache: two minutes at first, then seconds."""
     kernels = (
         analytic_kernel,
         color_affine_kernel,

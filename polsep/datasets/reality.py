@@ -260,13 +260,13 @@ def _changed(change: Callable[[Scene], Scene]) -> Callable[[Stage], Frame]:
     return lambda stage: expose_frame(stage, change(light_stage(stage)))
 
 
-def _two_lamps(stage: Stage) -> Frame:
-    """Half of the light from each of two lamps whose polarizers are crossed."""
+def light_by_two(stage: Stage, degrees: float) -> Scene:
+    """Return the stage under its lamp and as much light from another one, polarizers so many ``degrees`` apart."""
     second = random_light(stage.view.camera, stage.shape.size / 2, stage.draw(3))
-    second = replace(second, polarizer=stage.light.polarizer + math.pi / 2)
+    second = replace(second, polarizer=stage.light.polarizer + math.radians(degrees))
     first, other = light_stage(stage), light_stage(stage, second)
     even = first.diffuse.s0.mean() / other.diffuse.s0.mean().clamp(min=1e-9)
-    return expose_frame(stage, scale_light(add_scenes(first, scale_light(other, even)), 0.5))
+    return add_scenes(first, scale_light(other, even))
 
 
 def _metals(only_dielectrics: bool) -> Callable[[Stage], Frame]:
@@ -393,7 +393,7 @@ DISTURBANCES: dict[str, Callable[[Stage], Frame]] = {
     "retained 5 %": _changed(lambda scene: retain_polarization(scene, 0.05)),
     "polarizer 0.9": lambda stage: expose_frame(stage, _with_polarizer(stage, 0.9)),
     "polarizer 0.8": lambda stage: expose_frame(stage, _with_polarizer(stage, 0.8)),
-    "two lamps": _two_lamps,
+    "two lamps": lambda stage: expose_frame(stage, scale_light(light_by_two(stage, 90), 0.5)),
     "metals": _metals(False),
     "dielectrics beside metals": _metals(True),
     "clipped 1 %": _clipped(0.01),

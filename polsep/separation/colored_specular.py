@@ -1,8 +1,8 @@
 """Specular light that does not have the lamp's colour: metals and tinted highlights.
 
 Methods that assume white specular light leave its colour in the diffuse image. That part betrays itself: it is
-polarized as mirror images are. In a window, the polarization along the lamp's is regressed on the diffuse image, both
-as deviations from their mean over colours. Diffuse light of dielectrics has slopes of at most 0.3, and that only at
+polarized as mirror images are. The polarization along the lamp's is regressed on the diffuse image, both as deviations
+from their mean over colours. Diffuse light of dielectrics has slopes of at most 0.3, and that only at
 grazing angles; diffuse images of gold have 1 and more. There the whole polarized light becomes specular.
 
 Evidence is taken per period of the mosaic, 4x4 pixels, whose cells show one colour each, and must fill 3x3 periods, so
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pixel_unshuffle
+from torch.nn.functional import interpolate, max_pool2d, pixel_unshuffle
 
 from polsep.demosaic.bilinear import split_analysers
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes
@@ -28,8 +28,8 @@ from polsep.separation.images import FrameImages, Tally
 PERIOD = 4
 #: Slopes from which on, and up to which, diffuse light turns into specular light.
 SLOPES = (0.4, 0.7)
-#: Side of the window in periods; evidence must hold in the window and in a single period.
-WINDOW = 5
+#: Raw pixels along the side of the least frame.
+MIN_SIZE = 80
 #: Contrast of colours that counts as none: variance [white^2], and relative to the squared brightness.
 MIN_CONTRAST, MIN_RELATIVE = 1e-4, 1e-2
 #: Least share of the frame, and the largest gain of an image by its samples.
@@ -55,7 +55,7 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     ``light``: camera RGB of the lamp, which is divided out. The same object and 0 where nothing is found.
     """
     tally, gain = images.tally, torch.tensor(light).view(-1, 1, 1)
-    if mosaic.layout.channels != 3 or mosaic.data.ndim != 2 or tally is None or min(mosaic.data.shape) < 16 * WINDOW:
+    if mosaic.layout.channels != 3 or mosaic.data.ndim != 2 or tally is None or min(mosaic.data.shape) < MIN_SIZE:
         return images, 0.0
     row, col = mosaic.layout.origin
     layout, data = mosaic.layout.rolled(-row, -col), mosaic.data[row:, col:].cpu()
@@ -65,7 +65,7 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     thin = replace(white, data=_thin(data, PERIOD))
     side = 2 if 2 * diffuse.shape[-1] <= data.shape[-1] else PERIOD
     some = _see(thin, _thin(diffuse, side) / gain, _thin(specular, side) / gain, tally)
-    if float((_part(*_sums(some)) > 0.5).float().mean()) < MIN_SHARE:
+    if float((_part(some) > 0.5).float().mean()) < MIN_SHARE:
         return images, 0.0
     diffuse, specular = diffuse / gain, specular / gain
     seen = _see(white, diffuse, specular, tally)
@@ -98,23 +98,17 @@ def _see(mosaic: Mosaic, diffuse: Tensor, specular: Tensor, tally: Tally) -> Per
 
 def find_colored(seen: Periods) -> Tensor:
     """The part ``[1, h, w]``, 0 to 1, of the diffuse image that is specular."""
-    sums = _sums(seen)
-    around = [avg_pool2d(x[None], WINDOW, 1, WINDOW // 2, count_include_pad=False)[0] for x in sums]
-    part = torch.minimum(_part(*sums), _part(*around))
+    part = _part(seen)
     solid = max_pool2d(-max_pool2d(-part[None], 3, 1, 1), 3, 1, 1)[0]
     return torch.minimum(part, solid)
 
 
-def _sums(seen: Periods) -> tuple[Tensor, Tensor, Tensor]:
-    """Covariance of the colours' diffuse and polarized light, variance of the former, brightness ``[1, h, w]``."""
+def _part(seen: Periods) -> Tensor:
+    """0 to 1, as the slope of the colours' polarized on their diffuse light is in `SLOPES`, period by period."""
     colors = seen.diffuse - seen.diffuse.mean(dim=0, keepdim=True)
     product = ((seen.polarized - seen.polarized.mean(dim=0, keepdim=True)) * colors).sum(dim=0, keepdim=True)
-    return product, (colors * colors).sum(dim=0, keepdim=True), seen.total.mean(dim=0, keepdim=True)
-
-
-def _part(product: Tensor, contrast: Tensor, brightness: Tensor) -> Tensor:
-    """0 to 1, as the slope is in `SLOPES`."""
-    slope = product / (contrast + MIN_CONTRAST + MIN_RELATIVE * brightness**2)
+    brightness = seen.total.mean(dim=0, keepdim=True)
+    slope = product / ((colors * colors).sum(dim=0, keepdim=True) + MIN_CONTRAST + MIN_RELATIVE * brightness**2)
     return ((slope - SLOPES[0]) / (SLOPES[1] - SLOPES[0])).clamp(0, 1)
 
 

@@ -20,9 +20,8 @@ from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import Separation, light_polarizer_angle
 from polsep.separation.images import FrameImages, Tally
 
-#: Below this concentration of AoLP there is no single polarized light, by methods that expect errors: 2 % of rendered
-#: frames of the split validation under one lamp, glossy, matte, white and small things among them, lie below, 4 % of
-#: other ones (`python -m evaluation warned`).
+#: Below this concentration of AoLP there is no single polarized light, by methods that expect errors. Chosen so that
+#: 2 % of rendered frames under one lamp lie below; of others 3 % do (`python -m evaluation warned`).
 MIN_CONCENTRATION = 0.34
 #: The same of methods that take all polarized light for specular, or nearly all, since the diffuse light has many
 #: angles.

@@ -136,7 +136,8 @@ def _cells(rows: list[dict[str, Any]]) -> dict[tuple[str, str, str], str]:
     values: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:
         metric = re.sub(r"^(diffuse|specular) (?=PSNR|flicker|loss|pattern)", "diffuse / specular ", row["metric"])
-        values.setdefault((row["case"], f"{metric} [{row['unit']}]", row["method"]), []).append(_number(row["value"]))
+        measured = f"{metric} [{row['unit']}]" if row["unit"] else metric
+        values.setdefault((row["case"], measured, row["method"]), []).append(_number(row["value"]))
     return {key: " / ".join(texts) for key, texts in values.items()}
 
 

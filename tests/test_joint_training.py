@@ -32,6 +32,7 @@ from polsep.train import command, loop
 from polsep.train import joint_task as module
 from polsep.train.command import JointOptions, train_weights
 from polsep.train.digest import digest_examples
+from polsep.train.growth import grow
 from polsep.train.inputs import JointInputs, joint_inputs, joint_mono_inputs
 from polsep.train.joint_losses import (
     DATA_SCALE,
@@ -504,6 +505,35 @@ def test_of_a_network_a_part_can_be_trained_alone(part: str, tmp_path: Path, sho
     assert moved and all(name.startswith(f"{part}.") for name in moved)
     assert f"--part {part}" in metadata["command"]
     assert int(metadata["parameters"]) == sum(x.numel() for name, x in after.items() if name != "demosaic")
+
+
+@pytest.mark.parametrize("sees_frame", [False, True])
+def test_a_network_grows_without_a_change_of_its_images(sees_frame: bool) -> None:
+    """More channels and blocks, and a look at the whole frame, change nothing until they are trained."""
+    torch.manual_seed(1)
+    small = Joint(3, ResidualSize(8, (0, 1, 1)), sees_frame=sees_frame)
+    for weight in small.parameters():
+        torch.nn.init.normal_(weight, std=0.1)
+    large = Joint(3, ResidualSize(12, (2, 1, 3)), sees_frame=True)
+    large.load_state_dict(grow(small.state_dict(), large))
+    raw = torch.rand(2, 1, 32, 32)
+    clipped = raw > 0.9
+    with torch.no_grad():
+        (before, a), (after, b) = small(raw, clipped), large(raw, clipped)
+    for name in ("diffuse", "specular", "log_variance", *(("light",) if sees_frame else ())):
+        assert_close(getattr(after, name), getattr(before, name), scale=10)
+    if sees_frame:
+        assert_close(b.specular, a.specular, scale=10)
+
+
+def test_a_network_grows_from_a_part_of_itself_alone() -> None:
+    small, large = (Joint(3, ResidualSize(width, (0, 1, 1))) for width in (8, 12))
+    with pytest.raises(ValueError, match=r"expected weights of a part of \(8"):
+        grow(large.state_dict(), small)
+    with pytest.raises(ValueError, match="expected weights of the same parts"):
+        grow(Joint(3, ResidualSize(8, (0, 1))).state_dict(), large)
+    with pytest.raises(ValueError, match="expected weights of the same parts"):
+        grow(Joint(3, ResidualSize(8, (0, 1, 2)), sees_frame=True).state_dict(), large)
 
 
 def test_filters_are_fitted_anew_only_when_asked(tmp_path: Path, shortened: None) -> None:

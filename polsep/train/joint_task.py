@@ -24,12 +24,16 @@ from polsep.train.joint_losses import Goal, joint_loss, paper_difference
 from polsep.train.stream import StreamOptions, stream_lane
 from polsep.train.tasks import Task
 
-#: The shipped networks: the best one at two frames a second on two cores, and the real-time one.
-SIZES = {"joint": ResidualSize(48, (0, 1, 1)), "joint-fast": ResidualSize(16, (0, 1, 1), 16)}
+#: The joint networks: for stills, a frame in seconds; for two frames a second on two cores; for real time.
+SIZES = {
+    "joint-large": ResidualSize(64, (3, 3, 2)),
+    "joint": ResidualSize(48, (0, 1, 1)),
+    "joint-fast": ResidualSize(16, (0, 1, 1), 16),
+}
 #: Source of their Stokes images for colour frames; mono frames use a linear filter.
-DEMOSAICKERS: dict[str, Demosaicker] = {"joint": "guided", "joint-fast": "linear"}
+DEMOSAICKERS: dict[str, Demosaicker] = {"joint-large": "guided", "joint": "guided", "joint-fast": "linear"}
 #: Networks that see a thumbnail of the whole frame, by name and variant.
-SEES_FRAME = {("joint", "mosaic")}
+SEES_FRAME = {("joint-large", "mosaic"), ("joint", "mosaic")}
 #: Cells by which the guided demosaicker extends crops.
 MARGIN = 8
 #: Batches for the fit of the filter, size of their scene pool, and their lane, which no worker uses.

@@ -24,6 +24,8 @@ from torch.utils.data import DataLoader
 from polsep.compute.threads import set_threads
 from polsep.io.store.checkpoints import read_checkpoint, write_checkpoint
 from polsep.io.store.weights import read_weights
+from polsep.networks.joint import Joint
+from polsep.train.growth import grow
 from polsep.train.inputs import Inputs
 from polsep.train.log import Report, open_log
 from polsep.train.optimizers import Optimizers
@@ -35,8 +37,6 @@ from polsep.train.validation import score, score_averaged, score_references, val
 LAST_SHARE = 0.01
 #: Largest norm of a network's gradient. Usual ones are 13 to 42, so only outliers are clipped.
 MAX_GRADIENT = 100.0
-#: Parts of a network, by the prefix of their names, that weights to start with may lack.
-NEW_PARTS = ("whole_frame.",)
 #: A batch: a named tuple of tensors.
 Batch = TypeVar("Batch", bound=tuple[Any, ...])
 
@@ -197,15 +197,16 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
 
 
 def load_mean(paths: Sequence[Path], network: nn.Module) -> None:
-    """Load the mean of files of weights, if any, into a network. Raises ValueError on weights of another network."""
+    """Load the mean of files of weights, if any, into a network; those of smaller joint networks grow (`growth`).
+
+    Raises ValueError on weights of another network.
+    """
     mean: dict[str, Tensor] = {}
     for count, path in enumerate(paths, start=1):
         tensors, _ = read_weights(path)
         try:
-            missing, unexpected = network.load_state_dict(tensors, strict=False)
-            if unexpected or any(not name.startswith(NEW_PARTS) for name in missing):
-                raise RuntimeError
-        except RuntimeError:
+            network.load_state_dict(grow(tensors, network) if isinstance(network, Joint) else tensors)
+        except (RuntimeError, ValueError):
             raise ValueError(
                 f"expected weights of the network to be trained in {path}, found those of another"
             ) from None

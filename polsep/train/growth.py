@@ -1,0 +1,69 @@
+"""Weights of a small joint network in a larger one that gives the same images, so that training goes on from there.
+
+A larger network has more residual blocks per level, whose last convolutions start at zero, or more channels, on which
+nothing that was there depends at first. It need not learn again what the small one knows (Chen et al. 2016, Net2Net,
+arXiv 1511.05641).
+"""
+
+from __future__ import annotations
+
+import re
+
+import torch
+from torch import Tensor
+
+from polsep.networks.joint import Joint
+
+#: Parts that a smaller network may lack: they change nothing until they are trained.
+NEW_PARTS = re.compile(r"whole_frame\.|net\.(encoders|decoders)\.\d+\.\d+\.")
+
+
+def grow(tensors: dict[str, Tensor], network: Joint) -> dict[str, Tensor]:
+    """Return the state of a network with the weights of a smaller one in it.
+
+    What the smaller one lacks keeps its initial values, but old outputs do not depend on new inputs. Raises ValueError
+    on weights of a network that is not a part of this one.
+    """
+    state = {name: value.clone() for name, value in network.state_dict().items()}
+    lacking = [name for name in state if name not in tensors and not NEW_PARTS.match(name)]
+    if lacking or not tensors.keys() <= state.keys():
+        raise ValueError(
+            f"expected weights of the same parts, found {sorted(lacking or tensors.keys() - state.keys())}"
+        )
+    downs = [tensors[name].shape[0] for name in tensors if re.fullmatch(r"net\.downs\.\d+\.bias", name)]
+    places = _moved((tensors["details.change.weight"].shape[1], *downs), network.size.widths)
+    for name, old in tensors.items():
+        state[name] = _embed(old, state[name], places.get(name))
+    return state
+
+
+def _moved(old: tuple[int, ...], new: tuple[int, ...]) -> dict[str, tuple[int, Tensor]]:
+    """Dimension and indices of old outputs and inputs that are not the first ones of a larger network."""
+    starts = [2 * sum(new[:level]) for level in range(len(new))]
+    parts = [
+        at + torch.arange(few)
+        for few, many, start in zip(old, new, starts, strict=False)
+        for at in (start, start + many)
+    ]
+    scales = (0, torch.cat(parts))
+    features = (1, torch.cat([torch.arange(old[0]), new[0] + torch.arange(12)]))
+    return {"whole_frame.change.weight": scales, "whole_frame.change.bias": scales, "details.belief.0.weight": features}
+
+
+def _embed(old: Tensor, new: Tensor, moved: tuple[int, Tensor] | None) -> Tensor:
+    """New weights with the old ones at their first outputs and inputs, or at indices of one dimension."""
+    if old.shape == new.shape:
+        return old
+    if (
+        old.ndim != new.ndim
+        or old.shape[2:] != new.shape[2:]
+        or any(a > b for a, b in zip(old.shape, new.shape, strict=True))
+    ):
+        raise ValueError(f"expected weights of a part of {tuple(new.shape)}, found {tuple(old.shape)}")
+    places = [torch.arange(n) for n in old.shape[:2]]
+    if moved is not None:
+        places[moved[0]] = moved[1]
+    grown = new.clone()
+    grown[places[0]] = 0
+    grown[tuple(torch.meshgrid(*places, indexing="ij"))] = old
+    return grown

@@ -55,8 +55,8 @@ from polsep.cli.app import DIR, app, extra_needed
 @click.option("--refit", is_flag=True, help="Fit the linear filter of a joint network again after --start.")
 @click.option("--precision", default="bf16-mixed", metavar="NAME", help="bf16-mixed or 32-true.")
 def train(rung: str, output: Path, data: str, **options: Any) -> None:
-    """Train joint-large, joint, joint-fast, material or a rung of the paper's ladder: paper, unpolarized, polarized, shared,
-    signed, no-angle, stokes.
+    """Train joint-large, joint, joint-fast, material or a rung of the paper's ladder: paper, unpolarized, polarized,
+    shared, signed, no-angle, stokes.
 
     Data are rendered while training, from seeds that no test uses. Run the same command again to resume a run that was
     stopped. 'tensorboard --logdir DIR' shows its curves. Needs the extra train.

@@ -70,17 +70,22 @@ Rerender = Callable[[bool], Scene]
 class RealScene(NamedTuple):
     """A ``scene`` in the sensor's light, the lamp's colour ``told [3]`` to be divided out, and what is common to it.
 
-    ``light [4]``: truth of `networks.whole_frame.LIGHT`.
+    ``light [4]``: truth of `networks.whole_frame.LIGHT`. ``errors``: its sensor may have errors.
     """
 
     scene: Scene
     told: Tensor
     light: Tensor
+    errors: bool = True
 
 
 def as_ideal(scene: Scene) -> RealScene:
-    """Return a scene under one perfect white lamp in a dark room."""
-    return RealScene(scene, torch.ones(3), describe_light(torch.zeros(2), 1.0, 0.0))
+    """Return a scene under one perfect white lamp in a dark room, before a perfect sensor.
+
+    A sensor's gain errors of a percent look like a percent of specular light: networks that see them in all scenes
+    doubt what matte things mirror.
+    """
+    return RealScene(scene, torch.ones(3), describe_light(torch.zeros(2), 1.0, 0.0), errors=False)
 
 
 def describe_light(color_error: Tensor, dolp: float, room: float) -> Tensor:

@@ -134,7 +134,7 @@ class PooledScene:
     """A scene of the pool, in half precision, scaled so that the brightest object sample is 1.
 
     ``light [18, H, W]``: s0, s1, s2 of three colours each, diffuse, then specular. ``told [3]``: the lamp's colour that
-    is divided out; ``common [4]``: truth of `networks.whole_frame.LIGHT`; ``real``: whether sensors have errors.
+    is divided out; ``common [4]``: truth of `networks.whole_frame.LIGHT`; ``dark``, ``errors``: what sensors may have.
     ``places [N, 2]``: all object pixels; ``bright [M, 2]``: the brightest ones; ``brightness``: quantiles of the
     object's samples; ``level``: median of the lit ones.
     """
@@ -142,7 +142,8 @@ class PooledScene:
     light: Tensor
     told: Tensor
     common: Tensor
-    real: bool
+    dark: bool
+    errors: bool
     mask: Tensor
     places: Tensor
     bright: Tensor
@@ -246,8 +247,8 @@ def _rerender(shape: MeshScene, lit_view: LitView, sigma: float, everywhere: boo
     return blur(shade_view(*lit_view._replace(lit=lit)), sigma)
 
 
-def _as_pooled(real: RealScene, errors: bool) -> PooledScene:
-    """The scene for the pool; ``errors``: of sensors and exposures."""
+def _as_pooled(real: RealScene, dark: bool) -> PooledScene:
+    """The scene for the pool; ``dark``: with exposures that are darker than usual."""
     scene = real.scene
     signal = filter_light(scene.diffuse + scene.specular, Layout(), IMX250)
     samples = signal[scene.mask]
@@ -261,7 +262,9 @@ def _as_pooled(real: RealScene, errors: bool) -> PooledScene:
     planes = [getattr(light, name) for light in (scene.diffuse, scene.specular) for name in ("s0", "s1", "s2")]
     light = torch.cat(planes).mul_(gain).half()
     places, brightness = scene.mask.nonzero(), brightness * gain
-    return PooledScene(light, real.told, real.light, errors, scene.mask, places, bright, brightness, level)
+    return PooledScene(
+        light, real.told, real.light, dark, dark and real.errors, scene.mask, places, bright, brightness, level
+    )
 
 
 def random_example(pool: deque[PooledScene], crop: int, generator: torch.Generator) -> Examples:
@@ -284,9 +287,9 @@ def random_example(pool: deque[PooledScene], crop: int, generator: torch.Generat
         light, mask, rows, cols = light.transpose(-1, -2), mask.T, cols, rows
     s1, s2 = 1 - 2 * transposed, (1 - 2 * across) * (1 - 2 * down)
     signs = torch.tensor([1.0] * 3 + [s1] * 3 + [s2] * 3).repeat(2)[:, None, None]
-    gain = random_gain(scene, generator) * (random_darkness(generator) if scene.real else 1.0)
+    gain = random_gain(scene, generator) * (random_darkness(generator) if scene.dark else 1.0)
     total = ((light[:9].float() + light[9:]) * (gain * signs[:9])).clamp(-MAX_LIGHT, MAX_LIGHT)
-    codes = record(Stokes(*total.chunk(3)), scene.real, generator)
+    codes = record(Stokes(*total.chunk(3)), scene.errors, generator)
     clipped = codes >= 1 - CLIP_MARGIN
     told = scene.told[colors]
     told_order = told / told[1]

@@ -53,7 +53,7 @@ SMALL = StreamOptions(batch=3, crop=32, size=64, pool=3, uses=1)
 def pooled(ranks: torch.Tensor, level: float) -> PooledScene:
     """A scene without pixels, of which only the brightness is asked."""
     nothing = torch.zeros(0)
-    return PooledScene(nothing, torch.ones(3), torch.zeros(4), False, nothing, nothing, nothing, ranks, level)
+    return PooledScene(nothing, torch.ones(3), torch.zeros(4), False, False, nothing, nothing, nothing, ranks, level)
 
 
 def take(options: StreamOptions, lane: int, first: int, count: int) -> list[Examples]:
@@ -138,7 +138,7 @@ def test_a_thumbnail_is_of_the_whole_frame() -> None:
     light[3:9], light[12:] = 0, 0
     told, common, ranks = torch.ones(3), torch.zeros(4), torch.linspace(LOWEST_QUANTILE, 1, QUANTILES)
     places = [torch.tensor([[k, k]]) for k in (8, 56)]
-    scenes = [PooledScene(light, told, common, False, mask, place, place, ranks, 0.5) for place in places]
+    scenes = [PooledScene(light, told, common, False, False, mask, place, place, ranks, 0.5) for place in places]
     one, other = (random_example(deque([scene]), 16, torch.Generator().manual_seed(1)) for scene in scenes)
     assert torch.equal(one.thumbnail, other.thumbnail)
     assert not torch.equal(one.raw, other.raw)
@@ -188,7 +188,7 @@ def test_some_crops_are_about_the_brightest_pixels() -> None:
     light, bright = torch.zeros(18, size, size), torch.tensor([[40, 90]])
     light[9:12, 40, 90] = 1
     told, common, ranks = torch.ones(3), torch.zeros(4), torch.ones(QUANTILES)
-    scene = PooledScene(light, told, common, False, mask, mask.nonzero(), bright, ranks, 0.5)
+    scene = PooledScene(light, told, common, False, False, mask, mask.nonzero(), bright, ranks, 0.5)
     crops = [random_example(deque([scene]), crop, torch.Generator().manual_seed(k)) for k in range(draws)]
     about = sum(bool(drawn.specular.any()) for drawn in crops)
     expected = BRIGHT_SHARE + (1 - BRIGHT_SHARE) * (crop / size) ** 2

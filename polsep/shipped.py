@@ -24,7 +24,7 @@ from polsep.sensor.orient import orient
 from polsep.separation.analytic import Separation
 
 #: Methods of the joint network.
-NAMES = ("joint", "joint-fast")
+NAMES = ("joint-large", "joint", "joint-fast")
 #: The paper's networks, trained on noisy mosaics of colour cameras, and of those without colour filters.
 PAPER, PAPER_MONO = "paper-mosaic", "paper-mono"
 
@@ -77,7 +77,7 @@ def weights_name(method: str, layout: Layout) -> str:
 
 
 def separate_joint(method: str, capture: Mosaic | Measurements, full: bool = False) -> Separation:
-    """Separate a mosaic by the method ``joint`` or ``joint-fast`` in torch, with shipped weights.
+    """Separate a mosaic by a method of `NAMES` in torch, with shipped weights.
 
     Raises ValueError on co-sited measurements, and on layouts that are not Sony's in any orientation.
     """

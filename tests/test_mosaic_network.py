@@ -16,7 +16,7 @@ from polsep.methods import METHODS, find_method
 from polsep.networks import run as mosaic_network
 from polsep.networks.channels import INPUTS
 from polsep.networks.joint import Joint
-from polsep.networks.run import cut_rows, run_joint
+from polsep.networks.run import cut_rows, margin_of, run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
@@ -88,7 +88,7 @@ def test_strips_are_the_whole_frame(layout: Layout, full: bool, monkeypatch: pyt
     network, mosaic = random_network(layout), random_mosaic(layout, 720, 36)
     whole = run_joint(network, mosaic, full)
     monkeypatch.setattr(mosaic_network, "MAX_PIXELS", 36 * 600)
-    assert len(list(cut_rows((720, 36), 16))) > 5
+    assert len(list(cut_rows((720, 36), margin_of(network), 16))) > 5
     parts = run_joint(network, mosaic, full)
     assert torch.equal(parts.valid, whole.valid)
     for name in ("diffuse", "specular", "expected_error"):
@@ -101,9 +101,10 @@ def test_frames_of_a_batch_are_separated_alike() -> None:
     assert_close(run_joint(network, two).diffuse[0], run_joint(network, mosaic).diffuse)
 
 
-def test_reach_is_within_the_margin() -> None:
+@pytest.mark.parametrize("blocks", [(0, 1, 1), (1, 1, 2), (3, 3, 2)], ids=str)
+def test_reach_is_within_the_margin(blocks: tuple[int, ...]) -> None:
     """The shipped sizes, too, see no farther than strips overlap."""
-    network = Joint(1, ResidualSize(2, (1, 1, 2)))
+    network = Joint(1, ResidualSize(2, blocks))
     for weight in network.parameters():
         torch.nn.init.normal_(weight, std=0.3)
     raw = random_mosaic(MONO, 1024, 8).data[None, None]
@@ -112,8 +113,8 @@ def test_reach_is_within_the_margin() -> None:
     nothing = torch.zeros_like(raw, dtype=torch.bool)
     changed = (network.half_resolution(other, nothing).diffuse - network.half_resolution(raw, nothing).diffuse).abs()
     rows = 2 * changed.amax(dim=(0, 1, 3)).nonzero()[:, 0]
-    assert int(rows.min()) > 512 - mosaic_network.MARGIN
-    assert int(rows.max()) < 512 + mosaic_network.MARGIN
+    assert int(rows.min()) > 512 - margin_of(network)
+    assert int(rows.max()) < 512 + margin_of(network)
 
 
 def write_network(path: Path, layout: Layout, changed: dict[str, str] | None = None) -> Joint:

@@ -25,7 +25,7 @@ from polsep.compute.warm_up import make_ready
 from polsep.networks.channels import PERIOD
 from polsep.networks.joint import Joint
 from polsep.networks.openvino_engine import OpenVinoEngine, modulation_of
-from polsep.networks.run import MARGIN, cut_rows, own_order
+from polsep.networks.run import cut_rows, margin_of, own_order
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.orient import Orientation, orient
 from polsep.separation.images import FrameImages
@@ -119,7 +119,7 @@ def run_engine(network: Joint, mosaic: Mosaic, full: bool) -> FrameImages | None
     turned = data if as_it_is else orientation.turn(data.float()).contiguous()
     cells, parts, levels = 1 if full else 2, [], (mosaic.black_level, mosaic.white_level)
     modulation = modulation_of(network, turned.numpy(), levels, mosaic.light_color)
-    for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), PERIOD * network.net.grid):
+    for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), network):
         job = _Job(network, full, (bottom - top, turned.shape[1]), get_threads())
         with ENGINES.borrow(job) as engine:
             rows = slice(*((row - top) // cells for row in kept))
@@ -128,15 +128,16 @@ def run_engine(network: Joint, mosaic: Mosaic, full: bool) -> FrameImages | None
     return images if as_it_is else _turn_back(images, orientation, 2 if full else 1)
 
 
-def _strips(size: tuple[int, int], grid: int) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+def _strips(size: tuple[int, int], network: Joint) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
     """Raw rows that an engine sees and those that it makes images of: one strip, or several of at most two heights."""
-    height, pieces = size[0], list(cut_rows(size, grid))
+    grid, margin = PERIOD * network.net.grid, margin_of(network)
+    height, pieces = size[0], list(cut_rows(size, margin, grid))
     if len(pieces) == 1:
         yield pieces[0], pieces[0]
         return
-    rows = pieces[0][1] + 2 * MARGIN
+    rows = pieces[0][1] + 2 * margin
     for first, last in pieces:
-        top = max(min(first - MARGIN, (height - rows) // grid * grid), 0)
+        top = max(min(first - margin, (height - rows) // grid * grid), 0)
         bottom = height if height - top - rows < grid else top + rows
         yield (top, bottom), (first, last)
 

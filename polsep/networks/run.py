@@ -25,8 +25,8 @@ from polsep.separation.analytic import Separation
 
 #: Raw pixels of a frame, or of a strip with its margins, that are processed at once: some 250 bytes of memory each.
 MAX_PIXELS = 6_000_000
-#: Raw rows of margin around a strip, more than the network's receptive field (a test measures that).
-MARGIN = 256
+#: Raw rows beyond the reach of the U-Net that demosaicking and the closed form see (a test measures that).
+OTHER_REACH = 128
 
 
 def own_order(layout: Layout) -> Layout:
@@ -48,8 +48,9 @@ def run_joint(network: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
     batch, (height, width) = raw.shape[:-2], raw.shape[-2:]
     raw, clipped = (x.reshape(-1, 1, height, width) for x in (raw, clipped))
     parts, thumbnail = [], network.thumbnail(raw, clipped)
-    for first, last in cut_rows((height, width), PERIOD * network.net.grid):
-        top, bottom = max(first - MARGIN, 0), min(last + MARGIN, height)
+    margin = margin_of(network)
+    for first, last in cut_rows((height, width), margin, PERIOD * network.net.grid):
+        top, bottom = max(first - margin, 0), min(last + margin, height)
         with torch.no_grad():
             strip = (raw[..., top:bottom, :], clipped[..., top:bottom, :])
             images = _images(network, strip, thumbnail, full)
@@ -73,10 +74,16 @@ def _halve(separation: Separation) -> Separation:
     )
 
 
-def cut_rows(size: tuple[int, int], grid: int) -> Iterator[tuple[int, int]]:
+def margin_of(network: Joint) -> int:
+    """Raw rows around a strip that its images depend on: whole rows of the network's grid."""
+    grid = PERIOD * network.net.grid
+    return -(-(PERIOD * network.net.reach + OTHER_REACH) // grid) * grid
+
+
+def cut_rows(size: tuple[int, int], margin: int, grid: int) -> Iterator[tuple[int, int]]:
     """First and last row of the strips of a frame of ``size``: one, or several that begin at multiples of ``grid``."""
     height, width = size
-    rows = height if height * width <= MAX_PIXELS else max(MAX_PIXELS // width - 2 * MARGIN, grid) // grid * grid
+    rows = height if height * width <= MAX_PIXELS else max(MAX_PIXELS // width - 2 * margin, grid) // grid * grid
     for first in range(0, height, rows):
         yield first, min(first + rows, height)
 

@@ -132,7 +132,7 @@ class ResidualUNet(nn.Module):
 
     def __init__(self, inputs: int, size: ResidualSize) -> None:
         super().__init__()
-        widths = size.widths
+        self.size, widths = size, size.widths
         self.enter = _entrance(inputs, size)
         self.encoders = nn.ModuleList(_chain(w, n) for w, n in zip(widths, size.blocks, strict=True))
         pairs = list(pairwise(widths))
@@ -140,6 +140,14 @@ class ResidualUNet(nn.Module):
         self.ups = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
         self.decoders = nn.ModuleList(_chain(w, n) for w, n in zip(widths[:-1], size.blocks, strict=False))
         self.out = _chain(widths[0], 1)
+
+    @property
+    def reach(self) -> int:
+        """Pixels around an output that it depends on, at most."""
+        counts = [2 * count for count in self.size.blocks[:-1]] + [self.size.blocks[-1]]
+        blocks = sum(2 * count << level for level, count in enumerate(counts))
+        # Besides: the entrance and the last block; a strided convolution, and a nearest neighbour, at every level.
+        return 3 + blocks + 2 * (self.grid - 1)
 
     @property
     def grid(self) -> int:

@@ -58,7 +58,7 @@ CLIPPED = (0.0005, 0.06)
 #: Share of examples exposed for their median instead, whatever clips, in general and with glaring highlights. Glaring:
 #: the brightest 0.3 % of the object's samples exceed the median of the lit ones by this factor. Range of that median,
 #: as a share of white.
-LEVEL_SHARE, GLARING_SHARE, GLARING, LEVELS = 0.2, 0.8, (0.003, 10.0), (0.05, 0.4)
+LEVEL_SHARE, GLARING_SHARE, GLARING, LEVELS = 0.25, 0.8, (0.003, 10.0), (0.05, 0.7)
 #: Share of crops centred on one of the brightest object pixels, and the share of these pixels: highlights and white
 #: surfaces clip there, which the networks must learn to distinguish.
 BRIGHT_SHARE, BRIGHT_PIXELS = 0.3, 0.02

@@ -26,10 +26,10 @@ from polsep.sensor.camera import IMX250, Sensor
 CLOSE_SHARE, MAGNIFICATIONS = 0.5, (1.0, 5.0)
 #: Shares of frames that are near-grey, that have a near-white ground, as painted and printed things have, and that have
 #: no textures.
-GREY_SHARE, WHITE_SHARE, PLAIN_SHARE = 0.3, 0.25, 0.2
+GREY_SHARE, WHITE_SHARE, PLAIN_SHARE = 0.25, 0.35, 0.2
 #: Share of matte frames, and the factor on their specular strength, log-uniform for every material. Photographs of
 #: painted, dusty or paper things have half a percent of the usual strength, which random materials rarely have.
-MATTE_SHARE, MATTE_STRENGTH = 0.4, (0.005, 1.0)
+MATTE_SHARE, MATTE_STRENGTH = 0.5, (0.005, 1.0)
 #: Share of frames whose highlights clip all analysers over an area, as mirror images of lamps do and those of point
 #: lights do not. Brightness of their middle over the diffuse light, log-uniform; roughness above which it is less.
 GLARE_SHARE, GLARES, GLARE_ROUGHNESS = 0.25, (30.0, 3000.0), 0.4

@@ -27,7 +27,7 @@ from polsep.sensor.calibration import Calibration, Corrections, falloff_image, m
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.levels import as_mosaic
-from polsep.separation.colored_specular import color_specular
+from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.images import FrameImages
 from polsep.separation.report import SeparatedFrame, describe
 
@@ -100,12 +100,12 @@ def separate_capture(
     checked = check_mosaic(capture) if isinstance(capture, Mosaic) else None
     capture = to_device(checked.mosaic if checked else capture, find_device(device))
     light, facts, remarks = resolve_light(light_color, capture)
-    images, colored = chosen.run(capture, light, full), 0.0
+    images, colored = chosen.run(capture, light, full), Colored()
     if chosen.assumes_white and isinstance(capture, Mosaic):
         images, colored = color_specular(images, capture, light)
     frame = make_frame(images, chosen, capture, light, full)
     frame.report["light"] = facts
-    frame.report["colored_specular"] = colored
+    frame.report.update(colored_specular=colored.share, retained_polarization=colored.retained)
     frame.report["warnings"] = [*remarks, *frame.report["warnings"]]
     if checked:
         frame.report.update(checked.report)

@@ -14,7 +14,7 @@ from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
 from polsep.render.disturbances import METALS
 from polsep.sensor.camera import IMX250, Layout, Mosaic, expose
-from polsep.separation.colored_specular import color_specular, period_stokes
+from polsep.separation.colored_specular import Colored, color_specular, period_stokes
 from polsep.separation.images import FrameImages, Tally
 
 SIZE = 96
@@ -72,7 +72,7 @@ def test_metal_keeps_its_color(metal: str, side: int, layout: Layout) -> None:
     mosaic = expose(scene(diffuse, specular), layout, IDEAL)
     white = specular.amin(dim=0, keepdim=True).expand(3, SIZE, SIZE)
     found, share = color_specular(separated(diffuse + specular - white, white, side), mosaic, (1.0, 1.0, 1.0))
-    assert share == pytest.approx(0.5, abs=0.08)
+    assert share.share == pytest.approx(0.5, abs=0.08)
     half, edge = SIZE // 2 // side, 8 // side
     inside, outside = slice(edge, half - 2 * edge), slice(half + 2 * edge, None)
     truth = specular[:, ::side, ::side].movedim(0, -1).numpy()
@@ -89,7 +89,7 @@ def test_bodies_are_left_alone(kept: float) -> None:
     mosaic = expose(scene(diffuse, specular, kept), Layout(), IDEAL)
     images = separated(diffuse, specular)
     found, share = color_specular(images, mosaic, (1.0, 1.0, 1.0))
-    assert found is images and share == 0
+    assert found is images and share == Colored()
 
 
 def test_edges_of_color_are_no_metal() -> None:
@@ -98,7 +98,7 @@ def test_edges_of_color_are_no_metal() -> None:
     diffuse, specular = BODY * stripes + 0.02, 0.3 * (1 - stripes)
     images = separated(diffuse, specular)
     found, share = color_specular(images, expose(scene(diffuse, specular), Layout(), IDEAL), (1.0, 1.0, 1.0))
-    assert found is images and share == 0
+    assert found is images and share == Colored()
 
 
 def test_demosaicking_tints_of_highlights_are_no_metal() -> None:
@@ -108,7 +108,7 @@ def test_demosaicking_tints_of_highlights_are_no_metal() -> None:
     white = torch.full((3, SIZE, SIZE), 0.4)
     images = separated(diffuse, white)
     found, share = color_specular(images, expose(scene(diffuse, specular), Layout(), IDEAL), (1.0, 1.0, 1.0))
-    assert found is images and share == 0
+    assert found is images and share == Colored()
 
 
 def test_the_lamp_is_divided_out() -> None:
@@ -118,7 +118,7 @@ def test_the_lamp_is_divided_out() -> None:
     mosaic = expose(scene(diffuse, specular), Layout(), IDEAL)
     images = separated(diffuse, specular)
     assert color_specular(images, mosaic, LIGHT)[0] is images
-    assert color_specular(images, mosaic, (1.0, 1.0, 1.0))[1] > 0.5
+    assert color_specular(images, mosaic, (1.0, 1.0, 1.0))[1].share > 0.5
     assert separate_capture(mosaic, light_color=LIGHT).report["colored_specular"] == 0
 
 
@@ -129,4 +129,4 @@ def test_mono_and_small_frames_are_returned() -> None:
         Mosaic(torch.ones(SIZE, SIZE), Layout(bayer=None), 0.0, 1.0),
         Mosaic(torch.ones(16, 16), Layout(), 0.0, 1.0),
     ):
-        assert color_specular(images, mosaic, (1.0, 1.0, 1.0)) == (images, 0.0)
+        assert color_specular(images, mosaic, (1.0, 1.0, 1.0)) == (images, Colored())

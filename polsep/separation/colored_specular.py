@@ -1,9 +1,11 @@
-"""Specular light that does not have the lamp's colour: metals and tinted highlights.
+"""Specular light that does not have the lamp's colour: metals, tinted highlights, and what bodies keep polarized.
 
 Methods that assume white specular light leave its colour in the diffuse image. That part betrays itself: it is
 polarized as mirror images are. The polarization along the lamp's is regressed on the diffuse image, both as deviations
 from their mean over colours. Diffuse light of dielectrics has slopes of at most 0.3, and that only at
 grazing angles; diffuse images of gold have 1 and more. There the whole polarized light becomes specular.
+
+A little of that polarization, the same all over a frame, is of another kind: `retained_polarization`.
 
 Evidence is taken per period of the mosaic, 4x4 pixels, whose cells show one colour each, and must fill 3x3 periods, so
 that colour fringes of edges do not count, and a part of the frame. Source: this project's; that metals tint highlights
@@ -23,13 +25,14 @@ from polsep.demosaic.bilinear import split_analysers
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes
 from polsep.sensor.camera import Mosaic
 from polsep.separation.images import FrameImages, Tally
+from polsep.separation.retained_polarization import find_retained
 
 #: Raw pixels along the side of a period.
 PERIOD = 4
 #: Slopes from which on, and up to which, diffuse light turns into specular light.
 SLOPES = (0.4, 0.7)
-#: Raw pixels along the side of the least frame.
-MIN_SIZE = 80
+#: Raw pixels along the side of the least frame, and from which on a ninth of it shows what bodies retain.
+MIN_SIZE, MANY = 80, 1500
 #: Contrast of colours that counts as none: variance [white^2], and relative to the squared brightness.
 MIN_CONTRAST, MIN_RELATIVE = 1e-4, 1e-2
 #: Least share of the frame, and the largest gain of an image by its samples.
@@ -39,24 +42,32 @@ MIN_SHARE, MAX_GAIN = 0.002, 1.5
 class Periods(NamedTuple):
     """Images ``[3, h, w]`` with a pixel per period of the mosaic, in white light.
 
-    ``s0``, ``polarized``: of the samples, all light and that along the lamp's polarization; ``diffuse``, ``total``: of
-    a method, the latter with its specular light.
+    ``s0``, ``polarized``, ``across``: of the samples, all light, that along the lamp's polarization, and at 45 degrees
+    to it; ``diffuse``, ``total``: of a method, the latter with its specular light.
     """
 
     s0: Tensor
     polarized: Tensor
+    across: Tensor
     diffuse: Tensor
     total: Tensor
 
 
-def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> tuple[FrameImages, float]:
-    """The images of one colour frame ``[H, W]``, with coloured specular light where it is proven, and its share.
+class Colored(NamedTuple):
+    """``share`` of a frame whose specular light has another colour; share of its diffuse light that is ``retained``."""
 
-    ``light``: camera RGB of the lamp, which is divided out. The same object and 0 where nothing is found.
+    share: float = 0.0
+    retained: float = 0.0
+
+
+def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> tuple[FrameImages, Colored]:
+    """The images of one colour frame ``[H, W]``, with coloured specular light where it is proven, and what was found.
+
+    ``light``: camera RGB of the lamp, which is divided out. The same object where nothing is found.
     """
     tally, gain = images.tally, torch.tensor(light).view(-1, 1, 1)
     if mosaic.layout.channels != 3 or mosaic.data.ndim != 2 or tally is None or min(mosaic.data.shape) < MIN_SIZE:
-        return images, 0.0
+        return images, Colored()
     row, col = mosaic.layout.origin
     layout, data = mosaic.layout.rolled(-row, -col), mosaic.data[row:, col:].cpu()
     white = replace(mosaic, data=data, layout=layout, light_color=light, falloff=None)
@@ -65,19 +76,25 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     thin = replace(white, data=_thin(data, PERIOD))
     side = 2 if 2 * diffuse.shape[-1] <= data.shape[-1] else PERIOD
     some = _see(thin, _thin(diffuse, side) / gain, _thin(specular, side) / gain, tally)
-    if float((_part(some) > 0.5).float().mean()) < MIN_SHARE:
-        return images, 0.0
-    diffuse, specular = diffuse / gain, specular / gain
-    seen = _see(white, diffuse, specular, tally)
-    share = find_colored(seen)
-    if float((share > 0.5).float().mean()) < MIN_SHARE:
-        return images, 0.0
-    ratio = torch.minimum(seen.polarized.clamp(min=0), seen.s0) / seen.total.clamp(min=1e-4)
-    share, ratio = (_resize(x, diffuse.shape[-2:], "bilinear") for x in (share, ratio.clamp(0, MAX_GAIN)))
-    mirrored = specular + share * (ratio * (diffuse + specular) - specular)
-    changed = [(x * gain).movedim(0, -1).contiguous().numpy() for x in ((1 - share) * diffuse, mirrored)]
-    tally = replace(tally, specular=tally.specular + float((mirrored - specular).mean(dim=0).double().sum()))
-    return replace(images, diffuse=changed[0], specular=changed[1], tally=tally), float(share.mean())
+    enough = some if min(data.shape) > MANY else _see(white, diffuse / gain, specular / gain, tally)
+    retained, share = find_retained(enough.polarized, enough.across, enough.diffuse), None
+    if float((_part(some) > 0.5).float().mean()) >= MIN_SHARE:
+        seen = _see(white, diffuse / gain, specular / gain, tally)
+        found = find_colored(seen)
+        share = found if float((found > 0.5).float().mean()) >= MIN_SHARE else None
+    if not retained and share is None:
+        return images, Colored()
+    body, mirrored = (1 - retained) * diffuse, specular + retained * diffuse
+    if share is not None:
+        ratio = torch.minimum(seen.polarized.clamp(min=0), seen.s0) / seen.total.clamp(min=1e-4)
+        share, ratio = (_resize(x, diffuse.shape[-2:], "bilinear") for x in (share, ratio.clamp(0, MAX_GAIN)))
+        body, mirrored = (1 - share) * body, mirrored + share * (ratio * (diffuse + specular) - mirrored)
+    changed = [x.movedim(0, -1).contiguous().numpy() for x in (body, mirrored)]
+    more = float(((mirrored - specular) / gain).mean(dim=0).double().sum())
+    images = replace(
+        images, diffuse=changed[0], specular=changed[1], tally=replace(tally, specular=tally.specular + more)
+    )
+    return images, Colored(0.0 if share is None else float(share.mean()), retained)
 
 
 def _thin(image: Tensor, side: int) -> Tensor:
@@ -92,8 +109,9 @@ def _see(mosaic: Mosaic, diffuse: Tensor, specular: Tensor, tally: Tally) -> Per
     stokes = period_stokes(mosaic)
     length = max((tally.along**2 + tally.across**2) ** 0.5, 1e-30)
     polarized = (stokes.s1 * tally.along + stokes.s2 * tally.across) / length
+    across = (stokes.s2 * tally.along - stokes.s1 * tally.across) / length
     diffuse, specular = (_resize(x, stokes.s0.shape[-2:], "area") for x in (diffuse, specular))
-    return Periods(stokes.s0, polarized, diffuse, diffuse + specular)
+    return Periods(stokes.s0, polarized, across, diffuse, diffuse + specular)
 
 
 def find_colored(seen: Periods) -> Tensor:

@@ -179,7 +179,6 @@ def _joint(name: str, summary: str) -> Method:
 _ALL = (
     _joint("joint", "one network from the raw mosaic to full-resolution images, with the closed form inside"),
     _joint("joint-fast", "the same, smaller, for real time"),
-    _joint("joint-large", "the same, larger, for stills: a frame in seconds"),
     Method(
         "color-affine",
         "closed form for polarized diffuse and white specular light, recovers clipped samples",

@@ -24,7 +24,7 @@ from polsep.sensor.orient import orient
 from polsep.separation.analytic import Separation
 
 #: Methods of the joint network.
-NAMES = ("joint-large", "joint", "joint-fast")
+NAMES = ("joint", "joint-fast")
 #: The paper's networks, trained on noisy mosaics of colour cameras, and of those without colour filters.
 PAPER, PAPER_MONO = "paper-mosaic", "paper-mono"
 

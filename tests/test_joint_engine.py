@@ -296,8 +296,9 @@ def test_huge_frames_are_separated_in_strips(
     mosaic = random_frame(1452, 36, layout)
     whole = run_engine(NETS[mosaic.layout.channels], mosaic, full)
     monkeypatch.setattr(mosaic_network, "MAX_PIXELS", 36 * 720)
-    heights = {bottom - top for (top, bottom), _ in engines._strips((1452, 36), 16)}
-    assert len(heights) == 2 and max(heights) <= 720 + 16
+    network = NETS[mosaic.layout.channels]
+    heights = {bottom - top for (top, bottom), _ in engines._strips((1452, 36), network)}
+    assert len(heights) == 2 and max(heights) <= 720 + PERIOD * network.net.grid
     parts = run_engine(NETS[mosaic.layout.channels], mosaic, full)
     assert whole is not None and parts is not None
     assert np.array_equal(parts.valid, whole.valid)

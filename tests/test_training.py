@@ -270,7 +270,8 @@ def test_mono_sees_the_green_light_behind_every_pixel() -> None:
     light = Stokes(diffuse + specular, *(avg_pool2d(examples.polarized[:, k : k + 1].float(), 2) for k in (1, 4)))
     error = measurements.data - measure(light, measurements.angles).data
     unclipped = torch.ones_like(error, dtype=torch.bool) if measurements.clipped is None else ~measurements.clipped
-    assert abs(float(error[unclipped].mean())) < 2e-3
+    # No mean: what demosaicking carries from bright samples to their neighbours counts in it, clipped ones do not.
+    assert abs(float(error[unclipped].median())) < 2e-3
     assert float(error[unclipped].abs().median()) < 1e-2
 
 

@@ -14,7 +14,6 @@ STYLES = {
     "analytic": ("#999999", "o"),
     "color-affine": ("#e69f00", "s"),
     "paper": ("#56b4e9", "v"),
-    "joint-large": ("#0072b2", "P"),
     "joint": ("#d55e00", "D"),
     "joint-fast": ("#009e73", "^"),
 }

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.averages import weighted_median
 from polsep.compute.warm_up import make_ready
 from polsep.light.color import ColorFit, axis_of, fit_color, planes_along, strongest
 from polsep.light.metals import MIN_MIRRORS, beside, is_metal, metal_share, only_mirrors, select
@@ -195,17 +196,11 @@ def combine(lights: Sequence[Light]) -> Light:
         return surest
     ratios = np.array([light.log_ratio for light in lights])
     weights = np.array([1 / (light.error_deg + 0.1) ** 2 for light in lights])
-    center = np.array([_weighted_median(ratios[:, k], weights) for k in range(2)])
+    center = np.array([weighted_median(ratios[:, k], weights) for k in range(2)])
     distance = np.hypot(*(ratios - center).T)
     weights = weights / (1 + (distance / 0.05) ** 2)
     mean = weights @ ratios / weights.sum()
     return replace(surest, log_ratio=(float(mean[0]), float(mean[1])))
-
-
-def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, total[-1] / 2)])
 
 
 def _as_light(fit: ColorFit, aolp: float) -> Light:

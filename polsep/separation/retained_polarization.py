@@ -18,6 +18,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from polsep.compute.averages import weighted_median
+
 #: Places along the shorter side of a frame, fewest samples along the side of one, and fewest places.
 PLACES, MIN_SIDE, MIN_PLACES = 16, 4, 20
 #: Contrast of colours that counts as none: variance [white^2], and over the squared brightness. Least brightness.
@@ -49,7 +51,7 @@ def find_retained(along: Tensor, across: Tensor, diffuse: Tensor) -> float:
     if len(weight) < MIN_PLACES:
         return 0.0
     (densest, beside), alike = find_densest(slopes, weight)
-    share = min(densest, weighted_median(slopes[0], weight))
+    share = min(densest, weighted_median(slopes[0].numpy(), weight.numpy()))
     if not RETAINED[0] < share < RETAINED[1] or abs(beside) > MAX_ACROSS or alike > MAX_ALIKE:
         return 0.0
     return share - CAUTION
@@ -64,13 +66,6 @@ def find_densest(slopes: Tensor, weight: Tensor) -> tuple[tuple[float, float], f
         near = weight * torch.exp(-0.5 * ((slopes - center[:, None]) ** 2).sum(dim=0) / WIDTH**2)
         center = (slopes * near).sum(dim=1) / near.sum()
     return (float(center[0]), float(center[1])), float(near.sum() / weight.sum())
-
-
-def weighted_median(values: Tensor, weight: Tensor) -> float:
-    """The value ``[N]`` at which half of the weight is reached."""
-    order = values.argsort()
-    place = weight[order].cumsum(dim=0) / weight.sum()
-    return float(values[order][int((place >= 0.5).nonzero()[0, 0])])
 
 
 def _deviations(image: Tensor) -> Tensor:

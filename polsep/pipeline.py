@@ -106,6 +106,7 @@ def separate_capture(
     frame = make_frame(images, chosen, capture, light, full)
     frame.report["light"] = facts
     frame.report.update(colored_specular=colored.share, retained_polarization=colored.retained)
+    frame.report["lamp_dolp"] = colored.lamp_dolp
     frame.report["warnings"] = [*remarks, *frame.report["warnings"]]
     if checked:
         frame.report.update(checked.report)

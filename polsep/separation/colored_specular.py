@@ -5,7 +5,8 @@ polarized as mirror images are. The polarization along the lamp's is regressed o
 from their mean over colours. Diffuse light of dielectrics has slopes of at most 0.3, and that only at
 grazing angles; diffuse images of gold have 1 and more. There the whole polarized light becomes specular.
 
-A little of that polarization, the same all over a frame, is of another kind: `retained_polarization`.
+A little of that polarization, the same all over a frame, is of another kind: `retained_polarization`. White specular light
+in the diffuse image is a lamp's that is not fully polarized: `lamp_polarization`.
 
 Evidence is taken per period of the mosaic, 4x4 pixels, whose cells show one colour each, and must fill 3x3 periods, so
 that colour fringes of edges do not count, and a part of the frame. Source: this project's; that metals tint highlights
@@ -19,12 +20,13 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate, max_pool2d, pixel_unshuffle
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pixel_unshuffle
 
 from polsep.demosaic.bilinear import split_analysers
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes
 from polsep.sensor.camera import Mosaic
 from polsep.separation.images import FrameImages, Tally
+from polsep.separation.lamp_polarization import find_unpolarized
 from polsep.separation.retained_polarization import find_retained
 
 #: Raw pixels along the side of a period.
@@ -54,10 +56,20 @@ class Periods(NamedTuple):
 
 
 class Colored(NamedTuple):
-    """``share`` of a frame whose specular light has another colour; share of its diffuse light that is ``retained``."""
+    """Specular light of a frame that is not white or not fully polarized.
+
+    ``share`` of a frame whose specular light has another colour; share of its diffuse light that is ``retained``;
+    ``unpolarized``: specular light that the diffuse image had, over that of the specular image.
+    """
 
     share: float = 0.0
     retained: float = 0.0
+    unpolarized: float = 0.0
+
+    @property
+    def lamp_dolp(self) -> float:
+        """The lamp's degree of polarization, 1 where nothing else is proven."""
+        return 1 / (1 + self.unpolarized)
 
 
 def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> tuple[FrameImages, Colored]:
@@ -71,10 +83,14 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     row, col = mosaic.layout.origin
     layout, data = mosaic.layout.rolled(-row, -col), mosaic.data[row:, col:].cpu()
     white = replace(mosaic, data=data, layout=layout, light_color=light, falloff=None)
-    diffuse, specular = (torch.from_numpy(x).movedim(-1, 0) for x in (images.diffuse, images.specular))
+    diffuse, before = (torch.from_numpy(x).movedim(-1, 0) for x in (images.diffuse, images.specular))
+    side = 2 if 2 * diffuse.shape[-1] <= data.shape[-1] else PERIOD
+    halves = [avg_pool2d((x / gain)[None], side // 2)[0] for x in (diffuse, before)]
+    unpolarized = find_unpolarized(halves[0], halves[1].mean(dim=0, keepdim=True))
+    left = torch.minimum(unpolarized * before, diffuse)
+    diffuse, specular = diffuse - left, before + left
     # What fills 3x3 periods fills one in every third row and column: a ninth of the frame shows that there is nothing.
     thin = replace(white, data=_thin(data, PERIOD))
-    side = 2 if 2 * diffuse.shape[-1] <= data.shape[-1] else PERIOD
     some = _see(thin, _thin(diffuse, side) / gain, _thin(specular, side) / gain, tally)
     enough = some if min(data.shape) > MANY else _see(white, diffuse / gain, specular / gain, tally)
     retained, share = find_retained(enough.polarized, enough.across, enough.diffuse), None
@@ -82,7 +98,7 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
         seen = _see(white, diffuse / gain, specular / gain, tally)
         found = find_colored(seen)
         share = found if float((found > 0.5).float().mean()) >= MIN_SHARE else None
-    if not retained and share is None:
+    if not retained and not unpolarized and share is None:
         return images, Colored()
     body, mirrored = (1 - retained) * diffuse, specular + retained * diffuse
     if share is not None:
@@ -90,11 +106,11 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
         share, ratio = (_resize(x, diffuse.shape[-2:], "bilinear") for x in (share, ratio.clamp(0, MAX_GAIN)))
         body, mirrored = (1 - share) * body, mirrored + share * (ratio * (diffuse + specular) - mirrored)
     changed = [x.movedim(0, -1).contiguous().numpy() for x in (body, mirrored)]
-    more = float(((mirrored - specular) / gain).mean(dim=0).double().sum())
+    more = float(((mirrored - before) / gain).mean(dim=0).double().sum())
     images = replace(
         images, diffuse=changed[0], specular=changed[1], tally=replace(tally, specular=tally.specular + more)
     )
-    return images, Colored(0.0 if share is None else float(share.mean()), retained)
+    return images, Colored(0.0 if share is None else float(share.mean()), retained, unpolarized)
 
 
 def _thin(image: Tensor, side: int) -> Tensor:

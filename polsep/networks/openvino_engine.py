@@ -1,7 +1,7 @@
 """The joint network on CPUs for frames of one size: kernels make its inputs, OpenVINO runs its layers, kernels images.
 
-The same as `run.run_joint`, in less time. Layers run in bfloat16 where the processor has it, in float32 elsewhere; the
-closed form and the images are float32 always.
+The same as `run.run_joint`, in less time. Layers run in bfloat16 where the processor has matrix tiles for it, else in
+float32; the closed form and the images are float32 always.
 """
 
 from __future__ import annotations
@@ -113,7 +113,8 @@ class OpenVinoEngine:
         self._layout = Layout() if network.colors == 3 else Layout(bayer=None)
         h, w = shape[0] // PERIOD, shape[1] // PERIOD
         channels = input_channels(network.colors, network.inputs)
-        halves = (precision or _usual_precision()) == "bf16"
+        precision = precision or _usual_precision()
+        halves = precision == "bf16"
         inputs = LayerInput.empty((h, w, channels.total), halves)
         closed = ClosedFormRows.empty(network.colors, h, w)
         beyond = np.empty((2 * h, 3 * network.colors, 2 * w) if full else (0, 0, 0), np.float32)
@@ -227,15 +228,14 @@ def _example_size(channels: int, network: Joint) -> tuple[int, int]:
     return (1, 1) if channels == 2 * sum(network.size.widths) else (32, 32)
 
 
-def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[Floats], precision: str | None) -> Any:
+def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[Floats], precision: str) -> Any:
     """A request that reads ``inputs [h, w, n]``, float32 or bits of bfloat16, and fills ``outputs [n, h, w]``."""
     from polsep.compute.threads import get_threads
 
     openvino = _import_openvino()
     # Pinned threads of two engines would share a core, and wait there for whoever else works on it.
     options: dict[str, Any] = {"INFERENCE_NUM_THREADS": get_threads(), "PERFORMANCE_HINT": "LATENCY"}
-    options |= {"ENABLE_CPU_PINNING": False}
-    options |= {} if precision is None else {"INFERENCE_PRECISION_HINT": precision}
+    options |= {"ENABLE_CPU_PINNING": False, "INFERENCE_PRECISION_HINT": precision}
     steps = openvino.preprocess.PrePostProcessor(model)
     kinds = [openvino.Type.bf16 if seen.dtype == np.uint16 else openvino.Type.f32 for seen in inputs]
     for k, kind in enumerate(kinds):
@@ -252,9 +252,15 @@ def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[Floats], prec
 
 
 def _usual_precision() -> str:
-    """The precision in which OpenVINO computes on this processor: "bf16" or "f32"."""
+    """The faster precision on this processor: "bf16" where OpenVINO takes it and matrix tiles (AMX) multiply it.
+
+    Vector units that know bfloat16 alone (AVX512-BF16) take 1.6 times as long with it as with float32
+    (docs/experiments.md).
+    """
+    from llvmlite.binding import get_host_cpu_features  # type: ignore[import-untyped]  # no stubs
+
     name: str = _core().get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name()
-    return name
+    return "f32" if name == "bf16" and not get_host_cpu_features().get("amx-bf16") else name
 
 
 def _import_openvino() -> Any:

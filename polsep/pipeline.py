@@ -53,7 +53,7 @@ class PolsepWarning(UserWarning):
 def separate(
     raw: NDArray[Any],
     method: str = "auto",
-    layout: Layout | None = None,
+    layout: Layout | str | None = None,
     black_level: float = 0,
     white_level: float | None = None,
     light_color: LightColor | str = "auto",
@@ -65,11 +65,12 @@ def separate(
     """Separate one raw mosaic ``[H, W]`` (uint8, uint16, float32) into diffuse and specular.
 
     Images are ``[H/2, W/2, C]``, the mean over each 2x2 polarizer cell; ``full=True`` gives ``[H, W, C]``. ``layout``
-    None is Sony's colour order. ``white_level`` None is the dtype's maximum (1.0 for float): 12-bit data in uint16 need
-    4095 or 65520 said. ``calibration``: a file of `polsep calibrate`, applied first. ``ambient``: a raw frame with the
-    lamp off, or several, subtracted. ``light_color``: "auto" finds it in the frame (`find_light`), or "white", or
-    camera RGB of the light. What the owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`.
-    Raises ValueError, with one line of what was expected and what was found, on input that is not a mosaic.
+    None is Sony's colour order; text is "color", "mono" or a `Layout.spec`. ``white_level`` None is the dtype's maximum
+    (1.0 for float): 12-bit data in uint16 need 4095 or 65520 said. ``calibration``: a file of `polsep calibrate`,
+    applied first. ``ambient``: a raw frame with the lamp off, or several, subtracted. ``light_color``: "auto" finds it
+    in the frame (`find_light`), or "white", or camera RGB of the light. What the owner should know is in
+    ``report["warnings"]`` and issued as `PolsepWarning`. Raises ValueError, with one line of what was expected and what
+    was found, on input that is not a mosaic.
     """
     measured = calibration if isinstance(calibration, Calibration | None) else read_calibration(Path(calibration))
     if white_level is None and measured is not None:

@@ -25,7 +25,7 @@ from polsep.networks.joint import Joint
 from polsep.networks.run import run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Stokes, measure
-from polsep.pipeline import find_device, separate_capture
+from polsep.pipeline import PolsepWarning, find_device, separate, separate_capture
 from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
 from polsep.separation.analytic import Separation
 from polsep.shipped import NAMES
@@ -448,3 +448,15 @@ def test_memory_of_a_whole_frame(method: str, most: float, compiled: None) -> No
         f"polsep.separate(raw, {method!r}, device='cpu'); print(read_peak_memory())"
     )
     assert float(run_python(code)) < most
+
+
+@pytest.mark.parametrize("text", ["color", "mono", "0,45,135,90/BGGR"])
+def test_layouts_may_be_text(text: str) -> None:
+    """Text means the layout that `Layout.parse` reads."""
+    raw = np.random.default_rng(5).integers(0, 4096, (32, 32), np.uint16)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PolsepWarning)
+        named, meant = (separate(raw, "analytic", layout, white_level=4095) for layout in (text, Layout.parse(text)))
+    np.testing.assert_array_equal(named.diffuse, meant.diffuse)
+    with pytest.raises(ValueError, match='expected "color", "mono" or angles'):
+        separate(raw, layout="monochrome")

@@ -92,7 +92,7 @@ class Light:
 
 def find_light(
     raw: NDArray[Any] | Mosaic | Measurements,
-    layout: Layout | None = None,
+    layout: Layout | str | None = None,
     black_level: float = 0,
     white_level: float | None = None,
 ) -> Light:

@@ -45,17 +45,17 @@ Notes = tuple[str, ...]
 
 
 def as_mosaic(
-    array: NDArray[Any], layout: Layout | None = None, black_level: float = 0.0, white_level: float | None = None
+    array: NDArray[Any], layout: Layout | str | None = None, black_level: float = 0.0, white_level: float | None = None
 ) -> tuple[Mosaic, Notes]:
     """One raw frame ``[H, W]`` (or ``[H, W, 1]``) as a `Mosaic` of float32, with notes for the user.
 
-    ``layout`` None is Sony's colour order; levels are in the units of ``array``. An odd last row or column is cropped
-    and gray stored as three equal channels is reduced to one, both with a note. Bit depth is not guessed. Raises
-    ValueError on another dtype or shape, values that are not finite, or white not above black.
+    ``layout`` None is Sony's colour order, text is read by `Layout.parse`; levels are in the units of ``array``. An odd
+    last row or column is cropped and gray stored as three equal channels is reduced to one, both with a note. Bit depth
+    is not guessed. Raises ValueError on another dtype or shape, values that are not finite, or white not above black.
     """
-    layout = Layout() if layout is None else layout
+    layout = Layout() if layout is None else Layout.parse(layout) if isinstance(layout, str) else layout
     if not isinstance(layout, Layout):
-        raise ValueError(f"expected a Layout or None, found {type(layout).__name__}")
+        raise ValueError(f'expected a Layout, "color", "mono", a specification or None, found {type(layout).__name__}')
     plane, notes = _one_channel(_checked(array))
     height, width = plane.shape
     odd_rows, odd_cols = ((n - start) % 2 for n, start in zip((height, width), layout.origin, strict=True))

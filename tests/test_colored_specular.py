@@ -78,6 +78,7 @@ def test_metal_keeps_its_color(metal: str, side: int, layout: Layout) -> None:
     truth = specular[:, ::side, ::side].movedim(0, -1).numpy()
     np.testing.assert_allclose(found.specular[inside], truth[inside], rtol=0.01)
     assert found.diffuse[inside].max() < 1e-6
+    assert not found.valid[inside].any() and found.valid[outside].all()
     body = BODY.expand(3, SIZE, SIZE)[:, ::side, ::side].movedim(0, -1).numpy()
     np.testing.assert_allclose(found.diffuse[outside], body[outside], rtol=1e-5)
 

@@ -5,8 +5,8 @@ polarized as mirror images are. The polarization along the lamp's is regressed o
 from their mean over colours. Diffuse light of dielectrics has slopes of at most 0.3, and that only at
 grazing angles; diffuse images of gold have 1 and more. There the whole polarized light becomes specular.
 
-A little of that polarization, the same all over a frame, is of another kind: `retained_polarization`. White specular light
-in the diffuse image is a lamp's that is not fully polarized: `lamp_polarization`.
+A little of that polarization, the same all over a frame, is of another kind: `retained_polarization`. White specular
+light in the diffuse image is a lamp's that is not fully polarized: `lamp_polarization`.
 
 Evidence is taken per period of the mosaic, 4x4 pixels, whose cells show one colour each, and must fill 3x3 periods, so
 that colour fringes of edges do not count, and a part of the frame. Source: this project's; that metals tint highlights
@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pixel_unshuffle
@@ -75,7 +76,8 @@ class Colored(NamedTuple):
 def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> tuple[FrameImages, Colored]:
     """The images of one colour frame ``[H, W]``, with coloured specular light where it is proven, and what was found.
 
-    ``light``: camera RGB of the lamp, which is divided out. The same object where nothing is found.
+    ``light``: camera RGB of the lamp, which is divided out. Metals are not ``valid``: their separation rests on more than
+    the samples. The same object where nothing is found.
     """
     tally, gain = images.tally, torch.tensor(light).view(-1, 1, 1)
     if mosaic.layout.channels != 3 or mosaic.data.ndim != 2 or tally is None or min(mosaic.data.shape) < MIN_SIZE:
@@ -100,16 +102,16 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
         share = found if float((found > 0.5).float().mean()) >= MIN_SHARE else None
     if not retained and not unpolarized and share is None:
         return images, Colored()
-    body, mirrored = (1 - retained) * diffuse, specular + retained * diffuse
+    body, mirrored, valid = (1 - retained) * diffuse, specular + retained * diffuse, images.valid
     if share is not None:
         ratio = torch.minimum(seen.polarized.clamp(min=0), seen.s0) / seen.total.clamp(min=1e-4)
         share, ratio = (_resize(x, diffuse.shape[-2:], "bilinear") for x in (share, ratio.clamp(0, MAX_GAIN)))
         body, mirrored = (1 - share) * body, mirrored + share * (ratio * (diffuse + specular) - mirrored)
+        valid = valid & (share[0] < 0.5).numpy()
     changed = [x.movedim(0, -1).contiguous().numpy() for x in (body, mirrored)]
     more = float(((mirrored - before) / gain).mean(dim=0).double().sum())
-    images = replace(
-        images, diffuse=changed[0], specular=changed[1], tally=replace(tally, specular=tally.specular + more)
-    )
+    tally = replace(tally, specular=tally.specular + more, valid=int(np.count_nonzero(valid)))
+    images = replace(images, diffuse=changed[0], specular=changed[1], valid=valid, tally=tally)
     return images, Colored(0.0 if share is None else float(share.mean()), retained, unpolarized)
 
 

@@ -76,8 +76,8 @@ class Colored(NamedTuple):
 def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> tuple[FrameImages, Colored]:
     """The images of one colour frame ``[H, W]``, with coloured specular light where it is proven, and what was found.
 
-    ``light``: camera RGB of the lamp, which is divided out. Metals are not ``valid``: their separation rests on more than
-    the samples. The same object where nothing is found.
+    ``light``: camera RGB of the lamp, which is divided out. Metals are not ``valid``: the samples do not determine their
+    separation. The same object where nothing is found.
     """
     tally, gain = images.tally, torch.tensor(light).view(-1, 1, 1)
     if mosaic.layout.channels != 3 or mosaic.data.ndim != 2 or tally is None or min(mosaic.data.shape) < MIN_SIZE:

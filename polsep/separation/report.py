@@ -38,8 +38,9 @@ class SeparatedFrame:
 
     ``diffuse``, ``specular``: float32 ``[h, w, C]``, C = 3 or 1, linear, 1.0 = one measurement at the white level, so
     their sum s0 reaches 2 (more where clipped highlights were recovered). ``valid``: bool ``[h, w]``, False where
-    clipping left something to assumption, or where specular light is coloured as a metal's. ``dolp``: float32 ``[h, w]``, of all channels together in white light, at
-    most 2, the most that four analysers show, and ``aolp``: radians in [0, pi), image-right toward image-up.
+    clipping left something to assumption, or where specular light is coloured as a metal's. ``dolp``: float32
+    ``[h, w]``, of all channels together in white light, at most 2, the most that four analysers show, and ``aolp``:
+    radians in [0, pi), image-right toward image-up.
     ``report``: JSON-able settings, statistics and warnings. ``error``: float32 ``[h, w, 2]``, the standard deviation
     that the method expects of the errors of diffuse and specular, over all colours, in the images' unit; None where a
     method expects none.

@@ -76,7 +76,7 @@ class Colored(NamedTuple):
 def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> tuple[FrameImages, Colored]:
     """The images of one colour frame ``[H, W]``, with coloured specular light where it is proven, and what was found.
 
-    ``light``: camera RGB of the lamp, which is divided out. Metals are not ``valid``: the samples do not determine their
+    ``light``: camera RGB of the lamp, which is divided out. Metals are not ``valid``: samples do not determine their
     separation. The same object where nothing is found.
     """
     tally, gain = images.tally, torch.tensor(light).view(-1, 1, 1)

@@ -18,14 +18,22 @@ from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import MIN_CELLS, demosaic_guided, demosaic_guided_half
 from polsep.io.store.weights import is_shipped
-from polsep.networks.engines import run_engine
+from polsep.networks.engines import combine_images, run_engine
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.analytic import Separation, separate_analytic
 from polsep.separation.color_affine import separate_color_affine
 from polsep.separation.images import FrameImages
 from polsep.separation.report import images_of, in_light, under_white_light
-from polsep.shipped import NAMES, accepts_mosaic, separate_joint, separate_paper, shipped_joint, weights_name
+from polsep.shipped import (
+    NAMES,
+    accepts_mosaic,
+    member_names,
+    separate_joint,
+    separate_paper,
+    shipped_joint,
+    weights_name,
+)
 
 #: A raw frame, or co-sited samples.
 Capture = Mosaic | Measurements
@@ -127,12 +135,13 @@ def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
 
 
 def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameImages:
-    """The joint network of that name: kernels and OpenVINO, else torch."""
+    """The joint networks of that name: kernels and OpenVINO, else torch."""
     if isinstance(capture, Mosaic) and capture.data.device.type == "cpu":
-        network = shipped_joint(weights_name(name, capture.layout), capture.data.device)
-        images = run_engine(network, replace(capture, light_color=light), full)
-        if images is not None:
-            return images
+        networks = [shipped_joint(member, capture.data.device) for member in member_names(name, capture.layout)]
+        images = [run_engine(network, replace(capture, light_color=light), full) for network in networks]
+        found = [one for one in images if one is not None]
+        if len(found) == len(networks):
+            return combine_images(found)
     return run_reference(partial(separate_joint, name), capture, light, full)
 
 
@@ -177,8 +186,12 @@ def _joint(name: str, summary: str) -> Method:
 
 
 _ALL = (
-    _joint("joint", "one network from the raw mosaic to full-resolution images, with the closed form inside"),
-    _joint("joint-fast", "the same, smaller, for real time"),
+    _joint(
+        "joint-large",
+        "one network from the raw mosaic to full-resolution images, with the closed form inside: best quality",
+    ),
+    _joint("joint", "the same, smaller, for many frames"),
+    _joint("joint-fast", "the same, smaller still, for real time"),
     Method(
         "color-affine",
         "closed form for polarized diffuse and white specular light, recovers clipped samples",
@@ -212,7 +225,7 @@ _ALL = (
 METHODS = {m.name: m for m in _ALL if not m.reads_mosaic or is_shipped(weights_name(m.name, Layout()))}
 
 #: The meaning of `auto`: the first of these that is installed and accepts the capture.
-BEST = tuple(METHODS[name] for name in ("joint", "color-affine") if name in METHODS)
+BEST = tuple(METHODS[name] for name in ("joint-large", "joint", "color-affine") if name in METHODS)
 
 #: The meaning of `auto-fast`, for streams.
 FASTEST = tuple(METHODS[name] for name in ("joint-fast", "joint", "color-affine") if name in METHODS)

@@ -16,7 +16,7 @@ import torch
 from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
 from polsep.networks.joint import Joint
 from polsep.networks.paper import RUNGS, Refinement, Rung, separate_refined
-from polsep.networks.run import own_order, run_joint
+from polsep.networks.run import combine, own_order, run_joint
 from polsep.networks.unet import ResidualSize, Size
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
@@ -24,7 +24,11 @@ from polsep.sensor.orient import orient
 from polsep.separation.analytic import Separation
 
 #: Methods of the joint network.
-NAMES = ("joint", "joint-fast")
+NAMES = ("joint-large", "joint", "joint-fast")
+#: Networks of a method that weighs the images of several by their expected errors.
+MEMBERS = {"joint-large": ("joint-large", "joint")}
+#: Weights of mono networks whose images are averaged over shifts: for stills, at four times the time.
+AVERAGED = ("joint-mono",)
 #: The paper's networks, trained on noisy mosaics of colour cameras, and of those without colour filters.
 PAPER, PAPER_MONO = "paper-mosaic", "paper-mono"
 
@@ -54,7 +58,9 @@ def shipped_joint(name: str, device: torch.device) -> Joint:
 
 @lru_cache(maxsize=8)
 def _read_joint(name: str, device: torch.device) -> Joint:
-    return load_joint(shipped_weights(name), device)
+    network = load_joint(shipped_weights(name), device)
+    network.averages_shifts = name in AVERAGED
+    return network
 
 
 def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[Joint, dict[str, str]]:
@@ -76,6 +82,11 @@ def weights_name(method: str, layout: Layout) -> str:
     return f"{method}-{'mono' if layout.bayer is None else 'mosaic'}"
 
 
+def member_names(method: str, layout: Layout) -> tuple[str, ...]:
+    """The names of the weights of all networks of a method, for frames of a layout."""
+    return tuple(weights_name(member, layout) for member in MEMBERS.get(method, (method,)))
+
+
 def separate_joint(method: str, capture: Mosaic | Measurements, full: bool = False) -> Separation:
     """Separate a mosaic by a method of `NAMES` in torch, with shipped weights.
 
@@ -83,8 +94,8 @@ def separate_joint(method: str, capture: Mosaic | Measurements, full: bool = Fal
     """
     if isinstance(capture, Measurements):
         raise ValueError(f"expected a mosaic for the method {method}, found four co-sited angle images")
-    network = shipped_joint(weights_name(method, capture.layout), capture.data.device)
-    return run_joint(network, capture, full)
+    networks = (shipped_joint(name, capture.data.device) for name in member_names(method, capture.layout))
+    return combine([run_joint(network, capture, full) for network in networks])
 
 
 def accepts_mosaic(method: str, capture: Mosaic | Measurements) -> bool:

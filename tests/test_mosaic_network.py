@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -16,11 +16,11 @@ from polsep.methods import METHODS, find_method
 from polsep.networks import run as mosaic_network
 from polsep.networks.channels import INPUTS
 from polsep.networks.joint import Joint
-from polsep.networks.run import cut_rows, margin_of, run_joint
+from polsep.networks.run import combine, cut_rows, margin_of, run_joint
 from polsep.networks.unet import ResidualSize
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.orient import orient
+from polsep.sensor.orient import orient, shifts_of
 from polsep.shipped import accepts_mosaic, load_joint, separate_joint, weights_name
 
 SIZE = ResidualSize(4, (0, 1, 1))
@@ -69,6 +69,54 @@ def test_mirrored_frames_give_mirrored_images(layout: Layout) -> None:
     assert_close(other.diffuse.flip(-1), found.diffuse)
     assert_close(other.stokes.s1.flip(-1), found.stokes.s1)
     assert_close(-other.stokes.s2.flip(-1), found.stokes.s2)
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (50, 63), (49, 61)])
+@pytest.mark.parametrize("full", [False, True])
+def test_shifted_frames_are_combined(height: int, width: int, full: bool) -> None:
+    """A mono frame less its first two rows or columns lies differently on the network's periods of four samples."""
+    network, mosaic = random_network(MONO), random_mosaic(MONO, height, width)
+    ways = shifts_of(orient(mosaic, MONO))
+    turned = [way.turn(mosaic.data) for way in ways]
+    assert len(ways) == 4 and len({frame.shape for frame in turned}) == 1
+    single = [mosaic_network._run_turned(network, mosaic, way, full) for way in ways]
+    assert not torch.allclose(single[0].diffuse, single[1].diffuse, atol=1e-3)
+    network.averages_shifts = True
+    found = run_joint(network, mosaic, full)
+    assert_close(found.diffuse, combine(single).diffuse)
+    assert_close(found.stokes.s0, found.diffuse + found.specular)
+    assert found.expected_error is not None and found.expected_error.shape[-2:] == found.diffuse.shape[-2:]
+
+
+def test_separations_are_weighed_by_their_expected_variances() -> None:
+    """Errors of one and two give weights of four fifths and one fifth, in each output by itself."""
+    one = run_joint(random_network(COLOR), random_mosaic(COLOR, 48, 64))
+    two = replace(one, diffuse=one.diffuse + 1, specular=one.specular + 1)
+    ones = torch.ones(1, *one.diffuse.shape[-2:])
+    one = replace(one, expected_error=torch.cat([ones, 2 * ones]))
+    two = replace(two, expected_error=torch.cat([2 * ones, ones]))
+    found = combine([one, two])
+    assert_close(found.diffuse, one.diffuse + 0.2)
+    assert_close(found.specular, one.specular + 0.8)
+    assert_close(found.stokes.s0, found.diffuse + found.specular)
+    assert found.expected_error is not None
+    assert_close(found.expected_error, torch.cat([1.2 * ones, 1.2 * ones]))
+    assert combine([one]) is one
+
+
+def test_even_light_has_no_pattern_where_shifts_are_averaged() -> None:
+    """Places in a period have weights of their own, so an untrained network gives even light a pattern."""
+    network, light = random_network(MONO), torch.tensor([[0.3, 0.35], [0.25, 0.3]]).repeat(280, 280)
+    mosaic = Mosaic(light, MONO, 0.0, 1.0)
+
+    def contrast() -> float:
+        border = margin_of(network) // 2
+        inner = run_joint(network, mosaic).diffuse[:, border:-border, border:-border]
+        return float(inner.max() - inner.min())
+
+    assert contrast() > 0.01
+    network.averages_shifts = True
+    assert contrast() < 1e-5
 
 
 def test_mono_cells_of_other_frames_are_their_own() -> None:

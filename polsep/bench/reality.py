@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from polsep.datasets.reality import Frame, Stage
 
 #: Methods in the order of the tables.
-ORDER = ("analytic", "color-affine", "paper", "joint", "joint-fast")
+ORDER = ("analytic", "color-affine", "paper", "joint-large", "joint", "joint-fast")
 #: Quality of JPEG files, and the loss against `analytic` that counts as worse than it [dB].
 JPEG_QUALITY, WORSE = 95, 1.0
 #: Ending of the rows that are told what differs.

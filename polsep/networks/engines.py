@@ -25,9 +25,9 @@ from polsep.compute.warm_up import make_ready
 from polsep.networks.channels import PERIOD
 from polsep.networks.joint import Joint
 from polsep.networks.openvino_engine import OpenVinoEngine, modulation_of
-from polsep.networks.run import cut_rows, margin_of, own_order
+from polsep.networks.run import LEAST_ERROR, cut_rows, margin_of, own_order
 from polsep.sensor.camera import Mosaic
-from polsep.sensor.orient import Orientation, orient
+from polsep.sensor.orient import Orientation, orient, shifts_of
 from polsep.separation.images import FrameImages
 
 #: Engines that are kept at least, each with the memory that its frames need.
@@ -115,6 +115,33 @@ def run_engine(network: Joint, mosaic: Mosaic, full: bool) -> FrameImages | None
     make_ready(_warm_up)
     if full:
         make_ready(_warm_up_full)
+    ways = shifts_of(orientation) if network.averages_shifts else (orientation,)
+    return combine_images([_run_turned(network, mosaic, way, full) for way in ways])
+
+
+def combine_images(images: list[FrameImages]) -> FrameImages:
+    """Images of one frame, weighed as `run.combine` does; the tally is that of all of them."""
+    first = images[0]
+    if len(images) == 1:
+        return first
+    arrays = {name: np.stack([one.arrays()[name] for one in images]) for name in first.arrays()}
+    weights = np.maximum(arrays["error"], np.float32(LEAST_ERROR)) ** -2
+    weights /= weights.sum(axis=0)
+    polarization = (arrays["dolp"] * np.exp(2j * arrays["aolp"])).mean(axis=0).astype(np.complex64)
+    return FrameImages(
+        (weights[..., :1] * arrays["diffuse"]).sum(axis=0),
+        (weights[..., 1:] * arrays["specular"]).sum(axis=0),
+        np.asarray(arrays["valid"].all(axis=0)),
+        np.abs(polarization),
+        _wrap(np.angle(polarization) / 2),
+        reduce(add, (one.tally for one in images if one.tally is not None)),
+        (weights * arrays["error"]).sum(axis=0),
+    )
+
+
+def _run_turned(network: Joint, mosaic: Mosaic, orientation: Orientation, full: bool) -> FrameImages:
+    """A frame's images in one orientation."""
+    data = mosaic.data
     as_it_is = orientation == Orientation(*data.shape) and not any(n % PERIOD for n in data.shape)
     turned = data if as_it_is else orientation.turn(data.float()).contiguous()
     cells, parts, levels = 1 if full else 2, [], (mosaic.black_level, mosaic.white_level)

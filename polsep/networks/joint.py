@@ -125,6 +125,8 @@ class Joint(nn.Module):
     ) -> None:
         super().__init__()
         self.colors, self.size, self.inputs, self.margin = colors, size, inputs, MARGIN
+        #: Mono frames are separated at all shifts of `orient.shifts_of` and combined: no pattern of a period is left.
+        self.averages_shifts = False
         #: Faster twin of `_guide_once`, which training on CPUs sets (`networks.guide`).
         self.guide: Callable[[Tensor, Layout], tuple[Tensor, Tensor]] | None = None
         self.layout = Layout(bayer="RGGB" if colors == 3 else None)

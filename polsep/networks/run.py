@@ -20,13 +20,15 @@ from polsep.networks.channels import PERIOD
 from polsep.networks.joint import Joint, limit
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.orient import Orientation, orient
+from polsep.sensor.orient import Orientation, orient, shifts_of
 from polsep.separation.analytic import Separation
 
 #: Raw pixels of a frame, or of a strip with its margins, that are processed at once: some 250 bytes of memory each.
 MAX_PIXELS = 6_000_000
 #: Raw rows beyond the reach of the U-Net that demosaicking and the closed form see (a test measures that).
 OTHER_REACH = 128
+#: Least expected error that counts when separations are weighed.
+LEAST_ERROR = 1e-5
 
 
 def own_order(layout: Layout) -> Layout:
@@ -44,6 +46,34 @@ def run_joint(network: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
     orientation = orient(mosaic, own_order(mosaic.layout))
     if not full and not orientation.keeps_cells:  # then the network's cells are not the frame's
         return _halve(run_joint(network, mosaic, full=True))
+    ways = shifts_of(orientation) if network.averages_shifts else (orientation,)
+    return combine([_run_turned(network, mosaic, way, full) for way in ways])
+
+
+def combine(separations: list[Separation]) -> Separation:
+    """Several separations of one frame, each pixel weighed by the inverse of its expected variance.
+
+    Diffuse and specular have weights of their own. A pixel is valid if it is in all of them; the expected error is the
+    weighted mean, since their errors are alike. Polarization and what is not an image are the mean and the first one's.
+    """
+    first = separations[0]
+    if len(separations) == 1:
+        return first
+    errors = torch.stack([s.expected_error for s in separations if s.expected_error is not None])
+    weights = errors.clamp(min=LEAST_ERROR) ** -2
+    weights = weights / weights.sum(dim=0)
+    diffuse, specular = weights[..., :1, :, :], weights[..., 1:, :, :]
+    images = (torch.stack([getattr(s, name) for s in separations]) for name in ("diffuse", "specular"))
+    body, mirrored = ((w * x).sum(dim=0) for w, x in zip((diffuse, specular), images, strict=True))
+    s1, s2 = (torch.stack([getattr(s.stokes, name) for s in separations]).mean(dim=0) for name in ("s1", "s2"))
+    valid = torch.stack([s.valid for s in separations]).all(dim=0)
+    error = (weights * errors).sum(dim=0)
+    stokes = Stokes(body + mirrored, s1, s2)
+    return replace(first, diffuse=body, specular=mirrored, valid=valid, stokes=stokes, expected_error=error)
+
+
+def _run_turned(network: Joint, mosaic: Mosaic, orientation: Orientation, full: bool) -> Separation:
+    """A mosaic through a network in one orientation."""
     raw, clipped = (orientation.turn(x) for x in (mosaic.linear().float(), mosaic.clipped()))
     batch, (height, width) = raw.shape[:-2], raw.shape[-2:]
     raw, clipped = (x.reshape(-1, 1, height, width) for x in (raw, clipped))

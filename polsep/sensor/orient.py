@@ -8,7 +8,7 @@ every added sample lies behind its own filter. Signs of Stokes images follow `La
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
@@ -82,6 +82,23 @@ class Orientation:
         """The same for polarization: s2 changes sign with each mirror, s1 when transposed."""
         s0, s1, s2 = (self.turn_back(s, scale) for s in (stokes.s0, stokes.s1, stokes.s2))
         return Stokes(s0, -s1 if self.transposed else s1, -s2 if self.down != self.across else s2)
+
+
+def shifts_of(orientation: Orientation) -> tuple[Orientation, ...]:
+    """The four ways in which a turned mono frame lies on periods of 4 samples, all of one size.
+
+    Its filters repeat every 2 samples, so each is as good as the one that is given.
+    """
+    sides = (orientation.height, orientation.width)
+    rows, cols = sides[::-1] if orientation.transposed else sides
+    tops, lefts = _shifts(rows, orientation.top), _shifts(cols, orientation.left)
+    return tuple(replace(orientation, top=top, left=left) for top in tops for left in lefts)
+
+
+def _shifts(count: int, before: int) -> tuple[int, int]:
+    """Samples before a side of ``count``, 2 apart, by which it becomes as many periods."""
+    first = before if (count + before) % PERIOD in (1, 2) else before + 2
+    return first, first + 2
 
 
 def _span(count: int, origin: int, before: int, mirrored: bool) -> tuple[int, int]:

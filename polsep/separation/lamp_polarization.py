@@ -15,12 +15,12 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 #: Side of a place in pixels at half resolution, and fewest places.
 SIDE, MIN_PLACES = 8, 12
 #: Least variance of the specular image in a place [white^2], and least squared share of white beside the body's colour.
-MIN_VARIANCE, MIN_WHITE = 5e-4, 0.02
+MIN_VARIANCE, MIN_WHITE = 5e-4, 0.15
 #: Largest sample of a place: s0 of light along an analyser, half of it across.
 MAX_SAMPLE = 0.9
-#: Least part that is believed, in standard errors of the median too, and the largest slope beside white over it. Chosen
+#: Range of parts that are believed, the least one in standard errors of the median too, and the largest slope beside white over it. Chosen
 #: on 16 validation stages of `datasets.reality` in 15 conditions (docs/experiments.md).
-MIN_PART, ERRORS, MAX_BESIDE = 0.04, 3.0, 0.5
+MIN_PART, MAX_PART, ERRORS, MAX_BESIDE = 0.04, 0.5, 3.0, 0.5
 #: Standard error of a median over the median deviation, times the root of the count, for normal errors.
 MEDIAN_ERROR = 1.4826 * 1.25
 
@@ -49,5 +49,5 @@ def find_unpolarized(diffuse: Tensor, specular: Tensor) -> float:
     beside = (slopes * torch.linalg.cross(body, white, dim=0)).sum(dim=0) / power
     part = float(along.median())
     error = MEDIAN_ERROR * float((along - part).abs().median()) / len(power) ** 0.5
-    proven = part > max(MIN_PART, ERRORS * error) and abs(float(beside.median())) < MAX_BESIDE * part
+    proven = max(MIN_PART, ERRORS * error) < part < MAX_PART and abs(float(beside.median())) < MAX_BESIDE * part
     return part if proven else 0.0

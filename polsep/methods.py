@@ -186,12 +186,9 @@ def _joint(name: str, summary: str) -> Method:
 
 
 _ALL = (
-    _joint(
-        "joint-large",
-        "one network from the raw mosaic to full-resolution images, with the closed form inside: best quality",
-    ),
-    _joint("joint", "the same, smaller, for many frames"),
-    _joint("joint-fast", "the same, smaller still, for real time"),
+    _joint("joint-large", "networks from the raw mosaic, weighed by their expected errors: best quality, for stills"),
+    _joint("joint", "one network from the raw mosaic to full-resolution images, with the closed form inside"),
+    _joint("joint-fast", "the same, smaller, for real time"),
     Method(
         "color-affine",
         "closed form for polarized diffuse and white specular light, recovers clipped samples",

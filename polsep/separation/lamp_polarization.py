@@ -18,8 +18,8 @@ SIDE, MIN_PLACES = 8, 12
 MIN_VARIANCE, MIN_WHITE = 5e-4, 0.15
 #: Largest sample of a place: s0 of light along an analyser, half of it across.
 MAX_SAMPLE = 0.9
-#: Range of parts that are believed, the least one in standard errors of the median too, and the largest slope beside white over it. Chosen
-#: on 16 validation stages of `datasets.reality` in 15 conditions (docs/experiments.md).
+#: Range of parts that are believed, the least one in standard errors of the median too, and the largest slope beside
+#: white over it. Chosen on 16 validation stages of `datasets.reality` in 15 conditions (docs/experiments.md).
 MIN_PART, MAX_PART, ERRORS, MAX_BESIDE = 0.04, 0.5, 3.0, 0.5
 #: Standard error of a median over the median deviation, times the root of the count, for normal errors.
 MEDIAN_ERROR = 1.4826 * 1.25

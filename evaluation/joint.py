@@ -10,6 +10,7 @@ import statistics
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,10 +23,9 @@ from evaluation.sets import load_sets
 from polsep.bench.rows import Row
 from polsep.methods import METHODS, Capture
 from polsep.metrics import psnr, reliability
-from polsep.networks.engines import run_engine
 from polsep.sensor.camera import IMX250, Layout, Mosaic, expose
 from polsep.separation.analytic import Separation
-from polsep.shipped import NAMES, shipped_joint, weights_name
+from polsep.shipped import NAMES
 
 if TYPE_CHECKING:
     from evaluation.testsets import Case, Recipe
@@ -120,19 +120,23 @@ def measure_reliability(name: str, recipes: Sequence[Recipe], data: Path) -> Ite
 
 
 def measure_engines(name: str, recipes: Sequence[Recipe], data: Path) -> Iterator[Row]:
-    """Difference of an engine, in bfloat16 where the processor has it, from torch: in PSNR of a set, and of a scene."""
+    """Difference of an engine, in bfloat16 where that is faster, from torch: in PSNR of a set, and of a scene.
+
+    Raises ValueError without OpenVINO, where torch would be compared with itself.
+    """
     from evaluation.testsets import build_cases
 
+    if find_spec("openvino") is None:
+        raise ValueError("expected the engine of OpenVINO, found none")
     changes: dict[tuple[str, str], list[float]] = {}
     for case in build_cases(recipes, data):
         for see, full in ((capture_noisy, False), (capture_full, True)):
             mosaic, (*truth, mask) = see(case)
             assert isinstance(mosaic, Mosaic)
             for method in NAMES:
-                network = shipped_joint(weights_name(method, mosaic.layout), mosaic.data.device)
-                images, exact = run_engine(network, mosaic, full), METHODS[method].reference(mosaic, full)
-                if images is None:
-                    raise ValueError("expected the engine of OpenVINO, found none")
+                chosen = METHODS[method]
+                images = chosen.run(mosaic, (1.0,) * mosaic.layout.channels, full)
+                exact = chosen.reference(mosaic, full)
                 pairs = ((images.diffuse, exact.diffuse), (images.specular, exact.specular))
                 for output, (found, wanted), image in zip(("diffuse", "specular"), pairs, truth, strict=True):
                     planes = torch.from_numpy(found).movedim(-1, 0)

@@ -125,7 +125,7 @@ def test_full_resolution_is_scored_at_full_resolution() -> None:
     case = build_case(GREY)
     capture, (diffuse, _, mask) = capture_full(case)
     found = {entry.name: entry.separate(capture) for entry in full_entries()}
-    assert set(found) == {"joint", "joint-fast", "color-affine", "analytic", "paper, enlarged"}
+    assert set(found) == {"joint-large", "joint", "joint-fast", "color-affine", "analytic", "paper, enlarged"}
     assert all(images.diffuse.shape == diffuse.shape for images in found.values())
     scores = list(score_case(case, [Protocol("full", capture_full, full_entries())]))
     value = {score.method: score.value for score in scores if score.metric == "diffuse PSNR"}

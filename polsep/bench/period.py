@@ -18,6 +18,7 @@ from torch import Tensor
 
 from polsep.bench.rows import Row
 from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.methods import METHODS
 from polsep.pipeline import PolsepWarning, separate_capture
 from polsep.sensor.camera import Layout, Mosaic
 
@@ -74,7 +75,7 @@ def bench_period(data: Path, methods: Sequence[str]) -> Iterator[Row]:
         layout = Layout() if "quadbayer" in path.stem else Layout(bayer=None)
         mosaic = next(read_frames(path, ReadOptions(layout))).data
         assert isinstance(mosaic, Mosaic)
-        for method in methods:
+        for method in (name for name in methods if METHODS[name].accepts(mosaic)):
             for full in (False, True):
                 if full and method == "paper":
                     continue

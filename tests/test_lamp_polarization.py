@@ -55,6 +55,13 @@ def test_grey_bodies_show_nothing() -> None:
     assert find_unpolarized(body + 0.2 * mirrored, 0.8 * mirrored) == 0
 
 
+def test_bodies_of_one_hue_show_nothing() -> None:
+    """There a lamp that is too yellow by a tenth leaves light on yellow bodies that looks like white light."""
+    body, mirrored = bodies()
+    skin = torch.tensor([0.6, 0.4, 0.2]).view(3, 1, 1) * body.mean(dim=0, keepdim=True)
+    assert find_unpolarized(skin + 0.2 * mirrored, 0.8 * mirrored) == 0
+
+
 @pytest.mark.parametrize("tint", [(0.3, 0.0, -0.3), (-0.2, 0.2, 0.0), (0.0, -0.3, 0.3)])
 def test_a_wrong_color_of_the_lamp_is_no_polarizer(tint: tuple[float, float, float]) -> None:
     """It leaves coloured light, beside white, in the diffuse image."""

@@ -3,7 +3,8 @@
 Methods take mirror images of the lamp for fully polarized. Behind an imperfect polarizer of degree p they find p of
 them; (1 - p) / p of the specular image is left in the diffuse image, in white. In a place, the diffuse image less the
 body's colour is regressed on the specular image. The median of the places counts where it is clear: more than its
-standard error, and along white rather than beside it, where wrong colours of the lamp lead. Grey bodies show nothing.
+standard error, and along white rather than beside it, where wrong colours of the lamp lead. Grey bodies show nothing, nor do
+bodies of one hue: there a wrong colour of the lamp may look white.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 SIDE, MIN_PLACES = 8, 12
 #: Least variance of the specular image in a place [white^2], and least squared share of white beside the body's colour.
 MIN_VARIANCE, MIN_WHITE = 5e-4, 0.15
+#: Least deviation of the places' colours, as unit vectors: skin has 0.01, bodies of two hues 0.06.
+MIN_HUES = 0.03
 #: Largest sample of a place: s0 of light along an analyser, half of it across.
 MAX_SAMPLE = 0.9
 #: Range of parts that are believed, the least one in standard errors of the median too, and the largest slope beside
@@ -42,7 +45,7 @@ def find_unpolarized(diffuse: Tensor, specular: Tensor) -> float:
     power = (white**2).sum(dim=0)
     shown = (variance > MIN_VARIANCE) & (power > MIN_WHITE) & (largest < MAX_SAMPLE)
     body, white, power, covariance = (x[..., shown] for x in (body, white, power, covariance))
-    if len(power) < MIN_PLACES:
+    if len(power) < MIN_PLACES or float(body.std(dim=1).norm()) < MIN_HUES:
         return 0.0
     slopes = covariance / variance[shown]
     along = (slopes * white).sum(dim=0) / power

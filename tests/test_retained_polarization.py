@@ -58,6 +58,13 @@ def test_grey_bodies_show_nothing() -> None:
     assert find_retained((a1 + 0.1) * grey, a2 * grey, grey) == 0
 
 
+def test_bodies_of_one_hue_show_nothing() -> None:
+    """Highlights that are not white, on bodies of their hue, look like retained light."""
+    colors, a1, a2 = ball(SIDE)
+    skin = torch.tensor([0.6, 0.4, 0.2]).view(3, 1, 1) * colors.mean(dim=0, keepdim=True)
+    assert find_retained((a1 + 0.1) * skin, a2 * skin, skin) == 0
+
+
 def test_retained_light_moves_to_the_specular_image() -> None:
     """From the raw frame: diffuse and specular keep their sum, and their ratio is that of the scene."""
     colors, a1, a2 = (x.repeat_interleave(4, dim=-1).repeat_interleave(4, dim=-2) for x in ball(SIDE))

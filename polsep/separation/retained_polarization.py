@@ -9,7 +9,8 @@ colours, so that white mirror images do not count. Slopes have two reasons. Tran
 equations, along and across the lamp's polarization, as the normals are, and hardly where surfaces face the camera: the
 densest slope of a frame is near 0. Retained light moves all slopes along the lamp's polarization, by its share. So the
 densest slope is that share, where it clearly lies along. The median must agree, since a frame of few planes has dense
-slopes anywhere; and a frame of one plane, all of whose slopes are alike, shows nothing.
+slopes anywhere; and a frame of one plane, all of whose slopes are alike, shows nothing. Nor does a frame of
+one hue, where highlights of a wrong colour look like it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from polsep.compute.averages import weighted_median
+from polsep.separation.lamp_polarization import MIN_HUES
 
 #: Places along the shorter side of a frame, fewest samples along the side of one, and fewest places.
 PLACES, MIN_SIDE, MIN_PLACES = 16, 4, 20
@@ -48,7 +50,9 @@ def find_retained(along: Tensor, across: Tensor, diffuse: Tensor) -> float:
     slopes, weight = torch.stack([first, second])[:, shown] / contrast[shown], contrast[shown].sqrt()
     kept = slopes[0].abs() < MAX_SLOPE
     slopes, weight = slopes[:, kept], weight[kept]
-    if len(weight) < MIN_PLACES:
+    body = avg_pool2d(diffuse[None], side)[0].flatten(1)[:, shown]
+    hues = body / body.norm(dim=0)
+    if len(weight) < MIN_PLACES or float(hues.std(dim=1).norm()) < MIN_HUES:
         return 0.0
     (densest, beside), alike = find_densest(slopes, weight)
     share = min(densest, weighted_median(slopes[0].numpy(), weight.numpy()))

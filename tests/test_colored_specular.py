@@ -96,7 +96,7 @@ def test_bodies_are_left_alone(kept: float) -> None:
 def test_edges_of_color_are_no_metal() -> None:
     """Cells show one colour each, so edges look coloured in single periods; thin evidence does not count."""
     stripes = (torch.arange(SIZE) // 12 % 2).float().view(1, 1, SIZE).expand(3, SIZE, SIZE)
-    diffuse, specular = BODY * (stripes + 0.04), 0.3 * (1 - stripes)
+    diffuse, specular = BODY * stripes + 0.02, 0.3 * (1 - stripes)
     images = separated(diffuse, specular)
     found, share = color_specular(images, expose(scene(diffuse, specular), Layout(), IDEAL), (1.0, 1.0, 1.0))
     assert found is images and share == Colored()

@@ -45,7 +45,7 @@ def find_unpolarized(diffuse: Tensor, specular: Tensor) -> float:
     power = (white**2).sum(dim=0)
     shown = (variance > MIN_VARIANCE) & (power > MIN_WHITE) & (largest < MAX_SAMPLE)
     body, white, power, covariance = (x[..., shown] for x in (body, white, power, covariance))
-    if len(power) < MIN_PLACES or float(body.std(dim=1).norm()) < MIN_HUES:
+    if len(power) < MIN_PLACES or not has_hues(body):
         return 0.0
     slopes = covariance / variance[shown]
     along = (slopes * white).sum(dim=0) / power
@@ -54,3 +54,8 @@ def find_unpolarized(diffuse: Tensor, specular: Tensor) -> float:
     error = MEDIAN_ERROR * float((along - part).abs().median()) / len(power) ** 0.5
     proven = max(MIN_PART, ERRORS * error) < part < MAX_PART and abs(float(beside.median())) < MAX_BESIDE * part
     return part if proven else 0.0
+
+
+def has_hues(body: Tensor) -> bool:
+    """True if colours ``[3, N]`` of two places or more, as unit vectors, are of several hues or saturations."""
+    return float(body.std(dim=1).norm()) >= MIN_HUES

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from polsep.compute.averages import weighted_median
-from polsep.separation.lamp_polarization import MIN_HUES
+from polsep.separation.lamp_polarization import has_hues
 
 #: Places along the shorter side of a frame, fewest samples along the side of one, and fewest places.
 PLACES, MIN_SIDE, MIN_PLACES = 16, 4, 20
@@ -51,8 +51,7 @@ def find_retained(along: Tensor, across: Tensor, diffuse: Tensor) -> float:
     kept = slopes[0].abs() < MAX_SLOPE
     slopes, weight = slopes[:, kept], weight[kept]
     body = avg_pool2d(diffuse[None], side)[0].flatten(1)[:, shown]
-    hues = body / body.norm(dim=0)
-    if len(weight) < MIN_PLACES or float(hues.std(dim=1).norm()) < MIN_HUES:
+    if len(weight) < MIN_PLACES or not has_hues(body / body.norm(dim=0)):
         return 0.0
     (densest, beside), alike = find_densest(slopes, weight)
     share = min(densest, weighted_median(slopes[0].numpy(), weight.numpy()))

@@ -1,0 +1,69 @@
+"""NumPy arrays and torch tensors by one code, after the array API standard: what separates frames runs without torch.
+
+Equations are written once, for both: ``xp = namespace(x)`` gives the standard's functions (``xp.clip``, ``xp.sum(x,
+axis=-3, keepdims=True)``, ``xp.stack``) for arrays of x's kind; torch keeps its gradients and devices. What the
+standard lacks is here.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, TypeAlias
+
+import numpy as np
+from array_api_compat import array_namespace, device, is_torch_array
+from numpy.typing import NDArray
+
+#: A NumPy array or a torch tensor; docstrings give its shape. (Type checkers know no type for both.)
+Array: TypeAlias = Any
+
+#: The functions for arrays of the kind of the arguments.
+namespace = array_namespace
+
+
+def to_numpy(x: Array) -> NDArray[Any]:
+    """An array of either kind as one of NumPy in the computer's own memory, without gradients; shares what it can."""
+    return x.detach().cpu().numpy() if is_torch_array(x) else np.asarray(x)
+
+
+def on_cpu(x: Array) -> bool:
+    """True for arrays in the computer's own memory."""
+    return not is_torch_array(x) or x.device.type == "cpu"
+
+
+def constant(values: Any, like: Array) -> Array:
+    """Numbers (nested lists or a NumPy array) as an array of the kind, dtype and device of ``like``."""
+    xp = namespace(like)
+    return xp.asarray(values, dtype=like.dtype, device=device(like))
+
+
+def as_floats(x: Array) -> Array:
+    """``x`` in float32; float64 stays."""
+    xp = namespace(x)
+    return x if x.dtype == xp.float64 else xp.astype(x, xp.float32, copy=False)
+
+
+def is_exporting() -> bool:
+    """True while torch exports a graph, in which one node is worth more than fast arithmetic."""
+    torch = sys.modules.get("torch")
+    return torch is not None and torch.compiler.is_exporting()
+
+
+def window(x: Array, first: int, count: int, axis: int) -> Array:
+    """``count`` places of ``x [..., h, w]`` from ``first`` on, along axis -1 or -2."""
+    return x[..., first : first + count] if axis == -1 else x[..., first : first + count, :]
+
+
+def pad_mirror(x: Array, margin: int, axis: int) -> Array:
+    """Continue ``x`` along an axis by mirroring about its outermost places, which are not repeated."""
+    xp, n = namespace(x), x.shape[axis]
+    place = np.arange(-margin, n + margin)
+    place = n - 1 - np.abs(place % max(2 * n - 2, 1) - (n - 1))
+    return xp.take(x, xp.asarray(place, device=device(x)), axis=axis)
+
+
+def pad_repeat(x: Array, margin: int, axis: int) -> Array:
+    """Continue ``x`` along an axis by repeating its outermost places."""
+    xp, n = namespace(x), x.shape[axis]
+    place = np.clip(np.arange(-margin, n + margin), 0, n - 1)
+    return xp.take(x, xp.asarray(place, device=device(x)), axis=axis)

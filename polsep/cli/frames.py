@@ -131,16 +131,20 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     The file runs in onnxruntime and similar programs without polsep. Frames [N, H, W] are in Sony's order with sides
     that are multiples of 4; black_level and white_level are in their units. Needs the extra export.
     """
+    import torch
+
     from polsep.io.store.atomic import refuse_existing
     from polsep.io.store.onnx import write_onnx
     from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork
+    from polsep.networks.joint import Joint
     from polsep.sensor.camera import Layout
     from polsep.shipped import find_joint
 
     refuse_existing(output.parent, [output], options["overwrite"])
     network, metadata = find_joint(method, Layout(bayer=None) if options["mono"] else Layout(), weights)
     print_note(f"exporting {method}, which takes a minute or a few")
-    write_onnx(output, ExportedNetwork(network, options["full"]), OUTPUT_NAMES, metadata)
+    graph = ExportedNetwork(Joint.of(network, torch.device("cpu")), options["full"])
+    write_onnx(output, graph, OUTPUT_NAMES, metadata)
     print(output)
 
 

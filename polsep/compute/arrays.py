@@ -67,3 +67,17 @@ def pad_repeat(x: Array, margin: int, axis: int) -> Array:
     xp, n = namespace(x), x.shape[axis]
     place = np.clip(np.arange(-margin, n + margin), 0, n - 1)
     return xp.take(x, xp.asarray(place, device=device(x)), axis=axis)
+
+
+def like(x: Array, values: NDArray[Any]) -> Array:
+    """A NumPy array as one of the kind and on the device of ``x``, of its own dtype."""
+    return namespace(x).asarray(values, device=device(x))
+
+
+def to_device(x: Array, device: str) -> Array:
+    """``x`` on a device: on the CPU an array stays of its kind, on others it is a torch tensor."""
+    if device == "cpu":
+        return x.cpu() if is_torch_array(x) else x
+    import torch
+
+    return torch.as_tensor(x, device=device)

@@ -95,8 +95,7 @@ def _integrate(across: NDArray[np.complex64], down: NDArray[np.complex64]) -> ND
     laplacian[0, 0] = 1
     waves /= laplacian
     waves[0, 0] = 0
-    found: NDArray[np.complex64] = np.fft.ifft2(waves)[:height, :width]
-    return found
+    return np.fft.ifft2(waves)[:height, :width].astype(np.complex64, copy=False)
 
 
 def sample(texture: Floats, at: tuple[Floats, Floats], texels: float) -> Floats:

@@ -4,8 +4,8 @@ Both images are smooth at most places, so their details are interpolated from th
 demosaicked s0 beyond that are texture or noise, of the diffuse or of the specular light: the network says for each cell
 how much of them belongs to each of the two images. Means of cells do not change.
 
-Conventions: means and details are those of Haar, sums of the 2x2 pixels of a cell with the signs of `channels.HAAR`, over
-four; "packed" as in `polsep.networks.joint`.
+Conventions: means and details are those of Haar, sums of the 2x2 pixels of a cell with the signs of `channels.HAAR`,
+over four; "packed" as in `polsep.networks.joint`.
 """
 
 from __future__ import annotations

@@ -151,8 +151,8 @@ def joint_model(weights: JointWeights, packed: tuple[int, int], full: bool) -> A
 
     From inputs ``[1, n, h, w]``, where ``full`` also `DETAIL_MAPS` of the size of details, and for networks that see a
     whole frame what modulates their features, see `whole_frame_model`. To corrections ``[1, 4 C + 8, h, w]`` of
-    diffuse, specular and the closed form's gain (`images_kernel.LayerOutputs`), relative to the local brightness and to the
-    closed form; to deviations ``[1, 8, h, w]``; and where ``full`` to ``[1, 24 + 12 (C + 1), h, w]``, see
+    diffuse, specular and the closed form's gain (`images_kernel.LayerOutputs`), relative to the local brightness and to
+    the closed form; to deviations ``[1, 8, h, w]``; and where ``full`` to ``[1, 24 + 12 (C + 1), h, w]``, see
     `details_kernel.DetailOutputs`.
     """
     graph, arrays = _Graph(weights.arrays), weights.arrays

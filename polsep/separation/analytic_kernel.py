@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.compiling import ONE, THIRD, ZERO, compiled, entry
-from polsep.compute.rows_kernel import add_rows, copy, fill
+from polsep.compute.compiling import HALF, ONE, THIRD, ZERO, compiled, entry
+from polsep.compute.rows_kernel import add_rows, add_up, copy, fill
 from polsep.compute.threads import RowRange, run_over_rows
 from polsep.demosaic.bilinear_kernel import (
+    PAD,
     Pattern,
     advance_window,
     flag_row,
@@ -28,12 +29,14 @@ from polsep.demosaic.bilinear_kernel import (
     read_pattern,
 )
 from polsep.demosaic.bilinear_full_kernel import (
+    Sources,
     advance_cells,
-    flag_pixels,
     interpolate_pixels,
     make_cells,
-    make_pixels,
     open_cells,
+    pixel_buffer,
+    sources_of,
+    weights_of,
 )
 from polsep.physics.stokes import stokes_inverse
 from polsep.physics.stokes_kernel import fit_stokes_row, polarize
@@ -41,7 +44,7 @@ from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import RawFrame, Samples, as_samples
 from polsep.separation.images import FrameImages
 from polsep.separation.images_kernel import check_images, interleave
-from polsep.separation.tally_kernel import RESIDUAL, make_tally, tally_row
+from polsep.separation.tally_kernel import ABOVE_ONE, RESIDUAL, S0, SPECULAR, make_tally, tally_row
 
 #: Least cell rows that a thread computes at a time: few enough to share the work, many enough to reuse loaded rows.
 STRIP = 32
@@ -214,37 +217,123 @@ def _separate_rows(
 
 
 @compiled
-def _split_pixels(m: Any, inverse: Any, share: Any, gray: Any, specular: Any, diffuse: Any) -> None:
-    """`_split_row` of one colour of a row of analysers ``m [4, n]``; ``share`` times its Stokes vectors onto ``gray``."""
-    i00, i01, i02, i03 = inverse[0, 0], inverse[0, 1], inverse[0, 2], inverse[0, 3]
-    i10, i11, i12, i13 = inverse[1, 0], inverse[1, 1], inverse[1, 2], inverse[1, 3]
-    i20, i21, i22, i23 = inverse[2, 0], inverse[2, 1], inverse[2, 2], inverse[2, 3]
-    m0, m1, m2, m3 = m[0, 0], m[1, 0], m[2, 0], m[3, 0]
-    g0, g1, g2 = gray[0], gray[1], gray[2]
-    for j in range(specular.size):
-        s0 = i00 * m0[j] + i01 * m1[j] + i02 * m2[j] + i03 * m3[j]
-        s1 = i10 * m0[j] + i11 * m1[j] + i12 * m2[j] + i13 * m3[j]
-        s2 = i20 * m0[j] + i21 * m1[j] + i22 * m2[j] + i23 * m3[j]
-        g0[j] += share * s0
-        g1[j] += share * s1
-        g2[j] += share * s2
-        total = s0 if s0 > ZERO else ZERO
-        polarized = np.sqrt(s1 * s1 + s2 * s2)
-        polarized = polarized if polarized < total else total
-        specular[j] = polarized
-        diffuse[j] = total - polarized
+def _split(s0: Any, s1: Any, s2: Any) -> Any:
+    """Specular light and s0, not below 0, of one pixel."""
+    total = s0 if s0 > ZERO else ZERO
+    polarized = np.sqrt(s1 * s1 + s2 * s2)
+    return polarized if polarized < total else total, total
+
+
+@compiled
+def _split_pixels(x: Sources, weights: Any, specular: Any, total: Any) -> None:
+    """`_split_row` of a row of pixels from rows of cells: one loop, in which Stokes vectors stay in registers."""
+    n = x.left.size // 2
+    le, lo, ln = x.left[PAD:], x.left[n + PAD :], x.left[PAD + 1 :]
+    rl, re, ro = x.right[n + PAD - 1 :], x.right[PAD:], x.right[n + PAD :]
+    ye, yo, yn = x.left_near[PAD:], x.left_near[n + PAD :], x.left_near[PAD + 1 :]
+    ze, zo, zn = x.left_far[PAD:], x.left_far[n + PAD :], x.left_far[PAD + 1 :]
+    ul, ue, uo = x.right_near[n + PAD - 1 :], x.right_near[PAD:], x.right_near[n + PAD :]
+    vl, ve, vo = x.right_far[n + PAD - 1 :], x.right_far[PAD:], x.right_far[n + PAD :]
+    l0, l1, l2 = weights[0, 0], weights[0, 1], weights[0, 2]
+    r0, r1, r2 = weights[1, 0], weights[1, 1], weights[1, 2]
+    m0, m1, m2 = weights[2, 0], weights[2, 1], weights[2, 2]
+    q0, q1, q2 = weights[3, 0], weights[3, 1], weights[3, 2]
+    for t in range(specular.size // 4):
+        left, left_odd, left_next = le[t], lo[t], ln[t]
+        other, other_odd, other_next = ye[t] + ze[t], yo[t] + zo[t], yn[t] + zn[t]
+        right_last, right, right_odd = rl[t], re[t], ro[t]
+        far_last, far, far_odd = ul[t] + vl[t], ue[t] + ve[t], uo[t] + vo[t]
+        # sums over the left analysers at even and odd cells and the next even one, and the right ones' from the last on
+        a0, a1, a2 = l0 * left + m0 * other, l1 * left + m1 * other, l2 * left + m2 * other
+        b0, b1, b2 = l0 * left_odd + m0 * other_odd, l1 * left_odd + m1 * other_odd, l2 * left_odd + m2 * other_odd
+        c0, c1, c2 = r0 * right + q0 * far, r1 * right + q1 * far, r2 * right + q2 * far
+        d0, d1, d2 = r0 * right_odd + q0 * far_odd, r1 * right_odd + q1 * far_odd, r2 * right_odd + q2 * far_odd
+        e0, e1, e2 = l0 * left_next + m0 * other_next, l1 * left_next + m1 * other_next, l2 * left_next + m2 * other_next
+        f0, f1, f2 = r0 * right_last + q0 * far_last, r1 * right_last + q1 * far_last, r2 * right_last + q2 * far_last
+        specular[4 * t], total[4 * t] = _split(a0 + HALF * (f0 + c0), a1 + HALF * (f1 + c1), a2 + HALF * (f2 + c2))
+        specular[4 * t + 1], total[4 * t + 1] = _split(
+            HALF * (a0 + b0) + c0, HALF * (a1 + b1) + c1, HALF * (a2 + b2) + c2
+        )
+        specular[4 * t + 2], total[4 * t + 2] = _split(
+            b0 + HALF * (c0 + d0), b1 + HALF * (c1 + d1), b2 + HALF * (c2 + d2)
+        )
+        specular[4 * t + 3], total[4 * t + 3] = _split(
+            HALF * (b0 + e0) + d0, HALF * (b1 + e1) + d1, HALF * (b2 + e2) + d2
+        )
+
+
+@compiled
+def _clear_rest(planes: Any, size: int) -> None:
+    """0 in all ``planes [K, n]`` behind the first ``size`` numbers."""
+    for k in range(planes.shape[0]):
+        for j in range(size, planes.shape[1]):
+            planes[k, j] = ZERO
+
+
+@compiled
+def _add_products(gray: Any, sums: Any) -> None:
+    """Add what `tally_kernel` sums of a row of Stokes vectors ``gray [3, n]`` to ``sums [4, L]``, L pixels at a time."""
+    above, power, along, across = sums[0], sums[1], sums[2], sums[3]
+    for first in range(0, gray.shape[1], sums.shape[1]):
+        s0, s1, s2 = gray[0, first:], gray[1, first:], gray[2, first:]
+        for j in range(above.size):
+            squared = s1[j] * s1[j] + s2[j] * s2[j]
+            size = np.sqrt(squared)
+            above[j] += ONE if size > s0[j] and s0[j] > ZERO else ZERO
+            power[j] += squared
+            along[j] += size * s1[j]
+            across[j] += size * s2[j]
+
+
+@compiled
+def _add_colors(planes: Any, sums: Any) -> None:
+    """Add the mean over ``planes [C, n]`` to ``sums [L]``, L pixels at a time."""
+    share, last = ONE / np.float32(planes.shape[0]), planes.shape[0] - 1
+    for first in range(0, planes.shape[1], sums.size):
+        x, y, z = planes[0, first:], planes[last // 2, first:], planes[last, first:]
+        for j in range(sums.size):
+            sums[j] += share * (x[j] + (y[j] + z[j] if last else ZERO))
+
+
+@compiled
+def _tally_pixels(split: Any, gray: Any, size: int, lanes: Any, sums: Any) -> None:
+    """`tally_row` of a row of ``size`` pixels; ``lanes [6, L]``: a buffer whose length divides that of the rows."""
+    for k in range(2):
+        _clear_rest(split[k], size)
+    _clear_rest(gray, size)
+    for k in range(6):
+        fill(ZERO, lanes[k])
+    _add_colors(split[0], lanes[SPECULAR])
+    _add_colors(split[1], lanes[S0])
+    _add_products(gray, lanes[ABOVE_ONE:])
+    for k in range(6):
+        sums[k] = add_up(lanes[k])
+
+
+@compiled
+def _write_difference(split: Any, gains: Any, image: Any) -> None:
+    """`interleave` of s0 minus specular light, ``split [2, C, n]``."""
+    last = gains.size - 1
+    r, g, b, x, y, z = split[0, 0], split[0, last // 2], split[0, last], split[1, 0], split[1, last // 2], split[1, last]
+    g0, g1, g2 = gains[0], gains[last // 2], gains[last]
+    if last == 0:
+        for j in range(image.size):
+            image[j] = g0 * (x[j] - r[j])
+        return
+    for j in range(image.size // 3):
+        image[3 * j] = g0 * (x[j] - r[j])
+        image[3 * j + 1] = g1 * (y[j] - g[j])
+        image[3 * j + 2] = g2 * (z[j] - b[j])
 
 
 @entry
 def _separate_pixels(
-    samples: Samples, pattern: Pattern, inverse: Any, gains: Any, targets: _Targets, row_range: RowRange
+    samples: Samples, pattern: Pattern, matrix: Any, gains: Any, targets: _Targets, row_range: RowRange
 ) -> None:
     """`_separate_rows` at full resolution: two rows of pixels for each of the frame's cell rows, first to last."""
-    cells, m = make_cells(pattern), make_pixels(pattern, 1)
-    n, w = m.shape[2], 2 * pattern.w
-    gray, split = np.empty((3, n), np.float32), np.empty((2, gains.size, n), np.float32)
-    mean, none_skipped = np.empty((2, n), np.float32), np.empty(0, np.uint16)
-    share = ONE / np.float32(gains.size)
+    cells, n, channels = make_cells(pattern), pixel_buffer(pattern), gains.size
+    split, lanes = np.zeros((2, channels, n), np.float32), np.empty((6, 2 * PAD), np.float32)
+    gray, weights, any_analyser = np.zeros((1, 3, n), np.float32), np.empty((channels, 1, n), np.float32), np.ones((1, 4), np.float32)
     open_cells(samples, pattern, cells, row_range[0])
     for r in range(row_range[0], row_range[1]):
         flagged = advance_cells(samples, pattern, cells, r)
@@ -252,19 +341,15 @@ def _separate_pixels(
             valid = targets.valid[y]
             for j in range(valid.size):
                 valid[j] = True
-            for i in range(3):
-                fill(ZERO, gray[i])
-            for c in range(gains.size):
-                if flagged:
-                    flag_pixels(pattern, cells, y, c, m)
-                    _clear_flagged(m, valid)
-                interpolate_pixels(pattern, cells, y, c, m)
-                _split_pixels(m, inverse, share, gray, split[0, c], split[1, c])
+            if flagged:
+                interpolate_pixels(pattern, cells, cells.flags, any_analyser, y, weights)
+                _clear_flagged(weights, valid)
+            of_sources = weights_of(cells.analysers, matrix, y)
+            for c in range(channels):
+                _split_pixels(sources_of(pattern, cells.analysers, cells.values, y, c), of_sources, split[0, c], split[1, c])
             interleave(split[0], gains, targets.specular[y])
-            interleave(split[1], gains, targets.diffuse[y])
+            _write_difference(split, gains, targets.diffuse[y])
             if targets.dolp.size:
-                polarize(gray[0], gray[1], gray[2], targets.dolp[y], targets.aolp[y])
-                _mean_color(split[0], mean[0])
-                _mean_color(split[1], mean[1])
-                specular, diffuse, s1, s2 = mean[0], mean[1], gray[1], gray[2]
-                tally_row(specular[:w], diffuse[:w], s1[:w], s2[:w], targets.dolp[y], none_skipped, targets.sums[y])
+                interpolate_pixels(pattern, cells, cells.means if channels == 3 else cells.values, matrix, y, gray)
+                polarize(gray[0, 0], gray[0, 1], gray[0, 2], targets.dolp[y], targets.aolp[y])
+                _tally_pixels(split, gray[0], valid.size, lanes, targets.sums[y])

@@ -79,9 +79,16 @@ def make_cells(pattern: Pattern) -> Cells:
 
 
 @compiled
-def pixel_buffer(pattern: Pattern) -> int:
-    """Length of rows of pixels that are made: 2 w, and up to 2 PAD more that are undefined; a multiple of 2 PAD."""
-    return 2 * (pattern.w + -pattern.w % PAD)
+def make_pixels(pattern: Pattern, planes: int, rows: int) -> Any:
+    """A buffer ``[planes, rows, n]`` float32 for rows of pixels; n is 2 w or a little more, a multiple of 2 PAD.
+
+    It begins at a cache line: stores of a line's length take twice as long across two of them.
+    """
+    n = 2 * (pattern.w + -pattern.w % PAD)
+    size = planes * rows * n
+    numbers = np.zeros(size + PAD, np.float32)
+    first = -(numbers.ctypes.data // 4) % PAD
+    return numbers[first : first + size].reshape(planes, rows, n)
 
 
 @compiled

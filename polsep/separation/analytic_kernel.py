@@ -1,4 +1,4 @@
-"""Twin of ``separate_analytic(demosaic_bilinear_half(mosaic))`` in one pass over the frame, on the CPU.
+"""Twins of ``separate_analytic`` after `demosaic_bilinear_half` and `demosaic_bilinear`, in one pass over the frame.
 
 Conventions are those of the twins: linear light, 1.0 = one measurement at the white level, AoLP in [0, pi) from
 image-right toward image-up. Values agree to rounding (2e-6 of white), ``valid`` exactly. Rows are computed
@@ -7,6 +7,7 @@ independently of each other, so the number of threads (`set_threads`) does not c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -14,9 +15,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.compiling import HALF, ONE, THIRD, ZERO, compiled, entry
-from polsep.compute.rows_kernel import add_rows, add_up, copy, fill
+from polsep.compute.compiling import HALF, THIRD, ZERO, compiled, entry
+from polsep.compute.rows_kernel import add_rows, copy
 from polsep.compute.threads import RowRange, run_over_rows
+from polsep.demosaic.bilinear_full_kernel import (
+    Sources,
+    advance_cells,
+    interpolate_pixels,
+    make_cells,
+    make_pixels,
+    open_cells,
+    sources_of,
+    weights_of,
+)
 from polsep.demosaic.bilinear_kernel import (
     PAD,
     Pattern,
@@ -28,23 +39,13 @@ from polsep.demosaic.bilinear_kernel import (
     open_window,
     read_pattern,
 )
-from polsep.demosaic.bilinear_full_kernel import (
-    Sources,
-    advance_cells,
-    interpolate_pixels,
-    make_cells,
-    open_cells,
-    pixel_buffer,
-    sources_of,
-    weights_of,
-)
 from polsep.physics.stokes import stokes_inverse
 from polsep.physics.stokes_kernel import fit_stokes_row, polarize
 from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import RawFrame, Samples, as_samples
 from polsep.separation.images import FrameImages
 from polsep.separation.images_kernel import check_images, interleave
-from polsep.separation.tally_kernel import ABOVE_ONE, RESIDUAL, S0, SPECULAR, make_tally, tally_row
+from polsep.separation.tally_kernel import LANES, RESIDUAL, make_tally, tally_pixels, tally_row
 
 #: Least cell rows that a thread computes at a time: few enough to share the work, many enough to reuse loaded rows.
 STRIP = 32
@@ -94,19 +95,7 @@ def separate_analytic_half(
     Raises ValueError on another dtype or shape, levels out of order, or images in ``options.out`` that do not fit.
     Source: Dave et al. 2022, Eqs. 15-18.
     """
-    options = AnalyticOptions() if options is None else options
-    samples, shape = as_samples(raw), (raw.shape[0], raw.shape[1])
-    pattern = read_pattern(shape, layout, black_level, white_level, options.light_color)
-    out = FrameImages.empty(shape, layout, options.report) if options.out is None else options.out
-    dolp, aolp = check_images(out, (pattern.h, pattern.w, pattern.channels), options.report)
-    rows, sums = (pattern.h, pattern.w * pattern.channels), np.zeros((dolp.shape[0], RESIDUAL))
-    targets = _Targets(out.diffuse.reshape(rows), out.specular.reshape(rows), out.valid, dolp, aolp, sums)
-    gains = np.array(options.light_color if options.in_light else (1, 1, 1), np.float32)[: pattern.channels]
-    run_over_rows(partial(_separate_rows, samples, pattern, _inverse(layout), gains, targets), pattern.h, STRIP)
-    if not options.report:
-        return out
-    valid = int(np.count_nonzero(out.valid))
-    return replace(out, tally=make_tally(out.valid.size, out.valid.size - valid, valid, sums))
+    return _separate(_separate_rows, raw, layout, (black_level, white_level), options or AnalyticOptions())
 
 
 def separate_analytic_full(
@@ -116,23 +105,31 @@ def separate_analytic_full(
     white_level: float,
     options: AnalyticOptions | None = None,
 ) -> FrameImages:
-    """`separate_analytic_half` at full resolution: images are ``[H, W, C]``, H and W the pixels of all whole cells.
+    """`separate_analytic_half` at full resolution: images ``[H, W, C]`` of all pixels of whole cells."""
+    return _separate(_separate_pixels, raw, layout, (black_level, white_level), options or AnalyticOptions())
 
-    The twin of ``separate_analytic(demosaic_bilinear(mosaic))``. A tenth to a half of the frame rate at half resolution.
-    """
-    options = AnalyticOptions() if options is None else options
-    samples, shape = as_samples(raw), (raw.shape[0], raw.shape[1])
-    pattern = read_pattern(shape, layout, black_level, white_level, options.light_color)
-    out = FrameImages.empty_full(shape, layout, options.report) if options.out is None else options.out
-    dolp, aolp = check_images(out, (2 * pattern.h, 2 * pattern.w, pattern.channels), options.report)
-    rows, sums = (2 * pattern.h, 2 * pattern.w * pattern.channels), np.zeros((dolp.shape[0], RESIDUAL))
-    targets = _Targets(out.diffuse.reshape(rows), out.specular.reshape(rows), out.valid, dolp, aolp, sums)
+
+def _separate(
+    run: Callable[..., None],
+    raw: RawFrame,
+    layout: Layout,
+    levels: tuple[float, float],
+    options: AnalyticOptions,
+) -> FrameImages:
+    """One frame by `_separate_rows` or `_separate_pixels`; ``levels``: black and white."""
+    samples, shape, full = as_samples(raw), (raw.shape[0], raw.shape[1]), run is _separate_pixels
+    pattern = read_pattern(shape, layout, *levels, options.light_color)
+    out = FrameImages.empty(shape, layout, options.report, full) if options.out is None else options.out
+    h, w = (2 * pattern.h, 2 * pattern.w) if full else (pattern.h, pattern.w)
+    dolp, aolp = check_images(out, (h, w, pattern.channels), options.report)
+    diffuse, specular = (image.reshape(h, w * pattern.channels) for image in (out.diffuse, out.specular))
+    targets = _Targets(diffuse, specular, out.valid, dolp, aolp, np.zeros((dolp.shape[0], RESIDUAL)))
     gains = np.array(options.light_color if options.in_light else (1, 1, 1), np.float32)[: pattern.channels]
-    run_over_rows(partial(_separate_pixels, samples, pattern, _inverse(layout), gains, targets), pattern.h, STRIP)
+    run_over_rows(partial(run, samples, pattern, _inverse(layout), gains, targets), pattern.h, STRIP)
     if not options.report:
         return out
     valid = int(np.count_nonzero(out.valid))
-    return replace(out, tally=make_tally(out.valid.size, out.valid.size - valid, valid, sums))
+    return replace(out, tally=make_tally(out.valid.size, out.valid.size - valid, valid, targets.sums))
 
 
 @lru_cache(maxsize=8)
@@ -145,6 +142,12 @@ def warm_up() -> None:
     """Compile the kernel, or load it from numba's cache on disk. One compilation serves all dtypes and layouts."""
     for layout in (Layout(), Layout(bayer=None)):
         separate_analytic_half(np.zeros((4, 4), np.uint8), layout, 0, 255, AnalyticOptions(report=True))
+
+
+def warm_up_full() -> None:
+    """`warm_up` of the kernel for full resolution."""
+    for layout in (Layout(), Layout(bayer=None)):
+        separate_analytic_full(np.zeros((4, 4), np.uint8), layout, 0, 255, AnalyticOptions(report=True))
 
 
 @compiled
@@ -217,109 +220,62 @@ def _separate_rows(
 
 
 @compiled
-def _split(s0: Any, s1: Any, s2: Any) -> Any:
-    """Specular light and s0, not below 0, of one pixel."""
-    total = s0 if s0 > ZERO else ZERO
-    polarized = np.sqrt(s1 * s1 + s2 * s2)
+def _as_tuples(w: Any) -> Any:
+    """Weights ``[4, 3]`` as tuples, which loops keep in registers."""
+    left, right = (w[0, 0], w[0, 1], w[0, 2]), (w[1, 0], w[1, 1], w[1, 2])
+    return left, right, (w[2, 0], w[2, 1], w[2, 2]), (w[3, 0], w[3, 1], w[3, 2])
+
+
+@compiled
+def _weigh(own: Any, others: Any, x: Any, y: Any) -> Any:
+    """A Stokes vector, or a part of it: ``own x + others y``."""
+    return own[0] * x + others[0] * y, own[1] * x + others[1] * y, own[2] * x + others[2] * y
+
+
+@compiled
+def _split(s: Any, before: Any, after: Any) -> Any:
+    """Specular light and s0, not below 0, of the Stokes vector that is ``s`` and the mean of its two neighbours."""
+    s0, s1, s2 = s[0] + HALF * (before[0] + after[0]), s[1] + HALF * (before[1] + after[1]), s[2]
+    s2 += HALF * (before[2] + after[2])
+    total, polarized = s0 if s0 > ZERO else ZERO, np.sqrt(s1 * s1 + s2 * s2)
     return polarized if polarized < total else total, total
 
 
 @compiled
 def _split_pixels(x: Sources, weights: Any, specular: Any, total: Any) -> None:
-    """`_split_row` of a row of pixels from rows of cells: one loop, in which Stokes vectors stay in registers."""
-    n = x.left.size // 2
-    le, lo, ln = x.left[PAD:], x.left[n + PAD :], x.left[PAD + 1 :]
-    rl, re, ro = x.right[n + PAD - 1 :], x.right[PAD:], x.right[n + PAD :]
-    ye, yo, yn = x.left_near[PAD:], x.left_near[n + PAD :], x.left_near[PAD + 1 :]
-    ze, zo, zn = x.left_far[PAD:], x.left_far[n + PAD :], x.left_far[PAD + 1 :]
-    ul, ue, uo = x.right_near[n + PAD - 1 :], x.right_near[PAD:], x.right_near[n + PAD :]
-    vl, ve, vo = x.right_far[n + PAD - 1 :], x.right_far[PAD:], x.right_far[n + PAD :]
-    l0, l1, l2 = weights[0, 0], weights[0, 1], weights[0, 2]
-    r0, r1, r2 = weights[1, 0], weights[1, 1], weights[1, 2]
-    m0, m1, m2 = weights[2, 0], weights[2, 1], weights[2, 2]
-    q0, q1, q2 = weights[3, 0], weights[3, 1], weights[3, 2]
+    """`_split_row` of a row of pixels from rows of cells, all in one loop so that Stokes vectors stay in registers.
+
+    An analyser in the left column of the cells is there at every even pixel and between two at the odd ones; one in the
+    right column at every odd pixel.
+    """
+    n, (left, right, lefts, rights) = x.left.size // 2, weights
+    a, b, c = x.left[PAD:], x.left[n + PAD :], x.left[PAD + 1 :]
+    a1, b1, c1 = x.left_near[PAD:], x.left_near[n + PAD :], x.left_near[PAD + 1 :]
+    a2, b2, c2 = x.left_far[PAD:], x.left_far[n + PAD :], x.left_far[PAD + 1 :]
+    d, e, f = x.right[n + PAD - 1 :], x.right[PAD:], x.right[n + PAD :]
+    d1, e1, f1 = x.right_near[n + PAD - 1 :], x.right_near[PAD:], x.right_near[n + PAD :]
+    d2, e2, f2 = x.right_far[n + PAD - 1 :], x.right_far[PAD:], x.right_far[n + PAD :]
     for t in range(specular.size // 4):
-        left, left_odd, left_next = le[t], lo[t], ln[t]
-        other, other_odd, other_next = ye[t] + ze[t], yo[t] + zo[t], yn[t] + zn[t]
-        right_last, right, right_odd = rl[t], re[t], ro[t]
-        far_last, far, far_odd = ul[t] + vl[t], ue[t] + ve[t], uo[t] + vo[t]
-        # sums over the left analysers at even and odd cells and the next even one, and the right ones' from the last on
-        a0, a1, a2 = l0 * left + m0 * other, l1 * left + m1 * other, l2 * left + m2 * other
-        b0, b1, b2 = l0 * left_odd + m0 * other_odd, l1 * left_odd + m1 * other_odd, l2 * left_odd + m2 * other_odd
-        c0, c1, c2 = r0 * right + q0 * far, r1 * right + q1 * far, r2 * right + q2 * far
-        d0, d1, d2 = r0 * right_odd + q0 * far_odd, r1 * right_odd + q1 * far_odd, r2 * right_odd + q2 * far_odd
-        e0, e1, e2 = l0 * left_next + m0 * other_next, l1 * left_next + m1 * other_next, l2 * left_next + m2 * other_next
-        f0, f1, f2 = r0 * right_last + q0 * far_last, r1 * right_last + q1 * far_last, r2 * right_last + q2 * far_last
-        specular[4 * t], total[4 * t] = _split(a0 + HALF * (f0 + c0), a1 + HALF * (f1 + c1), a2 + HALF * (f2 + c2))
-        specular[4 * t + 1], total[4 * t + 1] = _split(
-            HALF * (a0 + b0) + c0, HALF * (a1 + b1) + c1, HALF * (a2 + b2) + c2
-        )
-        specular[4 * t + 2], total[4 * t + 2] = _split(
-            b0 + HALF * (c0 + d0), b1 + HALF * (c1 + d1), b2 + HALF * (c2 + d2)
-        )
-        specular[4 * t + 3], total[4 * t + 3] = _split(
-            HALF * (b0 + e0) + d0, HALF * (b1 + e1) + d1, HALF * (b2 + e2) + d2
-        )
-
-
-@compiled
-def _clear_rest(planes: Any, size: int) -> None:
-    """0 in all ``planes [K, n]`` behind the first ``size`` numbers."""
-    for k in range(planes.shape[0]):
-        for j in range(size, planes.shape[1]):
-            planes[k, j] = ZERO
-
-
-@compiled
-def _add_products(gray: Any, sums: Any) -> None:
-    """Add what `tally_kernel` sums of a row of Stokes vectors ``gray [3, n]`` to ``sums [4, L]``, L pixels at a time."""
-    above, power, along, across = sums[0], sums[1], sums[2], sums[3]
-    for first in range(0, gray.shape[1], sums.shape[1]):
-        s0, s1, s2 = gray[0, first:], gray[1, first:], gray[2, first:]
-        for j in range(above.size):
-            squared = s1[j] * s1[j] + s2[j] * s2[j]
-            size = np.sqrt(squared)
-            above[j] += ONE if size > s0[j] and s0[j] > ZERO else ZERO
-            power[j] += squared
-            along[j] += size * s1[j]
-            across[j] += size * s2[j]
-
-
-@compiled
-def _add_colors(planes: Any, sums: Any) -> None:
-    """Add the mean over ``planes [C, n]`` to ``sums [L]``, L pixels at a time."""
-    share, last = ONE / np.float32(planes.shape[0]), planes.shape[0] - 1
-    for first in range(0, planes.shape[1], sums.size):
-        x, y, z = planes[0, first:], planes[last // 2, first:], planes[last, first:]
-        for j in range(sums.size):
-            sums[j] += share * (x[j] + (y[j] + z[j] if last else ZERO))
-
-
-@compiled
-def _tally_pixels(split: Any, gray: Any, size: int, lanes: Any, sums: Any) -> None:
-    """`tally_row` of a row of ``size`` pixels; ``lanes [6, L]``: a buffer whose length divides that of the rows."""
-    for k in range(2):
-        _clear_rest(split[k], size)
-    _clear_rest(gray, size)
-    for k in range(6):
-        fill(ZERO, lanes[k])
-    _add_colors(split[0], lanes[SPECULAR])
-    _add_colors(split[1], lanes[S0])
-    _add_products(gray, lanes[ABOVE_ONE:])
-    for k in range(6):
-        sums[k] = add_up(lanes[k])
+        here, beside = _weigh(left, lefts, a[t], a1[t] + a2[t]), _weigh(left, lefts, b[t], b1[t] + b2[t])
+        after = _weigh(left, lefts, c[t], c1[t] + c2[t])
+        before = _weigh(right, rights, d[t], d1[t] + d2[t])
+        there, last = _weigh(right, rights, e[t], e1[t] + e2[t]), _weigh(right, rights, f[t], f1[t] + f2[t])
+        specular[4 * t], total[4 * t] = _split(here, before, there)
+        specular[4 * t + 1], total[4 * t + 1] = _split(there, here, beside)
+        specular[4 * t + 2], total[4 * t + 2] = _split(beside, there, last)
+        specular[4 * t + 3], total[4 * t + 3] = _split(last, beside, after)
 
 
 @compiled
 def _write_difference(split: Any, gains: Any, image: Any) -> None:
     """`interleave` of s0 minus specular light, ``split [2, C, n]``."""
-    last = gains.size - 1
-    r, g, b, x, y, z = split[0, 0], split[0, last // 2], split[0, last], split[1, 0], split[1, last // 2], split[1, last]
-    g0, g1, g2 = gains[0], gains[last // 2], gains[last]
-    if last == 0:
+    (r, x), g0 = (split[0, 0], split[1, 0]), gains[0]
+    if gains.size == 1:
         for j in range(image.size):
             image[j] = g0 * (x[j] - r[j])
         return
+    g, y, g1 = split[0, 1], split[1, 1], gains[1]
+    b, z, g2 = split[0, 2], split[1, 2], gains[2]
     for j in range(image.size // 3):
         image[3 * j] = g0 * (x[j] - r[j])
         image[3 * j + 1] = g1 * (y[j] - g[j])
@@ -331,9 +287,10 @@ def _separate_pixels(
     samples: Samples, pattern: Pattern, matrix: Any, gains: Any, targets: _Targets, row_range: RowRange
 ) -> None:
     """`_separate_rows` at full resolution: two rows of pixels for each of the frame's cell rows, first to last."""
-    cells, n, channels = make_cells(pattern), pixel_buffer(pattern), gains.size
-    split, lanes = np.zeros((2, channels, n), np.float32), np.empty((6, 2 * PAD), np.float32)
-    gray, weights, any_analyser = np.zeros((1, 3, n), np.float32), np.empty((channels, 1, n), np.float32), np.ones((1, 4), np.float32)
+    cells, channels = make_cells(pattern), gains.size
+    split, gray = make_pixels(pattern, 2, channels), make_pixels(pattern, 1, 3)
+    weights, any_analyser = make_pixels(pattern, channels, 1), np.ones((1, 4), np.float32)
+    lanes = np.empty((6, LANES), np.float32)
     open_cells(samples, pattern, cells, row_range[0])
     for r in range(row_range[0], row_range[1]):
         flagged = advance_cells(samples, pattern, cells, r)
@@ -344,12 +301,13 @@ def _separate_pixels(
             if flagged:
                 interpolate_pixels(pattern, cells, cells.flags, any_analyser, y, weights)
                 _clear_flagged(weights, valid)
-            of_sources = weights_of(cells.analysers, matrix, y)
+            by_source = _as_tuples(weights_of(cells.analysers, matrix, y))
             for c in range(channels):
-                _split_pixels(sources_of(pattern, cells.analysers, cells.values, y, c), of_sources, split[0, c], split[1, c])
+                x = sources_of(pattern, cells.analysers, cells.values, y, c)
+                _split_pixels(x, by_source, split[0, c], split[1, c])
             interleave(split[0], gains, targets.specular[y])
             _write_difference(split, gains, targets.diffuse[y])
             if targets.dolp.size:
                 interpolate_pixels(pattern, cells, cells.means if channels == 3 else cells.values, matrix, y, gray)
                 polarize(gray[0, 0], gray[0, 1], gray[0, 2], targets.dolp[y], targets.aolp[y])
-                _tally_pixels(split, gray[0], valid.size, lanes, targets.sums[y])
+                tally_pixels(split, gray[0], valid.size, lanes, targets.sums[y])

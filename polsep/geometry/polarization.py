@@ -1,6 +1,6 @@
 """Normals from the polarization of diffuse light: azimuth up to half a turn, and zenith.
 
-Diffuse light that leaves a dielectric has its AoLP along the projected normal and the DoLP `fresnel.diffuse_dolp` of the
+Diffuse light that leaves a dielectric has its AoLP along the projected normal and the DoLP `diffuse_dolp` of the
 zenith under any light. So (s1, s2) of the diffuse image is the same multiple of its s0 in every frame: the diffuse
 polarization. Its estimate is robust: samples under specular light, which is polarized by itself, have less weight.
 Angles count from image-right toward image-up.

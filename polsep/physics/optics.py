@@ -106,7 +106,7 @@ def diffuse_stokes(g: Geometry, polarizer: Tensor, irradiance: Tensor, albedo: T
     """Stokes image of the diffuse lobe: transmitted in, depolarized, transmitted out.
 
     ``polarizer``: angle [rad] of the fully polarized light in its own frame; ``irradiance``: I/d^2 at the point,
-    without the cosine; ``albedo`` ``[..., C, H, W]``. AoLP is the azimuth of the normal, DoLP is `fresnel.diffuse_dolp`.
+    without the cosine; ``albedo`` ``[..., C, H, W]``. AoLP is the azimuth of the normal, DoLP is `diffuse_dolp`.
     No shadows: multiply ``irradiance``. Source: Eqs. 4-6 corrected (the incident azimuth of n).
     """
     camera, light = _camera_and_light_beams(g)

@@ -194,7 +194,7 @@ class OpenVinoEngine:
             run_over_rows(lambda row_range: map_rows(samples, pattern, taps, maps, row_range), h, _ROWS)
         else:
             angles = self._layout.angles
-            source = Source(samples, pattern, read_grid(pattern, angles, stokes_inverse(angles).float().numpy()))
+            source = Source(samples, pattern, read_grid(pattern, angles, stokes_inverse(angles).astype(np.float32)))
             # A strip begins with rows that the one before has too, many of them: one for each thread.
             run_over_rows(lambda row_range: map_guided_rows(source, maps, row_range), h, -(-h // get_threads()))
 

@@ -16,12 +16,12 @@ from evaluation import WEIGHTS
 from evaluation.scoring import Entry, Protocol, capture_noisy, score_sets
 from evaluation.sets import load_sets
 from polsep.bench.rows import Row
+from polsep.in_torch import load_joint
 from polsep.io.store.weights import read_weights
 from polsep.methods import Capture
 from polsep.networks.run import run_joint
 from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import Separation
-from polsep.shipped import load_joint
 
 #: Metrics of the table.
 TABLED = ("diffuse PSNR", "specular PSNR", "diffuse PSNR, highlights", "specular PSNR, highlights")

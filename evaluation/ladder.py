@@ -21,15 +21,17 @@ from evaluation import WEIGHTS
 from evaluation.scoring import Entry
 from polsep.bench.rows import Row
 from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.in_torch import load_refinement
 from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
 from polsep.methods import METHODS, compose
-from polsep.networks.paper import RUNGS, Refinement, separate_refined
+from polsep.networks.paper import Refinement
+from polsep.networks.rungs import RUNGS, separate_refined
 from polsep.networks.unet import count_parameters
 from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import separate_analytic
 from polsep.separation.color_affine import separate_color_affine
 from polsep.separation.multi_capture import separate_extremes
-from polsep.shipped import PAPER, load_refinement
+from polsep.shipped import PAPER
 
 #: What networks were trained on, as `train.tasks.VARIANTS` names it.
 MOSAIC, CO_SITED = "mosaic", "co-sited"
@@ -96,7 +98,7 @@ def network_entry(weights: Weights) -> Entry:
     rung, network = load_refinement(weights.path, torch.device("cpu"))
     if rung.name != weights.rung:
         raise ValueError(f"expected weights of the rung {weights.rung} in {weights.path}, found {rung.name}")
-    split = partial(separate_refined, rung=rung, networks=network)
+    split = partial(separate_refined, rung=rung, refine=network)
     return Entry(weights.name, compose(demosaic_bilinear_half, split), network)
 
 

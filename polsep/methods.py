@@ -1,8 +1,9 @@
 """The methods that are installed: each maps a capture to a separation.
 
 Formulas and the paper's networks work on demosaicked samples, so they come with a demosaicker; the joint network reads
-the mosaic itself. Every method has a `reference` in torch and a `run` for one frame, which uses compiled kernels and
-OpenVINO where these accept the frame and the reference elsewhere. Both agree to rounding.
+the mosaic itself. Every method has a readable `reference` and a `run` for one frame, which uses compiled kernels and
+OpenVINO where these accept the frame and the reference elsewhere. Both agree to rounding. References of formulas take
+NumPy arrays and torch tensors; of networks, NumPy by OpenVINO and tensors by torch (`in_torch`).
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
-import torch
+import numpy as np
 
+from polsep.compute.arrays import namespace, on_cpu, to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import MIN_CELLS, demosaic_guided, demosaic_guided_half
@@ -29,7 +31,6 @@ from polsep.shipped import (
     NAMES,
     accepts_mosaic,
     member_names,
-    separate_joint,
     separate_paper,
     shipped_joint,
     weights_name,
@@ -42,7 +43,7 @@ Light = tuple[float, ...]
 
 
 class Reference(Protocol):
-    """A method in torch: any capture, batches, all devices; a `Separation` in white light."""
+    """A method for any capture, batches, all devices; a `Separation` in white light."""
 
     def __call__(self, capture: Capture, full: bool = False) -> Separation:
         """Separate a capture."""
@@ -77,7 +78,8 @@ def compose(
 
     def separate_samples(capture: Capture) -> Separation:
         samples = capture if isinstance(capture, Measurements) else demosaic(capture)
-        clipped = None if samples.clipped is None else samples.clipped.any(dim=-4).any(dim=-3)
+        clipped = samples.clipped
+        clipped = None if clipped is None else namespace(clipped).any(clipped, axis=(-4, -3))
         return replace(split(samples), clipped=clipped)
 
     return separate_samples
@@ -95,7 +97,21 @@ def color_affine_reference(capture: Capture, full: bool = False) -> Separation:
 
 def paper_reference(capture: Capture, full: bool = False) -> Separation:
     """`separate_paper` of bilinear samples."""
-    return compose(demosaic_bilinear if full else demosaic_bilinear_half, separate_paper)(capture)
+    separate = separate_paper
+    if not isinstance(capture.data, np.ndarray):
+        from polsep import in_torch
+
+        separate = in_torch.separate_paper
+    return compose(demosaic_bilinear if full else demosaic_bilinear_half, separate)(capture)
+
+
+def joint_reference(name: str, capture: Capture, full: bool = False) -> Separation:
+    """`in_torch.separate_joint`; takes torch tensors alone. Raises ValueError on others."""
+    if isinstance(capture.data, np.ndarray):
+        raise ValueError(f"expected one mosaic [H, W] for the method {name}, found shape {capture.data.shape}")
+    from polsep.in_torch import separate_joint
+
+    return separate_joint(name, capture, full)
 
 
 def run_reference(reference: Reference, capture: Capture, light: Light, full: bool) -> FrameImages:
@@ -105,7 +121,7 @@ def run_reference(reference: Reference, capture: Capture, light: Light, full: bo
 
 
 def run_analytic(capture: Capture, light: Light, full: bool) -> FrameImages:
-    """`separate_analytic` of bilinear samples: a compiled kernel at half resolution, else torch."""
+    """`separate_analytic` of bilinear samples: a compiled kernel at half resolution, else the reference."""
     if full or not isinstance(capture, Mosaic) or not _is_plain(capture):
         return run_reference(analytic_reference, capture, light, full)
     make_ready(_warm_up_analytic)
@@ -113,11 +129,11 @@ def run_analytic(capture: Capture, light: Light, full: bool) -> FrameImages:
 
     options = AnalyticOptions(light, in_light=True, report=True)
     levels = (capture.black_level, capture.white_level)
-    return separate_analytic_half(capture.data.numpy(), capture.layout, *levels, options)
+    return separate_analytic_half(to_numpy(capture.data), capture.layout, *levels, options)
 
 
 def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
-    """`separate_color_affine` of guided samples: compiled kernels for colour at half resolution, else torch."""
+    """`separate_color_affine` of guided samples: compiled kernels for colour at half resolution."""
     if (
         full
         or not isinstance(capture, Mosaic)
@@ -131,25 +147,23 @@ def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
 
     options = ColorAffineOptions(light, in_light=True, guided=True, report=True)
     levels = (capture.black_level, capture.white_level)
-    return separate_color_affine_half(capture.data.numpy(), capture.layout, *levels, options)
+    return separate_color_affine_half(to_numpy(capture.data), capture.layout, *levels, options)
 
 
 def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameImages:
-    """The joint networks of that name: kernels and OpenVINO, else torch."""
-    if isinstance(capture, Mosaic) and capture.data.device.type == "cpu":
-        networks = [shipped_joint(member, capture.data.device) for member in member_names(name, capture.layout)]
-        images = [run_engine(network, replace(capture, light_color=light), full) for network in networks]
-        found = [one for one in images if one is not None]
-        if len(found) == len(networks):
-            return combine_images(found)
-    return run_reference(partial(separate_joint, name), capture, light, full)
+    """The joint networks of that name: kernels and OpenVINO, on other devices torch."""
+    if isinstance(capture, Mosaic) and capture.data.ndim == 2 and on_cpu(capture.data):
+        networks = [shipped_joint(member) for member in member_names(name, capture.layout)]
+        return combine_images([run_engine(network, replace(capture, light_color=light), full) for network in networks])
+    return run_reference(partial(joint_reference, name), capture, light, full)
 
 
 def _is_plain(mosaic: Mosaic) -> bool:
     """One frame in the computer's own memory, in samples that kernels read."""
     data = mosaic.data
-    readable = data.dtype in (torch.uint8, torch.uint16, torch.float32)
-    return data.ndim == 2 and data.device.type == "cpu" and readable and not data.requires_grad
+    if data.ndim != 2 or not on_cpu(data) or getattr(data, "requires_grad", False):
+        return False
+    return to_numpy(data).dtype in (np.uint8, np.uint16, np.float32)
 
 
 def _warm_up_analytic() -> None:
@@ -176,7 +190,7 @@ def _joint(name: str, summary: str) -> Method:
         summary,
         f"a raw mosaic with Sony's filters in any orientation, {colors}; trained under white light",
         "this project; after Dave et al. 2022 and the colour-affine closed form",
-        partial(separate_joint, name),
+        partial(joint_reference, name),
         partial(run_joint, name),
         partial(accepts_mosaic, name),
         expects_errors=True,

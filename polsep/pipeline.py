@@ -8,6 +8,7 @@ and DoLP, AoLP and statistics are of white light.
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from array_api_compat import is_array_api_obj
 from numpy.typing import NDArray
-from torch import Tensor
 
+from polsep.compute.arrays import to_device
 from polsep.io.store.calibrations import read_calibration
 from polsep.light.find import find_light
 from polsep.methods import Capture, Method, find_method
@@ -39,7 +40,8 @@ LIGHT_WORDS = (*FOUND_WORDS, "white")
 
 def _calm_torch() -> None:
     """Hold torch to one thread in a forked child, where its other threads are missing and would be waited for."""
-    torch.set_num_threads(1)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
 
 
 if hasattr(os, "register_at_fork"):
@@ -99,7 +101,7 @@ def separate_capture(
     """`separate` for a frame that is already a `Mosaic`, or co-sited `Measurements` (which keep their resolution)."""
     chosen = find_method(method, capture)
     checked = check_mosaic(capture) if isinstance(capture, Mosaic) else None
-    capture = to_device(checked.mosaic if checked else capture, find_device(device))
+    capture = move_capture(checked.mosaic if checked else capture, find_device(device))
     light, facts, remarks = resolve_light(light_color, capture)
     images, colored = chosen.run(capture, light, full), Colored()
     if chosen.assumes_white and isinstance(capture, Mosaic):
@@ -130,23 +132,36 @@ def make_frame(
     return SeparatedFrame(diffuse, specular, images.valid, images.dolp, images.aolp, report, error)
 
 
-def find_device(name: str) -> torch.device:
-    """``auto`` is CUDA where there is one, else the CPU. Raises ValueError on a device that is not there."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+def find_device(name: str) -> str:
+    """Name of a device: ``auto`` is CUDA where torch and a GPU are, else the CPU, which needs no torch.
+
+    Raises ValueError on a device that is not there.
+    """
+    if name == "cpu" or (name == "auto" and not _may_have_gpu()):
+        return "cpu"
     try:
-        device = torch.device(name)
-        torch.zeros(1, device=device).cpu()
-    except (RuntimeError, TypeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0][:120]
+        import torch
+
+        if name == "auto":
+            return "cuda" if torch.cuda.is_available() else "cpu"
+        torch.zeros(1, device=name).cpu()
+    except (ImportError, RuntimeError, TypeError, AssertionError, NotImplementedError) as error:
+        if name == "auto":
+            return "cpu"
+        reason = "install polsep[torch]" if isinstance(error, ImportError) else str(error).splitlines()[0][:120]
         raise ValueError(f"expected a device like auto, cpu or cuda, found {name!r}: {reason}") from None
-    return device
+    return name
 
 
-def to_device(capture: Capture, device: torch.device) -> Capture:
-    """The capture with its tensors on ``device``."""
-    moved = {name: value.to(device) for name, value in vars(capture).items() if isinstance(value, Tensor)}
-    return replace(capture, **moved)  # type: ignore[arg-type]
+def _may_have_gpu() -> bool:
+    """True if torch is loaded anyway, or may find a GPU: asking it takes a second and 200 MB of memory."""
+    return "torch" in sys.modules or Path("/dev/nvidiactl").exists() or sys.platform == "win32"
+
+
+def move_capture(capture: Capture, device: str) -> Capture:
+    """The capture with its arrays on a device: on the CPU as they are, on others as torch tensors."""
+    moved = {name: to_device(value, device) for name, value in vars(capture).items() if is_array_api_obj(value)}
+    return replace(capture, **moved)
 
 
 def parse_light_color(text: str) -> LightColor | str:

@@ -1,6 +1,7 @@
 """The networks that come with polsep: read from their weights once, applied to any frame.
 
-Weights lie in `polsep/weights`; their metadata say which network they belong to.
+Weights lie in `polsep/weights`; their metadata say which network they belong to. On CPUs they run without torch
+(`networks.engines`, `networks.paper_engine`); `in_torch` has the same networks as torch modules.
 """
 
 from __future__ import annotations
@@ -9,15 +10,14 @@ import json
 import threading
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
-import torch
-
+from polsep.compute.arrays import namespace
 from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
-from polsep.networks.joint import Joint
-from polsep.networks.paper import RUNGS, Refinement, Rung, separate_refined
-from polsep.networks.run import combine, own_order, run_joint
-from polsep.networks.unet import ResidualSize, Size
+from polsep.networks.joint_weights import JointWeights, joint_weights
+from polsep.networks.paper_engine import Refiner, refiner_of
+from polsep.networks.rungs import Refine, Rung, separate_refined
+from polsep.networks.sizes import Size
+from polsep.networks.strips import own_order
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import orient
@@ -35,35 +35,27 @@ PAPER, PAPER_MONO = "paper-mosaic", "paper-mono"
 _LOADING = threading.Lock()
 
 
-def load_joint(path: Path, device: torch.device) -> Joint:
-    """The network from a file of weights. Raises ValueError when the file is damaged or of another network."""
-    tensors, metadata = read_weights(path)
+def read_joint(path: Path, averages_shifts: bool = False) -> JointWeights:
+    """The network in a file of weights. Raises ValueError when the file is damaged or of another network."""
+    arrays, metadata = read_weights(path)
     try:
-        size = json.loads(metadata["size"])
-        size = ResidualSize(size["width"], tuple(size["blocks"]), size.get("entry", 0))
-        demosaicker: Any = metadata.get("demosaicker", "linear")  # what weights without a word on it were trained with
-        inputs, sees_frame = (json.loads(metadata.get(name, "false")) for name in ("inputs", "sees_frame"))
-        network = Joint(int(metadata["colors"]), size, tuple(inputs), demosaicker, sees_frame)
-        network.load_state_dict(tensors)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        return joint_weights(arrays, metadata, averages_shifts)
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"expected weights of a joint network in {path}, found {type(error).__name__}") from None
-    return network.to(device, torch.float32).eval()
 
 
-def shipped_joint(name: str, device: torch.device) -> Joint:
+def shipped_joint(name: str) -> JointWeights:
     """The joint network of a name of weights; the same object whoever asks, since engines are kept by network."""
     with _LOADING:
-        return _read_joint(name, device)
+        return _read_shipped(name)
 
 
 @lru_cache(maxsize=8)
-def _read_joint(name: str, device: torch.device) -> Joint:
-    network = load_joint(shipped_weights(name), device)
-    network.averages_shifts = name in AVERAGED
-    return network
+def _read_shipped(name: str) -> JointWeights:
+    return read_joint(shipped_weights(name), name in AVERAGED)
 
 
-def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[Joint, dict[str, str]]:
+def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[JointWeights, dict[str, str]]:
     """A method's network for frames of a layout, shipped or from a file of weights, and the weights' metadata.
 
     Raises ValueError on methods without such a network, and on weights for other frames.
@@ -71,7 +63,7 @@ def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[Joint, d
     if method not in NAMES:
         raise ValueError(f"expected a method of {', '.join(NAMES)}, found {method!r}")
     path = path or shipped_weights(weights_name(method, layout))
-    network, metadata = load_joint(path, torch.device("cpu")), read_weights(path)[1]
+    network, metadata = read_joint(path), read_weights(path)[1]
     if network.colors != layout.channels:
         raise ValueError(f"expected weights for {layout.channels} colours in {path}, found {network.colors}")
     return network, metadata
@@ -87,17 +79,6 @@ def member_names(method: str, layout: Layout) -> tuple[str, ...]:
     return tuple(weights_name(member, layout) for member in MEMBERS.get(method, (method,)))
 
 
-def separate_joint(method: str, capture: Mosaic | Measurements, full: bool = False) -> Separation:
-    """Separate a mosaic by a method of `NAMES` in torch, with shipped weights.
-
-    Raises ValueError on co-sited measurements, and on layouts that are not Sony's in any orientation.
-    """
-    if isinstance(capture, Measurements):
-        raise ValueError(f"expected a mosaic for the method {method}, found four co-sited angle images")
-    networks = (shipped_joint(name, capture.data.device) for name in member_names(method, capture.layout))
-    return combine([run_joint(network, capture, full) for network in networks])
-
-
 def accepts_mosaic(method: str, capture: Mosaic | Measurements) -> bool:
     """True for a mosaic in an order that the method knows, with weights shipped for its colours."""
     if isinstance(capture, Measurements) or not is_shipped(weights_name(method, capture.layout)):
@@ -109,39 +90,43 @@ def accepts_mosaic(method: str, capture: Mosaic | Measurements) -> bool:
     return True
 
 
-def load_refinement(path: Path, device: torch.device) -> tuple[Rung, Refinement]:
-    """The rung and its networks from a file of weights.
-
-    Raises ValueError when the file is damaged or of another network.
-    """
-    tensors, metadata = read_weights(path)
+def read_refiner(path: Path) -> Refiner:
+    """The paper's networks in a file of weights. Raises ValueError when the file is damaged or of another network."""
+    arrays, metadata = read_weights(path)
     try:
-        rung = RUNGS[metadata["rung"]]
-        network = Refinement(rung, int(metadata["colors"]), Size(**json.loads(metadata["size"])))
-        network.load_state_dict(tensors)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        return refiner_of(arrays, metadata, Size(**json.loads(metadata["size"])))
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"expected weights of a refinement in {path}, found {type(error).__name__}") from None
-    return rung, network.to(device, torch.float32).eval()
 
 
-@lru_cache(maxsize=4)
-def _read_refinement(name: str, device: torch.device) -> tuple[Rung, Refinement]:
-    return load_refinement(shipped_weights(name), device)
+@lru_cache(maxsize=2)
+def _shipped_refiner(name: str) -> Refiner:
+    return read_refiner(shipped_weights(name))
+
+
+def paper_name(measurements: Measurements) -> str:
+    """The name of the paper's weights for these measurements: those of mono frames where they are shipped."""
+    return PAPER_MONO if measurements.data.shape[-3] == 1 and is_shipped(PAPER_MONO) else PAPER
 
 
 def separate_paper(measurements: Measurements) -> Separation:
-    """The paper's method: an analytic split refined by two U-Nets. ``[..., 4, C, h, w]``, C = 3 or 1.
+    """The paper's method: an analytic split refined by two U-Nets. NumPy ``[..., 4, C, h, w]``, C = 3 or 1.
 
     Mono frames have networks of their own where those are shipped, else they go through as grey ones.
-    Source: Dave et al. 2022, Sec. 4.
+    Twin in torch: `in_torch.separate_paper`. Source: Dave et al. 2022, Sec. 4.
     """
-    name = PAPER_MONO if measurements.data.shape[-3] == 1 and is_shipped(PAPER_MONO) else PAPER
-    rung, network = _read_refinement(name, measurements.data.device)
-    if measurements.data.shape[-3] == network.colors:
-        return separate_refined(measurements, rung, network)
+    refiner = _shipped_refiner(paper_name(measurements))
+    return separate_colors(measurements, refiner.rung, refiner, refiner.colors)
+
+
+def separate_colors(measurements: Measurements, rung: Rung, refine: Refine, colors: int) -> Separation:
+    """`rungs.separate_refined` by networks of so many ``colors``, to which mono measurements go as grey ones."""
     data, clipped = measurements.data, measurements.clipped
-    shape = (*data.shape[:-3], network.colors, *data.shape[-2:])
-    copies = Measurements(data.expand(shape), measurements.angles, None if clipped is None else clipped.expand(shape))
-    found = separate_refined(copies, rung, network)
-    diffuse, specular = (x.mean(dim=-3, keepdim=True) for x in (found.diffuse, found.specular))
-    return Separation(diffuse, specular, found.valid, found.stokes.map(lambda s: s.mean(dim=-3, keepdim=True)))
+    if data.shape[-3] == colors:
+        return separate_refined(measurements, rung, refine)
+    xp, shape = namespace(data), (*data.shape[:-3], colors, *data.shape[-2:])
+    masks = None if clipped is None else xp.broadcast_to(clipped, shape)
+    found = separate_refined(Measurements(xp.broadcast_to(data, shape), measurements.angles, masks), rung, refine)
+    stokes = found.stokes.map(lambda s: xp.mean(s, axis=-3, keepdims=True))
+    diffuse, specular = (xp.mean(x, axis=-3, keepdims=True) for x in (found.diffuse, found.specular))
+    return Separation(diffuse, specular, found.valid, stokes)

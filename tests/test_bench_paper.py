@@ -53,8 +53,9 @@ from polsep.cli import app
 from polsep.io.store.image_codecs import write_jpeg
 from polsep.io.store.rows import read_rows
 from polsep.io.store.weights import write_weights
-from polsep.networks.paper import RUNGS, Refinement
-from polsep.networks.unet import Size
+from polsep.networks.paper import Refinement
+from polsep.networks.rungs import RUNGS
+from polsep.networks.sizes import Size
 from polsep.physics.stokes import Stokes
 from polsep.render.sphere_tracing import Scene
 from polsep.sensor.camera import Layout, Mosaic

@@ -18,14 +18,14 @@ pytest.importorskip("onnxscript", reason="exporting needs the extra 'export'")
 import onnxruntime
 
 from polsep import cli
+from polsep.in_torch import load_joint
 from polsep.io.store.weights import write_weights
 from polsep.networks.channels import INPUTS
 from polsep.networks.export import ExportedNetwork
 from polsep.networks.joint import Joint
 from polsep.networks.run import run_joint
-from polsep.networks.unet import ResidualSize
+from polsep.networks.sizes import ResidualSize
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.shipped import load_joint
 
 SIZE = ResidualSize(4, (0, 1))
 #: Rounding through two dozen layers, in white levels.

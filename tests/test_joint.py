@@ -28,7 +28,7 @@ from polsep.networks.joint import (
     pool_outputs,
     predict_samples,
 )
-from polsep.networks.unet import ResidualSize
+from polsep.networks.sizes import ResidualSize
 from polsep.physics.stokes import Stokes, fit_stokes, measure
 from polsep.sensor.camera import CLIP_MARGIN, IDEAL, Layout, Mosaic, expose, sample_mosaic
 from polsep.separation.closed_form import MAX_DIFFUSE_DOLP, white_specular

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,13 @@ from tolerances import assert_close, assert_same_angle, assert_within
 from polsep.compute.threads import own_threads
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.kernels import get_threads, set_threads
-from polsep.networks import engines, openvino_engine
-from polsep.networks import run as mosaic_network
+from polsep.networks import engines, openvino_engine, strips
 from polsep.networks.channels import INPUTS, PERIOD
 from polsep.networks.engines import run_engine
 from polsep.networks.joint import Demosaicker, Joint
 from polsep.networks.openvino_engine import OpenVinoEngine
 from polsep.networks.run import run_joint
-from polsep.networks.unet import ResidualSize
+from polsep.networks.sizes import ResidualSize
 from polsep.physics.stokes import MAX_DOLP, aolp, dolp
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation
@@ -66,6 +65,7 @@ def random_net(layout: Layout, inputs: tuple[str, ...] = INPUTS, demosaicker: De
 
 #: Networks for colour and mono frames.
 NETS = {layout.channels: random_net(layout) for layout in (COLOR, MONO)}
+WEIGHTS = {colors: net.weights() for colors, net in NETS.items()}
 
 
 def random_frame(height: int, width: int, layout: Layout, most: int = 4095) -> Mosaic:
@@ -85,7 +85,7 @@ def in_torch(net: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
 
 def in_engine(net: Joint, mosaic: Mosaic, precision: str = "f32", full: bool = False) -> FrameImages:
     height, width = mosaic.data.shape
-    engine = OpenVinoEngine(net, (height, width), full, precision)
+    engine = OpenVinoEngine(net.weights(), (height, width), full, precision)
     return engine.run(mosaic.data.numpy(), (mosaic.black_level, mosaic.white_level), mosaic.light_color)
 
 
@@ -170,7 +170,7 @@ def test_threads_and_frames_before_change_no_bit(full: bool) -> None:
     """Buffers are used again and again; strips of rows overlap."""
     net, threads = random_net(COLOR), get_threads()
     frames = [random_frame(320, 48, COLOR, most) for most in (4095, 2000)]
-    engine = OpenVinoEngine(net, (320, 48), full, "f32")
+    engine = OpenVinoEngine(net.weights(), (320, 48), full, "f32")
     runs = []
     try:
         for count in (1, 3):
@@ -193,7 +193,7 @@ def test_a_thread_writes_no_row_of_another(
     """Not even the same numbers: who reads them in between would see half of them."""
     height, row_range = 48, (3, 6)
     net, mosaic = random_net(layout, INPUTS, demosaicker), random_frame(height, 64, layout)
-    engine = OpenVinoEngine(net, (height, 64), True, "f32")
+    engine = OpenVinoEngine(net.weights(), (height, 64), True, "f32")
     *planes, clipped = engine._maps.closed
     for plane in (*planes, engine._maps.details):
         plane.fill(math.nan)
@@ -233,7 +233,7 @@ TURNS: dict[str, Callable[[Layout], Layout]] = {
 def test_frames_of_any_orientation_and_side(layout: Layout, turn: str, full: bool, exact: None) -> None:
     """Sides that are no multiples of the period, filters mirrored, transposed or cropped."""
     mosaic = random_frame(50, 62, TURNS[turn](layout))
-    found = run_engine(NETS[mosaic.layout.channels], mosaic, full)
+    found = run_engine(WEIGHTS[mosaic.layout.channels], mosaic, full)
     assert found is not None
     white = run_joint(random_net(layout), mosaic, full)
     for image, wanted in ((found.diffuse, in_light(white, mosaic.light_color).diffuse), (found.valid, white.valid)):
@@ -262,11 +262,11 @@ def test_threads_with_engines_of_their_own_find_the_same(exact: None) -> None:
 
     def separate(frame: Mosaic) -> FrameImages:
         with own_threads(1):
-            found = run_engine(NETS[frame.layout.channels], frame, False)
+            found = run_engine(WEIGHTS[frame.layout.channels], frame, False)
         assert found is not None
         return found
 
-    alone = [run_engine(NETS[frame.layout.channels], frame, False) for frame in frames]
+    alone = [run_engine(WEIGHTS[frame.layout.channels], frame, False) for frame in frames]
     with ThreadPoolExecutor(2) as pool:
         together = list(pool.map(separate, frames * 3))
     for found, expected in zip(together, alone * 3, strict=True):
@@ -275,16 +275,30 @@ def test_threads_with_engines_of_their_own_find_the_same(exact: None) -> None:
             assert one == other if field.name == "tally" else np.array_equal(one, other)
 
 
-def test_what_it_does_not_take_is_left_to_torch(exact: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Batches, other dtypes, cells half a cell off, and machines without OpenVINO."""
+@pytest.mark.parametrize("layout", [COLOR.rolled(1, 1), MONO.rolled(1, 0)], ids=lambda layout: layout.spec)
+def test_cells_half_a_cell_off_are_means_of_full_resolution(layout: Layout, exact: None) -> None:
+    """The network's cells are not the frame's then: images, polarization and validity of the frame's own cells."""
+    mosaic = random_frame(32, 48, layout)
+    found = run_engine(WEIGHTS[layout.channels], mosaic, False)
+    white = run_joint(NETS[layout.channels], mosaic, False)
+    lit, grey = in_light(white, mosaic.light_color), white.stokes.map(lambda s: s.mean(dim=-3))
+    for image, wanted in (
+        (found.diffuse, lit.diffuse),
+        (found.specular, lit.specular),
+        (found.error, lit.expected_error),
+    ):
+        assert_close(torch.from_numpy(image).movedim(-1, 0), wanted, 4.0)
+    assert torch.equal(torch.from_numpy(found.valid), white.valid)
+    lit = grey.s0 > 0.05
+    assert_within(torch.from_numpy(found.dolp)[lit], dolp(grey)[lit], 0.02)  # of images, not of demosaicked light
+
+
+def test_samples_of_double_precision_are_read_in_single(exact: None) -> None:
+    """The kernels read no others."""
     mosaic = random_frame(32, 48, COLOR)
-    assert run_engine(NETS[mosaic.layout.channels], mosaic, False) is not None
-    batch = Mosaic(mosaic.data.float()[None], COLOR, BLACK, WHITE)
-    double = Mosaic(mosaic.data.double(), COLOR, BLACK, WHITE)
-    half_off = random_frame(32, 48, MONO.rolled(1, 0))
-    assert [run_engine(NETS[frame.layout.channels], frame, False) for frame in (batch, double, half_off)] == [None] * 3
-    monkeypatch.setattr(engines, "find_spec", lambda name: None)
-    assert run_engine(NETS[mosaic.layout.channels], mosaic, False) is None
+    double = replace(mosaic, data=mosaic.data.double())
+    one, other = (run_engine(WEIGHTS[3], frame, False) for frame in (mosaic, double))
+    assert np.array_equal(one.diffuse, other.diffuse) and np.array_equal(one.specular, other.specular)
 
 
 @pytest.mark.parametrize("full", [False, True])
@@ -294,12 +308,12 @@ def test_huge_frames_are_separated_in_strips(
 ) -> None:
     """The same as whole ones, by engines for two heights at most; also where the height is no multiple of strips."""
     mosaic = random_frame(1452, 36, layout)
-    whole = run_engine(NETS[mosaic.layout.channels], mosaic, full)
-    monkeypatch.setattr(mosaic_network, "MAX_PIXELS", 36 * 720)
+    whole = run_engine(WEIGHTS[mosaic.layout.channels], mosaic, full)
+    monkeypatch.setattr(strips, "MAX_PIXELS", 36 * 720)
     network = NETS[mosaic.layout.channels]
-    heights = {bottom - top for (top, bottom), _ in engines._strips((1452, 36), network)}
-    assert len(heights) == 2 and max(heights) <= 720 + PERIOD * network.net.grid
-    parts = run_engine(NETS[mosaic.layout.channels], mosaic, full)
+    heights = {bottom - top for (top, bottom), _ in engines._strips((1452, 36), network.size)}
+    assert len(heights) == 2 and max(heights) <= 720 + PERIOD * network.size.grid
+    parts = run_engine(WEIGHTS[mosaic.layout.channels], mosaic, full)
     assert whole is not None and parts is not None
     assert np.array_equal(parts.valid, whole.valid)
     for name in ("diffuse", "specular", "error", "dolp"):

@@ -24,7 +24,8 @@ from polsep.io.store.weights import read_weights, write_weights
 from polsep.metrics import psnr
 from polsep.networks.channels import INPUTS
 from polsep.networks.joint import Joint, JointOutput, Polarization, bilinear_filter
-from polsep.networks.unet import ResidualSize, count_parameters
+from polsep.networks.sizes import ResidualSize
+from polsep.networks.unet import count_parameters
 from polsep.physics.stokes import Stokes
 from polsep.render.simulate import filter_light
 from polsep.sensor.camera import CLIP_MARGIN, IDEAL, IMX250, Layout, expose

@@ -18,11 +18,13 @@ from tolerances import assert_close
 from torch import Tensor
 
 from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.in_torch import load_refinement, separate_paper
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.store.weights import shipped_weights, write_weights
 from polsep.metrics import psnr
-from polsep.networks.paper import RUNGS, Refinement, analytic_inputs
-from polsep.networks.unet import Size
+from polsep.networks.paper import Refinement
+from polsep.networks.rungs import RUNGS, analytic_inputs
+from polsep.networks.sizes import Size
 from polsep.physics.stokes import (
     Measurements,
     Stokes,
@@ -33,7 +35,7 @@ from polsep.physics.stokes import (
     transpose,
 )
 from polsep.sensor.camera import Mosaic
-from polsep.shipped import PAPER, PAPER_MONO, is_shipped, load_refinement, separate_paper
+from polsep.shipped import PAPER, PAPER_MONO, is_shipped
 
 SIZE = Size(4, 1, 1)
 ANGLES = tuple(math.radians(t) for t in (0.0, 45.0, 90.0, 135.0))

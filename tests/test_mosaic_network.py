@@ -11,17 +11,19 @@ import torch
 from tolerances import assert_close, assert_within
 
 from polsep.demosaic.bilinear import mean_cells
+from polsep.in_torch import load_joint, separate_joint
 from polsep.io.store.weights import write_weights
 from polsep.methods import METHODS, find_method
 from polsep.networks import run as mosaic_network
+from polsep.networks import strips
 from polsep.networks.channels import INPUTS
 from polsep.networks.joint import Joint
 from polsep.networks.run import combine, cut_rows, margin_of, run_joint
-from polsep.networks.unet import ResidualSize
+from polsep.networks.sizes import ResidualSize
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import orient, shifts_of
-from polsep.shipped import accepts_mosaic, load_joint, separate_joint, weights_name
+from polsep.shipped import accepts_mosaic, weights_name
 
 SIZE = ResidualSize(4, (0, 1, 1))
 COLOR, MONO = Layout(), Layout(bayer=None)
@@ -110,7 +112,7 @@ def test_even_light_has_no_pattern_where_shifts_are_averaged() -> None:
     mosaic = Mosaic(light, MONO, 0.0, 1.0)
 
     def contrast() -> float:
-        border = margin_of(network) // 2
+        border = margin_of(network.size) // 2
         inner = run_joint(network, mosaic).diffuse[:, border:-border, border:-border]
         return float(inner.max() - inner.min())
 
@@ -135,8 +137,8 @@ def test_mono_cells_of_other_frames_are_their_own() -> None:
 def test_strips_are_the_whole_frame(layout: Layout, full: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     network, mosaic = random_network(layout), random_mosaic(layout, 720, 36)
     whole = run_joint(network, mosaic, full)
-    monkeypatch.setattr(mosaic_network, "MAX_PIXELS", 36 * 600)
-    assert len(list(cut_rows((720, 36), margin_of(network), 16))) > 5
+    monkeypatch.setattr(strips, "MAX_PIXELS", 36 * 600)
+    assert len(list(cut_rows((720, 36), network.size))) > 5
     parts = run_joint(network, mosaic, full)
     assert torch.equal(parts.valid, whole.valid)
     for name in ("diffuse", "specular", "expected_error"):
@@ -161,8 +163,8 @@ def test_reach_is_within_the_margin(blocks: tuple[int, ...]) -> None:
     nothing = torch.zeros_like(raw, dtype=torch.bool)
     changed = (network.half_resolution(other, nothing).diffuse - network.half_resolution(raw, nothing).diffuse).abs()
     rows = 2 * changed.amax(dim=(0, 1, 3)).nonzero()[:, 0]
-    assert int(rows.min()) > 512 - margin_of(network)
-    assert int(rows.max()) < 512 + margin_of(network)
+    assert int(rows.min()) > 512 - margin_of(network.size)
+    assert int(rows.max()) < 512 + margin_of(network.size)
 
 
 def write_network(path: Path, layout: Layout, changed: dict[str, str] | None = None) -> Joint:

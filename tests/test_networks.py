@@ -6,7 +6,8 @@ import pytest
 import torch
 from tolerances import assert_close, assert_finite
 
-from polsep.networks.unet import Size, UNet, count_parameters, pad_to_multiple
+from polsep.networks.sizes import Size
+from polsep.networks.unet import UNet, count_parameters, pad_to_multiple
 
 SIZES = [Size(4, 2, 1), Size(4, 1, 2)]
 

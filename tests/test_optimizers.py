@@ -8,8 +8,10 @@ from torch import Tensor, nn
 
 from polsep.material.network import MaterialNetwork, MaterialSize
 from polsep.networks.joint import Joint
-from polsep.networks.paper import RUNGS, Refinement
-from polsep.networks.unet import ResidualSize, ResidualUNet, Size, UNet
+from polsep.networks.paper import Refinement
+from polsep.networks.rungs import RUNGS
+from polsep.networks.sizes import ResidualSize, Size
+from polsep.networks.unet import ResidualUNet, UNet
 from polsep.train.optimizers import WEIGHT_DECAY, Optimizers, as_matrix, hidden_weights
 
 RATE = 1e-3

@@ -23,7 +23,7 @@ from polsep.methods import BEST, FASTEST, METHODS, Capture, Method, find_method,
 from polsep.networks.channels import MIN_BRIGHTNESS
 from polsep.networks.joint import Joint
 from polsep.networks.run import run_joint
-from polsep.networks.unet import ResidualSize
+from polsep.networks.sizes import ResidualSize
 from polsep.physics.stokes import Stokes, measure
 from polsep.pipeline import PolsepWarning, find_device, separate, separate_capture
 from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose

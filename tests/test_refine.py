@@ -8,8 +8,9 @@ import pytest
 import torch
 from tolerances import assert_close
 
-from polsep.networks.paper import RUNGS, Refinement, Rung, analytic_inputs, separate_refined
-from polsep.networks.unet import Size
+from polsep.networks.paper import Refinement
+from polsep.networks.rungs import RUNGS, Rung, analytic_inputs, separate_refined
+from polsep.networks.sizes import Size
 from polsep.physics.stokes import Measurements, Stokes, measure
 from polsep.separation.analytic import separate_analytic
 from polsep.train.losses import diffuse_loss, gradient_loss, proxy_diffuse, specular_loss

@@ -28,13 +28,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import polsep
 from polsep import cli
+from polsep.in_torch import load_refinement
 from polsep.io.store.checkpoints import read_checkpoint, read_lines, write_checkpoint, write_lines
 from polsep.io.store.weights import read_weights
 from polsep.methods import METHODS
-from polsep.networks.paper import RUNGS
-from polsep.networks.unet import Size
+from polsep.networks.rungs import RUNGS
+from polsep.networks.sizes import Size
 from polsep.physics.stokes import Stokes, measure
-from polsep.shipped import load_refinement
 from polsep.train import digest
 from polsep.train.command import (
     Options,

@@ -9,7 +9,7 @@ from torch.nn.functional import pixel_unshuffle
 
 from polsep.networks.channels import MIN_BRIGHTNESS, PERIOD
 from polsep.networks.joint import Joint
-from polsep.networks.unet import ResidualSize
+from polsep.networks.sizes import ResidualSize
 from polsep.networks.whole_frame import SIDE, make_thumbnail, thumbnail_channels
 from polsep.networks.whole_frame_kernel import thumbnail_of
 from polsep.physics.stokes import Stokes

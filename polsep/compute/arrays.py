@@ -74,3 +74,17 @@ def pad_repeat(x: Array, margin: int, axis: int) -> Array:
     """Continue ``x`` along axis -1 or -2 by repeating its outermost places."""
     first, last = window(x, 0, 1, axis), window(x, x.shape[axis] - 1, 1, axis)
     return namespace(x).concat([first] * margin + [x] + [last] * margin, axis=axis)
+
+
+def like(x: Array, values: NDArray[Any]) -> Array:
+    """A NumPy array as one of the kind and on the device of ``x``, of its own dtype."""
+    return namespace(x).asarray(values, device=device(x))
+
+
+def to_device(x: Array, device: str) -> Array:
+    """``x`` on a device: on the CPU an array stays of its kind, on others it is a torch tensor."""
+    if device == "cpu":
+        return x.cpu() if is_torch_array(x) else x
+    import torch
+
+    return torch.as_tensor(x, device=device)

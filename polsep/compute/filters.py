@@ -18,9 +18,9 @@ def box_mean(x: Array, radius: int) -> Array:
         return images.reshape(x.shape)
     xp = namespace(x)
     for axis in (-1, -2):
-        n, margin = x.shape[axis], list(x.shape)
-        margin[axis] = radius
-        zeros = xp.zeros(tuple(margin), dtype=x.dtype, device=device(x))
+        n = x.shape[axis]
+        border = (*x.shape[:-1], radius) if axis == -1 else (*x.shape[:-2], radius, x.shape[-1])
+        zeros = xp.zeros(border, dtype=x.dtype, device=device(x))
         padded = xp.concat([zeros, x, zeros], axis=axis)
         total = window(padded, 0, n, axis) + window(padded, 1, n, axis)
         for k in range(2, 2 * radius + 1):

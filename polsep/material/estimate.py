@@ -41,7 +41,7 @@ def load_estimator(name: str = "separated", path: Path | None = None) -> Estimat
     if path is None and name not in INPUTS:
         raise ValueError(f"expected an input of {', '.join(INPUTS)}, found {name!r}")
     source = shipped_weights(f"material/{name}") if path is None else path
-    tensors, metadata = read_weights(source)
+    arrays, metadata = read_weights(source)
     if metadata["method"] != "material":
         raise ValueError(f"expected weights of a network for materials in {source}, found {metadata['method']!r}")
     size = json.loads(metadata["size"])
@@ -49,5 +49,5 @@ def load_estimator(name: str = "separated", path: Path | None = None) -> Estimat
     network = MaterialNetwork(
         channels.stop - channels.start, MaterialSize(size["width"], tuple(size["growth"]), tuple(size.get("cues", ())))
     )
-    network.load_state_dict(tensors)
+    network.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})
     return Estimator(network.eval(), metadata["input"])

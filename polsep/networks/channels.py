@@ -13,6 +13,10 @@ from typing import NamedTuple
 PERIOD = 4
 #: Brightness that counts as black: below it inputs and corrections fade.
 MIN_BRIGHTNESS = 0.01
+#: Windows of the diffuse polarization in packed pixels, and the squared contrast of colours, relative to the local
+#: brightness, below which it falls back to the wider window and to zero. Chosen on validation views
+#: (docs/experiments.md).
+WINDOWS, MIN_CONTRAST = (9, 3), (3e-3, 3e-3)
 #: Maps that the network sees beside `log_brightness`, in order, by the groups that ablations leave out.
 GROUPS = {
     "samples": ("samples",),
@@ -25,6 +29,13 @@ GROUPS = {
 INPUTS = tuple(GROUPS)
 #: Maps of how large details are around: three details of four cells.
 DETAIL_MAPS = 12
+#: Signs of the pixels of a cell, in reading order: their mean, and the three details.
+HAAR = ((1.0, 1.0, 1.0, 1.0), (1.0, -1.0, 1.0, -1.0), (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, -1.0, 1.0))
+#: Squared details, relative to the local brightness, that count as none.
+MIN_DETAIL = 1e-7
+#: Largest log variances of diffuse and specular: errors of 2 and 26 times the local brightness, the hundredth largest
+#: of the validation views (docs/experiments.md).
+MAX_LOG_VARIANCE = (1.5, 6.5)
 
 
 class InputChannels(NamedTuple):

@@ -4,8 +4,8 @@ Both images are smooth at most places, so their details are interpolated from th
 demosaicked s0 beyond that are texture or noise, of the diffuse or of the specular light: the network says for each cell
 how much of them belongs to each of the two images. Means of cells do not change.
 
-Conventions: means and details are those of Haar, sums of the 2x2 pixels of a cell with the signs of `HAAR`, over four;
-"packed" as in `polsep.networks.joint`.
+Conventions: means and details are those of Haar, sums of the 2x2 pixels of a cell with the signs of `channels.HAAR`,
+over four; "packed" as in `polsep.networks.joint`.
 """
 
 from __future__ import annotations
@@ -16,16 +16,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, conv2d, pad, pixel_shuffle, pixel_unshuffle
 
-#: Signs of the pixels of a cell, in reading order: their mean, and the three details.
-HAAR = ((1.0, 1.0, 1.0, 1.0), (1.0, -1.0, 1.0, -1.0), (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, -1.0, 1.0))
+from polsep.networks.channels import HAAR, MIN_DETAIL
+from polsep.networks.joint_weights import HIDDEN
+
 #: Half the difference of the two pixels of a cell, and their mean, from the five cells around: cubic convolution (Keys
 #: 1981, doi:10.1109/TASSP.1981.1163711, a = -1/2) at a quarter of a cell to either side.
 _SLOPES = (-3 / 256, 38 / 256, 0.0, -38 / 256, 3 / 256)
 _MEANS = (-3 / 256, 20 / 256, 222 / 256, 20 / 256, -3 / 256)
-#: Channels between features and beliefs.
-HIDDEN = 32
-#: Squared details, relative to the local brightness, that count as none.
-MIN_DETAIL = 1e-7
 
 
 class Details(nn.Module):

@@ -2,7 +2,7 @@
 
 Three passes over the frame, each on finished rows of the one before: details of s0 less those interpolated from its
 means (`find_beyond`), their size around each cell (`emit_details`), and, after the network, the images
-(`write_pixels`). Rows of cells are planar; the order of details is that of `details.HAAR`.
+(`write_pixels`). Rows of cells are planar; the order of details is that of `channels.HAAR`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ from polsep.compute.rows_kernel import (
 )
 from polsep.compute.threads import RowRange
 from polsep.networks.buffers import ClosedFormRows, LayerInput
-from polsep.networks.channels import DETAIL_MAPS, PERIOD
-from polsep.networks.details import MIN_DETAIL
+from polsep.networks.channels import DETAIL_MAPS, MIN_DETAIL, PERIOD
 from polsep.networks.images_kernel import LayerOutputs, Targets, mark_clipped, spread
 from polsep.physics.stokes_kernel import polarize
 from polsep.separation.tally_kernel import add_polarization, count_above_one

@@ -1,7 +1,6 @@
 """The joint network on CPUs for frames of every size and orientation, by engines kept from frame to frame.
 
-An engine (`openvino_engine`) is for frames of one size. Without OpenVINO, and for frames that it does not accept, torch
-does the work (`run`).
+An engine (`openvino_engine`) is for frames of one size. Twin: `run`, in torch, for batches and on other devices.
 """
 
 from __future__ import annotations
@@ -12,20 +11,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import reduce
-from importlib.util import find_spec
 from operator import add
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import to_numpy
 from polsep.compute.threads import get_threads
 from polsep.compute.warm_up import make_ready
 from polsep.networks.channels import PERIOD
-from polsep.networks.joint import Joint
+from polsep.networks.joint_weights import JointWeights
 from polsep.networks.openvino_engine import OpenVinoEngine, modulation_of
-from polsep.networks.run import LEAST_ERROR, cut_rows, margin_of, own_order
+from polsep.networks.sizes import ResidualSize
+from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of, own_order
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.orient import Orientation, orient, shifts_of
 from polsep.separation.images import FrameImages
@@ -37,7 +36,7 @@ KEPT = 2
 class _Job(NamedTuple):
     """A kind of work that an engine is made for."""
 
-    network: Joint
+    network: JointWeights
     full: bool
     shape: tuple[int, int]
     threads: int
@@ -78,14 +77,11 @@ class _Engines:
 
 
 ENGINES = _Engines()
-_MAKING = threading.Lock()
 
 
 def _make_engine(job: _Job) -> OpenVinoEngine:
-    """One at a time: torch cannot trace two modules at once."""
-    with _MAKING:
-        logging.getLogger("polsep").debug("compiling a network for frames of %dx%d", *job.shape)
-        return OpenVinoEngine(job.network, job.shape, job.full)
+    logging.getLogger("polsep").debug("compiling a network for frames of %dx%d", *job.shape)
+    return OpenVinoEngine(job.network, job.shape, job.full)
 
 
 def _warm_up() -> None:
@@ -100,23 +96,46 @@ def _warm_up_full() -> None:
     details_kernel.warm_up()
 
 
-def run_engine(network: Joint, mosaic: Mosaic, full: bool) -> FrameImages | None:
-    """A network's images of one frame in its light, or None: batches, other devices, no OpenVINO.
+def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages:
+    """A network's images of one frame ``[H, W]`` on the CPU, in its light.
 
     Frames in other orientations than the network's are turned before and after, as in `run.run_joint`. Huge frames are
-    cut into strips, all of one height, since an engine is for one size.
+    cut into strips, all of one height, since an engine is for one size. Raises ValueError on layouts that are not
+    Sony's in any orientation.
     """
-    data = mosaic.data
-    if find_spec("openvino") is None or data.ndim != 2 or data.device.type != "cpu":
-        return None
     orientation = orient(mosaic, own_order(mosaic.layout))
-    if not orientation.keeps_cells or data.dtype not in (torch.uint8, torch.uint16, torch.float32):
-        return None
+    if not full and not orientation.keeps_cells:  # then the network's cells are not the frame's
+        return _halve(run_engine(network, mosaic, full=True), mosaic.light_color)
     make_ready(_warm_up)
     if full:
         make_ready(_warm_up_full)
     ways = shifts_of(orientation) if network.averages_shifts else (orientation,)
     return combine_images([_run_turned(network, mosaic, way, full) for way in ways])
+
+
+def _halve(images: FrameImages, light: tuple[float, ...]) -> FrameImages:
+    """Means over 2x2 cells of images at full resolution, in a ``light``; a cell is valid if all of its pixels are.
+
+    The tally is of the pixels at full resolution.
+    """
+    assert images.dolp is not None and images.aolp is not None and images.error is not None
+    colors = images.diffuse.shape[-1]
+    s0 = ((images.diffuse + images.specular) / np.array(light[:colors], np.float32)).mean(axis=-1)
+    polarized = _mean_cells(s0 * images.dolp * np.exp(2j * images.aolp))
+    s0 = _mean_cells(s0)
+    dolp = np.where(s0 > 0, np.abs(polarized) / np.where(s0 > 0, s0, 1), 0).astype(np.float32)
+    diffuse, specular, error = (_mean_cells(image) for image in (images.diffuse, images.specular, images.error))
+    valid = _mean_cells(images.valid.astype(np.float32)) == 1
+    aolp = _wrap((np.angle(polarized) / 2).astype(np.float32))
+    return replace(images, diffuse=diffuse, specular=specular, valid=valid, dolp=dolp, aolp=aolp, error=error)
+
+
+def _mean_cells(image: NDArray[Any]) -> NDArray[Any]:
+    """Means over 2x2 cells, ``[H, W, ...]`` to ``[H/2, W/2, ...]``."""
+    height, width = (n // 2 * 2 for n in image.shape[:2])
+    rows = image[0:height:2, :width] + image[1:height:2, :width]
+    means: NDArray[Any] = 0.25 * (rows[:, 0::2] + rows[:, 1::2])
+    return means
 
 
 def combine_images(images: list[FrameImages]) -> FrameImages:
@@ -139,26 +158,28 @@ def combine_images(images: list[FrameImages]) -> FrameImages:
     )
 
 
-def _run_turned(network: Joint, mosaic: Mosaic, orientation: Orientation, full: bool) -> FrameImages:
+def _run_turned(network: JointWeights, mosaic: Mosaic, orientation: Orientation, full: bool) -> FrameImages:
     """A frame's images in one orientation."""
-    data = mosaic.data
+    data = to_numpy(mosaic.data)
     as_it_is = orientation == Orientation(*data.shape) and not any(n % PERIOD for n in data.shape)
-    turned = data if as_it_is else orientation.turn(data.float()).contiguous()
+    readable = data.dtype in (np.uint8, np.uint16, np.float32)
+    floats = data if as_it_is and readable else data.astype(np.float32)
+    turned = floats if as_it_is else np.ascontiguousarray(orientation.turn(floats))
     cells, parts, levels = 1 if full else 2, [], (mosaic.black_level, mosaic.white_level)
-    modulation = modulation_of(network, turned.numpy(), levels, mosaic.light_color)
-    for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), network):
+    modulation = modulation_of(network, turned, levels, mosaic.light_color)
+    for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), network.size):
         job = _Job(network, full, (bottom - top, turned.shape[1]), get_threads())
         with ENGINES.borrow(job) as engine:
             rows = slice(*((row - top) // cells for row in kept))
-            parts.append(engine.run(turned[top:bottom].numpy(), levels, mosaic.light_color, modulation, rows))
+            parts.append(engine.run(turned[top:bottom], levels, mosaic.light_color, modulation, rows))
     images = _join(parts)
     return images if as_it_is else _turn_back(images, orientation, 2 if full else 1)
 
 
-def _strips(size: tuple[int, int], network: Joint) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+def _strips(shape: tuple[int, int], size: ResidualSize) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
     """Raw rows that an engine sees and those that it makes images of: one strip, or several of at most two heights."""
-    grid, margin = PERIOD * network.net.grid, margin_of(network)
-    height, pieces = size[0], list(cut_rows(size, margin, grid))
+    grid, margin = PERIOD * size.grid, margin_of(size)
+    height, pieces = shape[0], list(cut_rows(shape, size))
     if len(pieces) == 1:
         yield pieces[0], pieces[0]
         return
@@ -184,10 +205,9 @@ def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> Fra
     """
 
     def turn(image: NDArray[Any]) -> NDArray[Any]:
-        planes = torch.from_numpy(image)
-        planes = planes.movedim(-1, 0) if planes.ndim == 3 else planes
+        planes = np.moveaxis(image, -1, 0) if image.ndim == 3 else image
         planes = orientation.turn_back(planes, scale)
-        return np.ascontiguousarray((planes.movedim(0, -1) if planes.ndim == 3 else planes).numpy())
+        return np.ascontiguousarray(np.moveaxis(planes, 0, -1) if planes.ndim == 3 else planes)
 
     turned, tally = {name: turn(image) for name, image in images.arrays().items()}, images.tally
     assert tally is not None

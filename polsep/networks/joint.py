@@ -29,28 +29,26 @@ from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, pad, pixel_shuff
 
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import MARGIN, guide_once
-from polsep.networks.channels import INPUTS, MIN_BRIGHTNESS, PERIOD, input_channels, seen_maps
+from polsep.networks.channels import (
+    INPUTS,
+    MAX_LOG_VARIANCE,
+    MIN_BRIGHTNESS,
+    MIN_CONTRAST,
+    PERIOD,
+    WINDOWS,
+    input_channels,
+    seen_maps,
+)
 from polsep.networks.details import Details
-from polsep.networks.unet import ResidualSize, ResidualUNet
-from polsep.networks.whole_frame import LIGHT, WholeFrame, make_thumbnail, split_modulation
+from polsep.networks.joint_weights import DOUBT_HIDDEN, NAMES_IN_FILES, JointWeights
+from polsep.networks.sizes import ResidualSize
+from polsep.networks.taps import pool_outputs
+from polsep.networks.thumbnails import LIGHT
+from polsep.networks.unet import ResidualUNet
+from polsep.networks.whole_frame import WholeFrame, make_thumbnail, split_modulation
 from polsep.physics.stokes import fit_stokes
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.closed_form import fit_unclipped, limit_dolp, white_specular
-
-#: Largest log variances of diffuse and specular: errors of 2 and 26 times the local brightness, the hundredth largest
-#: of the validation views (docs/experiments.md).
-MAX_LOG_VARIANCE = (1.5, 6.5)
-#: Windows of the diffuse polarization in packed pixels, and the squared contrast of colours, relative to the local
-#: brightness, below which it falls back to the wider window and to zero. Chosen on validation views
-#: (docs/experiments.md).
-WINDOWS, MIN_CONTRAST = (9, 3), (3e-3, 3e-3)
-#: Parts of the network whose parameters have other names in files of weights.
-NAMES_IN_FILES = {
-    "corrections": "last",
-    "closed_form_gain": "trust",
-    "polarization": "pose",
-    "log_variance": "doubt",
-}
 
 #: Algorithms that make the Stokes images.
 Demosaicker = Literal["linear", "guided"]
@@ -89,7 +87,7 @@ class JointOutput(NamedTuple):
 
     ``s1``, ``s2 [N, C, H/2, W/2]`` as linearly demosaicked; ``log_variance [N, 2, H/2, W/2]`` of the errors of diffuse
     and specular, relative to the squared ``local_brightness [N, 1, H/4, W/4]``; ``fit_residual [N, 1, H/4, W/4]``;
-    ``light [N, 8]``: means and log variances of `whole_frame.LIGHT`, ``[N, 0]`` of networks that see no whole frame.
+    ``light [N, 8]``: means and log variances of `thumbnails.LIGHT`, ``[N, 0]`` of networks that see no whole frame.
     """
 
     diffuse: Tensor
@@ -139,11 +137,27 @@ class Joint(nn.Module):
         self.polarization = _zero_convolution(width, 4)
         largest = torch.tensor(MAX_LOG_VARIANCE).repeat_interleave(4).view(1, 8, 1, 1)
         self.register_buffer("max_log_variance", largest, persistent=False)
-        self.log_variance = nn.Sequential(nn.Conv2d(width, 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 8, 1))
+        self.log_variance = nn.Sequential(
+            nn.Conv2d(width, DOUBT_HIDDEN, 3, padding=1), nn.ReLU(), nn.Conv2d(DOUBT_HIDDEN, 8, 1)
+        )
         self.details = Details(colors, width)
         self.whole_frame = WholeFrame(colors, size.widths) if sees_frame else None
         self.register_state_dict_post_hook(_to_names_in_files)  # type: ignore[no-untyped-call]
         self.register_load_state_dict_pre_hook(_from_names_in_files)  # type: ignore[no-untyped-call]
+
+    @classmethod
+    def of(cls, weights: JointWeights, device: torch.device) -> Joint:
+        """The network of these weights, to run, not to train."""
+        demosaicker: Demosaicker = "guided" if weights.demosaic is None else "linear"
+        network = cls(weights.colors, weights.size, weights.inputs, demosaicker, weights.sees_frame)
+        network.load_state_dict({name: torch.tensor(array) for name, array in weights.arrays.items()})
+        network.averages_shifts = weights.averages_shifts
+        return network.to(device, torch.float32).eval()
+
+    def weights(self) -> JointWeights:
+        """The twin of `of`: copies of what files of weights hold."""
+        arrays = {name: tensor.float().cpu().numpy().copy() for name, tensor in self.state_dict().items()}
+        return JointWeights(self.colors, self.size, arrays, self.inputs, self.averages_shifts)
 
     def forward(
         self, raw: Tensor, clipped: Tensor, thumbnail: Tensor | None = None
@@ -355,11 +369,6 @@ def _filter(planes: Tensor, weight: Tensor) -> Tensor:
     """Correlate packed samples, repeated beyond the border."""
     reach = weight.shape[-1] // 2
     return conv2d(pad(planes, (reach, reach, reach, reach), mode="replicate"), weight)
-
-
-def pool_outputs(weight: Tensor) -> Tensor:
-    """Weights of packed full-resolution outputs ``[16 k, ...]``, as those of their means over cells ``[4 k, ...]``."""
-    return weight.view(-1, 2, 2, 2, 2, *weight.shape[1:]).mean(dim=(2, 4)).flatten(0, 2)
 
 
 def limit(output: JointOutput) -> tuple[Tensor, Tensor, Tensor]:

@@ -32,9 +32,8 @@ from polsep.demosaic.bilinear_kernel import Pattern
 from polsep.demosaic.cells_kernel import Source
 from polsep.demosaic.guided_kernel import Stream, demosaic_rows, open_stream
 from polsep.networks.buffers import ClosedFormRows, Maps, Taps
-from polsep.networks.channels import MIN_BRIGHTNESS, PERIOD
+from polsep.networks.channels import MIN_BRIGHTNESS, MIN_CONTRAST, PERIOD, WINDOWS
 from polsep.networks.closed_form_kernel import SUMMED, fit_residual, pool, steady_diffuse_polarization
-from polsep.networks.joint import MIN_CONTRAST, WINDOWS
 from polsep.networks.unclip_kernel import leave_clipped_out, unclip
 from polsep.sensor.unpack_kernel import Samples, read_row
 from polsep.separation.closed_form_kernel import limit_specular_row, offset_row, white_specular_row

@@ -1,14 +1,12 @@
 """The joint network in torch on frames of any size and orientation, in bounded memory.
 
 Frames are turned into the order of filters that the network was trained on (`orient`), cut into overlapping strips of
-rows where they are large, and turned back. Strips begin at multiples of the network's grid and overlap by more than its
-receptive field, so that they agree with the whole frame.
+rows where they are large (`strips`), and turned back. Twin on CPUs: `engines`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -16,24 +14,12 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from polsep.demosaic.bilinear import mean_cells
-from polsep.networks.channels import PERIOD
 from polsep.networks.joint import Joint, limit
+from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of, own_order
 from polsep.physics.stokes import Stokes
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Mosaic
 from polsep.sensor.orient import Orientation, orient, shifts_of
 from polsep.separation.analytic import Separation
-
-#: Raw pixels of a frame, or of a strip with its margins, that are processed at once: some 250 bytes of memory each.
-MAX_PIXELS = 6_000_000
-#: Raw rows beyond the reach of the U-Net that demosaicking and the closed form see (a test measures that).
-OTHER_REACH = 128
-#: Least expected error that counts when separations are weighed.
-LEAST_ERROR = 1e-5
-
-
-def own_order(layout: Layout) -> Layout:
-    """Sony's order, in colour or mono as the layout is, on which networks are trained."""
-    return Layout(bayer=None) if layout.bayer is None else Layout()
 
 
 def run_joint(network: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
@@ -78,8 +64,8 @@ def _run_turned(network: Joint, mosaic: Mosaic, orientation: Orientation, full: 
     batch, (height, width) = raw.shape[:-2], raw.shape[-2:]
     raw, clipped = (x.reshape(-1, 1, height, width) for x in (raw, clipped))
     parts, thumbnail = [], network.thumbnail(raw, clipped)
-    margin = margin_of(network)
-    for first, last in cut_rows((height, width), margin, PERIOD * network.net.grid):
+    margin = margin_of(network.size)
+    for first, last in cut_rows((height, width), network.size):
         top, bottom = max(first - margin, 0), min(last + margin, height)
         with torch.no_grad():
             strip = (raw[..., top:bottom, :], clipped[..., top:bottom, :])
@@ -102,20 +88,6 @@ def _halve(separation: Separation) -> Separation:
         clipped=None if separation.clipped is None else mean_cells(separation.clipped.float()) > 0,
         expected_error=None if separation.expected_error is None else mean_cells(separation.expected_error),
     )
-
-
-def margin_of(network: Joint) -> int:
-    """Raw rows around a strip that its images depend on: whole rows of the network's grid."""
-    grid = PERIOD * network.net.grid
-    return -(-(PERIOD * network.net.reach + OTHER_REACH) // grid) * grid
-
-
-def cut_rows(size: tuple[int, int], margin: int, grid: int) -> Iterator[tuple[int, int]]:
-    """First and last row of the strips of a frame of ``size``: one, or several that begin at multiples of ``grid``."""
-    height, width = size
-    rows = height if height * width <= MAX_PIXELS else max(MAX_PIXELS // width - 2 * margin, grid) // grid * grid
-    for first in range(0, height, rows):
-        yield first, min(first + rows, height)
 
 
 def _images(network: Joint, strip: tuple[Tensor, Tensor], thumbnail: Tensor | None, full: bool) -> list[Tensor]:

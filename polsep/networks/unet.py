@@ -6,12 +6,13 @@ Conventions: images ``[N, C, H, W]``, linear light; any H and W (padded by mirro
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, pad, pixel_shuffle, pixel_unshuffle, relu
+
+from polsep.networks.sizes import UNET64, ResidualSize, Size
 
 
 class DoubleConv(nn.Sequential):
@@ -28,27 +29,6 @@ class DoubleConv(nn.Sequential):
             if isinstance(layer, nn.Conv2d):
                 nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
                 nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-
-
-@dataclass(frozen=True)
-class Size:
-    """Size of a `UNet`: ``width`` channels at the top, doubled at each of ``levels`` halvings.
-
-    ``fold`` x ``fold`` pixels are folded into channels first and unfolded at last (Shi et al. 2016), which makes small
-    networks several times faster. 64, 4 and 1 are the classic one, `UNET64`. Raises ValueError on numbers below 1.
-    """
-
-    width: int = 32
-    levels: int = 3
-    fold: int = 2
-
-    def __post_init__(self) -> None:
-        if min(self.width, self.levels, self.fold) < 1:
-            raise ValueError(f"expected a width, levels and fold of at least 1, found {self}")
-
-
-#: The network of Ronneberger et al. 2015.
-UNET64 = Size(64, 4, 1)
 
 
 class UNet(nn.Module):
@@ -72,7 +52,7 @@ class UNet(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Images of any size; their padding to a multiple of fold 2^levels is cut off again."""
         height, width = x.shape[-2:]
-        x = pixel_unshuffle(pad_to_multiple(x, self.size.fold * 2**self.size.levels), self.size.fold)
+        x = pixel_unshuffle(pad_to_multiple(x, self.size.multiple), self.size.fold)
         skips = []
         for encoder in self.encoders[:-1]:
             x = encoder(x)
@@ -82,28 +62,6 @@ class UNet(nn.Module):
         for up, decoder, skip in zip(reversed(self.ups), reversed(self.decoders), reversed(skips), strict=True):
             x = decoder(torch.cat([skip, up(x)], dim=1))
         return pixel_shuffle(self.last(x), self.size.fold)[..., :height, :width]
-
-
-@dataclass(frozen=True)
-class ResidualSize:
-    """Size of a `ResidualUNet`: ``width`` channels at the top, doubled at every further level; ``blocks`` per level.
-
-    ``entry``: channels to which a 1x1 convolution brings the inputs first, 0 for none; where there are many inputs and
-    few channels, most of the time goes into the first 3x3 convolution. Raises ValueError on sizes that cannot be built.
-    """
-
-    width: int = 32
-    blocks: tuple[int, ...] = (1, 1, 1)
-    entry: int = 0
-
-    def __post_init__(self) -> None:
-        if self.width < 1 or not self.blocks or min(*self.blocks, self.entry) < 0:
-            raise ValueError(f"expected a width of at least 1, blocks per level and entry of at least 0, found {self}")
-
-    @property
-    def widths(self) -> tuple[int, ...]:
-        """Channels of every level."""
-        return tuple(self.width * 2**level for level in range(len(self.blocks)))
 
 
 class Block(nn.Module):
@@ -140,19 +98,6 @@ class ResidualUNet(nn.Module):
         self.ups = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
         self.decoders = nn.ModuleList(_chain(w, n) for w, n in zip(widths[:-1], size.blocks, strict=False))
         self.out = _chain(widths[0], 1)
-
-    @property
-    def reach(self) -> int:
-        """Pixels around an output that it depends on, at most."""
-        counts = [2 * count for count in self.size.blocks[:-1]] + [self.size.blocks[-1]]
-        blocks = sum(2 * count << level for level, count in enumerate(counts))
-        # Besides: the entrance and the last block; a strided convolution, and a nearest neighbour, at every level.
-        return 3 + blocks + 2 * (self.grid - 1)
-
-    @property
-    def grid(self) -> int:
-        """Pixels after which the strided convolutions repeat."""
-        return 1 << len(self.downs)
 
     def forward(self, x: Tensor, changes: Sequence[tuple[Tensor, Tensor]] = ()) -> Tensor:
         """Features at the input's resolution; ``changes``: scale and shift of each level's first features, or none."""

@@ -5,7 +5,7 @@ are common to a frame, so a small network reads a thumbnail of the frame, whatev
 features of the joint network (FiLM: Perez et al. 2018, arXiv 1709.07871). Strips of large frames, and crops in
 training, use the thumbnail of their own frame.
 
-The small network also predicts `LIGHT` with a variance; training supervises that.
+The small network also predicts `thumbnails.LIGHT` with a variance; training supervises that.
 """
 
 from __future__ import annotations
@@ -16,21 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, conv2d
 
-from polsep.networks.channels import MIN_BRIGHTNESS
+from polsep.networks.thumbnails import COMMON, LIGHT, SIDE, WIDTHS, scale_thumbnail, thumbnail_channels
 from polsep.sensor.camera import Layout
-
-#: Cells of a thumbnail along each side.
-SIDE = 64
-#: Channels of the convolutions, each of half the resolution of the one before; of what is common.
-WIDTHS, COMMON = (32, 48, 64, 96), 96
-#: What is predicted of the light: ln(red / green), ln(blue / green) of the lamp's colour relative to the one divided
-#: out; degree of polarization of its specular reflections; ln of room light's share of the diffuse light.
-LIGHT = ("red", "blue", "dolp", "room")
-
-
-def thumbnail_channels(colors: int) -> int:
-    """Channels of a thumbnail: means of s0, s1, s2, maxima of s0 and of the polarized light, clipping, brightness."""
-    return 5 * colors + 2
 
 
 def analysis_weights(layout: Layout) -> Tensor:
@@ -58,14 +45,8 @@ def make_thumbnail(planes: Tensor, masks: Tensor, layout: Layout) -> Tensor:
     polarized = torch.sqrt(s1 * s1 + s2 * s2)
     means = adaptive_avg_pool2d(torch.cat([stokes, masks.mean(dim=1, keepdim=True)], dim=1), SIDE)
     largest = adaptive_max_pool2d(torch.cat([s0, polarized], dim=1), SIDE)
-    return scale_thumbnail(means[:, :-1], largest, means[:, -1:])
-
-
-def scale_thumbnail(means: Tensor, largest: Tensor, clipped: Tensor) -> Tensor:
-    """The thumbnail of means of s0, s1, s2 and maxima of s0 and of the polarized light, in white levels."""
-    brightness = means[:, : means.shape[1] // 3].mean(dim=(1, 2, 3), keepdim=True).clamp(min=0) + MIN_BRIGHTNESS
-    light = torch.asinh(torch.cat([means, largest], dim=1) / brightness)
-    return torch.cat([light, clipped, torch.log(brightness).expand_as(clipped)], dim=1)
+    thumbnail: Tensor = scale_thumbnail(means[:, :-1], largest, means[:, -1:])
+    return thumbnail
 
 
 class WholeFrame(nn.Module):

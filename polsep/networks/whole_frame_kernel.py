@@ -5,18 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from polsep.compute.compiling import HALF, ONE, ZERO, compiled, entry
 from polsep.compute.rows_kernel import fill
 from polsep.compute.threads import RowRange, run_over_rows
 from polsep.demosaic.bilinear_kernel import Pattern, read_pattern
 from polsep.networks.channels import PERIOD
-from polsep.networks.whole_frame import SIDE, scale_thumbnail
+from polsep.networks.thumbnails import SIDE, scale_thumbnail
 from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import RawFrame, Samples, as_samples, read_row
+
+Floats = NDArray[np.float32]
 
 _SIXTEENTH, _LOW = np.float32(1 / 16), np.float32(-1e30)
 
@@ -86,7 +86,7 @@ def _pool_rows(samples: Samples, pattern: Pattern, row_range: RowRange, pooled: 
                     out[5 * colors, j] += stokes[3 * colors, x] * share
 
 
-def thumbnail_of(raw: RawFrame, layout: Layout, levels: tuple[float, float], light: tuple[float, ...]) -> Tensor:
+def thumbnail_of(raw: RawFrame, layout: Layout, levels: tuple[float, float], light: tuple[float, ...]) -> Floats:
     """The thumbnail ``[1, K, SIDE, SIDE]`` of a raw frame ``[H, W]`` in Sony's order with black and white ``levels``.
 
     ``light``: colour of the lamp that is divided out.
@@ -94,7 +94,8 @@ def thumbnail_of(raw: RawFrame, layout: Layout, levels: tuple[float, float], lig
     samples = as_samples(raw)
     pattern = read_pattern((raw.shape[0], raw.shape[1]), layout, *levels, light)
     colors = layout.channels
-    pooled: NDArray[np.float32] = np.empty((SIDE, 5 * colors + 1, SIDE), np.float32)
+    pooled: Floats = np.empty((SIDE, 5 * colors + 1, SIDE), np.float32)
     run_over_rows(lambda row_range: _pool_rows(samples, pattern, row_range, pooled), SIDE, 4)
-    planes = torch.from_numpy(pooled).movedim(1, 0)[None]
-    return scale_thumbnail(planes[:, : 3 * colors], planes[:, 3 * colors : 5 * colors], planes[:, 5 * colors :])
+    means, largest, clipped = np.split(np.moveaxis(pooled, 1, 0)[None], (3 * colors, 5 * colors), axis=1)
+    found: Floats = scale_thumbnail(means, largest, clipped)
+    return found

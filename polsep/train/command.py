@@ -13,8 +13,9 @@ import torch
 
 from polsep.io.store.weights import write_weights
 from polsep.networks.joint import Demosaicker
-from polsep.networks.paper import RUNGS
-from polsep.networks.unet import ResidualSize, Size, count_parameters
+from polsep.networks.rungs import RUNGS
+from polsep.networks.sizes import ResidualSize, Size
+from polsep.networks.unet import count_parameters
 from polsep.train.digest import digest_examples
 from polsep.train.inputs import JointInputs, LadderInputs
 from polsep.train.joint_task import (

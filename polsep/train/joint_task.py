@@ -15,7 +15,7 @@ from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.networks.channels import INPUTS
 from polsep.networks.guide import guide_batch
 from polsep.networks.joint import Demosaicker, Joint, bilinear_filter
-from polsep.networks.unet import ResidualSize
+from polsep.networks.sizes import ResidualSize
 from polsep.physics.stokes import Measurements, Stokes
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.analytic import Separation

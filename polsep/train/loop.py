@@ -203,7 +203,7 @@ def load_mean(paths: Sequence[Path], network: nn.Module) -> None:
     """
     mean: dict[str, Tensor] = {}
     for count, path in enumerate(paths, start=1):
-        tensors, _ = read_weights(path)
+        tensors = {name: torch.from_numpy(array) for name, array in read_weights(path)[0].items()}
         try:
             network.load_state_dict(grow(tensors, network) if isinstance(network, Joint) else tensors)
         except (RuntimeError, ValueError):

@@ -9,8 +9,9 @@ from typing import Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
-from polsep.networks.paper import Refinement, Rung, separate_refined
-from polsep.networks.unet import Size
+from polsep.networks.paper import Refinement
+from polsep.networks.rungs import Rung, separate_refined
+from polsep.networks.sizes import Size
 from polsep.physics.stokes import Measurements
 from polsep.separation.analytic import Separation
 from polsep.train.inputs import Inputs, LadderInputs, co_sited_inputs, mono_inputs, mosaic_inputs

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from polsep.compute.cluster import map_ordered
@@ -33,7 +32,15 @@ from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWri
 from polsep.io.store.errors import InputError
 from polsep.light.find import Light, combine, find_light
 from polsep.methods import Capture, find_method
-from polsep.pipeline import FOUND_WORDS, LightColor, find_device, is_calibrated, make_frame, separate_capture, to_device
+from polsep.pipeline import (
+    FOUND_WORDS,
+    LightColor,
+    find_device,
+    is_calibrated,
+    make_frame,
+    move_capture,
+    separate_capture,
+)
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import find_lasting_defects, repair
 from polsep.video.panels_kernel import STEPS, make_panels
@@ -169,7 +176,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
         "defects": 0 if first.defects is None else int(np.count_nonzero(first.defects)),
         "shape": list(first.shape),
         "colors": first.size[2],
-        "device": str(find_device(options.device)),
+        "device": find_device(options.device),
     }
     sequence = SequenceWriter(target.directory, recording.stem, target.kind, settings, target.overwrite)
     for warning in first.warnings:
@@ -307,7 +314,7 @@ def separate_on_ray(
     workers, device = get_threads(), find_device(options.device)
     submitted: deque[tuple[int | DamagedFrame, TemporalState | None]] = deque()
 
-    def jobs() -> Iterator[tuple[Capture, FirstFrame, torch.device]]:
+    def jobs() -> Iterator[tuple[Capture, FirstFrame, str]]:
         for frame, after in frames:
             submitted.append((frame if isinstance(frame, DamagedFrame) else frame.index, after))
             if not isinstance(frame, DamagedFrame):
@@ -332,10 +339,10 @@ def separate_on_ray(
 ENGINES = {"local": separate_here, "ray": separate_on_ray}
 
 
-def separate_one(job: tuple[Capture, FirstFrame, torch.device]) -> Result:
+def separate_one(job: tuple[Capture, FirstFrame, str]) -> Result:
     """Separate one frame with the method and the light colour of the first one."""
     data, first, device = job
-    data = to_device(data, device)
+    data = move_capture(data, device)
     method = find_method(first.method, data)
     frame = make_frame(method.run(data, first.light, False), method, data, first.light)
     return Result((frame.diffuse, frame.specular), frame.report)

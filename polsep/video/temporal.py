@@ -26,9 +26,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import like, to_numpy
 from polsep.sensor.camera import CLIP_MARGIN, Mosaic
 from polsep.sensor.noise import BLOCK, Floats, Levels, Noise, blocks_of, estimate_noise, least_noise
 
@@ -151,13 +151,13 @@ def _filter(mosaic: Mosaic, state: TemporalState | None, apply: Any) -> tuple[Mo
         count = np.ones(_blocks(raw.shape), np.float32)
         mean = raw.astype(np.float32)
         state = TemporalState(mean, count, noise, 0, 1, (levels.black, levels.white))
-        return replace(mosaic, data=_as_tensor(mean, mosaic)), state
+        return replace(mosaic, data=like(mosaic.data, mean)), state
     before = (_padded(state.mean), state.count)
     noise, estimates = _next_noise(samples, before, levels, state)
     filtered, mean, count = apply(samples, before, make_rules(noise, levels))
     filtered, mean = (np.ascontiguousarray(x[: raw.shape[0], : raw.shape[1]]) for x in (filtered, mean))
     state = TemporalState(mean, count, noise, estimates, state.frames + 1, state.levels)
-    return replace(mosaic, data=_as_tensor(filtered, mosaic)), state
+    return replace(mosaic, data=like(mosaic.data, filtered)), state
 
 
 def _raw_samples(mosaic: Mosaic, state: TemporalState | None) -> NDArray[Any]:
@@ -170,13 +170,8 @@ def _raw_samples(mosaic: Mosaic, state: TemporalState | None) -> NDArray[Any]:
         raise ValueError(f"expected frames of {sizes[0]} as before, found {sizes[1]}")
     if state is not None and levels != state.levels:
         raise ValueError(f"expected black and white at {state.levels} as before, found {levels}")
-    if data.dtype not in (torch.uint8, torch.uint16, torch.float32):
-        data = data.float()
-    return data.detach().cpu().numpy()
-
-
-def _as_tensor(mean: Floats, mosaic: Mosaic) -> torch.Tensor:
-    return torch.from_numpy(mean).to(mosaic.data.device)
+    samples = to_numpy(data)
+    return samples if samples.dtype in (np.uint8, np.uint16, np.float32) else samples.astype(np.float32)
 
 
 def _blocks(shape: tuple[int, ...]) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 
 from polsep.io.store.temporary import make_temporary_folders, remove_folder
 from polsep.methods import find_method
@@ -131,5 +131,5 @@ def _launch(page, options: ViewOptions) -> str:  # type: ignore[no-untyped-def]
 
 def warm_up(method: str) -> None:
     """Load kernels and weights, and build an engine of the usual size, before the first separation."""
-    mosaic = Mosaic(torch.zeros(2048, 2448), Layout(), 0.0, 1.0)
+    mosaic = Mosaic(np.zeros((2048, 2448), np.float32), Layout(), 0.0, 1.0)
     find_method(method, mosaic).run(mosaic, (1.0, 1.0, 1.0), False)

@@ -1,0 +1,39 @@
+"""Large frames in overlapping strips of rows, for torch and for engines.
+
+Strips begin at multiples of the network's grid and overlap by more than its receptive field, so that they agree with
+the whole frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from polsep.networks.channels import PERIOD
+from polsep.networks.sizes import ResidualSize
+from polsep.sensor.camera import Layout
+
+#: Raw pixels of a frame, or of a strip with its margins, that are processed at once: some 250 bytes of memory each.
+MAX_PIXELS = 6_000_000
+#: Raw rows beyond the reach of the U-Net that demosaicking and the closed form see (a test measures that).
+OTHER_REACH = 128
+#: Least expected error that counts when separations are weighed.
+LEAST_ERROR = 1e-5
+
+
+def own_order(layout: Layout) -> Layout:
+    """Sony's order, in colour or mono as the layout is, on which networks are trained."""
+    return Layout(bayer=None) if layout.bayer is None else Layout()
+
+
+def margin_of(size: ResidualSize) -> int:
+    """Raw rows around a strip that its images depend on: whole rows of the network's grid."""
+    grid = PERIOD * size.grid
+    return -(-(PERIOD * size.reach + OTHER_REACH) // grid) * grid
+
+
+def cut_rows(shape: tuple[int, int], size: ResidualSize) -> Iterator[tuple[int, int]]:
+    """First and last row of the strips of a frame of ``shape``: one, or several that begin at multiples of the grid."""
+    (height, width), grid, margin = shape, PERIOD * size.grid, margin_of(size)
+    rows = height if height * width <= MAX_PIXELS else max(MAX_PIXELS // width - 2 * margin, grid) // grid * grid
+    for first in range(0, height, rows):
+        yield first, min(first + rows, height)

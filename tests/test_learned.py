@@ -90,7 +90,7 @@ def capture() -> Measurements:
     """The embedded capture at half resolution, clipped highlights and all."""
     frame = next(read_frames(str(files("polsep") / "data" / "still_life.png"), ReadOptions(white_level=4095.0)))
     assert isinstance(frame.data, Mosaic)
-    return demosaic_bilinear_half(replace(frame.data, data=torch.from_numpy(frame.data.data)))
+    return demosaic_bilinear_half(replace(frame.data, data=torch.as_tensor(frame.data.data)))
 
 
 def cut(measurements: Measurements, row: int, col: int, shape: tuple[int, int]) -> Measurements:

@@ -6,10 +6,9 @@ Pixels are areas: the first and the last one end where the image does.
 from __future__ import annotations
 
 import numpy as np
-from array_api_compat import device
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import Array, constant, namespace
+from polsep.compute.arrays import Array, constant, namespace, of_kind
 
 
 def halve(x: Array) -> Array:
@@ -60,5 +59,5 @@ def _mix(x: Array, axis: int, places: list[NDArray[np.int64]], weights: list[NDA
     xp, mixed = namespace(x), 0.0
     for place, weight in zip(places, weights, strict=True):
         weight = weight if axis == -1 else weight[:, None]
-        mixed = mixed + xp.take(x, xp.asarray(place, device=device(x)), axis=axis) * constant(weight, x)
+        mixed = mixed + xp.take(x, of_kind(place, x), axis=axis) * constant(weight, x)
     return mixed

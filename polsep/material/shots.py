@@ -95,7 +95,8 @@ def photograph(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> t
 
 def unseparated_image(mosaic: Mosaic) -> Tensor:
     """The image of a camera without analysers, ``[3, h, w]``: s0, with clipped samples as they are."""
-    return 2 * demosaic_guided_half(mosaic).data.mean(dim=-4)
+    image: Tensor = 2 * demosaic_guided_half(mosaic).data.mean(dim=-4)
+    return image
 
 
 def separated_images(mosaic: Mosaic) -> Tensor:

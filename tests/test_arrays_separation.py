@@ -95,7 +95,7 @@ def _images(separation: Separation) -> dict[str, Any]:
 @pytest.mark.parametrize("layout", [Layout(), Layout(origin=(1, 0)), MONO], ids=["color", "odd origin", "mono"])
 @pytest.mark.parametrize("demosaic", DEMOSAICKERS)
 def test_closed_forms_agree(demosaic: Any, layout: Layout, brightness: float, generator: torch.Generator) -> None:
-    """Colour-affine separation in frames with clipped samples solves equations that amplify rounding, to 4e-5 of white."""
+    """Where samples clip, colour-affine separation solves equations that amplify rounding, to 4e-5 of white."""
     seen = demosaic(random_frame((91, 74), layout, IMX250, brightness, generator))
     arrays = as_numpy(seen)
     assert arrays is not None

@@ -153,6 +153,11 @@ def main() -> None:
     except BrokenPipeError:
         sys.stderr.close()  # nobody reads our output any more
         sys.exit(1)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "torch":
+            raise
+        print_note("error: expected the extra 'torch' (pip install 'polsep[torch]'), found no torch")
+        sys.exit(2)
     except (click.ClickException, ValueError, RuntimeError, OSError) as error:
         message = error.format_message() if isinstance(error, click.ClickException) else str(error)
         print_note(f"error: {one_line(message, 2 * MOST)}")

@@ -16,11 +16,13 @@ def box_mean(x: Array, radius: int) -> Array:
         for size, margin in (((1, 2 * radius + 1), (0, radius)), ((2 * radius + 1, 1), (radius, 0))):
             images = functional.avg_pool2d(images, size, 1, margin, count_include_pad=False)
         return images.reshape(x.shape)
+    if radius == 0:
+        return x
     xp = namespace(x)
     for axis in (-1, -2):
-        n, margin = x.shape[axis], list(x.shape)
-        margin[axis] = radius
-        zeros = xp.zeros(tuple(margin), dtype=x.dtype, device=device(x))
+        n = x.shape[axis]
+        border = (*x.shape[:-1], radius) if axis == -1 else (*x.shape[:-2], radius, x.shape[-1])
+        zeros = xp.zeros(border, dtype=x.dtype, device=device(x))
         padded = xp.concat([zeros, x, zeros], axis=axis)
         total = window(padded, 0, n, axis) + window(padded, 1, n, axis)
         for k in range(2, 2 * radius + 1):

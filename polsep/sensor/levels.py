@@ -25,6 +25,10 @@ from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
 #: Accepted samples and the white level that their type implies.
 WHITE_LEVELS = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0, "float64": 1.0}
 
+#: Distance from black to white, in units of the samples, and how many times it a sample or a level may be away. Beyond,
+#: squares overflow in float32, or white and black are one number in it.
+SPANS, MAX_RATIO = (1e-12, 1e12), 1e6
+
 #: Floats up to about 1 that lie below this share of the white level look as if white were 1.
 MIN_USED = 0.01
 
@@ -184,11 +188,13 @@ def _checked(array: NDArray[Any]) -> NDArray[Any]:
 
 def _require_finite(array: NDArray[Any]) -> None:
     """Raise ValueError when a value is not finite, or has no finite float32."""
+    with np.errstate(invalid="ignore"):
+        if max(-float(array.min()), float(array.max())) <= float(np.finfo(np.float32).max):
+            return
     bad = ~(np.abs(array) <= np.finfo(np.float32).max)
-    if bad.any():
-        first = tuple(int(i) for i in np.unravel_index(int(bad.argmax()), bad.shape))
-        count = np.count_nonzero(bad)
-        raise ValueError(f"expected finite values, found {count} that are not, the first ({array[first]:g}) at {first}")
+    first = tuple(int(i) for i in np.unravel_index(int(bad.argmax()), bad.shape))
+    count = np.count_nonzero(bad)
+    raise ValueError(f"expected finite values, found {count} that are not, the first ({array[first]:g}) at {first}")
 
 
 def _one_channel(array: NDArray[Any]) -> tuple[NDArray[Any], Notes]:
@@ -216,7 +222,22 @@ def _white_level(samples: NDArray[Any], black_level: float, white_level: float |
         raise ValueError(f"expected finite black and white levels, found {black_level:g} and {white:g}")
     if not white > black_level:
         raise ValueError(f"expected a white level above the black level, found white {white:g}, black {black_level:g}")
+    _require_span(samples, float(black_level), float(white))
     return float(white)
+
+
+def _require_span(samples: NDArray[Any], black: float, white: float) -> None:
+    """Raise ValueError for levels and samples with which float32 would overflow, or lose every digit."""
+    span = white - black
+    if not (SPANS[0] <= span <= SPANS[1] and max(abs(black), abs(white)) <= MAX_RATIO * span):
+        raise ValueError(f"expected a white level well above the black level, found white {white:g}, black {black:g}")
+    least, most = (samples.min(), samples.max()) if samples.dtype.kind == "f" else (0, WHITE_LEVELS[samples.dtype.name])
+    farthest = max(black - float(least), float(most) - black)
+    if farthest > MAX_RATIO * span:
+        raise ValueError(
+            f"expected samples within {MAX_RATIO:g} times the white level, found them {farthest:g} from black, "
+            f"white {white:g}: say --white-level N"
+        )
 
 
 def _as_float32(samples: NDArray[Any]) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ from evaluation.calibration import bench_calibration
 from evaluation.dynamic import bench_dynamic, bench_dynamic_quick
 from evaluation.gallery import REAL, draw_paper
 from evaluation.geometry import bench_geometry, bench_geometry_quick, draw_geometry
+from evaluation.install import bench_install
 from evaluation.joint import bench_joint
 from evaluation.material import PUBLISHED, bench_material, bench_material_quick
 from evaluation.material_gallery import draw_material
@@ -48,6 +49,7 @@ BENCHES: dict[str, Bench] = {
         ("diligent_normals", "meshes"),
         (*SEPARATION, "polsep/geometry"),
     ),
+    "install": Bench(bench_install, measures=("polsep", "pyproject.toml", "constraints.txt")),
     "view": Bench(bench_view, measures=("polsep/view", "polsep/edit")),
     "warned": Bench(
         bench_warned,

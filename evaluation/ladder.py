@@ -98,7 +98,7 @@ def network_entry(weights: Weights) -> Entry:
     rung, network = load_refinement(weights.path, torch.device("cpu"))
     if rung.name != weights.rung:
         raise ValueError(f"expected weights of the rung {weights.rung} in {weights.path}, found {rung.name}")
-    split = partial(separate_refined, rung=rung, refine=network)
+    split = torch.no_grad()(partial(separate_refined, rung=rung, refine=network))
     return Entry(weights.name, compose(demosaic_bilinear_half, split), network)
 
 

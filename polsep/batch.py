@@ -16,6 +16,7 @@ from typing import Any
 from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames
 from polsep.io.results.separation_writer import planned_outputs, write_separation
 from polsep.io.store.atomic import OutputError, refuse_existing
+from polsep.io.store.errors import one_line
 from polsep.pipeline import LightColor, separate_capture
 
 
@@ -71,7 +72,7 @@ def separate_files(
                 claimed |= {realpath(output): f"is of {path}" for output in outcome.written}
                 yield outcome
         except (ValueError, OSError, MemoryError, RuntimeError) as error:
-            yield Outcome(path, error=" ".join(str(error).split())[:500] or type(error).__name__)
+            yield Outcome(path, error=one_line(error) or type(error).__name__)
 
 
 def _separate_frame(

@@ -7,10 +7,11 @@ and DoLP, AoLP and statistics are of white light.
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -125,11 +126,22 @@ def make_frame(
     report = describe(images.tally, method.expects_errors)
     layout = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
     report |= {"method": method.name, "light_color": list(light), "full_resolution": full, "layout": layout}
+    if not _is_finite(report):
+        raise ValueError(f"expected finite images of {method.name}, found others: is the white level far too low?")
     diffuse, specular, error = images.diffuse, images.specular, images.error
     if isinstance(capture, Mosaic) and capture.falloff is not None:
         fall = falloff_image(capture.falloff, *diffuse.shape[:2])[..., None]
         diffuse, specular, error = diffuse / fall, specular / fall, None if error is None else error / fall
     return SeparatedFrame(diffuse, specular, images.valid, images.dolp, images.aolp, report, error)
+
+
+def _is_finite(facts: Any) -> bool:
+    """True unless a number in a report, which sums up the images, is NaN or infinite."""
+    if isinstance(facts, Mapping):
+        facts = facts.values()
+    elif not isinstance(facts, list | tuple):
+        return not isinstance(facts, float) or math.isfinite(facts)
+    return all(map(_is_finite, facts))
 
 
 def find_device(name: str) -> str:

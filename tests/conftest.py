@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from polsep import kernels, shipped
+from polsep import in_torch, kernels, shipped
 from polsep.io.store import weights
 from polsep.methods import METHODS
 from polsep.sensor.camera import Layout, Mosaic
@@ -59,9 +59,9 @@ def ship(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             raise ValueError("not shipped")
         return path
 
-    for room in (weights, shipped):
+    for room in (weights, shipped, in_torch):
         monkeypatch.setattr(room, "shipped_weights", find)
-    caches = (shipped._read_refinement, shipped._read_joint)
+    caches = (shipped._shipped_refiner, shipped._read_shipped, in_torch._shipped, in_torch._shipped_refinement)
     for cache in caches:
         cache.cache_clear()
     yield tmp_path

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from tolerances import MITSUBA, assert_within
 from torch import Tensor
 
-from polsep.physics.optics import ETA, normalize
+from polsep.physics.fresnel import ETA
+from polsep.physics.optics import normalize
 from polsep.physics.stokes import Stokes
 from polsep.render.materials import Materials, random_materials
 from polsep.render.shapes import FINE, Mesh, ellipsoid, random_mesh

@@ -15,7 +15,7 @@ from torch.nn.functional import avg_pool2d
 
 import polsep
 from polsep import cli
-from polsep.methods import METHODS
+from polsep.methods import BEST, METHODS
 from polsep.render.distances import still_life
 from polsep.render.sphere_tracing import cast, is_lit, render, shade
 from polsep.sensor.camera import IMX250, Layout, Sensor, expose
@@ -26,20 +26,23 @@ CAPTURE = Path(polsep.__file__).parent / "data" / "still_life.png"
 
 
 @pytest.mark.usefixtures("compiled")
+@pytest.mark.parametrize("every", [False, True])
 def test_demo_works_offline(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    every: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """`polsep demo` needs no network, separates the capture with every method, and prints paths that exist."""
+    """`polsep demo` needs no network, separates the capture with two methods or with every one, and prints paths."""
 
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("the demo opened a socket")
 
     monkeypatch.setattr(socket, "socket", refuse)
-    monkeypatch.setattr(sys, "argv", ["polsep", "demo", "-o", str(tmp_path / "o")])
+    monkeypatch.setattr(sys, "argv", ["polsep", "demo", "-o", str(tmp_path / "o"), *["--all"] * every])
     cli.main()
     said = capsys.readouterr()
     assert said.err == ""
-    for method in METHODS:
+    methods = tuple(METHODS) if every else ("analytic", BEST[0].name)
+    assert {p.name for p in (tmp_path / "o").iterdir()} == set(methods)
+    for method in methods:
         files = {p.name for p in (tmp_path / "o" / method).iterdir()}
         assert files == {"still_life.exr", "still_life.png", "still_life.json"}
         assert str(tmp_path / "o" / method / "still_life.png") in said.out

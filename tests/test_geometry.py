@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from polsep.physics.optics import diffuse_dolp, fresnel
+from polsep.physics.fresnel import diffuse_dolp, fresnel
 
 pytest.importorskip("scipy")
 

@@ -8,15 +8,17 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tolerances import assert_close
 from torch import Tensor
 
+from polsep import shipped
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.in_torch import load_refinement, separate_paper
 from polsep.io.raw.frames import ReadOptions, read_frames
@@ -88,7 +90,7 @@ def capture() -> Measurements:
     """The embedded capture at half resolution, clipped highlights and all."""
     frame = next(read_frames(str(files("polsep") / "data" / "still_life.png"), ReadOptions(white_level=4095.0)))
     assert isinstance(frame.data, Mosaic)
-    return demosaic_bilinear_half(frame.data)
+    return demosaic_bilinear_half(replace(frame.data, data=torch.as_tensor(frame.data.data)))
 
 
 def cut(measurements: Measurements, row: int, col: int, shape: tuple[int, int]) -> Measurements:
@@ -121,6 +123,22 @@ def test_tiles_equal_the_whole_away_from_seams(capture: Measurements) -> None:
     for a, b in ((whole.diffuse, tile.diffuse), (whole.specular, tile.specular)):
         assert_close(b[..., margin:], a[..., period + margin :])
         assert float((b - a[..., period:]).abs().max()) > 1e-3  # the seam is seen where it should be
+
+
+@pytest.mark.parametrize("shape", [(96, 128), (91, 75), (5, 7)])
+@pytest.mark.parametrize("colors", [3, 1])
+def test_without_torch_the_images_are_the_same(capture: Measurements, shape: tuple[int, int], colors: int) -> None:
+    """NumPy measurements by OpenVINO and tensors by torch: whole multiples of the coarsest pixel, others, and tiny."""
+    part = cut(capture, 304, 400, shape)
+    assert part.clipped is not None
+    part = Measurements(part.data[:, :colors], part.angles, part.clipped[:, :colors])
+    assert part.clipped is not None
+    expected = separate_paper(part)
+    found = shipped.separate_paper(Measurements(part.data.numpy(), part.angles, part.clipped.numpy()))
+    for name in ("diffuse", "specular"):
+        assert_close(torch.from_numpy(getattr(found, name)), getattr(expected, name), 10)
+    assert np.array_equal(found.valid, expected.valid.numpy())
+    assert_close(torch.from_numpy(found.stokes.s0), expected.stokes.s0)
 
 
 def test_results_do_not_depend_on_the_batch(capture: Measurements) -> None:

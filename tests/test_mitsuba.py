@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from tolerances import MITSUBA, assert_within
 from torch import Tensor
 
-from polsep.physics.optics import ETA, Geometry, beam_frame, diffuse_stokes, dot, normalize, specular_stokes
+from polsep.physics.fresnel import ETA
+from polsep.physics.optics import (
+    Geometry,
+    beam_frame,
+    diffuse_stokes,
+    dot,
+    normalize,
+    specular_stokes,
+)
 
 mi = pytest.importorskip("mitsuba")
 

@@ -17,17 +17,15 @@ from numpy.typing import NDArray
 from tolerances import PRINTED, QUADRATURE, ROUNDING, assert_close, assert_finite, assert_same_angle, assert_within
 from torch import Tensor
 
+from polsep.physics.fresnel import ETA, diffuse_dolp, fresnel
 from polsep.physics.optics import (
-    ETA,
     Beam,
     Geometry,
     beam_frame,
     cross,
-    diffuse_dolp,
     diffuse_stokes,
     dot,
     double_angle,
-    fresnel,
     ggx_distribution,
     mueller_diffuse,
     mueller_polarizer,

@@ -231,7 +231,7 @@ def doubting(monkeypatch: pytest.MonkeyPatch) -> Joint:
 
     def reference(capture: Capture, full: bool = False) -> Separation:
         assert isinstance(capture, Mosaic)
-        return run_joint(network, capture, full)
+        return run_joint(network, replace(capture, data=torch.as_tensor(capture.data)), full)
 
     run = partial(run_reference, reference)
     method = replace(METHODS["analytic"], name="joint", reference=reference, run=run, expects_errors=True)

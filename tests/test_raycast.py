@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from polsep.compute.threads import get_threads, set_threads
-from polsep.physics.optics import ETA, beam_frame, diffuse_dolp, dot, normalize
+from polsep.physics.fresnel import ETA, diffuse_dolp
+from polsep.physics.optics import beam_frame, dot, normalize
 from polsep.physics.stokes import Stokes
 from polsep.render import raycast, shapes
 from polsep.render.distances import ball, plain

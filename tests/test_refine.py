@@ -45,7 +45,7 @@ def test_every_rung_sees_and_separates(rung: Rung) -> None:
         torch.nn.init.constant_(net.last.bias, 0.25)  # type: ignore[union-attr, arg-type]
     torch.nn.init.zeros_(network.linear.weight)
     torch.nn.init.zeros_(network.linear.bias)  # type: ignore[arg-type]
-    found = separate_refined(seen(), rung, network)
+    found = separate_refined(seen(), rung, network.requires_grad_(False))
     assert_close(found.diffuse, torch.full((1, 3, 12, 12), 0.25))
     assert_close(found.specular, torch.full((1, 3, 12, 12), math.expm1(0.25)))
     assert_close(found.stokes.s0, separate_analytic(seen()).stokes.s0)
@@ -54,21 +54,21 @@ def test_every_rung_sees_and_separates(rung: Rung) -> None:
 @pytest.mark.parametrize("name", ["paper", "shared", "signed", "no-angle"])
 def test_networks_that_see_the_analytic_split_start_at_it(name: str) -> None:
     rung, expected = RUNGS[name], separate_analytic(seen())
-    found = separate_refined(seen(), rung, Refinement(rung, 3, Size(4, 1, 1)))
+    found = separate_refined(seen(), rung, Refinement(rung, 3, Size(4, 1, 1)).requires_grad_(False))
     assert_close(found.diffuse, expected.diffuse)
     assert_close(found.specular, expected.specular)
 
 
 @pytest.mark.parametrize("name", ["unpolarized", "polarized", "stokes"])
 def test_other_networks_start_with_all_light_diffuse(name: str) -> None:
-    found = separate_refined(seen(), RUNGS[name], Refinement(RUNGS[name], 3, Size(4, 1, 1)))
+    found = separate_refined(seen(), RUNGS[name], Refinement(RUNGS[name], 3, Size(4, 1, 1)).requires_grad_(False))
     assert_close(found.diffuse, torch.full((1, 3, 12, 12), 0.8))
     assert float(found.specular.max()) == 0
 
 
 def test_mono_has_one_colour() -> None:
     mono = Measurements(seen().data[:, :, :1], ANGLES)
-    found = separate_refined(mono, RUNGS["paper"], Refinement(RUNGS["paper"], 1, Size(4, 1, 1)))
+    found = separate_refined(mono, RUNGS["paper"], Refinement(RUNGS["paper"], 1, Size(4, 1, 1)).requires_grad_(False))
     assert found.diffuse.shape == (1, 1, 12, 12)
 
 

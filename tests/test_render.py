@@ -10,7 +10,8 @@ import torch
 from tolerances import HIT, NORMALS, ROUNDING, SHADING, assert_close, assert_finite, assert_same_angle, assert_within
 from torch import Tensor
 
-from polsep.physics.optics import diffuse_dolp, dot, normalize
+from polsep.physics.fresnel import diffuse_dolp
+from polsep.physics.optics import dot, normalize
 from polsep.physics.stokes import Stokes, aolp, dolp, polarized_intensity
 from polsep.render import sphere_tracing as render_module
 from polsep.render.distances import (

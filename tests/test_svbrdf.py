@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polsep.material.svbrdf import Svbrdf, plane_points, reflect, relight, unstack
-from polsep.physics.optics import Geometry, diffuse_stokes, fresnel, specular_stokes
+from polsep.physics.fresnel import fresnel
+from polsep.physics.optics import Geometry, diffuse_stokes, specular_stokes
 
 Doubles = NDArray[np.float64]
 

@@ -37,7 +37,8 @@ from evaluation.testsets.photographs import normals_from_depth, polarize_diffuse
 from evaluation.testsets.sheet import TILE
 from evaluation.testsets.statues import DILIGENT_FILES, random_albedo, span_surface, unproject
 from polsep.io.assets.objects import hash_files, read_depth, read_mask, read_mesh, read_normal_map, read_photograph
-from polsep.physics.optics import Geometry, diffuse_dolp, diffuse_stokes
+from polsep.physics.fresnel import diffuse_dolp
+from polsep.physics.optics import Geometry, diffuse_stokes
 from polsep.physics.stokes import Stokes, aolp, dolp, measure
 from polsep.render.shapes import Mesh
 from polsep.render.sphere_tracing import PinholeCamera, Scene

@@ -10,7 +10,8 @@ from torch.nn.functional import pixel_unshuffle
 from polsep.networks.channels import MIN_BRIGHTNESS, PERIOD
 from polsep.networks.joint import Joint
 from polsep.networks.sizes import ResidualSize
-from polsep.networks.whole_frame import SIDE, make_thumbnail, thumbnail_channels
+from polsep.networks.thumbnails import SIDE, thumbnail_channels
+from polsep.networks.whole_frame import make_thumbnail
 from polsep.networks.whole_frame_kernel import thumbnail_of
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import IDEAL, Layout, Mosaic, expose
@@ -37,7 +38,7 @@ def test_kernel_and_twin_agree(layout: Layout, size: tuple[int, int]) -> None:
     levels = (mosaic.black_level, mosaic.white_level)
     found = thumbnail_of(mosaic.data.numpy(), layout, levels, mosaic.light_color)
     assert found.shape == (1, thumbnail_channels(layout.channels), SIDE, SIDE)
-    assert_close(found, thumbnail(mosaic), scale=10)
+    assert_close(torch.from_numpy(found), thumbnail(mosaic), scale=10)
 
 
 @pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)

@@ -27,7 +27,7 @@ from torch.nn.functional import interpolate, pad
 
 from evaluation.testsets.cases import Recipe
 from polsep.io.assets.objects import read_depth, read_mask, read_photograph
-from polsep.physics.optics import diffuse_dolp
+from polsep.physics.fresnel import diffuse_dolp
 from polsep.physics.stokes import Stokes
 from polsep.render.shapes import Floats
 from polsep.render.sphere_tracing import Scene
@@ -64,7 +64,7 @@ def normals_from_depth(height: Floats) -> Floats:
 def polarize_diffuse(s0: Tensor, normal: Tensor) -> Stokes:
     """Diffuse light ``[3, H, W]`` that leaves a dielectric toward +z: AoLP is the azimuth of the unit normal.
 
-    DoLP is `optics.diffuse_dolp` at its zenith angle.
+    DoLP is `fresnel.diffuse_dolp` at its zenith angle.
     """
     x, y, z = normal
     squared = (x * x + y * y).clamp(min=1e-12)

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from polsep.calibrate.dark_flat import MOST_CLIPPED, require_same_sensor
 from polsep.calibrate.statistics import Doubles, place_means
+from polsep.compute.arrays import to_numpy
 from polsep.sensor.calibration import Analyser, Calibration
 from polsep.sensor.camera import Layout, Mosaic
 
@@ -125,9 +126,9 @@ def _means_of(frames: Iterable[Mosaic], before: Calibration | None) -> tuple[Dou
         height, width = mosaic.data.shape
         top, left = height // 4 // period * period, width // 4 // period * period
         middle = (slice(top, height - top), slice(left, width - left))
-        if (clipped := float(mosaic.clipped()[middle].float().mean())) > MOST_CLIPPED:
+        if (clipped := float(to_numpy(mosaic.clipped())[middle].mean())) > MOST_CLIPPED:
             raise ValueError(f"expected frames without clipping, found {clipped:.1%} of a frame's middle clipped")
-        rows.append(place_means(mosaic.linear()[middle].cpu().numpy(), period).reshape(-1))
+        rows.append(place_means(to_numpy(mosaic.linear())[middle], period).reshape(-1))
     if first is None:
         raise ValueError("expected frames behind a turned polarizer, found none")
     means = np.array(rows)

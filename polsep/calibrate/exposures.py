@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import of_kind, to_numpy
 from polsep.sensor.camera import CLIP_MARGIN, Mosaic
 from polsep.sensor.noise import Levels, Noise, estimate_noise
 
@@ -60,8 +60,8 @@ def merge_exposures(frames: Sequence[Mosaic], times: Sequence[float] | None = No
     _require_same(frames)
     if times is not None and (len(times) != len(frames) or not all(0 < t < float("inf") for t in times)):
         raise ValueError(f"expected {len(frames)} positive exposure times, one per frame, found {list(times)}")
-    linear = [frame.linear().cpu().numpy() for frame in frames]
-    clipped = [frame.clipped().cpu().numpy() for frame in frames]
+    linear = [to_numpy(frame.linear()) for frame in frames]
+    clipped = [to_numpy(frame.clipped()) for frame in frames]
     found, notes = _find_times(linear, clipped, times)
     order = sorted(range(len(frames)), key=lambda i: found[i])
     ratio = [found[i] / found[order[0]] for i in order]
@@ -69,7 +69,7 @@ def merge_exposures(frames: Sequence[Mosaic], times: Sequence[float] | None = No
     merged, moved = _merge([linear[i] for i in order], [clipped[i] for i in order], ratio, noise)
     if moved > MAX_MOVED and not notes:  # wrong times look like motion
         notes.append(f"{moved:.1%} of the samples differ between exposures by more than noise: did the scene move?")
-    mosaic = replace(frames[0], data=torch.from_numpy(merged), black_level=0.0, white_level=1.0)
+    mosaic = replace(frames[0], data=of_kind(merged, frames[0].data), black_level=0.0, white_level=1.0)
     return Merged(mosaic, tuple(found), noise, tuple(notes))
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from polsep.calibrate.exposures import merge_exposures
+from polsep.compute.arrays import to_numpy
 from polsep.io.raw.corrections import read_mosaics
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.raw.tiff import write_merged
@@ -66,10 +67,10 @@ def merge_files(
     }
     write_merged(output, merged.mosaic, facts)
     shortest, longest = min(merged.times), max(merged.times)
+    clipped = float(to_numpy(merged.mosaic.clipped()).mean())
     line = (
         f"{len(frames)} frames, exposure times {', '.join(f'{time:.4g}' for time in merged.times)} ({said}), range "
-        f"{longest / shortest:.3g}, {float(merged.mosaic.clipped().float().mean()):.2%} of the samples clipped in the "
-        f"shortest -> {output}"
+        f"{longest / shortest:.3g}, {clipped:.2%} of the samples clipped in the shortest -> {output}"
     )
     return line, (*notes, *merged.notes)
 

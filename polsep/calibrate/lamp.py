@@ -15,6 +15,7 @@ import numpy as np
 
 from polsep.calibrate.dark_flat import require_same_sensor
 from polsep.calibrate.statistics import Doubles
+from polsep.compute.arrays import to_numpy
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.light.find import SURE_DEG, Light, combine, find_light
 from polsep.physics.stokes import fit_stokes_unclipped
@@ -83,9 +84,9 @@ def _mirrored_polarization(mosaic: Mosaic) -> tuple[float, float]:
     """AoLP [radians] and degree of the polarized light of a frame where it is purest."""
     stokes, determined = fit_stokes_unclipped(demosaic_bilinear_half(mosaic))
     s0, s1, s2 = (
-        image.double().cpu().numpy().reshape(image.shape[-3], -1) for image in (stokes.s0, stokes.s1, stokes.s2)
+        to_numpy(image).astype(np.float64).reshape(image.shape[-3], -1) for image in (stokes.s0, stokes.s1, stokes.s2)
     )
-    known = determined.all(dim=-3).cpu().numpy().reshape(-1)
+    known = to_numpy(determined).all(axis=-3).reshape(-1)
     p = np.hypot(s1.mean(axis=0), s2.mean(axis=0)) * known
     strong = np.flatnonzero(p > max(STRONG * float(np.quantile(p, 0.999)), LEAST))
     if strong.size < MIN_PIXELS:
@@ -104,9 +105,9 @@ def _card_colors(mosaic: Mosaic) -> list[Doubles]:
     measurements = demosaic_bilinear_half(mosaic)
     height, width = measurements.data.shape[-2:]
     middle = (..., slice(height // 3, height - height // 3), slice(width // 3, width - width // 3))
-    if measurements.clipped is not None and bool(measurements.clipped[middle].any()):
+    if measurements.clipped is not None and bool(to_numpy(measurements.clipped)[middle].any()):
         raise ValueError("expected a card without clipping in the middle of the frame, found clipped samples")
-    light = measurements.data[middle].mean(dim=-4).double().cpu().numpy()
+    light = to_numpy(measurements.data)[middle].mean(axis=-4, dtype=np.float64)
     if float(light.mean()) < DARKEST_CARD:
         raise ValueError(f"expected a lit card in the middle of the frame, found {float(light.mean()):.1%} of white")
     return [part.reshape(part.shape[0], -1).mean(axis=1) for part in np.array_split(light, PARTS, axis=1)]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import to_numpy
 from polsep.sensor.camera import Mosaic
 
 Floats = NDArray[np.float32]
@@ -52,9 +53,9 @@ def average_frames(frames: Iterable[Mosaic]) -> FrameMean:
     mean: Floats = np.zeros((0, 0), np.float32)
     squares: Floats = mean
     for mosaic in frames:
-        samples = mosaic.data.cpu().numpy().astype(np.float32, copy=False)
+        samples = to_numpy(mosaic.data).astype(np.float32, copy=False)
         count += 1
-        clipped += float(mosaic.clipped().float().mean())
+        clipped += float(to_numpy(mosaic.clipped()).mean())
         if first is None:
             first, mean, squares = mosaic, samples.copy(), np.zeros_like(samples)
             continue

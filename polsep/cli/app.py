@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
+from polsep.io.store.errors import MOST, one_line
+
 if TYPE_CHECKING:
     from rich.progress import Progress
 
@@ -151,9 +153,14 @@ def main() -> None:
     except BrokenPipeError:
         sys.stderr.close()  # nobody reads our output any more
         sys.exit(1)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "torch":
+            raise
+        print_note("error: expected the extra 'torch' (pip install 'polsep[torch]'), found no torch")
+        sys.exit(2)
     except (click.ClickException, ValueError, RuntimeError, OSError) as error:
         message = error.format_message() if isinstance(error, click.ClickException) else str(error)
-        print_note(f"error: {' '.join(message.split())}")
+        print_note(f"error: {one_line(message, 2 * MOST)}")
         sys.exit(2)
 
 

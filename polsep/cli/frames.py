@@ -160,18 +160,22 @@ def methods() -> None:
 
 @app.command()
 @click.option("-o", "--output", type=DIR, default=Path("polsep-demo"), metavar="DIR", help="Folder of the results.")
-def demo(output: Path) -> None:
-    """Separate the example frame of polsep with every method, and print what to compare.
+@click.option(
+    "--all", "every", is_flag=True, help="With every method.  [default: the best one and the paper's formula]"
+)
+def demo(output: Path, every: bool) -> None:
+    """Separate the example frame of polsep, and print what to compare.
 
     The frame is a rendered 2448x2048 12-bit colour mosaic: seven objects under one polarized light, whose angle the
     methods do not know.
     """
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
     from polsep.io.raw.frames import ReadOptions
-    from polsep.methods import METHODS
+    from polsep.methods import BEST, METHODS
 
+    best = BEST[0].name
     capture = Path(polsep.__file__).parent / "data" / "still_life.png"
-    for name in METHODS:
+    for name in METHODS if every else ("analytic", best):
         write = WriteOptions(output / name, overwrite=True)
         for outcome in separate_files([str(capture)], ReadOptions(white_level=4095.0), SeparateOptions(name), write):
             if _report(outcome):
@@ -181,7 +185,7 @@ def demo(output: Path) -> None:
                 f"  {name}: {statistics['clipped_fraction']:.2%} of the pixels hold clipped samples, "
                 f"light polarizer about {statistics['light_polarizer_deg']:.0f} deg (25 deg in the scene)"
             )
-    print(f"Compare {output / 'joint' / 'still_life.png'} with {output / 'analytic' / 'still_life.png'}:")
+    print(f"Compare {output / best / 'still_life.png'} with {output / 'analytic' / 'still_life.png'}:")
     print("  in 'specular', the analytic split leaves coloured rims of the objects, and holes where highlights clip;")
-    print("  the network removes the rims and fills most of the holes. The EXR files hold the linear images for")
+    print("  the networks remove the rims and fill most of the holes. The EXR files hold the linear images for")
     print("  Blender, Nuke or Python.")

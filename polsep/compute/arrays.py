@@ -2,7 +2,7 @@
 
 Equations are written once, for both: ``xp = namespace(x)`` gives the standard's functions (``xp.clip``, ``xp.sum(x,
 axis=-3, keepdims=True)``, ``xp.stack``) for arrays of x's kind; torch keeps its gradients and devices. What the
-standard lacks is here.
+standard lacks is here. ``x.clip(least, most)`` and ``x.mT`` are methods of both kinds.
 """
 
 from __future__ import annotations
@@ -31,6 +31,11 @@ def on_cpu(x: Array) -> bool:
     return not is_torch_array(x) or x.device.type == "cpu"
 
 
+def of_kind(values: NDArray[Any], like: Array) -> Array:
+    """A NumPy array as an array of the kind and on the device of ``like``; shares what it can."""
+    return namespace(like).asarray(values, device=device(like))
+
+
 def constant(values: Any, like: Array) -> Array:
     """Numbers (nested lists or a NumPy array) as an array of the kind, dtype and device of ``like``."""
     xp = namespace(like)
@@ -55,23 +60,20 @@ def window(x: Array, first: int, count: int, axis: int) -> Array:
 
 
 def pad_mirror(x: Array, margin: int, axis: int) -> Array:
-    """Continue ``x`` along an axis by mirroring about its outermost places, which are not repeated."""
+    """Continue ``x`` along axis -1 or -2 by mirroring about its outermost places, which are not repeated."""
     xp, n = namespace(x), x.shape[axis]
-    place = np.arange(-margin, n + margin)
-    place = n - 1 - np.abs(place % max(2 * n - 2, 1) - (n - 1))
-    return xp.take(x, xp.asarray(place, device=device(x)), axis=axis)
+    if n == 1:
+        return pad_repeat(x, margin, axis)
+    reach = min(margin, n - 1)
+    before, after = (xp.flip(window(x, first, reach, axis), axis=axis) for first in (1, n - 1 - reach))
+    padded = xp.concat([before, x, after], axis=axis)
+    return padded if reach == margin else pad_mirror(padded, margin - reach, axis)
 
 
 def pad_repeat(x: Array, margin: int, axis: int) -> Array:
-    """Continue ``x`` along an axis by repeating its outermost places."""
-    xp, n = namespace(x), x.shape[axis]
-    place = np.clip(np.arange(-margin, n + margin), 0, n - 1)
-    return xp.take(x, xp.asarray(place, device=device(x)), axis=axis)
-
-
-def like(x: Array, values: NDArray[Any]) -> Array:
-    """A NumPy array as one of the kind and on the device of ``x``, of its own dtype."""
-    return namespace(x).asarray(values, device=device(x))
+    """Continue ``x`` along axis -1 or -2 by repeating its outermost places."""
+    first, last = window(x, 0, 1, axis), window(x, x.shape[axis] - 1, 1, axis)
+    return namespace(x).concat([first] * margin + [x] + [last] * margin, axis=axis)
 
 
 def to_device(x: Array, device: str) -> Array:

@@ -1,1 +1,1 @@
-"""Demosaicking: all analysers in all colours at common points; every kernel lies beside its torch twin."""
+"""Demosaicking: all analysers in all colours at common points; every kernel lies beside its readable twin."""

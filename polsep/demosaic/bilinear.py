@@ -16,131 +16,146 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
-from torch import Tensor
-from torch.nn import functional
+import numpy as np
+from array_api_compat import device
 
+from polsep.compute.arrays import Array, constant, is_exporting, namespace, pad_mirror, pad_repeat, window
 from polsep.compute.filters import box_mean
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
 
 
-def aligned(values: Tensor, layout: Layout) -> Tensor:
+def aligned(values: Array, layout: Layout) -> Array:
     """``values [..., H, W]`` from the layout's origin on, cropped to whole 2x2 polarizer cells."""
     row, col = layout.origin
     height, width = ((n - o) // 2 * 2 for n, o in zip(values.shape[-2:], layout.origin, strict=True))
     return values[..., row : row + height, col : col + width]
 
 
-def repeat_tile(tile: Tensor, image: Tensor, block: int) -> Tensor:
+def repeat_tile(tile: Array, image: Array, block: int) -> Array:
     """``tile [..., 2, 2]``, its places ``block`` x ``block`` pixels large, repeated over ``image [..., H, W]``."""
-    rows, cols = (torch.arange(n, device=image.device) // block % 2 for n in image.shape[-2:])
+    rows, cols = (namespace(image).arange(n, device=device(image)) // block % 2 for n in image.shape[-2:])
     return tile[..., rows[:, None], cols]
 
 
-def split_analysers(values: Tensor, layout: Layout) -> tuple[Tensor, list[tuple[int, int]]]:
+def split_analysers(values: Array, layout: Layout) -> tuple[Array, list[tuple[int, int]]]:
     """The four analyser planes ``[..., 4, H/2, W/2]`` of a mosaic, and each one's (row, col) inside the cell."""
     values = aligned(values, layout)
     cell = {float(layout.polarizer[row][col]): (row, col) for row in (0, 1) for col in (0, 1)}
     places = [cell[angle] for angle in layout.angles_deg]
-    return torch.stack([values[..., row::2, col::2] for row, col in places], dim=-3), places
+    return namespace(values).stack([values[..., row::2, col::2] for row, col in places], axis=-3), places
 
 
-def correlate(x: Tensor, taps: tuple[float, ...], dim: int) -> Tensor:
+def correlate(x: Array, taps: tuple[float, ...], axis: int) -> Array:
     """Correlate images ``[..., h, w]`` with an odd number of taps along -1 or -2; borders mirror, keeping phases."""
-    half, n = len(taps) // 2, x.shape[dim]
-    pads = (half, half, 0, 0) if dim == -1 else (0, 0, half, half)
+    if is_exporting():
+        return _correlate_exported(x, taps, axis)
+    padded, n = pad_mirror(x, len(taps) // 2, axis), x.shape[axis]
+    parts = (weight * window(padded, k, n, axis) for k, weight in enumerate(taps) if weight)
+    total = next(parts)
+    for part in parts:
+        total += part
+    return total
+
+
+def _correlate_exported(x: Array, taps: tuple[float, ...], axis: int) -> Array:
+    """`correlate` as one node of a graph instead of dozens; three times slower in torch itself."""
+    import torch
+    from torch.nn import functional
+
+    half = len(taps) // 2
+    pads, shape = ((half, half, 0, 0), (1, 1, 1, -1)) if axis == -1 else ((0, 0, half, half), (1, 1, -1, 1))
     padded = functional.pad(x.reshape(-1, 1, *x.shape[-2:]), pads, mode="reflect")
-    if torch.compiler.is_exporting():  # one node instead of dozens; three times slower in torch itself
-        kernel = torch.tensor(taps, dtype=x.dtype).reshape((1, 1, 1, -1) if dim == -1 else (1, 1, -1, 1))
-        return functional.conv2d(padded, kernel).reshape(x.shape)
-    total = torch.zeros(1, dtype=x.dtype, device=x.device)
-    for k, weight in enumerate(taps):
-        if weight:
-            total = total + weight * padded.narrow(dim, k, n)
-    return total.reshape(x.shape)
+    return functional.conv2d(padded, torch.tensor(taps, dtype=x.dtype).reshape(shape)).reshape(x.shape)
 
 
-def mean_cells(image: Tensor) -> Tensor:
+def mean_cells(image: Array) -> Array:
     """Means over 2x2 cells, ``[..., H, W]`` to ``[..., H/2, W/2]``."""
     rows = image[..., 0::2, :] + image[..., 1::2, :]
     return 0.25 * (rows[..., 0::2] + rows[..., 1::2])
 
 
-def _bayer_bilinear(planes: Tensor, bayer: str) -> Tensor:
+def _bayer_bilinear(planes: Array, bayer: str) -> Array:
     """RGB ``[..., 3, h, w]`` of Bayer planes ``[..., h, w]``, each colour interpolated on its own."""
-    places = torch.tensor(["RGB".index(color) for color in bayer], device=planes.device).view(2, 2)
-    red, green, blue = (planes * repeat_tile((places == c).to(planes.dtype), planes, 1) for c in range(3))
+    places = np.array(["RGB".index(color) for color in bayer]).reshape(2, 2)
+    red, green, blue = (planes * repeat_tile(constant(places == c, planes), planes, 1) for c in range(3))
     red, blue = (correlate(correlate(x, (0.5, 1.0, 0.5), -1), (0.5, 1.0, 0.5), -2) for x in (red, blue))
     green = correlate(green, (0.25, 0.5, 0.25), -1) + correlate(green, (0.25, 0.5, 0.25), -2)
-    return torch.stack([red, green, blue], dim=-3)
+    return namespace(planes).stack([red, green, blue], axis=-3)
 
 
-def colors_of(plane: Tensor, layout: Layout) -> Tensor:
+def colors_of(plane: Array, layout: Layout) -> Array:
     """An analyser's plane ``[..., h, w]`` in all the layout's colours ``[..., C, h, w]``."""
     return plane[..., None, :, :] if layout.bayer is None else _bayer_bilinear(plane, layout.bayer)
 
 
-def _neighbour(x: Tensor, place: int, dim: int) -> Tensor:
+def _neighbour(x: Array, place: int, axis: int) -> Array:
     """The next sample across the cell's centre line: below/right for place 0, above/left for place 1; edges mirror."""
-    n = x.shape[dim]
-    if place == 0:
-        return torch.cat([x.narrow(dim, 1, n - 1), x.narrow(dim, n - 1, 1)], dim)
-    return torch.cat([x.narrow(dim, 0, 1), x.narrow(dim, 0, n - 1)], dim)
+    n = x.shape[axis]
+    pair = ((1, n - 1), (n - 1, 1)) if place == 0 else ((0, 1), (0, n - 1))
+    return namespace(x).concat([window(x, first, count, axis) for first, count in pair], axis=axis)
 
 
-def to_center(x: Tensor, place: tuple[int, int]) -> Tensor:
+def to_center(x: Array, place: tuple[int, int]) -> Array:
     """Shift a plane by a quarter sample to the cell's centre: weights 3/4 and 1/4 in both directions."""
-    for dim in (-2, -1):
-        x = 0.75 * x + 0.25 * _neighbour(x, place[dim], dim)
+    for axis in (-2, -1):
+        x = 0.75 * x + 0.25 * _neighbour(x, place[axis], axis)
     return x
 
 
-def _to_full(x: Tensor, place: tuple[int, int]) -> Tensor:
+def interleave(first: Array, second: Array, axis: int) -> Array:
+    """Images ``[..., h, w]`` in turns along axis -1 or -2, which becomes twice as long."""
+    *batch, height, width = first.shape
+    shape = (*batch, height, 2 * width) if axis == -1 else (*batch, 2 * height, width)
+    return namespace(first).reshape(namespace(first).stack([first, second], axis=axis), shape)
+
+
+def _to_full(x: Array, place: tuple[int, int]) -> Array:
     """Interpolate a plane to all pixels of the mosaic: its own samples stay, the others are means of two or four."""
-    for dim in (-2, -1):
-        between = 0.5 * (x + _neighbour(x, place[dim], dim))
-        pair = (x, between) if place[dim] == 0 else (between, x)
-        x = torch.stack(pair, dim=dim).flatten(dim - 1, dim)
+    for axis in (-2, -1):
+        between = 0.5 * (x + _neighbour(x, place[axis], axis))
+        x = interleave(x, between, axis) if place[axis] == 0 else interleave(between, x, axis)
     return x
 
 
-def interpolate_analysers(values: Tensor, layout: Layout) -> Tensor:
+def interpolate_analysers(values: Array, layout: Layout) -> Array:
     """Samples ``[..., H, W]`` as all analysers and colours at every pixel ``[..., 4, C, H, W]``, bilinearly."""
     return _interpolate(values, layout, _to_full)
 
 
-def interpolate_analysers_half(values: Tensor, layout: Layout) -> Tensor:
+def interpolate_analysers_half(values: Array, layout: Layout) -> Array:
     """Samples ``[..., H, W]`` as all analysers and colours at the cells' centres ``[..., 4, C, H/2, W/2]``."""
     return _interpolate(values, layout, to_center)
 
 
-def _interpolate(values: Tensor, layout: Layout, register: Callable[[Tensor, tuple[int, int]], Tensor]) -> Tensor:
+def _interpolate(values: Array, layout: Layout, register: Callable[[Array, tuple[int, int]], Array]) -> Array:
     """Bayer bilinear per analyser, then ``register`` each analyser plane."""
     planes, places = split_analysers(values, layout)
     each = [register(colors_of(planes[..., k, :, :], layout), place) for k, place in enumerate(places)]
-    return torch.stack(each, dim=-4)
+    return namespace(values).stack(each, axis=-4)
 
 
-def _demosaic_bilinear(mosaic: Mosaic, interpolate: Callable[[Tensor, Layout], Tensor]) -> Measurements:
+def _demosaic_bilinear(mosaic: Mosaic, interpolate: Callable[[Array, Layout], Array]) -> Measurements:
     """Samples and their clip mask take the same path."""
     layout, clipped = mosaic.layout, mosaic.clipped()
-    mask = interpolate(clipped.float(), layout) > 0 if bool(clipped.any()) else None
+    xp = namespace(clipped)
+    mask = interpolate(xp.astype(clipped, xp.float32), layout) > 0 if bool(xp.any(clipped)) else None
     data = interpolate(mosaic.linear(), layout)
     return Measurements(data, layout.angles, mask, bilinear_variance(data))
 
 
-def bilinear_variance(data: Tensor) -> Tensor:
+def bilinear_variance(data: Array) -> Array:
     """Variance ``[..., 1, h, w]`` that bilinear interpolation adds to colour differences of ``data [..., 4, C, h, w]``.
 
     A missing colour is the mean of its neighbours, so it is off by about the second difference of the brightness: the
     local mean square of what the mean of four neighbours misses of s0.
     """
-    brightness = 2 * data.mean(dim=-4).mean(dim=-3, keepdim=True)
-    flat = functional.pad(brightness.reshape(-1, 1, *brightness.shape[-2:]), (1, 1, 1, 1), mode="replicate")
-    across = flat[..., :-2, 1:-1] + flat[..., 2:, 1:-1] + flat[..., 1:-1, :-2] + flat[..., 1:-1, 2:]
-    missed = flat[..., 1:-1, 1:-1] - 0.25 * across
-    return box_mean(missed * missed, 1).reshape(brightness.shape)
+    xp = namespace(data)
+    brightness = 2 * xp.mean(xp.mean(data, axis=-4), axis=-3, keepdims=True)
+    tall, wide = (pad_repeat(brightness, 1, axis) for axis in (-2, -1))
+    across = tall[..., :-2, :] + tall[..., 2:, :] + wide[..., :-2] + wide[..., 2:]
+    missed = brightness - 0.25 * across
+    return box_mean(missed * missed, 1)
 
 
 def demosaic_bilinear(mosaic: Mosaic) -> Measurements:

@@ -29,15 +29,17 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import torch
-from torch import Tensor
+import numpy as np
+from array_api_compat import device
 
+from polsep.compute.arrays import Array, constant, namespace
 from polsep.compute.filters import box_mean
 from polsep.demosaic.bilinear import (
     aligned,
     correlate,
     demosaic_bilinear,
     demosaic_bilinear_half,
+    interleave,
     interpolate_analysers,
     interpolate_analysers_half,
     mean_cells,
@@ -99,7 +101,7 @@ def demosaic_guided_half(mosaic: Mosaic) -> Measurements:
     return _complete(found, demosaic_bilinear_half(mosaic))
 
 
-def guide_once(mosaic: Mosaic, margin: int = MARGIN) -> tuple[Stokes, Tensor]:
+def guide_once(mosaic: Mosaic, margin: int = MARGIN) -> tuple[Stokes, Array]:
     """Stokes images ``[..., C, H/2, W/2]`` with an intensity guide in one round, and s0 at every pixel.
 
     Clipped samples count as they are. ``mosaic``: of at least 2x2 cells. ``margin``: cells by which it is continued;
@@ -114,10 +116,10 @@ def guide_once(mosaic: Mosaic, margin: int = MARGIN) -> tuple[Stokes, Tensor]:
 
 
 def _is_large_enough(mosaic: Mosaic) -> bool:
-    return min(aligned(mosaic.data, mosaic.layout).shape[-2:]) >= 2 * MIN_CELLS
+    return bool(min(aligned(mosaic.data, mosaic.layout).shape[-2:]) >= 2 * MIN_CELLS)
 
 
-def _padded(mosaic: Mosaic, margin: int = MARGIN) -> tuple[Tensor, Layout]:
+def _padded(mosaic: Mosaic, margin: int = MARGIN) -> tuple[Array, Layout]:
     """Linear samples from the first whole cell on with ``margin`` more cells around, and the layout they have."""
     values = _mirror_cells(aligned(mosaic.linear(), mosaic.layout), margin)
     return values, replace(mosaic.layout, origin=(0, 0))
@@ -127,12 +129,13 @@ def _complete(stokes: Stokes, plain: Measurements) -> Measurements:
     """The analysers that see ``stokes``, with the bilinear samples of ``plain`` wherever clipping touches a pixel."""
     data = measure(stokes, plain.angles).data
     if plain.clipped is not None:
-        touched = plain.clipped.any(dim=-4, keepdim=True).any(dim=-3, keepdim=True)
-        data = torch.where(touched, plain.data, data)
+        xp = namespace(data)
+        touched = xp.any(xp.any(plain.clipped, axis=-4, keepdims=True), axis=-3, keepdims=True)
+        data = xp.where(touched, plain.data, data)
     return Measurements(data, plain.angles, plain.clipped, plain.variance, plain)
 
 
-def _guide(values: Tensor, polarization: Stokes, layout: Layout) -> tuple[Tensor, Tensor]:
+def _guide(values: Array, polarization: Stokes, layout: Layout) -> tuple[Array, Array]:
     """s0 ``[..., C, H, W]`` of aligned samples ``[..., H, W]``, and the samples minus half their guide.
 
     ``polarization [..., C, H/2, W/2]`` is what is taken for known.
@@ -142,7 +145,7 @@ def _guide(values: Tensor, polarization: Stokes, layout: Layout) -> tuple[Tensor
     return s0, _residual_mosaic(values, intensity, s0, layout)
 
 
-def _smooth_polarization(values: Tensor, layout: Layout) -> Stokes:
+def _smooth_polarization(values: Array, layout: Layout) -> Stokes:
     """Stokes images at half resolution, bilinear and then smoothed by `SMOOTH_RADIUS`."""
     found = fit_stokes(Measurements(interpolate_analysers_half(values, layout), layout.angles))
     return found.map(lambda image: box_mean(image, SMOOTH_RADIUS))
@@ -154,33 +157,34 @@ def _reliable(found: Measurements) -> Stokes:
     A Wiener filter: detail counts by the share of its variance that exceeds `NOISE_MARGIN` times what noise and
     misregistration explain, which shows in `analyser_residual`.
     """
-    stokes = fit_stokes(found)
+    stokes, xp = fit_stokes(found), namespace(found.data)
     smooth = stokes.map(lambda image: box_mean(image, SMOOTH_RADIUS))
     d1, d2 = stokes.s1 - smooth.s1, stokes.s2 - smooth.s2
-    detail = box_mean((d1 * d1 + d2 * d2).mean(dim=-3, keepdim=True), 1)
-    noise = NOISE_MARGIN * box_mean((analyser_residual(found) ** 2).mean(dim=-3, keepdim=True), 1) + NOISE_FLOOR
-    share = ((detail - noise) / (detail + NOISE_FLOOR)).clamp(min=0)
+    detail = box_mean(xp.mean(d1 * d1 + d2 * d2, axis=-3, keepdims=True), 1)
+    contradiction = box_mean(xp.mean(analyser_residual(found) ** 2, axis=-3, keepdims=True), 1)
+    noise = NOISE_MARGIN * contradiction + NOISE_FLOOR
+    share = ((detail - noise) / (detail + NOISE_FLOOR)).clip(0.0, None)
     return Stokes(smooth.s0, smooth.s1 + share * d1, smooth.s2 + share * d2)
 
 
-def _intensity_mosaic(values: Tensor, polarization: Stokes, layout: Layout) -> Tensor:
+def _intensity_mosaic(values: Array, polarization: Stokes, layout: Layout) -> Array:
     """s0 of its own colour at every pixel ``[..., H, W]``: twice the sample minus the polarization that it passed."""
-    doubled = torch.deg2rad(2 * torch.tensor(layout.polarizer, dtype=torch.float64))
+    doubled = np.deg2rad(2 * np.array(layout.polarizer, np.float64))
     intensity = 2 * values
-    for weights, image in ((doubled.cos(), polarization.s1), (doubled.sin(), polarization.s2)):
-        weights = torch.where(weights.abs() < 1e-9, 0.0, weights).to(values)
-        intensity = intensity - repeat_tile(weights, values, 1) * _own(_enlarge(image), layout)
+    for weights, image in ((np.cos(doubled), polarization.s1), (np.sin(doubled), polarization.s2)):
+        exact = constant(np.where(np.abs(weights) < 1e-9, 0.0, weights), values)
+        intensity = intensity - repeat_tile(exact, values, 1) * _own(_enlarge(image), layout)
     return intensity
 
 
-def _residual_mosaic(values: Tensor, intensity: Tensor, s0: Tensor, layout: Layout) -> Tensor:
+def _residual_mosaic(values: Array, intensity: Array, s0: Array, layout: Layout) -> Array:
     """Samples minus half the guide ``[..., H, W]``: polarization, the smoother the better the guide."""
     tent = _own(_blur(s0, _TENT), layout)
     guide = tent + DETAIL_GAIN * _blur(intensity - tent, _TENT)
     return values - 0.5 * guide
 
 
-def fill_colors(mosaic: Tensor, layout: Layout) -> Tensor:
+def fill_colors(mosaic: Array, layout: Layout) -> Array:
     """All colours ``[..., 3, H, W]`` of a mosaic ``[..., H, W]`` of 2x2 blocks of one colour each (a quad Bayer one).
 
     The pixels' own values stay.
@@ -188,48 +192,48 @@ def fill_colors(mosaic: Tensor, layout: Layout) -> Tensor:
     masks, cells = color_masks(mosaic, layout, 2), color_masks(mosaic, layout, 1)
     green = _fill_green(mosaic, masks, cells)
     red, blue = (_fill_from_green(mosaic, green, masks[c], cells[c]) for c in (0, 2))
-    return torch.stack([red, green, blue], dim=-3)
+    return namespace(mosaic).stack([red, green, blue], axis=-3)
 
 
-def color_masks(mosaic: Tensor, layout: Layout, block: int) -> Tensor:
+def color_masks(mosaic: Array, layout: Layout, block: int) -> Array:
     """Masks of the colours: ``[C, n, m]`` of 0 and 1 per pixel of a mosaic (``block`` 2) or per cell (``block`` 1)."""
-    colors = torch.tensor(["RGB".index(color) for color in layout.bayer or "RRRR"], device=mosaic.device).view(2, 2)
-    own = (colors == torch.arange(layout.channels, device=mosaic.device)[:, None, None]).to(mosaic.dtype)
+    colors = np.array(["RGB".index(color) for color in layout.bayer or "RRRR"]).reshape(2, 2)
+    own = constant(colors == np.arange(layout.channels)[:, None, None], mosaic)
     return repeat_tile(own, mosaic if block == 2 else mosaic[..., ::2, ::2], block)
 
 
-def _fill_green(mosaic: Tensor, masks: Tensor, mask_cells: Tensor) -> Tensor:
+def _fill_green(mosaic: Array, masks: Array, mask_cells: Array) -> Array:
     """Green everywhere: estimates along both directions, weighed by how smooth green minus the other colour is."""
-    is_green, cells = masks[1] > 0, mean_cells(mosaic)
-    total, weights, precision = (torch.zeros_like(image) for image in (mosaic, cells, cells))
-    for dim in (-1, -2):
-        around, second = _across_pairs(mosaic, dim)
-        other = around + _repeat(_slope_of_other(cells, mask_cells[1], dim)) * second
-        difference = correlate(torch.where(is_green, mosaic - other, other - mosaic), _GENTLE, dim)
-        weight = 1 / (box_mean(mean_cells(correlate(difference, (-1.0, 0.0, 1.0), dim) ** 2), 1) + 1e-6)
+    xp, is_green, cells = namespace(mosaic), masks[1] > 0, mean_cells(mosaic)
+    total, weights, precision = 0.0, 0.0, 0.0
+    for axis in (-1, -2):
+        around, second = _across_pairs(mosaic, axis)
+        other = around + _repeat(_slope_of_other(cells, mask_cells[1], axis)) * second
+        difference = correlate(xp.where(is_green, mosaic - other, other - mosaic), _GENTLE, axis)
+        weight = 1 / (box_mean(mean_cells(correlate(difference, (-1.0, 0.0, 1.0), axis) ** 2), 1) + 1e-6)
         total, weights = total + _repeat(weight) * difference, weights + weight
         precision = precision + 1 / (box_mean(mean_cells(second) ** 2, 1) + 1e-12)
     difference = _without_error(total / _repeat(weights), 1 / precision, mask_cells)
     beside = 0.5 * (correlate(cells, (0.5, 0.0, 0.5), -1) + correlate(cells, (0.5, 0.0, 0.5), -2))
-    return torch.where(is_green, mosaic, _at_least(mosaic + difference, _repeat(beside)))
+    return xp.where(is_green, mosaic, _at_least(mosaic + difference, _repeat(beside)))
 
 
-def _without_error(difference: Tensor, error: Tensor, mask_cells: Tensor) -> Tensor:
+def _without_error(difference: Array, error: Array, mask_cells: Array) -> Array:
     """The ``difference [..., H, W]`` of green at red and at blue cells, smoothed where the ``error [..., h, w]``
     explains it: the variance within a window counts by the share that exceeds `DIFFERENCE_MARGIN` times the error.
     """
-    found = torch.zeros_like(difference)
+    found = 0.0
     for mask in (mask_cells[0], mask_cells[2]):
         share = box_mean(mask, DIFFERENCE_RADIUS)
         smooth = _repeat(box_mean(mean_cells(difference) * mask, DIFFERENCE_RADIUS) / share)
         detail = difference - smooth
         variance, noise = (box_mean(x * mask, DIFFERENCE_RADIUS) / share for x in (mean_cells(detail**2), error))
-        kept = ((variance - DIFFERENCE_MARGIN * noise) / (variance + 1e-12)).clamp(min=0)
+        kept = ((variance - DIFFERENCE_MARGIN * noise) / (variance + 1e-12)).clip(0.0, None)
         found = found + _repeat(mask) * (smooth + _repeat(kept) * detail)
     return found
 
 
-def _across_pairs(mosaic: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+def _across_pairs(mosaic: Array, axis: int) -> tuple[Array, Array]:
     """Along rows or columns A A B B: the other colour interpolated, and what the own one differs from the same of it.
 
     At the first of a pair the nearest samples of the other colour are 1 before and 2 after, so they weigh 2/3 and 1/3;
@@ -237,41 +241,42 @@ def _across_pairs(mosaic: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """
     around = ((0, 0, 0, 0, 6, 0, 0, 3, 0, 0, 0), (0, 0, 0, 3, 0, 0, 6, 0, 0, 0, 0))
     second = ((0, 0, -2, 0, 0, 5, -2, 0, 0, -1, 0), (0, -1, 0, 0, -2, 5, 0, 0, -2, 0, 0))
-    place = torch.arange(mosaic.shape[dim], device=mosaic.device) % 2 == 0
-    is_first = place if dim == -1 else place[:, None]
+    xp = namespace(mosaic)
+    place = xp.arange(mosaic.shape[axis], device=device(mosaic)) % 2 == 0
+    is_first = place if axis == -1 else place[:, None]
     found = []
     for first, last in (around, second):
         ninths = [tuple(weight / 9 for weight in taps) for taps in (first, last)]
-        found.append(torch.where(is_first, correlate(mosaic, ninths[0], dim), correlate(mosaic, ninths[1], dim)))
+        found.append(xp.where(is_first, correlate(mosaic, ninths[0], axis), correlate(mosaic, ninths[1], axis)))
     return found[0], found[1]
 
 
-def _slope_of_other(cells: Tensor, green_cells: Tensor, dim: int) -> Tensor:
+def _slope_of_other(cells: Array, green_cells: Array, axis: int) -> Array:
     """The slope ``[..., h, w]`` at which the other colour of a row (or column) follows a cell's own: a regression.
 
     Regressed are central differences over 5x5 cells, green and other cells apart.
     """
-    other, own = correlate(cells, (-0.5, 0.0, 0.5), dim), correlate(cells, (-0.25, 0.0, 0.0, 0.0, 0.25), dim)
+    other, own = correlate(cells, (-0.5, 0.0, 0.5), axis), correlate(cells, (-0.25, 0.0, 0.0, 0.0, 0.25), axis)
     means = [box_mean(cells * sites, 2) / box_mean(sites, 2) for sites in (green_cells, 1 - green_cells)]
     slopes = []
     for sites, mean_own, mean_other in ((green_cells, *means), (1 - green_cells, *means[::-1])):
         floor = SLOPE_FLOOR * box_mean(sites, 2)
         follows = box_mean(other * own * sites, 2) + floor * _prior_slope(mean_other, mean_own)
         slopes.append(follows / (box_mean(own * own * sites, 2) + floor))
-    return torch.where(green_cells > 0, slopes[0], slopes[1]).clamp(-0.5, 4.0)
+    return namespace(cells).where(green_cells > 0, slopes[0], slopes[1]).clip(-0.5, 4.0)
 
 
-def _prior_slope(mean: Tensor, mean_guide: Tensor) -> Tensor:
+def _prior_slope(mean: Array, mean_guide: Array) -> Array:
     """The slope where nothing can be regressed, from the means of both colours."""
-    return PRIOR_SHARE * ((mean + 1e-3) / (mean_guide.clamp(min=0) + 1e-3)).clamp(0.2, 5.0)
+    return PRIOR_SHARE * ((mean + 1e-3) / (mean_guide.clip(0.0, None) + 1e-3)).clip(0.2, 5.0)
 
 
-def _at_least(image: Tensor, plain: Tensor) -> Tensor:
+def _at_least(image: Array, plain: Array) -> Array:
     """Raise to at least `MIN_SHARE` of its interpolation, which may be negative."""
-    return torch.where(image < MIN_SHARE * plain, MIN_SHARE * plain, image)
+    return namespace(image).where(image < MIN_SHARE * plain, MIN_SHARE * plain, image)
 
 
-def _fill_from_green(mosaic: Tensor, green: Tensor, mask: Tensor, mask_cells: Tensor) -> Tensor:
+def _fill_from_green(mosaic: Array, green: Array, mask: Array, mask_cells: Array) -> Array:
     """Red or blue everywhere: a local linear function of green, plus its interpolated residual.
 
     Note: a binomial window, because it gives every phase of the Bayer pattern the same second moments; a box does not,
@@ -279,24 +284,24 @@ def _fill_from_green(mosaic: Tensor, green: Tensor, mask: Tensor, mask_cells: Te
     """
     share = _blur(mask_cells, _BINOMIAL)
 
-    def mean(image: Tensor) -> Tensor:
+    def mean(image: Array) -> Array:
         return _blur(mean_cells(image) * mask_cells, _BINOMIAL) / share
 
     mean_g, mean_x = mean(green), mean(mosaic)
     covariance, variance = mean(green * mosaic) - mean_g * mean_x, mean(green * green) - mean_g * mean_g
-    slope = (covariance + GUIDE_FLOOR * _prior_slope(mean_x, mean_g)) / (variance.clamp(min=0) + GUIDE_FLOOR)
+    slope = (covariance + GUIDE_FLOOR * _prior_slope(mean_x, mean_g)) / (variance.clip(0.0, None) + GUIDE_FLOOR)
     offset = mean_x - slope * mean_g
     guess = _enlarge(box_mean(slope, 1)) * green + _enlarge(box_mean(offset, 1))
     plain, residual = (_blur(image * mask, _PAIRS) for image in (mosaic, mosaic - guess))
-    return torch.where(mask > 0, mosaic, _at_least(guess + residual, plain))
+    return namespace(mosaic).where(mask > 0, mosaic, _at_least(guess + residual, plain))
 
 
-def _own(image: Tensor, layout: Layout) -> Tensor:
+def _own(image: Array, layout: Layout) -> Array:
     """The colour of each pixel's own filter ``[..., H, W]``, of an image ``[..., C, H, W]``."""
-    return (image * color_masks(image, layout, 2)).sum(dim=-3)
+    return namespace(image).sum(image * color_masks(image, layout, 2), axis=-3)
 
 
-def _blur(image: Tensor, taps: tuple[float, ...]) -> Tensor:
+def _blur(image: Array, taps: tuple[float, ...]) -> Array:
     return correlate(correlate(image, taps, -1), taps, -2)
 
 
@@ -304,32 +309,35 @@ def _blur_stokes(stokes: Stokes, taps: tuple[float, ...]) -> Stokes:
     return stokes.map(lambda image: _blur(image, taps))
 
 
-def _repeat(cells: Tensor) -> Tensor:
+def _repeat(cells: Array) -> Array:
     """Every cell's value at its four pixels."""
-    return cells.repeat_interleave(2, -1).repeat_interleave(2, -2)
+    xp = namespace(cells)
+    return xp.repeat(xp.repeat(cells, 2, axis=-1), 2, axis=-2)
 
 
-def _enlarge(image: Tensor) -> Tensor:
+def _enlarge(image: Array) -> Array:
     """Enlarge cells ``[..., h, w]`` to pixels ``[..., 2h, 2w]``, linearly between the cells' centres."""
-    for dim in (-2, -1):
-        before, after = correlate(image, (0.25, 0.75, 0.0), dim), correlate(image, (0.0, 0.75, 0.25), dim)
-        image = torch.stack((before, after), dim=dim).flatten(dim - 1, dim)
+    for axis in (-2, -1):
+        before, after = correlate(image, (0.25, 0.75, 0.0), axis), correlate(image, (0.0, 0.75, 0.25), axis)
+        image = interleave(before, after, axis)
     return image
 
 
-def _mirror_cells(values: Tensor, margin: int) -> Tensor:
+def _mirror_cells(values: Array, margin: int) -> Array:
     """Samples continued by ``margin`` cells on all sides: whole cells mirror about the outermost one.
 
     Colours and analysers keep their phase, and so uniform fields stay uniform.
     """
-    for dim in (-2, -1):
-        cells = values.shape[dim] // 2
-        place = torch.arange(-margin, cells + margin, device=values.device)
-        period = torch.full_like(place[:1], 2 * cells - 2)  # a tensor: a graph's sizes are no numbers
-        place = cells - 1 - (place.remainder(period) - (cells - 1)).abs()
-        values = values.index_select(dim, (2 * place[:, None] + torch.arange(2, device=values.device)).flatten())
+    xp = namespace(values)
+    for axis in (-2, -1):
+        cells = values.shape[axis] // 2
+        place = xp.arange(-margin, cells + margin, device=device(values))
+        period = xp.full_like(place[:1], 2 * cells - 2)  # an array: a graph's sizes are no numbers
+        place = cells - 1 - xp.abs(place % period - (cells - 1))
+        pairs = 2 * place[:, None] + xp.arange(2, device=device(values))
+        values = xp.take(values, xp.reshape(pairs, (-1,)), axis=axis)
     return values
 
 
-def _crop(image: Tensor, margin: int) -> Tensor:
+def _crop(image: Array, margin: int) -> Array:
     return image[..., margin:-margin, margin:-margin]

@@ -27,7 +27,7 @@ from polsep.io.results.separation_reader import NumberedFiles, find_numbered, re
 from polsep.io.results.separation_writer import planned_outputs
 from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter
 from polsep.io.store.atomic import OutputError, refuse_existing
-from polsep.io.store.errors import InputError, input_error
+from polsep.io.store.errors import InputError, input_error, one_line
 from polsep.video.recordings import ON_DAMAGE, Progress, black_picture, draw_panels, write_pictures
 
 #: Number of frames that are read and edited at once.
@@ -107,7 +107,7 @@ def edit_files(paths: Sequence[Path], work: Work, target: EditTarget) -> Iterato
             frame = _edited_frame(path, work)
             yield Edited(path, tuple(write_edited(frame, target.directory, path.stem, target.overwrite)))
         except (ValueError, OSError, MemoryError) as error:
-            yield Edited(path, error=" ".join(str(error).split())[:500] or type(error).__name__)
+            yield Edited(path, error=one_line(error) or type(error).__name__)
 
 
 def _edited_frame(path: Path, work: Work) -> EditedFrame:
@@ -233,7 +233,7 @@ class _SequenceEdit:
                 size = list(before.diffuse.shape)
                 raise InputError(f"{path}: expected {list(self.size)} as in the first frame, found {size}")
         except (ValueError, OSError) as error:
-            line = {"frame": number, "damaged": " ".join(str(error).split())}
+            line = {"frame": number, "damaged": one_line(error)}
             return black_picture(self.size, self.preview, line)
         panels = draw_panels(after.diffuse, after.specular, self.gain) if self.preview else None
         line = {"frame": number, "light": _light(before, after)}

@@ -9,13 +9,16 @@ a recipe: by file names relative to the recipe, at the command line.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 from polsep.edit.edits import EDITS, Edit
 from polsep.edit.images import Maps, Separated, SeparatedImages
 from polsep.edit.parameters import IMAGES, EditError
+from polsep.io.store.json_text import parse_json
 
 #: The only version there is.
 VERSION = 1
@@ -90,20 +93,20 @@ def _edit_as_data(edit: Edit) -> dict[str, Any]:
 def recipe_from_text(text: str) -> Recipe:
     """The recipe that a JSON text holds. Raises EditError."""
     try:
-        data = json.loads(text, object_pairs_hook=_without_repeats)
+        data = parse_json(text, _without_repeats)
     except EditError:
         raise
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise EditError(f"expected a recipe as JSON, found {error}") from error
     return recipe_from_data(data)
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    names = [name for name, _ in pairs]
-    repeated = next((name for name in names if names.count(name) > 1), None)
-    if repeated is not None:
-        raise EditError(f"expected each key once, found {repeated!r} again")
-    return dict(pairs)
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        counts = Counter(name for name, _ in pairs)
+        raise EditError(f"expected each key once, found {_brief(counts.most_common(1)[0][0])} again")
+    return found
 
 
 def recipe_from_data(data: object) -> Recipe:
@@ -148,11 +151,12 @@ def make_edit(kind: type[Edit], values: Mapping[str, Any]) -> Edit:
 def _refuse_unknown(data: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
     unknown = [key for key in data if key not in known]
     if unknown:
-        raise EditError(f"expected only {', '.join(known)} in {where}, found {', '.join(map(_brief, unknown))}")
+        raise EditError(f"expected only {', '.join(known)} in {where}, found {_names(dict.fromkeys(unknown))}")
 
 
 def _names(data: Mapping[str, Any]) -> str:
-    return ", ".join(map(_brief, data)) or "nothing"
+    names = [_brief(name) for name in islice(data, 4)]
+    return ", ".join(names + ["..."] * (len(data) > len(names))) or "nothing"
 
 
 def _brief(value: object) -> str:

@@ -16,12 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from polsep.geometry.polarization import Cue
-from polsep.physics.optics import fresnel
+from polsep.physics.fresnel import fresnel
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -180,7 +179,7 @@ def _transmission(normals: Floats, directions: Floats) -> Floats:
 
 
 def _through(cosines: Floats) -> Floats:
-    through: Floats = fresnel(torch.from_numpy(np.ascontiguousarray(cosines))).t_plus.double().numpy()
+    through: Floats = fresnel(cosines).t_plus.astype(np.float64)
     return through
 
 

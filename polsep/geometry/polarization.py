@@ -1,6 +1,6 @@
 """Normals from the polarization of diffuse light: azimuth up to half a turn, and zenith.
 
-Diffuse light that leaves a dielectric has its AoLP along the projected normal and the DoLP `optics.diffuse_dolp` of the
+Diffuse light that leaves a dielectric has its AoLP along the projected normal and the DoLP `diffuse_dolp` of the
 zenith under any light. So (s1, s2) of the diffuse image is the same multiple of its s0 in every frame: the diffuse
 polarization. Its estimate is robust: samples under specular light, which is polarized by itself, have less weight.
 Angles count from image-right toward image-up.
@@ -14,11 +14,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from polsep.physics.optics import diffuse_dolp
+from polsep.physics.fresnel import diffuse_dolp
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -79,7 +78,7 @@ def normals_from_polarization(polarization: NDArray[np.complex128]) -> Cue:
     Values beyond the end of the curve, at 89.5 degrees, are limited to it.
     """
     zeniths = np.linspace(0, math.radians(89.5), 500)
-    curve = diffuse_dolp(torch.from_numpy(np.cos(zeniths))).numpy()
+    curve = diffuse_dolp(np.cos(zeniths))
     strength = np.minimum(np.abs(polarization), curve[-1])
     zenith, azimuth = np.interp(strength, curve, zeniths), np.angle(polarization) / 2
     first = np.stack(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import to_numpy
 from polsep.compute.averages import weighted_median
 from polsep.compute.warm_up import make_ready
 from polsep.light.color import ColorFit, axis_of, fit_color, planes_along, strongest
@@ -163,10 +164,9 @@ def find_tiles(capture: Mosaic | Measurements) -> Tiles:
     """Return the tiles of a capture, by the kernel where it reads the frame."""
     if isinstance(capture, Measurements):
         return tile_measurements(capture)
-    data = capture.data.reshape(-1, *capture.data.shape[-2:])[0].detach().cpu()
-    if min(data.shape) < 12:
+    array = to_numpy(capture.data.reshape(-1, *capture.data.shape[-2:])[0])
+    if min(array.shape) < 12:
         return Tiles(np.zeros((0, 10, 10)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2), np.int64))
-    array = data.numpy()
     if array.dtype not in (np.uint8, np.uint16, np.float32):
         return tile_mosaic(capture)
     make_ready(_warm_up)

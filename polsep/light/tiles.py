@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import to_numpy
 from polsep.physics.stokes import Measurements, analyser_residual, fit_stokes, stokes_inverse
 from polsep.sensor.camera import Layout, Mosaic
 
@@ -59,7 +60,8 @@ def taps(offset: int) -> tuple[float, float, float]:
 
 def tile_mosaic(mosaic: Mosaic) -> Tiles:
     """Return the tiles of one frame, in its own light, in NumPy: the readable twin of `tiles_kernel`."""
-    data = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0].cpu().numpy().astype(np.float32)
+    data = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0]
+    data = to_numpy(data).astype(np.float32, copy=False)
     samples = (data - np.float32(mosaic.black_level)) / np.float32(mosaic.white_level - mosaic.black_level)
     h, w = (n // 4 for n in samples.shape)
     samples, step = samples[: 4 * h, : 4 * w], point_step(h, w)
@@ -94,26 +96,24 @@ def filter_weights(layout: Layout) -> dict[tuple[int, int], Floats]:
 
 def _analysis(angles: tuple[float, ...]) -> Doubles:
     """Rows ``[4, K]`` that give s0, s1, s2 and the contradiction of K analysers; zeros where none is defined."""
-    inverse = stokes_inverse(angles).numpy()
+    inverse = stokes_inverse(angles)
     if len(angles) != 4:
         return np.vstack([inverse, np.zeros((1, len(angles)))])
-    import torch
-
-    unit = torch.eye(4, dtype=torch.float64).reshape(4, 1, 1, 4)
-    return np.vstack([inverse, analyser_residual(Measurements(unit, angles)).reshape(1, 4).numpy()])
+    unit = np.eye(4).reshape(4, 1, 1, 4)
+    return np.vstack([inverse, analyser_residual(Measurements(unit, angles)).reshape(1, 4)])
 
 
 def tile_measurements(measurements: Measurements) -> Tiles:
     """Return the tiles of co-sited samples ``[..., K, C, H, W]``, the first frame of a batch; large ones averaged."""
-    data = measurements.data.reshape(-1, *measurements.data.shape[-4:])[0].detach().cpu().float()
+    data = to_numpy(measurements.data.reshape(-1, *measurements.data.shape[-4:])[0]).astype(np.float32, copy=False)
     single = Measurements(data, measurements.angles)
     stokes = fit_stokes(single)
     residual = analyser_residual(single) if len(single.angles) == 4 else 0 * stokes.s0
-    images = np.stack([s.numpy() for s in (stokes.s0, stokes.s1, stokes.s2, residual)])
-    bright = data.amax(dim=(0, 1)).numpy()
+    images = np.stack([stokes.s0, stokes.s1, stokes.s2, residual])
+    bright = data.max(axis=(0, 1))
     if measurements.clipped is not None:
-        clipped = measurements.clipped.reshape(-1, *measurements.data.shape[-4:])[0].any(dim=0).any(dim=0)
-        bright = np.where(clipped.cpu().numpy(), np.inf, bright)
+        clipped = to_numpy(measurements.clipped.reshape(-1, *measurements.data.shape[-4:])[0]).any(axis=(0, 1))
+        bright = np.where(clipped, np.inf, bright)
     times = -(-max(bright.shape) // LARGEST_SIDE)
     h, w = (n // times for n in bright.shape)
     images = images[..., : h * times, : w * times].reshape(*images.shape[:2], h, times, w, times).mean((3, 5))

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from polsep.material.svbrdf import Svbrdf, plane_points
-from polsep.physics.optics import fresnel, normalize
+from polsep.physics.fresnel import fresnel
+from polsep.physics.optics import normalize
 from polsep.render.materials import random_materials
 from polsep.render.textures import PLAIN, pattern_weight
 

@@ -20,7 +20,7 @@ from polsep.demosaic.guided import demosaic_guided_half
 from polsep.material.procedural import GLASS, halve, random_svbrdf
 from polsep.material.svbrdf import Svbrdf, plane_points
 from polsep.methods import METHODS
-from polsep.physics.optics import fresnel
+from polsep.physics.fresnel import fresnel
 from polsep.render.simulate import blur, capture, expose_to_clip, expose_to_level, half_resolution
 from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Scene, Vector, shade
 from polsep.render.views import BLURS, scene_seed
@@ -95,7 +95,8 @@ def photograph(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> t
 
 def unseparated_image(mosaic: Mosaic) -> Tensor:
     """The image of a camera without analysers, ``[3, h, w]``: s0, with clipped samples as they are."""
-    return 2 * demosaic_guided_half(mosaic).data.mean(dim=-4)
+    image: Tensor = 2 * demosaic_guided_half(mosaic).data.mean(dim=-4)
+    return image
 
 
 def separated_images(mosaic: Mosaic) -> Tensor:

@@ -24,7 +24,7 @@ def guide_batch(raw: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
     frames = np.ascontiguousarray(raw[:, 0].detach().numpy())
     count, height, width = frames.shape
     pattern = read_pattern((height, width), layout, 0.0, 1.0, (1.0, 1.0, 1.0))
-    grid = read_grid(pattern, layout.angles, stokes_inverse(layout.angles).float().numpy())
+    grid = read_grid(pattern, layout.angles, stokes_inverse(layout.angles).astype(np.float32))
     out = np.empty((count, height // 2, 18, width // 2), np.float32)
 
     def guide(frame_range: tuple[int, int]) -> None:

@@ -190,7 +190,7 @@ def warm_up() -> None:
     maps = Maps(*inputs, channels, closed, np.zeros((0, 0, 0), np.float32))
     nothing = np.zeros((4, AT_ONCE), np.int64)
     map_rows(samples, pattern, Taps(np.zeros((4, 9, AT_ONCE), np.float32), nothing, nothing, 3), maps, (0, size))
-    grid = read_grid(pattern, layout.angles, stokes_inverse(layout.angles).float().numpy())
+    grid = read_grid(pattern, layout.angles, stokes_inverse(layout.angles).astype(np.float32))
     map_guided_rows(Source(samples, pattern, grid), maps, (0, size))
     outputs = LayerOutputs.of(closed, *(np.zeros((n, size, size), np.float32) for n in (20, 8)))
     write_rows(outputs, np.ones(3, np.float32), Targets.empty((2 * size, 2 * size), 3), (0, size))

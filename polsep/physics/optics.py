@@ -7,8 +7,7 @@ Conventions:
 * A beam's frame has z along its propagation, y the projection of an "up" vector and x = y cross z. The camera's beam
   travels along v, so x is image-right and y image-up and angles count from x toward y, as in `stokes`. The light's beam
   travels along -l; its polarizer angle is measured in the frame of the light's own up vector.
-* Fresnel coefficients follow Verdet's convention (r_p = -r_s at normal incidence), with the angle on the AIR side, also
-  for light that leaves the material; Stokes vectors carry no eta^2 factor on leaving (reciprocal, as Mitsuba 3).
+* Fresnel coefficients as in `fresnel`.
 * Roughness r is GGX alpha = r^2. The diffuse lobe is albedo/pi, so both lobes have their physical ratio.
 
 Notes (deviations from the paper; derivation and check in docs/conventions.md): its Eq. 6 needs the INCIDENT azimuth,
@@ -26,20 +25,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from polsep.physics.fresnel import Fresnel, fresnel
 from polsep.physics.stokes import Stokes
-
-#: Refractive index of every dielectric in the paper (Sec. 3.1).
-ETA = 1.5
-
-
-class Fresnel(NamedTuple):
-    """Half sums and differences of the power coefficients for s and p light, and the signed product r_s r_p."""
-
-    r_plus: Tensor
-    r_minus: Tensor
-    r_cross: Tensor
-    t_plus: Tensor
-    t_minus: Tensor
 
 
 class Beam(NamedTuple):
@@ -75,30 +62,6 @@ def normalize(v: Tensor) -> Tensor:
     """Unit vectors; a zero vector stays zero, with finite gradients."""
     squared = dot(v, v)
     return v * torch.rsqrt(squared.clamp(min=torch.finfo(v.dtype).tiny * 4))
-
-
-def fresnel(cos_theta: Tensor, eta: float = ETA) -> Fresnel:
-    """Fresnel coefficients of an air-dielectric interface for the air-side angle of incidence.
-
-    r_cross = r_s r_p is negative below Brewster's angle arctan(eta) and positive above. t_minus = -r_minus <= 0:
-    transmission favours p. Source: Born and Wolf, Principles of Optics, 1.5.2; signs as Mitsuba 3 `fresnel.h`.
-    """
-    c = cos_theta.clamp(0, 1)
-    ct = torch.sqrt(1 - (1 - c * c) / eta**2)
-    rs = (c - eta * ct) / (c + eta * ct)
-    rp = (eta * c - ct) / (eta * c + ct)
-    power_s, power_p = rs * rs, rp * rp
-    plus, minus = 0.5 * (power_s + power_p), 0.5 * (power_s - power_p)
-    return Fresnel(plus, minus, rs * rp, 1 - plus, -minus)
-
-
-def diffuse_dolp(cos_theta: Tensor, eta: float = ETA) -> Tensor:
-    """beta_d = -T^-/T^+: DoLP of diffuse light that leaves at that zenith angle; 0.044 at 45 degrees, at most 0.385.
-
-    At exact grazing, where no light leaves, it is 0.
-    """
-    f = fresnel(cos_theta, eta)
-    return -f.t_minus / f.t_plus.clamp(min=torch.finfo(cos_theta.dtype).eps)
 
 
 def ggx_distribution(normal: Tensor, half: Tensor, alpha: Tensor) -> Tensor:

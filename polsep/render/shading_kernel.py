@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import HALF, ONE, TWO, ZERO, Compilable, entry
-from polsep.physics.optics import ETA
+from polsep.physics.fresnel import ETA
 from polsep.render.materials import Materials
 from polsep.render.patterns_kernel import INTEGER_ROWS, NUMBER_ROWS, RUN, PatternTable, pattern_table, weigh_run
 from polsep.render.sphere_tracing import PinholeCamera, PointLight
@@ -108,7 +108,7 @@ def _inlined(function: Compilable) -> Compilable:
 
 @_inlined
 def _fresnel(c: Any) -> Any:
-    """`optics.fresnel`: R+, R- and Rx."""
+    """`fresnel.fresnel`: R+, R- and Rx."""
     ct = math.sqrt(ONE - (ONE - c * c) * _INVERSE_ETA2)
     rs = (c - _ETA * ct) / (c + _ETA * ct)
     rp = (_ETA * c - ct) / (_ETA * c + ct)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import to_numpy
 from polsep.sensor.camera import CLIP_MARGIN, Mosaic
 from polsep.sensor.noise import BLOCK, blocks_of
 
@@ -66,10 +67,11 @@ def check_black_level(mosaic: Mosaic) -> BlackLevel:
 
 def _some_rows(mosaic: Mosaic) -> Floats:
     """Rows of blocks, evenly spread over the first frame, about `BLOCKS` of them."""
-    x = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0].detach().float().cpu().numpy()
+    x = to_numpy(mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0])
     height, width = (n // BLOCK * BLOCK for n in x.shape)
     step = max(1, height * width // BLOCK**2 // BLOCKS)
-    return np.ascontiguousarray(x[:height, :width].reshape(-1, BLOCK, width)[::step]).reshape(-1, width)
+    rows = x[:height].reshape(-1, BLOCK, x.shape[1])[::step, :, :width]
+    return np.ascontiguousarray(rows, np.float32).reshape(-1, width)
 
 
 def _black_of(mosaic: Mosaic, rows: Floats) -> float | None:

@@ -24,9 +24,9 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import as_floats, namespace, of_kind, to_numpy
 from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
 from polsep.sensor.defects import MIN_SIZE, repair
 from polsep.sensor.levels import WHITE_LEVELS
@@ -107,7 +107,7 @@ def correct_mosaic(mosaic: Mosaic, calibration: Calibration) -> Mosaic:
     Raises ValueError on a frame of another size, layout or white level than the calibration's.
     """
     _check_match(mosaic, calibration)
-    raw = mosaic.data.detach().cpu().numpy()
+    raw = to_numpy(mosaic.data)
     samples, black = raw, mosaic.black_level
     if calibration.black_level is not None:
         black = float(np.float32(calibration.black_level * mosaic.white_level / calibration.white_level))
@@ -120,18 +120,18 @@ def correct_mosaic(mosaic: Mosaic, calibration: Calibration) -> Mosaic:
     dead = calibration.dead if calibration.dead is not None and calibration.dead.size else None
     if dead is None and calibration.analysers is None and samples is raw:
         return _with_facts(mosaic, black, calibration)
-    clipped = mosaic.clipped().cpu().numpy()
+    clipped = to_numpy(mosaic.clipped())
     if dead is not None:
         clipped.flat[dead] = False  # as the prediction from its neighbours is
         samples = _keep_clipped(raw.copy() if samples is raw else samples, clipped, (black, mosaic.white_level))
         mask = np.zeros(raw.shape, np.bool_)
         mask.flat[dead] = True
-        found = replace(mosaic, data=torch.from_numpy(samples), black_level=black)
-        samples = repair(found, mask).data.numpy() if min(raw.shape) >= MIN_SIZE else samples
+        found = replace(mosaic, data=samples, black_level=black)
+        samples = repair(found, mask).data if min(raw.shape) >= MIN_SIZE else samples
     if calibration.analysers is not None:
         samples = correct_analysers(samples, black, calibration)
-    data = torch.from_numpy(_keep_clipped(samples, clipped, (black, mosaic.white_level)))
-    return _with_facts(replace(mosaic, data=data.to(mosaic.data.device)), black, calibration)
+    samples = _keep_clipped(samples, clipped, (black, mosaic.white_level))
+    return _with_facts(replace(mosaic, data=of_kind(samples, mosaic.data)), black, calibration)
 
 
 def _with_facts(mosaic: Mosaic, black: float, calibration: Calibration) -> Mosaic:
@@ -153,10 +153,12 @@ def subtract_ambient(mosaic: Mosaic, ambient: Mosaic) -> Mosaic:
             raise ValueError(f"expected an ambient frame with the frame's {name} {wanted}, found {found}")
     if mosaic.data.shape[-2:] != ambient.data.shape[-2:]:
         raise ValueError(f"expected an ambient frame of {_size(mosaic)} as the frame, found {_size(ambient)}")
-    clipped = mosaic.clipped() | ambient.clipped()
-    data = mosaic.data - (ambient.data.to(mosaic.data) - mosaic.black_level)
-    least = mosaic.black_level + (1 - CLIP_MARGIN) * (mosaic.white_level - mosaic.black_level)
-    return replace(mosaic, data=torch.where(clipped & (data < least), mosaic.white_level, data))
+    other = replace(ambient, data=of_kind(to_numpy(ambient.data), mosaic.data))
+    black, white = float(mosaic.black_level), float(mosaic.white_level)
+    data = as_floats(mosaic.data)
+    data = data - namespace(data).astype(as_floats(other.data) - black, data.dtype, copy=False)
+    hidden = (mosaic.clipped() | other.clipped()) & (data < black + (1 - CLIP_MARGIN) * (white - black))
+    return replace(mosaic, data=namespace(data).where(hidden, white, data))
 
 
 def mean_mosaic(mosaics: list[Mosaic]) -> Mosaic:
@@ -169,11 +171,12 @@ def mean_mosaic(mosaics: list[Mosaic]) -> Mosaic:
             raise ValueError(f"expected frames of one size, found {_size(first)} and {_size(other)}")
     if len(mosaics) == 1:
         return first
-    total, clipped = first.data.double(), first.clipped()
+    xp = namespace(first.data)
+    total, clipped = xp.astype(first.data, xp.float64), first.clipped()
     for other in mosaics[1:]:
         total, clipped = total + other.data, clipped | other.clipped()
-    mean = (total / len(mosaics)).float()
-    return replace(first, data=torch.where(clipped, mean.clamp(min=first.white_level), mean))
+    mean = xp.astype(total / len(mosaics), xp.float32)
+    return replace(first, data=xp.where(clipped, mean.clip(float(first.white_level), None), mean))
 
 
 def falloff_image(coefficients: Table, height: int, width: int) -> Floats:

@@ -16,12 +16,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import torch
-from torch import Tensor
+from array_api_compat import device
 
+from polsep.compute.arrays import Array, as_floats, constant, namespace
 from polsep.physics.stokes import Measurements, Stokes
+
+if TYPE_CHECKING:
+    import torch
 
 BAYER_ORDERS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
@@ -187,7 +190,7 @@ class Mosaic:
     period.
     """
 
-    data: Tensor
+    data: Array
     layout: Layout
     black_level: float
     white_level: float
@@ -197,7 +200,7 @@ class Mosaic:
     def __post_init__(self) -> None:
         check_frame(tuple(self.data.shape), self.layout, self.black_level, self.white_level)
 
-    def linear(self) -> Tensor:
+    def linear(self) -> Array:
         """Samples with black at 0 and white at 1, under white light; float32 (float64 for float64 data)."""
         samples = self._samples()
         if all(gain == 1 for gain in self.light_color):
@@ -206,14 +209,15 @@ class Mosaic:
         for row in range(period):
             for col in range(period):
                 channel = self.layout.filter_at(row, col).channel
-                samples[..., row::period, col::period] /= self.light_color[channel]
+                samples[..., row::period, col::period] /= float(self.light_color[channel])
         return samples
 
-    def _samples(self) -> Tensor:
-        data = self.data if self.data.dtype == torch.float64 else self.data.float()
-        return (data - self.black_level) / (self.white_level - self.black_level)
+    def _samples(self) -> Array:
+        samples = as_floats(self.data) - float(self.black_level)
+        samples /= float(self.white_level - self.black_level)
+        return samples
 
-    def clipped(self) -> Tensor:
+    def clipped(self) -> Array:
         """Mask ``[..., H, W]`` of samples that only bound the light from below."""
         return self._samples() >= 1 - CLIP_MARGIN
 
@@ -245,9 +249,9 @@ class Sensor:
         """Largest code: 2^bits - 1, or 1.0 without a converter."""
         return 1.0 if self.bits is None else 2.0**self.bits - 1
 
-    def noise_variance(self, signal: Tensor) -> Tensor:
+    def noise_variance(self, signal: Array) -> Array:
         """Variance of one unclipped sample of mean ``signal`` (white = 1): shot, read and quantization noise."""
-        shot = signal.clamp(min=0) / self.full_well
+        shot = signal.clip(0.0, None) / self.full_well
         read = (self.read_noise / self.full_well) ** 2
         step = 0.0 if self.bits is None else 1 / self.white_level
         return shot + read + step**2 / 12
@@ -261,14 +265,14 @@ IMX250 = Sensor(10_500.0, 2.4, 12, (149 / 151, 299 / 301, 424 / 426))
 IDEAL = Sensor()
 
 
-def sample_mosaic(measurements: Measurements, layout: Layout) -> Tensor:
+def sample_mosaic(measurements: Measurements, layout: Layout) -> Array:
     """The mosaic ``[..., H, W]`` of angle images ``[..., 4, C, H, W]``: of each pixel the sample behind its filter.
 
     The twin of every demosaicker. Channels beyond the layout's colours are ignored. Raises ValueError when the
     measurements lack an analyser of the layout.
     """
     data = measurements.data
-    out = torch.empty((*data.shape[:-4], *data.shape[-2:]), dtype=data.dtype, device=data.device)
+    out = namespace(data).empty((*data.shape[:-4], *data.shape[-2:]), dtype=data.dtype, device=device(data))
     degrees = [round(math.degrees(t), 6) for t in measurements.angles]
     for row in range(layout.period):
         for col in range(layout.period):
@@ -289,9 +293,9 @@ def measure_with_analysers(stokes: Stokes, angles: tuple[float, ...], diattenuat
     """
     if stokes.s0.shape[-3] == 1:
         diattenuation = diattenuation[len(diattenuation) // 2 :][:1]
-    d = torch.tensor(diattenuation, dtype=stokes.s0.dtype, device=stokes.s0.device)[:, None, None]
+    d = constant(diattenuation, stokes.s0)[:, None, None]
     data = [0.5 * (stokes.s0 + d * (stokes.s1 * math.cos(2 * t) + stokes.s2 * math.sin(2 * t))) for t in angles]
-    return Measurements(torch.stack(data, dim=-4), angles)
+    return Measurements(namespace(stokes.s0).stack(data, axis=-4), angles)
 
 
 def expose(stokes: Stokes, layout: Layout, sensor: Sensor, generator: torch.Generator | None = None) -> Mosaic:
@@ -303,16 +307,21 @@ def expose(stokes: Stokes, layout: Layout, sensor: Sensor, generator: torch.Gene
     """
     signal = sample_mosaic(measure_with_analysers(stokes, layout.angles, sensor.diattenuation), layout)
     signal = add_noise(signal, sensor, generator)
-    codes = signal.clamp(0, 1)
+    codes = signal.clip(0.0, 1.0)
     if sensor.bits is not None:
-        codes = torch.round(codes * sensor.white_level)
+        codes = namespace(codes).round(codes * sensor.white_level)
     return Mosaic(codes, layout, 0.0, sensor.white_level)
 
 
-def add_noise(signal: Tensor, sensor: Sensor, generator: torch.Generator | None) -> Tensor:
-    """Shot and read noise of ``sensor`` on a signal in units of the white level; neither clipped nor quantized."""
+def add_noise(signal: Array, sensor: Sensor, generator: torch.Generator | None) -> Array:
+    """Shot and read noise of ``sensor`` on a signal in units of the white level; neither clipped nor quantized.
+
+    Noise needs a tensor: torch draws it.
+    """
     if math.isinf(sensor.full_well):
         return signal
+    import torch
+
     electrons = torch.poisson(signal.clamp(min=0) * sensor.full_well, generator=generator)
     if sensor.read_noise:
         noise = torch.empty_like(electrons).normal_(generator=generator)

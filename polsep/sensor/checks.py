@@ -5,6 +5,7 @@ A frame that is encoded, or whose black level is too large, contradicts every la
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,7 +44,7 @@ def check_mosaic(mosaic: Mosaic) -> CheckedMosaic:
     understood = encoded is None and (black.warning is None or black.level is not None)
     layout = check_layout(mosaic, phases).warning if understood else None
     mosaic, count = remove_defects(mosaic)
-    share = count / mosaic.data.numel()
+    share = count / math.prod(mosaic.data.shape)
     many = (
         f"{count} dead or hot pixels were repaired ({share:.2%}): a calibration of the dark finds them more surely, "
         "see 'polsep calibrate dark'"

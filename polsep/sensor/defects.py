@@ -26,9 +26,9 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import of_kind, to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
 from polsep.sensor.noise import BLOCK, BLOCKS, MIN_BLOCKS, Levels, Noise, blocks_of, estimate_noise, least_noise
@@ -66,7 +66,7 @@ def remove_defects(mosaic: Mosaic) -> tuple[Mosaic, int]:
     places, repaired = _find(mosaic)
     if not len(places):
         return mosaic, 0
-    return replace(mosaic, data=torch.from_numpy(repaired).to(mosaic.data.device)), len(places)
+    return replace(mosaic, data=of_kind(repaired, mosaic.data)), len(places)
 
 
 def find_defects(mosaic: Mosaic) -> NDArray[np.bool_]:
@@ -106,7 +106,7 @@ def repair(mosaic: Mosaic, mask: NDArray[np.bool_]) -> Mosaic:
     make_ready(kernel.warm_up)
     x = x.copy()
     kernel.fill(x, make_predictor(mosaic.layout, x.shape), clip_level(mosaic), np.argwhere(mask))
-    return replace(mosaic, data=torch.from_numpy(x).to(mosaic.data.device))
+    return replace(mosaic, data=of_kind(x, mosaic.data))
 
 
 def _find(mosaic: Mosaic) -> tuple[Places, Floats]:
@@ -262,14 +262,14 @@ def repair_reference(mosaic: Mosaic, mask: NDArray[np.bool_]) -> Mosaic:
     excess = np.linalg.solve(factors, [window.residual(one) for one in places])
     for one, own in zip(places, excess, strict=True):
         window.x[one] -= own
-    return replace(mosaic, data=torch.from_numpy(window.x))
+    return replace(mosaic, data=of_kind(window.x, mosaic.data))
 
 
 def _samples(mosaic: Mosaic) -> Floats:
     """The samples of one frame in their own unit. Raises ValueError on a batch."""
     if mosaic.data.ndim != 2:
         raise ValueError(f"expected one frame [H, W], found {tuple(mosaic.data.shape)}")
-    return np.ascontiguousarray(mosaic.data.detach().float().cpu().numpy())
+    return np.ascontiguousarray(to_numpy(mosaic.data), np.float32)
 
 
 def _near(candidates: Places, new: Places, known: Places, shape: tuple[int, ...]) -> Places:

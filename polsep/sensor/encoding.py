@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import to_numpy
 from polsep.sensor.black_level import smooth_blocks
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.layout_check import crossed_pairs, phase_cells, see_phases
@@ -106,7 +107,7 @@ def noise_exponent(mosaic: Mosaic) -> float | None:
 
 def block_ratio(mosaic: Mosaic) -> float | None:
     """Strength of the finest waves in blocks of 8x8 over that in blocks moved by 4; None for small frames."""
-    x = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0].detach().float().cpu().numpy()
+    x = to_numpy(mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0]).astype(np.float32, copy=False)
     if min(x.shape) < 8 * SIDE:
         return None
     number = np.arange(SIDE)

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import to_numpy
 from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
 
 Floats = NDArray[np.float32]
@@ -96,13 +97,13 @@ def crossed_pairs(layout: Layout) -> str | None:
 def _strips(mosaic: Mosaic) -> list[Floats]:
     """The first frame's samples; of a large one `STRIPS` of them: as reliable, in an eighth of the time.
 
-    Everything else is NumPy, in this thread: waking torch's threads would take longer than a step.
+    Everything else is NumPy, in this thread: waking other threads would take longer than a step.
     """
     frame = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0]
     height = frame.shape[0]
     step = height // STRIPS // STRIP * STRIP
     tops, size = (range(0, STRIPS * step, step), STRIP) if height >= LARGE * STRIP else (range(1), height)
-    return [frame[top : top + size].detach().cpu().numpy().astype(np.float32, copy=False) for top in tops]
+    return [to_numpy(frame[top : top + size]).astype(np.float32, copy=False) for top in tops]
 
 
 def _phase_means(mosaic: Mosaic, data: Floats) -> Floats:

@@ -17,7 +17,6 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from polsep.physics.stokes import Measurements
@@ -25,6 +24,10 @@ from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
 
 #: Accepted samples and the white level that their type implies.
 WHITE_LEVELS = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0, "float64": 1.0}
+
+#: Distance from black to white, in units of the samples, and how many times it a sample or a level may be away. Beyond,
+#: squares overflow in float32, or white and black are one number in it.
+SPANS, MAX_RATIO = (1e-12, 1e12), 1e6
 
 #: Floats up to about 1 that lie below this share of the white level look as if white were 1.
 MIN_USED = 0.01
@@ -66,8 +69,8 @@ def as_mosaic(
     if plane.shape[0] < rows or plane.shape[1] < cols:
         raise ValueError(f"expected a mosaic of at least {cols}x{rows} pixels, found {width}x{height}")
     white = _white_level(plane, black_level, white_level)
-    data = torch.from_numpy(_as_float32(plane))
-    return Mosaic(data, layout, black_level, white), notes + level_notes(plane, black_level, white_level)
+    mosaic = Mosaic(_as_float32(plane), layout, black_level, white)
+    return mosaic, notes + level_notes(plane, black_level, white_level)
 
 
 def as_measurements(
@@ -85,8 +88,8 @@ def as_measurements(
     if planes.ndim != 4 or planes.shape[0] != 4 or planes.shape[-1] not in (1, 3):
         raise ValueError(f"expected four gray or RGB images, found shape {_shape(planes)}")
     white = _white_level(planes, black_level, white_level)
-    linear = (torch.from_numpy(_as_float32(planes)) - black_level) / (white - black_level)
-    data = linear.permute(0, 3, 1, 2).contiguous()
+    linear = (_as_float32(planes) - float(black_level)) / float(white - black_level)
+    data = np.ascontiguousarray(np.moveaxis(linear, -1, 1))
     angles = tuple(math.radians(angle) for angle in PLANE_ANGLES_DEG)
     return Measurements(data, angles, data >= 1 - CLIP_MARGIN), level_notes(planes, black_level, white_level)
 
@@ -185,11 +188,13 @@ def _checked(array: NDArray[Any]) -> NDArray[Any]:
 
 def _require_finite(array: NDArray[Any]) -> None:
     """Raise ValueError when a value is not finite, or has no finite float32."""
+    with np.errstate(invalid="ignore"):
+        if max(-float(array.min()), float(array.max())) <= float(np.finfo(np.float32).max):
+            return
     bad = ~(np.abs(array) <= np.finfo(np.float32).max)
-    if bad.any():
-        first = tuple(int(i) for i in np.unravel_index(int(bad.argmax()), bad.shape))
-        count = np.count_nonzero(bad)
-        raise ValueError(f"expected finite values, found {count} that are not, the first ({array[first]:g}) at {first}")
+    first = tuple(int(i) for i in np.unravel_index(int(bad.argmax()), bad.shape))
+    count = np.count_nonzero(bad)
+    raise ValueError(f"expected finite values, found {count} that are not, the first ({array[first]:g}) at {first}")
 
 
 def _one_channel(array: NDArray[Any]) -> tuple[NDArray[Any], Notes]:
@@ -217,7 +222,22 @@ def _white_level(samples: NDArray[Any], black_level: float, white_level: float |
         raise ValueError(f"expected finite black and white levels, found {black_level:g} and {white:g}")
     if not white > black_level:
         raise ValueError(f"expected a white level above the black level, found white {white:g}, black {black_level:g}")
+    _require_span(samples, float(black_level), float(white))
     return float(white)
+
+
+def _require_span(samples: NDArray[Any], black: float, white: float) -> None:
+    """Raise ValueError for levels and samples with which float32 would overflow, or lose every digit."""
+    span = white - black
+    if not (SPANS[0] <= span <= SPANS[1] and max(abs(black), abs(white)) <= MAX_RATIO * span):
+        raise ValueError(f"expected a white level well above the black level, found white {white:g}, black {black:g}")
+    least, most = (samples.min(), samples.max()) if samples.dtype.kind == "f" else (0, WHITE_LEVELS[samples.dtype.name])
+    farthest = max(black - float(least), float(most) - black)
+    if farthest > MAX_RATIO * span:
+        raise ValueError(
+            f"expected samples within {MAX_RATIO:g} times the white level, found them {farthest:g} from black, "
+            f"white {white:g}: say --white-level N"
+        )
 
 
 def _as_float32(samples: NDArray[Any]) -> NDArray[np.float32]:

@@ -11,9 +11,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
+from polsep.compute.arrays import Array, namespace, of_kind, window
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import Layout, Mosaic
 
@@ -54,15 +55,18 @@ class Orientation:
         """
         return all(first % 2 == 0 for first, _ in self.spans)
 
-    def turn(self, frames: Tensor) -> Tensor:
+    def turn(self, frames: Array) -> Array:
         """Frames ``[..., H, W]`` in the wanted order."""
         frames = frames.mT if self.transposed else frames
-        frames = frames.flip([axis for axis, wanted in ((-2, self.down), (-1, self.across)) if wanted])
-        rows, cols = frames.shape[-2:]
-        places = (_continued(rows, self.top), _continued(cols, self.left))
-        return frames[..., places[0][:, None].to(frames.device), places[1].to(frames.device)]
+        frames = self._mirror(frames)
+        rows, cols = (_continued(n, o) for n, o in zip(frames.shape[-2:], (self.top, self.left), strict=True))
+        return frames[..., of_kind(rows[:, None], frames), of_kind(cols, frames)]
 
-    def turn_back(self, images: Tensor, scale: int) -> Tensor:
+    def _mirror(self, images: Array) -> Array:
+        axes = tuple(axis for axis, wanted in ((-2, self.down), (-1, self.across)) if wanted)
+        return namespace(images).flip(images, axis=axes)
+
+    def turn_back(self, images: Array, scale: int) -> Array:
         """Images of a turned frame as those of the frame's whole cells; ``scale``: 2 pixels per cell and side, or 1.
 
         One pixel per cell, where the frame has cells of its own (`keeps_cells`), is the mean of those it lies between;
@@ -70,12 +74,13 @@ class Orientation:
         """
         for axis, (first, count) in zip((-2, -1), self.spans, strict=True):
             start, length = first * scale // 2, count * scale // 2
-            cells = images.narrow(axis, start, length)
+            cells = window(images, start, length, axis)
             if first * scale % 2:
-                others = images.narrow(axis, start + 1, length)
-                cells = cells | others if images.dtype == torch.bool else 0.5 * (cells + others)
+                others = window(images, start + 1, length, axis)
+                is_mask = images.dtype == namespace(images).bool
+                cells = cells | others if is_mask else 0.5 * (cells + others)
             images = cells
-        images = images.flip([axis for axis, wanted in ((-2, self.down), (-1, self.across)) if wanted])
+        images = self._mirror(images)
         return images.mT if self.transposed else images
 
     def turn_back_stokes(self, stokes: Stokes, scale: int) -> Stokes:
@@ -107,13 +112,13 @@ def _span(count: int, origin: int, before: int, mirrored: bool) -> tuple[int, in
     return before + (count - origin - whole if mirrored else origin), whole
 
 
-def _continued(count: int, before: int) -> Tensor:
+def _continued(count: int, before: int) -> NDArray[np.int64]:
     """Places of a side of ``count`` samples with ``before`` more, and as many behind as make a multiple of `PERIOD`."""
-    places = torch.arange(-before, count + (-count - before) % PERIOD)
+    places = np.arange(-before, count + (-count - before) % PERIOD)
     # Frames of less than a period are mono ones, which repeat after every cell.
     period = min(PERIOD, count // 2 * 2)
     behind = count - period + (places - count) % period
-    return torch.where(places < 0, places % period, torch.where(places >= count, behind, places))
+    return np.where(places < 0, places % period, np.where(places >= count, behind, places))
 
 
 def orient(mosaic: Mosaic, wanted: Layout) -> Orientation:

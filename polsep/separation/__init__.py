@@ -1,1 +1,1 @@
-"""Diffuse and specular by closed forms, and the report of a separated frame; kernels lie beside their torch twins."""
+"""Diffuse and specular by closed forms, and the report of a separated frame; kernels lie beside their twins."""

@@ -13,9 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
-
+from polsep.compute.arrays import Array, namespace
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes, fit_stokes_unclipped, polarized_intensity
 
 
@@ -31,21 +29,22 @@ class Separation:
     expects it, or None.
     """
 
-    diffuse: Tensor
-    specular: Tensor
-    valid: Tensor
+    diffuse: Array
+    specular: Array
+    valid: Array
     stokes: Stokes
-    diffuse_polarization: Tensor | None = None
-    residual: Tensor | None = None
-    noise: Tensor | None = None
-    clipped: Tensor | None = None
-    expected_error: Tensor | None = None
+    diffuse_polarization: Array | None = None
+    residual: Array | None = None
+    noise: Array | None = None
+    clipped: Array | None = None
+    expected_error: Array | None = None
 
 
-def _split(stokes: Stokes, specular: Tensor, valid: Tensor) -> Separation:
+def _split(stokes: Stokes, specular: Array, valid: Array) -> Separation:
     """Diffuse is s0 minus specular; both stay non-negative."""
-    total = stokes.s0.clamp(min=0)
-    specular = torch.minimum(specular, total)
+    xp = namespace(specular)
+    total = stokes.s0.clip(0, None)
+    specular = xp.minimum(specular, total)
     return Separation(total - specular, specular, valid, stokes)
 
 
@@ -56,16 +55,29 @@ def separate_analytic(measurements: Measurements) -> Separation:
     clips all analysers becomes a hole in the specular image. Source: Dave et al. 2022, Eqs. 15-18.
     """
     stokes = fit_stokes(measurements)
-    valid = torch.ones_like(stokes.s0[..., 0, :, :], dtype=torch.bool)
-    if measurements.clipped is not None:
-        valid = ~measurements.clipped.any(dim=-4).any(dim=-3)
-    return _split(stokes, polarized_intensity(stokes), valid)
+    clipped = clipped_pixels(measurements)
+    return _split(stokes, polarized_intensity(stokes), all_pixels(stokes.s0) if clipped is None else ~clipped)
 
 
 def separate_analytic_unclipped(measurements: Measurements) -> Separation:
     """`separate_analytic` from the unclipped analysers: exact with any three of them, bounds where fewer are left."""
     stokes, determined = fit_stokes_unclipped(measurements)
-    return _split(stokes, polarized_intensity(stokes), determined.all(dim=-3))
+    return _split(stokes, polarized_intensity(stokes), namespace(determined).all(determined, axis=-3))
+
+
+def all_pixels(image: Array) -> Array:
+    """A mask ``[..., h, w]`` of all pixels of an image ``[..., C, h, w]``."""
+    xp = namespace(image)
+    return xp.ones_like(image[..., 0, :, :], dtype=xp.bool)
+
+
+def clipped_pixels(measurements: Measurements) -> Array | None:
+    """Pixels ``[..., h, w]`` with a clipped sample; None if not determined."""
+    clipped = measurements.clipped
+    if clipped is None:
+        return None
+    xp = namespace(clipped)
+    return xp.any(xp.any(clipped, axis=-4), axis=-3)
 
 
 def light_polarizer_angle(specular_angle: float) -> float:

@@ -135,7 +135,7 @@ def _separate(
 @lru_cache(maxsize=8)
 def _inverse(layout: Layout) -> NDArray[np.float32]:
     """The matrix ``[3, 4]`` of `fit_stokes`."""
-    return stokes_inverse(layout.angles).float().numpy()
+    return stokes_inverse(layout.angles).astype(np.float32)
 
 
 def warm_up() -> None:

@@ -23,14 +23,12 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
-import torch
-from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
-
+from polsep.compute.arrays import Array, namespace
 from polsep.compute.filters import box_mean
+from polsep.compute.resizing import halve, resize_bilinear
 from polsep.physics.stokes import Measurements, Stokes, analyser_residual, fit_stokes_unclipped
-from polsep.separation.analytic import Separation, separate_analytic_unclipped
-from polsep.separation.closed_form import fit_unclipped, limit_dolp, white_specular
+from polsep.separation.analytic import Separation, all_pixels, clipped_pixels, separate_analytic_unclipped
+from polsep.separation.closed_form import fit_unclipped, limit_dolp, parts, white_specular
 
 #: Windows of the diffuse polarization, widest first: radius in pixels, and standard deviation per component from the
 #: next wider window's. The widest one is held toward zero, the paper's unpolarized diffuse.
@@ -72,7 +70,7 @@ def separate_color_affine(measurements: Measurements) -> Separation:
     """
     if measurements.data.shape[-3] != 3:
         return separate_analytic_unclipped(measurements)
-    even = measurements.uniform or measurements
+    xp, even = namespace(measurements.data), measurements.uniform or measurements
     stokes, exact = fit_stokes_unclipped(even)
     sample = sample_variance(even)
     edges = None if even is measurements else polarization_edges(even, stokes)
@@ -84,46 +82,57 @@ def separate_color_affine(measurements: Measurements) -> Separation:
     stokes, offset, determined = _solve_clipped(measurements, stokes, a, offset)
     valid = determined
     if measurements.clipped is not None:
-        valid = valid & ~measurements.clipped.all(dim=-4).any(dim=-3)
-    total = stokes.s0.clamp(min=0)
-    specular = white_specular(offset.chunk(2, dim=-3), a.chunk(2, dim=-3))
-    specular = torch.minimum(specular, total.amin(dim=-3, keepdim=True)).expand_as(total)
-    found = Separation(total - specular, specular, valid, stokes, a, residual, torch.sqrt(sample))
-    return found if bool(valid.all()) else _fill(found, measurements, offset, determined)
+        valid = valid & ~xp.any(xp.all(measurements.clipped, axis=-4), axis=-3)
+    total = stokes.s0.clip(0, None)
+    specular = xp.minimum(white_specular(parts(offset), parts(a)), xp.min(total, axis=-3, keepdims=True))
+    specular = xp.broadcast_to(specular, total.shape)
+    found = Separation(total - specular, specular, valid, stokes, a, residual, xp.sqrt(sample))
+    return found if bool(xp.all(valid)) else _fill(found, measurements, offset, determined)
 
 
-def _color_mean(x: Tensor) -> Tensor:
-    return x.mean(dim=-3, keepdim=True)
+def _color_mean(x: Array) -> Array:
+    return namespace(x).mean(x, axis=-3, keepdims=True)
 
 
-def sample_variance(measurements: Measurements, radius: int = 3) -> Tensor:
+def _color_sum(x: Array) -> Array:
+    return namespace(x).sum(x, axis=-3, keepdims=True)
+
+
+def _unclipped(measurements: Measurements, clipped: Array) -> Array:
+    """1 in pixels ``[..., 1, h, w]`` without a clipped sample, else 0."""
+    return namespace(clipped).astype(~clipped[..., None, :, :], measurements.data.dtype)
+
+
+def sample_variance(measurements: Measurements, radius: int = 3) -> Array:
     """Local noise variance of one sample ``[..., 1, h, w]`` from the analysers' contradiction of m0 + m90 = m45 + m135.
 
     It covers sensor noise and misregistration alike, needs no calibration, and is zero on exact data. Clipped samples
     are left out of the mean over the window.
     """
     squared = _color_mean(analyser_residual(measurements) ** 2)
-    if measurements.clipped is None:
+    clipped = clipped_pixels(measurements)
+    if clipped is None:
         return box_mean(squared, radius)
-    weight = (~measurements.clipped.any(dim=-4).any(dim=-3, keepdim=True)).to(squared)
-    return box_mean(squared * weight, radius) / box_mean(weight, radius).clamp(min=1e-6)
+    weight = _unclipped(measurements, clipped)
+    return box_mean(squared * weight, radius) / box_mean(weight, radius).clip(1e-6, None)
 
 
-def polarization_edges(measurements: Measurements, stokes: Stokes) -> Tensor:
+def polarization_edges(measurements: Measurements, stokes: Stokes) -> Array:
     """s1 / s0 and s2 / s0 ``[..., 2, h, w]`` of all colours in 3x3 pixels, clipped ones left out.
 
     They change where the surface does, and at the rim of a highlight, but hardly with texture.
     """
-    light = torch.cat([_color_mean(s) for s in (stokes.s0, stokes.s1, stokes.s2)], dim=-3)
-    if measurements.clipped is not None:
-        light = light * ~measurements.clipped.any(dim=-4).any(dim=-3, keepdim=True)
+    light = namespace(stokes.s0).concat([_color_mean(s) for s in (stokes.s0, stokes.s1, stokes.s2)], axis=-3)
+    clipped = clipped_pixels(measurements)
+    if clipped is not None:
+        light = light * _unclipped(measurements, clipped)
     light = box_mean(light, 1)
     return light[..., 1:, :, :] / (light[..., :1, :, :] + EDGE_FLOOR)
 
 
 def fit_diffuse_polarization(
-    known: tuple[Stokes, Tensor], sample: Tensor, interpolation: Tensor | None, edges: Tensor | None = None
-) -> Tensor:
+    known: tuple[Stokes, Array], sample: Array, interpolation: Array | None, edges: Array | None = None
+) -> Array:
     """Diffuse polarization a ``[..., 2, h, w]`` from how p varies with s0 over colours; |a| at most `MAX_DIFFUSE_DOLP`.
 
     Fitted to deviations from each pixel's own mean over colours, in which white specular light cancels exactly. Wide
@@ -134,93 +143,98 @@ def fit_diffuse_polarization(
     pixel needs two. ``sample``, ``interpolation``: variances of a sample. ``edges``: `polarization_edges`, if any.
     """
     stokes, exact = known
-    colors = exact.sum(dim=-3, keepdim=True)
-    means = ((s * exact).sum(dim=-3, keepdim=True) / colors.clamp(min=1) for s in (stokes.s0, stokes.s1, stokes.s2))
+    xp = namespace(sample)
+    colors = _color_sum(xp.astype(exact, sample.dtype))
+    means = (_color_sum(s * exact) / colors.clip(1, None) for s in (stokes.s0, stokes.s1, stokes.s2))
     d0, d1, d2 = ((s - m) * exact for s, m in zip((stokes.s0, stokes.s1, stokes.s2), means, strict=True))
     usable = colors > 1
     error = 2 * CONTRAST_MARGIN * sample
     if interpolation is not None:
         error = error + interpolation
-    weight = usable.to(error) * VARIANCE_FLOOR / (error + VARIANCE_FLOOR)
-    moments = torch.cat([d.sum(dim=-3, keepdim=True) for d in (d0 * d0, d0 * d1, d0 * d2)] + [error], dim=-3)
-    a = torch.zeros_like(moments[..., :2, :, :])
-    floor = torch.finfo(error.dtype).eps * 1e-2
+    weight = xp.astype(usable, error.dtype) * VARIANCE_FLOOR / (error + VARIANCE_FLOOR)
+    moments = xp.concat([*(_color_sum(d) for d in (d0 * d0, d0 * d1, d0 * d2)), error], axis=-3)
+    a = xp.zeros_like(moments[..., :2, :, :])
+    floor = float(xp.finfo(error.dtype).eps) * 1e-2
     for radius, spread in SCALES:
         if radius == EDGE_RADIUS and edges is not None:
             pooled, samples = _pool_to_edges(moments, weight, edges)
         else:
-            pooled, samples = _pool(moments, weight, radius) if radius else (moments * usable, torch.ones_like(weight))
+            pooled, samples = _pool(moments, weight, radius) if radius else (moments * usable, xp.ones_like(weight))
         contrast, moment, noise = pooled[..., :1, :, :], pooled[..., 1:3, :, :], pooled[..., 3:, :, :]
-        counted = ((contrast - noise) / (contrast + floor)).clamp(min=0)
+        counted = ((contrast - noise) / (contrast + floor)).clip(0, None)
         held = noise / CONTRAST_MARGIN / (spread**2 * samples) + floor
         a = (moment * counted + held * a) / (contrast + held)
     return limit_dolp(a)
 
 
-def _pool(moments: Tensor, weight: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+def _pool(moments: Array, weight: Array, radius: int) -> tuple[Array, Array]:
     """Weighted window means, and the number of independent pixels in each (interpolated neighbours count a quarter)."""
-    means = box_mean(torch.cat([moments * weight, weight, weight * weight], dim=-3), radius)
-    total, squares = means[..., -2:-1, :, :].clamp(min=1e-12), means[..., -1:, :, :].clamp(min=1e-20)
+    xp = namespace(moments)
+    means = box_mean(xp.concat([moments * weight, weight, weight * weight], axis=-3), radius)
+    total, squares = means[..., -2:-1, :, :].clip(1e-12, None), means[..., -1:, :, :].clip(1e-20, None)
     pixels = (2 * radius + 1) ** 2 * total * total / squares
-    return means[..., :-2, :, :] / total, (pixels / 4).clamp(min=1)
+    return means[..., :-2, :, :] / total, (pixels / 4).clip(1, None)
 
 
-def _pool_to_edges(moments: Tensor, weight: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
+def _pool_to_edges(moments: Array, weight: Array, edges: Array) -> tuple[Array, Array]:
     """`_pool` over the window of `EDGE_RADIUS`, whose pixels count less the more their polarization differs.
 
     A bilateral window (Tomasi and Manduchi 1998) with Tukey's biweight for a kernel, which is zero beyond `EDGE_REACH`.
     Every third pixel is independent of the others.
     """
-    height, width = weight.shape[-2:]
-    weighted = torch.cat([moments * weight, weight, weight * weight], dim=-3)
-    sums = torch.zeros_like(weighted)
+    xp, (height, width) = namespace(moments), weight.shape[-2:]
+    weighted = xp.concat([moments * weight, weight, weight * weight], axis=-3)
+    sums = xp.zeros_like(weighted)
     steps = range(-EDGE_RADIUS, EDGE_RADIUS + 1, EDGE_STEP)
     for down, right in ((down, right) for down in steps for right in steps):
         here = (..., slice(max(-down, 0), height - max(down, 0)), slice(max(-right, 0), width - max(right, 0)))
         there = (..., slice(max(down, 0), height - max(-down, 0)), slice(max(right, 0), width - max(-right, 0)))
         if abs(down) < height and abs(right) < width:
             apart = edges[there] - edges[here]
-            near = (1 - (apart * apart).sum(dim=-3, keepdim=True) / EDGE_REACH**2).clamp(min=0) ** 2
-            sums[here] += weighted[there] * torch.cat([near.expand_as(weighted[there][..., 1:, :, :]), near * near], -3)
-    total, squares = sums[..., -2:-1, :, :].clamp(min=1e-12), sums[..., -1:, :, :].clamp(min=1e-20)
-    return sums[..., :-2, :, :] / total, (total * total / squares).clamp(min=1)
+            near = (1 - _color_sum(apart * apart) / EDGE_REACH**2).clip(0, None) ** 2
+            sums[here][..., :-1, :, :] += weighted[there][..., :-1, :, :] * near
+            sums[here][..., -1:, :, :] += weighted[there][..., -1:, :, :] * (near * near)
+    total, squares = sums[..., -2:-1, :, :].clip(1e-12, None), sums[..., -1:, :, :].clip(1e-20, None)
+    return sums[..., :-2, :, :] / total, (total * total / squares).clip(1, None)
 
 
-def _offset(stokes: Stokes, a: Tensor) -> tuple[Tensor, Tensor]:
+def _offset(stokes: Stokes, a: Array) -> tuple[Array, Array]:
     """b of p_c = a s0_c + b, the mean over colours ``[..., 2, h, w]``, and the rms it leaves ``[..., 1, h, w]``."""
+    xp = namespace(a)
     lines = [s - a[..., k : k + 1, :, :] * stokes.s0 for k, s in enumerate((stokes.s1, stokes.s2))]
-    offset = torch.cat([_color_mean(line) for line in lines], dim=-3)
-    left = sum(((line - _color_mean(line)) ** 2).sum(dim=-3, keepdim=True) for line in lines)
-    return offset, torch.sqrt(torch.as_tensor(left) / 3)
+    means = [_color_mean(line) for line in lines]
+    first, second = (_color_sum((line - mean) ** 2) for line, mean in zip(lines, means, strict=True))
+    return xp.concat(means, axis=-3), xp.sqrt((first + second) / 3)
 
 
 def _solve_clipped(
-    measurements: Measurements, stokes: Stokes, diffuse_polarization: Tensor, offset: Tensor
-) -> tuple[Stokes, Tensor, Tensor]:
+    measurements: Measurements, stokes: Stokes, diffuse_polarization: Array, offset: Array
+) -> tuple[Stokes, Array, Array]:
     """Stokes and b of pixels with clipped samples by least squares over the others, and where those determine b.
 
     For given a, twice a sample is g_k s0_c + u_k . b with u_k = (cos 2t_k, sin 2t_k) and g_k = 1 + u_k . a. The s0 of
     each colour is eliminated, which leaves 2x2 normal equations for b. `_fill` completes what they leave open.
     """
-    determined = torch.ones_like(stokes.s0[..., 0, :, :], dtype=torch.bool)
-    if measurements.clipped is None or not bool(measurements.clipped.any()):
+    xp, clipped, determined = namespace(offset), measurements.clipped, all_pixels(stokes.s0)
+    if clipped is None or not bool(xp.any(clipped)):
         return stokes, offset, determined
-    clipped = measurements.clipped.movedim((-4, -3), (0, 1))
-    touched = clipped.any(dim=0).any(dim=0)
+    clipped = xp.moveaxis(clipped, (-4, -3), (0, 1))
+    touched = xp.any(xp.any(clipped, axis=0), axis=0)
     kept = ~clipped[:, :, touched]
-    samples = measurements.data.movedim((-4, -3), (0, 1))[:, :, touched]
-    a = diffuse_polarization.movedim(-3, 0)[:, touched]
-    b, s0, determined[touched] = fit_unclipped(2 * samples, kept.to(samples), a, measurements.angles)
-    solved = [s.movedim(-3, 0).clone() for s in (stokes.s0, stokes.s1, stokes.s2)]
-    partly = kept.any(dim=0) & ~kept.all(dim=0)
-    for image, values in zip(solved, (s0, a[0] * s0 + b[0], a[1] * s0 + b[1]), strict=True):
-        image[:, touched] = torch.where(partly, values, image[:, touched])
-    offset = offset.movedim(-3, 0).clone()
+    samples = xp.moveaxis(measurements.data, (-4, -3), (0, 1))[:, :, touched]
+    a = xp.moveaxis(diffuse_polarization, -3, 0)[:, touched]
+    b, s0, solvable = fit_unclipped(2 * samples, xp.astype(kept, samples.dtype), a, measurements.angles)
+    determined[touched] = solvable
+    solved = stokes.map(lambda image: xp.astype(xp.moveaxis(image, -3, 0), image.dtype))
+    partly = xp.any(kept, axis=0) & ~xp.all(kept, axis=0)
+    for image, values in zip((solved.s0, solved.s1, solved.s2), (s0, a[0] * s0 + b[0], a[1] * s0 + b[1]), strict=True):
+        image[:, touched] = xp.where(partly, values, image[:, touched])
+    offset = xp.astype(xp.moveaxis(offset, -3, 0), offset.dtype)
     offset[:, touched] = b
-    return Stokes(*(s.movedim(0, -3) for s in solved)), offset.movedim(0, -3), determined
+    return solved.map(lambda image: xp.moveaxis(image, 0, -3)), xp.moveaxis(offset, 0, -3), determined
 
 
-def _fill(found: Separation, measurements: Measurements, offset: Tensor, determined: Tensor) -> Separation:
+def _fill(found: Separation, measurements: Measurements, offset: Array, determined: Array) -> Separation:
     """Complete pixels that clipping left undetermined, with the valid pixels around as a weak prior.
 
     Where b is not ``determined`` the specular has the phase of its surroundings and fits the unclipped samples. The
@@ -230,37 +244,38 @@ def _fill(found: Separation, measurements: Measurements, offset: Tensor, determi
     """
     assert measurements.clipped is not None
     assert found.diffuse_polarization is not None
+    xp = namespace(offset)
     hole, known = ~found.valid[..., None, :, :], determined[..., None, :, :]
     own = _unit(offset + found.diffuse_polarization * found.specular[..., :1, :, :])
     nearby = interpolate_around(own * found.specular[..., :1, :, :], found.valid)
     around = interpolate_around(found.diffuse, found.valid)
-    phase, freedom = torch.where(known, own, _unit(nearby)), specular_freedom(nearby, around)
+    phase, freedom = xp.where(known, own, _unit(nearby)), specular_freedom(nearby, around)
     sums = _sum_unclipped(measurements, found.diffuse_polarization, phase, around)
     fitted = _fit_specular(sums, nearby, freedom)
     lit = (found.diffuse_polarization, phase, _fit_diffuse(sums, fitted), fitted)
-    specular = torch.where(known, found.specular[..., :1, :, :], _raise_specular(measurements, lit, freedom))
-    diffuse = torch.maximum(_fit_diffuse(sums, specular), _least_diffuse(measurements, found, specular, phase))
-    core = measurements.clipped.all(dim=-4).all(dim=-3)
-    if bool(core.any()):
-        rim = interpolate_around(torch.where(hole, specular, found.specular[..., :1, :, :]), ~core)
-        specular = torch.where(core[..., None, :, :], torch.maximum(specular, rim), specular)
+    specular = xp.where(known, found.specular[..., :1, :, :], _raise_specular(measurements, lit, freedom))
+    diffuse = xp.maximum(_fit_diffuse(sums, specular), _least_diffuse(measurements, found, specular, phase))
+    core = xp.all(xp.all(measurements.clipped, axis=-4), axis=-3)
+    if bool(xp.any(core)):
+        rim = interpolate_around(xp.where(hole, specular, found.specular[..., :1, :, :]), ~core)
+        specular = xp.where(core[..., None, :, :], xp.maximum(specular, rim), specular)
     p1, p2 = (
         found.diffuse_polarization[..., i : i + 1, :, :] * diffuse + phase[..., i : i + 1, :, :] * specular
         for i in (0, 1)
     )
     seen = found.stokes
-    stokes = [torch.where(hole, new, old) for new, old in ((diffuse + specular, seen.s0), (p1, seen.s1), (p2, seen.s2))]
-    diffuse = torch.where(hole, diffuse, found.diffuse)
-    specular = torch.where(hole, specular, found.specular)
+    stokes = [xp.where(hole, new, old) for new, old in ((diffuse + specular, seen.s0), (p1, seen.s1), (p2, seen.s2))]
+    diffuse = xp.where(hole, diffuse, found.diffuse)
+    specular = xp.where(hole, specular, found.specular)
     return replace(found, diffuse=diffuse, specular=specular, stokes=Stokes(*stokes))
 
 
-def specular_freedom(nearby: Tensor, around: Tensor) -> Tensor:
+def specular_freedom(nearby: Array, around: Array) -> Array:
     """Variance of the specular light over the diffuse light's ``[..., 1, h, w]``, see `SPECULAR_FREEDOM`.
 
     ``nearby [..., 2, h, w]``: the specular polarization around, ``around [..., C, h, w]``: the diffuse light.
     """
-    specular = SPECULAR_FREEDOM**2 * (nearby * nearby).sum(dim=-3, keepdim=True)
+    specular = SPECULAR_FREEDOM**2 * _color_sum(nearby * nearby)
     ratio = (specular + FREEDOM_FLOOR) / (_color_mean(around) ** 2 + FREEDOM_FLOOR)
     return ratio * ratio
 
@@ -268,18 +283,19 @@ def specular_freedom(nearby: Tensor, around: Tensor) -> Tensor:
 class _Sums(NamedTuple):
     """Sums over unclipped samples of 2 m = g tau_d + p tau_s and the prior tau_d = around, each ``[..., C, h, w]``."""
 
-    gg: Tensor
-    gp: Tensor
-    pp: Tensor
-    gy: Tensor
-    py: Tensor
+    gg: Array
+    gp: Array
+    pp: Array
+    gy: Array
+    py: Array
 
 
-def _sum_unclipped(measurements: Measurements, a: Tensor, phase: Tensor, around: Tensor) -> _Sums:
+def _sum_unclipped(measurements: Measurements, a: Array, phase: Array, around: Array) -> _Sums:
     """`_Sums` for given diffuse polarization, specular phase ``[..., 2, h, w]`` and diffuse light ``around``."""
     assert measurements.clipped is not None
-    gg, gy = torch.full_like(around, PRIOR_WEIGHT), PRIOR_WEIGHT * around
-    gp, pp, py = torch.zeros_like(around), torch.zeros_like(around), torch.zeros_like(around)
+    xp = namespace(around)
+    gg, gy = xp.full_like(around, PRIOR_WEIGHT), PRIOR_WEIGHT * around
+    gp, pp, py = xp.zeros_like(around), xp.zeros_like(around), xp.zeros_like(around)
     for k, t in enumerate(measurements.angles):
         kept = ~measurements.clipped[..., k, :, :, :]
         g, p, y = _transmitted(a, t) * kept, _transmitted(phase, t) * kept, 2 * measurements.data[..., k, :, :, :]
@@ -287,76 +303,80 @@ def _sum_unclipped(measurements: Measurements, a: Tensor, phase: Tensor, around:
     return _Sums(gg, gp, pp, gy, py)
 
 
-def _fit_specular(sums: _Sums, nearby: Tensor, freedom: Tensor) -> Tensor:
+def _fit_specular(sums: _Sums, nearby: Array, freedom: Array) -> Array:
     """tau_s ``[..., 1, h, w]`` by least squares over all colours, tau_d eliminated; ``nearby`` is its prior."""
-    likely = torch.sqrt((nearby * nearby).sum(dim=-3, keepdim=True))
-    weight = (PRIOR_WEIGHT / freedom).clamp(min=MIN_PRIOR)
-    curvature = (sums.pp - sums.gp**2 / sums.gg).sum(dim=-3, keepdim=True) + weight
-    pull = (sums.py - sums.gp * sums.gy / sums.gg).sum(dim=-3, keepdim=True) + weight * likely
-    return (pull / curvature.clamp(min=MIN_PRIOR / 2)).clamp(min=0)
+    weight = (PRIOR_WEIGHT / freedom).clip(MIN_PRIOR, None)
+    curvature = _color_sum(sums.pp - sums.gp**2 / sums.gg) + weight
+    pull = _color_sum(sums.py - sums.gp * sums.gy / sums.gg) + weight * _length(nearby)
+    return (pull / curvature.clip(MIN_PRIOR / 2, None)).clip(0, None)
 
 
-def _fit_diffuse(sums: _Sums, specular: Tensor) -> Tensor:
+def _fit_diffuse(sums: _Sums, specular: Array) -> Array:
     """tau_d ``[..., C, h, w]`` by least squares for given tau_s."""
-    return ((sums.gy - sums.gp * specular) / sums.gg).clamp(min=0)
+    return ((sums.gy - sums.gp * specular) / sums.gg).clip(0, None)
 
 
-def _raise_specular(measurements: Measurements, lit: tuple[Tensor, ...], freedom: Tensor) -> Tensor:
+def _raise_specular(measurements: Measurements, lit: tuple[Array, ...], freedom: Array) -> Array:
     """tau_s ``[..., 1, h, w]`` with its share of the light that clipped samples lack: 2 m = g tau_d + p tau_s >= 2.
 
     Never more than the unclipped samples allow, except those nearly crossed with it. ``lit``: diffuse polarization,
     phase, tau_d and tau_s so far.
     """
     assert measurements.clipped is not None
-    a, phase, diffuse, specular = lit
-    raised, most = specular, torch.full_like(specular, torch.inf)
+    xp, (a, phase, diffuse, specular) = namespace(freedom), lit
+    raised, most = specular, xp.full_like(specular, math.inf)
     for k, t in enumerate(measurements.angles):
         g, p, clipped = _transmitted(a, t), _transmitted(phase, t), measurements.clipped[..., k, :, :, :]
         y = 2 * measurements.data[..., k, :, :, :]
-        missing = torch.where(clipped, (y - g * diffuse - p * specular).clamp(min=0), 0.0).amax(dim=-3, keepdim=True)
-        raised = torch.maximum(raised, specular + missing * p * freedom / (p * p * freedom + g * g))
-        allowed = torch.where(clipped | (p <= 0.5), torch.inf, y / p.clamp(min=0.5)).amin(dim=-3, keepdim=True)
-        most = torch.minimum(most, allowed)
-    return torch.minimum(raised, most.clamp(min=0))
+        missing = xp.max(clipped * (y - g * diffuse - p * specular).clip(0, None), axis=-3, keepdims=True)
+        raised = xp.maximum(raised, specular + missing * p * freedom / (p * p * freedom + g * g))
+        allowed = xp.where(clipped | (p <= 0.5), math.inf, y / p.clip(0.5, None))
+        most = xp.minimum(most, xp.min(allowed, axis=-3, keepdims=True))
+    return xp.minimum(raised, most.clip(0, None))
 
 
-def _least_diffuse(measurements: Measurements, found: Separation, specular: Tensor, phase: Tensor) -> Tensor:
+def _least_diffuse(measurements: Measurements, found: Separation, specular: Array, phase: Array) -> Array:
     """The least tau_d ``[..., C, h, w]`` that makes every clipped sample clip for given tau_s; 0 where none does."""
     assert measurements.clipped is not None
     assert found.diffuse_polarization is not None
-    least = torch.zeros_like(found.diffuse)
+    xp = namespace(specular)
+    least = xp.zeros_like(found.diffuse)
     for k, t in enumerate(measurements.angles):
         needed = 2 * measurements.data[..., k, :, :, :] - _transmitted(phase, t) * specular
-        needed = torch.where(
-            measurements.clipped[..., k, :, :, :], needed / _transmitted(found.diffuse_polarization, t), 0.0
-        )
-        least = torch.maximum(least, needed)
+        needed = needed / _transmitted(found.diffuse_polarization, t)
+        least = xp.maximum(least, measurements.clipped[..., k, :, :, :] * needed)
     return least
 
 
-def _transmitted(polarization: Tensor, angle: float) -> Tensor:
+def _transmitted(polarization: Array, angle: float) -> Array:
     """1 + u.a: twice the share of light of that polarization ``[..., 2, h, w]`` that an analyser passes."""
     return 1 + math.cos(2 * angle) * polarization[..., :1, :, :] + math.sin(2 * angle) * polarization[..., 1:, :, :]
 
 
-def _unit(vectors: Tensor) -> Tensor:
+def _length(vectors: Array) -> Array:
+    """Lengths ``[..., 1, h, w]`` of vectors ``[..., 2, h, w]``."""
+    return namespace(vectors).sqrt(_color_sum(vectors * vectors))
+
+
+def _unit(vectors: Array) -> Array:
     """Vectors ``[..., 2, h, w]`` at length 1; zero stays zero."""
-    return vectors / torch.sqrt((vectors * vectors).sum(dim=-3, keepdim=True)).clamp(min=1e-12)
+    return vectors / _length(vectors).clip(1e-12, None)
 
 
-def interpolate_around(image: Tensor, valid: Tensor) -> Tensor:
+def interpolate_around(image: Array, valid: Array) -> Array:
     """``image`` where ``valid [..., h, w]``, elsewhere interpolated from the valid pixels around; 0 if there are none.
 
     Push and pull over a pyramid (after Gortler et al. 1996, The Lumigraph, Sec. 3.3): cost and reach grow with holes.
     """
-    *batch, height, width = image.shape
-    weight = valid[..., None, :, :].to(image).expand(image.shape).reshape(-1, 1, height, width)
-    levels = [(image.reshape(-1, 1, height, width) * weight, weight)]
-    while max(levels[-1][0].shape[-2:]) > 1:
-        levels.append(tuple(avg_pool2d(x, 2, ceil_mode=True) for x in levels[-1]))  # type: ignore[arg-type]
+    xp = namespace(image)
+    weight = xp.astype(valid[..., None, :, :], image.dtype)
+    levels = [(image * weight, weight)]
+    while max(levels[-1][1].shape[-2:]) > 1:
+        total, weight = levels[-1]
+        levels.append((halve(total), halve(weight)))
     total, weight = levels.pop()
-    result = total / weight.clamp(min=1e-12)
+    result = total / weight.clip(1e-12, None)
     for total, weight in reversed(levels):
-        coarse = interpolate(result, size=total.shape[-2:], mode="bilinear")
-        result = torch.where(weight > 0.25, total / weight.clamp(min=1e-12), coarse)
-    return result.reshape(*batch, height, width)
+        coarse = resize_bilinear(result, total.shape[-2:])
+        result = xp.where(weight > 0.25, total / weight.clip(1e-12, None), coarse)
+    return result

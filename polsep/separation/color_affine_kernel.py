@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from polsep.compute.threads import get_threads, run_over_rows
@@ -122,15 +121,15 @@ def strip_height(rows: int) -> int:
 @lru_cache(maxsize=8)
 def _matrices(layout: Layout) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
     """The matrices of `fit_stokes_unclipped`, which of them are exact, and the vector of `analyser_residual`."""
-    full = stokes_inverse(layout.angles).float().numpy()
+    full = stokes_inverse(layout.angles).astype(np.float32)
     inverses, exact = np.stack([full] * 16), np.zeros(16, np.bool_)
     exact[0] = True
     for code in range(1, 16):
         matrix, exact[code] = unclipped_inverse(layout.angles, code)
         if matrix is not None:
-            inverses[code] = matrix.float().numpy()
-    unit = torch.eye(4, dtype=torch.float64).reshape(4, 1, 1, 4)
-    null = analyser_residual(Measurements(unit, layout.angles)).reshape(4).float().numpy()
+            inverses[code] = matrix
+    unit = np.eye(4).reshape(4, 1, 1, 4)
+    null = analyser_residual(Measurements(unit, layout.angles)).reshape(4).astype(np.float32)
     return inverses, exact, null
 
 

@@ -16,18 +16,18 @@ and dielectrics do not is the dichromatic model (Shafer 1985, doi:10.1002/col.50
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pixel_unshuffle
 
+from polsep.compute.arrays import Array, namespace, pad_repeat, to_numpy, window
+from polsep.compute.resizing import block_means, resize_area, resize_bilinear
 from polsep.demosaic.bilinear import split_analysers
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes
 from polsep.sensor.camera import Mosaic
 from polsep.separation.images import FrameImages, Tally
-from polsep.separation.lamp_polarization import find_unpolarized
+from polsep.separation.lamp_polarization import Floats, find_unpolarized
 from polsep.separation.retained_polarization import find_retained
 
 #: Raw pixels along the side of a period.
@@ -49,11 +49,11 @@ class Periods(NamedTuple):
     to it; ``diffuse``, ``total``: of a method, the latter with its specular light.
     """
 
-    s0: Tensor
-    polarized: Tensor
-    across: Tensor
-    diffuse: Tensor
-    total: Tensor
+    s0: Floats
+    polarized: Floats
+    across: Floats
+    diffuse: Floats
+    total: Floats
 
 
 class Colored(NamedTuple):
@@ -79,43 +79,47 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     ``light``: camera RGB of the lamp, which is divided out. Metals are not ``valid``: samples do not determine their
     separation. The same object where nothing is found.
     """
-    tally, gain = images.tally, torch.tensor(light).view(-1, 1, 1)
+    tally, gain = images.tally, np.array(light, np.float32)[:, None, None]
     if mosaic.layout.channels != 3 or mosaic.data.ndim != 2 or tally is None or min(mosaic.data.shape) < MIN_SIZE:
         return images, Colored()
     row, col = mosaic.layout.origin
-    layout, data = mosaic.layout.rolled(-row, -col), mosaic.data[row:, col:].cpu()
+    layout, data = mosaic.layout.rolled(-row, -col), to_numpy(mosaic.data)[row:, col:]
     white = replace(mosaic, data=data, layout=layout, light_color=light, falloff=None)
-    diffuse, before = (torch.from_numpy(x).movedim(-1, 0) for x in (images.diffuse, images.specular))
+    diffuse, before = (_channels_first(x) for x in (images.diffuse, images.specular))
     side = 2 if 2 * diffuse.shape[-1] <= data.shape[-1] else PERIOD
-    halves = [avg_pool2d((x / gain)[None], side // 2)[0] for x in (diffuse, before)]
-    unpolarized = find_unpolarized(halves[0], halves[1].mean(dim=0, keepdim=True))
-    left = torch.minimum(unpolarized * before, diffuse)
+    halves = [x / gain if side == 2 else block_means(x / gain, 2) for x in (diffuse, before)]
+    unpolarized = find_unpolarized(halves[0], halves[1].mean(axis=0, keepdims=True))
+    left = np.minimum(unpolarized * before, diffuse)
     diffuse, specular = diffuse - left, before + left
     # What fills 3x3 periods fills one in every third row and column: a ninth of the frame shows that there is nothing.
     thin = replace(white, data=_thin(data, PERIOD))
     some = _see(thin, _thin(diffuse, side) / gain, _thin(specular, side) / gain, tally)
     enough = some if min(data.shape) > MANY else _see(white, diffuse / gain, specular / gain, tally)
     retained, share = find_retained(enough.polarized, enough.across, enough.diffuse), None
-    if float((_part(some) > 0.5).float().mean()) >= MIN_SHARE:
+    if float((_part(some) > 0.5).mean()) >= MIN_SHARE:
         seen = _see(white, diffuse / gain, specular / gain, tally)
         found = find_colored(seen)
-        share = found if float((found > 0.5).float().mean()) >= MIN_SHARE else None
+        share = found if float((found > 0.5).mean()) >= MIN_SHARE else None
     if not retained and not unpolarized and share is None:
         return images, Colored()
     body, mirrored, valid = (1 - retained) * diffuse, specular + retained * diffuse, images.valid
     if share is not None:
-        ratio = torch.minimum(seen.polarized.clamp(min=0), seen.s0) / seen.total.clamp(min=1e-4)
-        share, ratio = (_resize(x, diffuse.shape[-2:], "bilinear") for x in (share, ratio.clamp(0, MAX_GAIN)))
+        ratio = np.minimum(seen.polarized.clip(0), seen.s0) / seen.total.clip(1e-4)
+        share, ratio = (resize_bilinear(x, diffuse.shape[-2:]) for x in (share, ratio.clip(0, MAX_GAIN)))
         body, mirrored = (1 - share) * body, mirrored + share * (ratio * (diffuse + specular) - mirrored)
-        valid = valid & (share[0] < 0.5).numpy()
-    changed = [x.movedim(0, -1).contiguous().numpy() for x in (body, mirrored)]
-    more = float(((mirrored - before) / gain).mean(dim=0).double().sum())
+        valid = valid & (share[0] < 0.5)
+    changed = [np.ascontiguousarray(np.moveaxis(x, 0, -1)) for x in (body, mirrored)]
+    more = float(((mirrored - before) / gain).mean(axis=0).sum(dtype=np.float64))
     tally = replace(tally, specular=tally.specular + more, valid=int(np.count_nonzero(valid)))
     images = replace(images, diffuse=changed[0], specular=changed[1], valid=valid, tally=tally)
     return images, Colored(0.0 if share is None else float(share.mean()), retained, unpolarized)
 
 
-def _thin(image: Tensor, side: int) -> Tensor:
+def _channels_first(image: Floats) -> Floats:
+    return np.ascontiguousarray(np.moveaxis(image, -1, 0))
+
+
+def _thin(image: Array, side: int) -> Array:
     """Every third period of ``side`` pixels of an image ``[..., H, W]``, in both directions."""
     rows, cols = (n // side for n in image.shape[-2:])
     whole, kept = image[..., : rows * side, : cols * side], (-(-n // 3) * side for n in (rows, cols))
@@ -123,48 +127,57 @@ def _thin(image: Tensor, side: int) -> Tensor:
     return blocks.reshape(*image.shape[:-2], *kept)
 
 
-def _see(mosaic: Mosaic, diffuse: Tensor, specular: Tensor, tally: Tally) -> Periods:
+def _see(mosaic: Mosaic, diffuse: Floats, specular: Floats, tally: Tally) -> Periods:
     stokes = period_stokes(mosaic)
     length = max((tally.along**2 + tally.across**2) ** 0.5, 1e-30)
     polarized = (stokes.s1 * tally.along + stokes.s2 * tally.across) / length
     across = (stokes.s2 * tally.along - stokes.s1 * tally.across) / length
-    diffuse, specular = (_resize(x, stokes.s0.shape[-2:], "area") for x in (diffuse, specular))
+    diffuse, specular = (resize_area(x, stokes.s0.shape[-2:]) for x in (diffuse, specular))
     return Periods(stokes.s0, polarized, across, diffuse, diffuse + specular)
 
 
-def find_colored(seen: Periods) -> Tensor:
+def find_colored(seen: Periods) -> Floats:
     """The part ``[1, h, w]``, 0 to 1, of the diffuse image that is specular."""
     part = _part(seen)
-    solid = max_pool2d(-max_pool2d(-part[None], 3, 1, 1), 3, 1, 1)[0]
-    return torch.minimum(part, solid)
+    solid = _largest_around(-_largest_around(-part))
+    return np.minimum(part, solid)
 
 
-def _part(seen: Periods) -> Tensor:
+def _largest_around(image: Floats) -> Floats:
+    """The largest of 3x3 pixels, or of those that there are."""
+    for axis in (-2, -1):
+        padded, n = pad_repeat(image, 1, axis), image.shape[axis]
+        image = reduce(np.maximum, [window(padded, first, n, axis) for first in range(3)])
+    return image
+
+
+def _part(seen: Periods) -> Floats:
     """0 to 1, as the slope of the colours' polarized on their diffuse light is in `SLOPES`, period by period."""
-    colors = seen.diffuse - seen.diffuse.mean(dim=0, keepdim=True)
-    product = ((seen.polarized - seen.polarized.mean(dim=0, keepdim=True)) * colors).sum(dim=0, keepdim=True)
-    brightness = seen.total.mean(dim=0, keepdim=True)
-    slope = product / ((colors * colors).sum(dim=0, keepdim=True) + MIN_CONTRAST + MIN_RELATIVE * brightness**2)
-    return ((slope - SLOPES[0]) / (SLOPES[1] - SLOPES[0])).clamp(0, 1)
+    colors = seen.diffuse - seen.diffuse.mean(axis=0, keepdims=True)
+    product = ((seen.polarized - seen.polarized.mean(axis=0, keepdims=True)) * colors).sum(axis=0, keepdims=True)
+    brightness = seen.total.mean(axis=0, keepdims=True)
+    slope = product / ((colors * colors).sum(axis=0, keepdims=True) + MIN_CONTRAST + MIN_RELATIVE * brightness**2)
+    part: Floats = ((slope - SLOPES[0]) / (SLOPES[1] - SLOPES[0])).clip(0, 1)
+    return part
 
 
 def period_stokes(mosaic: Mosaic) -> Stokes:
     """Stokes images ``[3, h, w]`` of the mosaic's periods of 2x2 cells, of which each shows one colour."""
     layout = mosaic.layout
-    planes, _ = split_analysers(mosaic.linear().float(), layout)
+    linear = mosaic.linear()
+    xp = namespace(linear)
+    planes, _ = split_analysers(xp.astype(linear, xp.float32, copy=False), layout)
     found = fit_stokes(Measurements(planes[:, None], layout.angles))
     row, col = layout.origin
     channels = [layout.filter_at(row + 2 * (k // 2), col + 2 * (k % 2)).channel for k in range(4)]
 
-    def by_color(image: Tensor) -> Tensor:
+    def by_color(image: Array) -> Array:
         height, width = (n // 2 * 2 for n in image.shape[-2:])
-        cells = pixel_unshuffle(image[..., :height, :width], 2)
-        return torch.stack([cells[[k for k in range(4) if channels[k] == c]].mean(dim=0) for c in range(3)])
+        cells = [image[0, k // 2 : height : 2, k % 2 : width : 2] for k in range(4)]
+        return xp.stack([_mean([cells[k] for k in range(4) if channels[k] == c]) for c in range(3)])
 
     return found.map(by_color)
 
 
-def _resize(image: Tensor, size: torch.Size, mode: str) -> Tensor:
-    """An image ``[C, h, w]`` at another resolution."""
-    smooth = {"align_corners": False} if mode == "bilinear" else {}
-    return interpolate(image[None], list(size), mode=mode, **smooth)[0]
+def _mean(images: list[Array]) -> Array:
+    return sum(images) / len(images)

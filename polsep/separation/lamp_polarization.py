@@ -9,9 +9,12 @@ nothing, nor do bodies of one hue: there a wrong colour of the lamp may look whi
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.compute.resizing import block_means, blocks_of
+
+Floats = NDArray[np.float32]
 
 #: Side of a place in pixels at half resolution, and fewest places.
 SIDE, MIN_PLACES = 8, 12
@@ -28,34 +31,38 @@ MIN_PART, MAX_PART, ERRORS, MAX_BESIDE = 0.04, 0.5, 3.0, 0.5
 MEDIAN_ERROR = 1.4826 * 1.25
 
 
-def find_unpolarized(diffuse: Tensor, specular: Tensor) -> float:
+def find_unpolarized(diffuse: Floats, specular: Floats) -> float:
     """The part of the specular image that is left in the diffuse one, (1 - p) / p; 0 where none is proven.
 
     ``diffuse [3, h, w]``, ``specular [1, h, w]``: a method's images at half resolution, in white light.
     """
     if min(diffuse.shape[-2:]) < SIDE:
         return 0.0
-    products = torch.cat([diffuse, specular, specular * specular, specular * diffuse])
-    means = avg_pool2d(products[None], SIDE)[0].flatten(1)
-    largest = max_pool2d((specular + diffuse.amax(dim=0, keepdim=True) / 2)[None], SIDE).flatten()
-    color, light = means[:3], means[3]
-    variance, covariance = means[4] - light**2, means[5:] - light * color
-    body = color / color.norm(dim=0).clamp(min=1e-9)
-    white = 1 - body * body.sum(dim=0)
-    power = (white**2).sum(dim=0)
+    products = (diffuse, specular, specular * specular, specular * diffuse)
+    color, light, square, product = (block_means(x, SIDE).reshape(x.shape[0], -1) for x in products)
+    largest = blocks_of(specular[0] + diffuse.max(axis=0) / 2, SIDE).max(axis=(-3, -1)).reshape(-1)
+    variance, covariance = (square - light**2)[0], product - light * color
+    body = color / np.linalg.norm(color, axis=0).clip(1e-9)
+    white = 1 - body * body.sum(axis=0)
+    power = (white**2).sum(axis=0)
     shown = (variance > MIN_VARIANCE) & (power > MIN_WHITE) & (largest < MAX_SAMPLE)
     body, white, power, covariance = (x[..., shown] for x in (body, white, power, covariance))
     if len(power) < MIN_PLACES or not has_hues(body):
         return 0.0
     slopes = covariance / variance[shown]
-    along = (slopes * white).sum(dim=0) / power
-    beside = (slopes * torch.linalg.cross(body, white, dim=0)).sum(dim=0) / power
-    part = float(along.median())
-    error = MEDIAN_ERROR * float((along - part).abs().median()) / len(power) ** 0.5
-    proven = max(MIN_PART, ERRORS * error) < part < MAX_PART and abs(float(beside.median())) < MAX_BESIDE * part
+    along = (slopes * white).sum(axis=0) / power
+    beside = (slopes * np.cross(body, white, axis=0)).sum(axis=0) / power
+    part = _median(along)
+    error = MEDIAN_ERROR * _median(np.abs(along - part)) / len(power) ** 0.5
+    proven = max(MIN_PART, ERRORS * error) < part < MAX_PART and abs(_median(beside)) < MAX_BESIDE * part
     return part if proven else 0.0
 
 
-def has_hues(body: Tensor) -> bool:
+def has_hues(body: Floats) -> bool:
     """True if colours ``[3, N]`` of two places or more, as unit vectors, are of several hues or saturations."""
-    return float(body.std(dim=1).norm()) >= MIN_HUES
+    return float(np.linalg.norm(body.std(axis=1, ddof=1))) >= MIN_HUES
+
+
+def _median(values: Floats) -> float:
+    """The middle value, the lower one of two."""
+    return float(np.quantile(values, 0.5, method="lower"))

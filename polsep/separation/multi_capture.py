@@ -6,30 +6,31 @@ unpolarized light. Negative outputs, from clipping, noise or wrong polarizer ang
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+import operator
+from functools import reduce
 
+from polsep.compute.arrays import Array, namespace
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes
-from polsep.separation.analytic import Separation
+from polsep.separation.analytic import Separation, all_pixels, clipped_pixels
 
 
-def _as_separation(diffuse: Tensor, specular: Tensor, clipped: Tensor | None) -> Separation:
+def _as_separation(diffuse: Array, specular: Array, clipped: Array | None) -> Separation:
     """Both cut at 0, with s0 their sum and nothing known of s1 and s2; ``clipped [..., h, w]``."""
-    diffuse, specular = diffuse.clamp(min=0), specular.clamp(min=0)
-    nothing = torch.zeros_like(diffuse)
-    valid = torch.ones_like(diffuse[..., 0, :, :], dtype=torch.bool)
+    xp = namespace(diffuse)
+    diffuse, specular = diffuse.clip(0, None), specular.clip(0, None)
+    nothing, valid = xp.zeros_like(diffuse), all_pixels(diffuse)
     if clipped is not None:
         valid = valid & ~clipped
     return Separation(diffuse, specular, valid, Stokes(diffuse + specular, nothing, nothing))
 
 
-def _clipped_pixels(*captures: Measurements) -> Tensor | None:
+def _clipped_in(*captures: Measurements) -> Array | None:
     """Pixels ``[..., h, w]`` of which any capture has a clipped sample."""
-    masks = [c.clipped.any(dim=-4).any(dim=-3) for c in captures if c.clipped is not None]
-    return torch.stack(masks).any(dim=0) if masks else None
+    masks = [mask for mask in map(clipped_pixels, captures) if mask is not None]
+    return reduce(operator.or_, masks) if masks else None
 
 
-def separate_debevec2000(parallel: Tensor, crossed: Tensor) -> Separation:
+def separate_debevec2000(parallel: Array, crossed: Array) -> Separation:
     """Two photographs ``[..., C, h, w]`` behind an analyser parallel to the specular light and crossed with it.
 
     tau_d = 2 I_crossed, tau_s = I_parallel - I_crossed: exact for unpolarized diffuse light and an angle that is known.
@@ -46,8 +47,8 @@ def separate_ding2021(first: Measurements, second: Measurements) -> Separation:
     Polarimetric Helmholtz stereopsis. Note: their formulas are not public; this is derived from the polarimetric BRDF.
     """
     one, other = fit_stokes(first), fit_stokes(second)
-    specular = torch.hypot(one.s1 - other.s1, one.s2 - other.s2) / 2
-    return _as_separation((one.s0 + other.s0) / 2 - specular, specular, _clipped_pixels(first, second))
+    specular = namespace(one.s1).hypot(one.s1 - other.s1, one.s2 - other.s2) / 2
+    return _as_separation((one.s0 + other.s0) / 2 - specular, specular, _clipped_in(first, second))
 
 
 def separate_extremes(measurements: Measurements) -> Separation:
@@ -55,5 +56,6 @@ def separate_extremes(measurements: Measurements) -> Separation:
 
     `separate_analytic` in steps of 45 degrees: short of it by a factor cos 45 degrees between two analysers.
     """
-    least, most = measurements.data.amin(dim=-4), measurements.data.amax(dim=-4)
-    return _as_separation(2 * least, most - least, _clipped_pixels(measurements))
+    xp = namespace(measurements.data)
+    least, most = xp.min(measurements.data, axis=-4), xp.max(measurements.data, axis=-4)
+    return _as_separation(2 * least, most - least, _clipped_in(measurements))

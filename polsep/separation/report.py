@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from polsep.compute.arrays import Array, constant, namespace, to_numpy
 from polsep.physics.stokes import MAX_DOLP, Measurements, Stokes, aolp, dolp
 from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import Separation, light_polarizer_angle
@@ -57,43 +56,53 @@ class SeparatedFrame:
 
 def grey(stokes: Stokes) -> Stokes:
     """Stokes images ``[..., 1, h, w]`` of all colours together."""
-    return stokes.map(lambda image: image.mean(dim=-3, keepdim=True))
+    return stokes.map(lambda image: namespace(image).mean(image, axis=-3, keepdims=True))
 
 
 def tally(separation: Separation) -> Tally:
     """Sums over all pixels of a separation."""
-    mean = grey(separation.stokes)
-    p1, p2 = (image.double() for image in (mean.s1[..., 0, :, :], mean.s2[..., 0, :, :]))
-    diffuse, specular = (image.mean(dim=-3).double() for image in (separation.diffuse, separation.specular))
+    xp, mean = namespace(separation.diffuse), grey(separation.stokes)
+    p1, p2 = (_doubles(image[..., 0, :, :]) for image in (mean.s1, mean.s2))
+    diffuse, specular = (_doubles(xp.mean(image, axis=-3)) for image in (separation.diffuse, separation.specular))
     slope, errors = separation.diffuse_polarization, separation.expected_error
     if slope is not None:
         p1, p2 = (p - slope[..., i, :, :] * diffuse for i, p in enumerate((p1, p2)))
-    strength = torch.hypot(p1, p2)
+    strength = xp.hypot(p1, p2)
     # Networks find specular light where |p| is mostly the diffuse's; in closed forms both are the same.
     weight = strength if errors is None else specular
-    deviations = (None, None) if errors is None else errors.double().unbind(dim=-3)
-    variances = (None if deviation is None else float((deviation**2).sum()) for deviation in deviations)
+    variances = (None, None) if errors is None else (_total(_doubles(errors[..., i, :, :]) ** 2) for i in (0, 1))
     return Tally(
-        separation.valid.numel(),
-        0 if separation.clipped is None else int(separation.clipped.sum()),
-        int(separation.valid.sum()),
-        int((dolp(mean) > 1).sum()),
-        float((diffuse + specular).sum()),
-        float(specular.sum()),
-        float((weight * strength).sum()),
-        float((weight * p1).sum()),
-        float((weight * p2).sum()),
-        None if separation.residual is None else float(separation.residual.double().sum()),
-        None if separation.noise is None else float(separation.noise.double().sum()),
+        math.prod(separation.valid.shape),
+        0 if separation.clipped is None else int(xp.sum(separation.clipped)),
+        int(xp.sum(separation.valid)),
+        int(xp.sum(dolp(mean) > 1)),
+        _total(diffuse + specular),
+        _total(specular),
+        _total(weight * strength),
+        _total(weight * p1),
+        _total(weight * p2),
+        None if separation.residual is None else _total(separation.residual),
+        None if separation.noise is None else _total(separation.noise),
         *variances,
     )
+
+
+def _doubles(image: Array) -> Array:
+    xp = namespace(image)
+    return xp.astype(image, xp.float64)
+
+
+def _total(image: Array) -> float:
+    """The sum over all pixels, in float64."""
+    xp = namespace(image)
+    return float(xp.sum(image, dtype=xp.float64))
 
 
 def under_white_light(capture: Mosaic | Measurements, light: tuple[float, ...]) -> Mosaic | Measurements:
     """The capture as it would be in white light: the light's colour divided out of every sample."""
     if isinstance(capture, Mosaic):
         return replace(capture, light_color=light)
-    gain = torch.tensor(light, dtype=torch.float64).to(capture.data).view(-1, 1, 1)
+    gain = constant([[[gain]] for gain in light], capture.data)
     return replace(capture, data=capture.data / gain)
 
 
@@ -102,8 +111,8 @@ def in_light(separation: Separation, light: tuple[float, ...]) -> Separation:
 
     Expected errors are over all colours, so the mean of the colour multiplies them.
     """
-    gain = torch.tensor(light, dtype=torch.float64).to(separation.diffuse).view(-1, 1, 1)
-    error = None if separation.expected_error is None else separation.expected_error * gain.mean()
+    gain = constant([[[gain]] for gain in light], separation.diffuse)
+    error = None if separation.expected_error is None else separation.expected_error * (math.fsum(light) / len(light))
     return replace(
         separation, diffuse=separation.diffuse * gain, specular=separation.specular * gain, expected_error=error
     )
@@ -112,15 +121,15 @@ def in_light(separation: Separation, light: tuple[float, ...]) -> Separation:
 def images_of(white: Separation, lit: Separation) -> FrameImages:
     """One frame as NumPy arrays, channels last: images of ``lit``, polarization and tally of ``white``, its twin."""
 
-    def image(x: Tensor) -> NDArray[np.float32]:
-        return np.ascontiguousarray(x.detach().float().cpu().movedim(-3, -1).numpy())
+    def image(x: Array) -> NDArray[np.float32]:
+        return np.ascontiguousarray(np.moveaxis(to_numpy(x), -3, -1), np.float32)
 
     mean = grey(white.stokes)
     return FrameImages(
         image(lit.diffuse),
         image(lit.specular),
-        white.valid.cpu().numpy(),
-        image(dolp(mean).clamp(max=MAX_DOLP))[..., 0],
+        to_numpy(white.valid),
+        image(dolp(mean).clip(None, MAX_DOLP))[..., 0],
         image(aolp(mean))[..., 0],
         tally(white),
         None if lit.expected_error is None else image(lit.expected_error),

@@ -15,12 +15,11 @@ one hue, where highlights of a wrong colour look like it.
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
-from torch.nn.functional import avg_pool2d
+import numpy as np
 
 from polsep.compute.averages import weighted_median
-from polsep.separation.lamp_polarization import has_hues
+from polsep.compute.resizing import block_means
+from polsep.separation.lamp_polarization import Floats, has_hues
 
 #: Places along the shorter side of a frame, fewest samples along the side of one, and fewest places.
 PLACES, MIN_SIDE, MIN_PLACES = 16, 4, 20
@@ -36,7 +35,7 @@ CAUTION = 0.005
 STEPS = 10
 
 
-def find_retained(along: Tensor, across: Tensor, diffuse: Tensor) -> float:
+def find_retained(along: Floats, across: Floats, diffuse: Floats) -> float:
     """The share of the diffuse light that keeps the lamp's polarization all over a frame; 0 where none is proven.
 
     ``along``, ``across``: polarized light in the direction of the lamp's specular reflections and at 45 degrees to it;
@@ -44,32 +43,33 @@ def find_retained(along: Tensor, across: Tensor, diffuse: Tensor) -> float:
     """
     side = max(MIN_SIDE, min(diffuse.shape[-2:]) // PLACES)
     colors = _deviations(diffuse)
-    sums = [(x * colors).sum(dim=0) for x in (_deviations(along), _deviations(across), colors)]
-    first, second, contrast, brightness = (avg_pool2d(x[None], side).flatten() for x in (*sums, diffuse.mean(dim=0)))
+    sums = [(x * colors).sum(axis=0) for x in (_deviations(along), _deviations(across), colors)]
+    first, second, contrast, brightness = (block_means(x, side).reshape(-1) for x in (*sums, diffuse.mean(axis=0)))
     shown = (contrast > MIN_CONTRAST + MIN_RELATIVE * brightness**2) & (brightness > MIN_BRIGHTNESS)
-    slopes, weight = torch.stack([first, second])[:, shown] / contrast[shown], contrast[shown].sqrt()
-    kept = slopes[0].abs() < MAX_SLOPE
+    slopes, weight = np.stack([first, second])[:, shown] / contrast[shown], np.sqrt(contrast[shown])
+    kept = np.abs(slopes[0]) < MAX_SLOPE
     slopes, weight = slopes[:, kept], weight[kept]
-    body = avg_pool2d(diffuse[None], side)[0].flatten(1)[:, shown]
-    if len(weight) < MIN_PLACES or not has_hues(body / body.norm(dim=0)):
+    body = block_means(diffuse, side).reshape(3, -1)[:, shown]
+    if len(weight) < MIN_PLACES or not has_hues(body / np.linalg.norm(body, axis=0)):
         return 0.0
     (densest, beside), alike = find_densest(slopes, weight)
-    share = min(densest, weighted_median(slopes[0].numpy(), weight.numpy()))
+    share = min(densest, weighted_median(slopes[0], weight))
     if not RETAINED[0] < share < RETAINED[1] or abs(beside) > MAX_ACROSS or alike > MAX_ALIKE:
         return 0.0
     return share - CAUTION
 
 
-def find_densest(slopes: Tensor, weight: Tensor) -> tuple[tuple[float, float], float]:
+def find_densest(slopes: Floats, weight: Floats) -> tuple[tuple[float, float], float]:
     """The densest of slopes ``[2, N]`` with weights ``[N]``, and the part of the weight around it: a mean shift."""
-    far = ((slopes[:, :, None] - slopes[:, None]) ** 2).sum(dim=0)
-    center = slopes[:, int((torch.exp(-0.5 * far / WIDTH**2) @ weight).argmax())]
+    far = ((slopes[:, :, None] - slopes[:, None]) ** 2).sum(axis=0)
+    center = slopes[:, int((np.exp(-0.5 * far / WIDTH**2) @ weight).argmax())]
     near = weight
     for _ in range(STEPS):
-        near = weight * torch.exp(-0.5 * ((slopes - center[:, None]) ** 2).sum(dim=0) / WIDTH**2)
-        center = (slopes * near).sum(dim=1) / near.sum()
+        near = weight * np.exp(-0.5 * ((slopes - center[:, None]) ** 2).sum(axis=0) / WIDTH**2)
+        center = (slopes * near).sum(axis=1) / near.sum()
     return (float(center[0]), float(center[1])), float(near.sum() / weight.sum())
 
 
-def _deviations(image: Tensor) -> Tensor:
-    return image - image.mean(dim=0, keepdim=True)
+def _deviations(image: Floats) -> Floats:
+    deviations: Floats = image - image.mean(axis=0, keepdims=True)
+    return deviations

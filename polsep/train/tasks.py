@@ -70,7 +70,8 @@ def ladder_task(rung: Rung, variant: str, size: Size) -> Task[LadderInputs]:
         return first + specular_loss(logarithm, inputs.diffuse, inputs.specular)
 
     def separate(inputs: LadderInputs) -> Separation:
-        return separate_refined(inputs.measurements, rung, network)
+        with torch.no_grad():
+            return separate_refined(inputs.measurements, rung, network)
 
     return Task(network, prepare, loss, separate, lambda inputs: inputs.measurements)
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import gradio as gr
 
+from polsep.io.store import errors
 from polsep.view.edits import list_controls, recipe_of
 from polsep.view.images import KINDS
 from polsep.view.opening import DEMO, DEMO_WHITE, OpenedFrame, parse_settings
@@ -306,7 +307,7 @@ def _inside(share: object, count: int) -> int:
 
 def one_line(error: BaseException) -> str:
     """The message of an error in one line."""
-    return " ".join(str(error).split())[:500] or type(error).__name__
+    return errors.one_line(error) or type(error).__name__
 
 
 def failure_line(error: BaseException) -> str:

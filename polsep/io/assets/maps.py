@@ -8,6 +8,7 @@ already. Integers are scaled so that their largest value is 1. Masks are never d
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -65,13 +66,14 @@ def _read(path: Path, suffix: str) -> NDArray[Any] | Mapping[str, NDArray[Any]]:
     if suffix in _PHOTOS:
         with naming(path), path.open("rb") as stream:
             require_signature(stream, (b"\xff\xd8\xff",), "a JPEG")
-            with decoding("JPEG"), Image.open(stream, formats=["JPEG"]) as picture:
+            unwarned = warnings.catch_warnings(action="ignore")  # of large pictures, which have a limit of their own
+            with decoding("JPEG"), unwarned, Image.open(stream, formats=["JPEG"]) as picture:
                 require_size((picture.height, picture.width, 3))
                 return np.asarray(picture.convert("L" if picture.mode == "L" else "RGB"))
-    pages = [page.array for page in read_pages(path)]
-    if len(pages) != 1:
-        raise input_error(path, f"expected one image, found {len(pages)}")
-    return pages[0]
+    page = next(read_pages(path))
+    if page.count != 1:
+        raise input_error(path, f"expected one image, found {page.count}")
+    return page.array
 
 
 def _checked(codes: NDArray[Any]) -> NDArray[Any]:

@@ -22,13 +22,15 @@ from numpy.typing import NDArray
 
 from polsep.io.raw.page import Page
 from polsep.io.store.errors import decoding
-from polsep.io.store.header_checks import MAX_SAMPLES, describe, require_signature, require_size
+from polsep.io.store.header_checks import SAMPLES, describe, limit, require_signature, require_size
 
 MAGIC = b"\x93NUMPY"
 
 #: Names of four angle images in an archive.
 _ANGLE_KEYS = [tuple(f"{prefix}{angle}" for angle in (0, 45, 90, 135)) for prefix in ("", "i", "m")]
 _MOSAIC_KEYS = ("raw", "mosaic")
+#: NumPy makes no array of more.
+_MOST_AXES = 32
 
 
 def read_npy(path: Path, first: int = 0) -> Iterator[Page]:
@@ -57,7 +59,7 @@ def read_npz(path: Path, first: int = 0) -> Iterator[Page]:
 def read_arrays(path: Path, wanted: Container[str]) -> tuple[dict[str, NDArray[Any]], list[str]]:
     """The arrays of an NPZ archive with the names ``wanted``, and the names of all arrays. Raises ValueError."""
     with path.open("rb") as stream, _open_archive(stream) as archive:
-        names = [name.removesuffix(".npy") for name in archive.namelist()]
+        names = list(dict.fromkeys(name.removesuffix(".npy") for name in archive.namelist()))
         return {name: _read_member(archive, name) for name in names if name in wanted}, names
 
 
@@ -101,12 +103,17 @@ def _read_member(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
         raise ValueError(f"expected an NPY array in {member}, found {describe(head[:64])}")
     start = io.BytesIO(head)
     shape, dtype = _read_header(start)
-    if math.prod(shape) > 4 * MAX_SAMPLES:
-        raise ValueError(f"expected at most {4 * MAX_SAMPLES} samples in {member}, found {math.prod(shape)}")
+    most = 4 * limit(SAMPLES)
+    if math.prod(shape) * dtype.itemsize > 2 * most:
+        found = math.prod(shape) * dtype.itemsize
+        raise ValueError(f"expected at most {2 * most} bytes in {member}, found {found} ({SAMPLES} sets another limit)")
     _require_bytes(shape, dtype, archive.getinfo(member).file_size - start.tell())
-    with decoding("NPZ"), warnings.catch_warnings():
+    with decoding("NPZ"), warnings.catch_warnings(), archive.open(member) as stream:
         warnings.simplefilter("ignore")
-        return np.asarray(npy_format.read_array(io.BytesIO(archive.read(member)), allow_pickle=False))
+        array = np.asarray(npy_format.read_array(stream, allow_pickle=False))
+        if stream.read(1):  # at the end zipfile checks the CRC
+            raise ValueError("more bytes than the header says")
+    return array
 
 
 def _read_header(stream: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -121,6 +128,8 @@ def _read_header(stream: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
     shape, _, dtype = header
     if dtype.hasobject:
         raise ValueError("expected an array of numbers, found Python objects, which need a pickle")
+    if len(shape) > _MOST_AXES:
+        raise ValueError(f"expected an array of at most {_MOST_AXES} axes, found {len(shape)}")
     return shape, dtype
 
 

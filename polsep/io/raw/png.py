@@ -20,12 +20,15 @@ import numpy as np
 from polsep.io.raw.page import Page
 from polsep.io.store.errors import decoding
 from polsep.io.store.header_checks import require_signature, require_size
+from polsep.io.store.quiet import mute
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 #: Colour types of the standard, section 11.2.1, table 12.
 _COLORS = {0: "gray", 2: "RGB", 3: "palette", 4: "gray with alpha", 6: "RGB with alpha"}
 _CHANNELS = {0: 1, 2: 3}
+
+mute("imagecodecs")
 
 
 def read_png(path: Path, first: int = 0) -> Iterator[Page]:

@@ -28,6 +28,7 @@ from polsep.io.raw.headerless import headerless_page
 from polsep.io.raw.page import Page
 from polsep.io.store.atomic import refuse_existing, replace_text
 from polsep.io.store.header_checks import require_size
+from polsep.io.store.json_text import parse_json, read_text
 from polsep.sensor.camera import Layout
 
 FORMAT = "polsep recording 1"
@@ -141,15 +142,15 @@ def refuse_recording(directory: Path, overwrite: bool) -> None:
 def read_header(path: Path) -> Header:
     """The header of a ``recording.json``. Raises ValueError when it is another file or incomplete."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        raise ValueError(f"expected a polsep recording ({RECORD}), found a file that is not JSON") from None
+        record = parse_json(read_text(path))
+    except ValueError as error:
+        raise ValueError(f"expected a polsep recording ({RECORD}), found a file that is not JSON: {error}") from None
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise ValueError(f"expected a polsep recording ({RECORD} with format {FORMAT!r}), found another JSON file")
     width, height = record.get("width"), record.get("height")
     name, layout = record.get("pixel_format"), record.get("layout")
     if not (isinstance(width, int) and isinstance(height, int) and isinstance(name, str)):
-        raise ValueError(f"expected width, height and pixel_format in {RECORD}, found {width}, {height} and {name!r}")
+        raise ValueError(f"expected width, height and pixel_format in {RECORD}, found {width!r:.40}, {height!r:.40} and {name!r:.40}")
     if layout is not None:
         Layout.parse(str(layout))
     camera, settings = str(record.get("camera", "")), record.get("settings")
@@ -195,11 +196,28 @@ def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
 
 def _read_index(path: Path) -> dict[int, dict[str, Any]]:
     """The lines of the index by frame, without a last line that was cut short."""
-    lines = [line for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")]
+    found: dict[int, dict[str, Any]] = {}
+    with path.open("rb") as stream:
+        for number, text in enumerate(stream, 1):
+            if text.endswith(b"\n"):
+                line = _parse_line(text, number)
+                found[line["index"]] = line
+    return found
+
+
+def _parse_line(text: bytes, number: int) -> dict[str, Any]:
+    """One line of an index, whose numbers are numbers. Raises ValueError."""
     try:
-        return {int(line["index"]): line for line in map(json.loads, lines)}
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError):
-        raise ValueError(f"expected a JSON object with an index in every line of {INDEX}, found another") from None
+        line = parse_json(text.decode("utf-8"))
+    except ValueError:
+        line = None
+    if not isinstance(line, dict) or not isinstance(line.get("index"), int):
+        raise ValueError(f"expected a JSON object with an index in every line of {INDEX}, found another as {number}")
+    for name in ("crc32", "frame_id", "timestamp_ns", "lost_before", "away_s"):
+        value = line.get(name, 0)
+        if not isinstance(value, int | float if name == "away_s" else int):
+            raise ValueError(f"expected a number as {name} in every line of {INDEX}, found {value!r:.40} in {number}")
+    return line
 
 
 def _write_all(stream: BinaryIO, data: bytes) -> None:

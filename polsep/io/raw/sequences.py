@@ -15,7 +15,7 @@ from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD
-from polsep.io.store.errors import input_error
+from polsep.io.store.errors import input_error, one_line
 
 _NUMBER = re.compile(r"(\d+)")
 
@@ -78,7 +78,7 @@ def _read_files(files: list[Path], options: ReadOptions, first: int) -> Iterator
             if len(frames) != 1:
                 raise input_error(path, f"expected one frame per file of a folder, found {len(frames)}")
         except (ValueError, OSError) as error:
-            yield DamagedFrame(index, " ".join(str(error).split()))
+            yield DamagedFrame(index, one_line(error))
             continue
         yield Frame(frames[0].stem, frames[0].data, frames[0].notes, index, len(files))
 
@@ -92,5 +92,5 @@ def _read_stack(path: Path, options: ReadOptions, first: int, count: int) -> Ite
                 yield frame
             return
         except (ValueError, OSError) as error:
-            yield DamagedFrame(first, " ".join(str(error).split()))
+            yield DamagedFrame(first, one_line(error))
             first += 1

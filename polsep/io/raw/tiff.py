@@ -8,19 +8,24 @@ Source: Adobe, TIFF Revision 6.0; Adobe, Digital Negative Specification 1.7 (pho
 from __future__ import annotations
 
 import json
-import logging
 import math
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import tifffile
 
+from polsep.compute.arrays import to_numpy
 from polsep.io.raw.page import MergedFacts, Page
+from polsep.io.raw.tiff_directories import check_entries, walk_directories
 from polsep.io.store.atomic import atomic_path
 from polsep.io.store.errors import InputError, decoding
 from polsep.io.store.header_checks import require_signature, require_size
+from polsep.io.store.json_text import parse_json
+from polsep.io.store.plausible import require_falloff, require_gains
+from polsep.io.store.quiet import mute
 from polsep.sensor.camera import Layout, Mosaic
 
 #: Format of the description of merged frames.
@@ -32,8 +37,10 @@ _PHOTOMETRIC = {1: "black is zero", 2: "RGB", 32803: "colour filter array", 3489
 #: Compressions that change samples: old and new JPEG, lossy DNG, WebP.
 _LOSSY = {6: "old JPEG", 7: "JPEG", 34892: "lossy JPEG", 50001: "WebP"}
 
-# Without a handler, Python prints a library's warnings to the terminal; applications that configure logging see them.
-logging.getLogger("tifffile").addHandler(logging.NullHandler())
+#: Vendors' formats that tifffile would look for while it opens a file, in ways that no limit holds.
+_UNWANTED = {"is_lsm": False, "is_scanimage": False, "is_ndpi": False, "is_ome": False}
+
+mute("tifffile", "imagecodecs")
 
 
 def read_tiff(path: Path, first: int = 0) -> Iterator[Page]:
@@ -41,39 +48,25 @@ def read_tiff(path: Path, first: int = 0) -> Iterator[Page]:
     with path.open("rb") as stream:
         require_signature(stream, (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "a TIFF")
         size = path.stat().st_size
+        places = walk_directories(stream, size)
+        check_entries(stream, places[0], size)
+        stream.seek(0)
         with decoding("TIFF"):
-            tif = tifffile.TiffFile(stream)
+            tif = tifffile.TiffFile(stream, **_UNWANTED)
         with tif:
-            count = _count_pages(tif, stream)
-            for index in range(first, count):
+            for index in range(first, len(places)):
+                check_entries(stream, places[index], size)
                 with decoding("TIFF"):
-                    page = _read_page(tif.pages[index], size, index, count)
+                    page = _read_page(tif.pages[index], size, index, len(places))
                 yield page
-
-
-def _count_pages(tif: tifffile.TiffFile, stream: BinaryIO) -> int:
-    """Number of pictures; InputError when the chain of directories breaks or one directory describes many pictures."""
-    with decoding("TIFF"):
-        count = len(tif.pages)
-        if count:
-            stream.seek(tif.pages.next_page_offset or 0)
-            rest = stream.read(tif.tiff.offsetsize)
-    if count == 0:
-        raise InputError("expected a TIFF with a picture, found no readable directory: it is truncated or damaged")
-    if len(rest) < tif.tiff.offsetsize or any(rest):
-        raise InputError(f"expected a complete chain of TIFF directories, found {count} of them: it is truncated")
-    if count == 1:
-        with decoding("TIFF"):
-            page, series = tif.pages[0], tif.series[0]
-        if math.prod(series.shape) > math.prod(page.shape) > 0:
-            raise InputError(f"expected one TIFF directory per picture, found one for a series of shape {series.shape}")
-    return count
 
 
 def _read_page(page: tifffile.TiffPage | tifffile.TiffFrame, size: int, index: int, count: int) -> Page:
     """Samples of one directory of a file of ``size`` bytes, after `_require_readable`."""
     assert isinstance(page, tifffile.TiffPage)  # frames only come from TiffPages.useframes
     _require_readable(page, size)
+    if count == 1 and (pictures := _described_pictures(page)) > 1:
+        raise InputError(f"expected one TIFF directory per picture, found one for {pictures} pictures")
     array = np.asarray(page.asarray())
     if page.planarconfig == 2 and array.ndim == 3:  # separate planes [C, H, W]
         array = np.moveaxis(array, 0, -1)
@@ -85,6 +78,22 @@ def _read_page(page: tifffile.TiffPage | tifffile.TiffFrame, size: int, index: i
     orientation = page.tags.valueof(274, default=1)
     notes = () if orientation == 1 else (f"TIFF orientation {orientation} is not applied: pixels stay as stored",)
     return Page(array, index, count, white_level=white, notes=notes, exposure=_exposure_time(page))
+
+
+def _described_pictures(page: tifffile.TiffPage) -> int:
+    """How many pictures the only directory of a file stands for, by the descriptions of ImageJ and of tifffile.
+
+    ImageJ writes one directory for stacks of more than 4 GB, tifffile where it is asked to.
+    """
+    text = page.description
+    if text.startswith("ImageJ="):
+        said = re.search(r"^images=(\d{1,9})", text, re.MULTILINE)
+        return int(said[1]) if said else 1
+    if not text.startswith('{"shape": '):
+        return 1
+    shape = parse_json(text).get("shape")
+    whole = math.prod(side for side in shape if isinstance(side, int)) if isinstance(shape, list) else 1
+    return whole // max(math.prod(page.shape), 1)
 
 
 def _exposure_time(page: tifffile.TiffPage) -> float | None:
@@ -101,14 +110,19 @@ def _merged_facts(page: tifffile.TiffPage) -> dict[str, Any] | None:
     text = page.tags.valueof(270)
     if not isinstance(text, str) or not text.startswith('{"format": "' + MERGED):
         return None
-    facts = json.loads(text)
+    facts = parse_json(text)
     return facts if isinstance(facts, dict) else None
 
 
 def _as_merged(facts: dict[str, Any]) -> MergedFacts:
     falloff = facts["falloff_legendre"]
     falloff = None if falloff is None else tuple(tuple(float(x) for x in row) for row in falloff)
-    return MergedFacts(tuple(float(x) for x in facts["light_color"]), falloff)
+    color = tuple(float(x) for x in facts["light_color"])
+    if len(color) not in (1, 3):
+        raise InputError(f"expected a light of one or three colours, found {len(color)}")
+    require_gains("light colour", color)
+    require_falloff(falloff)
+    return MergedFacts(color, falloff)
 
 
 def write_merged(path: Path, mosaic: Mosaic, facts: Mapping[str, Any]) -> None:
@@ -123,7 +137,7 @@ def write_merged(path: Path, mosaic: Mosaic, facts: Mapping[str, Any]) -> None:
         **facts,
     }
     with atomic_path(path) as part:
-        data, description = mosaic.data.cpu().numpy(), json.dumps(text, allow_nan=False)
+        data, description = to_numpy(mosaic.data), json.dumps(text, allow_nan=False)
         tifffile.imwrite(
             part, data, photometric="minisblack", metadata=None, software="polsep", description=description
         )

@@ -10,16 +10,22 @@ import re
 from collections.abc import Iterator
 from itertools import count as count_from
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.raw.page import Page
 from polsep.io.store.errors import InputError, decoding
-from polsep.io.store.header_checks import require_size
+from polsep.io.store.header_checks import SAMPLES, limit, require_size
+from polsep.io.store.quiet import mute
 
 #: FFmpeg's pixel formats that hold a mosaic: gray, gray10le, ...; the number of bits is 8 unless named.
 _GREY = re.compile(r"gray(\d*)(?:le|be)?")
+#: FFmpeg's name of each container. It would look for any, also for lists that name other files or addresses.
+_CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mov": "mov", ".nut": "nut"}
+
+mute("libav")
 
 
 def load_library() -> Any:
@@ -35,17 +41,15 @@ def read_video(path: Path, first: int = 0) -> Iterator[Page]:
     """The frames of a lossless grey video from ``first`` on: uint8 or uint16 ``[H, W]``. Raises ValueError."""
     path.open("rb").close()  # a missing file is reported as such, not as damage
     av = load_library()
+    options = {"max_pixels": str(limit(SAMPLES))}
     with decoding("video"):
-        container = av.open(str(path))
+        container = av.open(f"file:{path}", format=_CONTAINERS[path.suffix.lower()], options=options)
     with container:
-        stream, bits = _grey_stream(container)
-        # 10 and 12 bits have their own white level, 8 and 16 that of the dtype.
-        white = None if bits in (8, 16) else float(2**bits - 1)
-        duration = (container.duration or 0) / 1_000_000
-        count = max(int(stream.frames), round(duration * float(stream.average_rate or 0)), 2)  # approximate
-        stream.thread_type = "SLICE"  # each packet then yields its own frame
+        with decoding("video"):
+            kind = _grey_stream(container, path.stat().st_size)
+        kind.stream.thread_type = "SLICE"  # each packet then yields its own frame
         index, intact = None, False
-        for number, packet in _packets_from_key_frame(container.demux(stream), first):
+        for number, packet in _packets_from_key_frame(container.demux(kind.stream), first):
             index = number if index is None else index
             frames, damage = _decode(av, packet)
             intact = damage is None and (intact or packet.is_keyframe or not packet.size)
@@ -53,10 +57,29 @@ def read_video(path: Path, first: int = 0) -> Iterator[Page]:
                 if index >= first and not intact:
                     raise ValueError(f"expected frame {index} intact, found {damage or 'one before it damaged'}")
                 if index >= first:
-                    with decoding("video"):
-                        array: NDArray[Any] = frames[0].to_ndarray()
-                    yield Page(array, index, max(count, index + 1), white_level=white)
+                    array = _as_array(frames[0], kind, index)
+                    yield Page(array, index, max(kind.count, index + 1), white_level=kind.white)
                 index += 1
+
+
+class _Grey(NamedTuple):
+    """A stream of grey frames ``[H, W]`` of a dtype, about ``count``; ``white``: its own white level, if any."""
+
+    stream: Any
+    shape: tuple[int, int]
+    dtype: type[np.unsignedinteger[Any]]
+    white: float | None
+    count: int
+
+
+def _as_array(frame: Any, kind: _Grey, index: int) -> NDArray[Any]:
+    """The samples of a frame, which must be as the stream announced them."""
+    with decoding("video"):
+        array: NDArray[Any] = frame.to_ndarray()
+    if array.shape != kind.shape or array.dtype != kind.dtype:
+        expected, found = (f"{np.dtype(t)} {'x'.join(map(str, s))}" for s, t in (kind[1:3], (array.shape, array.dtype)))
+        raise ValueError(f"expected frame {index} as {expected}, found {found}")
+    return array
 
 
 def _decode(av: Any, packet: Any) -> tuple[list[Any], str | None]:
@@ -89,8 +112,8 @@ def _packets_from_key_frame(packets: Iterator[Any], first: int) -> Iterator[tupl
             held = []
 
 
-def _grey_stream(container: Any) -> tuple[Any, int]:
-    """The one video stream, which checks its checksums, and its bits per sample.
+def _grey_stream(container: Any, size: int) -> _Grey:
+    """The one video stream of a file of ``size`` bytes, which checks its checksums.
 
     Raises ValueError unless it is lossless and grey.
     """
@@ -99,11 +122,18 @@ def _grey_stream(container: Any) -> tuple[Any, int]:
         raise InputError(f"expected one video stream, found {len(streams)}")
     stream = streams[0]
     context = stream.codec_context
+    if context is None:
+        raise InputError("expected a lossless codec such as FFV1, found none that is known")
     grey = _GREY.fullmatch(context.pix_fmt or "")
     if grey is None:
         raise InputError(f"expected a mosaic as grey samples, found pixels {context.pix_fmt} of {context.name}")
     if context.codec.lossy or not context.codec.lossless:
         raise InputError(f"expected a lossless codec such as FFV1, found {context.name}")
-    require_size((context.height, context.width))
-    context.options = {"err_detect": "crccheck+explode"}
-    return stream, int(grey[1] or 8)
+    shape, bits = (int(context.height), int(context.width)), int(grey[1] or 8)
+    require_size(shape)
+    context.options = {"err_detect": "crccheck+explode", "max_pixels": str(limit(SAMPLES))}
+    # 10 and 12 bits have their own white level, 8 and 16 that of the dtype.
+    white = None if bits in (8, 16) else float(2**bits - 1)
+    duration = (container.duration or 0) / 1_000_000
+    count = max(int(stream.frames), round(duration * float(stream.average_rate or 0)), 2)  # approximate
+    return _Grey(stream, shape, np.uint8 if bits == 8 else np.uint16, white, min(count, max(size, 2)))

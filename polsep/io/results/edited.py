@@ -20,6 +20,7 @@ from polsep.io.results.sidecars import EncodedFile, exr_notes, require_finite, w
 from polsep.io.store.atomic import refuse_existing, replace_bytes, replace_text
 from polsep.io.store.errors import naming
 from polsep.io.store.image_codecs import encode_png
+from polsep.io.store.json_text import read_text
 
 
 class EditedFrame(NamedTuple):
@@ -33,7 +34,7 @@ class EditedFrame(NamedTuple):
 def read_recipe_text(path: Path) -> str:
     """The text of a recipe. Raises InputError."""
     with naming(path):
-        return path.read_text(encoding="utf-8")
+        return read_text(path)
 
 
 def write_recipe_text(path: Path, text: str, overwrite: bool) -> None:

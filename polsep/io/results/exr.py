@@ -19,8 +19,10 @@ import numpy as np
 import OpenEXR  # a bare extension module without stubs
 from numpy.typing import NDArray
 
-from polsep.io.store.errors import InputError, decoding, naming
-from polsep.io.store.header_checks import require_signature, require_size
+from polsep.io.results.exr_header import EXPECTED, check_exr_header
+from polsep.io.store.errors import InputError, naming
+from polsep.io.store.header_checks import require_signature
+from polsep.io.store.quiet import quiet
 
 Number = TypeVar("Number", bound=np.generic)
 
@@ -32,6 +34,8 @@ COMPRESSIONS = {
 #: The largest half float.
 LARGEST_HALF = 65504.0
 _MAGIC, _VERSION, _HALF = 20000630, 2, 1
+#: How the lines begin that OpenEXR writes to standard error.
+_MARK = b"<python_buffer>"
 _SIGNATURE = _MAGIC.to_bytes(4, "little")
 
 
@@ -45,23 +49,19 @@ def read_exr_layers(path: Path) -> dict[str, NDArray[np.float32]]:
         with Path(path).open("rb") as stream:
             require_signature(stream, (_SIGNATURE,), "an OpenEXR")
             data = stream.read()
-        header = _open_exr(data, header_only=True).header()
-        with decoding("EXR"):
-            (left, top), (right, bottom) = header["dataWindow"]
-            shape = (int(bottom) - int(top) + 1, int(right) - int(left) + 1, max(len(header["channels"]), 1))
-        require_size(shape)
+        check_exr_header(data)
         return {name: channel.pixels for name, channel in _open_exr(data).channels().items()}
 
 
-def _open_exr(data: bytes, header_only: bool = False) -> Any:
+def _open_exr(data: bytes) -> Any:
     """OpenEXR's view of a file of one part."""
-    expected = "expected a complete single-part EXR file"
     try:
-        file = OpenEXR.File(io.BytesIO(data), separate_channels=True, header_only=header_only)
-    except RuntimeError as error:
-        raise InputError(f"{expected}, found one that OpenEXR cannot open") from error
+        with quiet(_MARK):
+            file = OpenEXR.File(io.BytesIO(data), separate_channels=True)
+    except Exception as error:  # RuntimeError as a rule, and what pybind11 makes of other damage
+        raise InputError(f"{EXPECTED}, found one that OpenEXR cannot open") from error
     if len(file.parts) != 1:
-        raise InputError(f"{expected}, found {len(file.parts)} readable parts")
+        raise InputError(f"{EXPECTED}, found {len(file.parts)} readable parts")
     return file
 
 

@@ -22,13 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.store.atomic import write_checked, write_set
-from polsep.io.store.errors import decoding, naming
+from polsep.io.store.errors import InputError, decoding, naming, one_line
+from polsep.io.store.header_checks import SAMPLES, limit
+from polsep.io.store.json_text import parse_json, read_text
+from polsep.io.store.plausible import require_falloff, require_gains, require_level, require_within
 from polsep.sensor.calibration import Analyser, Calibration, LampFacts, Table
 from polsep.sensor.camera import Layout
 
 FORMAT = "polsep calibration 1"
 #: Least steps of the maps: of black in codes, and of gains.
 BLACK_STEP, GAIN_STEP = 2.0**-10, 2.0**-17
+#: Angles of analysers lie within two turns.
+MOST_DEGREES = 720.0
 #: Arrays of the NPZ file.
 ARRAYS = ("black_offset_codes", "gain_minus_1", "defective_pixels")
 
@@ -77,14 +82,14 @@ def _read(path: Path, stamp: int, maps_stamp: int) -> Calibration:
     try:
         return _from_record(record, _read_maps(path, record.get("maps")))
     except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"expected a complete calibration, found a wrong or missing {error}") from None
+        raise ValueError(f"expected a complete calibration, found a wrong or missing {one_line(error, 80)}") from None
 
 
 def _read_record(path: Path) -> dict[str, Any]:
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        raise ValueError("expected a calibration of 'polsep calibrate', found a file that is not JSON") from None
+        record = parse_json(read_text(path))
+    except ValueError as error:
+        raise ValueError(f"expected a calibration of 'polsep calibrate', found no JSON: {error}") from None
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise ValueError(f"expected a calibration with format {FORMAT!r}, found another JSON file")
     return record
@@ -100,7 +105,10 @@ def _read_maps(path: Path, entry: Mapping[str, Any] | None) -> dict[str, NDArray
     data = maps.read_bytes()
     if hashlib.sha256(data).hexdigest() != entry["sha256"]:
         raise ValueError(f"expected the maps that it was written with in {maps.name}, found others")
+    most = 4 * limit(SAMPLES)
     with decoding("NPZ"), np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        if (found := sum(member.file_size for member in archive.zip.infolist())) > most:
+            raise InputError(f"expected at most {most} bytes in {maps.name}, found {found}")
         return {name: archive[name] for name in ARRAYS if name in archive.files}
 
 
@@ -157,7 +165,7 @@ def _from_record(record: dict[str, Any], maps: dict[str, NDArray[Any]]) -> Calib
     if light is not None:
         r, g, b = (float(x) for x in light["color_rgb"])
         lamp = LampFacts((r, g, b), *(None if light[k] is None else float(light[k]) for k in ("dolp", "aolp_deg")))
-    return Calibration(
+    found = Calibration(
         Layout.parse(record["layout"]),
         float(record["white_level_codes"]),
         size,
@@ -173,6 +181,30 @@ def _from_record(record: dict[str, Any], maps: dict[str, NDArray[Any]]) -> Calib
         lamp,
         {name: _details(section) for name, section in record.items() if isinstance(section, dict) and name != "maps"},
     )
+    _require_plausible(found)
+    return found
+
+
+def _require_plausible(c: Calibration) -> None:
+    """Raise ValueError where a frame that is corrected by these numbers would hold NaN or infinite samples."""
+    require_level("white level", c.white_level)
+    for name, level in (("black level", c.black_level), ("read noise", c.read_noise)):
+        require_within(name, level, c.white_level)
+    for name, codes in (("black pattern", c.black_pattern), ("black map", c.black_map)):
+        require_within(name, None if codes is None else np.asarray(codes), c.white_level)
+    require_gains("gains", None if c.gains is None else np.asarray(c.gains))
+    require_gains("gains of pixels", c.gain_map)
+    require_falloff(c.falloff)
+    for analyser in (analyser for row in c.analysers or () for analyser in row):
+        require_within("angles of analysers", analyser.angle_deg, MOST_DEGREES)
+        require_gains("gains of analysers", [analyser.gain])
+        require_level("extinction ratio", analyser.extinction if math.isfinite(analyser.extinction) else 1.0)
+    if c.lamp is not None:
+        require_gains("a lamp's colour", c.lamp.color)
+    if c.dead is not None:
+        count = math.prod(c.size or (0,))
+        if c.dead.ndim != 1 or c.dead.dtype.kind != "i" or (c.dead.size and not 0 <= c.dead.min() <= c.dead.max() < count):
+            raise ValueError(f"expected defective pixels as indices below {count}, found others")
 
 
 #: Entries of sections that are fields of `Calibration`; the others are its details.

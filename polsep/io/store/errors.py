@@ -1,7 +1,7 @@
 """`InputError`, and the conversion of other errors to it.
 
 Readers of one format raise ValueError (or InputError, from inside `decoding`) without naming the file; the caller
-that knows the path wraps them, once, in `naming`.
+that knows the path wraps them, once, in `naming`. Libraries quote what they read, so every message passes `one_line`.
 """
 
 from __future__ import annotations
@@ -10,14 +10,42 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+#: Most characters of a message with the name of its file, and of that name.
+MOST, MOST_OF_NAME = 300, 200
+_CUT = " ... "
+
 
 class InputError(ValueError):
     """A file that can't be read as asked; its message is one line, "expected ..., found ..."."""
 
 
+def one_line(text: object, most: int = MOST) -> str:
+    """One line of at most ``most`` printable characters: a longer text loses its middle, others are escaped.
+
+    So nothing in a file can move a terminal's cursor, or fill the screen.
+    """
+    whole = str(text)
+    if len(whole) > 8 * most:  # so that huge texts cost nothing; what is cut here would be cut below
+        whole = whole[: 4 * most] + _CUT + whole[-4 * most :]
+    return _shortened(_escaped(" ".join(whole.split())), most)
+
+
 def input_error(path: str | Path, reason: object) -> InputError:
     """An `InputError` with the file in front: ``shot.png: expected ..., found ...``, always one line."""
-    return InputError(" ".join(f"{path}: {reason}".split()))
+    name = _shortened(_escaped(str(path)), MOST_OF_NAME)
+    return InputError(f"{name}: {one_line(reason, MOST - len(name) - 2)}")
+
+
+def _escaped(text: str) -> str:
+    """Unprintable characters as ``\\x1b``."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def _shortened(text: str, most: int) -> str:
+    if len(text) <= most:
+        return text
+    end = (most - len(_CUT)) // 2
+    return text[: most - len(_CUT) - end] + _CUT + text[-end:]
 
 
 @contextmanager
@@ -41,4 +69,5 @@ def decoding(kind: str) -> Iterator[None]:
     except InputError:  # has its message already
         raise
     except Exception as error:
-        raise ValueError(f"expected an intact {kind} file, found damage: {error or type(error).__name__}") from error
+        found = one_line(error) or type(error).__name__
+        raise ValueError(f"expected an intact {kind} file, found damage: {found}") from error

@@ -1,11 +1,13 @@
-"""Checks of a file's first bytes and sizes, made before it is decoded.
+"""Checks of a file's first bytes, sizes and counts, made before it is decoded.
 
-Sizes in headers above `MAX_SAMPLES` are refused before any memory is allocated for them.
+What headers promise above a limit is refused before any memory is allocated for it. `LIMITS` are for sensors and scans
+that exist; whoever has larger files sets the environment variable that the message names.
 """
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -13,10 +15,12 @@ from typing import BinaryIO
 
 from polsep.io.store.errors import InputError
 
-#: Largest number of samples in a frame: fifty 5-megapixel sensors, or 1 GiB as float32.
-MAX_SAMPLES = 2**28
+SAMPLES, PAGES = "POLSEP_MAX_SAMPLES", "POLSEP_MAX_PAGES"
+#: Most samples in a frame (twenty-five 5-megapixel sensors, or 512 MiB as float32), and most pictures in a file (more
+#: than half an hour at 60 per second), by the environment variable that sets another limit.
+LIMITS = {SAMPLES: 2**27, PAGES: 2**17}
 
-_most_samples: ContextVar[int] = ContextVar("most_samples", default=MAX_SAMPLES)
+_most_samples: ContextVar[int | None] = ContextVar("most_samples", default=None)
 
 _SIGNATURES = (
     (b"\x89PNG\r\n\x1a\n", "a PNG file"),
@@ -55,19 +59,35 @@ def require_signature(stream: BinaryIO, signatures: tuple[bytes, ...], name: str
         raise InputError(f"expected {name} file, found {describe(head)}")
 
 
+def limit(name: str) -> int:
+    """The limit of that name of `LIMITS`, or the environment's. Raises InputError where that is no whole number."""
+    said = os.environ.get(name, "").strip()
+    if said and not (said.isdecimal() and len(said) < 19):
+        raise InputError(f"expected a whole number as {name}, found {said!r:.40}")
+    most = int(said) if said else LIMITS[name]
+    lower = _most_samples.get()
+    return most if name != SAMPLES or lower is None else min(most, lower)
+
+
+def require_at_most(found: int, name: str, what: str) -> None:
+    """Raise InputError for more of ``what`` than the limit of that name."""
+    if found > (most := limit(name)):
+        raise InputError(f"expected at most {most} {what}, found {found} ({name} sets another limit)")
+
+
 def require_size(shape: tuple[int, ...]) -> None:
-    """Raise InputError for a frame without samples, or with more than `at_most` allows."""
+    """Raise InputError for a frame without samples, or with more than the limit or `at_most` allows."""
     size = "x".join(str(n) for n in shape)
     if min(shape, default=0) < 1:
         raise InputError(f"expected an image with at least one pixel, found {size}")
-    if math.prod(shape) > (most := _most_samples.get()):
-        raise InputError(f"expected at most {most} samples in a frame, found {size}")
+    if math.prod(shape) > (most := limit(SAMPLES)):
+        raise InputError(f"expected at most {most} samples in a frame, found {size} ({SAMPLES} sets another limit)")
 
 
 @contextmanager
 def at_most(samples: int) -> Iterator[None]:
     """Lower the largest number of samples in a frame inside the block, as for files that strangers upload."""
-    token = _most_samples.set(min(samples, MAX_SAMPLES))
+    token = _most_samples.set(samples)
     try:
         yield
     finally:

@@ -19,6 +19,7 @@ from safetensors.numpy import save_file
 
 from polsep.compute.arrays import Array, to_numpy
 from polsep.io.store.atomic import atomic_path
+from polsep.io.store.errors import one_line
 
 
 def digest_arrays(arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -44,12 +45,13 @@ def read_weights(path: Path) -> tuple[dict[str, NDArray[np.float32]], dict[str, 
         with safe_open(path, framework="np") as file:
             metadata = dict(file.metadata() or {})
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dictionary
-    except (OSError, SafetensorError) as error:
-        raise ValueError(f"expected weights in {path}, found {str(error) or type(error).__name__}") from None
+    except (OSError, SafetensorError, TypeError, ValueError, KeyError, OverflowError, AttributeError) as error:
+        found = one_line(error, 120) or type(error).__name__  # NumPy's own errors are of absurd shapes
+        raise ValueError(f"expected weights in {path}, found {found}") from None
     if "method" not in metadata or "sha256" not in metadata:
         raise ValueError(f"expected weights of polsep in {path}, found a safetensors file of something else")
     if digest_arrays(arrays) != metadata["sha256"]:
-        raise ValueError(f"expected weights with sha256 {metadata['sha256']} in {path}, found damaged ones")
+        raise ValueError(f"expected weights with sha256 {metadata['sha256']:.64} in {path}, found damaged ones")
     return {name: array.astype(np.float32) for name, array in arrays.items()}, metadata
 
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import torch
 
-from polsep.physics.optics import ETA
+from polsep.physics.fresnel import ETA
 from polsep.render.materials import Materials, look_up
 from polsep.render.pathtrace.mueller import Matrix, turn_frames, turn_to_up
 from polsep.render.pathtrace.variants import in_variant, is_fast, only_errors

@@ -1,0 +1,58 @@
+"""JSON of files: strict, so that whatever was read can be written again.
+
+Python's own reader accepts NaN and Infinity, makes infinity of 1e999, and has no limit of digits or levels but its own.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+#: Digits of a whole number at most: 64 bits have 20.
+MOST_DIGITS = 20
+#: Largest file that is read as one JSON text [bytes].
+MOST_BYTES = 2**26
+
+Pairs = Callable[[list[tuple[str, Any]]], Any]
+
+
+def read_text(path: Path) -> str:
+    """The UTF-8 text of a file of at most `MOST_BYTES`. Raises ValueError, and OSError."""
+    with path.open("rb") as stream:
+        data = stream.read(MOST_BYTES + 1)
+    if len(data) > MOST_BYTES:
+        raise ValueError(f"expected a text of at most {MOST_BYTES} bytes, found more")
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"expected text in UTF-8, found byte {data[error.start]:#04x} at {error.start}") from None
+
+
+def parse_json(text: str, pairs: Pairs | None = None) -> Any:
+    """The values of a JSON text; ``pairs`` makes what stands for an object. Raises ValueError in one line."""
+    try:
+        return json.loads(
+            text, object_pairs_hook=pairs, parse_constant=_refuse, parse_float=_as_float, parse_int=_as_int
+        )
+    except RecursionError:
+        raise ValueError("expected JSON of a few levels, found hundreds") from None
+
+
+def _refuse(name: str) -> None:
+    raise ValueError(f"expected finite numbers, found {name}")
+
+
+def _as_float(digits: str) -> float:
+    number = float(digits)
+    if not math.isfinite(number):
+        raise ValueError(f"expected finite numbers, found {digits:.40}")
+    return number
+
+
+def _as_int(digits: str) -> int:
+    if len(digits) > MOST_DIGITS:
+        raise ValueError(f"expected whole numbers of at most {MOST_DIGITS} digits, found {len(digits)}")
+    return int(digits)

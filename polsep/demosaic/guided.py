@@ -77,7 +77,7 @@ _BINOMIAL = tuple(math.comb(8, k) / 256 for k in range(9))
 _PAIRS = (0.125, 0.25, 0.375, 0.5, 0.375, 0.25, 0.125)
 #: Mean over the samples of one colour around the first of a pair, mirrored at the second; holds both analysers in
 #: balance and keeps linear images.
-_AROUND = tuple(k / 16 for k in (1, 2, 0, 0, 6, 6, 0, 0, 1))
+AROUND = tuple(k / 16 for k in (1, 2, 0, 0, 6, 6, 0, 0, 1))
 
 
 def demosaic_guided(mosaic: Mosaic) -> Measurements:
@@ -189,7 +189,7 @@ def _surroundings(intensity: Array, layout: Layout) -> Array:
     if not layout.bayer:
         return _blur(intensity, _TENT)
     for axis in (-1, -2):
-        before, after = correlate(intensity, _AROUND, axis), correlate(intensity, _AROUND[::-1], axis)
+        before, after = correlate(intensity, AROUND, axis), correlate(intensity, AROUND[::-1], axis)
         intensity = namespace(intensity).where(_is_first(intensity, axis), before, after)
     return intensity
 

@@ -11,6 +11,9 @@ from polsep.compute.compiling import ONE, ZERO, compiled
 #: Samples that `filter_rows` reads at once.
 AT_ONCE = 6
 
+#: Sums that `add_up` makes side by side.
+_SUMS = 64
+
 _ROUND, _ODD, _SIXTEEN = np.uint32(0x7FFF), np.uint32(1), np.uint32(16)
 _SHIFTS = (np.uint64(16), np.uint64(32), np.uint64(48))
 
@@ -66,21 +69,19 @@ def add_rows(x: Any, y: Any, z: Any, factor: Any, total: Any) -> None:
 
 @compiled
 def add_up(row: Any) -> float:
-    """Return the sum of a row in double precision, by eight sums that a processor adds at once."""
-    a, b, c, d, e, f, g, h = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    whole = row.size - row.size % 8
-    for j in range(0, whole, 8):
-        a += row[j]
-        b += row[j + 1]
-        c += row[j + 2]
-        d += row[j + 3]
-        e += row[j + 4]
-        f += row[j + 5]
-        g += row[j + 6]
-        h += row[j + 7]
+    """Return the sum of a row: sums in single precision side by side, and of these in double precision."""
+    sums = np.zeros(_SUMS, np.float32)
+    whole = row.size - row.size % _SUMS
+    for first in range(0, whole, _SUMS):
+        x = row[first:]
+        for j in range(_SUMS):
+            sums[j] += x[j]
+    total = 0.0
+    for j in range(_SUMS):
+        total += sums[j]
     for j in range(whole, row.size):
-        a += row[j]
-    return ((a + b) + (c + d)) + ((e + f) + (g + h))
+        total += row[j]
+    return total
 
 
 @compiled

@@ -88,30 +88,38 @@ def _likeness(there: Any, here: Any, w: int, near: Any) -> None:
 
 
 @compiled
-def _add_alike(x: Any, near: Any, w: int, out: Any) -> None:
-    """Add the steps of a row about each pixel."""
+def _add_alike(x: Any, y: Any, near: Any, w: int, x_sums: Any, y_sums: Any) -> None:
+    """Add the steps of a row about each pixel, of two moments."""
     n0, n1, n2, n3, n4 = near[0], near[1], near[2], near[3], near[4]
     for j in range(w):
-        left, right = n0[j] * x[j] + n1[j] * x[j + _STEP], n3[j] * x[j + 3 * _STEP] + n4[j] * x[j + 4 * _STEP]
-        out[j] += left + n2[j] * x[j + 2 * _STEP] + right
+        a, b, c, d, e = n0[j], n1[j], n2[j], n3[j], n4[j]
+        left, right = a * x[j] + b * x[j + _STEP], d * x[j + 3 * _STEP] + e * x[j + 4 * _STEP]
+        x_sums[j] += left + c * x[j + 2 * _STEP] + right
+        left, right = a * y[j] + b * y[j + _STEP], d * y[j + 3 * _STEP] + e * y[j + 4 * _STEP]
+        y_sums[j] += left + c * y[j + 2 * _STEP] + right
 
 
 @compiled
-def _square(near: Any) -> None:
-    for i in range(near.size):
-        near[i] *= near[i]
+def _add_last(x: Any, y: Any, near: Any, w: int, x_sums: Any, y_sums: Any) -> None:
+    """`_add_alike` of the weight and of its square, which counts by the square of the likeness."""
+    n0, n1, n2, n3, n4 = near[0], near[1], near[2], near[3], near[4]
+    for j in range(w):
+        a, b, c, d, e = n0[j], n1[j], n2[j], n3[j], n4[j]
+        left, right = a * x[j] + b * x[j + _STEP], d * x[j + 3 * _STEP] + e * x[j + 4 * _STEP]
+        x_sums[j] += left + c * x[j + 2 * _STEP] + right
+        left, right = a * a * y[j] + b * b * y[j + _STEP], d * d * y[j + 3 * _STEP] + e * e * y[j + 4 * _STEP]
+        y_sums[j] += left + c * c * y[j + 2 * _STEP] + right
 
 
 @compiled
 def sum_alike(pattern: Pattern, t: int, rows: Rows, rings: Rings) -> None:
     """Sums over the middle window about row ``t`` as far as edges allow, into ``rows.sums``. Twin: `_pool_to_edges`."""
     rows.sums[:] = ZERO
-    here, w = rings.edges[t % KEPT], pattern.w
+    here, w, at = rings.edges[t % KEPT], pattern.w, PAD - MIDDLE
     for row in range(t - MIDDLE, t + MIDDLE + 1, _STEP):
         if 0 <= row < pattern.h:
-            weighted = rings.weighted[row % KEPT]
+            x, sums = rings.weighted[row % KEPT], rows.sums
             _likeness(rings.edges[row % KEPT], here, w, rows.near)
-            for k in range(5):
-                _add_alike(weighted[k, PAD - MIDDLE :], rows.near, w, rows.sums[k, PAD:])
-            _square(rows.near.reshape(-1))
-            _add_alike(weighted[5, PAD - MIDDLE :], rows.near, w, rows.sums[5, PAD:])
+            for k in (0, 2):
+                _add_alike(x[k, at:], x[k + 1, at:], rows.near, w, sums[k, PAD:], sums[k + 1, PAD:])
+            _add_last(x[4, at:], x[5, at:], rows.near, w, sums[4, PAD:], sums[5, PAD:])

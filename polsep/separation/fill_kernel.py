@@ -51,7 +51,10 @@ def halve_separation(
 
 def halve_specular(specular: NDArray[np.float32], outside: NDArray[np.bool_]) -> Level:
     """The first level of a white specular image ``[h, w, 3]``, ``outside`` of its holes."""
-    return _halve(np.where(outside, np.stack([specular[..., 0], np.ones_like(specular[..., 0])]), ZERO))
+    h, w = outside.shape
+    level = np.zeros((2, (h + 1) // 2, (w + 1) // 2), np.float32)
+    run_over_rows(partial(_halve_specular, specular, outside, level), h, _ROWS)
+    return level
 
 
 def _halve(level: Level) -> Level:
@@ -86,6 +89,16 @@ def _halve_separation(diffuse: Any, specular: Any, lines: Any, valid: Any, level
             for c in range(3):
                 level[2 + c, y, x] += share * diffuse[i, j, c]
             level[5, y, x] += share
+
+
+@entry
+def _halve_specular(specular: Any, outside: Any, level: Any, row_range: RowRange) -> None:
+    h, w = outside.shape
+    for i in range(row_range[0], row_range[1]):
+        for j in range(w):
+            share = _share(i, j, h, w) if outside[i, j] else ZERO
+            level[0, i // 2, j // 2] += share * specular[i, j, 0]
+            level[1, i // 2, j // 2] += share
 
 
 @entry

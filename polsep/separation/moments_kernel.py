@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import ONE, QUARTER, THIRD, TWO, ZERO, compiled
+from polsep.compute.rows_kernel import add_up
 from polsep.demosaic.bilinear_kernel import PAD, Pattern, make_analysers
 from polsep.physics.stokes_kernel import fit_stokes_row, fit_stokes_unclipped
 from polsep.separation import color_affine as twin
@@ -25,7 +26,7 @@ REACH = WIDEST + NOISE
 #: Rows of weighted moments and of edges that are kept: as far down as the widest window looks, as far up as the middle.
 KEPT = 20
 
-_TWELFTH = np.float32(1 / 12)
+_TWELFTH, _LEAST_WEIGHT = np.float32(1 / 12), np.float32(1e-6)
 _MARGIN, _VARIANCE_FLOOR = np.float32(twin.CONTRAST_MARGIN), np.float32(twin.VARIANCE_FLOOR)
 
 
@@ -254,11 +255,10 @@ def _errors(noise: Any, missed: Any, per_column: Any, counts: Any, error: Any) -
     w0, w1, w2, w3 = noise[0, 1, PAD:], noise[1, 1, PAD:], noise[2, 1, PAD:], noise[3, 1, PAD:]
     w4, w5, w6 = noise[4, 1, PAD:], noise[5, 1, PAD:], noise[6, 1, PAD:]
     v0, v1, v2, columns = missed[0, PAD:], missed[1, PAD:], missed[2, PAD:], counts[PAD:]
-    least = np.float32(1e-6)
     for j in range(error.size):
         total = ((q0[j] + q1[j]) + (q2[j] + q3[j])) + ((q4[j] + q5[j]) + q6[j])
         weight = ((w0[j] + w1[j]) + (w2[j] + w3[j])) + ((w4[j] + w5[j]) + w6[j])
-        weight = weight if weight > least else least
+        weight = weight if weight > _LEAST_WEIGHT else _LEAST_WEIGHT
         error[j] = TWO * _MARGIN * total / weight + (v0[j] + v1[j] + v2[j]) / (per_column * columns[j])
 
 
@@ -299,16 +299,20 @@ def enter_row(pattern: Pattern, conversion: Conversion, flagged: bool, t: int, r
 
 
 @compiled
-def sum_noise(pattern: Pattern, noise: Any) -> float:
-    """The sum over a row of the standard deviation of a sample, from a full ring of noise. Twin: `sample_variance`."""
-    total = 0.0
-    for j in range(PAD, PAD + pattern.w):
-        squares, weight = 0.0, 0.0
-        for i in range(7):
-            squares += noise[i, 0, j]
-            weight += noise[i, 1, j]
-        total += np.sqrt(squares / (weight if weight > 1e-6 else 1e-6))
-    return total
+def sum_noise(pattern: Pattern, noise: Any, row: Any) -> float:
+    """The sum over a row of the standard deviation of a sample, from a full ring of noise. Twin: `sample_variance`.
+
+    ``row [w]``: a buffer.
+    """
+    q0, q1, q2, q3 = noise[0, 0, PAD:], noise[1, 0, PAD:], noise[2, 0, PAD:], noise[3, 0, PAD:]
+    q4, q5, q6 = noise[4, 0, PAD:], noise[5, 0, PAD:], noise[6, 0, PAD:]
+    w0, w1, w2, w3 = noise[0, 1, PAD:], noise[1, 1, PAD:], noise[2, 1, PAD:], noise[3, 1, PAD:]
+    w4, w5, w6 = noise[4, 1, PAD:], noise[5, 1, PAD:], noise[6, 1, PAD:]
+    for j in range(pattern.w):
+        total = ((q0[j] + q1[j]) + (q2[j] + q3[j])) + ((q4[j] + q5[j]) + q6[j])
+        weight = ((w0[j] + w1[j]) + (w2[j] + w3[j])) + ((w4[j] + w5[j]) + w6[j])
+        row[j] = np.sqrt(total / (weight if weight > _LEAST_WEIGHT else _LEAST_WEIGHT))
+    return add_up(row)
 
 
 @compiled

@@ -212,7 +212,7 @@ def pass_on(
     if weighed >= strip.begin:
         weigh_row(frame, weighed, rows, rings)
         if targets.sums.size and 0 <= weighed < frame.h:  # neighbouring strips write the same
-            targets.sums[weighed, 7] = sum_noise(frame, rings.noise)
+            targets.sums[weighed, 7] = sum_noise(frame, rings.noise, rows.spare[0])
         fit_diffuse_polarization(frame, done, strip.start, rows, rings)
     if done >= strip.start:
         _write_row(conversion.gains, done, strip, better[place] if better.size else better[:0, 0], targets)

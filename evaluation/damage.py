@@ -1,7 +1,7 @@
 """Damage done to files: random, but the same for the same seed.
 
 `damage` takes the bytes of a file and gives those of a damaged one, by one to three changes of `CHANGES`: bits and bytes,
-cuts and insertions, lengths and other numbers at extremes, in binary and in text, and parts of another file.
+cuts and insertions, fields of headers and other numbers at extremes, in binary and in text, parts of another file.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import random
 import re
 import struct
 from collections.abc import Callable
+
+from evaluation.damage_fields import find_fields
 
 #: Whole numbers at which readers go wrong: around 0 and around the ends of types.
 NUMBERS = (0, 1, 2, 3, 7, 255, 256, 32767, 32768, 65535, 65536, 2**24, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**63, 2**64 - 1)
@@ -61,6 +63,19 @@ def set_number(data: bytes, other: bytes, draw: random.Random) -> bytes:
     return data[:place] + struct.pack(draw.choice("<>") + code, number) + data[place + size :]
 
 
+def set_field(data: bytes, other: bytes, draw: random.Random) -> bytes:
+    """A field of a header at an extreme, or a little or a power of two away; in a file without fields, a number."""
+    fields = find_fields(data)
+    if not fields:
+        return set_text_number(data, other, draw)
+    place, size, order = draw.choice(fields)
+    code, most = order + {1: "B", 2: "H", 4: "I", 8: "Q"}[size], 2 ** (8 * size)
+    (before,) = struct.unpack_from(code, data, place)
+    near = (before + 1, before - 1, 2 * before, before // 2, before << draw.randrange(24), most - 1 - before)
+    number = draw.choice((*NUMBERS, *near, *near, len(data), place, draw.randrange(16))) % most
+    return data[:place] + struct.pack(code, number) + data[place + size :]
+
+
 def set_text_number(data: bytes, other: bytes, draw: random.Random) -> bytes:
     """A number in text replaced by one of `WORDS`; in a file without text, a binary one."""
     found = list(_DIGITS.finditer(data[: 1 << 16]))
@@ -106,7 +121,9 @@ CHANGES: tuple[Change, ...] = (
     flip_bits,
     set_bytes,
     set_number,
-    set_number,
+    set_field,
+    set_field,
+    set_field,
     set_text_number,
     cut,
     insert,

@@ -3,11 +3,12 @@
 ``python -m evaluation reliability`` (``make fuzz``) damages small files of every reader (`damage`, `damage_seeds`) and
 reads each in a process of its own kind, with limits of time and memory. A fault is an exception that is no refusal, a
 message of several lines or of more than 300 characters or without the file's name, a value that is not finite, anything
-on standard error, more than 10 s or 2 GB, or the end of the process. Input K of a reader is the same in every run.
+printed, more than 10 s or 2 GB, or the end of the process. Input K of a reader is the same in every run.
 """
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import random
@@ -39,7 +40,7 @@ SECONDS, MEBIBYTES = 10.0, 2048.0
 ROOM = 6 << 30
 #: What can become of an input, and what can be wrong about it.
 OUTCOMES = ("refused", "accepted")
-FAULTS = ("stray exceptions", "bad messages", "values not finite", "stderr lines", "over time", "over memory", "crashes")
+FAULTS = ("stray exceptions", "bad messages", "values not finite", "lines of libraries", "over time", "over memory", "crashes")
 #: Inputs of each reader after which memory is measured anew from the start, as C libraries keep some.
 INPUTS = 2000
 
@@ -96,18 +97,20 @@ def write_files(folder: Path, files: Files) -> Path:
 
 
 class _Watch:
-    """Standard error in a file, and the peak of memory since the last look."""
+    """Everything printed, in a file, and the peak of memory since the last look."""
 
     def __init__(self) -> None:
         self._caught = tempfile.TemporaryFile()
-        os.dup2(self._caught.fileno(), 2)
+        for stream in (1, 2):
+            os.dup2(self._caught.fileno(), stream)
 
     def start(self) -> None:
         with suppress(OSError):
             Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
 
     def look(self) -> tuple[str, float]:
-        """Text on standard error, and peak memory [MiB]."""
+        """The printed text, and peak memory [MiB]."""
+        sys.stdout.flush()
         sys.stderr.flush()
         self._caught.seek(0)
         text = self._caught.read()
@@ -136,7 +139,7 @@ def _work(name: str, first: int, last: int, results: Connection) -> None:
             seconds = time.monotonic() - start
             said, peak = watch.look()
             faults = dict.fromkeys(found.faults)
-            faults |= {"stderr lines": None} if said else {}
+            faults |= {"lines of libraries": None} if said else {}
             faults |= {"over time": None} if seconds > SECONDS else {}
             faults |= {"over memory": None} if peak > MEBIBYTES else {}
             seen = f"{found.seen} | {said[:200]!r}" if said else found.seen
@@ -145,9 +148,9 @@ def _work(name: str, first: int, last: int, results: Connection) -> None:
                 file.unlink()
 
 
-def judge_damaged(name: str, first: int, last: int, deadline: float) -> Iterator[tuple[int, Judged]]:
-    """Inputs ``first`` to ``last`` of a reader, judged one after the other until ``deadline`` (`time.monotonic`)."""
-    context = multiprocessing.get_context("spawn")
+def judge_damaged(name: str, first: int, last: int, seconds: float) -> Iterator[tuple[int, Judged]]:
+    """Inputs ``first`` to ``last`` of a reader, judged one after the other for ``seconds`` and the start of processes."""
+    context, deadline = multiprocessing.get_context("spawn"), math.inf
     while first < last and time.monotonic() < deadline:
         ours, theirs = context.Pipe(duplex=False)
         worker: Any = context.Process(target=_work, args=(name, first, last, theirs), daemon=True)
@@ -165,6 +168,7 @@ def judge_damaged(name: str, first: int, last: int, deadline: float) -> Iterator
                         raise RuntimeError(f"expected a process that reads {name}, found that it ended") from None
                     ended, index, found = True, first, Judged("", ("crashes",), f"exit code {worker.exitcode}")
                 patience, started = 1.5 * SECONDS, True
+                deadline = time.monotonic() + seconds if deadline == math.inf else deadline
                 if found is not None:
                     first = index + 1
                     yield index, found
@@ -191,11 +195,10 @@ def count_rows(name: str, counts: Counter[str]) -> Iterator[Row]:
 def reliability(context: click.Context, **options: Any) -> None:
     """Read damaged files with every reader, and count what goes wrong; exit status 1 where something does."""
     names = [options["only"]] if options["only"] else list(READERS)
-    rows, total, begun = list[Row](), Counter[str](), time.monotonic()
-    for place, name in enumerate(names, 1):
+    rows, total, first = list[Row](), Counter[str](), options["first"]
+    for name in names:
         counts: Counter[str] = Counter()
-        deadline = begun + options["seconds"] * place / len(names)
-        for index, found in judge_damaged(name, options["first"], options["first"] + options["inputs"], deadline):
+        for index, found in judge_damaged(name, first, first + options["inputs"], options["seconds"] / len(names)):
             counts.update(["inputs", *([found.outcome] if found.outcome else []), *found.faults])
             if found.faults:
                 print(f"{name} {index}: {', '.join(found.faults)}: {found.seen}", flush=True)

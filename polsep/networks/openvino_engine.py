@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import conv2d
 
+from polsep.compute.processor import cpu_flags
 from polsep.networks.channels import DETAIL_MAPS, PERIOD, input_channels
 from polsep.networks.details import HAAR
 from polsep.networks.joint import Joint, pool_outputs
@@ -257,10 +258,8 @@ def _usual_precision() -> str:
     Vector units that know bfloat16 alone (AVX512-BF16) take 1.6 times as long with it as with float32
     (docs/experiments.md).
     """
-    from llvmlite.binding import get_host_cpu_features  # type: ignore[import-untyped]  # no stubs
-
     name: str = _core().get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name()
-    return "f32" if name == "bf16" and not get_host_cpu_features().get("amx-bf16") else name
+    return "f32" if name == "bf16" and "amx_bf16" not in cpu_flags() else name
 
 
 def _import_openvino() -> Any:

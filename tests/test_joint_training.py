@@ -506,7 +506,7 @@ def test_of_a_network_a_part_can_be_trained_alone(part: str, tmp_path: Path, sho
     moved = {name for name in before if not np.array_equal(before[name], after[name])}
     assert moved and all(name.startswith(f"{part}.") for name in moved)
     assert f"--part {part}" in metadata["command"]
-    assert int(metadata["parameters"]) == sum(x.numel() for name, x in after.items() if name != "demosaic")
+    assert int(metadata["parameters"]) == sum(x.size for name, x in after.items() if name != "demosaic")
 
 
 @pytest.mark.parametrize("sees_frame", [False, True])

@@ -196,7 +196,7 @@ def open_cells(samples: Samples, pattern: Pattern, cells: Cells, r: int) -> None
 def advance_cells(samples: Samples, pattern: Pattern, cells: Cells, r: int) -> bool:
     """Load the last row that cell row ``r`` needs; call it for every row in order. True if any sample is clipped."""
     _enter_row(samples, pattern, cells, r + 1)
-    return cells.flagged[0] or cells.flagged[1] or cells.flagged[2]
+    return bool(cells.flagged[0] or cells.flagged[1] or cells.flagged[2])
 
 
 @compiled

@@ -212,8 +212,8 @@ def read_grey(path: Path, white_level: float) -> Measurements:
     frame = next(read_frames(path, ReadOptions(Layout(bayer=None), white_level=white_level))).data
     seen = demosaic_bilinear_half(frame) if isinstance(frame, Mosaic) else frame
     shape = (*seen.data.shape[:-3], 3, *seen.data.shape[-2:])
-    clipped = None if seen.clipped is None else seen.clipped.expand(shape)
-    return Measurements(seen.data.expand(shape), seen.angles, clipped)
+    clipped = None if seen.clipped is None else torch.as_tensor(seen.clipped).expand(shape)
+    return Measurements(torch.as_tensor(seen.data).expand(shape), seen.angles, clipped)
 
 
 def draw_curves() -> Pixels | None:

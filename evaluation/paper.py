@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import torch
+
 from evaluation.calibration import Sweep, measure_sweep, snapshot_entries
 from evaluation.figures import require_matplotlib
 from evaluation.ladder import CO_SITED, MOSAIC, ladder_entries, measure_costs, rung_of
@@ -58,7 +60,8 @@ def measure_paper(data: Path, extent: Extent) -> Iterator[Row]:
     sets = {name: recipes[: extent.scenes.get(name)] for name, recipes in load_sets().items()}
     mosaic, co_sited = ladder_entries(MOSAIC), ladder_entries(CO_SITED)
     protocols = [Protocol(MOSAIC, capture_noisy, mosaic), Protocol(CO_SITED, capture_co_sited, co_sited)]
-    yield from measure_costs(mosaic, read_demo_capture(), extent.runs)
+    demo = read_demo_capture()
+    yield from measure_costs(mosaic, replace(demo, data=torch.as_tensor(demo.data)), extent.runs)
     for row in score_sets("paper", sets, data, protocols):
         yield from table_rows(row)
     yield from measure_sweep("paper/calibration", extent.sweep, snapshot_entries(co_sited))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from polsep.bench.rows import Row
 from polsep.bench.truth import read_demo_capture
+from polsep.compute.arrays import to_numpy
 from polsep.compute.workers import keep_memory
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.raw.genicam import pack_frame
@@ -109,5 +110,5 @@ def _rate_alone(method: str, frames: list[NDArray[np.uint16]]) -> float:
 
 def _frames() -> list[NDArray[np.uint16]]:
     """The demo capture, shifted by whole periods of its filters."""
-    raw = read_demo_capture().data.numpy().astype(np.uint16)
+    raw = to_numpy(read_demo_capture().data).astype(np.uint16)
     return [np.roll(raw, (8 * k, 16 * k), (0, 1)) for k in range(DISTINCT)]

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from evaluation.naive import NAIVE, naive_texture
 from polsep.bench.rows import Row
+from polsep.compute.arrays import to_numpy
 from polsep.edit import EDITS, SeparatedImages, Texture, make_edit
 from polsep.edit.edits import Edit
 from polsep.io.raw.frames import ReadOptions, read_frames
@@ -145,7 +146,8 @@ def _bench_page(address: str) -> Iterator[Row]:
         page.do(Event(part, "input", control.start))
     with TemporaryDirectory() as folder:
         path = Path(folder) / "stack.npy"
-        codes = next(read_frames(DEMO, ReadOptions(white_level=DEMO_WHITE))).data.data.numpy().astype(np.uint16)
+        demo = next(read_frames(DEMO, ReadOptions(white_level=DEMO_WHITE))).data
+        codes = to_numpy(demo.data).astype(np.uint16)
         write_array(path, np.stack([np.roll(codes, 16 * k, axis=1) for k in range(4)]))
         page.do(Event("ps-file", "upload", [page.send("stack.npy", read_bytes(path))]))
     page.do(Event("ps-play", "click", "Play"))

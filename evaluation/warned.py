@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from polsep.bench.rows import Row
+from polsep.compute.arrays import to_numpy
 from polsep.pipeline import separate_capture
 from polsep.sensor.levels import level_notes
 
@@ -55,7 +56,7 @@ def warned_kinds(frame: Known, method: str) -> set[str]:
     """The kinds of warnings in the report of a frame."""
     mosaic = frame.mosaic
     lines = [
-        *level_notes(mosaic.data.numpy(), mosaic.black_level, mosaic.white_level),
+        *level_notes(to_numpy(mosaic.data), mosaic.black_level, mosaic.white_level),
         *separate_capture(mosaic, method).report["warnings"],
     ]
     return {kind for kind, words in WORDS.items() for line in lines if any(word in line for word in words)}

@@ -263,7 +263,7 @@ def sample_angles(folder: Path, name: str, layout: Layout, white: float | None) 
     assert isinstance(images, Measurements)
     degrees = [round(math.degrees(angle)) for angle in images.angles]
     height, width = (n // 4 * 4 for n in images.data.shape[-2:])
-    samples = torch.zeros(height, width)
+    samples = np.zeros((height, width), np.float32)
     for row in range(4):
         for col in range(4):
             own = layout.filter_at(row, col)
@@ -281,4 +281,4 @@ def _real(name: str, deserves: str | None, frame: Mosaic) -> Iterator[Known]:
         yield Known(name, "real, mono read as colour", "layout", replace(frame, layout=Layout()))
     else:
         yield Known(name, "real, colour read as mono", "layout", replace(frame, layout=MONO))
-        yield Known(name, "real, cropped by 1 row", "layout", replace(frame, data=frame.data[1:].contiguous()))
+        yield Known(name, "real, cropped by 1 row", "layout", replace(frame, data=frame.data[1:]))

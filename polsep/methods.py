@@ -121,15 +121,17 @@ def run_reference(reference: Reference, capture: Capture, light: Light, full: bo
 
 
 def run_analytic(capture: Capture, light: Light, full: bool) -> FrameImages:
-    """`separate_analytic` of bilinear samples: a compiled kernel at half resolution, else the reference."""
-    if full or not isinstance(capture, Mosaic) or not _is_plain(capture):
+    """`separate_analytic` of bilinear samples: compiled kernels for one frame, else the reference."""
+    if not isinstance(capture, Mosaic) or not _is_plain(capture):
         return run_reference(analytic_reference, capture, light, full)
-    make_ready(_warm_up_analytic)
-    from polsep.separation.analytic_kernel import AnalyticOptions, separate_analytic_half
+    make_ready(_warm_up_analytic_full if full else _warm_up_analytic)
+    from polsep.separation import analytic_kernel
+    from polsep.separation.analytic_kernel import AnalyticOptions
 
+    separate = analytic_kernel.separate_analytic_full if full else analytic_kernel.separate_analytic_half
     options = AnalyticOptions(light, in_light=True, report=True)
     levels = (capture.black_level, capture.white_level)
-    return separate_analytic_half(to_numpy(capture.data), capture.layout, *levels, options)
+    return separate(to_numpy(capture.data), capture.layout, *levels, options)
 
 
 def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
@@ -170,6 +172,12 @@ def _warm_up_analytic() -> None:
     from polsep.separation import analytic_kernel
 
     analytic_kernel.warm_up()
+
+
+def _warm_up_analytic_full() -> None:
+    from polsep.separation import analytic_kernel
+
+    analytic_kernel.warm_up_full()
 
 
 def _warm_up_color_affine() -> None:

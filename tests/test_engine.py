@@ -48,11 +48,11 @@ def capture(layout: Layout, shape: tuple[int, int] = (96, 120), light: tuple[flo
     return Mosaic(((data + noise).clamp(0, 1) * 4095).round(), layout, 20.0, 4095.0)
 
 
-def both(mosaic: Mosaic, method: str, light: tuple[float, ...]) -> tuple[SeparatedFrame, SeparatedFrame]:
+def both(mosaic: Mosaic, method: str, light: tuple[float, ...], full: bool) -> tuple[SeparatedFrame, SeparatedFrame]:
     """The frame by the engine and by torch."""
     chosen, (light, *_) = METHODS[method], resolve_light(light, mosaic)
-    by_torch = run_reference(chosen.reference, mosaic, light, False)
-    images = (chosen.run(mosaic, light, False), by_torch)
+    by_torch = run_reference(chosen.reference, mosaic, light, full)
+    images = (chosen.run(mosaic, light, full), by_torch)
     return tuple(make_frame(each, chosen, mosaic, light) for each in images)  # type: ignore[return-value]
 
 
@@ -70,9 +70,12 @@ def both(mosaic: Mosaic, method: str, light: tuple[float, ...]) -> tuple[Separat
         ("color-affine", CROPPED, (97, 121), ODD_LIGHT),
     ],
 )
-def test_engine_and_torch_agree(method: str, layout: Layout, shape: tuple[int, int], light: tuple[float, ...]) -> None:
+@pytest.mark.parametrize("full", [False, True])
+def test_engine_and_torch_agree(
+    method: str, layout: Layout, shape: tuple[int, int], light: tuple[float, ...], full: bool
+) -> None:
     """Images, mask, DoLP, AoLP where it is defined, and every statistic, with clipped samples in the frame."""
-    found, expected = both(capture(layout, shape, light if layout.bayer else WHITE), method, light)
+    found, expected = both(capture(layout, shape, light if layout.bayer else WHITE), method, light, full)
     np.testing.assert_array_equal(found.valid, expected.valid)
     assert not bool(found.valid.all())
     assert float(found.valid.mean()) > 0.9
@@ -103,7 +106,11 @@ def test_dolp_aolp_and_statistics_are_of_white_light(method: str, full: bool) ->
     )
 
 
-KERNELS = {"analytic": "separate_analytic_half", "color-affine": "separate_color_affine_half"}
+#: Kernels of each method, at half and at full resolution.
+KERNELS = {
+    "analytic": ("separate_analytic_half", "separate_analytic_full"),
+    "color-affine": ("separate_color_affine_half", None),
+}
 
 
 @pytest.fixture
@@ -112,6 +119,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     names: list[str] = []
     for module, name in (
         (analytic_kernel, "separate_analytic_half"),
+        (analytic_kernel, "separate_analytic_full"),
         (color_affine_kernel, "separate_color_affine_half"),
     ):
         kernel = getattr(module, name)
@@ -128,7 +136,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @pytest.mark.parametrize("data", [torch.rand(2, 32, 32), torch.rand(32, 32).double()], ids=["batch", "double"])
 def test_kernels_leave_other_frames_to_torch(method: str, data: torch.Tensor, calls: list[str]) -> None:
     """Batches and double precision."""
-    METHODS[method].run(Mosaic(data, COLOR, 0.0, 1.0), WHITE, False)
+    for full in (False, True):
+        METHODS[method].run(Mosaic(data, COLOR, 0.0, 1.0), WHITE, full)
     assert calls == []
 
 
@@ -150,14 +159,14 @@ def test_small_and_mono_frames_of_color_affine_are_left_to_torch(calls: list[str
 
 
 @pytest.mark.parametrize("method", KERNELS)
-def test_kernels_make_half_resolution_and_torch_the_rest(method: str, calls: list[str]) -> None:
-    """No kernel runs for co-sited measurements, nor at full resolution."""
+def test_kernels_separate_mosaics_and_torch_the_rest(method: str, calls: list[str]) -> None:
+    """No kernel runs for co-sited measurements."""
     mosaic = capture(COLOR, (32, 32))
     separate_capture(Measurements(torch.rand(4, 3, 16, 16), COLOR.angles), method, device="cpu")
-    separate_capture(mosaic, method, full=True, device="cpu")
     assert calls == []
-    separate_capture(mosaic, method, device="cpu")
-    assert calls == [KERNELS[method]]
+    for full in (False, True):
+        separate_capture(mosaic, method, full=full, device="cpu")
+    assert calls == [name for name in KERNELS[method] if name]
 
 
 def test_slow_compilation_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:

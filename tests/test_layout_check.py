@@ -250,7 +250,7 @@ def real_frames(shared: Path) -> dict[str, Tensor]:
     frames = {}
     for name, layout in RAW_FRAMES.items():
         array = imagecodecs.png_decode((shared / "data" / "raw" / f"{name}.png").read_bytes())
-        frames[name] = as_mosaic(array, layout)[0].linear()
+        frames[name] = torch.from_numpy(as_mosaic(array, layout)[0].linear())
     return frames
 
 

@@ -345,7 +345,7 @@ def test_the_histogram_counts_every_sample(sessions: Sessions) -> None:
     found = opened(sessions)
     assert found.mosaic is not None and found.histogram is not None
     np.testing.assert_allclose(found.histogram.shares.sum(axis=1), 1.0, rtol=1e-12)
-    clipped = float(found.mosaic.clipped().float().mean())
+    clipped = float(found.mosaic.clipped().mean())
     weights = np.array([1, 2, 1]) / 4
     assert math.isclose(float(np.dot(weights, found.histogram.clipped)), clipped, rel_tol=1e-6)
     mono = Mosaic(found.mosaic.data, Layout(bayer=None), 0.0, WHITE)

@@ -21,6 +21,7 @@ from recorded import record
 import polsep
 from polsep.bench.rows import Row
 from polsep.bench.truth import read_demo_capture
+from polsep.compute.arrays import to_numpy
 from polsep.demosaic.bilinear import demosaic_bilinear
 from polsep.physics.stokes import Measurements, fit_stokes
 from polsep.sensor.camera import Layout
@@ -47,7 +48,7 @@ def peer_chain(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def main() -> None:
     """Measure parity and time, and record the rows."""
     mosaic = read_demo_capture()
-    raw = mosaic.data.numpy().astype(np.uint16)
+    raw = to_numpy(mosaic.data).astype(np.uint16)
     images = pa.demosaicing(raw, pa.COLOR_PolarRGB)
     data = torch.from_numpy(np.stack(images).astype(np.float64) / 4095).permute(0, 3, 1, 2)
     ours = Measurements(data, Layout().angles)
@@ -57,7 +58,7 @@ def main() -> None:
     diffuse = np.abs(2 * pa.cvtStokesToDiffuse(theirs) - split.diffuse.permute(1, 2, 0).numpy())
     specular = np.abs(pa.cvtStokesToSpecular(theirs) - split.specular.permute(1, 2, 0).numpy())
     physical = stokes.s0.permute(1, 2, 0).numpy() >= polarized(stokes)
-    bilinear = demosaic_bilinear(mosaic).data.permute(0, 2, 3, 1).numpy()
+    bilinear = np.moveaxis(to_numpy(demosaic_bilinear(mosaic).data), 1, -1)
     inner = (slice(None), slice(8, -8), slice(8, -8))
     apart = np.sqrt(np.mean((bilinear[inner] - np.stack(images)[..., ::-1][inner] / 4095) ** 2))
     peer_seconds = best_seconds(lambda: peer_chain(raw))

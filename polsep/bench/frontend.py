@@ -117,7 +117,7 @@ def read_cases(data: Path) -> Iterator[Case]:
         if not isinstance(found, Measurements) or found.data.shape[-3] != 3:
             raise ValueError(f"expected RGB pictures 0, 45, 90 and 135 in {folder}, found others")
         height, width = (n // 4 * 4 for n in found.data.shape[-2:])
-        truth = found.data[..., :height, :width]
+        truth = torch.from_numpy(found.data)[..., :height, :width]
         raw = sample_mosaic(Measurements(truth, found.angles), Layout())
         everywhere = torch.ones(height // 2, width // 2, dtype=torch.bool)
         yield at_face_value(Case(folder.name, Mosaic(raw, Layout(), 0.0, 1.0), truth, everywhere))

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from itertools import permutations
 from pathlib import Path
 
-import torch
+import numpy as np
 
 from polsep.bench.rows import Row
 from polsep.demosaic.bilinear import demosaic_bilinear_half
@@ -41,12 +41,12 @@ def _read_mosaic(path: Path) -> Mosaic:
 def _reference_angles(mosaic: Mosaic) -> Iterator[Row]:
     """Median AoLP inside each polarizer; its labels count clockwise from the vertical, so label t is AoLP 90 - t."""
     stokes = fit_stokes(demosaic_bilinear_half(mosaic))
-    rows, cols = torch.meshgrid(*(torch.arange(n) for n in stokes.s0.shape[-2:]), indexing="ij")
+    rows, cols = np.ogrid[: stokes.s0.shape[-2], : stokes.s0.shape[-1]]
     errors = []
     for label, row, col, radius in REFERENCE_POLARIZERS:
         disc = (rows - row) ** 2 + (cols - col) ** 2 < radius**2
-        found = 90 - torch.rad2deg(aolp(stokes)[0][disc])
-        error = float(((found - label + 90) % 180 - 90).median())
+        found = 90 - np.rad2deg(aolp(stokes)[0][disc])
+        error = float(np.median((found - label + 90) % 180 - 90))
         errors.append(error)
         yield Row("real", f"polarizer labelled {label}", "AoLP", "error", error, "deg")
     common = statistics.fmean(errors)
@@ -68,8 +68,8 @@ def _layout_verdicts(mosaic: Mosaic) -> Iterator[bool]:
     other = Layout(true.polarizer, None if true.bayer else "RGGB")
     yield _right(Mosaic(mosaic.data, other, 0, 255), true, True)
     changed = (
-        (mosaic.data.flip(-1), true.flipped_horizontal(width)),
-        (mosaic.data.flip(-2), true.flipped_vertical(height)),
+        (np.flip(mosaic.data, -1), true.flipped_horizontal(width)),
+        (np.flip(mosaic.data, -2), true.flipped_vertical(height)),
         (mosaic.data.mT, true.transposed()),
         (mosaic.data[1:, :], true.rolled(-1, 0)),
         (mosaic.data[:, 3:], true.rolled(0, -3)),

@@ -13,6 +13,7 @@ import numpy as np
 
 from polsep.bench.rows import Row
 from polsep.bench.truth import read_demo_capture
+from polsep.compute.arrays import to_numpy
 from polsep.io.store.rows import write_array
 from polsep.kernels import warm_up
 from polsep.methods import METHODS
@@ -56,7 +57,7 @@ def bench_resources() -> Iterator[Row]:
     runs in torch (`paper`) shares torch's own threads.
     """
     warm_up()
-    raw = read_demo_capture().data.numpy().astype(np.uint16)
+    raw = to_numpy(read_demo_capture().data).astype(np.uint16)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "raw.npy"
         write_array(path, raw)

@@ -28,6 +28,7 @@ from polsep.bench.peers import run_json, time_peers
 from polsep.bench.rows import Row
 from polsep.bench.truth import DEMO_WHITE as WHITE_LEVEL
 from polsep.bench.truth import read_demo_capture
+from polsep.compute.arrays import to_numpy
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.demosaic.guided import demosaic_guided_half
 from polsep.io.store.rows import read_array, read_peak_memory, write_array
@@ -90,7 +91,7 @@ KERNELS: dict[str, Chain] = {
 
 def bench_speed(peers: str | None) -> Iterator[Row]:
     """Milliseconds, frames/s, memory and share of the roofline of every chain, and ratios to the peers' of this run."""
-    raw = read_demo_capture().data.numpy().astype(np.uint16)
+    raw = to_numpy(read_demo_capture().data).astype(np.uint16)
     with TemporaryDirectory() as folder:
         path, unclipped = Path(folder) / "raw.npy", Path(folder) / "unclipped.npy"
         write_array(path, raw)

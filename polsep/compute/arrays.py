@@ -76,11 +76,6 @@ def pad_repeat(x: Array, margin: int, axis: int) -> Array:
     return namespace(x).concat([first] * margin + [x] + [last] * margin, axis=axis)
 
 
-def like(x: Array, values: NDArray[Any]) -> Array:
-    """A NumPy array as one of the kind and on the device of ``x``, of its own dtype."""
-    return namespace(x).asarray(values, device=device(x))
-
-
 def to_device(x: Array, device: str) -> Array:
     """``x`` on a device: on the CPU an array stays of its kind, on others it is a torch tensor."""
     if device == "cpu":

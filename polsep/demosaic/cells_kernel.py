@@ -1,10 +1,10 @@
 """Rows of polarizer cells for guided demosaicking: four planes a row, one per place in the cell.
 
 A row of cells is ``[4, n]``: plane 2 i + j holds the samples of sensor row i and column j of every cell. Rows are
-continued by `EDGE` mirrored cells on each side. No function computes the outermost `GUARD` values at both ends, so that
-filters need no borders: the errors there never reach the frame. Colours alternate along a row: ``other [n]``
-is 1 where a cell is red or blue (whichever the row has) and 0 where it is green. Loops multiply by it, exactly, because
-conditions keep them from being vectorised.
+continued by mirrored cells, `EDGE` or more, on each side. No function computes the outermost `GUARD` values at both
+ends, so that filters need no borders: the errors there never reach the frame. Colours alternate along a row: ``other
+[n]`` is 1 where a cell is red or blue (whichever the row has) and 0 where it is green. Loops multiply by it, exactly,
+because conditions keep them from being vectorised.
 
 Rows live in rings, the row r at r modulo the ring's length; rows count from the first one that a stream loads.
 """
@@ -32,15 +32,16 @@ _GREEN_OWN, _GREEN_FAR, _GREEN_BACK, _GREEN_NEAR = (np.float32(k / 16) for k in 
 
 
 class Grid(NamedTuple):
-    """Constants of all rows of a frame. ``n``: length of a row, ``w`` cells and `EDGE` more on each side.
+    """Constants of all rows of a frame. ``n``: length of a row, ``w`` cells and ``edge`` more on each side.
 
     ``others [2, n]``: 1 where a cell of an even, an odd row is red or blue. ``colors [2]``: which of both (0 or 2).
-    ``gains [2, n]``: of the samples. ``sources [2 EDGE]``: column of the frame behind each mirrored one.
+    ``gains [2, n]``: of the samples. ``sources [2 edge]``: column of the frame behind each mirrored one.
     ``cosines``, ``sines [4]``: of twice the analyser's angle, by place. ``inverse [3, 4]``: Stokes vector of analysers
     in the order of the places.
     """
 
     n: int
+    edge: int
     others: NDArray[np.float32]
     colors: NDArray[np.int64]
     gains: NDArray[np.float32]
@@ -58,18 +59,22 @@ class Source(NamedTuple):
     grid: Grid
 
 
-def read_grid(pattern: Pattern, angles: tuple[float, ...], inverse: NDArray[np.float32]) -> Grid:
-    """The grid of frames of a colour ``pattern`` whose analysers have ``angles`` [rad] and that ``inverse [3, 4]``."""
-    columns = np.arange(-EDGE, pattern.w + EDGE)
+def read_grid(pattern: Pattern, angles: tuple[float, ...], inverse: NDArray[np.float32], edge: int = EDGE) -> Grid:
+    """The grid of frames of a colour ``pattern`` whose analysers have ``angles`` [rad] and that ``inverse [3, 4]``.
+
+    ``edge``: mirrored cells on each side.
+    """
+    columns = np.arange(-edge, pattern.w + edge)
     place = [2 * row + col for row, col in pattern.places]
     by_place = np.argsort(place)
     doubled = 2 * np.array(angles)[by_place]
     return Grid(
         columns.size,
+        edge,
         np.ascontiguousarray(pattern.bayer[:, columns % 2] != 1, np.float32),
         np.array([min(row, key=lambda channel: channel == 1) for row in pattern.bayer.tolist()], np.int64),
         np.ascontiguousarray(pattern.gains[:, columns % 2]),
-        reflect(np.concatenate([columns[:EDGE], columns[-EDGE:]]), pattern.w),
+        reflect(np.concatenate([columns[:edge], columns[-edge:]]), pattern.w),
         np.where(np.abs(np.cos(doubled)) < 1e-9, 0, np.cos(doubled)).astype(np.float32),
         np.where(np.abs(np.sin(doubled)) < 1e-9, 0, np.sin(doubled)).astype(np.float32),
         np.ascontiguousarray(inverse[:, by_place]),
@@ -86,19 +91,19 @@ def reflect(places: NDArray[np.int64], count: int) -> NDArray[np.int64]:
 def load_cells(source: Source, r: int, row: Any, planes: Any) -> None:
     """The samples of the frame's cell row ``r`` to ``planes [4, n]``, linear; ``row``: a buffer for a sensor row."""
     samples, pattern, grid = source
-    gains = grid.gains[r % 2, EDGE:]
+    edge, gains = grid.edge, grid.gains[r % 2, grid.edge :]
     for i in range(2):
         read_row(samples, pattern.top + 2 * r + i, pattern.left, row)
-        left, right = planes[2 * i, EDGE:], planes[2 * i + 1, EDGE:]
+        left, right = planes[2 * i, edge:], planes[2 * i + 1, edge:]
         for j in range(row.size // 2):
             left[j] = (row[2 * j] - pattern.black) * gains[j]
             right[j] = (row[2 * j + 1] - pattern.black) * gains[j]
-    last = grid.n - EDGE
+    last = grid.n - edge
     for k in range(4):
         plane = planes[k]
-        for j in range(EDGE):
-            plane[j] = plane[EDGE + grid.sources[j]]
-            plane[last + j] = plane[EDGE + grid.sources[EDGE + j]]
+        for j in range(edge):
+            plane[j] = plane[edge + grid.sources[j]]
+            plane[last + j] = plane[edge + grid.sources[edge + j]]
 
 
 @compiled
@@ -163,10 +168,10 @@ def _add_green(q: Any, step: int, w1: Any, w2: Any, s1_row: Any, s2_row: Any) ->
 
 
 @compiled
-def polarize_row(ring: Any, r: int, grid: Grid, buffer: Any, sums: Any) -> None:
+def polarize_row(ring: Any, r: int, grid: Grid, weights: Any, buffer: Any, sums: Any) -> None:
     """s1 and s2 of row ``r`` to ``sums [2, 3, n]``, bilinear, from a ring of planes with rows r - 2 to r + 2.
 
-    ``buffer [3, n]``. Twin: `fit_stokes` of `interpolate_analysers_half`.
+    ``weights [2, 4]``: of the analysers, by place; ``buffer [3, n]``. Twin: `interpolate_analysers_half`, `fit_stokes`.
     """
     length, parity = ring.shape[0], r % 2
     other, green = grid.others[parity], grid.others[1 - parity]
@@ -178,7 +183,7 @@ def polarize_row(ring: Any, r: int, grid: Grid, buffer: Any, sums: Any) -> None:
         own, near = ring[r % length, place], ring[(r + d) % length, place]
         back, far = ring[(r - d) % length, place], ring[(r + 2 * d) % length, place]
         _interpolate_down(own, near, back, far, other, buffer)
-        w1, w2 = grid.inverse[1, place], grid.inverse[2, place]
+        w1, w2 = weights[0, place], weights[1, place]
         first, second = grid.colors[parity], grid.colors[1 - parity]
         _add_red_or_blue(buffer[0], other, step, w1, w2, sums[0, first], sums[1, first])
         _add_red_or_blue(buffer[1], green, step, w1, w2, sums[0, second], sums[1, second])

@@ -2,9 +2,7 @@
 
 One sample behind the analyser at angle t says 2 m - (s1 cos 2t + s2 sin 2t) = s0. Polarization is smooth where
 intensity is not, so a smoothed one turns the mosaic of analysers into a mosaic of s0 at the sensor's full resolution,
-whose colours come in 2x2 blocks (`_intensity_mosaic`). Demosaicking has two halves from there. Full resolution takes
-both twice, the second time with polarization as sharp as the first time's found to be reliable (`_reliable`), without
-which thin polarized highlights would keep the pattern of the analysers; in cell means that pattern cancels.
+whose colours come in 2x2 blocks (`_intensity_mosaic`). Demosaicking has two halves from there.
 
 1. s0 of all colours (`fill_colors`). Green first: along rows and columns, the interpolation of the other colour plus
    what the pixel's own colour differs from its interpolation, times the slope at which green follows that colour
@@ -15,6 +13,11 @@ which thin polarized highlights would keep the pattern of the analysers; in cell
 2. Polarization (`_residual_mosaic`). The guide is s0 of each pixel's own colour, from pixels around it; what the
    samples differ from it is interpolated bilinearly per analyser. A 3x3 tent holds all four analysers in balance, so
    the guide is the tent of s0 plus the detail that the analysers and colours around a pixel have in common.
+
+Full resolution takes polarization out of the mosaic as sharp as it is known to be (`_reliable`), without which thin
+polarized highlights would keep the pattern of the analysers; in cell means that pattern cancels. It is known from the
+second half alone, with a guide of each colour's own samples (`_surroundings`): filling in the colours before gains
+nothing (docs/experiments.md).
 
 The idea of an intensity guide for polarization mosaics is Morimatsu et al. 2020 (EARI, doi
 10.1109/ICIP40778.2020.9191062); the steps are this project's, see docs/experiments.md.
@@ -50,8 +53,8 @@ from polsep.sensor.camera import Layout, Mosaic
 
 #: Smallest number of cells per side for the guided filters; smaller frames stay bilinear.
 MIN_CELLS = 8
-#: Cells by which a frame is continued beyond its border: the reach of all filters together.
-MARGIN = 36
+#: Cells by which a frame is continued beyond its border, to half and to full resolution: the reach of all filters.
+MARGIN, FULL_MARGIN = 36, 48
 #: How strongly the detail that all analysers share sharpens the guide; chosen on tuning scenes and real pictures.
 DETAIL_GAIN = 1.8
 #: Radius, in cells, over which polarization counts as smooth when it is taken out of the samples.
@@ -72,6 +75,9 @@ _GENTLE = (0.125, 0.75, 0.125)
 _BINOMIAL = tuple(math.comb(8, k) / 256 for k in range(9))
 #: Bilinear interpolation of samples that come in pairs, every fourth pixel.
 _PAIRS = (0.125, 0.25, 0.375, 0.5, 0.375, 0.25, 0.125)
+#: Mean over the samples of one colour around the first of a pair, mirrored at the second; holds both analysers in
+#: balance and keeps linear images.
+AROUND = tuple(k / 16 for k in (1, 2, 0, 0, 6, 6, 0, 0, 1))
 
 
 def demosaic_guided(mosaic: Mosaic) -> Measurements:
@@ -81,12 +87,13 @@ def demosaic_guided(mosaic: Mosaic) -> Measurements:
     """
     if not _is_large_enough(mosaic):
         return demosaic_bilinear(mosaic)
-    values, layout = _padded(mosaic)
-    _, residual = _guide(values, _smooth_polarization(values, layout), layout)
+    values, layout = _padded(mosaic, FULL_MARGIN)
+    intensity = _intensity_mosaic(values, _smooth_polarization(values, layout), layout)
+    residual = _residual_mosaic(values, intensity, _surroundings(intensity, layout))
     first = Measurements(interpolate_analysers_half(residual, layout), layout.angles)
     s0, residual = _guide(values, _reliable(first), layout)
     polarization = _blur_stokes(fit_stokes(Measurements(interpolate_analysers(residual, layout), layout.angles)), _TENT)
-    found = Stokes(s0, polarization.s1, polarization.s2).map(lambda x: _crop(x, 2 * MARGIN))
+    found = Stokes(s0, polarization.s1, polarization.s2).map(lambda x: _crop(x, 2 * FULL_MARGIN))
     return _complete(found, demosaic_bilinear(mosaic))
 
 
@@ -142,7 +149,7 @@ def _guide(values: Array, polarization: Stokes, layout: Layout) -> tuple[Array, 
     """
     intensity = _intensity_mosaic(values, polarization, layout)
     s0 = fill_colors(intensity, layout) if layout.bayer else intensity[..., None, :, :]
-    return s0, _residual_mosaic(values, intensity, s0, layout)
+    return s0, _residual_mosaic(values, intensity, _own(_blur(s0, _TENT), layout))
 
 
 def _smooth_polarization(values: Array, layout: Layout) -> Stokes:
@@ -177,9 +184,27 @@ def _intensity_mosaic(values: Array, polarization: Stokes, layout: Layout) -> Ar
     return intensity
 
 
-def _residual_mosaic(values: Array, intensity: Array, s0: Array, layout: Layout) -> Array:
-    """Samples minus half the guide ``[..., H, W]``: polarization, the smoother the better the guide."""
-    tent = _own(_blur(s0, _TENT), layout)
+def _surroundings(intensity: Array, layout: Layout) -> Array:
+    """Means ``[..., H, W]`` of a mosaic of s0 over the pixels around, of the pixel's own colour alone."""
+    if not layout.bayer:
+        return _blur(intensity, _TENT)
+    for axis in (-1, -2):
+        before, after = correlate(intensity, AROUND, axis), correlate(intensity, AROUND[::-1], axis)
+        intensity = namespace(intensity).where(_is_first(intensity, axis), before, after)
+    return intensity
+
+
+def _is_first(mosaic: Array, axis: int) -> Array:
+    """True at the first of each pair of pixels along rows or columns, which broadcasts."""
+    place = namespace(mosaic).arange(mosaic.shape[axis], device=device(mosaic)) % 2 == 0
+    return place if axis == -1 else place[:, None]
+
+
+def _residual_mosaic(values: Array, intensity: Array, tent: Array) -> Array:
+    """Samples minus half the guide ``[..., H, W]``: polarization, the smoother the better the guide.
+
+    ``tent``: s0 of each pixel's own colour, from pixels around it.
+    """
     guide = tent + DETAIL_GAIN * _blur(intensity - tent, _TENT)
     return values - 0.5 * guide
 
@@ -241,10 +266,7 @@ def _across_pairs(mosaic: Array, axis: int) -> tuple[Array, Array]:
     """
     around = ((0, 0, 0, 0, 6, 0, 0, 3, 0, 0, 0), (0, 0, 0, 3, 0, 0, 6, 0, 0, 0, 0))
     second = ((0, 0, -2, 0, 0, 5, -2, 0, 0, -1, 0), (0, -1, 0, 0, -2, 5, 0, 0, -2, 0, 0))
-    xp = namespace(mosaic)
-    place = xp.arange(mosaic.shape[axis], device=device(mosaic)) % 2 == 0
-    is_first = place if axis == -1 else place[:, None]
-    found = []
+    xp, is_first, found = namespace(mosaic), _is_first(mosaic, axis), []
     for first, last in (around, second):
         ninths = [tuple(weight / 9 for weight in taps) for taps in (first, last)]
         found.append(xp.where(is_first, correlate(mosaic, ninths[0], axis), correlate(mosaic, ninths[1], axis)))

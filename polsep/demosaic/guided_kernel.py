@@ -18,7 +18,6 @@ from polsep.compute.rows_kernel import add_product, add_rows, copy, fill, subtra
 from polsep.compute.threads import RowRange
 from polsep.demosaic import guided as twin
 from polsep.demosaic.cells_kernel import (
-    EDGE,
     GUARD,
     Grid,
     Source,
@@ -39,13 +38,13 @@ from polsep.demosaic.green_kernel import GREEN, Green, fill_green_row, make_gree
 #: Rows back from the newest one: bilinear polarization, its smoothing, the mosaic of s0, green, all colours, the
 #: guide's tent, the residual, its polarization, and the result.
 _POLARIZED = 2
-_SMOOTHED = _POLARIZED + twin.SMOOTH_RADIUS
-_INTENSITY = _SMOOTHED + 1
-_GREEN = _INTENSITY + GREEN
-_FILLED = _GREEN + FILLED
-_TENT = _FILLED + 1
-_RESIDUAL = _TENT + 1
-_REPOLARIZED = _RESIDUAL + 2
+SMOOTHED = _POLARIZED + twin.SMOOTH_RADIUS
+INTENSITY = SMOOTHED + 1
+_GREEN = INTENSITY + GREEN
+COLORED = _GREEN + FILLED
+_TENT = COLORED + 1
+RESIDUAL = _TENT + 1
+_REPOLARIZED = RESIDUAL + 2
 REACH = _REPOLARIZED + 1
 
 _WINDOW = reciprocal((2 * twin.SMOOTH_RADIUS + 1) ** 2)
@@ -91,14 +90,14 @@ def open_stream(source: Source, start: int, apart: bool = False, details: bool =
     """
     n = source.grid.n
     return Stream(
-        np.zeros((_RESIDUAL + 1, 4, n), np.float32),
+        np.zeros((RESIDUAL + 1, 4, n), np.float32),
         np.zeros((9, 6, n), np.float32),
         np.zeros((3, 6, n), np.float32),
-        np.zeros((_TENT - _INTENSITY + 1, 4, n), np.float32),
-        np.zeros((_GREEN - _INTENSITY + 2, n), np.float32),
-        np.zeros((_RESIDUAL - _GREEN + 1, 4, n), np.float32),
+        np.zeros((_TENT - INTENSITY + 1, 4, n), np.float32),
+        np.zeros((_GREEN - INTENSITY + 2, n), np.float32),
+        np.zeros((RESIDUAL - _GREEN + 1, 4, n), np.float32),
         np.zeros((3, 8, n), np.float32),
-        np.zeros((REACH - _FILLED + 1, 12 if details else 3, n), np.float32),
+        np.zeros((REACH - COLORED + 1, 12 if details else 3, n), np.float32),
         np.zeros((2, 4, n), np.float32),
         np.zeros((3, 4, n), np.float32),
         np.zeros((5, 4, n), np.float32),
@@ -113,7 +112,7 @@ def open_stream(source: Source, start: int, apart: bool = False, details: bool =
 
 
 @compiled
-def _sum_nine(x: Any, out: Any) -> None:
+def sum_nine(x: Any, out: Any) -> None:
     """Sums of nine neighbours along a row."""
     a, b, c, d = x[GUARD - 4 :], x[GUARD - 3 :], x[GUARD - 2 :], x[GUARD - 1 :]
     e, f, g, h, i = x[GUARD:], x[GUARD + 1 :], x[GUARD + 2 :], x[GUARD + 3 :], x[GUARD + 4 :]
@@ -123,7 +122,7 @@ def _sum_nine(x: Any, out: Any) -> None:
 
 
 @compiled
-def _mean_nine(ring: Any, r: int, k: int, out: Any) -> None:
+def mean_nine(ring: Any, r: int, k: int, out: Any) -> None:
     """The mean over the nine rows of sums about row ``r``, always added in the same order."""
     a, b, c, d = ring[(r - 4) % 9, k], ring[(r - 3) % 9, k], ring[(r - 2) % 9, k], ring[(r - 1) % 9, k]
     e, f, g = ring[r % 9, k], ring[(r + 1) % 9, k], ring[(r + 2) % 9, k]
@@ -157,7 +156,7 @@ def _subtract_polarization(color: Any, green: Any, other: Any, weight: Any, plac
 
 
 @compiled
-def _intensity_row(stream: Stream, r: int, grid: Grid) -> None:
+def intensity_row(stream: Stream, r: int, grid: Grid) -> None:
     """Row ``r`` of the mosaic of s0. Twin: `guided._intensity_mosaic`."""
     rows, raw, mosaic = stream.rows, stream.raw[r % stream.raw.shape[0]], stream.mosaic[r % stream.mosaic.shape[0]]
     other = grid.others[r % 2]
@@ -192,7 +191,7 @@ def _tent_row(stream: Stream, r: int, grid: Grid) -> None:
 
 
 @compiled
-def _residual_row(stream: Stream, r: int) -> None:
+def residual_row(stream: Stream, r: int) -> None:
     """Row ``r`` of the samples minus half their guide. Twin: `guided._residual_mosaic`."""
     rows, tent, residual = stream.rows, stream.tent[r % 2], stream.residual[r % 5]
     above, here, below = stream.detail[(r - 1) % 3], stream.detail[r % 3], stream.detail[(r + 1) % 3]
@@ -210,7 +209,7 @@ def _repolarize_row(stream: Stream, r: int, grid: Grid) -> None:
     """Polarization of the residual of row ``r``, mean over colours or of each."""
     rows = stream.rows
     sums = rows[0:6].reshape(2, 3, grid.n)
-    polarize_row(stream.residual, r, grid, rows[6:9], sums)
+    polarize_row(stream.residual, r, grid, grid.inverse[1:3], rows[6:9], sums)
     if stream.polarized.shape[1] == 6:
         for k in range(6):
             blur_gently(rows[k], stream.polarized[r % 3, k])
@@ -221,28 +220,41 @@ def _repolarize_row(stream: Stream, r: int, grid: Grid) -> None:
 
 
 @compiled
-def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
-    """Read a row as the stream's ``u``-th, mirrored into the frame, and write the row `REACH` above it."""
+def load_row(source: Source, u: int, stream: Stream) -> None:
+    """Read a row as the stream's ``u``-th, mirrored into the frame; smooth polarization of the row `SMOOTHED` above."""
     rows, grid, last = stream.rows, source.grid, source.pattern.h - 1
     mirrored = last - abs((stream.first + u) % (2 * last) - last)
     load_cells(source, mirrored, stream.sensor_row, stream.raw[u % stream.raw.shape[0]])
-
     r = u - _POLARIZED
-    polarize_row(stream.raw, r, grid, rows[6:9], rows[0:6].reshape(2, 3, grid.n))
+    polarize_row(stream.raw, r, grid, grid.inverse[1:3], rows[6:9], rows[0:6].reshape(2, 3, grid.n))
     for k in range(6):
-        _sum_nine(rows[k], stream.sums[r % 9, k])
-    r = u - _SMOOTHED
+        sum_nine(rows[k], stream.sums[r % 9, k])
+    r = u - SMOOTHED
     for k in range(6):
-        _mean_nine(stream.sums, r, k, stream.smooth[r % 3, k])
+        mean_nine(stream.sums, r, k, stream.smooth[r % 3, k])
 
-    r = u - _INTENSITY
-    _intensity_row(stream, r, grid)
+
+@compiled
+def guide_row(stream: Stream, u: int, grid: Grid) -> None:
+    """From smooth polarization of row ``u - SMOOTHED`` on to s0 of row ``u - COLORED``, residual of ``u - RESIDUAL``.
+
+    Twin: `guided._guide`.
+    """
+    r = u - INTENSITY
+    intensity_row(stream, r, grid)
     fill_green_row(stream.mosaic, stream.means, r, grid, stream.for_green, stream.green)
+    fill_colors_row(stream.mosaic, stream.green, u - _GREEN, grid, stream.for_colors, stream.filled)
+    _tent_row(stream, u - _TENT, grid)
+    residual_row(stream, u - RESIDUAL)
 
-    r = u - _GREEN
-    fill_colors_row(stream.mosaic, stream.green, r, grid, stream.for_colors, stream.filled)
 
-    r = u - _FILLED
+@compiled
+def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
+    """Read a row as the stream's ``u``-th, and write the row `REACH` above it."""
+    rows, grid = stream.rows, source.grid
+    load_row(source, u, stream)
+    guide_row(stream, u, grid)
+    r = u - COLORED
     total = stream.total[r % stream.total.shape[0]]
     mean_cells(stream.filled[r % 3], total[0])
     mean_cells(stream.green[r % stream.green.shape[0]], total[1])
@@ -251,21 +263,18 @@ def _push_row(source: Source, u: int, stream: Stream, out: Any) -> None:
         detail_cells(stream.filled[r % 3], total[3:6])
         detail_cells(stream.green[r % stream.green.shape[0]], total[6:9])
         detail_cells(stream.filled[r % 3, 4:], total[9:12])
-
-    _tent_row(stream, u - _TENT, grid)
-    _residual_row(stream, u - _RESIDUAL)
     _repolarize_row(stream, u - _REPOLARIZED, grid)
 
     r = u - REACH
     total = stream.total[r % stream.total.shape[0]]
     for c in range(3):
-        copy(total[c][EDGE:], out[c])
+        copy(total[c][grid.edge :], out[c])
     above, here, below = stream.polarized[(r - 1) % 3], stream.polarized[r % 3], stream.polarized[(r + 1) % 3]
     for s in range(above.shape[0]):
         blur_gently_down(above[s], here[s], below[s], rows[0])
-        copy(rows[0][EDGE:], out[3 + s])
+        copy(rows[0][grid.edge :], out[3 + s])
     for k in range(3, total.shape[0]):
-        copy(total[k][EDGE:], out[above.shape[0] + k])
+        copy(total[k][grid.edge :], out[above.shape[0] + k])
 
 
 @entry

@@ -17,7 +17,6 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from polsep.physics.stokes import Measurements
@@ -70,8 +69,8 @@ def as_mosaic(
     if plane.shape[0] < rows or plane.shape[1] < cols:
         raise ValueError(f"expected a mosaic of at least {cols}x{rows} pixels, found {width}x{height}")
     white = _white_level(plane, black_level, white_level)
-    data = torch.from_numpy(_as_float32(plane))
-    return Mosaic(data, layout, black_level, white), notes + level_notes(plane, black_level, white_level)
+    mosaic = Mosaic(_as_float32(plane), layout, black_level, white)
+    return mosaic, notes + level_notes(plane, black_level, white_level)
 
 
 def as_measurements(
@@ -89,8 +88,8 @@ def as_measurements(
     if planes.ndim != 4 or planes.shape[0] != 4 or planes.shape[-1] not in (1, 3):
         raise ValueError(f"expected four gray or RGB images, found shape {_shape(planes)}")
     white = _white_level(planes, black_level, white_level)
-    linear = (torch.from_numpy(_as_float32(planes)) - black_level) / (white - black_level)
-    data = linear.permute(0, 3, 1, 2).contiguous()
+    linear = (_as_float32(planes) - float(black_level)) / float(white - black_level)
+    data = np.ascontiguousarray(np.moveaxis(linear, -1, 1))
     angles = tuple(math.radians(angle) for angle in PLANE_ANGLES_DEG)
     return Measurements(data, angles, data >= 1 - CLIP_MARGIN), level_notes(planes, black_level, white_level)
 

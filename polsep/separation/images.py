@@ -61,9 +61,13 @@ class FrameImages:
     error: NDArray[np.float32] | None = None
 
     @classmethod
-    def empty(cls, shape: tuple[int, int], layout: Layout, report: bool = False) -> FrameImages:
-        """Buffers for mosaics of that ``shape`` (H, W) at half resolution; for a ``report`` also for DoLP and AoLP."""
-        h, w = ((n - start) // 2 for n, start in zip(shape, layout.origin, strict=True))
+    def empty(cls, shape: tuple[int, int], layout: Layout, report: bool = False, full: bool = False) -> FrameImages:
+        """Buffers for mosaics of that ``shape`` (H, W) at half or ``full`` resolution, of all whole cells.
+
+        For a ``report`` also for DoLP and AoLP.
+        """
+        size = 2 if full else 1
+        h, w = ((n - start) // 2 * size for n, start in zip(shape, layout.origin, strict=True))
         diffuse, specular = (np.empty((h, w, layout.channels), np.float32) for _ in range(2))
         dolp, aolp = (np.empty((h, w), np.float32) if report else None for _ in range(2))
         return cls(diffuse, specular, np.empty((h, w), np.bool_), dolp, aolp)

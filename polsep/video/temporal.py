@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import like, to_numpy
+from polsep.compute.arrays import of_kind, to_numpy
 from polsep.sensor.camera import CLIP_MARGIN, Mosaic
 from polsep.sensor.noise import BLOCK, Floats, Levels, Noise, blocks_of, estimate_noise, least_noise
 
@@ -151,13 +151,13 @@ def _filter(mosaic: Mosaic, state: TemporalState | None, apply: Any) -> tuple[Mo
         count = np.ones(_blocks(raw.shape), np.float32)
         mean = raw.astype(np.float32)
         state = TemporalState(mean, count, noise, 0, 1, (levels.black, levels.white))
-        return replace(mosaic, data=like(mosaic.data, mean)), state
+        return replace(mosaic, data=of_kind(mean, mosaic.data)), state
     before = (_padded(state.mean), state.count)
     noise, estimates = _next_noise(samples, before, levels, state)
     filtered, mean, count = apply(samples, before, make_rules(noise, levels))
     filtered, mean = (np.ascontiguousarray(x[: raw.shape[0], : raw.shape[1]]) for x in (filtered, mean))
     state = TemporalState(mean, count, noise, estimates, state.frames + 1, state.levels)
-    return replace(mosaic, data=like(mosaic.data, filtered)), state
+    return replace(mosaic, data=of_kind(filtered, mosaic.data)), state
 
 
 def _raw_samples(mosaic: Mosaic, state: TemporalState | None) -> NDArray[Any]:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import to_numpy
 from polsep.io.results.previews import aolp_legend, aolp_wheel, dolp_map, exposure_of, srgb
 from polsep.io.store.image_codecs import encode_jpeg_quickly, encode_png
 from polsep.sensor.camera import Mosaic
@@ -223,7 +224,7 @@ class Histogram:
 
 def histogram(mosaic: Mosaic, bins: int = 128) -> Histogram:
     """Histogram of raw samples from black to white; samples beyond count in the first and last bins."""
-    samples, clipped = mosaic.linear().numpy(), mosaic.clipped().numpy()
+    samples, clipped = to_numpy(mosaic.linear()), to_numpy(mosaic.clipped())
     layout, period = mosaic.layout, mosaic.layout.period
     count = np.zeros((layout.channels, bins))
     over = np.zeros(layout.channels)

@@ -78,11 +78,11 @@ def _read_cell(mosaic: Mosaic, row: int, col: int) -> tuple[tuple[Sample, ...], 
     order = sorted(filters, key=lambda at: filters[at].angle_deg)
     samples = tuple(Sample(filters[at].angle_deg, float(cell[at]), bool(clipped[at])) for at in order)
     light = np.array([float(linear[at]) for at in order])
-    data = mosaic.data.new_tensor(light).view(4, 1, 1, 1)
-    found = fit_stokes(Measurements(data, tuple(math.radians(sample.angle_deg) for sample in samples)))
+    angles = tuple(math.radians(sample.angle_deg) for sample in samples)
+    found = fit_stokes(Measurements(light.reshape(4, 1, 1, 1), angles))
     colors = "RGB" if mosaic.layout.bayer else "Y"
     color = colors[filters[order[0]].channel]
-    return samples, color, (float(found.s0), float(found.s1), float(found.s2))
+    return samples, color, (found.s0.item(), found.s1.item(), found.s2.item())
 
 
 def readout_panel(found: Readout) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import tifffile
 
+from polsep.compute.arrays import to_numpy
 from polsep.io.raw.page import MergedFacts, Page
 from polsep.io.raw.tiff_chunks import PICTURES, STREAMS, check_chunks
 from polsep.io.raw.tiff_directories import check_entries, walk_directories
@@ -139,7 +140,7 @@ def write_merged(path: Path, mosaic: Mosaic, facts: Mapping[str, Any]) -> None:
         **facts,
     }
     with atomic_path(path) as part:
-        data, description = mosaic.data.cpu().numpy(), json.dumps(text, allow_nan=False)
+        data, description = to_numpy(mosaic.data), json.dumps(text, allow_nan=False)
         tifffile.imwrite(
             part, data, photometric="minisblack", metadata=None, software="polsep", description=description
         )

@@ -1,0 +1,91 @@
+"""The bare install: everything that separates frames runs where torch is not installed, and never loads it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polsep.methods import METHODS
+
+#: Refuses to find torch, as where it is not installed, if it is told to.
+BLOCK = """
+import importlib.abc, sys, warnings
+class Refuse(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "torch":
+            raise ModuleNotFoundError("No module named 'torch'", name="torch")
+warnings.simplefilter("ignore")
+if sys.argv[1] == "blocked":
+    sys.meta_path.insert(0, Refuse())
+"""
+SEPARATE = """
+import numpy as np, polsep
+raw = np.random.default_rng(0).integers(100, 4096, (64, 96)).astype(np.uint16)
+for method in sys.argv[2].split(","):
+    for full in (False, True):
+        for layout in ("color", "mono", polsep.Layout().rolled(1, 1).spec):
+            if layout != "mono" or method != "joint-large":
+                out = polsep.separate(raw, method, layout, white_level=4095, full=full)
+                assert np.isfinite(out.diffuse).all() and out.dolp.shape == out.valid.shape
+angles = np.random.default_rng(0).integers(100, 4096, (4, 32, 48, 3)).astype(np.uint16)
+from polsep.pipeline import separate_capture
+from polsep.sensor.levels import as_measurements
+for method in ("analytic", "color-affine", "paper"):
+    assert separate_capture(as_measurements(angles, 0, 4095)[0], method).diffuse.shape == (32, 48, 3)
+print(sorted(name for name in sys.modules if name.partition(".")[0] == "torch"))
+"""
+COMMANDS = """
+from polsep.cli import main
+sys.argv[:3] = ["polsep"]
+main()
+"""
+
+
+def run(program: str, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", BLOCK + program, *words], capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+@pytest.mark.usefixtures("compiled")
+@pytest.mark.parametrize("torch", ["blocked", "installed"])
+def test_every_method_separates(torch: str) -> None:
+    """Colour, mono and cropped mosaics at both resolutions, and co-sited samples; torch stays where it is."""
+    done = run(SEPARATE, torch, ",".join(METHODS))
+    assert done.stdout == "[]\n", done.stderr
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> Path:
+    """A folder of two raw frames."""
+    for k in range(2):
+        raw = np.random.default_rng(k).integers(100, 60000, (64, 96)).astype(np.uint16)
+        np.save(tmp_path / f"raw{k}.npy", raw)
+    return tmp_path
+
+
+@pytest.mark.usefixtures("compiled")
+def test_commands_of_the_bare_install(frames: Path) -> None:
+    """Stills, recordings and editing; what needs torch says so in one line."""
+    still, film, edited = (str(frames / name) for name in ("still", "film", "edited"))
+    stem = frames / "raw0.npy"
+    commands = (
+        ("separate", str(stem), "-o", still, "--method", "joint-fast"),
+        ("video", str(frames), "-o", film, "--method", "analytic"),
+        ("edit", f"{still}/raw0.exr", "-o", edited, "--rougher", "3"),
+    )
+    for words in commands:
+        done = run(COMMANDS, "blocked", "", *words)
+        assert done.returncode == 0, done.stderr
+    done = run(COMMANDS, "blocked", "", "separate", str(stem), "-o", still, "--overwrite", "--device", "cuda")
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].endswith("found 'cuda': install polsep[torch]")
+    done = run(COMMANDS, "blocked", "", "train", "joint", "-o", str(frames / "run"))
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1] == (
+        "polsep: error: expected the extra 'train' (pip install 'polsep[train]'), found no torch"
+    )

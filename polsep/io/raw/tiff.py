@@ -84,7 +84,7 @@ def _read_page(page: tifffile.TiffPage, index: int, count: int) -> Page:
 
 
 def _described_pictures(page: tifffile.TiffPage) -> int:
-    """The number of pictures that the only directory of a file stands for, by the descriptions of ImageJ and of tifffile.
+    """The number of pictures that a file's only directory stands for, by descriptions of ImageJ and of tifffile.
 
     ImageJ writes one directory for stacks of more than 4 GB, tifffile where it is asked to.
     """

@@ -1,12 +1,15 @@
 # make demo   set up and separate the embedded capture
 # make test   set up and run the whole suite: lint, types, tests
 # make docs   build the documentation site into site/
+# make fuzz   damage files of every kind and read them: make fuzz INPUTS=20000 SECONDS=1200
 PYTHON ?= python3
 VENV ?= .venv
+INPUTS ?= 2000
+SECONDS ?= 1200
 BIN := $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test docs bench clean
+.PHONY: demo test docs bench fuzz clean
 
 demo: $(VENV)/.installed
 	$(BIN)/polsep demo -o demo-out
@@ -25,6 +28,9 @@ docs: $(VENV)/.installed-docs
 bench: $(VENV)/.installed-dev
 	$(BIN)/polsep bench separation
 
+fuzz: $(VENV)/.installed-dev
+	$(BIN)/python -m evaluation reliability --inputs $(INPUTS) --seconds $(SECONDS) --keep fuzz-out
+
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
@@ -41,4 +47,4 @@ $(VENV)/.installed-docs: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo-out site
+	rm -rf $(VENV) demo-out fuzz-out site

@@ -1,7 +1,7 @@
 """Damage done to files: random, but the same for the same seed.
 
-`damage` takes the bytes of a file and gives those of a damaged one, by one to three changes of `CHANGES`: bits and bytes,
-cuts and insertions, fields of headers and other numbers at extremes, in binary and in text, parts of another file.
+`damage` takes the bytes of a file and gives those of a damaged one, by one to three changes of `CHANGES`: bits and
+bytes, cuts and insertions, fields of headers and other numbers at extremes, binary or text, parts of another file.
 """
 
 from __future__ import annotations
@@ -14,9 +14,43 @@ from collections.abc import Callable
 from evaluation.damage_fields import find_fields
 
 #: Whole numbers at which readers go wrong: around 0 and around the ends of types.
-NUMBERS = (0, 1, 2, 3, 7, 255, 256, 32767, 32768, 65535, 65536, 2**24, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**63, 2**64 - 1)
+NUMBERS = (
+    0,
+    1,
+    2,
+    3,
+    7,
+    255,
+    256,
+    32767,
+    32768,
+    65535,
+    65536,
+    2**24,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**40,
+    2**63,
+    2**64 - 1,
+)
 #: What stands for a number in damaged text.
-WORDS = ("0", "-1", "1e999", "-1e999", "1e-300", "NaN", "Infinity", "null", "true", '""', "[]", "{}", "1" * 400, "1e38")
+WORDS: tuple[str, ...] = (
+    "0",
+    "-1",
+    "1e999",
+    "-1e999",
+    "1e-300",
+    "NaN",
+    "Infinity",
+    "null",
+    "true",
+    '""',
+    "[]",
+    "{}",
+    "1" * 400,
+    "1e38",
+)
 WORDS += ("[" * 3000, '"' + "x" * 2000 + '"', str(2**31), str(2**63), "65536", "1048576", '"\\ud800\\u001b[2J"')
 _DIGITS = re.compile(rb"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 #: Bytes at the beginning of a file in which most headers lie.

@@ -52,7 +52,11 @@ def _tiff_fields(data: bytes) -> Iterator[Field]:
     for k in range(min(count, 40)):
         entry = place + number + k * step
         yield from (Field(entry, 2, order), Field(entry + 2, 2, order))
-        yield from (Field(entry + 4, width, order), Field(entry + 4 + width, width, order), Field(entry + 4 + width, 2, order))
+        yield from (
+            Field(entry + 4, width, order),
+            Field(entry + 4 + width, width, order),
+            Field(entry + 4 + width, 2, order),
+        )
     yield Field(place + number + count * step, width, order)
 
 

@@ -16,7 +16,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +147,8 @@ def _npy(array: Array) -> bytes:
 
 def _npz(compress: bool = False, **arrays: Array) -> bytes:
     stream = io.BytesIO()
-    (np.savez_compressed if compress else np.savez)(stream, **arrays)
+    save: Any = np.savez_compressed if compress else np.savez
+    save(stream, **arrays)
     return stream.getvalue()
 
 
@@ -233,7 +234,7 @@ def video_seeds() -> Seeds:
         (".nut", "rawvideo", "gray16le"),
         (".nut", "ffv1", "gray"),
     ):
-        made.append(_written(f"shot{suffix}", lambda path, c=codec, p=pixels: _write_film(path, c, p)))  # type: ignore[misc]
+        made.append(_written(f"shot{suffix}", partial(_write_film, codec=codec, pixels=pixels)))
     return made
 
 
@@ -264,7 +265,10 @@ def recording_seeds() -> Seeds:
         writer.close()
 
     files = _written("recording.json", write)
-    return [files, {"recording.json": files["recording.json"].replace(b'"finished": true', b'"finished": false'), **files}]
+    return [
+        files,
+        {"recording.json": files["recording.json"].replace(b'"finished": true', b'"finished": false'), **files},
+    ]
 
 
 def exr_seeds() -> Seeds:
@@ -306,16 +310,32 @@ def calibration_seeds() -> Seeds:
     lamp = LampFacts((0.8, 1.0, 1.2), 0.98, 30.0)
     black = np.full((HEIGHT, WIDTH), 60, np.float32)
     whole = Calibration(
-        Layout(), 4095.0, (HEIGHT, WIDTH), 60.0, ones, black, 2.5, ones, np.ones_like(black), ((0.9, 0.01), (0.01, -0.05)),
-        np.array([5, 70], np.int32), table, lamp, {"dark": {"frames": 16}},
-    )  # fmt: skip
+        Layout(),
+        4095.0,
+        (HEIGHT, WIDTH),
+        black_level=60.0,
+        black_pattern=ones,
+        black_map=black,
+        read_noise=2.5,
+        gains=ones,
+        gain_map=np.ones_like(black),
+        falloff=((0.9, 0.01), (0.01, -0.05)),
+        dead=np.array([5, 70], np.int32),
+        analysers=table,
+        lamp=lamp,
+        details={"dark": {"frames": 16}},
+    )
     few = Calibration(Layout(), 4095.0, black_level=60.0, black_pattern=ones, read_noise=2.5)
-    return [_written("cal.json", lambda path, c=c: write_calibration(path, c, "0.1")) for c in (whole, few)]  # type: ignore[misc]
+    return [_written("cal.json", partial(write_calibration, calibration=c, version="0.1")) for c in (whole, few)]
 
 
 def recipe_seeds() -> Seeds:
     """A recipe of several edits."""
-    edits = [{"edit": "rougher", "sigma": 10.0}, {"edit": "metallic", "gain": 45.0}, {"edit": "texture", "image": "a.png"}]
+    edits = [
+        {"edit": "rougher", "sigma": 10.0},
+        {"edit": "metallic", "gain": 45.0},
+        {"edit": "texture", "image": "a.png"},
+    ]
     edits += [{"edit": "specular-gain", "gain": 2.0}]
     return [{"recipe.json": json.dumps({"polsep_recipe": 1, "edits": edits[:n]}, indent=1).encode()} for n in (2, 4)]
 
@@ -348,7 +368,10 @@ def mend_zip(files: Files) -> Files:
         for start in _all(data, b"PK\x03\x04"):
             if start + 30 > len(data):
                 continue
-            method, length, extra = struct.unpack_from("<H", data, start + 8)[0], *struct.unpack_from("<HH", data, start + 26)
+            method, length, extra = (
+                struct.unpack_from("<H", data, start + 8)[0],
+                *struct.unpack_from("<HH", data, start + 26),
+            )
             body = data[start + 30 + length + extra :]
             with suppress(zlib.error):
                 body = zlib.decompressobj(-15).decompress(body, 1 << 20) if method == 8 else body.partition(b"PK")[0]

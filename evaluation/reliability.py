@@ -40,13 +40,21 @@ SECONDS, MEBIBYTES = 10.0, 2048.0
 ROOM = 6 << 30
 #: What can become of an input, and what can be wrong about it.
 OUTCOMES = ("refused", "accepted")
-FAULTS = ("stray exceptions", "bad messages", "values not finite", "lines of libraries", "over time", "over memory", "crashes")
+FAULTS = (
+    "stray exceptions",
+    "bad messages",
+    "values not finite",
+    "lines of libraries",
+    "over time",
+    "over memory",
+    "crashes",
+)
 #: Inputs of each reader after which memory is measured anew from the start, as C libraries keep some.
 INPUTS = 2000
 
 
 class Judged(NamedTuple):
-    """What became of one input: an outcome of `OUTCOMES`, or "", its faults, and the message or what was seen."""
+    """The fate of one input: an outcome of `OUTCOMES`, or "", its faults, and the message or what was seen."""
 
     outcome: str
     faults: tuple[str, ...]
@@ -100,7 +108,7 @@ class _Watch:
     """Everything printed, in a file, and the peak of memory since the last look."""
 
     def __init__(self) -> None:
-        self._caught = tempfile.TemporaryFile()
+        self._caught = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
         for stream in (1, 2):
             os.dup2(self._caught.fileno(), stream)
 
@@ -149,7 +157,7 @@ def _work(name: str, first: int, last: int, results: Connection) -> None:
 
 
 def judge_damaged(name: str, first: int, last: int, seconds: float) -> Iterator[tuple[int, Judged]]:
-    """Inputs ``first`` to ``last`` of a reader, judged one after the other for ``seconds`` and the start of processes."""
+    """Inputs ``first`` to ``last`` of a reader, judged one after the other, for ``seconds`` after the first start."""
     context, deadline = multiprocessing.get_context("spawn"), math.inf
     while first < last and time.monotonic() < deadline:
         ours, theirs = context.Pipe(duplex=False)
@@ -185,14 +193,15 @@ def count_rows(name: str, counts: Counter[str]) -> Iterator[Row]:
 
 
 @click.command()
-@click.option("--inputs", type=click.IntRange(1), default=INPUTS, show_default=True, metavar="N", help="Of each reader.")
+@click.option(
+    "--inputs", type=click.IntRange(1), default=INPUTS, show_default=True, metavar="N", help="Of each reader."
+)
 @click.option("--seconds", type=float, default=1200.0, show_default=True, metavar="S", help="For all readers.")
 @click.option("--first", type=click.IntRange(0), default=0, show_default=True, metavar="K", help="Number of the first.")
 @click.option("--only", type=click.Choice(list(READERS)), help="One reader, without rows.")
 @click.option("--keep", type=click.Path(path_type=Path), metavar="DIR", help="Folder for inputs with faults.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("results"), help="Of reliability.jsonl.")
-@click.pass_context
-def reliability(context: click.Context, **options: Any) -> None:
+def reliability(**options: Any) -> None:
     """Read damaged files with every reader, and count what goes wrong; exit status 1 where something does."""
     names = [options["only"]] if options["only"] else list(READERS)
     rows, total, first = list[Row](), Counter[str](), options["first"]
@@ -209,5 +218,8 @@ def reliability(context: click.Context, **options: Any) -> None:
         total += counts
     if not options["only"]:
         rows += count_rows("all readers", total)
-        write_rows(options["output"], "reliability", rows, f"python -m evaluation reliability --inputs {options['inputs']}")
-    context.exit(1 if any(total[fault] for fault in FAULTS) else 0)
+        write_rows(
+            options["output"], "reliability", rows, f"python -m evaluation reliability --inputs {options['inputs']}"
+        )
+    if any(total[fault] for fault in FAULTS):
+        raise SystemExit(1)

@@ -39,7 +39,7 @@ _PHOTOMETRIC = {1: "black is zero", 2: "RGB", 32803: "colour filter array", 3489
 _LOSSY = {6: "old JPEG", 7: "JPEG", 34892: "lossy JPEG", 50001: "WebP", 50002: "JPEG XL", 52546: "JPEG XL"}
 
 #: Vendors' formats that tifffile would look for while it opens a file, in ways that no limit holds.
-_UNWANTED = {"is_lsm": False, "is_scanimage": False, "is_ndpi": False, "is_ome": False}
+_UNWANTED: dict[str, Any] = {"is_lsm": False, "is_scanimage": False, "is_ndpi": False, "is_ome": False}
 
 mute("tifffile", "imagecodecs")
 
@@ -84,7 +84,7 @@ def _read_page(page: tifffile.TiffPage, index: int, count: int) -> Page:
 
 
 def _described_pictures(page: tifffile.TiffPage) -> int:
-    """How many pictures the only directory of a file stands for, by the descriptions of ImageJ and of tifffile.
+    """The number of pictures that the only directory of a file stands for, by the descriptions of ImageJ and of tifffile.
 
     ImageJ writes one directory for stacks of more than 4 GB, tifffile where it is asked to.
     """

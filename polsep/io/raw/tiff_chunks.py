@@ -2,7 +2,7 @@
 
 A chunk's room is what the directory says, but PNG, JPEG 2000 and LERC chunks have headers of their own, and their
 decoders believe those: a tile of 700 bytes can hold a picture of gigabytes.
-Sources: ISO/IEC 15444-1, A.5.1 (SIZ); W3C, PNG 3rd edition, 11.2.1 (IHDR); Esri, LERC 2 (github.com/Esri/lerc, Lerc2.h).
+Sources: ISO/IEC 15444-1, A.5.1 (SIZ); W3C, PNG, 3rd edition, 11.2.1 (IHDR); Esri, LERC 2, Lerc2.h.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ STREAMS = (1, 5, 8, 32773, 32946, 34925, 34926, 50000)
 PNG, JPEG_2000, LERC = 34933, (33003, 33005, 34712), 34887
 PICTURES = (PNG, *JPEG_2000, LERC)
 #: Samples that a chunk may have more than four times its picture: scanners write large tiles.
-_SPARE = 2**20
+_SPARE = 2**18
 
 
 def check_chunks(stream: BinaryIO, page: tifffile.TiffPage) -> None:

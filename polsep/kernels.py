@@ -13,7 +13,11 @@ from polsep.sensor import defects_kernel
 from polsep.sensor.unpack_kernel import PackedFrame
 from polsep.separation import analytic_kernel, color_affine_kernel
 from polsep.separation.analytic_kernel import AnalyticOptions, separate_analytic_full, separate_analytic_half
-from polsep.separation.color_affine_kernel import ColorAffineOptions, separate_color_affine_half
+from polsep.separation.color_affine_kernel import (
+    ColorAffineOptions,
+    separate_color_affine_full,
+    separate_color_affine_half,
+)
 from polsep.separation.images import FrameImages
 from polsep.video import temporal_kernel
 
@@ -29,6 +33,7 @@ __all__ = [
     "get_threads",
     "separate_analytic_full",
     "separate_analytic_half",
+    "separate_color_affine_full",
     "separate_color_affine_half",
     "set_threads",
     "warm_up",
@@ -50,3 +55,4 @@ def warm_up() -> None:
     for kernel in kernels:
         kernel.warm_up()
     analytic_kernel.warm_up_full()
+    color_affine_kernel.warm_up_full()

@@ -135,21 +135,23 @@ def run_analytic(capture: Capture, light: Light, full: bool) -> FrameImages:
 
 
 def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
-    """`separate_color_affine` of guided samples: compiled kernels for colour at half resolution."""
+    """`separate_color_affine` of guided samples: compiled kernels for one colour frame, else the reference."""
     if (
-        full
-        or not isinstance(capture, Mosaic)
+        not isinstance(capture, Mosaic)
         or not _is_plain(capture)
         or capture.layout.channels != 3
         or min((n - start) // 2 for n, start in zip(capture.data.shape, capture.layout.origin, strict=True)) < MIN_CELLS
     ):
         return run_reference(color_affine_reference, capture, light, full)
-    make_ready(_warm_up_color_affine)
-    from polsep.separation.color_affine_kernel import ColorAffineOptions, separate_color_affine_half
+    make_ready(_warm_up_color_affine_full if full else _warm_up_color_affine)
+    from polsep.separation import color_affine_kernel
+    from polsep.separation.color_affine_kernel import ColorAffineOptions
 
+    kernel = color_affine_kernel
+    separate = kernel.separate_color_affine_full if full else kernel.separate_color_affine_half
     options = ColorAffineOptions(light, in_light=True, guided=True, report=True)
     levels = (capture.black_level, capture.white_level)
-    return separate_color_affine_half(to_numpy(capture.data), capture.layout, *levels, options)
+    return separate(to_numpy(capture.data), capture.layout, *levels, options)
 
 
 def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameImages:
@@ -184,6 +186,12 @@ def _warm_up_color_affine() -> None:
     from polsep.separation import color_affine_kernel
 
     color_affine_kernel.warm_up()
+
+
+def _warm_up_color_affine_full() -> None:
+    from polsep.separation import color_affine_kernel
+
+    color_affine_kernel.warm_up_full()
 
 
 def _accepts_anything(capture: Capture) -> bool:

@@ -196,6 +196,12 @@ def open_cells(samples: Samples, pattern: Pattern, cells: Cells, r: int) -> None
 def advance_cells(samples: Samples, pattern: Pattern, cells: Cells, r: int) -> bool:
     """Load the last row that cell row ``r`` needs; call it for every row in order. True if any sample is clipped."""
     _enter_row(samples, pattern, cells, r + 1)
+    return any_flagged(cells)
+
+
+@compiled
+def any_flagged(cells: Cells) -> bool:
+    """True if any sample in the ring is clipped."""
     return bool(cells.flagged[0] or cells.flagged[1] or cells.flagged[2])
 
 
@@ -261,3 +267,40 @@ def interpolate_pixels(pattern: Pattern, cells: Cells, ring: Any, matrix: Any, y
             _combine(x.left, x.left_near, x.left_far, weights[0, k], weights[2, k], p)
             _combine(x.right, x.right_near, x.right_far, weights[1, k], weights[3, k], q)
             _widen(p, q, out[c, k])
+
+
+@compiled
+def _widen_left(x: Any, out: Any) -> None:
+    """A row of cells ``[2 n]`` of a left analyser to a row of pixels."""
+    even, odd, after = x[PAD:], x[x.size // 2 + PAD :], x[PAD + 1 :]
+    for t in range(out.size // 4):
+        out[4 * t] = even[t]
+        out[4 * t + 1] = HALF * (even[t] + odd[t])
+        out[4 * t + 2] = odd[t]
+        out[4 * t + 3] = HALF * (odd[t] + after[t])
+
+
+@compiled
+def _widen_right(x: Any, out: Any) -> None:
+    """A row of cells ``[2 n]`` of a right analyser to a row of pixels."""
+    before, even, odd = x[x.size // 2 + PAD - 1 :], x[PAD:], x[x.size // 2 + PAD :]
+    for t in range(out.size // 4):
+        out[4 * t] = HALF * (before[t] + even[t])
+        out[4 * t + 1] = even[t]
+        out[4 * t + 2] = HALF * (even[t] + odd[t])
+        out[4 * t + 3] = odd[t]
+
+
+@compiled
+def interpolate_analysers(pattern: Pattern, cells: Cells, ring: Any, y: int, out: Any) -> None:
+    """Fill ``out [4, C, n]`` with all analysers and colours in row ``y`` of pixels; ``ring``: of ``cells``."""
+    mean = cells.sums[0]
+    for c in range(out.shape[1]):
+        x = sources_of(pattern, cells.analysers, ring, y, c)
+        own, others = cells.analysers[y % 2], cells.analysers[1 - y % 2]
+        _widen_left(x.left, out[own[0], c])
+        _widen_right(x.right, out[own[1], c])
+        _mean(x.left_near, x.left_far, mean)
+        _widen_left(mean, out[others[0], c])
+        _mean(x.right_near, x.right_far, mean)
+        _widen_right(mean, out[others[1], c])

@@ -1,6 +1,6 @@
-"""Twin of ``separate_color_affine(demosaic_bilinear_half(mosaic))`` in one pass over the frame, on the CPU.
+"""Twins of ``separate_color_affine(demosaic_bilinear_half(mosaic))`` and full resolution, in one pass over the frame.
 
-With ``guided`` it is the twin of ``separate_color_affine(demosaic_guided_half(mosaic))``, which the pipeline uses.
+With ``guided`` they are twins of the same after guided demosaicking, which the pipeline uses.
 
 Pixels with clipped samples are few: `separation.strips_kernel` leaves them out of the diffuse polarization as the twin
 does, and `separation.clipped_kernel` solves them afterwards. Strips are computed independently of each other, so the
@@ -9,15 +9,17 @@ number of threads (`set_threads`) does not change a bit.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.threads import get_threads, run_over_rows
+from polsep.compute.threads import RowRange, get_threads, run_over_rows
 from polsep.demosaic.bilinear_kernel import read_pattern
-from polsep.demosaic.cells_kernel import Source, read_grid
+from polsep.demosaic.cells_kernel import EDGE, Source, read_grid
+from polsep.demosaic.guided_full_kernel import FULL_EDGE
 from polsep.physics.stokes import Measurements, analyser_residual, stokes_inverse, unclipped_inverse
 from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import RawFrame, as_samples
@@ -34,6 +36,12 @@ from polsep.separation.fill_kernel import halve_separation, halve_specular, inte
 from polsep.separation.images import FrameImages, Tally
 from polsep.separation.images_kernel import check_images
 from polsep.separation.moments_kernel import Conversion
+from polsep.separation.strips_full_kernel import (
+    Frame,
+    collect_pixels,
+    separate_guided_pixel_strip,
+    separate_pixel_strip,
+)
 from polsep.separation.strips_kernel import Targets, collect, rows_clip, separate_guided_strip, separate_strip
 from polsep.separation.tally_kernel import NOISE, make_tally
 
@@ -74,16 +82,33 @@ def separate_color_affine_half(
     ValueError on a mono layout, another dtype or shape, levels out of order, or images in ``options.out`` that do not
     fit.
     """
-    options = ColorAffineOptions() if options is None else options
+    return _separate(raw, layout, (black_level, white_level), options or ColorAffineOptions(), False)
+
+
+def separate_color_affine_full(
+    raw: RawFrame,
+    layout: Layout,
+    black_level: float,
+    white_level: float,
+    options: ColorAffineOptions | None = None,
+) -> FrameImages:
+    """`separate_color_affine_half` at full resolution: images ``[H, W, 3]`` of all pixels of whole cells."""
+    return _separate(raw, layout, (black_level, white_level), options or ColorAffineOptions(), True)
+
+
+def _separate(
+    raw: RawFrame, layout: Layout, levels: tuple[float, float], options: ColorAffineOptions, full: bool
+) -> FrameImages:
+    """One frame at half or ``full`` resolution; ``levels``: black and white."""
     if layout.channels != 3:
         raise ValueError(f"expected a colour layout, found {layout.spec!r}; mono frames have separate_analytic_half")
     samples, shape = as_samples(raw), (raw.shape[0], raw.shape[1])
-    pattern = read_pattern(shape, layout, black_level, white_level, options.light_color)
-    out = FrameImages.empty(shape, layout, options.report) if options.out is None else options.out
-    h, w = pattern.h, pattern.w
+    pattern = read_pattern(shape, layout, *levels, options.light_color)
+    out = FrameImages.empty(shape, layout, options.report, full) if options.out is None else options.out
+    h, w = (2 * pattern.h, 2 * pattern.w) if full else (pattern.h, pattern.w)
     dolp, aolp = check_images(out, (h, w, 3), options.report)
-    height = strip_height(h)
-    clips = any(run_over_rows(partial(rows_clip, samples, pattern), h, height))
+    height = strip_height(pattern.h)
+    clips = any(run_over_rows(partial(rows_clip, samples, pattern), pattern.h, height))
     lines, clipped = (
         np.empty((4, h, w) if clips else (4, 0, 0), np.float32),
         np.zeros((h, w) if clips else (0, 0), np.uint16),
@@ -93,14 +118,23 @@ def separate_color_affine_half(
     gains = np.array(options.light_color[:3] if options.in_light else (1, 1, 1), np.float32)
     # Filling compares colours with each other, so with clipped samples the light is multiplied back afterwards.
     conversion = Conversion(*_matrices(layout), np.ones(3, np.float32) if clips else gains)
-    source = Source(samples, pattern, read_grid(pattern, layout.angles, conversion.inverses[0]))
-    run = separate_guided_strip if options.guided else separate_strip
-    run_over_rows(partial(run, source, conversion, targets), h, height)
+    inverse = conversion.inverses[0]
+    source = Source(samples, pattern, read_grid(pattern, layout.angles, inverse, FULL_EDGE if full else EDGE))
+    run: Callable[[RowRange], None]
+    gather: Callable[..., None]
+    if full:
+        frame = Frame(source, pattern._replace(h=h, w=w))
+        strip = separate_guided_pixel_strip if options.guided else separate_pixel_strip
+        run, gather = partial(strip, frame, conversion, targets), partial(collect_pixels, frame)
+    else:
+        strip_of_cells = separate_guided_strip if options.guided else separate_strip
+        run, gather = partial(strip_of_cells, source, conversion, targets), partial(collect, source)
+    run_over_rows(run, pattern.h, height)
     out.valid[:] = True
     places = np.flatnonzero(clipped)
     tally = make_tally(h * w - places.size, 0, h * w - places.size, targets.sums)
     if places.size:
-        tally += _complete(source, layout, conversion.inverses, targets, places, out)
+        tally += _complete(gather, layout, conversion.inverses, targets, places, out)
     if clips and options.in_light:
         out.diffuse[...] *= gains
         out.specular[...] *= gains
@@ -111,6 +145,12 @@ def warm_up() -> None:
     """Compile the kernels, or load them from numba's cache on disk. One compilation serves all dtypes and layouts."""
     for guided in (False, True):
         separate_color_affine_half(np.eye(8, dtype=np.uint8), Layout(), 0, 1, ColorAffineOptions(guided=guided))
+
+
+def warm_up_full() -> None:
+    """`warm_up` of the kernels for full resolution."""
+    for guided in (False, True):
+        separate_color_affine_full(np.eye(8, dtype=np.uint8), Layout(), 0, 1, ColorAffineOptions(guided=guided))
 
 
 def strip_height(rows: int) -> int:
@@ -134,18 +174,21 @@ def _matrices(layout: Layout) -> tuple[NDArray[np.float32], NDArray[np.bool_], N
 
 
 def _complete(
-    source: Source,
+    gather: Callable[..., None],
     layout: Layout,
     inverses: NDArray[np.float32],
     targets: Targets,
     places: NDArray[np.int64],
     out: FrameImages,
 ) -> Tally:
-    """Solve and fill the N pixels ``places`` with clipped samples, into ``out``; their sums."""
+    """Solve and fill the N pixels ``places`` with clipped samples, into ``out``; their sums.
+
+    ``gather``: `collect` of the frame.
+    """
     doubled, lines = 2 * np.array(layout.angles), targets.lines.reshape(4, -1)
     cosines, sines = np.cos(doubled).astype(np.float32), np.sin(doubled).astype(np.float32)
     pixels = make_pixels(targets.clipped.reshape(-1)[places], np.ascontiguousarray(lines[:, places]))
-    run_over_rows(partial(collect, source, places, pixels.samples), places.size, PIXELS)
+    run_over_rows(partial(gather, places, pixels.samples), places.size, PIXELS)
     run_over_rows(partial(solve_pixels, pixels, cosines, sines, inverses), places.size, PIXELS)
     lines[2:, places] = pixels.lines[2:]
     out.valid.reshape(-1)[places] = pixels.valid

@@ -195,32 +195,41 @@ def open_strip(source: Source, row_range: RowRange, edges: int) -> Strip:
     return Strip(row_range[0], row_range[1], begin, window, make_rows(pattern), make_rings(pattern.w, edges))
 
 
+@compiled
+def pass_on(
+    frame: Pattern, conversion: Conversion, targets: Targets, strip: Strip, t: int, better: Any, place: int
+) -> None:
+    """After row ``t`` has entered the rings: everything behind it, to the row that is complete now.
+
+    ``frame``: of the images' size. ``better``: guided Stokes rows, that of the complete row at ``place``, or empty.
+    """
+    rows, rings, first = strip.rows, strip.rings, max(strip.begin - NOISE, 0)
+    if t - 2 > first or t - 2 == 0:
+        measure_misses(frame, t - 2, rows, rings)
+        if rings.edges.size:
+            measure_edges(frame, t - 2, rows, rings)
+    weighed, done = t - NOISE, t - REACH
+    if weighed >= strip.begin:
+        weigh_row(frame, weighed, rows, rings)
+        if targets.sums.size and 0 <= weighed < frame.h:  # neighbouring strips write the same
+            targets.sums[weighed, 7] = sum_noise(frame, rings.noise)
+        fit_diffuse_polarization(frame, done, strip.start, rows, rings)
+    if done >= strip.start:
+        _write_row(conversion.gains, done, strip, better[place] if better.size else better[:0, 0], targets)
+
+
 @entry
 def separate_rows(
     source: Source, conversion: Conversion, targets: Targets, strip: Strip, row_range: RowRange, better: Any
 ) -> None:
     """Separate the next rows of a strip; ``better [rows, 5, w]``: their guided Stokes rows, or empty."""
-    pattern, rows, rings = source.pattern, strip.rows, strip.rings
-    first = max(strip.begin - NOISE, 0)
+    pattern, first = source.pattern, max(strip.begin - NOISE, 0)
     for t in range(row_range[0] + REACH if row_range[0] > strip.start else strip.begin - NOISE, row_range[1] + REACH):
         if first <= t < pattern.h:
             _read_row(source, conversion, t, strip, targets)
         elif t >= pattern.h:
-            rings.noise[t % 7] = ZERO
-        if t - 2 > first or t - 2 == 0:
-            measure_misses(pattern, t - 2, rows, rings)
-            if rings.edges.size:
-                measure_edges(pattern, t - 2, rows, rings)
-        weighed, done = t - NOISE, t - REACH
-        if weighed >= strip.begin:
-            weigh_row(pattern, weighed, rows, rings)
-            if targets.sums.size and 0 <= weighed < pattern.h:  # neighbouring strips write the same
-                targets.sums[weighed, 7] = sum_noise(pattern, rings.noise)
-            fit_diffuse_polarization(pattern, done, strip.start, rows, rings)
-        if done >= strip.start:
-            _write_row(
-                conversion.gains, done, strip, better[done - row_range[0]] if better.size else better[:0, 0], targets
-            )
+            strip.rings.noise[t % 7] = ZERO
+        pass_on(pattern, conversion, targets, strip, t, better, t - REACH - row_range[0])
 
 
 def separate_strip(source: Source, conversion: Conversion, targets: Targets, row_range: RowRange) -> None:

@@ -25,6 +25,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import av
 import click
 import numpy as np
 
@@ -88,9 +89,9 @@ def judge(path: Path, reader: Reader) -> Judged:
 
 
 def _is_of_memory(error: BaseException | None) -> bool:
-    """True where running out of memory is behind an error."""
+    """True where running out of memory is behind an error; FFmpeg says so of what it does not even try."""
     while error is not None:
-        if isinstance(error, MemoryError):
+        if isinstance(error, MemoryError) and not isinstance(error, av.error.FFmpegError):
             return True
         error = error.__cause__ or error.__context__
     return False

@@ -48,7 +48,7 @@ def source() -> Source:
     """A frame of zeros, as kernels read it."""
     samples, layout = as_samples(np.zeros((64, 64), np.uint8)), Layout()
     pattern = read_pattern((64, 64), layout, 0, 1, (1.0, 1.0, 1.0))
-    return Source(samples, pattern, read_grid(pattern, layout.angles, stokes_inverse(layout.angles).float().numpy()))
+    return Source(samples, pattern, read_grid(pattern, layout.angles, stokes_inverse(layout.angles).astype(np.float32)))
 
 
 @needs_library

@@ -69,5 +69,6 @@ MEASURES = {name: bench.measures for name, bench in (polsep.bench.BENCHES | BENC
     "polanalyser": (*FORMULAS, "polsep/compute"),
     "blender": ("polsep/geometry", "polsep/material", "polsep/io/assets"),
     "materialx": ("polsep/material", "polsep/io/assets"),
+    "reliability": ("polsep/io", "polsep/sensor/levels.py", "polsep/edit/recipe.py", "evaluation/damage.py"),
     "house": (),  # of the commit that it names, and of no other
 }

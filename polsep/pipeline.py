@@ -149,6 +149,8 @@ def find_device(name: str) -> str:
 
     Raises ValueError on a device that is not there.
     """
+    if not isinstance(name, str):
+        raise ValueError(f"expected a device like auto, cpu or cuda, found {name!r}")
     if name == "cpu" or (name == "auto" and not _may_have_gpu()):
         return "cpu"
     try:

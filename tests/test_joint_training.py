@@ -10,6 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tolerances import assert_close, assert_finite
@@ -487,7 +488,7 @@ def test_training_ends_in_weights_that_say_all(variant: str, tmp_path: Path, sho
     assert set(json.loads(metadata["reference"])) == {"analytic", "color-affine"}
     assert metadata["command"].startswith("polsep train joint-fast ")
     network = Joint(colors, ResidualSize(**json.loads(metadata["size"])), tuple(json.loads(metadata["inputs"])))
-    network.load_state_dict({name: value.float() for name, value in weights.items()})
+    network.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
     assert metadata["parameters"] == str(count_parameters(network))
     examples = itertools.islice(stream_lane(STREAM, FIT_LANE, 0), 4)
     fitted = fit_filter(JOINT_VARIANTS[variant][0](batch) for batch in examples)
@@ -502,10 +503,10 @@ def test_of_a_network_a_part_can_be_trained_alone(part: str, tmp_path: Path, sho
     run = replace(run, out=tmp_path / "part", start=(start,))
     held = train_weights(JointOptions("joint-fast", size=TINY, part=part), run, lambda _: None)
     (before, _), (after, metadata) = read_weights(start), read_weights(held)
-    moved = {name for name in before if not torch.equal(before[name], after[name])}
+    moved = {name for name in before if not np.array_equal(before[name], after[name])}
     assert moved and all(name.startswith(f"{part}.") for name in moved)
     assert f"--part {part}" in metadata["command"]
-    assert int(metadata["parameters"]) == sum(x.numel() for name, x in after.items() if name != "demosaic")
+    assert int(metadata["parameters"]) == sum(x.size for name, x in after.items() if name != "demosaic")
 
 
 @pytest.mark.parametrize("sees_frame", [False, True])
@@ -543,14 +544,14 @@ def test_filters_are_fitted_anew_only_when_asked(tmp_path: Path, shortened: None
     first = train_weights(JointOptions("joint-fast", size=TINY), run, lambda _: None)
     before, metadata = read_weights(first)
     fitted = before["demosaic"]
-    write_weights(first, before | {"demosaic": torch.full_like(fitted, 0.25)}, {"method": metadata["method"]})
+    write_weights(first, before | {"demosaic": np.full_like(fitted, 0.25)}, {"method": metadata["method"]})
     on = replace(run, start=(first,), schedule=replace(SCHEDULE, steps=0))
-    for refit, expected in ((False, torch.full_like(fitted, 0.25)), (True, fitted)):
+    for refit, expected in ((False, np.full_like(fitted, 0.25)), (True, fitted)):
         asked = replace(on, out=tmp_path / str(refit), refit=refit)
         found, metadata = read_weights(train_weights(JointOptions("joint-fast", size=TINY), asked, lambda _: None))
         assert found.keys() == before.keys()
         assert all(
-            torch.equal(value, expected if name == "demosaic" else before[name]) for name, value in found.items()
+            np.array_equal(value, expected if name == "demosaic" else before[name]) for name, value in found.items()
         )
         assert ("--refit" in metadata["command"]) == refit
 

@@ -364,8 +364,7 @@ def test_every_shipped_method_and_device_is_found() -> None:
     for name, method in METHODS.items():
         assert find_method(name, Mosaic(torch.zeros(8, 8), Layout(), 0, 1)) is method and method.name == name
         assert method.summary and method.needs and method.source
-    assert find_device("cpu") == torch.device("cpu")
-    assert find_device("auto").type in ("cpu", "cuda")
+    assert find_device("cpu") == "cpu" and find_device("auto") in ("cpu", "cuda")
 
 
 @pytest.mark.parametrize("method", ["analytic", "color-affine"])

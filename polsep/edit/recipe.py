@@ -18,7 +18,6 @@ from typing import Any
 from polsep.edit.edits import EDITS, Edit
 from polsep.edit.images import Maps, Separated, SeparatedImages
 from polsep.edit.parameters import IMAGES, EditError
-from polsep.io.store.json_text import parse_json
 
 #: The only version there is.
 VERSION = 1
@@ -93,9 +92,11 @@ def _edit_as_data(edit: Edit) -> dict[str, Any]:
 def recipe_from_text(text: str) -> Recipe:
     """The recipe that a JSON text holds. Raises EditError."""
     try:
-        data = parse_json(text, _without_repeats)
+        data = json.loads(text, object_pairs_hook=_without_repeats)  # edits check their numbers, and name themselves
     except EditError:
         raise
+    except RecursionError:
+        raise EditError("expected a recipe as JSON, found hundreds of levels") from None
     except ValueError as error:
         raise EditError(f"expected a recipe as JSON, found {error}") from error
     return recipe_from_data(data)

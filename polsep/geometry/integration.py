@@ -106,7 +106,8 @@ class Equations:
         self.indices = around[around >= 0]
         starts = np.concatenate([[0], np.cumsum((around >= 0).sum(axis=1))]).astype(np.int32)
         self.places = Places(np.ascontiguousarray(around[:, [0, 1, 3, 4]]), starts)
-        self.wanted = Wanted(slopes.cosine[slopes.mask], np.stack([slopes.right, slopes.down])[:, slopes.mask])
+        inside = [values[slopes.mask] for values in (slopes.cosine, slopes.right, slopes.down)]
+        self.wanted = Wanted(inside[0], np.stack(inside[1:]))
         self.multigrid: Multigrid | None = None
 
     def even_weights(self) -> Floats:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.processor import cpu_flags
 from polsep.networks.channels import DETAIL_MAPS, PERIOD, input_channels
 from polsep.networks.graphs import core, import_openvino, joint_model, whole_frame_model
 from polsep.networks.joint_weights import JointWeights
@@ -179,10 +180,8 @@ def _usual_precision() -> str:
     Vector units that know bfloat16 alone (AVX512-BF16) take 1.6 times as long with it as with float32
     (docs/experiments.md).
     """
-    from llvmlite.binding import get_host_cpu_features  # type: ignore[import-untyped]  # no stubs
-
     name: str = core().get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name()
-    return "f32" if name == "bf16" and not get_host_cpu_features().get("amx-bf16") else name
+    return "f32" if name == "bf16" and "amx_bf16" not in cpu_flags() else name
 
 
 def _tally(targets: Any) -> Tally:

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from polsep.compute.arrays import Array, namespace
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes, polarized_intensity
 from polsep.separation.analytic import Separation, separate_analytic
@@ -130,7 +132,8 @@ def separate_refined(measurements: Measurements, rung: Rung, refine: Refine) -> 
     inputs = rung.inputs(measurements)
     xp = namespace(inputs)
     diffuse, logarithm = refine(xp.reshape(inputs, (-1, *inputs.shape[-3:])))
-    images = [xp.reshape(x, (*batch, *x.shape[-3:])) for x in (diffuse, xp.expm1(logarithm))]
+    with np.errstate(over="ignore"):  # of frames far above the white level; the pipeline refuses infinite images
+        images = [xp.reshape(x, (*batch, *x.shape[-3:])) for x in (diffuse, xp.expm1(logarithm))]
     diffuse, specular = (xp.clip(x, min=0) for x in images)
     seen = separate_analytic(measurements)
     return Separation(diffuse, specular, seen.valid, seen.stokes)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 from array_api_compat import device
@@ -31,6 +32,9 @@ BAYER_ORDERS = ("RGGB", "BGGR", "GRBG", "GBRG")
 #: A sample within this fraction of the white level counts as clipped: 12-bit data shifted left into 16 bits stops
 #: at 65520 of 65535, and 10-bit data at 65472; 8-bit data are only clipped at 255.
 CLIP_MARGIN = 2.0**-10
+
+#: Analysers that are closer than this [degrees] are one: no Stokes vector follows from their difference.
+MIN_APART_DEG = 0.1
 
 Cell = tuple[tuple[float, float], tuple[float, float]]
 
@@ -64,7 +68,8 @@ class Layout:
         if not all(math.isfinite(angle) for angle in flat):
             raise ValueError(f"a layout's polarizer must be 2x2 angles in degrees, found {self.polarizer!r}")
         object.__setattr__(self, "polarizer", ((a, b), (c, d)))
-        if len({angle % 180 for angle in flat}) != 4:
+        around = sorted(angle % 180 for angle in flat)
+        if min(b - a for a, b in pairwise([*around, around[0] + 180])) < MIN_APART_DEG:
             raise ValueError(
                 f"polarizer must hold four different angles (modulo 180 degrees), found {self.polarizer!r}"
             )

@@ -86,11 +86,11 @@ def confirm(
 
 def fill(x: NDArray[np.float32], predictor: Predictor, clip: float, places: NDArray[np.int64]) -> None:
     """Replace the samples of ``x`` at ``places [N, 2]`` by their predictions from each other and from all others."""
-    _fill_places(x, predictor, np.float32(clip), places)
+    _fill_places(x, predictor, np.float32(clip), np.ascontiguousarray(places))
 
 
 def warm_up() -> None:
-    """Compile the kernels, or load them from numba's cache."""
+    """Load the kernels, or compile them."""
     x = np.zeros((16, 16), np.float32)
     predictor = Predictor(np.zeros((2, 12, 12, SIDE * SIDE), np.float32), np.ones((2, 12, 12), np.float32))
     rules = Rules._make([ONE] * 9 + [PERIOD])

@@ -30,6 +30,8 @@ _PAGED, _PHOTOS = (".png", ".tif", ".tiff", ".npy"), (".jpg", ".jpeg")
 SUFFIXES = (*_PAGED, *_PHOTOS, ".exr")
 #: Shortest vector that counts as a normal: 8 bits and half floats change unit vectors less.
 _SHORTEST = 0.5
+#: Largest component of a vector that is taken for a normal.
+_LONGEST = 1e6
 
 
 def read_map(path: Path, kind: str) -> Floats:
@@ -125,6 +127,8 @@ def _as_normals(codes: NDArray[Any]) -> NDArray[Any]:
         raise InputError(f"expected normals of three channels, found shape {list(codes.shape)}")
     vectors = _in_unit(codes)
     vectors = 2 * vectors - 1 if codes.dtype.kind == "u" else vectors
+    if not (largest := float(np.abs(vectors).max())) <= _LONGEST:
+        raise InputError(f"expected vectors of about unit length, found components of {largest:g}")
     length = np.linalg.norm(vectors, axis=2, keepdims=True)
     known = (length >= _SHORTEST) & (vectors[..., 2:] > 0)
     return np.where(known, vectors / np.where(known, length, 1), 0)

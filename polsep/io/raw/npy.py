@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from polsep.io.raw.page import Page
 from polsep.io.store.errors import decoding
-from polsep.io.store.header_checks import SAMPLES, describe, limit, require_signature, require_size
+from polsep.io.store.header_checks import SAMPLES, advice, describe, limit, require_signature, require_size
 
 MAGIC = b"\x93NUMPY"
 
@@ -106,7 +106,7 @@ def _read_member(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
     most = 4 * limit(SAMPLES)
     if math.prod(shape) * dtype.itemsize > 2 * most:
         found = math.prod(shape) * dtype.itemsize
-        raise ValueError(f"expected at most {2 * most} bytes in {member}, found {found} ({SAMPLES} sets another limit)")
+        raise ValueError(f"expected at most {2 * most} bytes in {member}, found {found}{advice(SAMPLES)}")
     _require_bytes(shape, dtype, archive.getinfo(member).file_size - start.tell())
     with decoding("NPZ"), warnings.catch_warnings(), archive.open(member) as stream:
         warnings.simplefilter("ignore")

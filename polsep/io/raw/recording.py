@@ -150,7 +150,9 @@ def read_header(path: Path) -> Header:
     width, height = record.get("width"), record.get("height")
     name, layout = record.get("pixel_format"), record.get("layout")
     if not (isinstance(width, int) and isinstance(height, int) and isinstance(name, str)):
-        raise ValueError(f"expected width, height and pixel_format in {RECORD}, found {width!r:.40}, {height!r:.40} and {name!r:.40}")
+        raise ValueError(
+            f"expected width, height and pixel_format in {RECORD}, found {width!r:.40}, {height!r:.40} and {name!r:.40}"
+        )
     if layout is not None:
         Layout.parse(str(layout))
     camera, settings = str(record.get("camera", "")), record.get("settings")

@@ -19,6 +19,7 @@ import tifffile
 
 from polsep.compute.arrays import to_numpy
 from polsep.io.raw.page import MergedFacts, Page
+from polsep.io.raw.tiff_chunks import PICTURES, STREAMS, check_chunks
 from polsep.io.raw.tiff_directories import check_entries, walk_directories
 from polsep.io.store.atomic import atomic_path
 from polsep.io.store.errors import InputError, decoding
@@ -34,11 +35,11 @@ MERGED = "polsep merged mosaic 1"
 #: Photometric interpretations in which larger means brighter and samples are the data themselves.
 _PHOTOMETRIC = {1: "black is zero", 2: "RGB", 32803: "colour filter array", 34892: "linear raw"}
 
-#: Compressions that change samples: old and new JPEG, lossy DNG, WebP.
-_LOSSY = {6: "old JPEG", 7: "JPEG", 34892: "lossy JPEG", 50001: "WebP"}
+#: Compressions that change samples, or do not say whether they did.
+_LOSSY = {6: "old JPEG", 7: "JPEG", 34892: "lossy JPEG", 50001: "WebP", 50002: "JPEG XL", 52546: "JPEG XL"}
 
 #: Vendors' formats that tifffile would look for while it opens a file, in ways that no limit holds.
-_UNWANTED = {"is_lsm": False, "is_scanimage": False, "is_ndpi": False, "is_ome": False}
+_UNWANTED: dict[str, Any] = {"is_lsm": False, "is_scanimage": False, "is_ndpi": False, "is_ome": False}
 
 mute("tifffile", "imagecodecs")
 
@@ -57,14 +58,16 @@ def read_tiff(path: Path, first: int = 0) -> Iterator[Page]:
             for index in range(first, len(places)):
                 check_entries(stream, places[index], size)
                 with decoding("TIFF"):
-                    page = _read_page(tif.pages[index], size, index, len(places))
+                    directory = tif.pages[index]
+                    assert isinstance(directory, tifffile.TiffPage)  # frames only come from TiffPages.useframes
+                    _require_readable(directory, size)
+                    check_chunks(stream, directory)
+                    page = _read_page(directory, index, len(places))
                 yield page
 
 
-def _read_page(page: tifffile.TiffPage | tifffile.TiffFrame, size: int, index: int, count: int) -> Page:
-    """Samples of one directory of a file of ``size`` bytes, after `_require_readable`."""
-    assert isinstance(page, tifffile.TiffPage)  # frames only come from TiffPages.useframes
-    _require_readable(page, size)
+def _read_page(page: tifffile.TiffPage, index: int, count: int) -> Page:
+    """Samples of one directory, once it is checked."""
     if count == 1 and (pictures := _described_pictures(page)) > 1:
         raise InputError(f"expected one TIFF directory per picture, found one for {pictures} pictures")
     array = np.asarray(page.asarray())
@@ -81,7 +84,7 @@ def _read_page(page: tifffile.TiffPage | tifffile.TiffFrame, size: int, index: i
 
 
 def _described_pictures(page: tifffile.TiffPage) -> int:
-    """How many pictures the only directory of a file stands for, by the descriptions of ImageJ and of tifffile.
+    """The number of pictures that a file's only directory stands for, by descriptions of ImageJ and of tifffile.
 
     ImageJ writes one directory for stacks of more than 4 GB, tifffile where it is asked to.
     """
@@ -153,6 +156,8 @@ def _require_readable(page: tifffile.TiffPage, size: int) -> None:
         raise InputError(f"expected gray samples with black at zero, found TIFF photometric {_name(page.photometric)}")
     if page.compression in _LOSSY:
         raise InputError(f"expected lossless samples, found TIFF compression {_LOSSY[int(page.compression)]}")
+    if page.compression not in (*STREAMS, *PICTURES):
+        raise InputError(f"expected a TIFF compression such as LZW or DEFLATE, found {_name(page.compression)}")
     if page.dtype is None or page.bitspersample < 8:
         bits, kind = page.bitspersample, page.sampleformat
         raise InputError(f"expected samples of 8 bits or more, found {bits} bits of sample format {kind}")

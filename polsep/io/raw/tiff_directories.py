@@ -25,7 +25,7 @@ _TEXT = (1, 2, 6, 7)
 class _Form(NamedTuple):
     """Structures of a TIFF: number of entries, an entry without its value, and an offset (also a value's room)."""
 
-    count: struct.Struct
+    number: struct.Struct
     entry: struct.Struct
     offset: struct.Struct
 
@@ -47,10 +47,10 @@ def walk_directories(stream: BinaryIO, size: int) -> list[int]:
         if offset in places:
             raise InputError(f"expected a chain of TIFF directories with an end, {found} and a way back: it is damaged")
         stream.seek(min(offset, size))
-        head = stream.read(form.count.size)
-        tags = form.count.unpack(head)[0] if len(head) == form.count.size else 0
-        end = offset + form.count.size + tags * form.step
-        if end + form.offset.size > size or len(head) < form.count.size:
+        head = stream.read(form.number.size)
+        tags = form.number.unpack(head)[0] if len(head) == form.number.size else 0
+        end = offset + form.number.size + tags * form.step
+        if end + form.offset.size > size or len(head) < form.number.size:
             missing = "no readable one" if not places else f"{len(places)} of them"
             raise InputError(f"expected a complete chain of TIFF directories, found {missing}: it is truncated")
         if tags > MOST_TAGS:
@@ -68,7 +68,7 @@ def check_entries(stream: BinaryIO, place: int, size: int) -> None:
     """Raise InputError where entries of the directory at ``place`` claim more than a file of ``size`` bytes holds."""
     form, _ = _read_form(stream)
     stream.seek(place)
-    (tags,) = form.count.unpack(stream.read(form.count.size))
+    (tags,) = form.number.unpack(stream.read(form.number.size))
     data, total = stream.read(tags * form.step), 0
     for k in range(tags):
         code, kind, count = form.entry.unpack_from(data, k * form.step)

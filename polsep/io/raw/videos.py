@@ -58,18 +58,18 @@ def read_video(path: Path, first: int = 0) -> Iterator[Page]:
                     raise ValueError(f"expected frame {index} intact, found {damage or 'one before it damaged'}")
                 if index >= first:
                     array = _as_array(frames[0], kind, index)
-                    yield Page(array, index, max(kind.count, index + 1), white_level=kind.white)
+                    yield Page(array, index, max(kind.about, index + 1), white_level=kind.white)
                 index += 1
 
 
 class _Grey(NamedTuple):
-    """A stream of grey frames ``[H, W]`` of a dtype, about ``count``; ``white``: its own white level, if any."""
+    """A stream of grey frames ``[H, W]`` of a dtype, ``about`` so many; ``white``: its own white level, if any."""
 
     stream: Any
     shape: tuple[int, int]
     dtype: type[np.unsignedinteger[Any]]
     white: float | None
-    count: int
+    about: int
 
 
 def _as_array(frame: Any, kind: _Grey, index: int) -> NDArray[Any]:

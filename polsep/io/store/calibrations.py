@@ -203,7 +203,11 @@ def _require_plausible(c: Calibration) -> None:
         require_gains("a lamp's colour", c.lamp.color)
     if c.dead is not None:
         count = math.prod(c.size or (0,))
-        if c.dead.ndim != 1 or c.dead.dtype.kind != "i" or (c.dead.size and not 0 <= c.dead.min() <= c.dead.max() < count):
+        if (
+            c.dead.ndim != 1
+            or c.dead.dtype.kind != "i"
+            or (c.dead.size and not 0 <= c.dead.min() <= c.dead.max() < count)
+        ):
             raise ValueError(f"expected defective pixels as indices below {count}, found others")
 
 

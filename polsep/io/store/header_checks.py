@@ -69,10 +69,15 @@ def limit(name: str) -> int:
     return most if name != SAMPLES or lower is None else min(most, lower)
 
 
+def advice(name: str) -> str:
+    """The end of a message about a limit: how to set another, unless `at_most` lowers it here."""
+    return "" if name == SAMPLES and _most_samples.get() is not None else f" ({name} sets another limit)"
+
+
 def require_at_most(found: int, name: str, what: str) -> None:
     """Raise InputError for more of ``what`` than the limit of that name."""
     if found > (most := limit(name)):
-        raise InputError(f"expected at most {most} {what}, found {found} ({name} sets another limit)")
+        raise InputError(f"expected at most {most} {what}, found {found}{advice(name)}")
 
 
 def require_size(shape: tuple[int, ...]) -> None:
@@ -81,7 +86,7 @@ def require_size(shape: tuple[int, ...]) -> None:
     if min(shape, default=0) < 1:
         raise InputError(f"expected an image with at least one pixel, found {size}")
     if math.prod(shape) > (most := limit(SAMPLES)):
-        raise InputError(f"expected at most {most} samples in a frame, found {size} ({SAMPLES} sets another limit)")
+        raise InputError(f"expected at most {most} samples in a frame, found {size}{advice(SAMPLES)}")
 
 
 @contextmanager

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,6 @@ from typing import Any
 MOST_DIGITS = 20
 #: Largest file that is read as one JSON text [bytes].
 MOST_BYTES = 2**26
-
-Pairs = Callable[[list[tuple[str, Any]]], Any]
 
 
 def read_text(path: Path) -> str:
@@ -31,12 +28,10 @@ def read_text(path: Path) -> str:
         raise ValueError(f"expected text in UTF-8, found byte {data[error.start]:#04x} at {error.start}") from None
 
 
-def parse_json(text: str, pairs: Pairs | None = None) -> Any:
-    """The values of a JSON text; ``pairs`` makes what stands for an object. Raises ValueError in one line."""
+def parse_json(text: str) -> Any:
+    """The values of a JSON text. Raises ValueError in one line."""
     try:
-        return json.loads(
-            text, object_pairs_hook=pairs, parse_constant=_refuse, parse_float=_as_float, parse_int=_as_int
-        )
+        return json.loads(text, parse_constant=_refuse, parse_float=_as_float, parse_int=_as_int)
     except RecursionError:
         raise ValueError("expected JSON of a few levels, found hundreds") from None
 

@@ -47,7 +47,7 @@ def quiet(mark: bytes) -> Iterator[None]:
     """
     with _ONE_AT_A_TIME:
         before = sys.stdout
-        sys.stdout = None if before is None else _OthersOnly(before)  # type: ignore[assignment]
+        sys.stdout = None if before is None else _OthersOnly(before)
         try:
             with _kept_lines(mark):
                 yield

@@ -51,7 +51,9 @@ def read_weights(path: Path) -> tuple[dict[str, NDArray[np.float32]], dict[str, 
     if "method" not in metadata or "sha256" not in metadata:
         raise ValueError(f"expected weights of polsep in {path}, found a safetensors file of something else")
     if digest_arrays(arrays) != metadata["sha256"]:
-        raise ValueError(f"expected weights with sha256 {metadata['sha256']:.64} in {path}, found damaged ones")
+        raise ValueError(
+            f"expected weights with sha256 {one_line(metadata['sha256'], 64)} in {path}, found damaged ones"
+        )
     return {name: array.astype(np.float32) for name, array in arrays.items()}, metadata
 
 

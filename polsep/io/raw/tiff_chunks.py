@@ -1,0 +1,60 @@
+"""Strips and tiles of a TIFF picture, measured before they are decoded.
+
+A chunk's room is what the directory says, but PNG, JPEG 2000 and LERC chunks have headers of their own, and their
+decoders believe those: a tile of 700 bytes can hold a picture of gigabytes.
+Sources: ISO/IEC 15444-1, A.5.1 (SIZ); W3C, PNG, 3rd edition, 11.2.1 (IHDR); Esri, LERC 2, Lerc2.h.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import BinaryIO
+
+import tifffile
+
+from polsep.io.store.errors import InputError
+from polsep.io.store.header_checks import require_size
+
+#: Compressions of streams of bytes, whose decoders stop at the room of a chunk, and of pictures.
+STREAMS = (1, 5, 8, 32773, 32946, 34925, 34926, 50000)
+PNG, JPEG_2000, LERC = 34933, (33003, 33005, 34712), 34887
+PICTURES = (PNG, *JPEG_2000, LERC)
+#: Samples that a chunk may have more than four times its picture: scanners write large tiles.
+_SPARE = 2**18
+
+
+def check_chunks(stream: BinaryIO, page: tifffile.TiffPage) -> None:
+    """Raise InputError where the chunks of a directory could hold much more than its picture."""
+    across, chunk = page.chunked, math.prod(page.chunks)
+    require_size(page.chunks)
+    if chunk > 4 * math.prod(page.shape) + _SPARE:
+        sides = "x".join(map(str, page.chunks))
+        raise InputError(f"expected TIFF strips or tiles of about the picture's size, found {sides} samples in one")
+    if page.compression not in PICTURES:
+        return
+    height, width = (page.tilelength, page.tilewidth) if page.is_tiled else (page.imagelength, page.imagewidth)
+    for offset, count in zip(page.dataoffsets[: math.prod(across)], page.databytecounts, strict=False):
+        if count:
+            stream.seek(offset)
+            found = _size_in(int(page.compression), stream.read(min(count, 64)))
+            if found is None or found[0] > height or found[1] > width:
+                raise InputError(f"expected a chunk of at most {height}x{width} as the TIFF says, found {_said(found)}")
+
+
+def _said(size: tuple[int, int] | None) -> str:
+    return "a damaged one" if size is None else f"{size[0]}x{size[1]}"
+
+
+def _size_in(compression: int, head: bytes) -> tuple[int, int] | None:
+    """Height and width by a chunk's own header; None where that is not of the ``compression``."""
+    if compression == PNG and head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR" and len(head) >= 24:
+        width, height = struct.unpack_from(">2I", head, 16)
+    elif compression in JPEG_2000 and head[:4] == b"\xff\x4f\xff\x51" and len(head) >= 24:
+        width, height = struct.unpack_from(">2I", head, 8)
+    elif compression == LERC and head[:6] == b"Lerc2 " and len(head) >= 22:
+        (version,) = struct.unpack_from("<i", head, 6)
+        height, width = struct.unpack_from("<2i", head, 14 if version >= 3 else 10)
+    else:
+        return None
+    return height, width

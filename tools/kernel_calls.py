@@ -17,7 +17,11 @@ from polsep.networks.whole_frame_kernel import thumbnail_of
 from polsep.sensor.calibration import neighbours
 from polsep.sensor.calibration_kernel import mix_neighbours
 from polsep.sensor.camera import Layout
-from polsep.separation.color_affine_kernel import ColorAffineOptions, separate_color_affine_half
+from polsep.separation.color_affine_kernel import (
+    ColorAffineOptions,
+    separate_color_affine_full,
+    separate_color_affine_half,
+)
 from polsep.video.panels_kernel import STEPS, make_panels
 
 
@@ -35,7 +39,8 @@ def _separate_clipped() -> None:
     raw = np.eye(64, dtype=np.float32)
     raw[16:32, 16:32] = 1
     for guided in (False, True):
-        separate_color_affine_half(raw, Layout(), 0, 1, ColorAffineOptions(guided=guided, report=True))
+        for separate in (separate_color_affine_half, separate_color_affine_full):
+            separate(raw, Layout(), 0, 1, ColorAffineOptions(guided=guided, report=True))
 
 
 def _guide() -> None:

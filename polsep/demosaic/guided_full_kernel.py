@@ -62,8 +62,8 @@ _NOISE_MARGIN, _NOISE_FLOOR = np.float32(twin.NOISE_MARGIN), np.float32(twin.NOI
 _NINTH = reciprocal(9)
 
 
-class FullStream(NamedTuple):
-    """Two streams and rings of what is between and behind them, all ``[length, k, n]``.
+class Between(NamedTuple):
+    """Rings between the two streams and behind the second one, all ``[length, k, n]``.
 
     ``polarized``: s1 and s2 of three colours, of the first stream's residual; ``sums``, ``smooth``: over windows along
     the row, and all over. ``contradiction``: mean squared `analyser_residual`, ``detail``: mean squared detail of
@@ -71,8 +71,6 @@ class FullStream(NamedTuple):
     colours. ``pixels``: s1, then s2. ``null [2, 4]``: vector of `analyser_residual`, by place. ``rows``: buffers.
     """
 
-    first: Stream
-    second: Stream
     polarized: NDArray[np.float32]
     sums: NDArray[np.float32]
     smooth: NDArray[np.float32]
@@ -85,6 +83,14 @@ class FullStream(NamedTuple):
     rows: NDArray[np.float32]
 
 
+class FullStream(NamedTuple):
+    """Two streams, with rings in between; kernels take no more of it than they need, which compiles faster."""
+
+    first: Stream
+    second: Stream
+    between: Between
+
+
 def open_full_stream(source: Source, null: NDArray[np.float32], start: int) -> FullStream:
     """A stream whose results begin with the frame's row ``start``, an even one.
 
@@ -93,9 +99,7 @@ def open_full_stream(source: Source, null: NDArray[np.float32], start: int) -> F
     n = source.grid.n
     raw = np.zeros((_BEHIND + RESIDUAL + 1, 4, n), np.float32)
     first, second = (open_stream(source, start)._replace(raw=raw, first=start - REACH) for _ in range(2))
-    return FullStream(
-        first,
-        second,
+    between = Between(
         np.zeros((_RELIABLE - _POLARIZED + 1, 6, n), np.float32),
         np.zeros((9, 6, n), np.float32),
         np.zeros((2, 6, n), np.float32),
@@ -107,6 +111,7 @@ def open_full_stream(source: Source, null: NDArray[np.float32], start: int) -> F
         np.stack([null, np.zeros_like(null)]),
         np.zeros((16, n), np.float32),
     )
+    return FullStream(first, second, between)
 
 
 @compiled
@@ -166,32 +171,30 @@ def _add_square(x: Any, smooth: Any, out: Any) -> None:
 
 
 @compiled
-def _polarize_first(stream: FullStream, r: int, grid: Grid) -> None:
-    """Polarization of row ``r`` of the first residual, its sums along the row, and the analysers' contradiction."""
+def _polarize_first(residual: Any, stream: Between, r: int, grid: Grid) -> None:
+    """Polarization of row ``r`` of the first ``residual``, its sums along the row, and the analysers' contradiction."""
     rows, polarized = stream.rows, stream.polarized[r % stream.polarized.shape[0]]
-    ring, sums = stream.first.residual, stream.sums[r % 9]
-    polarize_row(ring, r, grid, stream.null, rows[6:9], rows[0:6].reshape(2, 3, grid.n))
+    polarize_row(residual, r, grid, stream.null, rows[6:9], rows[0:6].reshape(2, 3, grid.n))
     _mean_square(rows, rows[9])
     sum_three(rows[9], stream.contradiction[r % stream.contradiction.shape[0]])
-    polarize_row(ring, r, grid, grid.inverse[1:3], rows[6:9], polarized.reshape(2, 3, grid.n))
-    for k in range(6):
-        sum_nine(polarized[k], sums[k])
+    polarize_row(residual, r, grid, grid.inverse[1:3], rows[6:9], polarized.reshape(2, 3, grid.n))
+    sum_nine(polarized.reshape(-1), stream.sums[r % 9].reshape(-1))
 
 
 @compiled
-def _smooth_first(stream: FullStream, r: int) -> None:
+def _smooth_first(stream: Between, r: int) -> None:
     """Smooth polarization of row ``r``, and what the row differs from it."""
     polarized, smooth, square = stream.polarized[r % stream.polarized.shape[0]], stream.smooth[r % 2], stream.rows[0]
     for j in range(square.size):
         square[j] = ZERO
+    mean_nine(stream.sums, r, smooth)
     for k in range(6):
-        mean_nine(stream.sums, r, k, smooth[k])
         _add_square(polarized[k], smooth[k], square)
     sum_three(square, stream.detail[r % 3])
 
 
 @compiled
-def _share(stream: FullStream, r: int, share: Any) -> None:
+def _share(stream: Between, r: int, share: Any) -> None:
     """Share of the detail of polarization that counts. Twin: `guided._reliable`."""
     c = stream.contradiction
     n0, n1, n2 = c[(r - 1) % c.shape[0]], c[r % c.shape[0]], c[(r + 1) % c.shape[0]]
@@ -211,9 +214,9 @@ def _mix(x: Any, smooth: Any, share: Any, out: Any) -> None:
 
 
 @compiled
-def _trust_row(stream: FullStream, r: int) -> None:
-    """Polarization of row ``r`` for the second stream to take out."""
-    share, out = stream.rows[0], stream.second.smooth[r % 3]
+def _trust_row(stream: Between, r: int, out: Any) -> None:
+    """Polarization of row ``r`` for the second stream to take out, to ``out [6, n]``."""
+    share = stream.rows[0]
     polarized, smooth = stream.polarized[r % stream.polarized.shape[0]], stream.smooth[r % 2]
     _share(stream, r, share)
     for k in range(6):
@@ -230,6 +233,14 @@ def _mean_of_colors(above: Any, here: Any, below: Any, other: Any, out: Any) -> 
         beside = (left[j] + right[j]) + (up[j] + down[j])
         across = (up_left[j] + up_right[j]) + (down_left[j] + down_right[j])
         mean[j] = THIRD * (x[j] + HALF * beside + QUARTER * is_other[j] * (across - beside))
+
+
+@compiled
+def _mean_colors(residual: Any, r: int, grid: Grid, means: Any) -> None:
+    """Means over the colours of all analysers of row ``r``, to a ring ``means``."""
+    for k in range(4):
+        above, here, below = residual[(r - 1) % 5, k], residual[r % 5, k], residual[(r + 1) % 5, k]
+        _mean_of_colors(above, here, below, grid.others[r % 2], means[r % 3, k])
 
 
 @compiled
@@ -251,7 +262,7 @@ def _between(left: Any, right: Any, even: Any, odd: Any) -> None:
 
 
 @compiled
-def _polarize_pixels(stream: FullStream, r: int, grid: Grid) -> None:
+def _polarize_pixels(stream: Between, r: int, grid: Grid) -> None:
     """s1 and s2, means over colours, at the pixels of row ``r``. Twin: `fit_stokes` of `interpolate_analysers`."""
     left, right, pixels = stream.rows[0], stream.rows[1], stream.pixels[r % 3]
     here = stream.means[r % 3]
@@ -265,6 +276,13 @@ def _polarize_pixels(stream: FullStream, r: int, grid: Grid) -> None:
 
 
 @compiled
+def _keep_colors(green: Any, filled: Any, s0: Any) -> None:
+    """s0 of a row, ``[12, n]``: of green, red and blue."""
+    copy(green.reshape(-1), s0[0:4].reshape(-1))
+    copy(filled.reshape(-1), s0[4:12].reshape(-1))
+
+
+@compiled
 def _join(even: Any, odd: Any, out: Any) -> None:
     for j in range(out.size // 2):
         out[2 * j] = even[j]
@@ -272,7 +290,7 @@ def _join(even: Any, odd: Any, out: Any) -> None:
 
 
 @compiled
-def _write_row(stream: FullStream, r: int, edge: int, out: Any) -> None:
+def _write_row(stream: Between, r: int, edge: int, out: Any) -> None:
     """Both rows of pixels of row ``r`` to ``out [2, 5, 2 w]``."""
     rows, s0 = stream.rows, stream.s0[r % stream.s0.shape[0]]
     above, here, below = stream.pixels[(r - 1) % 3], stream.pixels[r % 3], stream.pixels[(r + 1) % 3]
@@ -291,29 +309,21 @@ def _write_row(stream: FullStream, r: int, edge: int, out: Any) -> None:
 @compiled
 def _push_row(source: Source, u: int, stream: FullStream, out: Any) -> None:
     """Read a row as the stream's ``u``-th, and write the row `REACH` above it."""
-    grid, first, second = source.grid, stream.first, stream.second
+    grid, first, second, between = source.grid, stream.first, stream.second, stream.between
     load_row(source, u, first)
     intensity_row(first, u - INTENSITY, grid)
     _around_row(first, u - _AROUND)
     residual_row(first, u - _FIRST)
-    _polarize_first(stream, u - _POLARIZED, grid)
-    _smooth_first(stream, u - _SMOOTH)
-    _trust_row(stream, u - _RELIABLE)
+    _polarize_first(first.residual, between, u - _POLARIZED, grid)
+    _smooth_first(between, u - _SMOOTH)
+    _trust_row(between, u - _RELIABLE, second.smooth[(u - _RELIABLE) % 3])
 
     guide_row(second, u - _BEHIND, grid)
     r = u - _BEHIND - COLORED
-    s0, green = stream.s0[r % stream.s0.shape[0]], second.green[r % second.green.shape[0]]
-    for k in range(4):
-        copy(green[k], s0[k])
-    for k in range(8):
-        copy(second.filled[r % 3, k], s0[4 + k])
-
-    r, residual = u - _MEANS, second.residual
-    for k in range(4):
-        above, here, below = residual[(r - 1) % 5, k], residual[r % 5, k], residual[(r + 1) % 5, k]
-        _mean_of_colors(above, here, below, grid.others[r % 2], stream.means[r % 3, k])
-    _polarize_pixels(stream, u - _PIXELS, grid)
-    _write_row(stream, u - REACH, grid.edge, out)
+    _keep_colors(second.green[r % second.green.shape[0]], second.filled[r % 3], between.s0[r % between.s0.shape[0]])
+    _mean_colors(second.residual, u - _MEANS, grid, between.means)
+    _polarize_pixels(between, u - _PIXELS, grid)
+    _write_row(between, u - REACH, grid.edge, out)
 
 
 @entry

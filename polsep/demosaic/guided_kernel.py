@@ -113,7 +113,7 @@ def open_stream(source: Source, start: int, apart: bool = False, details: bool =
 
 @compiled
 def sum_nine(x: Any, out: Any) -> None:
-    """Sums of nine neighbours along a row."""
+    """Sums of nine neighbours along a row, or along rows that lie one behind the other."""
     a, b, c, d = x[GUARD - 4 :], x[GUARD - 3 :], x[GUARD - 2 :], x[GUARD - 1 :]
     e, f, g, h, i = x[GUARD:], x[GUARD + 1 :], x[GUARD + 2 :], x[GUARD + 3 :], x[GUARD + 4 :]
     total = out[GUARD:]
@@ -122,14 +122,15 @@ def sum_nine(x: Any, out: Any) -> None:
 
 
 @compiled
-def mean_nine(ring: Any, r: int, k: int, out: Any) -> None:
-    """The mean over the nine rows of sums about row ``r``, always added in the same order."""
-    a, b, c, d = ring[(r - 4) % 9, k], ring[(r - 3) % 9, k], ring[(r - 2) % 9, k], ring[(r - 1) % 9, k]
-    e, f, g = ring[r % 9, k], ring[(r + 1) % 9, k], ring[(r + 2) % 9, k]
-    h, i = ring[(r + 3) % 9, k], ring[(r + 4) % 9, k]
-    for j in range(out.size):
+def mean_nine(ring: Any, r: int, out: Any) -> None:
+    """The means over the nine rows of sums about row ``r``, always added in the same order; ``out``: as a row of it."""
+    a, b, c = ring[(r - 4) % 9].reshape(-1), ring[(r - 3) % 9].reshape(-1), ring[(r - 2) % 9].reshape(-1)
+    d, e, f = ring[(r - 1) % 9].reshape(-1), ring[r % 9].reshape(-1), ring[(r + 1) % 9].reshape(-1)
+    g, h, i = ring[(r + 2) % 9].reshape(-1), ring[(r + 3) % 9].reshape(-1), ring[(r + 4) % 9].reshape(-1)
+    means = out.reshape(-1)
+    for j in range(means.size):
         total = (((a[j] + b[j]) + (c[j] + d[j])) + ((e[j] + f[j]) + (g[j] + h[j]))) + i[j]
-        out[j] = _WINDOW * total
+        means[j] = _WINDOW * total
 
 
 @compiled
@@ -227,11 +228,9 @@ def load_row(source: Source, u: int, stream: Stream) -> None:
     load_cells(source, mirrored, stream.sensor_row, stream.raw[u % stream.raw.shape[0]])
     r = u - _POLARIZED
     polarize_row(stream.raw, r, grid, grid.inverse[1:3], rows[6:9], rows[0:6].reshape(2, 3, grid.n))
-    for k in range(6):
-        sum_nine(rows[k], stream.sums[r % 9, k])
+    sum_nine(rows[0:6].reshape(-1), stream.sums[r % 9].reshape(-1))
     r = u - SMOOTHED
-    for k in range(6):
-        mean_nine(stream.sums, r, k, stream.smooth[r % 3, k])
+    mean_nine(stream.sums, r, stream.smooth[r % 3])
 
 
 @compiled

@@ -5,9 +5,11 @@ Rows of pixels come from `demosaic.bilinear_full_kernel` and `demosaic.guided_fu
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polsep.compute.compiling import ZERO, compiled, entry
 from polsep.compute.rows_kernel import copy, fill
@@ -114,11 +116,19 @@ def separate_guided_pixel_strip(frame: Frame, conversion: Conversion, targets: T
     null = conversion.null[np.argsort(2 * places[:, 0] + places[:, 1])]
     stream = guided.open_full_stream(frame.source, null, row_range[0])
     strip = open_pixel_strip(frame, (2 * row_range[0], 2 * row_range[1]), KEPT)
-    better = np.empty((2 * CHUNK, 5, frame.pixels.w), np.float32)
+    better = _at_cache_line((2 * CHUNK, 5, frame.pixels.w))
     for start in range(row_range[0], row_range[1], CHUNK):
         stop = min(start + CHUNK, row_range[1])
         guided.demosaic_pixels(frame.source, stream, (start, stop), better)
         separate_pixels(frame, conversion, targets, strip, (2 * start, 2 * stop), better)
+
+
+def _at_cache_line(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """An array of that ``shape`` that begins at a cache line, which stores of a line's length prefer."""
+    size, line = math.prod(shape), 16
+    numbers = np.empty(size + line, np.float32)
+    first = -(numbers.ctypes.data // 4) % line
+    return numbers[first : first + size].reshape(shape)
 
 
 @entry

@@ -114,17 +114,6 @@ def _replace_unclipped(better: Any, clipped: Any, stokes: Any) -> None:
 
 
 @compiled
-def _keep_lines(stokes: Any, slope: Any, lines: Any) -> None:
-    """Slope and offset of a row, ``lines [4, w]``."""
-    for j in range(lines.shape[1]):
-        x = PAD + j
-        mean = THIRD * (stokes[0, x] + stokes[1, x] + stokes[2, x])
-        for i in range(2):
-            lines[i, j] = slope[i, x]
-            lines[2 + i, j] = stokes[3 + i, x] - slope[i, x] * mean
-
-
-@compiled
 def _report(strip: Strip, t: int, clipped: Any, targets: Targets) -> None:
     """DoLP and AoLP of row ``t``, and what its unclipped pixels add to the sums."""
     rows, stokes, moments = strip.rows, strip.rings.stokes[t % 16], strip.rings.moments[t % 16]
@@ -162,11 +151,8 @@ def _write_row(gains: Any, t: int, strip: Strip, better: Any, targets: Targets) 
     interleave(rows.planes[1:4], gains, targets.diffuse[t])
     if targets.lines.size:
         for i in range(2):
-            for j in range(targets.lines.shape[2]):
-                targets.lines[i, t, j], targets.lines[2 + i, t, j] = (
-                    rows.diffuse_polarization[i, PAD + j],
-                    rows.spare[1 + i, j],
-                )
+            copy(rows.diffuse_polarization[i, PAD:], targets.lines[i, t])
+            copy(rows.spare[1 + i], targets.lines[2 + i, t])
     if targets.sums.size:
         _report(strip, t, clipped, targets)
 

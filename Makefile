@@ -1,5 +1,6 @@
 # make demo   set up and separate the embedded capture
 # make test   set up and run the whole suite: lint, types, tests
+# make kernels  compile the kernels anew, after a change of them
 # make docs   build the documentation site into site/
 # make fuzz   damage files of every kind and read them: make fuzz INPUTS=20000 SECONDS=1200
 PYTHON ?= python3
@@ -9,7 +10,7 @@ SECONDS ?= 1200
 BIN := $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test docs bench fuzz clean
+.PHONY: demo test kernels docs bench fuzz clean
 
 demo: $(VENV)/.installed
 	$(BIN)/polsep demo -o demo-out
@@ -18,8 +19,10 @@ test: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -c "from polsep.kernels import warm_up; warm_up()"
 	$(BIN)/pytest -n auto --dist loadfile
+
+kernels: $(VENV)/.installed-dev
+	PYTHONHASHSEED=0 nice $(BIN)/python -m tools.build_kernels
 
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -1,4 +1,4 @@
-"""What a new user waits for: a bare install from a checkout, its size, and the first frames in new processes.
+"""A bare install from a checkout, as a new user has it: its size, what it takes, and the first frames in new processes.
 
 Each checkout is installed by pip into a virtual environment of its own, with the checkout's constraints, on this
 machine: `before` is the commit before torch became an extra, `now` the committed state. No compiled code is kept from

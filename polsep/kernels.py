@@ -1,7 +1,6 @@
-"""The fused CPU twins of the hot path, compiled by numba, and nothing else.
+"""The fused CPU twins of the hot path, compiled, and nothing else.
 
-Every kernel computes what a readable torch function computes, which its docstring names and a test compares. Importing
-this room imports numba; ``import polsep`` does not.
+Every kernel computes what a readable torch function computes, which its docstring names and a test compares.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ __all__ = [
 
 
 def warm_up() -> None:
-    """Compile what `separate` and streams use, or load it from numba's cache: two minutes at first, then seconds."""
+    """Load what `separate` and streams use; where the library has no code for the machine, compile it: two minutes."""
     kernels = (
         analytic_kernel,
         color_affine_kernel,

@@ -62,7 +62,7 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Path
         importlib.invalidate_caches()
         calling = importlib.import_module("tiny.calling")
         result = calling.run(calling.Argument(5, 7))
-        return result, bool(calling.run.stats.cache_hits)
+        return result, bool(calling.run.dispatcher.stats.cache_hits)
 
     monkeypatch.syspath_prepend(str(folder.parent))
     assert load() == (15, False)
@@ -139,7 +139,7 @@ def test_a_package_that_cannot_be_written_is_cached_in_the_users_folder(
 
 def test_what_code_is_known_by_is_the_same_in_every_process() -> None:
     code = """
-from polsep.compute.compiling import fingerprint
+from polsep.compute.jit import fingerprint
 from polsep.separation.strips_kernel import separate_rows
 print(fingerprint(separate_rows.py_func))
 """

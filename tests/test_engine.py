@@ -10,12 +10,12 @@ import time
 from dataclasses import replace
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 import torch
 
-from polsep.compute import warm_up
+from polsep.compute import jit, warm_up
+from polsep.compute.compiling import OPTIONS
 from polsep.methods import METHODS, run_reference
 from polsep.physics.stokes import Measurements
 from polsep.pipeline import SeparatedFrame, make_frame, resolve_light, separate_capture
@@ -177,7 +177,7 @@ def test_slow_compilation_is_said_once(monkeypatch: pytest.MonkeyPatch, caplog: 
         time.sleep(0.2)
 
     def compile_something() -> None:
-        numba.njit(lambda x: x + 1)(1)
+        jit.make_dispatcher(lambda x: x + 1, OPTIONS, cached=False)(1)
         time.sleep(0.2)
 
     with caplog.at_level(logging.WARNING, "polsep"):

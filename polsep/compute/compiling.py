@@ -1,27 +1,25 @@
-"""Two decorators that compile kernels with numba, and the numbers that keep their arithmetic in float32.
+"""Decorators of kernels, and the numbers that keep their arithmetic in float32.
 
-Both decorators allow fused multiply-adds and ignore the sign of zero, but allow no reassociation and do not assume
-finite values: bits do not depend on how loops are cut. Division by zero gives infinity or NaN, as in NumPy.
+A kernel is compiled ahead of time, into a library that comes with polsep (`polsep.compute.library`), or else on first
+use by numba (`polsep.compute.jit`). This module imports neither, so that a kernel costs nothing until it is called.
 
-Compiled code is kept on disk where numba keeps it: in ``__pycache__`` beside the kernels or, where that cannot be
-written, in the user's cache folder (``NUMBA_CACHE_DIR`` overrides both). Numba alone would renew it only when the file
-of the `entry` changes. Here it is renewed exactly when the code of the `entry`, of anything that it calls, a constant
-or the fields of a tuple change: not by comments, nor by the path or the time of a file.
+All decorators allow no reassociation and do not assume finite values: bits do not depend on how loops are cut. Division
+by zero gives infinity or NaN, as in NumPy. Unless said otherwise they allow fused multiply-adds and ignore the sign of
+zero.
 """
 
 from __future__ import annotations
 
-import hashlib
-import sys
+import logging
+import os
+import threading
 from collections.abc import Callable, Iterator
 from types import CodeType, ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
-from numba import njit
-from numba.core import types
-from numba.core.caching import FunctionCache, IndexDataCacheFile
-from numba.core.dispatcher import Dispatcher
+
+from polsep.compute import library
 
 Compilable = TypeVar("Compilable", bound=Callable[..., Any])
 
@@ -29,111 +27,141 @@ Compilable = TypeVar("Compilable", bound=Callable[..., Any])
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 HALF, THIRD, QUARTER = np.float32(0.5), np.float32(1 / 3), np.float32(0.25)
 
-_FASTMATH = {"contract", "nsz"}
+#: The environment variable that chooses compiled code: "jit" for numba; unset for the library where it is valid.
+CHOICE = "POLSEP_KERNELS"
+
+_FASTMATH = ("contract", "nsz")
+#: Numba's options of all kernels.
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": _FASTMATH}
+# Wrappers for Python would take longer to compile than the functions themselves.
+_CALLED: dict[str, Any] = OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+class Kernel:
+    """A function to compile and numba's ``options`` for it; numba's own dispatcher is made when it is asked for."""
+
+    _lock = threading.RLock()
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self.__module__, self.__doc__ = function.__module__, function.__doc__
+        self.__name__, self.__qualname__ = function.__name__, function.__qualname__
+        self.py_func, self.options = function, options
+        self._dispatcher: Any = None
+
+    @property
+    def dispatcher(self) -> Any:
+        """Numba's dispatcher. Raises ImportError without numba."""
+        from polsep.compute import jit
+
+        with self._lock:
+            if self._dispatcher is None:
+                self._dispatcher = jit.make_dispatcher(self.py_func, self.options, isinstance(self, Entry))
+            return self._dispatcher
+
+    @property
+    def _numba_type_(self) -> Any:
+        """The type by which numba knows a global that kernels name."""
+        return self.dispatcher._numba_type_
+
+    def __reduce__(self) -> str:
+        """Pickle by name, as functions are."""
+        return self.py_func.__qualname__
+
+
+class Entry(Kernel):
+    """A kernel that Python calls. State: the compiled code it was bound to by the first call."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        super().__init__(function, options)
+        self._code: Callable[..., Any] | None = None
+
+    def __call__(self, *args: Any) -> Any:
+        """Run the compiled code, without the interpreter's lock, so that threads overlap."""
+        if self._code is None:
+            self._code = _bind(self)
+        return self._code(*args)
 
 
 def compiled(function: Compilable) -> Compilable:
-    """Decorator of everything that an `entry` calls: compiled into it, not callable from Python, not cached on its own.
+    """Decorator of everything that an `entry` calls: compiled into it, not callable from Python.
 
-    Wrappers for Python would take longer to compile than the functions themselves. Inside, copy arrays by loops: an
-    assignment of slices brings numba's broadcasting with it, seconds of compilation.
+    Inside, copy arrays by loops: an assignment of slices brings numba's broadcasting with it, seconds of compilation.
     """
-    decorated: Compilable = njit(  # type: ignore[call-overload]  # numba's stubs lack its two options for wrappers
-        nogil=True, fastmath=_FASTMATH, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
-    )(function)
-    return decorated
+    result: Any = Kernel(function, _CALLED)
+    return result  # type: ignore[no-any-return]
+
+
+def inlined(function: Compilable) -> Compilable:
+    """Decorator like `compiled`, inlined into the calling loop, which LLVM can vectorise only then."""
+    result: Any = Kernel(function, _CALLED | {"forceinline": True})
+    return result  # type: ignore[no-any-return]
+
+
+def inlined_exactly(function: Compilable) -> Compilable:
+    """Decorator like `inlined`, with every operation rounded on its own.
+
+    ``fastmath=False`` must be given: without it numba compiles a function with its caller's setting.
+    """
+    result: Any = Kernel(function, _CALLED | {"forceinline": True, "fastmath": False})
+    return result  # type: ignore[no-any-return]
 
 
 def entry(function: Compilable) -> Compilable:
-    """Decorator of what Python calls: cached on disk, and without the interpreter's lock, so that threads overlap."""
-    decorated: Any = njit(nogil=True, fastmath=_FASTMATH, error_model="numpy")(function)
-    decorated._cache = _Cache(function)  # type: ignore[no-untyped-call]
-    result: Compilable = decorated
-    return result
+    """Decorator of what Python calls, by position: NumPy arrays, numbers and tuples of them."""
+    result: Any = Entry(function, OPTIONS)
+    return result  # type: ignore[no-any-return]
 
 
-class _CacheFile(IndexDataCacheFile):
-    """Numba's file of one function; one that names types which are gone is of other code, like one of another stamp."""
-
-    def _load_index(self) -> Any:
+def _bind(kernel: Entry) -> Callable[..., Any]:
+    """The kernel's code in the library, or numba's. Raises ImportError if there is neither."""
+    choice = os.environ.get(CHOICE, "")
+    if choice not in ("", "jit"):
+        raise ValueError(f"expected {CHOICE}=jit or nothing, found {choice!r}")
+    try:
+        if choice == "jit":
+            raise library.Unusable(f"{CHOICE}=jit")
+        return library.find(kernel.py_func)
+    except library.Unusable as reason:
+        logging.getLogger("polsep").debug("numba compiles %s: %s", kernel.__qualname__, reason)
         try:
-            return super()._load_index()  # type: ignore[no-untyped-call]
-        except (AttributeError, ImportError):
-            return {}
+            return kernel.dispatcher  # type: ignore[no-any-return]
+        except ImportError as error:
+            raise ImportError(
+                f"expected compiled code of {kernel.__qualname__}, found none ({reason}) and no numba to compile it: "
+                "pip install numba"
+            ) from error
 
 
-class _Cache(FunctionCache):
-    """Numba's cache of one function, in numba's folder, that is valid for one `fingerprint`."""
+def reach(function: Callable[..., Any]) -> Iterator[tuple[Callable[..., Any], list[tuple[str, str, Any]]]]:
+    """A function and all compiled ones that it calls, each with the globals that it names.
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load as numba does; called before a function is compiled or saved, when all that it calls is defined."""
-        name = f"{self._py_func.__module__.rpartition('.')[2]}.{self._py_func.__qualname__}"
-        name = f"{name.replace('<', '').replace('>', '')}.py{sys.version_info[0]}{sys.version_info[1]}"
-        stamp = fingerprint(self._py_func)
-        self._cache_file = _CacheFile(self._cache_path, name, stamp)  # type: ignore[no-untyped-call]
-        return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-
-    def _index_key(self, sig: Any, codegen: Any) -> Any:
-        return *super()._index_key(sig, codegen), tuple(_fields(sig))  # type: ignore[no-untyped-call]
-
-
-def fingerprint(function: Callable[..., Any]) -> str:
-    """Hash of the code of a function, of all compiled functions that it calls, and of the constants that they use."""
-    text, hashed, pending = [_describe(_FASTMATH)], set(), [function]
+    Globals are told by their module, name and value; those inside of a named module, ``math.pi`` say, by that module.
+    """
+    seen, pending = set(), [function]
     while pending:
         current = pending.pop()
-        if current in hashed:
+        if current in seen:
             continue
-        hashed.add(current)
-        text.append(f"{current.__module__}.{current.__qualname__}")
-        names: list[str] = []
-        for code in _codes(current.__code__):
-            constants = [c for c in code.co_consts if not isinstance(c, CodeType) and c != current.__doc__]
-            text += [code.co_code.hex(), _describe(tuple(constants)), _describe(code.co_names), str(code.co_argcount)]
-            names += code.co_names
-        for name, value in _globals(current, names):
-            if isinstance(value, Dispatcher):
-                pending.append(value.py_func)
-                value = tuple(value.targetoptions.items())
-            text.append(f"{name}={_describe(value)}")
-    return hashlib.sha256("\n".join(text).encode()).hexdigest()
+        seen.add(current)
+        named = list(_globals(current))
+        pending += [value.py_func for _, _, value in named if hasattr(value, "py_func")]
+        yield current, named
 
 
-def _codes(code: CodeType) -> Iterator[CodeType]:
+def codes(code: CodeType) -> Iterator[CodeType]:
     """The code of a function and of all functions inside it."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            yield from _codes(constant)
+            yield from codes(constant)
 
 
-def _globals(function: Callable[..., Any], names: list[str]) -> Iterator[tuple[str, Any]]:
+def _globals(function: Callable[..., Any]) -> Iterator[tuple[str, str, Any]]:
     """The globals that a function names, and what it may name inside of modules among them."""
+    names = [name for code in codes(function.__code__) for name in code.co_names]
     for name in names:
         value = function.__globals__.get(name)
         if isinstance(value, ModuleType):
-            yield from ((f"{name}.{each}", getattr(value, each)) for each in names if hasattr(value, each))
+            yield from ((value.__name__, each, getattr(value, each)) for each in names if hasattr(value, each))
         elif value is not None:
-            yield name, value
-
-
-def _describe(value: Any) -> str:
-    """Text of a constant that differs for another value; of types and functions their name and fields."""
-    if isinstance(value, np.ndarray):
-        return f"{value.dtype}{value.shape}{value.tobytes().hex()}"
-    if isinstance(value, tuple):
-        return f"{getattr(value, '_fields', '')}({','.join(map(_describe, value))})"
-    if isinstance(value, set | frozenset):  # in an order that differs between processes
-        return f"{{{','.join(sorted(map(_describe, value)))}}}"
-    if isinstance(value, np.generic | float | int | str):
-        return f"{type(value).__name__} {value!r}"
-    return f"{getattr(value, '__qualname__', type(value).__name__)}{getattr(value, '_fields', '')}"
-
-
-def _fields(signature: Any) -> Iterator[tuple[str, ...]]:
-    """Fields of all named tuples in a signature, in which numba names only their types."""
-    for kind in signature:
-        if isinstance(kind, types.BaseNamedTuple):
-            yield kind.fields  # type: ignore[attr-defined]
-        if isinstance(kind, types.BaseTuple):
-            yield from _fields(kind)
+            yield function.__module__, name, value

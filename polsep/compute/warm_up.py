@@ -7,10 +7,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any
 
 #: Compilation that takes less than this many seconds is not worth a word.
 PATIENCE = 2.0
+
+#: Warnings of those who wait for kernels now.
+_NOTICES: list[threading.Timer] = []
 
 
 @lru_cache
@@ -23,26 +25,22 @@ def make_ready(warm_up: Callable[[], object]) -> None:
         warm_up()
 
 
+def announce_compilation() -> None:
+    """Start the clocks of all who wait in `make_ready`: the compiler has begun."""
+    for notice in _NOTICES:
+        if notice.ident is None:
+            notice.start()
+
+
 @contextmanager
 def _watch_compiler() -> Iterator[None]:
     """Log a warning `PATIENCE` seconds after the compiler starts, if the block is not done by then."""
-    from numba.core import event
-
     text = "compiling this method for this machine, once: up to a minute or two"
     notice = threading.Timer(PATIENCE, logging.getLogger("polsep").warning, (text,))
     notice.daemon = True
-
-    class Start(event.Listener):
-        def on_start(self, event: Any) -> None:
-            del event
-            if notice.ident is None:
-                notice.start()
-
-        def on_end(self, event: Any) -> None:
-            del event
-
-    with event.install_listener("numba:compile", Start()):
-        try:
-            yield
-        finally:
-            notice.cancel()
+    _NOTICES.append(notice)
+    try:
+        yield
+    finally:
+        _NOTICES.remove(notice)
+        notice.cancel()

@@ -37,7 +37,7 @@ def iterate_fast(planes: Planes) -> Iterated:
 
 
 def warm_up() -> None:
-    """Compile the kernel, or load it from numba's cache on disk."""
+    """Load the kernel, or compile it."""
     square, line = np.ones((1, 3, 3)), np.ones(1)
     iterate_fast(Planes(square, square, square, line, line, line))
 

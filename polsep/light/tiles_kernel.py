@@ -75,7 +75,7 @@ def tile_raw(raw: RawFrame, layout: Layout, black_level: float, white_level: flo
 
 
 def warm_up() -> None:
-    """Compile the kernel, or load it from numba's cache on disk. One compilation serves all dtypes and layouts."""
+    """Load the kernel, or compile it. One compilation serves all dtypes and layouts."""
     tile_raw(np.eye(16, dtype=np.uint8), Layout(), 0, 1)
 
 

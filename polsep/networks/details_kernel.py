@@ -344,7 +344,7 @@ def write_pixels(
 
 
 def warm_up() -> None:
-    """Compile the passes of full resolution, or load them from numba's cache on disk."""
+    """Load the passes of full resolution, or compile them."""
     size = 4
     closed, beyond = ClosedFormRows.empty(3, size, size), np.zeros((2 * size, 9, 2 * size), np.float32)
     smooth = read_smooth(np.zeros((3, 1, _SIDE, _SIDE), np.float32))

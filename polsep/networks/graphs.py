@@ -116,7 +116,7 @@ class _Graph:
         return self.relu(self.chain(x, "net.out", 1))
 
     def modulate(self, x: Node, changes: Sequence[tuple[Node, Node]], level: int) -> Node:
-        """As `unet.modulate`."""
+        """The twin of `unet.modulate`."""
         if not changes:
             return x
         scale, shift = changes[level]

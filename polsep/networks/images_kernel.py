@@ -181,7 +181,7 @@ def write_rows(outputs: LayerOutputs, gains: Floats, targets: Targets, row_range
 
 
 def warm_up() -> None:
-    """Compile both ways to the maps and what writes the images, or load them from numba's cache on disk."""
+    """Load both ways to the maps and what writes the images, or compile them."""
     layout, size = Layout(), 4
     samples = as_samples(np.eye(PERIOD * size, dtype=np.uint8))
     pattern = read_pattern((PERIOD * size, PERIOD * size), layout, 0, 1, (1.0, 1.0, 1.0))

@@ -10,10 +10,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from polsep.compute.compiling import HALF, ONE, TWO, ZERO, Compilable
+from polsep.compute.compiling import HALF, ONE, TWO, ZERO, inlined_exactly
 from polsep.render.materials import Materials
 from polsep.render.textures import (
     CHECKER,
@@ -49,22 +48,6 @@ _NOISE_GAIN, _GAIN, _LACUNARITY = np.float32(NOISE_GAIN), np.float32(GAIN), np.f
 _FAR = np.float32(np.inf)
 
 
-def _strict(function: Compilable) -> Compilable:
-    """Decorator like `compiling.compiled`, inlined, with every operation rounded on its own.
-
-    ``fastmath=False`` must be given: without it numba compiles a function with its caller's setting.
-    """
-    decorated: Compilable = njit(  # type: ignore[call-overload]  # numba's stubs lack some of its options
-        nogil=True,
-        fastmath=False,
-        error_model="numpy",
-        no_cpython_wrapper=True,
-        no_cfunc_wrapper=True,
-        forceinline=True,
-    )(function)
-    return decorated
-
-
 class PatternTable(NamedTuple):
     """Arrays of `polsep.render.textures.Textures`: ``pattern``, ``octaves``, ``seed``, each ``[S]``.
 
@@ -93,27 +76,27 @@ def pattern_table(materials: Materials) -> PatternTable:
     )
 
 
-@_strict
+@inlined_exactly
 def _ramp(x: Any) -> Any:
     """`textures.ramp`."""
     x = min(max(x, ZERO), ONE)
     return x * x * (_THREE - TWO * x)
 
 
-@_strict
+@inlined_exactly
 def _floor(x: Any) -> Any:
     """The largest whole number up to x, as int32; for lattice coordinates, which are small."""
     whole = np.int32(x)
     return np.int32(whole - np.int32(x < np.float32(whole)))
 
 
-@_strict
+@inlined_exactly
 def _wave(x: Any) -> Any:
     """`textures.wave`."""
     return abs(TWO * (x - np.float32(_floor(x))) - ONE)
 
 
-@_strict
+@inlined_exactly
 def _mix(h: Any) -> Any:
     """`textures.hash_cell` from the combined lattice coordinates on."""
     h = np.uint32(h ^ (h >> _S16))
@@ -123,20 +106,20 @@ def _mix(h: Any) -> Any:
     return np.uint32(h ^ (h >> _S16))
 
 
-@_strict
+@inlined_exactly
 def _fraction(h: Any, shift: Any) -> Any:
     """Ten bits as a fraction; via signed integers, which every CPU converts fast."""
     return np.float32(np.int32(np.uint32(h >> shift) & _TEN_BITS)) * _FRACTION
 
 
-@_strict
+@inlined_exactly
 def _shade(h: Any) -> Any:
     """The shade of a cell, as in `textures.cells`."""
     h = np.uint32((h ^ (h >> _S7)) * _M0)
     return np.float32(np.int32(np.uint32(h >> _S8) & _SIXTEEN_BITS)) * _SHADE
 
 
-@_strict
+@inlined_exactly
 def _gradient(h: Any, x: Any, y: Any, z: Any) -> Any:
     """Product of a lattice point's random gradient with (x, y, z)."""
     gx = TWO * _fraction(h, np.uint32(0)) - ONE
@@ -145,13 +128,13 @@ def _gradient(h: Any, x: Any, y: Any, z: Any) -> Any:
     return gx * x + gy * y + gz * z
 
 
-@_strict
+@inlined_exactly
 def _fade(t: Any) -> Any:
     """Perlin's quintic interpolant."""
     return t * t * t * (t * (t * _SIX - _FIFTEEN) + _TEN)
 
 
-@_strict
+@inlined_exactly
 def gradient_noise(x: Any, y: Any, z: Any, seed: Any) -> Any:
     """`textures.gradient_noise` at one point."""
     i, j, k = _floor(x), _floor(y), _floor(z)
@@ -177,7 +160,7 @@ def gradient_noise(x: Any, y: Any, z: Any, seed: Any) -> Any:
     return left + u * (right - left)
 
 
-@_strict
+@inlined_exactly
 def _octave_noise(f: Any, count: int, seed: Any, octaves: int) -> None:
     """`textures.octave_noise` of a run, to row NOISE."""
     for n in range(count):
@@ -190,7 +173,7 @@ def _octave_noise(f: Any, count: int, seed: Any, octaves: int) -> None:
         scale, gain, seed = scale * _LACUNARITY, gain * _GAIN, np.uint32(seed + _STEP)
 
 
-@_strict
+@inlined_exactly
 def _visit_cell(f: Any, k: Any, count: int, step: tuple[Any, Any, Any], seed: Any) -> None:
     """Update the two nearest centres of every point by the centre in the cell at this ``step`` from its own."""
     di, dj, dk = np.uint32(step[0]) * _P0, np.uint32(step[1]) * _P1, np.uint32(step[2]) * _P2
@@ -210,7 +193,7 @@ def _visit_cell(f: Any, k: Any, count: int, step: tuple[Any, Any, Any], seed: An
         k[_HASH + n] = h if closer else first_hash
 
 
-@_strict
+@inlined_exactly
 def _find_cells(f: Any, k: Any, count: int, seed: Any) -> None:
     """`textures.cells` of a run: distances to rows FIRST and SECOND, hashes to HASH and NEXT."""
     for n in range(count):
@@ -231,7 +214,7 @@ def _find_cells(f: Any, k: Any, count: int, seed: Any) -> None:
         f[_SECOND + n] = math.sqrt(f[_SECOND + n])
 
 
-@_strict
+@inlined_exactly
 def _weigh_cells(f: Any, k: Any, count: int, which: int, threshold: Any, edge: Any) -> None:
     """Weights of PATCHES, CRACKS and DOTS from the rows of `_find_cells`, to row X."""
     if which == PATCHES:
@@ -247,7 +230,7 @@ def _weigh_cells(f: Any, k: Any, count: int, which: int, threshold: Any, edge: A
             f[_X + n] = _ramp((threshold - f[_FIRST + n]) / edge)
 
 
-@_strict
+@inlined_exactly
 def _weigh_noise(f: Any, count: int, which: int, threshold: Any, edge: Any, warp: Any) -> None:
     """Weights of CLOUDS, RINGS and STRIPES from row NOISE, to row X."""
     if which == CLOUDS:
@@ -261,13 +244,13 @@ def _weigh_noise(f: Any, count: int, which: int, threshold: Any, edge: Any, warp
         f[_X + n] = _ramp((_wave(f[_X + n] + warp * f[_NOISE + n]) - threshold) / edge + HALF)
 
 
-@_strict
+@inlined_exactly
 def _side(x: Any, edge: Any) -> Any:
     """Side of a checker's borders along one axis, from -1 to 1, smooth across an ``edge``."""
     return min(max((_wave(HALF * x) - HALF) / edge, -ONE), ONE)
 
 
-@_strict
+@inlined_exactly
 def weigh_run(table: PatternTable, slot: int, count: int, f: Any, k: Any) -> None:
     """Replace row x of ``f`` by the weights of ``count`` points of one slot.
 

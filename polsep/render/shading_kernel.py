@@ -14,10 +14,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from polsep.compute.compiling import HALF, ONE, TWO, ZERO, Compilable, entry
+from polsep.compute.compiling import HALF, ONE, TWO, ZERO, entry, inlined
 from polsep.physics.fresnel import ETA
 from polsep.render.materials import Materials
 from polsep.render.patterns_kernel import INTEGER_ROWS, NUMBER_ROWS, RUN, PatternTable, pattern_table, weigh_run
@@ -93,20 +92,7 @@ def build_beams(camera: PinholeCamera, light: PointLight) -> Beams:
     return Beams(eye, lamp, np.float32(light.intensity), np.float32(cosine), np.float32(sine))
 
 
-def _inlined(function: Compilable) -> Compilable:
-    """Decorator like `compiling.compiled`, inlined into the calling loop, which LLVM can vectorise only then."""
-    decorated: Compilable = njit(  # type: ignore[call-overload]  # numba's stubs lack some of its options
-        nogil=True,
-        fastmath={"contract", "nsz"},
-        error_model="numpy",
-        no_cpython_wrapper=True,
-        no_cfunc_wrapper=True,
-        forceinline=True,
-    )(function)
-    return decorated
-
-
-@_inlined
+@inlined
 def _fresnel(c: Any) -> Any:
     """`fresnel.fresnel`: R+, R- and Rx."""
     ct = math.sqrt(ONE - (ONE - c * c) * _INVERSE_ETA2)
@@ -116,21 +102,21 @@ def _fresnel(c: Any) -> Any:
     return HALF * (s + p), HALF * (s - p), rs * rp
 
 
-@_inlined
+@inlined
 def _double_angle(a: Any, b: Any) -> Any:
     """cos and sin of twice the azimuth of (a, b)."""
     scale = ONE / max(a * a + b * b, _TINY)
     return (a * a - b * b) * scale, TWO * a * b * scale
 
 
-@_inlined
+@inlined
 def _smith(c: Any, alpha2: Any) -> Any:
     """`optics.smith_shadowing`."""
     c = max(c, _MIN_SMITH)
     return TWO / (ONE + math.sqrt(ONE + alpha2 * max(ONE - c * c, ZERO) / (c * c)))
 
 
-@_inlined
+@inlined
 def _toward(target: Any, x: Any, y: Any, z: Any) -> Any:
     """Unit vector to a point, and the squared distance."""
     x, y, z = target[0] - x, target[1] - y, target[2] - z
@@ -139,7 +125,7 @@ def _toward(target: Any, x: Any, y: Any, z: Any) -> Any:
     return x * inverse, y * inverse, z * inverse, square
 
 
-@_inlined
+@inlined
 def _shade_run(f: Any, count: int, beams: Beams) -> None:
     """Write the Stokes vectors of both lobes, for albedo and specular strength 1, to rows D0 to S2.
 
@@ -188,7 +174,7 @@ def _shade_run(f: Any, count: int, beams: Beams) -> None:
         f[_S2 + n] = shading * (b * co - a * so)
 
 
-@_inlined
+@inlined
 def _add_run(f: Any, table: Table, slot: Any, pixels: Any, image: Any) -> None:
     """Add a run's light to its pixels."""
     plain, second = table.plain[slot], table.second[slot]
@@ -212,7 +198,7 @@ def _add_run(f: Any, table: Table, slot: Any, pixels: Any, image: Any) -> None:
         light[11] += specular * f[_S2 + n]
 
 
-@_inlined
+@inlined
 def _sort_block(hits: Points, first: int, stop: int, counts: Any, order: Any) -> None:
     """Sort the lit hits of ``range(first, stop)`` by slot into ``order``; ``counts [S + 1]``: start of each slot."""
     slots = counts.size - 1
@@ -234,7 +220,7 @@ def _sort_block(hits: Points, first: int, stop: int, counts: Any, order: Any) ->
     counts[0] = 0
 
 
-@_inlined
+@inlined
 def _block_end(pixel: Any, first: int) -> int:
     """End of the block that starts at hit ``first``: at most `BLOCK` hits, without those of an incomplete pixel."""
     stop: int = min(first + BLOCK, pixel.size)
@@ -244,7 +230,7 @@ def _block_end(pixel: Any, first: int) -> int:
     return stop
 
 
-@_inlined
+@inlined
 def _gather(hits: Points, order: Any, f: Any, pixels: Any) -> None:
     """Copy position, normal and pixel of the hits ``order`` to the rows of a run."""
     for n in range(order.size):

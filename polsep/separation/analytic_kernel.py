@@ -91,7 +91,7 @@ def separate_analytic_half(
 
     ``raw``: ``[H, W]`` uint8, uint16, float32, or a `PackedFrame`; levels in its units. Images are ``[h, w, C]`` with
     h and w the whole 2x2 cells from the layout's origin on, in white light unless ``options`` say otherwise. A frame
-    whose rows are not contiguous is copied first. The first call ever compiles (see `warm_up`).
+    whose rows are not contiguous is copied first.
     Raises ValueError on another dtype or shape, levels out of order, or images in ``options.out`` that do not fit.
     Source: Dave et al. 2022, Eqs. 15-18.
     """
@@ -139,7 +139,7 @@ def _inverse(layout: Layout) -> NDArray[np.float32]:
 
 
 def warm_up() -> None:
-    """Compile the kernel, or load it from numba's cache on disk. One compilation serves all dtypes and layouts."""
+    """Load the kernel, or compile it. One compilation serves all dtypes and layouts."""
     for layout in (Layout(), Layout(bayer=None)):
         separate_analytic_half(np.zeros((4, 4), np.uint8), layout, 0, 255, AnalyticOptions(report=True))
 

@@ -142,7 +142,7 @@ def _separate(
 
 
 def warm_up() -> None:
-    """Compile the kernels, or load them from numba's cache on disk. One compilation serves all dtypes and layouts."""
+    """Load the kernels, or compile them. One compilation serves all dtypes and layouts."""
     for guided in (False, True):
         separate_color_affine_half(np.eye(8, dtype=np.uint8), Layout(), 0, 1, ColorAffineOptions(guided=guided))
 

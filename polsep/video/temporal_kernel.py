@@ -87,7 +87,7 @@ def blend_images(images: tuple[Any, Any], weight: NDArray[Any], side: int) -> ND
 
 
 def warm_up() -> None:
-    """Compile the kernels of a stream, or load them from numba's cache."""
+    """Load the kernels of a stream, or compile them."""
     raw, count = np.zeros((8, 8)), np.ones((2, 2), np.float32)
     rules = Rules(*(np.float32(1) for _ in Rules._fields))
     for dtype in (np.uint16, np.float32):

@@ -589,3 +589,15 @@ def test_edits_are_made_by_name() -> None:
     assert make_edit(EDITS["metallic"], {"gain": 3}) == Metallic(gain=3.0)
     with pytest.raises(EditError, match="expected only amount, gain, mask in metallic, found 'size'"):
         make_edit(EDITS["metallic"], {"size": 3})
+
+
+@pytest.mark.parametrize("change", [blur, deblur])
+def test_read_only_images_and_masks_are_filtered(change: Callable[..., Any]) -> None:
+    """Images read from files are often read-only; the result is that of writable ones."""
+    image = np.random.default_rng(0).random((16, 20, 3)).astype(np.float32)
+    mask = np.zeros((16, 20), np.float32)
+    mask[4:9, 3:12] = 1
+    expected = [change(image, 2.0), change(image, 2.0, mask)]
+    image.flags.writeable = mask.flags.writeable = False
+    for found, wanted in zip((change(image, 2.0), change(image, 2.0, mask)), expected, strict=True):
+        assert np.array_equal(found, wanted)

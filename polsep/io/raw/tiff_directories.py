@@ -20,6 +20,8 @@ MOST_NUMBERS = 2**18
 #: Bytes per value of the types of entries; unknown types are left out by tifffile.
 _BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 _TEXT = (1, 2, 6, 7)
+#: Entries that lead to other directories: EXIF, GPS, interoperability. Entries of MetaMorph's stacks.
+_INNER, _STACKS = (34665, 34853, 40965), (33628, 33629, 33630, 33631)
 
 
 class _Form(NamedTuple):
@@ -65,11 +67,28 @@ def walk_directories(stream: BinaryIO, size: int) -> list[int]:
 
 
 def check_entries(stream: BinaryIO, place: int, size: int) -> None:
-    """Raise InputError where entries of the directory at ``place`` claim more than a file of ``size`` bytes holds."""
+    """Raise InputError where entries of the directory at ``place`` claim more than a file of ``size`` bytes holds.
+
+    So do those of its EXIF and GPS directories, which tifffile reads with it.
+    """
     form, _ = _read_form(stream)
-    stream.seek(place)
-    (tags,) = form.number.unpack(stream.read(form.number.size))
+    for code, start in _check_entries(stream, form, place, size):
+        if code in _INNER:
+            for _ in _check_entries(stream, form, start, size):
+                pass
+
+
+def _check_entries(stream: BinaryIO, form: _Form, place: int, size: int) -> list[tuple[int, int]]:
+    """The code and the offset of every entry of one directory, once they are checked."""
+    stream.seek(min(place, size))
+    head = stream.read(form.number.size)
+    tags = form.number.unpack(head)[0] if len(head) == form.number.size else 0
+    if tags > MOST_TAGS:
+        raise InputError(f"expected at most {MOST_TAGS} entries in a TIFF directory, found {tags}")
     data, total = stream.read(tags * form.step), 0
+    if len(data) < tags * form.step:
+        raise InputError(f"expected {tags} entries of a TIFF directory, found the end of the file: it is truncated")
+    found = []
     for k in range(tags):
         code, kind, count = form.entry.unpack_from(data, k * form.step)
         needed = count * _BYTES.get(kind, 0)
@@ -78,9 +97,13 @@ def check_entries(stream: BinaryIO, place: int, size: int) -> None:
             raise InputError(f"expected TIFF entry {code} within {size} bytes, found its end at {start + needed}")
         if kind not in _TEXT and count > MOST_NUMBERS:
             raise InputError(f"expected at most {MOST_NUMBERS} numbers in TIFF entry {code}, found {count}")
+        if code in _STACKS:
+            raise InputError("expected one TIFF directory per picture, found a stack of MetaMorph")
         total += needed
+        found.append((code, start))
     if total > 2 * size + tags * form.offset.size:
         raise InputError(f"expected TIFF entries that share no bytes, found {total} bytes of them in {size}")
+    return found
 
 
 def _read_form(stream: BinaryIO) -> tuple[_Form, int]:

@@ -17,13 +17,20 @@ import psutil
 import pytest
 
 from polsep.compute import compiling, library, processor
-from polsep.compute.compiling import Entry
+from polsep.compute.compiling import ONE, ZERO, Entry, read_only
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
+from polsep.edit.blur_kernel import filter_image
+from polsep.kernels import separate_analytic_half, separate_color_affine_half
 from polsep.physics.stokes import stokes_inverse
+from polsep.sensor import defects_kernel
+from polsep.sensor.calibration import neighbours
+from polsep.sensor.calibration_kernel import mix_neighbours
 from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import as_samples
 from polsep.separation import analytic_kernel, fill_kernel, strips_kernel
+from polsep.video.panels_kernel import STEPS, make_panels
+from polsep.video.temporal_kernel import blend_images
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE: dict[str, Any] = json.loads(library.PATH.with_suffix(".json").read_text())
@@ -156,9 +163,22 @@ def test_other_arguments_are_refused(arguments: tuple[Any, ...], problem: str) -
 @needs_library
 def test_frames_that_cannot_be_written_are_refused_where_kernels_write() -> None:
     code, level = library.find(fill_kernel._halve_planes.py_func), np.zeros((6, 2, 2), np.float32)
-    level.flags.writeable = False
     with pytest.raises(TypeError, match="expected float32 C3, found float32 readonly C3"):
-        code(LEVEL, level)
+        code(LEVEL, read_only(level))
+
+
+@needs_library
+def test_images_that_cannot_be_written_are_read() -> None:
+    """As those of files are: separating, repairing, filtering and showing them."""
+    image, raw = read_only(np.full((16, 16, 3), 0.5, np.float32)), read_only(np.full((16, 16), 0.5, np.float32))
+    assert separate_analytic_half(raw, Layout(), 0, 1).diffuse.max() > 0
+    assert separate_color_affine_half(raw, Layout(), 0, 1).diffuse.max() > 0
+    assert len(defects_kernel.find_candidates(raw, defects_kernel.Rules._make([ONE] * 9 + [4]))) == 0
+    near = neighbours(16, 0, 4)
+    assert mix_neighbours(raw, ZERO, near, near, np.zeros((4, 4, 4), np.float32)).shape == (16, 16)
+    np.testing.assert_allclose(filter_image(image, read_only(np.ones(1, np.float32))), image)
+    np.testing.assert_array_equal(blend_images((image, image), read_only(np.ones((4, 4), np.float32)), 4), image)
+    assert make_panels((image, image), 1.0, read_only(np.zeros(STEPS + 1, np.uint8)), 16).shape == (16, 48, 3)
 
 
 @needs_library

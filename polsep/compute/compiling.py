@@ -18,10 +18,12 @@ from types import CodeType, ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polsep.compute import library
 
 Compilable = TypeVar("Compilable", bound=Callable[..., Any])
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 # A bare 1.0 in a kernel is a double, and so would be everything computed from it.
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
@@ -110,6 +112,16 @@ def entry(function: Compilable) -> Compilable:
     """Decorator of what Python calls, by position: NumPy arrays, numbers and tuples of them."""
     result: Any = Entry(function, OPTIONS)
     return result  # type: ignore[no-any-return]
+
+
+def read_only(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """A view that cannot be written, for what a kernel only reads.
+
+    Kernels know such arrays as a type of their own. Whoever passes only them can pass frames that may not be written.
+    """
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def _bind(kernel: Entry) -> Callable[..., Any]:

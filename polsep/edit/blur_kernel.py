@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.compiling import compiled, entry
+from polsep.compute.compiling import compiled, entry, read_only
 from polsep.compute.threads import RowRange, run_over_rows
 
 #: Rows per task of a thread.
@@ -72,8 +72,8 @@ def fill_filtered(
 def filter_image(image: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
     """The image ``[h, w, C]``, filtered along both axes; ``weights``: of the distances 0, 1, 2, ..."""
     height, width, colors = image.shape
-    source = np.ascontiguousarray(image).reshape(height, width * colors)
-    paired = weights if weights.size % 2 else np.append(weights, np.float32(0))
+    source = read_only(np.ascontiguousarray(image).reshape(height, width * colors))
+    paired = read_only(weights if weights.size % 2 else np.append(weights, np.float32(0)))
     out = np.empty_like(source)
     run_over_rows(lambda rows: fill_filtered(source, paired, colors, out, rows), height, _ROWS)
     return out.reshape(image.shape)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.compiling import ONE, entry
+from polsep.compute.compiling import ONE, entry, read_only
 from polsep.compute.threads import RowRange, run_over_rows
 
 Floats = NDArray[np.float32]
@@ -37,10 +37,10 @@ def _mix_rows(x: Any, black: Any, rows: Any, cols: Any, weights: Any, first: int
 
 def mix_neighbours(samples: Floats, black: Any, rows: Any, cols: Any, weights: Floats) -> Floats:
     """Return `calibration.mix_neighbours` of a frame, in threads."""
-    mixed, places = np.empty_like(samples), (tuple(rows), tuple(cols))
+    mixed, given, places = np.empty_like(samples), read_only(samples), (tuple(rows), tuple(cols))
 
     def mix(band: RowRange) -> None:
-        _mix_rows(samples, black, *places, weights, *band, mixed)
+        _mix_rows(given, black, *places, weights, *band, mixed)
 
     run_over_rows(mix, samples.shape[0], ROWS)
     return mixed

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.compiling import HALF, ONE, ZERO, compiled, entry
+from polsep.compute.compiling import HALF, ONE, ZERO, compiled, entry, read_only
 from polsep.compute.threads import RowRange, run_over_rows
 
 #: Pixels of a window's side, and on each side of its middle; the filters' period that all layouts share.
@@ -69,7 +69,7 @@ class Predictor(NamedTuple):
 def find_candidates(x: NDArray[np.float32], rules: Rules) -> NDArray[np.int64]:
     """Row and column ``[N, 2]`` of samples of ``x [H, W]`` that stand out of their own kind, in reading order."""
     marks, counts = np.zeros(x.shape, np.uint8), np.zeros(x.shape[0], np.int64)
-    run_over_rows(partial(_mark_rows, x, rules, marks, counts), x.shape[0], STRIP)
+    run_over_rows(partial(_mark_rows, read_only(x), rules, marks, counts), x.shape[0], STRIP)
     rows = np.flatnonzero(counts)
     at, columns = np.nonzero(marks[rows])
     return np.stack([rows[at], columns], axis=1)
@@ -80,7 +80,7 @@ def confirm(
 ) -> NDArray[np.int64]:
     """Places ``[M, 2]`` of the candidates that are defects, alone or in a cluster, with the clusters' other pixels."""
     found = np.full((len(candidates), MOST, 2), -1, np.int64)
-    run_over_rows(partial(_confirm_some, x, predictor, rules, candidates, found), len(candidates), STEP)
+    run_over_rows(partial(_confirm_some, read_only(x), predictor, rules, candidates, found), len(candidates), STEP)
     return found[found[..., 0] >= 0]
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.compiling import compiled
+from polsep.compute.compiling import compiled, read_only
 
 UINT8, UINT16, FLOAT32, GIGE, LSB = range(5)
 
@@ -98,9 +98,7 @@ def as_samples(raw: RawFrame) -> Samples:
         data, stored = raw, _STORED[raw.dtype]
         row_size, row_pixels = data.shape[1], 0
     flat = np.require(data, requirements=["C", "A"]).reshape(-1)
-    arrays: list[NDArray[Any]] = [flat.view() if flat.dtype == kind else np.empty(0, kind) for kind in _STORED]
-    for array in arrays:
-        array.flags.writeable = False  # a type of its own to numba: frames that cannot be written would compile anew
+    arrays: list[NDArray[Any]] = [read_only(flat if flat.dtype == kind else np.empty(0, kind)) for kind in _STORED]
     return Samples(arrays[0], arrays[1], arrays[2], stored, row_size, row_pixels)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.compiling import ONE, ZERO, compiled, entry
+from polsep.compute.compiling import ONE, ZERO, compiled, entry, read_only
 from polsep.compute.threads import RowRange, run_over_rows
 
 #: Steps of the tone curve's table.
@@ -87,6 +87,8 @@ def make_panels(
     """
     height, width = images[0].shape[:2]
     factor = -(-max(height, width) // widest)
+    first, second = (read_only(np.ascontiguousarray(image)) for image in images)
+    curve = read_only(table)
     out = np.empty((max(height // factor // 2 * 2, 2), 3 * max(width // factor // 2 * 2, 2), 3), np.uint8)
-    run_over_rows(lambda rows: fill_panels(images, gain, table, out, rows), out.shape[0], _ROWS)
+    run_over_rows(lambda rows: fill_panels((first, second), gain, curve, out, rows), out.shape[0], _ROWS)
     return out

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.compiling import ONE, ZERO, compiled, entry
+from polsep.compute.compiling import ONE, ZERO, compiled, entry, read_only
 from polsep.compute.threads import RowRange, run_over_rows
 from polsep.sensor.unpack_kernel import Samples, as_samples, read_row
 
@@ -69,7 +69,8 @@ class Ring(NamedTuple):
 def filter_samples(raw: NDArray[Any], before: tuple[Any, Any], rules: Rules) -> tuple[Any, Any, Any]:
     """Samples ``[H, W]`` (uint8, uint16, float32) filtered, and the new means and counts, from those ``before``."""
     mean, count = before
-    frames = Frames(mean, count, np.empty_like(mean), np.empty_like(count), np.empty_like(mean))
+    new = np.empty_like(mean), np.empty_like(count), np.empty_like(mean)
+    frames = Frames(read_only(mean), read_only(count), *new)
     run_over_rows(partial(_filter_strip, as_samples(raw), frames, rules), count.shape[0], STEP)
     return frames.filtered, frames.new_mean, frames.new_number
 
@@ -80,9 +81,9 @@ def blend_images(images: tuple[Any, Any], weight: NDArray[Any], side: int) -> ND
     Blocks have ``side`` pixels. See `temporal.steady_images`.
     """
     shape = images[0].shape
-    now, old = (np.ascontiguousarray(x, np.float32).reshape(shape[0], -1) for x in images)
+    now, old = (read_only(np.ascontiguousarray(x, np.float32).reshape(shape[0], -1)) for x in images)
     new, sides = np.empty_like(now), (side, side * shape[2])
-    run_over_rows(partial(_blend_rows, (now, old), weight, sides, new), shape[0], STEP)
+    run_over_rows(partial(_blend_rows, (now, old), read_only(weight), sides, new), shape[0], STEP)
     return new.reshape(shape)
 
 

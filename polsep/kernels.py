@@ -1,6 +1,6 @@
 """The fused CPU twins of the hot path, compiled, and nothing else.
 
-Every kernel computes what a readable torch function computes, which its docstring names and a test compares.
+Every kernel computes what a readable function computes, which its docstring names and a test compares.
 """
 
 from __future__ import annotations

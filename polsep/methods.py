@@ -23,8 +23,11 @@ from polsep.io.store.weights import is_shipped
 from polsep.networks.engines import combine_images, run_engine
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
+from polsep.separation import analytic_kernel, color_affine_kernel
 from polsep.separation.analytic import Separation, separate_analytic
+from polsep.separation.analytic_kernel import AnalyticOptions
 from polsep.separation.color_affine import separate_color_affine
+from polsep.separation.color_affine_kernel import ColorAffineOptions
 from polsep.separation.images import FrameImages
 from polsep.separation.report import images_of, in_light, under_white_light
 from polsep.shipped import (
@@ -124,10 +127,7 @@ def run_analytic(capture: Capture, light: Light, full: bool) -> FrameImages:
     """`separate_analytic` of bilinear samples: compiled kernels for one frame, else the reference."""
     if not isinstance(capture, Mosaic) or not _is_plain(capture):
         return run_reference(analytic_reference, capture, light, full)
-    make_ready(_warm_up_analytic_full if full else _warm_up_analytic)
-    from polsep.separation import analytic_kernel
-    from polsep.separation.analytic_kernel import AnalyticOptions
-
+    make_ready(analytic_kernel.warm_up_full if full else analytic_kernel.warm_up)
     separate = analytic_kernel.separate_analytic_full if full else analytic_kernel.separate_analytic_half
     options = AnalyticOptions(light, in_light=True, report=True)
     levels = (capture.black_level, capture.white_level)
@@ -143,11 +143,8 @@ def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
         or min((n - start) // 2 for n, start in zip(capture.data.shape, capture.layout.origin, strict=True)) < MIN_CELLS
     ):
         return run_reference(color_affine_reference, capture, light, full)
-    make_ready(_warm_up_color_affine_full if full else _warm_up_color_affine)
-    from polsep.separation import color_affine_kernel
-    from polsep.separation.color_affine_kernel import ColorAffineOptions
-
     kernel = color_affine_kernel
+    make_ready(kernel.warm_up_full if full else kernel.warm_up)
     separate = kernel.separate_color_affine_full if full else kernel.separate_color_affine_half
     options = ColorAffineOptions(light, in_light=True, guided=True, report=True)
     levels = (capture.black_level, capture.white_level)
@@ -168,30 +165,6 @@ def _is_plain(mosaic: Mosaic) -> bool:
     if data.ndim != 2 or not on_cpu(data) or getattr(data, "requires_grad", False):
         return False
     return to_numpy(data).dtype in (np.uint8, np.uint16, np.float32)
-
-
-def _warm_up_analytic() -> None:
-    from polsep.separation import analytic_kernel
-
-    analytic_kernel.warm_up()
-
-
-def _warm_up_analytic_full() -> None:
-    from polsep.separation import analytic_kernel
-
-    analytic_kernel.warm_up_full()
-
-
-def _warm_up_color_affine() -> None:
-    from polsep.separation import color_affine_kernel
-
-    color_affine_kernel.warm_up()
-
-
-def _warm_up_color_affine_full() -> None:
-    from polsep.separation import color_affine_kernel
-
-    color_affine_kernel.warm_up_full()
 
 
 def _accepts_anything(capture: Capture) -> bool:

@@ -17,10 +17,16 @@ from tolerances import assert_within
 
 from polsep.compute import library
 from polsep.compute.threads import get_threads, set_threads
-from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.bilinear_kernel import clip_code
 from polsep.io.raw.genicam import pack_frame
-from polsep.kernels import AnalyticImages, AnalyticOptions, PackedFrame, separate_analytic_half
+from polsep.kernels import (
+    AnalyticImages,
+    AnalyticOptions,
+    PackedFrame,
+    separate_analytic_full,
+    separate_analytic_half,
+)
 from polsep.methods import compose
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import BAYER_ORDERS, CLIP_MARGIN, Layout, Mosaic
@@ -66,9 +72,11 @@ def random_codes(shape: tuple[int, int], dtype: str = "uint16", clipped: float =
     return (samples * WHITES[dtype]).astype(dtype)
 
 
-def twin(raw: NDArray[Any], layout: Layout, black: float, white: float, light: tuple[float, ...]) -> Separation:
-    mosaic = Mosaic(torch.from_numpy(raw.astype(np.float32)), layout, black, white, light)
-    return separate_analytic(demosaic_bilinear_half(mosaic))
+def twin(
+    raw: NDArray[Any], layout: Layout, levels: tuple[float, float], light: tuple[float, ...], full: bool = False
+) -> Separation:
+    mosaic = Mosaic(torch.from_numpy(raw.astype(np.float32)), layout, *levels, light)
+    return compose(demosaic_bilinear if full else demosaic_bilinear_half, separate_analytic)(mosaic)
 
 
 def assert_same(images: AnalyticImages, expected: Separation, tolerance: float = ROUNDING) -> None:
@@ -78,25 +86,29 @@ def assert_same(images: AnalyticImages, expected: Separation, tolerance: float =
     np.testing.assert_array_equal(images.valid, expected.valid.numpy())
 
 
-def assert_agrees(raw: NDArray[Any], layout: Layout, black: float = 0.0, white: float | None = None) -> AnalyticImages:
-    white = WHITES[str(raw.dtype)] if white is None else white
-    images = separate_analytic_half(raw, layout, black, white)
-    assert_same(images, twin(raw, layout, black, white, (1.0, 1.0, 1.0)))
+def assert_agrees(
+    raw: NDArray[Any], layout: Layout, black: float = 0.0, white: float | None = None, full: bool = False
+) -> AnalyticImages:
+    levels = black, WHITES[str(raw.dtype)] if white is None else white
+    images = (separate_analytic_full if full else separate_analytic_half)(raw, layout, *levels)
+    assert_same(images, twin(raw, layout, levels, (1.0, 1.0, 1.0), full))
     return images
 
 
+@pytest.mark.parametrize("full", [False, True], ids=["half", "full"])
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
-def test_every_layout_and_size_agrees(layout: Layout) -> None:
+def test_every_layout_and_size_agrees(layout: Layout, full: bool) -> None:
     """From one period on, odd sizes too, with and without clipped samples, within a strip and across strips."""
     top, left = layout.origin
     for seed, (height, width) in enumerate(
         ((4, 4), (4, 6), (6, 4), (5, 7), (6, 6), (9, 11), (8, 70), (67, 9), (134, 6))
     ):
         shape = (max(height, layout.period + top), max(width, layout.period + left))
-        assert_agrees(random_codes(shape, seed=seed), layout)
-        assert_agrees(random_codes(shape, clipped=0.03, seed=seed), layout)
+        assert_agrees(random_codes(shape, seed=seed), layout, full=full)
+        assert_agrees(random_codes(shape, clipped=0.03, seed=seed), layout, full=full)
 
 
+@pytest.mark.parametrize("full", [False, True], ids=["half", "full"])
 @given(
     st.sampled_from(LAYOUTS),
     st.tuples(st.integers(5, 24), st.integers(5, 40)),
@@ -104,10 +116,12 @@ def test_every_layout_and_size_agrees(layout: Layout) -> None:
     st.sampled_from([0.0, 0.02, 0.3, 1.0]),
     st.integers(0, 2**32 - 1),
 )
-def test_any_frame_agrees(layout: Layout, shape: tuple[int, int], dtype: str, clipped: float, seed: int) -> None:
+def test_any_frame_agrees(
+    full: bool, layout: Layout, shape: tuple[int, int], dtype: str, clipped: float, seed: int
+) -> None:
     """Random layouts, sizes, dtypes and numbers of clipped samples, black at a twentieth of white."""
     raw = random_codes(shape, dtype, clipped, seed)
-    assert_agrees(raw, layout, black=WHITES[dtype] / 20)
+    assert_agrees(raw, layout, black=WHITES[dtype] / 20, full=full)
 
 
 @pytest.mark.parametrize("layout", [LAYOUTS[0], LAYOUTS[5], Layout(SONY, None)], ids=spec)
@@ -135,7 +149,7 @@ def test_uniform_polarized_field_is_exact_to_the_border() -> None:
 def test_light_color_is_divided_out_and_multiplied_back(layout: Layout, light: tuple[float, ...]) -> None:
     """As `Mosaic.light_color` and, on demand, as the pipeline's `in_light`."""
     raw = random_codes((17, 23), clipped=0.01)
-    expected = twin(raw, layout, 1000.0, 65535.0, light)
+    expected = twin(raw, layout, (1000.0, 65535.0), light)
     options = AnalyticOptions(light)
     assert_same(separate_analytic_half(raw, layout, 1000, 65535, options), expected, ROUNDING / min(light))
     options = AnalyticOptions(light, in_light=True)
@@ -151,7 +165,7 @@ def test_dolp_and_aolp_agree_with_the_pipeline(layout: Layout) -> None:
     """DoLP and AoLP of the mean over colours in white light; AoLP where it is defined to more than rounding."""
     light, raw = (0.8, 1.0, 1.3), random_codes((40, 60))
     images = separate_analytic_half(raw, layout, 0, 65535, AnalyticOptions(light, in_light=True, report=True))
-    white = twin(raw, layout, 0.0, 65535.0, light)
+    white = twin(raw, layout, (0.0, 65535.0), light)
     expected = images_of(white, white)
     assert expected.dolp is not None and expected.aolp is not None
     assert images.dolp is not None and images.aolp is not None
@@ -253,7 +267,7 @@ def test_diffuse_and_specular_add_up_to_s0() -> None:
     """Energy: the sum is the s0 of the twin, and both are non-negative, black level above some samples included."""
     raw = random_codes((30, 30))
     images = separate_analytic_half(raw, Layout(), 20_000, 65535)
-    stokes: Stokes = twin(raw, Layout(), 20_000.0, 65535.0, (1.0, 1.0, 1.0)).stokes
+    stokes: Stokes = twin(raw, Layout(), (20_000.0, 65535.0), (1.0, 1.0, 1.0)).stokes
     total = torch.from_numpy(images.diffuse + images.specular)
     assert_within(total, stokes.s0.clamp(min=0).movedim(-3, -1), ROUNDING)
     assert images.diffuse.min() >= 0 and images.specular.min() >= 0

@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from numpy.typing import NDArray
-from test_kernels_analytic import ANGLE, LAYOUTS, ROUNDING, SONY, UNUSUAL, WHITES, assert_same, random_codes, spec
+from test_kernels_analytic import (
+    ANGLE,
+    LAYOUTS,
+    ROUNDING,
+    SONY,
+    UNUSUAL,
+    assert_agrees,
+    assert_same,
+    random_codes,
+    spec,
+    twin,
+)
 from tolerances import assert_within
 
 from polsep.compute.threads import get_threads, set_threads
-from polsep.demosaic.bilinear import demosaic_bilinear
 from polsep.io.raw.genicam import pack_frame
 from polsep.kernels import AnalyticImages, AnalyticOptions, PackedFrame, separate_analytic_full
-from polsep.methods import compose
-from polsep.sensor.camera import Layout, Mosaic
-from polsep.separation.analytic import Separation, separate_analytic
+from polsep.sensor.camera import Layout
 from polsep.separation.report import images_of, in_light, tally
 
 WHITE_LIGHT, LIGHT = (1.0, 1.0, 1.0), (0.8, 1.0, 1.3)
@@ -36,40 +40,6 @@ def one_thread() -> Iterator[None]:
     set_threads(threads)
 
 
-def twin(raw: NDArray[Any], layout: Layout, black: float, white: float, light: tuple[float, ...]) -> Separation:
-    mosaic = Mosaic(torch.from_numpy(raw.astype(np.float32)), layout, black, white, light)
-    return compose(demosaic_bilinear, separate_analytic)(mosaic)
-
-
-def assert_agrees(raw: NDArray[Any], layout: Layout, black: float = 0.0) -> None:
-    white = WHITES[str(raw.dtype)]
-    assert_same(separate_analytic_full(raw, layout, black, white), twin(raw, layout, black, white, WHITE_LIGHT))
-
-
-@pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
-def test_every_layout_and_size_agrees(layout: Layout) -> None:
-    """From one period on, odd sizes too, with and without clipped samples, within a strip and across strips."""
-    top, left = layout.origin
-    for seed, (height, width) in enumerate(
-        ((4, 4), (4, 6), (6, 4), (5, 7), (6, 6), (9, 11), (8, 70), (67, 9), (134, 6))
-    ):
-        shape = (max(height, layout.period + top), max(width, layout.period + left))
-        assert_agrees(random_codes(shape, seed=seed), layout)
-        assert_agrees(random_codes(shape, clipped=0.03, seed=seed), layout)
-
-
-@given(
-    st.sampled_from(LAYOUTS),
-    st.tuples(st.integers(5, 24), st.integers(5, 40)),
-    st.sampled_from(sorted(WHITES)),
-    st.sampled_from([0.0, 0.02, 0.3, 1.0]),
-    st.integers(0, 2**32 - 1),
-)
-def test_any_frame_agrees(layout: Layout, shape: tuple[int, int], dtype: str, clipped: float, seed: int) -> None:
-    """Random layouts, sizes, dtypes and numbers of clipped samples, black at a twentieth of white."""
-    assert_agrees(random_codes(shape, dtype, clipped, seed), layout, black=WHITES[dtype] / 20)
-
-
 @pytest.mark.parametrize("layout", [LAYOUTS[0], LAYOUTS[5], Layout(SONY, None)], ids=spec)
 def test_one_clipped_sample_marks_what_it_touches(layout: Layout) -> None:
     """Wherever the one clipped sample lies, border included, the same pixels lose validity as in the twin."""
@@ -77,7 +47,7 @@ def test_one_clipped_sample_marks_what_it_touches(layout: Layout) -> None:
         for col in range(10):
             raw = np.full((10, 10), 0.5, np.float32)
             raw[row, col] = 1
-            assert_agrees(raw, layout)
+            assert_agrees(raw, layout, full=True)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
@@ -100,7 +70,7 @@ def test_samples_stay_where_they_are() -> None:
         raw = np.zeros((10, 10), np.float32)
         raw[row, col] = 0.8
         images = separate_analytic_full(raw, layout, 0.0, 1.0)
-        alone = twin(raw, layout, 0.0, 1.0, WHITE_LIGHT).stokes.s0[0, row, col]
+        alone = twin(raw, layout, (0.0, 1.0), WHITE_LIGHT, full=True).stokes.s0[0, row, col]
         total = images.diffuse + images.specular
         assert_within(torch.tensor(total[row, col, 0]), max(float(alone), 0.0), ROUNDING)
         assert float(total.max()) == pytest.approx(float(total[row, col, 0]))
@@ -110,7 +80,7 @@ def test_samples_stay_where_they_are() -> None:
 def test_light_color_is_divided_out_and_multiplied_back(layout: Layout) -> None:
     """As `Mosaic.light_color` and, on demand, as the pipeline's `in_light`."""
     raw = random_codes((17, 23), clipped=0.01)
-    expected = twin(raw, layout, 1000.0, 65535.0, LIGHT)
+    expected = twin(raw, layout, (1000.0, 65535.0), LIGHT, full=True)
     found = separate_analytic_full(raw, layout, 1000, 65535, AnalyticOptions(LIGHT))
     assert_same(found, expected, ROUNDING / min(LIGHT))
     found = separate_analytic_full(raw, layout, 1000, 65535, AnalyticOptions(LIGHT, in_light=True))
@@ -121,7 +91,7 @@ def test_light_color_is_divided_out_and_multiplied_back(layout: Layout) -> None:
 def test_reports_as_the_twin_does(layout: Layout) -> None:
     """DoLP, AoLP where it is defined, and every sum over the frame, of white light; the counts exactly."""
     raw = random_codes((71, 61), clipped=0.01)
-    white = twin(raw, layout, 25_000.0, 65535.0, LIGHT)
+    white = twin(raw, layout, (25_000.0, 65535.0), LIGHT, full=True)
     options = AnalyticOptions(LIGHT, in_light=True, report=True)
     images, expected = separate_analytic_full(raw, layout, 25_000, 65535, options), images_of(white, white)
     assert images.dolp is not None and images.aolp is not None

@@ -35,7 +35,7 @@ def blur(image: Floats, sigma: float, mask: Floats | None = None) -> Floats:
 
     Stays non-negative. At sigma 0 the values are the image's own.
     """
-    weights, image = gaussian_weights(sigma), _writable(image)
+    weights = gaussian_weights(sigma)
     if mask is None:
         return filter_image(image, weights)
     inside, reached = _inside(image, mask, weights)
@@ -49,7 +49,7 @@ def deblur(image: Floats, sigma: float, mask: Floats | None = None) -> Floats:
     columns of A sum to 1. Detail below the noise is not restored; the noise grows.
     Source: Richardson 1972, doi 10.1364/JOSA.62.000055; Lucy 1974, doi 10.1086/111605.
     """
-    weights, image = gaussian_weights(sigma), _writable(image)
+    weights = gaussian_weights(sigma)
     if mask is None:
         return _richardson_lucy(image, lambda x: filter_image(x, weights), lambda x: filter_image(x, weights))
     inside, reached = _inside(image, mask, weights)
@@ -74,15 +74,10 @@ def _richardson_lucy(
 
 def _inside(image: Floats, mask: Floats, weights: Floats) -> tuple[Floats, Floats]:
     """m and G m, for every colour ``[h, w, C]``; G m is 1 instead of 0, so that it can be a divisor."""
-    share = filter_image(_writable(mask)[..., None], weights)
+    share = filter_image(mask[..., None], weights)
     reached = np.where(share > 0, share, np.float32(1))
     # Repeated, because NumPy multiplies by the same number for three colours at a sixth of the speed.
     return np.repeat(mask[..., None], image.shape[2], axis=2), np.repeat(reached, image.shape[2], axis=2)
-
-
-def _writable(image: Floats) -> Floats:
-    """The image, or a copy of one that is read-only, which the kernel does not take."""
-    return np.require(image, requirements="W")
 
 
 def gaussian_weights(sigma: float) -> Floats:

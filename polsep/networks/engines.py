@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from polsep.compute.arrays import to_numpy
 from polsep.compute.threads import get_threads
 from polsep.compute.warm_up import make_ready
+from polsep.demosaic.bilinear import mean_cells
+from polsep.networks import details_kernel, images_kernel
 from polsep.networks.channels import PERIOD
 from polsep.networks.joint_weights import JointWeights
 from polsep.networks.openvino_engine import OpenVinoEngine, modulation_of
@@ -84,18 +86,6 @@ def _make_engine(job: _Job) -> OpenVinoEngine:
     return OpenVinoEngine(job.network, job.shape, job.full)
 
 
-def _warm_up() -> None:
-    from polsep.networks import images_kernel
-
-    images_kernel.warm_up()
-
-
-def _warm_up_full() -> None:
-    from polsep.networks import details_kernel
-
-    details_kernel.warm_up()
-
-
 def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages:
     """A network's images of one frame ``[H, W]`` on the CPU, in its light.
 
@@ -106,9 +96,9 @@ def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages
     orientation = orient(mosaic, own_order(mosaic.layout))
     if not full and not orientation.keeps_cells:  # then the network's cells are not the frame's
         return _halve(run_engine(network, mosaic, full=True), mosaic.light_color)
-    make_ready(_warm_up)
+    make_ready(images_kernel.warm_up)
     if full:
-        make_ready(_warm_up_full)
+        make_ready(details_kernel.warm_up)
     ways = shifts_of(orientation) if network.averages_shifts else (orientation,)
     return combine_images([_run_turned(network, mosaic, way, full) for way in ways])
 
@@ -131,11 +121,9 @@ def _halve(images: FrameImages, light: tuple[float, ...]) -> FrameImages:
 
 
 def _mean_cells(image: NDArray[Any]) -> NDArray[Any]:
-    """Means over 2x2 cells, ``[H, W, ...]`` to ``[H/2, W/2, ...]``."""
+    """`mean_cells` of an image ``[H, W, ...]``, whose last row and column do not count where it has an odd size."""
     height, width = (n // 2 * 2 for n in image.shape[:2])
-    rows = image[0:height:2, :width] + image[1:height:2, :width]
-    means: NDArray[Any] = 0.25 * (rows[:, 0::2] + rows[:, 1::2])
-    return means
+    return np.moveaxis(mean_cells(np.moveaxis(image[:height, :width], (0, 1), (-2, -1))), (-2, -1), (0, 1))
 
 
 def combine_images(images: list[FrameImages]) -> FrameImages:

@@ -8,22 +8,27 @@ from __future__ import annotations
 
 import threading
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.processor import cpu_flags
+from polsep.compute.threads import get_threads, run_over_rows
+from polsep.demosaic.bilinear_kernel import Pattern, read_pattern
+from polsep.demosaic.cells_kernel import Source, read_grid
+from polsep.networks.buffers import ClosedFormRows, LayerInput, Maps
 from polsep.networks.channels import DETAIL_MAPS, PERIOD, input_channels
+from polsep.networks.details_kernel import DetailOutputs, emit_details, find_beyond, read_smooth, write_pixels
 from polsep.networks.graphs import core, import_openvino, joint_model, whole_frame_model
+from polsep.networks.images_kernel import LayerOutputs, Targets, write_rows
 from polsep.networks.joint_weights import JointWeights
+from polsep.networks.maps_kernel import map_guided_rows, map_rows
 from polsep.networks.taps import make_taps
+from polsep.networks.whole_frame_kernel import thumbnail_of
 from polsep.physics.stokes import stokes_inverse
+from polsep.sensor.unpack_kernel import RawFrame, Samples, as_samples
 from polsep.separation.images import FrameImages, Tally
-
-if TYPE_CHECKING:
-    from polsep.demosaic.bilinear_kernel import Pattern
-    from polsep.sensor.unpack_kernel import RawFrame, Samples
 
 Floats = NDArray[np.float32]
 
@@ -41,10 +46,6 @@ class OpenVinoEngine:
     def __init__(
         self, network: JointWeights, shape: tuple[int, int], full: bool = False, precision: str | None = None
     ) -> None:
-        from polsep.networks.buffers import ClosedFormRows, LayerInput, Maps
-        from polsep.networks.details_kernel import DetailOutputs, read_smooth
-        from polsep.networks.images_kernel import LayerOutputs
-
         self._lock, self._colors, self._full = threading.Lock(), network.colors, full
         self._layout = network.layout
         h, w = shape[0] // PERIOD, shape[1] // PERIOD
@@ -83,12 +84,6 @@ class OpenVinoEngine:
         ``modulation``: `modulation_of` the frame that this is a strip of; None where it is a whole one. ``kept``: rows
         of the images that are wanted; others are left out, and do not count in the tally.
         """
-        from polsep.compute.threads import run_over_rows
-        from polsep.demosaic.bilinear_kernel import read_pattern
-        from polsep.networks.details_kernel import emit_details, find_beyond, write_pixels
-        from polsep.networks.images_kernel import Targets, write_rows
-        from polsep.sensor.unpack_kernel import as_samples
-
         samples, shape = as_samples(raw), (raw.shape[0], raw.shape[1])
         pattern = read_pattern(shape, self._layout, *levels, light)
         h, w = shape if self._full else (shape[0] // 2, shape[1] // 2)
@@ -120,10 +115,6 @@ class OpenVinoEngine:
 
     def _fill_inputs(self, samples: Samples, pattern: Pattern) -> None:
         """The layers' inputs, and the closed form, of a frame."""
-        from polsep.compute.threads import get_threads, run_over_rows
-        from polsep.demosaic.cells_kernel import Source, read_grid
-        from polsep.networks.maps_kernel import map_guided_rows, map_rows
-
         h, taps, maps = pattern.h // 2, self._taps, self._maps
         if taps is not None:
             run_over_rows(lambda row_range: map_rows(samples, pattern, taps, maps, row_range), h, _ROWS)
@@ -138,8 +129,6 @@ def modulation_of(
     network: JointWeights, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...]
 ) -> Floats | None:
     """Scales and shifts of a network's features for a whole frame ``[H, W]``; None for networks that see none."""
-    from polsep.networks.whole_frame_kernel import thumbnail_of
-
     if not network.sees_frame:
         return None
     request = _whole_frame_of(network).create_infer_request()
@@ -155,8 +144,6 @@ def _whole_frame_of(network: JointWeights) -> Any:
 
 def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[Floats], precision: str) -> Any:
     """A request that reads ``inputs [h, w, n]``, float32 or bits of bfloat16, and fills ``outputs [n, h, w]``."""
-    from polsep.compute.threads import get_threads
-
     openvino = import_openvino()
     # Pinned threads of two engines would share a core, and wait there for whoever else works on it.
     options: dict[str, Any] = {"INFERENCE_NUM_THREADS": get_threads(), "PERFORMANCE_HINT": "LATENCY"}

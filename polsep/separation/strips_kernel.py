@@ -183,11 +183,12 @@ def open_strip(source: Source, row_range: RowRange, edges: int) -> Strip:
 
 @compiled
 def pass_on(
-    frame: Pattern, conversion: Conversion, targets: Targets, strip: Strip, t: int, better: Any, place: int
+    frame: Pattern, conversion: Conversion, targets: Targets, strip: Any, t: int, better: Any, place: int
 ) -> None:
     """After row ``t`` has entered the rings: everything behind it, to the row that is complete now.
 
-    ``frame``: of the images' size. ``better``: guided Stokes rows, that of the complete row at ``place``, or empty.
+    ``frame``: of the images' size. ``strip``: of cells, or of pixels (`strips_full_kernel`). ``better``: guided Stokes
+    rows, that of the complete row at ``place``, or empty.
     """
     rows, rings, first = strip.rows, strip.rings, max(strip.begin - NOISE, 0)
     if t - 2 > first or t - 2 == 0:

@@ -1,12 +1,16 @@
 """The networks as OpenVINO models, built from their files of weights: no torch, no other files.
 
 Twins: the torch modules `joint.Joint` (its layers), `whole_frame.WholeFrame` and `paper.Refinement`.
+
+Layers whose inputs have known ranges (`ranges`) can be rounded to 8 bits: inputs in 256 steps of one size, weights in
+255 steps of one size per output, as processors multiply them (Jacob et al. 2018, arXiv:1712.05877). Blocks whose
+second layer has the range (0, 0) only add its bias: training left them silent.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -20,6 +24,8 @@ from polsep.networks.thumbnails import SIDE, WIDTHS, thumbnail_channels
 
 #: A value in a graph.
 Node = Any
+#: Least and largest input of layers, by name.
+Ranges = Mapping[str, tuple[float, float]]
 
 
 def import_openvino() -> Any:
@@ -45,24 +51,42 @@ def core() -> Any:
 
 
 class _Graph:
-    """Layers by the names of their arrays."""
+    """Layers by the names of their arrays, ``quantized`` where their ``ranges`` are known; convolutions keep names."""
 
-    def __init__(self, arrays: Arrays) -> None:
+    def __init__(self, arrays: Arrays, ranges: Ranges | None = None, quantized: bool = False) -> None:
         import_openvino()
         from openvino import opset13
 
-        self.ops, self.arrays = opset13, arrays
+        self.ops, self.arrays, self.ranges, self.quantized = opset13, arrays, ranges or {}, quantized
 
     def convolve(self, x: Node, name: str, stride: int = 1) -> Node:
         """A convolution that keeps the size, but for its stride."""
         weight, bias = (self.arrays[f"{name}.{part}"] for part in ("weight", "bias"))
-        return self.correlate(x, weight, bias, stride)
+        factors = self.ops.constant(weight)
+        low, high = self.ranges.get(name, (0.0, 0.0))
+        if self.quantized and high > low:
+            x = self.quantize(x, 256, *(np.full((1, 1, 1, 1), bound) for bound in (low, high)))
+            largest = np.maximum(np.abs(weight).max(axis=(1, 2, 3), keepdims=True), 1e-12)
+            factors = self.quantize(factors, 255, -largest, largest)
+        return self._add_bias(self._convolution(x, factors, weight.shape[-1], stride, name), bias)
 
-    def correlate(self, x: Node, weight: Any, bias: Any, stride: int = 1) -> Node:
-        """The same with arrays ``[n, m, k, k]`` and ``[n]``."""
-        margin, ops = [weight.shape[-1] // 2] * 2, self.ops
-        found = ops.convolution(x, ops.constant(weight), [stride, stride], margin, margin, [1, 1])
-        return ops.add(found, ops.constant(bias.reshape(1, -1, 1, 1)))
+    def quantize(self, x: Node, levels: int, low: Any, high: Any) -> Node:
+        """``x`` rounded to so many levels between bounds that broadcast to it."""
+        bounds = [self.ops.constant(bound.astype(np.float32)) for bound in (low, high)]
+        return self.ops.fake_quantize(x, *bounds, *bounds, levels)
+
+    def correlate(self, x: Node, weight: Any, bias: Any, name: str) -> Node:
+        """A convolution with arrays ``[n, m, k, k]`` and ``[n]``."""
+        return self._add_bias(self._convolution(x, self.ops.constant(weight), weight.shape[-1], 1, name), bias)
+
+    def _convolution(self, x: Node, weight: Node, side: int, stride: int, name: str) -> Node:
+        margin = [side // 2] * 2
+        found = self.ops.convolution(x, weight, [stride, stride], margin, margin, [1, 1])
+        found.set_friendly_name(name)
+        return found
+
+    def _add_bias(self, x: Node, bias: Any) -> Node:
+        return self.ops.add(x, self.ops.constant(bias.reshape(1, -1, 1, 1)))
 
     def relu(self, x: Node) -> Node:
         """max(x, 0)."""
@@ -70,6 +94,8 @@ class _Graph:
 
     def block(self, x: Node, name: str) -> Node:
         """A `unet.Block`."""
+        if self.ranges.get(f"{name}.second") == (0, 0):
+            return self._add_bias(x, self.arrays[f"{name}.second.bias"])
         return self.ops.add(x, self.convolve(self.relu(self.convolve(x, f"{name}.first")), f"{name}.second"))
 
     def chain(self, x: Node, name: str, count: int) -> Node:
@@ -146,16 +172,16 @@ class _Graph:
         return ops.depth_to_space(x, "depth_first", size.fold) if size.fold > 1 else x
 
 
-def joint_model(weights: JointWeights, packed: tuple[int, int], full: bool) -> Any:
+def joint_model(weights: JointWeights, packed: tuple[int, int], full: bool, quantized: bool = False) -> Any:
     """A network's layers for ``packed`` pixels (h, w), twice the size of the mosaic's period.
 
     From inputs ``[1, n, h, w]``, where ``full`` also `DETAIL_MAPS` of the size of details, and for networks that see a
     whole frame what modulates their features, see `whole_frame_model`. To corrections ``[1, 4 C + 8, h, w]`` of
     diffuse, specular and the closed form's gain (`images_kernel.LayerOutputs`), relative to the local brightness and to
     the closed form; to deviations ``[1, 8, h, w]``; and where ``full`` to ``[1, 24 + 12 (C + 1), h, w]``, see
-    `details_kernel.DetailOutputs`.
+    `details_kernel.DetailOutputs`. ``quantized``: layers with known ranges in 8 bits.
     """
-    graph, arrays = _Graph(weights.arrays), weights.arrays
+    graph, arrays = _Graph(weights.arrays, weights.ranges, quantized), weights.arrays
     ops, widths = graph.ops, weights.size.widths
     sizes = [input_channels(weights.colors, weights.inputs).total, *[DETAIL_MAPS] * full]
     parameters = [ops.parameter([1, n, *packed], np.float32) for n in sizes]
@@ -169,7 +195,7 @@ def joint_model(weights: JointWeights, packed: tuple[int, int], full: bool) -> A
     weight, bias = arrays["last.weight"], arrays["last.bias"]
     gain = [arrays.get(f"trust.{part}") for part in ("weight", "bias")]
     gain = [np.zeros_like(own[:4]) if found is None else found for own, found in zip((weight, bias), gain, strict=True)]
-    corrections = graph.correlate(features, np.concatenate([weight, gain[0]]), np.concatenate([bias, gain[1]]))
+    corrections = graph.correlate(features, np.concatenate([weight, gain[0]]), np.concatenate([bias, gain[1]]), "last")
     log_variance = graph.convolve(graph.relu(graph.convolve(features, "doubt.0")), "doubt.2")
     largest = np.repeat(np.array(MAX_LOG_VARIANCE, np.float32), 4).reshape(1, 8, 1, 1)
     deviation = ops.exp(ops.multiply(ops.minimum(log_variance, largest), np.float32(0.5)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -32,7 +32,8 @@ class JointWeights:
     """Sizes and ``arrays`` of a joint network, by their names in files; two are equal if they are one object.
 
     ``colors``: 3, or 1 for mono frames. ``inputs``: the groups of `channels.GROUPS` that it sees. ``averages_shifts``:
-    mono frames are separated at all shifts of `orient.shifts_of` and combined: no pattern of a period is left. Raises
+    mono frames are separated at all shifts of `orient.shifts_of` and combined: no pattern of a period is left.
+    ``ranges``: least and largest input of layers that may be rounded to 8 bits, by name, see `ranges`. Raises
     ValueError when arrays are missing or of other shapes.
     """
 
@@ -41,6 +42,7 @@ class JointWeights:
     arrays: Arrays
     inputs: tuple[str, ...] = INPUTS
     averages_shifts: bool = False
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         found = {name: array.shape for name, array in self.arrays.items()}
@@ -70,7 +72,9 @@ def joint_weights(arrays: Arrays, metadata: Mapping[str, str], averages_shifts: 
     """The network of a file's arrays and metadata. Raises KeyError, TypeError or ValueError when it is of another."""
     size = json.loads(metadata["size"])
     size = ResidualSize(size["width"], tuple(size["blocks"]), size.get("entry", 0))
-    return JointWeights(int(metadata["colors"]), size, arrays, tuple(json.loads(metadata["inputs"])), averages_shifts)
+    ranges = {name: (float(low), float(high)) for name, (low, high) in json.loads(metadata.get("ranges", "{}")).items()}
+    inputs = tuple(json.loads(metadata["inputs"]))
+    return JointWeights(int(metadata["colors"]), size, arrays, inputs, averages_shifts, ranges)
 
 
 def expected_shapes(weights: JointWeights) -> dict[str, tuple[int, ...]]:

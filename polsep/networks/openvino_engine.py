@@ -1,7 +1,8 @@
 """The joint network on CPUs for frames of one size: kernels make its inputs, OpenVINO runs its layers, kernels images.
 
-The same as `run.run_joint`, in less time. Layers run in bfloat16 where the processor has matrix tiles for it, else in
-float32; the closed form and the images are float32 always.
+The same as `run.run_joint`, in less time. Layers run in what is fastest on the processor: bfloat16 where it has matrix
+tiles for it, else most of them in 8-bit integers where it multiplies those, else in float32. The closed form and the
+images are float32 always.
 """
 
 from __future__ import annotations
@@ -39,8 +40,9 @@ _ROWS = 16
 class OpenVinoEngine:
     """A network for frames of one shape in its own order of filters, H and W multiples of 4.
 
-    ``full``: images at full instead of half resolution. ``precision``: "bf16", "f32", or None for what suits the
-    processor. State: compiled layers and buffers between raw samples and images, for one frame at a time.
+    ``full``: images at full instead of half resolution. ``precision`` of layers: "bf16", "f32", "i8" (that of
+    `JointWeights.ranges`, others in float32), or None for what suits the processor. State: compiled layers and buffers
+    between raw samples and images, for one frame at a time. ``inputs [h, w, n]``: what `prepare` fills.
     """
 
     def __init__(
@@ -50,7 +52,7 @@ class OpenVinoEngine:
         self._layout = network.layout
         h, w = shape[0] // PERIOD, shape[1] // PERIOD
         channels = input_channels(network.colors, network.inputs)
-        precision = precision or _usual_precision()
+        precision = precision or usual_precision()
         halves = precision == "bf16"
         inputs = LayerInput.empty((h, w, channels.total), halves)
         closed = ClosedFormRows.empty(network.colors, h, w)
@@ -59,17 +61,18 @@ class OpenVinoEngine:
         self._taps = None if network.demosaic is None else make_taps(network.demosaic, network.colors, w, full)
         change, deviation = (np.empty((n, h, w), np.float32) for n in (4 * network.colors + 8, 8))
         self._outputs = LayerOutputs.of(closed, change, deviation)
-        filled, outputs = [inputs.filled], [change, deviation]
+        self.inputs, outputs = [inputs.filled], [change, deviation]
         if full:
             shares = np.empty((2 * DETAIL_MAPS + DETAIL_MAPS * (network.colors + 1), h, w), np.float32)
             smooth = read_smooth(network.arrays["details.smooth"])
             self._details = DetailOutputs.of(shares, beyond, smooth)
             self._detail_input = LayerInput.empty((h, w, DETAIL_MAPS), halves)
-            filled, outputs = [*filled, self._detail_input.filled], [*outputs, shares]
+            self.inputs, outputs = [*self.inputs, self._detail_input.filled], [*outputs, shares]
         self._network, self._modulation = network, np.zeros((1, 1, 2 * sum(network.size.widths)), np.float32)
         if network.sees_frame:
-            filled = [*filled, self._modulation]
-        self._request = _compile(joint_model(network, (h, w), full), filled, outputs, precision)
+            self.inputs = [*self.inputs, self._modulation]
+        model = joint_model(network, (h, w), full, quantized=precision == "i8")
+        self._request = _compile(model, self.inputs, outputs, "f32" if precision == "i8" else precision)
 
     def run(
         self,
@@ -84,24 +87,12 @@ class OpenVinoEngine:
         ``modulation``: `modulation_of` the frame that this is a strip of; None where it is a whole one. ``kept``: rows
         of the images that are wanted; others are left out, and do not count in the tally.
         """
-        samples, shape = as_samples(raw), (raw.shape[0], raw.shape[1])
-        pattern = read_pattern(shape, self._layout, *levels, light)
+        shape = (raw.shape[0], raw.shape[1])
         h, w = shape if self._full else (shape[0] // 2, shape[1] // 2)
         targets, gains = Targets.empty((h, w), self._colors), np.array(light[: self._colors], np.float32)
-        if modulation is None:
-            modulation = modulation_of(self._network, raw, levels, light)
         with self._lock:
-            if modulation is not None:
-                self._modulation[0, 0] = modulation
-            self._fill_inputs(samples, pattern)
-            rows, closed, beyond = shape[0] // PERIOD, self._maps.closed, self._maps.details
-            if self._full:
-                run_over_rows(
-                    lambda row_range: find_beyond(closed, self._details.smooth, beyond, row_range), rows, _ROWS
-                )
-                run_over_rows(
-                    lambda row_range: emit_details(beyond, closed, self._detail_input, row_range), rows, _ROWS
-                )
+            self.prepare(raw, levels, light, modulation)
+            rows = shape[0] // PERIOD
             self._request.infer()
             if self._full:
                 run_over_rows(
@@ -113,8 +104,23 @@ class OpenVinoEngine:
         diffuse, specular, error = (image.reshape(image.shape[0], w, -1) for image in targets[:3])
         return FrameImages(diffuse, specular, targets.valid, targets.dolp, targets.aolp, _tally(targets), error)
 
-    def _fill_inputs(self, samples: Samples, pattern: Pattern) -> None:
-        """The layers' inputs, and the closed form, of a frame."""
+    def prepare(
+        self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...], modulation: Floats | None = None
+    ) -> None:
+        """Fill the layers' inputs, and the closed form, of a frame; arguments as of `run`."""
+        if modulation is None:
+            modulation = modulation_of(self._network, raw, levels, light)
+        if modulation is not None:
+            self._modulation[0, 0] = modulation
+        samples, pattern = as_samples(raw), read_pattern((raw.shape[0], raw.shape[1]), self._layout, *levels, light)
+        rows, closed, beyond = raw.shape[0] // PERIOD, self._maps.closed, self._maps.details
+        self._fill_maps(samples, pattern)
+        if self._full:
+            run_over_rows(lambda row_range: find_beyond(closed, self._details.smooth, beyond, row_range), rows, _ROWS)
+            run_over_rows(lambda row_range: emit_details(beyond, closed, self._detail_input, row_range), rows, _ROWS)
+
+    def _fill_maps(self, samples: Samples, pattern: Pattern) -> None:
+        """The first input, and the closed form."""
         h, taps, maps = pattern.h // 2, self._taps, self._maps
         if taps is not None:
             run_over_rows(lambda row_range: map_rows(samples, pattern, taps, maps, row_range), h, _ROWS)
@@ -161,14 +167,16 @@ def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[Floats], prec
     return request
 
 
-def _usual_precision() -> str:
-    """The faster precision on this processor: "bf16" where OpenVINO takes it and matrix tiles (AMX) multiply it.
+def usual_precision() -> str:
+    """The fastest precision on this processor: "bf16" where OpenVINO takes it and matrix tiles (AMX) multiply it.
 
-    Vector units that know bfloat16 alone (AVX512-BF16) take 1.6 times as long with it as with float32
-    (docs/experiments.md).
+    Vector units that know bfloat16 alone (AVX512-BF16) take 1.6 times as long with it as with float32, and those that
+    multiply 8-bit integers (VNNI) a third as long with these (docs/experiments.md).
     """
     name: str = core().get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name()
-    return "f32" if name == "bf16" and "amx_bf16" not in cpu_flags() else name
+    if name == "bf16" and "amx_bf16" not in cpu_flags():
+        name = "f32"
+    return "i8" if name == "f32" and cpu_flags() & {"avx512_vnni", "avx_vnni"} else name
 
 
 def _tally(targets: Any) -> Tally:

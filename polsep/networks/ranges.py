@@ -1,0 +1,57 @@
+"""Ranges of the inputs of a joint network's layers, by which these can be rounded to 8 bits.
+
+A layer's range is `MARGIN` times that of all but a share `BEYOND` of its inputs on each side, of the frame with the
+widest; where some are negative it is symmetric. It is (0, 0) for the second layer of a block whose first one is below
+zero everywhere, on all frames. The first layer, which sees the samples, and the last ones stay exact: rounding them
+costs many times what rounding all others does (docs/experiments.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from polsep.networks.channels import PERIOD
+from polsep.networks.graphs import core, joint_model
+from polsep.networks.joint_weights import JointWeights
+from polsep.networks.openvino_engine import OpenVinoEngine
+from polsep.sensor.camera import Mosaic
+
+#: Layers that are rounded, by how their names begin.
+ROUNDED = ("net.encoders", "net.downs", "net.ups", "net.decoders", "doubt.0")
+#: Share of the inputs beyond each end of what is seen, and the range over that.
+BEYOND, MARGIN = 1e-4, 1.5
+
+
+def measure_ranges(network: JointWeights, frames: Iterable[Mosaic]) -> dict[str, tuple[float, float]]:
+    """Least and largest input of every layer of `ROUNDED` on frames ``[H, W]``, H and W multiples of 4.
+
+    Frames are in the network's own order of filters. Raises ValueError without frames.
+    """
+    bounds: dict[str, list[tuple[float, float]]] = {}
+    for frame in frames:
+        shape = (frame.data.shape[0], frame.data.shape[1])
+        engine = OpenVinoEngine(network, shape, precision="f32")
+        engine.prepare(np.asarray(frame.data), (frame.black_level, frame.white_level), frame.light_color)
+        model = joint_model(network, (shape[0] // PERIOD, shape[1] // PERIOD), full=False)
+        layers = {op.get_friendly_name(): op for op in model.get_ops() if op.get_type_name() == "Convolution"}
+        names = [name for name in layers if name.startswith(ROUNDED)]
+        model.add_outputs([layers[name].input_value(0) for name in names])
+        request = core().compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"}).create_infer_request()
+        found = list(request.infer([np.moveaxis(seen, -1, 0)[None] for seen in engine.inputs]).values())
+        for name, values in zip(names, found[-len(names) :], strict=True):
+            ends = np.quantile(values, [BEYOND, 1 - BEYOND]) if np.mean(values > 0) > BEYOND else values
+            bounds.setdefault(name, []).append((MARGIN * float(ends.min()), MARGIN * float(ends.max())))
+    if not bounds:
+        raise ValueError("expected at least one frame to measure ranges on, found none")
+    return {name: _widest(found) for name, found in bounds.items()}
+
+
+def _widest(bounds: list[tuple[float, float]]) -> tuple[float, float]:
+    """One range for all: from 0 where nothing is negative, else of as many steps below 0 as bytes with sign have."""
+    low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
+    if low >= 0:
+        return 0.0, high
+    largest = max(-low * 127 / 128, high)
+    return -largest * 128 / 127, largest

@@ -19,7 +19,7 @@ from tolerances import assert_close, assert_same_angle, assert_within
 from polsep.compute.threads import own_threads
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.kernels import get_threads, set_threads
-from polsep.networks import engines, strips
+from polsep.networks import engines, openvino_engine, strips
 from polsep.networks.channels import INPUTS, PERIOD
 from polsep.networks.engines import run_engine
 from polsep.networks.joint import Demosaicker, Joint
@@ -197,8 +197,8 @@ def test_a_thread_writes_no_row_of_another(
     for plane in (*planes, engine._maps.details):
         plane.fill(math.nan)
     clipped.fill(12345)
-    monkeypatch.setattr("polsep.compute.threads.run_over_rows", lambda work, rows, step: work(row_range))
-    engine._fill_inputs(as_samples(mosaic.data.numpy()), read_pattern((height, 64), layout, BLACK, WHITE, LIGHT))
+    monkeypatch.setattr(openvino_engine, "run_over_rows", lambda work, rows, step: work(row_range))
+    engine._fill_maps(as_samples(mosaic.data.numpy()), read_pattern((height, 64), layout, BLACK, WHITE, LIGHT))
     others = np.ones(height // PERIOD, np.bool_)
     others[slice(*row_range)] = False
     for plane in planes:

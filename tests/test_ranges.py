@@ -29,10 +29,9 @@ def run(network: JointWeights, mosaic: Mosaic, precision: str, full: bool = Fals
 
 
 def rms(network: JointWeights, other: JointWeights, precisions: tuple[str, str], layout: Layout, full: bool) -> float:
+    """Root mean square difference of the images of two networks."""
     one, two = (run(net, frame(layout), p, full) for net, p in zip((network, other), precisions, strict=True))
-    return float(
-        np.sqrt(np.mean([(a - b) ** 2 for a, b in ((one.diffuse, two.diffuse), (one.specular, two.specular))]))
-    )
+    return float(np.sqrt(np.mean([(one.diffuse - two.diffuse) ** 2, (one.specular - two.specular) ** 2])))
 
 
 @pytest.mark.parametrize("layout", [COLOR, MONO], ids=["color", "mono"])

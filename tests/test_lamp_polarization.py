@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from test_colored_specular import IDEAL, scene, separated
 from tolerances import assert_close
 from torch import Tensor
 
+from polsep.compute.resizing import block_means
 from polsep.sensor.camera import Layout, expose
 from polsep.separation.colored_specular import color_specular
-from polsep.separation.lamp_polarization import MIN_PART, SIDE, find_unpolarized
+from polsep.separation.lamp_polarization import MIN_PART, SIDE, find_unpolarized, measure_places
+from polsep.separation.places_kernel import measure_places_fast
 
 SIZE = 96
 #: Errors of a slope, since the mean colour of a place holds a little of what is left.
@@ -29,7 +32,7 @@ def bodies(saturation: float = 1.0) -> tuple[Tensor, Tensor]:
 
 
 def found_in(diffuse: Tensor, specular: Tensor) -> float:
-    return find_unpolarized(diffuse.numpy(), specular.numpy())
+    return find_unpolarized(measure_places(diffuse.numpy(), specular.numpy()))
 
 
 @pytest.mark.parametrize("degree", [0.7, 0.8, 0.9, 0.95])
@@ -90,3 +93,16 @@ def test_light_that_is_left_moves_to_the_specular_image(side: int) -> None:
     assert_close(torch.from_numpy(found.diffuse + found.specular), torch.from_numpy(images.diffuse + images.specular))
     truth = white[:, ::side, ::side].movedim(0, -1)
     torch.testing.assert_close(torch.from_numpy(found.specular), truth, rtol=0, atol=SLOPE)
+
+
+@pytest.mark.parametrize("cell", [1, 2])
+def test_the_kernel_measures_the_same_places(cell: int) -> None:
+    """Of images whose sides are no multiples, in a coloured light, at half and full resolution."""
+    generator = np.random.default_rng(1)
+    diffuse, specular = generator.random((2, cell * 50 + cell - 1, cell * 67, 3)).astype(np.float32)
+    gains = np.array([0.5, 1.0, 1.5], np.float32)
+    halves = [block_means(np.moveaxis(image / gains, -1, 0), cell) for image in (diffuse, specular)]
+    expected = measure_places(halves[0], halves[1].mean(axis=0, keepdims=True))
+    for found, wanted in zip(measure_places_fast(diffuse, specular, gains, cell), expected, strict=True):
+        assert found.shape == wanted.shape
+        np.testing.assert_allclose(found, wanted, rtol=2e-6)

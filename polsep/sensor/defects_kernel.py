@@ -68,11 +68,12 @@ class Predictor(NamedTuple):
 
 def find_candidates(x: NDArray[np.float32], rules: Rules) -> NDArray[np.int64]:
     """Row and column ``[N, 2]`` of samples of ``x [H, W]`` that stand out of their own kind, in reading order."""
-    marks, counts = np.zeros(x.shape, np.uint8), np.zeros(x.shape[0], np.int64)
-    run_over_rows(partial(_mark_rows, read_only(x), rules, marks, counts), x.shape[0], STRIP)
-    rows = np.flatnonzero(counts)
-    at, columns = np.nonzero(marks[rows])
-    return np.stack([rows[at], columns], axis=1)
+    marks = np.zeros((x.shape[0], -(-x.shape[1] // 8) * 8), np.uint8)
+    run_over_rows(partial(_mark_rows, read_only(x), rules, marks), x.shape[0], STRIP)
+    # Few samples are marked: eight are looked at together.
+    at = np.flatnonzero(marks.view(np.uint64))
+    which, inside = np.nonzero(marks.reshape(-1, 8)[at])
+    return np.stack(np.divmod(8 * at[which] + inside, marks.shape[1]), axis=1)
 
 
 def confirm(
@@ -124,7 +125,7 @@ def _outside(x: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: 
 
 
 @entry
-def _mark_rows(x: Any, rules: Rules, marks: Any, counts: Any, row_range: RowRange) -> None:
+def _mark_rows(x: Any, rules: Rules, marks: Any, row_range: RowRange) -> None:
     """Mark the candidates of some rows; beyond the border, the neighbour on the other side counts twice."""
     height, width = x.shape
     p = rules.period
@@ -137,20 +138,15 @@ def _mark_rows(x: Any, rules: Rules, marks: Any, counts: Any, row_range: RowRang
         up_a, up_b, up_c = up[:n], up[p : p + n], up[2 * p : 2 * p + n]
         down_a, down_b, down_c = down[:n], down[p : p + n], down[2 * p : 2 * p + n]
         before, after = here[:n], here[2 * p : 2 * p + n]
-        total = 0
         for j in range(n):
-            found = _outside(
+            out[j] = _outside(
                 middle[j], up_a[j], up_b[j], up_c[j], before[j], after[j], down_a[j], down_b[j], down_c[j], rules
             )
-            out[j] = found
-            total += found
         for k in range(2 * p):
             j = k if k < p else width - 2 * p + k
             a = j - p if j >= p else j + p
             b = j + p if j + p < width else j - p
             row[j] = _outside(here[j], up[a], up[j], up[b], here[a], here[b], down[a], down[j], down[b], rules)
-            total += row[j]
-        counts[i] = total
 
 
 @compiled

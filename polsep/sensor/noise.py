@@ -122,22 +122,30 @@ def _by_brightness(signal: Floats, changes: list[Floats], span: float) -> Double
     bins = min(max(root.size // BLOCKS_PER_BIN, FEWEST_BINS), MAX_BINS)
     scale = np.float32(bins / max(float(root.max()), 1e-3 * span**0.5))
     which = np.minimum(root * scale, np.float32(bins - 1)).astype(np.int64)
-    order = np.argsort(which, kind="stable")
+    ends = np.cumsum(np.bincount(which, minlength=bins))[:-1]
+    signals, *parts = (np.split(values[np.lexsort((values, which))], ends) for values in (signal, *changes))
     found = []
-    for part in np.split(order, np.cumsum(np.bincount(which, minlength=bins))[:-1]):
-        variance = min(_central(values[part]) for values in changes)
+    for own, *squares in zip(signals, *parts, strict=True):
+        variance = min(_central(ordered) for ordered in squares)
         if np.isfinite(variance):
-            found.append((float(np.median(signal[part])), variance, part.size))
+            found.append((_quantile(own, 0.5), variance, own.size))
     return np.array(found, np.float64).reshape(-1, 3)
 
 
-def _central(values: Floats) -> float:
-    """The variance that explains most of the blocks' mean squares ``values``; inf if too few are finite."""
-    values = values[np.isfinite(values)]
-    if values.size < MIN_BLOCKS:
+def _central(ordered: Floats) -> float:
+    """The variance that explains most of the blocks' ascending mean squares; inf if too few are finite."""
+    finite = ordered[: np.searchsorted(ordered, np.inf)]
+    if finite.size < MIN_BLOCKS:
         return float("inf")
-    quiet = float(np.quantile(values, 0.25)) / QUARTER
-    return float(np.median(values[values <= OUTLIER * quiet])) / MEDIAN
+    quiet = _quantile(finite, 0.25) / QUARTER
+    return _quantile(finite[: np.searchsorted(finite, OUTLIER * quiet, side="right")], 0.5) / MEDIAN
+
+
+def _quantile(ordered: Floats, share: float) -> float:
+    """`numpy.quantile` of ascending values, without its overhead, which is most of an estimate's time."""
+    whole, part = divmod(share * (ordered.size - 1), 1)
+    first, second = (float(ordered[min(int(whole) + step, ordered.size - 1)]) for step in (0, 1))
+    return first + part * (second - first)
 
 
 def _fit(points: Doubles, levels: Levels) -> Noise:

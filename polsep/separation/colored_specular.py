@@ -22,10 +22,12 @@ from typing import NamedTuple
 import numpy as np
 
 from polsep.compute.arrays import Array, namespace, pad_repeat, to_numpy, window
-from polsep.compute.resizing import block_means, resize_area, resize_bilinear
+from polsep.compute.resizing import resize_area, resize_bilinear
+from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import split_analysers
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes
 from polsep.sensor.camera import Mosaic
+from polsep.separation import places_kernel
 from polsep.separation.images import FrameImages, Tally
 from polsep.separation.lamp_polarization import Floats, find_unpolarized
 from polsep.separation.retained_polarization import find_retained
@@ -85,12 +87,14 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     row, col = mosaic.layout.origin
     layout, data = mosaic.layout.rolled(-row, -col), to_numpy(mosaic.data)[row:, col:]
     white = replace(mosaic, data=data, layout=layout, light_color=light, falloff=None)
-    diffuse, before = (_channels_first(x) for x in (images.diffuse, images.specular))
+    diffuse, before = (np.moveaxis(x, -1, 0) for x in (images.diffuse, images.specular))
     side = 2 if 2 * diffuse.shape[-1] <= data.shape[-1] else PERIOD
-    halves = [x / gain if side == 2 else block_means(x / gain, 2) for x in (diffuse, before)]
-    unpolarized = find_unpolarized(halves[0], halves[1].mean(axis=0, keepdims=True))
-    left = np.minimum(unpolarized * before, diffuse)
-    diffuse, specular = diffuse - left, before + left
+    make_ready(places_kernel.warm_up)
+    places = places_kernel.measure_places_fast(images.diffuse, images.specular, gain.reshape(-1), side // 2)
+    unpolarized, specular = find_unpolarized(places), before
+    if unpolarized:
+        left = np.minimum(unpolarized * before, diffuse)
+        diffuse, specular = diffuse - left, before + left
     # What fills 3x3 periods fills one in every third row and column: a ninth of the frame shows that there is nothing.
     thin = replace(white, data=_thin(data, PERIOD))
     some = _see(thin, _thin(diffuse, side) / gain, _thin(specular, side) / gain, tally)
@@ -113,10 +117,6 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     tally = replace(tally, specular=tally.specular + more, valid=int(np.count_nonzero(valid)))
     images = replace(images, diffuse=changed[0], specular=changed[1], valid=valid, tally=tally)
     return images, Colored(0.0 if share is None else float(share.mean()), retained, unpolarized)
-
-
-def _channels_first(image: Floats) -> Floats:
-    return np.ascontiguousarray(np.moveaxis(image, -1, 0))
 
 
 def _thin(image: Array, side: int) -> Array:

@@ -9,6 +9,8 @@ nothing, nor do bodies of one hue: there a wrong colour of the lamp may look whi
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,16 +33,30 @@ MIN_PART, MAX_PART, ERRORS, MAX_BESIDE = 0.04, 0.5, 3.0, 0.5
 MEDIAN_ERROR = 1.4826 * 1.25
 
 
-def find_unpolarized(diffuse: Floats, specular: Floats) -> float:
-    """The part of the specular image that is left in the diffuse one, (1 - p) / p; 0 where none is proven.
+class Places(NamedTuple):
+    """Means over places: ``color [3, N]`` of the diffuse image, ``light [1, N]`` of the specular one, and products.
 
-    ``diffuse [3, h, w]``, ``specular [1, h, w]``: a method's images at half resolution, in white light.
+    ``square [1, N]``: specular light squared; ``product [3, N]``: times the diffuse light; ``largest [N]`` sample.
     """
-    if min(diffuse.shape[-2:]) < SIDE:
-        return 0.0
+
+    color: Floats
+    light: Floats
+    square: Floats
+    product: Floats
+    largest: Floats
+
+
+def measure_places(diffuse: Floats, specular: Floats) -> Places:
+    """The places of a method's images ``[3, h, w]`` and ``[1, h, w]`` at half resolution, in white light."""
     products = (diffuse, specular, specular * specular, specular * diffuse)
     color, light, square, product = (block_means(x, SIDE).reshape(x.shape[0], -1) for x in products)
     largest = blocks_of(specular[0] + diffuse.max(axis=0) / 2, SIDE).max(axis=(-3, -1)).reshape(-1)
+    return Places(color, light, square, product, largest)
+
+
+def find_unpolarized(places: Places) -> float:
+    """The part of the specular image that is left in the diffuse one, (1 - p) / p; 0 where none is proven."""
+    color, light, square, product, largest = places
     variance, covariance = (square - light**2)[0], product - light * color
     body = color / np.linalg.norm(color, axis=0).clip(1e-9)
     white = 1 - body * body.sum(axis=0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,10 +22,13 @@ from polsep.cli.app import (
     SIZE,
     WHITE_LEVEL,
     app,
+    parse_size,
     print_note,
-    progress_bar,
     read_options,
+    require_extra,
+    require_paths,
 )
+from polsep.cli.progress import show_progress
 
 if TYPE_CHECKING:
     from polsep.batch import Outcome
@@ -64,7 +66,8 @@ if TYPE_CHECKING:
 def separate(files: tuple[str, ...], **options: Any) -> None:
     """Separate raw frames of a polarization camera into diffuse and specular images.
 
-    FILE is PNG, TIFF, NPY, NPZ, PGM or headerless raw; 'shot_{angle}.png' is four images at 0, 45, 90 and 135 degrees.
+    FILE is PNG, TIFF, NPY, NPZ, PGM or headerless raw, or a folder of such files or of 'polsep capture';
+    'shot_{angle}.png' is four images at 0, 45, 90 and 135 degrees.
     For every frame, DIR/STEM.exr gets the layers diffuse.R/G/B, specular.R/G/B, dolp.Y, aolp.Y [radians] and valid.Y
     (networks also write their expected errors, error.diffuse and error.specular), DIR/STEM.png is a preview, and
     DIR/STEM.json holds settings and statistics.
@@ -74,6 +77,7 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     polsep separate shot.tiff --white-level 4095      12-bit values in 16-bit words
     polsep separate mono.png --layout mono            a monochrome polarization sensor
     polsep separate dump.raw --size 2448x2048 --pixel-format BayerRG12p
+    polsep separate shots/                            every frame of a folder
     polsep separate 'shot_{angle}.png'                four images, one per analyser angle
 
     \b
@@ -81,7 +85,11 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     --layout mono    the same without colours
     --layout SPEC    2x2 angles in reading order and the Bayer order, like 90,45,135,0/RGGB or 0,45,90,135/mono
     """
+    if len(files) == 1:  # of several the others are separated all the same
+        require_paths(*files)
+    parse_size(options["size"])
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
+    from polsep.io.raw.sequences import expand_folders
     from polsep.methods import check_method
     from polsep.pipeline import find_device, parse_light_color
 
@@ -91,15 +99,14 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     check_method(options["method"])
     find_device(options["device"])
     light = parse_light_color(options["light_color"])
+    paths = expand_folders(files)
     run = SeparateOptions(options["method"], light, options["device"], options["full"])
     write = WriteOptions(options["output"], options["format"], options["overwrite"])
     failures, sources = 0, set[str]()
-    with progress_bar() if len(files) > 1 else nullcontext() as progress:
-        task = None if progress is None else progress.add_task("separating", total=len(files), speed="")
-        for outcome in separate_files(files, read, run, write):
+    with show_progress(f"separating {paths[0]}" if len(paths) == 1 else "separating", len(paths)) as progress:
+        for outcome in separate_files(paths, read, run, write):
             sources.add(outcome.source)
-            if progress is not None and task is not None:
-                progress.update(task, completed=len(sources), description=outcome.source)
+            progress.update(len(sources))
             failures += _report(outcome)
     if failures:
         sys.exit(2)
@@ -113,7 +120,34 @@ def _report(outcome: Outcome) -> int:
     for warning in outcome.warnings:
         print_note(f"{outcome.source}: {warning}")
     print(f"{outcome.source} -> {', '.join(str(path) for path in outcome.written)}")
+    print(f"  {summary(outcome.report)}", flush=True)
     return 0
+
+
+def summary(report: dict[str, Any]) -> str:
+    """One line of what matters in the report of a frame: method, clipping, the light, expected errors, warnings."""
+    facts, light = report["statistics"], report.get("light", {})
+    parts = [report["method"], f"{_percent(facts['clipped_fraction'])} clipped"]
+    angle = f"polarizer at {facts['light_polarizer_deg']:.0f} deg"
+    parts.append(f"light: {angle}" if len(report["light_color"]) == 1 else f"light: {angle}, {_color(light)}")
+    if "expected_diffuse_error" in facts:
+        errors = [facts[f"expected_{image}_error_median"] for image in ("diffuse", "specular")]
+        parts.append("median expected error: diffuse {:.2g}, specular {:.2g}".format(*errors))
+    count = len(report["warnings"])
+    return "; ".join([*parts, f"{count} warning{'s' * (count != 1)}" if count else "no warnings"])
+
+
+def _color(light: dict[str, Any]) -> str:
+    """The light's colour and where it is from."""
+    color = ",".join(f"{c:.2f}" for c in light["color"])
+    error = light.get("error_deg")
+    found = light["source"] if error is None else f"{light['source']}, +- {error:.2g} deg"
+    return f"colour {color} ({found})"
+
+
+def _percent(share: float) -> str:
+    """A share in percent; a few pixels never read as none."""
+    return "nothing" if share == 0 else f"{share:.2%}" if share >= 1e-4 else "below 0.01%"
 
 
 @app.command()
@@ -131,20 +165,25 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     The file runs in onnxruntime and similar programs without polsep. Frames [N, H, W] are in Sony's order with sides
     that are multiples of 4; black_level and white_level are in their units. Needs the extra export.
     """
+    require_extra("export")
+    if weights is not None:
+        require_paths(weights)
+    from polsep.io.store.atomic import refuse_existing
+
+    refuse_existing(output.parent, [output], options["overwrite"])
     import torch
 
-    from polsep.io.store.atomic import refuse_existing
     from polsep.io.store.onnx import write_onnx
     from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork
     from polsep.networks.joint import Joint
     from polsep.sensor.camera import Layout
     from polsep.shipped import find_joint
 
-    refuse_existing(output.parent, [output], options["overwrite"])
     network, metadata = find_joint(method, Layout(bayer=None) if options["mono"] else Layout(), weights)
     print_note(f"exporting {method}, which takes a minute or a few")
-    graph = ExportedNetwork(Joint.of(network, torch.device("cpu")), options["full"])
-    write_onnx(output, graph, OUTPUT_NAMES, metadata)
+    with show_progress(f"exporting {method}"):
+        graph = ExportedNetwork(Joint.of(network, torch.device("cpu")), options["full"])
+        write_onnx(output, graph, OUTPUT_NAMES, metadata)
     print(output)
 
 

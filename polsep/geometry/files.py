@@ -21,7 +21,7 @@ from polsep.geometry.polarization import Polarized, find_diffuse_polarization, n
 from polsep.geometry.surface import Surface, draw_views, relight, span_surface
 from polsep.io.assets.maps import read_map
 from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
-from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.frames import ReadOptions, read_frames, refuse_forgotten
 from polsep.io.raw.videos import load_library
 from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import exposure_of, toned
@@ -112,6 +112,7 @@ def _read_frame(path: Path, source: Source) -> SeparatedFrame:
     frames = list(read_frames(path, source.options))
     if len(frames) != 1:
         raise input_error(path, f"expected one frame under one light, found {len(frames)}")
+    refuse_forgotten(path, frames[0])
     try:
         return separate_capture(frames[0].data, source.method)
     except (ValueError, RuntimeError) as error:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from polsep.io.assets.materials import MaterialFiles, material_targets, write_material
-from polsep.io.raw.frames import ReadOptions, output_stem, read_frames
+from polsep.io.raw.frames import ReadOptions, output_stem, read_frames, refuse_forgotten
 from polsep.io.results.previews import Panel, Pixels, titled_sheet, toned
 from polsep.io.results.separation_reader import read_separated
 from polsep.io.store.atomic import refuse_existing, refuse_inputs
@@ -107,6 +107,7 @@ def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photogra
             lobes.append((frame.diffuse, frame.specular))
         else:
             for raw in read_frames(path, options.read):
+                refuse_forgotten(path, raw)
                 frame = separate_capture(raw.data, options.method, options.light_color)
                 lobes.append((frame.diffuse, frame.specular))
                 notes += [f"{path}: {note}" for note in (*raw.notes, *frame.report["warnings"])]

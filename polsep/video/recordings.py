@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from polsep.compute.cluster import map_ordered
 from polsep.compute.threads import get_threads, own_threads
 from polsep.compute.workers import DEPTH, ahead, map_ahead
-from polsep.io.raw.frames import Frame, ReadOptions
+from polsep.io.raw.frames import Frame, ReadOptions, refuse_forgotten
 from polsep.io.raw.sequences import DamagedFrame, FrameSequence, open_sequence
 from polsep.io.results.previews import exposure_of, srgb
 from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWriter, State
@@ -199,6 +199,7 @@ def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFram
         if isinstance(frame, DamagedFrame):
             reason = frame.reason
             continue
+        refuse_forgotten(recording.stem, frame)
         told, found = _light_of(recording, options)
         separated = separate_capture(frame.data, options.method, told, options.device)
         gain = exposure_of(separated.diffuse + separated.specular)

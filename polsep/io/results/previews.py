@@ -9,6 +9,7 @@ angle atan2(-d_row, d_col). Shrinking averages light, and polarization as Stokes
 
 from __future__ import annotations
 
+import builtins
 from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -137,6 +138,14 @@ def contact_sheet(frame: SeparatedFrame) -> Pixels:
     _draw_aolp_legend(sheet, (lefts[1], below))
     _draw_flag_legend(sheet, (lefts[2], below), flags)
     return np.array(sheet, dtype=np.uint8)
+
+
+def show_frame(frame: SeparatedFrame) -> Image.Image:
+    """Open the contact sheet in the system's picture viewer, and return it; in a notebook only return it."""
+    sheet = Image.fromarray(contact_sheet(frame))
+    if not hasattr(builtins, "__IPYTHON__"):
+        sheet.show()
+    return sheet
 
 
 def live_sheet(frame: SeparatedFrame) -> Pixels:

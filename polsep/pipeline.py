@@ -107,6 +107,8 @@ def separate(
     the owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises ValueError, with one line
     of what was expected and what was found, on other input; of wrong types it is also a TypeError.
     """
+    if not isinstance(full, bool | np.bool_):
+        raise WrongType(f"expected full as True or False, found {full!r:.40}")
     if not isinstance(calibration, Calibration | str | PathLike | None):
         raise WrongType(f"expected a calibration or its file, found {type(calibration).__name__}")
     measured = calibration if isinstance(calibration, Calibration | None) else read_calibration(Path(calibration))

@@ -87,9 +87,8 @@ def to_device(x: Array, device: str) -> Array:
 
 def short_repr(thing: Any) -> str:
     """Text of a dataclass of arrays for its ``__repr__``: of arrays only type and shape."""
-    fields = (
-        f"{name}={_shape(value) if is_array_api_obj(value) else repr(value)}" for name, value in vars(thing).items()
-    )
+    texts = {name: _shape(value) if is_array_api_obj(value) else repr(value) for name, value in vars(thing).items()}
+    fields = (f"{name}={text}" for name, text in texts.items())
     return f"{type(thing).__name__}({', '.join(fields)})"
 
 

@@ -200,6 +200,8 @@ def _advice(found: Any) -> str:
     """What to do with a thing that is no array, where that is clear."""
     if type(found).__module__.partition(".")[0] == "torch":
         return ": say raw.numpy(force=True)"
+    if isinstance(getattr(found, "data", None), Mosaic | Measurements):
+        return ": say frame.data"
     return ": read files by polsep.read_frames" if isinstance(found, str | PathLike) else ""
 
 

@@ -135,9 +135,9 @@ def test_separate_writes_the_contract(tmp_path: Path) -> None:
     run = subprocess_run("separate", source, "-o", tmp_path / "out")
     assert run.status == 0, run
     assert run.err == ""
-    assert run.out.strip() == f"{source} -> " + ", ".join(
-        str(tmp_path / "out" / f"shot.{s}") for s in ("exr", "png", "json")
-    )
+    files, facts = run.out.splitlines()
+    assert files == f"{source} -> " + ", ".join(str(tmp_path / "out" / f"shot.{s}") for s in ("exr", "png", "json"))
+    assert re.fullmatch(rf"  {BEST[0].name}; .* clipped; light: polarizer at \d+ deg, colour .*; no warnings", facts)
     layers = read_exr_layers(tmp_path / "out" / "shot.exr")
     errors = {"error.diffuse", "error.specular"} if BEST[0].name in NAMES else set()
     assert set(layers) == COLOR_LAYERS | MAPS | errors
@@ -186,7 +186,7 @@ def test_pages_become_numbered_frames(tmp_path: Path, polsep: Cli) -> None:
     """A TIFF of three pages gives three results, numbered from 0."""
     tifffile.imwrite(tmp_path / "run.tiff", np.stack([frame(k) for k in range(3)]), photometric="minisblack")
     run = polsep("separate", tmp_path / "run.tiff", "-o", tmp_path / "o")
-    assert run.status == 0 and len(run.out.splitlines()) == 3
+    assert run.status == 0 and len(run.out.splitlines()) == 6
     assert set(contents(tmp_path / "o")) == {f"run_000{k}.{s}" for k in range(3) for s in ("exr", "png", "json")}
 
 
@@ -229,10 +229,41 @@ def test_same_command_same_bytes(tmp_path: Path, polsep: Cli) -> None:
 
 def test_warnings_are_lines_on_stderr(tmp_path: Path, polsep: Cli) -> None:
     """What the owner should know is said once, on stderr, with the file's name; stdout stays for results."""
-    run = polsep("separate", png(tmp_path / "dim.png", frame() >> 4), "-o", tmp_path / "o")
+    odd = frame()[:, :-1]
+    run = polsep("separate", png(tmp_path / "odd.png", odd), "-o", tmp_path / "o")
     assert run.status == 0
-    assert run.err.startswith(f"polsep: {tmp_path / 'dim.png'}: values never exceed 4095")
-    assert run.err.count("\n") == 1 and run.out.count("\n") == 1
+    assert run.err.startswith(f"polsep: {tmp_path / 'odd.png'}: odd size 31x32")
+    assert run.err.count("\n") == 1 and run.out.splitlines()[1].endswith("; 1 warning")
+
+
+def test_forgotten_white_level_is_refused(tmp_path: Path, polsep: Cli) -> None:
+    """12-bit values in 16-bit words without their white level: refused before anything is written, with what to say.
+
+    A dark frame beside frames that use the range of their type is only warned of.
+    """
+    dim = png(tmp_path / "dim.png", frame() >> 4)
+    assert_refused(
+        polsep("separate", dim, "-o", tmp_path / "o"), "dim.png", "--white-level 4095", "--white-level 65535"
+    )
+    assert not (tmp_path / "o").exists()
+    for level in ("4095", "65535"):
+        run = polsep("separate", dim, "-o", tmp_path / level, "--white-level", level)
+        assert run.status == 0 and "--white-level" not in run.err
+    run = polsep("separate", png(tmp_path / "bright.png", frame()), dim, "-o", tmp_path / "o")
+    assert run.status == 0 and "--white-level 4095 if so" in run.err
+
+
+def test_folders_are_separated(tmp_path: Path, polsep: Cli) -> None:
+    """A folder stands for its frames: single files in natural order, and four angle images as one frame."""
+    (tmp_path / "in").mkdir()
+    for name in ("shot10", "shot9", *(f"set_{angle}" for angle in (0, 45, 90, 135))):
+        png(tmp_path / "in" / f"{name}.png", frame())
+    run = polsep("separate", tmp_path / "in", "-o", tmp_path / "o", "--method", "analytic")
+    assert run.status == 0, run
+    sources = [line.split(" -> ")[0] for line in run.out.splitlines() if " -> " in line]
+    assert sources == [str(tmp_path / "in" / name) for name in ("set_{angle}.png", "shot9.png", "shot10.png")]
+    (tmp_path / "none").mkdir()
+    assert_refused(polsep("separate", tmp_path / "none", "-o", tmp_path / "o"), "expected a folder of frames")
 
 
 def test_good_files_are_written_beside_bad_ones(tmp_path: Path, polsep: Cli) -> None:
@@ -242,7 +273,7 @@ def test_good_files_are_written_beside_bad_ones(tmp_path: Path, polsep: Cli) -> 
     run = polsep("separate", first, tmp_path / "b.png", last, "-o", tmp_path / "o")
     assert run.status == 2
     assert LINE.fullmatch(run.err) and "b.png" in run.err
-    assert len(run.out.splitlines()) == 2
+    assert len(run.out.splitlines()) == 4
     assert set(contents(tmp_path / "o")) == {f"{stem}.{s}" for stem in "ac" for s in ("exr", "png", "json")}
 
 
@@ -340,7 +371,8 @@ def test_bad_files(tmp_path: Path, polsep: Cli, name: str, data: bytes, options:
     """Every damaged or unfit file: status 2, one line that names it, and no output at all."""
     (tmp_path / name).write_bytes(data)
     run = polsep("separate", tmp_path / name, "-o", tmp_path / "o", *cli_options(options))
-    assert_refused(run, name, "expected", "found")
+    named = "--white-level" if "white_level" in options and not options["white_level"] > 0 else name
+    assert_refused(run, named, "expected", "found")
     assert not (tmp_path / "o").exists()
 
 

@@ -433,10 +433,13 @@ def test_without_the_library_films_are_refused_before_any_work(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    assert run(monkeypatch, *command(recording, tmp_path / "o")) == 2
-    assert "expected the extra 'video'" in capsys.readouterr().err
-    assert not (tmp_path / "o").exists()
-    assert run(monkeypatch, *command(recording, tmp_path / "o", "--no-preview", "--frames", "1")) == 0
+    for asked in ("--preview", "--format=ffv1"):
+        assert run(monkeypatch, *command(recording, tmp_path / "o", asked)) == 2
+        assert "expected the extra 'video'" in capsys.readouterr().err
+        assert not (tmp_path / "o").exists()
+    assert run(monkeypatch, *command(recording, tmp_path / "o", "--frames", "1")) == 0
+    assert "no video to watch is written: it needs the extra 'video'" in capsys.readouterr().err
+    assert not list((tmp_path / "o").glob("*.mp4"))
 
 
 def _title(psutil: Any, process: Any) -> str:

@@ -166,7 +166,14 @@ def has_extra(extra: str) -> bool:
 
 def missing_module(extra: str) -> str | None:
     """A module of an extra that is not installed, None if all are."""
-    return next((name for name in EXTRAS[extra] if find_spec(name) is None), None)
+    return next((name for name in EXTRAS[extra] if not _is_installed(name)), None)
+
+
+def _is_installed(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
 
 
 def require_extra(extra: str) -> None:

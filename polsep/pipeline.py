@@ -35,7 +35,7 @@ from polsep.separation.images import FrameImages
 from polsep.separation.report import SeparatedFrame, describe, error_quantiles
 
 if TYPE_CHECKING:
-    from PIL import Image
+    from polsep.io.results.previews import Picture
 
 LightColor = Sequence[float]
 #: Formats by the endings of file names.
@@ -77,7 +77,7 @@ class Result(SeparatedFrame):
             raise ValueError(f"expected a file name that ends in {', '.join(_ENDINGS)}, found {target.name!r:.80}")
         return write_separation(self, target.parent, stem, _ENDINGS.get(target.suffix.lower(), "exr"), overwrite)
 
-    def show(self) -> Image.Image:
+    def show(self) -> Picture:
         """Show the preview in the system's picture viewer and return it, which notebooks display instead."""
         from polsep.io.results.previews import show_frame
 
@@ -134,7 +134,7 @@ def separate(
 def _as_capture(
     raw: NDArray[Any] | Capture, layout: Layout | str | None, black_level: float, white_level: float | None
 ) -> tuple[Capture, tuple[str, ...]]:
-    """What `separate` accepts as a capture, with notes for the user."""
+    """A capture of anything that `separate` accepts, with notes for the user."""
     if isinstance(raw, Mosaic | Measurements):
         if layout is not None or black_level != 0 or white_level is not None:
             raise ValueError(f"expected layout and levels with an array, found them with a {type(raw).__name__}")

@@ -64,8 +64,26 @@ class Number(_ParamType):
         return noun
 
 
+class Word(_ParamType):
+    """One of a few words; another one is an error that names its option as typed."""
+
+    name = "word"
+
+    def __init__(self, *words: str) -> None:
+        self.words = words
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the word. Raises BadParameter."""
+        if value not in self.words:
+            self.fail(
+                f"expected {', '.join(self.words[:-1])} or {self.words[-1]}, found {str(value)!r:.40}", param, ctx
+            )
+        return value
+
+
 COUNT, POSITIVE, FINITE = Number(int, 1), Number(float, 0, above=True), Number(float)
 RATE = Number(float, 0.001, 100_000)
+COMPRESSION, DAMAGED = Word("none", "zip", "piz"), Word("stop", "skip")
 
 LAYOUT = click.option(
     "--layout", metavar="color|mono|SPEC", help="Filter layout of the sensor, as in 'polsep separate'."
@@ -100,7 +118,11 @@ AMBIENT = click.option(
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace existing results.")
 DEVICE = click.option("--device", default="auto", metavar="NAME", help="Device: auto, cpu or cuda.")
 ENGINE = click.option(
-    "--engine", default="local", metavar="NAME", help="local: this machine; ray: the cluster of RAY_ADDRESS."
+    "--engine",
+    type=Word("local", "ray"),
+    default="local",
+    metavar="NAME",
+    help="local: this machine; ray: the cluster of RAY_ADDRESS.",
 )
 
 
@@ -125,22 +147,27 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def read_options(options: Mapping[str, Any]) -> ReadOptions:
-    """Options of reading raw frames, from the options of a command. Raises ValueError."""
+def check_read_options(options: Mapping[str, Any]) -> None:
+    """Raise ValueError on levels, sizes and files that `read_options` would refuse; without heavy imports."""
     black, white = options["black_level"], options["white_level"]
     if white is not None and not white > black:
         raise ValueError(f"expected --white-level above the black level, found white {white:g}, black {black:g}")
-    size = parse_size(options.get("size"))
+    parse_size(options.get("size"))
     require_paths(*filter(None, [options.get("calibration"), *options.get("ambient", ())]))
+
+
+def read_options(options: Mapping[str, Any]) -> ReadOptions:
+    """Options of reading raw frames, from the options of a command. Raises ValueError."""
+    check_read_options(options)
     from polsep.io.raw.corrections import with_corrections
     from polsep.io.raw.frames import ReadOptions
     from polsep.sensor.camera import Layout
 
     read = ReadOptions(
         None if options["layout"] is None else Layout.parse(options["layout"]),
-        black,
-        white,
-        size,
+        options["black_level"],
+        options["white_level"],
+        parse_size(options.get("size")),
         options.get("pixel_format"),
         options.get("pages", "frames"),
     )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from polsep.cli.app import DIR, FILE, OVERWRITE, RATE, app, print_note, require_paths
+from polsep.cli.app import COMPRESSION, DAMAGED, DIR, FILE, OVERWRITE, RATE, app, print_note, require_paths
 from polsep.cli.progress import report_step, show_progress
 from polsep.cli.video import with_preview
 
@@ -42,7 +42,13 @@ if TYPE_CHECKING:
 @click.option("--remove-highlights", type=float, metavar="X", help="Remove specular light; 0 none, 1 all of it.")
 @click.option("--isolate-highlights", type=float, metavar="X", help="Remove diffuse light; 0 none, 1 all of it.")
 @click.option("--tint", metavar="R,G,B", help="Multiply the colour of the light.")
-@click.option("--compression", default="none", metavar="none|zip|piz", help="Compression of a sequence's EXR files.")
+@click.option(
+    "--compression",
+    type=COMPRESSION,
+    default="none",
+    metavar="none|zip|piz",
+    help="Compression of a sequence's EXR files.",
+)
 @click.option(
     "--preview/--no-preview",
     default=None,
@@ -50,7 +56,11 @@ if TYPE_CHECKING:
 )
 @click.option("--rate", type=RATE, default=25.0, metavar="N", help="Frames per second of that video.")
 @click.option(
-    "--damaged", default="stop", metavar="stop|skip", help="Stop at a missing frame of a sequence, or skip it."
+    "--damaged",
+    type=DAMAGED,
+    default="stop",
+    metavar="stop|skip",
+    help="Stop at a missing frame of a sequence, or skip it.",
 )
 @OVERWRITE
 @click.option("--list", "listing", is_flag=True, help="List the edits with their ranges and exit.")
@@ -115,7 +125,9 @@ def _edit_all(inputs: tuple[Path, ...], work: Work, target: EditTarget) -> int:
 
 def _find_recipe(options: dict[str, Any]) -> tuple[Recipe, Path]:
     """Return the edits of the options, and the folder that their files are relative to."""
+    from polsep.edit.edits import EDITS
     from polsep.edit.files import read_recipe
+    from polsep.edit.parameters import EditError
     from polsep.edit.recipe import Recipe, make_edit
 
     given = list(_given_edits(options))
@@ -126,7 +138,14 @@ def _find_recipe(options: dict[str, Any]) -> tuple[Recipe, Path]:
         return read_recipe(path), path.parent
     if not given:
         raise ValueError("expected an edit such as --metallic 1, or --recipe FILE, found none; --list shows them")
-    return Recipe(tuple(make_edit(kind, values) for kind, values in given)), Path()
+    edits = []
+    for kind, values in given:
+        try:
+            edits.append(make_edit(kind, values))
+        except EditError as error:
+            name = next(name for name, edit in EDITS.items() if edit is kind)
+            raise ValueError(f"--{name}: {error}") from None
+    return Recipe(tuple(edits)), Path()
 
 
 def _given_edits(options: dict[str, Any]) -> Iterator[tuple[Any, dict[str, Any]]]:

@@ -22,7 +22,7 @@ from polsep.cli.app import (
     SIZE,
     WHITE_LEVEL,
     app,
-    parse_size,
+    check_read_options,
     print_note,
     read_options,
     require_extra,
@@ -87,7 +87,7 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     """
     if len(files) == 1:  # of several the others are separated all the same
         require_paths(*files)
-    parse_size(options["size"])
+    check_read_options(options)
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
     from polsep.io.raw.sequences import expand_folders
     from polsep.methods import check_method
@@ -169,17 +169,17 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     if weights is not None:
         require_paths(weights)
     from polsep.io.store.atomic import refuse_existing
+    from polsep.sensor.camera import Layout
+    from polsep.shipped import find_joint
 
     refuse_existing(output.parent, [output], options["overwrite"])
+    network, metadata = find_joint(method, Layout(bayer=None) if options["mono"] else Layout(), weights)
     import torch
 
     from polsep.io.store.onnx import write_onnx
     from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork
     from polsep.networks.joint import Joint
-    from polsep.sensor.camera import Layout
-    from polsep.shipped import find_joint
 
-    network, metadata = find_joint(method, Layout(bayer=None) if options["mono"] else Layout(), weights)
     print_note(f"exporting {method}, which takes a minute or a few")
     with show_progress(f"exporting {method}"):
         graph = ExportedNetwork(Joint.of(network, torch.device("cpu")), options["full"])

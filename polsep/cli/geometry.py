@@ -18,6 +18,7 @@ from polsep.cli.app import (
     OVERWRITE,
     WHITE_LEVEL,
     Number,
+    Word,
     app,
     read_options,
     require_extra,
@@ -54,9 +55,13 @@ ORDER = "right front-right front front-left left above"
 )
 @click.option("--size", "longest", type=COUNT, default=640, metavar="PX", help="Longer side of the maps at most.")
 @click.option(
-    "--integration", default="bilateral", metavar="bilateral|smooth", help="Depth with jumps, or one smooth surface."
+    "--integration",
+    type=Word("bilateral", "smooth"),
+    default="bilateral",
+    metavar="bilateral|smooth",
+    help="Depth with jumps, or one smooth surface.",
 )
-@click.option("--mesh", default="glb", metavar="glb|ply", help="Format of the mesh.")
+@click.option("--mesh", type=Word("glb", "ply"), default="glb", metavar="glb|ply", help="Format of the mesh.")
 @click.option("--turntable", is_flag=True, help="Also write DIR/STEM.mp4, the turning mesh; needs the extra video.")
 @OVERWRITE
 def geometry(files: tuple[Path, ...], **options: Any) -> None:

@@ -1,4 +1,4 @@
-"""How far a command is: a bar on a terminal, elsewhere a line every half minute, both on stderr."""
+"""Progress of a command: a bar on a terminal, elsewhere a line every half minute, both on stderr."""
 
 from __future__ import annotations
 

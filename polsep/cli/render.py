@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from polsep.cli.app import COUNT, DIR, ENGINE, Number, app, print_note, require_extra
+from polsep.cli.app import COUNT, DIR, ENGINE, Number, Word, app, print_note, require_extra
 from polsep.cli.progress import show_progress
 
 
@@ -17,7 +17,13 @@ from polsep.cli.progress import show_progress
 @click.option("--size", type=Number(int, 32, 16_384), default=1024, metavar="PX", help="Side of the raw frames.")
 @click.option("--seed", type=Number(int, 0, 2**63), default=0, metavar="N", help="Random seed; each gives another set.")
 @click.option("-o", "--output", type=DIR, required=True, metavar="DIR", help="New directory, or one to resume.")
-@click.option("--split", default="train", metavar="NAME", help="train, validation or test; they share no random draws.")
+@click.option(
+    "--split",
+    type=Word("train", "validation", "test"),
+    default="train",
+    metavar="NAME",
+    help="train, validation or test; they share no random draws.",
+)
 @click.option("--samples", type=Number(int, 1, 16), default=2, metavar="N", help="Trace N x N rays per pixel.")
 @click.option("--format", type=click.Choice(["exr", "npz"]), default="exr", help="Format of the ground truth.")
 @click.option("--workers", type=COUNT, metavar="N", help="Number of processes.  [default: one per core]")
@@ -35,6 +41,8 @@ def render(output: Path, workers: int | None, engine: str, **options: Any) -> No
     polsep render --shapes 25 --views 20 --size 1024 --split test -o test    shapes that no training uses
     """
     require_extra("render")
+    if options["size"] % 4:
+        raise ValueError(f"expected --size a multiple of 4, found {options['size']}")
     if engine == "ray":
         require_extra("ray")
     from polsep.datasets.rendered import RenderOptions, default_workers, render_dataset

@@ -8,11 +8,17 @@ from typing import Any
 
 import click
 
-from polsep.cli.app import COUNT, DIR, POSITIVE, app, require_extra, require_paths
+from polsep.cli.app import COUNT, DIR, POSITIVE, Word, app, require_extra, require_paths
+
+#: What can be trained.
+RUNGS = (
+    *("joint-large", "joint", "joint-fast", "material"),
+    *("paper", "unpolarized", "polarized", "shared", "signed", "no-angle", "stokes"),
+)
 
 
 @app.command()
-@click.argument("rung")
+@click.argument("rung", type=Word(*RUNGS))
 @click.option("-o", "--output", type=DIR, required=True, metavar="DIR", help="New directory, or one to resume.")
 @click.option(
     "--data",

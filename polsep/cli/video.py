@@ -12,7 +12,9 @@ from polsep.cli.app import (
     AMBIENT,
     BLACK_LEVEL,
     CALIBRATION,
+    COMPRESSION,
     COUNT,
+    DAMAGED,
     DEVICE,
     DIR,
     ENGINE,
@@ -23,6 +25,7 @@ from polsep.cli.app import (
     RATE,
     SIZE,
     WHITE_LEVEL,
+    Word,
     app,
     has_extra,
     print_note,
@@ -46,9 +49,15 @@ from polsep.cli.progress import report_step, show_progress
 @AMBIENT
 @LIGHT_COLOR
 @click.option(
-    "--format", default="exr", metavar="exr|ffv1|none", help="A file per frame, a lossless video, or only a preview."
+    "--format",
+    type=Word("exr", "ffv1", "none"),
+    default="exr",
+    metavar="exr|ffv1|none",
+    help="A file per frame, a lossless video, or only a preview.",
 )
-@click.option("--compression", default="none", metavar="none|zip|piz", help="Compression of EXR files.")
+@click.option(
+    "--compression", type=COMPRESSION, default="none", metavar="none|zip|piz", help="Compression of EXR files."
+)
 @click.option(
     "--preview/--no-preview",
     default=None,
@@ -56,10 +65,16 @@ from polsep.cli.progress import report_step, show_progress
 )
 @click.option("--rate", type=RATE, default=25.0, metavar="N", help="Frames per second of the videos written.")
 @click.option(
-    "--filter", default="temporal", metavar="temporal|none", help="temporal: average over frames where nothing moves."
+    "--filter",
+    type=Word("temporal", "none"),
+    default="temporal",
+    metavar="temporal|none",
+    help="temporal: average over frames where nothing moves.",
 )
 @click.option("--frames", type=COUNT, metavar="N", help="Separate the first N frames at most.")
-@click.option("--damaged", default="stop", metavar="stop|skip", help="Stop at a damaged frame, or skip it.")
+@click.option(
+    "--damaged", type=DAMAGED, default="stop", metavar="stop|skip", help="Stop at a damaged frame, or skip it."
+)
 @SIZE
 @PIXEL_FORMAT
 @OVERWRITE

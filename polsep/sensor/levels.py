@@ -197,7 +197,7 @@ def _checked(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _advice(found: Any) -> str:
-    """What to do with a thing that is no array, where that is clear."""
+    """Advice on a thing that is no array, where it is clear what to do."""
     if type(found).__module__.partition(".")[0] == "torch":
         return ": say raw.numpy(force=True)"
     if isinstance(getattr(found, "data", None), Mosaic | Measurements):

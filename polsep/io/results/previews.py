@@ -13,7 +13,7 @@ import builtins
 import textwrap
 from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 Values = NDArray[np.floating[Any]]
 Pixels = NDArray[np.uint8]
+Picture: TypeAlias = Image.Image
 
 PANEL = 640  # longest side of a panel in pixels
 COLUMNS = 4  # panels in a row of the contact sheet
@@ -151,7 +152,7 @@ def contact_sheet(frame: SeparatedFrame) -> Pixels:
     return np.array(sheet, dtype=np.uint8)
 
 
-def show_frame(frame: SeparatedFrame) -> Image.Image:
+def show_frame(frame: SeparatedFrame) -> Picture:
     """Open the contact sheet in the system's picture viewer, and return it; in a notebook only return it."""
     sheet = Image.fromarray(contact_sheet(frame))
     if not hasattr(builtins, "__IPYTHON__"):

@@ -259,8 +259,10 @@ def test_a_killed_run_goes_on_to_the_same_files(recording: Path, steady: Path, t
         process.send_signal(signal.SIGKILL)
         process.wait()
         assert not (output / "run.json").exists()
+        done = PART * len(list(output.glob(".polsep-*/[0-9]*.json")))
         again = [*program, *command(recording, output, *STEADY)]
-        subprocess.run(again, check=True, stdout=subprocess.DEVNULL, timeout=120)
+        resumed = subprocess.run(again, check=True, capture_output=True, text=True, timeout=120)
+        assert (f"polsep: resuming at frame {done} of {FRAMES}" in resumed.stderr) == (done > 0), resumed.stderr
         assert contents(output) == contents(steady)
 
 

@@ -30,7 +30,7 @@ USUAL_DIFFUSE = 0.29
 #: Smallest and largest side of maps.
 MIN_SIZE, LARGEST_SIZE = 32, 1024
 #: Parts along a side of the square, and the least light of one relative to the brightest that a flat sample shows.
-#: Random flat materials: 0.11 and more; objects on black: 0.000, spheres that fill the square 0.02 to 0.04.
+#: Random flat materials: 0.06 and more; objects on black: 0.000, spheres that fill the square 0.02 to 0.04.
 FLAT_PARTS, MIN_PART = 8, 0.05
 #: Positions of the lights of the preview, and the side of its pictures in pixels.
 PREVIEW_LIGHTS = ((0.0, 0.0, 2.75), (-1.2, 0.8, 1.8), (1.3, 0.9, 1.5), (1.0, -1.3, 1.2), (-1.6, -0.6, 0.9))

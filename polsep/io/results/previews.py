@@ -214,7 +214,8 @@ def _clearness(frame: SeparatedFrame, light: Values) -> NDArray[np.float64]:
 
 def _faded(picture: Pixels, share: Values) -> Pixels:
     """A picture where ``share [h, w, 1]`` is 1, grey where it is 0."""
-    return np.rint(share * picture + (1 - share) * np.array(FADED)).astype(np.uint8)
+    mixed: NDArray[np.float64] = share * picture + (1 - share) * np.array(FADED)
+    return np.rint(mixed).astype(np.uint8)
 
 
 def _to_bytes(display: Values) -> Pixels:

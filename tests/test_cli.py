@@ -525,7 +525,7 @@ def test_missing_paths_are_named_before_any_import(tmp_path: Path, words: str) -
     )
     command = [sys.executable, "-c", program, *words.split()]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120, check=True)
-    assert re.fullmatch(r"no\S*: expected a file or folder, found nothing at this path False\n", done.stdout), done
+    assert re.fullmatch(r"no\S*: expected a file, found nothing at this path False\n", done.stdout), done
 
 
 def test_words_of_options_are_those_of_the_library() -> None:

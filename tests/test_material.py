@@ -271,12 +271,12 @@ def test_a_photograph_becomes_files(
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (["--size", "3"], r"expected a size of 32 to 1024 pixels, found 3"),
-        (["--white", "a"], r"expected --white N or N,N,... like 0.8, found 'a'"),
-        (["--white", "0"], r"expected levels of white above 0, found 0"),
+        (["--size", "3"], r"'--size': expected a whole number from 32 to 1024, found '3'"),
+        (["--white", "a"], r"expected --white N or N,N,... above 0, like 0.8, found 'a'"),
+        (["--white", "0"], r"expected --white N or N,N,... above 0, like 0.8, found '0'"),
         (["--white", "1,1"], r"expected one level of white, or 1, one for each photograph, found 2"),
         (["--method", "magic"], r"expected a method of"),
-        (["--weights", "nowhere.safetensors"], r"expected weights in nowhere.safetensors"),
+        (["--weights", "nowhere.safetensors"], r"nowhere.safetensors: expected a file"),
         (["--layout", "magic"], r'expected "color", "mono"'),
     ],
 )
@@ -291,6 +291,7 @@ def test_bad_options_are_one_line(
     """Exit status 2, one line that says what was expected, and no files."""
     out = frame.parent / "out"
     asked = ["material", str(frame), "-o", str(out), "--weights", str(weights), "--size", "32", "--method", "analytic"]
+    asked += ["--white-level", "4095"]
     assert run([*asked, *change], monkeypatch) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     assert len(lines) == 1 and re.search(said, lines[0])

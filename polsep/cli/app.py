@@ -213,7 +213,7 @@ def require_paths(*paths: str | Path) -> None:
     """Raise ValueError, which names the first path where nothing is. To call before heavy imports."""
     for path in paths:
         if "{angle}" not in str(path) and not os.path.lexists(path):
-            raise ValueError(one_line(f"{path}: expected a file or folder, found nothing at this path"))
+            raise ValueError(one_line(f"{path}: expected a file, found nothing at this path"))
 
 
 def main() -> None:

@@ -85,7 +85,8 @@ def edit(inputs: tuple[Path, ...], **options: Any) -> None:
         return
     if not inputs:
         raise ValueError("expected a separated frame or a folder of them, found nothing to edit")
-    require_paths(*inputs)
+    if len(inputs) == 1:  # of several the others are edited all the same
+        require_paths(*inputs)
     from polsep.compute.workers import keep_memory
     from polsep.edit.files import EditTarget, load_work
     from polsep.io.results.sequences import SequenceKind

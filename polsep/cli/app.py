@@ -116,13 +116,13 @@ AMBIENT = click.option(
     help="Frame with the lamp off, subtracted; of several (the option repeated, or in a file) their mean.",
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace existing results.")
-DEVICE = click.option("--device", default="auto", metavar="NAME", help="Device: auto, cpu or cuda.")
+DEVICE = click.option("--device", default="auto", metavar="NAME", help="Device: auto, cpu or cuda (extra torch).")
 ENGINE = click.option(
     "--engine",
     type=Word("local", "ray"),
     default="local",
     metavar="NAME",
-    help="local: this machine; ray: the cluster of RAY_ADDRESS.",
+    help="local: this machine; ray: the cluster of RAY_ADDRESS (extra ray).",
 )
 
 

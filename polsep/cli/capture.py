@@ -56,7 +56,7 @@ def capture(camera: str | None, listing: bool, **options: Any) -> None:
     CAMERA is aravis:ID, pylon:ID, folder:PATH or loop:PATH (raw frames of files, once or repeatedly); without it, the
     only connected camera. DIR gets frames.raw, the bytes as they came, frames.jsonl, a line per frame, recording.json
     and live.jpg, the newest separation. Frames lost in transfer, or dropped because the disk is slow, are counted. A
-    camera that is unplugged is waited for.
+    camera that is unplugged is waited for. Basler's pylon cameras need the extra camera.
 
     \b
     polsep capture --list

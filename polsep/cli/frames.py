@@ -29,6 +29,7 @@ from polsep.cli.app import (
     require_paths,
 )
 from polsep.cli.progress import show_progress
+from polsep.cli.summary import summary
 
 if TYPE_CHECKING:
     from polsep.batch import Outcome
@@ -124,32 +125,6 @@ def _report(outcome: Outcome) -> int:
     return 0
 
 
-def summary(report: dict[str, Any]) -> str:
-    """One line of what matters in the report of a frame: method, clipping, the light, expected errors, warnings."""
-    facts, light = report["statistics"], report.get("light", {})
-    parts = [report["method"], f"{_percent(facts['clipped_fraction'])} clipped"]
-    angle = f"polarizer at {facts['light_polarizer_deg']:.0f} deg"
-    parts.append(f"light: {angle}" if len(report["light_color"]) == 1 else f"light: {angle}, {_color(light)}")
-    if "expected_diffuse_error" in facts:
-        errors = [facts[f"expected_{image}_error_median"] for image in ("diffuse", "specular")]
-        parts.append("median expected error: diffuse {:.2g}, specular {:.2g}".format(*errors))
-    count = len(report["warnings"])
-    return "; ".join([*parts, f"{count} warning{'s' * (count != 1)}" if count else "no warnings"])
-
-
-def _color(light: dict[str, Any]) -> str:
-    """The light's colour and where it is from."""
-    color = ",".join(f"{c:.2f}" for c in light["color"])
-    error = light.get("error_deg")
-    found = light["source"] if error is None else f"{light['source']}, +- {error:.2g} deg"
-    return f"colour {color} ({found})"
-
-
-def _percent(share: float) -> str:
-    """A share in percent; a few pixels never read as none."""
-    return "nothing" if share == 0 else f"{share:.2%}" if share >= 1e-4 else "below 0.01%"
-
-
 @app.command()
 @click.argument("method")
 @click.option("-o", "--output", type=FILE, required=True, metavar="FILE.onnx")
@@ -219,11 +194,7 @@ def demo(output: Path, every: bool) -> None:
         for outcome in separate_files([str(capture)], ReadOptions(white_level=4095.0), SeparateOptions(name), write):
             if _report(outcome):
                 sys.exit(2)
-            statistics = outcome.report["statistics"]
-            print(
-                f"  {name}: {statistics['clipped_fraction']:.2%} of the pixels hold clipped samples, "
-                f"light polarizer about {statistics['light_polarizer_deg']:.0f} deg (25 deg in the scene)"
-            )
+    print("In the scene the polarizer is at 25 deg.")
     print(f"Compare {output / best / 'still_life.png'} with {output / 'analytic' / 'still_life.png'}:")
     print("  in 'specular', the analytic split leaves coloured rims of the objects, and holes where highlights clip;")
     print("  the networks remove the rims and fill most of the holes. The EXR files hold the linear images for")

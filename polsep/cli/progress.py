@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from polsep.cli.summary import summary
+
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
@@ -86,6 +88,8 @@ def report_step(step: Step, progress: Progress) -> bool:
         print(f"polsep: {step.warning}", file=sys.stderr, flush=True)
     for path in step.written:
         print(path)
+    if step.report is not None:
+        print(f"  {step.count} frames: {summary(step.report)}")
     return step.damaged
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import builtins
 import textwrap
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, reduce
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -175,7 +175,8 @@ def _panels(frame: SeparatedFrame, total: Values, flags: list[Flag]) -> list[Pan
     light = total.mean(axis=-1)
     dolp, aolp = _shrunk_polarization(frame, light)
     shown = _clearness(frame, light)[..., None]
-    combined, diffuse, specular = (toned(_shrunk(image), gain) for image in (total, frame.diffuse, frame.specular))
+    parts = [_shrunk(np.maximum(image, 0)) for image in (frame.diffuse, frame.specular)]
+    combined, diffuse, specular = (toned(image, gain) for image in (parts[0] + parts[1], *parts))
     exposure = f"exposure x {gain:.3g}"
     panels = [
         Panel("Input", exposure, combined),
@@ -184,14 +185,14 @@ def _panels(frame: SeparatedFrame, total: Values, flags: list[Flag]) -> list[Pan
         Panel(
             "Specular, brighter" if own >= gain else "Specular, darker",
             f"exposure x {own:.3g}",
-            toned(_shrunk(frame.specular), own),
+            toned(parts[1], own),
         ),
         Panel("DoLP", "degree of linear polarization", _faded(dolp_map(dolp), shown)),
         Panel("AoLP", "angle of linear polarization", _faded(aolp_wheel(aolp, dolp), shown)),
         Panel("Mask", "", _flagged(combined, flags)),
     ]
     if frame.error is not None:
-        error = _shrunk(frame.error.max(axis=-1))
+        error = _shrunk(np.maximum(frame.error[..., 0], frame.error[..., 1]))
         top = max(float(np.percentile(error, 99)), 1e-9)
         panels.append(Panel("Expected error", f"yellow: {top:.2g} or more", dolp_map(error / top)))
     return panels
@@ -252,7 +253,11 @@ def _flags(frame: SeparatedFrame, total: Values) -> list[Flag]:
     """The flags of the mask panel; later ones are drawn over earlier ones."""
     return [
         Flag(frame.dolp > 1, ABOVE_ONE, "DoLP above 1"),
-        Flag(np.max(total, axis=-1) > 2, ABOVE_RANGE, "above the measurable range"),
+        Flag(
+            reduce(np.logical_or, (total[..., k] > 2 for k in range(total.shape[-1]))),
+            ABOVE_RANGE,
+            "above the measurable range",
+        ),
         Flag(~frame.valid, NOT_VALID, "not valid"),
     ]
 

@@ -249,11 +249,13 @@ def parse_light_color(text: str) -> LightColor | str:
     """The light's colour as people write it: ``R,G,B``, ``white``, ``auto`` or ``estimate``. Raises ValueError."""
     if text in LIGHT_WORDS:
         return text
+    expected = 'expected a light colour R,G,B like 1,0.9,0.7, "white" or "auto"'
     try:
         r, g, b = (float(part) for part in text.split(","))
     except ValueError:
-        expected = 'expected a light colour R,G,B like 1,0.9,0.7, "white" or "auto"'
         raise ValueError(f"{expected}, found {text!r:.40}") from None
+    if not all(1e-6 < c < 1e6 for c in (r, g, b)):
+        raise ValueError(f"{expected}, all positive, found {text!r:.40}")
     return (r, g, b)
 
 

@@ -22,6 +22,7 @@ from polsep.io.store.errors import MOST, one_line
 
 if TYPE_CHECKING:
     from polsep.io.raw.frames import ReadOptions
+    from polsep.pipeline import LightColor
 
     _ParamType = click.ParamType[Any]
 else:
@@ -93,7 +94,8 @@ WHITE_LEVEL = click.option(
     "--white-level",
     type=FINITE,
     metavar="N",
-    help="Sample value at which the sensor clips.  [default: largest of the data type]",
+    help="Sample value at which the sensor clips; 12-bit values in 16-bit words need it.  "
+    "[default: largest of the data type]",
 )
 LIGHT_COLOR = click.option(
     "--light-color",
@@ -154,6 +156,16 @@ def check_read_options(options: Mapping[str, Any]) -> None:
         raise ValueError(f"expected --white-level above the black level, found white {white:g}, black {black:g}")
     parse_size(options.get("size"))
     require_paths(*filter(None, [options.get("calibration"), *options.get("ambient", ())]))
+
+
+def read_light(options: Mapping[str, Any]) -> LightColor | str:
+    """The colour of the light from the options of a command. Raises ValueError, which names the option."""
+    from polsep.pipeline import parse_light_color
+
+    try:
+        return parse_light_color(options["light_color"])
+    except ValueError as error:
+        raise ValueError(f"--light-color: {error}") from None
 
 
 def read_options(options: Mapping[str, Any]) -> ReadOptions:

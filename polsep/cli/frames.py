@@ -24,6 +24,7 @@ from polsep.cli.app import (
     app,
     check_read_options,
     print_note,
+    read_light,
     read_options,
     require_extra,
     require_paths,
@@ -92,14 +93,14 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
     from polsep.io.raw.sequences import expand_folders
     from polsep.methods import check_method
-    from polsep.pipeline import find_device, parse_light_color
+    from polsep.pipeline import find_device
 
     if click.get_current_context().get_parameter_source("layout") != click.core.ParameterSource.COMMANDLINE:
         options["layout"] = None  # files that say their own layout are read by it
     read = read_options(options)
     check_method(options["method"])
     find_device(options["device"])
-    light = parse_light_color(options["light_color"])
+    light = read_light(options)
     paths = expand_folders(files)
     run = SeparateOptions(options["method"], light, options["device"], options["full"])
     write = WriteOptions(options["output"], options["format"], options["overwrite"])

@@ -20,6 +20,7 @@ from polsep.cli.app import (
     Number,
     app,
     print_note,
+    read_light,
     read_options,
     require_extra,
     require_paths,
@@ -76,10 +77,9 @@ def material(files: tuple[str, ...], **options: Any) -> None:
     require_paths(*files, *filter(None, [options["weights"]]))
     white, read = _parse_white(options["white"]), read_options(options)
     from polsep.methods import check_method
-    from polsep.pipeline import parse_light_color
 
     check_method(options["method"])
-    light = parse_light_color(options["light_color"])
+    light = read_light(options)
     from polsep.material.files import MaterialOptions, estimate_files
 
     settings = MaterialOptions(

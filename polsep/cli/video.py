@@ -29,6 +29,7 @@ from polsep.cli.app import (
     app,
     has_extra,
     print_note,
+    read_light,
     read_options,
     require_extra,
     require_paths,
@@ -103,12 +104,11 @@ def video(recording: Path, output: Path, **options: Any) -> None:
     from polsep.compute.workers import keep_memory
     from polsep.io.results.sequences import SequenceKind
     from polsep.methods import check_method
-    from polsep.pipeline import parse_light_color
     from polsep.video.recordings import Target, VideoOptions, separate_video
 
     keep_memory()
     check_method(options["method"])
-    light = parse_light_color(options["light_color"])
+    light = read_light(options)
     shared = {name: options[name] for name in ("method", "device", "damaged", "frames", "engine", "filter")}
     run = VideoOptions(light_color=light, **shared)
     kind = SequenceKind(options["format"], options["compression"], with_preview(options["preview"]), options["rate"])

@@ -84,7 +84,9 @@ def main(directory: str) -> None:
     out = Path(directory)
     out.mkdir(parents=True, exist_ok=True)
     sheet.save(out / "still_life.jpg", quality=90)
-    preview = Image.fromarray(contact_sheet(found)).resize((1420, 949), Image.Resampling.LANCZOS)
+    found.report["source"] = "still_life.png"
+    preview = Image.fromarray(contact_sheet(found))
+    preview = preview.resize((1420, round(1420 * preview.height / preview.width)), Image.Resampling.LANCZOS)
     preview.save(out / "contact_sheet.jpg", quality=85)
     mistakes(raw).save(out / "mistakes.jpg", quality=88)
     with TemporaryDirectory() as folder:

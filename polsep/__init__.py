@@ -15,10 +15,13 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from polsep.io.raw.frames import Frame, ReadOptions, read_frames
+    from polsep.io.results.separation_reader import read_separated
+    from polsep.io.store.calibrations import read_calibration
     from polsep.light.find import Light, find_light
     from polsep.methods import METHODS
     from polsep.physics.stokes import Measurements, Stokes
-    from polsep.pipeline import PolsepWarning, separate
+    from polsep.pipeline import PolsepWarning, Result, separate
     from polsep.sensor.calibration import Calibration
     from polsep.sensor.camera import Layout, Mosaic
     from polsep.separation.analytic import Separation
@@ -27,30 +30,42 @@ if TYPE_CHECKING:
 __all__ = [
     "METHODS",
     "Calibration",
+    "Frame",
     "Layout",
     "Light",
     "Measurements",
     "Mosaic",
     "PolsepWarning",
+    "ReadOptions",
+    "Result",
     "SeparatedFrame",
     "Separation",
     "Stokes",
     "find_light",
+    "read_calibration",
+    "read_frames",
+    "read_separated",
     "separate",
 ]
 
 _HOME = {
     "METHODS": "methods",
     "Calibration": "sensor.calibration",
+    "Frame": "io.raw.frames",
     "Layout": "sensor.camera",
     "Light": "light.find",
     "Measurements": "physics.stokes",
     "Mosaic": "sensor.camera",
     "PolsepWarning": "pipeline",
+    "ReadOptions": "io.raw.frames",
+    "Result": "pipeline",
     "SeparatedFrame": "separation.report",
     "Separation": "separation.analytic",
     "Stokes": "physics.stokes",
     "find_light": "light.find",
+    "read_calibration": "io.store.calibrations",
+    "read_frames": "io.raw.frames",
+    "read_separated": "io.results.separation_reader",
     "separate": "pipeline",
 }
 

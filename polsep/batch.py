@@ -13,7 +13,7 @@ from os.path import realpath
 from pathlib import Path
 from typing import Any
 
-from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames
+from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames, refuse_forgotten
 from polsep.io.results.separation_writer import planned_outputs, write_separation
 from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import one_line
@@ -56,14 +56,19 @@ def separate_files(
     """Separate every frame of the files and yield one outcome per frame, or one with an error for a bad file.
 
     Raises OutputError before any work when two inputs have one name. A frame whose outputs would replace an input, or
-    one of another frame, is refused, also with ``overwrite``.
+    one of another frame, is refused, also with ``overwrite``. So is one whose white level was likely forgotten, unless
+    a frame before it used its range.
     """
     _refuse_equal_names(paths)
     angles = ("0", "45", "90", "135")
     claimed = {realpath(path.replace("{angle}", angle)): "is an input" for path in paths for angle in angles}
+    trusted = False
     for path in paths:
         try:
             for frame in read_frames(path, read):
+                trusted = trusted or not frame.notes
+                if not trusted:
+                    refuse_forgotten(path, frame)
                 outputs = planned_outputs(write.directory, frame.stem, write.format)
                 if clash := sorted({realpath(output) for output in outputs} & claimed.keys()):
                     raise OutputError(f"{path}: expected outputs of its own, found that {clash[0]} {claimed[clash[0]]}")

@@ -22,7 +22,7 @@ from polsep.demosaic.guided import MIN_CELLS, demosaic_guided, demosaic_guided_h
 from polsep.io.store.weights import is_shipped
 from polsep.networks.engines import combine_images, run_engine
 from polsep.physics.stokes import Measurements
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Layout, Mosaic, WrongType
 from polsep.separation import analytic_kernel, color_affine_kernel
 from polsep.separation.analytic import Separation, separate_analytic
 from polsep.separation.analytic_kernel import AnalyticOptions
@@ -250,5 +250,7 @@ def find_method(name: str, capture: Capture) -> Method:
 
 def check_method(name: str) -> None:
     """Raise ValueError, with the names there are, unless a method is called so."""
+    if not isinstance(name, str):
+        raise WrongType(f"expected the name of a method, found {type(name).__name__}")
     if name not in _CHOICES and name not in METHODS:
         raise ValueError(f"expected a method of {', '.join([*_CHOICES, *METHODS])}, found {name!r}")

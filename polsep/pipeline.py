@@ -12,10 +12,10 @@ import os
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from array_api_compat import is_array_api_obj
@@ -25,15 +25,21 @@ from polsep.compute.arrays import to_device
 from polsep.io.store.calibrations import read_calibration
 from polsep.light.find import find_light
 from polsep.methods import Capture, Method, find_method
+from polsep.physics.stokes import Measurements
 from polsep.sensor.calibration import Calibration, Corrections, falloff_image, mean_mosaic, subtract_ambient
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Layout, Mosaic, WrongType
 from polsep.sensor.checks import check_mosaic
-from polsep.sensor.levels import as_mosaic
+from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.images import FrameImages
-from polsep.separation.report import SeparatedFrame, describe
+from polsep.separation.report import SeparatedFrame, describe, error_quantiles
+
+if TYPE_CHECKING:
+    from polsep.io.results.previews import Picture
 
 LightColor = Sequence[float]
+#: Formats by the endings of file names.
+_ENDINGS = {".exr": "exr", ".npz": "npz", ".tiff": "tiff", ".tif": "tiff", ".png": "png"}
 #: Words for the light's colour: found in the frame (two words for one thing), or white.
 FOUND_WORDS = ("auto", "estimate")
 LIGHT_WORDS = (*FOUND_WORDS, "white")
@@ -53,8 +59,33 @@ class PolsepWarning(UserWarning):
     """Something about a frame that its owner should know: the layout, the bit depth, the exposure, the light."""
 
 
+@dataclass(frozen=True, repr=False)
+class Result(SeparatedFrame):
+    """A separated frame that can be saved and shown; its images are those of `SeparatedFrame`."""
+
+    def save(self, path: str | PathLike[str], overwrite: bool = False) -> list[Path]:
+        """Write images, a preview STEM.png and the report STEM.json, as `polsep separate` does; return their paths.
+
+        ``path``: DIR/STEM.exr, .npz, .tiff or .png (sets of one file per image); EXR without an ending. All or nothing.
+        Raises ValueError where files exist and ``overwrite`` is False, on another ending, or where writing fails.
+        """
+        from polsep.io.results.separation_writer import write_separation
+
+        target = Path(path)
+        stem = target.stem if target.suffix.lower() in _ENDINGS else target.name
+        if target.suffix and stem == target.name:
+            raise ValueError(f"expected a file name that ends in {', '.join(_ENDINGS)}, found {target.name!r:.80}")
+        return write_separation(self, target.parent, stem, _ENDINGS.get(target.suffix.lower(), "exr"), overwrite)
+
+    def show(self) -> Picture:
+        """Show the preview in the system's picture viewer and return it, which notebooks display instead."""
+        from polsep.io.results.previews import show_frame
+
+        return show_frame(self)
+
+
 def separate(
-    raw: NDArray[Any],
+    raw: NDArray[Any] | Capture,
     method: str = "auto",
     layout: Layout | str | None = None,
     black_level: float = 0,
@@ -64,32 +95,66 @@ def separate(
     full: bool = False,
     calibration: Calibration | str | PathLike[str] | None = None,
     ambient: NDArray[Any] | Sequence[NDArray[Any]] | None = None,
-) -> SeparatedFrame:
+) -> Result:
     """Separate one raw mosaic ``[H, W]`` (uint8, uint16, float32) into diffuse and specular.
 
     Images are ``[H/2, W/2, C]``, the mean over each 2x2 polarizer cell; ``full=True`` gives ``[H, W, C]``. ``layout``
     None is Sony's colour order; text is "color", "mono" or a `Layout.spec`. ``white_level`` None is the dtype's maximum
     (1.0 for float): 12-bit data in uint16 need 4095 or 65520 said. ``calibration``: a file of `polsep calibrate`,
     applied first. ``ambient``: a raw frame with the lamp off, or several, subtracted. ``light_color``: "auto" finds it
-    in the frame (`find_light`), or "white", or camera RGB of the light. What the owner should know is in
-    ``report["warnings"]`` and issued as `PolsepWarning`. Raises ValueError, with one line of what was expected and what
-    was found, on input that is not a mosaic.
+    in the frame (`find_light`), or "white", or camera RGB of the light. ``raw`` may also be four angle images at 0, 45,
+    90, 135 degrees, ``[4, H, W]`` or ``[4, H, W, 3]``, which keep their resolution, or what `read_frames` read. What
+    the owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises ValueError, with one line
+    of what was expected and what was found, on other input; of wrong types it is also a TypeError.
     """
+    if not isinstance(full, bool | np.bool_):
+        raise WrongType(f"expected full as True or False, found {full!r:.40}")
+    if not isinstance(calibration, Calibration | str | PathLike | None):
+        raise WrongType(f"expected a calibration or its file, found {type(calibration).__name__}")
     measured = calibration if isinstance(calibration, Calibration | None) else read_calibration(Path(calibration))
-    if white_level is None and measured is not None:
+    if white_level is None and measured is not None and isinstance(raw, np.ndarray):
         white_level = measured.white_level_of(raw)
-    mosaic, notes = as_mosaic(raw, layout, black_level, white_level)
-    corrections = Corrections(measured)
-    mosaic = corrections.apply(mosaic)
-    if ambient is not None:
-        rooms = [ambient] if isinstance(ambient, np.ndarray) and ambient.ndim == 2 else list(ambient)
-        lamp_off = [corrections.apply(as_mosaic(room, layout, black_level, white_level)[0]) for room in rooms]
-        mosaic = subtract_ambient(mosaic, mean_mosaic(lamp_off))
-    frame = separate_capture(mosaic, method, light_color, device, full)
+    levels = (layout, black_level, white_level)
+    capture, notes = _as_capture(raw, *levels)
+    if isinstance(capture, Mosaic):
+        corrections = Corrections(measured)
+        capture = corrections.apply(capture)
+        if ambient is not None:
+            rooms = [corrections.apply(as_mosaic(room, *levels)[0]) for room in _ambient_frames(ambient)]
+            capture = subtract_ambient(capture, mean_mosaic(rooms))
+    elif measured is not None or ambient is not None:
+        raise ValueError("expected a raw mosaic to calibrate or to subtract room light from, found four angle images")
+    frame = separate_capture(capture, method, light_color, device, full)
     frame.report["warnings"] = [*notes, *frame.report["warnings"]]
     for note in frame.report["warnings"]:
         warnings.warn(note, PolsepWarning, stacklevel=2)
     return frame
+
+
+def _as_capture(
+    raw: NDArray[Any] | Capture, layout: Layout | str | None, black_level: float, white_level: float | None
+) -> tuple[Capture, tuple[str, ...]]:
+    """A capture of anything that `separate` accepts, with notes for the user."""
+    if isinstance(raw, Mosaic | Measurements):
+        if layout is not None or black_level != 0 or white_level is not None:
+            raise ValueError(f"expected layout and levels with an array, found them with a {type(raw).__name__}")
+        return raw, ()
+    four = isinstance(raw, np.ndarray) and raw.ndim in (3, 4) and raw.shape[0] == 4
+    if not four or (raw.ndim == 3 and raw.shape[2] in (1, 3)):
+        return as_mosaic(raw, layout, black_level, white_level)
+    layout = Layout.parse(layout) if isinstance(layout, str) else layout
+    if raw.ndim == 3 and layout is not None and layout.bayer is not None:
+        return as_mosaic(interleave_planes(raw, layout), layout, black_level, white_level)
+    return as_measurements(raw, black_level, white_level)
+
+
+def _ambient_frames(ambient: NDArray[Any] | Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
+    """One frame or several as a list."""
+    if isinstance(ambient, np.ndarray):
+        return [ambient] if ambient.ndim == 2 else list(ambient)
+    if isinstance(ambient, str) or not isinstance(ambient, Sequence):
+        raise WrongType(f"expected a raw frame with the lamp off, or several, found {type(ambient).__name__}")
+    return list(ambient)
 
 
 def separate_capture(
@@ -98,7 +163,7 @@ def separate_capture(
     light_color: LightColor | str = "auto",
     device: str = "auto",
     full: bool = False,
-) -> SeparatedFrame:
+) -> Result:
     """`separate` for a frame that is already a `Mosaic`, or co-sited `Measurements` (which keep their resolution)."""
     chosen = find_method(method, capture)
     checked = check_mosaic(capture) if isinstance(capture, Mosaic) else None
@@ -120,10 +185,12 @@ def separate_capture(
 
 def make_frame(
     images: FrameImages, method: Method, capture: Capture, light: tuple[float, ...], full: bool = False
-) -> SeparatedFrame:
+) -> Result:
     """Images that a method made of a capture, with their report."""
     assert images.dolp is not None and images.aolp is not None and images.tally is not None
     report = describe(images.tally, method.expects_errors)
+    if images.error is not None:
+        report["statistics"] |= error_quantiles(images.error, math.fsum(light) / len(light))
     layout = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
     report |= {"method": method.name, "light_color": list(light), "full_resolution": full, "layout": layout}
     if not _is_finite(report):
@@ -132,7 +199,7 @@ def make_frame(
     if isinstance(capture, Mosaic) and capture.falloff is not None:
         fall = falloff_image(capture.falloff, *diffuse.shape[:2])[..., None]
         diffuse, specular, error = diffuse / fall, specular / fall, None if error is None else error / fall
-    return SeparatedFrame(diffuse, specular, images.valid, images.dolp, images.aolp, report, error)
+    return Result(diffuse, specular, images.valid, images.dolp, images.aolp, report, error)
 
 
 def _is_finite(facts: Any) -> bool:
@@ -150,7 +217,7 @@ def find_device(name: str) -> str:
     Raises ValueError on a device that is not there.
     """
     if not isinstance(name, str):
-        raise ValueError(f"expected a device like auto, cpu or cuda, found {name!r}")
+        raise WrongType(f"expected a device like auto, cpu or cuda, found {name!r}")
     if name == "cpu" or (name == "auto" and not _may_have_gpu()):
         return "cpu"
     try:
@@ -182,11 +249,13 @@ def parse_light_color(text: str) -> LightColor | str:
     """The light's colour as people write it: ``R,G,B``, ``white``, ``auto`` or ``estimate``. Raises ValueError."""
     if text in LIGHT_WORDS:
         return text
+    expected = 'expected a light colour R,G,B like 1,0.9,0.7, "white" or "auto"'
     try:
         r, g, b = (float(part) for part in text.split(","))
     except ValueError:
-        expected = 'expected a light colour R,G,B like 1,0.9,0.7, "white" or "auto"'
         raise ValueError(f"{expected}, found {text!r:.40}") from None
+    if not all(1e-6 < c < 1e6 for c in (r, g, b)):
+        raise ValueError(f"{expected}, all positive, found {text!r:.40}")
     return (r, g, b)
 
 
@@ -214,7 +283,9 @@ def resolve_light(
         told = capture.light_color if isinstance(capture, Mosaic) and told != "white" else (1.0, 1.0, 1.0)
     try:
         color = tuple(float(c) for c in told)
-    except (TypeError, ValueError):
+    except TypeError:
+        raise WrongType(f"expected a light colour of three positive numbers, found {light_color!r:.40}") from None
+    except ValueError:
         color = ()
     if len(color) != 3 or not all(1e-6 < c < 1e6 for c in color):
         raise ValueError(f"expected a light colour of three positive numbers, found {light_color!r}")

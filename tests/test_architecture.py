@@ -39,6 +39,7 @@ RANKS = {
     "bench": 13,
     "view": 13,
     "cli": 14,
+    "__main__": 15,
 }
 #: Rooms inside of io, which has the same rule.
 IO_RANKS = {"store": 0, "raw": 1, "results": 2, "assets": 3}

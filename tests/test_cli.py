@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from test_bad_input import FILES
 
 from polsep import cli
+from polsep.cli.progress import Progress
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.separation_writer import FORMATS, LAYERS
@@ -135,9 +137,9 @@ def test_separate_writes_the_contract(tmp_path: Path) -> None:
     run = subprocess_run("separate", source, "-o", tmp_path / "out")
     assert run.status == 0, run
     assert run.err == ""
-    assert run.out.strip() == f"{source} -> " + ", ".join(
-        str(tmp_path / "out" / f"shot.{s}") for s in ("exr", "png", "json")
-    )
+    files, facts = run.out.splitlines()
+    assert files == f"{source} -> " + ", ".join(str(tmp_path / "out" / f"shot.{s}") for s in ("exr", "png", "json"))
+    assert re.fullmatch(rf"  {BEST[0].name}; .* clipped; light: polarizer at \d+ deg, colour .*; no warnings", facts)
     layers = read_exr_layers(tmp_path / "out" / "shot.exr")
     errors = {"error.diffuse", "error.specular"} if BEST[0].name in NAMES else set()
     assert set(layers) == COLOR_LAYERS | MAPS | errors
@@ -186,7 +188,7 @@ def test_pages_become_numbered_frames(tmp_path: Path, polsep: Cli) -> None:
     """A TIFF of three pages gives three results, numbered from 0."""
     tifffile.imwrite(tmp_path / "run.tiff", np.stack([frame(k) for k in range(3)]), photometric="minisblack")
     run = polsep("separate", tmp_path / "run.tiff", "-o", tmp_path / "o")
-    assert run.status == 0 and len(run.out.splitlines()) == 3
+    assert run.status == 0 and len(run.out.splitlines()) == 6
     assert set(contents(tmp_path / "o")) == {f"run_000{k}.{s}" for k in range(3) for s in ("exr", "png", "json")}
 
 
@@ -229,10 +231,41 @@ def test_same_command_same_bytes(tmp_path: Path, polsep: Cli) -> None:
 
 def test_warnings_are_lines_on_stderr(tmp_path: Path, polsep: Cli) -> None:
     """What the owner should know is said once, on stderr, with the file's name; stdout stays for results."""
-    run = polsep("separate", png(tmp_path / "dim.png", frame() >> 4), "-o", tmp_path / "o")
+    odd = frame()[:, :-1]
+    run = polsep("separate", png(tmp_path / "odd.png", odd), "-o", tmp_path / "o")
     assert run.status == 0
-    assert run.err.startswith(f"polsep: {tmp_path / 'dim.png'}: values never exceed 4095")
-    assert run.err.count("\n") == 1 and run.out.count("\n") == 1
+    assert run.err.startswith(f"polsep: {tmp_path / 'odd.png'}: odd size 31x32")
+    assert run.err.count("\n") == 1 and run.out.splitlines()[1].endswith("; 1 warning")
+
+
+def test_forgotten_white_level_is_refused(tmp_path: Path, polsep: Cli) -> None:
+    """12-bit values in 16-bit words without their white level: refused before anything is written, with what to say.
+
+    A dark frame beside frames that use the range of their type is only warned of.
+    """
+    dim = png(tmp_path / "dim.png", frame() >> 4)
+    assert_refused(
+        polsep("separate", dim, "-o", tmp_path / "o"), "dim.png", "--white-level 4095", "--white-level 65535"
+    )
+    assert not (tmp_path / "o").exists()
+    for level in ("4095", "65535"):
+        run = polsep("separate", dim, "-o", tmp_path / level, "--white-level", level)
+        assert run.status == 0 and "--white-level" not in run.err
+    run = polsep("separate", png(tmp_path / "bright.png", frame()), dim, "-o", tmp_path / "o")
+    assert run.status == 0 and "--white-level 4095 if so" in run.err
+
+
+def test_folders_are_separated(tmp_path: Path, polsep: Cli) -> None:
+    """A folder stands for its frames: single files in natural order, and four angle images as one frame."""
+    (tmp_path / "in").mkdir()
+    for name in ("shot10", "shot9", *(f"set_{angle}" for angle in (0, 45, 90, 135))):
+        png(tmp_path / "in" / f"{name}.png", frame())
+    run = polsep("separate", tmp_path / "in", "-o", tmp_path / "o", "--method", "analytic")
+    assert run.status == 0, run
+    sources = [line.split(" -> ")[0] for line in run.out.splitlines() if " -> " in line]
+    assert sources == [str(tmp_path / "in" / name) for name in ("set_{angle}.png", "shot9.png", "shot10.png")]
+    (tmp_path / "none").mkdir()
+    assert_refused(polsep("separate", tmp_path / "none", "-o", tmp_path / "o"), "expected a folder of frames")
 
 
 def test_good_files_are_written_beside_bad_ones(tmp_path: Path, polsep: Cli) -> None:
@@ -242,7 +275,7 @@ def test_good_files_are_written_beside_bad_ones(tmp_path: Path, polsep: Cli) -> 
     run = polsep("separate", first, tmp_path / "b.png", last, "-o", tmp_path / "o")
     assert run.status == 2
     assert LINE.fullmatch(run.err) and "b.png" in run.err
-    assert len(run.out.splitlines()) == 2
+    assert len(run.out.splitlines()) == 4
     assert set(contents(tmp_path / "o")) == {f"{stem}.{s}" for stem in "ac" for s in ("exr", "png", "json")}
 
 
@@ -340,7 +373,8 @@ def test_bad_files(tmp_path: Path, polsep: Cli, name: str, data: bytes, options:
     """Every damaged or unfit file: status 2, one line that names it, and no output at all."""
     (tmp_path / name).write_bytes(data)
     run = polsep("separate", tmp_path / name, "-o", tmp_path / "o", *cli_options(options))
-    assert_refused(run, name, "expected", "found")
+    named = "--white-level" if "white_level" in options and not options["white_level"] > 0 else name
+    assert_refused(run, named, "expected", "found")
     assert not (tmp_path / "o").exists()
 
 
@@ -423,6 +457,96 @@ def test_bad_options(tmp_path: Path, polsep: Cli, options: list[str], word: str)
 def test_bad_commands(polsep: Cli, args: list[str]) -> None:
     """Unknown commands and missing arguments: status 2, one line."""
     assert_refused(polsep(*args))
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        ("separate a.png --white-level nan", "--white-level"),
+        ("separate a.png --black-level 4 --white-level 3", "--white-level"),
+        ("video in -o o --rate -2", "--rate"),
+        ("video in -o o --frames 0", "--frames"),
+        ("video in -o o --compression rar", "--compression"),
+        ("video in -o o --format gif", "--format"),
+        ("render --shapes 0 --views 1 -o o", "--shapes"),
+        ("render --shapes 1 --views 1 -o o --size 33", "--size"),
+        ("render --shapes 1 --views 1 -o o --engine fog", "--engine"),
+        ("geometry a.png --fov 400", "--fov"),
+        ("geometry a.png --integration rough", "--integration"),
+        ("material a.png --size 9", "--size"),
+        ("material a.png --white 0", "--white"),
+        ("train joint -o o --rate 0", "--rate"),
+        ("train everything -o o", "RUNG"),
+        ("capture --seconds 0", "--seconds"),
+        ("view --port 99999", "--port"),
+        ("edit a.png --metallic 7", "--metallic"),
+        ("edit a.png --damaged hide", "--damaged"),
+        ("calibrate analysers a.png --polarizer-extinction 1", "--polarizer-extinction"),
+        ("merge a.png -o m.tiff --times soon", "--times"),
+    ],
+)
+def test_wrong_ranges_name_the_option(
+    tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch, words: str, option: str
+) -> None:
+    """A number out of range or an unknown word is a line that names the option as typed."""
+    monkeypatch.chdir(tmp_path)
+    png(tmp_path / "a.png", frame())
+    (tmp_path / "in").mkdir()
+    assert_refused(polsep(*words.split()), option, "expected", "found")
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "separate no.png",
+        "separate a.png --ambient no.png",
+        "separate a.png --calibration no.json",
+        "video no -o o",
+        "edit no.exr --metallic 1",
+        "material no.png",
+        "geometry no.png",
+        "calibrate dark no.png",
+        "merge no.png -o m.tiff",
+        "train joint -o o --start no.safetensors",
+        "export joint -o o.onnx --weights no.safetensors",
+        "view no.png",
+    ],
+)
+def test_missing_paths_are_named_before_any_import(tmp_path: Path, words: str) -> None:
+    """A path where nothing is costs one line and no library: not even NumPy is loaded by then."""
+    png(tmp_path / "a.png", frame())
+    program = (
+        "import sys, polsep.cli\n"
+        "cli = sys.modules['polsep.cli.app']\n"
+        "cli.EXTRAS = dict.fromkeys(cli.EXTRAS, ())\n"
+        "try: cli.app(sys.argv[1:], standalone_mode=False)\n"
+        "except ValueError as error: print(error, 'numpy' in sys.modules)"
+    )
+    command = [sys.executable, "-c", program, *words.split()]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120, check=True)
+    assert re.fullmatch(r"no\S*: expected a file, found nothing at this path False\n", done.stdout), done
+
+
+def test_words_of_options_are_those_of_the_library() -> None:
+    """The words that the command line knows, without loading anything, are those that the library knows."""
+    from polsep.geometry.files import INTEGRATIONS
+    from polsep.io.results.exr import COMPRESSIONS
+    from polsep.io.results.sequences import FORMATS as kinds
+    from polsep.networks.rungs import RUNGS
+    from polsep.render.views import SPLITS as splits
+    from polsep.video.recordings import ENGINES, FILTERS, ON_DAMAGE
+
+    def words(command: str, option: str) -> set[str]:
+        parameter = next(p for p in cli.app.commands[command].params if option in p.opts)
+        return set(parameter.type.words)  # type: ignore[attr-defined]
+
+    assert words("video", "--format") == set(kinds) and words("video", "--compression") == set(COMPRESSIONS)
+    assert words("video", "--filter") == set(FILTERS) and words("video", "--engine") == set(ENGINES)
+    assert words("edit", "--damaged") == words("video", "--damaged") == set(ON_DAMAGE)
+    assert words("geometry", "--integration") == set(INTEGRATIONS)
+    assert words("render", "--split") == set(splits)
+    assert words("train", "rung") == {*RUNGS, *NAMES, "material"}
 
 
 @pytest.mark.parametrize(
@@ -518,3 +642,29 @@ def test_reader_of_our_output_may_leave(tmp_path: Path) -> None:
         process.stdout.close()
         assert "Traceback" not in process.stderr.read()
         process.wait(timeout=60)
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
+def test_results_stay_on_stdout_beside_a_terminal(tmp_path: Path) -> None:
+    """With progress on a terminal, what is printed for other programs still goes to them."""
+    files = [png(tmp_path / f"{name}.png", frame()) for name in "ab"]
+    main, terminal = os.openpty()
+    command = [sys.executable, "-m", "polsep", "separate", *map(str, files), "-o", str(tmp_path / "o")]
+    process = subprocess.Popen([*command, "--method", "analytic"], stdout=subprocess.PIPE, stderr=terminal, text=True)
+    os.close(terminal)
+    drawn = b""
+    with suppress(OSError):  # Linux ends a closed terminal so
+        while read := os.read(main, 4096):
+            drawn += read
+    os.close(main)
+    assert process.communicate(timeout=60)[0].count(" -> ") == 2 and process.returncode == 0
+    assert b"separating" in drawn and b" -> " not in drawn
+
+
+def test_progress_says_how_much_is_left() -> None:
+    """Without a terminal the state is one line: what, how many, since when, and for how long."""
+    progress = Progress("separating", None, None)
+    assert progress.line() == "separating: 0 s"
+    progress.resume(500)
+    progress.update(750, 1000)
+    assert re.fullmatch(r"separating: 750 of 1000, 0 s, 0 s left", progress.line())

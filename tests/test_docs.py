@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import ast
 import re
+import runpy
 import shlex
+import sys
 import warnings
 from importlib import import_module
 from pathlib import Path
 
 import click
+import imagecodecs
+import numpy as np
 import pytest
 
 import evaluation.benches
@@ -162,3 +166,18 @@ def test_worked_examples_run(name: str, tmp_path: Path, monkeypatch: pytest.Monk
     finally:
         METHODS.pop("minimum", None)
     assert len(names) > 2
+
+
+def test_the_minimal_example_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """examples/minimal.py separates a frame that is named and says what it wrote."""
+    frame = np.random.default_rng(0).integers(100, 4000, (64, 96)).astype(np.uint16)
+    (tmp_path / "shot.png").write_bytes(imagecodecs.png_encode(frame))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["minimal.py", "shot.png"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        runpy.run_path(str(ROOT / "examples" / "minimal.py"), run_name="__main__")
+    assert "polsep-out/shot.exr" in capsys.readouterr().out
+    assert (tmp_path / "polsep-out" / "shot.exr").is_file()

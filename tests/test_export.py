@@ -87,7 +87,7 @@ def test_what_graphs_do_otherwise_is_the_same(monkeypatch: pytest.MonkeyPatch) -
     ("asked", "said"),
     [
         (["paper"], "expected a method of joint-large, joint, joint-fast, found 'paper'"),
-        (["joint", "--weights", "nowhere"], "expected weights in nowhere"),
+        (["joint", "--weights", "nowhere"], "nowhere: expected a file, found nothing"),
         (["joint", "--weights", "w.safetensors", "--mono"], "expected weights for 1 colours"),
     ],
 )

@@ -121,7 +121,7 @@ def test_photographs_do_too(polsep: Cli, tmp_path: Path) -> None:
         (["--lights", "right left"], ["2 files", "found 6"]),
         (["--lights", "right left behind 0,0,1 1,0,1 0,1,1"], ["behind"]),
         (["--lights", "1,0,1 0,0,1 1,0,0 1,0,2 1,0,3 1,0,4"], ["one plane"]),
-        (["--fov", "190"], ["field of view"]),
+        (["--fov", "190"], ["--fov", "from 0 to 120"]),
         (["--mesh", "obj"], ["glb or ply"]),
         (["--integration", "rough"], ["bilateral or smooth"]),
         (["--size", "0"], ["--size"]),

@@ -162,6 +162,23 @@ def test_mirrored_frames(
     assert read_as(turn(mono_frame), MONO).warning is None
 
 
+def test_whole_frames_that_stand_upright_are_seen(color_frame: Tensor, mono_frame: Tensor) -> None:
+    """A sensor's whole frame, transposed or turned, is higher than wide: told what to say, then silent."""
+    lying = color_frame.repeat(16, 20)[:2048, :2448]
+    assert read_as(lying, COLOR).warning is None
+    transposed = read_as(lying.mT, COLOR).warning
+    assert transposed is not None and f"--layout {COLOR.transposed().spec} (transposed)" in transposed
+    assert read_as(lying.mT, COLOR.transposed()).warning is None
+    for turns, flip in ((1, COLOR.transposed().flipped_vertical(4)), (-1, COLOR.transposed().flipped_horizontal(4))):
+        turned = read_as(torch.rot90(lying, turns), COLOR).warning
+        assert turned is not None and flip.spec in turned and "turned to the left" in turned
+        assert read_as(torch.rot90(lying, turns), flip).warning is None
+    plain = mono_frame.repeat(10, 8)[:2448, :2048]
+    mono = read_as(plain, MONO).warning
+    assert mono is not None and f"--layout {MONO.transposed().spec} (transposed)" in mono
+    assert read_as(plain[:-4], MONO).warning is None
+
+
 def test_color_read_as_mono(color_frame: Tensor) -> None:
     """A colour frame under the mono layout is warned of, and the colour layout offered."""
     check = read_as(color_frame, MONO)

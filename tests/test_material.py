@@ -25,9 +25,10 @@ from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
 from polsep.io.store.weights import write_weights
 from polsep.material.estimate import load_estimator
+from polsep.material.files import Photographs, flatness_notes
 from polsep.material.network import MaterialNetwork, MaterialSize, detail_cues, encode_images
 from polsep.material.procedural import halve, random_svbrdf
-from polsep.material.shots import CAMERA, INPUTS, photograph, random_example, random_flash
+from polsep.material.shots import CAMERA, CAMERA_HEIGHT, INPUTS, photograph, random_example, random_flash
 from polsep.material.svbrdf import Svbrdf, plane_points, relight, unstack
 from polsep.render.sphere_tracing import PointLight
 from polsep.train.material_losses import material_loss
@@ -270,12 +271,12 @@ def test_a_photograph_becomes_files(
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (["--size", "3"], r"expected a size of 32 to 1024 pixels, found 3"),
-        (["--white", "a"], r"expected --white N or N,N,... like 0.8, found 'a'"),
-        (["--white", "0"], r"expected levels of white above 0, found 0"),
+        (["--size", "3"], r"'--size': expected a whole number from 32 to 1024, found '3'"),
+        (["--white", "a"], r"expected --white N or N,N,... above 0, like 0.8, found 'a'"),
+        (["--white", "0"], r"expected --white N or N,N,... above 0, like 0.8, found '0'"),
         (["--white", "1,1"], r"expected one level of white, or 1, one for each photograph, found 2"),
         (["--method", "magic"], r"expected a method of"),
-        (["--weights", "nowhere.safetensors"], r"expected weights in nowhere.safetensors"),
+        (["--weights", "nowhere.safetensors"], r"nowhere.safetensors: expected a file"),
         (["--layout", "magic"], r'expected "color", "mono"'),
     ],
 )
@@ -290,6 +291,7 @@ def test_bad_options_are_one_line(
     """Exit status 2, one line that says what was expected, and no files."""
     out = frame.parent / "out"
     asked = ["material", str(frame), "-o", str(out), "--weights", str(weights), "--size", "32", "--method", "analytic"]
+    asked += ["--white-level", "4095"]
     assert run([*asked, *change], monkeypatch) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     assert len(lines) == 1 and re.search(said, lines[0])
@@ -376,3 +378,13 @@ def test_details_are_slopes_of_a_glossy_bump() -> None:
         MaterialSize(cues=("magic",))
     network = MaterialNetwork(6, replace(SMALL, cues=("details",)))
     assert network(torch.rand(1, 2, 6, 40, 32, generator=seeded(1))).shape == (1, 9, 40, 32)
+
+
+def test_samples_that_are_not_flat_are_warned_of() -> None:
+    """A disc before black is no flat sample; paper in the uneven light of a flash is."""
+    y, x = torch.meshgrid(torch.linspace(-1, 1, 64), torch.linspace(-1, 1, 64), indexing="ij")
+    radius = torch.hypot(x, y)
+    solid, paper = (radius < 0.6).float() * (1 - radius), 1 / (1 + radius**2 / CAMERA_HEIGHT**2) ** 2
+    views = torch.stack([light.expand(6, -1, -1) for light in (solid, paper)])
+    (note,) = flatness_notes(Photographs(views, ("ball.png", "paper.png"), ()))
+    assert note.startswith("ball.png: ") and "flat" in note

@@ -9,16 +9,19 @@ import sys
 import warnings
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from tolerances import assert_close
 from torch.nn.functional import interpolate
 
 import polsep
+from polsep.io.results.previews import contact_sheet
 from polsep.methods import BEST, FASTEST, METHODS, Capture, Method, find_method, run_reference
 from polsep.networks.channels import MIN_BRIGHTNESS
 from polsep.networks.joint import Joint
@@ -27,6 +30,7 @@ from polsep.networks.sizes import ResidualSize
 from polsep.physics.stokes import Stokes, measure
 from polsep.pipeline import PolsepWarning, find_device, separate, separate_capture
 from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
+from polsep.sensor.levels import as_mosaic
 from polsep.separation.analytic import Separation
 from polsep.shipped import NAMES
 
@@ -53,7 +57,7 @@ def raw_frame(dtype: str = "uint16", layout: Layout | None = None, **scene: Any)
     return (np.rint(signal * white) if white > 1 else signal).astype(dtype)
 
 
-def quietly(*args: Any, **kwargs: Any) -> polsep.SeparatedFrame:
+def quietly(*args: Any, **kwargs: Any) -> polsep.Result:
     """`polsep.separate` under white light unless told, without its warnings, which stay in the report."""
     kwargs.setdefault("light_color", "white")
     with warnings.catch_warnings():
@@ -357,6 +361,93 @@ def test_arguments_of_other_kinds_are_one_line(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="expected") as caught:
         polsep.separate(raw_frame(), **options)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("raw", "options", "advice"),
+    [
+        (torch.zeros(8, 8), {}, r"found Tensor: say raw.numpy\(force=True\)"),
+        ("shot.png", {}, "found str: read files by polsep.read_frames"),
+        (None, {}, "found NoneType"),
+        (np.zeros((8, 8), np.uint8), {"layout": 3}, "found int"),
+        (np.zeros((8, 8), np.uint8), {"white_level": "4095"}, "white level that is a number"),
+        (np.zeros((8, 8), np.uint8), {"method": 3}, "name of a method"),
+        (np.zeros((8, 8), np.uint8), {"light_color": 3}, "light colour of three"),
+        (np.zeros((8, 8), np.uint8), {"device": 3}, "device"),
+        (np.zeros((8, 8), np.uint8), {"calibration": 3}, "calibration"),
+        (np.zeros((8, 8), np.uint8), {"ambient": 3}, "lamp off"),
+        (np.zeros((8, 8), np.uint8), {"full": "yes"}, "True or False"),
+    ],
+)
+def test_wrong_types_are_type_errors(raw: Any, options: dict[str, Any], advice: str) -> None:
+    """An argument of a wrong type is a TypeError of one line that says what to do."""
+    with pytest.raises(TypeError, match=advice) as caught:
+        polsep.separate(raw, **options)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 120
+
+
+def test_captures_and_four_angle_images_are_separated_as_files_are() -> None:
+    """A `Mosaic` gives what its array gives; four angle images keep their size; planes of a mosaic go back to it."""
+    raw = raw_frame()
+    mosaic = as_mosaic(raw)[0]
+    assert (quietly(mosaic, method="analytic").diffuse == quietly(raw, method="analytic").diffuse).all()
+    with pytest.raises(ValueError, match="levels with an array"):
+        polsep.separate(mosaic, white_level=65535)
+    planes = np.stack([raw] * 4)
+    assert quietly(planes, method="analytic").diffuse.shape == (*raw.shape, 1)
+    assert quietly(np.stack([planes] * 3, -1), method="analytic").diffuse.shape == (*raw.shape, 3)
+    cells = np.stack([raw[1::2, 1::2], raw[::2, 1::2], raw[::2, ::2], raw[1::2, ::2]])
+    assert (quietly(cells, "analytic", layout="color").diffuse == quietly(raw, "analytic").diffuse).all()
+
+
+def test_results_are_short_texts() -> None:
+    """What people see of results in Python is one short line, not the arrays."""
+    out = quietly(raw_frame(), method="analytic")
+    assert repr(out) == f"Result(analytic: diffuse and specular [{SIZE // 2}, {SIZE // 2}, 3], no warnings)"
+    for thing in (as_mosaic(raw_frame())[0], measure(lit_scene(), (0.0, 1.0, 2.0)), lit_scene()):
+        assert len(repr(thing)) < 300 and "float32 [" in repr(thing)
+
+
+@pytest.mark.parametrize("name", ["shot.exr", "shot.npz", "shot.tif", "shot.png", "shot"])
+def test_results_are_saved(tmp_path: Path, name: str) -> None:
+    """`save` writes what the command line writes; files from before stay unless they are to be replaced."""
+    out = quietly(raw_frame(), method="analytic")
+    written = out.save(tmp_path / "new" / name)
+    assert {path.name for path in written} >= {"shot.png", "shot.json"} and all(path.is_file() for path in written)
+    with pytest.raises(ValueError, match="found one from before"):
+        out.save(tmp_path / "new" / name)
+    assert out.save(tmp_path / "new" / name, overwrite=True) == written
+    if name.endswith(("exr", "npz")):
+        assert (polsep.read_separated(written[0]).diffuse == out.diffuse).all()
+
+
+def test_results_of_unknown_endings_are_refused(tmp_path: Path) -> None:
+    """An ending that no format has is refused before anything is written."""
+    with pytest.raises(ValueError, match=r"ends in \.exr"):
+        quietly(raw_frame(), method="analytic").save(tmp_path / "shot.jpg")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_results_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`show` opens the preview, and returns it; in a notebook it only returns it."""
+    opened: list[Image.Image] = []
+    monkeypatch.setattr(Image.Image, "show", lambda image: opened.append(image))
+    out = quietly(raw_frame(), method="analytic")
+    shown = out.show()
+    assert opened == [shown] and (np.asarray(shown) == contact_sheet(out)).all()
+    monkeypatch.setattr("builtins.__IPYTHON__", True, raising=False)
+    out.show()
+    assert len(opened) == 1
+
+
+def test_expected_errors_of_ordinary_pixels_stand_beside_the_mean() -> None:
+    """Median and 95 % of the expected errors are in the report, in white light as the mean is."""
+    out = quietly(raw_frame(), method="joint-fast", light_color=(0.5, 1, 1.5))
+    facts = out.report["statistics"]
+    assert out.error is not None
+    for k, image in enumerate(("diffuse", "specular")):
+        np.testing.assert_allclose(facts[f"expected_{image}_error_median"], np.median(out.error[..., k]), rtol=1e-5)
+        assert facts[f"expected_{image}_error_median"] <= facts[f"expected_{image}_error_95"]
 
 
 def test_every_shipped_method_and_device_is_found() -> None:

@@ -10,6 +10,8 @@ import pytest
 from skimage.color import rgb2lab
 
 from polsep.io.results.previews import (
+    BACKGROUND,
+    FADED,
     NOT_VALID,
     PANEL,
     aolp_legend,
@@ -119,12 +121,12 @@ def test_sheet_is_rgb_bytes_of_bounded_size_for_any_frame(shape: tuple[int, int,
     assert sheet.dtype == np.uint8
     assert sheet.shape[2] == 3
     assert sheet.shape[0] <= 2 * PANEL + 300
-    assert sheet.shape[1] <= 3 * PANEL + 100
+    assert sheet.shape[1] <= 4 * PANEL + 100
 
 
 def panel_of(sheet: np.ndarray, row: int, col: int, height: int, width: int) -> np.ndarray:
     """The pixels of one panel of a sheet whose cells are as wide as the panels."""
-    top = 16 + 34 + row * (34 + height + 12)
+    top = 38 + 16 + 34 + row * (34 + height + 12)
     left = 16 + col * (width + 12)
     return sheet[top : top + height, left : left + width]
 
@@ -141,6 +143,47 @@ def test_input_diffuse_and_specular_share_one_exposure() -> None:
     sheet = contact_sheet(uniform_frame(400, 500, 0, 0))
     for col, level in ((0, 0.9), (1, 0.45), (2, 0.45)):
         npt.assert_array_equal(panel_of(sheet, 0, col, 400, 500), round(255 * float(srgb(level))))
+
+
+def test_specular_light_is_shown_at_an_exposure_of_its_own() -> None:
+    frame = uniform_frame(400, 500, 0, 0)
+    sheet = contact_sheet(replace(frame, specular=0.01 * frame.specular))
+    npt.assert_array_equal(panel_of(sheet, 0, 3, 400, 500), round(255 * float(srgb(0.9))))
+
+
+def test_expected_errors_have_a_panel_where_there_are_any() -> None:
+    frame = uniform_frame(400, 500, 0, 0)
+    assert (panel_of(contact_sheet(frame), 1, 3, 400, 500) == BACKGROUND).all()
+    error = np.zeros((400, 500, 2), np.float32)
+    error[:200, :, 1] = 0.25
+    panel = panel_of(contact_sheet(replace(frame, error=error)), 1, 3, 400, 500)
+    npt.assert_array_equal(panel[:200], np.broadcast_to(dolp_map(1.0), (200, 500, 3)))
+    npt.assert_array_equal(panel[200:], np.broadcast_to(dolp_map(0.0), (200, 500, 3)))
+
+
+def test_file_method_and_warnings_stand_above() -> None:
+    frame = uniform_frame(400, 500, 0, 0)
+    named = contact_sheet(replace(frame, report={"source": "shot.png", "method": "joint"}))
+    plain = contact_sheet(frame)
+    assert named.shape == plain.shape
+    assert (named[:38] != plain[:38]).any() and (named[38:] == plain[38:]).all()
+    warned = contact_sheet(replace(frame, report={"warnings": ["black frame", "word " * 400]}))
+    assert warned.shape[1] == plain.shape[1] and warned.shape[0] > plain.shape[0] + 3 * 22
+
+
+def test_polarization_is_faded_where_the_light_is_at_the_noise() -> None:
+    rng = np.random.default_rng(3)
+    frame = uniform_frame(400, 500, 0.3, 0.5)
+    dark = 1e-3 * rng.random((400, 500), np.float32)
+    dark[:, 250:] = 0.5
+    aolp = np.pi * rng.random((400, 500), np.float32)
+    aolp[:, 250:] = 0.5
+    dolp = np.where(dark < 0.5, 2 * rng.random((400, 500)), 0.3).astype(np.float32)
+    noisy = replace(frame, diffuse=np.stack([dark] * 3, -1), specular=0 * frame.specular, dolp=dolp, aolp=aolp)
+    for col, color in ((0, dolp_map(0.3)), (1, aolp_wheel(0.5, 0.3))):
+        panel = panel_of(contact_sheet(noisy), 1, col, 400, 500)
+        npt.assert_array_equal(panel[:, :249], np.broadcast_to(FADED, (400, 249, 3)))
+        assert np.abs(panel[:, 251:].astype(int) - color).max() <= 1
 
 
 def test_shrinking_averages_light_before_the_tone_curve() -> None:

@@ -259,8 +259,10 @@ def test_a_killed_run_goes_on_to_the_same_files(recording: Path, steady: Path, t
         process.send_signal(signal.SIGKILL)
         process.wait()
         assert not (output / "run.json").exists()
+        done = PART * len(list(output.glob(".polsep-*/[0-9]*.json")))
         again = [*program, *command(recording, output, *STEADY)]
-        subprocess.run(again, check=True, stdout=subprocess.DEVNULL, timeout=120)
+        resumed = subprocess.run(again, check=True, capture_output=True, text=True, timeout=120)
+        assert (f"polsep: resuming at frame {done} of {FRAMES}" in resumed.stderr) == (done > 0), resumed.stderr
         assert contents(output) == contents(steady)
 
 
@@ -433,10 +435,13 @@ def test_without_the_library_films_are_refused_before_any_work(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    assert run(monkeypatch, *command(recording, tmp_path / "o")) == 2
-    assert "expected the extra 'video'" in capsys.readouterr().err
-    assert not (tmp_path / "o").exists()
-    assert run(monkeypatch, *command(recording, tmp_path / "o", "--no-preview", "--frames", "1")) == 0
+    for asked in ("--preview", "--format=ffv1"):
+        assert run(monkeypatch, *command(recording, tmp_path / "o", asked)) == 2
+        assert "expected the extra 'video'" in capsys.readouterr().err
+        assert not (tmp_path / "o").exists()
+    assert run(monkeypatch, *command(recording, tmp_path / "o", "--frames", "1")) == 0
+    assert "no video to watch is written: it needs the extra 'video'" in capsys.readouterr().err
+    assert not list((tmp_path / "o").glob("*.mp4"))
 
 
 def _title(psutil: Any, process: Any) -> str:

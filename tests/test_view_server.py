@@ -78,7 +78,7 @@ def test_the_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: 
     said = capsys.readouterr()
     assert (
         said.out == ""
-        and said.err == "polsep: error: expected the extra 'view' (pip install 'polsep[view]'), found none\n"
+        and said.err == "polsep: error: expected the extra 'view' (pip install 'polsep[view]'), found no gradio\n"
     )
 
 

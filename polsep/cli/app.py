@@ -6,10 +6,12 @@ Exit status: 0 only when everything asked for was written; 2 after bad input, wi
 
 from __future__ import annotations
 
+import math
+import os
 import signal
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -19,24 +21,81 @@ import click
 from polsep.io.store.errors import MOST, one_line
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from polsep.io.raw.frames import ReadOptions
+    from polsep.pipeline import LightColor
+
+    _ParamType = click.ParamType[Any]
+else:
+    _ParamType = click.ParamType  # generic from click 8.4 on
 
 SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True, "max_content_width": 100}
 
 DIR = click.Path(path_type=Path)
 FILE = click.Path(path_type=Path, dir_okay=False)
 
+
+class Number(_ParamType):
+    """A finite number in a range, of type ``kind``; another one is an error that names its option as typed.
+
+    ``above``: the lower end itself is excluded.
+    """
+
+    name = "number"
+
+    def __init__(self, kind: type, low: float = -math.inf, high: float = math.inf, above: bool = False) -> None:
+        self.kind, self.low, self.high, self.above = kind, low, high, above
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the number. Raises BadParameter."""
+        try:
+            number = self.kind(value)
+            fits = math.isfinite(number) and self.low <= number <= self.high and not (self.above and number == self.low)
+        except (ValueError, OverflowError):
+            fits = False
+        if not fits:
+            self.fail(f"expected {self._range()}, found {str(value)!r:.40}", param, ctx)
+        return number
+
+    def _range(self) -> str:
+        noun = "a whole number" if self.kind is int else "a finite number"
+        if self.high < math.inf:
+            return f"{noun} from {self.low:.10g} to {self.high:.10g}"
+        if self.low > -math.inf:
+            return f"{noun} above {self.low:g}" if self.above else f"{noun} of {self.low:g} or more"
+        return noun
+
+
+class Word(_ParamType):
+    """One of a few words; another one is an error that names its option as typed."""
+
+    name = "word"
+
+    def __init__(self, *words: str) -> None:
+        self.words = words
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the word. Raises BadParameter."""
+        if value not in self.words:
+            self.fail(
+                f"expected {', '.join(self.words[:-1])} or {self.words[-1]}, found {str(value)!r:.40}", param, ctx
+            )
+        return value
+
+
+COUNT, POSITIVE, FINITE = Number(int, 1), Number(float, 0, above=True), Number(float)
+RATE = Number(float, 0.001, 100_000)
+COMPRESSION, DAMAGED = Word("none", "zip", "piz"), Word("stop", "skip")
+
 LAYOUT = click.option(
     "--layout", metavar="color|mono|SPEC", help="Filter layout of the sensor, as in 'polsep separate'."
 )
-BLACK_LEVEL = click.option("--black-level", type=float, default=0.0, metavar="N", help="Sample value without light.")
+BLACK_LEVEL = click.option("--black-level", type=FINITE, default=0.0, metavar="N", help="Sample value without light.")
 WHITE_LEVEL = click.option(
     "--white-level",
-    type=float,
+    type=FINITE,
     metavar="N",
-    help="Sample value at which the sensor clips.  [default: largest of the data type]",
+    help="Sample value at which the sensor clips; 12-bit values in 16-bit words need it.  "
+    "[default: largest of the data type]",
 )
 LIGHT_COLOR = click.option(
     "--light-color",
@@ -59,9 +118,13 @@ AMBIENT = click.option(
     help="Frame with the lamp off, subtracted; of several (the option repeated, or in a file) their mean.",
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace existing results.")
-DEVICE = click.option("--device", default="auto", metavar="NAME", help="Device: auto, cpu or cuda.")
+DEVICE = click.option("--device", default="auto", metavar="NAME", help="Device: auto, cpu or cuda (extra torch).")
 ENGINE = click.option(
-    "--engine", default="local", metavar="NAME", help="local: this machine; ray: the cluster of RAY_ADDRESS."
+    "--engine",
+    type=Word("local", "ray"),
+    default="local",
+    metavar="NAME",
+    help="local: this machine; ray: the cluster of RAY_ADDRESS (extra ray).",
 )
 
 
@@ -81,13 +144,33 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     width, x, height = text.lower().partition("x")
-    if not (x and width.isdecimal() and height.isdecimal()):
+    if not (x and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise ValueError(f"expected --size WIDTHxHEIGHT like 2448x2048, found {text!r}")
     return int(width), int(height)
 
 
+def check_read_options(options: Mapping[str, Any]) -> None:
+    """Raise ValueError on levels, sizes and files that `read_options` would refuse; without heavy imports."""
+    black, white = options["black_level"], options["white_level"]
+    if white is not None and not white > black:
+        raise ValueError(f"expected --white-level above the black level, found white {white:g}, black {black:g}")
+    parse_size(options.get("size"))
+    require_paths(*filter(None, [options.get("calibration"), *options.get("ambient", ())]))
+
+
+def read_light(options: Mapping[str, Any]) -> LightColor | str:
+    """The colour of the light from the options of a command. Raises ValueError, which names the option."""
+    from polsep.pipeline import parse_light_color
+
+    try:
+        return parse_light_color(options["light_color"])
+    except ValueError as error:
+        raise ValueError(f"--light-color: {error}") from None
+
+
 def read_options(options: Mapping[str, Any]) -> ReadOptions:
     """Options of reading raw frames, from the options of a command. Raises ValueError."""
+    check_read_options(options)
     from polsep.io.raw.corrections import with_corrections
     from polsep.io.raw.frames import ReadOptions
     from polsep.sensor.camera import Layout
@@ -103,40 +186,46 @@ def read_options(options: Mapping[str, Any]) -> ReadOptions:
     return with_corrections(read, options.get("calibration"), options.get("ambient", ()))
 
 
-def progress_bar() -> Progress:
-    """A progress bar on stderr, hidden unless stderr is a terminal; each task has a field ``speed``."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[speed]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        disable=not sys.stderr.isatty(),
-    )
+#: A module of each extra by which it is known; several where an extra has several uses.
+EXTRAS = {
+    "torch": ("torch",),
+    "render": ("embreex", "numba", "scipy", "torch"),
+    "ray": ("ray",),
+    "video": ("av",),
+    "train": ("embreex", "lightning_fabric", "numba", "tensorboard", "torch"),
+    "export": ("onnx", "onnxscript", "torch"),
+    "view": ("gradio",),
+}
 
 
-@contextmanager
-def extra_needed(extra: str, *modules: str) -> Iterator[None]:
-    """Name the extra to install where one of its modules is missing; without names, where any module is."""
+def has_extra(extra: str) -> bool:
+    """True if all modules of an extra are installed; imports none."""
+    return missing_module(extra) is None
+
+
+def missing_module(extra: str) -> str | None:
+    """A module of an extra that is not installed, None if all are."""
+    return next((name for name in EXTRAS[extra] if not _is_installed(name)), None)
+
+
+def _is_installed(module: str) -> bool:
     try:
-        yield
-    except ModuleNotFoundError as error:
-        if modules and (error.name or "").partition(".")[0] not in modules:
-            raise
-        missing = "none" if modules else f"no {error.name}"
-        raise ValueError(f"expected the extra {extra!r} (pip install 'polsep[{extra}]'), found {missing}") from None
+        return find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def require_extra(extra: str) -> None:
+    """Raise ValueError, which names the extra to install, unless it is there. To call before any work."""
+    if (missing := missing_module(extra)) is not None:
+        raise ValueError(f"expected the extra {extra!r} (pip install 'polsep[{extra}]'), found no {missing}")
+
+
+def require_paths(*paths: str | Path) -> None:
+    """Raise ValueError, which names the first path where nothing is. To call before heavy imports."""
+    for path in paths:
+        if "{angle}" not in str(path) and not os.path.lexists(path):
+            raise ValueError(one_line(f"{path}: expected a file, found nothing at this path"))
 
 
 def main() -> None:

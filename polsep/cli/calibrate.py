@@ -19,10 +19,13 @@ from polsep.cli.app import (
     PIXEL_FORMAT,
     SIZE,
     WHITE_LEVEL,
+    Number,
     app,
     print_note,
     read_options,
+    require_paths,
 )
+from polsep.cli.progress import show_progress
 
 FRAMES = click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FRAMES...")
 OUTPUT = click.option(
@@ -62,10 +65,10 @@ def dark(files: tuple[Path, ...], output: Path, **options: Any) -> None:
     One frame shows levels, rows and columns; ten or more also every pixel, and the read noise. Use the exposure time
     and gain of the frames to come.
     """
+    require_paths(*files)
     from polsep.calibrate.dark_flat import measure_dark
-    from polsep.calibrate.files import calibrate_files
 
-    print(calibrate_files(files, read_options(options), output, "dark", measure_dark))
+    _measure(files, options, output, "dark", measure_dark)
 
 
 @calibrate.command()
@@ -77,17 +80,17 @@ def flat(files: tuple[Path, ...], output: Path, **options: Any) -> None:
     One frame shows vignetting and the gain of each filter; four or more also every pixel. Turn the camera between
     frames if the light may be slightly polarized, as the sky's.
     """
+    require_paths(*files)
     from polsep.calibrate.dark_flat import measure_flat
-    from polsep.calibrate.files import calibrate_files
 
-    print(calibrate_files(files, read_options(options), output, "flat", measure_flat))
+    _measure(files, options, output, "flat", measure_flat)
 
 
 @calibrate.command()
 @frame_options
 @click.option(
     "--polarizer-extinction",
-    type=float,
+    type=Number(float, 1, above=True),
     metavar="N",
     help="Extinction ratio of the turned polarizer.  [default: perfect]",
 )
@@ -98,12 +101,12 @@ def analysers(files: tuple[Path, ...], output: Path, polarizer_extinction: float
     polarizer turned by some 20 degrees more. Its angles need not be known; lamp, exposure and paper stay as they are.
     The middle of the frames is used. Measure flat before: it makes this more exact.
     """
+    require_paths(*files)
     from polsep.calibrate.analysers import measure_analysers
-    from polsep.calibrate.files import calibrate_files
 
     extinction = math.inf if polarizer_extinction is None else polarizer_extinction
     measure = partial(measure_analysers, polarizer_extinction=extinction)
-    print(calibrate_files(files, read_options(options), output, "analysers", measure))
+    _measure(files, options, output, "analysers", measure)
 
 
 @calibrate.command()
@@ -115,10 +118,21 @@ def light(files: tuple[Path, ...], output: Path, card: bool, **options: Any) -> 
     Highlights must not clip: expose less than usual. A black billiard ball is best; on other objects the degree of
     polarization is a lower bound. With --card, matte grey card or white paper shows the colour alone.
     """
-    from polsep.calibrate.files import calibrate_files
+    require_paths(*files)
     from polsep.calibrate.lamp import measure_lamp
 
-    print(calibrate_files(files, read_options(options), output, "light", partial(measure_lamp, card=card)))
+    _measure(files, options, output, "light", partial(measure_lamp, card=card))
+
+
+def _measure(
+    files: tuple[Path, ...], options: dict[str, Any], output: Path, kind: str, measure: Callable[..., Any]
+) -> None:
+    """Measure one kind and print what was found."""
+    from polsep.calibrate.files import calibrate_files
+
+    with show_progress(f"measuring {kind}"):
+        line = calibrate_files(files, read_options(options), output, kind, measure)
+    print(line)
 
 
 @app.command()
@@ -144,9 +158,12 @@ def merge(files: tuple[Path, ...], output: Path, times: str | None, overwrite: b
     polsep merge short.png middle.png long.png --white-level 4095 --black-level 64 -o merged.tiff
     polsep merge exposures/*.tiff --times 1,4,16 --calibration rig.json -o merged.tiff
     """
+    require_paths(*files)
+    exposure_times = _parse_times(times)
     from polsep.calibrate.files import merge_files
 
-    line, notes = merge_files(files, read_options(options), output, _parse_times(times), overwrite)
+    with show_progress("merging"):
+        line, notes = merge_files(files, read_options(options), output, exposure_times, overwrite)
     for note in notes:
         print_note(note)
     print(line)

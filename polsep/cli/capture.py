@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from polsep.cli.app import AMBIENT, CALIBRATION, DIR, app, print_note
+from polsep.cli.app import (
+    AMBIENT,
+    CALIBRATION,
+    COUNT,
+    DIR,
+    FINITE,
+    POSITIVE,
+    Number,
+    app,
+    print_note,
+)
 
 if TYPE_CHECKING:
     from polsep.capture.session import Status
@@ -17,11 +27,11 @@ if TYPE_CHECKING:
 @click.argument("camera", required=False, metavar="[CAMERA]")
 @click.option("-o", "--output", type=DIR, metavar="DIR", help="Record into this folder.")
 @click.option("--list", "listing", is_flag=True, help="List the connected cameras and exit.")
-@click.option("--seconds", type=float, metavar="N", help="End after N seconds.  [default: at Ctrl-C]")
-@click.option("--frames", type=int, metavar="N", help="End after N frames.")
-@click.option("--exposure", type=float, metavar="US", help="Exposure time in microseconds.")
-@click.option("--gain", type=float, metavar="DB", help="Gain in decibels.")
-@click.option("--rate", type=float, metavar="HZ", help="Frames per second.")
+@click.option("--seconds", type=POSITIVE, metavar="N", help="End after N seconds.  [default: at Ctrl-C]")
+@click.option("--frames", type=COUNT, metavar="N", help="End after N frames.")
+@click.option("--exposure", type=POSITIVE, metavar="US", help="Exposure time in microseconds.")
+@click.option("--gain", type=FINITE, metavar="DB", help="Gain in decibels.")
+@click.option("--rate", type=POSITIVE, metavar="HZ", help="Frames per second.")
 @click.option("--trigger", metavar="SOURCE", help="Trigger source: off, Software (at --rate), or a line like Line0.")
 @click.option("--pixel-format", metavar="NAME", help="GenICam pixel format, like BayerRG12p.")
 @click.option("--set", "features", multiple=True, metavar="NAME=VALUE", help="Set any other GenICam feature.")
@@ -30,12 +40,15 @@ if TYPE_CHECKING:
 )
 @click.option("--layout", metavar="color|mono|SPEC", help="Filter layout of the sensor.  [default: by pixel format]")
 @click.option(
-    "--show", type=int, metavar="PORT", help="Show the live view at http://127.0.0.1:PORT/; 0 picks a free port."
+    "--show",
+    type=Number(int, 0, 65_535),
+    metavar="PORT",
+    help="Show the live view at http://127.0.0.1:PORT/; 0 picks a free port.",
 )
 @CALIBRATION
 @AMBIENT
-@click.option("--timeout", type=float, default=30.0, metavar="S", help="Seconds to wait for a lost camera.")
-@click.option("--ring", type=int, default=32, metavar="N", help="Frames buffered while the disk is busy.")
+@click.option("--timeout", type=POSITIVE, default=30.0, metavar="S", help="Seconds to wait for a lost camera.")
+@click.option("--ring", type=COUNT, default=32, metavar="N", help="Frames buffered while the disk is busy.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing recording.")
 def capture(camera: str | None, listing: bool, **options: Any) -> None:
     """Record a camera without loss, and show its separation live.
@@ -43,7 +56,7 @@ def capture(camera: str | None, listing: bool, **options: Any) -> None:
     CAMERA is aravis:ID, pylon:ID, folder:PATH or loop:PATH (raw frames of files, once or repeatedly); without it, the
     only connected camera. DIR gets frames.raw, the bytes as they came, frames.jsonl, a line per frame, recording.json
     and live.jpg, the newest separation. Frames lost in transfer, or dropped because the disk is slow, are counted. A
-    camera that is unplugged is waited for.
+    camera that is unplugged is waited for. Basler's pylon cameras need the extra camera.
 
     \b
     polsep capture --list

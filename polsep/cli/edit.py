@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from polsep.cli.app import DIR, FILE, OVERWRITE, app, print_note
+from polsep.cli.app import COMPRESSION, DAMAGED, DIR, FILE, OVERWRITE, RATE, app, print_note, require_paths
+from polsep.cli.progress import report_step, show_progress
+from polsep.cli.video import with_preview
 
 if TYPE_CHECKING:
     from polsep.edit.files import EditTarget, Work
@@ -40,13 +42,25 @@ if TYPE_CHECKING:
 @click.option("--remove-highlights", type=float, metavar="X", help="Remove specular light; 0 none, 1 all of it.")
 @click.option("--isolate-highlights", type=float, metavar="X", help="Remove diffuse light; 0 none, 1 all of it.")
 @click.option("--tint", metavar="R,G,B", help="Multiply the colour of the light.")
-@click.option("--compression", default="none", metavar="none|zip|piz", help="Compression of a sequence's EXR files.")
 @click.option(
-    "--preview/--no-preview", default=True, help="Write a video of a sequence to watch; needs the extra video."
+    "--compression",
+    type=COMPRESSION,
+    default="none",
+    metavar="none|zip|piz",
+    help="Compression of a sequence's EXR files.",
 )
-@click.option("--rate", type=float, default=25.0, metavar="N", help="Frames per second of that video.")
 @click.option(
-    "--damaged", default="stop", metavar="stop|skip", help="Stop at a missing frame of a sequence, or skip it."
+    "--preview/--no-preview",
+    default=None,
+    help="Write a video of a sequence to watch.  [default: where the extra video is installed]",
+)
+@click.option("--rate", type=RATE, default=25.0, metavar="N", help="Frames per second of that video.")
+@click.option(
+    "--damaged",
+    type=DAMAGED,
+    default="stop",
+    metavar="stop|skip",
+    help="Stop at a missing frame of a sequence, or skip it.",
 )
 @OVERWRITE
 @click.option("--list", "listing", is_flag=True, help="List the edits with their ranges and exit.")
@@ -66,19 +80,22 @@ def edit(inputs: tuple[Path, ...], **options: Any) -> None:
     polsep edit out/shot.exr -o edited --texture wood.jpg --texture-normals normals.png --save-recipe wood.json
     polsep edit film/ -o edited --recipe wood.json
     """
+    if options["listing"]:
+        _list()
+        return
+    if not inputs:
+        raise ValueError("expected a separated frame or a folder of them, found nothing to edit")
+    if len(inputs) == 1:  # of several the others are edited all the same
+        require_paths(*inputs)
     from polsep.compute.workers import keep_memory
     from polsep.edit.files import EditTarget, load_work
     from polsep.io.results.sequences import SequenceKind
 
-    if options["listing"]:
-        _list()
-        return
     keep_memory()
-    if not inputs:
-        raise ValueError("expected a separated frame or a folder of them, found nothing to edit")
     recipe, folder = _find_recipe(options)
     work = load_work(recipe, folder)
-    kind = SequenceKind("exr", options["compression"], options["preview"], options["rate"])
+    preview = with_preview(options["preview"]) if any(path.is_dir() for path in inputs) else False
+    kind = SequenceKind("exr", options["compression"], preview, options["rate"])
     target = EditTarget(options["output"], options["overwrite"], kind, options["damaged"])
     if options["save_recipe"] is not None:
         _save_recipe(recipe, folder, options["save_recipe"], options["overwrite"])
@@ -102,18 +119,16 @@ def _edit_all(inputs: tuple[Path, ...], work: Work, target: EditTarget) -> int:
         else:
             print(f"{outcome.source} -> {', '.join(map(str, outcome.written))}")
     for path in (path for path in inputs if path.is_dir()):
-        for step in edit_sequence(path, work, target):
-            if step.warning is not None:
-                print_note(step.warning)
-            failures += step.damaged
-            for written in step.written:
-                print(written)
+        with show_progress(f"editing {path}") as progress:
+            failures += sum(report_step(step, progress) for step in edit_sequence(path, work, target))
     return failures
 
 
 def _find_recipe(options: dict[str, Any]) -> tuple[Recipe, Path]:
     """Return the edits of the options, and the folder that their files are relative to."""
+    from polsep.edit.edits import EDITS
     from polsep.edit.files import read_recipe
+    from polsep.edit.parameters import EditError
     from polsep.edit.recipe import Recipe, make_edit
 
     given = list(_given_edits(options))
@@ -124,7 +139,14 @@ def _find_recipe(options: dict[str, Any]) -> tuple[Recipe, Path]:
         return read_recipe(path), path.parent
     if not given:
         raise ValueError("expected an edit such as --metallic 1, or --recipe FILE, found none; --list shows them")
-    return Recipe(tuple(make_edit(kind, values) for kind, values in given)), Path()
+    edits = []
+    for kind, values in given:
+        try:
+            edits.append(make_edit(kind, values))
+        except EditError as error:
+            name = next(name for name, edit in EDITS.items() if edit is kind)
+            raise ValueError(f"--{name}: {error}") from None
+    return Recipe(tuple(edits)), Path()
 
 
 def _given_edits(options: dict[str, Any]) -> Iterator[tuple[Any, dict[str, Any]]]:

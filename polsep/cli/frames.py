@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,10 +22,15 @@ from polsep.cli.app import (
     SIZE,
     WHITE_LEVEL,
     app,
+    check_read_options,
     print_note,
-    progress_bar,
+    read_light,
     read_options,
+    require_extra,
+    require_paths,
 )
+from polsep.cli.progress import show_progress
+from polsep.cli.summary import summary
 
 if TYPE_CHECKING:
     from polsep.batch import Outcome
@@ -64,7 +68,8 @@ if TYPE_CHECKING:
 def separate(files: tuple[str, ...], **options: Any) -> None:
     """Separate raw frames of a polarization camera into diffuse and specular images.
 
-    FILE is PNG, TIFF, NPY, NPZ, PGM or headerless raw; 'shot_{angle}.png' is four images at 0, 45, 90 and 135 degrees.
+    FILE is PNG, TIFF, NPY, NPZ, PGM or headerless raw, or a folder of such files or of 'polsep capture';
+    'shot_{angle}.png' is four images at 0, 45, 90 and 135 degrees.
     For every frame, DIR/STEM.exr gets the layers diffuse.R/G/B, specular.R/G/B, dolp.Y, aolp.Y [radians] and valid.Y
     (networks also write their expected errors, error.diffuse and error.specular), DIR/STEM.png is a preview, and
     DIR/STEM.json holds settings and statistics.
@@ -74,6 +79,7 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     polsep separate shot.tiff --white-level 4095      12-bit values in 16-bit words
     polsep separate mono.png --layout mono            a monochrome polarization sensor
     polsep separate dump.raw --size 2448x2048 --pixel-format BayerRG12p
+    polsep separate shots/                            every frame of a folder
     polsep separate 'shot_{angle}.png'                four images, one per analyser angle
 
     \b
@@ -81,25 +87,28 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     --layout mono    the same without colours
     --layout SPEC    2x2 angles in reading order and the Bayer order, like 90,45,135,0/RGGB or 0,45,90,135/mono
     """
+    if len(files) == 1:  # of several the others are separated all the same
+        require_paths(*files)
+    check_read_options(options)
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
+    from polsep.io.raw.sequences import expand_folders
     from polsep.methods import check_method
-    from polsep.pipeline import find_device, parse_light_color
+    from polsep.pipeline import find_device
 
     if click.get_current_context().get_parameter_source("layout") != click.core.ParameterSource.COMMANDLINE:
         options["layout"] = None  # files that say their own layout are read by it
     read = read_options(options)
     check_method(options["method"])
     find_device(options["device"])
-    light = parse_light_color(options["light_color"])
+    light = read_light(options)
+    paths = expand_folders(files)
     run = SeparateOptions(options["method"], light, options["device"], options["full"])
     write = WriteOptions(options["output"], options["format"], options["overwrite"])
     failures, sources = 0, set[str]()
-    with progress_bar() if len(files) > 1 else nullcontext() as progress:
-        task = None if progress is None else progress.add_task("separating", total=len(files), speed="")
-        for outcome in separate_files(files, read, run, write):
+    with show_progress(f"separating {paths[0]}" if len(paths) == 1 else "separating", len(paths)) as progress:
+        for outcome in separate_files(paths, read, run, write):
             sources.add(outcome.source)
-            if progress is not None and task is not None:
-                progress.update(task, completed=len(sources), description=outcome.source)
+            progress.update(len(sources))
             failures += _report(outcome)
     if failures:
         sys.exit(2)
@@ -113,6 +122,7 @@ def _report(outcome: Outcome) -> int:
     for warning in outcome.warnings:
         print_note(f"{outcome.source}: {warning}")
     print(f"{outcome.source} -> {', '.join(str(path) for path in outcome.written)}")
+    print(f"  {summary(outcome.report)}", flush=True)
     return 0
 
 
@@ -131,20 +141,25 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     The file runs in onnxruntime and similar programs without polsep. Frames [N, H, W] are in Sony's order with sides
     that are multiples of 4; black_level and white_level are in their units. Needs the extra export.
     """
-    import torch
-
+    require_extra("export")
+    if weights is not None:
+        require_paths(weights)
     from polsep.io.store.atomic import refuse_existing
-    from polsep.io.store.onnx import write_onnx
-    from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork
-    from polsep.networks.joint import Joint
     from polsep.sensor.camera import Layout
     from polsep.shipped import find_joint
 
     refuse_existing(output.parent, [output], options["overwrite"])
     network, metadata = find_joint(method, Layout(bayer=None) if options["mono"] else Layout(), weights)
+    import torch
+
+    from polsep.io.store.onnx import write_onnx
+    from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork
+    from polsep.networks.joint import Joint
+
     print_note(f"exporting {method}, which takes a minute or a few")
-    graph = ExportedNetwork(Joint.of(network, torch.device("cpu")), options["full"])
-    write_onnx(output, graph, OUTPUT_NAMES, metadata)
+    with show_progress(f"exporting {method}"):
+        graph = ExportedNetwork(Joint.of(network, torch.device("cpu")), options["full"])
+        write_onnx(output, graph, OUTPUT_NAMES, metadata)
     print(output)
 
 
@@ -180,11 +195,7 @@ def demo(output: Path, every: bool) -> None:
         for outcome in separate_files([str(capture)], ReadOptions(white_level=4095.0), SeparateOptions(name), write):
             if _report(outcome):
                 sys.exit(2)
-            statistics = outcome.report["statistics"]
-            print(
-                f"  {name}: {statistics['clipped_fraction']:.2%} of the pixels hold clipped samples, "
-                f"light polarizer about {statistics['light_polarizer_deg']:.0f} deg (25 deg in the scene)"
-            )
+    print("In the scene the polarizer is at 25 deg.")
     print(f"Compare {output / best / 'still_life.png'} with {output / 'analytic' / 'still_life.png'}:")
     print("  in 'specular', the analytic split leaves coloured rims of the objects, and holes where highlights clip;")
     print("  the networks remove the rims and fill most of the holes. The EXR files hold the linear images for")

@@ -11,15 +11,20 @@ from polsep.cli.app import (
     AMBIENT,
     BLACK_LEVEL,
     CALIBRATION,
+    COUNT,
     DIR,
     FILE,
     LAYOUT,
     OVERWRITE,
     WHITE_LEVEL,
+    Number,
+    Word,
     app,
-    extra_needed,
     read_options,
+    require_extra,
+    require_paths,
 )
+from polsep.cli.progress import show_progress
 
 #: The order of photographs without --lights.
 ORDER = "right front-right front front-left left above"
@@ -42,12 +47,21 @@ ORDER = "right front-right front front-left left above"
 @WHITE_LEVEL
 @CALIBRATION
 @AMBIENT
-@click.option("--fov", type=float, metavar="DEG", help="The camera's vertical field of view.  [default: orthographic]")
-@click.option("--size", "longest", type=int, default=640, metavar="PX", help="Longer side of the maps at most.")
 @click.option(
-    "--integration", default="bilateral", metavar="bilateral|smooth", help="Depth with jumps, or one smooth surface."
+    "--fov",
+    type=Number(float, 0, 120, above=True),
+    metavar="DEG",
+    help="The camera's vertical field of view.  [default: orthographic]",
 )
-@click.option("--mesh", default="glb", metavar="glb|ply", help="Format of the mesh.")
+@click.option("--size", "longest", type=COUNT, default=640, metavar="PX", help="Longer side of the maps at most.")
+@click.option(
+    "--integration",
+    type=Word("bilateral", "smooth"),
+    default="bilateral",
+    metavar="bilateral|smooth",
+    help="Depth with jumps, or one smooth surface.",
+)
+@click.option("--mesh", type=Word("glb", "ply"), default="glb", metavar="glb|ply", help="Format of the mesh.")
 @click.option("--turntable", is_flag=True, help="Also write DIR/STEM.mp4, the turning mesh; needs the extra video.")
 @OVERWRITE
 def geometry(files: tuple[Path, ...], **options: Any) -> None:
@@ -68,22 +82,15 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     polsep geometry sep/*.exr --lights "0,0,1 0.5,0,0.9 -0.5,0,0.9 0,0.6,0.8" -o out
     polsep geometry --srgb [0-5].JPG --mask mask.png --turntable -o out
     """
-    with extra_needed("render"):
-        from polsep.geometry.files import (
-            ShapeOptions,
-            Source,
-            find_object,
-            find_shape,
-            read_object,
-            read_views,
-            shrink,
-        )
+    require_extra("render")
+    if options["turntable"]:
+        require_extra("video")
+    require_paths(*files, *filter(None, [options["mask"]]))
     from polsep.geometry.lights import parse_lights
     from polsep.io.assets.shapes import shape_targets, write_shape
     from polsep.io.store.atomic import refuse_existing, refuse_inputs
     from polsep.methods import check_method
 
-    shape_options = ShapeOptions(options["mesh"], options["fov"], options["integration"], options["turntable"])
     directions = parse_lights(options["lights"])
     if len(files) != len(directions):
         raise ValueError(f"expected {len(directions)} files, one per light of --lights, found {len(files)}")
@@ -92,12 +99,22 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     targets = shape_targets(options["output"], options["name"], options["mesh"], options["turntable"])
     refuse_inputs(targets, [*files, *([options["mask"]] if options["mask"] else [])])
     refuse_existing(options["output"], targets, options["overwrite"])
-    views = read_views(files, Source("photographs" if options["srgb"] else "frames", read, options["method"]))
-    size = views.images.shape[1:3]
-    mask = find_object(views) if options["mask"] is None else read_object(options["mask"], size)
-    if options["longest"] < 1:
-        raise ValueError(f"expected --size of 1 or more, found {options['longest']}")
-    views, mask = shrink(views, mask, options["longest"])
-    write_shape(find_shape(views, directions, mask, shape_options), targets)
+    from polsep.geometry.files import (
+        ShapeOptions,
+        Source,
+        find_object,
+        find_shape,
+        read_object,
+        read_views,
+        shrink,
+    )
+
+    shape_options = ShapeOptions(options["mesh"], options["fov"], options["integration"], options["turntable"])
+    with show_progress("finding the shape"):
+        views = read_views(files, Source("photographs" if options["srgb"] else "frames", read, options["method"]))
+        size = views.images.shape[1:3]
+        mask = find_object(views) if options["mask"] is None else read_object(options["mask"], size)
+        views, mask = shrink(views, mask, options["longest"])
+        write_shape(find_shape(views, directions, mask, shape_options), targets)
     for path in targets:
         print(path)

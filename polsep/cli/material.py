@@ -17,10 +17,15 @@ from polsep.cli.app import (
     OVERWRITE,
     PIXEL_FORMAT,
     WHITE_LEVEL,
+    Number,
     app,
     print_note,
+    read_light,
     read_options,
+    require_extra,
+    require_paths,
 )
+from polsep.cli.progress import show_progress
 
 
 @app.command()
@@ -30,7 +35,9 @@ from polsep.cli.app import (
 @click.option(
     "--white", metavar="N,...", help="s0 of white paper in the middle: one number, or one for each photograph."
 )
-@click.option("--size", "side", type=int, default=128, metavar="PX", help="Side of the maps; trained at 128.")
+@click.option(
+    "--size", "side", type=Number(int, 32, 1024), default=128, metavar="PX", help="Side of the maps; trained at 128."
+)
 @click.option(
     "--input", "network_input", default="separated", metavar="NAME", help="separated, or unseparated to compare."
 )
@@ -55,6 +62,7 @@ def material(files: tuple[str, ...], **options: Any) -> None:
     FILE is a raw frame, as for 'polsep separate', or a separated one (.exr). All are photographs of one material from
     above by a camera that does not move, each under one polarized light: a flash beside the lens, or several lights in
     turn, in any order. The middle square is used. The material is assumed to be a dielectric, and its light white.
+    Needs the extra torch.
 
     DIR/NAME.exr gets all maps; NAME_normal.png, NAME_diffuse.png, NAME_roughness.png and NAME_specular.png are
     textures; NAME.glb opens in Blender, NAME.mtlx in MaterialX viewers; NAME.png shows the maps and the material under
@@ -65,21 +73,26 @@ def material(files: tuple[str, ...], **options: Any) -> None:
     polsep material flash.png left.png right.png --white 0.8 several, where white paper has an s0 of 0.8
     polsep material out/flash.exr                            separated before
     """
-    from polsep.material.files import MaterialOptions, estimate_files
+    require_extra("torch")
+    require_paths(*files, *filter(None, [options["weights"]]))
+    white, read = _parse_white(options["white"]), read_options(options)
     from polsep.methods import check_method
-    from polsep.pipeline import parse_light_color
 
     check_method(options["method"])
+    light = read_light(options)
+    from polsep.material.files import MaterialOptions, estimate_files
+
     settings = MaterialOptions(
-        read_options(options),
+        read,
         options["method"],
-        parse_light_color(options["light_color"]),
-        _parse_white(options["white"]),
+        light,
+        white,
         options["side"],
         options["network_input"],
         options["weights"],
     )
-    written, notes = estimate_files(files, settings, options["output"], options["name"], options["overwrite"])
+    with show_progress("estimating the material"):
+        written, notes = estimate_files(files, settings, options["output"], options["name"], options["overwrite"])
     for note in notes:
         print_note(note)
     for path in written:
@@ -91,6 +104,9 @@ def _parse_white(text: str | None) -> tuple[float, ...]:
     if text is None:
         return ()
     try:
-        return tuple(float(level) for level in text.split(","))
+        levels = tuple(float(level) for level in text.split(","))
     except ValueError:
-        raise ValueError(f"expected --white N or N,N,... like 0.8, found {text!r}") from None
+        levels = ()
+    if not levels or not all(0 < level < float("inf") for level in levels):
+        raise ValueError(f"expected --white N or N,N,... above 0, like 0.8, found {text!r:.40}")
+    return levels

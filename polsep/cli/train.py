@@ -8,11 +8,17 @@ from typing import Any
 
 import click
 
-from polsep.cli.app import DIR, app, extra_needed
+from polsep.cli.app import COUNT, DIR, POSITIVE, Word, app, require_extra, require_paths
+
+#: What can be trained.
+RUNGS = (
+    *("joint-large", "joint", "joint-fast", "material"),
+    *("paper", "unpolarized", "polarized", "shared", "signed", "no-angle", "stokes"),
+)
 
 
 @app.command()
-@click.argument("rung")
+@click.argument("rung", type=Word(*RUNGS))
 @click.option("-o", "--output", type=DIR, required=True, metavar="DIR", help="New directory, or one to resume.")
 @click.option(
     "--data",
@@ -26,9 +32,9 @@ from polsep.cli.app import DIR, app, extra_needed
     metavar="NAME",
     help="Rendered scenes: real; varied: under a perfect white lamp; usual: as in the paper, no glare or relief.",
 )
-@click.option("--width", type=int, metavar="N", help="Channels of the network's first level; 32 on the ladder.")
-@click.option("--levels", type=int, default=3, metavar="N", help="How often a ladder network halves the resolution.")
-@click.option("--fold", type=int, default=2, metavar="N", help="Fold N x N pixels into channels; 1 folds none.")
+@click.option("--width", type=COUNT, metavar="N", help="Channels of the network's first level; 32 on the ladder.")
+@click.option("--levels", type=COUNT, default=3, metavar="N", help="How often a ladder network halves the resolution.")
+@click.option("--fold", type=COUNT, default=2, metavar="N", help="Fold N x N pixels into channels; 1 folds none.")
 @click.option("--blocks", metavar="N,N,...", help="Residual blocks per level of a joint network.")
 @click.option(
     "--entry", type=int, metavar="N", help="Channels after a joint network's first layer; 0 keeps all inputs."
@@ -36,15 +42,15 @@ from polsep.cli.app import DIR, app, extra_needed
 @click.option("--ablation", default="none", metavar="NAME", help="Ablation of a joint network.")
 @click.option("--part", default="all", metavar="NAME", help="Part of a joint network to train: all, details or doubt.")
 @click.option("--input", "seen", default="separated", metavar="NAME", help="material: unseparated, separated, perfect.")
-@click.option("--examples", type=int, default=768, metavar="N", help="material: number of training examples.")
+@click.option("--examples", type=COUNT, default=768, metavar="N", help="material: number of training examples.")
 @click.option("--cues", metavar="NAME,...", help="material: inputs beside the images, such as details.")
 @click.option("--folder", type=DIR, metavar="DIR", help="material: folder of the examples.  [default: DIR/../examples]")
-@click.option("--steps", type=int, default=20_000, metavar="N", help="Batches of 8 crops, or of 4 materials.")
-@click.option("--until", type=int, metavar="N", help="material: end at this step of the schedule.")
-@click.option("--rate", type=float, default=1e-3, metavar="X", help="Peak learning rate.")
+@click.option("--steps", type=COUNT, default=20_000, metavar="N", help="Batches of 8 crops, or of 4 materials.")
+@click.option("--until", type=COUNT, metavar="N", help="material: end at this step of the schedule.")
+@click.option("--rate", type=POSITIVE, default=1e-3, metavar="X", help="Peak learning rate.")
 @click.option("--seed", type=int, default=0, metavar="N", help="Random seed of the weights and of the data.")
-@click.option("--workers", type=int, default=1, metavar="N", help="Rendering processes per device.")
-@click.option("--devices", type=int, default=1, metavar="N", help="Number of GPUs, where there are any.")
+@click.option("--workers", type=COUNT, default=1, metavar="N", help="Rendering processes per device.")
+@click.option("--devices", type=COUNT, default=1, metavar="N", help="Number of GPUs, where there are any.")
 @click.option(
     "--start",
     type=click.Path(path_type=Path),
@@ -67,11 +73,13 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     polsep train paper --width 64 --levels 4 --fold 1 -o runs/unet64      the classic U-Net
     polsep train material --input separated --steps 2000 -o runs/separated
     """
-    with extra_needed("train"):
-        from polsep.train.command import choose_options, plan_run, train_weights
-        from polsep.train.loop import Run, Schedule
-        from polsep.train.material_command import choose_material, train_material
-        from polsep.train.stream import StreamOptions
+    require_extra("train")
+    require_paths(*options["start"])
+    from polsep.train.command import choose_options, plan_run, train_weights
+    from polsep.train.loop import Run, Schedule
+    from polsep.train.material_command import choose_material, train_material
+    from polsep.train.stream import StreamOptions
+
     shared = {name: options[name] for name in ("workers", "devices", "start", "refit")}
     if rung == "material":
         material, schedule = choose_material(options)

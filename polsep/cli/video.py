@@ -12,6 +12,9 @@ from polsep.cli.app import (
     AMBIENT,
     BLACK_LEVEL,
     CALIBRATION,
+    COMPRESSION,
+    COUNT,
+    DAMAGED,
     DEVICE,
     DIR,
     ENGINE,
@@ -19,14 +22,19 @@ from polsep.cli.app import (
     LIGHT_COLOR,
     OVERWRITE,
     PIXEL_FORMAT,
+    RATE,
     SIZE,
     WHITE_LEVEL,
+    Word,
     app,
-    extra_needed,
+    has_extra,
     print_note,
-    progress_bar,
+    read_light,
     read_options,
+    require_extra,
+    require_paths,
 )
+from polsep.cli.progress import report_step, show_progress
 
 
 @app.command()
@@ -42,16 +50,32 @@ from polsep.cli.app import (
 @AMBIENT
 @LIGHT_COLOR
 @click.option(
-    "--format", default="exr", metavar="exr|ffv1|none", help="A file per frame, a lossless video, or only a preview."
+    "--format",
+    type=Word("exr", "ffv1", "none"),
+    default="exr",
+    metavar="exr|ffv1|none",
+    help="A file per frame, a lossless video, or only a preview.",
 )
-@click.option("--compression", default="none", metavar="none|zip|piz", help="Compression of EXR files.")
-@click.option("--preview/--no-preview", default=True, help="Write a video of input, diffuse and specular to watch.")
-@click.option("--rate", type=float, default=25.0, metavar="N", help="Frames per second of the videos written.")
 @click.option(
-    "--filter", default="temporal", metavar="temporal|none", help="temporal: average over frames where nothing moves."
+    "--compression", type=COMPRESSION, default="none", metavar="none|zip|piz", help="Compression of EXR files."
 )
-@click.option("--frames", type=int, metavar="N", help="Separate the first N frames at most.")
-@click.option("--damaged", default="stop", metavar="stop|skip", help="Stop at a damaged frame, or skip it.")
+@click.option(
+    "--preview/--no-preview",
+    default=None,
+    help="Write a video of input, diffuse and specular to watch.  [default: where the extra video is installed]",
+)
+@click.option("--rate", type=RATE, default=25.0, metavar="N", help="Frames per second of the videos written.")
+@click.option(
+    "--filter",
+    type=Word("temporal", "none"),
+    default="temporal",
+    metavar="temporal|none",
+    help="temporal: average over frames where nothing moves.",
+)
+@click.option("--frames", type=COUNT, metavar="N", help="Separate the first N frames at most.")
+@click.option(
+    "--damaged", type=DAMAGED, default="stop", metavar="stop|skip", help="Stop at a damaged frame, or skip it."
+)
 @SIZE
 @PIXEL_FORMAT
 @OVERWRITE
@@ -63,39 +87,42 @@ def video(recording: Path, output: Path, **options: Any) -> None:
     IN is a folder of frames or of 'polsep capture', a TIFF or NPY file of many frames, a lossless grey video (FFV1 in
     .mkv, raw .avi), or a headerless raw stream. DIR gets STEM_000123.exr (half floats, layers diffuse and specular) for
     every frame, or STEM_diffuse.mkv and STEM_specular.mkv (FFV1, 16 bits); STEM_preview.mp4 to watch; STEM.jsonl with a
-    line of statistics per frame; and STEM.json. Run the same command again to resume a run that was stopped. Writing
-    videos needs the extra video.
+    line of statistics per frame; and STEM.json. Run the same command again to resume a run that was stopped. Reading
+    and writing videos needs the extra video; a folder of frames to EXR files needs none.
 
     \b
     polsep video frames/ -o out --white-level 4095
     polsep video run.raw --size 2448x2048 --pixel-format BayerRG12p -o out --rate 24
     polsep video run.mkv -o out --format ffv1 --method joint
     """
+    require_paths(recording)
+    if options["engine"] == "ray":
+        require_extra("ray")
+    if options["format"] == "ffv1" or recording.suffix.lower() in (".mkv", ".avi", ".mov", ".nut"):
+        require_extra("video")
+    read = read_options(options)
     from polsep.compute.workers import keep_memory
     from polsep.io.results.sequences import SequenceKind
     from polsep.methods import check_method
-    from polsep.pipeline import parse_light_color
     from polsep.video.recordings import Target, VideoOptions, separate_video
 
     keep_memory()
-    read = read_options(options)
     check_method(options["method"])
-    light = parse_light_color(options["light_color"])
+    light = read_light(options)
     shared = {name: options[name] for name in ("method", "device", "damaged", "frames", "engine", "filter")}
     run = VideoOptions(light_color=light, **shared)
-    kind = SequenceKind(options["format"], options["compression"], options["preview"], options["rate"])
+    kind = SequenceKind(options["format"], options["compression"], with_preview(options["preview"]), options["rate"])
     target = Target(output, kind, options["overwrite"])
-    failures = 0
-    with extra_needed("ray", "ray"), progress_bar() as progress:
-        task = progress.add_task("separating", total=None, speed="")
-        for step in separate_video(recording, read, run, target):
-            speed = progress.tasks[0].speed
-            shown = f"{speed:.1f} frames/s" if speed else ""
-            progress.update(task, completed=step.done, total=step.count, speed=shown)
-            if step.warning is not None:
-                print_note(step.warning)
-            for path in step.written:
-                print(path)
-            failures += step.damaged
+    with show_progress(f"separating {recording}") as progress:
+        failures = sum(report_step(step, progress) for step in separate_video(recording, read, run, target))
     if failures:
         sys.exit(2)
+
+
+def with_preview(asked: bool | None) -> bool:
+    """True if a video to watch is to be written: as asked, else where its library is. Raises ValueError."""
+    if asked:
+        require_extra("video")
+    if asked is None and not has_extra("video"):
+        print_note("no video to watch is written: it needs the extra 'video' (pip install 'polsep[video]')")
+    return has_extra("video") if asked is None else asked

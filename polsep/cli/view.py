@@ -8,7 +8,18 @@ from typing import Any
 
 import click
 
-from polsep.cli.app import AMBIENT, CALIBRATION, LAYOUT, PIXEL_FORMAT, SIZE, app, extra_needed, print_note
+from polsep.cli.app import (
+    AMBIENT,
+    CALIBRATION,
+    LAYOUT,
+    PIXEL_FORMAT,
+    SIZE,
+    Number,
+    app,
+    print_note,
+    require_extra,
+    require_paths,
+)
 
 
 @app.command()
@@ -16,7 +27,12 @@ from polsep.cli.app import AMBIENT, CALIBRATION, LAYOUT, PIXEL_FORMAT, SIZE, app
 @click.option(
     "--host", default="127.0.0.1", metavar="ADDRESS", help="Address to listen on; others let other machines connect."
 )
-@click.option("--port", type=int, metavar="N", help="Port to listen on.  [default: the first free one from 7860 on]")
+@click.option(
+    "--port",
+    type=Number(int, 1, 65_535),
+    metavar="N",
+    help="Port to listen on.  [default: the first free one from 7860 on]",
+)
 @click.option("--open", "opens", is_flag=True, help="Open the page in this machine's browser.")
 @click.option("--method", default="auto", metavar="NAME", help="Separation method; 'polsep methods' lists them.")
 @LAYOUT
@@ -43,17 +59,18 @@ def view(file: Path | None, host: str, port: int | None, opens: bool, upload_lim
     polsep view film/
     polsep view dump.raw --size 2448x2048 --pixel-format BayerRG12p
     """
+    require_extra("view")
+    if file is not None:
+        require_paths(file)
     from polsep.view.opening import find_sources, parse_settings
     from polsep.view.server import ViewOptions, serve
 
     names = {"black_level": "black", "white_level": "white", "light_color": "light"}
     settings = {names.get(name, name): value for name, value in options.items() if value not in (None, ())}
     parse_settings(settings)
-    if file is not None and not file.exists():
-        raise ValueError(f"{file}: expected a file, found nothing")
     if file is not None:
         find_sources(file)
-    with extra_needed("view", "gradio"), serve(ViewOptions(host, port, file, settings, upload_limit)) as address:
+    with serve(ViewOptions(host, port, file, settings, upload_limit)) as address:
         print(address, flush=True)
         print_note("serving until Ctrl-C")
         if opens:

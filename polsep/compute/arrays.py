@@ -11,7 +11,7 @@ import sys
 from typing import Any, TypeAlias
 
 import numpy as np
-from array_api_compat import array_namespace, device, is_torch_array
+from array_api_compat import array_namespace, device, is_array_api_obj, is_torch_array
 from numpy.typing import NDArray
 
 #: A NumPy array or a torch tensor; docstrings give its shape. (Type checkers know no type for both.)
@@ -83,3 +83,14 @@ def to_device(x: Array, device: str) -> Array:
     import torch
 
     return torch.as_tensor(x, device=device)
+
+
+def short_repr(thing: Any) -> str:
+    """Text of a dataclass of arrays for its ``__repr__``: of arrays only type and shape."""
+    texts = {name: _shape(value) if is_array_api_obj(value) else repr(value) for name, value in vars(thing).items()}
+    fields = (f"{name}={text}" for name, text in texts.items())
+    return f"{type(thing).__name__}({', '.join(fields)})"
+
+
+def _shape(array: Any) -> str:
+    return f"{str(array.dtype).removeprefix('torch.')} {list(array.shape)}"

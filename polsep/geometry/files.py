@@ -21,10 +21,10 @@ from polsep.geometry.polarization import Polarized, find_diffuse_polarization, n
 from polsep.geometry.surface import Surface, draw_views, relight, span_surface
 from polsep.io.assets.maps import read_map
 from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
-from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.frames import ReadOptions, read_frames, refuse_forgotten
 from polsep.io.raw.videos import load_library
 from polsep.io.results.films import WATCHABLE, encode_film
-from polsep.io.results.previews import exposure_of, toned
+from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
 from polsep.io.results.separation_reader import SUFFIXES, read_separated
 from polsep.io.store.errors import InputError, input_error
 from polsep.pipeline import separate_capture
@@ -112,6 +112,7 @@ def _read_frame(path: Path, source: Source) -> SeparatedFrame:
     frames = list(read_frames(path, source.options))
     if len(frames) != 1:
         raise input_error(path, f"expected one frame under one light, found {len(frames)}")
+    refuse_forgotten(path, frames[0])
     try:
         return separate_capture(frames[0].data, source.method)
     except (ValueError, RuntimeError) as error:
@@ -210,16 +211,16 @@ def draw_sheet(views: Views, shown: Appearance, surface: Surface) -> Pixels:
     front = views.images[int(views.images.sum(axis=(1, 2, 3)).argmax())]
     relit = relight(shown)
     flat = [
-        toned(front, exposure_of(front[mask])),
-        np.rint(255 * (shown.normals + 1) / 2).astype(np.uint8),
-        toned(shown.albedo, 0.9),
-        toned(relit, exposure_of(relit[mask])),
+        Panel("Brightest frame", "", toned(front, exposure_of(front[mask]))),
+        Panel("Normals", "red right, green up", np.rint(255 * (shown.normals + 1) / 2).astype(np.uint8)),
+        Panel("Albedo", "brightest = white", toned(shown.albedo, 0.9)),
+        Panel("Another light", "from above left", toned(relit, exposure_of(relit[mask]))),
     ]
     meshes = np.stack(list(draw_views(surface, CELL, VIEWS)))
     gain = exposure_of(meshes[meshes.sum(axis=-1) > 0])
-    solid = [_on_grey(picture, gain) for picture in meshes]
-    rows = [np.concatenate([_cell(picture, mask) for picture in flat], axis=1), np.concatenate(solid, axis=1)]
-    return np.concatenate(rows).astype(np.uint8)
+    sides = [f"{abs(azimuth):g} deg {'left' if azimuth < 0 else 'right'}" for azimuth, _ in VIEWS]
+    solid = [Panel("Mesh", side, _on_grey(picture, gain)) for side, picture in zip(sides, meshes, strict=True)]
+    return titled_sheet([[panel._replace(pixels=_cell(panel.pixels, mask)) for panel in flat], solid])
 
 
 def draw_turntable(surface: Surface) -> Iterator[Pixels]:

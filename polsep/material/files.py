@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from polsep.io.assets.materials import MaterialFiles, material_targets, write_material
-from polsep.io.raw.frames import ReadOptions, output_stem, read_frames
+from polsep.io.raw.frames import ReadOptions, output_stem, read_frames, refuse_forgotten
 from polsep.io.results.previews import Panel, Pixels, titled_sheet, toned
 from polsep.io.results.separation_reader import read_separated
 from polsep.io.store.atomic import refuse_existing, refuse_inputs
@@ -29,6 +29,9 @@ Floats = NDArray[np.float32]
 USUAL_DIFFUSE = 0.29
 #: Smallest and largest side of maps.
 MIN_SIZE, LARGEST_SIZE = 32, 1024
+#: Parts along a side of the square, and the least light of one relative to the brightest that a flat sample shows.
+#: Random flat materials: 0.06 and more; objects on black: 0.000, spheres that fill the square 0.02 to 0.04.
+FLAT_PARTS, MIN_PART = 8, 0.05
 #: Positions of the lights of the preview, and the side of its pictures in pixels.
 PREVIEW_LIGHTS = ((0.0, 0.0, 2.75), (-1.2, 0.8, 1.8), (1.3, 0.9, 1.5), (1.0, -1.3, 1.2), (-1.6, -0.6, 0.9))
 PREVIEW_SIDE = 256
@@ -82,7 +85,7 @@ def estimate_files(
     white = find_white(photographs.views, options.white)
     views = photographs.views / torch.tensor(white)[:, None, None, None]
     maps = estimator.estimate(views[:, :3] + views[:, 3:] if estimator.input == "unseparated" else views)
-    notes = list(photographs.notes)
+    notes = [*photographs.notes, *flatness_notes(photographs)]
     if not options.white:
         notes.append("the level of white paper is not known (--white): the diffuse map's brightness is a guess")
     sidecar = {
@@ -107,6 +110,7 @@ def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photogra
             lobes.append((frame.diffuse, frame.specular))
         else:
             for raw in read_frames(path, options.read):
+                refuse_forgotten(path, raw)
                 frame = separate_capture(raw.data, options.method, options.light_color)
                 lobes.append((frame.diffuse, frame.specular))
                 notes += [f"{path}: {note}" for note in (*raw.notes, *frame.report["warnings"])]
@@ -120,6 +124,20 @@ def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photogra
     if not views:
         raise InputError("expected photographs of a material, found none")
     return Photographs(torch.stack(views), tuple(sources), tuple(notes))
+
+
+def flatness_notes(photographs: Photographs) -> list[str]:
+    """A line for each photograph with large parts that are nearly black, as behind or on the side of a thing that is
+    not flat."""
+    light = photographs.views.mean(dim=1, keepdim=True)
+    parts = adaptive_avg_pool2d(light, FLAT_PARTS).flatten(1)
+    shares = (parts.amin(dim=1) / parts.amax(dim=1)).tolist()
+    return [
+        f"{source}: a part of the middle square has {share:.1%} of the light of the brightest part: "
+        "is the sample flat, does it fill the square, and is it lit everywhere?"
+        for source, share in zip(photographs.sources, shares, strict=True)
+        if share < MIN_PART
+    ]
 
 
 def _middle_square(image: Tensor, size: int) -> Tensor:

@@ -22,7 +22,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import Array, constant, namespace
+from polsep.compute.arrays import Array, constant, namespace, short_repr
 
 Doubles = NDArray[np.float64]
 
@@ -31,13 +31,15 @@ Doubles = NDArray[np.float64]
 MAX_DOLP = 2.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Stokes:
     """Linear Stokes images ``s0, s1, s2``, each ``[..., C, H, W]``, floating point, same linear scale."""
 
     s0: Array
     s1: Array
     s2: Array
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if self.s1.shape != self.s0.shape or self.s2.shape != self.s0.shape:
@@ -59,7 +61,7 @@ class Stokes:
         return Stokes(function(self.s0), function(self.s1), function(self.s2))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Measurements:
     """Samples behind K analysers at the same points: ``data`` and ``clipped`` are ``[..., K, C, H, W]``.
 
@@ -74,6 +76,8 @@ class Measurements:
     clipped: Array | None = None
     variance: Array | None = None
     uniform: Measurements | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if self.data.ndim < 4 or self.data.shape[-4] != len(self.angles):

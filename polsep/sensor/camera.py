@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from array_api_compat import device
 
-from polsep.compute.arrays import Array, as_floats, constant, namespace
+from polsep.compute.arrays import Array, as_floats, constant, namespace, short_repr
 from polsep.physics.stokes import Measurements, Stokes
 
 if TYPE_CHECKING:
@@ -44,6 +44,10 @@ class Filter(NamedTuple):
 
     angle_deg: float
     channel: int
+
+
+class WrongType(TypeError, ValueError):
+    """An argument of a wrong type; also a ValueError, as every wrong input is."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,8 @@ class Layout:
     @classmethod
     def parse(cls, spec: str) -> Layout:
         """A layout from ``color``, ``mono`` or ``"90,45,135,0/RGGB"``: angles in reading order, Bayer order or mono."""
+        if not isinstance(spec, str):
+            raise WrongType(f"expected a layout as text, found {type(spec).__name__}")
         if spec in ("color", "colour"):
             return cls()
         if spec == "mono":
@@ -184,7 +190,7 @@ def check_frame(shape: tuple[int, ...], layout: Layout, black_level: float, whit
         raise ValueError(f"white_level must be above black_level, found {white_level} and {black_level}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Mosaic:
     """One raw frame (or a batch): linear sensor values ``data [..., H, W]`` with what is needed to read them.
 
@@ -201,6 +207,8 @@ class Mosaic:
     white_level: float
     light_color: tuple[float, ...] = (1.0, 1.0, 1.0)
     falloff: tuple[tuple[float, ...], ...] | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_frame(tuple(self.data.shape), self.layout, self.black_level, self.white_level)

@@ -6,7 +6,8 @@ Colour sensors show more: the colour changes from cell to cell, which gives the 
 on one diagonal of the Bayer block.
 
 No frame can show these: 0 and 90 swapped, 45 and 135 swapped, or the two pairs swapped obey the same identity, and so
-do red and blue. A mirrored, rotated or transposed MONO frame therefore looks in order. The check never warns of those.
+do red and blue. A mirrored, rotated or transposed MONO frame therefore looks in order, and so does a transposed colour
+frame. Of those only whole frames of known sensors are seen, which stand upright when they were transposed or turned.
 
 All statistics are means over blocks of 16x16 pixels, first-order corrected for the brightness gradient, without blocks
 that hold a clipped sample, in units of the mean brightness. The light's colour is left in: what is compared are the
@@ -57,6 +58,9 @@ DARK, MAX_DARK = 0.01, 0.8
 
 #: Strips of a large frame, rows of one, a multiple of the blocks' 16, and how many times that a frame has to have.
 STRIPS, STRIP, LARGE = 4, 64, 16
+
+#: Width and height of whole frames of Sony's polarization sensors: IMX250, IMX264 and IMX253, without and with borders.
+SENSOR_SIZES = {(2448, 2048), (2464, 2056), (4096, 3000), (4112, 3008)}
 
 _PAIRINGS = {
     "diagonals": np.array([1.0, -1.0, -1.0, 1.0], np.float32),
@@ -214,8 +218,10 @@ def check_layout(mosaic: Mosaic, seen: Floats | None = None) -> LayoutCheck:
     fits = _fitting(mosaic.layout, color, origin, greens, pairs)
     layouts = tuple(fits)
     if mosaic.layout in fits:
-        return LayoutCheck(None, pairs, color, layouts)
+        return LayoutCheck(_upright(mosaic), pairs, color, layouts)
     likely, reason = next(iter(fits.items()))
+    if _stands_upright(mosaic):
+        likely, reason = next(((turn, why) for turn, why in _turned(mosaic.layout) if turn in fits), (likely, reason))
     option = f"--layout {'mono' if likely == Layout(bayer=None) else likely.spec} ({reason})"
     if color is False and mosaic.layout.bayer is not None:
         said = f"the frame shows no colour pattern: unless all it shows is grey, say {option}"
@@ -223,6 +229,28 @@ def check_layout(mosaic: Mosaic, seen: Floats | None = None) -> LayoutCheck:
     return LayoutCheck(
         f"the frame contradicts layout {mosaic.layout.spec}: it fits {option}, the likeliest", pairs, color, layouts
     )
+
+
+def _stands_upright(mosaic: Mosaic) -> bool:
+    """True for a whole frame of a known sensor that was turned or transposed, under a layout that sensors have."""
+    return mosaic.data.shape[-2:] in SENSOR_SIZES and mosaic.layout in (Layout(), Layout(bayer=None))
+
+
+def _upright(mosaic: Mosaic) -> str | None:
+    """A warning of a frame that stands upright although nothing in it contradicts its layout."""
+    if not _stands_upright(mosaic):
+        return None
+    height, width = mosaic.data.shape[-2:]
+    seen = f"the frame is {width}x{height}, a sensor's {height}x{width} turned or transposed"
+    return (
+        f"{seen}: say --layout {mosaic.layout.transposed().spec} (transposed), the likeliest, or save it as it was read"
+    )
+
+
+def _turned(layout: Layout) -> list[tuple[Layout, str]]:
+    """The layout of frames turned by a right angle, which swap red and blue: the reason names the other one too."""
+    left, right = layout.transposed().flipped_vertical(4), layout.transposed().flipped_horizontal(4)
+    return [(left, f"turned to the left; if to the right, {right.spec}")]
 
 
 def _find_color(phases: Floats, layout: Layout) -> tuple[bool | None, tuple[int, int], float]:
@@ -298,7 +326,7 @@ def _candidates(layout: Layout) -> tuple[tuple[Layout, str], ...]:
     bayer, swapped = (None, "mono read as colour") if layout.bayer else ("RGGB", "colour read as mono")
     for other in (Layout(layout.polarizer, bayer), *(Layout(order, bayer) for order in _ORDERS.values())):
         mistakes += [(other, swapped), *((crop, f"{swapped}, {reason}") for crop, reason in _cropped(other))]
-    return tuple(mistakes)
+    return (*mistakes, *_turned(layout))
 
 
 def _cropped(layout: Layout) -> list[tuple[Layout, str]]:

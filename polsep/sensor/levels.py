@@ -7,20 +7,22 @@ Conventions, shared by Python callers and by files:
 * A white level of None means the largest code of the dtype: 255, 65535, or 1.0 for floats. Nothing else is ever
   assumed: the likely bit depth (12 bits in 16, for example) is reported in a note, one line for the user.
 * Samples above the white level are kept and count as clipped; samples below the black level are kept.
-* Everything refused raises ValueError with one line: what was expected, what was found.
+* Everything refused raises ValueError with one line: what was expected, what was found; `WrongType` where an argument
+  is of another type.
 """
 
 from __future__ import annotations
 
 import math
 from numbers import Real
+from os import PathLike
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polsep.physics.stokes import Measurements
-from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
+from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, WrongType
 
 #: Accepted samples and the white level that their type implies.
 WHITE_LEVELS = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0, "float64": 1.0}
@@ -47,6 +49,13 @@ _NARROW_BITS = (8, 10, 12, 14)
 Notes = tuple[str, ...]
 
 
+class ForgottenLevel(str):
+    """A note on samples whose white level nobody said and is likely another: images would be far too dark or clipped.
+
+    Python's callers are warned; commands that write files refuse such a frame (`io.raw.frames.refuse_forgotten`).
+    """
+
+
 def as_mosaic(
     array: NDArray[Any], layout: Layout | str | None = None, black_level: float = 0.0, white_level: float | None = None
 ) -> tuple[Mosaic, Notes]:
@@ -58,7 +67,7 @@ def as_mosaic(
     """
     layout = Layout() if layout is None else Layout.parse(layout) if isinstance(layout, str) else layout
     if not isinstance(layout, Layout):
-        raise ValueError(f'expected a Layout, "color", "mono", a specification or None, found {type(layout).__name__}')
+        raise WrongType(f'expected a Layout, "color", "mono", a specification or None, found {type(layout).__name__}')
     plane, notes = _one_channel(_checked(array))
     height, width = plane.shape
     odd_rows, odd_cols = ((n - start) % 2 for n, start in zip((height, width), layout.origin, strict=True))
@@ -126,7 +135,8 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
             "or merge several exposures (polsep merge)",
         )
     if white_level is None and samples.dtype.kind == "f" and high > 2:
-        return (*notes, f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white")
+        said = f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white"
+        return (*notes, ForgottenLevel(said))
     if samples.dtype.kind == "f" and high <= 2 and high - black_level < MIN_USED * (white - black_level):
         notes += (f"float values reach {high:g} of white level {white:g}: is white 1? Then leave out --white-level",)
     if high > white:
@@ -166,7 +176,7 @@ def _depth_notes(samples: NDArray[Any], high: int) -> Notes:
         return ()
     top = 2**right - 1
     seen = f"values never exceed {top} of 65535: looks like {right}-bit right-justified data"
-    return (f"{seen}; say --white-level {top} if so",)
+    return (ForgottenLevel(f"{seen}; say --white-level {top} if so"),)
 
 
 def _shape(array: NDArray[Any]) -> str:
@@ -176,7 +186,7 @@ def _shape(array: NDArray[Any]) -> str:
 def _checked(array: NDArray[Any]) -> NDArray[Any]:
     """``array`` in native byte order, once its type, size and values are known to be acceptable."""
     if not isinstance(array, np.ndarray) or isinstance(array, np.ma.MaskedArray):  # masked samples have no value
-        raise ValueError(f"expected a NumPy array, found {type(array).__name__}")
+        raise WrongType(f"expected a NumPy array, found {type(array).__name__}{_advice(array)}")
     if array.dtype.name not in WHITE_LEVELS:
         raise ValueError(f"expected samples of uint8, uint16, float32 or float64, found {array.dtype}")
     if array.size == 0 or array.ndim < 2:
@@ -184,6 +194,15 @@ def _checked(array: NDArray[Any]) -> NDArray[Any]:
     if array.dtype.kind == "f":
         _require_finite(array)
     return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+def _advice(found: Any) -> str:
+    """Advice on a thing that is no array, where it is clear what to do."""
+    if type(found).__module__.partition(".")[0] == "torch":
+        return ": say raw.numpy(force=True)"
+    if isinstance(getattr(found, "data", None), Mosaic | Measurements):
+        return ": say frame.data"
+    return ": read files by polsep.read_frames" if isinstance(found, str | PathLike) else ""
 
 
 def _require_finite(array: NDArray[Any]) -> None:
@@ -217,7 +236,7 @@ def _white_level(samples: NDArray[Any], black_level: float, white_level: float |
     white = WHITE_LEVELS[samples.dtype.name] if white_level is None else white_level
     for name, level in (("black", black_level), ("white", white)):
         if not isinstance(level, Real):
-            raise ValueError(f"expected a {name} level that is a number, found {level!r:.40}")
+            raise WrongType(f"expected a {name} level that is a number, found {level!r:.40}")
     if not (math.isfinite(white) and math.isfinite(black_level)):
         raise ValueError(f"expected finite black and white levels, found {black_level:g} and {white:g}")
     if not white > black_level:

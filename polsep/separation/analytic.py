@@ -13,11 +13,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from polsep.compute.arrays import Array, namespace
+from polsep.compute.arrays import Array, namespace, short_repr
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes, fit_stokes_unclipped, polarized_intensity
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Separation:
     """A diffuse and a specular image ``[..., C, h, w]`` with ``valid [..., h, w]`` and the `stokes` they came from.
 
@@ -38,6 +38,8 @@ class Separation:
     noise: Array | None = None
     clipped: Array | None = None
     expected_error: Array | None = None
+
+    __repr__ = short_repr
 
 
 def _split(stokes: Stokes, specular: Array, valid: Array) -> Separation:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from polsep.compute.cluster import map_ordered
 from polsep.compute.threads import get_threads, own_threads
 from polsep.compute.workers import DEPTH, ahead, map_ahead
-from polsep.io.raw.frames import Frame, ReadOptions
+from polsep.io.raw.frames import Frame, ReadOptions, refuse_forgotten
 from polsep.io.raw.sequences import DamagedFrame, FrameSequence, open_sequence
 from polsep.io.results.previews import exposure_of, srgb
 from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWriter, State
@@ -144,6 +144,7 @@ class Progress:
     """``done`` of ``count`` frames; ``warning``: a line for the user; ``written``: the files of a complete run.
 
     ``damaged``: this frame is missing or, for a complete run, some frame is, also where an earlier run left it out.
+    ``report``: what matters in the reports of all frames of a complete run, as `SeparatedFrame.report` has it.
     """
 
     done: int
@@ -151,6 +152,7 @@ class Progress:
     warning: str | None = None
     damaged: bool = False
     written: tuple[Path, ...] = ()
+    report: dict[str, Any] | None = None
 
 
 def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target: Target) -> Iterator[Progress]:
@@ -189,7 +191,8 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
             yield step
     lines = sequence.lines()
     report = _report({**settings, "damaged": options.damaged}, first, lines)
-    yield Progress(last, last, damaged=bool(report["damaged"]), written=tuple(sequence.finish(report)))
+    written = tuple(sequence.finish(report))
+    yield Progress(last, last, damaged=bool(report["damaged"]), written=written, report=_shared_report(first, lines))
 
 
 def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFrame:
@@ -199,6 +202,7 @@ def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFram
         if isinstance(frame, DamagedFrame):
             reason = frame.reason
             continue
+        refuse_forgotten(recording.stem, frame)
         told, found = _light_of(recording, options)
         separated = separate_capture(frame.data, options.method, told, options.device)
         gain = exposure_of(separated.diffuse + separated.specular)
@@ -377,6 +381,20 @@ def black_picture(size: tuple[int, ...], preview: bool, line: dict[str, Any]) ->
     """A black picture in place of a missing frame; ``line``: for the log."""
     black = np.zeros(size, np.float32)
     return Picture(black, black, draw_panels(black, black, 1.0) if preview else None, line)
+
+
+def _shared_report(first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """Statistics of all frames as one, and each warning once; None where all frames are damaged."""
+    good = [line for line in lines if "damaged" not in line]
+    if not good:
+        return None
+    names = [name for name in good[0] if name not in ("frame", "warnings")]
+    statistics = {name: float(np.mean([line[name] for line in good if name in line])) for name in names}
+    turned = np.exp(2j * np.radians([line["light_polarizer_deg"] for line in good])).sum()
+    statistics["light_polarizer_deg"] = float(np.degrees(np.angle(turned)) / 2 % 180)
+    warnings = dict.fromkeys([*first.warnings, *(text for line in good for text in line.get("warnings", ()))])
+    light = {"light_color": list(first.light), "light": first.facts}
+    return {"method": first.method, "statistics": statistics, **light, "warnings": list(warnings)}
 
 
 def _report(settings: dict[str, Any], first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, Any]:

@@ -31,9 +31,19 @@ from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
 from polsep.sensor.calibration import Corrections
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
+from polsep.sensor.levels import WHITE_LEVELS, ForgottenLevel, as_measurements, as_mosaic, interleave_planes
 
-__all__ = ["READERS", "Frame", "InputError", "ReadOptions", "decode_frame", "output_stem", "read_frames", "read_pages"]
+__all__ = [
+    "READERS",
+    "Frame",
+    "InputError",
+    "ReadOptions",
+    "decode_frame",
+    "output_stem",
+    "read_frames",
+    "read_pages",
+    "refuse_forgotten",
+]
 
 
 class Reader(NamedTuple):
@@ -170,6 +180,14 @@ def read_pages(path: Path, options: ReadOptions | None = None, first: int = 0) -
             with path.open("rb") as stream:
                 found = describe(stream.read(64))
             raise ValueError(f"expected {SUPPORTED}, found extension {path.suffix!r} and {found}")
+
+
+def refuse_forgotten(path: str | Path, frame: Frame) -> None:
+    """Raise InputError on a frame of a file whose white level was likely forgotten, before anything is made of it."""
+    note = next((note for note in frame.notes if isinstance(note, ForgottenLevel)), None)
+    if note is not None:
+        default = WHITE_LEVELS["float32" if note.startswith("float") else "uint16"]
+        raise input_error(path, f"expected a white level, found that {note}, or --white-level {default:g} if not")
 
 
 def decode_frame(payload: bytes, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,6 +62,38 @@ def _frame_files(folder: Path) -> list[Path]:
         found = ", ".join(f"{count} {suffix}" for suffix, count in sorted(kinds.items()))
         raise input_error(folder, f"expected frames of one kind, found {found}")
     return sorted(files, key=natural_order)
+
+
+def expand_folders(paths: Sequence[str]) -> list[str]:
+    """The paths with each folder replaced by its frames: a recording, or its files of all kinds in natural order.
+
+    Files like ``shot_0.png``, ``shot_45.png``, ``shot_90.png``, ``shot_135.png`` without others of their name are four
+    angle images, ``shot_{angle}.png``. Raises InputError on a folder without frames.
+    """
+    return [frame for path in paths for frame in (_folder_frames(Path(path)) if Path(path).is_dir() else [path])]
+
+
+def _folder_frames(folder: Path) -> list[str]:
+    if (folder / RECORD).is_file():
+        return [str(folder / RECORD)]
+    files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.suffix.lower() in FRAME_FILES]
+    if not files:
+        raise input_error(folder, f"expected a folder of frames ({', '.join(FRAME_FILES)}), found none")
+    groups: dict[tuple[str, str], set[str]] = {}
+    for path in files:
+        name, number = _numbered(path)
+        groups.setdefault((name, path.suffix), set()).add(number)
+    angles = {"0", "45", "90", "135"}
+    frames = [
+        p if groups[_numbered(p)[0], p.suffix] != angles else p.with_stem(_numbered(p)[0] + "{angle}") for p in files
+    ]
+    return list(dict.fromkeys(str(path) for path in sorted(frames, key=natural_order)))
+
+
+def _numbered(path: Path) -> tuple[str, str]:
+    """The stem of a file without the digits at its end, and those digits."""
+    name = path.stem.rstrip("0123456789")
+    return name, path.stem[len(name) :]
 
 
 def natural_order(path: Path) -> list[tuple[int, int, str]]:

@@ -9,9 +9,11 @@ angle atan2(-d_row, d_col). Shrinking averages light, and polarization as Stokes
 
 from __future__ import annotations
 
+import builtins
+import textwrap
 from collections.abc import Sequence
-from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import cache, reduce
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,11 +24,17 @@ if TYPE_CHECKING:
 
 Values = NDArray[np.floating[Any]]
 Pixels = NDArray[np.uint8]
+Picture: TypeAlias = Image.Image
 
 PANEL = 640  # longest side of a panel in pixels
+COLUMNS = 4  # panels in a row of the contact sheet
 TITLE, GUTTER, MARGIN, LEGEND = 34, 12, 16, 116  # heights and gaps of the contact sheet in pixels
+HEADER, LINE = 38, 22  # heights of its first line, and of one of the warnings below
 NARROWEST = 300  # width that titles and legends need
 BACKGROUND, TEXT, FAINT = (22, 22, 24), (235, 235, 235), (150, 150, 155)
+WARNING, FADED = (240, 180, 60), (70, 70, 76)
+#: Light in units of its noise below which polarization is not shown, and from which on it is in full.
+AT_NOISE, CLEAR = 4.0, 20.0
 
 #: Nine evenly spaced colours of matplotlib's "inferno" (van der Walt and Smith 2015, CC0): ever lighter.
 INFERNO = "000004 210c4a 56106e 89226a bb3754 e35932 f98c0a f9c932 fcffa4"
@@ -113,11 +121,13 @@ def dolp_map(dolp: ArrayLike) -> Pixels:
 
 
 def contact_sheet(frame: SeparatedFrame) -> Pixels:
-    """One picture ``uint8 [h, w, 3]`` of a frame: input, diffuse, specular; DoLP, AoLP and a mask, with legends.
+    """One picture ``uint8 [h, w, 3]`` of a frame: its file, method and warnings; light above, maps with legends below.
 
-    Input is diffuse + specular; the three share one gain, printed on them. Panels keep the aspect ratio, at most
-    `PANEL` pixels on the longer side; frames smaller than half of that show every pixel as 2x2.
-    The mask marks pixels that are not valid, sums above the measurable 2, and DoLP above 1, with their shares.
+    Light: input (diffuse + specular), diffuse and specular with one gain, and specular with a gain of its own. Maps:
+    DoLP and AoLP, faded where the light is at the noise, a mask, and the expected error where the method has one.
+    Panels keep the aspect ratio, at most `PANEL` pixels on the longer side; frames smaller than half of that show
+    every pixel as 2x2. The mask marks pixels that are not valid, sums above the measurable 2, and DoLP above 1, with
+    their shares.
     """
     total = np.maximum(frame.diffuse, 0) + np.maximum(frame.specular, 0)
     flags = _flags(frame, total)
@@ -125,18 +135,29 @@ def contact_sheet(frame: SeparatedFrame) -> Pixels:
     height, width = panels[0].pixels.shape[:2]
     scale = 2 if 2 * max(height, width) <= PANEL else 1
     cell_width, cell_height = max(scale * width, NARROWEST), TITLE + scale * height + GUTTER
-    lefts = [MARGIN + k * (cell_width + GUTTER) for k in range(3)]
-    size = (lefts[-1] + cell_width + MARGIN, 2 * cell_height + LEGEND + 2 * MARGIN)
-    sheet = Image.new("RGB", size, BACKGROUND)
+    lefts = [MARGIN + k * (cell_width + GUTTER) for k in range(COLUMNS)]
+    full_width = lefts[-1] + cell_width + MARGIN
+    warned = _warning_lines(frame, full_width - 2 * MARGIN)
+    begin = HEADER + LINE * len(warned)
+    sheet = Image.new("RGB", (full_width, begin + 2 * cell_height + LEGEND + 2 * MARGIN), BACKGROUND)
+    _draw_header(sheet, frame, warned)
     for k, panel in enumerate(panels):
-        left, top = lefts[k % 3], MARGIN + k // 3 * cell_height
+        left, top = lefts[k % COLUMNS], begin + MARGIN + k // COLUMNS * cell_height
         _draw_title(sheet, (left, top, cell_width), panel.title, panel.note)
         _paste(sheet, panel.pixels.repeat(scale, axis=0).repeat(scale, axis=1), (left, top + TITLE))
-    below = MARGIN + 2 * cell_height
+    below = begin + MARGIN + 2 * cell_height
     _draw_dolp_legend(sheet, (lefts[0], below, cell_width))
     _draw_aolp_legend(sheet, (lefts[1], below))
     _draw_flag_legend(sheet, (lefts[2], below), flags)
     return np.array(sheet, dtype=np.uint8)
+
+
+def show_frame(frame: SeparatedFrame) -> Picture:
+    """Open the contact sheet in the system's picture viewer, and return it; in a notebook only return it."""
+    sheet = Image.fromarray(contact_sheet(frame))
+    if not hasattr(builtins, "__IPYTHON__"):
+        sheet.show()
+    return sheet
 
 
 def live_sheet(frame: SeparatedFrame) -> Pixels:
@@ -149,19 +170,53 @@ def live_sheet(frame: SeparatedFrame) -> Pixels:
 
 
 def _panels(frame: SeparatedFrame, total: Values, flags: list[Flag]) -> list[Panel]:
-    """The six pictures of the contact sheet in reading order, all of one size; ``total`` is the linear input."""
-    gain = exposure_of(total)
-    dolp, aolp = _shrunk_polarization(frame, total.mean(axis=-1))
-    combined, diffuse, specular = (toned(_shrunk(image), gain) for image in (total, frame.diffuse, frame.specular))
+    """The pictures of the contact sheet in reading order, all of one size; ``total`` is the linear input."""
+    gain, own = exposure_of(total), exposure_of(frame.specular)
+    light = total.mean(axis=-1)
+    dolp, aolp = _shrunk_polarization(frame, light)
+    shown = _clearness(frame, light)[..., None]
+    parts = [_shrunk(np.maximum(image, 0)) for image in (frame.diffuse, frame.specular)]
+    combined, diffuse, specular = (toned(image, gain) for image in (parts[0] + parts[1], *parts))
     exposure = f"exposure x {gain:.3g}"
-    return [
+    panels = [
         Panel("Input", exposure, combined),
         Panel("Diffuse", exposure, diffuse),
         Panel("Specular", exposure, specular),
-        Panel("DoLP", "degree of linear polarization", dolp_map(dolp)),
-        Panel("AoLP", "angle of linear polarization", aolp_wheel(aolp, dolp)),
+        Panel(
+            "Specular, brighter" if own >= gain else "Specular, darker",
+            f"exposure x {own:.3g}",
+            toned(parts[1], own),
+        ),
+        Panel("DoLP", "degree of linear polarization", _faded(dolp_map(dolp), shown)),
+        Panel("AoLP", "angle of linear polarization", _faded(aolp_wheel(aolp, dolp), shown)),
         Panel("Mask", "", _flagged(combined, flags)),
     ]
+    if frame.error is not None:
+        error = _shrunk(np.maximum(frame.error[..., 0], frame.error[..., 1]))
+        top = max(float(np.percentile(error, 99)), 1e-9)
+        panels.append(Panel("Expected error", f"yellow: {top:.2g} or more", dolp_map(error / top)))
+    return panels
+
+
+def _clearness(frame: SeparatedFrame, light: Values) -> NDArray[np.float64]:
+    """From 0 where the light ``[H, W]`` is at its noise to 1 where polarization can be seen, shrunk.
+
+    The noise is that of s1 in the darkest quarter, as neighbours on the diagonal differ there.
+    """
+    s1 = light * frame.dolp * np.cos(2 * frame.aolp)
+    dark = light <= np.percentile(light, 25)
+    steps = np.abs(s1[1:, 1:] - s1[:-1, :-1])[dark[1:, 1:]]
+    noise = float(steps.mean()) * np.sqrt(np.pi) / 2 if steps.size else 0.0
+    if noise == 0:
+        return np.ones_like(_shrunk(light))
+    clear: NDArray[np.float64] = np.clip((_shrunk(light) / noise - AT_NOISE) / (CLEAR - AT_NOISE), 0, 1)
+    return clear
+
+
+def _faded(picture: Pixels, share: Values) -> Pixels:
+    """A picture where ``share [h, w, 1]`` is 1, grey where it is 0."""
+    mixed: NDArray[np.float64] = share * picture + (1 - share) * np.array(FADED)
+    return np.rint(mixed).astype(np.uint8)
 
 
 def _to_bytes(display: Values) -> Pixels:
@@ -198,7 +253,11 @@ def _flags(frame: SeparatedFrame, total: Values) -> list[Flag]:
     """The flags of the mask panel; later ones are drawn over earlier ones."""
     return [
         Flag(frame.dolp > 1, ABOVE_ONE, "DoLP above 1"),
-        Flag(np.max(total, axis=-1) > 2, ABOVE_RANGE, "above the measurable range"),
+        Flag(
+            reduce(np.logical_or, (total[..., k] > 2 for k in range(total.shape[-1]))),
+            ABOVE_RANGE,
+            "above the measurable range",
+        ),
         Flag(~frame.valid, NOT_VALID, "not valid"),
     ]
 
@@ -223,6 +282,21 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 def _paste(sheet: Image.Image, pixels: Pixels, corner: tuple[int, int]) -> None:
     """Copy an array onto the sheet with its top left pixel at ``corner`` (x, y)."""
     sheet.paste(Image.fromarray(np.ascontiguousarray(pixels)), corner)
+
+
+def _warning_lines(frame: SeparatedFrame, width: int) -> list[str]:
+    """The warnings of a report, wrapped to a width in pixels."""
+    wrapped = (textwrap.wrap(f"Warning: {text}", width // 8) for text in frame.report.get("warnings", ()))
+    return [line for lines in wrapped for line in lines]
+
+
+def _draw_header(sheet: Image.Image, frame: SeparatedFrame, warned: list[str]) -> None:
+    """File, method and warnings above the panels."""
+    draw = ImageDraw.Draw(sheet)
+    named = "   ".join(str(frame.report[key]) for key in ("source", "method") if frame.report.get(key))
+    draw.text((MARGIN, HEADER - 8), named, fill=TEXT, font=_font(20), anchor="ls")
+    for k, line in enumerate(warned):
+        draw.text((MARGIN, HEADER + k * LINE + LINE / 2), line, fill=WARNING, font=_font(15), anchor="lm")
 
 
 def _draw_title(sheet: Image.Image, box: tuple[int, int, int], title: str, note: str) -> None:
@@ -254,7 +328,7 @@ def _draw_aolp_legend(sheet: Image.Image, corner: tuple[int, int]) -> None:
     for angle, anchor in ((0, "lm"), (45, "lb"), (90, "mb"), (135, "rb")):
         at = (x + reach * np.cos(np.radians(angle)), y - reach * np.sin(np.radians(angle)))
         draw.text(at, f"{angle}°", fill=TEXT, font=_font(14), anchor=anchor)
-    for text, offset in (("centre: DoLP 0", -12), ("rim: DoLP 1", 12)):
+    for text, offset in (("centre: DoLP 0", -24), ("rim: DoLP 1", 0), ("grey: at the noise", 24)):
         draw.text((left + size + 44, y + offset), text, fill=FAINT, font=_font(15), anchor="lm")
 
 

@@ -45,13 +45,14 @@ class NumberedFiles:
         return [number for number, path in enumerate(self.files, self.first) if path is None]
 
 
-def read_separated(path: Path) -> SeparatedFrame:
+def read_separated(path: str | Path) -> SeparatedFrame:
     """The frame in a file of polsep, bit for bit, without its report.
 
     Files of diffuse and specular alone, as of `polsep video` and `polsep edit`, are valid everywhere and of DoLP and
     AoLP 0. Raises InputError, also on values that no separation has (below 0, infinite, not a number) and on too large
     sizes in the header.
     """
+    path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise input_error(

@@ -67,8 +67,9 @@ def write_calibration(path: Path, calibration: Calibration, version: str) -> lis
     return targets[::-1] if arrays else targets[1:]
 
 
-def read_calibration(path: Path) -> Calibration:
+def read_calibration(path: str | Path) -> Calibration:
     """The calibration of a JSON file and of the maps beside it. Raises InputError, in one line that names the file."""
+    path = Path(path)
     with naming(path):
         record = _read_record(path)
         maps = maps_path(path)

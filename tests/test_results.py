@@ -105,6 +105,26 @@ def test_single_scenes_have_a_file_of_their_own(tmp_path: Path) -> None:
     assert provenance("c")["command"] == "c"
 
 
+def test_a_part_never_replaces_the_whole(tmp_path: Path) -> None:
+    """Rows that lack a case or a method go to a file of their own, and one line says which; not so for quick runs."""
+    rows = [Row("a/real", case, m, "PSNR", 1, "dB") for case in ("one", "two") for m in ("x", "y")]
+    write_rows(tmp_path, "a", rows, "c")
+    before = (tmp_path / "a.jsonl").read_bytes()
+    with pytest.raises(
+        ValueError, match=r"\Aexpected all that a\.jsonl has, found nothing of a/real: two, y: [^\n]+\Z"
+    ):
+        write_rows(tmp_path, "a", rows[:-1], "c")
+    with pytest.raises(ValueError, match="found nothing of a/real: one, x and 2 more"):
+        write_rows(tmp_path, "a", [replace(rows[3], metric="SSIM")], "c")
+    assert (tmp_path / "a.jsonl").read_bytes() == before
+    assert [row["metric"] for row in read_rows(tmp_path / "a-partial.jsonl")] == ["SSIM"]
+    write_rows(tmp_path, "a", [*rows, replace(rows[0], method="new")], "c")
+    assert len(read_rows(tmp_path / "a.jsonl")) == 5
+    for some in (rows, rows[:1]):
+        write_rows(tmp_path, "a-quick", some, "c")
+        assert len(read_rows(tmp_path / "a-quick.jsonl")) == len(some)
+
+
 def test_tables_join_diffuse_and_specular() -> None:
     """The PSNR of both outputs shares a cell, and methods are columns."""
     rows = [

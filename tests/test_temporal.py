@@ -337,6 +337,24 @@ def test_the_noise_over_a_black_level_is_the_same(frames: int) -> None:
         assert float(found.variance(np.float32(4095 * signal))) == pytest.approx(expected, rel=0.15)
 
 
+@pytest.mark.parametrize(
+    ("change", "share", "expected"), [(0.0, 0.0, 1.0), (3.0, 0.3, 1.0), (1e3, 1.0, 1.15)], ids=["still", "busy", "pan"]
+)
+def test_the_noise_of_flat_light_is_known_to_percents(change: float, share: float, expected: float) -> None:
+    """Blocks are counted by the median of what is left of them without moving ones; neighbours by 1.15 times theirs.
+
+    ``change``: variance by which a ``share`` of blocks differs more from the frame before, in variances of the noise.
+    """
+    rng, size, variance = np.random.default_rng(8), (512, 512), 400.0
+    now, before = (1500 + variance**0.5 * rng.standard_normal(size) for _ in range(2))
+    moving = (rng.random([n // BLOCK for n in size]) < share).repeat(BLOCK, 0).repeat(BLOCK, 1)
+    before += moving * (2 * change * variance) ** 0.5 * rng.standard_normal(size)
+    count = np.ones([n // BLOCK for n in size], np.float32)
+    found = estimate_noise(now.astype(np.float32), (before.astype(np.float32), count), CODES, 0)
+    assert found is not None
+    assert float(found.variance(np.float32(1500))) == pytest.approx(expected * variance, rel=0.04)
+
+
 def test_the_noise_of_a_stream_is_the_mean_of_its_estimates() -> None:
     """Every frame tells for the first eight, every fourth from then on; the latest sixteen estimates count."""
     light = make_light().clamp(min=0.03)

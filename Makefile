@@ -1,5 +1,5 @@
 # make demo   set up and separate the embedded capture
-# make test   set up and run the whole suite: lint, types, tests
+# make test   set up and run the suite: lint, types, and all tests whose needs are installed
 # make optional  also what optional tests need: the viewer and a browser's driver, Ray, cameras
 # make kernels  compile the kernels anew, after a change of them
 # make docs   build the documentation site into site/

@@ -46,7 +46,7 @@ def ablation_entry(name: str, path: Path) -> Entry:
 
 
 def bench_ablations(data: Path) -> Iterator[Row]:
-    """Scores of the ablated networks on the test sets, noisy mosaics, and on the validation views of their training.
+    """Scores of ablated networks on the selection sets, noisy mosaics, and on the validation views of their training.
 
     Raises ValueError as `evaluation.sets.bench_sets` does.
     """

@@ -1,4 +1,4 @@
-"""The records of the test sets: what each scene is made of and what comes out. Change them only with their version."""
+"""The records of the sets: what each scene is made of and what comes out. Change them only with their version."""
 
 from __future__ import annotations
 

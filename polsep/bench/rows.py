@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 
 from polsep.bench.history import ask_git
 from polsep.io.store.atomic import replace_text
-from polsep.io.store.rows import read_rows
+from polsep.io.store.rows import SPREAD, read_rows
 
 #: Tables of single scenes, objects and points of curves, "NAME/PART", which are too long for the repository.
 SCENE_PARTS = ("scenes", "objects", "curve", "films")
@@ -70,6 +72,19 @@ def write_rows(folder: Path, name: str, rows: Sequence[Row], command: str) -> No
         raise ValueError(
             f"expected all that {name}.jsonl has, found nothing of {missing}: it stays as it is, see {path}"
         )
+
+
+def standard_error(values: Sequence[float]) -> float:
+    """The standard error of a mean over scenes: how far another draw of as many scenes may be off; NaN of one."""
+    return statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+
+
+def with_spread(mean: Row, values: Sequence[float]) -> Iterator[Row]:
+    """The row of a mean over ``values``, then of its standard error, which tables show behind it, and of the median."""
+    yield mean
+    if len(values) > 1:
+        yield replace(mean, metric=f"{mean.metric}{SPREAD}", value=standard_error(values))
+        yield replace(mean, metric=f"{mean.metric}, median", value=statistics.median(values))
 
 
 def find_lost(path: Path, rows: Sequence[Row]) -> list[str]:

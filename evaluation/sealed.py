@@ -6,7 +6,6 @@ Noisy mosaics of the lamp's white light, at half and at full resolution, by the 
 from __future__ import annotations
 
 import json
-import platform
 import statistics
 from collections.abc import Iterator, Sequence
 from datetime import date
@@ -123,7 +122,7 @@ def score_release(data: Path | None, quick: bool, output: Path) -> Path:
     for name, scores in score_recipes(recipes, data):  # noqa: B007
         print(f"{name}: {len(METHODS)} methods", flush=True)
     print_scores(summary := summarize(scores))
-    line = {"date": date.today().isoformat(), "version": polsep.__version__, **made_by, "processor": platform.machine()}
+    line: dict[str, Any] = {"date": date.today().isoformat(), "version": polsep.__version__, **made_by}
     line |= {"set": "practice" if quick else version_of(recipes)[:12], "scenes": len(recipes), "dB": summary}
     log = output / ("sealed-quick.log" if quick else "sealed.log")
     append_line(log, json.dumps(line))

@@ -1,5 +1,6 @@
 # make demo   set up and separate the embedded capture
-# make test   set up and run the whole suite: lint, types, tests
+# make test   set up and run the suite: lint, types, and all tests whose needs are installed
+# make optional  also what optional tests need: the viewer and a browser's driver, Ray, cameras
 # make kernels  compile the kernels anew, after a change of them
 # make docs   build the documentation site into site/
 # make fuzz   damage files of every kind and read them: make fuzz INPUTS=20000 SECONDS=1200
@@ -10,7 +11,7 @@ SECONDS ?= 1200
 BIN := $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test kernels docs bench fuzz clean
+.PHONY: demo test optional kernels docs bench fuzz clean
 
 demo: $(VENV)/.installed
 	$(BIN)/polsep demo -o demo-out
@@ -20,6 +21,9 @@ test: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/pytest -n auto --dist loadfile
+
+optional: $(VENV)/.installed-dev
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[view,ray,camera]" playwright
 
 kernels: $(VENV)/.installed-dev
 	PYTHONHASHSEED=0 nice $(BIN)/python -m tools.build_kernels

@@ -1,4 +1,4 @@
-"""The laboratory: the paper's tables, the test sets, galleries and peers, from a checkout of the repository."""
+"""The laboratory: the paper's tables, the selection sets, galleries and peers, from a checkout of the repository."""
 
 from __future__ import annotations
 

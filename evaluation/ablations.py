@@ -17,6 +17,7 @@ from evaluation.scoring import Entry, Protocol, capture_noisy, score_sets
 from evaluation.sets import load_sets
 from polsep.bench.rows import Row
 from polsep.in_torch import load_joint
+from polsep.io.store.rows import SPREAD
 from polsep.io.store.weights import read_weights
 from polsep.methods import Capture
 from polsep.networks.run import run_joint
@@ -46,7 +47,7 @@ def ablation_entry(name: str, path: Path) -> Entry:
 
 
 def bench_ablations(data: Path) -> Iterator[Row]:
-    """Scores of the ablated networks on the test sets, noisy mosaics, and on the validation views of their training.
+    """Scores of ablated networks on the selection sets, noisy mosaics, and on the validation views of their training.
 
     Raises ValueError as `evaluation.sets.bench_sets` does.
     """
@@ -56,5 +57,5 @@ def bench_ablations(data: Path) -> Iterator[Row]:
             yield Row("ablations", "validation views", name, metric, value, "dB")
     entries = tuple(ablation_entry(name, path) for name, path in found.items())
     for row in score_sets("ablations", sets, data, [Protocol("noisy", capture_noisy, entries)]):
-        if row.bench == "ablations/noisy" and row.metric in TABLED:
+        if row.bench == "ablations/noisy" and row.metric.removesuffix(SPREAD) in TABLED:
             yield Row("ablations", row.case.partition(",")[0], row.method, row.metric, row.value, row.unit)

@@ -22,7 +22,7 @@ from evaluation.warned import bench_warned, bench_warned_quick
 from polsep.bench import FORMULAS, SEPARATION
 from polsep.bench.run import Bench
 
-#: Data of the test sets, below the data folder.
+#: Data of the selection sets, below the data folder.
 SET_DATA = ("crossed_polarizers", "diligent_normals", "meshes")
 #: What separates rendered scenes and scores what it separated.
 SCENES = (*SEPARATION, "polsep/render", "polsep/metrics.py")

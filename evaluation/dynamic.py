@@ -83,7 +83,7 @@ class Tally:
 
 
 def bench_dynamic() -> Iterator[Row]:
-    """Flicker and PSNR on the dynamic test set with and without the temporal filter, and what a frame of it takes.
+    """Flicker and PSNR on the dynamic selection set with and without the temporal filter, and what a frame of it takes.
 
     Raises ValueError without the extra render, and on a frame that does not come out as recorded.
     """

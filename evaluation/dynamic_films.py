@@ -1,6 +1,6 @@
 """Make the films of docs/video.md (the paper's Fig. 7): python -m evaluation.dynamic_films docs/images
 
-Renders the three test films (extras render, video), separates them as recordings and keeps the films to watch: what the
+Renders the three selection films (extras render, video), separates them as recordings and keeps films: what the
 camera sees, diffuse, specular. dynamic.jpg shows three frames of each.
 """
 

@@ -1,4 +1,4 @@
-"""The joint networks on the fixed test sets: full resolution, mono frames, expected errors, engines.
+"""The joint networks on the fixed selection sets: full resolution, mono frames, expected errors, engines.
 
 Full resolution is scored against the truth of every pixel of the noisy mosaic. Methods that give half-resolution images
 only have theirs enlarged, linearly between the cells' centres.
@@ -39,7 +39,7 @@ BINS = 10
 
 
 def bench_joint(data: Path) -> Iterator[Row]:
-    """On the test sets: scores at full resolution and of mono frames, reliability, engines against torch.
+    """On the selection sets: scores at full resolution and of mono frames, reliability, engines against torch.
 
     Raises ValueError as `evaluation.sets.bench_sets` does.
     """

@@ -15,6 +15,8 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, pad
 from torch.utils.flop_counter import FlopCounterMode
 
 from evaluation import WEIGHTS
@@ -27,6 +29,7 @@ from polsep.methods import METHODS, compose
 from polsep.networks.paper import Refinement
 from polsep.networks.rungs import RUNGS, separate_refined
 from polsep.networks.unet import count_parameters
+from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import separate_analytic
 from polsep.separation.color_affine import separate_color_affine
@@ -68,11 +71,43 @@ def find_weights(rung: str, variant: str) -> Path | None:
     return path if path.is_file() else None
 
 
+def demosaic_regrouped(mosaic: Mosaic) -> Measurements:
+    """Four images ``[4, C, H/2, W/2]``, one per analyser, as if all had stood at one place (the paper's Sec. 4.1).
+
+    The samples behind one analyser are a Bayer mosaic of half the size, demosaicked bilinearly alone. So the images of
+    analysers lie a pixel of the sensor beside each other. Of colour mosaics without an origin.
+    """
+    samples, clipped = torch.as_tensor(mosaic.linear()), torch.as_tensor(mosaic.clipped())
+    order = sorted((angle, (i, j)) for i, row in enumerate(mosaic.layout.polarizer) for j, angle in enumerate(row))
+    parts = [(samples[i::2, j::2], clipped[i::2, j::2].float()) for _, (i, j) in order]
+    colors = [_bayer_mask(mosaic.layout.bayer or "", color, parts[0][0].shape) for color in "RGB"]
+    found = [torch.stack([_fill(part, mask) for mask in colors]) for part, _ in parts]
+    touched = [torch.stack([_fill(part, mask) > 0 for mask in colors]) for _, part in parts]
+    return Measurements(torch.stack(found), mosaic.layout.angles, torch.stack(touched))
+
+
+def _bayer_mask(bayer: str, color: str, shape: tuple[int, ...]) -> Tensor:
+    """1 where a Bayer mosaic has a colour, else 0."""
+    tile = torch.tensor([float(name == color) for name in bayer]).reshape(2, 2)
+    return tile.repeat(-(-shape[0] // 2), -(-shape[1] // 2))[: shape[0], : shape[1]]
+
+
+def _fill(samples: Tensor, mask: Tensor) -> Tensor:
+    """Samples where the mask is 1, and bilinear interpolation of them where it is 0, mirrored at the border."""
+    tent = torch.tensor([1.0, 2.0, 1.0])
+    total, weight = (
+        conv2d(pad(image[None, None], (1, 1, 1, 1), "reflect"), torch.outer(tent, tent)[None, None])[0, 0]
+        for image in (samples * mask, mask)
+    )
+    return torch.where(mask > 0, samples, total / weight)
+
+
 @lru_cache(maxsize=3)
 def ladder_entries(variant: str, rungs: tuple[str, ...] = tuple(RUNGS)) -> tuple[Entry, ...]:
     """Everything that separates one frame of a ``variant``: formulas, color-affine, ``rungs``, the method `paper`.
 
-    All see the same bilinear data; `color-affine` itself, with the demosaicker of its own, is there for mosaics only.
+    All see the same bilinear data; of mosaics there are also `color-affine` itself, with its own demosaicker, and the
+    analytic split of regrouped samples, the paper's preprocessing.
     """
     entries = [
         Entry("analytic", compose(demosaic_bilinear_half, separate_analytic)),
@@ -83,6 +118,7 @@ def ladder_entries(variant: str, rungs: tuple[str, ...] = tuple(RUNGS)) -> tuple
         entries.append(network_entry(Weights("paper", SHIPPED, shipped_weights(PAPER))))
     own = METHODS["color-affine"]
     if variant == MOSAIC:
+        entries.insert(1, Entry("analytic, regrouped", compose(demosaic_regrouped, separate_analytic)))
         entries.append(Entry("color-affine, bilinear", compose(demosaic_bilinear_half, separate_color_affine)))
     return (*entries, Entry(own.name, own.reference))
 

@@ -20,10 +20,11 @@ from evaluation.scoring import Protocol, capture_co_sited, capture_noisy, score_
 from evaluation.sets import load_sets
 from polsep.bench.rows import Row
 from polsep.bench.truth import read_demo_capture
+from polsep.io.store.rows import SPREAD
 
 #: Rungs that leave something out of the paper's method (Table 2); all others are baselines (Table 3).
 ABLATIONS = ("shared", "signed", "no-angle", "stokes")
-#: Metrics of Tables 2 and 3.
+#: Metrics of Tables 2 and 3, with their standard errors.
 TABLED = ("diffuse PSNR", "specular PSNR")
 
 
@@ -41,7 +42,7 @@ QUICK = Extent({"objects": 2, "statues": 1, "photographs": 1}, Sweep(2, (0, 20))
 
 
 def bench_paper(data: Path) -> Iterator[Row]:
-    """The paper's Tables 2 and 3 and Fig. 5, on all test sets, with all rungs that have weights.
+    """The paper's Tables 2 and 3 and Fig. 5, on all selection sets, with all rungs that have weights.
 
     Raises ValueError without the extra bench, and without the sets' files in ``data``.
     """
@@ -73,7 +74,7 @@ def table_rows(row: Row) -> Iterator[Row]:
         yield row
         return
     suffix = "_co_sited" if row.bench == f"paper/{CO_SITED}" else ""
-    if row.metric in TABLED:
+    if row.metric.removesuffix(SPREAD) in TABLED:
         ablation = rung_of(row.method) in ABLATIONS
         if ablation or rung_of(row.method) == "paper" or row.method == "analytic":
             yield replace(row, bench=f"paper/ablations{suffix}")

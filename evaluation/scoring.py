@@ -1,4 +1,4 @@
-"""One way to score on the test sets, for everything that is compared: entries under protocols, scene by scene.
+"""One way to score on the selection sets, for everything that is compared: entries under protocols, scene by scene.
 
 A protocol says how a scene is captured: noisy and clean mosaics are separated into half-resolution images, and co-sited
 samples, as the paper has them, into images of their own resolution. Scores are those of `polsep.metrics`.
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from polsep.bench.rows import Row
+from polsep.bench.rows import Row, with_spread
 from polsep.methods import METHODS, Capture
 from polsep.metrics import chroma, flip, highlights, psnr, psnr_unlimited, ssim, worst_mean
 from polsep.networks.paper import Refinement
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 #: Fewest pixels of a highlight that are worth a score.
 MIN_HIGHLIGHT = 20
+
+#: Ends of metrics whose means are given with their standard errors and medians over scenes.
+UNCERTAIN = (" PSNR", " PSNR, unlimited")
 
 #: True diffuse and specular ``[C, h, w]`` and mask ``[h, w]``.
 Truth = tuple[Tensor, Tensor, Tensor]
@@ -86,7 +89,8 @@ def capture_co_sited(case: Case) -> tuple[Capture, Truth]:
 def score_sets(
     bench: str, sets: dict[str, tuple[Recipe, ...]], data: Path, protocols: Sequence[Protocol]
 ) -> Iterator[Row]:
-    """Rows of ``bench``/scenes: the PSNR of every scene; and of ``bench``/PROTOCOL: every metric's mean over a set.
+    """Rows of ``bench``/scenes: the PSNR of every scene; and of ``bench``/PROTOCOL: every metric's mean over a set,
+    of `UNCERTAIN` ones with standard error and median.
 
     Sets whose files are not in ``data`` are left out, which one line on stderr says. Raises ValueError on files other
     than recorded, and on a scene that does not come out as recorded.
@@ -108,7 +112,11 @@ def score_sets(
                     yield Row(f"{bench}/scenes", title, score.method, score.metric, score.value, score.unit)
         for (protocol, method, metric, unit, _), values in scores.items():
             table, title = f"{bench}/{protocol}", f"{name}, {protocol}"
-            yield Row(table, title, method, metric, statistics.fmean(values), unit)
+            mean = Row(table, title, method, metric, statistics.fmean(values), unit)
+            if not metric.endswith(UNCERTAIN):
+                yield mean
+                continue
+            yield from with_spread(mean, values)
             if metric.endswith(" PSNR"):
                 yield Row(table, title, method, f"{metric}, worst tenth", worst_mean(values), unit)
 

@@ -1,4 +1,4 @@
-"""Every method on the fixed test sets: noisy and clean mosaics to half resolution, and noise-free co-sited samples.
+"""Every method on the selection sets: noisy and clean mosaics to half resolution, and noise-free co-sited samples.
 
 Per set the mean over its scenes of every metric of `polsep.metrics`; rows of "sets/scenes" hold the single scenes.
 """

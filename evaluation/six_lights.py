@@ -3,7 +3,7 @@
 The six lights stand where `geometry.lights.NAMED` says, but for the errors that a hand makes: each is a point at
 `LIGHT_DISTANCE` radii of the object, turned by up to `LARGEST_TURN_DEG`, brighter or darker by up to `LARGEST_GAIN`,
 behind a polarizer at any angle. Methods are told the named directions alone. Shapes, poses, skins and roughness are
-those of the test set `statues`; shadows are cast. One exposure serves all six frames.
+those of the selection set `statues`; shadows are cast. One exposure serves all six frames.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Shoot:
 
 
 def load_subjects(data: Path, names: Sequence[str] | None = None) -> list[Subject]:
-    """The objects of the test set `statues`, or those of ``names`` (bear, spot, ...). Raises ValueError."""
+    """The objects of the selection set `statues`, or those of ``names`` (bear, spot, ...). Raises ValueError."""
     found = []
     for number, name in enumerate((*DILIGENT, *SCANS)):
         stem = name.split(".")[0].split("-")[0].split("_")[0]
@@ -112,7 +112,7 @@ def _statue(folder: Path) -> tuple[Mesh, PinholeCamera]:
 
 
 def _scan(data: Path, name: str) -> tuple[Mesh, PinholeCamera]:
-    """A scanned mesh in the pose of the test set."""
+    """A scanned mesh in the pose of the selection set."""
     mesh, pose = read_mesh(data / "meshes" / name), SCANS[name]
     if pose.up == "z":
         turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

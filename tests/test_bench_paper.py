@@ -41,6 +41,7 @@ from evaluation.ladder import (
     MOSAIC,
     SHIPPED,
     count_gflop,
+    demosaic_regrouped,
     ladder_entries,
     measure_costs,
     read_curves,
@@ -102,7 +103,7 @@ def make_two_tones(_paths: list[Path], _generator: torch.Generator) -> Scene:
 
 @pytest.fixture
 def tiny_sets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One scene of two tones in place of the test sets, and small views for the sweep."""
+    """One scene of two tones in place of the selection sets, and small views for the sweep."""
     recipe = Recipe("two-tones", 1, (), make_two_tones)
     monkeypatch.setattr(testsets, "SETS", {"objects": (recipe, recipe)})
     monkeypatch.setattr(testsets, "check_case", lambda _: None)
@@ -115,13 +116,43 @@ def tiny_sets(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_rungs_without_weights_are_left_out(weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With one line each; those that have none of co-sited data are named so."""
-    expected = ["analytic", "min and max", "paper", "stokes", "color-affine, bilinear", "color-affine"]
+    expected = [
+        "analytic",
+        "analytic, regrouped",
+        "min and max",
+        "paper",
+        "stokes",
+        "color-affine, bilinear",
+        "color-affine",
+    ]
     assert [entry.name for entry in ladder_entries(MOSAIC)] == expected
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == len(RUNGS) - 2
     assert "polsep: the rung unpolarized is left out: no weights ladder/unpolarized-mosaic" in lines
     expected = ["analytic", "min and max", "paper", "stokes, trained on mosaics", "color-affine"]
     assert [entry.name for entry in ladder_entries(CO_SITED)] == expected
+
+
+def test_regrouped_analysers_are_bayer_mosaics_of_their_own() -> None:
+    """A sample of its own colour stays, others are the mean of the 2 or 4 nearest; light that is even stays even."""
+    layout = Layout()
+    samples = torch.arange(64.0).reshape(8, 8) / 100
+    samples[4, 4] = 1  # 90 in a red cell
+    found = demosaic_regrouped(Mosaic(samples, layout, 0.0, 1.0))
+    ninety = 2  # of 0, 45, 90, 135
+    own = samples[0::2, 0::2]
+    assert found.data.shape == (4, 3, 4, 4) and found.angles == layout.angles
+    torch.testing.assert_close(found.data[ninety, 0, 2, 2], own[2, 2])
+    torch.testing.assert_close(found.data[ninety, 0, 2, 1], (own[2, 0] + own[2, 2]) / 2)
+    torch.testing.assert_close(found.data[ninety, 0, 1, 1], (own[0, 0] + own[0, 2] + own[2, 0] + own[2, 2]) / 4)
+    torch.testing.assert_close(found.data[ninety, 1, 2, 2], (own[1, 2] + own[3, 2] + own[2, 1] + own[2, 3]) / 4)
+    torch.testing.assert_close(found.data[ninety, 2, 1, 1], own[1, 1])
+    assert found.clipped is not None
+    assert (
+        found.clipped[ninety, 0, 1:4, 1:4].all() and not found.clipped[ninety, 1:].any() and not found.clipped[0].any()
+    )
+    even = demosaic_regrouped(Mosaic(torch.full((10, 14), 0.3), layout, 0.0, 1.0))
+    torch.testing.assert_close(even.data, torch.full((4, 3, 5, 7), 0.3))
 
 
 def test_the_method_paper_is_in_where_it_is_shipped(weights: Path) -> None:

@@ -1,4 +1,4 @@
-"""Benchmarks on test sets: one scoring path, sets that are not there, refusals before anything is measured."""
+"""Benchmarks on selection sets: one scoring path, sets that are not there, refusals before anything is measured."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ PROTOCOLS = [
 
 
 def test_scenes_that_nobody_recorded_get_no_score(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A test set that changed unknowingly stops the benchmark."""
+    """A selection set that changed unknowingly stops the benchmark."""
     monkeypatch.setattr(testsets, "SETS", {"grey": (GREY,)})
     with pytest.raises(ValueError, match="expected a recorded test scene, found grey"):
         next(bench_sets(tmp_path))

@@ -118,8 +118,12 @@ every_edit = pytest.mark.parametrize("name", EDITS)
 
 
 def test_metallic_is_the_papers() -> None:
-    """45 tau_s + tau_d with the diffuse hue and saturation on tau_s, by the standard library's HSV."""
+    """45 tau_s + tau_d with the diffuse hue and saturation on tau_s, by the standard library's HSV.
+
+    Highlights of a coloured lamp too: what is kept is their value V, not their mean.
+    """
     images = random_images()
+    images = SeparatedImages(images.diffuse, images.specular * np.array([1, 0.7, 0.4], np.float32))
     expected = np.empty((HEIGHT, WIDTH, 3))
     for y in range(HEIGHT):
         for x in range(WIDTH):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -10,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from polsep.demosaic.bilinear import demosaic_bilinear_half
-from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half, fill_colors
+from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half, fill_colors, guide_once
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes, flip_horizontal, flip_vertical, transpose
 from polsep.render.distances import random_light, random_parts
 from polsep.render.sphere_tracing import PinholeCamera, render
@@ -32,6 +33,8 @@ DEMOSAICKERS = [
     pytest.param(demosaic_guided, lambda x: x, id="full"),
 ]
 Demosaicker = Callable[[Mosaic], Measurements]
+#: Away from the border of a frame of 108 cells.
+INSIDE = (..., slice(40, -40), slice(40, -40))
 Reduced = Callable[[Tensor], Tensor]
 
 
@@ -92,6 +95,34 @@ def test_mirrored_scenes_give_mirrored_images(flip, turned, layout: Layout, demo
     mirrored = fit_stokes(demosaic(expose(flip(scene), turned(layout), IDEAL)))
     for name in ("s0", "s1", "s2"):
         torch.testing.assert_close(getattr(mirrored, name), getattr(straight, name), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("along", [-1, -2])
+@pytest.mark.parametrize("ninths", [2, 3, 4, 5, 6])
+def test_false_polarization_of_texture_is_that_of_a_guide_of_gain_1_8(ninths: int, along: int) -> None:
+    """A grating of unpolarized light, w = k pi / 9 per pixel: the tent (1, 2, 1) / 4 passes T = (1 + cos w) / 2 of it.
+
+    The guide is T + 1.8 T (1 - T), so the samples minus the guide keep (1 - T)(1 - 1.8 T) of the texture, and with it
+    the same share of the false polarization that bilinear interpolation shows. Windows of nine cells hold whole waves.
+    """
+    frequency = math.pi * ninths / 9
+    wave = 0.5 + 0.3 * torch.cos(frequency * torch.arange(216.0) + 0.4)
+    samples = (wave if along == -1 else wave[:, None]).expand(216, 216) / 2
+    mosaic = Mosaic(samples.contiguous(), Layout(bayer=None), 0, 1)
+    found = guide_once(mosaic)[0]
+    plain = fit_stokes(demosaic_bilinear_half(mosaic)).map(gently_blurred)
+    passed = (1 + math.cos(frequency)) / 2
+    share = (1 - passed) * (1 - 1.8 * passed)
+    for guided, bilinear in ((found.s1, plain.s1), (found.s2, plain.s2)):
+        assert float(bilinear[INSIDE].abs().max()) > 5e-3
+        torch.testing.assert_close(guided[INSIDE], share * bilinear[INSIDE], rtol=0, atol=1e-5)
+
+
+def gently_blurred(image: Tensor) -> Tensor:
+    """Behind (1, 6, 1) / 8 along rows and columns of cells, the last filter of the guided demosaicker."""
+    for dim in (-1, -2):
+        image = 0.75 * image + 0.125 * (image.roll(1, dim) + image.roll(-1, dim))
+    return image
 
 
 def test_samples_of_a_colour_stay() -> None:

@@ -252,6 +252,26 @@ def test_gain_errors_do_not_count(color_frame: Tensor) -> None:
     assert read_as(frame, COLOR).warning is None
 
 
+def one_polarization(s1: float, s2: float) -> Tensor:
+    """A mono frame of texture whose light is polarized alike everywhere, relative to s0."""
+    s0 = smooth_light(1).s0
+    return expose(Stokes(s0, s1 * s0, s2 * s0), MONO, IDEAL).data
+
+
+def test_a_gain_error_beside_weak_polarization_is_no_wrong_layout() -> None:
+    """90 reads 2 % too much, 0.01 of s0: rows, -s1 + s2 + 0.01, then fit exactly, and the true diagonals do not."""
+    frame = one_polarization(0.1, 0.09)
+    frame[0::2, 0::2] *= 1.02
+    assert read_as(frame, MONO).warning is None
+
+
+def test_a_contradiction_that_is_the_same_everywhere_is_still_one() -> None:
+    """Of light with one polarization a wrong order is told too: no gain error is as large as 0.3 of the brightness."""
+    frame = one_polarization(0.3, 0.0)
+    for order, silent in (((90, 45, 135, 0), True), ((0, 90, 45, 135), False), ((0, 45, 90, 135), False)):
+        assert (read_as(frame, order_layout(order, None)).warning is None) == silent
+
+
 def test_first_frame_of_a_batch_and_exposure(color_frame: Tensor) -> None:
     """Of a batch the first frame is judged; exposure changes nothing."""
     batch = torch.stack([color_frame, color_frame.flip(-1)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import subprocess
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ import pytest
 
 from polsep.bench import history
 from polsep.bench.history import TIMED, ask_git, find_changes
-from polsep.bench.rows import Row, provenance, to_jsonl, write_rows
+from polsep.bench.rows import Row, provenance, to_jsonl, with_spread, write_rows
 from polsep.io.store.rows import fill_tables, markdown_table, read_rows
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -105,6 +106,26 @@ def test_single_scenes_have_a_file_of_their_own(tmp_path: Path) -> None:
     assert provenance("c")["command"] == "c"
 
 
+def test_a_part_never_replaces_the_whole(tmp_path: Path) -> None:
+    """Rows that lack a case or a method go to a file of their own, and one line says which; not so for quick runs."""
+    rows = [Row("a/real", case, m, "PSNR", 1, "dB") for case in ("one", "two") for m in ("x", "y")]
+    write_rows(tmp_path, "a", rows, "c")
+    before = (tmp_path / "a.jsonl").read_bytes()
+    with pytest.raises(
+        ValueError, match=r"\Aexpected all that a\.jsonl has, found nothing of a/real: two, y: [^\n]+\Z"
+    ):
+        write_rows(tmp_path, "a", rows[:-1], "c")
+    with pytest.raises(ValueError, match="found nothing of a/real: one, x and 2 more"):
+        write_rows(tmp_path, "a", [replace(rows[3], metric="SSIM")], "c")
+    assert (tmp_path / "a.jsonl").read_bytes() == before
+    assert [row["metric"] for row in read_rows(tmp_path / "a-partial.jsonl")] == ["SSIM"]
+    write_rows(tmp_path, "a", [*rows, replace(rows[0], method="new")], "c")
+    assert len(read_rows(tmp_path / "a.jsonl")) == 5
+    for some in (rows, rows[:1]):
+        write_rows(tmp_path, "a-quick", some, "c")
+        assert len(read_rows(tmp_path / "a-quick.jsonl")) == len(some)
+
+
 def test_tables_join_diffuse_and_specular() -> None:
     """The PSNR of both outputs shares a cell, and methods are columns."""
     rows = [
@@ -112,6 +133,25 @@ def test_tables_join_diffuse_and_specular() -> None:
         for m, o, v in (("p", "diffuse", 30.0), ("p", "specular", 31.25), ("q", "diffuse", 1.0), ("q", "specular", 0.5))
     ]
     assert "| x | diffuse / specular PSNR [dB] | 30 / 31.2 | 1 / 0.5 |" in markdown_table(rows)
+
+
+def test_means_are_shown_with_their_standard_errors(tmp_path: Path) -> None:
+    """Of 1, 2 and 6: mean 3, standard error sqrt(7 / 3), median 2. The error stands behind the mean."""
+    rows = [
+        row
+        for output, shift in (("diffuse", 0.0), ("specular", 10.0))
+        for row in with_spread(
+            Row("a/b", "c", "m", f"{output} PSNR", 3.0 + shift, "dB"), [1 + shift, 2 + shift, 6 + shift]
+        )
+    ]
+    assert [row.value for row in rows[:3]] == pytest.approx([3, math.sqrt(7 / 3), 2])
+    assert list(with_spread(rows[0], [3.0])) == rows[:1]
+    (tmp_path / "a.jsonl").write_text(to_jsonl(rows, MADE_BY), encoding="utf-8")
+    whole, one = (fill_tables(f"<!-- table: a/b{only} -->\n<!-- end -->", tmp_path) for only in ("", " only PSNR"))
+    shown = "| c | diffuse / specular PSNR [dB] | 3 ± 1.53 / 13 ± 1.53 |\n"
+    assert shown in whole and shown in one
+    assert "| c | diffuse / specular PSNR, median [dB] | 2 / 12 |\n" in whole and "median" not in one
+    assert "standard error" not in whole + one
 
 
 def test_tables_of_one_metric_leave_the_others_out(tmp_path: Path) -> None:

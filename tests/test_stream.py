@@ -19,7 +19,8 @@ from polsep.physics.stokes import Stokes
 from polsep.render.sensor_errors import SensorErrors
 from polsep.render.simulate import filter_light
 from polsep.sensor.camera import CLIP_MARGIN, IMX250, Layout
-from polsep.train import reality, stream
+from polsep.train import reality, stream, variety
+from polsep.train.constants import constants_set, list_constants, read_constant
 from polsep.train.stream import (
     BRIGHT_SHARE,
     BRIGHTEST,
@@ -243,3 +244,46 @@ def test_usual_looks_go_without(kind: str, monkeypatch: pytest.MonkeyPatch) -> N
 def test_unknown_looks_are_refused() -> None:
     with pytest.raises(ValueError, match="varied or usual or real, found 'odd'"):
         replace(SMALL, looks="odd")
+
+
+# Constants
+
+
+def test_constants_of_a_stream_change_its_examples_alone() -> None:
+    """Batches are other ones; the modules keep their numbers, and other streams in the same process theirs."""
+    usual, set_ = SMALL, replace(SMALL, constants=(("stream.LEVEL_SHARE", (1.0,)), ("stream.LEVELS", (0.01, 0.02))))
+    before = list_constants()
+    dark, plain = (stream_lane(options, 0, 0) for options in (set_, usual))
+    first, other = next(dark), next(plain)
+    assert list_constants() == before
+    assert float(first.raw.max()) > 0 and float(first.raw.mean()) < 0.5 * float(other.raw.mean())
+    alone = next(stream_lane(usual, 0, 0))
+    assert all(torch.equal(a, b) for a, b in zip(other, alone, strict=True))
+    known = list_constants(set_.constants)
+    assert (
+        known["stream.LEVELS"] == [0.01, 0.02] and known["variety.MATTE_STRENGTH"] == before["variety.MATTE_STRENGTH"]
+    )
+    assert before["variety.BITS"] == [8, 10, 12] and "reality.IDEAL_SHARE" in before
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("variety.NOTHING=1", "expected a constant such as variety.MATTE_SHARE .*, found 'variety.NOTHING'"),
+        ("variety.MATTE_STRENGTH=0.02", "expected variety.MATTE_STRENGTH of 2 numbers, found 1"),
+        ("variety.MATTE_SHARE", "expected NAME=NUMBER,..., found 'variety.MATTE_SHARE'"),
+        ("variety.MATTE_SHARE=much", "expected NAME=NUMBER,..., found 'variety.MATTE_SHARE=much'"),
+    ],
+)
+def test_constants_are_read_by_name(text: str, said: str) -> None:
+    assert read_constant("variety.MATTE_STRENGTH=0.02,1") == ("variety.MATTE_STRENGTH", (0.02, 1.0))
+    with pytest.raises(ValueError, match=said):
+        read_constant(text)
+
+
+def test_numbers_stay_of_their_kind() -> None:
+    """Bits and octaves are whole."""
+    with constants_set((("variety.BITS", (10.0, 10.0, 12.0)), ("variety.MAX_OCTAVES", (2.0,)))):
+        assert variety.BITS == (10, 10, 12) and all(isinstance(bits, int) for bits in variety.BITS)
+        assert variety.MAX_OCTAVES == 2 and isinstance(variety.MAX_OCTAVES, int)
+    assert variety.BITS == (8, 10, 12) and variety.MAX_OCTAVES == 3

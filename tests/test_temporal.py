@@ -13,7 +13,7 @@ from tolerances import ROUNDING, SIGMAS, assert_within
 
 from polsep.kernels import get_threads, set_threads
 from polsep.sensor.camera import IMX250, Layout, Mosaic, Sensor, add_noise
-from polsep.sensor.noise import BLOCK, Levels, blocks_of, estimate_noise, least_noise
+from polsep.sensor.noise import BLOCK, Levels, Noise, blocks_of, estimate_noise, least_noise
 from polsep.video.temporal import (
     FRAMES,
     REACH,
@@ -21,8 +21,11 @@ from polsep.video.temporal import (
     TemporalState,
     filter_frame,
     filter_frame_reference,
+    filter_samples,
+    make_rules,
     steady_images,
 )
+from polsep.video.temporal_kernel import filter_samples as filter_samples_by_kernel
 
 SIZE = (96, 128)
 LAYOUTS = {"color": Layout(), "mono": Layout(bayer=None), "cropped": Layout(origin=(1, 1))}
@@ -226,6 +229,53 @@ def test_the_kernel_is_the_reference(size: tuple[int, int]) -> None:
         assert found.data.shape == frame.data.shape and found.data.is_contiguous()
 
 
+#: Noise, black and white of frames whose every number is known, and of how many frames their means are.
+GAIN, FLOOR, BLACK, BEFORE = 0.5, 9.0, 240.0, 4
+KNOWN = Levels(BLACK, 4095.0, 1.0, 4091.0)
+FILTERS = {"kernel": filter_samples_by_kernel, "reference": filter_samples}
+
+
+def filtered_by(name: str, score: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Samples that differ from means of four frames by ``score`` standard deviations; filtered; the means; counts."""
+    mean = (BLACK + 50 + 40 * np.random.default_rng(4).random(score.shape)).astype(np.float32)
+    sigma = np.sqrt((GAIN * (mean.astype(np.float64) - BLACK) + FLOOR) * (1 + 1 / BEFORE))
+    samples = (mean + score * sigma).astype(np.float32)
+    count = np.full([n // BLOCK for n in score.shape], BEFORE, np.float32)
+    found, new, number = FILTERS[name](samples, (mean, count), make_rules(Noise(GAIN, FLOOR), KNOWN))
+    assert np.array_equal(found, new)
+    return samples, found, mean, number
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_drift_is_weighed_as_kalman_says(name: str) -> None:
+    """All samples 0.3 deviations high: 25 blocks' sum squared is 25 times 0.09, beyond 1.75 by 0.5, a lag of 0.02.
+
+    With the 5/4 of means of four frames, 0.025: 1 + 1 / (1/4 + 0.025) frames. At 0.2 deviations there is no lag; at
+    0.35, 0.066 exceeds 0.05 and the current frame alone counts.
+    """
+    inside = (slice(2, -2), slice(2, -2))
+    for size, expected in ((0.2, 5.0), (0.3, 1 + 1 / (0.25 + 0.025)), (0.35, 1.0)):
+        samples, found, mean, number = filtered_by(name, np.full((32, 40), size))
+        np.testing.assert_allclose(number[inside], expected, rtol=1e-3)
+        mixed = mean + (samples - mean) / expected
+        np.testing.assert_allclose(found[8:-8, 8:-8], mixed[8:-8, 8:-8], rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_rough_and_sudden_changes_have_their_limits(name: str) -> None:
+    """Signs that cancel over blocks: beyond a mean square of 1.5 the excess is lag. One block alone restarts at 3."""
+    signs = np.indices((8, 10)).sum(0).repeat(BLOCK, 0).repeat(BLOCK, 1) % 2 * 2 - 1
+    for square, expected in ((1.45, 5.0), (1.52, 1 + 1 / (0.25 + 0.025)), (1.56, 1.0)):
+        _, _, _, number = filtered_by(name, math.sqrt(square) * signs)
+        np.testing.assert_allclose(number[2:-2, 2:-2], expected, rtol=1e-3)
+    alone = np.zeros((32, 40))
+    alone[16:20, 20:24] = 1
+    for square, expected in ((2.95, 5.0), (3.05, 1.0)):
+        _, _, _, number = filtered_by(name, math.sqrt(square) * alone)
+        np.testing.assert_allclose(number[3:6, 4:7], expected, rtol=1e-3)
+        assert (np.delete(number, (3, 4, 5), axis=0) == 5).all()
+
+
 # Separated images
 
 
@@ -271,6 +321,58 @@ def test_the_noise_is_the_cameras(sensor: Sensor, moving: float) -> None:
     for signal in (0.05, 0.33, 0.7):
         expected = float(sensor.noise_variance(torch.tensor(signal))) * 4095**2
         assert float(found.variance(np.float32(4095 * signal))) == pytest.approx(expected, rel=0.2)
+
+
+@pytest.mark.parametrize("frames", [1, 9])
+def test_the_noise_over_a_black_level_is_the_same(frames: int) -> None:
+    """A signal counts from black on, and means of nine frames have a ninth of the noise."""
+    light, black = make_light().clamp(min=0.03), 240
+    shots = [shoot(light, seed).data.float().numpy() + black for seed in range(frames + 1)]
+    count = np.full((SIZE[0] // BLOCK, SIZE[1] // BLOCK), frames, np.float32)
+    levels = Levels(black, 4095.0 + black, 1.0, 4091.0 + black)
+    found = estimate_noise(shots[0], (np.mean(shots[1:], axis=0, dtype=np.float32), count), levels, 0)
+    assert found is not None
+    for signal in (0.05, 0.33, 0.7):
+        expected = float(IMX250.noise_variance(torch.tensor(signal))) * 4095**2
+        assert float(found.variance(np.float32(4095 * signal))) == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("change", "share", "expected"), [(0.0, 0.0, 1.0), (3.0, 0.3, 1.0), (1e3, 1.0, 1.15)], ids=["still", "busy", "pan"]
+)
+def test_the_noise_of_flat_light_is_known_to_percents(change: float, share: float, expected: float) -> None:
+    """Blocks are counted by the median of what is left of them without moving ones; neighbours by 1.15 times theirs.
+
+    ``change``: variance by which a ``share`` of blocks differs more from the frame before, in variances of the noise.
+    """
+    rng, size, variance = np.random.default_rng(8), (512, 512), 400.0
+    now, before = (1500 + variance**0.5 * rng.standard_normal(size) for _ in range(2))
+    moving = (rng.random([n // BLOCK for n in size]) < share).repeat(BLOCK, 0).repeat(BLOCK, 1)
+    before += moving * (2 * change * variance) ** 0.5 * rng.standard_normal(size)
+    count = np.ones([n // BLOCK for n in size], np.float32)
+    found = estimate_noise(now.astype(np.float32), (before.astype(np.float32), count), CODES, 0)
+    assert found is not None
+    assert float(found.variance(np.float32(1500))) == pytest.approx(expected * variance, rel=0.04)
+
+
+def test_the_noise_of_a_stream_is_the_mean_of_its_estimates() -> None:
+    """Every frame tells for the first eight, every fourth from then on; the latest sixteen estimates count."""
+    light = make_light().clamp(min=0.03)
+    state, told, gains = None, [], []
+    for number in range(24):
+        frame = shoot(light, number)
+        before = state
+        _, state = filter_frame(frame, state)
+        if before is None:
+            continue
+        if before.frames <= 8 or before.frames % 4 == 0:
+            data = frame.data.float().numpy()
+            found = estimate_noise(data, (before.mean, before.count), CODES, before.frames)
+            assert found is not None
+            told.append(found.gain)
+        gains.append(float(np.mean(told)))
+        assert state.estimates == len(told)
+        assert state.noise.gain == pytest.approx(gains[-1], rel=1e-6)
 
 
 def test_the_noise_of_a_pan_is_that_of_its_smooth_parts() -> None:

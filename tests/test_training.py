@@ -194,6 +194,21 @@ def test_weights_say_how_they_came_about(variant: str, tmp_path: Path) -> None:
     assert len(lines) == 2
 
 
+def test_weights_say_what_they_started_from_and_with_which_constants(tmp_path: Path) -> None:
+    """Name and sha256 of every file of ``--start``, all constants, and a command that sets those that differ."""
+    options, schedule = TrainOptions("paper", "mosaic", Size(4, 1, 1)), replace(SCHEDULE, steps=1)
+    first = train_weights(options, replace(run_in(tmp_path / "a", schedule), workers=0), lambda _: None)
+    other = replace(STREAM, constants=(("variety.MATTE_STRENGTH", (0.02, 1.0)),))
+    run = replace(run_in(tmp_path / "b", schedule), workers=0, start=(first, first), stream=other)
+    metadata = read_weights(train_weights(options, run, lambda _: None))[1]
+    assert json.loads(metadata["start"]) == 2 * [["paper-mosaic.safetensors", read_weights(first)[1]["sha256"]]]
+    assert json.loads(metadata["constants"])["variety.MATTE_STRENGTH"] == [0.02, 1.0]
+    assert json.loads(read_weights(first)[1]["constants"])["variety.MATTE_STRENGTH"] == [0.005, 1.0]
+    assert "--set variety.MATTE_STRENGTH=0.02,1 --start paper-mosaic.safetensors" in metadata["command"]
+    assert json.loads(read_weights(first)[1]["start"]) == [] and "--set" not in read_weights(first)[1]["command"]
+    assert metadata["data"] != read_weights(first)[1]["data"]
+
+
 def test_data_have_a_digest_of_their_options() -> None:
     streams = (STREAM, STREAM, replace(STREAM, seed=1), replace(STREAM, crop=64))
     digests = [digest_examples(asdict(stream), "polsep.train.stream") for stream in streams]

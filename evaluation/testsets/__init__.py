@@ -1,7 +1,7 @@
-"""Fixed test sets of known truth: random objects, statues and scans, and crossed-polarizer photographs.
+"""Fixed selection sets of known truth: random objects, statues and scans, and crossed-polarizer photographs.
 
 A set is a tuple of `Recipe`; `build_cases` makes its scenes one by one. Every scene's inputs and outputs are recorded
-in `expected`, and `version_of` is a sha256 over these records, so that nobody changes a test set unknowingly. No
+in `expected`, and `version_of` is a sha256 over these records, so that nobody changes a selection set unknowingly. No
 network is trained on them; docs/testsets.md lists the choices made by their scores. Needs the extra ``render``.
 """
 
@@ -13,7 +13,7 @@ from evaluation.testsets.photographs import PHOTOGRAPHS
 from evaluation.testsets.sheet import draw_sheet
 from evaluation.testsets.statues import STATUES
 
-#: The sets by name: (a), (b) and (c) of docs/testsets.md.
+#: The selection sets by name: (a), (b) and (c) of docs/testsets.md. `sealed` is apart: nobody scores it by chance.
 SETS: dict[str, tuple[Recipe, ...]] = {"objects": OBJECTS, "statues": STATUES, "photographs": PHOTOGRAPHS}
 
 __all__ = [

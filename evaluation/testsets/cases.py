@@ -1,4 +1,4 @@
-"""Cases of a test set: exposed scenes with three captures each, and their records.
+"""Cases of a selection set: exposed scenes with three captures each, and their records.
 
 Records compare numbers, not bytes: ray casts and powers differ by rounding between machines, and a hash over floats,
 however coarsely rounded, flips where a value lies at a rounding step. So `fingerprint` is eight weighted means per

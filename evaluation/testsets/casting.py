@@ -47,18 +47,26 @@ def look_at(mesh: Mesh, azimuth_deg: float, elevation_deg: float) -> PinholeCame
     return PinholeCamera(_vector(distance * back), (0.0, 0.0, 0.0), FOV_DEG)
 
 
-def random_light_near(camera: PinholeCamera, generator: torch.Generator) -> PointLight:
-    """A light within `LARGEST_ANGLE_DEG` of the camera as its target sees it, with a random polarizer angle."""
+def random_light_near(
+    camera: PinholeCamera,
+    generator: torch.Generator,
+    angles_deg: tuple[float, float] = (0.0, LARGEST_ANGLE_DEG),
+    distances: tuple[float, float] = LIGHT_DISTANCES,
+) -> PointLight:
+    """A light so many degrees from the camera as its target sees it, with a random polarizer angle.
+
+    ``distances``: relative to the camera's.
+    """
     draws = torch.rand(4, generator=generator, dtype=torch.float64)
-    least = math.cos(math.radians(LARGEST_ANGLE_DEG))
-    cosine, around = least + (1 - least) * float(draws[0]), 2 * math.pi * float(draws[1])
+    most, least = (math.cos(math.radians(angle)) for angle in angles_deg)
+    cosine, around = least + (most - least) * float(draws[0]), 2 * math.pi * float(draws[1])
     target = torch.tensor(camera.target, dtype=torch.float64)
     way = torch.tensor(camera.position, dtype=torch.float64) - target
     back = way / way.norm()
     right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), back)
     right = right / right.norm()
     sideways = math.cos(around) * right + math.sin(around) * torch.linalg.cross(back, right)
-    low, high = LIGHT_DISTANCES
+    low, high = distances
     distance = float(way.norm()) * (low + (high - low) * float(draws[2]))
     position = target + distance * (cosine * back + math.sqrt(1 - cosine**2) * sideways)
     return PointLight(_vector(position), 1.0, math.pi * float(draws[3]))

@@ -1,4 +1,4 @@
-"""The records of the test sets: what each scene is made of and what comes out. Change them only with their version."""
+"""The records of the sets: what each scene is made of and what comes out. Change them only with their version."""
 
 from __future__ import annotations
 
@@ -59,6 +59,18 @@ EXPECTED: dict[str, Expected] = {
     "photo-panther": Expected("04d92b0a0f783378", (523383, 4662, 3808, 5350, -2751, 4589, 267587, 267642)),
     "photo-phone": Expected("b8247c04b13799c0", (194552, 1577, -820, 2910, 2470, 1539, 105210, 105238)),
     "photo-raccoon": Expected("ce27e84c09d37495", (522806, -5197, 1182, 2358, -1417, 1885, 264958, 264967)),
+    "sealed-00": Expected("a888257fd4251d23", (500728, 1471, -9653, 211571, 65854, -194344, 370621, 370667)),
+    "sealed-01": Expected("9f59860861914417", (24652, 142, -252, 2816, 1749, -2189, 18168, 18248)),
+    "sealed-02": Expected("4452fb3caaa213e2", (215776, -2190, 100, 67248, -60538, -26443, 148319, 148340)),
+    "sealed-03": Expected("103fa33ab942bbcf", (48512, 18, -192, 7546, 5715, -4851, 27228, 27306)),
+    "sealed-04": Expected("3226aa21e3cc5cb1", (388524, -7604, 1073, 32735, 7037, 29261, 214611, 214644)),
+    "sealed-05": Expected("8b408c35af9cef9e", (77423, -1971, 1832, 43858, -15790, -40870, 55346, 55438)),
+    "sealed-06": Expected("22226268988dda27", (183607, -429, -4463, 156060, 126627, 88280, 178463, 178486)),
+    "sealed-07": Expected("829449e1c7e18cc4", (107191, 1353, -131, 5132, -3751, 3423, 54915, 54991)),
+    "sealed-08": Expected("3908cabacdb901c8", (290516, -4624, -4619, 135615, 46566, 127001, 218960, 219059)),
+    "sealed-09": Expected("ede5a9b97aec1d2c", (43312, 461, 81, 7469, 6409, 3573, 24306, 24386)),
+    "sealed-10": Expected("79299fb7b4af0fde", (324307, -6014, 1042, 59581, 699, 55628, 226536, 226557)),
+    "sealed-11": Expected("f2d45e6a0c802d46", (81708, -755, 1415, 16365, -12320, 10697, 45168, 45247)),
 }
 
 #: Films by name and number of the frame: `dynamic.fingerprint_frame`.

@@ -1,4 +1,4 @@
-"""A picture of a test set for people: a row per scene, with its light and its polarization."""
+"""A picture of a selection set for people: a row per scene, with its light and its polarization."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Every row says what was measured (`bench`, `case`, `method`, `metric`, `value`, `unit`) and by what (`command`,
 `commit`, `machine`). The tables of README and docs are made from these rows by `io.store.rows.fill_tables`. The
-paper's evaluation and the test sets are measured by ``python -m evaluation`` in a checkout of the repository.
+paper's evaluation and the selection sets are measured by ``python -m evaluation`` in a checkout of the repository.
 """
 
 from __future__ import annotations

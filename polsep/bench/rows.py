@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 
 from polsep.bench.history import ask_git
 from polsep.io.store.atomic import replace_text
+from polsep.io.store.rows import SPREAD, read_rows
 
 #: Tables of single scenes, objects and points of curves, "NAME/PART", which are too long for the repository.
 SCENE_PARTS = ("scenes", "objects", "curve", "films")
@@ -46,14 +49,47 @@ def to_jsonl(rows: Sequence[Row], made_by: dict[str, str]) -> str:
 def write_rows(folder: Path, name: str, rows: Sequence[Row], command: str) -> None:
     """Replace ``folder``/NAME.jsonl, and ``folder``/scenes/NAME.jsonl with the rows of `SCENE_PARTS`, not committed.
 
-    Raises ValueError where there are no rows, so that nothing replaces what was measured before.
+    Raises ValueError where there are no rows, and where the file has results of more cases or methods: then what was
+    measured goes to NAME-partial.jsonl, and nothing replaces what was measured before. Quick runs may have fewer.
     """
     if not rows:
         raise ValueError(f"expected rows of {name}, found none: {folder / name}.jsonl stays as it is")
     made_by = provenance(command)
-    tables: dict[Path, list[Row]] = {}
+    tables: dict[bool, list[Row]] = {True: [], False: []}
     for row in rows:
-        single = row.bench.partition("/")[2] in SCENE_PARTS
-        tables.setdefault((folder / "scenes" if single else folder) / f"{name}.jsonl", []).append(row)
-    for path, lines in tables.items():
-        replace_text(path, to_jsonl(lines, made_by))
+        tables[row.bench.partition("/")[2] in SCENE_PARTS].append(row)
+    scenes, means = tables[True], tables[False]
+    path = folder / f"{name}.jsonl"
+    lost = [] if name.endswith("-quick") else find_lost(path, means)
+    if scenes:
+        replace_text(folder / "scenes" / path.name, to_jsonl(scenes, made_by))
+    if lost:
+        path = path.with_stem(f"{name}-partial")
+    if means:
+        replace_text(path, to_jsonl(means, made_by))
+    if lost:
+        missing = lost[0] + (f" and {len(lost) - 1} more" if len(lost) > 1 else "")
+        raise ValueError(
+            f"expected all that {name}.jsonl has, found nothing of {missing}: it stays as it is, see {path}"
+        )
+
+
+def standard_error(values: Sequence[float]) -> float:
+    """The standard error of a mean over scenes: how far another draw of as many scenes may be off; NaN of one."""
+    return statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+
+
+def with_spread(mean: Row, values: Sequence[float]) -> Iterator[Row]:
+    """The row of a mean over ``values``, then of its standard error, which tables show behind it, and of the median."""
+    yield mean
+    if len(values) > 1:
+        yield replace(mean, metric=f"{mean.metric}{SPREAD}", value=standard_error(values))
+        yield replace(mean, metric=f"{mean.metric}, median", value=statistics.median(values))
+
+
+def find_lost(path: Path, rows: Sequence[Row]) -> list[str]:
+    """Cases and methods of a file of results that ``rows`` have nothing of; none where there is no such file."""
+    before = read_rows(path) if path.is_file() else []
+    measured = {(row.bench, row.case, row.method) for row in rows}
+    kept = dict.fromkeys((row["bench"], row["case"], row["method"]) for row in before)
+    return [f"{bench}: {case}, {method}" for bench, case, method in kept if (bench, case, method) not in measured]

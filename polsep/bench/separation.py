@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterator
 
-from polsep.bench.rows import Row
+from polsep.bench.rows import Row, with_spread
 from polsep.bench.truth import SCENE_SEEDS, captures, render_scene
 from polsep.methods import METHODS
 from polsep.metrics import psnr
@@ -28,6 +28,7 @@ def bench_separation() -> Iterator[Row]:
                     ):
                         scores.setdefault((capture, name, output), []).append(psnr(image, truth, mask))
         for (capture, name, output), values in scores.items():
-            yield Row("separation", f"{case}, {capture}", name, f"{output} PSNR", statistics.fmean(values), "dB")
+            mean = Row("separation", f"{case}, {capture}", name, f"{output} PSNR", statistics.fmean(values), "dB")
+            yield from with_spread(mean, values)
             if "unclipped" in capture:
                 yield Row("separation", f"{case}, {capture}", name, f"{output} PSNR, worst scene", min(values), "dB")

@@ -59,6 +59,13 @@ RUNGS = (
     help="Weights to start from; the mean of several.",
 )
 @click.option("--refit", is_flag=True, help="Fit the linear filter of a joint network again after --start.")
+@click.option(
+    "--set",
+    "constants",
+    multiple=True,
+    metavar="NAME=X,...",
+    help="Another constant of the examples, as variety.MATTE_SHARE=0.3; polsep/train has them.",
+)
 @click.option("--precision", default="bf16-mixed", metavar="NAME", help="bf16-mixed or 32-true.")
 def train(rung: str, output: Path, data: str, **options: Any) -> None:
     """Train joint-large, joint, joint-fast, material or a rung of the paper's ladder: paper, unpolarized, polarized,
@@ -76,12 +83,14 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     require_extra("train")
     require_paths(*options["start"])
     from polsep.train.command import choose_options, plan_run, train_weights
+    from polsep.train.constants import read_constant
     from polsep.train.loop import Run, Schedule
     from polsep.train.material_command import choose_material, train_material
     from polsep.train.stream import StreamOptions
-
     shared = {name: options[name] for name in ("workers", "devices", "start", "refit")}
     if rung == "material":
+        if options["constants"]:
+            raise ValueError(f"expected no --set with material, found --set {options['constants'][0]}")
         material, schedule = choose_material(options)
         folder = options["folder"] or output.parent / "examples"
         run = Run(output, schedule=schedule, until=options["until"], **shared)
@@ -89,7 +98,9 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     else:
         network = choose_options(rung, data, options)
         schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])
-        run = Run(output, stream=StreamOptions(looks=options["looks"]), schedule=schedule, **shared)
+        constants = tuple(read_constant(text) for text in options["constants"])
+        stream = StreamOptions(looks=options["looks"], constants=constants)
+        run = Run(output, stream=stream, schedule=schedule, **shared)
         path = train_weights(network, plan_run(run, network), _print_log)
     print(path)
 

@@ -11,11 +11,12 @@ from typing import Any
 
 import torch
 
-from polsep.io.store.weights import write_weights
+from polsep.io.store.weights import read_weights, write_weights
 from polsep.networks.joint import Demosaicker
 from polsep.networks.rungs import RUNGS
 from polsep.networks.sizes import ResidualSize, Size
 from polsep.networks.unet import count_parameters
+from polsep.train.constants import list_constants
 from polsep.train.digest import digest_examples
 from polsep.train.inputs import JointInputs, LadderInputs
 from polsep.train.joint_task import (
@@ -134,6 +135,7 @@ def train_weights(options: Options, run: Run, report: Callable[[dict[str, Any]],
     """
     torch.manual_seed(options.seed)
     data = digest_examples(asdict(run.stream), "polsep.train.stream")
+    starts = hash_starts(run)
     path = run.out / f"{options.name}-{options.variant}.safetensors"
     task: Task[Any] = options.task()
     average = train(task, run, report)
@@ -152,6 +154,8 @@ def train_weights(options: Options, run: Run, report: Callable[[dict[str, Any]],
         "schedule": json.dumps(asdict(run.schedule)),
         "stream": json.dumps(asdict(run.stream)),
         "data": data,
+        "constants": json.dumps(list_constants(run.stream.constants)),
+        "start": json.dumps(starts),
         "command": describe_command(options, run),
         "validation": json.dumps(scores),
         "curve": json.dumps(curve_of(lines)),
@@ -181,7 +185,14 @@ def describe_command(options: Options, run: Run) -> str:
         "output": run.out.name,
     }
     words = [word for name, value in asked.items() for word in (f"--{name}", str(value))]
+    for name, values in run.stream.constants:
+        words += ["--set", f"{name}={','.join(f'{value:g}' for value in values)}"]
     return shlex.join(["polsep", "train", options.name, *words, *describe_start(run)])
+
+
+def hash_starts(run: Run) -> list[list[str]]:
+    """Name and sha256 of the tensors of every file that a training started from, as `read_weights` checks it."""
+    return [[path.name, read_weights(path)[1]["sha256"]] for path in run.start]
 
 
 def describe_start(run: Run) -> list[str]:

@@ -223,6 +223,9 @@ def _to(device: torch.device, batch: Batch) -> Batch:
 def _describe(run: Run) -> str:
     """JSON of all that must be equal for a training to resume from a checkpoint."""
     described: dict[str, Any] = {"what": run.what, "stream": asdict(run.stream), "schedule": asdict(run.schedule)}
+    described["stream"] |= {"constants": list(run.stream.constants)}
+    if not run.stream.constants:
+        del described["stream"]["constants"]
     described |= {"start": [path.name for path in run.start]} if run.start else {}
     described |= {"refit": True} if run.refit else {}
     return json.dumps(described | {"workers": run.workers, "devices": run.devices})

@@ -15,7 +15,7 @@ from polsep.io.store.weights import write_weights
 from polsep.material.examples import make_examples
 from polsep.material.network import MaterialSize
 from polsep.networks.unet import count_parameters
-from polsep.train.command import check_run, describe_start
+from polsep.train.command import check_run, describe_start, hash_starts
 from polsep.train.digest import digest_examples
 from polsep.train.log import read_log
 from polsep.train.loop import Run, Schedule, run_training
@@ -50,6 +50,7 @@ def train_material(options: MaterialOptions, run: Run, folder: Path, report: Cal
     torch.manual_seed(options.seed)
     training = material_training(options, folder)
     run = replace(run, what=json.dumps(asdict(options)))
+    starts = hash_starts(run)
     average = run_training(training, run, report)
     path = run.out / f"material-{options.input}.safetensors"
     if average is None:
@@ -67,6 +68,7 @@ def train_material(options: MaterialOptions, run: Run, folder: Path, report: Cal
         "options": json.dumps(asdict(options)),
         "data": digest_examples(counts, "polsep.material.examples"),
         "steps": str(run.last),
+        "start": json.dumps(starts),
         "command": describe_command(options, run),
         "validation": json.dumps(training.score(training.network)),
         "curve": json.dumps([[line["step"], round(line["loss"], 5)] for line in read_log(run.out) if line["step"]]),

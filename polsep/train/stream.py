@@ -33,6 +33,7 @@ from polsep.render.simulate import HEADROOM, blur, filter_light
 from polsep.render.sphere_tracing import Scene
 from polsep.render.views import MIN_LEVEL, random_shot, scene_seed, seeded_shape
 from polsep.sensor.camera import CLIP_MARGIN, IMX250, Layout, Sensor
+from polsep.train.constants import Constant, check_constant, constants_set
 from polsep.train.reality import RealScene, as_ideal, disturb, random_darkness, random_errors
 from polsep.train.variety import (
     LitView,
@@ -83,8 +84,9 @@ class StreamOptions:
     """Options of a stream: ``batch`` crops of ``crop`` x ``crop`` raw pixels from views of ``size`` x ``size``.
 
     ``pool``: scenes per lane; ``uses``: mean number of times that a scene's pixels are used before it is replaced; 0
-    for one crop of each. ``samples``: rays along a pixel's side. ``looks``: one of `LOOK_KINDS`. Raises ValueError when
-    crops do not fit or are no multiples of the mosaic's period.
+    for one crop of each. ``samples``: rays along a pixel's side. ``looks``: one of `LOOK_KINDS`. ``constants``: of
+    `train.constants`, where they are not the usual ones. Raises ValueError when crops do not fit or are no multiples of
+    the mosaic's period.
     """
 
     split: str = "train"
@@ -96,6 +98,7 @@ class StreamOptions:
     pool: int = 48
     uses: int = 6
     looks: str = "varied"
+    constants: tuple[Constant, ...] = ()
 
     def __post_init__(self) -> None:
         if self.crop % PERIOD or self.size % PERIOD or not PERIOD <= self.crop <= self.size:
@@ -104,6 +107,8 @@ class StreamOptions:
             raise ValueError(f"expected batch, samples and pool of at least 1 and uses of at least 0, found {self}")
         if self.looks not in LOOK_KINDS:
             raise ValueError(f"expected looks of {' or '.join(LOOK_KINDS)}, found {self.looks!r}")
+        for constant in self.constants:
+            check_constant(constant)
 
     @property
     def reuse(self) -> int:
@@ -176,17 +181,19 @@ def stream_lane(options: StreamOptions, lane: int, first: int) -> Iterator[Examp
     scenes = pool_scenes(options, lane, first * options.batch // options.reuse)
     pool: deque[PooledScene] = deque(maxlen=options.pool)
     newest = first * options.batch // options.reuse - 1
-    while len(pool) < options.pool:
-        pool.append(next(scenes))
-        newest += 1
+    with constants_set(options.constants):
+        while len(pool) < options.pool:
+            pool.append(next(scenes))
+            newest += 1
     oldest = newest - options.pool + 1
     while True:
         examples, number = [], first * options.batch
-        for k in range(options.batch):
-            if (number + k) // options.reuse > oldest:
-                pool.append(next(scenes))
-                oldest += 1
-            examples.append(random_example(pool, options.crop, _generator(options, lane, number + k)))
+        with constants_set(options.constants):
+            for k in range(options.batch):
+                if (number + k) // options.reuse > oldest:
+                    pool.append(next(scenes))
+                    oldest += 1
+                examples.append(random_example(pool, options.crop, _generator(options, lane, number + k)))
         yield Examples(*(torch.stack(values) for values in zip(*examples, strict=True)))
         first += 1
 

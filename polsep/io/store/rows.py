@@ -21,6 +21,8 @@ _TABLE = re.compile(
     r"(?P<before>.*?)(?P<end><!-- end -->)",
     re.DOTALL,
 )
+#: End of the metric whose value a table shows behind that of the metric itself, as "mean ± standard error".
+SPREAD = ", standard error"
 #: The last line of a table whose numbers are older than the code.
 _OLDER = re.compile(r"Measured at commit (?P<commit>\w+), before the last change of .*\n")
 #: The paths measured by a benchmark, by its name, that changed after commits; None: unknown.
@@ -37,6 +39,12 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         else:
             made_by = entry
     return rows
+
+
+def append_line(path: Path, line: str) -> None:
+    """Add a line to a log; its other lines stay, and it is whole at any time."""
+    before = path.read_text(encoding="utf-8") if path.is_file() else ""
+    replace_text(path, f"{before}{line}\n")
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
@@ -89,7 +97,8 @@ def fill_tables(markdown: str, results: Path, find_changes: FindChanges = lambda
         path, bench = results / f"{match['name']}.jsonl", f"{match['name']}{match['part'] or ''}"
         rows = [row for row in read_rows(path) if row["bench"] == bench] if path.is_file() else []
         if metric := match["metric"]:
-            rows = [row for row in rows if row["metric"] in (metric, f"diffuse {metric}", f"specular {metric}")]
+            names = (metric, f"diffuse {metric}", f"specular {metric}")
+            rows = [row for row in rows if row["metric"].removesuffix(SPREAD) in names]
         if not rows:
             return f"{match[1]}Not measured yet: `polsep bench {match['name']}`.\n{match['end']}"
         made = method_table(rows) if match["turned"] else markdown_table(rows)
@@ -134,10 +143,16 @@ def method_table(rows: list[dict[str, Any]]) -> str:
 def _cells(rows: list[dict[str, Any]]) -> dict[tuple[str, str, str], str]:
     """Numbers by case, metric with unit, and method."""
     values: dict[tuple[str, str, str], list[str]] = {}
+    spreads = {(row["case"], row["method"], row["metric"]): _number(row["value"]) for row in rows}
     for row in rows:
+        if row["metric"].endswith(SPREAD):
+            continue
+        spread = spreads.get((row["case"], row["method"], row["metric"] + SPREAD))
         metric = re.sub(r"^(diffuse|specular) (?=PSNR|flicker|loss|pattern)", "diffuse / specular ", row["metric"])
         measured = f"{metric} [{row['unit']}]" if row["unit"] else metric
-        values.setdefault((row["case"], measured, row["method"]), []).append(_number(row["value"]))
+        values.setdefault((row["case"], measured, row["method"]), []).append(
+            _number(row["value"]) + (f" ± {spread}" if spread else "")
+        )
     return {key: " / ".join(texts) for key, texts in values.items()}
 
 

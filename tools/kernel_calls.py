@@ -12,6 +12,7 @@ import torch
 from polsep import kernels
 from polsep.edit.blur_kernel import filter_image
 from polsep.geometry.integration_kernel import Places, Wanted, fill_system, fill_weights
+from polsep.io.results import pixels_kernel
 from polsep.networks.guide import guide_batch
 from polsep.networks.whole_frame_kernel import thumbnail_of
 from polsep.sensor.calibration import neighbours
@@ -32,6 +33,7 @@ def call_kernels() -> None:
     _guide()
     _edit()
     _integrate()
+    pixels_kernel.warm_up()
 
 
 def _separate_clipped() -> None:

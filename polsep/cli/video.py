@@ -42,7 +42,10 @@ from polsep.cli.app import (
 @AMBIENT
 @LIGHT_COLOR
 @click.option(
-    "--format", default="exr", metavar="exr|ffv1|none", help="A file per frame, a lossless video, or only a preview."
+    "--format",
+    default="exr",
+    metavar="exr|ffv1|ffvhuff|none",
+    help="A file per frame; lossless videos, small or fast; or only a preview.",
 )
 @click.option("--compression", default="none", metavar="none|zip|piz", help="Compression of EXR files.")
 @click.option("--preview/--no-preview", default=True, help="Write a video of input, diffuse and specular to watch.")
@@ -62,9 +65,9 @@ def video(recording: Path, output: Path, **options: Any) -> None:
 
     IN is a folder of frames or of 'polsep capture', a TIFF or NPY file of many frames, a lossless grey video (FFV1 in
     .mkv, raw .avi), or a headerless raw stream. DIR gets STEM_000123.exr (half floats, layers diffuse and specular) for
-    every frame, or STEM_diffuse.mkv and STEM_specular.mkv (FFV1, 16 bits); STEM_preview.mp4 to watch; STEM.jsonl with a
-    line of statistics per frame; and STEM.json. Run the same command again to resume a run that was stopped. Writing
-    videos needs the extra video.
+    every frame, or STEM_diffuse and STEM_specular as .mkv (FFV1, 16 bits) or .avi (FFVHuff, 16 bits: ten times as fast,
+    1.6 times as large); STEM_preview.mp4 to watch; STEM.jsonl with a line of statistics per frame; and STEM.json. Run
+    the same command again to resume a run that was stopped. Writing videos needs the extra video.
 
     \b
     polsep video frames/ -o out --white-level 4095

@@ -29,8 +29,8 @@ from polsep.compute.threads import own_threads
 from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.raw.sequences import DamagedFrame, natural_order, open_sequence
 from polsep.io.results import sequences
-from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.pixels_kernel import CHUNK, HEAD, half_rows, zip_rows
+from polsep.io.results.exr import half_rows, read_exr_layers, zip_rows
+from polsep.io.results.pixels_kernel import CHUNK, HEAD
 from polsep.io.results.sequences import FILM_WHITE, PART, Picture, SequenceKind, SequenceWriter, write_exr
 from polsep.io.store.atomic import OutputError
 from polsep.physics.stokes import Stokes

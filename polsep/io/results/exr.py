@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,8 +19,10 @@ import numpy as np
 import OpenEXR  # a bare extension module without stubs
 from numpy.typing import NDArray
 
+from polsep.compute.compiling import read_only
+from polsep.compute.threads import run_over_rows
 from polsep.io.results.exr_header import EXPECTED, check_exr_header
-from polsep.io.results.pixels_kernel import CHUNK, HEAD, LARGEST, half_rows, zip_rows
+from polsep.io.results.pixels_kernel import CHUNK, HEAD, LARGEST, ROWS, STORED, fill_rows, pack_chunks
 from polsep.io.store.errors import InputError, naming
 from polsep.io.store.header_checks import require_signature
 from polsep.io.store.quiet import quiet
@@ -113,6 +116,38 @@ def encode_exr_halves(
     head = _header(names, (width, height), notes, _NUMBERS[compression])
     offsets = len(head) + 8 * len(sizes) + np.cumsum(sizes) - sizes
     return [head, offsets.astype("<u8").tobytes(), *chunks]
+
+
+def half_rows(images: Sequence[NDArray[np.float32]]) -> NDArray[np.uint16]:
+    """Rows ``[H, HEAD + n W]`` with the bits of half floats, rounded to even, of planes ``[H, W]`` of n channels.
+
+    ``images [H, W, C]``: their channels follow in the order of the images, from the last channel to the first. Light
+    above `LARGEST_HALF` becomes that. The first words are not set.
+    """
+    height, width = images[0].shape[:2]
+    rows = np.empty((height, HEAD + width * sum(image.shape[2] for image in images)), np.uint16)
+    place = HEAD
+    for image in images:
+        light = read_only(np.ascontiguousarray(image, np.float32).reshape(height, -1))
+        fill = partial(fill_rows, light, image.shape[2], place, rows)
+        run_over_rows(fill, height, ROWS)
+        place += width * image.shape[2]
+    return rows
+
+
+def zip_rows(rows: NDArray[np.uint16], width: int) -> list[memoryview]:
+    """The chunks of rows ``[H, HEAD + n width]``, packed; one that would not get smaller as it is."""
+    chunks = -(-rows.shape[0] // CHUNK)
+    size = 2 * CHUNK * (rows.shape[1] - HEAD)
+    packed = np.empty((chunks, size // 4 + 5 * (size // STORED + 2) + 16), np.uint32)
+    sizes = np.zeros(chunks, np.int64)
+    run_over_rows(partial(pack_chunks, read_only(rows), width, packed, sizes), chunks, 1)
+    found = []
+    for k in range(chunks):
+        own = rows[CHUNK * k : CHUNK * (k + 1), HEAD:]
+        data: NDArray[Any] = np.ascontiguousarray(own) if sizes[k] >= own.nbytes else packed[k]
+        found.append(data.data.cast("B")[: min(int(sizes[k]), own.nbytes)])
+    return found
 
 
 def _header(channels: list[str], size: tuple[int, int], notes: Mapping[str, str], compression: int) -> bytes:

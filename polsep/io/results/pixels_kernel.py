@@ -12,7 +12,6 @@ Source: OpenEXR, "OpenEXR File Layout" (openexr.com/en/latest/OpenEXRFileLayout.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -26,8 +25,8 @@ from polsep.compute.threads import RowRange, run_over_rows
 HEAD = 4
 #: Rows of a chunk of OpenEXR's ZIP compression.
 CHUNK = 16
-#: Rows of half floats that a thread makes at a time.
-_ROWS = 64
+#: Rows that a thread fills at a time.
+ROWS = 64
 
 #: The largest half float; light above becomes that.
 LARGEST = np.float32(65504)
@@ -45,7 +44,7 @@ _WHITE = np.float32(65535)
 #: Codes: bytes, the end of a block, lengths of repetitions; the longest code; bytes of the longest repetition.
 _CODES, _END, _LONGEST_CODE, _LONGEST = 286, 256, 15, 258
 #: Farthest that a repetition may be from what it repeats, the shortest row that may repeat, bytes of a stored block.
-_FARTHEST, _SHORTEST, _STORED = 32768, 8, 65535
+_FARTHEST, _SHORTEST, STORED = 32768, 8, 65535
 #: Bits of the codes of lengths, in the order in which they are sent: repetitions have none, 0 to 15 have 4 each.
 _SENT = np.array([0, 0, 0] + 16 * [4], np.int64)
 #: Codes save next to nothing where a block of them is not smaller than this part of its bytes; bits of a block's head.
@@ -54,58 +53,16 @@ _WORTH, _HEAD_BITS = 0.98, 2000
 _SUMMED, _ADLER = 2048, 65521
 
 
-def half_rows(images: Sequence[NDArray[np.float32]]) -> NDArray[np.uint16]:
-    """Rows ``[H, HEAD + n W]`` with the bits of half floats, rounded to even, of planes ``[H, W]`` of n channels.
-
-    ``images [H, W, C]``: their channels follow in the order of the images, from the last channel to the first. Light
-    above `LARGEST` becomes that. The first words are not set.
-    """
-    height, width = images[0].shape[:2]
-    rows = np.empty((height, HEAD + width * sum(image.shape[2] for image in images)), np.uint16)
-    place = HEAD
-    for image in images:
-        fill = partial(fill_rows, _lines_of(image), image.shape[2], place, rows)
-        run_over_rows(fill, height, _ROWS)
-        place += width * image.shape[2]
-    return rows
-
-
 def code_planes(image: NDArray[np.float32], white: float) -> NDArray[np.uint16]:
     """Linear light ``[H, W, C]`` as 16-bit codes ``[C, H, W]``: 65535 stands for ``white``; values outside are limited.
 
     Colours are in the order green, blue, red, in which films have them.
     """
     height, width, colors = image.shape
+    light = read_only(np.ascontiguousarray(image, np.float32).reshape(height, -1))
     planes = np.empty((colors * height, width), np.uint16)
-    run_over_rows(partial(fill_planes, _lines_of(image), np.float32(65535 / white), planes), height, _ROWS)
+    run_over_rows(partial(fill_planes, light, np.float32(65535 / white), planes), height, ROWS)
     return planes.reshape(colors, height, width)
-
-
-def _lines_of(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """An image as ``[H, W C]``, for kernels."""
-    return read_only(np.ascontiguousarray(image, np.float32).reshape(image.shape[0], -1))
-
-
-def zip_rows(rows: NDArray[np.uint16], width: int) -> list[memoryview]:
-    """The chunks of rows ``[H, HEAD + n width]``, packed; one that would not get smaller as it is."""
-    chunks = -(-rows.shape[0] // CHUNK)
-    size = 2 * CHUNK * (rows.shape[1] - HEAD)
-    packed = np.empty((chunks, size // 4 + 5 * (size // _STORED + 2) + 16), np.uint32)
-    sizes = np.zeros(chunks, np.int64)
-    run_over_rows(partial(pack_chunks, read_only(rows), width, packed, sizes), chunks, 1)
-    found = []
-    for k in range(chunks):
-        own = rows[CHUNK * k : CHUNK * (k + 1), HEAD:]
-        data: NDArray[Any] = np.ascontiguousarray(own) if sizes[k] >= own.nbytes else packed[k]
-        found.append(data.data.cast("B")[: min(int(sizes[k]), own.nbytes)])
-    return found
-
-
-def warm_up() -> None:
-    """Load the kernels, or compile them."""
-    image = np.zeros((1, 8, 3), np.float32)
-    zip_rows(half_rows([image]), 8)
-    code_planes(image, 1.0)
 
 
 @compiled
@@ -268,7 +225,7 @@ def _length_code(length: int) -> tuple[int, int]:
 
 @compiled
 def _count(data: Any, width: int, repeats: Any, counts: Any) -> None:
-    """How often each code is needed: of bytes, of the end, and of lengths."""
+    """Count how often each code is needed: of bytes, of the end, and of lengths."""
     room = np.zeros((4, 256), np.int32)
     a, b, c, d = room[0], room[1], room[2], room[3]
     for x in range(counts.size):
@@ -415,8 +372,8 @@ def _write_codes(data: Any, width: int, repeats: Any, codes: Any, words: Any, st
 @compiled
 def _write_stored(data: Any, last: int, words: Any, state: Any) -> None:
     """Bytes as they are."""
-    for first in range(0, data.size, _STORED):
-        part = data[first : first + _STORED]
+    for first in range(0, data.size, STORED):
+        part = data[first : first + STORED]
         n = part.size
         _put(last if first + n == data.size else 0, 1, words, state)
         _put(0, 2, words, state)

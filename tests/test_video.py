@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
@@ -9,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -23,9 +25,12 @@ from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
 from polsep import cli
+from polsep.compute.threads import own_threads
 from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.raw.sequences import DamagedFrame, natural_order, open_sequence
-from polsep.io.results.exr import read_exr_layers
+from polsep.io.results import sequences
+from polsep.io.results.exr import half_rows, read_exr_layers, zip_rows
+from polsep.io.results.pixels_kernel import CHUNK, HEAD
 from polsep.io.results.sequences import FILM_WHITE, PART, Picture, SequenceKind, SequenceWriter, write_exr
 from polsep.io.store.atomic import OutputError
 from polsep.physics.stokes import Stokes
@@ -177,6 +182,50 @@ def test_files_hold_half_floats(colors: int, compression: str, tmp_path: Path) -
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 
 
+def test_half_floats_are_rounded_to_even() -> None:
+    """As NumPy rounds them: all half floats, what lies between two of them, and what has no half float."""
+    halves = np.arange(0x7C00, dtype=np.uint16).view(np.float16).astype(np.float32)
+    between = (halves[1:] + halves[:-1]) / 2
+    positive = np.concatenate([halves, between, np.nextafter(between, 0), np.nextafter(between, 1e9), [1e9, 1e-30]])
+    values = np.concatenate([positive, -positive, [np.inf, -np.inf, np.nan, 65519.99, -65520]]).astype(np.float32)
+    found = half_rows([values.reshape(1, -1, 1)])[0, HEAD:].view(np.float16)
+    with np.errstate(over="ignore"):
+        np.testing.assert_array_equal(found, np.minimum(values, np.float32(65504)).astype(np.float16))
+    assert np.signbit(found[positive.size])
+
+
+@pytest.mark.parametrize("size", [(40, 61), (33, 7), (17, 300)])
+@pytest.mark.parametrize("kind", ["noise", "dark", "grey", "few", "skewed"])
+def test_packed_rows_are_zlib_streams_of_what_they_were(kind: str, size: tuple[int, int]) -> None:
+    generator = np.random.default_rng(5)
+    (height, width), n = size, 6
+    words = generator.integers(0, 65536, (height, n, width))
+    fibonacci = np.round(1.618 ** np.arange(22))  # the rarest of whose codes would be the longest
+    words = {
+        "noise": words,
+        "dark": np.zeros_like(words),
+        "grey": np.broadcast_to(words[:, :1], words.shape),
+        "few": words % 3,
+        "skewed": 256 * np.cumsum(generator.choice(22, words.size, p=fibonacci / fibonacci.sum())).reshape(words.shape),
+    }[kind]
+    rows = np.zeros((height, HEAD + n * width), np.uint16)
+    rows[:, HEAD:] = (words % 65536).reshape(height, -1)
+    chunks = zip_rows(rows, width)
+    assert len(chunks) == -(-height // CHUNK)
+    for k, chunk in enumerate(chunks):
+        expected = rows[CHUNK * k : CHUNK * (k + 1), HEAD:].astype("<u2").tobytes()
+        assert len(chunk) <= len(expected)
+        if len(chunk) == len(expected):
+            assert bytes(chunk) == expected
+            continue
+        data = np.frombuffer(zlib.decompress(chunk), np.uint8).astype(np.int64)
+        data[1:] -= 128
+        low, high = np.cumsum(data).astype(np.uint8).reshape(2, -1)
+        assert np.stack([low, high], axis=-1).tobytes() == expected
+    saved = {"noise": 0.0, "dark": 0.5, "grey": 0.0 if width < 60 else 0.5, "few": 0.25, "skewed": 0.25}[kind]
+    assert sum(map(len, chunks)) <= (1 - saved) * 2 * words.size
+
+
 def test_the_film_to_watch_has_every_frame_at_its_time(undisturbed: Path) -> None:
     with av.open(str(undisturbed / "run_preview.mp4")) as container:
         times = [float(frame.pts * frame.time_base) for frame in container.decode(video=0)]
@@ -203,19 +252,59 @@ def test_every_kind_of_recording_gives_the_same_images(
     assert exr == {name: data for name, data in contents(undisturbed).items() if name.endswith("exr")}
 
 
+@pytest.mark.parametrize(("codec", "suffix"), [("ffv1", "mkv"), ("ffvhuff", "avi")])
 def test_lossless_films_hold_the_images_in_sixteen_bits(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    codec: str, suffix: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    more = ("--format", "ffv1", "--frames", str(PART + 2), "--no-preview", "--rate", "30")
+    more = ("--format", codec, "--frames", str(PART + 2), "--no-preview", "--rate", "30")
     assert run(monkeypatch, *command(recording, tmp_path, *more)) == 0
-    assert set(contents(tmp_path)) == {"run_diffuse.mkv", "run_specular.mkv", "run.json", "run.jsonl"}
+    assert set(contents(tmp_path)) == {f"run_diffuse.{suffix}", f"run_specular.{suffix}", "run.json", "run.jsonl"}
     for name, white in FILM_WHITE.items():
-        with av.open(str(tmp_path / f"run_{name}.mkv")) as container:
+        with av.open(str(tmp_path / f"run_{name}.{suffix}")) as container:
+            assert container.streams.video[0].average_rate == 30
             shown = [frame.to_ndarray() for frame in container.decode(video=0)]
         assert len(shown) == PART + 2
-        alone = separated_alone(np.load(recording)[PART + 1])
-        expected = np.clip(getattr(alone, name) / white, 0, 1) * 65535
-        assert float(np.abs(shown[-1] - expected).max()) <= 0.5 + 1e-2  # rounding of the codes, and of float32
+        for index in (0, PART + 1):
+            alone = getattr(separated_alone(np.load(recording)[index]), name) * np.float32(65535 / white)
+            np.testing.assert_array_equal(shown[index], np.rint(np.clip(alone, 0, 65535)).astype(np.uint16))
+
+
+@pytest.mark.parametrize("colors", [1, 3])
+@pytest.mark.parametrize("codec", ["ffv1", "ffvhuff"])
+def test_films_do_not_depend_on_threads(codec: str, colors: int, tmp_path: Path) -> None:
+    """Neither do they on the width, of which rows in memory are a multiple."""
+    light = np.random.default_rng(4).uniform(0, 3, (2, 22, 35, colors)).astype(np.float32)
+    films = []
+    for threads in (1, 4):
+        with own_threads(threads):
+            writer = SequenceWriter(
+                tmp_path / str(threads), "run", SequenceKind(codec, preview=False), {"colors": colors}
+            )
+            writer.append(0, Picture(light[0], light[1], None, {}))
+            writer.end_part()
+            films.append([path.read_bytes() for path in writer.finish({})])
+            writer.close()
+    assert films[0] == films[1]
+
+
+def test_an_error_of_a_thread_that_writes_ends_the_run(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The part is not complete, and the same command goes on."""
+
+    def fail(path: Path, *more: Any) -> None:
+        if path.name.endswith(f"{PART + 3:06d}.exr"):
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write_exr(path, *more)
+
+    monkeypatch.setattr(sequences, "write_exr", fail)
+    assert run(monkeypatch, *command(recording, tmp_path)) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and f"{PART + 3:06d}.exr" in error
+    assert not (tmp_path / "run.json").exists() and not list(tmp_path.rglob("*.part"))
+    assert [path.name for path in (tmp_path / ".polsep-run").glob("0*.json")] == ["000000.json"]
+    monkeypatch.setattr(sequences, "write_exr", write_exr)
+    assert run(monkeypatch, *command(recording, tmp_path)) == 0
 
 
 def test_a_recording_goes_on_from_any_frame(recording: Path, tmp_path: Path) -> None:
@@ -420,7 +509,7 @@ def test_films_that_hold_no_mosaic_are_refused(codec: str, pixels: str, tmp_path
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        ({"format": "gif"}, "expected a format of exr, ffv1, none, found 'gif'"),
+        ({"format": "gif"}, "expected a format of exr, ffv1, ffvhuff, none, found 'gif'"),
         ({"compression": "rar"}, "expected a compression of none, zip, piz, found 'rar'"),
         ({"rate": 0.0}, "expected a rate of 0.001 to 100000 frames per second, found 0"),
         ({"format": "none", "preview": False}, "expected something to write"),

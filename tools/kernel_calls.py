@@ -12,6 +12,8 @@ import torch
 from polsep import kernels
 from polsep.edit.blur_kernel import filter_image
 from polsep.geometry.integration_kernel import Places, Wanted, fill_system, fill_weights
+from polsep.io.results.exr import half_rows, zip_rows
+from polsep.io.results.pixels_kernel import code_planes
 from polsep.networks.guide import guide_batch
 from polsep.networks.whole_frame_kernel import thumbnail_of
 from polsep.sensor.calibration import neighbours
@@ -32,6 +34,7 @@ def call_kernels() -> None:
     _guide()
     _edit()
     _integrate()
+    _write()
 
 
 def _separate_clipped() -> None:
@@ -61,3 +64,9 @@ def _integrate() -> None:
     wanted = Wanted(np.ones(1), np.zeros((2, 1)))
     fill_weights(np.zeros(1), places, wanted, 1.0, np.zeros((2, 1)))
     fill_system(places, wanted, np.zeros((2, 1)), np.zeros(1), np.zeros(1))
+
+
+def _write() -> None:
+    image = np.zeros((1, 8, 3), np.float32)
+    zip_rows(half_rows([image]), 8)
+    code_planes(image, 1.0)

@@ -74,7 +74,7 @@ class VideoOptions:
     images where nothing moves (`temporal`).
     """
 
-    method: str = "auto"
+    method: str = "auto-fast"
     light_color: LightColor | str = "auto"
     device: str = "auto"
     damaged: str = "stop"

@@ -1,17 +1,17 @@
 """OpenEXR files, read and written by layers.
 
-Note: `write_exr_halves` writes uncompressed half floats without the library, which takes twice as long: it spends 35 of
-50 ms per 2448x2048 frame on copying channels, too much for a video. (Best of 9 on two busy cores, two such colour
-images: 0.91 s by `encode_exr(planes, {}, "none")`, 0.44 s by `write_exr_halves`.) Uncompressed scanlines are a header,
-a table of offsets and the rows; the tests read them back by the library. Source: OpenEXR, "OpenEXR File Layout"
-(openexr.com/en/latest/OpenEXRFileLayout.html).
+Note: `encode_exr_halves` makes files without the library, which takes five times as long for the images of a video: it
+copies channels, and its ZIP compression searches where there is nothing to find (`pixels_kernel`). Scanlines are a
+header, a table of offsets and the chunks; the tests read them back by the library. Source: OpenEXR, "OpenEXR File
+Layout" (openexr.com/en/latest/OpenEXRFileLayout.html).
 """
 
 from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,7 +19,10 @@ import numpy as np
 import OpenEXR  # a bare extension module without stubs
 from numpy.typing import NDArray
 
+from polsep.compute.compiling import read_only
+from polsep.compute.threads import run_over_rows
 from polsep.io.results.exr_header import EXPECTED, check_exr_header
+from polsep.io.results.pixels_kernel import CHUNK, HEAD, LARGEST, ROWS, STORED, fill_rows, pack_chunks
 from polsep.io.store.errors import InputError, naming
 from polsep.io.store.header_checks import require_signature
 from polsep.io.store.quiet import quiet
@@ -32,7 +35,9 @@ COMPRESSIONS = {
     "piz": OpenEXR.PIZ_COMPRESSION,
 }
 #: The largest half float.
-LARGEST_HALF = 65504.0
+LARGEST_HALF = float(LARGEST)
+#: Numbers of compressions in headers.
+_NUMBERS = {"none": 0, "zip": 3}
 _MAGIC, _VERSION, _HALF = 20000630, 2, 1
 #: How the lines begin that OpenEXR writes to standard error.
 _MARK = b"<python_buffer>"
@@ -84,37 +89,74 @@ def as_planes(layers: Mapping[str, NDArray[Number]]) -> dict[str, NDArray[Number
     }
 
 
-def as_half_planes(layers: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float16]]:
-    """`as_planes` in half floats. Light above the largest half float becomes that."""
-    halves: dict[str, NDArray[np.float16]] = {}
-    for name, image in layers.items():
-        halves[name] = np.minimum(image, np.float32(LARGEST_HALF)).astype(np.float16)
-    return as_planes(halves)
+def encode_exr_halves(
+    layers: Mapping[str, NDArray[np.float32]], notes: Mapping[str, str], compression: str
+) -> list[Any]:
+    """Pieces of a file of half floats, one part of scanlines; ``layers [H, W, C]`` by name, ``notes``: attributes.
+
+    Light above the largest half float becomes that.
+    """
+    ordered = sorted(layers)
+    names = sorted(as_planes(layers))  # as half_rows puts them: by layer, and B before G before R
+    height, width = layers[ordered[0]].shape[:2]
+    rows = half_rows([layers[name] for name in ordered])
+    if compression not in _NUMBERS:
+        planes = (rows[:, HEAD + width * k : HEAD + width * (k + 1)] for k in range(len(names)))
+        halves = {name: np.ascontiguousarray(plane).view(np.float16) for name, plane in zip(names, planes, strict=True)}
+        return [encode_exr(halves, notes, compression)]
+    if compression == "none":
+        rows[:, :HEAD].view("<i4")[:] = [(y, 2 * len(names) * width) for y in range(height)]
+        chunks: list[Any] = [rows.data.cast("B")]
+        sizes = np.full(height, rows.strides[0])
+    else:
+        packed = zip_rows(rows, width)
+        leaders = (struct.pack("<2i", CHUNK * k, len(chunk)) for k, chunk in enumerate(packed))
+        chunks = [piece for pair in zip(leaders, packed, strict=True) for piece in pair]
+        sizes = np.array([8 + len(chunk) for chunk in packed])
+    head = _header(names, (width, height), notes, _NUMBERS[compression])
+    offsets = len(head) + 8 * len(sizes) + np.cumsum(sizes) - sizes
+    return [head, offsets.astype("<u8").tobytes(), *chunks]
 
 
-def write_exr_halves(path: Path, planes: Mapping[str, NDArray[np.float16]], notes: Mapping[str, str]) -> None:
-    """Write channels ``[H, W]`` without compression; ``notes``: attributes. Raises OSError."""
-    names = sorted(planes)
-    height, width = planes[names[0]].shape
-    rows = np.empty(height, np.dtype([("y", "<i4"), ("bytes", "<i4"), ("light", "<f2", (len(names), width))]))
-    rows["y"], rows["bytes"] = np.arange(height), 2 * len(names) * width
-    for place, name in enumerate(names):
-        rows["light"][:, place] = planes[name]
-    head = _header(names, (width, height), notes)
-    offsets = len(head) + 8 * height + rows.itemsize * np.arange(height, dtype="<u8")
-    with path.open("wb") as stream:
-        stream.write(head)
-        stream.write(offsets.astype("<u8").tobytes())
-        stream.write(rows.data)
+def half_rows(images: Sequence[NDArray[np.float32]]) -> NDArray[np.uint16]:
+    """Rows ``[H, HEAD + n W]`` with the bits of half floats, rounded to even, of planes ``[H, W]`` of n channels.
+
+    ``images [H, W, C]``: their channels follow in the order of the images, from the last channel to the first. Light
+    above `LARGEST_HALF` becomes that. The first words are not set.
+    """
+    height, width = images[0].shape[:2]
+    rows = np.empty((height, HEAD + width * sum(image.shape[2] for image in images)), np.uint16)
+    place = HEAD
+    for image in images:
+        light = read_only(np.ascontiguousarray(image, np.float32).reshape(height, -1))
+        fill = partial(fill_rows, light, image.shape[2], place, rows)
+        run_over_rows(fill, height, ROWS)
+        place += width * image.shape[2]
+    return rows
 
 
-def _header(channels: list[str], size: tuple[int, int], notes: Mapping[str, str]) -> bytes:
+def zip_rows(rows: NDArray[np.uint16], width: int) -> list[memoryview]:
+    """The chunks of rows ``[H, HEAD + n width]``, packed; one that would not get smaller as it is."""
+    chunks = -(-rows.shape[0] // CHUNK)
+    size = 2 * CHUNK * (rows.shape[1] - HEAD)
+    packed = np.empty((chunks, size // 4 + 5 * (size // STORED + 2) + 16), np.uint32)
+    sizes = np.zeros(chunks, np.int64)
+    run_over_rows(partial(pack_chunks, read_only(rows), width, packed, sizes), chunks, 1)
+    found = []
+    for k in range(chunks):
+        own = rows[CHUNK * k : CHUNK * (k + 1), HEAD:]
+        data: NDArray[Any] = np.ascontiguousarray(own) if sizes[k] >= own.nbytes else packed[k]
+        found.append(data.data.cast("B")[: min(int(sizes[k]), own.nbytes)])
+    return found
+
+
+def _header(channels: list[str], size: tuple[int, int], notes: Mapping[str, str], compression: int) -> bytes:
     """Magic number, version and attributes of a part of scanlines."""
     window = struct.pack("<4i", 0, 0, size[0] - 1, size[1] - 1)
     listed = b"".join(name.encode() + b"\0" + struct.pack("<i4B2i", _HALF, 0, 0, 0, 0, 1, 1) for name in channels)
     attributes = [
         ("channels", "chlist", listed + b"\0"),
-        ("compression", "compression", b"\0"),
+        ("compression", "compression", bytes([compression])),
         ("dataWindow", "box2i", window),
         ("displayWindow", "box2i", window),
         ("lineOrder", "lineOrder", b"\0"),

@@ -12,9 +12,10 @@ Conventions: images are linear light, 1.0 = one measurement at the white level. 
 from __future__ import annotations
 
 import glob
-import io
 import json
 import shutil
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,17 +23,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.threads import own_threads
 from polsep.io.raw.videos import load_library
-from polsep.io.results.exr import COMPRESSIONS, as_half_planes, encode_exr, write_exr_halves
-from polsep.io.results.films import LOSSLESS, LOSSLESS_GREY, WATCHABLE, Film, FilmKind, as_codes, join_films
+from polsep.io.results.exr import COMPRESSIONS, encode_exr_halves
+from polsep.io.results.films import LOSSLESS, WATCHABLE, Film, FilmKind, join_films
 from polsep.io.results.separation_writer import UNITS
 from polsep.io.results.sidecars import require_same_settings
-from polsep.io.store.atomic import OutputError, atomic_path, replace_bytes, replace_text, write_checked
+from polsep.io.store.atomic import OutputError, atomic_path, replace_bytes, replace_text
 
 #: Frames per part, about a second; films have a key frame at least as often.
 PART = 25
 #: Images as an EXR file per frame, as lossless films, or only as the film to watch.
-FORMATS = ("exr", "ffv1", "none")
+FORMATS = ("exr", "ffv1", "ffvhuff", "none")
+#: Formats that are films.
+LOSSLESS_CODECS = FORMATS[1:3]
+#: Threads that write at once: an EXR file or two lossless films, and the film to watch.
+_WRITERS = 3
 #: The value of code 65535 in lossless films.
 FILM_WHITE = {"diffuse": 2.0, "specular": 8.0}
 
@@ -105,12 +111,14 @@ class SequenceWriter:
             self._done += 1
         self._films: dict[str, Film] = {}
         self._log: list[dict[str, Any]] = []
+        self._pool: ThreadPoolExecutor | None = None
+        self._begun: list[Future[None]] = []
 
     def _film_kinds(self) -> dict[str, FilmKind]:
         """The kinds of the films of a run, by the images they show."""
         kinds: dict[str, FilmKind] = {}
-        if self.kind.format == "ffv1":
-            lossless = LOSSLESS if self._settings["colors"] == 3 else LOSSLESS_GREY
+        if self.kind.format in LOSSLESS_CODECS:
+            lossless = LOSSLESS[self.kind.format, self._settings["colors"]]
             kinds |= {"diffuse": lossless, "specular": lossless}
         return kinds | ({"preview": WATCHABLE} if self.kind.preview else {})
 
@@ -142,39 +150,65 @@ class SequenceWriter:
     def append(self, index: int, picture: Picture, state: State | None = None) -> None:
         """Write a frame: number ``index`` names its EXR file, which a missing frame has not.
 
-        ``state``: what the next part depends on; it is written at the end of a part.
+        It is written in threads of its own, while the caller makes the next one; their errors are raised by the next
+        call. ``state``: what the next part depends on; it is written at the end of a part.
         """
+        self._wait()
         if self.kind.format == "exr" and "damaged" not in picture.line:
-            write_exr(self._exr_path(index), picture, self.kind.compression)
+            self._start(write_exr, self._exr_path(index), picture, self.kind.compression)
         for image, kind in self._kinds.items():
-            pixels = picture.panels if image == "preview" else as_codes(getattr(picture, image), FILM_WHITE[image])
-            assert pixels is not None
+            pixels = getattr(picture, "panels" if image == "preview" else image)
             if image not in self._films:
                 size = (pixels.shape[0], pixels.shape[1])
                 self._films[image] = Film(self._film_path(self._done, image), kind, size, self.kind.rate)
-            self._films[image].write(pixels)
+            self._start(_write_pixels, self._films[image], pixels, FILM_WHITE.get(image))
         self._log.append(picture.line)
         if len(self._log) == PART:
             self.end_part(state)
+
+    def _start(self, write: Callable[..., None], *given: Any) -> None:
+        """Call a function in another thread, whose kernels use that one alone."""
+        self._pool = self._pool or ThreadPoolExecutor(_WRITERS, "polsep-writer")
+
+        def work() -> None:
+            with own_threads(1):
+                write(*given)
+
+        self._begun.append(self._pool.submit(work))
+
+    def _wait(self) -> None:
+        """Wait for what was started, all of it before an error is raised."""
+        begun, self._begun = self._begun, []
+        wait(begun)
+        for future in begun:
+            future.result()
 
     def end_part(self, state: State | None = None) -> None:
         """Complete the part that is being written, if any; to call behind the last frame."""
         if not self._log:
             return
-        self.close()
+        self._wait()
+        self._close_films()
         if state:
-            stream = io.BytesIO()
-            np.savez(stream, **state)  # type: ignore[arg-type]  # names are not parameters of savez
-            replace_bytes(self._state_path(self._done), stream.getvalue())
+            with atomic_path(self._state_path(self._done)) as part, part.open("wb") as stream:
+                np.savez(stream, **state)  # type: ignore[arg-type]  # names are not parameters of savez
         replace_text(self._record(self._done), "".join(json.dumps(line) + "\n" for line in self._log))
         self._state_path(self._done - 1).unlink(missing_ok=True)
         self._done, self._log = self._done + 1, []
 
     def close(self) -> None:
         """End the films of the part that is being written. The next run writes an incomplete part anew."""
-        for film in self._films.values():
+        wait(self._begun)
+        self._begun = []
+        self._close_films()
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+    def _close_films(self) -> None:
+        films, self._films = self._films, {}
+        for film in films.values():
             film.close()
-        self._films = {}
 
     def lines(self) -> list[dict[str, Any]]:
         """The log of all frames in complete parts."""
@@ -192,7 +226,7 @@ class SequenceWriter:
         log = self.directory / f"{self.stem}.jsonl"
         replace_bytes(log, b"".join(self._record(k).read_bytes() for k in range(self._done)))
         units = {name: UNITS[name] for name in ("diffuse", "specular")}
-        if self.kind.format == "ffv1":
+        if self.kind.format in LOSSLESS_CODECS:
             units = {name: f"{units[name]}; code 65535 is {white:g}" for name, white in FILM_WHITE.items()}
         replace_text(self._report, json.dumps({**report, "units": units}, indent=2) + "\n")
         if self._overwrite:
@@ -213,10 +247,15 @@ def write_exr(path: Path, picture: Picture, compression: str) -> None:
     layers = {"diffuse": picture.diffuse, "specular": picture.specular}
     if picture.combined is not None:
         layers["combined"] = picture.combined
-    planes = as_half_planes(layers)
     notes = {f"{layer}Units": UNITS[layer] for layer in layers}
-    with atomic_path(path) as part:
-        if compression == "none":
-            write_exr_halves(part, planes, notes)
-        else:
-            write_checked(part, encode_exr(planes, notes, compression))
+    with atomic_path(path) as part, part.open("wb") as stream:
+        stream.writelines(encode_exr_halves(layers, notes, compression))
+
+
+def _write_pixels(film: Film, pixels: NDArray[Any], white: float | None) -> None:
+    """Append an image to a film; ``white``: the value of the largest code of linear light."""
+    if white is not None:
+        from polsep.io.results.pixels_kernel import code_planes
+
+        pixels = code_planes(pixels, white)
+    film.write(pixels)

@@ -12,9 +12,9 @@ from polsep.bench.frontend import bench_frontend, bench_frontend_quick
 from polsep.bench.real import bench_real
 from polsep.bench.reality import bench_reality
 from polsep.bench.reality_plot import draw_reality
-from polsep.bench.resources import bench_resources
 from polsep.bench.run import Bench
 from polsep.bench.separation import bench_separation
+from polsep.bench.speed import bench_speed, bench_speed_quick
 
 #: Code that formulas consist of, and that every method does.
 FORMULAS = ("polsep/physics", "polsep/sensor", "polsep/demosaic", "polsep/separation")
@@ -27,11 +27,11 @@ BENCHES: dict[str, Bench] = {
     "reality": Bench(
         bench_reality, bench_reality, draw_reality, measures=(*SEPARATION, "polsep/datasets", "polsep/pipeline.py")
     ),
-    "resources": Bench(bench_resources, measures=(*SEPARATION, "polsep/compute", "polsep/pipeline.py")),
+    "speed": Bench(bench_speed, bench_speed_quick, measures=(*SEPARATION, "polsep/compute", "polsep/pipeline.py")),
     "frontend": Bench(
         bench_frontend,
         bench_frontend_quick,
         data=("four_angle",),
-        measures=(*FORMULAS, "polsep/compute"),
+        measures=FORMULAS,
     ),
 }

@@ -1,4 +1,4 @@
-"""What `polsep.bench.speed` times of polsep: chains from a raw frame of 12 bits to diffuse and specular images.
+"""Chains that `polsep.bench.speed` times of polsep: from a raw frame of 12 bits to diffuse and specular images.
 
 * "METHOD, one frame": `polsep.separate`, frame after frame, all cores for each;
 * "METHOD, many frames": the same, as many frames at once as there are cores and each on one of them, as `polsep video`;

@@ -52,7 +52,7 @@ RESOLUTIONS = ("half", "full")
 
 @dataclass
 class Times:
-    """What is known of a chain: seconds to the first image, milliseconds of frames, MiB; ``spent`` seconds in all."""
+    """Measurements of a chain: seconds to the first image, milliseconds of frames, MiB; ``spent`` seconds in all."""
 
     first: list[float] = field(default_factory=list)
     frames: list[float] = field(default_factory=list)

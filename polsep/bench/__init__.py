@@ -1,4 +1,4 @@
-"""Benchmarks for users: separation, exactness, the front end, time and memory, real frames; rows in results/*.jsonl.
+"""Benchmarks for users: separation, exactness, the front end, time, memory, GPUs, real frames; rows in results/*.jsonl.
 
 Every row says what was measured (`bench`, `case`, `method`, `metric`, `value`, `unit`) and by what (`command`,
 `commit`, `machine`). The tables of README and docs are made from these rows by `io.store.rows.fill_tables`. The
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from polsep.bench.exactness import bench_exactness
 from polsep.bench.frontend import bench_frontend, bench_frontend_quick
+from polsep.bench.gpu import bench_gpu
 from polsep.bench.real import bench_real
 from polsep.bench.reality import bench_reality
 from polsep.bench.reality_plot import draw_reality
@@ -28,6 +29,7 @@ BENCHES: dict[str, Bench] = {
         bench_reality, bench_reality, draw_reality, measures=(*SEPARATION, "polsep/datasets", "polsep/pipeline.py")
     ),
     "speed": Bench(bench_speed, bench_speed_quick, measures=(*SEPARATION, "polsep/compute", "polsep/pipeline.py")),
+    "gpu": Bench(bench_gpu, measures=(*SEPARATION, "polsep/in_torch.py", "polsep/pipeline.py")),
     "frontend": Bench(
         bench_frontend,
         bench_frontend_quick,

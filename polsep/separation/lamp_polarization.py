@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import Array, namespace, to_numpy_together
 from polsep.compute.resizing import block_means, blocks_of
 
 Floats = NDArray[np.float32]
@@ -31,16 +32,17 @@ MIN_PART, MAX_PART, ERRORS, MAX_BESIDE = 0.04, 0.5, 3.0, 0.5
 MEDIAN_ERROR = 1.4826 * 1.25
 
 
-def find_unpolarized(diffuse: Floats, specular: Floats) -> float:
+def find_unpolarized(diffuse: Array, specular: Array) -> float:
     """The part of the specular image that is left in the diffuse one, (1 - p) / p; 0 where none is proven.
 
-    ``diffuse [3, h, w]``, ``specular [1, h, w]``: a method's images at half resolution, in white light.
+    ``diffuse [3, h, w]``, ``specular [1, h, w]``: a method's images at half resolution, in white light, on any device.
     """
     if min(diffuse.shape[-2:]) < SIDE:
         return 0.0
-    products = (diffuse, specular, specular * specular, specular * diffuse)
-    color, light, square, product = (block_means(x, SIDE).reshape(x.shape[0], -1) for x in products)
-    largest = blocks_of(specular[0] + diffuse.max(axis=0) / 2, SIDE).max(axis=(-3, -1)).reshape(-1)
+    xp, products = namespace(diffuse), (diffuse, specular, specular * specular, specular * diffuse)
+    brightest = xp.max(blocks_of(specular[0] + xp.max(diffuse, axis=0) / 2, SIDE), axis=(-3, -1))
+    places = to_numpy_together(brightest, *(block_means(x, SIDE) for x in products))
+    largest, (color, light, square, product) = places[0].reshape(-1), (x.reshape(x.shape[0], -1) for x in places[1:])
     variance, covariance = (square - light**2)[0], product - light * color
     body = color / np.linalg.norm(color, axis=0).clip(1e-9)
     white = 1 - body * body.sum(axis=0)

@@ -3,10 +3,10 @@
 Frames are turned into the order of filters that the network was trained on (`orient`), cut into overlapping strips of
 rows where they are large (`strips`), and turned back. Twin on CPUs: `engines`.
 
-On GPUs, layers run in float16, whose 11 bits lose nothing: images differ from those of float32 layers by 70 dB or less
-noise (`polsep bench gpu`; in bfloat16, by 52). The closed form and all that makes images of features stay in float32.
-Where the environment variable POLSEP_COMPILE is 1, torch compiles networks and replays them as CUDA graphs: minutes at
-first, for streams of frames of one size.
+On GPUs, layers run in float16, whose 11 bits lose nothing: the noise that they add is 60 dB below white and more, and
+bfloat16 adds ten times as much (tests/test_gpu.py measures both). The closed form and all that makes images of features
+stay in float32. Where the environment variable POLSEP_COMPILE is 1, torch compiles networks and replays them as CUDA
+graphs: minutes at first, for streams of frames of one size.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torch.nn.functional import max_pool2d
 from polsep.demosaic.bilinear import mean_cells
 from polsep.networks.joint import Joint, limit
 from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of, own_order
-from polsep.physics.stokes import Stokes
+from polsep.physics.stokes import Stokes, stokes_inverse
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.orient import Orientation, orient, shifts_of
 from polsep.separation.analytic import Separation
@@ -131,6 +131,8 @@ def _run_layers(network: Joint, strip: tuple[Tensor, Tensor], thumbnail: Tensor 
 
 @cache
 def _compiled() -> Callable[..., list[Tensor]]:
+    # Of angles alone, in NumPy, which would cut the graph in pieces.
+    torch.compiler.assume_constant_result(stokes_inverse)  # type: ignore[no-untyped-call]
     return torch.compile(_images, mode="reduce-overhead", dynamic=False)
 
 

@@ -66,7 +66,7 @@ BENCHES: dict[str, Bench] = {
 
 #: Paths that the numbers of every results file speak of; evaluation/peers writes what is not of a benchmark.
 MEASURES = {name: bench.measures for name, bench in (polsep.bench.BENCHES | BENCHES).items()} | {
-    "polanalyser": (*FORMULAS, "polsep/compute"),
+    "polanalyser": FORMULAS,
     "blender": ("polsep/geometry", "polsep/material", "polsep/io/assets"),
     "materialx": ("polsep/material", "polsep/io/assets"),
     "reliability": ("polsep/io", "polsep/sensor/levels.py", "polsep/edit/recipe.py", "evaluation/damage.py"),

@@ -32,7 +32,7 @@ from polsep.sensor.checks import check_mosaic
 from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.images import FrameImages
-from polsep.separation.report import SeparatedFrame, describe, error_quantiles
+from polsep.separation.report import SeparatedFrame, describe, error_quantiles, on_host
 
 if TYPE_CHECKING:
     from polsep.io.results.previews import Picture
@@ -167,8 +167,9 @@ def separate_capture(
     """`separate` for a frame that is already a `Mosaic`, or co-sited `Measurements` (which keep their resolution)."""
     chosen = find_method(method, capture)
     checked = check_mosaic(capture) if isinstance(capture, Mosaic) else None
-    capture = move_capture(checked.mosaic if checked else capture, find_device(device))
-    light, facts, remarks = resolve_light(light_color, capture)
+    capture, device = checked.mosaic if checked else capture, find_device(device)
+    light, facts, remarks = resolve_light(light_color, capture)  # before it moves: a device sends no raw frame back
+    capture = move_capture(capture, device)
     images, colored = chosen.run(capture, light, full), Colored()
     if chosen.assumes_white and isinstance(capture, Mosaic):
         images, colored = color_specular(images, capture, light)
@@ -186,7 +187,8 @@ def separate_capture(
 def make_frame(
     images: FrameImages, method: Method, capture: Capture, light: tuple[float, ...], full: bool = False
 ) -> Result:
-    """Images that a method made of a capture, with their report."""
+    """Images that a method made of a capture, in the computer's own memory, with their report."""
+    images = on_host(images)
     assert images.dolp is not None and images.aolp is not None and images.tally is not None
     report = describe(images.tally, method.expects_errors)
     if images.error is not None:

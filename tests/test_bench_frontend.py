@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from polsep.bench import frontend, speed
+from polsep.bench import frontend
 from polsep.bench.frontend import (
     Case,
     demosaic_case,
@@ -145,17 +144,6 @@ def test_failing_program_is_one_line() -> None:
     """The last line of what a program said becomes the message."""
     with pytest.raises(ValueError, match=r"\Ash failed: no luck\Z"):
         run_json("sh", "-c", "echo much; echo no luck >&2; exit 3")
-
-
-def test_chains_print_their_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A chain's time and memory come as JSON; every chain in the table can be found or is a kernel that is missing."""
-    threads = torch.get_num_threads()
-    np.save(tmp_path / "raw.npy", np.full((64, 64), 1000, np.uint16))
-    speed.print_time("polsep analytic, bilinear", str(tmp_path / "raw.npy"))
-    torch.set_num_threads(threads)
-    found = json.loads(capsys.readouterr().out)
-    assert 0 < found["best"] < 1000
-    assert 0 <= found["working"] < found["peak"]
 
 
 def test_tables_of_parts(tmp_path: Path) -> None:

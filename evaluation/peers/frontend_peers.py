@@ -1,8 +1,7 @@
 """Colour polarization demosaickers of other packages, for `polsep bench frontend`; run by the peers' python.
 
     frontend_peers.py demosaic IN OUT     every IN/STEM.npy by every peer: OUT/METHOD/STEM.npy, and OUT/timing.json
-    frontend_peers.py chains              the names of the chains that can be timed, as JSON
-    frontend_peers.py time CHAIN FILE     one chain on one 12-bit raw: milliseconds and MiB, as JSON
+    frontend_peers.py chains              the names of the chains that `polsep bench speed` times, as JSON
 
 Raws are uint16 [H, W] mosaics, 90 45 / 135 0 under RGGB; IN is scaled to white = 65535. Results are float32 in units of
 the white level, [4, 3, H, W] (or [4, 3, H/2, W/2] where a method has no more), angles 0 45 90 135, colours R G B.
@@ -19,8 +18,9 @@ import json
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,6 @@ warnings.simplefilter("ignore")
 #: Row and column of the analysers 0, 45, 90, 135 in a cell.
 PLACES = ((1, 1), (0, 1), (0, 0), (1, 0))
 WHITE, WHITE_12_BIT = 65535.0, 4095.0
-MOST_RUNS, MOST_SECONDS = 40, 4.0
 
 Array = np.ndarray[Any, Any]
 
@@ -95,35 +94,49 @@ def demosaickers() -> dict[str, Callable[[Array], Array]]:
     }
 
 
-def separate_polanalyser(raw: Array) -> tuple[Array, Array]:
-    """polanalyser's chain as its README has it, at full resolution."""
+def separate_polanalyser(raw: Array, half: bool) -> tuple[Array, Array]:
+    """polanalyser's chain as its README has it; at half resolution, which it lacks, with means over cells before it."""
+    import cv2
     import polanalyser as pa
 
     images = pa.demosaicing(raw, pa.COLOR_PolarRGB)
+    if half:
+        images = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in images]
     stokes = pa.calcStokes(images, np.deg2rad([0, 45, 90, 135]))
     return pa.cvtStokesToDiffuse(stokes), pa.cvtStokesToSpecular(stokes)
 
 
-def separate_opencv(raw: Array) -> tuple[Array, Array]:
-    """The analytic split by hand, at half resolution in float32."""
+def separate_opencv(raw: Array, half: bool) -> tuple[Array, Array]:
+    """The analytic split by hand in float32: at half resolution regrouped, at full resolution registered."""
     import cv2
 
-    m0, m45, m90, m135 = demosaic_opencv(raw).astype(np.float32) * np.float32(1 / WHITE_12_BIT)
+    images = demosaic_opencv(raw) if half else register(demosaic_opencv(raw))
+    m0, m45, m90, m135 = images.astype(np.float32, copy=False) * np.float32(1 / WHITE_12_BIT)
     specular = cv2.magnitude((m0 - m90).reshape(len(m0), -1), (m45 - m135).reshape(len(m0), -1)).reshape(m0.shape)
     return 0.5 * (m0 + m45 + m90 + m135) - specular, specular
 
 
-def chains() -> dict[str, Callable[[Array], Any]]:
-    """Timed chains by name: 12-bit raw to the result that the name says."""
-    polanalyser, opencv = f"polanalyser {version('polanalyser')}", f"OpenCV {version('opencv-python-headless')}"
-    eari, colour = f"eari-demosaic {version('eari-demosaic')}", f"colour-demosaicing {version('colour-demosaicing')}"
+def chains() -> dict[str, Callable[[Array, bool], Any]]:
+    """Timed chains by name: 12-bit raw to diffuse and specular, at half resolution or full."""
     return {
-        f"{polanalyser}, full resolution": separate_polanalyser,
-        f"{opencv} + NumPy by hand": separate_opencv,
-        f"{eari}, demosaicking alone": lambda raw: demosaic_eari(raw.astype(np.float32) * np.float32(1 / WHITE_12_BIT)),
-        f"{colour} Malvar2004, demosaicking alone": lambda raw: demosaic_colour(raw / WHITE_12_BIT, "Malvar2004"),
-        f"{colour} Menon2007, demosaicking alone": lambda raw: demosaic_colour(raw / WHITE_12_BIT, "Menon2007"),
+        f"polanalyser {version('polanalyser')}": separate_polanalyser,
+        f"OpenCV {version('opencv-python-headless')} + NumPy by hand": separate_opencv,
     }
+
+
+def chain_names() -> list[str]:
+    """Every chain as `polsep bench speed` names it, "RESOLUTION: NAME"."""
+    return [f"{resolution}: {name}" for resolution in ("half", "full") for name in chains()]
+
+
+def frames(chain: str, path: str) -> tuple[Iterator[Any], int]:
+    """The frames of a chain, for ever, of the raw file at ``path``, one at once; for polsep's bench/stopwatch.py."""
+    import cv2
+
+    cv2.setNumThreads(2)
+    resolution, _, name = chain.partition(": ")
+    raw, separate = np.load(path), chains()[name]
+    return (separate(raw, resolution == "half") for _ in repeat(None)), 1
 
 
 def write_results(source: Path, target: Path) -> None:
@@ -140,37 +153,12 @@ def write_results(source: Path, target: Path) -> None:
     (target / "timing.json").write_text(json.dumps(seconds))
 
 
-def peak_mebibytes() -> float:
-    """Peak memory of this program so far (ru_maxrss would count that of the program that started it)."""
-    return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1024
-
-
-def time_chain(name: str, path: Path) -> dict[str, float]:
-    """Best of some runs after a warm-up, in milliseconds, and peak memory."""
-    import cv2
-
-    cv2.setNumThreads(2)
-    raw, function = np.load(path), chains()[name]
-    function(raw[:64, :64])  # imports what it needs
-    before = peak_mebibytes()
-    function(raw)
-    times: list[float] = []
-    while not times or (len(times) < MOST_RUNS and sum(times) < MOST_SECONDS):
-        start = time.perf_counter()
-        function(raw)
-        times.append(time.perf_counter() - start)
-    peak = peak_mebibytes()
-    return {"best": 1000 * min(times), "peak": peak, "working": peak - before}
-
-
 def main(command: str, *arguments: str) -> None:
-    """One of the three commands above."""
+    """One of the two commands above."""
     if command == "demosaic":
         write_results(Path(arguments[0]), Path(arguments[1]))
-    elif command == "chains":
-        print(json.dumps(list(chains())))
     else:
-        print(json.dumps(time_chain(arguments[0], Path(arguments[1]))))
+        print(json.dumps(chain_names()))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""polanalyser 3.0.0 beside polsep: equal Stokes vectors, its formulas in our scale, and seconds in one run.
+"""polanalyser 3.0.0 beside polsep: equal Stokes vectors, and its formulas in our scale.
 
     pip install polanalyser==3.0.0 opencv-python-headless matplotlib
     python evaluation/peers/polanalyser_formulas.py           # writes results/polanalyser.jsonl
@@ -8,10 +8,6 @@ up to Imax instead of s0. polsep's rows are the same formulas on the same four i
 """
 
 from __future__ import annotations
-
-import time
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import polanalyser as pa
@@ -28,25 +24,8 @@ from polsep.sensor.camera import Layout
 from polsep.separation.analytic import separate_analytic
 
 
-def best_seconds(function: Callable[[], Any], repeats: int = 3) -> float:
-    """Shortest of a few runs."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
-def peer_chain(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """polanalyser's whole chain at full resolution."""
-    images = pa.demosaicing(raw, pa.COLOR_PolarRGB)
-    stokes = pa.calcStokes(images, np.deg2rad([0, 45, 90, 135]))
-    return pa.cvtStokesToDiffuse(stokes), pa.cvtStokesToSpecular(stokes)
-
-
 def main() -> None:
-    """Measure parity and time, and record the rows."""
+    """Measure parity and record the rows."""
     mosaic = read_demo_capture()
     raw = to_numpy(mosaic.data).astype(np.uint16)
     images = pa.demosaicing(raw, pa.COLOR_PolarRGB)
@@ -61,19 +40,12 @@ def main() -> None:
     bilinear = np.moveaxis(to_numpy(demosaic_bilinear(mosaic).data), 1, -1)
     inner = (slice(None), slice(8, -8), slice(8, -8))
     apart = np.sqrt(np.mean((bilinear[inner] - np.stack(images)[..., ::-1][inner] / 4095) ** 2))
-    peer_seconds = best_seconds(lambda: peer_chain(raw))
-    own_seconds = best_seconds(lambda: polsep.separate(raw, method="analytic", white_level=4095, full=True))
-    half_seconds = best_seconds(lambda: polsep.separate(raw, method="analytic", white_level=4095))
     case = "demo capture, 2448x2048"
     rows = [
         Row("polanalyser", case, "difference", "Stokes vectors", float(np.abs(theirs - own).max()), "white"),
         Row("polanalyser", case, "difference", "2 x diffuse where DoLP <= 1", float(diffuse[physical].max()), "white"),
         Row("polanalyser", case, "difference", "specular where DoLP <= 1", float(specular[physical].max()), "white"),
         Row("polanalyser", case, "difference", "bilinear demosaicking, rms", float(apart), "white"),
-        Row("polanalyser", case, "polanalyser", "seconds, full resolution", peer_seconds, "s"),
-        Row("polanalyser", case, "polsep analytic", "seconds, full resolution", own_seconds, "s"),
-        Row("polanalyser", case, "polsep analytic", "seconds, half resolution", half_seconds, "s"),
-        Row("polanalyser", case, "polsep analytic", "times faster, half resolution", peer_seconds / half_seconds, "x"),
     ]
     record("polanalyser", rows, "python evaluation/peers/polanalyser_formulas.py")
 

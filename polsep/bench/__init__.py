@@ -1,4 +1,4 @@
-"""Benchmarks for users: separation, exactness, the front end, time and memory, real frames; rows in results/*.jsonl.
+"""Benchmarks for users: separation, exactness, the front end, time, memory, GPUs, real frames; rows in results/*.jsonl.
 
 Every row says what was measured (`bench`, `case`, `method`, `metric`, `value`, `unit`) and by what (`command`,
 `commit`, `machine`). The tables of README and docs are made from these rows by `io.store.rows.fill_tables`. The
@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from polsep.bench.exactness import bench_exactness
 from polsep.bench.frontend import bench_frontend, bench_frontend_quick
+from polsep.bench.gpu import bench_gpu
 from polsep.bench.real import bench_real
 from polsep.bench.reality import bench_reality
 from polsep.bench.reality_plot import draw_reality
-from polsep.bench.resources import bench_resources
 from polsep.bench.run import Bench
 from polsep.bench.separation import bench_separation
+from polsep.bench.speed import bench_speed, bench_speed_quick
 
 #: Code that formulas consist of, and that every method does.
 FORMULAS = ("polsep/physics", "polsep/sensor", "polsep/demosaic", "polsep/separation")
@@ -27,11 +28,12 @@ BENCHES: dict[str, Bench] = {
     "reality": Bench(
         bench_reality, bench_reality, draw_reality, measures=(*SEPARATION, "polsep/datasets", "polsep/pipeline.py")
     ),
-    "resources": Bench(bench_resources, measures=(*SEPARATION, "polsep/compute", "polsep/pipeline.py")),
+    "speed": Bench(bench_speed, bench_speed_quick, measures=(*SEPARATION, "polsep/compute", "polsep/pipeline.py")),
+    "gpu": Bench(bench_gpu, measures=(*SEPARATION, "polsep/in_torch.py", "polsep/pipeline.py")),
     "frontend": Bench(
         bench_frontend,
         bench_frontend_quick,
         data=("four_angle",),
-        measures=(*FORMULAS, "polsep/compute"),
+        measures=FORMULAS,
     ),
 }

@@ -27,7 +27,6 @@ from torch import Tensor
 
 from polsep.bench.peers import demosaic_by_peers, find_peers
 from polsep.bench.rows import Row
-from polsep.bench.speed import bench_speed
 from polsep.bench.truth import SCENE_SEEDS, captures, render_scene
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half, mean_cells
 from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half
@@ -79,7 +78,7 @@ class Case:
 
 
 def bench_frontend(data: Path) -> Iterator[Row]:
-    """Demosaickers and chains beside those of others (POLSEP_PEERS: their python): accuracy, speed and memory.
+    """Demosaickers, and the separation after them, beside those of others (POLSEP_PEERS: their python): accuracy.
 
     Needs the real pictures of ``data``/four_angle. Raises ValueError without them, and without the peers.
     """
@@ -104,7 +103,6 @@ def _measure(data: Path, peers: str | None) -> Iterator[Row]:
                 mixed[key] = mixed.get(key, 0.0) + share * row.value
     for (method, metric), value in mixed.items():
         yield Row("frontend/split", "mixed renders, half", method, metric, value, "dB")
-    yield from bench_speed(peers)
 
 
 def read_cases(data: Path) -> Iterator[Case]:

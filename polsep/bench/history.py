@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 #: equal, to the bit or, where two copies of an equation became one, within rounding.
 UNCHANGED = "results/unchanged.txt"
 #: Benchmarks of time and memory, which code that gives the same outputs may change.
-TIMED = frozenset(("resources", "rendering", "video", "view"))
+TIMED = frozenset(("gpu", "rendering", "speed", "video", "view"))
 
 
 def ask_git(*arguments: str) -> str:

@@ -1,4 +1,4 @@
-"""Demosaickers of other packages, run in a virtual environment of their own that `POLSEP_PEERS` names.
+"""Other packages, run in a virtual environment of their own that `POLSEP_PEERS` names.
 
 evaluation/peers/frontend_peers.py does the work there; evaluation/peers/requirements.txt says what to install.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -60,9 +59,3 @@ def demosaic_by_peers(python: str, raws: dict[str, Tensor]) -> dict[str, dict[st
         run_json(python, str(SCRIPT), "demosaic", str(source), str(target))
         methods = sorted(path for path in target.iterdir() if path.is_dir())
         return {m.name: {n: torch.from_numpy(read_array(m / f"{n}.npy")) for n in raws} for m in methods}
-
-
-def time_peers(python: str, raw: Path) -> Iterator[tuple[str, dict[str, float]]]:
-    """Milliseconds and memory of every peer's chain on a 12-bit raw file, each in its own process."""
-    for name in run_json(python, str(SCRIPT), "chains"):
-        yield name, run_json(python, str(SCRIPT), "time", name, str(raw))

@@ -1,169 +1,207 @@
-"""Time and memory of whole chains, raw frame to diffuse and specular, each in its own process with two threads.
+"""Time and memory of whole chains, a raw frame to diffuse and specular, each in a process of its own.
 
-All see the demo capture: 2448x2048, 12 bits in uint16, colour; fused ones also at half its brightness, where nothing
-clips (solving clipped pixels takes time), and into the same images frame after frame, as a stream does. polsep's chains
-end at half resolution in float32.
+All see the demo capture, 2448x2048, 12 bits in uint16, colour, and have two cores. `chains` names polsep's, and
+evaluation/peers/frontend_peers.py those of other packages. Each runs in several processes, `stopwatch`, in rounds in
+which all take turns, every other one backwards, so that no chain has the machine at a better time than another; one
+that took long is not started again.
 
-A chain must at least read the raw and write both images. ``roofline`` is that traffic at the bandwidth at which two
-threads copy 512 MiB (bytes read plus bytes written), the floor for any chain that leaves the cache; its share says how
-near a chain comes.
+* start to image: from the start of the process to its first frame, everything imported, loaded and compiled: median;
+* frame, least and median: of the frames after it, in all processes; many frames are the mean of a process;
+* peak memory: of the whole process, read from outside.
+
+Ratios compare chains of one resolution, by their least times. A chain must at least read the raw frame and write both
+images in float32. ``roofline`` is that traffic at the bandwidth at which two threads copy 512 MiB (bytes read plus
+bytes written), the floor for any chain that leaves the cache; its share says how near a chain comes.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import statistics
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from polsep.bench.peers import run_json, time_peers
+from polsep.bench import chains, stopwatch
+from polsep.bench.history import ROOT
+from polsep.bench.peers import SCRIPT, TWO_THREADS, find_peers, run_json
 from polsep.bench.rows import Row
-from polsep.bench.truth import DEMO_WHITE as WHITE_LEVEL
 from polsep.bench.truth import read_demo_capture
 from polsep.compute.arrays import to_numpy
-from polsep.demosaic.bilinear import demosaic_bilinear_half
-from polsep.demosaic.guided import demosaic_guided_half
-from polsep.io.store.rows import read_array, read_peak_memory, write_array
-from polsep.kernels import (
-    AnalyticImages,
-    AnalyticOptions,
-    ColorAffineImages,
-    ColorAffineOptions,
-    separate_analytic_half,
-    separate_color_affine_half,
-    set_threads,
-)
-from polsep.physics.stokes import Measurements
-from polsep.sensor.camera import Layout, Mosaic
-from polsep.separation.analytic import Separation, separate_analytic
-from polsep.separation.color_affine import separate_color_affine
+from polsep.io.store.rows import read_cpu_times, read_peak_memory, write_array
+from polsep.kernels import warm_up
 
-CASE = "2448x2048 colour frame"
-#: Every chain is timed in so many processes, in turns, each time so often or so long; the best time counts.
-ROUNDS, MAX_RUNS, MAX_SECONDS = 2, 40, 4.0
-#: Threads of every chain.
-THREADS = 2
-
-Raw = NDArray[Any]
-Chain = Callable[[Raw], Any]
+#: Rounds, the seconds of frames in each process, and those after which a chain is not started again.
+ROUNDS, SECONDS, ENOUGH = 3, 2.0, 20.0
+#: The same of ``--quick``.
+QUICK_ROUNDS, QUICK_SECONDS = 1, 0.5
+#: Other programs may use so much of the cores before a round; it waits up to so many seconds for that.
+IDLE, PATIENCE = 0.1, 30
+#: Packages that chains are compared with, by the beginning of their names.
+REFERENCES = {"polanalyser": "polanalyser", "OpenCV": "OpenCV + NumPy"}
+RESOLUTIONS = ("half", "full")
 
 
-def _compose(demosaic: Callable[[Mosaic], Measurements], separate: Callable[[Measurements], Separation]) -> Chain:
-    """The chain of a demosaicker and a split in torch."""
-    return lambda raw: separate(demosaic(Mosaic(torch.from_numpy(raw), Layout(), 0.0, WHITE_LEVEL)))
+@dataclass
+class Times:
+    """Measurements of a chain: seconds to the first image, milliseconds of frames, MiB; ``spent`` seconds in all."""
+
+    first: list[float] = field(default_factory=list)
+    frames: list[float] = field(default_factory=list)
+    peaks: list[float] = field(default_factory=list)
+    spent: float = 0.0
 
 
-def _stream(images: Any, options: Callable[..., Any], separate: Callable[..., Any]) -> Chain:
-    """The chain of a function of `polsep.kernels` with its options, into the same images frame after frame."""
-    buffers: dict[tuple[int, ...], Any] = {}
+@dataclass(frozen=True)
+class Program:
+    """A Python and the file in which `stopwatch` finds chains."""
 
-    def chain(raw: Raw) -> Any:
-        if raw.shape not in buffers:
-            buffers[raw.shape] = images.empty(raw.shape, Layout())
-        return separate(raw, Layout(), 0.0, WHITE_LEVEL, options(out=buffers[raw.shape]))
-
-    return chain
+    python: str
+    source: Path
 
 
-#: polsep's chains in torch, and those of `polsep.kernels`.
-CHAINS: dict[str, Chain] = {
-    "polsep analytic, bilinear": _compose(demosaic_bilinear_half, separate_analytic),
-    "polsep analytic, guided": _compose(demosaic_guided_half, separate_analytic),
-    "polsep color-affine, bilinear": _compose(demosaic_bilinear_half, separate_color_affine),
-    "polsep color-affine, guided": _compose(demosaic_guided_half, separate_color_affine),
-}
-KERNELS: dict[str, Chain] = {
-    "polsep analytic, bilinear, kernel": _stream(AnalyticImages, AnalyticOptions, separate_analytic_half),
-    "polsep color-affine, bilinear, kernel": _stream(ColorAffineImages, ColorAffineOptions, separate_color_affine_half),
-    "polsep color-affine, guided, kernel": _stream(
-        ColorAffineImages, partial(ColorAffineOptions, guided=True), separate_color_affine_half
-    ),
-}
+def bench_speed() -> Iterator[Row]:
+    """Time and memory of every method and stream, half and full resolution, beside other packages and the roofline.
 
-
-def bench_speed(peers: str | None) -> Iterator[Row]:
-    """Milliseconds, frames/s, memory and share of the roofline of every chain, and ratios to the peers' of this run."""
-    raw = to_numpy(read_demo_capture().data).astype(np.uint16)
-    with TemporaryDirectory() as folder:
-        path, unclipped = Path(folder) / "raw.npy", Path(folder) / "unclipped.npy"
-        write_array(path, raw)
-        write_array(unclipped, raw // 2)
-        found: dict[str, dict[str, float]] = {}
-        for _ in range(ROUNDS):
-            for name, times in (*_time_own(path, unclipped), *(time_peers(peers, path) if peers else ())):
-                found[name] = times if times["best"] < found.get(name, times)["best"] else found.get(name, times)
-    bandwidth = measure_copy_bandwidth()
-    least = 1000 * (raw.nbytes + 2 * 3 * 4 * raw.size // 4) / bandwidth
-    yield Row("frontend/speed", CASE, "roofline", "copy bandwidth", bandwidth / 1e9, "GB/s")
-    yield from _speed_rows("roofline", least)
-    references = {peer: _time_of(found, peer) for peer in ("polanalyser", "eari-demosaic")}
-    for name, times in found.items():
-        yield from _speed_rows(name, times["best"])
-        for label, milliseconds in references.items():
-            if milliseconds is not None:
-                yield Row("frontend/speed", CASE, name, f"times as fast as {label}", milliseconds / times["best"], "x")
-        if name.startswith("polsep"):
-            yield Row("frontend/speed", CASE, name, "roofline reached", 100 * least / times["best"], "%")
-        yield Row("frontend/speed", CASE, name, "peak memory", times["peak"], "MiB")
-        yield Row("frontend/speed", CASE, name, "of it by the chain", times["working"], "MiB")
-
-
-def _speed_rows(method: str, milliseconds: float) -> Iterator[Row]:
-    yield Row("frontend/speed", CASE, method, "time", milliseconds, "ms")
-    yield Row("frontend/speed", CASE, method, "rate", 1000 / milliseconds, "frames/s")
-
-
-def _time_of(found: dict[str, dict[str, float]], start: str) -> float | None:
-    """Milliseconds of the chain whose name starts so."""
-    return next((times["best"] for name, times in found.items() if name.startswith(start)), None)
-
-
-def _time_own(path: Path, unclipped: Path) -> Iterator[tuple[str, dict[str, float]]]:
-    """`print_time` of every chain that there is, each in its own process."""
-    script = "import sys; from polsep.bench.speed import print_time; print_time(*sys.argv[1:])"
-    for name in (*CHAINS, *KERNELS):
-        yield name, run_json(sys.executable, "-c", script, name, str(path))
-    for name in KERNELS:
-        yield f"{name}, nothing clipped", run_json(sys.executable, "-c", script, name, str(unclipped))
-
-
-def print_time(name: str, path: str) -> None:
-    """Milliseconds of a chain, best of some runs after a warm-up, and this process's peak memory.
-
-    Printed as JSON.
+    POLSEP_PEERS names the python of the packages (evaluation/peers). Ten minutes on an idle machine of two cores.
+    Raises ValueError without the peers.
     """
-    torch.set_num_threads(THREADS)
-    raw, chain = read_array(Path(path)), (CHAINS | KERNELS)[name]
-    set_threads(THREADS)
-    before = read_peak_memory()
-    chain(raw)
-    times: list[float] = []
-    while not times or (len(times) < MAX_RUNS and sum(times) < MAX_SECONDS):
-        start = time.perf_counter()
-        chain(raw)
-        times.append(time.perf_counter() - start)
-    peak = max(read_peak_memory(), before)  # Linux counts pages in batches, so that peaks may even fall a little
-    print(json.dumps({"best": 1000 * min(times), "peak": peak, "working": peak - before}))
+    peers = Program(find_peers(), SCRIPT)
+    names = run_json(peers.python, str(SCRIPT), "chains")
+    own = [name for resolution in RESOLUTIONS for name in chains.chain_names(resolution)]
+    yield from measure(dict.fromkeys(own, _own()) | dict.fromkeys(names, peers), ROUNDS, SECONDS)
+
+
+def bench_speed_quick() -> Iterator[Row]:
+    """`bench_speed` of polsep alone at half resolution, in one round."""
+    yield from measure(dict.fromkeys(chains.chain_names("half"), _own()), QUICK_ROUNDS, QUICK_SECONDS)
+
+
+def _own() -> Program:
+    return Program(sys.executable, Path(chains.__file__))
+
+
+def measure(programs: dict[str, Program], rounds: int, seconds: float) -> Iterator[Row]:
+    """Rows of chains by name, "RESOLUTION: TITLE"."""
+    warm_up()  # compiled kernels are kept on disk, so that no process has to make them
+    raw, found = to_numpy(read_demo_capture().data).astype(np.uint16), {name: Times() for name in programs}
+    busy, bandwidths = [], []
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "raw.npy"
+        write_array(path, raw)
+        for turn in range(rounds):
+            busy.append(wait_until_idle())
+            bandwidths.append(measure_copy_bandwidth())
+            for name in list(programs)[:: -1 if turn % 2 else 1]:
+                if found[name].spent < ENOUGH:
+                    run_chain(programs[name], name, (path, seconds), found[name])
+    yield Row("speed/machine", "before each round", "other programs", "use of the cores, most", max(busy), "%")
+    yield Row(
+        "speed/machine", "before each round", "two threads", "bandwidth of copying, most", max(bandwidths) / 1e9, "GB/s"
+    )
+    for resolution in RESOLUTIONS:
+        times = {name.partition(": ")[2]: t for name, t in found.items() if name.startswith(f"{resolution}: ")}
+        pixels = raw.size if resolution == "full" else raw.size // 4
+        floor = 1000 * (raw.nbytes + 2 * 3 * 4 * pixels) / max(bandwidths)
+        yield from (chain_rows(resolution, times, floor) if times else ())
+        yield from method_rows(resolution, times)
+
+
+def chain_rows(resolution: str, times: dict[str, Times], floor: float) -> Iterator[Row]:
+    """Rows of all chains of a resolution; ``floor``: milliseconds that none can beat."""
+    case, references = f"{resolution} resolution", _references(times)
+    yield Row("speed/chains", case, "roofline", "frame, least", floor, "ms")
+    yield Row("speed/chains", case, "roofline", "rate", 1000 / floor, "frames/s")
+    for name, t in times.items():
+        least = min(t.frames)
+        yield Row("speed/chains", case, name, "frame, least", least, "ms")
+        yield Row("speed/chains", case, name, "frame, median", statistics.median(t.frames), "ms")
+        yield Row("speed/chains", case, name, "rate", 1000 / least, "frames/s")
+        for label, reference in references.items():
+            yield Row("speed/chains", case, name, f"times as fast as {label}", min(reference.frames) / least, "x")
+        yield Row("speed/chains", case, name, "roofline reached", 100 * floor / least, "%")
+        yield Row("speed/chains", case, name, "start to image", statistics.median(t.first), "s")
+        yield Row("speed/chains", case, name, "peak memory", max(t.peaks), "MiB")
+
+
+def method_rows(resolution: str, times: dict[str, Times]) -> Iterator[Row]:
+    """Rows of the table in the README: every method, and the packages that it is compared with."""
+    case = f"{resolution} resolution"
+    one = {name.removesuffix(", one frame"): t for name, t in times.items() if name.endswith(", one frame")}
+    for name, t in (one | _references(times)).items():
+        yield Row("speed", case, name, "process start to first image", statistics.median(t.first), "s")
+        yield Row("speed", case, name, "one frame, least", min(t.frames) / 1000, "s")
+        yield Row("speed", case, name, "one frame, median", statistics.median(t.frames) / 1000, "s")
+        if many := times.get(f"{name}, many frames"):
+            yield Row("speed", case, name, "many frames, one per core", 1000 / min(many.frames), "frames/s")
+        yield Row("speed", case, name, "peak memory, one frame", max(t.peaks), "MiB")
+
+
+def _references(times: dict[str, Times]) -> dict[str, Times]:
+    """The chains of `REFERENCES` among others, by their labels."""
+    return {label: t for start, label in REFERENCES.items() for name, t in times.items() if name.startswith(start)}
+
+
+def run_chain(program: Program, chain: str, task: tuple[Path, float], times: Times) -> None:
+    """Add a process of a chain to its ``times``; ``task``: the raw file, and seconds of frames.
+
+    Raises ValueError with the last line that it said when it fails.
+    """
+    paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))  # the polsep that is running
+    environment = os.environ | TWO_THREADS | ({"PYTHONPATH": paths} if program.python == sys.executable else {})
+    arguments = (stopwatch.__file__, str(program.source), *map(str, task), chain)
+    start = time.perf_counter()
+    with subprocess.Popen(
+        (program.python, "-P", *arguments),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        first = time.perf_counter() - start
+        frames = process.stdout.readline()
+        peak = read_peak_memory(process.pid) if frames else 0.0
+        _, said = process.communicate()
+    if process.returncode:
+        raise ValueError(f"{chain} failed: {(said.strip().splitlines() or ['no message'])[-1]}")
+    times.first.append(first)
+    times.frames.extend(json.loads(frames))
+    times.peaks.append(peak)
+    times.spent += time.perf_counter() - start
+
+
+def wait_until_idle() -> float:
+    """Percent of the cores that all programs use, once it is little, or after `PATIENCE` looks of a second each."""
+    share = 1.0
+    for _ in range(PATIENCE):
+        before = read_cpu_times()
+        time.sleep(1)
+        busy, passed = (now - then for now, then in zip(read_cpu_times(), before, strict=True))
+        share = busy / max(passed, 1e-9)
+        if share <= IDLE:
+            return 100 * share
+    print(f"machine busy: other programs use {share:.0%} of the cores", file=sys.stderr, flush=True)
+    return 100 * share
 
 
 def measure_copy_bandwidth(mebibytes: int = 512) -> float:
-    """Bytes/s, read and written, at which two threads of torch copy that much: best of 5."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(THREADS)
-    source = torch.ones(mebibytes * 2**18)
-    target = torch.zeros_like(source)
-    times = []
-    for _ in range(5):
-        start = time.perf_counter()
-        target.copy_(source)
-        times.append(time.perf_counter() - start)
-    torch.set_num_threads(threads)
+    """Bytes/s, read and written, at which two threads copy that much: best of 5."""
+    source = np.ones((2, mebibytes * 2**17), np.float32)
+    target, times = np.zeros_like(source), []
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(5):
+            start = time.perf_counter()
+            list(pool.map(np.copyto, target, source))
+            times.append(time.perf_counter() - start)
     return 2 * source.nbytes / min(times)

@@ -87,6 +87,7 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     from polsep.train.loop import Run, Schedule
     from polsep.train.material_command import choose_material, train_material
     from polsep.train.stream import StreamOptions
+
     shared = {name: options[name] for name in ("workers", "devices", "start", "refit")}
     if rung == "material":
         if options["constants"]:

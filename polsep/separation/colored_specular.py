@@ -20,16 +20,26 @@ from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
+from array_api_compat import is_torch_array
 
-from polsep.compute.arrays import Array, namespace, pad_repeat, to_numpy, window
-from polsep.compute.resizing import resize_area, resize_bilinear
+from polsep.compute.arrays import (
+    Array,
+    constant,
+    contiguous,
+    namespace,
+    pad_repeat,
+    to_numpy,
+    to_numpy_together,
+    window,
+)
+from polsep.compute.resizing import block_means, resize_area, resize_bilinear
 from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import split_analysers
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes
 from polsep.sensor.camera import Mosaic
 from polsep.separation import places_kernel
 from polsep.separation.images import FrameImages, Tally
-from polsep.separation.lamp_polarization import Floats, find_unpolarized
+from polsep.separation.lamp_polarization import Places, find_unpolarized, measure_places
 from polsep.separation.retained_polarization import find_retained
 
 #: Raw pixels along the side of a period.
@@ -51,11 +61,11 @@ class Periods(NamedTuple):
     to it; ``diffuse``, ``total``: of a method, the latter with its specular light.
     """
 
-    s0: Floats
-    polarized: Floats
-    across: Floats
-    diffuse: Floats
-    total: Floats
+    s0: Array
+    polarized: Array
+    across: Array
+    diffuse: Array
+    total: Array
 
 
 class Colored(NamedTuple):
@@ -79,44 +89,64 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     """The images of one colour frame ``[H, W]``, with coloured specular light where it is proven, and what was found.
 
     ``light``: camera RGB of the lamp, which is divided out. Metals are not ``valid``: samples do not determine their
-    separation. The same object where nothing is found.
+    separation. The same object where nothing is found. Images on a GPU stay there; means over places are looked at.
     """
-    tally, gain = images.tally, np.array(light, np.float32)[:, None, None]
+    tally = images.tally
     if mosaic.layout.channels != 3 or mosaic.data.ndim != 2 or tally is None or min(mosaic.data.shape) < MIN_SIZE:
         return images, Colored()
+    xp, gain = namespace(images.diffuse), constant([[[gain]] for gain in light], images.diffuse)
     row, col = mosaic.layout.origin
-    layout, data = mosaic.layout.rolled(-row, -col), to_numpy(mosaic.data)[row:, col:]
+    data = mosaic.data if is_torch_array(images.diffuse) else to_numpy(mosaic.data)
+    layout, data = mosaic.layout.rolled(-row, -col), data[row:, col:]
     white = replace(mosaic, data=data, layout=layout, light_color=light, falloff=None)
-    diffuse, before = (np.moveaxis(x, -1, 0) for x in (images.diffuse, images.specular))
+    diffuse, before = (xp.moveaxis(x, -1, 0) for x in (images.diffuse, images.specular))
     side = 2 if 2 * diffuse.shape[-1] <= data.shape[-1] else PERIOD
-    make_ready(places_kernel.warm_up)
-    places = places_kernel.measure_places_fast(images.diffuse, images.specular, gain.reshape(-1), side // 2)
-    unpolarized, specular = find_unpolarized(places), before
+    unpolarized, specular = find_unpolarized(_measure_places(images, light, side // 2)), before
     if unpolarized:
-        left = np.minimum(unpolarized * before, diffuse)
+        left = xp.minimum(unpolarized * before, diffuse)
         diffuse, specular = diffuse - left, before + left
     # What fills 3x3 periods fills one in every third row and column: a ninth of the frame shows that there is nothing.
     thin = replace(white, data=_thin(data, PERIOD))
     some = _see(thin, _thin(diffuse, side) / gain, _thin(specular, side) / gain, tally)
-    enough = some if min(data.shape) > MANY else _see(white, diffuse / gain, specular / gain, tally)
+    some = Periods(*to_numpy_together(*some))
+    enough = some
+    if min(data.shape) <= MANY:
+        enough = Periods(*to_numpy_together(*_see(white, diffuse / gain, specular / gain, tally)))
     retained, share = find_retained(enough.polarized, enough.across, enough.diffuse), None
     if float((_part(some) > 0.5).mean()) >= MIN_SHARE:
         seen = _see(white, diffuse / gain, specular / gain, tally)
         found = find_colored(seen)
-        share = found if float((found > 0.5).mean()) >= MIN_SHARE else None
+        share = found if _share(found) >= MIN_SHARE else None
     if not retained and not unpolarized and share is None:
         return images, Colored()
     body, mirrored, valid = (1 - retained) * diffuse, specular + retained * diffuse, images.valid
     if share is not None:
-        ratio = np.minimum(seen.polarized.clip(0), seen.s0) / seen.total.clip(1e-4)
-        share, ratio = (resize_bilinear(x, diffuse.shape[-2:]) for x in (share, ratio.clip(0, MAX_GAIN)))
-        body, mirrored = (1 - share) * body, mirrored + share * (ratio * (diffuse + specular) - mirrored)
-        valid = valid & (share[0] < 0.5)
-    changed = [np.ascontiguousarray(np.moveaxis(x, 0, -1)) for x in (body, mirrored)]
-    more = float(((mirrored - before) / gain).mean(axis=0).sum(dtype=np.float64))
-    tally = replace(tally, specular=tally.specular + more, valid=int(np.count_nonzero(valid)))
+        ratio = xp.minimum(seen.polarized.clip(0, None), seen.s0) / seen.total.clip(1e-4, None)
+        part, ratio = (resize_bilinear(x, diffuse.shape[-2:]) for x in (share, ratio.clip(0, MAX_GAIN)))
+        body, mirrored = (1 - part) * body, mirrored + part * (ratio * (diffuse + specular) - mirrored)
+        valid = valid & (part[0] < 0.5)
+    changed = [contiguous(xp.moveaxis(x, 0, -1)) for x in (body, mirrored)]
+    more = float(xp.sum(xp.mean((mirrored - before) / gain, axis=0), dtype=xp.float64))
+    tally = replace(tally, specular=tally.specular + more, valid=int(xp.sum(valid)))
     images = replace(images, diffuse=changed[0], specular=changed[1], valid=valid, tally=tally)
-    return images, Colored(0.0 if share is None else float(share.mean()), retained, unpolarized)
+    return images, Colored(0.0 if share is None else float(xp.mean(share)), retained, unpolarized)
+
+
+def _measure_places(images: FrameImages, light: tuple[float, ...], cell: int) -> Places:
+    """The places of images at half resolution, or at full resolution in a ``cell`` of two pixels' side."""
+    if not is_torch_array(images.diffuse):
+        make_ready(places_kernel.warm_up)
+        return places_kernel.measure_places_fast(images.diffuse, images.specular, np.array(light, np.float32), cell)
+    xp, gain = namespace(images.diffuse), constant([[[gain]] for gain in light], images.diffuse)
+    planes = (xp.moveaxis(x, -1, 0) / gain for x in (images.diffuse, images.specular))
+    diffuse, specular = (x if cell == 1 else block_means(x, cell) for x in planes)
+    return measure_places(diffuse, xp.mean(specular, axis=0, keepdims=True))
+
+
+def _share(part: Array) -> float:
+    """The share of a frame in which more than half is specular."""
+    xp = namespace(part)
+    return float(xp.mean(xp.astype(part > 0.5, xp.float64)))
 
 
 def _thin(image: Array, side: int) -> Array:
@@ -127,7 +157,7 @@ def _thin(image: Array, side: int) -> Array:
     return blocks.reshape(*image.shape[:-2], *kept)
 
 
-def _see(mosaic: Mosaic, diffuse: Floats, specular: Floats, tally: Tally) -> Periods:
+def _see(mosaic: Mosaic, diffuse: Array, specular: Array, tally: Tally) -> Periods:
     stokes = period_stokes(mosaic)
     length = max((tally.along**2 + tally.across**2) ** 0.5, 1e-30)
     polarized = (stokes.s1 * tally.along + stokes.s2 * tally.across) / length
@@ -136,29 +166,30 @@ def _see(mosaic: Mosaic, diffuse: Floats, specular: Floats, tally: Tally) -> Per
     return Periods(stokes.s0, polarized, across, diffuse, diffuse + specular)
 
 
-def find_colored(seen: Periods) -> Floats:
+def find_colored(seen: Periods) -> Array:
     """The part ``[1, h, w]``, 0 to 1, of the diffuse image that is specular."""
     part = _part(seen)
     solid = _largest_around(-_largest_around(-part))
-    return np.minimum(part, solid)
+    return namespace(part).minimum(part, solid)
 
 
-def _largest_around(image: Floats) -> Floats:
+def _largest_around(image: Array) -> Array:
     """The largest of 3x3 pixels, or of those that there are."""
     for axis in (-2, -1):
         padded, n = pad_repeat(image, 1, axis), image.shape[axis]
-        image = reduce(np.maximum, [window(padded, first, n, axis) for first in range(3)])
+        image = reduce(namespace(image).maximum, [window(padded, first, n, axis) for first in range(3)])
     return image
 
 
-def _part(seen: Periods) -> Floats:
+def _part(seen: Periods) -> Array:
     """0 to 1, as the slope of the colours' polarized on their diffuse light is in `SLOPES`, period by period."""
-    colors = seen.diffuse - seen.diffuse.mean(axis=0, keepdims=True)
-    product = ((seen.polarized - seen.polarized.mean(axis=0, keepdims=True)) * colors).sum(axis=0, keepdims=True)
-    brightness = seen.total.mean(axis=0, keepdims=True)
-    slope = product / ((colors * colors).sum(axis=0, keepdims=True) + MIN_CONTRAST + MIN_RELATIVE * brightness**2)
-    part: Floats = ((slope - SLOPES[0]) / (SLOPES[1] - SLOPES[0])).clip(0, 1)
-    return part
+    xp = namespace(seen.diffuse)
+    colors = seen.diffuse - xp.mean(seen.diffuse, axis=0, keepdims=True)
+    across = seen.polarized - xp.mean(seen.polarized, axis=0, keepdims=True)
+    product, brightness = xp.sum(across * colors, axis=0, keepdims=True), xp.mean(seen.total, axis=0, keepdims=True)
+    contrast = xp.sum(colors * colors, axis=0, keepdims=True)
+    slope = product / (contrast + MIN_CONTRAST + MIN_RELATIVE * brightness**2)
+    return ((slope - SLOPES[0]) / (SLOPES[1] - SLOPES[0])).clip(0, 1)
 
 
 def period_stokes(mosaic: Mosaic) -> Stokes:

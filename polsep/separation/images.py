@@ -49,7 +49,7 @@ class FrameImages:
     ``diffuse``, ``specular``: float32 ``[h, w, C]``; ``valid``: bool ``[h, w]``, as in `Separation`. Made on request,
     else None: ``dolp`` and ``aolp`` [rad], float32 ``[h, w]``, and ``tally``, all of white light and the mean over
     colours. ``error``: float32 ``[h, w, 2]``, expected standard deviation of the errors of diffuse and specular, from
-    methods that expect one.
+    methods that expect one. What a GPU made are torch tensors there, until `report.on_host`.
     """
 
     diffuse: NDArray[np.float32]

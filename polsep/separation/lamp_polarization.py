@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import Array, namespace, to_numpy_together
 from polsep.compute.resizing import block_means, blocks_of
 
 Floats = NDArray[np.float32]
@@ -46,12 +47,16 @@ class Places(NamedTuple):
     largest: Floats
 
 
-def measure_places(diffuse: Floats, specular: Floats) -> Places:
-    """The places of a method's images ``[3, h, w]`` and ``[1, h, w]`` at half resolution, in white light."""
-    products = (diffuse, specular, specular * specular, specular * diffuse)
-    color, light, square, product = (block_means(x, SIDE).reshape(x.shape[0], -1) for x in products)
-    largest = blocks_of(specular[0] + diffuse.max(axis=0) / 2, SIDE).max(axis=(-3, -1)).reshape(-1)
-    return Places(color, light, square, product, largest)
+def measure_places(diffuse: Array, specular: Array) -> Places:
+    """The places of a method's images ``[3, h, w]`` and ``[1, h, w]`` at half resolution, in white light.
+
+    Images may be on any device. Twin: `places_kernel.measure_places_fast`.
+    """
+    xp, products = namespace(diffuse), (diffuse, specular, specular * specular, specular * diffuse)
+    brightest = xp.max(blocks_of(specular[0] + xp.max(diffuse, axis=0) / 2, SIDE), axis=(-3, -1))
+    largest, *means = to_numpy_together(brightest, *(block_means(x, SIDE) for x in products))
+    color, light, square, product = (x.reshape(x.shape[0], -1) for x in means)
+    return Places(color, light, square, product, largest.reshape(-1))
 
 
 def find_unpolarized(places: Places) -> float:

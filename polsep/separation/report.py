@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from array_api_compat import is_array_api_obj
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import Array, constant, namespace, to_numpy
+from polsep.compute.arrays import Array, constant, contiguous, namespace, on_cpu, to_numpy, to_numpy_together
 from polsep.physics.stokes import MAX_DOLP, Measurements, Stokes, aolp, dolp
 from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import Separation, light_polarizer_angle
@@ -77,21 +78,28 @@ def tally(separation: Separation) -> Tally:
     strength = xp.hypot(p1, p2)
     # Networks find specular light where |p| is mostly the diffuse's; in closed forms both are the same.
     weight = strength if errors is None else specular
-    variances = (None, None) if errors is None else (_total(_doubles(errors[..., i, :, :]) ** 2) for i in (0, 1))
-    return Tally(
-        math.prod(separation.valid.shape),
-        0 if separation.clipped is None else int(xp.sum(separation.clipped)),
-        int(xp.sum(separation.valid)),
-        int(xp.sum(dolp(mean) > 1)),
-        _total(diffuse + specular),
-        _total(specular),
-        _total(weight * strength),
-        _total(weight * p1),
-        _total(weight * p2),
-        None if separation.residual is None else _total(separation.residual),
-        None if separation.noise is None else _total(separation.noise),
-        *variances,
-    )
+    found: dict[str, Array] = {
+        "valid": xp.sum(separation.valid),
+        "above_one": xp.sum(dolp(mean) > 1),
+        "s0": _total(diffuse + specular),
+        "specular": _total(specular),
+        "power": _total(weight * strength),
+        "along": _total(weight * p1),
+        "across": _total(weight * p2),
+    }
+    if separation.clipped is not None:
+        found["clipped"] = xp.sum(separation.clipped)
+    for name, image in (("residual", separation.residual), ("noise", separation.noise)):
+        if image is not None:
+            found[name] = _total(image)
+    if errors is not None:
+        for i, name in enumerate(("diffuse_variance", "specular_variance")):
+            found[name] = _total(_doubles(errors[..., i, :, :]) ** 2)
+    # One copy from the device for all, which is waited for once.
+    sums = to_numpy(xp.stack([_doubles(value) for value in found.values()])).tolist()
+    counts = ("valid", "above_one", "clipped")
+    values = {name: int(x) if name in counts else x for name, x in zip(found, sums, strict=True)}
+    return Tally(math.prod(separation.valid.shape), **values)
 
 
 def _doubles(image: Array) -> Array:
@@ -99,10 +107,10 @@ def _doubles(image: Array) -> Array:
     return xp.astype(image, xp.float64)
 
 
-def _total(image: Array) -> float:
+def _total(image: Array) -> Array:
     """The sum over all pixels, in float64."""
     xp = namespace(image)
-    return float(xp.sum(image, dtype=xp.float64))
+    return xp.sum(image, dtype=xp.float64)
 
 
 def under_white_light(capture: Mosaic | Measurements, light: tuple[float, ...]) -> Mosaic | Measurements:
@@ -126,16 +134,21 @@ def in_light(separation: Separation, light: tuple[float, ...]) -> Separation:
 
 
 def images_of(white: Separation, lit: Separation) -> FrameImages:
-    """One frame as NumPy arrays, channels last: images of ``lit``, polarization and tally of ``white``, its twin."""
+    """One frame's images, channels last: images of ``lit``, polarization and tally of ``white``, its twin.
 
-    def image(x: Array) -> NDArray[np.float32]:
-        return np.ascontiguousarray(np.moveaxis(to_numpy(x), -3, -1), np.float32)
+    NumPy arrays, but on a GPU they stay there, until `on_host`.
+    """
+
+    def image(x: Array) -> Array:
+        xp = namespace(x)
+        here = contiguous(xp.astype(xp.moveaxis(x, -3, -1), xp.float32, copy=False))
+        return to_numpy(here) if on_cpu(here) else here
 
     mean = grey(white.stokes)
     return FrameImages(
         image(lit.diffuse),
         image(lit.specular),
-        to_numpy(white.valid),
+        to_numpy(white.valid) if on_cpu(white.valid) else white.valid,
         image(dolp(mean).clip(None, MAX_DOLP))[..., 0],
         image(aolp(mean))[..., 0],
         tally(white),
@@ -156,6 +169,15 @@ def error_quantiles(error: NDArray[np.float32], gain: float) -> dict[str, float]
         for column, image in enumerate(("diffuse", "specular"))
         for row, name in enumerate(("median", "95"))
     }
+
+
+def on_host(images: FrameImages) -> FrameImages:
+    """The images of a frame as NumPy arrays, copied together from a device where they are on one."""
+    if on_cpu(images.diffuse):
+        return images
+    found = {name: image for name, image in vars(images).items() if is_array_api_obj(image)}
+    arrays: dict[str, Any] = dict(zip(found, to_numpy_together(*found.values()), strict=True))
+    return replace(images, **arrays)
 
 
 def dominant_angle(sums: Tally) -> tuple[float, float]:

@@ -76,12 +76,30 @@ def write_chunks(path: Path, chunks: Iterable[bytes]) -> None:
             stream.write(chunk)
 
 
-def read_peak_memory() -> float:
-    """Peak resident MiB of this program; outside Linux that of the program that started it counts too."""
-    status = Path("/proc/self/status")
+def read_peak_memory(process: int | str = "self") -> float:
+    """Peak resident MiB of this program, or of a running process by its number.
+
+    Outside Linux that of the program that started it counts too, and of other processes nothing is known: 0.
+    """
+    status = Path(f"/proc/{process}/status")
     if status.is_file():
         return int(re.findall(r"VmHWM:\s*(\d+) kB", status.read_text(encoding="utf-8"))[0]) / 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 if process == "self" else 0.0
+
+
+def read_cpu_times() -> tuple[float, float]:
+    """Seconds that the cores of this process have worked, for any program, and that have passed, summed over cores.
+
+    Both 0 where the system does not tell, outside Linux.
+    """
+    stat, busy, total = Path("/proc/stat"), 0.0, 0.0
+    lines = stat.read_text(encoding="utf-8").splitlines() if stat.is_file() else []
+    cores = {f"cpu{core}" for core in os.sched_getaffinity(0)} if lines else set()
+    for words in (line.split() for line in lines):
+        if words and words[0] in cores:
+            ticks = [int(word) / os.sysconf("SC_CLK_TCK") for word in words[1:9]]  # idle and waiting are 3 and 4
+            busy, total = busy + sum(ticks[:3]) + sum(ticks[5:]), total + sum(ticks)
+    return busy, total
 
 
 def fill_tables(markdown: str, results: Path, find_changes: FindChanges = lambda *_: None) -> str:

@@ -146,7 +146,8 @@ class Session:
                 if self._settings is None or replace(settings, index=0) != replace(self._settings, index=0):
                     self._drop_reel()
                 self.mark = self.mark if self.opened is not None and self.opened.index == found.index else None
-                found = replace(found, remarks=found.remarks + self._drop_unfit(found))
+                unfit = self._drop_unfit(found)
+                found = replace(found, remarks=found.remarks + unfit) if unfit else found
                 self.opened, self._settings = found, settings
             assert self.opened is not None
             self.against, self.makers = other, (settings.maker, against.maker if against is not None else "")

@@ -169,10 +169,9 @@ watch('value', () => {
 });
 """
 
-EMPTY = (
-    '<div class="ps-nothing"><div><b>No frame yet</b><p>Drop raw frames of a polarization camera here, or four images '
-    "at 0, 45, 90 and 135 degrees.<br>The demo capture shows what polsep does.</p></div></div>"
-)
+EMPTY = """<div class="ps-nothing"><div><b>No frame yet</b>
+<p>Open or drop raw frames of a polarization camera, or four images at 0, 45, 90 and 135 degrees.<br>
+The demo capture shows what polsep does.</p></div></div>"""
 
 CSS = """
 .gradio-container { max-width: none !important; padding: 0 !important; }
@@ -209,7 +208,8 @@ footer { display: none !important; }
 .ps-layer-right { clip-path: inset(0 0 0 var(--cut, 50%)); }
 .ps-over { pointer-events: none; }
 .ps-world { position: absolute; aspect-ratio: var(--ratio);
-  width: calc(min(100cqw, 100cqh * var(--ratio)) * var(--z, 1)); left: calc(50% + var(--x, 0) * 1px); top: calc(50% + var(--y, 0) * 1px); transform: translate(-50%, -50%); }
+  width: calc(min(100cqw, 100cqh * var(--ratio)) * var(--z, 1));
+  left: calc(50% + var(--x, 0) * 1px); top: calc(50% + var(--y, 0) * 1px); transform: translate(-50%, -50%); }
 .ps-stage .ps-world img { position: absolute; inset: 0; width: 100%; height: 100%; max-width: none; margin: 0;
   border-radius: 0; }
 .ps-large .ps-world img { image-rendering: pixelated; }
@@ -279,6 +279,7 @@ footer { display: none !important; }
   .ps-stage { height: min(calc(92vw / var(--ratio, 1.2)), 56vh); min-height: 220px; }
   .ps-nothing { height: 38vh; }
   .ps-tools { bottom: 6px; }
-  .ps-tools button { min-width: 38px; height: 36px; }
+  .ps-tools button { min-width: 40px; height: 34px; }
+  .ps-tools [data-tool=in], .ps-tools [data-tool=out] { display: none; }
 }
 """

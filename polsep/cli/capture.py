@@ -30,7 +30,10 @@ if TYPE_CHECKING:
 )
 @click.option("--layout", metavar="color|mono|SPEC", help="Filter layout of the sensor.  [default: by pixel format]")
 @click.option(
-    "--show", type=int, metavar="PORT", help="Show the live view at http://127.0.0.1:PORT/; 0 picks a free port."
+    "--show",
+    type=int,
+    metavar="PORT",
+    help="Show the live view at http://127.0.0.1:PORT/ with exposure, focus and polarization; 0 picks a free port.",
 )
 @CALIBRATION
 @AMBIENT

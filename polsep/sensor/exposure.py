@@ -1,4 +1,4 @@
-"""Exposure and focus of a raw frame: histogram, cells that clip or are black, sharp edges. For people who set up a shot.
+"""Exposure and focus of a raw frame for people who set up a shot: histogram, cells that clip or are black, sharp edges.
 
 A cell is 2x2 pixels under the four analysers, the unit of half resolution.
 """

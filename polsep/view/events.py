@@ -172,18 +172,22 @@ class Events:
         except FAILURES as error:
             yield self._failed(error, session)
             return
-        ticket = self.sessions.line.join(
-            _key(request), lambda ticket: session.separate(settings, against, lambda: ticket.wanted)
-        )
+        key, about = _key(request), (settings, against)
+        if self.sessions.line.has(key, about):  # lists fire twice: when chosen, and when left
+            yield self._kept()
+            return
+        ticket = self.sessions.line.join(key, lambda ticket: session.separate(*about, lambda: ticket.wanted), about)
         task = asyncio.wrap_future(ticket.future)
         try:
             while not (await asyncio.wait({task}, timeout=WORD_S))[0]:
                 words = f'<span role="status">{ticket.describe()}</span>'
                 yield {parts.progress: words, parts.cancel: gr.update(visible=True)}
-            if not task.cancelled():
+            if task.cancelled():
+                yield self._kept()
+            else:
                 yield await asyncio.to_thread(self._show, session, task.result(), values)
         except Superseded:
-            return
+            yield self._kept()
         except FAILURES as error:
             yield self._failed(error, session)
         finally:
@@ -195,6 +199,10 @@ class Events:
         session = self._session(request)
         kept = "" if session.opened is None else ": the picture is as before"
         return {**self._idle(), self.components.progress: f'<span role="status">Cancelled{kept}</span>'}
+
+    def _kept(self) -> Updates:
+        """No change; Gradio takes an empty update for a missing one, and a generator's for None everywhere."""
+        return {self.components.stage: gr.skip()}
 
     def _idle(self) -> Updates:
         return {self.components.progress: "", self.components.cancel: gr.update(visible=False)}
@@ -240,16 +248,16 @@ class Events:
         session = self._session(request)
         try:
             if not session.sharpen(Window.parse(event.window)):
-                return {}
+                return self._kept()
         except FAILURES:
-            return {}
+            return self._kept()
         return self.draw(values, request)
 
     def point(self, values: Values, request: gr.Request, event: gr.EventData) -> Updates:
         """Keep the clicked pixel, and show its numbers."""
         session = self._session(request)
         if session.opened is None:
-            return {}
+            return self._kept()
         session.mark = _share(event.y), _share(event.x)
         parts = self.components
         shown = {parts.beside: gr.update(selected="pixel"), parts.readout: self._readout(session)}
@@ -307,6 +315,7 @@ class Events:
         """After a pause, show numbers and panels of the current frame."""
         session = self._session(request)
         if session.playing or session.opened is None or session.place == session.opened.index:
+            yield self._kept()
             return
         values = {**values, self.components.settings["index"]: session.place}
         async for update in self.separate(values, request):
@@ -317,7 +326,7 @@ class Events:
         session = self._session(request)
         try:
             if not session.playing or not session.play():
-                return {}
+                return self._kept()
         except FAILURES as error:
             session.playing = False
             return {self.components.status: failure_line(error)} | self._play_state(session)

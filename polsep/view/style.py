@@ -9,7 +9,8 @@ from __future__ import annotations
 FONTS = ["system-ui", "Segoe UI", "Roboto", "Helvetica Neue", "sans-serif"]
 MONOSPACE = ["ui-monospace", "Menlo", "Consolas", "monospace"]
 
-#: Always the dark theme, for pictures; Gradio would follow the system. Files may be dropped anywhere.
+#: Always the dark theme, for pictures; Gradio would follow the system. Files may be dropped anywhere. A list that loses
+#: the keyboard is closed: Gradio opens it again on the Tab key.
 ON_LOAD = """() => {
   const keep = () => document.body.classList.contains('dark') || document.body.classList.add('dark');
   new MutationObserver(keep).observe(document.body, {attributes: true, attributeFilter: ['class']});
@@ -21,6 +22,11 @@ ON_LOAD = """() => {
     if (!field || !event.dataTransfer?.files.length) return;
     field.files = event.dataTransfer.files;
     field.dispatchEvent(new Event('change', {bubbles: true}));
+  });
+  document.addEventListener('focusout', (event) => {
+    if (event.target.matches('input[role=combobox]')) {
+      event.target.dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape', bubbles: true}));
+    }
   });
 }"""
 
@@ -189,7 +195,7 @@ footer { display: none !important; }
 #ps-side { flex: 0 0 360px; }
 #ps-beside .tab-container button { padding: 6px 9px; font-size: .86rem; }
 #ps-downloads { gap: 6px; }
-#ps-fetch { position: absolute; width: 1px; height: 1px; overflow: hidden; opacity: 0; pointer-events: none; }
+#ps-fetch { position: absolute; width: 1px; height: 1px; overflow: hidden; visibility: hidden; }
 .ps-line { font-size: .88rem; color: #c9c9ce; line-height: 1.5; }
 .ps-line b { color: #fff; font-weight: 600; margin-right: .5em; }
 .ps-line span + span::before { content: "·"; margin: 0 .55em; color: #6b6b73; }

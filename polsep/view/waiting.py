@@ -12,8 +12,8 @@ from typing import Any
 class Ticket:
     """A job of a page. State: when it began, and whether its result is still wanted."""
 
-    def __init__(self, line: Line, key: str) -> None:
-        self._line, self.key = line, key
+    def __init__(self, line: Line, key: str, about: object = None) -> None:
+        self._line, self.key, self.about = line, key, about
         self.future: Future[Any] = Future()
         self.wanted, self.begun_s = True, 0.0
 
@@ -38,10 +38,15 @@ class Line:
         self._tickets: list[Ticket] = []
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="polsep-separate")
 
-    def join(self, key: str, work: Callable[[Ticket], Any]) -> Ticket:
+    def has(self, key: str, about: object) -> bool:
+        """True if a page waits for a job about this."""
+        with self._lock:
+            return any(t.key == key and t.wanted and t.about == about for t in self._tickets)
+
+    def join(self, key: str, work: Callable[[Ticket], Any], about: object = None) -> Ticket:
         """Wait in the line with a job; another one of the same page is cancelled."""
         self.leave(key)
-        ticket = Ticket(self, key)
+        ticket = Ticket(self, key, about)
         with self._lock:
             self._tickets.append(ticket)
         self._pool.submit(self._run, ticket, work)

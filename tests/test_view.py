@@ -388,7 +388,7 @@ def test_two_separations_of_a_frame_are_compared(sessions: Sessions) -> None:
         opening.parse_against("magic, full", settings)
 
 
-def test_four_angle_images_are_one_frame(sessions: Sessions) -> None:
+def test_four_angle_images_are_one_frame(sessions: Sessions, tmp_path: Path) -> None:
     """Files whose names differ by 0, 45, 90 and 135 alone are one; any other file makes a sequence of them."""
     group = opening.group_angles
     assert group(["a_135.png", "a_0.png", "a_45.png", "a_90.png"]) == {"a_{angle}.png": (1, 2, 3, 0)}
@@ -406,6 +406,14 @@ def test_four_angle_images_are_one_frame(sessions: Sessions) -> None:
     np.testing.assert_allclose(found.frame.specular, truth.specular, atol=1e-6)
     sent[2].write_bytes(png(light[0, :-2]))
     sessions.open_upload("b", [(str(path), path.name) for path in sent])
+    folder = tmp_path / "angles"
+    folder.mkdir()
+    for path in sent:
+        (folder / path.name).write_bytes(path.read_bytes())
+    (source,) = opening.find_sources(folder)
+    assert (source.path, source.stem, source.separated) == (folder / "car_{angle}.png", "car", False)
+    (folder / "more.png").write_bytes(b"")
+    assert [source.stem for source in opening.find_sources(folder)] == ["car_0", "car_45", "car_90", "car_135", "more"]
     with pytest.raises(InputError, match=r"^car.png: expected") as caught:
         sessions.find("b").separate(parse_settings({"white": "4095"}))
     assert str(sessions.scratch.root) not in str(caught.value)

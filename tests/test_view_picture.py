@@ -228,7 +228,8 @@ def test_sliders_agree_with_their_boxes(page: Any, frame: Any) -> None:
             box = float(page.input_value(f"#{part} input[type=number]"))
             assert abs(slider - box) <= control.step / 2 * 1.001, (part, value)
     inner = """() => [...document.querySelectorAll('#ps-side, #ps-side *')].filter((e) =>
-      e.scrollHeight > e.clientHeight + 1 && /auto|scroll/.test(getComputedStyle(e).overflowY)).map((e) => e.className)"""
+      e.scrollHeight > e.clientHeight + 1 && /auto|scroll/.test(getComputedStyle(e).overflowY))
+      .map((e) => e.className)"""
     assert page.evaluate(inner) == []
 
 
@@ -305,8 +306,9 @@ def test_fingers_pinch(phone: Any) -> None:
     touch("touchEnd")
     z, across, down = phone.evaluate(VIEW)
     assert abs(z - 3) < 0.05 and abs(across) < 2 and abs(down) < 2
-    phone.touchscreen.tap(x, y)
-    phone.wait_for_selector(".ps-readout:has-text('row 80, column 96')")
+    world = phone.locator(".ps-world").first.bounding_box()
+    phone.touchscreen.tap(world["x"] + world["width"] * 76.5 / 192, world["y"] + world["height"] * 82.5 / 160)
+    phone.wait_for_selector(".ps-readout:has-text('row 82, column 76')")
 
 
 def test_the_demo_is_opened_again_after_an_error(page: Any) -> None:

@@ -176,6 +176,11 @@ class Events:
         if self.sessions.line.has(key, about):  # lists fire twice: when chosen, and when left
             yield self._kept()
             return
+        if session.made(settings) is not None and (against is None or session.made(against) is not None):
+            self.sessions.line.leave(key)
+            found = await asyncio.to_thread(session.separate, settings, against)
+            yield await asyncio.to_thread(self._show, session, found, values)
+            return
         ticket = self.sessions.line.join(key, lambda ticket: session.separate(*about, lambda: ticket.wanted), about)
         task = asyncio.wrap_future(ticket.future)
         try:

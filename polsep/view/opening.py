@@ -158,6 +158,13 @@ def find_sources(path: Path) -> tuple[Source, ...]:
         return tuple(as_source(path / template, output_stem(template)) for template in groups)
 
 
+def four_angles(path: Path) -> tuple[Path, ...]:
+    """The files of a path: four of a template with ``{angle}``, else the one."""
+    if _PLACEHOLDER not in path.name:
+        return (path,)
+    return tuple(path.with_name(path.name.replace(_PLACEHOLDER, str(angle))) for angle in _ANGLES)
+
+
 def group_angles(names: Sequence[str]) -> dict[str, tuple[int, ...]] | None:
     """Frames of four angle images: the places of 0, 45, 90 and 135 degrees in ``names``, by template.
 
@@ -273,10 +280,8 @@ def _renamed(source: Source) -> Iterator[None]:
         yield
     except ValueError as error:
         said = str(error).replace(str(source.path), source.stem + source.path.suffix)
-        for angle in _ANGLES if _PLACEHOLDER in source.path.name else ():
-            said = said.replace(
-                str(source.path).replace(_PLACEHOLDER, f"{angle}"), f"{source.stem} {angle}°{source.path.suffix}"
-            )
+        for path, angle in zip(four_angles(source.path), _ANGLES, strict=False):
+            said = said.replace(str(path), f"{source.stem} {angle}°{path.suffix}")
         raise InputError(said) from error
 
 

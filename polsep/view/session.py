@@ -91,7 +91,7 @@ class Session:
         self._sources: tuple[Source, ...] = ()
         self._read: tuple[tuple[Source, ...], ReadOptions, int, Frame | SeparatedFrame] | None = None
         self._settings: Settings | None = None
-        self._made: list[tuple[Settings, OpenedFrame]] = []
+        self._made: list[tuple[tuple[Source, ...], Settings, OpenedFrame]] = []
         self._edited_frame_of: tuple[OpenedFrame, Recipe, Floats] | None = None
 
     def begin(self, sources: tuple[Source, ...]) -> None:
@@ -136,9 +136,8 @@ class Session:
             sources = self._sources
         if not sources:
             raise ValueError("expected an opened file, found none: choose one, or the demo capture")
-        with self._working:
-            found = self._find(sources, settings)
-            other = None if against is None else self._find(sources, against)
+        found = self._find(sources, settings)
+        other = None if against is None else self._find(sources, against)
         with self.lock:
             if self._sources is not sources or not wanted():
                 raise Superseded
@@ -151,21 +150,26 @@ class Session:
                 self.opened, self._settings = found, settings
             assert self.opened is not None
             self.against, self.makers = other, (settings.maker, against.maker if against is not None else "")
-            self._made = [pair for pair in self._made if pair[0] in (settings, against)]
+            self._made = [made for made in self._made if made[0] is sources and made[1] in (settings, against)]
             self.place, self.sharp = self.opened.index, None
             self.shown = self._edited(self.opened.small)
             return self.opened
 
     def _find(self, sources: tuple[Source, ...], settings: Settings) -> OpenedFrame:
         """The frame with these settings: the one that was made before, else a new one."""
-        for made, found in self._made:
-            if made == settings:
-                return found
-        begin = time.perf_counter()
-        found = open_frame(sources, settings, self._frame(sources, settings))
-        found = replace(found, seconds=time.perf_counter() - begin)
-        self._made.append((settings, found))
+        if (made := self.made(settings, sources)) is not None:
+            return made
+        with self._working:
+            begin = time.perf_counter()
+            found = open_frame(sources, settings, self._frame(sources, settings))
+            found = replace(found, seconds=time.perf_counter() - begin)
+        self._made = [*self._made, (sources, settings, found)]
         return found
+
+    def made(self, settings: Settings, sources: tuple[Source, ...] | None = None) -> OpenedFrame | None:
+        """The frame of these files, or the opened ones, with these settings, if it was made before."""
+        files = self._sources if sources is None else sources
+        return next((found for of, made, found in self._made if of is files and made == settings), None)
 
     def _frame(self, sources: tuple[Source, ...], settings: Settings) -> Frame | SeparatedFrame:
         """The frame of the file, read again only if the file or the reading options have changed."""
@@ -200,7 +204,7 @@ class Session:
 
     def size(self) -> int:
         """Bytes of the frames in memory."""
-        frames = [found for _, found in self._made]
+        frames = [found for *_, found in self._made]
         images = (x for found in frames for x in vars(found.frame).values() if isinstance(x, np.ndarray))
         return int(sum(image.nbytes for image in images) + sum(f.mosaic.data.nbytes for f in frames[:1] if f.mosaic))
 

@@ -34,9 +34,9 @@ def view(file: Path | None, host: str, port: int | None, opens: bool, upload_lim
     """Open raw frames and results in the browser: compare, inspect, edit, download.
 
     FILE is a raw frame, a file of several frames, an EXR or NPZ file of polsep, or a folder of raw frames or of 'polsep
-    video'; 'shot_{angle}.png' is four images at 0, 45, 90 and 135 degrees. More files can be opened on the page. It is
-    served to this machine alone unless --host says otherwise. It needs no network, and deletes uploaded files when it is
-    closed. Needs the extra view.
+    video'; 'shot_{angle}.png' is four images at 0, 45, 90 and 135 degrees. More files can be opened on the page. It
+    is served to this machine alone unless --host says otherwise. It needs no network, and deletes uploaded files when
+    it is closed. Needs the extra view.
 
     \b
     polsep view

@@ -21,6 +21,7 @@ import pytest
 from viewer import running
 
 from polsep import cli
+from polsep.view.pictures import Exposure, Picture, Place, Small, stage
 
 GRADIO = importlib.util.find_spec("gradio") is not None
 needs_gradio = pytest.mark.skipif(not GRADIO, reason="needs the extra view")
@@ -222,6 +223,20 @@ def test_a_stranger_sees_nothing(viewer: str) -> None:
         assert status == 200 and b"ps-readout" not in said and b"data:image" not in said and b"mine" not in said
     assert b"ps-stage" not in fire(viewer, "stranger", message_of(config, "separate"))
     assert b"mine" not in fire(viewer, "stranger", message_of(config, "answer"))
+
+
+@needs_gradio
+def test_the_docs_name_what_is_on_the_page(viewer: str) -> None:
+    """Every label in docs/view.md is one of the page's."""
+    text = (Path(__file__).resolve().parents[1] / "docs" / "view.md").read_text()
+    labels = set(re.findall(r"\*\*([^*]+)\*\*", text)) - {"Specular"} | {"Specular [stops]"}
+    panels = re.findall(r"^\| (\w+) \|", text[text.index("## Panels") : text.index("Downloads:")], re.MULTILINE)[1:]
+    ones = np.ones((4, 4, 3), np.float32)
+    small = Small(1, ones, ones, ones[..., 0], ones[..., 0], None, 1.0)
+    drawn = stage((Picture("Input", small), Picture("Input", small)), Exposure(), Place(4))
+    page = ask(viewer, "GET", "/config")[1].decode() + drawn
+    assert len(labels) > 10 and panels == ["Settings", "Pixel", "Exposure", "Light", "Edit"]
+    assert [label for label in [*labels, *panels] if f'"{label}"' not in page and f">{label}<" not in page] == []
 
 
 def test_the_pinned_gradio_was_checked() -> None:

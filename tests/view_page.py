@@ -23,7 +23,7 @@ needs_browser = pytest.mark.skipif(not READY, reason="needs the extra view, play
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
 FLAGS += ["--disable-sync", "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1"]
 DEMO = Path(polsep.__file__).parent / "data" / "still_life.png"
-WAIT_MS = 20_000
+WAIT_MS = 120_000
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +83,7 @@ def choose(page: Any, part: str, value: str) -> None:
     else:
         page.get_by_role("option", name=value, exact=True).click()
     field.blur()
+    page.wait_for_function("document.querySelectorAll('[role=option]').length === 0")
 
 
 def tab(page: Any, name: str) -> None:

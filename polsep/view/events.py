@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import html
 import math
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -172,6 +172,7 @@ class Events:
         except FAILURES as error:
             yield self._failed(error, session)
             return
+        self._see(session, values)
         key, about = _key(request), (settings, against)
         if self.sessions.line.has(key, about):  # lists fire twice: when chosen, and when left
             yield self._kept()
@@ -179,7 +180,7 @@ class Events:
         if session.made(settings) is not None and (against is None or session.made(against) is not None):
             self.sessions.line.leave(key)
             found = await asyncio.to_thread(session.separate, settings, against)
-            yield await asyncio.to_thread(self._show, session, found, values)
+            yield await asyncio.to_thread(self._show, session, found)
             return
         ticket = self.sessions.line.join(key, lambda ticket: session.separate(*about, lambda: ticket.wanted), about)
         task = asyncio.wrap_future(ticket.future)
@@ -190,7 +191,7 @@ class Events:
             if task.cancelled():
                 yield self._kept()
             else:
-                yield await asyncio.to_thread(self._show, session, task.result(), values)
+                yield await asyncio.to_thread(self._show, session, task.result())
         except Superseded:
             yield self._kept()
         except FAILURES as error:
@@ -212,14 +213,15 @@ class Events:
     def _idle(self) -> Updates:
         return {self.components.progress: "", self.components.cancel: gr.update(visible=False)}
 
-    def _show(self, session: Session, found: OpenedFrame, values: Values) -> Updates:
+    def _show(self, session: Session, found: OpenedFrame) -> Updates:
+        session.turn += 1
         parts, mends = self.components, found.mends()
         offered = [gr.update(visible=True, value=mend.words) for mend in mends[:MENDS]]
         offered += [gr.update(visible=False)] * (MENDS - len(offered))
         return {
             **self._idle(),
             parts.status: status_line(found),
-            parts.stage: self._stage(session, values),
+            parts.stage: self._stage(session),
             parts.readout: self._readout(session),
             parts.exposure: exposure_panel(found.frame, found.histogram),
             parts.light: light_panel(found.frame, found.small),
@@ -244,21 +246,35 @@ class Events:
             **{button: gr.update(visible=False) for button in parts.mends},
         }
 
-    def draw(self, values: Values, request: gr.Request) -> Updates:
-        """Draw the same frame with other pictures or another exposure."""
-        return {self.components.stage: self._stage(self._session(request), values)}
+    def _see(self, session: Session, values: Values) -> None:
+        """Note what the pictures show from now on: a separation that ends later draws that."""
+        session.view = {name: values[component] for name, component in self.components.view.items()}
 
-    def sharpen(self, values: Values, request: gr.Request, event: gr.EventData) -> Updates:
+    async def draw(self, values: Values, request: gr.Request) -> Updates:
+        """Draw the same frame with other pictures or another exposure."""
+        session = self._session(request)
+        self._see(session, values)
+        return await self._drawn(session)
+
+    async def _drawn(self, session: Session) -> Updates:
+        """The new picture, unless a later one was begun meanwhile: answers may overtake each other."""
+        session.turn += 1
+        turn = session.turn
+        drawn = await asyncio.to_thread(self._stage, session)
+        return {self.components.stage: drawn} if turn == session.turn else self._kept()
+
+    async def sharpen(self, values: Values, request: gr.Request, event: gr.EventData) -> Updates:
         """Draw the part of the frame that the page shows at the screen's resolution."""
         session = self._session(request)
+        self._see(session, values)
         try:
-            if not session.sharpen(Window.parse(event.window)):
+            if not await asyncio.to_thread(session.sharpen, Window.parse(event.window)):
                 return self._kept()
         except FAILURES:
             return self._kept()
-        return self.draw(values, request)
+        return await self._drawn(session)
 
-    def point(self, values: Values, request: gr.Request, event: gr.EventData) -> Updates:
+    async def point(self, values: Values, request: gr.Request, event: gr.EventData) -> Updates:
         """Keep the clicked pixel, and show its numbers."""
         session = self._session(request)
         if session.opened is None:
@@ -266,43 +282,44 @@ class Events:
         session.mark = _share(event.y), _share(event.x)
         parts = self.components
         shown = {parts.beside: gr.update(selected="pixel"), parts.readout: self._readout(session)}
-        return self.draw(values, request) | shown
+        return await self.draw(values, request) | shown
 
     def hover(self, request: gr.Request, event: gr.EventData) -> Updates:
         """Show the numbers of the pixel under the pointer; beside the picture, of the one that was clicked."""
         place = None if event.x is None else (_share(event.y), _share(event.x))
         return {self.components.readout: self._readout(self._session(request), place)}
 
-    def edit(self, values: Values, request: gr.Request) -> Updates:
+    async def edit(self, values: Values, request: gr.Request) -> Updates:
         """Show the frame with the edits of the controls as the right picture."""
         session = self._session(request)
         try:
-            session.edit(self._recipe(session, values))
+            await asyncio.to_thread(session.edit, self._recipe(session, values))
         except FAILURES as error:
             return {self.components.status: failure_line(error)}
-        return self._edited(session, values)
+        return await self._edited(session, values)
 
-    def undo(self, values: Values, request: gr.Request) -> Updates:
+    async def undo(self, values: Values, request: gr.Request) -> Updates:
         """Remove all edits and their images."""
         session, starts = self._session(request), [control.start for control in list_controls()]
         session.edit(recipe_of(starts))
         session.drop_images()
         controls = dict(zip(self.components.controls, starts, strict=True))
-        return self._edited(session, values) | self._image_names(session) | controls
+        return await self._edited(session, values) | self._image_names(session) | controls
 
-    def add_image(self, kind: str) -> Callable[[Values, gr.Request], Updates]:
+    def add_image(self, kind: str) -> Callable[[Values, gr.Request], Awaitable[Updates]]:
         """A function that uses an uploaded image of a kind for edits; a first texture is applied at once."""
 
-        def answer(values: Values, request: gr.Request) -> Updates:
+        async def answer(values: Values, request: gr.Request) -> Updates:
             session, component = self._session(request), self.components.images[kind]
             amount = self.components.control("texture", "amount")
             values = values | {amount: values[amount] or 1.0} if kind == "texture" else values
             try:
-                self.sessions.add_image(_key(request), kind, *_claim(values[component]))
-                session.edit(self._recipe(session, values))
+                sent = _claim(values[component])
+                await asyncio.to_thread(self.sessions.add_image, _key(request), kind, *sent)
+                await asyncio.to_thread(session.edit, self._recipe(session, values))
             except FAILURES as error:
                 return {self.components.status: failure_line(error)} | self._image_names(session)
-            return self._edited(session, values) | self._image_names(session) | {amount: values[amount]}
+            return await self._edited(session, values) | self._image_names(session) | {amount: values[amount]}
 
         return answer
 
@@ -326,23 +343,24 @@ class Events:
         async for update in self.separate(values, request):
             yield update
 
-    def advance(self, values: Values, request: gr.Request) -> Updates:
+    async def advance(self, values: Values, request: gr.Request) -> Updates:
         """Show the next frame of a playing sequence, if it is ready."""
         session = self._session(request)
         try:
-            if not session.playing or not session.play():
+            if not session.playing or not await asyncio.to_thread(session.play):
                 return self._kept()
         except FAILURES as error:
             session.playing = False
             return {self.components.status: failure_line(error)} | self._play_state(session)
-        return self.draw(values, request) | {self.components.settings["index"]: session.place}
+        return await self.draw(values, request) | {self.components.settings["index"]: session.place}
 
-    def _edited(self, session: Session, values: Values) -> Updates:
+    async def _edited(self, session: Session, values: Values) -> Updates:
         session.against, view = None, self.components.view
         chosen = {view["left"]: "Input", view["right"]: "Edited", view["against"]: SAME}
         remarks = session.recipe.cautions()
         status = {} if session.opened is None else {self.components.status: status_line(session.opened, remarks)}
-        return {self.components.stage: self._stage(session, {**values, **chosen}), **chosen, **status}
+        self._see(session, {**values, **chosen})
+        return {**await self._drawn(session), **chosen, **status}
 
     def write(self, kind: str) -> Callable[[gr.Request], Updates]:
         """A function that writes one of `DOWNLOADS` and returns its path."""
@@ -363,11 +381,11 @@ class Events:
     def _session(self, request: gr.Request) -> Session:
         return self.sessions.find(_key(request))
 
-    def _stage(self, session: Session, values: Values) -> Any:
+    def _stage(self, session: Session) -> Any:
         shown, found, other = session.shown, session.opened, session.against
         if shown is None or found is None:
             return EMPTY
-        said = {name: values[component] for name, component in self.components.view.items()}
+        said = session.view
         exposure = Exposure(float(said["stops"]), float(said["specular_stops"]), bool(said["marks"]))
         sharp = session.sharp or (None, None)
         makers = session.makers if other is not None else ("", "")

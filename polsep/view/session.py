@@ -11,6 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +72,8 @@ class Session:
 
     ``kept`` and ``downloads`` are its own folders: for its files, and for results to download. ``opened`` is the frame
     whose numbers and files the page has, ``against`` another separation of it that the right picture shows, ``shown``
-    what the page sees: the opened frame, or one that is being played. ``mark``: row and column as shares.
+    what the page sees: the opened frame, or one that is being played. ``mark``: row and column as shares. ``view``:
+    what the pictures show, as last said; ``turn``: number of pictures that were begun, of which the last one counts.
     """
 
     def __init__(self, kept: Path, downloads: Path, ahead: Prefetcher) -> None:
@@ -83,6 +85,8 @@ class Session:
         self.shown: Small | None = None
         self.place, self.playing = 0, False
         self.mark: tuple[float, float] | None = None
+        self.view: dict[str, Any] = {}
+        self.turn = 0
         self.window: Window | None = None
         self.sharp: tuple[Sharp, Sharp] | None = None
         self.recipe = Recipe()

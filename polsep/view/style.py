@@ -166,11 +166,20 @@ element.addEventListener('keydown', (event) => {
   } else return;
   event.preventDefault();
 });
+const room = () => {  // the height that remains above the controls of the picture
+  const parts = ['#ps-view', '#ps-strip'].map((part) => document.querySelector(part)?.offsetHeight ?? 0);
+  const rest = innerHeight - element.getBoundingClientRect().top - scrollY - parts[0] - parts[1] - 42;
+  if (innerWidth > 900) element.style.setProperty('--room', Math.max(rest, 300) + 'px');
+  else element.style.removeProperty('--room');
+};
+const around = new ResizeObserver(() => { room(); apply(); });
+for (const part of ['body', '#ps-status', '#ps-mends']) around.observe(document.querySelector(part) ?? document.body);
 new ResizeObserver(() => apply()).observe(element);
 watch('value', () => {
   const now = stage()?.dataset.width + stage()?.style.getPropertyValue('--ratio');
   if (stage() && now !== element.dataset.frame) { element.dataset.frame = now; view = {z: 1, x: 0, y: 0}; }
   cut(parseFloat(element.style.getPropertyValue('--cut') || '50') / 100);
+  room();
   apply();
 });
 """
@@ -202,11 +211,12 @@ footer { display: none !important; }
 .ps-error { border-left: 3px solid #ff6b5e; background: #35201f; color: #ffd9d5; padding: 8px 12px; font-size: .9rem; }
 .ps-remark { border-left: 3px solid #e0b13c; background: #2f2a1c; color: #f3e3b5; padding: 5px 12px; margin-top: 5px;
   font-size: .84rem; }
-.ps-nothing { display: grid; place-items: center; height: max(300px, calc(100vh - 250px)); padding: 0 12px;
+.ps-nothing { display: grid; place-items: center; height: var(--room, max(300px, calc(100vh - 250px))); padding: 0 12px;
   border: 1px dashed #45454d; border-radius: 8px; text-align: center; color: #9a9aa2; background: #1b1b1e; }
 .ps-nothing b { color: #e4e4e8; font-size: 1.05rem; }
 .ps-nothing p { margin: 6px 0 0; line-height: 1.5; color: #9a9aa2 !important; }
-.ps-stage { position: relative; height: max(300px, calc(100vh - 250px)); cursor: crosshair; user-select: none;
+.ps-stage { position: relative; height: var(--room, max(300px, calc(100vh - 250px))); cursor: crosshair;
+  user-select: none;
   touch-action: pan-y; background: #111; overflow: hidden; border-radius: 4px; container-type: size; outline: none; }
 .ps-stage:focus-visible { box-shadow: inset 0 0 0 2px #6ea8fe; }
 .ps-zoomed { cursor: grab; touch-action: none; }

@@ -79,6 +79,7 @@ def main() -> None:
         page.goto(address)
         page.wait_for_selector("#ps-demo")
         show_demo(page)
+        page.get_by_role("tab", name="Settings", exact=True).click()
         choose(page, "ps-method", "color-affine")
         show_sequence(page, Path(folder))
         browser.close()

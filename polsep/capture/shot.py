@@ -1,4 +1,4 @@
-"""What people need to know to set up a shot: exposure, focus and polarization of the newest frame, with marks on it."""
+"""Facts for setting up a shot: exposure, focus and polarization of the newest frame, and a picture with marks."""
 
 from __future__ import annotations
 

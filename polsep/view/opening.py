@@ -186,7 +186,7 @@ def in_numbers(name: str) -> list[tuple[int, str]]:
 
 
 class Mend(NamedTuple):
-    """What a remark advises: a setting, its value, and words for a button."""
+    """Advice of a remark: a setting, its value, and words for a button."""
 
     setting: str
     value: str

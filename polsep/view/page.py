@@ -13,8 +13,9 @@ import gradio as gr
 from polsep.io.assets.maps import SUFFIXES
 from polsep.io.raw.genicam import PIXEL_FORMATS
 from polsep.methods import METHODS
+from polsep.view.components import HINT, IMAGES, MENDS, NOTHING, OF_FILES, SAME, Components, Start
 from polsep.view.edits import list_controls
-from polsep.view.events import HINT, IMAGES, MENDS, NOTHING, OF_FILES, SAME, Components, Events, Start
+from polsep.view.events import Events
 from polsep.view.images import KINDS
 from polsep.view.opening import FULL, HALF, UNSAID
 from polsep.view.pictures import VIEWS
@@ -98,7 +99,7 @@ def _strip() -> tuple[Any, Any, Any]:
 
 
 def _view_row() -> dict[str, Any]:
-    """What the two pictures show, and their exposure."""
+    """Choice of what the two pictures show, and their exposure."""
     makers = [SAME, *(f"{name}, {size}" for name in METHODS for size in (HALF, FULL))]
     lists: dict[str, Any] = {"min_width": 130, "filterable": False}
     sliders: dict[str, Any] = {"minimum": -6, "maximum": 6, "value": 0, "step": 0.1, "min_width": 180, "scale": 2}

@@ -69,7 +69,7 @@ class Small:
 
 @dataclass(frozen=True)
 class Exposure:
-    """How pictures are drawn: stops above the exposure that fits, more for the specular; marks of clipping."""
+    """Exposure of pictures: stops above the exposure that fits, more for the specular; marks of clipping."""
 
     stops: float = 0.0
     specular_stops: float = 0.0
@@ -250,7 +250,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Place:
-    """What a page points at: the frame's width in pixels, a marked place (row and column as shares), and the window."""
+    """Places on a picture: the frame's width in pixels, a marked place (row and column as shares), and the window."""
 
     width: int
     mark: tuple[float, float] | None = None

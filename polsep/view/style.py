@@ -292,6 +292,7 @@ footer { display: none !important; }
 @media (max-width: 900px) {
   .gradio-container .fillable { padding: 8px 10px !important; }
   #ps-side { flex: 1 1 100%; }
+  #ps-against { min-width: 100% !important; }
   .ps-stage { height: min(calc(92vw / var(--ratio, 1.2)), 56vh); min-height: 220px; }
   .ps-nothing { height: 38vh; }
   .ps-tools { bottom: 6px; }

@@ -203,10 +203,9 @@ class Events:
         drawn = await asyncio.to_thread(self._stage, session)
         return {self.components.stage: drawn} if turn == session.turn else self._kept()
 
-    async def sharpen(self, values: Values, request: gr.Request, event: gr.EventData) -> Updates:
+    async def sharpen(self, request: gr.Request, event: gr.EventData) -> Updates:
         """Draw the part of the frame that the page shows at the screen's resolution."""
         session = self._session(request)
-        self._see(session, values)
         try:
             if not await asyncio.to_thread(session.sharpen, Window.parse(event.window)):
                 return self._kept()
@@ -214,7 +213,7 @@ class Events:
             return self._kept()
         return await self._drawn(session)
 
-    async def point(self, values: Values, request: gr.Request, event: gr.EventData) -> Updates:
+    async def point(self, request: gr.Request, event: gr.EventData) -> Updates:
         """Keep the clicked pixel, and show its numbers."""
         session = self._session(request)
         if session.opened is None:
@@ -222,7 +221,7 @@ class Events:
         session.mark = _share(event.y), _share(event.x)
         parts = self.components
         shown = {parts.beside: gr.update(selected="pixel"), parts.readout: self._readout(session)}
-        return await self.draw(values, request) | shown
+        return await self._drawn(session) | shown
 
     def hover(self, request: gr.Request, event: gr.EventData) -> Updates:
         """Show the numbers of the pixel under the pointer; beside the picture, of the one that was clicked."""
@@ -283,7 +282,7 @@ class Events:
         async for update in self.separate(values, request):
             yield update
 
-    async def advance(self, values: Values, request: gr.Request) -> Updates:
+    async def advance(self, request: gr.Request) -> Updates:
         """Show the next frame of a playing sequence, if it is ready."""
         session = self._session(request)
         try:
@@ -292,7 +291,7 @@ class Events:
         except FAILURES as error:
             session.playing = False
             return {self.components.status: failure_line(error)} | self._play_state(session)
-        return await self.draw(values, request) | {self.components.settings["index"]: session.place}
+        return await self._drawn(session) | {self.components.settings["index"]: session.place}
 
     async def _edited(self, session: Session, values: Values) -> Updates:
         session.against, view = None, self.components.view

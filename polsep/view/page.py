@@ -198,8 +198,8 @@ def _connect(page: Any, components: Components, events: Events) -> None:
     for name, component in components.view.items():
         if name != "against":
             component.input(events.draw, picture, components.stage, **_AT_ONCE)
-    components.stage.input(events.sharpen, picture, components.stage, **_AT_ONCE)
-    components.stage.click(events.point, picture, [components.stage, components.beside, components.readout], **_AT_ONCE)
+    components.stage.input(events.sharpen, None, components.stage, **_AT_ONCE)
+    components.stage.click(events.point, None, [components.stage, components.beside, components.readout], **_AT_ONCE)
     components.stage.select(events.hover, None, components.readout, **_AT_ONCE)
     controls = {*components.controls, *picture}
     for control in components.controls:
@@ -209,7 +209,7 @@ def _connect(page: Any, components: Components, events: Events) -> None:
     components.neutral.click(events.undo, picture, changed, **_AT_ONCE)
     played = components.play.click(events.toggle, None, [components.play, components.timer], **_AT_ONCE)
     played.then(events.settle, everything, changed, **_SEPARATE)
-    components.timer.tick(events.advance, picture, changed, **{**_AT_ONCE, "trigger_mode": "once"})
+    components.timer.tick(events.advance, None, changed, **{**_AT_ONCE, "trigger_mode": "once"})
     for kind, button in components.fetch.items():
         written = button.click(events.write(kind), None, components.link, **_WRITE)
         written.success(None, None, None, js=FETCH)

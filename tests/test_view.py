@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,10 @@ from polsep.io.results.separation_reader import read_separated
 from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.errors import InputError
 from polsep.io.store.temporary import TemporaryFolders, find_upload, make_temporary_folders, remove_folder
+from polsep.physics.stokes import Measurements
 from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.exposure import histogram
 from polsep.separation.report import SeparatedFrame
 from polsep.view import guard, opening, session
 from polsep.view.edits import at_scale, edit_small, list_controls, recipe_of
@@ -31,11 +34,14 @@ from polsep.view.guard import Guard, host_name, names_address
 from polsep.view.opening import Settings, parse_settings, plain_name
 from polsep.view.pictures import (
     VIEWS,
-    confidence_panel,
+    Exposure,
+    Picture,
+    Place,
+    Window,
+    cut_window,
     draw,
-    histogram,
-    histogram_panel,
-    polarization_panel,
+    exposure_panel,
+    light_panel,
     shrink,
     shrink_frame,
     stage,
@@ -44,6 +50,7 @@ from polsep.view.pictures import (
 from polsep.view.playback import Prefetcher
 from polsep.view.readout import read_pixel, readout_panel
 from polsep.view.session import Session, Sessions
+from polsep.view.waiting import Ticket
 
 WHITE = 4095
 
@@ -124,8 +131,11 @@ def test_an_unsaid_white_level_is_recommended_not_guessed(sessions: Sessions) ->
     """12 bits in 16 give a remark in the page's words, and the level that a button offers."""
     found = opened(sessions, white=opening.UNSAID)
     assert found.mosaic is not None and found.mosaic.white_level == 65535
-    assert any("set White level to 4095" in remark for remark in found.remarks)
-    assert found.suggested_white() == 4095
+    assert any("White level 4095" in remark and "--" not in remark for remark in found.remarks)
+    assert found.mends() == (("white", "4095", "Use white level 4095"),)
+    advised = ("say --layout 90,45,135,0/GBRG (rows); or --layout mono", "say --white-level N if N is white")
+    mends = opening.OpenedFrame(found.frame, found.small, None, None, (), "a", advice=advised).mends()
+    assert [mend[:2] for mend in mends] == [("layout", "90,45,135,0/GBRG"), ("layout", "mono")]
 
 
 def test_results_are_opened_again(sessions: Sessions, tmp_path: Path) -> None:
@@ -313,31 +323,151 @@ def test_shrinking_keeps_means_and_angles(sessions: Sessions) -> None:
 def test_exposure_is_in_stops(sessions: Sessions) -> None:
     """One stop more is twice the light, of the input as of its parts; maps of polarization stay."""
     small = opened(sessions).small
-    np.testing.assert_array_equal(draw(small, "Diffuse", 1.0), tone(small.diffuse, 2 * small.gain))
-    np.testing.assert_array_equal(draw(small, "DoLP", 1.0), draw(small, "DoLP", -3.0))
-    assert draw(small, "Input", 1.0).astype(int).sum() > draw(small, "Input", 0.0).astype(int).sum()
+    up, own = Exposure(1.0), Exposure(1.0, 2.0)
+    np.testing.assert_array_equal(draw(small, "Diffuse", up), tone(small.diffuse, 2 * small.gain))
+    np.testing.assert_array_equal(draw(small, "Diffuse", own), draw(small, "Diffuse", up))
+    np.testing.assert_array_equal(draw(small, "Specular", own), tone(small.specular, 8 * small.gain))
+    np.testing.assert_array_equal(draw(small, "DoLP", up), draw(small, "DoLP", Exposure(-3.0)))
+    assert draw(small, "Input", up).astype(int).sum() > draw(small, "Input", Exposure()).astype(int).sum()
     for view in VIEWS:
-        picture = draw(small, view, 0.0)
+        picture = draw(small, view, Exposure())
         assert picture.dtype == np.uint8 and picture.shape == (*small.size, 3)
     with pytest.raises(ValueError, match="expected a picture of Input"):
-        draw(small, "<script>", 0.0)
+        draw(small, "<script>", Exposure())
+
+
+def test_marks_are_on_cells_that_clip(sessions: Sessions) -> None:
+    """Every cell with a clipped sample is red, and no other changes; at full resolution, its four pixels are."""
+    found = opened(sessions)
+    assert found.mosaic is not None and found.flags is not None
+    clipped = np.asarray(found.mosaic.clipped()).reshape(48, 2, 64, 2).any(axis=(1, 3))
+    plain, marked = (draw(found.small, "Input", Exposure(marks=marks)) for marks in (False, True))
+    assert clipped.any() and (marked[clipped] == (255, 40, 40)).all()
+    np.testing.assert_array_equal(marked[~clipped], plain[~clipped])
+    said = {"method": "color-affine", "white": "4095", "resolution": "full"}
+    full = sessions.find("a").separate(parse_settings(said))
+    assert full.flags is not None
+    np.testing.assert_array_equal(full.flags, found.flags.repeat(2, axis=0).repeat(2, axis=1))
+
+
+def test_windows_are_the_frame_itself(sessions: Sessions) -> None:
+    """As many pixels as the screen has, those of the frame where it has fewer, at the place that the window says."""
+    found = opened(sessions)
+    sharp = cut_window(found.frame, Window(0.25, 0.5, 0.5, 1.0, 999), found.small, None, found.flags)
+    assert (sharp.left, sharp.top, sharp.right, sharp.bottom) == (0.25, 0.5, 0.5, 1.0) and sharp.small.step == 1
+    np.testing.assert_array_equal(sharp.small.specular, found.frame.specular[24:, 16:32])
+    assert sharp.small.gain == found.small.gain
+    coarse = cut_window(found.frame, Window(0, 0, 1, 1, 32), found.small, found.frame.diffuse, None).small
+    np.testing.assert_array_equal(coarse.diffuse, shrink(found.frame.diffuse, 2))
+    np.testing.assert_array_equal(coarse.edited, shrink(found.frame.diffuse, 2))
+    assert str(Window.parse("0,25,5000,10000,640")) == "0,25,5000,10000,640"
+    for wrong in ("", "1,2,3", "5,0,5,9,1", "0,0,10001,9,1", "0,0,9,9,0", "a,b,c,d,e", None, "-1,0,2,2,2"):
+        with pytest.raises(ValueError, match="expected a window like"):
+            Window.parse(wrong)
+
+
+def test_two_separations_of_a_frame_are_compared(sessions: Sessions) -> None:
+    """The right picture is of another method or resolution; both are the library's, and coming back costs nothing."""
+    page = sessions.find("a")
+    first = opened(sessions)
+    settings = parse_settings({"method": "color-affine", "white": "4095"})
+    against = opening.parse_against("analytic, full", settings)
+    assert against is not None and opening.parse_against("the same", settings) is None
+    assert page.separate(settings, against) is first
+    mosaic = Mosaic(torch.from_numpy(mosaic_codes().astype(np.float32)), Layout(), 0.0, WHITE)
+    truth = separate_capture(mosaic, "analytic", full=True)
+    assert page.against is not None and page.makers == ("color-affine, half", "analytic, full")
+    np.testing.assert_array_equal(page.against.frame.specular, truth.specular)
+    other = page.against
+    assert page.separate(against, settings) is other and page.against is first
+    assert page.sharpen(Window(0, 0, 1, 1, 500))
+    assert page.sharp is not None and [s.small.size for s in page.sharp] == [(96, 128), (48, 64)]
+    seen = read_pixel(other.frame, other.mosaic, (41, 63))
+    assert seen.samples == read_pixel(first.frame, first.mosaic, (20, 31)).samples
+    with pytest.raises(ValueError, match="expected a method of"):
+        opening.parse_against("magic, full", settings)
+
+
+def test_four_angle_images_are_one_frame(sessions: Sessions, tmp_path: Path) -> None:
+    """Files whose names differ by 0, 45, 90 and 135 alone are one; any other file makes a sequence of them."""
+    group = opening.group_angles
+    assert group(["a_135.png", "a_0.png", "a_45.png", "a_90.png"]) == {"a_{angle}.png": (1, 2, 3, 0)}
+    assert group(["000.tif", "045.tif", "090.tif", "135.tif"]) == {"{angle}.tif": (0, 1, 2, 3)}
+    assert group([f"s{n}_{a}.png" for n in (0, 1) for a in (0, 45, 90, 135)]) is not None
+    assert group(["a_0.png", "a_45.png", "a_90.png"]) is None and group([f"f{k}.png" for k in range(136)]) is None
+    light = np.random.default_rng(0).integers(100, 3000, (4, 20, 24, 3), np.uint16)
+    sent = [upload(sessions, f"car_{a}.png", png(light[k])) for k, a in enumerate((0, 45, 90, 135))]
+    sessions.open_upload("a", [(str(path), path.name) for path in sent[::-1]])
+    found = sessions.find("a").separate(parse_settings({"method": "analytic", "white": "4095"}))
+    assert (found.count, found.stem, found.mosaic) == (1, "car", None)
+    planes = torch.from_numpy(np.moveaxis(light, -1, 1).astype(np.float32) / WHITE)
+    measurements = Measurements(planes, tuple(math.radians(angle) for angle in (0, 45, 90, 135)))
+    truth = separate_capture(measurements, "analytic")
+    np.testing.assert_allclose(found.frame.specular, truth.specular, atol=1e-6)
+    sent[2].write_bytes(png(light[0, :-2]))
+    sessions.open_upload("b", [(str(path), path.name) for path in sent])
+    folder = tmp_path / "angles"
+    folder.mkdir()
+    for path in sent:
+        (folder / path.name).write_bytes(path.read_bytes())
+    (source,) = opening.find_sources(folder)
+    assert (source.path, source.stem, source.separated) == (folder / "car_{angle}.png", "car", False)
+    (folder / "more.png").write_bytes(b"")
+    assert [source.stem for source in opening.find_sources(folder)] == ["car_0", "car_45", "car_90", "car_135", "more"]
+    with pytest.raises(InputError, match=r"^car.png: expected") as caught:
+        sessions.find("b").separate(parse_settings({"white": "4095"}))
+    assert str(sessions.scratch.root) not in str(caught.value)
+    sessions.end("a")
+    sessions.end("b")
+    assert [*sessions.scratch.exchange.iterdir(), *sessions.scratch.kept.iterdir()] == []
+
+
+def test_a_result_that_nobody_waits_for_is_dropped(sessions: Sessions) -> None:
+    """A cancelled separation leaves the page as it was; the page is usable while another one is made."""
+    page, found = sessions.find("a"), opened(sessions)
+    other = parse_settings({"method": "analytic", "white": "4095"})
+    with pytest.raises(session.Superseded):
+        page.separate(other, wanted=lambda: False)
+    assert page.opened is found
+    begun, go_on = threading.Event(), threading.Event()
+    line = sessions.line
+
+    def slow(ticket: Ticket) -> Any:
+        begun.set()
+        go_on.wait(60)
+        return page.separate(other, wanted=lambda: ticket.wanted)
+
+    first, second = line.join("a", slow), line.join("b", lambda ticket: "done")
+    begun.wait(60)
+    assert first.describe().startswith("Separating") and second.describe() == "Waiting, 1 before this one"
+    page.edit(Recipe((Metallic(amount=0.5),)))
+    line.leave("a")
+    assert first.future.cancelled()
+    go_on.set()
+    assert second.future.result(60) == "done" and page.opened is found
+    again, later = line.join("c", lambda ticket: 1), line.join("c", lambda ticket: 2)
+    assert later.future.result(60) == 2 and (again.future.cancelled() or again.future.result() == 1)
+    failed = line.join("d", lambda ticket: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        failed.future.result(60)
 
 
 def test_panels_hold_their_pictures_and_nothing_from_elsewhere(sessions: Sessions) -> None:
     """Everything that a page shows is in the text itself: no address, no file."""
     found = opened(sessions)
     panels = [
-        stage(found.small, ("Input", "Specular"), 0.0, (3, 4)),
-        polarization_panel(found.small),
-        histogram_panel(found.histogram),
-        histogram_panel(None),
-        confidence_panel(found.frame, found.small),
+        stage(
+            (Picture("AoLP", found.small), Picture("Specular", found.small, "<b>")), Exposure(), Place(64, (0.1, 0.2))
+        ),
+        exposure_panel(found.frame, found.histogram),
+        exposure_panel(found.frame, None),
+        light_panel(found.frame, found.small),
         readout_panel(read_pixel(found.frame, found.mosaic, (3, 4))),
     ]
     for panel in panels:
         assert "http" not in panel and "file=" not in panel and "<script" not in panel
-    assert panels[0].count("data:image/") == 2 and "ps-mark" in panels[0]
-    assert "does not say how far off" in panels[4]
+    assert panels[0].count("data:image/") == 3 and "ps-mark" in panels[0] and "<b>" not in panels[0]
+    assert "does not say how far off" in panels[1]
 
 
 def test_the_histogram_counts_every_sample(sessions: Sessions) -> None:

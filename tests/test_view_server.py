@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import importlib.util
 import json
+import re
 import socket
 import subprocess
 import sys
@@ -20,6 +21,7 @@ import pytest
 from viewer import running
 
 from polsep import cli
+from polsep.view.pictures import Exposure, Picture, Place, Small, stage
 
 GRADIO = importlib.util.find_spec("gradio") is not None
 needs_gradio = pytest.mark.skipif(not GRADIO, reason="needs the extra view")
@@ -48,8 +50,8 @@ def open_message(config: dict[str, Any], path: str) -> dict[str, Any]:
     """What the page sends after an upload."""
     (event,) = (d for d in config["dependencies"] if d["api_name"] == "open_upload")
     kinds = {c["id"]: c for c in config["components"]}
-    file = {"path": path, "orig_name": "a.png", "meta": {"_type": "gradio.FileData"}}
-    data = [[file] if kinds[i]["type"] == "file" else kinds[i]["props"].get("value") for i in event["inputs"]]
+    file = {"path": path, "orig_name": Path(path).name, "meta": {"_type": "gradio.FileData"}}
+    data = [[file] if kinds[i]["type"] == "uploadbutton" else kinds[i]["props"].get("value") for i in event["inputs"]]
     return {"data": data, "fn_index": event["id"]}
 
 
@@ -156,24 +158,95 @@ def test_claimed_paths_open_nothing(viewer: str) -> None:
         assert b"ps-stage" not in said
 
 
+def send_file(address: str, name: str, data: bytes) -> str:
+    """Upload a file, and return where the server keeps it."""
+    head = f'--x\r\nContent-Disposition: form-data; name="files"; filename="{name}"\r\n\r\n'.encode()
+    body, kind = head + data + b"\r\n--x--\r\n", "multipart/form-data; boundary=x"
+    status, said = ask(address, "POST", "/gradio_api/upload", body, content_type=kind)
+    assert status == 200
+    return str(json.loads(said)[0])
+
+
+def fire(address: str, key: str, message: dict[str, Any]) -> bytes:
+    """Everything that the server says to a page about one of its events."""
+    body = json.dumps({**message, "session_hash": key}).encode()
+    assert ask(address, "POST", "/gradio_api/queue/join", body, content_type="application/json")[0] == 200
+    return ask(address, "GET", f"/gradio_api/queue/data?session_hash={key}")[1]
+
+
+def message_of(config: dict[str, Any], name: str, **more: Any) -> dict[str, Any]:
+    """An event of the page with the values that its components begin with."""
+    event = next(d for d in config["dependencies"] if d["api_name"] == name)
+    kinds = {c["id"]: c for c in config["components"]}
+    data = [kinds[i]["props"].get("value") for i in event["inputs"]]
+    return {"data": data, "fn_index": event["id"], "event_data": more}
+
+
 @needs_gradio
-def test_twenty_sessions_at_once_all_finish(viewer: str) -> None:
-    """Twenty pages send the same frame and wait in one queue; every one gets its picture."""
-    codes = (np.add.outer(np.arange(64), np.arange(64)) * 30).astype(np.uint16)
-    picture = bytes(imagecodecs.png_encode(codes))
-    body = b'--x\r\nContent-Disposition: form-data; name="files"; filename="a.png"\r\n\r\n' + picture + b"\r\n--x--\r\n"
+def test_fifty_sessions_at_once_see_their_own_frames(viewer: str) -> None:
+    """Fifty pages send fifty frames and wait in one line; every one gets its picture, and nothing of another's."""
     config = json.loads(ask(viewer, "GET", "/config")[1])
+    cells = np.add.outer(np.arange(64), np.arange(64))
 
-    def run(key: str) -> bytes:
-        status, said = ask(viewer, "POST", "/gradio_api/upload", body, content_type="multipart/form-data; boundary=x")
-        assert status == 200
-        message = json.dumps({**open_message(config, json.loads(said)[0]), "session_hash": key}).encode()
-        assert ask(viewer, "POST", "/gradio_api/queue/join", message, content_type="application/json")[0] == 200
-        return ask(viewer, "GET", f"/gradio_api/queue/data?session_hash={key}")[1]
+    def run(k: int) -> bytes:
+        path = send_file(
+            viewer, f"frame{k:03d}.png", bytes(imagecodecs.png_encode((cells * (20 + k)).astype(np.uint16)))
+        )
+        message = open_message(config, path)
+        return fire(viewer, f"page{k}", message)
 
-    with ThreadPoolExecutor(20) as pool:
-        found = list(pool.map(run, [f"page{k}" for k in range(20)]))
-    assert [b"process_completed" in said and b"ps-stage" in said for said in found] == [True] * 20
+    with ThreadPoolExecutor(50) as pool:
+        found = list(pool.map(run, range(50)))
+    for k, said in enumerate(found):
+        assert b"process_completed" in said and b"ps-stage" in said, said[-400:]
+        assert set(re.findall(rb"frame\d{3}", said)) == {b"frame%03d" % k}
+    pictures = {re.findall(rb"data:image/png;base64,[^\\\"]+", said)[0] for said in found}
+    assert len(pictures) == 1  # brightness alone differs, and each page fits the exposure to its own frame
+    pixels = {
+        ask(viewer, "POST", "/gradio_api/run/predict", body, content_type="application/json")[1]
+        for k in range(50)
+        for body in [json.dumps({**message_of(config, "hover", x=0.9, y=0.9), "session_hash": f"page{k}"}).encode()]
+    }
+    assert len(pixels) == 50
+
+
+@needs_gradio
+def test_a_stranger_sees_nothing(viewer: str) -> None:
+    """A page without a file gets no picture, no number and no file, whatever it asks."""
+    config = json.loads(ask(viewer, "GET", "/config")[1])
+    path = send_file(viewer, "mine.png", bytes(imagecodecs.png_encode(np.full((32, 32), 99, np.uint8))))
+    assert b"ps-stage" in fire(viewer, "owner", open_message(config, path))
+    for name in ("draw", "hover", "point", "sharpen", "advance"):
+        message = message_of(config, name, x=0.5, y=0.5, window="0,0,10000,10000,100")
+        body = json.dumps({**message, "session_hash": "stranger"}).encode()
+        status, said = ask(viewer, "POST", "/gradio_api/run/predict", body, content_type="application/json")
+        assert status == 200 and b"ps-readout" not in said and b"data:image" not in said and b"mine" not in said
+    assert b"ps-stage" not in fire(viewer, "stranger", message_of(config, "separate"))
+    assert b"mine" not in fire(viewer, "stranger", message_of(config, "answer"))
+
+
+@needs_gradio
+def test_the_docs_name_what_is_on_the_page(viewer: str) -> None:
+    """Every label in docs/view.md is one of the page's."""
+    text = (Path(__file__).resolve().parents[1] / "docs" / "view.md").read_text()
+    labels = set(re.findall(r"\*\*([^*]+)\*\*", text)) - {"Specular"} | {"Specular [stops]"}
+    panels = re.findall(r"^\| (\w+) \|", text[text.index("## Panels") : text.index("Downloads:")], re.MULTILINE)[1:]
+    ones = np.ones((4, 4, 3), np.float32)
+    small = Small(1, ones, ones, ones[..., 0], ones[..., 0], None, 1.0)
+    drawn = stage((Picture("Input", small), Picture("Input", small)), Exposure(), Place(4))
+    page = ask(viewer, "GET", "/config")[1].decode() + drawn
+    assert len(labels) > 10 and panels == ["Settings", "Pixel", "Exposure", "Light", "Edit"]
+    assert [label for label in [*labels, *panels] if f'"{label}"' not in page and f">{label}<" not in page] == []
+
+
+def test_the_pinned_gradio_was_checked() -> None:
+    """The page's libraries are pinned, and docs/view.md says when these versions were checked against advisories."""
+    root = Path(__file__).resolve().parents[1]
+    pinned = dict(re.findall(r"^(\S+)==(\S+)$", (root / "constraints.txt").read_text(), re.MULTILINE))
+    said = re.search(r"Checked on \d{4}-\d{2}-\d{2}: (.*?)\.\s", (root / "docs" / "view.md").read_text(), re.DOTALL)
+    assert said is not None
+    checked = dict(re.findall(r"(\S+) (\d[\d.]*\d)", said[1]))
+    assert checked == {name: pinned[name] for name in ("gradio", "fastapi", "starlette", "uvicorn", "python-multipart")}
 
 
 @needs_gradio

@@ -12,6 +12,7 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
+from polsep.capture.shot import Shot
 from polsep.capture.sources import CameraInfo
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import ReadOptions, decode_frame
@@ -34,12 +35,16 @@ NICENESS = 5
 
 @dataclass(frozen=True)
 class Shown:
-    """The latest picture: bytes of a JPEG file, id of the frame, angle of the light's polarizer [degrees], remarks."""
+    """The latest picture: bytes of a JPEG file, id of the frame, angle of the light's polarizer [degrees], remarks.
+
+    ``shot``: what a page tells of the frame.
+    """
 
     jpeg: bytes
     frame_id: int
     light_deg: float
     remarks: tuple[str, ...]
+    shot: Shot | None = None
 
 
 class LiveView:
@@ -66,12 +71,12 @@ class LiveView:
         self._options = with_corrections(read, self._calibration, self._ambient)
         self.separate(bytes(find_pixel_format(info.pixel_format).frame_bytes(info.width, info.height)))
 
-    def separate(self, payload: bytes) -> tuple[SeparatedFrame, tuple[str, ...]]:
-        """One separated frame, and remarks on it."""
+    def separate(self, payload: bytes) -> tuple[SeparatedFrame, tuple[str, ...], Capture]:
+        """One separated frame, remarks on it, and the frame as it was."""
         data, notes = decode_frame(payload, self._options)
         frame = separate_capture(data, self._method, self._light(data))
         remarks = (*notes, *frame.report["warnings"])
-        return frame, tuple(advise(remark, self._options.pixel_format or "") for remark in remarks)
+        return frame, tuple(advise(remark, self._options.pixel_format or "") for remark in remarks), data
 
     def _light(self, data: Capture) -> LightColor | str:
         """Colour of the light: the mean of what the first `LIGHT_FRAMES` frames that show something say, then fixed."""
@@ -87,9 +92,10 @@ class LiveView:
 
     def show(self, image: RawImage) -> Shown:
         """Separate a frame and replace the picture atomically."""
-        frame, remarks = self.separate(image.payload)
+        frame, remarks, data = self.separate(image.payload)
         light = float(frame.report["statistics"]["light_polarizer_deg"])
-        shown = Shown(encode_jpeg(live_sheet(frame)), image.frame_id, light, remarks)
+        picture, shot = encode_jpeg(live_sheet(frame)), Shot(data, frame, remarks)
+        shown = Shown(picture, image.frame_id, light, remarks, shot)
         if self._picture is not None:
             replace_bytes(self._picture, shown.jpeg)
         self.latest = shown

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     "--show",
     type=Number(int, 0, 65_535),
     metavar="PORT",
-    help="Show the live view at http://127.0.0.1:PORT/; 0 picks a free port.",
+    help="Show the live view at http://127.0.0.1:PORT/ with exposure, focus and polarization; 0 picks a free port.",
 )
 @CALIBRATION
 @AMBIENT

@@ -49,26 +49,27 @@ from polsep.cli.app import (
 def view(file: Path | None, host: str, port: int | None, opens: bool, upload_limit: int, **options: Any) -> None:
     """Open raw frames and results in the browser: compare, inspect, edit, download.
 
-    FILE is a raw frame, a file of several frames, an EXR or NPZ file of polsep, or a folder of 'polsep video'; more
-    files can be opened on the page. The page is served to this machine alone unless --host says otherwise. It needs no
-    network, and deletes uploaded files when it is closed. Needs the extra view.
+    FILE is a raw frame, a file of several frames, an EXR or NPZ file of polsep, or a folder of raw frames or of 'polsep
+    video'; 'shot_{angle}.png' is four images at 0, 45, 90 and 135 degrees. More files can be opened on the page. It
+    is served to this machine alone unless --host says otherwise. It needs no network, and deletes uploaded files when
+    it is closed. Needs the extra view.
 
     \b
     polsep view
     polsep view shot.tiff --white-level 4095 --open
     polsep view film/
+    polsep view 'shot_{angle}.png'
     polsep view dump.raw --size 2448x2048 --pixel-format BayerRG12p
     """
     require_extra("view")
-    if file is not None:
-        require_paths(file)
-    from polsep.view.opening import find_sources, parse_settings
+    from polsep.view.opening import find_sources, four_angles, parse_settings
     from polsep.view.server import ViewOptions, serve
 
     names = {"black_level": "black", "white_level": "white", "light_color": "light"}
     settings = {names.get(name, name): value for name, value in options.items() if value not in (None, ())}
     parse_settings(settings)
     if file is not None:
+        require_paths(*four_angles(file))
         find_sources(file)
     with serve(ViewOptions(host, port, file, settings, upload_limit)) as address:
         print(address, flush=True)

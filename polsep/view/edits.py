@@ -5,6 +5,7 @@ The panel is generated: an edit in `EDITS` appears by itself. Every control star
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,6 +32,13 @@ class Control:
         """The parameter's name with its unit."""
         name = self.parameter.name.capitalize()
         return f"{name} [{self.parameter.unit}]" if self.parameter.unit else name
+
+    @property
+    def step(self) -> float:
+        """A round step, about a thousandth of the range, so that the slider can stand where its box says."""
+        span = float(self.parameter.high - self.parameter.low) / 1000
+        power = 10.0 ** math.floor(math.log10(span))
+        return next(n * power for n in (5, 2, 1) if n * power <= span * (1 + 1e-9))
 
 
 def list_controls() -> tuple[Control, ...]:

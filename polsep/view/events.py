@@ -1,93 +1,46 @@
-"""Event functions of the page: each acts on the page's session and returns updates of components, in order.
+"""Event functions of the page: each acts on the page's session and returns updates of components.
 
-A playing page asks for frame after frame; each answer has the next one if it is ready, with the current edits.
+Separating waits in the line of all pages: its functions are generators that tell how far they are. A playing page asks
+for frame after frame; each answer has the next one if it is ready, with the current edits.
 """
 
 from __future__ import annotations
 
-import html
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import asyncio
+import math
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import replace
 from typing import Any
 
 import gradio as gr
 
-from polsep.io.store import errors
+from polsep.view.components import (
+    HINT,
+    IMAGES,
+    MENDS,
+    NOTHING,
+    OF_FILES,
+    SAME,
+    Components,
+    Start,
+    Updates,
+    Values,
+    failure_line,
+    one_line,
+    status_line,
+)
 from polsep.view.edits import list_controls, recipe_of
 from polsep.view.images import KINDS
-from polsep.view.opening import DEMO, DEMO_WHITE, OpenedFrame, parse_settings
-from polsep.view.pictures import confidence_panel, histogram_panel, polarization_panel, stage
+from polsep.view.opening import DEMO, DEMO_WHITE, OpenedFrame, parse_against, parse_settings
+from polsep.view.pictures import Exposure, Picture, Place, Window, exposure_panel, light_panel, stage
 from polsep.view.readout import read_pixel, readout_panel
-from polsep.view.session import Session, Sessions
+from polsep.view.session import Session, Sessions, Superseded
 from polsep.view.style import EMPTY
 
-HINT = '<p class="ps-hint">Click into the picture to read a pixel; drag to move the line.</p>'
 #: Errors of files, settings and disks; each message is one line.
 FAILURES = (ValueError, OSError, MemoryError, RuntimeError)
-#: Labels of the buttons that upload images.
-IMAGES = {"texture": "Texture", "normals": "Normals", "mask": "Mask for all edits"}
-
-Values = dict[Any, Any]
-
-
-@dataclass(frozen=True)
-class Start:
-    """The first state of the page: values of its settings, and a ``file`` of the owner to open."""
-
-    settings: dict[str, Any]
-    file: Any = None
-
-    def corrections(self) -> dict[str, Any]:
-        """The settings that the command line gives and no page may: paths of files."""
-        return {name: self.settings[name] for name in ("calibration", "ambient") if name in self.settings}
-
-
-@dataclass(frozen=True)
-class Components:
-    """The page's components. ``settings`` by the names of `parse_settings`, ``images`` by kind."""
-
-    settings: dict[str, Any]
-    file: Any
-    demo: Any
-    suggest: Any
-    status: Any
-    left: Any
-    right: Any
-    stops: Any
-    stage: Any
-    strip: Any
-    play: Any
-    timer: Any
-    readout: Any
-    panels: tuple[Any, Any, Any]
-    controls: tuple[Any, ...]
-    images: dict[str, Any]
-    neutral: Any
-    fetch: dict[str, Any]
-    link: Any
-
-    def shown(self) -> list[Any]:
-        """Components that a separation changes, in the order of `Events._show`."""
-        index = self.settings["index"]
-        changed = [self.status, self.stage, self.readout, *self.panels, self.strip, index, self.play, self.timer]
-        return [*changed, *self.images.values(), self.suggest]
-
-    def picture(self) -> list[Any]:
-        """Components that determine the picture."""
-        return [self.left, self.right, self.stops]
-
-    def edited(self) -> list[Any]:
-        """Components that an edit changes."""
-        return [self.stage, self.status, self.left, self.right]
-
-    def played(self) -> list[Any]:
-        """Components that the next frame changes."""
-        return [self.stage, self.settings["index"], self.status, self.play, self.timer]
-
-    def control(self, edit: str, parameter: str) -> Any:
-        """The control of one parameter of an edit."""
-        places = [(control.edit.name, control.parameter.name) for control in list_controls()]
-        return self.controls[places.index((edit, parameter))]
+#: Seconds between two words on progress.
+WORD_S = 0.3
 
 
 class Events:
@@ -96,116 +49,216 @@ class Events:
     def __init__(self, sessions: Sessions, components: Components, start: Start) -> None:
         self.sessions, self.components, self.start = sessions, components, start
 
-    def open_upload(self, values: Values, request: gr.Request) -> list[Any]:
+    async def open_upload(self, values: Values, request: gr.Request) -> AsyncIterator[Updates]:
         """Open files that the user uploaded."""
         sent = [_claim(file) for file in values[self.components.file] or ()]
-        return self._open(lambda: self.sessions.open_upload(_key(request), sent), values, request)
+        async for update in self._open(lambda: self.sessions.open_upload(_key(request), sent), values, request):
+            yield update
 
-    def open_demo(self, values: Values, request: gr.Request) -> list[Any]:
-        """Open the example frame of polsep, whose white level is known."""
-        white = self.components.settings["white"]
-        values = {**values, white: f"{DEMO_WHITE:g}", self.components.settings["black"]: "0"}
-        return self._open(lambda: self._session(request).begin_own(DEMO), values, request)
+    async def open_demo(self, values: Values, request: gr.Request) -> AsyncIterator[Updates]:
+        """Open the example frame of polsep, whose levels are known."""
+        settings, known = self.components.settings, {**OF_FILES, "white": f"{DEMO_WHITE:g}"}
+        said = {settings[name]: value for name, value in known.items()}
+        session = self._session(request)
+        async for update in self._open(lambda: session.begin_own(DEMO), values, request, said):
+            yield update
 
-    def open_own(self, file: Any, values: Values, request: gr.Request) -> list[Any]:
+    async def open_own(self, file: Any, values: Values, request: gr.Request) -> AsyncIterator[Updates]:
         """Open the file named on the command line."""
-        return self._open(lambda: self._session(request).begin_own(file), values, request)
+        session = self._session(request)
+        async for update in self._open(lambda: session.begin_own(file), values, request):
+            yield update
 
-    def use_white(self, values: Values, request: gr.Request) -> list[Any]:
-        """Separate with the white level that a remark recommends."""
-        found = self._session(request).opened
-        white = None if found is None else found.suggested_white()
-        values = values if white is None else {**values, self.components.settings["white"]: f"{white:g}"}
-        return [*self.separate(values, request), values[self.components.settings["white"]], None]
+    def mend(self, place: int) -> Callable[[Values, gr.Request], AsyncIterator[Updates]]:
+        """A function that separates again as a remark advises."""
 
-    def _open(self, prepare: Callable[[], None], values: Values, request: gr.Request) -> list[Any]:
-        session, white = self._session(request), values[self.components.settings["white"]]
-        session.playing = False
+        async def answer(values: Values, request: gr.Request) -> AsyncIterator[Updates]:
+            found = self._session(request).opened
+            mends = () if found is None else found.mends()
+            said = {self.components.settings[m.setting]: m.value for m in mends[place : place + 1]}
+            async for update in self.separate({**values, **said}, request):
+                yield said | update
+
+        return answer
+
+    async def _open(
+        self, prepare: Callable[[], None], values: Values, request: gr.Request, said: Updates | None = None
+    ) -> AsyncIterator[Updates]:
+        """Open a file. The settings of files begin anew with it, unless the page keeps them or had no file before."""
+        session, settings = self._session(request), self.components.settings
+        first, session.playing = not session.sources, False
+        emptied = {self.components.file: None}  # for the next upload
         try:
-            prepare()
+            await asyncio.to_thread(prepare)
         except FAILURES as error:
             session.forget()
-            return [*self._failed(error, session), white, None]
-        return [*self.separate({**values, self.components.settings["index"]: 0}, request), white, None]
+            yield emptied | self._failed(error, session)
+            return
+        if said is None:
+            names = [] if first or values[self.components.keep] else list(OF_FILES)
+            if any(source.path.suffix.lower() in (".raw", ".bin") for source in session.sources):
+                names = [name for name in names if name not in ("size", "pixel_format")]
+            said = {settings[name]: value for name, value in self.start.of_files().items() if name in names}
+        async for update in self.separate({**values, **said, settings["index"]: 0}, request):
+            yield emptied | said | update
 
-    def separate(self, values: Values, request: gr.Request) -> list[Any]:
-        """Separate the session's file with the settings of the page."""
+    async def separate(self, values: Values, request: gr.Request) -> AsyncIterator[Updates]:
+        """Separate the session's file with the settings of the page; tell the progress meanwhile."""
+        session, parts = self._session(request), self.components
+        try:
+            said = {name: values[component] for name, component in parts.settings.items()}
+            settings = parse_settings(self.start.corrections() | said)
+            against = parse_against(values[parts.view["against"]], settings)
+        except FAILURES as error:
+            yield self._failed(error, session)
+            return
+        self._see(session, values)
+        key, about = _key(request), (settings, against)
+        if self.sessions.line.has(key, about):  # lists fire twice: when chosen, and when left
+            yield self._kept()
+            return
+        if session.made(settings) is not None and (against is None or session.made(against) is not None):
+            self.sessions.line.leave(key)
+            found = await asyncio.to_thread(session.separate, settings, against)
+            yield await asyncio.to_thread(self._show, session, found)
+            return
+        ticket = self.sessions.line.join(key, lambda ticket: session.separate(*about, lambda: ticket.wanted), about)
+        task = asyncio.wrap_future(ticket.future)
+        try:
+            while not (await asyncio.wait({task}, timeout=WORD_S))[0]:
+                words = f'<span role="status">{ticket.describe()}</span>'
+                yield {parts.progress: words, parts.cancel: gr.update(visible=True)}
+            if task.cancelled():
+                yield self._kept()
+            else:
+                yield await asyncio.to_thread(self._show, session, task.result())
+        except Superseded:
+            yield self._kept()
+        except FAILURES as error:
+            yield self._failed(error, session)
+        finally:
+            ticket.cancel()
+
+    def cancel(self, request: gr.Request) -> Updates:
+        """Leave the line, or drop what is being separated."""
+        self.sessions.line.leave(_key(request))
+        session = self._session(request)
+        kept = "" if session.opened is None else ": the picture is as before"
+        return {**self._idle(), self.components.progress: f'<span role="status">Cancelled{kept}</span>'}
+
+    def _kept(self) -> Updates:
+        """No change; Gradio takes an empty update for a missing one, and a generator's for None everywhere."""
+        return {self.components.stage: gr.skip()}
+
+    def _idle(self) -> Updates:
+        return {self.components.progress: "", self.components.cancel: gr.update(visible=False)}
+
+    def _show(self, session: Session, found: OpenedFrame) -> Updates:
+        session.turn += 1
+        parts, mends = self.components, found.mends()
+        offered = [gr.update(visible=True, value=mend.words) for mend in mends[:MENDS]]
+        offered += [gr.update(visible=False)] * (MENDS - len(offered))
+        return {
+            **self._idle(),
+            parts.status: status_line(found),
+            parts.stage: self._stage(session),
+            parts.readout: self._readout(session),
+            parts.exposure: exposure_panel(found.frame, found.histogram),
+            parts.light: light_panel(found.frame, found.small),
+            parts.strip: gr.update(visible=found.count > 1),
+            parts.settings["index"]: gr.update(maximum=max(found.count - 1, 1), value=found.index),
+            **self._play_state(session),
+            **self._image_names(session),
+            **dict(zip(parts.mends, offered, strict=True)),
+        }
+
+    def _failed(self, error: BaseException, session: Session) -> Updates:
+        """Show the error in the status; pictures stay if there is still a frame."""
+        session.playing, parts = False, self.components
+        nothing = {parts.stage: EMPTY, parts.readout: HINT, parts.strip: gr.update(visible=False)}
+        nothing |= {parts.exposure: NOTHING, parts.light: NOTHING}
+        return {
+            **self._idle(),
+            parts.status: failure_line(error),
+            **({} if session.opened is not None else nothing),
+            **self._play_state(session),
+            **self._image_names(session),
+            **{button: gr.update(visible=False) for button in parts.mends},
+        }
+
+    def _see(self, session: Session, values: Values) -> None:
+        """Note what the pictures show from now on: a separation that ends later draws that."""
+        session.view = {name: values[component] for name, component in self.components.view.items()}
+
+    async def draw(self, values: Values, request: gr.Request) -> Updates:
+        """Draw the same frame with other pictures or another exposure."""
+        session = self._session(request)
+        self._see(session, values)
+        return await self._drawn(session)
+
+    async def _drawn(self, session: Session) -> Updates:
+        """The new picture, unless a later one was begun meanwhile: answers may overtake each other."""
+        session.turn += 1
+        turn = session.turn
+        drawn = await asyncio.to_thread(self._stage, session)
+        return {self.components.stage: drawn} if turn == session.turn else self._kept()
+
+    async def sharpen(self, request: gr.Request, event: gr.EventData) -> Updates:
+        """Draw the part of the frame that the page shows at the screen's resolution."""
         session = self._session(request)
         try:
-            said = {n: values[component] for n, component in self.components.settings.items()}
-            found = session.separate(parse_settings(self.start.corrections() | said))
-        except FAILURES as error:
-            return self._failed(error, session)
-        return self._show(session, found, values)
+            if not await asyncio.to_thread(session.sharpen, Window.parse(event.window)):
+                return self._kept()
+        except FAILURES:
+            return self._kept()
+        return await self._drawn(session)
 
-    def _show(self, session: Session, found: OpenedFrame, values: Values) -> list[Any]:
-        white = found.suggested_white()
-        return [
-            status_line(found),
-            self._stage(session, values),
-            self._readout(session, found),
-            polarization_panel(found.small),
-            histogram_panel(found.histogram),
-            confidence_panel(found.frame, found.small),
-            gr.update(visible=found.count > 1),
-            gr.update(maximum=max(found.count - 1, 1), value=found.index),
-            *_play_state(session),
-            *_image_names(session),
-            gr.update(visible=white is not None, value=f"Use white level {white or 0:g}"),
-        ]
-
-    def _failed(self, error: BaseException, session: Session) -> list[Any]:
-        """Show the error in the status; pictures stay if there is still a frame."""
-        session.playing = False
-        nothing = [EMPTY, HINT, *[EMPTY] * 3, gr.update(visible=False)]
-        kept = [gr.skip()] * len(nothing) if session.opened is not None else nothing
-        stopped = [gr.skip(), *_play_state(session), *_image_names(session), gr.update(visible=False)]
-        return [failure_line(error), *kept, *stopped]
-
-    def draw(self, values: Values, request: gr.Request) -> Any:
-        """Draw the same frame with other pictures or another exposure."""
-        return self._stage(self._session(request), values)
-
-    def point(self, values: Values, request: gr.Request, event: gr.EventData) -> list[Any]:
-        """Show the numbers of the clicked pixel."""
+    async def point(self, request: gr.Request, event: gr.EventData) -> Updates:
+        """Keep the clicked pixel, and show its numbers."""
         session = self._session(request)
-        found = session.opened
-        if found is None:
-            return [gr.skip(), gr.skip()]
-        height, width = found.small.size
-        session.mark = _inside(event.y, height), _inside(event.x, width)
-        return [self._stage(session, values), self._readout(session, found)]
+        if session.opened is None:
+            return self._kept()
+        session.mark = _share(event.y), _share(event.x)
+        parts = self.components
+        shown = {parts.beside: gr.update(selected="pixel"), parts.readout: self._readout(session)}
+        return await self._drawn(session) | shown
 
-    def edit(self, values: Values, request: gr.Request) -> list[Any]:
+    def hover(self, request: gr.Request, event: gr.EventData) -> Updates:
+        """Show the numbers of the pixel under the pointer; beside the picture, of the one that was clicked."""
+        place = None if event.x is None else (_share(event.y), _share(event.x))
+        return {self.components.readout: self._readout(self._session(request), place)}
+
+    async def edit(self, values: Values, request: gr.Request) -> Updates:
         """Show the frame with the edits of the controls as the right picture."""
         session = self._session(request)
         try:
-            session.edit(self._recipe(session, values))
+            await asyncio.to_thread(session.edit, self._recipe(session, values))
         except FAILURES as error:
-            return [gr.skip(), failure_line(error), gr.skip(), gr.skip()]
-        return self._edited(session, values)
+            return {self.components.status: failure_line(error)}
+        return await self._edited(session, values)
 
-    def undo(self, values: Values, request: gr.Request) -> list[Any]:
+    async def undo(self, values: Values, request: gr.Request) -> Updates:
         """Remove all edits and their images."""
         session, starts = self._session(request), [control.start for control in list_controls()]
         session.edit(recipe_of(starts))
         session.drop_images()
-        return [*self._edited(session, values), *_image_names(session), *starts]
+        controls = dict(zip(self.components.controls, starts, strict=True))
+        return await self._edited(session, values) | self._image_names(session) | controls
 
-    def add_image(self, kind: str) -> Callable[[Values, gr.Request], list[Any]]:
+    def add_image(self, kind: str) -> Callable[[Values, gr.Request], Awaitable[Updates]]:
         """A function that uses an uploaded image of a kind for edits; a first texture is applied at once."""
 
-        def answer(values: Values, request: gr.Request) -> list[Any]:
+        async def answer(values: Values, request: gr.Request) -> Updates:
             session, component = self._session(request), self.components.images[kind]
             amount = self.components.control("texture", "amount")
             values = values | {amount: values[amount] or 1.0} if kind == "texture" else values
             try:
-                self.sessions.add_image(_key(request), kind, *_claim(values[component]))
-                session.edit(self._recipe(session, values))
+                sent = _claim(values[component])
+                await asyncio.to_thread(self.sessions.add_image, _key(request), kind, *sent)
+                await asyncio.to_thread(session.edit, self._recipe(session, values))
             except FAILURES as error:
-                skipped = [gr.skip()] * (len(self.components.edited()) - 2)
-                return [gr.skip(), failure_line(error), *skipped, *_image_names(session), gr.skip()]
-            return [*self._edited(session, values), *_image_names(session), values[amount]]
+                return {self.components.status: failure_line(error)} | self._image_names(session)
+            return await self._edited(session, values) | self._image_names(session) | {amount: values[amount]}
 
         return answer
 
@@ -213,44 +266,48 @@ class Events:
         names = {kind: sent.name for kind, sent in session.images.items()}
         return recipe_of([values[control] for control in self.components.controls], names)
 
-    def toggle(self, request: gr.Request) -> list[Any]:
+    def toggle(self, request: gr.Request) -> Updates:
         """Play or pause."""
         session = self._session(request)
         session.playing = not session.playing and session.opened is not None and session.opened.count > 1
-        return _play_state(session)
+        return self._play_state(session)
 
-    def settle(self, values: Values, request: gr.Request) -> list[Any]:
+    async def settle(self, values: Values, request: gr.Request) -> AsyncIterator[Updates]:
         """After a pause, show numbers and panels of the current frame."""
         session = self._session(request)
         if session.playing or session.opened is None or session.place == session.opened.index:
-            return [gr.skip()] * len(self.components.shown())
-        return self.separate({**values, self.components.settings["index"]: session.place}, request)
+            yield self._kept()
+            return
+        values = {**values, self.components.settings["index"]: session.place}
+        async for update in self.separate(values, request):
+            yield update
 
-    def advance(self, values: Values, request: gr.Request) -> list[Any]:
+    async def advance(self, request: gr.Request) -> Updates:
         """Show the next frame of a playing sequence, if it is ready."""
         session = self._session(request)
-        waiting = [gr.skip()] * len(self.components.played())
         try:
-            if not session.playing or not session.play():
-                return waiting
+            if not session.playing or not await asyncio.to_thread(session.play):
+                return self._kept()
         except FAILURES as error:
             session.playing = False
-            return [gr.skip(), gr.skip(), failure_line(error), *_play_state(session)]
-        return [self._stage(session, values), session.place, *waiting[2:]]
+            return {self.components.status: failure_line(error)} | self._play_state(session)
+        return await self._drawn(session) | {self.components.settings["index"]: session.place}
 
-    def _edited(self, session: Session, values: Values) -> list[Any]:
-        values = {**values, self.components.left: "Input", self.components.right: "Edited"}
+    async def _edited(self, session: Session, values: Values) -> Updates:
+        session.against, view = None, self.components.view
+        chosen = {view["left"]: "Input", view["right"]: "Edited", view["against"]: SAME}
         remarks = session.recipe.cautions()
-        status = gr.skip() if session.opened is None else status_line(session.opened, remarks)
-        return [self._stage(session, values), status, "Input", "Edited"]
+        status = {} if session.opened is None else {self.components.status: status_line(session.opened, remarks)}
+        self._see(session, {**values, **chosen})
+        return {**await self._drawn(session), **chosen, **status}
 
-    def write(self, kind: str) -> Callable[[gr.Request], list[Any]]:
+    def write(self, kind: str) -> Callable[[gr.Request], Updates]:
         """A function that writes one of `DOWNLOADS` and returns its path."""
 
-        def answer(request: gr.Request) -> list[Any]:
+        def answer(request: gr.Request) -> Updates:
             session = self._session(request)
             try:
-                return [str(session.write(kind)), gr.skip()]
+                return {self.components.link: str(session.write(kind))}
             except FAILURES as error:
                 raise gr.Error(one_line(error), print_exception=False) from error
 
@@ -263,19 +320,46 @@ class Events:
     def _session(self, request: gr.Request) -> Session:
         return self.sessions.find(_key(request))
 
-    def _stage(self, session: Session, values: Values) -> Any:
-        shown = session.shown
-        if shown is None:
+    def _stage(self, session: Session) -> Any:
+        shown, found, other = session.shown, session.opened, session.against
+        if shown is None or found is None:
             return EMPTY
-        left, right, stops = (values[component] for component in self.components.picture())
-        return stage(shown, (str(left), str(right)), float(stops), session.mark)
+        said = session.view
+        exposure = Exposure(float(said["stops"]), float(said["specular_stops"]), bool(said["marks"]))
+        sharp = session.sharp or (None, None)
+        makers = session.makers if other is not None else ("", "")
+        still = other is not None and session.place == found.index
+        second = replace(other.small, gain=shown.gain) if other is not None and still else shown
+        pictures = (
+            Picture(str(said["left"]), shown, makers[0], sharp[0]),
+            Picture(str(said["right"]), second, makers[1], sharp[1]),
+        )
+        width = max(frame.frame.valid.shape[1] for frame in (found, other) if frame is not None)
+        return stage(pictures, exposure, Place(width, session.mark, session.window))
 
-    def _readout(self, session: Session, found: OpenedFrame) -> str:
-        if session.mark is None:
+    def _readout(self, session: Session, place: tuple[float, float] | None = None) -> str:
+        place = place or session.mark
+        found, other = session.opened, session.against
+        if place is None or found is None:
             return HINT
-        step, (height, width) = found.small.step, found.frame.valid.shape
-        row, col = (min(n * step + step // 2, most - 1) for n, most in zip(session.mark, (height, width), strict=True))
-        return readout_panel(read_pixel(found.frame, found.mosaic, (row, col)))
+        pairs = [(found, session.makers[0] if other is not None else ""), (other, session.makers[1])]
+        tables = []
+        for frame, maker in pairs:
+            if frame is not None:
+                sides = frame.frame.valid.shape
+                at = [min(int(share * side), side - 1) for share, side in zip(place, sides, strict=True)]
+                tables.append(readout_panel(read_pixel(frame.frame, frame.mosaic, (at[0], at[1])), maker))
+        return "".join(tables)
+
+    def _play_state(self, session: Session) -> Updates:
+        """Updates of the play button and the timer."""
+        words = "Pause" if session.playing else "Play"
+        return {self.components.play: gr.update(value=words), self.components.timer: gr.update(active=session.playing)}
+
+    def _image_names(self, session: Session) -> Updates:
+        """Labels of the upload buttons with the names of their images."""
+        names = {kind: session.images[kind].name if kind in session.images else "none" for kind in KINDS}
+        return {self.components.images[kind]: gr.update(label=f"{IMAGES[kind]}: {names[kind]}") for kind in KINDS}
 
 
 def _key(request: gr.Request) -> str:
@@ -288,47 +372,7 @@ def _claim(sent: object) -> tuple[object, str]:
     return upload.get("path"), str(upload.get("orig_name") or upload.get("path") or "")
 
 
-def _play_state(session: Session) -> list[Any]:
-    """Updates of the play button and the timer."""
-    return [gr.update(value="Pause" if session.playing else "Play"), gr.update(active=session.playing)]
-
-
-def _image_names(session: Session) -> list[Any]:
-    """Labels of the upload buttons with the names of their images."""
-    names = {kind: session.images[kind].name if kind in session.images else "none" for kind in KINDS}
-    return [gr.update(label=f"{IMAGES[kind]}: {names[kind]}") for kind in KINDS]
-
-
-def _inside(share: object, count: int) -> int:
-    """The pixel at a share of a side, limited to the side for any value of a client."""
-    value = float(share) if isinstance(share, (int, float)) else 0.0
-    return min(max(int(min(max(value, 0.0), 1.0) * count), 0), count - 1)
-
-
-def one_line(error: BaseException) -> str:
-    """The message of an error in one line."""
-    return errors.one_line(error) or type(error).__name__
-
-
-def failure_line(error: BaseException) -> str:
-    """The status after an error."""
-    return f'<div class="ps-error" role="alert">{html.escape(one_line(error))}</div>'
-
-
-def status_line(found: OpenedFrame, more: Sequence[str] = ()) -> str:
-    """The status after a separation: size, method, statistics and remarks."""
-    frame = found.frame
-    height, width = frame.valid.shape
-    texts = [f"{width} × {height} pixels", str(frame.report["method"])]
-    if found.mosaic is not None:
-        rows, cols = found.mosaic.data.shape[-2:]
-        texts[0] = f"{cols} × {rows} raw, {texts[0]} separated"
-    statistics = frame.report["statistics"]
-    if "clipped_fraction" in statistics:
-        texts.append(f"{statistics['clipped_fraction']:.2%} of the pixels clip")
-        texts.append(f"light polarizer about {statistics['light_polarizer_deg']:.0f}°")
-    texts.append(f"{found.seconds:.2f} s")
-    name = html.escape(found.stem)
-    line = "".join(f"<span>{html.escape(text)}</span>" for text in texts)
-    remarks = "".join(f'<div class="ps-remark">{html.escape(remark)}</div>' for remark in (*found.remarks, *more))
-    return f'<div class="ps-line"><b>{name}</b>{line}</div>{remarks}'
+def _share(value: object) -> float:
+    """A share of a side, from 0 to 1 for any value of a client."""
+    number = float(value) if isinstance(value, (int, float)) else 0.0
+    return min(max(number, 0.0), 1.0) if math.isfinite(number) else 0.0

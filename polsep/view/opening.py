@@ -1,27 +1,31 @@
 """Opening of files on a page: raw frames, results, and sequences of either.
 
-A sequence is one file of several frames, or several files of one frame each.
+A sequence is one file of several frames, or several files of one frame each. Four files whose names differ by 0, 45,
+90 and 135 are one frame.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from polsep.io.raw.corrections import with_corrections
-from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, read_frames
+from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
 from polsep.io.store.errors import InputError
 from polsep.io.store.header_checks import at_most
 from polsep.methods import check_method
 from polsep.pipeline import LightColor, parse_light_color, separate_capture
 from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.exposure import Histogram, exposure_flags, histogram
 from polsep.separation.report import SeparatedFrame
-from polsep.view.pictures import Histogram, Small, histogram, shrink_frame
+from polsep.view.pictures import Pixels, Small, shrink_frame
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,20 +37,42 @@ DEMO_WHITE = 4095.0
 MAX_SAMPLES = 2**26
 #: The value of unset fields: the file, or the type of its samples, decides.
 UNSAID = "from file"
+#: Resolutions: a pixel per cell of 2x2 samples, or per sample.
+HALF, FULL = "half", "full"
+#: What a remark advises: the command's option, the page's name of it, and the setting.
+OPTIONS = {
+    "white-level": ("White level", "white"),
+    "black-level": ("Black level", "black"),
+    "layout": ("Filter layout", "layout"),
+    "light-color": ("Light colour", "light"),
+}
+_ADVICE = re.compile(rf"--({'|'.join(OPTIONS)}) (?!N\b)([\w][^\s;:)]*)")
+_PLACEHOLDER = "{angle}"
+_ANGLE = re.compile(r"(?<!\d)(?:0{1,3}|0?45|0?90|135)(?!\d)")
+_ANGLES = (0, 45, 90, 135)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of reading and separating, as in `ReadOptions` and `pipeline.separate`, and the frame's ``index``."""
+    """Settings of reading and separating, as in `ReadOptions` and `pipeline.separate`, and the frame's ``index``.
+
+    ``full``: at full resolution, where the frame is a mosaic.
+    """
 
     read: ReadOptions = field(default_factory=ReadOptions)
     method: str = "auto"
     light_color: LightColor | str = "auto"
     index: int = 0
+    full: bool = False
+
+    @property
+    def maker(self) -> str:
+        """Method and resolution in words."""
+        return f"{self.method}, {FULL if self.full else HALF}"
 
 
 def parse_settings(said: Mapping[str, Any]) -> Settings:
-    """Settings from the fields of the page: layout, black, white, light, method, size, pixel_format, index.
+    """Settings from the fields of the page: layout, black, white, light, method, resolution, size, pixel_format, index.
 
     ``calibration`` and ``ambient`` are paths that only the command line gives.
 
@@ -64,7 +90,16 @@ def parse_settings(said: Mapping[str, Any]) -> Settings:
     )
     read = with_corrections(read, said.get("calibration"), said.get("ambient") or ())
     light = parse_light_color(_text(said.get("light")) or "auto")
-    return Settings(read, method, light, int(said.get("index") or 0))
+    return Settings(read, method, light, int(said.get("index") or 0), said.get("resolution") == FULL)
+
+
+def parse_against(text: object, settings: Settings) -> Settings | None:
+    """The settings of a comparison ``METHOD, half`` or ``METHOD, full``; None where it names none."""
+    method, comma, resolution = str(text or "").partition(", ")
+    if not comma:
+        return None
+    check_method(method)
+    return replace(settings, method=method, full=resolution == FULL)
 
 
 def _text(value: object) -> str | None:
@@ -99,15 +134,63 @@ class Source:
 
 
 def as_source(path: Path, stem: str) -> Source:
-    """A file as a source with a display name."""
-    separated = path.suffix.lower() == ".exr" or (path.suffix.lower() == ".npz" and holds_separated(path))
+    """A file, or a template of four angle images, as a source with a display name."""
+    plain = _PLACEHOLDER not in path.name
+    separated = plain and (path.suffix.lower() == ".exr" or (path.suffix.lower() == ".npz" and holds_separated(path)))
     return Source(path, stem, separated)
 
 
 def find_sources(path: Path) -> tuple[Source, ...]:
-    """The owner's own file, or the frames of a folder as `polsep video` writes them. Raises InputError."""
-    paths = [file for file in find_numbered(path).files if file is not None] if path.is_dir() else [path]
-    return tuple(as_source(file, file.stem) for file in paths)
+    """The owner's own file, four of a template with ``{angle}``, or a folder: frames as `polsep video` writes them, or
+    raw ones. Raises InputError.
+    """
+    if not path.is_dir():
+        return (as_source(path, output_stem(path)),)
+    try:
+        return tuple(as_source(file, file.stem) for file in find_numbered(path).files if file is not None)
+    except InputError:
+        files = sorted((f for f in path.iterdir() if f.suffix.lower() in FRAME_FILES), key=lambda f: in_numbers(f.name))
+        if not files:
+            raise
+        groups = group_angles([file.name for file in files])
+        if groups is None:
+            return tuple(as_source(file, file.stem) for file in files)
+        return tuple(as_source(path / template, output_stem(template)) for template in groups)
+
+
+def four_angles(path: Path) -> tuple[Path, ...]:
+    """The files of a path: four of a template with ``{angle}``, else the one."""
+    if _PLACEHOLDER not in path.name:
+        return (path,)
+    return tuple(path.with_name(path.name.replace(_PLACEHOLDER, str(angle))) for angle in _ANGLES)
+
+
+def group_angles(names: Sequence[str]) -> dict[str, tuple[int, ...]] | None:
+    """Frames of four angle images: the places of 0, 45, 90 and 135 degrees in ``names``, by template.
+
+    None unless all names belong to one: frames of a sequence may have such numbers too.
+    """
+    found: dict[str, dict[int, int]] = {}
+    for place, name in enumerate(names):
+        for match in _ANGLE.finditer(name):
+            template = name[: match.start()] + _PLACEHOLDER + name[match.end() :]
+            found.setdefault(template, {})[int(match[0])] = place
+    whole = {t: tuple(places[a] for a in _ANGLES) for t, places in found.items() if set(places) == set(_ANGLES)}
+    used = sorted(place for places in whole.values() for place in places)
+    return whole if used == list(range(len(names))) else None
+
+
+def in_numbers(name: str) -> list[tuple[int, str]]:
+    """A key that sorts numbered names by number: shot2 before shot10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+class Mend(NamedTuple):
+    """Advice of a remark: a setting, its value, and words for a button."""
+
+    setting: str
+    value: str
+    words: str
 
 
 @dataclass(frozen=True)
@@ -115,7 +198,7 @@ class OpenedFrame:
     """One separated frame and its display data. ``mosaic`` and ``histogram`` are None without a raw frame.
 
     It is number ``index`` of ``count``; ``remarks`` are lines for the user; ``seconds``: time of reading and
-    separating.
+    separating; ``flags``: `exposure_flags` at the frame's resolution; ``advice``: the remarks in the command's words.
     """
 
     frame: SeparatedFrame
@@ -127,13 +210,15 @@ class OpenedFrame:
     index: int = 0
     count: int = 1
     seconds: float = 0.0
+    flags: Pixels | None = None
+    advice: tuple[str, ...] = ()
 
-    def suggested_white(self) -> float | None:
-        """The white level that a remark recommends."""
-        for remark in self.remarks:
-            if (said := re.search(r"set White level to (\d+)", remark)) is not None:
-                return float(said[1])
-        return None
+    def mends(self) -> tuple[Mend, ...]:
+        """The settings that remarks advise, each once."""
+        found = [(OPTIONS[name], value) for remark in self.advice for name, value in _ADVICE.findall(remark)]
+        return tuple(
+            dict.fromkeys(Mend(setting, value, f"Use {words.lower()} {value}") for (words, setting), value in found)
+        )
 
 
 def read_source(sources: tuple[Source, ...], read: ReadOptions, index: int) -> Frame | SeparatedFrame:
@@ -156,14 +241,28 @@ def open_frame(sources: tuple[Source, ...], settings: Settings, read: Frame | Se
     stem = sources[min(settings.index, len(sources) - 1)].stem
     if isinstance(read, SeparatedFrame):
         return OpenedFrame(read, shrink_frame(read), None, None, (), stem, settings.index, len(sources))
-    frame = separate_capture(read.data, settings.method, settings.light_color)
+    frame = separate_capture(read.data, settings.method, settings.light_color, full=settings.full)
     frame.report["source"] = stem
-    frame.report["warnings"] = [*read.notes, *frame.report["warnings"]]
+    advice = (*read.notes, *frame.report["warnings"])
+    frame.report["warnings"] = list(advice)
+    remarks = tuple(re.sub(rf"--({'|'.join(OPTIONS)})", lambda found: OPTIONS[found[1]][0], text) for text in advice)
     mosaic = read.data if isinstance(read.data, Mosaic) else None
-    remarks = tuple(remark.replace("say --white-level", "set White level to") for remark in frame.report["warnings"])
+    flags = None if mosaic is None else _flags(mosaic, frame.valid.shape)
     counted = None if mosaic is None else histogram(mosaic)
     stem = stem if len(sources) > 1 or read.count == 1 else f"{stem}_{read.index:04d}"
-    return OpenedFrame(frame, shrink_frame(frame), mosaic, counted, remarks, stem, read.index, read.count)
+    small, place = shrink_frame(frame, flags), (read.index, read.count)
+    return OpenedFrame(frame, small, mosaic, counted, remarks, stem, *place, flags=flags, advice=advice)
+
+
+def _flags(mosaic: Mosaic, shape: tuple[int, ...]) -> Pixels:
+    """`exposure_flags` for a separated frame of a shape: of its cells, or of the samples in them."""
+    cells = exposure_flags(mosaic)
+    if cells.shape == shape:
+        return cells
+    (top, left), (height, width) = mosaic.layout.origin, cells.shape
+    flags = np.zeros(shape, np.uint8)
+    flags[top : top + 2 * height, left : left + 2 * width] = cells.repeat(2, axis=0).repeat(2, axis=1)
+    return flags
 
 
 def open_small(sources: tuple[Source, ...], settings: Settings) -> Small:
@@ -171,7 +270,7 @@ def open_small(sources: tuple[Source, ...], settings: Settings) -> Small:
     read = read_source(sources, settings.read, settings.index)
     if isinstance(read, SeparatedFrame):
         return shrink_frame(read)
-    return shrink_frame(separate_capture(read.data, settings.method, settings.light_color))
+    return shrink_frame(separate_capture(read.data, settings.method, settings.light_color, full=settings.full))
 
 
 @contextmanager
@@ -180,7 +279,10 @@ def _renamed(source: Source) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise InputError(str(error).replace(str(source.path), source.stem + source.path.suffix)) from error
+        said = str(error).replace(str(source.path), source.stem + source.path.suffix)
+        for path, angle in zip(four_angles(source.path), _ANGLES, strict=False):
+            said = said.replace(str(path), f"{source.stem} {angle}°{path.suffix}")
+        raise InputError(said) from error
 
 
 def plain_name(name: str, suffixes: tuple[str, ...] = (*FRAME_FILES, ".exr"), kinds: str = "") -> tuple[str, str]:

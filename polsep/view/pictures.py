@@ -1,26 +1,29 @@
 """Pictures of the viewer: small linear copies of a separated frame, drawn at any exposure.
 
-A copy is made once per separation; the exposure slider only changes the lookup in a table. Light is averaged before any
-tone curve, and polarization as Stokes vectors. Pictures are sRGB ``uint8 [h, w, 3]``.
+A copy is made once per separation; the exposure slider only changes the lookup in a table. A window of the frame is a
+copy too, in as many pixels as the screen has. Light is averaged before any tone curve, and polarization as Stokes
+vectors. Pictures are sRGB ``uint8 [h, w, 3]``.
 """
 
 from __future__ import annotations
 
 import html
+import math
+import re
 from base64 import b64encode
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import to_numpy
+from polsep.io.results.charts import CHANNELS, histogram_svg, rose_shares, rose_svg
 from polsep.io.results.previews import aolp_legend, aolp_wheel, dolp_map, exposure_of, srgb
 from polsep.io.store.image_codecs import encode_jpeg_quickly, encode_png
-from polsep.sensor.camera import Mosaic
+from polsep.sensor.exposure import BLACK, CLIPPED, Histogram
 from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float32]
@@ -28,11 +31,16 @@ Pixels = NDArray[np.uint8]
 
 #: Longest side of a picture in pixels.
 SCREEN = 640
+#: Longest side of a window in pixels.
+MAX_WINDOW = 2048
+#: Pictures of at most so many pixels are sent without loss: every pixel of the frame is large then.
+LOSSLESS = 1 << 16
 #: Steps of the tone table: fine enough that no step skips an 8-bit code.
 _STEPS = 1 << 14
 #: Exposure of pictures of errors relative to that of light: errors are small.
 _ERROR_GAIN = 8.0
-_COLORS = {"R": "#ff6b6b", "G": "#63d471", "B": "#6ea8fe", "Y": "#d0d0d4"}
+#: Colours of marked pixels.
+_MARKS = {CLIPPED: (255, 40, 40), BLACK: (40, 110, 255)}
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,7 @@ class Small:
     """A linear frame at screen size: ``step`` pixels of the frame wide is one pixel; ``gain``: exposure that fits it.
 
     ``diffuse``, ``specular``: ``[h, w, C]``; ``dolp``, ``aolp``: ``[h, w]``; ``error``: ``[h, w, 2]`` or None;
-    ``edited``: ``[h, w, C]`` after edits, None without.
+    ``edited``: ``[h, w, C]`` after edits, None without; ``flags``: `exposure_flags`, None without a raw frame.
     """
 
     step: int
@@ -51,6 +59,7 @@ class Small:
     error: Floats | None
     gain: float
     edited: Floats | None = None
+    flags: Pixels | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -58,9 +67,18 @@ class Small:
         return self.dolp.shape[0], self.dolp.shape[1]
 
 
-def shrink_frame(frame: SeparatedFrame) -> Small:
-    """The copy of a frame whose longer side is at most `SCREEN`."""
-    step = -(-max(frame.valid.shape) // SCREEN)
+@dataclass(frozen=True)
+class Exposure:
+    """Exposure of pictures: stops above the exposure that fits, more for the specular; marks of clipping."""
+
+    stops: float = 0.0
+    specular_stops: float = 0.0
+    marks: bool = False
+
+
+def shrink_frame(frame: SeparatedFrame, flags: Pixels | None = None, step: int | None = None) -> Small:
+    """The copy of a frame whose longer side is at most `SCREEN`, or at ``step`` pixels per pixel."""
+    step = step or -(-max(frame.valid.shape) // SCREEN)
     diffuse, specular = (shrink(np.maximum(image, 0), step) for image in (frame.diffuse, frame.specular))
     s0 = (frame.diffuse + frame.specular).mean(axis=-1, dtype=np.float32)
     polarized = s0 * frame.dolp
@@ -69,7 +87,70 @@ def shrink_frame(frame: SeparatedFrame) -> Small:
     dolp = (np.hypot(s1, s2) / np.where(light > 0, light, 1)).astype(np.float32)
     aolp = np.mod(np.arctan2(s2, s1) / 2, np.float32(np.pi))
     error = None if frame.error is None else np.sqrt(shrink(frame.error**2, step))
-    return Small(step, diffuse, specular, dolp, aolp, error, exposure_of(diffuse + specular))
+    marked = None if flags is None else _any_flag(flags, step)
+    return Small(step, diffuse, specular, dolp, aolp, error, exposure_of(diffuse + specular), None, marked)
+
+
+def _any_flag(flags: Pixels, step: int) -> Pixels:
+    """The flags that any pixel of a block has."""
+    if step == 1:
+        return flags
+    rows, cols = (np.arange(0, side, step) for side in flags.shape)
+    found: Pixels = np.bitwise_or.reduceat(np.bitwise_or.reduceat(flags, rows, axis=0), cols, axis=1)
+    return found
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of a frame that a page shows: shares of the frame's sides, and the width on screen in pixels."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+    pixels: int
+
+    @classmethod
+    def parse(cls, text: object) -> Window:
+        """The window ``left,top,right,bottom,pixels`` of a page, sides in 1/10000. Raises ValueError on others."""
+        found = re.fullmatch(r"(\d{1,5}),(\d{1,5}),(\d{1,5}),(\d{1,5}),(\d{1,5})", str(text))
+        numbers = [int(part) for part in found.groups()] if found else []
+        if not numbers or not (numbers[0] < numbers[2] <= 10000 and numbers[1] < numbers[3] <= 10000 and numbers[4]):
+            raise ValueError(f"expected a window like 0,0,10000,10000,800, found {text!r:.60}")
+        left, top, right, bottom = (number / 10000 for number in numbers[:4])
+        return cls(left, top, right, bottom, numbers[4])
+
+    def __str__(self) -> str:
+        sides = (self.left, self.top, self.right, self.bottom)
+        return ",".join(f"{round(10000 * side)}" for side in sides) + f",{self.pixels}"
+
+
+@dataclass(frozen=True)
+class Sharp:
+    """A window of a frame as a copy; its place as shares of the frame's sides, in whole pixels."""
+
+    small: Small
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+
+def cut_window(
+    frame: SeparatedFrame, window: Window, like: Small, edited: Floats | None, flags: Pixels | None
+) -> Sharp:
+    """The part of a frame in a window, in about as many pixels as the window has, with the exposure of ``like``."""
+    height, width = frame.valid.shape
+    cols = math.floor(window.left * width), min(math.ceil(window.right * width), width)
+    rows = math.floor(window.top * height), min(math.ceil(window.bottom * height), height)
+    part = np.s_[rows[0] : rows[1], cols[0] : cols[1]]
+    longest = max(rows[1] - rows[0], cols[1] - cols[0])
+    step = max((cols[1] - cols[0]) // window.pixels, -(-longest // MAX_WINDOW), 1)
+    error = None if frame.error is None else frame.error[part]
+    images = (frame.diffuse[part], frame.specular[part], frame.valid[part], frame.dolp[part], frame.aolp[part])
+    small = shrink_frame(SeparatedFrame(*images, {}, error), None if flags is None else flags[part], step)
+    small = replace(small, gain=like.gain, edited=None if edited is None else shrink(edited[part], step))
+    return Sharp(small, cols[0] / width, rows[0] / height, cols[1] / width, rows[1] / height)
 
 
 def shrink(image: Floats, step: int) -> Floats:
@@ -97,34 +178,42 @@ def tone(image: Floats, gain: float) -> Pixels:
     return codes if codes.shape[2] == 3 else codes.repeat(3, axis=2)
 
 
-#: Pictures that can be compared, by name: functions of a copy and a gain.
-VIEWS: dict[str, Callable[[Small, float], Pixels]] = {
-    "Input": lambda small, gain: tone(small.diffuse + small.specular, gain),
-    "Diffuse": lambda small, gain: tone(small.diffuse, gain),
-    "Specular": lambda small, gain: tone(small.specular, gain),
-    "Edited": lambda small, gain: tone(small.diffuse + small.specular if small.edited is None else small.edited, gain),
-    "DoLP": lambda small, gain: dolp_map(small.dolp),
-    "AoLP": lambda small, gain: aolp_wheel(small.aolp, small.dolp),
+#: Pictures that can be compared, by name: functions of a copy, its gain, and that of its specular light.
+VIEWS: dict[str, Callable[[Small, float, float], Pixels]] = {
+    "Input": lambda small, gain, _: tone(small.diffuse + small.specular, gain),
+    "Diffuse": lambda small, gain, _: tone(small.diffuse, gain),
+    "Specular": lambda small, _, gain: tone(small.specular, gain),
+    "Edited": lambda small, gain, _: tone(
+        small.diffuse + small.specular if small.edited is None else small.edited, gain
+    ),
+    "DoLP": lambda small, *_: dolp_map(small.dolp),
+    "AoLP": lambda small, *_: aolp_wheel(small.aolp, small.dolp),
+    "Error of diffuse": lambda small, *_: _draw_error(small, 0),
+    "Error of specular": lambda small, *_: _draw_error(small, 1),
 }
 
 
-def draw(small: Small, view: str, stops: float) -> Pixels:
-    """One of `VIEWS`, ``stops`` above the exposure that fits the frame. Raises ValueError for another name."""
+def draw(small: Small, view: str, exposure: Exposure) -> Pixels:
+    """One of `VIEWS`. Raises ValueError for another name."""
     if view not in VIEWS:
         raise ValueError(f"expected a picture of {', '.join(VIEWS)}, found {view!r:.60}")
-    return VIEWS[view](small, small.gain * 2.0**stops)
+    gain = small.gain * 2.0**exposure.stops
+    pixels = VIEWS[view](small, gain, gain * 2.0**exposure.specular_stops)
+    if exposure.marks and small.flags is not None:
+        for flag, color in _MARKS.items():
+            pixels[(small.flags & flag) > 0] = color
+    return pixels
 
 
-def draw_error(small: Small) -> tuple[Pixels, Pixels] | None:
-    """Expected errors of diffuse and of specular, `_ERROR_GAIN` times as bright as the frame."""
+def _draw_error(small: Small, which: int) -> Pixels:
+    """The expected error of diffuse or specular, `_ERROR_GAIN` times as bright as the frame; grey without any."""
     if small.error is None:
-        return None
-    gain = np.float32(small.gain * _ERROR_GAIN)
-    return dolp_map(small.error[..., 0] * gain), dolp_map(small.error[..., 1] * gain)
+        return np.full((*small.size, 3), 48, np.uint8)
+    return dolp_map(small.error[..., which] * np.float32(small.gain * _ERROR_GAIN))
 
 
 def error_at_white(small: Small) -> float:
-    """The error at the brightest colour of `draw_error`, in the images' unit."""
+    """The error at the brightest colour of a picture of errors, in the images' unit."""
     return 1 / (small.gain * _ERROR_GAIN)
 
 
@@ -134,138 +223,152 @@ def as_url(pixels: Pixels) -> str:
     Note: JPEG of high quality, unlike the PNG previews in files, because it must follow a slider. Numbers are read from
     the frame (`readout`), never from here.
     """
+    if pixels.shape[0] * pixels.shape[1] <= LOSSLESS:
+        return lossless_url(pixels)
     return f"data:image/jpeg;base64,{b64encode(encode_jpeg_quickly(pixels)).decode('ascii')}"
 
 
-def scale_url(pixels: Pixels) -> str:
-    """A legend or scale as a data URL, lossless."""
-    return f"data:image/png;base64,{b64encode(encode_png(pixels)).decode('ascii')}"
-
-
-def stage(small: Small, views: tuple[str, str], stops: float, mark: tuple[int, int] | None = None) -> str:
-    """The page's element that compares two pictures; ``mark``: row and column of a marked pixel."""
-    with ThreadPoolExecutor(2) as pool:
-        left, right = pool.map(lambda view: as_url(draw(small, view, stops)), views)
-    height, width = small.size
-    names = [html.escape(view) for view in views]
-    ring = ""
-    if mark is not None:
-        x, y = 100 * (mark[1] + 0.5) / width, 100 * (mark[0] + 0.5) / height
-        ring = f'<span class="ps-mark" style="left:{x:.3f}%;top:{y:.3f}%"></span>'
-    return (
-        f'<div class="ps-stage" style="--ratio:{width / height:.5f}">'
-        f'<img class="ps-left" src="{left}" alt="{names[0]}" decoding="sync" draggable="false">'
-        f'<img class="ps-right" src="{right}" alt="{names[1]}" decoding="sync" draggable="false">{ring}'
-        f'<span class="ps-name ps-name-left">{names[0]}</span><span class="ps-name ps-name-right">{names[1]}</span>'
-        '<span class="ps-handle" role="slider" tabindex="0" aria-label="Compare" aria-valuemin="0" aria-valuemax="100" '
-        'aria-valuenow="50"></span></div>'
-    )
-
-
-def polarization_panel(small: Small) -> str:
-    """DoLP with its scale and AoLP with its wheel."""
-    bar = np.repeat(dolp_map(np.linspace(0, 1, 256))[None], 4, axis=0)
-    ticks = "".join(f"<span>{k / 4:g}</span>" for k in range(5))
-    places = {"0°": (104, 50), "45°": (90, 8), "90°": (50, -8), "135°": (10, 8)}
-    angles = "".join(f'<i style="left:{x}%;top:{y}%">{angle}</i>' for angle, (x, y) in places.items())
-    wheel = f'<div class="ps-wheel"><img src="{scale_url(aolp_legend(96))}" alt="colour wheel">{angles}</div>'
-    return _pair(
-        _figure("Degree of linear polarization", draw(small, "DoLP", 0)),
-        _scale(scale_url(bar), ticks),
-        _figure("Angle of linear polarization, from right toward up", draw(small, "AoLP", 0)),
-        f'<div class="ps-legend">{wheel}<p>centre: unpolarized<br>rim: fully polarized</p></div>',
-    )
-
-
-def confidence_panel(frame: SeparatedFrame, small: Small) -> str:
-    """Expected errors per pixel, and the share of valid pixels."""
-    valid = f"{float(frame.valid.mean()):.2%} of the pixels are valid: clipping left nothing of them to assumption."
-    drawn = draw_error(small)
-    if drawn is None:
-        return f'<p class="ps-empty">This method does not say how far off it expects to be. {valid}</p>'
-    bar = np.repeat(dolp_map(np.linspace(0, 1, 256))[None], 4, axis=0)
-    white = error_at_white(small)
-    ticks = "".join(f"<span>{white * k / 4:.2g}</span>" for k in range(5))
-    assert frame.error is not None
-    rms = [float(np.sqrt(np.mean(frame.error[..., k].astype(np.float64) ** 2))) for k in range(2)]
-    return _pair(
-        _figure(f"Expected error of diffuse, rms {rms[0]:.2g}", drawn[0]),
-        _scale(scale_url(bar), ticks),
-        _figure(f"Expected error of specular, rms {rms[1]:.2g}", drawn[1]),
-        f'<div class="ps-legend"><p>standard deviation, 1 = one measurement at the white level<br>{valid}</p></div>',
-    )
-
-
-def _figure(title: str, pixels: Pixels) -> str:
-    return f'<figcaption>{html.escape(title)}</figcaption><img src="{as_url(pixels)}" alt="{html.escape(title)}">'
-
-
-def _scale(bar: str, ticks: str) -> str:
-    return f'<div class="ps-legend"><div class="ps-scale"><img src="{bar}" alt="scale"><div>{ticks}</div></div></div>'
-
-
-def _pair(first: str, below_first: str, second: str, below_second: str) -> str:
-    """Two pictures side by side, each with its legend."""
-    cells = ((first, below_first), (second, below_second))
-    return f'<div class="ps-pair">{"".join(f"<figure>{figure}{legend}</figure>" for figure, legend in cells)}</div>'
+def lossless_url(pixels: Pixels) -> str:
+    """A small picture as a data URL, without loss."""
+    return f"data:image/png;base64,{b64encode(encode_png(pixels, 1)).decode('ascii')}"
 
 
 @dataclass(frozen=True)
-class Histogram:
-    """Shares of raw samples per bin between black and white, for each colour: rows of ``shares`` [colours, bins].
+class Picture:
+    """One of the two compared pictures: a view of a frame, what made it, and the window of it that is seen."""
 
-    ``clipped``: the share of samples of each colour that clip.
-    """
+    view: str
+    small: Small
+    maker: str = ""
+    sharp: Sharp | None = None
 
-    names: str
-    shares: NDArray[np.float64]
-    clipped: tuple[float, ...]
-
-
-def histogram(mosaic: Mosaic, bins: int = 128) -> Histogram:
-    """Histogram of raw samples from black to white; samples beyond count in the first and last bins."""
-    samples, clipped = to_numpy(mosaic.linear()), to_numpy(mosaic.clipped())
-    layout, period = mosaic.layout, mosaic.layout.period
-    count = np.zeros((layout.channels, bins))
-    over = np.zeros(layout.channels)
-    for row in range(period):
-        for col in range(period):
-            channel = layout.filter_at(row, col).channel
-            values = samples[row::period, col::period]
-            codes = np.clip(values * bins, 0, bins - 1).astype(np.int64)
-            count[channel] += np.bincount(codes.ravel(), minlength=bins)
-            over[channel] += int(np.count_nonzero(clipped[row::period, col::period]))
-    total = count.sum(axis=1)
-    names = "RGB" if layout.channels == 3 else "Y"
-    return Histogram(names, count / total[:, None], tuple((over / total).tolist()))
+    def urls(self, exposure: Exposure) -> tuple[str, str | None]:
+        """The whole picture, and its window."""
+        whole = as_url(draw(self.small, self.view, exposure))
+        return whole, None if self.sharp is None else as_url(draw(self.sharp.small, self.view, exposure))
 
 
-def histogram_panel(found: Histogram | None) -> str:
-    """The histogram as a drawing, with the clipped share of every colour."""
-    if found is None:
-        return '<p class="ps-empty">Results and angle images have no raw samples to count.</p>'
-    width, height, floor = 640, 220, 1e-6
-    shown = np.log10(np.maximum(found.shares, floor) / floor)
-    top = max(float(shown.max()), 1.0)
-    lines = []
-    for name, row in zip(found.names, shown, strict=True):
-        x = (np.arange(row.size) + 0.5) * width / row.size
-        points = " ".join(f"{a:.1f},{height - b / top * (height - 12):.1f}" for a, b in zip(x, row, strict=True))
-        lines.append(
-            f'<polyline points="0,{height} {points} {width},{height}" fill="{_COLORS[name]}" fill-opacity=".13" '
-            f'stroke="{_COLORS[name]}" stroke-width="1.5" vector-effect="non-scaling-stroke"/>'
+@dataclass(frozen=True)
+class Place:
+    """Places on a picture: the frame's width in pixels, a marked place (row and column as shares), and the window."""
+
+    width: int
+    mark: tuple[float, float] | None = None
+    window: Window | None = None
+
+
+def stage(pictures: tuple[Picture, Picture], exposure: Exposure, place: Place) -> str:
+    """The page's element that compares two pictures: layers of both, names, legends, and tools to zoom."""
+    with ThreadPoolExecutor(2) as pool:
+        urls = list(pool.map(lambda picture: picture.urls(exposure), pictures))
+    layers = "".join(
+        f'<div class="ps-layer ps-layer-{side}"><div class="ps-world">{_images(picture, url, side)}</div></div>'
+        for picture, url, side in zip(pictures, urls, ("left", "right"), strict=True)
+    )
+    names = "".join(
+        f'<span class="ps-name ps-name-{side}">{html.escape(" · ".join(t for t in (p.view, p.maker) if t))}</span>'
+        f'<div class="ps-key ps-key-{side}">{_key(p)}</div>'
+        for p, side in zip(pictures, ("left", "right"), strict=True)
+    )
+    ring = ""
+    if place.mark is not None:
+        ring = f'<span class="ps-mark" style="left:{100 * place.mark[1]:.4f}%;top:{100 * place.mark[0]:.4f}%"></span>'
+    height, width = pictures[0].small.size
+    tools = "".join(
+        f'<button type="button" data-tool="{tool}" title="{title}" aria-label="{title}">{text}</button>'
+        for tool, title, text in (
+            ("out", "Zoom out (-)", "−"), ("in", "Zoom in (+)", "+"),
+            ("one", "One pixel of the frame is one of the screen (1)", "1:1"), ("fit", "Fit (0)", "Fit"),
         )
+    )  # fmt: skip
+    key = "" if place.window is None or pictures[0].sharp is None else str(place.window)
+    return (
+        f'<div class="ps-stage" tabindex="0" role="group" aria-label="Pictures: arrow keys move, plus and minus zoom" '
+        f'style="--ratio:{width / height:.5f}" data-width="{place.width}" data-window="{key}">{layers}'
+        f'<div class="ps-layer ps-over"><div class="ps-world">{ring}</div></div>{names}'
+        '<span class="ps-handle" role="slider" tabindex="0" aria-label="Compare" aria-valuemin="0" aria-valuemax="100" '
+        f'aria-valuenow="50"></span><div class="ps-tools">{tools}<output></output></div></div>'
+    )
+
+
+def _images(picture: Picture, urls: tuple[str, str | None], side: str) -> str:
+    whole, window = urls
+    name = html.escape(picture.view)
+    found = f'<img class="ps-{side}" src="{whole}" alt="{name}" decoding="sync" draggable="false">'
+    if window is not None and (sharp := picture.sharp) is not None:
+        place = f"left:{100 * sharp.left:.5f}%;top:{100 * sharp.top:.5f}%"
+        size = f"width:{100 * (sharp.right - sharp.left):.5f}%;height:{100 * (sharp.bottom - sharp.top):.5f}%"
+        found += (
+            f'<img class="ps-sharp" src="{window}" alt="" style="{place};{size}" decoding="sync" draggable="false">'
+        )
+    return found
+
+
+def _key(picture: Picture) -> str:
+    """The legend of a picture that shows no light."""
+    if picture.view == "AoLP":
+        angles = "".join(f"<i>{angle}°</i>" for angle in (0, 45, 90, 135))
+        return f'<div class="ps-wheel"><img src="{_wheel_url()}" alt="colour wheel">{angles}</div>'
+    if picture.view.startswith("Error") and picture.small.error is None:
+        return "<span>this method expects no errors</span>"
+    if picture.view != "DoLP" and not picture.view.startswith("Error"):
+        return ""
+    most = 1.0 if picture.view == "DoLP" else error_at_white(picture.small)
+    return f'<span>0</span><img class="ps-bar" src="{_bar_url()}" alt="scale"><span>{most:.2g}</span>'
+
+
+@cache
+def _wheel_url() -> str:
+    return lossless_url(aolp_legend(72))
+
+
+@cache
+def _bar_url() -> str:
+    return lossless_url(np.repeat(dolp_map(np.linspace(0, 1, 128))[None], 4, axis=0))
+
+
+def exposure_panel(frame: SeparatedFrame, found: Histogram | None) -> str:
+    """The histogram with the clipped share of every colour, the share of valid pixels, and expected errors."""
+    rows = [f"{float(frame.valid.mean()):.2%} of the pixels are valid: clipping left nothing of them to assumption."]
+    if frame.error is None:
+        rows.append("This method does not say how far off it expects to be.")
+    else:
+        levels = [np.quantile(frame.error[..., k], (0.5, 0.95)) for k in range(2)]
+        texts = [f"{name} {a:.2g} (95 % below {b:.2g})" for name, (a, b) in zip(("diffuse", "specular"), levels)]  # noqa: B905
+        rows.append(f"Expected error, median: {', '.join(texts)}; 1 is one measurement at the white level.")
+    said = "".join(f"<p>{row}</p>" for row in rows)
+    if found is None:
+        return f'<div class="ps-note"><p>Results and angle images have no raw samples to count.</p>{said}</div>'
     shares = "".join(
-        f'<span style="color:{_COLORS[name]}">{_label(name)} {share:.3%}</span>'
+        f'<span style="color:{CHANNELS[name][0]}">{CHANNELS[name][1]} {share:.3%}</span>'
         for name, share in zip(found.names, found.clipped, strict=True)
     )
     return (
-        f'<div class="ps-histogram"><svg viewBox="0 0 {width} {height}" preserveAspectRatio="none" role="img" '
-        f'aria-label="histogram of raw samples">{"".join(lines)}</svg>'
-        '<div class="ps-axis"><span>black level</span><span>raw samples, shares on a logarithmic scale</span>'
-        f'<span>white level</span></div><div class="ps-shares"><b>Clipped</b>{shares}</div></div>'
+        f'<div class="ps-histogram">{histogram_svg(found)}'
+        '<div class="ps-axis"><span>black</span><span>raw samples, logarithmic</span><span>white</span></div>'
+        f'<div class="ps-shares"><b>Clipped</b>{shares}</div></div><div class="ps-note">{said}</div>'
     )
 
 
-def _label(color: str) -> str:
-    return {"R": "red", "G": "green", "B": "blue", "Y": "all"}[color]
+def light_panel(frame: SeparatedFrame, small: Small) -> str:
+    """The rose of the polarized light's angles, the angle of the light's polarizer, and the light's colour."""
+    power = (small.diffuse + small.specular).mean(axis=-1) * small.dolp
+    statistics = frame.report.get("statistics", {})
+    axes, rows = {}, ["Angles of all polarized light, from right toward up; the area is its share."]
+    if "specular_aolp_deg" in statistics:
+        axes = {"ps-found": statistics["specular_aolp_deg"], "ps-lamp": statistics["light_polarizer_deg"]}
+        rows.append(
+            f'<b class="ps-found">Highlights</b> {axes["ps-found"]:.0f}°, concentration '
+            f"{statistics['specular_aolp_concentration']:.2f} of 1"
+        )
+        rows.append(f'<b class="ps-lamp">Polarizer of the light</b> {axes["ps-lamp"]:.0f}°')
+    color = frame.report.get("light_color")
+    if color is not None and len(color) == 3:
+        swatch = "".join(f"{round(255 * float(part)):02x}" for part in srgb(np.array(color) / max(color)))
+        source = html.escape(str(frame.report.get("light", {}).get("source", "")))
+        values = ", ".join(f"{part:.3f}" for part in color)
+        rows.append(f'<i class="ps-swatch" style="background:#{swatch}"></i><b>Light colour</b> {values} {source}')
+    text = "".join(f"<p>{row}</p>" for row in rows)
+    return (
+        f'<div class="ps-rose">{rose_svg(rose_shares(small.aolp, power), axes)}</div><div class="ps-note">{text}</div>'
+    )

@@ -1,11 +1,13 @@
 """The numbers of one pixel: raw samples of its 2x2 cell, their Stokes vector, and its separation.
 
-Coordinates are those of the separated images, row and column from the upper left; the cell of pixel (r, c) starts at
-raw pixel (2r, 2c), after the layout's origin. Angles are in degrees, from image-right toward image-up.
+Coordinates are those of the separated images, row and column from the upper left. At half resolution, the cell of pixel
+(r, c) starts at raw pixel (2r, 2c), after the layout's origin; at full resolution it is the one around the pixel.
+Angles are in degrees, from image-right toward image-up.
 """
 
 from __future__ import annotations
 
+import html
 import math
 from dataclasses import dataclass
 
@@ -52,7 +54,14 @@ def read_pixel(frame: SeparatedFrame, mosaic: Mosaic | None, place: tuple[int, i
     height, width = frame.valid.shape
     if not (0 <= row < height and 0 <= col < width):
         raise ValueError(f"expected a pixel of {width}x{height}, found row {row}, column {col}")
+    if mosaic is not None and height > mosaic.data.shape[-2] // 2:  # full resolution
+        cells = [
+            min(max(n - start, 0) // 2, (side - start) // 2 - 1)
+            for n, start, side in zip(place, mosaic.layout.origin, mosaic.data.shape, strict=True)
+        ]
+        row, col = cells
     samples, color, stokes = ((), "", None) if mosaic is None else _read_cell(mosaic, row, col)
+    row, col = place
     error = None if frame.error is None else (float(frame.error[row, col, 0]), float(frame.error[row, col, 1]))
     return Readout(
         row,
@@ -85,9 +94,10 @@ def _read_cell(mosaic: Mosaic, row: int, col: int) -> tuple[tuple[Sample, ...], 
     return samples, color, (found.s0.item(), found.s1.item(), found.s2.item())
 
 
-def readout_panel(found: Readout) -> str:
-    """The numbers as a table."""
-    rows = [("Pixel", f"row {found.row}, column {found.col}" + ("" if found.valid else " · not valid"))]
+def readout_panel(found: Readout, maker: str = "") -> str:
+    """The numbers as a table; ``maker``: what separated them."""
+    rows = [("Method", html.escape(maker))] if maker else []
+    rows += [("Pixel", f"row {found.row}, column {found.col}" + ("" if found.valid else " · not valid"))]
     if found.samples:
         name = {"R": "red", "G": "green", "B": "blue", "Y": "mono"}[found.color]
         raw = "".join(

@@ -86,7 +86,7 @@ def _build(options: ViewOptions, sessions: Sessions):  # type: ignore[no-untyped
     """Build the page; imports Gradio only here, as that takes seconds and its dependencies warn."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        from polsep.view.events import Start
+        from polsep.view.components import Start
         from polsep.view.page import build_page
 
         return build_page(sessions, Start(options.settings, options.file))

@@ -5,19 +5,19 @@ A `Session` is the state of one page. It ends with the page, and its user's file
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from polsep.edit import EditError, Recipe, apply, recipe_as_data, recipe_as_text
+from polsep.edit import EditError, Recipe, SeparatedImages, apply, recipe_as_data, recipe_as_text
 from polsep.io.assets.maps import read_map
-from polsep.io.raw.frames import Frame, ReadOptions
+from polsep.io.raw.frames import Frame, ReadOptions, output_stem
 from polsep.io.results.edited import EditedFrame, write_edited, write_recipe
 from polsep.io.results.previews import toned
 from polsep.io.results.separation_writer import write_separation
@@ -41,49 +41,73 @@ from polsep.view.opening import (
     Source,
     as_source,
     find_sources,
+    group_angles,
+    in_numbers,
     open_frame,
     open_small,
     plain_name,
     read_source,
 )
-from polsep.view.pictures import Small
+from polsep.view.pictures import Floats, Sharp, Small, Window, cut_window
 from polsep.view.playback import AHEAD, Prefetcher, Reel
+from polsep.view.waiting import Line
 
 #: Largest number of open pages; beyond it, the one idle for longest ends.
-MAX_SESSIONS = 32
+MAX_SESSIONS = 64
+#: Bytes of the frames of all pages; beyond them, the page idle for longest ends.
+MAX_BYTES = 4 << 30
 #: Largest number of files that a page opens at once.
 MAX_FILES = 1000
 #: Files to download: the separation, its contact sheet, the edited frame, the edits as a file.
 DOWNLOADS = ("exr", "png", "edited", "recipe")
 
 
-class Session:
-    """The state of one page. Its methods may be called from several threads and exclude each other.
+class Superseded(Exception):
+    """A separation that nobody waits for any more: cancelled, or of files that were closed meanwhile."""
 
-    ``kept`` and ``downloads`` are its own folders: for its files, and for results to download.
-    ``found`` is the frame whose numbers and files the page has, ``shown`` what it sees: the same, or a frame that
-    is being played.
+
+class Session:
+    """The state of one page. Its methods may be called from several threads; only separating takes long, and what is
+    shown stays usable meanwhile.
+
+    ``kept`` and ``downloads`` are its own folders: for its files, and for results to download. ``opened`` is the frame
+    whose numbers and files the page has, ``against`` another separation of it that the right picture shows, ``shown``
+    what the page sees: the opened frame, or one that is being played. ``mark``: row and column as shares. ``view``:
+    what the pictures show, as last said; ``turn``: number of pictures that were begun, of which the last one counts.
     """
 
     def __init__(self, kept: Path, downloads: Path, ahead: Prefetcher) -> None:
         self.kept, self.downloads = kept, downloads
-        self.lock = threading.Lock()
+        self.lock, self._working = threading.Lock(), threading.Lock()
         self.opened: OpenedFrame | None = None
+        self.against: OpenedFrame | None = None
+        self.makers = ("", "")
         self.shown: Small | None = None
         self.place, self.playing = 0, False
-        self.mark: tuple[int, int] | None = None
+        self.mark: tuple[float, float] | None = None
+        self.view: dict[str, Any] = {}
+        self.turn = 0
+        self.window: Window | None = None
+        self.sharp: tuple[Sharp, Sharp] | None = None
         self.recipe = Recipe()
         self.images: dict[str, EditImage] = {}
         self._ahead, self._reel = ahead, Reel()
         self._sources: tuple[Source, ...] = ()
-        self._read: tuple[ReadOptions, int, Frame | SeparatedFrame] | None = None
+        self._read: tuple[tuple[Source, ...], ReadOptions, int, Frame | SeparatedFrame] | None = None
         self._settings: Settings | None = None
+        self._made: list[tuple[tuple[Source, ...], Settings, OpenedFrame]] = []
+        self._edited_frame_of: tuple[OpenedFrame, Recipe, Floats] | None = None
 
     def begin(self, sources: tuple[Source, ...]) -> None:
         """Open other files and drop the state of the ones before."""
         with self.lock:
             self._forget()
             self._sources = sources
+
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """The opened files."""
+        return self._sources
 
     def begin_own(self, path: Path) -> None:
         """Open the owner's file, or folder of separated frames. Raises InputError."""
@@ -97,36 +121,96 @@ class Session:
     def _forget(self) -> None:
         self._drop_reel()
         self._sources, self.place, self.playing = (), 0, False
-        self._read = self.opened = self.shown = self.mark = self._settings = None
+        self._read = self.opened = self.against = self.shown = self.mark = self._settings = None
+        self.window = self.sharp = self._edited_frame_of = None
+        self._made = []
 
     def _drop_reel(self) -> None:
         self._ahead.drop(self._reel)
         self._reel = Reel()
 
-    def separate(self, settings: Settings) -> OpenedFrame:
-        """Separate the opened file with these settings. Raises ValueError, in one line that names the file."""
+    def separate(
+        self, settings: Settings, against: Settings | None = None, wanted: Callable[[], bool] = lambda: True
+    ) -> OpenedFrame:
+        """Separate the opened file with these settings, and with those of ``against`` for comparison.
+
+        Raises ValueError, in one line that names the file, and Superseded if the result is not ``wanted`` at the end.
+        """
         with self.lock:
-            if not self._sources:
-                raise ValueError("expected an opened file, found none: choose one, or the demo capture")
-            if self.opened is None or settings != self._settings:
+            sources = self._sources
+        if not sources:
+            raise ValueError("expected an opened file, found none: choose one, or the demo capture")
+        found = self._find(sources, settings)
+        other = None if against is None else self._find(sources, against)
+        with self.lock:
+            if self._sources is not sources or not wanted():
+                raise Superseded
+            if settings != self._settings:
                 if self._settings is None or replace(settings, index=0) != replace(self._settings, index=0):
                     self._drop_reel()
-                self.mark = self.mark if self.opened is not None and self.opened.index == settings.index else None
-                begin = time.perf_counter()
-                found = open_frame(self._sources, settings, self._frame(settings))
-                found = replace(found, remarks=found.remarks + self._drop_unfit(found))
-                self.opened = replace(found, seconds=time.perf_counter() - begin)
-                self._settings, self.place = settings, found.index
-            self.place = self.opened.index
+                self.mark = self.mark if self.opened is not None and self.opened.index == found.index else None
+                unfit = self._drop_unfit(found)
+                found = replace(found, remarks=found.remarks + unfit) if unfit else found
+                self.opened, self._settings = found, settings
+            assert self.opened is not None
+            self.against, self.makers = other, (settings.maker, against.maker if against is not None else "")
+            self._made = [made for made in self._made if made[0] is sources and made[1] in (settings, against)]
+            self.place, self.sharp = self.opened.index, None
             self.shown = self._edited(self.opened.small)
             return self.opened
 
-    def _frame(self, settings: Settings) -> Frame | SeparatedFrame:
+    def _find(self, sources: tuple[Source, ...], settings: Settings) -> OpenedFrame:
+        """The frame with these settings: the one that was made before, else a new one."""
+        if (made := self.made(settings, sources)) is not None:
+            return made
+        with self._working:
+            begin = time.perf_counter()
+            found = open_frame(sources, settings, self._frame(sources, settings))
+            found = replace(found, seconds=time.perf_counter() - begin)
+        self._made = [*self._made, (sources, settings, found)]
+        return found
+
+    def made(self, settings: Settings, sources: tuple[Source, ...] | None = None) -> OpenedFrame | None:
+        """The frame of these files, or the opened ones, with these settings, if it was made before."""
+        files = self._sources if sources is None else sources
+        return next((found for of, made, found in self._made if of is files and made == settings), None)
+
+    def _frame(self, sources: tuple[Source, ...], settings: Settings) -> Frame | SeparatedFrame:
         """The frame of the file, read again only if the file or the reading options have changed."""
-        if self._read is None or self._read[:2] != (settings.read, settings.index):
-            frame = read_source(self._sources, settings.read, settings.index)
-            self._read = (settings.read, settings.index, frame)
-        return self._read[2]
+        read = self._read
+        if read is None or read[:3] != (sources, settings.read, settings.index):
+            read = self._read = (
+                sources,
+                settings.read,
+                settings.index,
+                read_source(sources, settings.read, settings.index),
+            )
+        return read[3]
+
+    def sharpen(self, window: Window) -> bool:
+        """Cut what is seen of the frame out of it, at the screen's resolution; False while another frame is shown."""
+        with self.lock:
+            found, other = self.opened, self.against
+            if found is None or self.shown is None or self.playing or self.place != found.index:
+                return False
+            edited = self._edited_image(found) if self.recipe.edits else None
+            self.window, left = window, cut_window(found.frame, window, found.small, edited, found.flags)
+            right = left if other is None else cut_window(other.frame, window, found.small, None, other.flags)
+            self.sharp = left, right
+            return True
+
+    def _edited_image(self, found: OpenedFrame) -> Floats:
+        """The edited picture at full size, made once for a recipe."""
+        made = self._edited_frame_of
+        if made is None or made[0] is not found or made[1] is not self.recipe:
+            made = self._edited_frame_of = (found, self.recipe, self._apply(found).combined)
+        return made[2]
+
+    def size(self) -> int:
+        """Bytes of the frames in memory."""
+        frames = [found for *_, found in self._made]
+        images = (x for found in frames for x in vars(found.frame).values() if isinstance(x, np.ndarray))
+        return int(sum(image.nbytes for image in images) + sum(f.mosaic.data.nbytes for f in frames[:1] if f.mosaic))
 
     def _drop_unfit(self, found: OpenedFrame) -> tuple[str, ...]:
         """Drop masks and normals that do not fit the frame, and return remarks on them."""
@@ -163,7 +247,7 @@ class Session:
             if small is None:
                 return False
             self.shown = self._edited(replace(small, gain=found.small.gain))
-            self.place = places[0]
+            self.place, self.sharp = places[0], None
             return True
 
     def edit(self, recipe: Recipe) -> None:
@@ -178,6 +262,7 @@ class Session:
                 raise
 
     def _edited(self, small: Small) -> Small:
+        self.sharp = None
         maps = {sent.name: sent.small for sent in self.images.values()}
         return replace(small, edited=edit_small(small, self.recipe, maps) if self.recipe.edits else None)
 
@@ -218,11 +303,15 @@ class Session:
             write_edited(self._edited_frame(self.opened), folder, f"{stem}_edited", False)
             return folder / f"{stem}_edited.exr"
 
-    def _edited_frame(self, found: OpenedFrame) -> EditedFrame:
-        """The frame at full size with the recipe, as `polsep edit` writes it."""
+    def _apply(self, found: OpenedFrame) -> SeparatedImages:
+        """The frame at full size with the recipe."""
         paths = {sent.name: sent.path for sent in self.images.values()}
         maps = {name: read_map(paths[name], kind) for name, kind in self.recipe.images().items()}
-        after = apply(found.frame, self.recipe, maps)
+        return apply(found.frame, self.recipe, maps)
+
+    def _edited_frame(self, found: OpenedFrame) -> EditedFrame:
+        """The frame at full size with the recipe, as `polsep edit` writes it."""
+        after = self._apply(found)
         layers = {"diffuse": after.diffuse, "specular": after.specular, "combined": after.combined}
         said = {"source": found.stem, "recipe": recipe_as_data(self.recipe), "warnings": self.recipe.cautions()}
         return EditedFrame(layers, np.asarray(toned(after.combined, found.small.gain)), said)
@@ -236,7 +325,7 @@ class Sessions:
 
     def __init__(self, scratch: TemporaryFolders, most_bytes: int) -> None:
         self.scratch, self.most_bytes = scratch, most_bytes
-        self._ahead = Prefetcher()
+        self._ahead, self.line = Prefetcher(), Line()
         self._lock = threading.Lock()
         self._open: OrderedDict[str, Session] = OrderedDict()
         self._uploads: dict[Path, set[str]] = {}
@@ -249,10 +338,16 @@ class Sessions:
                 kept, downloads = (make_folder(parent, name) for parent in (self.scratch.kept, self.scratch.exchange))
                 self._open[key] = Session(kept, downloads, self._ahead)
             self._open.move_to_end(key)
-            oldest = next(iter(self._open)) if len(self._open) > MAX_SESSIONS else None
-        if oldest is not None:
-            self.end(oldest)
-        return self._open[key]
+            found = self._open[key]
+            size = sum(session.size() for session in self._open.values())
+            over: list[str] = []
+            for other, session in list(self._open.items())[:-1]:
+                if len(self._open) - len(over) > MAX_SESSIONS or size > MAX_BYTES:
+                    over.append(other)
+                    size -= session.size()
+        for other in over:
+            self.end(other)
+        return found
 
     def open_upload(self, key: str, sent: Sequence[tuple[object, str]]) -> None:
         """Open the files that a page uploaded, in the order of their names; ``sent``: claimed path and name.
@@ -266,12 +361,26 @@ class Sessions:
             most = self.most_bytes / 2**20
             raise InputError(f"expected files of at most {most:.0f} MB together, found {size / 2**20:.0f} MB")
         names = [plain_name(name) for _, name in sent]
+        groups = group_angles(["".join(name) for name in names])
         session = self.find(key)
         session.forget()
         folder = clear_folder(session.kept / "frames")
-        pairs = sorted(zip(names, paths, strict=True), key=lambda pair: _in_numbers(pair[0][0]))
-        kept = [(self._keep(key, path, folder, suffix), stem) for (stem, suffix), path in pairs]
-        session.begin(tuple(as_source(path, stem) for path, stem in kept))
+        if groups is not None:
+            kept = [self._keep_angles(key, [paths[k] for k in places], folder, t) for t, places in groups.items()]
+        else:
+            pairs = zip(names, paths, strict=True)
+            kept = [as_source(self._keep(key, path, folder, suffix), stem) for (stem, suffix), path in pairs]
+        session.begin(tuple(sorted(kept, key=lambda source: in_numbers(source.stem))))
+
+    def _keep_angles(self, key: str, paths: Sequence[Path], folder: Path, template: str) -> Source:
+        """Link the uploads of four angles, 0, 45, 90 and 135, as one source."""
+        suffix, name = Path(template).suffix, random_name()
+        with self._lock:
+            for path in paths:
+                self._uploads.setdefault(path, set()).add(key)
+        for path, angle in zip(paths, (0, 45, 90, 135), strict=True):
+            link_upload(path, folder, f"{name}_{angle}{suffix}")
+        return as_source(folder / f"{name}_{{angle}}{suffix}", output_stem(template))
 
     def add_image(self, key: str, kind: str, claimed: object, name: str) -> None:
         """Use an uploaded image for a page's edits. Raises ValueError for files that are no uploads, or no images."""
@@ -289,6 +398,7 @@ class Sessions:
 
     def end(self, key: str) -> None:
         """End a session and delete its files."""
+        self.line.leave(key)
         with self._lock:
             session = self._open.pop(key, None)
             for users in self._uploads.values():
@@ -305,6 +415,7 @@ class Sessions:
 
     def close(self) -> None:
         """End all sessions, and wait for the frame in progress."""
+        self.line.close()
         for key in list(self._open):
             self.end(key)
         self._ahead.close()
@@ -312,8 +423,3 @@ class Sessions:
     def __len__(self) -> int:
         """Number of open pages."""
         return len(self._open)
-
-
-def _in_numbers(name: str) -> list[tuple[int, str]]:
-    """A key that sorts numbered names by number: shot2 before shot10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

@@ -3,15 +3,18 @@
 A film is written in parts, each a complete file that begins with a key frame, and the parts are joined without
 decoding. Containers have no dates and no random numbers. So a film of an interrupted and resumed run is byte-identical
 to that of an uninterrupted one.
+
+FFmpeg writes through Python's files, which say why they fail, and never again after a failure: asked for a second
+header on a full disk, it ends the process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
-from io import BytesIO
+from io import BufferedWriter, BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -46,16 +49,16 @@ LOSSLESS_GREY = FilmKind(".mkv", "ffv1", "gray16le", "gray16le", _FFV1)
 
 
 class Film:
-    """A film that is being written; its file is complete after `close`. Raises ValueError without PyAV.
+    """A film that is being written; its file is complete after `close`. Raises ValueError without PyAV, and OSError.
 
-    State: the encoder. ``rate`` in frames per second.
+    State: the encoder, and whether it goes on: not once anything has failed. ``rate`` in frames per second.
     """
 
     def __init__(self, target: Path | BinaryIO, kind: FilmKind, size: tuple[int, int], rate: float) -> None:
         av = load_library()
-        self._kind, self._count = kind, 0
-        file = str(target) if isinstance(target, Path) else target
-        self._container: Any = av.open(file, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
+        self._kind, self._count, self._open = kind, 0, True
+        self._file = target.open("wb") if isinstance(target, Path) else target
+        self._container: Any = av.open(self._file, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
         fraction = Fraction(rate).limit_denominator(1001)
         self._stream: Any = self._container.add_stream(kind.codec, rate=fraction, options=dict(kind.options))
         self._stream.height, self._stream.width = size
@@ -74,15 +77,32 @@ class Film:
             frame = frame.reformat(format=self._kind.pixels)
         frame.pts, frame.time_base = self._count, 1 / self._rate
         self._count += 1
-        for packet in self._stream.encode(frame):
-            self._container.mux(packet)
+        with self._ending_at_failure():
+            self._container.mux(self._stream.encode(frame))
 
     def close(self) -> None:
-        """Write the frames that the encoder still holds, and end the file."""
-        if self._count:
-            for packet in self._stream.encode():
-                self._container.mux(packet)
-        self._container.close()
+        """Write the frames that the encoder still holds, and end the file; nothing where anything has failed."""
+        if self._open:
+            with self._ending_at_failure():
+                if self._count:
+                    self._container.mux(self._stream.encode())
+                self._container.close()
+                if isinstance(self._file, BufferedWriter):
+                    self._file.close()
+            self._open = False
+
+    @contextmanager
+    def _ending_at_failure(self) -> Iterator[None]:
+        """Closes the file where anything is raised inside, as FFmpeg then leaves it alone."""
+        try:
+            yield
+        except BaseException as error:
+            self._open = False
+            with suppress(OSError):  # of what Python still holds; the first failure is raised
+                self._file.close()
+            if isinstance(error, OSError) and isinstance(self._file, BufferedWriter):
+                raise OSError(error.errno, error.strerror, self._file.name) from error
+            raise
 
 
 def encode_film(images: Iterable[NDArray[Any]], kind: FilmKind, rate: float) -> bytes:
@@ -101,7 +121,8 @@ def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -
     """Join films of one ``kind`` and ``rate`` in their order by copying the encoded packets."""
     av = load_library()
     stream, frames = None, 0
-    with closing(av.open(str(path), "w", format=_FORMATS[kind.suffix], options=_EXACTLY)) as output:
+    with path.open("wb") as file:  # closed before its container where anything fails: nothing more is written then
+        output = av.open(file, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
         for part in parts:
             with av.open(str(part)) as source:
                 template = source.streams.video[0]
@@ -113,6 +134,7 @@ def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -
                     packet.pts, packet.dts, packet.stream = packet.pts + offset, packet.dts + offset, stream
                     output.mux(packet)
                 frames += len(packets)
+        output.close()
 
 
 def as_codes(image: NDArray[np.float32], white: float) -> NDArray[np.uint16]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from evaluation.benches import BENCHES, MEASURES
+from evaluation.faults import faults
 from evaluation.house import house
 from evaluation.reliability import reliability
 from polsep.bench.run import Folders, fill_tables_of_docs, run_bench
@@ -42,6 +43,7 @@ def fill_tables(output: Path) -> None:
 
 
 app = click.Group(help=__doc__)
+app.add_command(faults)
 app.add_command(house)
 app.add_command(reliability)
 app.add_command(click.Command("readme", callback=fill_tables, params=[RESULTS], help=fill_tables.__doc__))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import platform
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ import torch
 
 from polsep.bench.history import ask_git
 from polsep.io.store.atomic import replace_text
+from polsep.io.store.rows import read_rows
 
 #: Tables of single scenes, objects and points of curves, "NAME/PART", which are too long for the repository.
 SCENE_PARTS = ("scenes", "objects", "curve", "films")
@@ -57,3 +59,21 @@ def write_rows(folder: Path, name: str, rows: Sequence[Row], command: str) -> No
         tables.setdefault((folder / "scenes" if single else folder) / f"{name}.jsonl", []).append(row)
     for path, lines in tables.items():
         replace_text(path, to_jsonl(lines, made_by))
+
+
+def replace_rows(folder: Path, name: str, rows: Sequence[Row], command: str) -> None:
+    """Replace the rows of these benches, or add them, in ``folder``/NAME.jsonl; all others stay with what made them.
+
+    Raises ValueError where there are no rows.
+    """
+    if not rows:
+        raise ValueError(f"expected rows of {name}, found none: {folder / name}.jsonl stays as it is")
+    path, fields = folder / f"{name}.jsonl", [field.name for field in dataclasses.fields(Row)]
+    tables: dict[str, tuple[list[Row], dict[str, str]]] = {}
+    for old in read_rows(path) if path.is_file() else ():
+        made_by = {key: value for key, value in old.items() if key not in fields}
+        tables.setdefault(old["bench"], ([], made_by))[0].append(Row(**{key: old[key] for key in fields}))
+    made_by = provenance(command)
+    for bench in {row.bench: None for row in rows}:
+        tables[bench] = ([row for row in rows if row.bench == bench], made_by)
+    replace_text(path, "".join(to_jsonl(*table) for table in tables.values()))

@@ -66,6 +66,15 @@ class Ended(NamedTuple):
     lines: list[str]
 
 
+class Undisturbed(NamedTuple):
+    """The files before and after a run without faults, its lines on stderr, and its seconds."""
+
+    before: Contents
+    after: Contents
+    warnings: list[str]
+    seconds: float
+
+
 def make_inputs(folder: Path) -> None:
     """The inputs of all works: a film of two parts, single frames, frames of a lens cap and of white paper."""
     draw = np.random.default_rng(30)
@@ -139,26 +148,27 @@ def read_contents(out: Path, patterns: Sequence[str] = ("*",)) -> Contents:
     return {str(name): read_bytes(out / name) for name in names if not any(part[0] == "." for part in name.parts)}
 
 
-def run_undisturbed(work: Work, out: Path) -> tuple[Contents, Contents, float]:
-    """The files before and after an undisturbed run into ``out``, and its seconds."""
+def run_undisturbed(work: Work, out: Path) -> Undisturbed:
+    """Run a work into ``out``. Raises RuntimeError where that fails."""
     if work.before is not None:
         work.before(out)
     before, start = read_contents(out, work.kept), time.monotonic()
     ended = run_program(work.command, out)
     if ended.status != 0:
         raise RuntimeError(f"expected a run without faults, found status {ended.status}: {ended.lines[-1:]}")
-    return before, read_contents(out, work.kept), time.monotonic() - start
+    return Undisturbed(before, read_contents(out, work.kept), ended.lines, time.monotonic() - start)
 
 
-def count_partial(found: Contents, before: Contents, after: Contents) -> int:
+def count_partial(found: Contents, usual: Undisturbed) -> int:
     """Files whose bytes are neither those from before nor those of the undisturbed run."""
-    return sum(data not in (before.get(name), after.get(name)) for name, data in found.items())
+    return sum(data not in (usual.before.get(name), usual.after.get(name)) for name, data in found.items())
 
 
 def kill(work: Work, kills: int, folder: Path, seed: int = 0) -> Counter[str]:
     """Kill runs of a work at random moments, ``kills`` times; counts of `KILL_METRICS`."""
     draw, counts = random.Random(seed), Counter[str]()
-    before, after, seconds = run_undisturbed(work, folder / "undisturbed" / "out")
+    (folder / "undisturbed").mkdir()
+    usual = run_undisturbed(work, folder / "undisturbed" / "out")
     while counts["kills"] < kills:
         counts["runs"] += 1
         out = folder / f"run{counts['runs']}" / "out"
@@ -168,16 +178,16 @@ def kill(work: Work, kills: int, folder: Path, seed: int = 0) -> Counter[str]:
         for begun in range(min(IN_A_ROW, kills - counts["kills"])):
             there = set(read_contents(out, work.kept))
             command = (*work.command, *(work.again if begun else ()))
-            if not _is_killed(command, out, seconds * draw.uniform(0.2, 1), draw):
+            if not _is_killed(command, out, usual.seconds * draw.uniform(0.2, 1), draw):
                 break
             found = read_contents(out, work.kept)
             counts["kills"] += 1
-            counts["partial files"] += count_partial(found, before, after)
+            counts["partial files"] += count_partial(found, usual)
             counts["lost files"] += len(there - set(found))
         ended = run_program((*work.command, *work.again), out)
         finished = bool(ended.lines) and "--overwrite replaces it" in ended.lines[-1]  # killed behind the last file
         counts["failed resumptions"] += ended.status != 0 and not finished
-        counts["other bytes"] += read_contents(out, work.kept) != after
+        counts["other bytes"] += read_contents(out, work.kept) != usual.after
         if ended.status != 0 and not finished:
             print(ended, flush=True)
         shutil.rmtree(out.parent)

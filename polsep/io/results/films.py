@@ -4,17 +4,17 @@ A film is written in parts, each a complete file that begins with a key frame, a
 decoding. Containers have no dates and no random numbers. So a film of an interrupted and resumed run is byte-identical
 to that of an uninterrupted one.
 
-FFmpeg writes through Python's files, which say why they fail, and never again after a failure: asked for a second
-header on a full disk, it ends the process.
+FFmpeg ends the process where it is asked to go on after a header that did not fit on a full disk, so it never hears of
+a failure: it writes to a `_Sink`, which keeps it for us.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from fractions import Fraction
-from io import BufferedWriter, BytesIO
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -48,17 +48,63 @@ LOSSLESS = FilmKind(".mkv", "ffv1", "gbrp16le", "gbrp16le", _FFV1)
 LOSSLESS_GREY = FilmKind(".mkv", "ffv1", "gray16le", "gray16le", _FFV1)
 
 
+class _Sink:
+    """A file as FFmpeg sees it, which never fails: all that comes after the first failure goes nowhere.
+
+    State: where FFmpeg writes, and the first ``failure``, if any.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._at = file, 0
+        self.failure: OSError | None = None
+
+    def write(self, data: bytes) -> int:
+        """Write at the present place, and count it as done."""
+        self._try(self._file.write, data)
+        self._at += len(data)
+        return len(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Go to a place, and return it."""
+        self._at = self._try(self._file.seek, offset, whence) or (offset if whence == 0 else self._at)
+        return self._at
+
+    def tell(self) -> int:
+        """The present place."""
+        return self._at
+
+    def finish(self) -> None:
+        """Close a file, and raise the first failure, if any; what is in memory stays open."""
+        if not isinstance(self._file, BytesIO) and not self._file.closed:
+            self._try(self._file.flush)
+            with suppress(OSError):
+                self._file.close()
+        self.check()
+
+    def check(self) -> None:
+        """Raise the first failure, if any."""
+        if self.failure is not None:
+            raise OSError(self.failure.errno, self.failure.strerror, self._file.name) from self.failure
+
+    def _try(self, do: Callable[..., int | None], *arguments: Any) -> int | None:
+        try:
+            return do(*arguments) if self.failure is None else None
+        except OSError as error:
+            self.failure = error
+            return None
+
+
 class Film:
     """A film that is being written; its file is complete after `close`. Raises ValueError without PyAV, and OSError.
 
-    State: the encoder, and whether it goes on: not once anything has failed. ``rate`` in frames per second.
+    State: the encoder and the file. ``rate`` in frames per second.
     """
 
     def __init__(self, target: Path | BinaryIO, kind: FilmKind, size: tuple[int, int], rate: float) -> None:
         av = load_library()
-        self._kind, self._count, self._open = kind, 0, True
-        self._file = target.open("wb") if isinstance(target, Path) else target
-        self._container: Any = av.open(self._file, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
+        self._kind, self._count = kind, 0
+        self._sink = _Sink(target.open("wb") if isinstance(target, Path) else target)
+        self._container: Any = av.open(self._sink, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
         fraction = Fraction(rate).limit_denominator(1001)
         self._stream: Any = self._container.add_stream(kind.codec, rate=fraction, options=dict(kind.options))
         self._stream.height, self._stream.width = size
@@ -77,32 +123,16 @@ class Film:
             frame = frame.reformat(format=self._kind.pixels)
         frame.pts, frame.time_base = self._count, 1 / self._rate
         self._count += 1
-        with self._ending_at_failure():
-            self._container.mux(self._stream.encode(frame))
+        self._container.mux(self._stream.encode(frame))
+        self._sink.check()
 
     def close(self) -> None:
-        """Write the frames that the encoder still holds, and end the file; nothing where anything has failed."""
-        if self._open:
-            with self._ending_at_failure():
-                if self._count:
-                    self._container.mux(self._stream.encode())
-                self._container.close()
-                if isinstance(self._file, BufferedWriter):
-                    self._file.close()
-            self._open = False
-
-    @contextmanager
-    def _ending_at_failure(self) -> Iterator[None]:
-        """Closes the file where anything is raised inside, as FFmpeg then leaves it alone."""
-        try:
-            yield
-        except BaseException as error:
-            self._open = False
-            with suppress(OSError):  # of what Python still holds; the first failure is raised
-                self._file.close()
-            if isinstance(error, OSError) and isinstance(self._file, BufferedWriter):
-                raise OSError(error.errno, error.strerror, self._file.name) from error
-            raise
+        """Write the frames that the encoder still holds, and end the file; again, say again why it failed."""
+        if self._count:
+            self._count = 0
+            self._container.mux(self._stream.encode())
+        self._container.close()
+        self._sink.finish()
 
 
 def encode_film(images: Iterable[NDArray[Any]], kind: FilmKind, rate: float) -> bytes:
@@ -120,9 +150,8 @@ def encode_film(images: Iterable[NDArray[Any]], kind: FilmKind, rate: float) -> 
 def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -> None:
     """Join films of one ``kind`` and ``rate`` in their order by copying the encoded packets."""
     av = load_library()
-    stream, frames = None, 0
-    with path.open("wb") as file:  # closed before its container where anything fails: nothing more is written then
-        output = av.open(file, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
+    stream, frames, sink = None, 0, _Sink(path.open("wb"))
+    with closing(av.open(sink, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)) as output:
         for part in parts:
             with av.open(str(part)) as source:
                 template = source.streams.video[0]
@@ -134,7 +163,8 @@ def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -
                     packet.pts, packet.dts, packet.stream = packet.pts + offset, packet.dts + offset, stream
                     output.mux(packet)
                 frames += len(packets)
-        output.close()
+            sink.check()
+    sink.finish()
 
 
 def as_codes(image: NDArray[np.float32], white: float) -> NDArray[np.uint16]:

@@ -238,7 +238,7 @@ def faults(kills: int, every: int, seed: int, output: Path) -> None:
             return kill(WORKS[name], round(kills * SHARES[name] / 100), folder / name, seed)
 
         def fill_disks(name: str) -> Counter[str]:
-            return fill_elsewhere(name, every, folder / "disks" / name)
+            return fill_elsewhere(name, folder / "disks" / name, every)
 
         for bench, works, measure, metrics in (
             ("kills", WORKS, kill_work, KILL_METRICS),

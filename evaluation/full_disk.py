@@ -1,7 +1,7 @@
 """Programs on a disk that is too small: of every size from 0 to what they need, then with enough.
 
 Each disk is a file system in memory (tmpfs), mounted where no other program sees it: in a namespace of this process
-alone, which `fill_elsewhere` starts as ``python -m evaluation.full_disk NAME EVERY FOLDER``.
+alone, which `fill_elsewhere` starts as ``python -m evaluation.full_disk ARGUMENTS``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from evaluation.faults import (
 )
 
 #: Steps of the size of a disk, and more than any work needs [KiB].
-STEP, ENOUGH = 4, 2**16
+STEP, ENOUGH = 4, 2**13
 #: What is counted.
 DISK_METRICS: tuple[str, ...] = ("disk sizes", "refused", "completed", "crashes", "not one line", "partial files")
 DISK_METRICS += ("failed resumptions", "other bytes")
@@ -45,11 +45,11 @@ DISK_WORKS = {
 }
 
 
-def fill_elsewhere(name: str, every: int, folder: Path) -> Counter[str]:
+def fill_elsewhere(name: str, folder: Path, every: int = 1, sizes: Sequence[int] = ()) -> Counter[str]:
     """`fill_disks` in a process with disks of its own. Raises RuntimeError where none can be mounted."""
     folder.mkdir(parents=True)
     own = ("unshare", "--mount", "--propagation", "private", *(() if os.geteuid() == 0 else ("--map-root-user",)))
-    command = (*own, sys.executable, "-m", "evaluation.full_disk", name, str(every), str(folder))
+    command = (*own, sys.executable, "-m", "evaluation.full_disk", json.dumps([name, str(folder), every, list(sizes)]))
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     *faulty, last = done.stdout.splitlines() or [""]
     for line in faulty:
@@ -59,24 +59,18 @@ def fill_elsewhere(name: str, every: int, folder: Path) -> Counter[str]:
     return Counter(json.loads(last))
 
 
-def fill_disks(work: Work, every: int, folder: Path) -> Counter[str]:
-    """Run a work on every ``every``-th size of disk up to the first that is enough; counts of `DISK_METRICS`.
+def fill_disks(work: Work, folder: Path, every: int = 1, sizes: Sequence[int] = ()) -> Counter[str]:
+    """Run a work on disks, and count `DISK_METRICS`; prints what is faulty.
 
-    Prints what is faulty.
+    ``sizes`` in `STEP`; none: every ``every``-th up to the first that is enough.
     """
     disk = folder / "disk"
     disk.mkdir()
     make_inputs(folder)
     with mounted(disk, ENOUGH):
         usual = run_undisturbed(work, disk / "out")
-    low, high = 0, ENOUGH // STEP  # sizes that are too small, and enough
-    while high - low > 1:
-        size = (low + high) // 2
-        with mounted(disk, STEP * size):
-            enough = run_on(work, disk).status == 0
-        low, high = (low, size) if enough else (size, high)
     counts: Counter[str] = Counter()
-    for size in {*range(0, high + 1, every), low, high}:
+    for size in sizes or choose_sizes(work, disk, every):
         with mounted(disk, STEP * size):
             ended = run_on(work, disk)
             found, hidden = read_contents(disk / "out", work.kept), list((disk / "out").glob(".*.part"))
@@ -93,6 +87,17 @@ def fill_disks(work: Work, every: int, folder: Path) -> Counter[str]:
         if any(seen[metric] for metric in DISK_METRICS[3:]):
             print(f"{STEP * size} KiB: {ended}, {dict(seen)}, {sorted(found)[:4]}", flush=True)
     return counts
+
+
+def choose_sizes(work: Work, disk: Path, every: int) -> list[int]:
+    """Every ``every``-th size of a disk, the last one that is too small, and the first that is enough [`STEP`]."""
+    low, high = 0, ENOUGH // STEP
+    while high - low > 1:
+        size = (low + high) // 2
+        with mounted(disk, STEP * size):
+            enough = run_on(work, disk).status == 0
+        low, high = (low, size) if enough else (size, high)
+    return sorted({*range(0, high + 1, every), low, high})
 
 
 def run_on(work: Work, disk: Path) -> Ended:
@@ -118,4 +123,5 @@ def mounted(disk: Path, size: int) -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(fill_disks(DISK_WORKS[sys.argv[1]], int(sys.argv[2]), Path(sys.argv[3]))))
+    name, folder, every, sizes = json.loads(sys.argv[1])
+    print(json.dumps(fill_disks(DISK_WORKS[name], Path(folder), every, sizes)))

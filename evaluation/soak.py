@@ -22,10 +22,11 @@ import numpy as np
 import polsep
 from evaluation.faults import Contents, read_contents
 from polsep.bench.rows import Row, replace_rows
+from polsep.compute.arrays import to_numpy
 from polsep.compute.workers import keep_memory
-from polsep.io.raw.frames import ReadOptions
-from polsep.io.raw.png import read_png
+from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.store.rows import read_memory, write_array
+from polsep.sensor.camera import Mosaic
 from polsep.video.recordings import Target, VideoOptions, separate_video
 
 #: Frames of the recording, two parts of a sequence and a half, and their size.
@@ -47,18 +48,23 @@ class Pass(NamedTuple):
 
 def make_recording(path: Path) -> None:
     """A pan over the example frame."""
-    raw = read_png(Path(polsep.__file__).parent / "data" / "still_life.png")
+    example = Path(polsep.__file__).parent / "data" / "still_life.png"
+    (frame,) = read_frames(str(example), ReadOptions(white_level=4095.0))
+    assert isinstance(frame.data, Mosaic)
+    raw = to_numpy(frame.data.data).astype(np.uint16)
     views = [raw[600 + 8 * k : 600 + 8 * k + SIZE[0], 700 + 4 * k :][:, : SIZE[1]] for k in range(FRAMES)]
     write_array(path, np.stack(views))
 
 
-def play(recording: Path, read: ReadOptions, seconds: float, folder: Path) -> Iterator[tuple[Pass, Contents]]:
+def play(
+    recording: Path, read: ReadOptions, seconds: float, folder: Path, method: str = "auto-fast"
+) -> Iterator[tuple[Pass, Contents]]:
     """Play a recording for some time; yields each pass, and the files that it has written."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         start, count = time.monotonic(), 0
         target = Target(folder / "out", overwrite=True)
-        for step in separate_video(recording, read, VideoOptions("auto-fast"), target):
+        for step in separate_video(recording, read, VideoOptions(method), target):
             count = step.done
         speed = count / (time.monotonic() - start)
         found = Pass(speed, read_memory(), len(os.listdir("/proc/self/fd")), threading.active_count())

@@ -196,8 +196,10 @@ def kill(work: Work, kills: int, folder: Path, seed: int = 0) -> Counter[str]:
 
 def _is_killed(command: Sequence[str], out: Path, seconds: float, draw: random.Random) -> bool:
     """Start a program and kill it after some time, in half of the cases with its workers; False if it has ended."""
-    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen(command, cwd=out.parent, env=ours(), start_new_session=True, **silent) as program:
+    null = subprocess.DEVNULL
+    with subprocess.Popen(
+        command, cwd=out.parent, env=ours(), start_new_session=True, stdout=null, stderr=null
+    ) as program:
         try:
             program.wait(seconds)
         except subprocess.TimeoutExpired:

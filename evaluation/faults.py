@@ -60,7 +60,7 @@ class Work(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """How a program ended: its status, minus the signal that ended it, and its lines on stderr."""
+    """The end of a program: its status, minus the signal that ended it, and its lines on stderr."""
 
     status: int
     lines: list[str]

@@ -4,14 +4,19 @@
 # make kernels  compile the kernels anew, after a change of them
 # make docs   build the documentation site into site/
 # make fuzz   damage files of every kind and read them: make fuzz INPUTS=20000 SECONDS=1200
+# make faults  kill programs and fill disks: make faults KILLS=100 EVERY=1
+# make soak   play a recording in a loop: make soak MINUTES=480
 PYTHON ?= python3
 VENV ?= .venv
 INPUTS ?= 2000
 SECONDS ?= 1200
+KILLS ?= 100
+EVERY ?= 1
+MINUTES ?= 480
 BIN := $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test optional kernels docs bench fuzz clean
+.PHONY: demo test optional kernels docs bench fuzz faults soak clean
 
 demo: $(VENV)/.installed
 	$(BIN)/polsep demo -o demo-out
@@ -37,6 +42,12 @@ bench: $(VENV)/.installed-dev
 
 fuzz: $(VENV)/.installed-dev
 	$(BIN)/python -m evaluation reliability --inputs $(INPUTS) --seconds $(SECONDS) --keep fuzz-out
+
+faults: $(VENV)/.installed-dev
+	$(BIN)/python -m evaluation faults --kills $(KILLS) --every $(EVERY)
+
+soak: $(VENV)/.installed-dev
+	$(BIN)/python -m evaluation soak --minutes $(MINUTES)
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

@@ -7,9 +7,11 @@ from pathlib import Path
 import click
 
 from evaluation.benches import BENCHES, MEASURES
+from evaluation.faults import faults
 from evaluation.house import house
 from evaluation.reliability import reliability
 from evaluation.sealed import sealed
+from evaluation.soak import soak
 from polsep.bench.run import Folders, fill_tables_of_docs, run_bench
 
 DIR = click.Path(file_okay=False, path_type=Path)
@@ -43,9 +45,11 @@ def fill_tables(output: Path) -> None:
 
 
 app = click.Group(help=__doc__)
+app.add_command(faults)
 app.add_command(house)
 app.add_command(reliability)
 app.add_command(sealed)
+app.add_command(soak)
 app.add_command(click.Command("readme", callback=fill_tables, params=[RESULTS], help=fill_tables.__doc__))
 for name, bench in BENCHES.items():
     app.add_command(click.Command(name, callback=measure, params=list(OPTIONS), help=bench.run.__doc__))

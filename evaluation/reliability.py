@@ -31,7 +31,7 @@ import numpy as np
 
 from evaluation.damage import damage
 from evaluation.damage_seeds import READERS, Files, Reader, seeds_of
-from polsep.bench.rows import Row, write_rows
+from polsep.bench.rows import Row, replace_rows
 from polsep.io.store.errors import MOST
 from polsep.io.store.rows import read_peak_memory
 
@@ -219,7 +219,7 @@ def reliability(**options: Any) -> None:
         total += counts
     if not options["only"]:
         rows += count_rows("all readers", total)
-        write_rows(
+        replace_rows(
             options["output"], "reliability", rows, f"python -m evaluation reliability --inputs {options['inputs']}"
         )
     if any(total[fault] for fault in FAULTS):

@@ -331,27 +331,6 @@ def test_a_network_runs_on_frames_of_several_sizes() -> None:
         assert_close(torch.from_numpy(found.specular[..., 0]), LIGHT[0] * expected, 4.0)
 
 
-FORKED = """
-import multiprocessing, sys
-import numpy, polsep
-def separate(side, method="joint"):
-    return polsep.separate(numpy.full((side, side), 0.25, numpy.float32), method).diffuse.shape
-if __name__ == "__main__":
-    separate(32)
-    with multiprocessing.get_context("fork").Pool(1) as pool:
-        print(pool.apply_async(separate, (48,)).get(60))
-        print(pool.apply_async(separate, (48, "paper")).get(60))
-"""
-
-
-def test_forked_children_separate_frames_of_other_sizes() -> None:
-    """And by other methods: nothing waits for threads that have stayed behind."""
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", FORKED], capture_output=True, text=True, timeout=90, check=False
-    )
-    assert done.stdout == "(24, 24, 3)\n" * 2, done.stderr
-
-
 INTERRUPTED = """
 import gc, signal, sys, threading
 sys.path.insert(0, sys.argv[1])

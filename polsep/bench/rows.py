@@ -7,7 +7,7 @@ import math
 import platform
 import statistics
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -93,3 +93,21 @@ def find_lost(path: Path, rows: Sequence[Row]) -> list[str]:
     measured = {(row.bench, row.case, row.method) for row in rows}
     kept = dict.fromkeys((row["bench"], row["case"], row["method"]) for row in before)
     return [f"{bench}: {case}, {method}" for bench, case, method in kept if (bench, case, method) not in measured]
+
+
+def replace_rows(folder: Path, name: str, rows: Sequence[Row], command: str) -> None:
+    """Replace the rows of these benches, or add them, in ``folder``/NAME.jsonl; all others stay with what made them.
+
+    Raises ValueError where there are no rows.
+    """
+    if not rows:
+        raise ValueError(f"expected rows of {name}, found none: {folder / name}.jsonl stays as it is")
+    path, names = folder / f"{name}.jsonl", [field.name for field in fields(Row)]
+    tables: dict[str, tuple[list[Row], dict[str, str]]] = {}
+    for old in read_rows(path) if path.is_file() else ():
+        made_by = {key: value for key, value in old.items() if key not in names}
+        tables.setdefault(old["bench"], ([], made_by))[0].append(Row(**{key: old[key] for key in names}))
+    made_by = provenance(command)
+    for bench in {row.bench: None for row in rows}:
+        tables[bench] = ([row for row in rows if row.bench == bench], made_by)
+    replace_text(path, "".join(to_jsonl(*table) for table in tables.values()))

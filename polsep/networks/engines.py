@@ -23,6 +23,7 @@ from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import mean_cells
 from polsep.networks import details_kernel, images_kernel
 from polsep.networks.channels import PERIOD
+from polsep.networks.graphs import require_own_threads
 from polsep.networks.joint_weights import JointWeights
 from polsep.networks.openvino_engine import OpenVinoEngine, modulation_of
 from polsep.networks.sizes import ResidualSize
@@ -91,8 +92,9 @@ def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages
 
     Frames in other orientations than the network's are turned before and after, as in `run.run_joint`. Huge frames are
     cut into strips, all of one height, since an engine is for one size. Raises ValueError on layouts that are not
-    Sony's in any orientation.
+    Sony's in any orientation, and RuntimeError as `require_own_threads`.
     """
+    require_own_threads()
     orientation = orient(mosaic, own_order(mosaic.layout))
     if not full and not orientation.keeps_cells:  # then the network's cells are not the frame's
         return _halve(run_engine(network, mosaic, full=True), mosaic.light_color)

@@ -9,6 +9,7 @@ second layer has the range (0, 0) only add its bias: training left them silent.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -37,6 +38,29 @@ def import_openvino() -> Any:
     import openvino  # type: ignore[import-untyped]  # no stubs
 
     return openvino
+
+
+class _Process:
+    """State of the process: whether it was ``forked`` from one that had used OpenVINO."""
+
+    forked = False
+
+
+def _note_fork() -> None:
+    _Process.forked = _Process.forked or core.cache_info().currsize > 0
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note_fork)
+
+
+def require_own_threads() -> None:
+    """Raise RuntimeError in a child that was forked after networks had run: it would wait for OpenVINO's threads."""
+    if _Process.forked:
+        raise RuntimeError(
+            "expected networks in a process with their threads, found one that was forked after they had run: start it "
+            'by multiprocessing.get_context("spawn"), or fork before'
+        )
 
 
 @lru_cache(maxsize=1)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.networks.graphs import core, refinement_model
+from polsep.networks.graphs import core, refinement_model, require_own_threads
 from polsep.networks.rungs import RUNGS, Rung
 from polsep.networks.sizes import Size
 
@@ -31,6 +31,7 @@ class Refiner:
 
     def __call__(self, inputs: Floats) -> tuple[Floats, Floats]:
         """tau_d and log(1 + tau_s), ``[N, C, h, w]`` each, of inputs ``[N, K, h, w]``."""
+        require_own_threads()
         height, width = inputs.shape[-2:]
         rows, cols = ((-n) % self._size.multiple for n in (height, width))
         mode: Any = "reflect" if rows < height and cols < width else "edge"

@@ -3,12 +3,15 @@
 A film is written in parts, each a complete file that begins with a key frame, and the parts are joined without
 decoding. Containers have no dates and no random numbers. So a film of an interrupted and resumed run is byte-identical
 to that of an uninterrupted one.
+
+FFmpeg ends the process where it is asked to go on after a header that did not fit on a full disk, so it never hears of
+a failure: it writes to a `_Sink`, which keeps it for us.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from io import BytesIO
@@ -54,17 +57,63 @@ LOSSLESS = {
 }
 
 
-class Film:
-    """A film that is being written; its file is complete after `close`. Raises ValueError without PyAV.
+class _Sink:
+    """A file as FFmpeg sees it, which never fails: all that comes after the first failure goes nowhere.
 
-    State: the encoder. ``rate`` in frames per second.
+    State: where FFmpeg writes, and the first ``failure``, if any.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._at = file, 0
+        self.failure: OSError | None = None
+
+    def write(self, data: bytes) -> int:
+        """Write at the present place, and count it as done."""
+        self._try(self._file.write, data)
+        self._at += len(data)
+        return len(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Go to a place, and return it."""
+        self._at = self._try(self._file.seek, offset, whence) or (offset if whence == 0 else self._at)
+        return self._at
+
+    def tell(self) -> int:
+        """The present place."""
+        return self._at
+
+    def finish(self) -> None:
+        """Close a file, and raise the first failure, if any; what is in memory stays open."""
+        if not isinstance(self._file, BytesIO) and not self._file.closed:
+            self._try(self._file.flush)
+            with suppress(OSError):
+                self._file.close()
+        self.check()
+
+    def check(self) -> None:
+        """Raise the first failure, if any."""
+        if self.failure is not None:
+            raise OSError(self.failure.errno, self.failure.strerror, self._file.name) from self.failure
+
+    def _try(self, do: Callable[..., int | None], *arguments: Any) -> int | None:
+        try:
+            return do(*arguments) if self.failure is None else None
+        except OSError as error:
+            self.failure = error
+            return None
+
+
+class Film:
+    """A film that is being written; its file is complete after `close`. Raises ValueError without PyAV, and OSError.
+
+    State: the encoder and the file. ``rate`` in frames per second.
     """
 
     def __init__(self, target: Path | BinaryIO, kind: FilmKind, size: tuple[int, int], rate: float) -> None:
         av = load_library()
         self._kind, self._count = kind, 0
-        file = str(target) if isinstance(target, Path) else target
-        self._container: Any = av.open(file, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
+        self._sink = _Sink(target.open("wb") if isinstance(target, Path) else target)
+        self._container: Any = av.open(self._sink, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)
         fraction = Fraction(rate).limit_denominator(1001)
         self._stream: Any = self._container.add_stream(kind.codec, rate=fraction, options=dict(kind.options))
         self._stream.height, self._stream.width = size
@@ -86,15 +135,16 @@ class Film:
                 np.frombuffer(plane, np.uint16).reshape(image.shape[1], -1)[:, : image.shape[2]] = codes
         frame.pts, frame.time_base = self._count, 1 / self._rate
         self._count += 1
-        for packet in self._stream.encode(frame):
-            self._container.mux(packet)
+        self._container.mux(self._stream.encode(frame))
+        self._sink.check()
 
     def close(self) -> None:
-        """Write the frames that the encoder still holds, and end the file."""
+        """Write the frames that the encoder still holds, and end the file; again, say again why it failed."""
         if self._count:
-            for packet in self._stream.encode():
-                self._container.mux(packet)
+            self._count = 0
+            self._container.mux(self._stream.encode())
         self._container.close()
+        self._sink.finish()
 
 
 def encode_film(images: Iterable[NDArray[Any]], kind: FilmKind, rate: float) -> bytes:
@@ -112,8 +162,8 @@ def encode_film(images: Iterable[NDArray[Any]], kind: FilmKind, rate: float) -> 
 def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -> None:
     """Join films of one ``kind`` and ``rate`` in their order by copying the encoded packets."""
     av = load_library()
-    stream, frames = None, 0
-    with closing(av.open(str(path), "w", format=_FORMATS[kind.suffix], options=_EXACTLY)) as output:
+    stream, frames, sink = None, 0, _Sink(path.open("wb"))
+    with closing(av.open(sink, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)) as output:
         for part in parts:
             with av.open(str(part)) as source:
                 template = source.streams.video[0]
@@ -125,3 +175,5 @@ def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -
                     packet.pts, packet.dts, packet.stream = packet.pts + offset, packet.dts + offset, stream
                     output.mux(packet)
                 frames += len(packets)
+            sink.check()
+    sink.finish()

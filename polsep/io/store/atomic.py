@@ -12,9 +12,13 @@ import shutil
 import signal
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+#: Seconds after which a hidden folder of a set is nobody's any more: a set of files is written in far less.
+FORGOTTEN = 3600.0
 
 
 class OutputError(ValueError):
@@ -126,6 +130,7 @@ def _delayed_signals() -> Iterator[None]:
 
 def _write_and_move(targets: Sequence[Path], write: Callable[[Path], None]) -> None:
     """Write into a hidden directory beside the targets, then rename; that directory is gone afterwards."""
+    _remove_forgotten(targets[0].parent)
     staging = Path(tempfile.mkdtemp(prefix=".polsep-", dir=targets[0].parent))
     try:
         (staging / "new").mkdir()
@@ -148,13 +153,35 @@ def _move_into_place(staging: Path, targets: Sequence[Path]) -> None:
         for target in targets:
             begun.append(target)
             if os.path.lexists(target):
-                os.replace(target, staging / "old" / target.name)
+                _keep(target, staging / "old" / target.name)
             if target.name in written:
                 os.replace(staging / "new" / target.name, target)
+            else:
+                target.unlink(missing_ok=True)
     except BaseException:
         for target in reversed(begun):
-            if target.name in written and not (staging / "new" / target.name).exists():
+            kept = staging / "old" / target.name
+            if os.path.lexists(kept):
+                os.replace(kept, target)
+                kept.unlink(missing_ok=True)  # where both are one file, replacing does nothing
+            elif target.name in written and not (staging / "new" / target.name).exists():
                 target.unlink(missing_ok=True)
-            if os.path.lexists(staging / "old" / target.name):
-                os.replace(staging / "old" / target.name, target)
         raise
+
+
+def _keep(target: Path, kept: Path) -> None:
+    """A second name for a file, so that the first is there whenever the program is killed; or move it."""
+    try:
+        os.link(target, kept, follow_symlinks=False)
+    except (OSError, NotImplementedError):
+        os.replace(target, kept)
+
+
+def _remove_forgotten(directory: Path) -> None:
+    """Remove what killed programs have left of sets in a directory, but for files from before."""
+    for old in directory.glob(".polsep-*/old"):
+        with suppress(OSError):
+            if time.time() - old.stat().st_mtime > FORGOTTEN:
+                shutil.rmtree(old.with_name("new"), ignore_errors=True)
+                old.rmdir()
+                old.parent.rmdir()

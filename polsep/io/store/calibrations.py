@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.io.store.atomic import write_checked, write_set
+from polsep.io.store.atomic import OutputError, replace_bytes, replace_text
 from polsep.io.store.errors import InputError, decoding, naming, one_line
 from polsep.io.store.header_checks import SAMPLES, limit
 from polsep.io.store.json_text import parse_json, read_text
@@ -44,27 +44,35 @@ def maps_path(path: Path) -> Path:
 
 
 def write_calibration(path: Path, calibration: Calibration, version: str) -> list[Path]:
-    """Write a calibration as ``path``, and its maps beside it; both appear together or not at all. The files written.
+    """Write a calibration as ``path``, and its maps beside it; the files written. ``version``: of polsep.
 
-    Raises OutputError. ``version``: of polsep.
+    Whenever the program is killed, the calibration is the one before or the new one: maps wait under a hidden name,
+    where they are read too, until the JSON file is replaced. Raises OutputError, and leaves the one before.
     """
     if path.suffix.lower() != ".json":
         raise ValueError(f"expected a calibration file that ends in .json, found {path.name!r}")
-    arrays = _arrays(calibration)
-    targets = [maps_path(path), path]
-
-    def write(folder: Path) -> None:
-        record = _record(calibration) | {"polsep": version}
+    arrays, maps = _arrays(calibration), maps_path(path)
+    record = _record(calibration) | {"polsep": version}
+    try:
         if arrays:
             buffer = io.BytesIO()
             np.savez(buffer, **arrays)  # type: ignore[arg-type]
-            data = buffer.getvalue()
-            write_checked(folder / targets[0].name, data)
-            record["maps"] = {"file": targets[0].name, "sha256": hashlib.sha256(data).hexdigest()}
-        write_checked(folder / path.name, (_to_json(record) + "\n").encode())
+            replace_bytes(_waiting(maps), buffer.getvalue())
+            record["maps"] = {"file": maps.name, "sha256": hashlib.sha256(buffer.getvalue()).hexdigest()}
+        replace_text(path, _to_json(record) + "\n")
+    except OSError as error:
+        _waiting(maps).unlink(missing_ok=True)
+        raise OutputError(f"expected to write {path.name!r} into {path.parent}, found {error.strerror}") from error
+    if arrays:
+        os.replace(_waiting(maps), maps)
+    else:
+        maps.unlink(missing_ok=True)
+    return [path, maps] if arrays else [path]
 
-    write_set(targets, path.stem, write)
-    return targets[::-1] if arrays else targets[1:]
+
+def _waiting(maps: Path) -> Path:
+    """The name of maps whose JSON file is not there yet."""
+    return maps.with_name(f".{maps.name}.new")
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -101,15 +109,16 @@ def _read_maps(path: Path, entry: Mapping[str, Any] | None) -> dict[str, NDArray
     if entry is None:
         return {}
     maps = maps_path(path)
-    if not maps.exists():
+    found = [file.read_bytes() for file in (maps, _waiting(maps)) if file.exists()]
+    if not found:
         raise ValueError(f"expected its maps in {maps.name} beside it, found none")
-    data = maps.read_bytes()
-    if hashlib.sha256(data).hexdigest() != entry["sha256"]:
+    data = next((data for data in found if hashlib.sha256(data).hexdigest() == entry["sha256"]), None)
+    if data is None:
         raise ValueError(f"expected the maps that it was written with in {maps.name}, found others")
     most = 4 * limit(SAMPLES)
     with decoding("NPZ"), np.load(io.BytesIO(data), allow_pickle=False) as archive:
-        if (found := sum(member.file_size for member in archive.zip.infolist())) > most:
-            raise InputError(f"expected at most {most} bytes in {maps.name}, found {found}")
+        if (size := sum(member.file_size for member in archive.zip.infolist())) > most:
+            raise InputError(f"expected at most {most} bytes in {maps.name}, found {size}")
         return {name: archive[name] for name in ARRAYS if name in archive.files}
 
 

@@ -177,7 +177,7 @@ def separate_capture(
     frame.report["light"] = facts
     frame.report.update(colored_specular=colored.share, retained_polarization=colored.retained)
     frame.report["lamp_dolp"] = colored.lamp_dolp
-    frame.report["warnings"] = [*remarks, *frame.report["warnings"]]
+    frame.report["warnings"] = [*remarks, *([colored.remark] if colored.remark else []), *frame.report["warnings"]]
     if checked:
         frame.report.update(checked.report)
         frame.report["warnings"] = [*checked.warnings, *frame.report["warnings"]]

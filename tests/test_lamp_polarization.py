@@ -11,7 +11,7 @@ from torch import Tensor
 
 from polsep.compute.resizing import block_means
 from polsep.sensor.camera import Layout, expose
-from polsep.separation.colored_specular import color_specular
+from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.lamp_polarization import MIN_PART, SIDE, find_unpolarized, measure_places
 from polsep.separation.places_kernel import measure_places_fast
 
@@ -90,6 +90,7 @@ def test_light_that_is_left_moves_to_the_specular_image(side: int) -> None:
     mosaic = expose(scene(body + (1 - degree) * white, degree * white), Layout(), IDEAL)
     found, colored = color_specular(images, mosaic, (1.0, 1.0, 1.0))
     assert colored.lamp_dolp == pytest.approx(degree, abs=SLOPE) and colored.share == colored.retained == 0
+    assert colored.remark is not None and "found one of 80%" in colored.remark and Colored().remark is None
     assert_close(torch.from_numpy(found.diffuse + found.specular), torch.from_numpy(images.diffuse + images.specular))
     truth = white[:, ::side, ::side].movedim(0, -1)
     torch.testing.assert_close(torch.from_numpy(found.specular), truth, rtol=0, atol=SLOPE)

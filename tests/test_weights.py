@@ -22,6 +22,16 @@ def test_round_trip_in_half_precision(tmp_path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["x.safetensors"]
 
 
+def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
+    """Whatever the order in which their metadata are told."""
+    paths, metadata = [tmp_path / f"{k}.safetensors" for k in range(8)], {str(k): "é" * k for k in range(20)}
+    for path in paths:
+        write_weights(path, {"a": torch.ones(3), "b": torch.zeros(2, 2)}, metadata | {"method": "paper"})
+        metadata = dict(reversed(metadata.items()))
+    assert len({path.read_bytes() for path in paths}) == 1
+    assert read_weights(paths[0])[1].keys() == metadata.keys() | {"method", "sha256"}
+
+
 def test_damage_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "x.safetensors"
     write_weights(path, {"a": torch.ones(100)}, {"method": "paper"})

@@ -84,6 +84,16 @@ class Colored(NamedTuple):
         """The lamp's degree of polarization, 1 where nothing else is proven."""
         return 1 / (1 + self.unpolarized)
 
+    @property
+    def remark(self) -> str | None:
+        """What the owner of the frame should know of it, in a line."""
+        if not self.unpolarized:
+            return None
+        return (
+            f"a fully polarized lamp was expected, found one of {self.lamp_dolp:.0%}: what its highlights leave in the "
+            "diffuse image was moved to the specular one; a better polarizer before the lamp separates more"
+        )
+
 
 def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> tuple[FrameImages, Colored]:
     """The images of one colour frame ``[H, W]``, with coloured specular light where it is proven, and what was found.

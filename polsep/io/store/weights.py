@@ -7,6 +7,7 @@ shapes and bytes, so that a damaged file is told from a good one. Shipped weight
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -15,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from polsep.compute.arrays import Array, to_numpy
-from polsep.io.store.atomic import atomic_path
+from polsep.io.store.atomic import replace_bytes
 from polsep.io.store.errors import one_line
 
 
@@ -34,9 +35,12 @@ def digest_arrays(arrays: Mapping[str, NDArray[Any]]) -> str:
 def write_weights(path: Path, arrays: Mapping[str, Array], metadata: dict[str, str]) -> None:
     """Write arrays, or torch tensors, in half precision, atomically."""
     halves = {name: np.ascontiguousarray(to_numpy(array), np.float16) for name, array in arrays.items()}
-    with atomic_path(path) as part:
-        save_file(halves, part, metadata | {"sha256": digest_arrays(halves)})
-        part.chmod(0o644)  # safetensors makes files that only their owner can read
+    data = save(halves, metadata | {"sha256": digest_arrays(halves)})
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])  # whose metadata are in random order: the same weights in other bytes
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(size)
+    replace_bytes(path, data[:8] + text + data[8 + size :])
 
 
 def read_weights(path: Path) -> tuple[dict[str, NDArray[np.float32]], dict[str, str]]:

@@ -52,7 +52,8 @@ def test_exported_graphs_agree(
     words = ["polsep", "export", "joint", "--weights", str(weights), "-o", str(target)]
     monkeypatch.setattr(sys, "argv", words + ["--full"] * (resolution == "full"))
     cli.main()
-    assert capfd.readouterr().err.splitlines() == ["polsep: exporting joint, which takes a minute or a few"]
+    lines = capfd.readouterr().err.splitlines()  # on a slow machine others tell the progress
+    assert lines[0] == "polsep: exporting joint, which takes a minute or a few"
     assert [path.name for path in target.parent.iterdir()] == ["joint.onnx"]
     session = onnxruntime.InferenceSession(target, providers=["CPUExecutionProvider"])
     network = load_joint(weights, torch.device("cpu"))

@@ -62,6 +62,8 @@ def view(file: Path | None, host: str, port: int | None, opens: bool, upload_lim
     polsep view dump.raw --size 2448x2048 --pixel-format BayerRG12p
     """
     require_extra("view")
+    if file is not None:
+        require_paths(file)
     from polsep.view.opening import find_sources, four_angles, parse_settings
     from polsep.view.server import ViewOptions, serve
 

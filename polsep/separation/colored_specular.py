@@ -86,7 +86,7 @@ class Colored(NamedTuple):
 
     @property
     def remark(self) -> str | None:
-        """What the owner of the frame should know of it, in a line."""
+        """A line for the owner of the frame, or None."""
         if not self.unpolarized:
             return None
         return (

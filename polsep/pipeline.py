@@ -33,6 +33,7 @@ from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.images import FrameImages
 from polsep.separation.report import SeparatedFrame, describe, error_quantiles, on_host
+from polsep.separation.under_highlights import fill_under_highlights
 
 if TYPE_CHECKING:
     from polsep.io.results.previews import Picture
@@ -170,13 +171,15 @@ def separate_capture(
     capture, device = checked.mosaic if checked else capture, find_device(device)
     light, facts, remarks = resolve_light(light_color, capture)  # before it moves: a device sends no raw frame back
     capture = move_capture(capture, device)
-    images, colored = chosen.run(capture, light, full), Colored()
-    if chosen.assumes_white and isinstance(capture, Mosaic):
-        images, colored = color_specular(images, capture, light)
+    images, colored, filled = chosen.run(capture, light, full), Colored(), 0.0
+    if isinstance(capture, Mosaic):
+        if chosen.assumes_white:
+            images, colored = color_specular(images, capture, light)
+        images, filled = fill_under_highlights(images, capture, light)
     frame = make_frame(images, chosen, capture, light, full)
     frame.report["light"] = facts
     frame.report.update(colored_specular=colored.share, retained_polarization=colored.retained)
-    frame.report["lamp_dolp"] = colored.lamp_dolp
+    frame.report.update(lamp_dolp=colored.lamp_dolp, filled_under_highlights=filled)
     frame.report["warnings"] = [*remarks, *([colored.remark] if colored.remark else []), *frame.report["warnings"]]
     if checked:
         frame.report.update(checked.report)

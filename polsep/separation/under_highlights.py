@@ -1,0 +1,267 @@
+"""Diffuse light under clipped highlights, from the diffuse light around them.
+
+Where a highlight clips, samples hardly tell diffuse from specular light, and what a network guesses there shows as grey
+or coloured spots. Most bodies go on under a highlight as they do around it. So every *hole*, a connected set of pixels
+with a clipped sample among the 3x3 cells around, is filled from its border without sources (Laplace's equation), and
+this fill and the network's guess are averaged by their variances:
+
+* The network expects its own error.
+* The fill is off by the body's texture, colour by colour: `TEXTURE` times what a plane leaves of the ring around the
+  hole. Where both guesses differ by more than the network's error explains, the rest is counted as the fill's error.
+* Bodies that are bright enough to clip by themselves betray themselves by strong texture or large holes; the network's
+  guess stays there.
+
+The specular image stays as it is. Constants are of validation frames (docs/experiments.md, "Diffuse light under
+highlights"). Source: this project's; filling by Laplace's equation as in Perez et al. 2003, doi:10.1145/882262.882269.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.compute.arrays import Array, namespace, of_kind, to_numpy, to_numpy_together
+from polsep.sensor.camera import Mosaic
+from polsep.sensor.defects import clip_level
+from polsep.separation.images import FrameImages
+
+Floats = NDArray[np.float64]
+Places = NDArray[np.int64]
+
+#: Cells on each side of a clipped one that it may spoil, and cells around a hole that make its ring.
+SPOILED, RING = 1, 3
+#: Standard deviations of the fill per standard deviation of the ring from its plane.
+TEXTURE = 2.0
+#: Largest deviation of the ring from its plane that is filled over, relative to the ring's light, and at white = 1.
+MAX_TEXTURE, MAX_NOISE = 0.3, 0.01
+#: Cells of the largest hole and of the least ring, and the share of clipped cells from which on nothing is filled.
+MAX_HOLE, MIN_RING, MAX_CLIPPED = 4000, 6, 0.2
+#: Where the solution of Laplace's equation ends: largest residual at white = 1, and most steps.
+TOLERANCE, STEPS = 1e-4, 200
+
+
+class _Holes(NamedTuple):
+    """Pixels of holes in an image of a ``shape``, ``scale`` pixels along a cell's side.
+
+    ``flat [N]``: places of the pixels in the image, row by row; ``of [N]``: the hole of each, of ``total`` ones.
+    """
+
+    flat: Places
+    of: Places
+    total: int
+    shape: tuple[int, int]
+    scale: int
+
+
+def fill_under_highlights(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> tuple[FrameImages, float]:
+    """Images of one frame ``[H, W]`` with the holes of the diffuse image filled, and the share of its pixels that was.
+
+    ``images``: at half or full resolution, with expected errors, in a ``light`` (camera RGB); their arrays are written
+    to. Expected errors shrink as those of weighed means do, and pixels count in the share by the fill's weight.
+    """
+    error, (height, width, colors) = images.error, images.diffuse.shape
+    if error is None or mosaic.data.ndim != 2:
+        return images, 0.0
+    scale = 2 if 2 * height > mosaic.data.shape[0] else 1
+    clipped = _clipped_cells(mosaic)
+    if not 0 < len(clipped) <= MAX_CLIPPED * height * width / scale**2:
+        return images, 0.0
+    holes = _find_holes(clipped, (height, width), scale)
+    gain = np.array(light[:colors], np.float64)
+    diffuse, expected = images.diffuse.reshape(-1, colors), error.reshape(-1, 2)[:, 0]
+    plane, texture, usable = _fit_planes(holes, diffuse, gain)
+    chosen = usable[holes.of]
+    if not chosen.any():
+        return images, 0.0
+    holes = _Holes(holes.flat[chosen], holes.of[chosen], holes.total, holes.shape, scale)
+    own, deviation = to_numpy_together(_take(diffuse, holes.flat), _take(expected, holes.flat))
+    own, deviation = own / gain, deviation / gain.mean()
+    fill = _solve_laplace(holes, diffuse, gain, plane[chosen])
+    weights = _weigh(holes, fill - own, deviation, texture)
+    weight = weights.mean(axis=1)
+    _put(diffuse, holes.flat, gain * (own + weights * (fill - own)))
+    _put(expected, holes.flat, gain.mean() * deviation * np.sqrt(1 - weight))
+    tally = images.tally
+    if tally is not None and tally.diffuse_variance is not None:
+        less = float((weight * deviation**2).sum())
+        tally = replace(tally, diffuse_variance=max(tally.diffuse_variance - less, 0.0))
+    return replace(images, tally=tally), float(weight.sum()) / (height * width)
+
+
+def _weigh(holes: _Holes, change: Floats, deviation: Floats, texture: Floats) -> Floats:
+    """Weights ``[N, C]`` of a fill that differs by ``change [N, C]`` from guesses of an expected ``deviation [N]``.
+
+    ``texture [total, C]``: of rings. Colours of a body have textures of their own; both guesses disagree as wholes.
+    """
+    guessed, apart = (_means(holes, x)[:, None] for x in (deviation**2, (change**2).mean(axis=1)))
+    off = np.maximum((TEXTURE * texture) ** 2, apart - guessed)
+    weights: Floats = (guessed / np.maximum(guessed + off, 1e-12))[holes.of]
+    return weights
+
+
+def _clipped_cells(mosaic: Mosaic) -> Places:
+    """Row and column ``[N, 2]`` of the 2x2 cells with a clipped sample."""
+    width = mosaic.data.shape[1]
+    level, data = clip_level(mosaic), mosaic.data.reshape(-1)
+    at = to_numpy(namespace(data).nonzero(data >= level)[0]).astype(np.int64)
+    places = np.stack(np.divmod(at, width), axis=1) - np.array(mosaic.layout.origin)
+    count = (np.array(mosaic.data.shape) - mosaic.layout.origin) // 2
+    cells = places[(places >= 0).all(axis=1)] // 2
+    cells = cells[(cells < count).all(axis=1)]
+    return np.stack(np.divmod(np.unique(cells[:, 0] * count[1] + cells[:, 1]), count[1]), axis=1)
+
+
+def _find_holes(clipped: Places, shape: tuple[int, int], scale: int) -> _Holes:
+    """Connected pixels, also over corners, of what clipped cells spoil in an image of that shape."""
+    cells = _grow(clipped, (shape[0] // scale, shape[1] // scale), SPOILED)
+    within = np.stack(np.divmod(np.arange(scale**2), scale), axis=1)
+    pixels = (scale * cells[:, None] + within).reshape(-1, 2)
+    flat = np.sort(pixels[:, 0] * shape[1] + pixels[:, 1])
+    number = _numbers(flat, shape)
+    pairs = [_neighbors(number, flat, shape, step) for step in ((0, 1), (1, -1), (1, 0), (1, 1))]
+    one = np.concatenate([np.flatnonzero(other >= 0) for other in pairs])
+    two = np.concatenate([other[other >= 0] for other in pairs])
+    label, before = np.arange(len(flat)), None
+    while before is None or not np.array_equal(before, label):  # the lowest number of a hole spreads, and its roots'
+        before, low = label, np.minimum(label[one], label[two])
+        label = label.copy()
+        for place in (one, two, before[one], before[two]):
+            np.minimum.at(label, place, low)
+        label = label[label]
+    roots, of = np.unique(label, return_inverse=True)
+    return _Holes(flat, of, len(roots), shape, scale)
+
+
+def _fit_planes(holes: _Holes, diffuse: Array, gain: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Planes through the rings of holes: their values in the holes ``[N, C]``, and the rms of rings from them.
+
+    The rms ``[total, C]``, and whether a hole may be filled, ``[total]``.
+    """
+    (height, width), reach = holes.shape, RING * holes.scale
+    number = _numbers(holes.flat, holes.shape)
+    edge = np.zeros(len(holes.flat), np.bool_)
+    for step in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        edge |= _neighbors(number, holes.flat, holes.shape, step) < 0
+    near = _around(np.stack(np.divmod(holes.flat[edge], width), axis=1), reach)
+    inside = (near >= 0).all(axis=-1) & (near < (height, width)).all(axis=-1)
+    keys = (holes.of[edge][:, None] * height + near[..., 0]) * width + near[..., 1]
+    of, flat = np.divmod(np.unique(keys[inside]), height * width)
+    free = number[flat] < 0
+    of, flat = of[free], flat[free]
+    values = to_numpy(_take(diffuse, flat)) / gain
+    count = np.bincount(of, minlength=holes.total)
+    center = (
+        np.stack([_sums(of, x, holes.total) for x in np.divmod(flat, width)], axis=1) / np.maximum(count, 1)[:, None]
+    )
+
+    def shapes(flat: Places, of: Places) -> Floats:
+        offsets = np.stack(np.divmod(flat, width), axis=1) - center[of]
+        return np.concatenate([np.ones((len(flat), 1)), offsets / reach], axis=1)
+
+    ring = shapes(flat, of)
+    products = np.stack([[_sums(of, a * b, holes.total) for a in ring.T] for b in ring.T]).transpose(2, 0, 1)
+    totals = np.stack([[_sums(of, a * b, holes.total) for b in values.T] for a in ring.T]).transpose(2, 0, 1)
+    factors = np.linalg.pinv(products, hermitian=True) @ totals
+    rest = values - (ring[:, None] @ factors[of])[:, 0]
+    texture = np.stack([_sums(of, x, holes.total) for x in (rest**2).T], axis=1)
+    texture = np.sqrt(texture / np.maximum(count, 1)[:, None])
+    light = _sums(of, values.mean(axis=1), holes.total) / np.maximum(count, 1)
+    size = np.bincount(holes.of, minlength=holes.total)
+    usable = (np.sqrt((texture**2).mean(axis=1)) <= MAX_TEXTURE * light + MAX_NOISE) & (
+        count >= MIN_RING * holes.scale**2
+    )
+    usable &= size <= MAX_HOLE * holes.scale**2
+    return (shapes(holes.flat, holes.of)[:, None] @ factors[holes.of])[:, 0], texture, usable
+
+
+def _solve_laplace(holes: _Holes, diffuse: Array, gain: Floats, start: Floats) -> Floats:
+    """Values ``[N, C]`` of the holes' pixels, each the mean of its four neighbours, in white light.
+
+    By conjugate gradients from a ``start``. Beyond the image's border there are no neighbours.
+    """
+    number, width = _numbers(holes.flat, holes.shape), holes.shape[1]
+    count, right = np.zeros((len(holes.flat), 1)), np.zeros_like(start)
+    links = []
+    for down, across in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        other = _neighbors(number, holes.flat, holes.shape, (down, across))
+        links.append((np.flatnonzero(other >= 0), other[other >= 0]))
+        known = np.flatnonzero(other == _OUTSIDE)
+        right[known] += to_numpy(_take(diffuse, holes.flat[known] + down * width + across)) / gain
+        count[other != _BEYOND] += 1
+
+    def apply(x: Floats) -> Floats:
+        changed = count * x
+        for one, two in links:
+            changed[one] -= x[two]
+        return changed
+
+    x = start.copy()
+    rest = right - apply(x)
+    step, power = rest.copy(), float((rest**2).sum())
+    for _ in range(STEPS):
+        if not rest.size or np.abs(rest).max() <= TOLERANCE:
+            break
+        moved = apply(step)
+        length = power / max(float((step * moved).sum()), 1e-30)
+        x += length * step
+        rest -= length * moved
+        before, power = power, float((rest**2).sum())
+        step = rest + power / before * step
+    return np.maximum(x, 0)
+
+
+#: Numbers of neighbours that are not pixels of holes: other pixels, and none.
+_OUTSIDE, _BEYOND = -1, -2
+
+
+def _numbers(flat: Places, shape: tuple[int, int]) -> Places:
+    """The number of each pixel of a hole at its place in an image, elsewhere -1."""
+    number = np.full(shape[0] * shape[1], _OUTSIDE, np.int64)
+    number[flat] = np.arange(len(flat))
+    return number
+
+
+def _neighbors(number: Places, flat: Places, shape: tuple[int, int], step: tuple[int, int]) -> Places:
+    """The numbers of the pixels one ``step`` (rows, columns) on; `_BEYOND` the image's border."""
+    rows, cols = np.divmod(flat, shape[1])
+    rows, cols = rows + step[0], cols + step[1]
+    inside = (rows >= 0) & (rows < shape[0]) & (cols >= 0) & (cols < shape[1])
+    found: Places = np.where(inside, number[np.where(inside, rows * shape[1] + cols, 0)], _BEYOND)
+    return found
+
+
+def _around(places: Places, reach: int) -> Places:
+    """All places ``[N, K, 2]`` up to ``reach`` rows and columns from some."""
+    side = 2 * reach + 1
+    near: Places = places[:, None] + np.stack(np.divmod(np.arange(side**2), side), axis=1) - reach
+    return near
+
+
+def _grow(places: Places, shape: tuple[int, int], reach: int) -> Places:
+    """Places up to ``reach`` from some, inside of an image of that shape, each once."""
+    near = _around(places, reach).reshape(-1, 2)
+    near = near[(near >= 0).all(axis=1) & (near < shape).all(axis=1)]
+    return np.stack(np.divmod(np.unique(near[:, 0] * shape[1] + near[:, 1]), shape[1]), axis=1)
+
+
+def _sums(of: Places, values: NDArray[Any], count: int) -> Floats:
+    """Sums of values by hole."""
+    return np.bincount(of, values, count).astype(np.float64)
+
+
+def _means(holes: _Holes, values: Floats) -> Floats:
+    """Means of values of the holes' pixels by hole."""
+    return _sums(holes.of, values, holes.total) / np.maximum(np.bincount(holes.of, minlength=holes.total), 1)
+
+
+def _take(image: Array, flat: Places) -> Array:
+    """Pixels of an image whose rows are joined, ``[N, ...]``."""
+    return image[of_kind(flat, image)]
+
+
+def _put(image: Array, flat: Places, values: Floats) -> None:
+    """The twin of `_take`: write pixels."""
+    image[of_kind(flat, image)] = of_kind(values.astype(np.float32), image)

@@ -115,7 +115,7 @@ def test_orientation_does_not_matter(turn: object) -> None:
     assert callable(turn)
     frame, images = mosaic(), guessed(slope(1) ** 2, 1)
     data = frame.data.copy()
-    data[0, ::2] = 4095
+    data[0, :32:2] = 4095
     turned = replace(images, **{n: np.ascontiguousarray(_turn(turn, x)) for n, x in images.arrays().items()})
     one, share = fill_under_highlights(images, replace(frame, data=data), LIGHT)
     two, other = fill_under_highlights(turned, replace(frame, data=np.ascontiguousarray(turn(data))), LIGHT)
@@ -139,10 +139,24 @@ def test_tensors_give_the_same() -> None:
     assert np.array_equal(one.diffuse, np.asarray(two.diffuse)) and share == other
 
 
+def test_bright_bodies_are_no_highlights() -> None:
+    """Where all analysers clip alike, or nearly so, nothing of a highlight is seen, and the guess stays."""
+    frame = mosaic()
+    data = frame.data.copy()
+    rows, cols = (slice(2 * s.start, 2 * s.stop) for s in CORE)
+    data[rows, cols] = 4095
+    data[2 * SINGLE[0] : 2 * SINGLE[0] + 2, 2 * SINGLE[1] : 2 * SINGLE[1] + 2] = [[4000, 4050], [4020, 4095]]
+    images = guessed(slope(1), 1)
+    found, share = fill_under_highlights(images, replace(frame, data=data), LIGHT)
+    assert np.array_equal(found.diffuse, guessed(slope(1), 1).diffuse) and share == 0
+
+
 def test_reports_say_how_much_was_filled() -> None:
-    """An even grey sheet with a white highlight: its diffuse image is even, and the report names the share."""
+    """An even grey sheet with a polarized highlight: the report names the share of its image that was filled."""
     data = np.full((128, 128), 1200, np.uint16)
     rows, cols = np.mgrid[:128, :128]
-    data[np.hypot(rows - 64, cols - 64) < 6] = 4095
+    highlight = 4000 * np.exp(-((rows - 64) ** 2 + (cols - 64) ** 2) / 50)
+    polarized = np.tile([[0.5, 0.15], [0.85, 0.5]], (64, 64))  # Malus' law for light at 30 degrees, about
+    data = np.minimum(data + highlight * polarized, 4095).astype(np.uint16)
     out = separate_capture(Mosaic(data, Layout(bayer=None), 0.0, WHITE), "joint", "white")
     assert 0 < out.report["filled_under_highlights"] < 0.05

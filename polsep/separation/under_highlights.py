@@ -5,11 +5,11 @@ or coloured spots. Most bodies go on under a highlight as they do around it. So 
 with a clipped sample among the 3x3 cells around, is filled from its border without sources (Laplace's equation), and
 this fill and the network's guess are averaged by their variances:
 
-* The network expects its own error.
+* The network expects its own error, which under highlights is too small by `SURPRISE`.
 * The fill is off by the body's texture, colour by colour: `TEXTURE` times what a plane leaves of the ring around the
   hole. Where both guesses differ by more than the network's error explains, the rest is counted as the fill's error.
-* Bodies that are bright enough to clip by themselves betray themselves by strong texture or large holes; the network's
-  guess stays there.
+* Highlights of a polarized lamp are polarized: what the samples of a hole have beyond its fill differs from analyser to
+  analyser. Bodies that are bright enough to clip by themselves look alike through all of them and stay as they are.
 
 The specular image stays as it is. Constants are of validation frames (docs/experiments.md, "Diffuse light under
 highlights"). Source: this project's; filling by Laplace's equation as in Perez et al. 2003, doi:10.1145/882262.882269.
@@ -33,12 +33,16 @@ Places = NDArray[np.int64]
 
 #: Cells on each side of a clipped one that it may spoil, and cells around a hole that make its ring.
 SPOILED, RING = 1, 3
+#: Polarized share of what lies beyond the fill from which on a hole may be a highlight, and is one for sure.
+CONTRASTS = (0.3, 0.5)
+#: Errors of networks' guesses in holes, over those that they expect.
+SURPRISE = 1.4
 #: Standard deviations of the fill per standard deviation of the ring from its plane.
 TEXTURE = 2.0
 #: Largest deviation of the ring from its plane that is filled over, relative to the ring's light, and at white = 1.
 MAX_TEXTURE, MAX_NOISE = 0.3, 0.01
 #: Cells of the largest hole and of the least ring, and the share of clipped cells from which on nothing is filled.
-MAX_HOLE, MIN_RING, MAX_CLIPPED = 4000, 6, 0.2
+MAX_HOLE, MIN_RING, MAX_CLIPPED = 4000, 6, 0.05
 #: Where the solution of Laplace's equation ends: largest residual at white = 1, and most steps.
 TOLERANCE, STEPS = 1e-4, 200
 
@@ -73,14 +77,15 @@ def fill_under_highlights(images: FrameImages, mosaic: Mosaic, light: tuple[floa
     gain = np.array(light[:colors], np.float64)
     diffuse, expected = images.diffuse.reshape(-1, colors), error.reshape(-1, 2)[:, 0]
     plane, texture, usable = _fit_planes(holes, diffuse, gain)
-    chosen = usable[holes.of]
+    sure = ((_contrast(holes, mosaic, plane, gain) - CONTRASTS[0]) / (CONTRASTS[1] - CONTRASTS[0])).clip(0, 1)
+    chosen = (usable & (sure > 0))[holes.of]
     if not chosen.any():
         return images, 0.0
     holes = _Holes(holes.flat[chosen], holes.of[chosen], holes.total, holes.shape, scale)
     own, deviation = to_numpy_together(_take(diffuse, holes.flat), _take(expected, holes.flat))
     own, deviation = own / gain, deviation / gain.mean()
     fill = _solve_laplace(holes, diffuse, gain, plane[chosen])
-    weights = _weigh(holes, fill - own, deviation, texture)
+    weights = sure[holes.of, None] * _weigh(holes, fill - own, deviation, texture)
     weight = weights.mean(axis=1)
     _put(diffuse, holes.flat, gain * (own + weights * (fill - own)))
     _put(expected, holes.flat, gain.mean() * deviation * np.sqrt(1 - weight))
@@ -96,10 +101,29 @@ def _weigh(holes: _Holes, change: Floats, deviation: Floats, texture: Floats) ->
 
     ``texture [total, C]``: of rings. Colours of a body have textures of their own; both guesses disagree as wholes.
     """
-    guessed, apart = (_means(holes, x)[:, None] for x in (deviation**2, (change**2).mean(axis=1)))
+    guessed, apart = (_means(holes, x)[:, None] for x in ((SURPRISE * deviation) ** 2, (change**2).mean(axis=1)))
     off = np.maximum((TEXTURE * texture) ** 2, apart - guessed)
     weights: Floats = (guessed / np.maximum(guessed + off, 1e-12))[holes.of]
     return weights
+
+
+def _contrast(holes: _Holes, mosaic: Mosaic, fill: Floats, gain: Floats) -> Floats:
+    """Polarized share of what holes ``[total]`` have beyond a fill, by the analysers of their cells.
+
+    (most - least) / (most + least - fill) of samples under white light, in sums over a hole: unpolarized light of a
+    fill, which is s0, is half of it in each sample. Mirror images of the lamp have 0.7 to 1, less where all clip.
+    """
+    (row, col), width = mosaic.layout.origin, mosaic.data.shape[1]
+    cells = np.stack(np.divmod(holes.flat, holes.shape[1])) // holes.scale
+    first = (row + 2 * cells[0]) * width + col + 2 * cells[1]
+    data = mosaic.data.reshape(-1)
+    samples = to_numpy(_take(data, np.stack([first, first + 1, first + width, first + width + 1]))).astype(np.float64)
+    channels = [[mosaic.layout.filter_at(row + 2 * a, col + 2 * b).channel for b in range(2)] for a in range(2)]
+    channel = np.array(channels)[cells[0] % 2, cells[1] % 2]
+    samples = (samples - mosaic.black_level) / (mosaic.white_level - mosaic.black_level) / gain[channel]
+    most, least = samples.max(axis=0), samples.min(axis=0)
+    beyond = np.maximum(most + least - fill[np.arange(len(fill)), channel], 0)
+    return _sums(holes.of, most - least, holes.total) / np.maximum(_sums(holes.of, beyond, holes.total), 1e-9)
 
 
 def _clipped_cells(mosaic: Mosaic) -> Places:

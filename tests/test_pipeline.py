@@ -246,7 +246,7 @@ def doubting(monkeypatch: pytest.MonkeyPatch) -> Joint:
 @pytest.mark.parametrize("full", [False, True])
 def test_expected_errors_reach_their_owner(doubting: Joint, full: bool) -> None:
     """The frame holds what the method expects, and the report their rms; other methods have neither."""
-    raw = raw_frame("float32")
+    raw = raw_frame("float32", exposure=0.5)
     out = quietly(raw, method="joint", full=full)
     expected = run_joint(doubting, Mosaic(torch.from_numpy(raw), Layout(), 0.0, 1.0), full).expected_error
     assert expected is not None and out.error is not None

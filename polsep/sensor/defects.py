@@ -331,46 +331,42 @@ def make_predictor(layout: Layout, shape: tuple[int, ...]) -> Predictor:
 def _predictor(layout: Layout, rows: int, cols: int) -> Predictor:
     from polsep.sensor.defects_kernel import Predictor
 
-    offsets, filters = np.arange(81), layout.table()
-    coefficients = np.zeros((2, 12, 12, 81))
-    for row, (i, top) in enumerate(_window_places(16 + rows)):
-        for col, (j, left) in enumerate(_window_places(16 + cols)):
-            place = np.stack([top + offsets // 9, left + offsets % 9])
-            kinds = [filters[a % 4][b % 4] for a, b in place.T]
-            angle = np.radians([kind.angle_deg for kind in kinds])
-            color = np.array([kind.channel for kind in kinds])
-            middle = 9 * (i - top) + j - left
-            same = np.array([kind == kinds[middle] for kind in kinds])
-            coefficients[0, row, col] = _kriging(place, angle, color, middle)
-            coefficients[1, row, col, same] = _kriging(
-                place[:, same], angle[same], color[same], int(np.flatnonzero(same).tolist().index(middle))
-            )
-    return Predictor(coefficients.astype(np.float32), np.sqrt((coefficients**2).sum(-1)).astype(np.float32))
+    (tops, middles_y), (lefts, middles_x) = (np.array(_window_places(16 + extra)).T for extra in (rows, cols))
+    middles = 9 * middles_y[:, None] + middles_x
+    kept = np.ascontiguousarray(_residuals(layout)[:, tops[:, None] % 4, lefts % 4, middles])
+    return Predictor(kept.astype(np.float32), np.sqrt((kept**2).sum(-1)).astype(np.float32))
 
 
 def _window_places(size: int) -> list[tuple[int, int]]:
-    """Row and first row of its window for the twelve cases of `defects_kernel.Predictor`."""
-    first, inside, last = range(4), range(8, 12), range(size - 4, size)
-    return [*((i, 0) for i in first), *((i, i - 4) for i in inside), *((i, size - 9) for i in last)]
+    """First row of the window, and row in it, for the twelve cases of `defects_kernel.Predictor`."""
+    return [*((0, i) for i in range(4)), *((i, 4) for i in range(4, 8)), *((size - 9, i) for i in range(5, 9))]
 
 
-def _kriging(
-    place: NDArray[np.int64], angle: NDArray[np.float64], color: NDArray[np.int64], middle: int
-) -> NDArray[np.float64]:
-    """Coefficients of the residual of sample number ``middle``: 1 for itself, minus the weights of the others.
+def _residuals(layout: Layout) -> NDArray[np.float64]:
+    """Coefficients ``[2, 4, 4, 81, 81]`` by table, first row and column of the window modulo 4, sample and others."""
+    y, x = np.divmod(np.arange(81), 9)
+    at = (np.arange(4)[:, None, None] + y) % 4, (np.arange(4)[:, None] + x) % 4
+    angle = np.radians([[place.angle_deg for place in row] for row in layout.table()])[at]
+    color = np.array([[place.channel for place in row] for row in layout.table()])[at]
+    same = (angle[..., None] == angle[..., None, :]) & (color[..., None] == color[..., None, :])
+    alike = np.where(color[..., None] == color[..., None, :], 1.0, CORRELATION)
+    mix = 0.25 * (1 + POLARIZATION**2 * np.cos(2 * (angle[..., None] - angle[..., None, :])))
+    distance = np.hypot(y[:, None] - y, x[:, None] - x)
+    covariance = np.exp(-distance / LENGTH) * alike * mix + ALLOWANCE**2 * np.eye(81)
+    shapes = np.stack([np.ones_like(angle), np.cos(2 * angle), np.sin(2 * angle)], axis=-1)
+    drift = np.concatenate([shapes * (color == c)[..., None] for c in np.unique(color)], axis=-1)
+    kinds = np.unique(np.stack([color, angle], axis=-1).reshape(-1, 2), axis=0)
+    constant = np.stack([(color == c) & (angle == t) for c, t in kinds], axis=-1)
+    return np.stack([_kriging(covariance, drift), _kriging(covariance * same, constant)])
 
-    Unknown constants: s0, s1, s2 of each colour, as far as the samples can tell them apart.
+
+def _kriging(covariance: NDArray[np.float64], drift: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients of each sample's residual, in rows: 1 for itself, minus the weights that predict it from the others.
+
+    ``covariance [..., n, n]`` of the samples; ``drift [..., n, k]``: what unknown constants add to them.
+    Source: O. Dubrule, "Cross validation of kriging in a unique neighborhood", Math. Geology 15, 1983.
     """
-    distance = np.hypot(*(place[:, :, None] - place[:, None, :]))
-    alike = np.where(color[:, None] == color, 1.0, CORRELATION)
-    mix = 0.25 * (1 + POLARIZATION**2 * np.cos(2 * (angle[:, None] - angle)))
-    covariance = np.exp(-distance / LENGTH) * alike * mix + ALLOWANCE**2 * np.eye(len(angle))
-    shapes = np.stack([np.ones(len(angle)), np.cos(2 * angle), np.sin(2 * angle)])
-    drift = np.concatenate([shapes * (color == c) for c in np.unique(color)]).T
-    others = np.arange(len(angle)) != middle
-    count = drift.shape[1]
-    system = np.block([[covariance[others][:, others], drift[others]], [drift[others].T, np.zeros((count, count))]])
-    target = np.concatenate([covariance[others, middle], drift[middle]])
-    coefficients = np.ones(len(angle))
-    coefficients[others] = -np.linalg.lstsq(system, target, rcond=None)[0][: len(angle) - 1]
-    return coefficients
+    inverse = np.linalg.inv(covariance)
+    share = inverse @ drift
+    inverse -= share @ np.linalg.solve(drift.mT @ share, share.mT)
+    return inverse / np.diagonal(inverse, axis1=-2, axis2=-1)[..., None]

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,9 @@ import OpenEXR
 import pytest
 import tifffile
 
+from polsep.compute.threads import own_threads
 from polsep.io.results import separation_writer
-from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.exr import encode_exr, read_exr_layers
 from polsep.io.results.separation_writer import FORMATS, UNITS, planned_outputs, write_separation
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.errors import InputError
@@ -83,6 +85,52 @@ def test_exr_is_one_zip_part_that_states_units_and_version(tmp_path: Path) -> No
     assert {layer: header[f"{layer}Units"] for layer in LAYERS} == {layer: UNITS[layer] for layer in LAYERS}
     assert "errorUnits" not in header
     assert header["polsepVersion"] == sidecar(tmp_path)["polsep"]
+
+
+def test_exr_does_not_depend_on_threads() -> None:
+    """Any number of threads makes the same bytes, and so do several writers at once."""
+    plane = np.random.default_rng(0).random((200, 300), np.float32)
+    planes = {"a.Y": plane, "b.Y": np.round(plane, 1)}
+
+    def encode(threads: int) -> bytes:
+        with own_threads(threads):
+            return bytes(encode_exr(planes, {"note": "x"}))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert len({*pool.map(encode, (1, 2, 3, 7) * 4), encode(1)}) == 1
+
+
+FORKING = """
+import os, threading, warnings
+import numpy as np
+from polsep.compute.threads import set_threads
+from polsep.io.results.exr import encode_exr
+
+warnings.simplefilter("ignore")
+set_threads(3)
+planes, ended = {"a.Y": np.random.default_rng(0).random((200, 300), np.float32)}, threading.Event()
+
+def work():
+    while not ended.is_set():
+        encode_exr(planes, {})
+
+writer = threading.Thread(target=work)
+writer.start()
+for _ in range(20):
+    child = os.fork()
+    if child == 0:
+        encode_exr(planes, {})
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+ended.set()
+writer.join()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_child_forked_while_an_exr_is_written_writes_its_own() -> None:
+    """It has none of the threads of OpenEXR that its parent's writer uses."""
+    assert subprocess.run([sys.executable, "-c", FORKING], check=False, timeout=120).returncode == 0
 
 
 @pytest.mark.parametrize("turn", [lambda a: a.swapaxes(0, 1), lambda a: a[::-1, ::2]])

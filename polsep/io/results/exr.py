@@ -9,7 +9,9 @@ Layout" (openexr.com/en/latest/OpenEXRFileLayout.html).
 from __future__ import annotations
 
 import io
+import os
 import struct
+import threading
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,7 +22,7 @@ import OpenEXR  # a bare extension module without stubs
 from numpy.typing import NDArray
 
 from polsep.compute.compiling import read_only
-from polsep.compute.threads import run_over_rows
+from polsep.compute.threads import get_threads, run_over_rows
 from polsep.io.results.exr_header import EXPECTED, check_exr_header
 from polsep.io.results.pixels_kernel import CHUNK, HEAD, LARGEST, ROWS, STORED, fill_rows, pack_chunks
 from polsep.io.store.errors import InputError, naming
@@ -42,6 +44,11 @@ _MAGIC, _VERSION, _HALF = 20000630, 2, 1
 #: How the lines begin that OpenEXR writes to standard error.
 _MARK = b"<python_buffer>"
 _SIGNATURE = _MAGIC.to_bytes(4, "little")
+#: Held while OpenEXR has threads, which are the process's: a child forked meanwhile would wait for them in vain.
+_WRITING = threading.Lock()
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_WRITING.acquire, after_in_parent=_WRITING.release, after_in_child=_WRITING.release)
 
 
 def read_exr_layers(path: Path) -> dict[str, NDArray[np.float32]]:
@@ -76,7 +83,12 @@ def encode_exr(planes: Mapping[str, NDArray[Any]], notes: Mapping[str, str], com
     # A fresh dict, because OpenEXR replaces its arrays, and contiguous planes, because it misreads others silently.
     channels = {name: np.ascontiguousarray(plane) for name, plane in planes.items()}
     stream = io.BytesIO()
-    OpenEXR.File(header, channels).write(stream)
+    with _WRITING:
+        OpenEXR.set_global_thread_count(get_threads())
+        try:
+            OpenEXR.File(header, channels).write(stream)
+        finally:
+            OpenEXR.set_global_thread_count(0)
     return stream.getbuffer()
 
 

@@ -172,9 +172,10 @@ def live_sheet(frame: SeparatedFrame) -> Pixels:
 def _panels(frame: SeparatedFrame, total: Values, flags: list[Flag]) -> list[Panel]:
     """The pictures of the contact sheet in reading order, all of one size; ``total`` is the linear input."""
     gain, own = exposure_of(total), exposure_of(frame.specular)
-    light = total.mean(axis=-1)
-    dolp, aolp = _shrunk_polarization(frame, light)
-    shown = _clearness(frame, light)[..., None]
+    light = reduce(np.add, np.moveaxis(total, -1, 0)) / total.shape[-1]
+    s1, s2 = (light * frame.dolp * turn(2 * frame.aolp) for turn in (np.cos, np.sin))
+    dolp, aolp = _shrunk_polarization(light, s1, s2)
+    shown = _clearness(light, s1)[..., None]
     parts = [_shrunk(np.maximum(image, 0)) for image in (frame.diffuse, frame.specular)]
     combined, diffuse, specular = (toned(image, gain) for image in (parts[0] + parts[1], *parts))
     exposure = f"exposure x {gain:.3g}"
@@ -198,12 +199,11 @@ def _panels(frame: SeparatedFrame, total: Values, flags: list[Flag]) -> list[Pan
     return panels
 
 
-def _clearness(frame: SeparatedFrame, light: Values) -> NDArray[np.float64]:
+def _clearness(light: Values, s1: Values) -> NDArray[np.float64]:
     """From 0 where the light ``[H, W]`` is at its noise to 1 where polarization can be seen, shrunk.
 
     The noise is that of s1 in the darkest quarter, as neighbours on the diagonal differ there.
     """
-    s1 = light * frame.dolp * np.cos(2 * frame.aolp)
     dark = light <= np.percentile(light, 25)
     steps = np.abs(s1[1:, 1:] - s1[:-1, :-1])[dark[1:, 1:]]
     noise = float(steps.mean()) * np.sqrt(np.pi) / 2 if steps.size else 0.0
@@ -229,22 +229,28 @@ def toned(image: Values, gain: float) -> Pixels:
     return _to_bytes(np.broadcast_to(srgb(gain * image), (*image.shape[:2], 3)))
 
 
-def _shrunk(image: Values) -> NDArray[np.float64]:
+def _shrunk(image: Values | NDArray[np.bool_]) -> NDArray[np.float64]:
     """Area average over square blocks, cut at the border, so that neither side of ``[H, W, ...]`` exceeds `PANEL`."""
     height, width = image.shape[:2]
     k = -(-max(height, width) // PANEL)
-    rows, cols = np.arange(0, height, k), np.arange(0, width, k)
-    sums: NDArray[np.float64] = np.add.reduceat(np.add.reduceat(image.astype(np.float64), rows, axis=0), cols, axis=1)
-    count = np.diff(rows, append=height)[:, None] * np.diff(cols, append=width)
-    mean: NDArray[np.float64] = sums / count.reshape(count.shape + (1,) * (image.ndim - 2))
-    return mean
+    low, wide = np.arange(0, height, k), np.arange(0, width, k)
+    bands = np.zeros((len(low), width, image.size // (height * width)), np.float32)
+    for first in range(k):  # whole rows at a time
+        own = image[first::k].reshape(-1, *bands.shape[1:])
+        bands[: len(own)] += own
+    sums = np.zeros((len(low), len(wide), bands.shape[2]))
+    for channel in range(bands.shape[2]):
+        for first in range(k):
+            part = bands[:, first::k, channel]
+            sums[:, : part.shape[1], channel] += part
+    count = np.diff(low, append=height)[:, None] * np.diff(wide, append=width)
+    mean: NDArray[np.float64] = sums / count[..., None]
+    return mean.reshape(*count.shape, *image.shape[2:])
 
 
-def _shrunk_polarization(frame: SeparatedFrame, s0: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """DoLP and AoLP ``[h, w]`` of the averaged Stokes vectors; DoLP 0 where there is no light."""
-    light = _shrunk(s0)
-    s1 = _shrunk(s0 * frame.dolp * np.cos(2 * frame.aolp))
-    s2 = _shrunk(s0 * frame.dolp * np.sin(2 * frame.aolp))
+def _shrunk_polarization(*stokes: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """DoLP and AoLP ``[h, w]`` of averaged Stokes vectors s0, s1, s2 ``[H, W]``; DoLP 0 where there is no light."""
+    light, s1, s2 = map(_shrunk, stokes)
     dolp = np.hypot(s1, s2) / np.where(light > 0, light, 1)
     return dolp, np.mod(np.arctan2(s2, s1) / 2, np.pi)
 
@@ -264,12 +270,12 @@ def _flags(frame: SeparatedFrame, total: Values) -> list[Flag]:
 
 def _flagged(picture: Pixels, flags: list[Flag]) -> Pixels:
     """The picture grey and dim, with every flagged pixel tinted, however few of a block they are."""
-    grey = picture.astype(np.float64).mean(axis=-1, keepdims=True) * 0.55
-    out: NDArray[np.float64] = np.broadcast_to(grey, picture.shape)
+    grey = picture.mean(axis=-1, keepdims=True) * 0.55
+    out: NDArray[np.float64] = np.repeat(grey, picture.shape[-1], axis=-1)
     for flag in flags:
-        share = _shrunk(flag.where.astype(np.float64))[..., None]
-        opacity = np.where(share > 0, 0.45 + 0.4 * share, 0)
-        out = (1 - opacity) * out + opacity * np.array(flag.color)
+        share = _shrunk(flag.where)
+        opacity = 0.45 + 0.4 * share[share > 0][:, None]
+        out[share > 0] += opacity * (np.array(flag.color) - out[share > 0])
     return np.rint(out).astype(np.uint8)
 
 

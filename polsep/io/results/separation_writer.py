@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from polsep import __version__
 from polsep.io.results.exr import as_planes, encode_exr
 from polsep.io.results.previews import contact_sheet
 from polsep.io.results.sidecars import (
@@ -32,11 +34,10 @@ from polsep.io.results.sidecars import (
     exr_notes,
     require_finite,
     require_stem,
-    version_text,
     write_with_sidecar,
 )
 from polsep.io.store.atomic import OutputError, refuse_existing
-from polsep.io.store.image_codecs import encode_png
+from polsep.io.store.image_codecs import encode_png, encode_png_quickly
 
 if TYPE_CHECKING:
     from polsep.separation.report import SeparatedFrame
@@ -140,7 +141,15 @@ def _check_frame(frame: SeparatedFrame) -> None:
 
 
 def _encoded_files(frame: SeparatedFrame, stem: str, format: str) -> Iterator[EncodedFile]:
-    """Name and contents of each image file, then of the preview; one in memory at a time."""
+    """Name and contents of each image file, one in memory at a time; then of the preview, drawn in the meantime."""
+    with ThreadPoolExecutor(1, "polsep-preview") as pool:
+        preview = pool.submit(lambda: encode_png_quickly(contact_sheet(frame)))
+        yield from _encoded_images(frame, stem, format)
+        yield f"{stem}.png", preview.result()
+
+
+def _encoded_images(frame: SeparatedFrame, stem: str, format: str) -> Iterator[EncodedFile]:
+    """Name and contents of each image file."""
     if format == "exr":
         yield f"{stem}.exr", _encode_exr(frame)
     elif format == "npz":
@@ -151,7 +160,6 @@ def _encoded_files(frame: SeparatedFrame, stem: str, format: str) -> Iterator[En
     else:
         for layer in _layers(frame):
             yield f"{stem}_{layer}.png", encode_png(_png_codes(frame, layer))
-    yield f"{stem}.png", encode_png(contact_sheet(frame))
 
 
 def _encode_exr(frame: SeparatedFrame) -> memoryview:
@@ -187,7 +195,7 @@ def _encode_tiff(frame: SeparatedFrame, layer: str) -> bytes:
         compression="zlib",
         predictor=predictor,
         description=f"{layer}: {UNITS[layer]}",
-        software=f"polsep {version_text()}",
+        software=f"polsep {__version__}",
         metadata=None,
     )
     return stream.getvalue()

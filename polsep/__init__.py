@@ -11,7 +11,6 @@ Names are loaded on first use, so ``import polsep`` and ``polsep --help`` cost n
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -69,10 +68,7 @@ _HOME = {
     "separate": "pipeline",
 }
 
-try:
-    __version__ = version("polsep")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
+__version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from polsep import __version__
 from polsep.calibrate.exposures import merge_exposures
 from polsep.compute.arrays import to_numpy
 from polsep.io.raw.corrections import read_mosaics
@@ -33,7 +33,7 @@ def calibrate_files(paths: Sequence[Path], read: ReadOptions, output: Path, kind
         read = replace(read, layout=before.layout)
     used = None if before is None else corrections_for(kind, before)
     found = measure(read_mosaics(paths, replace(read, corrections=used)), before)
-    written = write_calibration(output, found, importlib.metadata.version("polsep"))
+    written = write_calibration(output, found, __version__)
     return f"{kind}: {describe(found, kind)} -> {', '.join(str(path) for path in written)}"
 
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
+from polsep import __version__
 from polsep.io.store.errors import MOST, one_line
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ ENGINE = click.option(
 
 
 @click.group(context_settings=SETTINGS, no_args_is_help=True)
-@click.version_option(package_name="polsep", message="polsep %(version)s")
+@click.version_option(__version__, message="polsep %(version)s")
 def app() -> None:
     """One raw frame of a polarization camera in, a diffuse and a specular image out."""
 

@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 #: A NumPy array or a torch tensor; docstrings give its shape. (Type checkers know no type for both.)
 Array: TypeAlias = Any
 
-#: The functions for arrays of the kind of the arguments.
-namespace = array_namespace
+
+def namespace(x: Array) -> Any:
+    """The standard's functions for arrays of x's kind: NumPy's are NumPy itself, of which no copy is made."""
+    return np if isinstance(x, np.ndarray | np.generic) else array_namespace(x)
 
 
 def to_numpy(x: Array) -> NDArray[Any]:

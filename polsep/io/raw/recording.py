@@ -14,7 +14,6 @@ end.
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import zlib
 from collections.abc import Iterator, Mapping
@@ -23,6 +22,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from polsep import __version__
 from polsep.io.raw.genicam import find_pixel_format
 from polsep.io.raw.headerless import headerless_page
 from polsep.io.raw.page import Page
@@ -114,7 +114,7 @@ class RecordingWriter:
         """Replace the record: header, number of frames so far, and remarks such as counters."""
         record = {
             "format": FORMAT,
-            "polsep": importlib.metadata.version("polsep"),
+            "polsep": __version__,
             "finished": finished,
             "width": self.header.width,
             "height": self.header.height,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep import __version__
 from polsep.io.store.atomic import OutputError, write_checked, write_set
 
 #: A file name and the file's contents.
@@ -50,7 +50,7 @@ def write_with_sidecar(
             write_checked(folder / name, data)
             listed.append({"name": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()})
         sidecar = {
-            "polsep": version_text(),
+            "polsep": __version__,
             **facts,
             "preview": f"{stem}.png is sRGB, 8 bit, for people: do not measure in it",
             "files": listed,
@@ -83,12 +83,4 @@ def _flat_names(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
 
 def exr_notes(units: Mapping[str, str]) -> dict[str, str]:
     """Attributes of an EXR file: the polsep version and the unit of each layer."""
-    return {"polsepVersion": version_text(), **{f"{layer}Units": unit for layer, unit in units.items()}}
-
-
-def version_text() -> str:
-    """The version of the installed polsep."""
-    try:
-        return importlib.metadata.version("polsep")
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
+    return {"polsepVersion": __version__, **{f"{layer}Units": unit for layer, unit in units.items()}}

@@ -23,11 +23,14 @@ from numpy.typing import NDArray
 
 from polsep.compute.threads import get_threads
 from polsep.io.raw.videos import load_library
+from polsep.io.store.atomic import release_cache
 
 #: Containers by suffix.
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".avi": "avi"}
 #: FFmpeg's options for containers without dates and random numbers.
 _EXACTLY = {"fflags": "+bitexact"}
+#: Bytes of a film that the system keeps in memory, about.
+_RELEASED = 2**25
 
 
 @dataclass(frozen=True)
@@ -64,13 +67,16 @@ class _Sink:
     """
 
     def __init__(self, file: BinaryIO) -> None:
-        self._file, self._at = file, 0
+        self._file, self._at, self._released = file, 0, 0
         self.failure: OSError | None = None
 
     def write(self, data: bytes) -> int:
         """Write at the present place, and count it as done."""
         self._try(self._file.write, data)
         self._at += len(data)
+        if self._at > self._released + _RELEASED and not isinstance(self._file, BytesIO):
+            self._released = self._at
+            release_cache(self._file.fileno())
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:

@@ -29,7 +29,7 @@ from polsep.io.results.exr import COMPRESSIONS, encode_exr_halves
 from polsep.io.results.films import LOSSLESS, WATCHABLE, Film, FilmKind, join_films
 from polsep.io.results.separation_writer import UNITS
 from polsep.io.results.sidecars import require_same_settings
-from polsep.io.store.atomic import OutputError, atomic_path, replace_bytes, replace_text
+from polsep.io.store.atomic import OutputError, atomic_path, release_cache, replace_bytes, replace_text
 
 #: Frames per part, about a second; films have a key frame at least as often.
 PART = 25
@@ -39,6 +39,8 @@ FORMATS = ("exr", "ffv1", "ffvhuff", "none")
 LOSSLESS_CODECS = FORMATS[1:3]
 #: Threads that write at once: an EXR file or two lossless films, and the film to watch.
 _WRITERS = 3
+#: EXR files after which one of them is on the disk.
+_CACHED = 8
 #: The value of code 65535 in lossless films.
 FILM_WHITE = {"diffuse": 2.0, "specular": 8.0}
 
@@ -155,7 +157,7 @@ class SequenceWriter:
         """
         self._wait()
         if self.kind.format == "exr" and "damaged" not in picture.line:
-            self._start(write_exr, self._exr_path(index), picture, self.kind.compression)
+            self._start(self._write_exr, index, picture)
         for image, kind in self._kinds.items():
             pixels = getattr(picture, "panels" if image == "preview" else image)
             if image not in self._films:
@@ -175,6 +177,12 @@ class SequenceWriter:
                 write(*given)
 
         self._begun.append(self._pool.submit(work))
+
+    def _write_exr(self, index: int, picture: Picture) -> None:
+        """Write the EXR file of a frame; the system keeps the last few in memory."""
+        write_exr(self._exr_path(index), picture, self.kind.compression)
+        for number in (index, index - _CACHED):
+            release_cache(self._exr_path(number))
 
     def _wait(self) -> None:
         """Wait for what was started, all of it before an error is raised."""

@@ -65,6 +65,22 @@ def write_checked(path: Path, data: bytes | memoryview) -> None:
         raise OSError(errno.EIO, f"expected {len(data)} bytes, found {found}", str(path))
 
 
+def release_cache(file: int | Path) -> None:
+    """Have the system write a file to the disk, and forget what of it is there; on Linux, as advice.
+
+    For streams, of each file when it is written and again some files later: they would fill the memory with what
+    nobody reads now, and on virtual machines memory that is used for the first time takes ten times as long to fill.
+    """
+    if not hasattr(os, "posix_fadvise"):
+        return
+    with suppress(OSError):
+        if isinstance(file, Path):
+            with file.open("rb") as stream:
+                release_cache(stream.fileno())
+        else:
+            os.posix_fadvise(file, 0, 0, os.POSIX_FADV_DONTNEED)
+
+
 def refuse_existing(directory: Path, targets: Sequence[Path], overwrite: bool) -> None:
     """Raise OutputError where files would be replaced without ``overwrite``, or a directory at all. Call it first."""
     nearest = next((d for d in (directory, *directory.parents) if os.path.lexists(d)), None)

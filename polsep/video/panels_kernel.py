@@ -21,33 +21,41 @@ _ROWS = 16
 
 
 @compiled
-def _shrink(image: Any, y: int, factor: int, rows: Any, row: Any) -> None:
-    """Sums over squares of an image ``[H, W C]`` to ``row [w C]``; ``rows``: room for a row of the image."""
-    colors, n = row.shape[1], row.shape[0]
+def _shrink(image: Any, at: tuple[int, int], colors: int, room: tuple[Any, Any], row: Any) -> None:
+    """Sums over squares of an image ``[H, W C]`` to ``row [w C]``; ``at``: the row, and the side of a square."""
+    (y, factor), (rows, sums) = at, room
     for x in range(rows.size):
         rows[x] = ZERO
     for k in range(factor * y, factor * y + factor):
         line = image[k]
         for x in range(rows.size):
             rows[x] += line[x]
-    for c in range(colors):
-        own = rows[c:]
+    n = rows.size - (factor - 1) * colors
+    for x in range(n):
+        sums[x] = rows[x]
+    for k in range(1, factor):
+        shifted = rows[k * colors :]
         for x in range(n):
-            total = ZERO
-            for k in range(factor):
-                total += own[(factor * x + k) * colors]
-            row[x, c] = total
+            sums[x] += shifted[x]
+    for x in range(row.size // colors):
+        for c in range(colors):
+            row[colors * x + c] = sums[factor * colors * x + c]
 
 
 @compiled
-def _encode(light: Any, scale: Any, table: Any, codes: Any) -> None:
-    """Codes ``[w, 3]`` of a row of light ``[w, C]``."""
-    colors = light.shape[1]
-    for x in range(codes.shape[0]):
+def _encode(light: Any, scale: Any, table: Any, at: Any, codes: Any) -> None:
+    """Codes ``[3 w]`` of a row of light ``[w C]``; ``at``: room for places in the table."""
+    for x in range(light.size):
+        value = light[x] * scale
+        value = (value if value < ONE else ONE) if value > ZERO else ZERO
+        at[x] = np.int32(np.sqrt(value) * np.float32(STEPS) + np.float32(0.5))
+    if light.size == codes.size:
+        for x in range(codes.size):
+            codes[x] = table[at[x]]
+        return
+    for x in range(light.size):
         for c in range(3):
-            value = light[x, c if colors == 3 else 0] * scale
-            value = (value if value < ONE else ONE) if value > ZERO else ZERO
-            codes[x, c] = table[np.int32(np.sqrt(value) * np.float32(STEPS) + np.float32(0.5))]
+            codes[3 * x + c] = table[at[x]]
 
 
 @entry
@@ -63,19 +71,19 @@ def fill_panels(
     width = out.shape[1] // 3
     factor = height // out.shape[0]
     scale = np.float32(gain / (factor * factor))
-    rows = np.empty(full * colors, np.float32)
-    one, two = np.empty((width, colors), np.float32), np.empty((width, colors), np.float32)
-    both = np.empty((width, colors), np.float32)
+    room = np.empty(full * colors, np.float32), np.empty(full * colors, np.float32)
+    one, two = np.empty(width * colors, np.float32), np.empty(width * colors, np.float32)
+    both, at = np.empty(width * colors, np.float32), np.empty(width * colors, np.int32)
     first, second = images[0].reshape(height, -1), images[1].reshape(height, -1)
+    panels = out.reshape(out.shape[0], -1)
     for y in range(row_range[0], row_range[1]):
-        _shrink(first, y, factor, rows, one)
-        _shrink(second, y, factor, rows, two)
-        for x in range(width):
-            for c in range(colors):
-                both[x, c] = one[x, c] + two[x, c]
-        _encode(both, scale, table, out[y, :width])
-        _encode(one, scale, table, out[y, width : 2 * width])
-        _encode(two, scale, table, out[y, 2 * width :])
+        _shrink(first, (y, factor), colors, room, one)
+        _shrink(second, (y, factor), colors, room, two)
+        for x in range(both.size):
+            both[x] = one[x] + two[x]
+        _encode(both, scale, table, at, panels[y, : 3 * width])
+        _encode(one, scale, table, at, panels[y, 3 * width : 6 * width])
+        _encode(two, scale, table, at, panels[y, 6 * width :])
 
 
 def make_panels(

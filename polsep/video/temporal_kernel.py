@@ -282,14 +282,22 @@ def _filter_strip(samples: Samples, frames: Any, rules: Any, row_range: RowRange
             _average(row, frames.mean[k], spread, rules.clip, (frames.new_mean[k], frames.filtered[k]))
 
 
+@compiled
+def _blend(row: Any, old: Any, part: Any, out: Any) -> None:
+    for j in range(out.size):
+        mixed = old[j] + (row[j] - old[j]) * part[j]
+        out[j] = row[j] if part[j] == ONE else mixed
+
+
 @entry
 def _blend_rows(images: tuple[Any, Any], weight: Any, sides: tuple[int, int], new: Any, row_range: RowRange) -> None:
     """``sides``: rows, and numbers of a row, that share a weight."""
     (image, before), (down, along) = images, sides
+    part = np.empty(new.shape[1], np.float32)
     for y in range(row_range[0], row_range[1]):
-        row, old, out, weights = image[y], before[y], new[y], weight[y // down]
-        for block in range(weights.size):
-            first, stop = along * block, min(along * (block + 1), out.size)
-            part = weights[block]
-            for j in range(first, stop):
-                out[j] = row[j] if part == ONE else old[j] + (row[j] - old[j]) * part
+        if y == row_range[0] or y % down == 0:
+            for block in range(weight.shape[1]):
+                own = weight[y // down, block]
+                for j in range(along * block, min(along * (block + 1), part.size)):
+                    part[j] = own
+        _blend(image[y], before[y], part, new[y])

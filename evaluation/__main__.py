@@ -12,6 +12,7 @@ from evaluation.house import house
 from evaluation.reliability import reliability
 from evaluation.sealed import sealed
 from evaluation.soak import soak
+from polsep.bench.rows import accept_partial
 from polsep.bench.run import Folders, fill_tables_of_docs, run_bench
 
 DIR = click.Path(file_okay=False, path_type=Path)
@@ -44,12 +45,23 @@ def fill_tables(output: Path) -> None:
     fill_tables_of_docs(output, MEASURES)
 
 
+def accept(name: str, output: Path) -> None:
+    """Replace DIR/NAME.jsonl by DIR/NAME-partial.jsonl, where a benchmark no longer measures some cases; list those."""
+    try:
+        print("\n".join(f"dropped {case}" for case in accept_partial(output, name)))
+    except ValueError as error:
+        raise InputFailure(str(error)) from None
+
+
 app = click.Group(help=__doc__)
 app.add_command(faults)
 app.add_command(house)
 app.add_command(reliability)
 app.add_command(sealed)
 app.add_command(soak)
+app.add_command(
+    click.Command("accept", callback=accept, params=[click.Argument(["name"]), RESULTS], help=accept.__doc__)
+)
 app.add_command(click.Command("readme", callback=fill_tables, params=[RESULTS], help=fill_tables.__doc__))
 for name, bench in BENCHES.items():
     app.add_command(click.Command(name, callback=measure, params=list(OPTIONS), help=bench.run.__doc__))

@@ -14,7 +14,7 @@ import pytest
 
 from polsep.bench import history
 from polsep.bench.history import TIMED, ask_git, find_changes
-from polsep.bench.rows import Row, provenance, to_jsonl, with_spread, write_rows
+from polsep.bench.rows import Row, accept_partial, provenance, to_jsonl, with_spread, write_rows
 from polsep.io.store.rows import fill_tables, markdown_table, read_rows
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -121,9 +121,21 @@ def test_a_part_never_replaces_the_whole(tmp_path: Path) -> None:
     assert [row["metric"] for row in read_rows(tmp_path / "a-partial.jsonl")] == ["SSIM"]
     write_rows(tmp_path, "a", [*rows, replace(rows[0], method="new")], "c")
     assert len(read_rows(tmp_path / "a.jsonl")) == 5
+    with pytest.raises(ValueError, match=r"a-partial\.jsonl, .* found none"):  # it is older than what is complete
+        accept_partial(tmp_path, "a")
     for some in (rows, rows[:1]):
         write_rows(tmp_path, "a-quick", some, "c")
         assert len(read_rows(tmp_path / "a-quick.jsonl")) == len(some)
+
+
+def test_cases_that_are_no_longer_measured_go_when_told(tmp_path: Path) -> None:
+    rows = [Row("a/real", case, "x", "PSNR", 1, "dB") for case in ("one", "two", "three")]
+    write_rows(tmp_path, "a", rows, "c")
+    with pytest.raises(ValueError, match="'python -m evaluation accept a' takes that instead"):
+        write_rows(tmp_path, "a", rows[:1], "d")
+    assert accept_partial(tmp_path, "a") == ["a/real: two, x", "a/real: three, x"]
+    assert [(row["case"], row["command"]) for row in read_rows(tmp_path / "a.jsonl")] == [("one", "d")]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.jsonl"]
 
 
 def test_tables_join_diffuse_and_specular() -> None:

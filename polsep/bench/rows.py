@@ -14,7 +14,7 @@ import torch
 
 from polsep.bench.history import ask_git
 from polsep.io.store.atomic import replace_text
-from polsep.io.store.rows import SPREAD, read_rows
+from polsep.io.store.rows import SPREAD, move_rows, read_rows, remove_rows
 
 #: Tables of single scenes, objects and points of curves, "NAME/PART", which are too long for the repository.
 SCENE_PARTS = ("scenes", "objects", "curve", "films")
@@ -63,15 +63,33 @@ def write_rows(folder: Path, name: str, rows: Sequence[Row], command: str) -> No
     lost = [] if name.endswith("-quick") else find_lost(path, means)
     if scenes:
         replace_text(folder / "scenes" / path.name, to_jsonl(scenes, made_by))
+    partial = path.with_stem(f"{name}-partial")
     if lost:
-        path = path.with_stem(f"{name}-partial")
+        path = partial
+    else:
+        remove_rows(partial)  # older ones
     if means:
         replace_text(path, to_jsonl(means, made_by))
     if lost:
         missing = lost[0] + (f" and {len(lost) - 1} more" if len(lost) > 1 else "")
         raise ValueError(
-            f"expected all that {name}.jsonl has, found nothing of {missing}: it stays as it is, see {path}"
+            f"expected all that {name}.jsonl has, found nothing of {missing}: it stays as it is, see {path}; "
+            f"'python -m evaluation accept {name}' takes that instead"
         )
+
+
+def accept_partial(folder: Path, name: str) -> list[str]:
+    """Replace NAME.jsonl by NAME-partial.jsonl, which `write_rows` has left; return the cases and methods that go.
+
+    For benchmarks that no longer measure these. Raises ValueError where there is no such file.
+    """
+    path, partial = (folder / f"{stem}.jsonl" for stem in (name, f"{name}-partial"))
+    if not partial.is_file():
+        raise ValueError(f"expected {partial}, of a run that lacks cases, found none")
+    names = [field.name for field in fields(Row)]
+    lost = find_lost(path, [Row(**{key: row[key] for key in names}) for row in read_rows(partial)])
+    move_rows(partial, path)
+    return lost
 
 
 def standard_error(values: Sequence[float]) -> float:

@@ -41,6 +41,16 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def move_rows(path: Path, target: Path) -> None:
+    """Move a results file to another name, in the place of what is there."""
+    path.replace(target)
+
+
+def remove_rows(path: Path) -> None:
+    """Remove a results file, if there is one."""
+    path.unlink(missing_ok=True)
+
+
 def append_line(path: Path, line: str) -> None:
     """Add a line to a log; its other lines stay, and it is whole at any time."""
     before = path.read_text(encoding="utf-8") if path.is_file() else ""

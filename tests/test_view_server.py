@@ -64,8 +64,6 @@ def test_separating_starts_no_process_and_calls_nobody() -> None:
         "from polsep.pipeline import separate_capture\n"
         "separate_capture(Mosaic(torch.rand(64, 64), Layout(), 0.0, 1.0), 'joint-fast')\n"
         "assert 'openvino' in sys.modules and sys.modules['openvino_telemetry'] is None\n"
-        "assert 'openvino.tools.ovc' not in sys.modules\n"
-        "from openvino.tools.ovc import convert_model\n"
         "assert multiprocessing.active_children() == []\n"
     )
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)

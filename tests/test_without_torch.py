@@ -36,7 +36,7 @@ from polsep.pipeline import separate_capture
 from polsep.sensor.levels import as_measurements
 for method in ("analytic", "color-affine", "paper"):
     assert separate_capture(as_measurements(angles, 0, 4095)[0], method).diffuse.shape == (32, 48, 3)
-slow = {"array_api_compat.numpy", "numpy.f2py", "openvino.tools.ovc"}  # a tenth of a second together, for nothing
+slow = {"array_api_compat.numpy", "numpy.f2py"}  # a tenth of a second together, for nothing
 print(sorted(name for name in sys.modules if name.partition(".")[0] == "torch" or name in slow))
 """
 COMMANDS = """

@@ -27,22 +27,16 @@ from polsep.networks.thumbnails import SIDE, WIDTHS, thumbnail_channels
 Node = Any
 #: Least and largest input of layers, by name.
 Ranges = Mapping[str, tuple[float, float]]
-#: OpenVINO's converter of models of other frameworks.
-_CONVERTER = "openvino.tools.ovc"
 
 
 def import_openvino() -> Any:
     """OpenVINO without its telemetry, which reports its import to Google from a forked process that may hang.
 
-    None in the place of the telemetry's module makes OpenVINO do without. So it does without its converter of models,
-    which takes as much time to import as all the rest; that can be imported afterwards.
+    None in the place of the telemetry's module makes OpenVINO do without.
     """
     sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
-    hidden = sys.modules.setdefault(_CONVERTER, None) is None  # type: ignore[arg-type]
     import openvino  # type: ignore[import-untyped]  # no stubs
 
-    if hidden:
-        sys.modules.pop(_CONVERTER, None)
     return openvino
 
 

@@ -1,8 +1,8 @@
 """The colour-affine closed form: separation of polarized diffuse and white specular light from colour contrast.
 
 Exact where samples are, where the specular is fully polarized and white, and where the surface has colours. The light's
-own colour has to be divided out before (`Mosaic.light_color`, found in the frame or stated): with a wrong one, highlights
-stay in the diffuse image.
+own colour has to be divided out before (`Mosaic.light_color`, found in the frame or stated): with a wrong one,
+highlights stay in the diffuse image.
 
 Let p = s1 + i s2 and a = beta_d exp(2i phi_d), the diffuse polarization, which depends on geometry but not on colour.
 The specular light of a dielectric is white and fully polarized, so in every pixel and every colour c

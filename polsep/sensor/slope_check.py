@@ -73,8 +73,10 @@ def _block_means(mosaic: Mosaic, frame: NDArray[np.generic], side: int, most: in
     lines = frame[: rows * side].reshape(rows, side, -1)[:, :4, : cols * side].astype(np.float32)
     periods = lines.reshape(rows, 4, cols, side // 4, 4)
     span = np.float32(mosaic.white_level - mosaic.black_level)
-    brightest: Floats = lines.max(1).reshape(rows, cols, side).max(2)
-    means = (periods.mean(3) if side > 4 else periods[:, :, :, 0]).transpose(1, 3, 0, 2)
+    tops = lines.max(1)  # then by slices: NumPy reduces short last axes slowly
+    brightest = np.maximum.reduce([tops[:, col::side] for col in range(side)])
+    total: Floats = np.add.reduce([periods[:, :, :, k] for k in range(side // 4)])
+    means = total.transpose(1, 3, 0, 2) / np.float32(side // 4)
     black = np.float32(mosaic.black_level)
     usable: NDArray[np.bool_] = (brightest - black) / span < 1 - CLIP_MARGIN
     return (means - black) / span, usable
@@ -84,7 +86,8 @@ def _halve(means: Floats, usable: NDArray[np.bool_]) -> tuple[Floats, NDArray[np
     """The same for blocks of twice the side."""
     rows, cols = (n // 2 for n in usable.shape)
     whole: NDArray[np.bool_] = np.all(usable.reshape(rows, 2, cols, 2), axis=(1, 3))
-    return means.reshape(4, 4, rows, 2, cols, 2).mean((3, 5)), whole
+    pairs = means[..., ::2, :] + means[..., 1::2, :]
+    return np.float32(0.25) * (pairs[..., ::2] + pairs[..., 1::2]), whole
 
 
 def slope_agreement(phases: Floats, usable: NDArray[np.bool_], layout: Layout, side: int) -> tuple[float, float]:

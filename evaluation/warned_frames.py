@@ -180,6 +180,12 @@ def _moved(rows: int, cols: int, layout: Layout) -> Callable[[Stage], Mosaic]:
     return make
 
 
+def _transposed(stage: Stage) -> Mosaic:
+    """Rows and columns exchanged, read as if they were not."""
+    frame = _by_sensor(Layout())(stage)
+    return replace(frame, data=frame.data.mT.contiguous())
+
+
 def _in_color(stage: Stage) -> Mosaic:
     names = list(LAMPS)
     return _mosaic(expose_frame(stage, light_stage(stage), Capture(LAMPS[names[stage.seed % len(names)]])))
@@ -218,6 +224,7 @@ CONDITIONS: dict[str, tuple[str | None, Callable[[Stage], Mosaic]]] = {
     "colour read as mono": ("layout", _read_as(_by_sensor(Layout()), MONO)),
     "cropped by 1 row": ("layout", _moved(1, 0, Layout())),
     "cropped by 2 columns": ("layout", _moved(0, 2, Layout())),
+    "transposed": ("layout", _transposed),
     "black level 16": ("black level", _by_reality("black level 16")),
     "black level 240": ("black level", _by_reality("black level 240")),
     "gamma": ("encoding", _encoded),

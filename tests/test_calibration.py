@@ -182,6 +182,18 @@ def test_a_frame_without_the_lamp_is_refused() -> None:
         measure_lamp([replace(frame, data=torch.full(SIZE, LEVEL))], card=True)
 
 
+def test_pictures_are_no_dark_frames() -> None:
+    """A dark picture of a bright thing: most of it is black, a tenth is not. Nor is an evenly lit frame."""
+    picture = np.full(SIZE, LEVEL, np.float32)
+    picture[: SIZE[0] // 10] += 0.3 * WHITE
+    for data, found in (
+        (picture, r"found .*% of the pixels far from black"),
+        (picture * 0 + WHITE / 2, "found a median of"),
+    ):
+        with pytest.raises(ValueError, match=rf"expected frames without light \(lens cap on\), {found}"):
+            measure_dark([Mosaic(data, Layout(), 0.0, WHITE)] * 2)
+
+
 def test_a_lamp_that_objects_do_not_show_is_refused() -> None:
     """Polarized light of a body's own colour is not the lamp's: the frame is refused, with what to do."""
     sensor, body = BadSensor(Layout(), dead=0), np.array([0.2, 0.3, 0.9])

@@ -403,7 +403,7 @@ def test_files_that_are_not_there(tmp_path: Path, polsep: Cli, kind: str) -> Non
 BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--nothing"], "--nothing"),
     (["--layout"], "--layout"),
-    (["--layout", "sony"], "expected"),
+    (["--layout", "sony"], "--layout: expected"),
     (["--layout", ""], "expected"),
     (["--layout", "90,45,135,0"], "expected"),
     (["--layout", "90,45,135/RGGB"], "expected"),

@@ -30,12 +30,20 @@ CAPTURE = Path(polsep.__file__).parent / "data" / "still_life.png"
 def test_demo_works_offline(
     every: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """`polsep demo` needs no network, separates the capture with two methods or with every one, and prints paths."""
+    """`polsep demo` needs no network, separates the capture with two methods or with every one, and prints paths.
+
+    Every one sees its middle alone, which takes a tenth of the time.
+    """
 
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("the demo opened a socket")
 
     monkeypatch.setattr(socket, "socket", refuse)
+    if every:
+        middle = imagecodecs.png_decode(CAPTURE.read_bytes())[768:1280, 768:1536]
+        (tmp_path / "data").mkdir()
+        (tmp_path / "data" / CAPTURE.name).write_bytes(imagecodecs.png_encode(np.ascontiguousarray(middle)))
+        monkeypatch.setattr(polsep, "__file__", str(tmp_path / "__init__.py"))
     monkeypatch.setattr(sys, "argv", ["polsep", "demo", "-o", str(tmp_path / "o"), *["--all"] * every])
     cli.main()
     said = capsys.readouterr()

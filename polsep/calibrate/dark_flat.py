@@ -27,6 +27,8 @@ from polsep.sensor.camera import Layout, Mosaic
 
 #: Least deviation from black of a hot pixel, relative to white, and in robust deviations of all pixels.
 HOT, HOT_DEVIATIONS = 0.01, 12.0
+#: Share of hot pixels above which they are a picture. Sensors have less than 1 %.
+MOST_HOT = 0.05
 #: Least deviation of a defective pixel's gain, and in robust deviations of all pixels.
 DEAD, DEAD_DEVIATIONS = 0.25, 8.0
 #: Brightest black level that a dark frame may have, relative to white; least signal and most clipping of a flat one.
@@ -55,6 +57,10 @@ def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) ->
     residual = dark.mean - tile(table, dark.mean.shape)
     spread = robust_deviation(residual)
     hot = np.abs(residual) > max(HOT * mosaic.white_level, HOT_DEVIATIONS * spread)
+    if hot.mean() > MOST_HOT:
+        raise ValueError(
+            f"expected frames without light (lens cap on), found {hot.mean():.1%} of the pixels far from black"
+        )
     noise = dark.noise if dark.noise is not None else spread**2
     kept = np.where(hot, 0, residual)
     lines = _line_offsets(kept, spread**2)

@@ -24,6 +24,7 @@ from polsep.io.store.errors import MOST, one_line
 if TYPE_CHECKING:
     from polsep.io.raw.frames import ReadOptions
     from polsep.pipeline import LightColor
+    from polsep.sensor.camera import Layout
 
     _ParamType = click.ParamType[Any]
 else:
@@ -169,15 +170,24 @@ def read_light(options: Mapping[str, Any]) -> LightColor | str:
         raise ValueError(f"--light-color: {error}") from None
 
 
+def chosen_layout(options: Mapping[str, Any]) -> Layout | None:
+    """The layout that ``--layout`` says, None if it was not given. Raises ValueError."""
+    from polsep.sensor.camera import Layout
+
+    try:
+        return None if options["layout"] is None else Layout.parse(options["layout"])
+    except ValueError as error:
+        raise ValueError(f"--layout: {error}") from None
+
+
 def read_options(options: Mapping[str, Any]) -> ReadOptions:
     """Options of reading raw frames, from the options of a command. Raises ValueError."""
     check_read_options(options)
     from polsep.io.raw.corrections import with_corrections
     from polsep.io.raw.frames import ReadOptions
-    from polsep.sensor.camera import Layout
 
     read = ReadOptions(
-        None if options["layout"] is None else Layout.parse(options["layout"]),
+        chosen_layout(options),
         options["black_level"],
         options["white_level"],
         parse_size(options.get("size")),

@@ -16,6 +16,7 @@ from polsep.cli.app import (
     POSITIVE,
     Number,
     app,
+    chosen_layout,
     print_note,
 )
 
@@ -69,7 +70,6 @@ def capture(camera: str | None, listing: bool, **options: Any) -> None:
     from polsep.capture.session import CapturePlan, Limits, Session
     from polsep.capture.sources import CameraSettings
     from polsep.methods import check_method
-    from polsep.sensor.camera import Layout
 
     if listing:
         _list()
@@ -83,7 +83,7 @@ def capture(camera: str | None, listing: bool, **options: Any) -> None:
         raise ValueError("expected a method to show, found --method none")
     if method is not None:
         check_method(method)
-    layout = None if options["layout"] is None else Layout.parse(options["layout"])
+    layout = chosen_layout(options)
     settings = CameraSettings(
         options["exposure"],
         options["gain"],

@@ -136,10 +136,11 @@ def _report(outcome: Outcome) -> int:
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def export(method: str, output: Path, weights: Path | None, **options: bool) -> None:
-    """Write joint or joint-fast as one ONNX file: raw uint16 frames in, diffuse, specular and expected error out.
+    """Write a network as one ONNX file: raw uint16 frames in, diffuse, specular and expected error out.
 
-    The file runs in onnxruntime and similar programs without polsep. Frames [N, H, W] are in Sony's order with sides
-    that are multiples of 4; black_level and white_level are in their units. Needs the extra export.
+    METHOD is joint, joint-fast or joint-large (its own network, without the one that is weighed with it). The file runs
+    in onnxruntime and similar programs without polsep. Frames [N, H, W] are in Sony's order with sides that are
+    multiples of 4; black_level and white_level are in their units. Needs the extra export.
     """
     require_extra("export")
     if weights is not None:

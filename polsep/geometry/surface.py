@@ -146,5 +146,6 @@ def draw_views(surface: Surface, size: int, views: Sequence[tuple[float, float]]
         shading = np.maximum(hits.normal[..., 0].double().numpy().T @ toward, 0) + AMBIENT
         fine = np.zeros((rows.numel(), 3))
         fine[hits.ray.numpy()] = colors[hits.slot.numpy()] * shading[:, None]
-        picture: Floats = fine.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))
+        cells = fine.reshape(size, 2, size, 2, 3)
+        picture: Floats = 0.25 * (cells[:, 0, :, 0] + cells[:, 0, :, 1] + cells[:, 1, :, 0] + cells[:, 1, :, 1])
         yield picture

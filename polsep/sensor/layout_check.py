@@ -5,9 +5,10 @@ pairs: those on the diagonals (Sony's order and all its shifts, mirrors and rota
 Colour sensors show more: the colour changes from cell to cell, which gives the cells' alignment, and the two greens lie
 on one diagonal of the Bayer block.
 
-No frame can show these: 0 and 90 swapped, 45 and 135 swapped, or the two pairs swapped obey the same identity, and so
-do red and blue. A mirrored, rotated or transposed MONO frame therefore looks in order, and so does a transposed colour
-frame. Of those only whole frames of known sensors are seen, which stand upright when they were transposed or turned.
+The identity does not show these: 0 and 90 swapped, 45 and 135 swapped, or the two pairs swapped obey it too, and so do
+red and blue. A mirrored, rotated or transposed MONO frame therefore looks in order. Of those only whole frames of known
+sensors are seen, which stand upright when they were transposed or turned. A transposed COLOUR frame, or one turned by
+180 degrees, has AoLP wrong by 90 degrees: that shows where things are round and coloured (`slope_check`).
 
 All statistics are means over blocks of 16x16 pixels, first-order corrected for the brightness gradient, without blocks
 that hold a clipped sample, in units of the mean brightness. The light's colour is left in: what is compared are the
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
 from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
+from polsep.sensor.slope_check import lies_across, turned_across
 
 Floats = NDArray[np.float32]
 
@@ -218,7 +220,7 @@ def check_layout(mosaic: Mosaic, seen: Floats | None = None) -> LayoutCheck:
     fits = _fitting(mosaic.layout, color, origin, greens, pairs)
     layouts = tuple(fits)
     if mosaic.layout in fits:
-        return LayoutCheck(_upright(mosaic), pairs, color, layouts)
+        return LayoutCheck(_upright(mosaic) or (_across(mosaic) if color else None), pairs, color, layouts)
     likely, reason = next(iter(fits.items()))
     if _stands_upright(mosaic):
         likely, reason = next(((turn, why) for turn, why in _turned(mosaic.layout) if turn in fits), (likely, reason))
@@ -244,6 +246,18 @@ def _upright(mosaic: Mosaic) -> str | None:
     seen = f"the frame is {width}x{height}, a sensor's {height}x{width} turned or transposed"
     return (
         f"{seen}: say --layout {mosaic.layout.transposed().spec} (transposed), the likeliest, or save it as it was read"
+    )
+
+
+def _across(mosaic: Mosaic) -> str | None:
+    """A warning of a colour frame whose AoLP is 90 degrees off; whole frames of known sensors are taken as they are."""
+    layout = mosaic.layout
+    if mosaic.data.shape[-2:] in SENSOR_SIZES or not lies_across(mosaic):
+        return None
+    around = layout.flipped_horizontal(4).flipped_vertical(4)
+    return (
+        f"surfaces are polarized across their slopes under layout {layout.spec}: say --layout "
+        f"{turned_across(layout).spec} (transposed, the likeliest; if turned by 180 degrees, {around.spec})"
     )
 
 

@@ -1,4 +1,8 @@
-"""The colour-affine closed form: exact separation of polarized diffuse and white specular light from colour alone.
+"""The colour-affine closed form: separation of polarized diffuse and white specular light from colour contrast.
+
+Exact where samples are, where the specular is fully polarized and white, and where the surface has colours. The light's
+own colour has to be divided out before (`Mosaic.light_color`, found in the frame or stated): with a wrong one,
+highlights stay in the diffuse image.
 
 Let p = s1 + i s2 and a = beta_d exp(2i phi_d), the diffuse polarization, which depends on geometry but not on colour.
 The specular light of a dielectric is white and fully polarized, so in every pixel and every colour c
@@ -7,8 +11,8 @@ The specular light of a dielectric is white and fully polarized, so in every pix
     b = tau_s (exp(2i phi_s) - a).
 
 a follows from how p varies with s0 over the three colours, b from the mean, and |exp(2i phi_s)| = 1 leaves one
-positive tau_s. No light angle, no calibration, no training. Where there is no colour contrast a tends to zero and the
-result to the paper's analytic split.
+positive tau_s. Neither the light's angle nor training is needed. Where there is no colour contrast a tends to zero and
+the result to the paper's analytic split.
 
 With a known, every unclipped sample is linear in (s0_R, s0_G, s0_B, b): a highlight that clips some analysers
 in some colours is still solved by least squares over the samples that are left (`_solve_clipped`).
@@ -106,8 +110,8 @@ def _unclipped(measurements: Measurements, clipped: Array) -> Array:
 def sample_variance(measurements: Measurements, radius: int = 3) -> Array:
     """Local noise variance of one sample ``[..., 1, h, w]`` from the analysers' contradiction of m0 + m90 = m45 + m135.
 
-    It covers sensor noise and misregistration alike, needs no calibration, and is zero on exact data. Clipped samples
-    are left out of the mean over the window.
+    It covers sensor noise and misregistration alike, needs no noise model of the sensor, and is zero on exact data.
+    Clipped samples are left out of the mean over the window.
     """
     squared = _color_mean(analyser_residual(measurements) ** 2)
     clipped = clipped_pixels(measurements)

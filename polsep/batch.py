@@ -32,11 +32,19 @@ class SeparateOptions:
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """Directory and ``format`` of the results, one of `io.results.separation_writer.FORMATS`."""
+    """Directory and ``format`` of the results, one of `io.results.separation_writer.FORMATS`.
+
+    ``stokes``: with Stokes images, for EXR files alone. Raises OutputError on others.
+    """
 
     directory: Path = Path("polsep-out")
     format: str = "exr"
     overwrite: bool = False
+    stokes: bool = False
+
+    def __post_init__(self) -> None:
+        if self.stokes and self.format != "exr":
+            raise OutputError(f"expected the format exr for Stokes images, found {self.format}")
 
 
 @dataclass(frozen=True)
@@ -90,6 +98,9 @@ def _separate_frame(
     separated.report["source"] = Path(path).name
     separated.report["settings"] = read.settings()
     separated.report["warnings"] = [*frame.notes, *separated.report["warnings"]]
+    separated.report.update(frame.taken())
+    if write.stokes:
+        separated = separated.with_stokes()
     written = write_separation(separated, write.directory, frame.stem, write.format, write.overwrite)
     return Outcome(path, tuple(written), tuple(separated.report["warnings"]), separated.report)
 

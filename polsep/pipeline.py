@@ -22,6 +22,7 @@ from array_api_compat import is_array_api_obj
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_device
+from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.io.store.calibrations import read_calibration
 from polsep.light.find import find_light
 from polsep.methods import Capture, Method, find_method
@@ -62,13 +63,33 @@ class PolsepWarning(UserWarning):
 
 @dataclass(frozen=True, repr=False)
 class Result(SeparatedFrame):
-    """A separated frame that can be saved and shown; its images are those of `SeparatedFrame`."""
+    """A separated frame that can be saved and shown; its images are those of `SeparatedFrame`.
 
-    def save(self, path: str | PathLike[str], overwrite: bool = False) -> list[Path]:
+    ``capture``: what was separated, its defects repaired, from which `with_stokes` takes Stokes images.
+    """
+
+    capture: Capture | None = None
+
+    def with_stokes(self) -> Result:
+        """The same with ``stokes [3, h, w, C]``: s0, s1, s2 as measured. Raises ValueError where there is no capture.
+
+        In the unit and the light of the images, and registered with them; not changed by the method
+        (`demosaic.measured_stokes`).
+        """
+        if self.capture is None:
+            raise ValueError("expected a frame with its capture, found one without: Stokes images are measured in it")
+        light, full = tuple(self.report["light_color"]), self.report["full_resolution"]
+        stokes = measured_stokes(self.capture, light, full)
+        if isinstance(self.capture, Mosaic) and self.capture.falloff is not None:
+            stokes = stokes / falloff_image(self.capture.falloff, *stokes.shape[1:3])[..., None]
+        return replace(self, stokes=stokes)
+
+    def save(self, path: str | PathLike[str], overwrite: bool = False, stokes: bool = False) -> list[Path]:
         """Write images, a preview STEM.png and the report STEM.json, as `polsep separate` does; return their paths.
 
         ``path``: DIR/STEM.exr, .npz, .tiff or .png (sets of one file per image); EXR without an ending. All or nothing.
-        Raises ValueError where files exist and ``overwrite`` is False, on another ending, or where writing fails.
+        ``stokes``: EXR files also get the layers S0, S1, S2 of `with_stokes`. Raises ValueError where files exist and
+        ``overwrite`` is False, on another ending, or where writing fails.
         """
         from polsep.io.results.separation_writer import write_separation
 
@@ -76,7 +97,8 @@ class Result(SeparatedFrame):
         stem = target.stem if target.suffix.lower() in _ENDINGS else target.name
         if target.suffix and stem == target.name:
             raise ValueError(f"expected a file name that ends in {', '.join(_ENDINGS)}, found {target.name!r:.80}")
-        return write_separation(self, target.parent, stem, _ENDINGS.get(target.suffix.lower(), "exr"), overwrite)
+        frame = self.with_stokes() if stokes else self
+        return write_separation(frame, target.parent, stem, _ENDINGS.get(target.suffix.lower(), "exr"), overwrite)
 
     def show(self) -> Picture:
         """Show the preview in the system's picture viewer and return it, which notebooks display instead."""
@@ -170,7 +192,7 @@ def separate_capture(
     checked = check_mosaic(capture) if isinstance(capture, Mosaic) else None
     capture, device = checked.mosaic if checked else capture, find_device(device)
     light, facts, remarks = resolve_light(light_color, capture)  # before it moves: a device sends no raw frame back
-    capture = move_capture(capture, device)
+    seen, capture = capture, move_capture(capture, device)
     images, colored, filled = chosen.run(capture, light, full), Colored(), 0.0
     if isinstance(capture, Mosaic):
         if chosen.assumes_white:
@@ -184,7 +206,7 @@ def separate_capture(
     if checked:
         frame.report.update(checked.report)
         frame.report["warnings"] = [*checked.warnings, *frame.report["warnings"]]
-    return frame
+    return replace(frame, capture=seen)
 
 
 def make_frame(
@@ -198,6 +220,8 @@ def make_frame(
         report["statistics"] |= error_quantiles(images.error, math.fsum(light) / len(light))
     layout = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
     report |= {"method": method.name, "light_color": list(light), "full_resolution": full, "layout": layout}
+    if isinstance(capture, Mosaic):
+        report |= {"black_level": float(capture.black_level), "white_level": float(capture.white_level)}
     if not _is_finite(report):
         raise ValueError(f"expected finite images of {method.name}, found others: is the white level far too low?")
     diffuse, specular, error = images.diffuse, images.specular, images.error

@@ -120,6 +120,7 @@ AMBIENT = click.option(
     help="Frame with the lamp off, subtracted; of several (the option repeated, or in a file) their mean.",
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace existing results.")
+STOKES = click.option("--stokes", is_flag=True, help="EXR files also get the measured Stokes images S0, S1, S2.")
 DEVICE = click.option("--device", default="auto", metavar="NAME", help="Device: auto, cpu or cuda (extra torch).")
 ENGINE = click.option(
     "--engine",

@@ -20,6 +20,7 @@ from polsep.cli.app import (
     OVERWRITE,
     PIXEL_FORMAT,
     SIZE,
+    STOKES,
     WHITE_LEVEL,
     app,
     check_read_options,
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
     help="Format of the images; a PNG preview is always written.",
 )
 @click.option("--full", is_flag=True, help="Full resolution instead of one pixel per 2x2 cell.")
+@STOKES
 @SIZE
 @PIXEL_FORMAT
 @click.option(
@@ -103,7 +105,7 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     light = read_light(options)
     paths = expand_folders(files)
     run = SeparateOptions(options["method"], light, options["device"], options["full"])
-    write = WriteOptions(options["output"], options["format"], options["overwrite"])
+    write = WriteOptions(options["output"], options["format"], options["overwrite"], options["stokes"])
     failures, sources = 0, set[str]()
     with show_progress(f"separating {paths[0]}" if len(paths) == 1 else "separating", len(paths)) as progress:
         for outcome in separate_files(paths, read, run, write):

@@ -24,6 +24,7 @@ from polsep.cli.app import (
     PIXEL_FORMAT,
     RATE,
     SIZE,
+    STOKES,
     WHITE_LEVEL,
     Word,
     app,
@@ -76,6 +77,7 @@ from polsep.cli.progress import report_step, show_progress
 @click.option(
     "--damaged", type=DAMAGED, default="stop", metavar="stop|skip", help="Stop at a damaged frame, or skip it."
 )
+@STOKES
 @SIZE
 @PIXEL_FORMAT
 @OVERWRITE
@@ -110,7 +112,7 @@ def video(recording: Path, output: Path, **options: Any) -> None:
     keep_memory()
     check_method(options["method"])
     light = read_light(options)
-    shared = {name: options[name] for name in ("method", "device", "damaged", "frames", "engine", "filter")}
+    shared = {name: options[name] for name in ("method", "device", "damaged", "frames", "engine", "filter", "stokes")}
     run = VideoOptions(light_color=light, **shared)
     kind = SequenceKind(options["format"], options["compression"], with_preview(options["preview"]), options["rate"])
     target = Target(output, kind, options["overwrite"])

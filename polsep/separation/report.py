@@ -45,7 +45,7 @@ class SeparatedFrame:
     radians in [0, pi), image-right toward image-up.
     ``report``: JSON-able settings, statistics and warnings. ``error``: float32 ``[h, w, 2]``, the standard deviation
     that the method expects of the errors of diffuse and specular, over all colours, in the images' unit; None where a
-    method expects none.
+    method expects none. ``stokes``: float32 ``[3, h, w, C]``, s0, s1, s2 as measured, on request (`measured_stokes`).
     """
 
     diffuse: NDArray[np.float32]
@@ -55,6 +55,7 @@ class SeparatedFrame:
     aolp: NDArray[np.float32]
     report: dict[str, Any]
     error: NDArray[np.float32] | None = None
+    stokes: NDArray[np.float32] | None = None
 
     def __repr__(self) -> str:
         method, count = self.report.get("method", "no method"), len(self.report.get("warnings", ()))

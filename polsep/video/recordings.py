@@ -17,7 +17,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +70,7 @@ ON_DAMAGE = ("stop", "skip")
 class VideoOptions:
     """Options of the separation, as in `pipeline.separate`; at most ``frames`` of them; ``damaged``: of `ON_DAMAGE`.
 
-    ``engine``: of `ENGINES`, which changes no byte. ``filter``: of `FILTERS`; "temporal" averages raw samples and
+    ``engine``: of `ENGINES`, which changes no byte. ``stokes``: EXR files also get Stokes images. ``filter``: of `FILTERS`; "temporal" averages raw samples and
     images where nothing moves (`temporal`).
     """
 
@@ -81,6 +81,7 @@ class VideoOptions:
     frames: int | None = None
     engine: str = "local"
     filter: str = "temporal"
+    stokes: bool = False
 
     def __post_init__(self) -> None:
         if self.damaged not in ON_DAMAGE:
@@ -124,10 +125,21 @@ class FirstFrame:
 
 @dataclass(frozen=True)
 class Result:
-    """Diffuse and specular images of a separated frame, and its ``report``."""
+    """Diffuse and specular images of a separated frame, and its ``report``; Stokes images on request."""
 
     images: Images
     report: dict[str, Any]
+    stokes: Floats | None = None
+
+
+class Job(NamedTuple):
+    """A frame to separate on a ``device``, how it was ``taken`` (`Frame.taken`), with Stokes images or without."""
+
+    data: Capture
+    first: FirstFrame
+    device: str
+    taken: dict[str, Any]
+    stokes: bool
 
 
 @dataclass(frozen=True)
@@ -161,6 +173,8 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     Raises ValueError on what cannot be read or written and, with ``damaged`` "stop", at the first damaged frame;
     frames done by then stay, and the same call resumes there.
     """
+    if options.stokes and target.kind.format != "exr":
+        raise ValueError(f"expected the format exr for Stokes images, found {target.kind.format}")
     recording = open_sequence(path, read)
     count = recording.count if options.frames is None else min(recording.count, options.frames)
     first = separate_first(recording, options)
@@ -169,6 +183,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
         "frames": options.frames,
         "read": read.settings(),
         "filter": options.filter,
+        "stokes": options.stokes,
         "kind": asdict(target.kind),
         "method": first.method,
         "light_color": list(first.light),
@@ -282,7 +297,8 @@ def _pictures(
                     line["warnings"] = report["warnings"]
                 diffuse, specular = images
                 panels = draw_panels(diffuse, specular, first.gain) if preview else None
-                picture = Picture(diffuse, specular, panels, line)
+                stokes = frame.result.stokes
+                picture = Picture(diffuse, specular, panels, line, stokes=stokes, report=report)
             kept: State = {}
             if frame.state is not None:
                 kept = frame.state.to_arrays() | (dict(zip(IMAGES, before, strict=True)) if before else {})
@@ -305,7 +321,8 @@ def separate_here(
         if isinstance(frame, DamagedFrame):
             return Separated(frame.index, frame, after)
         with own_threads(cores // workers):
-            return Separated(frame.index, separate_one((frame.data, first, device)), after)
+            job = Job(frame.data, first, device, frame.taken(), options.stokes)
+            return Separated(frame.index, separate_one(job), after)
 
     with closing(ahead(_prepared(recording, options, first, begin, state), 1)) as frames:
         yield from map_ahead(separate, frames, workers)
@@ -318,11 +335,11 @@ def separate_on_ray(
     workers, device = get_threads(), find_device(options.device)
     submitted: deque[tuple[int | DamagedFrame, TemporalState | None]] = deque()
 
-    def jobs() -> Iterator[tuple[Capture, FirstFrame, str]]:
+    def jobs() -> Iterator[Job]:
         for frame, after in frames:
             submitted.append((frame if isinstance(frame, DamagedFrame) else frame.index, after))
             if not isinstance(frame, DamagedFrame):
-                yield frame.data, first, device
+                yield Job(frame.data, first, device, frame.taken(), options.stokes)
 
     def damaged_frames() -> Iterator[Separated]:
         while submitted and isinstance(submitted[0][0], DamagedFrame):
@@ -343,13 +360,13 @@ def separate_on_ray(
 ENGINES = {"local": separate_here, "ray": separate_on_ray}
 
 
-def separate_one(job: tuple[Capture, FirstFrame, str]) -> Result:
+def separate_one(job: Job) -> Result:
     """Separate one frame with the method and the light colour of the first one."""
-    data, first, device = job
-    data = move_capture(data, device)
-    method = find_method(first.method, data)
-    frame = make_frame(method.run(data, first.light, False), method, data, first.light)
-    return Result((frame.diffuse, frame.specular), frame.report)
+    light, data = job.first.light, move_capture(job.data, job.device)
+    method = find_method(job.first.method, data)
+    frame = make_frame(method.run(data, light, False), method, data, light)
+    stokes = replace(frame, capture=job.data).with_stokes().stokes if job.stokes else None
+    return Result((frame.diffuse, frame.specular), frame.report | job.taken, stokes)
 
 
 def _prepared(

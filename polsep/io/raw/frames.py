@@ -120,8 +120,8 @@ class ReadOptions:
 class Frame:
     """One frame of a file: ``stem`` names its outputs, ``notes`` are one-line remarks for the user.
 
-    It is number ``index`` of ``count`` (approximate where a video does not say). ``exposure``: its time in seconds,
-    where the file says it.
+    It is number ``index`` of ``count`` (approximate where a video does not say). Where the file says them,
+    ``exposure``: its time in seconds, and ``captured``: when it was taken, in ISO 8601.
     """
 
     stem: str
@@ -130,6 +130,12 @@ class Frame:
     index: int = 0
     count: int = 1
     exposure: float | None = None
+    captured: str | None = None
+
+    def taken(self) -> dict[str, Any]:
+        """How it was taken, for reports: what the file says of it."""
+        found = {"exposure_s": self.exposure, "captured": self.captured}
+        return {name: value for name, value in found.items() if value is not None}
 
 
 def read_frames(path: str | Path, options: ReadOptions | None = None, first: int = 0) -> Iterator[Frame]:
@@ -153,7 +159,7 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
             data, notes = _convert(page, options)
         stem = output_stem(path)
         name = stem if page.count == 1 else f"{stem}_{page.index:04d}"
-        yield Frame(name, data, page.notes + notes, page.index, page.count, page.exposure)
+        yield Frame(name, data, page.notes + notes, page.index, page.count, page.exposure, page.captured)
 
 
 def read_pages(path: Path, options: ReadOptions | None = None, first: int = 0) -> Iterator[Page]:

@@ -19,6 +19,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -39,6 +40,7 @@ RAW, INDEX, RECORD, PICTURE = "frames.raw", "frames.jsonl", "recording.json", "l
 class Header:
     """Properties that all frames share. ``layout``: the spec of a layout where the user gave one, else None.
 
+    ``began``: time of the first frame in ISO 8601, of recordings that were read, or None where it is not known.
     ``width`` and ``height`` are those of the pixel format (of ONE angle image for LUCID's angles); ``settings`` are
     the camera's, as it reported them. Raises ValueError on an unknown pixel format, or a size that no frame has.
     """
@@ -49,6 +51,7 @@ class Header:
     camera: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
     layout: str | None = None
+    began: str | None = None
 
     def __post_init__(self) -> None:
         planes = find_pixel_format(self.pixel_format).planes
@@ -156,7 +159,16 @@ def read_header(path: Path) -> Header:
     if layout is not None:
         Layout.parse(str(layout))
     camera, settings = str(record.get("camera", "")), record.get("settings")
-    return Header(width, height, name, camera, settings if isinstance(settings, dict) else {}, layout)
+    began = record.get("began") if _is_time(record.get("began")) else None
+    return Header(width, height, name, camera, settings if isinstance(settings, dict) else {}, layout, began)
+
+
+def _is_time(text: Any) -> bool:
+    """True for a time with its zone, in ISO 8601."""
+    try:
+        return datetime.fromisoformat(text).tzinfo is not None
+    except (TypeError, ValueError):
+        return False
 
 
 def read_images(path: Path, first: int = 0) -> Iterator[RawImage]:
@@ -189,11 +201,21 @@ def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
     size = (header.width, header.height)
     exposure_us = header.settings.get("exposure_us")
     exposure = exposure_us * 1e-6 if isinstance(exposure_us, int | float) and exposure_us > 0 else None
+    start = _read_index(path.with_name(INDEX)).get(0, {}).get("timestamp_ns", 0)
     for index, image in enumerate(read_images(path, first), first):
         page = headerless_page(image.payload, size, header.pixel_format, index, count)
         if header.layout is not None:
             page = replace(page, layout=Layout.parse(header.layout), notes=())
-        yield replace(page, notes=page.notes + notes, exposure=exposure)
+        yield replace(page, notes=page.notes + notes, exposure=exposure, captured=_captured(header, start, image))
+
+
+def _captured(header: Header, start: int, image: RawImage) -> str | None:
+    """When a frame was taken: by the camera's clock after the first one, whose time stamp is ``start`` [ns]."""
+    after_ns = image.timestamp_ns - start
+    if header.began is None or after_ns < 0 or not start:
+        return None
+    when = datetime.fromisoformat(header.began) + timedelta(microseconds=after_ns // 1000)
+    return when.isoformat(timespec="milliseconds")
 
 
 def _read_index(path: Path) -> dict[int, dict[str, Any]]:

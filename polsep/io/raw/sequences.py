@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
@@ -112,7 +112,7 @@ def _read_files(files: list[Path], options: ReadOptions, first: int) -> Iterator
         except (ValueError, OSError) as error:
             yield DamagedFrame(index, one_line(error))
             continue
-        yield Frame(frames[0].stem, frames[0].data, frames[0].notes, index, len(files))
+        yield replace(frames[0], index=index, count=len(files))
 
 
 def _read_stack(path: Path, options: ReadOptions, first: int, count: int) -> Iterator[Frame | DamagedFrame]:

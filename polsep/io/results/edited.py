@@ -1,7 +1,7 @@
 """Files of `polsep edit`: recipes, and one edited frame, written atomically.
 
-An edited frame is DIR/STEM.exr with the layers diffuse, specular and combined (float32, ZIP), DIR/STEM.png, the edited
-picture in sRGB, and the sidecar DIR/STEM.json.
+An edited frame is DIR/STEM.exr with the layers diffuse, specular and combined (float32, ZIP), and combined once more as
+R, G, B, DIR/STEM.png, the edited picture in sRGB, and the sidecar DIR/STEM.json.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.results.exr import as_planes, encode_exr
-from polsep.io.results.separation_writer import UNITS, planned_outputs
+from polsep.io.results.separation_writer import TOTAL, UNITS, planned_outputs
 from polsep.io.results.sidecars import EncodedFile, exr_notes, require_finite, write_with_sidecar
 from polsep.io.store.atomic import refuse_existing, replace_bytes, replace_text
 from polsep.io.store.errors import naming
@@ -72,7 +72,8 @@ def write_edited(frame: EditedFrame, directory: Path, stem: str, overwrite: bool
 
 def _encoded_files(frame: EditedFrame, stem: str, units: Mapping[str, str]) -> Iterator[EncodedFile]:
     """The EXR file and the preview."""
-    yield f"{stem}.exr", encode_exr(as_planes(frame.layers), exr_notes(units))
+    planes = as_planes({**frame.layers, TOTAL: frame.layers["combined"]})
+    yield f"{stem}.exr", encode_exr(planes, exr_notes(units))
     yield f"{stem}.png", encode_png(frame.preview)
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.compiling import read_only
 from polsep.compute.threads import get_threads, run_over_rows
-from polsep.io.results.exr_header import EXPECTED, check_exr_header
+from polsep.io.results.exr_header import EXPECTED, Notes, check_exr_header, packed_note
 from polsep.io.results.pixels_kernel import CHUNK, HEAD, LARGEST, ROWS, STORED, fill_rows, pack_chunks
 from polsep.io.store.errors import InputError, naming
 from polsep.io.store.header_checks import require_signature
@@ -77,7 +77,7 @@ def _open_exr(data: bytes) -> Any:
     return file
 
 
-def encode_exr(planes: Mapping[str, NDArray[Any]], notes: Mapping[str, str], compression: str = "zip") -> memoryview:
+def encode_exr(planes: Mapping[str, NDArray[Any]], notes: Notes, compression: str = "zip") -> memoryview:
     """One part of scanlines: channels ``[H, W]``, float16 or float32, by name; ``notes``: attributes."""
     header = {**notes, "compression": COMPRESSIONS[compression], "type": OpenEXR.scanlineimage}
     # A fresh dict, because OpenEXR replaces its arrays, and contiguous planes, because it misreads others silently.
@@ -93,17 +93,18 @@ def encode_exr(planes: Mapping[str, NDArray[Any]], notes: Mapping[str, str], com
 
 
 def as_planes(layers: Mapping[str, NDArray[Number]]) -> dict[str, NDArray[Number]]:
-    """Channels of layers by name, views: name.R, name.G and name.B of ``[H, W, 3]``, name.Y of ``[H, W, 1]``."""
+    """Channels of layers by name, views: name.R, name.G and name.B of ``[H, W, 3]``, name.Y of ``[H, W, 1]``.
+
+    Those of the layer "" have no prefix: programs that know no layers show them.
+    """
     return {
-        f"{name}.{color}": image[..., k]
+        f"{name}.{color}" if name else color: image[..., k]
         for name, image in layers.items()
         for k, color in enumerate("RGB" if image.shape[2] == 3 else "Y")
     }
 
 
-def encode_exr_halves(
-    layers: Mapping[str, NDArray[np.float32]], notes: Mapping[str, str], compression: str
-) -> list[Any]:
+def encode_exr_halves(layers: Mapping[str, NDArray[np.float32]], notes: Notes, compression: str) -> list[Any]:
     """Pieces of a file of half floats, one part of scanlines; ``layers [H, W, C]`` by name, ``notes``: attributes.
 
     Light above the largest half float becomes that.
@@ -162,7 +163,7 @@ def zip_rows(rows: NDArray[np.uint16], width: int) -> list[memoryview]:
     return found
 
 
-def _header(channels: list[str], size: tuple[int, int], notes: Mapping[str, str], compression: int) -> bytes:
+def _header(channels: list[str], size: tuple[int, int], notes: Notes, compression: int) -> bytes:
     """Magic number, version and attributes of a part of scanlines."""
     window = struct.pack("<4i", 0, 0, size[0] - 1, size[1] - 1)
     listed = b"".join(name.encode() + b"\0" + struct.pack("<i4B2i", _HALF, 0, 0, 0, 0, 1, 1) for name in channels)
@@ -175,7 +176,7 @@ def _header(channels: list[str], size: tuple[int, int], notes: Mapping[str, str]
         ("pixelAspectRatio", "float", struct.pack("<f", 1)),
         ("screenWindowCenter", "v2f", struct.pack("<2f", 0, 0)),
         ("screenWindowWidth", "float", struct.pack("<f", 1)),
-        *((name, "string", text.encode()) for name, text in notes.items()),
+        *((name, *packed_note(note)) for name, note in notes.items()),
     ]
     packed = (
         name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value

@@ -8,11 +8,13 @@ Source: OpenEXR, "OpenEXR File Layout" (openexr.com/en/latest/OpenEXRFileLayout.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from polsep.io.store.errors import InputError
 from polsep.io.store.header_checks import require_size
 
+#: Attributes of a file by name: texts, and numbers, which become float32.
+Notes = Mapping[str, str | float]
 #: How every message begins.
 EXPECTED = "expected a complete single-part EXR file"
 #: Flags of the version field: tiles, deep pixels, several parts.
@@ -49,6 +51,11 @@ def check_exr_header(data: bytes) -> None:
         chunks = -(-width // across) * -(-height // down)
     if (needed := end + chunks * (_LEADER + _ENTRY)) > len(data):
         raise InputError(f"{EXPECTED} of {needed} bytes or more for {chunks} chunks, found {len(data)} bytes")
+
+
+def packed_note(note: str | float) -> tuple[str, bytes]:
+    """Type and bytes of an attribute."""
+    return ("string", note.encode()) if isinstance(note, str) else ("float", struct.pack("<f", note))
 
 
 def _attributes(data: bytes) -> Iterator[tuple[str, bytes, int]]:

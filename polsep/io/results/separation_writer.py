@@ -27,7 +27,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from polsep import __version__
-from polsep.io.results.exr import as_planes, encode_exr
+from polsep.io.results.exr import LARGEST_HALF, as_planes, encode_exr
 from polsep.io.results.previews import contact_sheet
 from polsep.io.results.sidecars import (
     EncodedFile,
@@ -47,6 +47,8 @@ FORMATS = ("exr", "npz", "tiff", "png")
 LAYERS = ("diffuse", "specular", "dolp", "aolp", "valid")
 #: The layer of frames whose method expects an error: two channels, for diffuse and specular.
 ERROR = "error"
+#: Layers of EXR files alone: all light, for programs that know no layers; Stokes images of frames that have some.
+TOTAL, STOKES = "", ("S0", "S1", "S2")
 
 #: The unit of images.
 LIGHT = "linear light, 1.0 = one measurement at the white level (an unclipped s0 = diffuse + specular reaches 2)"
@@ -59,6 +61,9 @@ UNITS = {
     "valid": "1 (TIFF: 255) where the separation is trustworthy, else 0",
     ERROR: "expected standard deviation of the error of diffuse and of specular, over all colours, in their unit",
     "combined": f"{LIGHT}; the sum of diffuse and specular, as edited",
+    "S0": f"{LIGHT}; measured s0 = m0 + m90, not changed by the method",
+    "S1": f"{LIGHT}; measured s1 = m0 - m90, angles from image-right toward image-up",
+    "S2": f"{LIGHT}; measured s2 = m45 - m135, angles from image-right toward image-up",
 }
 #: Meaning of the codes in the PNG set.
 PNG_UNITS = {
@@ -109,16 +114,24 @@ def write_separation(
     targets = planned_outputs(directory, stem, format)
     directory = Path(directory)
     refuse_existing(directory, targets, overwrite)
+    if frame.stokes is not None and format != "exr":
+        raise OutputError(f"expected the format exr for Stokes images, found {format}")
     _check_frame(frame)
     facts = {
         "source": frame.report.get("source"),
         "format": format,
         "shape": list(frame.diffuse.shape),
-        "units": {layer: (PNG_UNITS if format == "png" else UNITS)[layer] for layer in _layers(frame)},
+        "units": _units(frame, format),
     }
     limited = {"limited_samples": _limited_samples(frame)} if format == "png" else {}
     write_with_sidecar(targets, _encoded_files(frame, stem, format), facts, {"report": frame.report, **limited})
     return [directory / name for name in _file_names(stem, format, _layers(frame))]
+
+
+def _units(frame: SeparatedFrame, format: str) -> dict[str, str]:
+    """Meaning of the layers of a frame's files."""
+    layers = (*_layers(frame), *stokes_layers(frame.stokes))
+    return {layer: (PNG_UNITS if format == "png" else UNITS)[layer] for layer in layers}
 
 
 def _check_frame(frame: SeparatedFrame) -> None:
@@ -128,9 +141,11 @@ def _check_frame(frame: SeparatedFrame) -> None:
         raise OutputError(f"expected valid as bool [H, W], found {frame.valid.dtype} {list(size)}")
     channels = frame.diffuse.shape[-1]
     color = (*size, 3 if channels == 3 else 1)
-    shapes = {"diffuse": color, "specular": color, "dolp": size, "aolp": size}
+    shapes: dict[str, tuple[int, ...]] = {"diffuse": color, "specular": color, "dolp": size, "aolp": size}
     if frame.error is not None:
         shapes[ERROR] = (*size, 2)
+    if frame.stokes is not None:
+        shapes["stokes"] = (3, *color)
     for name, shape in shapes.items():
         image = getattr(frame, name)
         if image.shape != shape or image.dtype != np.float32:
@@ -163,12 +178,27 @@ def _encoded_images(frame: SeparatedFrame, stem: str, format: str) -> Iterator[E
 
 
 def _encode_exr(frame: SeparatedFrame) -> memoryview:
-    """One part of float32 channels, ZIP compressed, with the units as header attributes."""
-    planes = as_planes({"diffuse": frame.diffuse, "specular": frame.specular})
+    """One part, ZIP compressed, with units and settings as header attributes: float32 channels.
+
+    Layers that others show or measure in, `TOTAL` and `STOKES`, are half floats: half the size, 11 bits.
+    """
+    planes: dict[str, NDArray[Any]] = as_planes({"diffuse": frame.diffuse, "specular": frame.specular})
     planes |= {"dolp.Y": frame.dolp, "aolp.Y": frame.aolp, "valid.Y": frame.valid.astype(np.float32)}
     if frame.error is not None:
         planes |= {f"{ERROR}.{image}": frame.error[..., k] for k, image in enumerate(("diffuse", "specular"))}
-    return encode_exr(planes, exr_notes({layer: UNITS[layer] for layer in _layers(frame)}))
+    shown = {TOTAL: frame.diffuse + frame.specular, **stokes_layers(frame.stokes)}
+    planes |= {name: as_halves(plane) for name, plane in as_planes(shown).items()}
+    return encode_exr(planes, exr_notes(_units(frame, "exr"), frame.report))
+
+
+def as_halves(plane: NDArray[np.float32]) -> NDArray[np.float16]:
+    """A plane in half floats; values beyond the largest of them become that."""
+    return np.clip(plane, -LARGEST_HALF, LARGEST_HALF).astype(np.float16)
+
+
+def stokes_layers(stokes: NDArray[np.float32] | None) -> dict[str, NDArray[np.float32]]:
+    """Layers ``[h, w, C]`` of Stokes images ``[3, h, w, C]``, by name; none of None."""
+    return {} if stokes is None else dict(zip(STOKES, stokes, strict=True))
 
 
 def _encode_npz(frame: SeparatedFrame) -> bytes:

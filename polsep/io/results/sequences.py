@@ -14,7 +14,7 @@ from __future__ import annotations
 import glob
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +27,8 @@ from polsep.compute.threads import own_threads
 from polsep.io.raw.videos import load_library
 from polsep.io.results.exr import COMPRESSIONS, encode_exr_halves
 from polsep.io.results.films import LOSSLESS, WATCHABLE, Film, FilmKind, join_films
-from polsep.io.results.separation_writer import UNITS
-from polsep.io.results.sidecars import require_same_settings
+from polsep.io.results.separation_writer import TOTAL, UNITS, stokes_layers
+from polsep.io.results.sidecars import exr_notes, require_same_settings
 from polsep.io.store.atomic import OutputError, atomic_path, release_cache, replace_bytes, replace_text
 
 #: Frames per part, about a second; films have a key frame at least as often.
@@ -50,8 +50,8 @@ State = dict[str, NDArray[Any]]
 class Picture(NamedTuple):
     """Results of a frame: float32 ``diffuse``, ``specular [h, w, C]``, ``panels`` to watch, a ``line`` for the log.
 
-    ``combined``: for EXR files only, of frames that were edited. A frame that is missing has black images, and a line
-    with the key "damaged".
+    ``combined``: for EXR files only, of frames that were edited. ``stokes [3, h, w, C]``, and the ``report`` of which
+    headers tell: for EXR files too. A frame that is missing has black images, and a line with the key "damaged".
     """
 
     diffuse: NDArray[np.float32]
@@ -59,6 +59,8 @@ class Picture(NamedTuple):
     panels: NDArray[np.uint8] | None
     line: dict[str, Any]
     combined: NDArray[np.float32] | None = None
+    stokes: NDArray[np.float32] | None = None
+    report: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -251,11 +253,12 @@ class SequenceWriter:
 
 
 def write_exr(path: Path, picture: Picture, compression: str) -> None:
-    """Write half floats, layers diffuse, specular and any combined, atomically."""
-    layers = {"diffuse": picture.diffuse, "specular": picture.specular}
+    """Write half floats, layers diffuse, specular, any combined or Stokes images, and all light, atomically."""
+    layers = {"diffuse": picture.diffuse, "specular": picture.specular, **stokes_layers(picture.stokes)}
     if picture.combined is not None:
         layers["combined"] = picture.combined
-    notes = {f"{layer}Units": UNITS[layer] for layer in layers}
+    notes = exr_notes({layer: UNITS[layer] for layer in layers}, picture.report)
+    layers[TOTAL] = picture.diffuse + picture.specular if picture.combined is None else picture.combined
     with atomic_path(path) as part, part.open("wb") as stream:
         stream.writelines(encode_exr_halves(layers, notes, compression))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,14 @@ from numpy.typing import NDArray
 from polsep import __version__
 from polsep.io.store.atomic import OutputError, write_checked, write_set
 
+#: Attributes of EXR files by the keys of a report.
+_REPORTED = {
+    "method": "polsepMethod",
+    "layout": "polsepLayout",
+    "black_level": "polsepBlackLevel",
+    "white_level": "polsepWhiteLevel",
+    "exposure_s": "expTime",
+}
 #: A file name and the file's contents.
 EncodedFile = tuple[str, bytes | memoryview]
 
@@ -81,6 +90,21 @@ def _flat_names(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
     return flat
 
 
-def exr_notes(units: Mapping[str, str]) -> dict[str, str]:
-    """Attributes of an EXR file: the polsep version and the unit of each layer."""
-    return {"polsepVersion": __version__, **{f"{layer}Units": unit for layer, unit in units.items()}}
+def exr_notes(units: Mapping[str, str], report: Mapping[str, Any] | None = None) -> dict[str, str | float]:
+    """Attributes of an EXR file: the polsep version, the unit of each layer, and what a frame's ``report`` says.
+
+    Method, layout, levels and light colour are polsep's own; exposure time [s] and time of the capture (UTC) are OpenEXR's
+    standard attributes ``expTime``, ``capDate`` and ``utcOffset``. What is not known is left out.
+    """
+    notes: dict[str, str | float] = {"polsepVersion": __version__}
+    notes |= {f"{layer}Units": unit for layer, unit in units.items()}
+    found = report or {}
+    for key, name in _REPORTED.items():
+        if found.get(key) is not None:
+            notes[name] = found[key] if isinstance(found[key], str) else float(found[key])
+    if found.get("light_color") is not None:
+        notes["polsepLightColor"] = ",".join(f"{gain:.6g}" for gain in found["light_color"])
+    if found.get("captured") is not None:
+        when = datetime.fromisoformat(found["captured"]).astimezone(UTC)
+        notes |= {"capDate": when.strftime("%Y:%m:%d %H:%M:%S"), "utcOffset": 0.0}
+    return notes

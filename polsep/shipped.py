@@ -55,18 +55,21 @@ def _read_shipped(name: str) -> JointWeights:
     return read_joint(shipped_weights(name), name in AVERAGED)
 
 
-def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[JointWeights, dict[str, str]]:
-    """A method's network for frames of a layout, shipped or from a file of weights, and the weights' metadata.
+def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[list[JointWeights], dict[str, str]]:
+    """A method's networks for frames of a layout, and the metadata of the first one's weights.
 
-    Raises ValueError on methods without such a network, and on weights for other frames.
+    They are those that are shipped, all that the method weighs together; or the one in a file of weights. Raises
+    ValueError on methods without such a network, and on weights for other frames.
     """
     if method not in NAMES:
         raise ValueError(f"expected a method of {', '.join(NAMES)}, found {method!r}")
-    path = path or shipped_weights(weights_name(method, layout))
+    if path is None:
+        names = member_names(method, layout)
+        return [shipped_joint(name) for name in names], read_weights(shipped_weights(names[0]))[1]
     network, metadata = read_joint(path), read_weights(path)[1]
     if network.colors != layout.channels:
         raise ValueError(f"expected weights for {layout.channels} colours in {path}, found {network.colors}")
-    return network, metadata
+    return [network], metadata
 
 
 def weights_name(method: str, layout: Layout) -> str:

@@ -97,7 +97,9 @@ def test_a_frame_becomes_an_edited_one(tmp_path: Path, polsep: Cli, format: str,
     for layer in ("diffuse", "specular", "combined"):
         assert np.array_equal(image_of(paths[0], layer), getattr(expected, layer))
     names = "RGB" if colors == 3 else "Y"
-    assert set(read_exr_layers(paths[0])) == {f"{a}.{c}" for a in ("diffuse", "specular", "combined") for c in names}
+    planes = read_exr_layers(paths[0])
+    assert set(planes) == {f"{a}{c}" for a in ("diffuse.", "specular.", "combined.", "") for c in names}
+    assert all(np.array_equal(planes[c], planes[f"combined.{c}"].astype(np.float16)) for c in names)
     said = json.loads(paths[2].read_text())
     assert said["recipe"]["edits"][0] == {"edit": "rougher", "sigma": 3.0}
     assert said["light"]["after"]["specular"] == pytest.approx(2 * said["light"]["before"]["specular"], rel=1e-5)

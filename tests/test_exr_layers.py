@@ -24,9 +24,11 @@ from polsep.io.raw.recording import RECORD, RawImage, RecordingWriter
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.separation_reader import read_separated
 from polsep.io.results.separation_writer import write_separation
+from polsep.io.results.sequences import SequenceKind
 from polsep.physics.stokes import Measurements, Stokes, dolp, fit_stokes, measure
 from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout, Mosaic, sample_mosaic
+from polsep.video.recordings import Target, VideoOptions, separate_video
 
 COLOR, MONO = Layout(), Layout(bayer=None)
 #: Relative rounding of half floats.
@@ -173,12 +175,12 @@ def test_frames_of_recordings_know_when_they_were_taken(tmp_path: Path, began: s
 def test_frames_of_videos_have_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = recording(tmp_path / "take", 2, "2026-03-01T23:59:59.980+00:00")
     words = ["polsep", "video", str(folder), "-o", str(tmp_path / "out"), "--method", "analytic", "--no-preview"]
-    for options in (["--filter", "none", "--stokes"], ["--format", "none", "--preview", "--stokes"]):
-        monkeypatch.setattr(sys, "argv", [*words, *options])
-        try:
-            cli.main()
-        except SystemExit as stopped:
-            assert stopped.code == 2 and "--format" in options
+    monkeypatch.setattr(sys, "argv", [*words, "--stokes", "--filter", "none"])
+    cli.main()
+    with pytest.raises(ValueError, match="expected the format exr for Stokes images, found ffvhuff"):
+        next(
+            separate_video(folder, ReadOptions(), VideoOptions(stokes=True), Target(tmp_path, SequenceKind("ffvhuff")))
+        )
     told, layers = header(tmp_path / "out" / "take_000001.exr"), read_exr_layers(tmp_path / "out" / "take_000001.exr")
     assert told["polsepMethod"] == "analytic" and told["capDate"] == "2026:03:02 00:00:00"
     assert told["expTime"] == pytest.approx(0.002)

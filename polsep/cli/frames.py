@@ -138,11 +138,13 @@ def _report(outcome: Outcome) -> int:
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def export(method: str, output: Path, weights: Path | None, **options: bool) -> None:
-    """Write a network as one ONNX file: raw uint16 frames in, diffuse, specular and expected error out.
+    """Write a joint method as one ONNX file: raw uint16 frames in, diffuse, specular, expected error and valid out.
 
-    METHOD is joint, joint-fast or joint-large (its own network, without the one that is weighed with it). The file runs
-    in onnxruntime and similar programs without polsep. Frames [N, H, W] are in Sony's order with sides that are
-    multiples of 4; black_level and white_level are in their units. Needs the extra export.
+    METHOD is joint, joint-fast or joint-large (both of its networks). The file runs in onnxruntime and similar programs
+    without polsep. Frames [N, H, W] are in Sony's order with sides that are multiples of 4; black_level and white_level
+    are in their units; light_color is camera RGB of the light, 1, 1, 1 if it is white (graphs for mono have none).
+    Images equal those of 'polsep separate' with layers in float32 (POLSEP_LAYERS=f32), where that finds no defects,
+    metals or holes to fill. Needs the extra export.
     """
     require_extra("export")
     if weights is not None:
@@ -152,17 +154,20 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     from polsep.shipped import find_joint
 
     refuse_existing(output.parent, [output], options["overwrite"])
-    network, metadata = find_joint(method, Layout(bayer=None) if options["mono"] else Layout(), weights)
-    import torch
-
-    from polsep.io.store.onnx import write_onnx
-    from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork
-    from polsep.networks.joint import Joint
-
+    layout = Layout(bayer=None) if options["mono"] else Layout()
+    networks, metadata = find_joint(method, layout, weights)
     print_note(f"exporting {method}, which takes a minute or a few")
-    with show_progress(f"exporting {method}"):
-        graph = ExportedNetwork(Joint.of(network, torch.device("cpu")), options["full"])
-        write_onnx(output, graph, OUTPUT_NAMES, metadata)
+    with show_progress(f"exporting {method}") as progress:
+        import torch
+
+        from polsep.io.store.onnx import STEPS, describe_graph, write_onnx
+        from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork
+        from polsep.networks.joint import Joint
+
+        graph = ExportedNetwork([Joint.of(network, torch.device("cpu")) for network in networks], options["full"])
+        metadata |= describe_graph(method, layout, options["full"])
+        for number, step in enumerate(write_onnx(output, graph, OUTPUT_NAMES, metadata), 1):
+            progress.update(0, None, f"exporting {method}, step {number} of {len(STEPS)}: {step}")
     print(output)
 
 

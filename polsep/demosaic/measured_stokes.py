@@ -24,13 +24,12 @@ from polsep.physics.stokes import Measurements, fit_stokes, stokes_inverse
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.unpack_kernel import as_samples
 
+Floats = NDArray[np.float32]
 #: Largest number of stretches of rows that threads share: each computes some rows above its own once more.
 _STRETCHES = 4
 
 
-def measured_stokes(
-    capture: Mosaic | Measurements, light: tuple[float, ...], full: bool = False
-) -> NDArray[np.float32]:
+def measured_stokes(capture: Mosaic | Measurements, light: tuple[float, ...], full: bool = False) -> Floats:
     """s0, s1, s2 of one frame ``[3, h, w, C]``, in the light whose colour has so many gains; 1.0 as in `Stokes`.
 
     Half resolution is that of images: means over 2x2 cells. Of s1 and s2 the signs are those of docs/conventions.md.
@@ -51,7 +50,7 @@ def measured_stokes(
     return np.ascontiguousarray(to_numpy(images), np.float32)
 
 
-def _guided_half(mosaic: Mosaic) -> NDArray[np.float32]:
+def _guided_half(mosaic: Mosaic) -> Floats:
     """`guided.guide_once` of a colour mosaic ``[H, W]`` in white light, by its kernel: ``[3, h, w, 3]``."""
     data, layout = mosaic.data, mosaic.layout
     frame = data if data.dtype in (np.uint8, np.uint16, np.float32) else data.astype(np.float32)

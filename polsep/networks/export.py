@@ -1,36 +1,104 @@
-"""The joint network as one exportable module from raw samples to images, for engines other than torch.
+"""The joint networks of a method as one exportable module from raw samples to images, for engines other than torch.
 
-It accepts a batch of raw frames ``[N, H, W]`` in Sony's order, H and W multiples of 4, with their black and white
-level, and returns ``[N, h, w, ...]`` images, those of `networks.run.run_joint` for such frames. `io.store.onnx` writes
-it to a file.
+A graph is what the method makes of a frame: levels, clip mask and colour of the light, demosaicking and closed form,
+layers in float32, all networks of the method weighed by their expected errors, the four shifts of mono networks that
+average them: the twin of `run.run_joint` and, in float32, of `engines.run_engine`. Around it, `pipeline.separate`
+repairs defects, finds black level and light, and moves what metals, bodies and weak polarizers leave in the diffuse
+image; graphs do none of that. `io.store.onnx` writes them to files.
 """
 
 from __future__ import annotations
 
-from torch import Tensor, nn
+from collections.abc import Sequence
 
-from polsep.networks.joint import Joint, limit
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pixel_shuffle, pixel_unshuffle
+
+from polsep.networks.channels import PERIOD
+from polsep.networks.joint import Joint
+from polsep.networks.run import cells_near_clipping, combine, repeat, run_images
+from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import CLIP_MARGIN
+from polsep.separation.analytic import Separation
 
 #: Names of the outputs, in order.
-OUTPUT_NAMES = ("diffuse", "specular", "error")
+OUTPUT_NAMES = ("diffuse", "specular", "error", "valid")
+#: Samples above and left of the frame in the four ways in which a mono one lies on periods (`orient.shifts_of`).
+_SHIFTS = tuple((top, left) for top in (2, 4) for left in (2, 4))
 
 
 class ExportedNetwork(nn.Module):
-    """``raw [N, H, W]`` integers or floats, ``black_level [1]``, ``white_level [1]`` to images, channels last.
+    """``raw [N, H, W]`` integers or floats in Sony's order, H and W multiples of 4, to images, channels last.
 
-    ``diffuse [N, h, w, C]``, ``specular [N, h, w, 1]`` white, not negative; ``error [N, h/k, w/k, 2]``: expected
-    standard deviation of the error of both at half resolution. h = H / 2, or H with ``full``.
+    ``black_level [1]``, ``white_level [1]`` in the units of the samples; ``light_color [3]``, of colour networks alone:
+    camera RGB of the light. ``diffuse``, ``specular [N, h, w, C]`` in that light, not negative; ``error [N, H/2, W/2,
+    2]``: expected standard deviation of the error of both at half resolution; ``valid [N, h, w]``. h = H / 2, or H with
+    ``full``.
     """
 
-    def __init__(self, network: Joint, full: bool) -> None:
+    def __init__(self, networks: Sequence[Joint], full: bool) -> None:
         super().__init__()
-        self.network, self.full = network, full
+        self.members, self.full, self.colors = nn.ModuleList(networks), full, networks[0].colors
+        filters = [networks[0].layout.filter_at(k // PERIOD, k % PERIOD) for k in range(PERIOD**2)]
+        #: The colour of each sample of a period.
+        self.channels = [min(filter.channel, self.colors - 1) for filter in filters]
 
-    def forward(self, raw: Tensor, black_level: Tensor, white_level: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        self, raw: Tensor, black_level: Tensor, white_level: Tensor, light_color: Tensor | None = None
+    ) -> tuple[Tensor, ...]:
         """See the class."""
         samples = ((raw.float() - black_level) / (white_level - black_level))[:, None]
         clipped = samples >= 1 - CLIP_MARGIN
-        images = self.network(samples, clipped)[0] if self.full else self.network.half_resolution(samples, clipped)
-        diffuse, specular, error = limit(images)
-        return diffuse.permute(0, 2, 3, 1), specular.permute(0, 2, 3, 1), error.permute(0, 2, 3, 1)
+        light = torch.ones(self.colors) if light_color is None else light_color
+        gains = torch.cat([light[c : c + 1] for c in self.channels]).view(1, -1, 1, 1)
+        samples = pixel_shuffle(pixel_unshuffle(samples, PERIOD) / gains, PERIOD)
+        found = []
+        for network in self.members:
+            assert isinstance(network, Joint)
+            found += (self._run_shifted if network.averages_shifts else self._run)(network, samples, clipped)
+        whole, color = combine(found), light.view(1, -1, 1, 1)
+        assert whole.expected_error is not None
+        error = whole.expected_error[..., :: self._scale, :: self._scale] * light.mean()
+        images = (whole.diffuse * color, whole.specular * color, error)
+        return (*(image.permute(0, 2, 3, 1) for image in images), whole.valid)
+
+    @property
+    def _scale(self) -> int:
+        """Pixels along the side of a cell."""
+        return 2 if self.full else 1
+
+    def _run(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:
+        """A network's images of whole frames ``[N, 1, H, W]``."""
+        diffuse, specular, *_, error, _ = run_images(network, (samples, clipped), None, self.full)
+        near = cells_near_clipping(clipped)[:, 1:]
+        error, near = (repeat(x, self._scale) for x in (error, near))
+        return [_separation(diffuse, specular.expand_as(diffuse), ~near[:, 0], error)]
+
+    def _run_shifted(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:
+        """The same at all shifts, as one batch."""
+        frames, count = (samples, clipped), samples.shape[0]
+        batch = [torch.cat([_shifted(_shifted(x, top, -2), left, -1) for top, left in _SHIFTS]) for x in frames]
+        (whole,) = self._run(network, *batch)
+        height, width = (n * self._scale // 2 for n in samples.shape[-2:])
+        assert whole.expected_error is not None
+        images, found = (whole.diffuse, whole.specular, whole.valid, whole.expected_error), []
+        for k, (top, left) in enumerate(_SHIFTS):
+            row, col = top * self._scale // 2, left * self._scale // 2
+            own = [image[k * count : (k + 1) * count] for image in images]
+            found.append(_separation(*(image[..., row : row + height, col : col + width] for image in own)))
+        return found
+
+
+def _separation(diffuse: Tensor, specular: Tensor, valid: Tensor, error: Tensor) -> Separation:
+    """What `run.combine` weighs; of its Stokes images nothing is exported."""
+    return Separation(diffuse, specular, valid, Stokes(diffuse, diffuse, diffuse), expected_error=error)
+
+
+def _shifted(frames: Tensor, before: int, axis: int) -> Tensor:
+    """Frames with 2 or 4 more samples before and a whole period in all, along -1 or -2, as `Orientation.turn` does."""
+    length = frames.shape[axis]
+    parts = [frames.narrow(axis, PERIOD - before, before), frames]
+    if before < PERIOD:
+        parts.append(frames.narrow(axis, length - PERIOD, PERIOD - before))
+    return torch.cat(parts, dim=axis)

@@ -7,6 +7,7 @@ images are float32 always.
 
 from __future__ import annotations
 
+import os
 import threading
 from functools import lru_cache
 from typing import Any
@@ -33,6 +34,8 @@ from polsep.separation.images import FrameImages, Tally
 
 Floats = NDArray[np.float32]
 
+#: Precisions of layers.
+PRECISIONS = ("bf16", "f32", "i8")
 #: Packed rows that a thread processes at a time.
 _ROWS = 16
 
@@ -171,8 +174,14 @@ def usual_precision() -> str:
     """The fastest precision on this processor: "bf16" where OpenVINO takes it and matrix tiles (AMX) multiply it.
 
     Vector units that know bfloat16 alone (AVX512-BF16) take 1.6 times as long with it as with float32, and those that
-    multiply 8-bit integers (VNNI) a third as long with these (docs/experiments.md).
+    multiply 8-bit integers (VNNI) a third as long with these (docs/experiments.md). The environment variable
+    POLSEP_LAYERS says another one. Raises ValueError on what is none.
     """
+    asked = os.environ.get("POLSEP_LAYERS")
+    if asked is not None:
+        if asked not in PRECISIONS:
+            raise ValueError(f"expected POLSEP_LAYERS as {', '.join(PRECISIONS)}, found {asked!r:.40}")
+        return asked
     name: str = core().get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name()
     if name == "bf16" and "amx_bf16" not in cpu_flags():
         name = "f32"

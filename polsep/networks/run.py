@@ -91,7 +91,7 @@ def _run_turned(network: Joint, mosaic: Mosaic, orientation: Orientation, full: 
         parts.append([_rows(x, (first - top, last - top), bottom - top) for x in images])
     joined = (torch.cat(strips, dim=-2) for strips in zip(*parts, strict=True))
     images = [image.reshape(*batch, *image.shape[1:]) for image in joined]
-    return _as_separation(images, _cells(clipped).reshape(*batch, 2, height // 2, width // 2), orientation)
+    return _as_separation(images, cells_near_clipping(clipped).reshape(*batch, 2, height // 2, width // 2), orientation)
 
 
 def _halve(separation: Separation) -> Separation:
@@ -109,7 +109,7 @@ def _halve(separation: Separation) -> Separation:
 
 
 def _run_layers(network: Joint, strip: tuple[Tensor, Tensor], thumbnail: Tensor | None, full: bool) -> list[Tensor]:
-    """`_images` in the device's type of layers, compiled if that is asked for and works."""
+    """`run_images` in the device's type of layers, compiled if that is asked for and works."""
     kind = strip[0].device.type
     # Graphs do not keep what autocast would: weights in its type, from one call to the next.
     precision = (
@@ -126,24 +126,24 @@ def _run_layers(network: Joint, strip: tuple[Tensor, Tensor], thumbnail: Tensor 
                 State.compiled = False
                 reason = (str(error).splitlines() or [""])[0][:120]
                 logging.getLogger("polsep").warning("networks run uncompiled: %s: %s", type(error).__name__, reason)
-        return _images(network, strip, thumbnail, full)
+        return run_images(network, strip, thumbnail, full)
 
 
 @cache
 def _compiled() -> Callable[..., list[Tensor]]:
     # Of angles alone, in NumPy, which would cut the graph in pieces.
     torch.compiler.assume_constant_result(stokes_inverse)  # type: ignore[no-untyped-call]
-    return torch.compile(_images, mode="reduce-overhead", dynamic=False)
+    return torch.compile(run_images, mode="reduce-overhead", dynamic=False)
 
 
-def _images(network: Joint, strip: tuple[Tensor, Tensor], thumbnail: Tensor | None, full: bool) -> list[Tensor]:
+def run_images(network: Joint, strip: tuple[Tensor, Tensor], thumbnail: Tensor | None, full: bool) -> list[Tensor]:
     """Diffuse, specular, s1, s2, the standard deviations of the errors of both, and the fit residual, of a strip."""
     output = network(*strip, thumbnail)[0] if full else network.half_resolution(*strip, thumbnail)
     diffuse, specular, error = limit(output)
-    return [diffuse, specular, output.s1, output.s2, error, _repeat(output.fit_residual, 2)]
+    return [diffuse, specular, output.s1, output.s2, error, repeat(output.fit_residual, 2)]
 
 
-def _repeat(image: Tensor, times: int) -> Tensor:
+def repeat(image: Tensor, times: int) -> Tensor:
     """Every pixel's value ``times`` in both directions."""
     return image.repeat_interleave(times, dim=-1).repeat_interleave(times, dim=-2) if times > 1 else image
 
@@ -154,7 +154,7 @@ def _rows(image: Tensor, rows: tuple[int, int], height: int) -> Tensor:
     return image[..., first:last, :]
 
 
-def _cells(clipped: Tensor) -> Tensor:
+def cells_near_clipping(clipped: Tensor) -> Tensor:
     """Cells ``[N, 2, H/2, W/2]`` near which a sample clips, and near which all of a cell do.
 
     A cell is of one colour, so where it clips, the cells around, which are of the others, lack that colour too.
@@ -168,7 +168,7 @@ def _as_separation(images: list[Tensor], cells: Tensor, orientation: Orientation
     """Turn everything back to the frame's own orientation, and the masks and Stokes images to the images' size."""
     diffuse, specular = images[0], images[1].expand_as(images[0])
     scale = 2 if diffuse.shape[-1] > cells.shape[-1] else 1
-    s1, s2, error, residual, cells = (_repeat(x, scale) for x in (*images[2:], cells))
+    s1, s2, error, residual, cells = (repeat(x, scale) for x in (*images[2:], cells))
     stokes = Stokes(diffuse + specular, s1, s2)
     turned = [orientation.turn_back(x, scale) for x in (diffuse, specular, cells, error, math.sqrt(2) * residual)]
     diffuse, specular, cells, error, residual = turned

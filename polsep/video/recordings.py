@@ -70,8 +70,8 @@ ON_DAMAGE = ("stop", "skip")
 class VideoOptions:
     """Options of the separation, as in `pipeline.separate`; at most ``frames`` of them; ``damaged``: of `ON_DAMAGE`.
 
-    ``engine``: of `ENGINES`, which changes no byte. ``stokes``: EXR files also get Stokes images. ``filter``: of `FILTERS`; "temporal" averages raw samples and
-    images where nothing moves (`temporal`).
+    ``engine``: of `ENGINES`, which changes no byte. ``stokes``: EXR files also get Stokes images. ``filter``: of
+    `FILTERS`; "temporal" averages raw samples and images where nothing moves (`temporal`).
     """
 
     method: str = "auto-fast"

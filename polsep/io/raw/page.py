@@ -27,8 +27,8 @@ class Page:
     """One picture of a file: ``array`` ``[H, W]`` or ``[H, W, C]``; with ``angles`` a leading axis of 0, 45, 90, 135.
 
     ``exposure``: its time in seconds; ``captured``: when it was taken, in ISO 8601. ``merged``: facts of a frame of
-    `polsep merge`. ``index`` of ``count`` pictures. ``white_level`` and ``layout`` are those that the file itself names, or None.
-    ``sampled``: the angle planes were taken from one mosaic, so their pixels lie at different points.
+    `polsep merge`. ``index`` of ``count`` pictures. ``white_level`` and ``layout`` are those that the file itself
+    names, or None. ``sampled``: the angle planes were taken from one mosaic, so their pixels lie at different points.
     """
 
     array: NDArray[Any]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.results.exr import as_planes, encode_exr
-from polsep.io.results.separation_writer import TOTAL, UNITS, planned_outputs
+from polsep.io.results.separation_writer import TOTAL, UNITS, as_halves, planned_outputs
 from polsep.io.results.sidecars import EncodedFile, exr_notes, require_finite, write_with_sidecar
 from polsep.io.store.atomic import refuse_existing, replace_bytes, replace_text
 from polsep.io.store.errors import naming
@@ -72,7 +72,8 @@ def write_edited(frame: EditedFrame, directory: Path, stem: str, overwrite: bool
 
 def _encoded_files(frame: EditedFrame, stem: str, units: Mapping[str, str]) -> Iterator[EncodedFile]:
     """The EXR file and the preview."""
-    planes = as_planes({**frame.layers, TOTAL: frame.layers["combined"]})
+    planes: dict[str, NDArray[Any]] = as_planes(frame.layers)
+    planes |= {name: as_halves(plane) for name, plane in as_planes({TOTAL: frame.layers["combined"]}).items()}
     yield f"{stem}.exr", encode_exr(planes, exr_notes(units))
     yield f"{stem}.png", encode_png(frame.preview)
 

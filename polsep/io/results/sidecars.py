@@ -93,8 +93,8 @@ def _flat_names(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
 def exr_notes(units: Mapping[str, str], report: Mapping[str, Any] | None = None) -> dict[str, str | float]:
     """Attributes of an EXR file: the polsep version, the unit of each layer, and what a frame's ``report`` says.
 
-    Method, layout, levels and light colour are polsep's own; exposure time [s] and time of the capture (UTC) are OpenEXR's
-    standard attributes ``expTime``, ``capDate`` and ``utcOffset``. What is not known is left out.
+    Method, layout, levels and light colour are polsep's own; exposure time [s] and time of the capture (UTC) are
+    OpenEXR's standard attributes ``expTime``, ``capDate`` and ``utcOffset``. What is not known is left out.
     """
     notes: dict[str, str | float] = {"polsepVersion": __version__}
     notes |= {f"{layer}Units": unit for layer, unit in units.items()}

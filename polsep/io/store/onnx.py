@@ -11,15 +11,19 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from polsep.io.results.sidecars import version_text
 from polsep.io.store.atomic import atomic_path
+from polsep.sensor.camera import Layout
 
-#: Inputs of an exported network, in order.
-INPUTS = ("raw", "black_level", "white_level")
+#: Inputs of an exported network, in order; those of mono networks end before the last.
+INPUTS = ("raw", "black_level", "white_level", "light_color")
 #: The oldest set of operators that torch's exporter writes.
 OPERATORS = 18
 #: Frames that the exporter traces; the network accepts any batch and sides of any multiple of 4. Traced with a batch of
 #: 1, it would accept no other.
 EXAMPLE = (2, 64, 96)
+#: What `write_onnx` does, in order.
+STEPS = ("tracing", "translating", "simplifying", "writing")
 
 
 @contextmanager
@@ -36,8 +40,27 @@ def _quiet() -> Iterator[None]:
         log.setLevel(before)
 
 
-def write_onnx(path: Path, network: nn.Module, outputs: tuple[str, ...], metadata: dict[str, str]) -> None:
-    """Write a network that maps uint16 frames, black and white level to ``outputs``, atomically.
+def describe_graph(method: str, layout: Layout, full: bool) -> dict[str, str]:
+    """Metadata of a graph: name, version, layout, units, licence."""
+    kind, size = "mono" if layout.bayer is None else "colour", "full" if full else "half"
+    return {
+        "name": f"polsep {method}, {kind} frames, {size} resolution",
+        "version": version_text(),
+        "layout": layout.spec,
+        "resolution": size,
+        "precision": "float32",
+        "units": (
+            "raw, black_level, white_level: codes of the camera; light_color: camera RGB of the light, 1,1,1 is white; "
+            "diffuse, specular: linear light in camera RGB, 1.0 = one measurement at the white level (an unclipped "
+            "diffuse + specular reaches 2); error: expected standard deviation of the error of diffuse and of specular "
+            "in that unit, at half resolution; valid: false where clipping leaves no measurement"
+        ),
+        "license": "MIT, code and weights",
+    }
+
+
+def write_onnx(path: Path, network: nn.Module, outputs: tuple[str, ...], metadata: dict[str, str]) -> Iterator[str]:
+    """Write an `ExportedNetwork` to ``path``, atomically; yield each of `STEPS` before it begins.
 
     Raises ValueError where the extra ``export`` is missing.
     """
@@ -45,21 +68,34 @@ def write_onnx(path: Path, network: nn.Module, outputs: tuple[str, ...], metadat
         import onnxscript  # noqa: F401  # what torch exports with
     except ImportError as error:
         raise ValueError(f"expected the extra 'export' (pip install 'polsep[export]'), found no {error.name}") from None
-    frame = torch.zeros(EXAMPLE, dtype=torch.uint16)
-    arguments = (frame, torch.tensor([0.0]), torch.tensor([4095.0]))
+    arguments = [torch.zeros(EXAMPLE, dtype=torch.uint16), torch.tensor([0.0]), torch.tensor([4095.0]), torch.ones(3)]
+    names = INPUTS if network.colors == 3 else INPUTS[:-1]
     free = torch.export.Dim.DYNAMIC
+    shapes = {name: dict.fromkeys(range(3), free) if name == "raw" else {} for name in names}
+    steps = iter(STEPS)
+    yield next(steps)
+    with _quiet(), torch.no_grad():
+        traced = torch.export.export(
+            network.eval(), tuple(arguments[: len(names)]), dynamic_shapes=shapes, strict=False
+        )
+    yield next(steps)
     with _quiet():
         program = torch.onnx.export(
-            network,
-            arguments,
+            traced,
             dynamo=True,
             verbose=False,
-            input_names=list(INPUTS),
+            optimize=False,
+            input_names=list(names),
             output_names=list(outputs),
-            dynamic_shapes={"raw": dict.fromkeys(range(3), free), "black_level": {}, "white_level": {}},
             opset_version=OPERATORS,
         )
     assert program is not None
+    yield next(steps)
+    with _quiet():
+        program.optimize()
+    yield next(steps)
     program.model.metadata_props.update(metadata)
+    program.model.producer_name, program.model.producer_version = "polsep", version_text()
+    program.model.doc_string = metadata["name"]
     with atomic_path(path) as part:
         program.save(part)

@@ -160,12 +160,12 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     with show_progress(f"exporting {method}") as progress:
         import torch
 
-        from polsep.io.store.onnx import STEPS, describe_graph, write_onnx
-        from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork
+        from polsep.io.store.onnx import STEPS, write_onnx
+        from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork, describe_graph
         from polsep.networks.joint import Joint
 
         graph = ExportedNetwork([Joint.of(network, torch.device("cpu")) for network in networks], options["full"])
-        metadata |= describe_graph(method, layout, options["full"])
+        metadata |= describe_graph(method, layout, options["full"], polsep.__version__)
         for number, step in enumerate(write_onnx(output, graph, OUTPUT_NAMES, metadata), 1):
             progress.update(0, None, f"exporting {method}, step {number} of {len(STEPS)}: {step}")
     print(output)

@@ -19,13 +19,32 @@ from polsep.networks.channels import PERIOD
 from polsep.networks.joint import Joint
 from polsep.networks.run import cells_near_clipping, combine, repeat, run_images
 from polsep.physics.stokes import Stokes
-from polsep.sensor.camera import CLIP_MARGIN
+from polsep.sensor.camera import CLIP_MARGIN, Layout
 from polsep.separation.analytic import Separation
 
 #: Names of the outputs, in order.
 OUTPUT_NAMES = ("diffuse", "specular", "error", "valid")
 #: Samples above and left of the frame in the four ways in which a mono one lies on periods (`orient.shifts_of`).
 _SHIFTS = tuple((top, left) for top in (2, 4) for left in (2, 4))
+
+
+def describe_graph(method: str, layout: Layout, full: bool, version: str) -> dict[str, str]:
+    """Metadata of a graph of a method, by a ``version`` of polsep: name, version, layout, units, licence."""
+    kind, size = "mono" if layout.bayer is None else "colour", "full" if full else "half"
+    return {
+        "name": f"polsep {method}, {kind} frames, {size} resolution",
+        "version": version,
+        "layout": layout.spec,
+        "resolution": size,
+        "precision": "float32",
+        "units": (
+            "raw, black_level, white_level: codes of the camera; light_color: camera RGB of the light, 1,1,1 is white; "
+            "diffuse, specular: linear light in camera RGB, 1.0 = one measurement at the white level (an unclipped "
+            "diffuse + specular reaches 2); error: expected standard deviation of the error of diffuse and of specular "
+            "in that unit, at half resolution; valid: false where clipping leaves no measurement"
+        ),
+        "license": "MIT, code and weights",
+    }
 
 
 class ExportedNetwork(nn.Module):
@@ -91,7 +110,7 @@ class ExportedNetwork(nn.Module):
 
 
 def _separation(diffuse: Tensor, specular: Tensor, valid: Tensor, error: Tensor) -> Separation:
-    """What `run.combine` weighs; of its Stokes images nothing is exported."""
+    """Images for `run.combine` to weigh; of their Stokes images nothing is exported."""
     return Separation(diffuse, specular, valid, Stokes(diffuse, diffuse, diffuse), expected_error=error)
 
 

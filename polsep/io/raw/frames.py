@@ -133,7 +133,7 @@ class Frame:
     captured: str | None = None
 
     def taken(self) -> dict[str, Any]:
-        """How it was taken, for reports: what the file says of it."""
+        """Facts of the capture, for reports: those that the file says."""
         found = {"exposure_s": self.exposure, "captured": self.captured}
         return {name: value for name, value in found.items() if value is not None}
 

@@ -210,7 +210,7 @@ def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
 
 
 def _captured(header: Header, start: int, image: RawImage) -> str | None:
-    """When a frame was taken: by the camera's clock after the first one, whose time stamp is ``start`` [ns]."""
+    """Time of a frame: by the camera's clock after the first one, whose time stamp is ``start`` [ns]."""
     after_ns = image.timestamp_ns - start
     if header.began is None or after_ns < 0 or not start:
         return None

@@ -11,9 +11,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from polsep.io.results.sidecars import version_text
 from polsep.io.store.atomic import atomic_path
-from polsep.sensor.camera import Layout
 
 #: Inputs of an exported network, in order; those of mono networks end before the last.
 INPUTS = ("raw", "black_level", "white_level", "light_color")
@@ -40,29 +38,10 @@ def _quiet() -> Iterator[None]:
         log.setLevel(before)
 
 
-def describe_graph(method: str, layout: Layout, full: bool) -> dict[str, str]:
-    """Metadata of a graph: name, version, layout, units, licence."""
-    kind, size = "mono" if layout.bayer is None else "colour", "full" if full else "half"
-    return {
-        "name": f"polsep {method}, {kind} frames, {size} resolution",
-        "version": version_text(),
-        "layout": layout.spec,
-        "resolution": size,
-        "precision": "float32",
-        "units": (
-            "raw, black_level, white_level: codes of the camera; light_color: camera RGB of the light, 1,1,1 is white; "
-            "diffuse, specular: linear light in camera RGB, 1.0 = one measurement at the white level (an unclipped "
-            "diffuse + specular reaches 2); error: expected standard deviation of the error of diffuse and of specular "
-            "in that unit, at half resolution; valid: false where clipping leaves no measurement"
-        ),
-        "license": "MIT, code and weights",
-    }
-
-
 def write_onnx(path: Path, network: nn.Module, outputs: tuple[str, ...], metadata: dict[str, str]) -> Iterator[str]:
     """Write an `ExportedNetwork` to ``path``, atomically; yield each of `STEPS` before it begins.
 
-    Raises ValueError where the extra ``export`` is missing.
+    ``metadata``: with name and version. Raises ValueError where the extra ``export`` is missing.
     """
     try:
         import onnxscript  # noqa: F401  # what torch exports with
@@ -95,7 +74,7 @@ def write_onnx(path: Path, network: nn.Module, outputs: tuple[str, ...], metadat
         program.optimize()
     yield next(steps)
     program.model.metadata_props.update(metadata)
-    program.model.producer_name, program.model.producer_version = "polsep", version_text()
+    program.model.producer_name, program.model.producer_version = "polsep", metadata["version"]
     program.model.doc_string = metadata["name"]
     with atomic_path(path) as part:
         program.save(part)

@@ -27,6 +27,7 @@ import polsep
 from polsep import cli
 from polsep.in_torch import load_joint
 from polsep.io.store.weights import write_weights
+from polsep.methods import METHODS
 from polsep.networks.channels import INPUTS
 from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork
 from polsep.networks.joint import Joint
@@ -121,6 +122,20 @@ def test_the_shipped_graph_is_what_the_command_line_says(
     raw, white = real_crop()
     codes = raw[None].astype(np.uint16)
     assert_separated([x[0] for x in images_of(tmp_path / "fast.onnx", codes, (0, white), LIGHT)], raw, white, asked)
+
+
+def test_layers_are_of_the_precision_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in a process that has computed in another one."""
+    raw, white = clipped_crop()
+    mosaic, found = Mosaic(raw, Layout(), 0, white), {}
+    for asked in ("f32", "i8", "f32"):
+        monkeypatch.setenv("POLSEP_LAYERS", asked)
+        image = METHODS["joint-fast"].run(mosaic, LIGHT, False).specular
+        npt.assert_array_equal(image, found.setdefault(asked, image))
+    assert not np.array_equal(found["f32"], found["i8"])
+    monkeypatch.setenv("POLSEP_LAYERS", "f16")
+    with pytest.raises(ValueError, match="expected POLSEP_LAYERS as bf16, f32, i8, found 'f16'"):
+        polsep.separate(raw, "joint-fast", white_level=white)
 
 
 @pytest.mark.parametrize("full", [False, True])

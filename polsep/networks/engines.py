@@ -25,7 +25,7 @@ from polsep.networks import details_kernel, images_kernel
 from polsep.networks.channels import PERIOD
 from polsep.networks.graphs import require_own_threads
 from polsep.networks.joint_weights import JointWeights
-from polsep.networks.openvino_engine import OpenVinoEngine, modulation_of
+from polsep.networks.openvino_engine import OpenVinoEngine, asked_precision, modulation_of
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of, own_order
 from polsep.sensor.camera import Mosaic
@@ -37,12 +37,13 @@ KEPT = 2
 
 
 class _Job(NamedTuple):
-    """A kind of work that an engine is made for."""
+    """A kind of work that an engine is made for; ``layers``: the precision that is asked for, if one is."""
 
     network: JointWeights
     full: bool
     shape: tuple[int, int]
     threads: int
+    layers: str | None
 
 
 class _Engines:
@@ -158,7 +159,7 @@ def _run_turned(network: JointWeights, mosaic: Mosaic, orientation: Orientation,
     cells, parts, levels = 1 if full else 2, [], (mosaic.black_level, mosaic.white_level)
     modulation = modulation_of(network, turned, levels, mosaic.light_color)
     for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), network.size):
-        job = _Job(network, full, (bottom - top, turned.shape[1]), get_threads())
+        job = _Job(network, full, (bottom - top, turned.shape[1]), get_threads(), asked_precision())
         with ENGINES.borrow(job) as engine:
             rows = slice(*((row - top) // cells for row in kept))
             parts.append(engine.run(turned[top:bottom], levels, mosaic.light_color, modulation, rows))

@@ -55,7 +55,7 @@ class OpenVinoEngine:
         self._layout = network.layout
         h, w = shape[0] // PERIOD, shape[1] // PERIOD
         channels = input_channels(network.colors, network.inputs)
-        precision = precision or usual_precision()
+        precision = precision or asked_precision() or usual_precision()
         halves = precision == "bf16"
         inputs = LayerInput.empty((h, w, channels.total), halves)
         closed = ClosedFormRows.empty(network.colors, h, w)
@@ -170,18 +170,20 @@ def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[Floats], prec
     return request
 
 
+def asked_precision() -> str | None:
+    """Precision of layers that the environment variable POLSEP_LAYERS asks for. Raises ValueError on another word."""
+    asked = os.environ.get("POLSEP_LAYERS")
+    if asked not in (None, *PRECISIONS):
+        raise ValueError(f"expected POLSEP_LAYERS as {', '.join(PRECISIONS)}, found {asked!r:.40}")
+    return asked
+
+
 def usual_precision() -> str:
     """The fastest precision on this processor: "bf16" where OpenVINO takes it and matrix tiles (AMX) multiply it.
 
     Vector units that know bfloat16 alone (AVX512-BF16) take 1.6 times as long with it as with float32, and those that
-    multiply 8-bit integers (VNNI) a third as long with these (docs/experiments.md). The environment variable
-    POLSEP_LAYERS says another one. Raises ValueError on what is none.
+    multiply 8-bit integers (VNNI) a third as long with these (docs/experiments.md).
     """
-    asked = os.environ.get("POLSEP_LAYERS")
-    if asked is not None:
-        if asked not in PRECISIONS:
-            raise ValueError(f"expected POLSEP_LAYERS as {', '.join(PRECISIONS)}, found {asked!r:.40}")
-        return asked
     name: str = core().get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name()
     if name == "bf16" and "amx_bf16" not in cpu_flags():
         name = "f32"

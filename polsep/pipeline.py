@@ -196,8 +196,8 @@ def make_frame(
     report = describe(images.tally, method.expects_errors)
     if images.error is not None:
         report["statistics"] |= error_quantiles(images.error, math.fsum(light) / len(light))
-    layout = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
-    report |= {"method": method.name, "light_color": list(light), "full_resolution": full, "layout": layout}
+    report |= {"method": method.name, "light_color": list(light), "full_resolution": full}
+    report["layout"] = capture.layout.spec if isinstance(capture, Mosaic) else _describe_angles(capture)
     if not _is_finite(report):
         raise ValueError(f"expected finite images of {method.name}, found others: is the white level far too low?")
     diffuse, specular, error = images.diffuse, images.specular, images.error
@@ -205,6 +205,12 @@ def make_frame(
         fall = falloff_image(capture.falloff, *diffuse.shape[:2])[..., None]
         diffuse, specular, error = diffuse / fall, specular / fall, None if error is None else error / fall
     return Result(diffuse, specular, images.valid, images.dolp, images.aolp, report, error)
+
+
+def _describe_angles(samples: Measurements) -> str:
+    """Co-sited measurements in a few words."""
+    number = len(samples.angles)
+    return "two crossed photographs" if number == 2 else f"{'four' if number == 4 else number} co-sited angle images"
 
 
 def _is_finite(facts: Any) -> bool:

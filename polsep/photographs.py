@@ -48,7 +48,7 @@ EQUAL = 0.12
 MAX_CONTRADICTION = 0.03
 #: Largest error of angles that count as found [rad]; motion of a corner in pixels below which a photograph stays as it
 #: is; motion left after alignment of which to warn; and least share of the picture that all photographs show.
-MAX_ANGLE_ERROR, STILL, MAX_LEFT, LEAST_SHARED = math.radians(2), 0.03, 0.5, 0.5
+MAX_ANGLE_ERROR, STILL, MAX_LEFT, LEAST_SHARED = math.radians(2), 0.1, 0.5, 0.5
 #: Clipped light is marked within this many pixels in a photograph that was moved: the reach of cubic interpolation.
 REACH = 2
 #: Side of the blocks from whose means angles and exposures are found, in pixels.

@@ -3,8 +3,8 @@
 Motions are 3x3 homographies that map pixels (x, y, 1) of the reference to those of the moved picture. They are found
 by ECC (Evangelidis and Psarakis 2008, doi 10.1109/TPAMI.2008.113), which ignores differences of gain and offset, from
 coarse to fine on a pyramid. What is compared are square roots of brightness without their slow parts, so that
-highlights and shadings that a turned filter changes weigh little; pixels that differ most are left out of the last
-round.
+highlights and shadings that a turned filter changes weigh little; pixels that differ most are left out of later
+rounds.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ MOTIONS = ("shift", "rigid", "affine", "homography")
 COARSEST, FINEST = 96, 2048
 #: Standard deviations of the band of details that is compared, in pixels of a level.
 FINE, SLOW = 0.8, 6.0
-#: Share of pixels that the last round keeps: those whose details agree best.
-KEPT = 0.8
+#: Share of pixels that later rounds on a level keep, those whose details agree best, and the number of these rounds.
+KEPT, ROUNDS = 0.8, 2
 #: Blocks along a side whose shifts show what a motion left, and the response from which a block's shift counts.
 BLOCKS, TRUSTED = 6, 0.2
 #: Steps of a level, and the change of the correlation below which it ends.
@@ -65,8 +65,9 @@ def find_motion(reference: Floats, moved: Floats, kind: str = "rigid") -> Motion
             break
         details = (_details(pair[0]), _details(pair[1]))
         matrix = _refine(details, matrix, model, None)
-        if level == 0 or max(pyramid[level - 1][0].shape) > FINEST:
+        for _ in range(ROUNDS):
             matrix = _refine(details, matrix, model, _agreeing(details, matrix))
+        if level == 0 or max(pyramid[level - 1][0].shape) > FINEST:
             break
         matrix = _scaled(matrix, 2.0)
     after, before = (_correlation(details, m) for m in (matrix, np.eye(3)))

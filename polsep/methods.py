@@ -211,7 +211,7 @@ def _joint(name: str, summary: str) -> Method:
     return Method(
         name,
         summary,
-        f"a raw mosaic with Sony's filters in any orientation, or three co-sited images, {colors}; white light",
+        f"a raw mosaic in Sony's order, however turned, or co-sited images; {colors}; trained under white light",
         "this project; after Dave et al. 2022 and the colour-affine closed form",
         partial(joint_reference, name),
         partial(run_joint, name),

@@ -21,8 +21,9 @@ from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.raw.photographs import MOST_FRAMES, read_photographs
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
+from polsep.methods import METHODS
 from polsep.photographs import PAIR, PhotoOptions, read_measurements
-from polsep.physics.stokes import Measurements
+from polsep.physics.stokes import Measurements, fit_stokes
 from polsep.sensor.camera import Mosaic
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -307,3 +308,18 @@ def test_an_extra_that_is_missing_is_named_before_any_work(
     paths = [write_tiff(tmp_path / f"{k}.tif", photograph(90 * k)) for k in range(2)]
     run = polsep("separate", "--parallel", paths[0], "--crossed", paths[1], "-o", tmp_path / "o")
     assert_refused(run, "expected the extra 'photos'")
+
+
+@pytest.mark.parametrize("colors", [3, 1], ids=["colour", "mono"])
+def test_networks_separate_co_sited_images_at_their_resolution(colors: int) -> None:
+    """Their images sum to s0 of the samples, three angles give what four do, and both the scene's lobes."""
+    diffuse, specular, _ = lobes()
+    s0 = np.moveaxis(diffuse[:colors] + specular, 0, -1)
+    for angles in ((0.0, 45.0, 90.0, 135.0), (0.0, 60.0, 120.0)):
+        data = np.stack([photograph(angle, seed=k)[:colors] for k, angle in enumerate(angles)])
+        samples = Measurements(data, tuple(math.radians(angle) for angle in angles))
+        images = METHODS["joint-fast"].run(samples, (1.0,) * colors, False)
+        total = np.moveaxis(fit_stokes(samples).s0, 0, -1)
+        assert images.diffuse.shape == s0.shape and np.abs(images.diffuse + images.specular - total).max() < 1e-6
+        assert images.diffuse.min() >= 0 and images.specular.min() >= 0
+        assert np.abs(images.specular - specular[..., None]).mean() < 0.3 * specular.mean()

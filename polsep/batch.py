@@ -17,6 +17,7 @@ from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames, r
 from polsep.io.results.separation_writer import planned_outputs, write_separation
 from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import one_line
+from polsep.methods import find_method
 from polsep.pipeline import LightColor, separate_capture
 
 if TYPE_CHECKING:
@@ -90,8 +91,10 @@ def separate_photographs(
 
     The report's ``photographs`` holds their angles, exposures and alignment. Raises ValueError.
     """
-    from polsep.photographs import read_measurements
+    from polsep.photographs import ANY_PAIR, PAIR, read_measurements
 
+    if photos.angles_deg == PAIR:
+        find_method(options.method, ANY_PAIR)
     outputs = planned_outputs(write.directory, output_stem(paths[0]), write.format)
     if clash := sorted({realpath(output) for output in outputs} & {realpath(path) for path in paths}):
         raise OutputError(f"{paths[0]}: expected outputs of its own, found that {clash[0]} is an input")

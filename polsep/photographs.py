@@ -35,6 +35,8 @@ from polsep.physics.stokes import Measurements, contradictions, correct_extincti
 from polsep.physics.turned_analyser import find_angles, find_pair_exposure, gram
 from polsep.sensor.levels import as_measurements
 
+#: A pair of one colour pixel, to ask methods whether they take pairs.
+ANY_PAIR = Measurements(np.zeros((2, 3, 1, 1), np.float32), (0.0, math.pi / 2))
 ENCODINGS = ("linear", "srgb")
 ALIGNMENTS = ("none", *MOTIONS)
 #: Angles of two photographs through a parallel and a crossed filter, in degrees from the specular light's direction.
@@ -44,6 +46,8 @@ _FRAMES: dict[tuple[float, ...] | None, str] = {None: "the first photograph", PA
 
 #: Largest logarithm of the ratio of a pair's exposures that counts as none: finding it may err by as much.
 EQUAL = 0.12
+#: Brightness of the parallel over the crossed photograph below which they may be swapped.
+DARKER = 0.97
 #: Largest contradiction of four and more photographs, relative to their brightness, of which nobody is warned.
 MAX_CONTRADICTION = 0.03
 #: Largest error of angles that count as found [rad]; motion of a corner in pixels below which a photograph stays as it
@@ -60,7 +64,7 @@ class PhotoOptions:
     """Facts of photographs that files do not contain.
 
     ``angles_deg``: of the filter in each photograph [degrees], in their order; None: unknown. `PAIR` is a parallel and
-    a crossed photograph. ``exposures``: relative ones, told; None: found where that is possible, else equal.
+    a crossed photograph. ``exposures``: relative ones, told; None: what camera raw says, else equal, of pairs found.
     ``extinction``: of filters, parallel over crossed light of a mirror. ``align``: one of `ALIGNMENTS`. ``encoding``:
     one of `ENCODINGS`. ``full``: camera raw at full resolution. Raises ValueError on anything else.
     """
@@ -101,13 +105,16 @@ def read_measurements(
             raise ValueError(f"expected {number} {name} for {number} photographs, found {len(given)}")
     with naming(paths[0]):
         images, notes = _to_light(photos, options, read)
+    refuse_forgotten(paths[0], Frame("", images, notes))
     images, motions, left = _align(images, photos.names, options.align)
     exposures, source = _exposures(images, photos, options)
     images = _divide(images, exposures)
     angles, error = _angles(images, options)
     data = correct_extinction(replace(images, angles=angles), options.extinction)
+    means = data.data.mean(axis=(1, 2, 3))
     facts: dict[str, Any] = {
         "files": list(photos.names),
+        "brightness": [round(float(mean), 5) for mean in means],
         "angles_deg": [round(math.degrees(t), 3) for t in angles],
         "angles": "found, up to a common roll and mirror" if options.angles_deg is None else "told",
         "frame": _FRAMES.get(options.angles_deg, "picture"),
@@ -124,9 +131,7 @@ def read_measurements(
         missed = contradictions(Measurements(seen[:, None, None], angles))
         facts["contradiction"] = round(float(np.sqrt((missed**2).mean()) / seen.mean()), 5)
     remarks = tuple(_remarks(facts, options))
-    frame = Frame(output_stem(paths[0]), data, (*photos.notes, *notes, *remarks))
-    refuse_forgotten(paths[0], frame)
-    return frame, facts
+    return Frame(output_stem(paths[0]), data, (*photos.notes, *notes, *remarks)), facts
 
 
 def _to_light(photos: Photographs, options: PhotoOptions, read: ReadOptions) -> tuple[Measurements, tuple[str, ...]]:
@@ -247,6 +252,8 @@ def _angles(images: Measurements, options: PhotoOptions) -> tuple[tuple[float, .
 
 def _remarks(facts: dict[str, Any], options: PhotoOptions) -> Iterator[str]:
     """Remarks for whoever took the photographs."""
+    if options.angles_deg == PAIR and facts["brightness"][0] < DARKER * facts["brightness"][1]:
+        yield "a parallel photograph brighter than the crossed one was expected, found the reverse: are they swapped?"
     if facts["exposures_source"] == "found":
         said = ",".join(f"{e:.3g}" for e in facts["exposures"])
         yield f"equal exposures were expected, found {said}, good to about 5 %: say --exposures, or expose by hand"

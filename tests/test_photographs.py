@@ -154,6 +154,14 @@ def test_photographs_that_stand_still_are_not_resampled(tmp_path: Path) -> None:
     assert any("of their light contradict" in note for note in told.notes)
 
 
+def test_swapped_pairs_are_doubted(tmp_path: Path) -> None:
+    """The parallel photograph has the highlights, so it is the brighter one."""
+    paths = [str(write_tiff(tmp_path / f"{angle:g}.tif", photograph(angle))) for angle in PAIR]
+    for order, count in ((paths, 0), (paths[::-1], 1)):
+        frame, _ = read_measurements(order, PhotoOptions(PAIR, exposures=(1, 1), align="none"))
+        assert sum("are they swapped?" in note for note in frame.notes) == count
+
+
 def test_unknown_angles_are_found(tmp_path: Path, polsep: Cli) -> None:
     """Of six photographs, named in an order; of light of one direction nothing is found, in one line."""
     paths = [write_tiff(tmp_path / f"{k}.tif", photograph(angle, seed=k)) for k, angle in enumerate(SIX)]
@@ -162,7 +170,7 @@ def test_unknown_angles_are_found(tmp_path: Path, polsep: Cli) -> None:
     facts = json.loads((tmp_path / "o" / "0.json").read_text())["report"]["photographs"]
     assert np.abs(np.array(facts["angles_deg"]) - SIX).max() < 0.3
     assert facts["angles"] == "found, up to a common roll and mirror" and facts["angle_error_deg"] < 0.2
-    flat = [write_tiff(tmp_path / f"f{k}.tif", 0.4 * photograph(0, seed=k)) for k in range(5)]
+    flat = [write_tiff(tmp_path / f"f{k}.tif", 0.8 * photograph(0, seed=k)) for k in range(5)]
     assert_refused(polsep("separate", "--angles", "unknown", *flat, *common), "one direction", "say --angles")
 
 

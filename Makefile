@@ -57,7 +57,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev,render,mitsuba,train,bench,export,video]"
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev,render,mitsuba,train,bench,export,video,photos]"
 	touch $@
 
 $(VENV)/.installed-docs: pyproject.toml constraints.txt | $(VENV)/bin/python

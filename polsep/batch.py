@@ -7,17 +7,21 @@ the order of files, so the same command on the same files writes the same bytes.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from os.path import realpath
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames, refuse_forgotten
 from polsep.io.results.separation_writer import planned_outputs, write_separation
 from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import one_line
+from polsep.methods import find_method
 from polsep.pipeline import LightColor, separate_capture
+
+if TYPE_CHECKING:
+    from polsep.photographs import PhotoOptions
 
 
 @dataclass(frozen=True)
@@ -88,8 +92,32 @@ def separate_files(
             yield Outcome(path, error=one_line(error) or type(error).__name__)
 
 
+def separate_photographs(
+    paths: Sequence[str], photos: PhotoOptions, read: ReadOptions, options: SeparateOptions, write: WriteOptions
+) -> Outcome:
+    """Separate the photographs of one scene through a turned filter, as one frame with the name of the first.
+
+    The report's ``photographs`` holds their angles, exposures and alignment. Raises ValueError.
+    """
+    from polsep.photographs import ANY_PAIR, PAIR, read_measurements
+
+    if photos.angles_deg == PAIR:
+        find_method(options.method, ANY_PAIR)
+    outputs = planned_outputs(write.directory, output_stem(paths[0]), write.format)
+    if clash := sorted({realpath(output) for output in outputs} & {realpath(path) for path in paths}):
+        raise OutputError(f"{paths[0]}: expected outputs of its own, found that {clash[0]} is an input")
+    refuse_existing(write.directory, outputs, write.overwrite)
+    frame, facts = read_measurements(paths, photos, read)
+    return _separate_frame(paths[0], frame, read, options, write, {"photographs": facts})
+
+
 def _separate_frame(
-    path: str, frame: Frame, read: ReadOptions, options: SeparateOptions, write: WriteOptions
+    path: str,
+    frame: Frame,
+    read: ReadOptions,
+    options: SeparateOptions,
+    write: WriteOptions,
+    facts: Mapping[str, Any] | None = None,
 ) -> Outcome:
     try:
         separated = separate_capture(frame.data, options.method, options.light_color, options.device, options.full)
@@ -97,6 +125,7 @@ def _separate_frame(
         raise ValueError(f"{path}: {error}") from error
     separated.report["source"] = Path(path).name
     separated.report["settings"] = read.settings()
+    separated.report.update(facts or {})
     separated.report["warnings"] = [*frame.notes, *separated.report["warnings"]]
     separated.report.update(frame.taken())
     if write.stokes:

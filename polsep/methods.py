@@ -21,8 +21,8 @@ from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import MIN_CELLS, demosaic_guided, demosaic_guided_half
 from polsep.io.store.weights import is_shipped
 from polsep.networks.engines import combine_images, run_engine
-from polsep.physics.stokes import Measurements
-from polsep.sensor.camera import Layout, Mosaic, WrongType
+from polsep.physics.stokes import Measurements, behind_angles, fit_stokes, is_pair
+from polsep.sensor.camera import Layout, Mosaic, WrongType, sample_fine_mosaic
 from polsep.separation import analytic_kernel, color_affine_kernel
 from polsep.separation.analytic import Separation, separate_analytic
 from polsep.separation.analytic_kernel import AnalyticOptions
@@ -109,8 +109,8 @@ def paper_reference(capture: Capture, full: bool = False) -> Separation:
 
 
 def joint_reference(name: str, capture: Capture, full: bool = False) -> Separation:
-    """`in_torch.separate_joint`; takes torch tensors alone. Raises ValueError on others."""
-    if isinstance(capture.data, np.ndarray):
+    """`in_torch.separate_joint`; takes mosaics as torch tensors alone. Raises ValueError on others."""
+    if isinstance(capture.data, np.ndarray) or isinstance(capture, Measurements):
         raise ValueError(f"expected one mosaic [H, W] for the method {name}, found shape {capture.data.shape}")
     from polsep.in_torch import separate_joint
 
@@ -153,10 +153,31 @@ def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
 
 def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameImages:
     """The joint networks of that name: kernels and OpenVINO, on other devices torch."""
+    if isinstance(capture, Measurements):
+        return run_joint_co_sited(name, capture, light)
     if isinstance(capture, Mosaic) and capture.data.ndim == 2 and on_cpu(capture.data):
         networks = [shipped_joint(member) for member in member_names(name, capture.layout)]
         return combine_images([run_engine(network, replace(capture, light_color=light), full) for network in networks])
     return run_reference(partial(joint_reference, name), capture, light, full)
+
+
+def run_joint_co_sited(name: str, samples: Measurements, light: Light) -> FrameImages:
+    """The joint networks on the mosaic that a sensor twice as fine would see of co-sited samples, at their resolution.
+
+    Better than a mosaic of the samples themselves, which lacks three analysers and two colours in every pixel
+    (docs/experiments.md). s0 is that of the samples: the networks say how it splits.
+    """
+    layout = Layout(bayer=None) if samples.data.shape[-3] == 1 else Layout()
+    mosaic = sample_fine_mosaic(behind_angles(samples, layout.angles), layout)
+    images = run_joint(name, mosaic, light, False)
+    light_of_samples, clipped, xp = fit_stokes(samples).s0.clip(0, None), samples.clipped, namespace(samples.data)
+    unknown = xp.zeros_like(light_of_samples, dtype=xp.bool) if clipped is None else xp.any(clipped, axis=-4)
+    s0, unknown = (xp.moveaxis(image, -3, -1) for image in (light_of_samples, unknown))
+    if isinstance(images.specular, np.ndarray):  # tensors on the CPU go through the same kernels
+        s0, unknown, xp = to_numpy(s0), to_numpy(unknown), np
+    specular = xp.minimum(images.specular, s0)
+    diffuse = xp.where(unknown, images.diffuse, s0 - specular)
+    return replace(images, diffuse=diffuse, specular=xp.where(unknown, images.specular, specular))
 
 
 def _is_plain(mosaic: Mosaic) -> bool:
@@ -172,16 +193,29 @@ def _accepts_anything(capture: Capture) -> bool:
     return True
 
 
+def _sees_all(capture: Capture) -> bool:
+    """True unless it is a crossed pair, which shows one component of the polarization alone."""
+    return isinstance(capture, Mosaic) or not is_pair(capture)
+
+
+def _accepts_joint(name: str, capture: Capture) -> bool:
+    """True for mosaics that the networks of that name know, and for co-sited samples whose colours have weights."""
+    if isinstance(capture, Mosaic):
+        return accepts_mosaic(name, capture)
+    layout = Layout(bayer=None) if capture.data.shape[-3] == 1 else Layout()
+    return _sees_all(capture) and capture.data.ndim == 4 and is_shipped(weights_name(name, layout))
+
+
 def _joint(name: str, summary: str) -> Method:
     colors = "colour or mono" if is_shipped(weights_name(name, Layout(bayer=None))) else "colour"
     return Method(
         name,
         summary,
-        f"a raw mosaic with Sony's filters in any orientation, {colors}; trained under white light",
+        f"a raw mosaic in Sony's order, however turned, or co-sited images; {colors}; trained under white light",
         "this project; after Dave et al. 2022 and the colour-affine closed form",
         partial(joint_reference, name),
         partial(run_joint, name),
-        partial(accepts_mosaic, name),
+        partial(_accepts_joint, name),
         expects_errors=True,
         reads_mosaic=True,
         assumes_white=True,
@@ -217,7 +251,7 @@ _ALL = (
         "Dave et al. 2022, Sec. 4; weights are this project's",
         paper_reference,
         partial(run_reference, paper_reference),
-        _accepts_anything,
+        _sees_all,
     ),
 )
 
@@ -242,6 +276,10 @@ def find_method(name: str, capture: Capture) -> Method:
     check_method(name)
     if name in _CHOICES:
         return next(method for method in _CHOICES[name] if method.accepts(capture))
+    if isinstance(capture, Measurements) and not METHODS[name].accepts(capture):
+        able = ", ".join(method.name for method in METHODS.values() if method.accepts(capture))
+        kind = "two crossed photographs" if is_pair(capture) else "these images"
+        raise ValueError(f"expected a method for {kind} ({able}), found {name}")
     if name in NAMES and isinstance(capture, Mosaic) and not is_shipped(weights_name(name, capture.layout)):
         kind = "mono" if capture.layout.bayer is None else "colour"
         raise ValueError(f"expected a method with weights for {kind} frames, as auto finds, found {name}")

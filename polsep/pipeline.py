@@ -218,7 +218,7 @@ def make_frame(
     report = describe(images.tally, method.expects_errors)
     if images.error is not None:
         report["statistics"] |= error_quantiles(images.error, math.fsum(light) / len(light))
-    layout = capture.layout.spec if isinstance(capture, Mosaic) else "four co-sited angle images"
+    layout = capture.layout.spec if isinstance(capture, Mosaic) else _describe_angles(capture)
     report |= {"method": method.name, "light_color": list(light), "full_resolution": full, "layout": layout}
     if isinstance(capture, Mosaic):
         report |= {"black_level": float(capture.black_level), "white_level": float(capture.white_level)}
@@ -229,6 +229,12 @@ def make_frame(
         fall = falloff_image(capture.falloff, *diffuse.shape[:2])[..., None]
         diffuse, specular, error = diffuse / fall, specular / fall, None if error is None else error / fall
     return Result(diffuse, specular, images.valid, images.dolp, images.aolp, report, error)
+
+
+def _describe_angles(samples: Measurements) -> str:
+    """Co-sited measurements in a few words."""
+    number = len(samples.angles)
+    return "two crossed photographs" if number == 2 else f"{'four' if number == 4 else number} co-sited angle images"
 
 
 def _is_finite(facts: Any) -> bool:

@@ -339,7 +339,7 @@ ARRAYS: list[tuple[str, Callable[[], object], str]] = [
     ("three angles", lambda: as_measurements(np.ones((3, 4, 4))), "expected four gray or RGB images"),
     ("four channels", lambda: as_measurements(np.ones((4, 4, 4, 4))), "expected four gray or RGB images"),
     ("five planes", lambda: interleave_planes(np.ones((5, 4, 4)), Layout()), "expected four planes"),
-    ("pages", lambda: ReadOptions(pages="both"), 'expected pages "frames" or "angles", found'),
+    ("pages", lambda: ReadOptions(pages="both"), 'expected pages "auto", "frames" or "angles", found'),
     ("size", lambda: ReadOptions(size=(0, 4)), "expected a size of positive width and height, found (0, 4)"),
 ]
 

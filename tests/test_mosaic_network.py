@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -190,8 +191,11 @@ def test_methods_take_what_they_have_weights_for(ship: Path) -> None:
 
 
 def test_auto_takes_the_closed_form_where_no_network_does() -> None:
-    co_sited = Measurements(torch.rand(4, 3, 8, 8), COLOR.angles)
-    assert find_method("auto", co_sited) is METHODS["color-affine"]
+    pair = Measurements(torch.rand(2, 3, 8, 8), (0.0, math.pi / 2))
+    assert find_method("auto", pair) is METHODS["color-affine"]
+    assert find_method("auto", Measurements(torch.rand(3, 3, 8, 8), (0.0, 1.0, 2.0))) is METHODS["joint-large"]
+    with pytest.raises(ValueError, match="expected a method for two crossed photographs"):
+        find_method("joint", pair)
 
 
 @pytest.mark.parametrize("changed", [{"colors": "1"}, {"size": "[]"}, {"size": "{}"}, {"inputs": "3"}])

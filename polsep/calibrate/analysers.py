@@ -20,7 +20,7 @@ Solved by damped least squares (Levenberg 1944, Marquardt 1963) from the layout'
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from polsep.calibrate.dark_flat import MOST_CLIPPED, require_same_sensor
 from polsep.calibrate.statistics import Doubles, place_means
 from polsep.compute.arrays import to_numpy
+from polsep.compute.least_squares import least_squares
 from polsep.sensor.calibration import Analyser, Calibration
 from polsep.sensor.camera import Layout, Mosaic
 
@@ -46,8 +47,6 @@ MIN_FRAMES, MIN_SPREAD = 5, 0.1
 MAX_RESIDUAL = 0.02
 #: Least signal, and least degree of polarization by the layout's analysers, of a frame behind a polarizer.
 DARKEST, MIN_DOLP = 0.02, 0.5
-#: Steps of the solver.
-STEPS = 60
 
 
 class Fit(NamedTuple):
@@ -212,36 +211,6 @@ def _solve(means: Doubles, start: Fit, colors: Ints, nominal: Doubles, gain_spre
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * max(1.0, (residual * start.light.mean() / scale) ** 2)
     deviations = [float(np.sqrt(np.diag(covariance)[i * k : (i + 1) * k].mean())) for i in range(3)]
     return fit, Errors(*deviations), residual
-
-
-def least_squares(residuals: Callable[[Doubles], Doubles], x: Doubles) -> tuple[Doubles, Doubles]:
-    """The nearest minimum of a sum of squares by Levenberg and Marquardt, and the Jacobian there, by differences."""
-    damping, value = 1e-3, residuals(x)
-    jacobian = _jacobian(residuals, x, value)
-    for _ in range(STEPS):
-        normal = jacobian.T @ jacobian
-        step = np.linalg.solve(
-            normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(x.size), -jacobian.T @ value
-        )
-        moved = residuals(x + step)
-        if moved @ moved < value @ value:
-            done = float(np.abs(step).max()) < 1e-10
-            x, value, damping = x + step, moved, damping / 5
-            jacobian = _jacobian(residuals, x, value)
-            if done:
-                break
-        else:
-            damping *= 5
-    return x, jacobian
-
-
-def _jacobian(residuals: Callable[[Doubles], Doubles], x: Doubles, value: Doubles) -> Doubles:
-    columns = []
-    for i in range(x.size):
-        moved = x.copy()
-        moved[i] += 1e-6
-        columns.append((residuals(moved) - value) / 1e-6)
-    return np.stack(columns, axis=1)
 
 
 def _extinction(diattenuation: float) -> float:

@@ -193,7 +193,7 @@ def read_options(options: Mapping[str, Any]) -> ReadOptions:
         options["white_level"],
         parse_size(options.get("size")),
         options.get("pixel_format"),
-        options.get("pages", "frames"),
+        options.get("pages", "auto"),
     )
     return with_corrections(read, options.get("calibration"), options.get("ambient", ()))
 
@@ -207,6 +207,7 @@ EXTRAS = {
     "train": ("embreex", "lightning_fabric", "numba", "tensorboard", "torch"),
     "export": ("onnx", "onnxscript", "torch"),
     "view": ("gradio",),
+    "photos": ("cv2", "rawpy"),
 }
 
 

@@ -30,6 +30,7 @@ from polsep.cli.app import (
     require_extra,
     require_paths,
 )
+from polsep.cli.photographs import find_photographs, photo_options, read_photo_options
 from polsep.cli.progress import show_progress
 from polsep.cli.summary import summary
 
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 
 @app.command()
-@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.argument("files", nargs=-1, metavar="FILE...")
 @click.option("-o", "--output", type=DIR, default=Path("polsep-out"), metavar="DIR", help="Folder of the results.")
 @click.option(
     "--method", default="auto", metavar="NAME", help="Method, see 'polsep methods'; auto is the best one installed."
@@ -61,17 +62,20 @@ if TYPE_CHECKING:
 @PIXEL_FORMAT
 @click.option(
     "--pages",
-    type=click.Choice(["frames", "angles"]),
-    default="frames",
-    help="Pages of one file: single frames, or every four are the angles 0, 45, 90, 135.",
+    type=click.Choice(["auto", "frames", "angles"]),
+    default="auto",
+    help="Pages of one file: frames, or every four are the angles 0, 45, 90, 135; auto looks at them.",
 )
+@photo_options
 @OVERWRITE
 @DEVICE
 def separate(files: tuple[str, ...], **options: Any) -> None:
     """Separate raw frames of a polarization camera into diffuse and specular images.
 
     FILE is PNG, TIFF, NPY, NPZ, PGM or headerless raw, or a folder of such files or of 'polsep capture';
-    'shot_{angle}.png' is four images at 0, 45, 90 and 135 degrees.
+    'shot_{angle}.png' is four images at 0, 45, 90 and 135 degrees, and so is a TIFF of four such pages.
+    With --parallel and --crossed, or with --angles, photographs of an ordinary camera through a polarizing filter:
+    camera raw, TIFF, PNG, films; they are aligned first (extra photos).
     For every frame, DIR/STEM.exr gets the layers diffuse.R/G/B, specular.R/G/B, dolp.Y, aolp.Y [radians] and valid.Y
     (networks also write their expected errors, error.diffuse and error.specular), DIR/STEM.png is a preview, and
     DIR/STEM.json holds settings and statistics.
@@ -83,29 +87,38 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     polsep separate dump.raw --size 2448x2048 --pixel-format BayerRG12p
     polsep separate shots/                            every frame of a folder
     polsep separate 'shot_{angle}.png'                four images, one per analyser angle
+    polsep separate --parallel p.nef --crossed c.nef  two photographs through a filter
+    polsep separate --angles 0,60,120 a.tif b.tif c.tif
+    polsep separate --angles unknown film.mkv         a filter that turns
 
     \b
     --layout color   Sony's 90 45 / 135 0 under RGGB
     --layout mono    the same without colours
     --layout SPEC    2x2 angles in reading order and the Bayer order, like 90,45,135,0/RGGB or 0,45,90,135/mono
     """
-    if len(files) == 1:  # of several the others are separated all the same
+    if click.get_current_context().get_parameter_source("layout") != click.core.ParameterSource.COMMANDLINE:
+        options["layout"] = None  # files that say their own layout are read by it
+    photographs = find_photographs(files, options)
+    if len(files) == 1 and not photographs:  # of several the others are separated all the same
         require_paths(*files)
     check_read_options(options)
-    from polsep.batch import SeparateOptions, WriteOptions, separate_files
+    from polsep.batch import SeparateOptions, WriteOptions, separate_files, separate_photographs
     from polsep.io.raw.sequences import expand_folders
     from polsep.methods import check_method
     from polsep.pipeline import find_device
 
-    if click.get_current_context().get_parameter_source("layout") != click.core.ParameterSource.COMMANDLINE:
-        options["layout"] = None  # files that say their own layout are read by it
     read = read_options(options)
     check_method(options["method"])
     find_device(options["device"])
     light = read_light(options)
-    paths = expand_folders(files)
     run = SeparateOptions(options["method"], light, options["device"], options["full"])
     write = WriteOptions(options["output"], options["format"], options["overwrite"], options["stokes"])
+    if photographs:
+        with show_progress(f"separating {len(photographs)} photographs"):
+            outcome = separate_photographs(photographs, read_photo_options(options), read, run, write)
+        _report(outcome)
+        return
+    paths = expand_folders(files)
     failures, sources = 0, set[str]()
     with show_progress(f"separating {paths[0]}" if len(paths) == 1 else "separating", len(paths)) as progress:
         for outcome in separate_files(paths, read, run, write):

@@ -9,8 +9,10 @@ def summary(report: dict[str, Any]) -> str:
     """Method, clipping, the light, expected errors and the number of warnings, in one line."""
     facts, light = report["statistics"], report.get("light", {})
     parts = [report["method"], f"{_percent(facts['clipped_fraction'])} clipped"]
-    angle = f"polarizer at {facts['light_polarizer_deg']:.0f} deg"
-    parts.append(f"light: {angle}" if len(report["light_color"]) == 1 else f"light: {angle}, {_color(light)}")
+    known = report.get("photographs", {}).get("frame", "picture") == "picture"  # else 0 deg lies nobody knows where
+    seen = [f"polarizer at {facts['light_polarizer_deg']:.0f} deg"] if known else []
+    seen += [] if len(report["light_color"]) == 1 else [_color(light)]
+    parts += [f"light: {', '.join(seen)}"] if seen else []
     if "expected_diffuse_error_median" in facts:
         errors = [facts[f"expected_{image}_error_median"] for image in ("diffuse", "specular")]
         parts.append("median expected error: diffuse {:.2g}, specular {:.2g}".format(*errors))

@@ -20,7 +20,7 @@ from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
 from polsep.demosaic.guided import MIN_CELLS
 from polsep.demosaic.guided_kernel import demosaic_rows, open_stream
-from polsep.physics.stokes import Measurements, fit_stokes, stokes_inverse
+from polsep.physics.stokes import Measurements, complete_pair, fit_stokes, is_pair, stokes_inverse
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.unpack_kernel import as_samples
 
@@ -43,7 +43,7 @@ def measured_stokes(capture: Mosaic | Measurements, light: tuple[float, ...], fu
         gains = np.array(light, np.float32)[:, None, None]
         samples = Measurements(interpolate(white.linear(), white.layout) * gains, white.layout.angles)
     else:
-        samples = capture
+        samples = complete_pair(capture) if is_pair(capture) else capture
     found = fit_stokes(samples)
     xp = namespace(found.s0)
     images = xp.moveaxis(xp.stack([found.s0, found.s1, found.s2]), -3, -1)

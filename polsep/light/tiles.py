@@ -16,7 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
-from polsep.physics.stokes import Measurements, analyser_residual, fit_stokes, stokes_inverse
+from polsep.physics.stokes import (
+    Measurements,
+    analyser_residual,
+    complete_pair,
+    fit_stokes,
+    is_pair,
+    stokes_inverse,
+)
 from polsep.sensor.camera import Layout, Mosaic
 
 Floats = NDArray[np.float32]
@@ -107,6 +114,7 @@ def tile_measurements(measurements: Measurements) -> Tiles:
     """Return the tiles of co-sited samples ``[..., K, C, H, W]``, the first frame of a batch; large ones averaged."""
     data = to_numpy(measurements.data.reshape(-1, *measurements.data.shape[-4:])[0]).astype(np.float32, copy=False)
     single = Measurements(data, measurements.angles)
+    single = complete_pair(single) if is_pair(single) else single
     stokes = fit_stokes(single)
     residual = analyser_residual(single) if len(single.angles) == 4 else 0 * stokes.s0
     images = np.stack([stokes.s0, stokes.s1, stokes.s2, residual])

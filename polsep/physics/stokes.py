@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Real
 
@@ -197,20 +197,86 @@ def unclipped_inverse(angles: tuple[float, ...], code: int) -> tuple[Doubles | N
     return inverse, rank == 3
 
 
-def analyser_residual(measurements: Measurements) -> Array:
-    """Contradiction of four analysers: the component of m outside the range of P, ``[..., C, H, W]``.
+def contradictions(measurements: Measurements) -> Array:
+    """Components of m outside the range of P, ``[..., K - 3, C, H, W]``: what K > 3 analysers cannot all see.
 
-    With 0/45/90/135 degrees it is ``(m0 - m45 + m90 - m135) / 2``: zero without noise, clipping or misregistration,
-    and of the same standard deviation as one sample's noise otherwise. Raises ValueError unless four analysers
-    determine a Stokes vector.
+    Zero without noise, clipping or misregistration, and each of the same standard deviation as one sample's noise
+    otherwise. Raises ValueError unless four or more analysers determine a Stokes vector.
     """
     matrix = analyser_matrix(measurements.angles)
-    if len(measurements.angles) != 4 or _rank(matrix) < 3:
+    if len(measurements.angles) < 4 or _rank(matrix) < 3:
         degrees = [round(math.degrees(t), 3) for t in measurements.angles]
-        raise ValueError(f"the residual needs four analysers of at least three angles, found {degrees}")
-    null = np.linalg.svd(matrix)[0][:, 3]
-    null = null * np.sign(null[np.abs(null) > 0.5 * np.abs(null).max()][0])
-    return _combine(null[None], measurements.data)[0]
+        raise ValueError(f"need four analysers of at least three angles, found {degrees}")
+    null = np.linalg.svd(matrix)[0][:, 3:].T
+    first = [row[np.abs(row) > 0.5 * np.abs(row).max()][0] for row in null]
+    return namespace(measurements.data).moveaxis(_combine(null * np.sign(first)[:, None], measurements.data), 0, -4)
+
+
+def analyser_residual(measurements: Measurements) -> Array:
+    """`contradictions` of four analysers, ``[..., C, H, W]``: ``(m0 - m45 + m90 - m135) / 2`` with 0/45/90/135 degrees.
+
+    Raises ValueError on other numbers of analysers, and unless they determine a Stokes vector.
+    """
+    if len(measurements.angles) != 4:
+        raise ValueError(f"need four analysers of at least three angles, found {len(measurements.angles)} analysers")
+    return contradictions(measurements)[..., 0, :, :, :]
+
+
+def is_pair(measurements: Measurements) -> bool:
+    """True for two crossed analysers, which see s0 and one component of the polarization."""
+    turns = [2 * t for t in measurements.angles]
+    return len(turns) == 2 and abs(math.cos(turns[0] - turns[1]) + 1) < 1e-6
+
+
+def complete_pair(pair: Measurements) -> Measurements:
+    """Two crossed analysers and, between them, the two that would see the same light if the pair saw all of it.
+
+    Nothing is then polarized obliquely to the pair, so both analysers between see s0 / 2. Exact for unpolarized
+    diffuse light and a lamp along the pair. Angles in [0, pi) from the pair's first. Raises ValueError on others.
+    """
+    if not is_pair(pair):
+        degrees = [round(math.degrees(t), 3) for t in pair.angles]
+        raise ValueError(f"need two crossed analysers, found {degrees}")
+    xp = namespace(pair.data)
+    half = xp.mean(pair.data, axis=-4)
+    data = xp.stack([pair.data[..., 0, :, :, :], half, pair.data[..., 1, :, :, :], half], axis=-4)
+    clipped = pair.clipped
+    if clipped is not None:
+        some = xp.any(clipped, axis=-4)
+        clipped = xp.stack([clipped[..., 0, :, :, :], some, clipped[..., 1, :, :, :], some], axis=-4)
+    return Measurements(data, tuple(pair.angles[0] + k * math.pi / 4 for k in range(4)), clipped)
+
+
+def behind_angles(measurements: Measurements, angles: tuple[float, ...]) -> Measurements:
+    """The same light behind analysers at other ``angles`` [rad], by `fit_stokes_unclipped`; as it is at the same ones.
+
+    A sample counts as clipped from white on, and where clipping leaves it unknown, and is white at least there.
+    """
+    turns = [t % math.pi for t in angles]
+    if len(turns) == len(measurements.angles) and np.allclose(
+        [t % math.pi for t in measurements.angles], turns, 0, 1e-9
+    ):
+        return measurements
+    stokes, determined = fit_stokes_unclipped(measurements)
+    found, xp = measure(stokes, angles), namespace(measurements.data)
+    clipped = (found.data >= 1) | ~determined[..., None, :, :, :]
+    return replace(found, data=xp.where(clipped, found.data.clip(1, None), found.data), clipped=clipped)
+
+
+def correct_extinction(measurements: Measurements, extinction: float) -> Measurements:
+    """Samples of ideal analysers, from those of ones that pass 1 / ``extinction`` of the light across them.
+
+    m = (s0 + D p_t) / 2 with D = (extinction - 1) / (extinction + 1), so m - s0 / 2 is divided by D. The extinction may
+    be that of a lamp's filter and an analyser together. Raises ValueError unless it is above 1.
+    """
+    if not extinction > 1:
+        raise ValueError(f"expected an extinction ratio above 1, found {extinction:g}")
+    if math.isinf(extinction):
+        return measurements
+    whole = complete_pair(measurements) if is_pair(measurements) else measurements
+    half, loss = fit_stokes(whole).s0 / 2, (extinction + 1) / (extinction - 1)
+    half = half[..., None, :, :, :]
+    return replace(measurements, data=half + (measurements.data - half) * loss)
 
 
 def polarized_intensity(stokes: Stokes) -> Array:

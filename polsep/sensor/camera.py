@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from array_api_compat import device
 
 from polsep.compute.arrays import Array, as_floats, constant, namespace, short_repr
+from polsep.compute.resizing import resize_bilinear
 from polsep.physics.stokes import Measurements, Stokes
 
 if TYPE_CHECKING:
@@ -297,6 +298,33 @@ def sample_mosaic(measurements: Measurements, layout: Layout) -> Array:
                 ..., k, filt.channel, row :: layout.period, col :: layout.period
             ]
     return out
+
+
+def sample_fine_mosaic(measurements: Measurements, layout: Layout) -> Mosaic:
+    """The frame ``[..., 2H, 2W]`` that a sensor of ``layout`` with pixels half as large would take of co-sited samples.
+
+    For methods that read mosaics: their images at half resolution are those of ``[H, W]``. Light between the samples is
+    interpolated linearly; pixels in clipped samples clip. Raises ValueError when the measurements lack an analyser.
+    """
+    xp, data, clipped = namespace(measurements.data), measurements.data, measurements.clipped
+    height, width = (2 * n for n in data.shape[-2:])
+    out = xp.empty((*data.shape[:-4], height, width), dtype=data.dtype, device=device(data))
+    period, filters = layout.period, dict[Filter, list[tuple[int, int]]]()
+    for row in range(period):
+        for col in range(period):
+            filters.setdefault(layout.filter_at(row, col), []).append((row, col))
+    degrees = [round(math.degrees(t), 6) for t in measurements.angles]
+    for (angle, channel), places in filters.items():
+        if round(angle, 6) not in degrees:
+            raise ValueError(f"expected measurements at {layout.angles_deg} degrees, found {degrees}")
+        k = degrees.index(round(angle, 6))
+        fine = resize_bilinear(data[..., k, channel, :, :], (height, width))
+        if clipped is not None:
+            mask = xp.repeat(xp.repeat(clipped[..., k, channel, :, :], 2, axis=-1), 2, axis=-2)
+            fine = xp.where(mask, fine.clip(1, None), fine.clip(None, 1 - 2 * CLIP_MARGIN))
+        for row, col in places:
+            out[..., row::period, col::period] = fine[..., row::period, col::period]
+    return Mosaic(out, layout, 0.0, 1.0)
 
 
 def measure_with_analysers(stokes: Stokes, angles: tuple[float, ...], diattenuation: tuple[float, ...]) -> Measurements:

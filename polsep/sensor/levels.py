@@ -14,6 +14,7 @@ Conventions, shared by Python callers and by files:
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from numbers import Real
 from os import PathLike
 from typing import Any
@@ -83,23 +84,27 @@ def as_mosaic(
 
 
 def as_measurements(
-    planes: NDArray[Any], black_level: float = 0.0, white_level: float | None = None
+    planes: NDArray[Any],
+    black_level: float = 0.0,
+    white_level: float | None = None,
+    angles_deg: Sequence[float] = PLANE_ANGLES_DEG,
 ) -> tuple[Measurements, Notes]:
-    """Four co-sited images behind 0, 45, 90, 135 degrees as `Measurements` ``[4, C, H, W]``, black 0 and white 1.
+    """K co-sited images behind analysers at ``angles_deg`` as `Measurements` ``[K, C, H, W]``, black 0 and white 1.
 
-    ``planes``: ``[4, H, W]``, or ``[4, H, W, C]`` with C = 1 or 3. ``clipped`` marks samples within `CLIP_MARGIN` of
+    ``planes``: ``[K, H, W]``, or ``[K, H, W, C]`` with C = 1 or 3. ``clipped`` marks samples within `CLIP_MARGIN` of
     white. Not for planes sampled from one mosaic: their pixels are not at the same points, see `interleave_planes`.
     Raises ValueError as `as_mosaic` does.
     """
-    planes = _checked(planes)
+    planes, count = _checked(planes), len(angles_deg)
     if planes.ndim == 3:
         planes = planes[..., None]
-    if planes.ndim != 4 or planes.shape[0] != 4 or planes.shape[-1] not in (1, 3):
-        raise ValueError(f"expected four gray or RGB images, found shape {_shape(planes)}")
+    if planes.ndim != 4 or planes.shape[0] != count or planes.shape[-1] not in (1, 3):
+        number = "four" if count == 4 else str(count)
+        raise ValueError(f"expected {number} gray or RGB images, found shape {_shape(planes)}")
     white = _white_level(planes, black_level, white_level)
     linear = (_as_float32(planes) - float(black_level)) / float(white - black_level)
     data = np.ascontiguousarray(np.moveaxis(linear, -1, 1))
-    angles = tuple(math.radians(angle) for angle in PLANE_ANGLES_DEG)
+    angles = tuple(math.radians(angle) for angle in angles_deg)
     return Measurements(data, angles, data >= 1 - CLIP_MARGIN), level_notes(planes, black_level, white_level)
 
 

@@ -14,7 +14,15 @@ import math
 from dataclasses import dataclass
 
 from polsep.compute.arrays import Array, namespace, short_repr
-from polsep.physics.stokes import Measurements, Stokes, fit_stokes, fit_stokes_unclipped, polarized_intensity
+from polsep.physics.stokes import (
+    Measurements,
+    Stokes,
+    complete_pair,
+    fit_stokes,
+    fit_stokes_unclipped,
+    is_pair,
+    polarized_intensity,
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -54,8 +62,10 @@ def separate_analytic(measurements: Measurements) -> Separation:
     """The paper's initial split: tau_s = sqrt(s1^2 + s2^2), tau_d = s0 - tau_s, clipped samples at face value.
 
     Exact if the diffuse light is unpolarized and nothing clips. Per pixel and colour; no parameters. A highlight that
-    clips all analysers becomes a hole in the specular image. Source: Dave et al. 2022, Eqs. 15-18.
+    clips all analysers becomes a hole in the specular image. Of a crossed pair tau_s is the polarization along it, and
+    tau_d twice what the darker one sees. Source: Dave et al. 2022, Eqs. 15-18; of pairs, Debevec et al. 2000, Sec. 3.
     """
+    measurements = complete_pair(measurements) if is_pair(measurements) else measurements
     stokes = fit_stokes(measurements)
     clipped = clipped_pixels(measurements)
     return _split(stokes, polarized_intensity(stokes), all_pixels(stokes.s0) if clipped is None else ~clipped)

@@ -30,7 +30,14 @@ from typing import NamedTuple
 from polsep.compute.arrays import Array, namespace
 from polsep.compute.filters import box_mean
 from polsep.compute.resizing import halve, resize_bilinear
-from polsep.physics.stokes import Measurements, Stokes, analyser_residual, fit_stokes_unclipped
+from polsep.physics.stokes import (
+    Measurements,
+    Stokes,
+    complete_pair,
+    contradictions,
+    fit_stokes_unclipped,
+    is_pair,
+)
 from polsep.separation.analytic import Separation, all_pixels, clipped_pixels, separate_analytic_unclipped
 from polsep.separation.closed_form import fit_unclipped, limit_dolp, parts, white_specular
 
@@ -72,11 +79,12 @@ def separate_color_affine(measurements: Measurements) -> Separation:
     clipped samples from the unclipped analysers and colours of the same pixel; where too few are left, ``valid`` is
     False, the diffuse is interpolated from around and the specular the least that explains the clipping.
     """
+    sample = sample_variance(measurements.uniform or measurements)
+    measurements = complete_pair(measurements) if is_pair(measurements) else measurements
     if measurements.data.shape[-3] != 3:
         return separate_analytic_unclipped(measurements)
     xp, even = namespace(measurements.data), measurements.uniform or measurements
     stokes, exact = fit_stokes_unclipped(even)
-    sample = sample_variance(even)
     edges = None if even is measurements else polarization_edges(even, stokes)
     a = fit_diffuse_polarization((stokes, exact), sample, even.variance, edges)
     offset, residual = _offset(stokes, a)
@@ -111,14 +119,32 @@ def sample_variance(measurements: Measurements, radius: int = 3) -> Array:
     """Local noise variance of one sample ``[..., 1, h, w]`` from the analysers' contradiction of m0 + m90 = m45 + m135.
 
     It covers sensor noise and misregistration alike, needs no noise model of the sensor, and is zero on exact data.
-    Clipped samples are left out of the mean over the window.
+    Clipped samples are left out of the mean over the window. Three analysers and crossed pairs cannot contradict: of
+    them it is from differences of neighbours, in which lines along rows, columns and slopes cancel, but not textures.
     """
-    squared = _color_mean(analyser_residual(measurements) ** 2)
+    if len(measurements.angles) > 3:
+        squared = _color_mean(contradictions(measurements) ** 2)
+        squared = namespace(squared).mean(squared, axis=-4)
+    else:
+        squared = _fine_details(measurements.data)
     clipped = clipped_pixels(measurements)
     if clipped is None:
         return box_mean(squared, radius)
     weight = _unclipped(measurements, clipped)
     return box_mean(squared * weight, radius) / box_mean(weight, radius).clip(1e-6, None)
+
+
+def _fine_details(data: Array) -> Array:
+    """Squared differences of 2x2 pixels across both axes: ``[..., K, C, h, w]`` to ``[..., 1, h, w]``.
+
+    In mean the variance of one sample where all else is even. The last row and column repeat the ones before.
+    """
+    xp = namespace(data)
+    right = data[..., :, 1:] - data[..., :, :-1]
+    both = (right[..., 1:, :] - right[..., :-1, :]) / 2
+    squared = xp.mean(_color_mean(both * both), axis=-4)
+    squared = xp.concat([squared, squared[..., -1:, :]], axis=-2)
+    return xp.concat([squared, squared[..., :, -1:]], axis=-1)
 
 
 def polarization_edges(measurements: Measurements, stokes: Stokes) -> Array:

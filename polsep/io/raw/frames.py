@@ -15,8 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from polsep.io.raw.headerless import headerless_page, read_headerless
 from polsep.io.raw.npy import read_npy, read_npz, stack_angles
@@ -78,6 +82,8 @@ FRAME_FILES = (*(suffix for suffix, reader in READERS.items() if reader.single),
 _LOSSY = {".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".heic": "HEIC", ".mp4": "video"}
 _ANGLES = (0, 45, 90, 135)
 _PLACEHOLDER = "{angle}"
+#: Mean contradiction of four pages, relative to their mean differences, below which they are angle images.
+MOST_CONTRADICTION = 0.25
 
 #: Every supported format, for messages.
 SUPPORTED = (
@@ -91,8 +97,9 @@ class ReadOptions:
     """Facts that files may not contain. Levels are in the units of the samples; None: see the module.
 
     ``size`` (width, height) and ``pixel_format`` (a GenICam name) describe headerless raw. ``pages``: several pages of
-    a file are separate "frames", or every four are the "angles" 0, 45, 90, 135. ``corrections``: made to every mosaic,
-    by a calibration that also says the white level where nothing else does. Raises ValueError on anything else.
+    a file are separate "frames", or every four are the "angles" 0, 45, 90, 135; "auto": angles if they are four RGB
+    pages, or four grey ones that obey m0 + m90 = m45 + m135 as no four frames do. ``corrections``: made to every
+    mosaic, by a calibration that also says the white level where nothing else does. Raises ValueError on anything else.
     """
 
     layout: Layout | None = None
@@ -100,12 +107,12 @@ class ReadOptions:
     white_level: float | None = None
     size: tuple[int, int] | None = None
     pixel_format: str | None = None
-    pages: str = "frames"
+    pages: str = "auto"
     corrections: Corrections | None = None
 
     def __post_init__(self) -> None:
-        if self.pages not in ("frames", "angles"):
-            raise ValueError(f'expected pages "frames" or "angles", found {self.pages!r}')
+        if self.pages not in ("auto", "frames", "angles"):
+            raise ValueError(f'expected pages "auto", "frames" or "angles", found {self.pages!r}')
         if self.size is not None and (len(self.size) != 2 or min(self.size) < 1):
             raise ValueError(f"expected a size of positive width and height, found {self.size}")
 
@@ -148,10 +155,12 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
     options = ReadOptions() if options is None else options
     if _PLACEHOLDER in str(path):
         pages: Iterator[Page] = iter([_read_template(str(path), options)])
+    elif options.pages == "frames":
+        pages = read_pages(Path(path), options, first)
     elif options.pages == "angles":
         pages = _group_angles(Path(path), options)
     else:
-        pages = read_pages(Path(path), options, first)
+        pages = _look_for_angles(Path(path), options, first)
     for page in pages:
         if page.index < first:
             continue
@@ -279,6 +288,46 @@ def _group_angles(path: Path, options: ReadOptions) -> Iterator[Page]:
             with naming(path):
                 yield _stacked(group, [f"page {p.index}" for p in group])
             group = []
+
+
+def _look_for_angles(path: Path, options: ReadOptions, first: int) -> Iterator[Page]:
+    """The pages of a file, or its only four as one page of angles where they look like that."""
+    pages = read_pages(path, options, first)
+    start = next(pages, None)
+    if start is None:
+        return
+    if start.count != 4 or start.index or start.angles:
+        yield start
+        yield from pages
+        return
+    group = [start, *islice(pages, 3)]
+    if len(group) == 4 and _are_angles([page.array for page in group]):
+        note = "its four pages are read as the angles 0, 45, 90, 135: say --pages frames if they are frames"
+        page = _stacked(group, [f"page {p.index}" for p in group])
+        yield replace(page, notes=(*page.notes, note))
+        return
+    yield from group
+    yield from pages
+
+
+def _are_angles(images: list[NDArray[Any]]) -> bool:
+    """True if four images are RGB, so not mosaics, or contradict m0 + m90 = m45 + m135 by far less than they differ.
+
+    Frames with noise differ 1.4 times as much as they contradict, those under a light that changes evenly twice.
+    """
+    if len({(image.shape, image.dtype.name) for image in images}) != 1:
+        return False
+    first = images[0]
+    if first.ndim == 3 and first.shape[-1] == 3:
+        return not bool((first == first[..., :1]).all())
+    height, width = (n // 4 * 4 for n in first.shape[:2])
+    if min(height, width) < 16:
+        return False
+    m0, m45, m90, m135 = (
+        image[:height, :width].reshape(height // 4, 4, width // 4, -1).mean((1, 3)) for image in images
+    )
+    differ = float(np.abs(m0 - m90).mean() + np.abs(m45 - m135).mean())
+    return float(np.abs(m0 + m90 - m45 - m135).mean()) < MOST_CONTRADICTION * differ
 
 
 def _read_template(template: str, options: ReadOptions) -> Page:

@@ -69,12 +69,12 @@ def _open_archive(stream: BinaryIO) -> zipfile.ZipFile:
         return zipfile.ZipFile(stream)
 
 
-def stack_angles(images: dict[str, NDArray[Any]]) -> NDArray[Any]:
-    """Four images of one shape and dtype, stacked in their order; ValueError, with their names, when they differ."""
+def stack_angles(images: dict[str, NDArray[Any]], kind: str = "angle images") -> NDArray[Any]:
+    """Images of one shape and dtype, stacked in their order; ValueError, with their names, when they differ."""
     kinds = {(image.shape, image.dtype.name) for image in images.values()}
     if len(kinds) != 1:
         found = ", ".join(f"{name} {'x'.join(map(str, i.shape))} {i.dtype}" for name, i in images.items())
-        raise ValueError(f"expected angle images of one size and type, found {found}")
+        raise ValueError(f"expected {kind} of one size and type, found {found}")
     return np.stack(list(images.values()))
 
 

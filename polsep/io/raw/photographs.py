@@ -1,0 +1,167 @@
+"""Photographs of an ordinary camera: camera raw (rawpy), TIFF, PNG and the like, JPEG, and films (PyAV).
+
+All are read as codes ``[K, H, W]`` or ``[K, H, W, 3]`` of one type. Camera raw comes demosaicked (AHD, by LibRaw) in
+the camera's own colours, without white balance, curve or turning: black 0 and white 1; unless it is ``full``, with the
+mean of each 2x2 pixels, as all colours are measured there. What a clipped sample contributed to is white at least.
+JPEG, and films that are not lossless RGB or grey, have a curve, so they are read only as ``encoded`` ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import imagecodecs
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.compute.filters import box_mean
+from polsep.compute.resizing import halve
+from polsep.io.raw.extensions import CAMERA_RAW, FILMS, JPEG
+from polsep.io.raw.frames import read_pages
+from polsep.io.raw.npy import stack_angles
+from polsep.io.raw.page import Page
+from polsep.io.raw.videos import load_library
+from polsep.io.store.errors import decoding, input_error, naming
+from polsep.io.store.header_checks import SAMPLES, limit, require_signature, require_size
+
+#: Most frames of a film that are used, evenly spaced: more of them add little and fill the memory.
+MOST_FRAMES = 24
+#: Reach of LibRaw's interpolation in pixels, within which a clipped sample counts.
+REACH = 2
+#: Channel of LibRaw's colour numbers: 3 is the second green.
+_CHANNEL = np.array([0, 1, 2, 1])
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """K photographs as codes ``[K, H, W]`` or ``[K, H, W, 3]``, and ``names`` of them for messages.
+
+    ``white_level``: what the files themselves say, else None. ``exposures``: how much light each one let in, up to a
+    factor (time, sensitivity and aperture), where all say it.
+    """
+
+    array: NDArray[Any]
+    names: tuple[str, ...]
+    white_level: float | None = None
+    exposures: tuple[float, ...] | None = None
+    notes: tuple[str, ...] = ()
+
+
+def read_photographs(paths: Sequence[Path], encoded: bool = False, full: bool = False) -> Photographs:
+    """The photographs of K files, or of one film or file of several pages; see the module.
+
+    Raises InputError on whatever can't be read, and on photographs of different sizes, types or white levels.
+    """
+    pages: list[tuple[str, Page]] = []
+    for path in paths:
+        with naming(path):
+            found = _read_pages(path, encoded, full)
+        if len(paths) > 1 and len(found) > 1:
+            raise input_error(path, f"expected one photograph per file, found {len(found)}")
+        pages += [(path.name if len(found) == 1 else f"{path.name} {page.index}", page) for page in found]
+    names = tuple(name for name, _ in pages)
+    levels = {page.white_level for _, page in pages}
+    if len(levels) != 1:
+        raise ValueError(f"expected photographs of one bit depth, found white levels {sorted(map(str, levels))}")
+    array = stack_angles({f"{k}: {name}": page.array for k, (name, page) in enumerate(pages)}, "photographs")
+    said = tuple(page.exposure for _, page in pages if page.exposure is not None)
+    notes = tuple(dict.fromkeys(note for _, page in pages for note in page.notes))
+    return Photographs(array, names, levels.pop(), said if len(said) == len(pages) else None, notes)
+
+
+def _read_pages(path: Path, encoded: bool, full: bool) -> list[Page]:
+    suffix = path.suffix.lower()
+    if suffix in CAMERA_RAW:
+        if encoded:
+            raise ValueError("expected --encoding linear for camera raw, found srgb")
+        return [_read_camera_raw(path, full)]
+    if suffix in FILMS:
+        return _read_film(path, encoded)
+    if suffix in JPEG:
+        if not encoded:
+            raise ValueError("expected linear photographs, or --encoding srgb for JPEG, found JPEG")
+        return [_read_jpeg(path)]
+    pages = [page for page in read_pages(path) if not page.sampled]
+    if any(page.angles for page in pages):
+        return [Page(array, k, 4, page.white_level) for page in pages for k, array in enumerate(page.array)]
+    return pages
+
+
+def _read_jpeg(path: Path) -> Page:
+    with path.open("rb") as stream:
+        require_signature(stream, (b"\xff\xd8\xff",), "a JPEG")
+        data = stream.read()
+    with decoding("JPEG"):
+        array = np.asarray(imagecodecs.jpeg_decode(data))
+    require_size(array.shape)
+    return Page(array, notes=("JPEG has the camera's own curve, which --encoding srgb only resembles: use camera raw",))
+
+
+def _read_camera_raw(path: Path, full: bool) -> Page:
+    import rawpy
+
+    path.open("rb").close()  # a missing file is reported as such, not as damage
+    with decoding("camera raw"), rawpy.imread(str(path)) as raw:
+        require_size((raw.sizes.height, raw.sizes.width))
+        image = raw.postprocess(
+            gamma=(1, 1),
+            no_auto_bright=True,
+            output_bps=16,
+            output_color=rawpy.ColorSpace.raw,
+            user_wb=[1.0, 1.0, 1.0, 1.0],
+            adjust_maximum_thr=0.0,
+            user_flip=0,
+        )
+        samples, exposure = raw.raw_image_visible, _light_of(raw.other)
+        clipped = samples >= raw.white_level
+        channels = _CHANNEL[raw.raw_colors_visible] if samples.ndim == 2 else None
+    planes = np.moveaxis(image.astype(np.float32) / 65535, -1, 0)
+    if channels is not None and clipped.any():  # else LibRaw interpolates nothing
+        for channel, plane in enumerate(planes):
+            near = box_mean((clipped & (channels == channel)).astype(np.float32), REACH) > 0
+            plane[near[: plane.shape[0], : plane.shape[1]]] = 1
+    if not full:
+        height, width = (n // 2 * 2 for n in planes.shape[1:])
+        whole = planes[:, :height, :width]
+        planes = np.where(halve((whole >= 1).astype(np.float32)) > 0, 1, halve(whole)).astype(np.float32)
+    return Page(np.ascontiguousarray(np.moveaxis(planes, 0, -1)), white_level=1.0, exposure=exposure)
+
+
+def _light_of(facts: Any) -> float | None:
+    """Time times sensitivity over the square of the f-number (1 where a lens tells none); None without a time."""
+    time, iso, stop = float(facts.shutter_speed), float(facts.iso_speed), float(facts.aperture)
+    return time * (iso or 1) / (stop or 1) ** 2 if time > 0 else None
+
+
+def _read_film(path: Path, encoded: bool) -> list[Page]:
+    """At most `MOST_FRAMES` frames of a film, evenly spaced over it."""
+    path.open("rb").close()
+    av = load_library()
+    with decoding("film"):
+        with av.open(f"file:{path}", options={"max_pixels": str(limit(SAMPLES))}) as container:
+            number = sum(packet.size > 0 for packet in container.demux(video=0))
+        wanted = set(np.unique(np.linspace(0, number - 1, min(number, MOST_FRAMES)).round().astype(int)).tolist())
+        pages: list[Page] = []
+        with av.open(f"file:{path}", options={"max_pixels": str(limit(SAMPLES))}) as container:
+            stream = container.streams.video[0]
+            context = stream.codec_context
+            exact = context.codec.lossless and str(context.pix_fmt).startswith(("gray", "gbr", "rgb", "bgr"))
+            if not (exact or encoded):
+                kind = f"{context.pix_fmt} of {context.name}"
+                raise ValueError(f"expected lossless RGB or grey, or --encoding srgb for other films, found {kind}")
+            for index, frame in enumerate(islice(container.decode(stream), number)):
+                if index in wanted:
+                    pages.append(Page(_as_codes(frame), len(pages), len(wanted)))
+    return pages
+
+
+def _as_codes(frame: Any) -> NDArray[Any]:
+    """A film's frame as uint8, or uint16 scaled to 65535: grey or RGB."""
+    deep = frame.format.components[0].bits > 8
+    grey = len(frame.format.components) == 1
+    kind = ("gray16le" if grey else "rgb48le") if deep else ("gray" if grey else "rgb24")
+    return np.asarray(frame.to_ndarray(format=kind))

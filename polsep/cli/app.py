@@ -207,6 +207,9 @@ EXTRAS = {
     "train": ("embreex", "lightning_fabric", "numba", "tensorboard", "torch"),
     "export": ("onnx", "onnxscript", "torch"),
     "view": ("gradio",),
+    "camera": ("pypylon",),
+    "bench": ("embreex", "flip_evaluator", "matplotlib", "numba", "scipy", "torch"),
+    "mitsuba": ("mitsuba",),
 }
 
 

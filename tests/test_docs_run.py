@@ -108,6 +108,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
         warnings.simplefilter("ignore")
         patch.chdir(folder)
         for line in (
+            "polsep samples -o samples",
             "polsep separate shot.png -o out --method analytic",
             "polsep video frames/ -o film --method analytic",
             "polsep calibrate dark cap_*.png --white-level 4095 -o rig.json",

@@ -56,8 +56,8 @@ def test_numba_is_installed_where_no_library_of_kernels_is(system: str, machine:
 
 
 def test_versions_agree() -> None:
-    """pyproject.toml, CITATION.cff and the first section of the changelog."""
-    version = PROJECT["project"]["version"]
+    """The package, CITATION.cff and the first section of the changelog."""
+    version = polsep.__version__
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert re.findall(r"^version: (.*)$", citation, re.MULTILINE) == [version]
     first = re.search(r"^## (\S+) \((unreleased|\d{4}-\d\d-\d\d)\)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)

@@ -35,6 +35,7 @@ LEFT_OUT = {
     "polsep train": "takes hours",
     "polsep render": "renders for hours; tests/test_dataset.py runs it small",
     "polsep view": "serves until it is stopped; tests/test_view_server.py",
+    "polsep doctor": "tries every method; tests/test_doctor.py",
     "polsep capture -o": "needs a camera; tests/test_capture_cameras.py",
     "polsep calibrate (flat|analysers|light)": "needs pictures of a rig; tests/test_calibration.py",
     "polsep geometry": "needs six lights on one thing; tests/test_geometry_files.py",

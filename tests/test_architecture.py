@@ -36,6 +36,7 @@ RANKS = {
     "geometry": 11,
     "edit": 12,
     "kernels": 12,
+    "doctor": 12,
     "train": 13,
     "bench": 13,
     "view": 13,

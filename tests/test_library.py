@@ -215,10 +215,10 @@ def bind(entry: Any) -> Any:
 @pytest.fixture
 def _afresh() -> Any:
     """Nothing is known of the library, before a test and after it."""
-    for known in (library.find, library._open):
+    for known in (library.find, library.open_library):
         known.cache_clear()
     yield
-    for known in (library.find, library._open):
+    for known in (library.find, library.open_library):
         known.cache_clear()
 
 
@@ -240,7 +240,7 @@ def test_numba_compiles_what_the_library_does_not_have(
     """Other sources, constants, tables and processors, and no library at all."""
     if sys.platform == "linux" and processor.cpu_flags() >= processor.X86_64_V3:
         assert isinstance(bind(fill_kernel._push_at), library._Code)
-    for known in (library.find, library._open):
+    for known in (library.find, library.open_library):
         known.cache_clear()
     monkeypatch.setattr(place, name, value)
     if sys.platform == "linux":

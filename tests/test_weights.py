@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from polsep.io.store.weights import read_weights, shipped_weights, write_weights
+from polsep.io.store.weights import digest_arrays, read_weights, round_array, shipped_weights, write_weights
 
 
 def test_round_trip_in_half_precision(tmp_path: Path) -> None:
@@ -20,6 +20,28 @@ def test_round_trip_in_half_precision(tmp_path: Path) -> None:
     assert metadata["method"] == "paper"
     assert all(np.array_equal(found[name], tensor.half().float()) for name, tensor in tensors.items())
     assert [p.name for p in path.parent.iterdir()] == ["x.safetensors"]
+
+
+def test_rounded_arrays_are_within_half_a_step(tmp_path: Path) -> None:
+    """Each output has its own step; rounding again changes nothing, and nor does an output of zeros."""
+    array = (
+        np.random.default_rng(0).normal(size=(4, 3, 3)).astype(np.float32) * np.array([1, 10, 0, 0.1])[:, None, None]
+    )
+    path = tmp_path / "x.safetensors"
+    write_weights(path, {"a": array, "b": array}, {"method": "paper"}, {"a"})
+    found = read_weights(path)[0]
+    assert found.keys() == {"a", "b"}
+    steps = np.abs(array).max(axis=(1, 2), keepdims=True) / 127
+    assert (np.abs(found["a"] - array) <= 0.501 * steps).all()
+    np.testing.assert_array_equal(round_array(found["a"])[0], round_array(array)[0])
+
+
+def test_rounded_arrays_without_their_steps_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.safetensors"
+    codes = {"a": np.ones((2, 2), np.int8)}
+    save_file({"a": torch.ones(2, 2, dtype=torch.int8)}, path, {"method": "paper", "sha256": digest_arrays(codes)})
+    with pytest.raises(ValueError, match="expected steps of all arrays in 8 bits"):
+        read_weights(path)
 
 
 def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:

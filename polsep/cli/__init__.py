@@ -1,6 +1,20 @@
 """The command line: parse, call one function, print. Heavy imports stay inside the commands."""
 
-from polsep.cli import bench, calibrate, capture, edit, frames, geometry, material, render, train, video, view
+from polsep.cli import (
+    bench,
+    calibrate,
+    capture,
+    doctor,
+    edit,
+    frames,
+    geometry,
+    material,
+    render,
+    samples,
+    train,
+    video,
+    view,
+)
 from polsep.cli.app import app, main
 
 __all__ = [
@@ -8,12 +22,14 @@ __all__ = [
     "bench",
     "calibrate",
     "capture",
+    "doctor",
     "edit",
     "frames",
     "geometry",
     "main",
     "material",
     "render",
+    "samples",
     "train",
     "video",
     "view",

@@ -208,6 +208,9 @@ EXTRAS = {
     "export": ("onnx", "onnxscript", "torch"),
     "view": ("gradio",),
     "photos": ("cv2", "rawpy"),
+    "camera": ("pypylon",),
+    "bench": ("embreex", "flip_evaluator", "matplotlib", "numba", "scipy", "torch"),
+    "mitsuba": ("mitsuba",),
 }
 
 

@@ -68,7 +68,7 @@ def find(function: Callable[..., Any]) -> Callable[..., Any]:
     Raises Unusable unless there is any, made of these very sources. What it returns raises TypeError on arguments of
     types that it was not compiled for.
     """
-    name, library = name_of(function), _open()
+    name, library = name_of(function), open_library()
     found = library.table["entries"].get(name)
     if found is None:
         raise Unusable("not in the library")
@@ -131,7 +131,7 @@ class _Library:
 
 
 @lru_cache(maxsize=1)
-def _open() -> _Library:
+def open_library() -> _Library:
     """Load the library. Raises Unusable on a machine that it is not made for."""
     system = f"{sys.platform}-{platform.machine()}-{sys.implementation.name}"
     if system != "linux-x86_64-cpython":

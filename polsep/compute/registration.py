@@ -117,7 +117,8 @@ def _coarse_shift(reference: Floats, moved: Floats) -> tuple[float, float]:
     import cv2
 
     window = cv2.createHanningWindow((reference.shape[1], reference.shape[0]), cv2.CV_32F)
-    (x, y), response = cv2.phaseCorrelate(*(np.nan_to_num(_details(image)) for image in (reference, moved)), window)
+    fixed, free = (np.nan_to_num(_details(image)) for image in (reference, moved))
+    (x, y), response = cv2.phaseCorrelate(fixed, free, window)
     return (x, y) if response > 0.1 else (0.0, 0.0)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-import resource
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -89,12 +89,17 @@ def write_chunks(path: Path, chunks: Iterable[bytes]) -> None:
 def read_peak_memory(process: int | str = "self") -> float:
     """Peak resident MiB of this program, or of a running process by its number.
 
-    Outside Linux that of the program that started it counts too, and of other processes nothing is known: 0.
+    Outside Linux that of the program that started it counts too, and of other processes nothing is known: 0. Nor of
+    this one on Windows.
     """
     status = Path(f"/proc/{process}/status")
     if status.is_file():
         return int(re.findall(r"VmHWM:\s*(\d+) kB", status.read_text(encoding="utf-8"))[0]) / 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 if process == "self" else 0.0
+    if process != "self" or sys.platform == "win32":
+        return 0.0
+    import resource  # not on Windows
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def read_cpu_times() -> tuple[float, float]:

@@ -313,7 +313,7 @@ class Joint(nn.Module):
         lacking = torch.where(determined & (kept.amax(dim=0) > 0), s0 - s0_seen, 0.0).clamp(min=0)
         lift = [_mean([lacking[k] for k in cells]) for cells in self._cells_of_colors()]
         moved = torch.cat([torch.where(determined, b - seen, 0.0), torch.stack(lift)])
-        found = moved.view(-1, n, h, w).movedim(0, 1)
+        found = moved.view(2 + self.colors, n, h, w).movedim(0, 1)
         return found[:, :2], found[:, 2:]
 
 

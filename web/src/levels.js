@@ -1,0 +1,73 @@
+// Levels of a raw frame, and what its owner should know of them: twin of polsep/sensor/levels.py.
+
+/** A sample within this share of white counts as clipped. */
+export const CLIP_MARGIN = 2 ** -10;
+const MAX_CLIPPED = 0.03, LIT = 0.02, NARROW_BITS = [8, 10, 12, 14];
+
+/** The white level that a type of samples implies. */
+export const whiteOf = (samples) =>
+  samples instanceof Uint8Array ? 255 : samples instanceof Uint16Array ? 65535 : 1;
+
+/** The least clipped sample. */
+export const clipLevel = ({ black, white }) => black + (1 - CLIP_MARGIN) * (white - black);
+
+/**
+ * Notes on exposure and bit depth: [{text, white}], `white` being the level to offer. `white` null: nobody said one.
+ */
+export function levelNotes(samples, width, black, said) {
+  const white = said ?? whiteOf(samples), notes = [];
+  let low = Infinity, high = -Infinity, used = 0, above = 0;
+  for (const value of samples) {
+    if (value < low) low = value;
+    if (value > high) high = value;
+    used |= value;
+    above += value > white;
+  }
+  if (high <= black) return [{ text: `black frame: no sample exceeds the black level ${black} (largest ${high})` }];
+  const shown = Number(white.toPrecision(6));
+  if (low - black >= (1 - CLIP_MARGIN) * (white - black))
+    notes.push({ text: `every sample is clipped: the smallest is ${low} of white level ${shown}` });
+  else if (high >= white) {
+    const share = clippedShare(samples, width, black, white);
+    if (share > MAX_CLIPPED)
+      notes.push({
+        text: `overexposed: ${Math.round(100 * share)}% of the lit samples are clipped, what they hide is estimated: ` +
+          "expose less, or merge several exposures (polsep merge)",
+      });
+  }
+  if (high > white)
+    notes.push({ text: `${above} samples exceed the white level ${shown} (largest ${high}): they count as clipped` });
+  if (white > whiteOf(samples))
+    notes.push({ text: `white level ${shown} is beyond the file's samples: no sample can count as clipped` });
+  if (said == null && samples instanceof Uint16Array) notes.push(...depthNotes(used, high));
+  return notes;
+}
+
+function clippedShare(samples, width, black, white) {
+  const height = samples.length / width, span = white - black, every = height >= 1024 ? 16 : 4;
+  const lit = black + LIT * span, full = black + (1 - CLIP_MARGIN) * span;
+  let bright = 0, clipped = 0;
+  for (let first = 0; first + 4 <= height; first += every)
+    for (let k = first * width; k < (first + 4) * width; k++) {
+      bright += samples[k] > lit;
+      clipped += samples[k] >= full;
+    }
+  return clipped / Math.max(bright, 1);
+}
+
+/** The likely bit depth of 16-bit words of unknown white level; codes at the left have idle low bits. */
+function depthNotes(used, high) {
+  const idle = used ? 31 - Math.clz32(used & -used) : 0;
+  const left = NARROW_BITS.find((bits) => idle >= 16 - bits);
+  if (left) {
+    const largest = (2 ** left - 1) * 2 ** (16 - left), seen = `the lowest ${16 - left} bits are always zero`;
+    const kind = `${left}-bit left-justified data`;
+    if (largest >= (1 - CLIP_MARGIN) * 65535) return [{ text: `${seen}: ${kind}; white level 65535 fits` }];
+    return [{ text: `${seen}: ${kind}; say white level ${largest} if so`, white: largest }];
+  }
+  const right = NARROW_BITS.find((bits) => high < 2 ** bits);
+  if (!right) return [];
+  const top = 2 ** right - 1;
+  const seen = `values never exceed ${top} of 65535: looks like ${right}-bit right-justified data`;
+  return [{ text: `${seen}; say white level ${top} if so`, white: top }];
+}

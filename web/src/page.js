@@ -1,0 +1,303 @@
+// The page: files in, settings, pictures, files out. Everything is computed by the worker.
+
+import { PIXEL_FORMATS } from "./read.js";
+import { drawView, fittingGain } from "./tone.js";
+import { Viewer } from "./viewer.js";
+
+const VIEWS = { input: "Input", diffuse: "Diffuse", specular: "Specular", dolp: "DoLP", aolp: "AoLP" };
+const part = (id) => document.getElementById(id);
+const options = new URLSearchParams(location.search);
+const worker = new Worker(new URL("worker.js", location.href), { type: "module" });
+const viewer = new Viewer(part("stage"), part("canvas"), part("handle"), showScale);
+const state = { file: null, images: null, report: null, gain: 1, busy: false, again: false, name: "" };
+
+for (const [id, start] of [["left", "diffuse"], ["right", "specular"]])
+  part(id).append(...Object.entries(VIEWS).map(([value, text]) => new Option(text, value, value === start, value === start)));
+part("format").append(...Object.keys(PIXEL_FORMATS).map((name) => new Option(name, name)));
+part("format").value = "BayerRG12p";
+
+/** One job of the worker at a time: what it answers. Throws what went wrong, in one line. */
+function ask(job, message = {}) {
+  return new Promise((resolve, reject) => {
+    worker.onmessage = ({ data }) => {
+      if (data.progress) return showProgress(data.progress);
+      part("progress").hidden = true;
+      if (data.failed) reject(new Error(data.failed));
+      else resolve(data);
+    };
+    worker.onerror = (event) => reject(new Error(event.message || "the worker failed"));
+    worker.postMessage({ job, ...message });
+  });
+}
+
+function showProgress({ share, text }) {
+  part("progress").hidden = false;
+  part("progress").value = share;
+  part("status").textContent = `${state.name} · ${text} …`;
+}
+
+const settings = () => ({
+  method: part("method").value,
+  white: part("white").valueAsNumber || null,
+  black: part("black").valueAsNumber || 0,
+  layout: part("sensor").value === "other" ? part("layout").value || part("layout").placeholder : part("sensor").value || null,
+  light: part("light").value === "stated" ? part("color").value.split(",").map(Number) : part("light").value,
+  threads: Number(options.get("threads")) || 0,
+  device: options.get("device") || part("device").value,
+});
+
+/** Read a file and separate it. `stated`: format and size of files without a header. */
+async function open(file, stated = null) {
+  if (state.busy) return;
+  Object.assign(state, { file, name: file.name, busy: true });
+  part("raw").hidden = true;
+  clearNotes();
+  try {
+    const found = await ask("open", { file, name: file.name, stated });
+    if (found.needsFormat) askFormat(found);
+    else {
+      state.busy = false;
+      await separate();
+    }
+  } catch (error) {
+    fail(error);
+  } finally {
+    state.busy = false;
+  }
+}
+
+function askFormat({ size, guesses }) {
+  part("raw").hidden = false;
+  part("status").textContent = `${state.name}: ${size} bytes without a header. Which format and size?`;
+  if (!guesses.length) return;
+  part("format").value = guesses[0].format;
+  part("width").value = guesses[0].width;
+  part("height").value = guesses[0].height;
+}
+
+/** Separate the frame that is open, by the settings as they are; once more where these change meanwhile. */
+async function separate() {
+  if (!state.file) return;
+  if (state.busy) return void (state.again = true);
+  state.busy = true;
+  document.body.dataset.state = "busy";
+  try {
+    do {
+      state.again = false;
+      showResult(await ask("separate", { settings: settings() }));
+    } while (state.again);
+  } catch (error) {
+    fail(error);
+  } finally {
+    state.busy = false;
+  }
+}
+
+function showResult({ images, report, notes }) {
+  const first = !state.images;
+  Object.assign(state, { images, report, gain: fittingGain(images) });
+  part("empty").hidden = true;
+  clearNotes();
+  part("notes").append(...notes.map(noteItem));
+  draw();
+  if (first) viewer.fit();
+  const seconds = report.seconds - report.load_seconds, where = report.device ? ` on the ${report.device}` : "";
+  part("status").textContent = `${state.name} · ${images.width}×${images.height} · ${report.method}${where} · ${seconds.toFixed(1)} s`;
+  showFacts(report);
+  document.body.dataset.state = "done";
+  window.polsep = { images, report, notes };  // for tests and the curious
+}
+
+function showFacts({ light, light_color: color, statistics: s, defects, colored_specular: metal }) {
+  const percent = (share) => `${(100 * share).toFixed(share < 0.01 ? 2 : 1)} %`, facts = [];
+  if (color.length === 3) {
+    const swatch = document.createElement("span"), top = Math.max(...color);
+    swatch.className = "swatch";
+    swatch.style.background = `rgb(${color.map((gain) => Math.round(255 * (gain / top) ** (1 / 2.2)))})`;
+    const sure = light.source === "found" ? (light.sure ? ", found" : ", unsure") : ", stated";
+    facts.push(["Lamp R,G,B", [swatch, color.map((gain) => gain.toFixed(2)).join(", ") + sure]]);
+  }
+  facts.push(["Specular share", [percent(s.specular_fraction)]], ["Clipped", [percent(s.clipped_fraction)]],
+    ["Lamp's AoLP", [`${s.specular_aolp_deg.toFixed(0)}°, concentration ${s.specular_aolp_concentration.toFixed(2)}`]]);
+  if (defects) facts.push(["Pixels repaired", [String(defects)]]);
+  if (metal) facts.push(["Coloured metal", [percent(metal)]]);
+  part("facts").replaceChildren(...facts.flatMap(([name, values]) => {
+    const [term, value] = [document.createElement("dt"), document.createElement("dd")];
+    term.textContent = name;
+    value.append(...values);
+    return [term, value];
+  }));
+}
+
+/** A note with a button for what it recommends. */
+function noteItem({ text, white, layout }) {
+  const item = document.createElement("li");
+  item.textContent = text;
+  const offer = (label, act) => {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.textContent = label;
+    button.onclick = () => {
+      act();
+      separate();
+    };
+    item.append(button);
+  };
+  if (white) offer(`Use white level ${white}`, () => (part("white").value = white));
+  if (layout) offer(`Use ${layout}`, () => useLayout(layout));
+  return item;
+}
+
+function useLayout(layout) {
+  const known = ["color", "mono"].includes(layout);
+  part("sensor").value = known ? layout : "other";
+  part("layout").value = known ? "" : layout;
+  part("order").hidden = known;
+}
+
+const clearNotes = () => part("notes").replaceChildren();
+
+function fail(error) {
+  const item = document.createElement("li");
+  item.className = "failed";
+  item.textContent = `${state.name}: ${error.message}`;
+  part("notes").replaceChildren(item);
+  part("status").textContent = "";
+  part("progress").hidden = true;
+  document.body.dataset.state = "failed";
+}
+
+let waiting = 0;
+/** Draw both pictures, at most once per frame of the screen. */
+function draw() {
+  part("stops-shown").value = Number(part("stops").value).toFixed(1);
+  if (!state.images) return;
+  waiting ||= requestAnimationFrame(() => {
+    waiting = 0;
+    const { images } = state, gain = state.gain * 2 ** Number(part("stops").value);
+    const picture = (view) => new ImageData(drawView(view, images, gain), images.width, images.height);
+    const [left, right] = [part("left").value, part("right").value], one = picture(left);
+    viewer.show(one, left === right ? one : picture(right));
+    drawLegend([left, right].find((view) => view === "dolp" || view === "aolp"));
+  });
+}
+
+/** What the colours of a map mean: a bar from 0 to 1 for DoLP, a disc of angles for AoLP. */
+function drawLegend(view) {
+  const canvas = part("legend"), side = canvas.width, context = canvas.getContext("2d");
+  canvas.hidden = !view;
+  if (!view) return;
+  const n = side * side, dolp = new Float32Array(n), aolp = new Float32Array(n), alpha = new Uint8Array(n);
+  for (let r = 0, k = 0; r < side; r++)
+    for (let c = 0; c < side; c++, k++) {
+      const [x, y] = [c - side / 2 + 0.5, side / 2 - 0.5 - r], radius = Math.hypot(x, y) / (side / 2);
+      aolp[k] = (Math.atan2(y, x) + Math.PI) % Math.PI;
+      dolp[k] = view === "aolp" ? radius : c / side;
+      alpha[k] = view === "aolp" ? 235 * (radius < 1) : 235 * (r > side - 34 && r < side - 18);
+    }
+  const picture = new ImageData(drawView(view, { dolp, aolp, diffuse: dolp, specular: dolp, colors: 1 }, 1), side, side);
+  alpha.forEach((value, k) => (picture.data[4 * k + 3] = value));
+  context.putImageData(picture, 0, 0);
+  context.fillStyle = "#e8e8ea";
+  context.font = "12px system-ui, sans-serif";
+  context.shadowColor = "#000";
+  context.shadowBlur = 3;
+  if (view === "dolp") {
+    context.fillText("DoLP 0", 0, side - 3);
+    context.fillText("1", side - 8, side - 3);
+  } else {
+    context.fillText("0°", side - 18, side / 2 + 4);
+    context.fillText("90°", side / 2 - 9, 13);
+  }
+  context.shadowBlur = 0;
+}
+
+function showScale() {
+  part("scale").value = viewer.pictures.length ? `${Math.round(100 * viewer.scale * viewer.ratio)} %` : "";
+}
+
+/** Offer a file to the visitor. */
+function save(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+}
+
+async function download(format) {
+  part("download").open = false;
+  if (!state.images || state.busy) return;
+  const stem = state.name.replace(/\.[^.]*$/, "");
+  if (format === "left" || format === "right") {
+    const canvas = viewer.pictures[format === "left" ? 0 : 1];
+    return save(await canvas.convertToBlob({ type: "image/png" }), `${stem}_${part(format).value}_preview.png`);
+  }
+  const status = part("status").textContent;
+  state.busy = true;
+  try {
+    const { blob } = await ask("write", { format });
+    save(blob, format === "exr" ? `${stem}.exr` : `${stem}_${format}.png`);
+    part("status").textContent = status;
+  } catch (error) {
+    fail(error);
+  } finally {
+    state.busy = false;
+  }
+}
+
+/** Values under the pointer. */
+function showReadout(event) {
+  const box = part("stage").getBoundingClientRect(), place = viewer.pixelAt(event.clientX - box.left, event.clientY - box.top);
+  if (!place || !state.images) return void (part("readout").textContent = "");
+  const { width, colors, diffuse, specular, dolp, aolp, valid } = state.images, k = place[0] * width + place[1];
+  const values = (image) => Array.from({ length: colors }, (_, c) => image[k * colors + c].toFixed(3)).join("  ");
+  part("readout").textContent = `row ${place[0]}, column ${place[1]}${valid[k] ? "" : ", clipped: estimated"}\n` +
+    `diffuse ${values(diffuse)}\nspecular ${values(specular)}\nDoLP ${dolp[k].toFixed(3)}, AoLP ${((aolp[k] * 180) / Math.PI).toFixed(1)}°`;
+}
+
+for (const id of ["open", "choose"]) part(id).onclick = () => part("file").click();
+part("file").onchange = () => {
+  if (part("file").files[0]) open(part("file").files[0]);
+  part("file").value = "";
+};
+part("example").onclick = async () => {
+  const answer = await fetch("example.png").catch(() => null);
+  if (!answer?.ok) return fail(new Error("expected the example beside the page, found none"));
+  part("white").value = 4095;
+  open(new File([await answer.blob()], "example.png"));
+};
+part("raw").onsubmit = (event) => {
+  event.preventDefault();
+  open(state.file, { format: part("format").value, width: part("width").valueAsNumber, height: part("height").valueAsNumber });
+};
+part("settings").onsubmit = (event) => event.preventDefault();
+part("settings").onchange = () => {
+  part("order").hidden = part("sensor").value !== "other";
+  part("rgb").hidden = part("light").value !== "stated";
+  separate();
+};
+for (const id of ["left", "right"]) part(id).onchange = draw;
+part("stops").oninput = draw;
+part("stops").ondblclick = () => {
+  part("stops").value = 0;
+  draw();
+};
+part("fit").onclick = () => viewer.fit();
+part("actual").onclick = () => viewer.actual();
+part("download").onclick = ({ target }) => target.dataset.format && download(target.dataset.format);
+part("stage").addEventListener("pointermove", showReadout);
+addEventListener("dragover", (event) => {
+  event.preventDefault();
+  part("over").hidden = false;
+});
+addEventListener("dragleave", (event) => event.relatedTarget || (part("over").hidden = true));
+addEventListener("drop", (event) => {
+  event.preventDefault();
+  part("over").hidden = true;
+  if (event.dataTransfer.files[0]) open(event.dataTransfer.files[0]);
+});
+
+// The page works offline once it was loaded; the service worker also asks for what threads need (sw.js).
+if (!options.has("plain")) navigator.serviceWorker?.register("sw.js").catch(() => {});
+document.body.dataset.state = "ready";

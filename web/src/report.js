@@ -1,0 +1,78 @@
+// Polarization of separated images and what their owner should know: twin of polsep/separation/report.py.
+
+const MIN_CONCENTRATION = 0.34, MIN_CONCENTRATION_CLOSED = 0.29, MAX_RESIDUAL = 0.07, MAX_DOLP = 2;
+
+/** Degree (0 where s0 <= 0, at most 2) and angle [rad, in [0, pi)] of linear polarization, Dave et al. 2022, Eq. 2. */
+export function addPolarization(images) {
+  const { s0, s1, s2 } = images, n = s0.length;
+  images.dolp = new Float32Array(n);
+  images.aolp = new Float32Array(n);
+  for (let k = 0; k < n; k++) {
+    images.dolp[k] = s0[k] > 0 ? Math.min(Math.sqrt(s1[k] * s1[k] + s2[k] * s2[k]) / s0[k], MAX_DOLP) : 0;
+    const angle = 0.5 * Math.atan2(s2[k] + 0, s1[k] + 0);
+    images.aolp[k] = angle < 0 ? angle + Math.PI : angle;
+    if (images.aolp[k] >= Math.PI) images.aolp[k] = 0;
+  }
+}
+
+/** Sums over all pixels; `weighted`: the specular image weighs its polarization, as networks need, else its strength. */
+export function tallyOf(images, weighted) {
+  const { s0, s1, s2, specular, diffuse, colors, residual } = images, n = s0.length;
+  const sums = { pixels: n, s0: 0, specular: 0, power: 0, along: 0, across: 0, residual: 0, valid: 0, clipped: 0, above: 0 };
+  for (let k = 0; k < n; k++) {
+    let tau = 0, body = 0;
+    for (let c = 0; c < colors; c++) {
+      tau += specular[k * colors + c];
+      body += diffuse[k * colors + c];
+    }
+    tau /= colors;
+    const strength = Math.sqrt(s1[k] * s1[k] + s2[k] * s2[k]), weight = weighted ? tau : strength;
+    sums.s0 += tau + body / colors;
+    sums.specular += tau;
+    sums.power += weight * strength;
+    sums.along += weight * s1[k];
+    sums.across += weight * s2[k];
+    sums.residual += residual ? residual[k] : 0;
+    sums.valid += images.valid[k];
+    sums.clipped += images.clipped[k];
+    sums.above += images.dolp[k] > 1;
+  }
+  return sums;
+}
+
+/** Statistics of a frame and lines for its owner; `network`: of the method joint-fast. */
+export function describe(sums, network, colors) {
+  const angle = (0.5 * Math.atan2(sums.across, sums.along) + Math.PI) % Math.PI, warnings = [];
+  const concentration = sums.power > 0 ? Math.hypot(sums.along, sums.across) / sums.power : 0;
+  const brightness = sums.s0 / sums.pixels, misfit = sums.s0 > 0 ? sums.residual / sums.s0 : 0;
+  if (brightness > 1e-3 && concentration < (network ? MIN_CONCENTRATION : MIN_CONCENTRATION_CLOSED))
+    warnings.push("polarized light of one angle was expected, found many (concentration " +
+      `${concentration.toFixed(2)}): is the light polarized, and the only one?`);
+  if (network && colors === 3 && brightness > 1e-3 && misfit > MAX_RESIDUAL)
+    warnings.push("white highlights on coloured things were expected, found polarization of other colours (misfit " +
+      `${misfit.toFixed(2)} of the light): are there metals, or several lights?`);
+  const statistics = {
+    clipped_fraction: sums.clipped / sums.pixels,
+    valid_fraction: sums.valid / sums.pixels,
+    mean_s0: brightness,
+    specular_fraction: sums.s0 > 0 ? sums.specular / sums.s0 : 0,
+    dolp_above_1_fraction: sums.above / sums.pixels,
+    specular_aolp_deg: (angle * 180) / Math.PI,
+    specular_aolp_concentration: concentration,
+  };
+  return { statistics, warnings };
+}
+
+/** Multiply the light's colour back into diffuse and specular, in place. */
+export function intoLight(images, light) {
+  const { diffuse, specular, colors } = images;
+  if (light.every((gain) => gain === 1)) return;
+  for (let k = 0; k < diffuse.length; k++) {
+    diffuse[k] *= light[k % colors];
+    specular[k] *= light[k % colors];
+  }
+  if (images.error) {
+    const gain = light.reduce((a, b) => a + b) / light.length;
+    images.error.forEach((value, k) => (images.error[k] = value * gain));
+  }
+}

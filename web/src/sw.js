@@ -1,0 +1,32 @@
+// The service worker: the page works offline once it was loaded, and may use threads on hosts that send no headers.
+
+const CACHE = "polsep-VERSION", FILES = ["./", ...FILES_OF_THE_PAGE];
+
+self.addEventListener("install", (event) => {
+  event.waitUntil(caches.open(CACHE).then((cache) => cache.addAll(FILES)).then(() => self.skipWaiting()));
+});
+
+self.addEventListener("activate", (event) => {
+  const old = caches.keys().then((names) => Promise.all(names.filter((name) => name !== CACHE && name.startsWith("polsep-")).map((name) => caches.delete(name))));
+  event.waitUntil(old.then(() => self.clients.claim()));
+});
+
+self.addEventListener("fetch", (event) => {
+  const url = new URL(event.request.url);
+  if (event.request.method !== "GET" || url.origin !== self.location.origin) return;
+  event.respondWith(answer(event.request));
+});
+
+/** From the cache, else from the host; with the headers that isolate the page, which threads need. */
+async function answer(request) {
+  let found = await caches.match(request, { ignoreSearch: true, cacheName: CACHE });
+  if (!found) {
+    found = await fetch(request);
+    if (found.status === 200) await (await caches.open(CACHE)).put(request, found.clone());
+  }
+  const headers = new Headers(found.headers);
+  headers.set("Cross-Origin-Opener-Policy", "same-origin");
+  headers.set("Cross-Origin-Embedder-Policy", "require-corp");
+  headers.set("Cross-Origin-Resource-Policy", "same-origin");
+  return new Response(found.body, { status: found.status, statusText: found.statusText, headers });
+}

@@ -1,0 +1,130 @@
+// The worker: reads a frame, checks it, separates it and writes files. The page only draws.
+//
+// Messages in: {job, ...}; out: {progress} while it works, then {done: job, ...} or {failed: text}.
+
+import { separateAnalytic } from "./analytic.js";
+import { colorSpecular } from "./colored.js";
+import { removeDefects } from "./defects.js";
+import { encodingWarning } from "./encoding.js";
+import { separateJoint } from "./joint.js";
+import { checkLayout, seePhases } from "./layout_check.js";
+import { channelsOf, parseLayout, specOf } from "./layout.js";
+import { levelNotes, whiteOf } from "./levels.js";
+import { findLight } from "./light.js";
+import { checkBlackLevel } from "./noise.js";
+import { readFrame } from "./read.js";
+import { addPolarization, describe, intoLight, tallyOf } from "./report.js";
+import { networkOf } from "./runtime.js";
+import { encodeExr, encodeLinearPng, layersOf } from "./write.js";
+
+const MAX_SAMPLES = 3e7;
+let frame = null, separated = null;
+
+const tell = (share, text) => postMessage({ progress: { share, text } });
+
+const JOBS = {
+  /** Read a file; {needsFormat} where it has no header and nothing was stated of it. */
+  async open({ name, file, stated }) {
+    tell(0.02, "Reading");
+    const found = readFrame(name, new Uint8Array(await file.arrayBuffer()), stated);
+    if (found.needsFormat) return found;
+    if (found.width * found.height > MAX_SAMPLES)
+      throw new Error(`expected a frame of at most ${MAX_SAMPLES / 1e6} million samples, found ${found.width}x${found.height}`);
+    frame = { ...found, name };
+    return { name, width: found.width, height: found.height, white: found.white, layout: found.layout };
+  },
+
+  /** Separate the frame that was read. `settings`: {method, layout, black, white, light, threads, device}. */
+  async separate({ settings }) {
+    const begin = performance.now(), { mosaic, notes, defects } = prepare(settings);
+    tell(0.12, "Finding the light");
+    const light = lightOf(settings.light, mosaic);
+    const network = settings.method === "joint-fast";
+    let images, device = "", load = 0;
+    if (network) {
+      tell(0.15, "Loading the network");
+      const start = performance.now(), { run, name } = await networkOf(channelsOf(mosaic.layout), settings);
+      load = performance.now() - start;
+      device = name;
+      tell(0.2, "Separating");
+      images = await separateJoint(mosaic, light.color, run, (share) => tell(0.2 + 0.75 * share, "Separating"));
+    } else {
+      tell(0.3, "Separating");
+      images = separateAnalytic(mosaic, light.color);
+    }
+    addPolarization(images);
+    const sums = tallyOf(images, network), colored = network ? colorSpecular(images, mosaic, light.color, sums) : {};
+    const { statistics, warnings } = describe(sums, network, images.colors);
+    intoLight(images, light.color);
+    const report = {
+      method: settings.method, layout: specOf(mosaic.layout), white_level: mosaic.white, black_level: mosaic.black,
+      light_color: light.color, light, defects, statistics, ...colored.report,
+      seconds: (performance.now() - begin) / 1000, load_seconds: load / 1000, device,
+    };
+    const said = [...notes, ...[...light.remarks, ...(colored.remark ? [colored.remark] : []), ...warnings].map((text) => ({ text }))];
+    separated = { images, report: { ...report, warnings: said.map(({ text }) => text) } };
+    const { height, width, colors, diffuse, specular, dolp, aolp, valid } = images;
+    return { images: { height, width, colors, diffuse, specular, dolp, aolp, valid }, report, notes: said, name: frame.name };
+  },
+
+  /** A file of the images: "exr", or a linear PNG of "diffuse" or "specular". */
+  async write({ format }) {
+    const { images, report } = separated, { width, height, colors } = images;
+    tell(0.5, "Writing");
+    if (format !== "exr") return { blob: encodeLinearPng(images[format], colors, width, height, 2) };
+    const notes = { software: "polsep in the browser", method: report.method, report: JSON.stringify(report) };
+    return { blob: encodeExr(layersOf(images), width, height, notes) };
+  },
+};
+
+/** The frame as a mosaic, put right where that is sure, with notes for its owner: {text, white, layout}. */
+function prepare(settings) {
+  const layout = parseLayout(settings.layout || frame.layout || "color"), notes = frame.notes.map((text) => ({ text }));
+  const said = settings.white ?? frame.white, white = said ?? whiteOf(frame.data), black = settings.black || 0;
+  if (!(white > black)) throw new Error(`expected a white level above the black level, found white ${white}, black ${black}`);
+  const [top, left] = layout.origin, height = frame.height - ((frame.height - top) % 2), width = frame.width - ((frame.width - left) % 2);
+  if (height !== frame.height || width !== frame.width)
+    notes.push({ text: `odd size ${frame.width}x${frame.height}: cropped to ${width}x${height}, whole polarizer cells` });
+  if (Math.min(height, width) < 16) throw new Error(`expected a mosaic of at least 16x16 pixels, found ${frame.width}x${frame.height}`);
+  const data = new Float32Array(height * width);
+  for (let r = 0; r < height; r++) data.set(frame.data.subarray(r * frame.width, r * frame.width + width), r * width);
+  notes.push(...levelNotes(frame.data, frame.width, black, said));
+  const mosaic = { data, height, width, layout, black, white };
+  tell(0.05, "Checking the frame");
+  let phases = seePhases(mosaic);
+  const level = checkBlackLevel(mosaic), encoded = encodingWarning(mosaic, phases);
+  if (encoded) notes.push({ text: encoded });
+  if (level) notes.push({ text: level.text, black: level.level });
+  if (level?.level != null && black === 0) {
+    mosaic.black = level.level;
+    phases = seePhases(mosaic);
+  }
+  const wrong = !encoded && (!level || level.level != null) ? checkLayout(mosaic, phases) : null;
+  if (wrong) notes.push(wrong);
+  const defects = removeDefects(mosaic), share = defects / data.length;
+  if (share >= 5e-4)
+    notes.push({ text: `${defects} dead or hot pixels were repaired (${(100 * share).toFixed(2)}%): a calibration of the dark ` +
+      "finds them more surely, see 'polsep calibrate dark'" });
+  return { mosaic, notes, defects };
+}
+
+/** The light's colour, {color: [gain per channel], source, remarks}: found in the frame unless it was said. */
+function lightOf(said, mosaic) {
+  const white = channelsOf(mosaic.layout) === 3 ? [1, 1, 1] : [1];
+  if (white.length === 1) return { color: white, source: "mono", remarks: [] };
+  if (said === "white") return { color: white, source: "told", remarks: [] };
+  if (Array.isArray(said)) {
+    if (said.length !== 3 || !said.every((gain) => gain > 1e-6 && gain < 1e6))
+      throw new Error("expected a light colour of three positive numbers like 1,0.9,0.7");
+    return { color: said, source: "told", remarks: [] };
+  }
+  return findLight(mosaic);
+}
+
+onmessage = async ({ data }) => {
+  try {
+    postMessage({ done: data.job, ...(await JOBS[data.job](data)) });
+  } catch (error) {
+    postMessage({ failed: error.message.split("\n")[0], stack: error.stack });
+  }
+};

@@ -3,6 +3,7 @@
 # make optional  also what optional tests need: the viewer and a browser's driver, Ray, cameras
 # make kernels  compile the kernels anew, after a change of them
 # make docs   build the documentation site into site/
+# make web    build the page that separates in a browser into web/dist; needs node and npm
 # make fuzz   damage files of every kind and read them: make fuzz INPUTS=20000 SECONDS=1200
 # make faults  kill programs and fill disks: make faults KILLS=100 EVERY=1
 # make soak   play a recording in a loop: make soak MINUTES=480
@@ -16,7 +17,7 @@ MINUTES ?= 480
 BIN := $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test optional kernels docs bench fuzz faults soak clean
+.PHONY: demo test optional kernels docs web bench fuzz faults soak clean
 
 demo: $(VENV)/.installed
 	$(BIN)/polsep demo -o demo-out
@@ -36,6 +37,14 @@ kernels: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo site/index.html
+
+web: $(VENV)/.installed-dev web/node_modules
+	$(BIN)/python -m tools.web_models web/models
+	node web/build.mjs web/models polsep/data/still_life.png web/dist
+
+web/node_modules: web/package-lock.json
+	npm --prefix web ci --ignore-scripts --no-audit --no-fund --loglevel error
+	touch $@
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/polsep bench separation
@@ -65,4 +74,4 @@ $(VENV)/.installed-docs: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo-out fuzz-out site
+	rm -rf $(VENV) demo-out fuzz-out site web/dist web/models web/node_modules

@@ -19,6 +19,7 @@ from evaluation.sets import bench_sets
 from evaluation.video import bench_video, bench_video_quick
 from evaluation.viewing import bench_view
 from evaluation.warned import bench_warned, bench_warned_quick
+from evaluation.web import bench_web, bench_web_quick
 from polsep.bench import FORMULAS, SEPARATION
 from polsep.bench.run import Bench
 
@@ -51,6 +52,7 @@ BENCHES: dict[str, Bench] = {
     ),
     "install": Bench(bench_install, measures=("polsep", "pyproject.toml", "constraints.txt")),
     "view": Bench(bench_view, measures=("polsep/view", "polsep/edit")),
+    "web": Bench(bench_web, bench_web_quick, measures=("web", "tools/web_models.py")),
     "warned": Bench(
         bench_warned,
         bench_warned_quick,

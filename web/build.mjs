@@ -13,7 +13,7 @@ rmSync(out, { recursive: true, force: true });
 mkdirSync(out, { recursive: true });
 
 await build({
-  entryPoints: ["page.js", "worker.js"].map(source), outdir: out, bundle: true, minify: true, format: "esm",
+  entryPoints: ["page.js", "worker.js", "network.js"].map(source), outdir: out, bundle: true, minify: true, format: "esm",
   target: "es2022", charset: "utf8", legalComments: "eof", logLevel: "warning",
 });
 for (const name of ["index.html", "style.css", "icon.svg"]) copyFileSync(source(name), join(out, name));

@@ -16,15 +16,20 @@ export function stokesInverse(degrees) {
   return adjoint.map((own) => rows.map((row) => (own[0] * row[0] + own[1] * row[1] + own[2] * row[2]) / det));
 }
 
-/** Correlate an image with (side, middle, side) along rows (step 1) or columns (step w); borders mirror. */
+/** Correlate an image with (side, middle, side) along rows, or `down` columns; borders mirror. */
 function correlate(x, out, [h, w], side, middle, down) {
-  for (let r = 0; r < h; r++) {
-    const up = down ? (r > 0 ? -w : h > 1 ? w : 0) : 0, below = down ? (r < h - 1 ? w : h > 1 ? -w : 0) : 0;
-    for (let c = 0, k = r * w; c < w; c++, k++) {
-      const before = down ? up : c > 0 ? -1 : w > 1 ? 1 : 0, after = down ? below : c < w - 1 ? 1 : w > 1 ? -1 : 0;
-      out[k] = side * (x[k + before] + x[k + after]) + middle * x[k];
+  if (down)
+    for (let r = 0; r < h; r++) {
+      const up = (r > 0 ? r - 1 : Math.min(1, h - 1)) * w, here = r * w, below = (r < h - 1 ? r + 1 : Math.max(h - 2, 0)) * w;
+      for (let c = 0; c < w; c++) out[here + c] = side * (x[up + c] + x[below + c]) + middle * x[here + c];
     }
-  }
+  else
+    for (let r = 0; r < h; r++) {
+      const first = r * w, last = first + w - 1;
+      for (let k = first + 1; k < last; k++) out[k] = side * (x[k - 1] + x[k + 1]) + middle * x[k];
+      out[first] = 2 * side * x[Math.min(first + 1, last)] + middle * x[first];
+      out[last] = 2 * side * x[Math.max(last - 1, first)] + middle * x[last];
+    }
   return out;
 }
 
@@ -41,22 +46,24 @@ function toCenter(x, [h, w], [row, col]) {
   }
 }
 
-/** Call `use(analyser, channel, image)` with every analyser in every colour at the cells' centres. */
-function interpolate(read, mosaic, use) {
-  const { height, width, layout } = mosaic, [top, left] = layout.origin;
-  const h = (height - top) >> 1, w = (width - left) >> 1, size = [h, w], colors = channelsOf(layout);
-  const masked = new Float32Array(h * w), one = new Float32Array(h * w), two = new Float32Array(h * w);
+/** Call `use(analyser, channel, image)` with every analyser of `samples [H, W]` in every colour at the cells' centres. */
+function interpolate(samples, { height, width, layout }, use) {
+  const [top, left] = layout.origin, h = (height - top) >> 1, w = (width - left) >> 1, size = [h, w];
+  const one = new Float32Array(h * w), two = new Float32Array(h * w), masked = new Float32Array(h * w);
   anglesOf(layout).forEach((angle, k) => {
     const spot = layout.polarizer.indexOf(angle), place = [spot >> 1, spot & 1];
-    for (let c = 0; c < colors; c++) {
-      for (let i = 0, at = 0; i < h; i++)
-        for (let j = 0; j < w; j++, at++) {
-          const y = top + 2 * i + place[0], x = left + 2 * j + place[1];
-          masked[at] = colors === 1 || filterAt2(layout, i, j) === c ? read(y, x, c) : 0;
+    for (let c = 0; c < channelsOf(layout); c++) {
+      masked.fill(0);
+      for (let cell = 0; cell < 4; cell++) {  // of a 2x2 block of cells, those of this colour
+        if (layout.bayer && layout.bayer[cell] !== "RGB"[c]) continue;
+        for (let i = cell >> 1; i < h; i += 2) {
+          const row = (top + 2 * i + place[0]) * width + left + place[1];
+          for (let j = cell & 1; j < w; j += 2) masked[i * w + j] = samples[row + 2 * j];
         }
+      }
       let image = masked;
-      if (colors === 3 && c !== 1) image = correlate(correlate(masked, one, size, 0.5, 1, false), two, size, 0.5, 1, true);
-      else if (colors === 3) {
+      if (layout.bayer && c !== 1) image = correlate(correlate(masked, one, size, 0.5, 1, false), two, size, 0.5, 1, true);
+      else if (layout.bayer) {
         correlate(masked, one, size, 0.25, 0.5, false);
         correlate(masked, two, size, 0.25, 0.5, true);
         for (let at = 0; at < one.length; at++) two[at] += one[at];
@@ -68,18 +75,16 @@ function interpolate(read, mosaic, use) {
   });
 }
 
-/** The colour of a polarizer cell. */
-const filterAt2 = ({ bayer }, i, j) => "RGB".indexOf(bayer[(i & 1) * 2 + (j & 1)]);
-
-/** Samples with black at 0 and white at 1, under white light. */
-export function linearReader({ data, width, black, white }, light) {
-  const gains = light.map((gain) => 1 / ((white - black) * gain));
-  return (row, col, channel) => (data[row * width + col] - black) * gains[channel];
+/** The samples [H, W] of a mosaic with black at 0 and white at 1, under white light. */
+export function linearSamples({ data, height, width, layout, black, white }, light) {
+  const out = new Float32Array(data.length);
+  for (let k = 0; k < 16; k++) {
+    const gain = 1 / ((white - black) * light[filterAt(layout, k >> 2, k & 3)[1]]);
+    for (let r = k >> 2; r < height; r += 4)
+      for (let at = r * width + (k & 3), end = (r + 1) * width; at < end; at += 4) out[at] = (data[at] - black) * gain;
+  }
+  return out;
 }
-
-/** Gain of every filter of a 4x4 period in a light. */
-export const gainsOf = (layout, light) =>
-  Float32Array.from({ length: 16 }, (_, k) => light[filterAt(layout, k >> 2, k & 3)[1]]);
 
 /**
  * The paper's first estimate: specular = sqrt(s1^2 + s2^2), at most s0; diffuse = s0 - specular; clipped samples at
@@ -90,7 +95,7 @@ export function separateAnalytic(mosaic, light) {
   const { layout, data } = mosaic, colors = channelsOf(layout), inverse = stokesInverse(anglesOf(layout));
   const h = (mosaic.height - layout.origin[0]) >> 1, w = (mosaic.width - layout.origin[1]) >> 1, n = h * w;
   const stokes = Array.from({ length: 3 * colors }, () => new Float32Array(n));
-  interpolate(linearReader(mosaic, light), mosaic, (k, c, image) => {
+  interpolate(linearSamples(mosaic, light), mosaic, (k, c, image) => {
     for (let i = 0; i < 3; i++) {
       const target = stokes[3 * c + i], weight = inverse[i][k];
       for (let at = 0; at < n; at++) target[at] += weight * image[at];
@@ -98,7 +103,7 @@ export function separateAnalytic(mosaic, light) {
   });
   const valid = new Uint8Array(n).fill(1), full = clipLevel(mosaic);
   if (data.some((value) => value >= full))
-    interpolate((row, col) => +(data[row * mosaic.width + col] >= full), mosaic, (k, c, image) => {
+    interpolate(data.map((value) => +(value >= full)), mosaic, (k, c, image) => {
       for (let at = 0; at < n; at++) if (image[at] > 0) valid[at] = 0;
     });
   const diffuse = new Float32Array(n * colors), specular = new Float32Array(n * colors);

@@ -2,7 +2,7 @@
 // polsep/separation/colored_specular.py, lamp_polarization.py and retained_polarization.py, which explain all of it.
 // Images are in white light; `Periods` have a pixel per 4x4 period of the mosaic, three colours in one array each.
 
-import { linearReader, stokesInverse } from "./analytic.js";
+import { linearSamples, stokesInverse } from "./analytic.js";
 import { anglesOf, channelsOf, filterAt } from "./layout.js";
 import { mean, sum, weightedMedian } from "./numbers.js";
 
@@ -80,7 +80,7 @@ function metallic({ diffuse, specular, height, width, valid }, seen, share, reta
 
 /** Stokes images of the samples along and across the lamp's polarization, and a method's images, period by period. */
 function seePeriods(images, mosaic, light, sums, thin) {
-  const { layout } = mosaic, [top, left] = layout.origin, step = thin ? 3 : 1, read = linearReader(mosaic, light);
+  const { layout } = mosaic, [top, left] = layout.origin, step = thin ? 3 : 1, samples = linearSamples(mosaic, light);
   const rows = (mosaic.height - top) >> 2, cols = (mosaic.width - left) >> 2;
   const h = Math.ceil(rows / step), w = Math.ceil(cols / step), angles = anglesOf(layout), inverse = stokesInverse(angles);
   const filters = Array.from({ length: 16 }, (_, k) => {
@@ -97,7 +97,7 @@ function seePeriods(images, mosaic, light, sums, thin) {
     for (let j = 0; j < w; j++, at += 3) {
       stokes.fill(0);
       for (const { row, col, channel, part } of filters) {
-        const value = read(4 * step * i + row, 4 * step * j + col, channel) / cells[channel];
+        const value = samples[(4 * step * i + row) * mosaic.width + 4 * step * j + col] / cells[channel];
         for (let s = 0; s < 3; s++) stokes[3 * s + channel] += part[s] * value;
       }
       light6.fill(0);

@@ -3,16 +3,18 @@
 // The network (tools/web_models.py) takes frames [1, 2, H, W] in Sony's order: linear samples in white light, and which
 // of them clip. Strips overlap by all that an output depends on, so they agree with the whole frame.
 
-import { channelsOf, filterAt, orient, spansOf, turnedPlaces } from "./layout.js";
+import { linearSamples } from "./analytic.js";
+import { channelsOf, orient, spansOf, turnedPlaces } from "./layout.js";
 import { clipLevel } from "./levels.js";
 
-/** Raw rows around a strip that its images depend on (tests/test_web.py compares), and raw samples of a strip. */
-const MARGIN = 112, SAMPLES = 1.8e6;
+/** Raw rows around a strip that its images depend on. Raw samples of all strips that run at once, and of one. */
+const MARGIN = 112, AT_ONCE = 5.2e6, SAMPLES = 1.9e6;
 
 /** First and last row that is kept of every strip; strips begin at multiples of the network's grid, 16. */
-function cutRows(height, width) {
-  const rows = Math.max(Math.floor((SAMPLES / width - 2 * MARGIN) / 16), 4) * 16;
-  const count = Math.max(1, Math.ceil(height / rows)), each = Math.ceil(height / count / 16) * 16;
+function cutRows(height, width, workers) {
+  const most = Math.max(Math.floor((Math.min(SAMPLES, AT_ONCE / workers) / width - 2 * MARGIN) / 16), 4) * 16;
+  const count = Math.ceil(Math.ceil(height / most) / workers) * workers;  // as many for each worker
+  const each = Math.max(Math.ceil(height / count / 16), 4) * 16;
   return Array.from({ length: Math.ceil(height / each) }, (_, k) => [k * each, Math.min((k + 1) * each, height)]);
 }
 
@@ -27,37 +29,41 @@ class Planes {
 }
 
 /**
- * Images as `separateAnalytic` gives them, with `residual` and `error`, of a mosaic in a light.
- * `run(samples, rows, width)` calls the network; `progress(share)` is told after every strip.
+ * Images as `separateAnalytic` gives them, with `error` and `sums`, of a mosaic in a light.
+ * `network`: {run(samples, rows, width), count of strips at once}; `progress(share)` is told after every strip.
  */
-export async function separateJoint(mosaic, light, run, progress) {
+export async function separateJoint(mosaic, light, network, progress) {
   const way = orient(mosaic.height, mosaic.width, mosaic.layout), { rows, cols } = turnedPlaces(way);
   const H = rows.length, W = cols.length, colors = channelsOf(mosaic.layout), full = clipLevel(mosaic);
-  const gains = Float32Array.from({ length: 16 }, (_, k) => 1 / ((mosaic.white - mosaic.black) *
-    light[filterAt(mosaic.layout, k >> 2, k & 3)[1]]));
+  const samples = linearSamples(mosaic, light);
   const planes = new Planes({ diffuse: colors, specular: 1, error: 2, s1: colors, s2: colors }, H / 2, W / 2);
   const residual = new Float32Array((H * W) / 16);
-  const strips = cutRows(H, W);
-  for (const [k, [first, last]] of strips.entries()) {
-    const top = Math.max(first - MARGIN, 0), bottom = Math.min(last + MARGIN, H), count = (bottom - top) * W;
-    const frame = new Float32Array(2 * count);
+  const strips = cutRows(H, W, network.count);
+  let next = 0, done = 0;
+
+  async function takeStrip([first, last]) {
+    const top = Math.max(first - MARGIN, 0), bottom = Math.min(last + MARGIN, H), size = (bottom - top) * W;
+    const frame = new Float32Array(2 * size);
     for (let r = top, at = 0; r < bottom; r++)
       for (let c = 0; c < W; c++, at++) {
-        const place = rows[r] + cols[c], value = mosaic.data[place];
-        const y = Math.floor(place / mosaic.width), x = place - y * mosaic.width;
-        frame[at] = (value - mosaic.black) * gains[(y & 3) * 4 + (x & 3)];
-        frame[count + at] = value >= full ? 1 : 0;
+        const place = rows[r] + cols[c];
+        frame[at] = samples[place];
+        frame[size + at] = mosaic.data[place] >= full ? 1 : 0;
       }
-    const images = await run(frame, bottom - top, W);
+    const images = await network.run(frame, bottom - top, W);
     for (const name of ["diffuse", "specular", "error", "s1", "s2"])
       planes[name].forEach((plane, c) => {
-        const size = ((bottom - top) * W) / 4, begin = c * size + ((first - top) / 2) * (W / 2);
+        const begin = (c * size) / 4 + ((first - top) / 2) * (W / 2);
         plane.set(images[name].subarray(begin, begin + ((last - first) * W) / 4), (first / 2) * (W / 2));
       });
     const begin = ((first - top) * W) / 16;
     residual.set(images.residual.subarray(begin, begin + ((last - first) * W) / 16), (first * W) / 16);
-    progress((k + 1) / strips.length);
+    progress(++done / strips.length);
   }
+
+  await Promise.all(Array.from({ length: network.count }, async () => {
+    while (next < strips.length) await takeStrip(strips[next++]);
+  }));
   return turnBack(planes, residual, colors, way, clippedCells(mosaic, full));
 }
 
@@ -90,7 +96,7 @@ function turnBack(planes, residual, colors, way, near) {
   const out = {
     height, width, colors,
     diffuse: new Float32Array(n * colors), specular: new Float32Array(n * colors), error: new Float32Array(2 * n),
-    s0: new Float32Array(n), s1: new Float32Array(n), s2: new Float32Array(n), residual: new Float32Array(n),
+    s0: new Float32Array(n), s1: new Float32Array(n), s2: new Float32Array(n),
     valid: near.map((bits) => (bits & 2 ? 0 : 1)), clipped: near.map((bits) => bits & 1),
   };
   const sign1 = way.turn ? -1 : 1, sign2 = way.down !== way.across ? -1 : 1;
@@ -111,7 +117,29 @@ function turnBack(planes, residual, colors, way, near) {
       }
       out.error[2 * at] = planes.error[0][from];
       out.error[2 * at + 1] = planes.error[1][from];
-      out.residual[at] = Math.SQRT2 * residual[(r >> 1) * (planes.width / 2) + (c >> 1)];
     }
-  return out;
+  return { ...out, sums: sumsOf(planes, residual, colors, way) };
+}
+
+/** Sums over all that the network saw, in the frame's own orientation, as `tallyOf` (report.js) names them. */
+function sumsOf({ height, width, ...planes }, residual, colors, { turn, down, across }) {
+  const sums = { pixels: height * width, s0: 0, specular: 0, power: 0, along: 0, across: 0, residual: 0 };
+  for (let k = 0; k < sums.pixels; k++) {
+    const tau = planes.specular[0][k];
+    let body = 0, x = 0, y = 0;
+    for (let c = 0; c < colors; c++) {
+      body += planes.diffuse[c][k] / colors;
+      x += planes.s1[c][k] / colors;
+      y += planes.s2[c][k] / colors;
+    }
+    sums.s0 += tau + body;
+    sums.specular += tau;
+    sums.power += tau * Math.sqrt(x * x + y * y);
+    sums.along += tau * x;
+    sums.across += tau * y;
+  }
+  for (const value of residual) sums.residual += 4 * Math.SQRT2 * value;  // rms of two components, of four cells each
+  if (turn) sums.along = -sums.along;
+  if (down !== across) sums.across = -sums.across;
+  return sums;
 }

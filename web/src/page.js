@@ -16,16 +16,20 @@ for (const [id, start] of [["left", "diffuse"], ["right", "specular"]])
 part("format").append(...Object.keys(PIXEL_FORMATS).map((name) => new Option(name, name)));
 part("format").value = "BayerRG12p";
 
-/** One job of the worker at a time: what it answers. Throws what went wrong, in one line. */
+const asked = [];
+worker.onmessage = ({ data }) => {
+  if (data.progress) return showProgress(data.progress);
+  const { resolve, reject } = asked.shift();
+  part("progress").hidden = true;
+  if (data.failed) reject(new Error(data.failed));
+  else resolve(data);
+};
+worker.onerror = (event) => asked.shift()?.reject(new Error(event.message || "the worker failed"));
+
+/** What the worker answers to a job; it takes one after the other. Throws what went wrong, in one line. */
 function ask(job, message = {}) {
   return new Promise((resolve, reject) => {
-    worker.onmessage = ({ data }) => {
-      if (data.progress) return showProgress(data.progress);
-      part("progress").hidden = true;
-      if (data.failed) reject(new Error(data.failed));
-      else resolve(data);
-    };
-    worker.onerror = (event) => reject(new Error(event.message || "the worker failed"));
+    asked.push({ resolve, reject });
     worker.postMessage({ job, ...message });
   });
 }
@@ -43,7 +47,7 @@ const settings = () => ({
   layout: part("sensor").value === "other" ? part("layout").value || part("layout").placeholder : part("sensor").value || null,
   light: part("light").value === "stated" ? part("color").value.split(",").map(Number) : part("light").value,
   threads: Number(options.get("threads")) || 0,
-  device: options.get("device") || part("device").value,
+  device: part("device").value,
 });
 
 /** Read a file and separate it. `stated`: format and size of files without a header. */
@@ -97,11 +101,13 @@ function showResult({ images, report, notes }) {
   const first = !state.images;
   Object.assign(state, { images, report, gain: fittingGain(images) });
   part("empty").hidden = true;
+  document.body.classList.remove("empty");
   clearNotes();
   part("notes").append(...notes.map(noteItem));
   draw();
   if (first) viewer.fit();
-  const seconds = report.seconds - report.load_seconds, where = report.device ? ` on the ${report.device}` : "";
+  const seconds = Object.entries(report.seconds).reduce((total, [name, own]) => (name === "load" ? total : total + own), 0);
+  const where = report.device ? ` on the ${report.device}` : "";
   part("status").textContent = `${state.name} · ${images.width}×${images.height} · ${report.method}${where} · ${seconds.toFixed(1)} s`;
   showFacts(report);
   document.body.dataset.state = "done";
@@ -114,11 +120,11 @@ function showFacts({ light, light_color: color, statistics: s, defects, colored_
     const swatch = document.createElement("span"), top = Math.max(...color);
     swatch.className = "swatch";
     swatch.style.background = `rgb(${color.map((gain) => Math.round(255 * (gain / top) ** (1 / 2.2)))})`;
-    const sure = light.source === "found" ? (light.sure ? ", found" : ", unsure") : ", stated";
-    facts.push(["Lamp R,G,B", [swatch, color.map((gain) => gain.toFixed(2)).join(", ") + sure]]);
+    const source = light.source === "found" ? (light.sure ? "found" : "unsure") : "stated";
+    facts.push([`Lamp, ${source}`, [swatch, color.map((gain) => gain.toFixed(2)).join(", ")]]);
   }
   facts.push(["Specular share", [percent(s.specular_fraction)]], ["Clipped", [percent(s.clipped_fraction)]],
-    ["Lamp's AoLP", [`${s.specular_aolp_deg.toFixed(0)}°, concentration ${s.specular_aolp_concentration.toFixed(2)}`]]);
+    ["Highlights' AoLP", [`${s.specular_aolp_deg.toFixed(0)}°`]], ["Concentration", [s.specular_aolp_concentration.toFixed(2)]]);
   if (defects) facts.push(["Pixels repaired", [String(defects)]]);
   if (metal) facts.push(["Coloured metal", [percent(metal)]]);
   part("facts").replaceChildren(...facts.flatMap(([name, values]) => {
@@ -301,3 +307,4 @@ addEventListener("drop", (event) => {
 // The page works offline once it was loaded; the service worker also asks for what threads need (sw.js).
 if (!options.has("plain")) navigator.serviceWorker?.register("sw.js").catch(() => {});
 document.body.dataset.state = "ready";
+ask("warm", { settings: settings() }).catch((error) => console.warn(error));  // while the visitor looks for a file

@@ -15,29 +15,28 @@ export function addPolarization(images) {
   }
 }
 
-/** Sums over all pixels; `weighted`: the specular image weighs its polarization, as networks need, else its strength. */
-export function tallyOf(images, weighted) {
-  const { s0, s1, s2, specular, diffuse, colors, residual } = images, n = s0.length;
-  const sums = { pixels: n, s0: 0, specular: 0, power: 0, along: 0, across: 0, residual: 0, valid: 0, clipped: 0, above: 0 };
+/** Sums over all pixels; of the formula the strength of the polarized light weighs its direction. */
+export function tallyOf(images) {
+  const { s0, s1, s2, specular, diffuse, colors, valid, clipped, dolp } = images, n = s0.length;
+  const counts = { frame: n, valid: 0, clipped: 0, above: 0 };
   for (let k = 0; k < n; k++) {
-    let tau = 0, body = 0;
-    for (let c = 0; c < colors; c++) {
-      tau += specular[k * colors + c];
-      body += diffuse[k * colors + c];
-    }
-    tau /= colors;
-    const strength = Math.sqrt(s1[k] * s1[k] + s2[k] * s2[k]), weight = weighted ? tau : strength;
-    sums.s0 += tau + body / colors;
-    sums.specular += tau;
-    sums.power += weight * strength;
-    sums.along += weight * s1[k];
-    sums.across += weight * s2[k];
-    sums.residual += residual ? residual[k] : 0;
-    sums.valid += images.valid[k];
-    sums.clipped += images.clipped[k];
-    sums.above += images.dolp[k] > 1;
+    counts.valid += valid[k];
+    counts.clipped += clipped[k];
+    counts.above += dolp[k] > 1;
   }
-  return sums;
+  if (images.sums) return { ...counts, ...images.sums };  // of the network
+  const sums = { pixels: n, s0: 0, specular: 0, power: 0, along: 0, across: 0, residual: 0 };
+  for (let k = 0; k < n * colors; k++) {
+    sums.s0 += (diffuse[k] + specular[k]) / colors;
+    sums.specular += specular[k] / colors;
+  }
+  for (let k = 0; k < n; k++) {
+    const square = s1[k] * s1[k] + s2[k] * s2[k], strength = Math.sqrt(square);
+    sums.power += square;
+    sums.along += strength * s1[k];
+    sums.across += strength * s2[k];
+  }
+  return { ...counts, ...sums };
 }
 
 /** Statistics of a frame and lines for its owner; `network`: of the method joint-fast. */
@@ -52,11 +51,11 @@ export function describe(sums, network, colors) {
     warnings.push("white highlights on coloured things were expected, found polarization of other colours (misfit " +
       `${misfit.toFixed(2)} of the light): are there metals, or several lights?`);
   const statistics = {
-    clipped_fraction: sums.clipped / sums.pixels,
-    valid_fraction: sums.valid / sums.pixels,
+    clipped_fraction: sums.clipped / sums.frame,
+    valid_fraction: sums.valid / sums.frame,
     mean_s0: brightness,
     specular_fraction: sums.s0 > 0 ? sums.specular / sums.s0 : 0,
-    dolp_above_1_fraction: sums.above / sums.pixels,
+    dolp_above_1_fraction: sums.above / sums.frame,
     specular_aolp_deg: (angle * 180) / Math.PI,
     specular_aolp_concentration: concentration,
   };

@@ -1,32 +1,71 @@
-// The network's runtime: ONNX Runtime Web on the graphics processor by WebGPU where there is one that agrees with the
-// processor, else WebAssembly with as many threads as the page may have.
+// Workers that run the network, and which kind: WebGPU where there is one that agrees with the processor, else
+// WebAssembly on several cores, a strip of the frame on each. No host needs to send headers for that.
 
-const KINDS = {
-  cpu: { module: "ort.wasm.bundle.min.mjs", binary: "ort-cpu.bin", provider: "wasm" },
-  gpu: { module: "ort.webgpu.bundle.min.mjs", binary: "ort-gpu.bin", provider: "webgpu" },
-};
-/** Largest difference of the two on a test frame, white = 1, for the graphics processor to be used. */
+/** Largest difference of both kinds on a test frame, white = 1, for the graphics processor to be used; its side. */
 const AGREEMENT = 1e-3, TEST_SIDE = 96;
-const sessions = new Map();
+/** Most workers of WebAssembly: each takes some 200 MB. */
+const MOST = 4;
 
-/** Threads that the page may have: several only where it is cross-origin isolated. */
-export const threadsOf = ({ threads }) =>
-  self.crossOriginIsolated ? threads || Math.min(navigator.hardwareConcurrency || 1, 8) : 1;
+/** Workers of one kind, each with one strip at a time. State: idle ones and what waits for one. */
+class Pool {
+  constructor(kind, count) {
+    Object.assign(this, { kind, waiting: [], jobs: new Map(), next: 0 });
+    this.idle = Array.from({ length: count }, () => {
+      const worker = new Worker(new URL("network.js", self.location.href), { type: "module" });
+      worker.onmessage = ({ data: { id, images, failed } }) => this.finish(worker, id, (job) => failed ? job.reject(new Error(failed)) : job.resolve(images));
+      worker.onerror = (event) => this.finish(worker, worker.job, (job) => job.reject(new Error(event.message || "a worker failed")));
+      return worker;
+    });
+    this.count = count;
+  }
 
-/** {run(samples, rows, width), name} of the network for so many colours. `settings`: {threads, device}. */
-export async function networkOf(colors, settings) {
-  const threads = threadsOf(settings), cpu = () => open("cpu", colors, threads);
-  if (settings.device !== "cpu" && (await hasGpu())) {
-    try {
-      const gpu = await open("gpu", colors, threads);
-      gpu.agrees ??= await agree(gpu, await cpu());
-      if (gpu.agrees) return { run: gpu.run, name: "graphics processor" };
-      console.warn("the graphics processor's images differ: the processor is taken");
-    } catch (error) {
-      console.warn("the graphics processor failed: the processor is taken", error);
+  /** The network's images of a strip. */
+  run(colors, samples, rows, width) {
+    return new Promise((resolve, reject) => {
+      this.waiting.push({ resolve, reject, message: { id: this.next++, kind: this.kind, colors, samples, rows, width } });
+      this.give();
+    });
+  }
+
+  give() {
+    while (this.idle.length && this.waiting.length) {
+      const worker = this.idle.pop(), job = this.waiting.shift();
+      worker.job = job.message.id;
+      this.jobs.set(worker.job, job);
+      worker.postMessage(job.message, [job.message.samples.buffer]);
     }
   }
-  return { run: (await cpu()).run, name: `processor, ${threads} thread${threads > 1 ? "s" : ""}` };
+
+  finish(worker, id, settle) {
+    this.idle.push(worker);
+    if (this.jobs.has(id)) settle(this.jobs.get(id));
+    this.jobs.delete(id);
+    this.give();
+  }
+}
+
+const pools = new Map();
+
+function poolOf(kind, count) {
+  const key = `${kind}${count}`;
+  if (!pools.has(key)) pools.set(key, new Pool(kind, count));
+  return pools.get(key);
+}
+
+/** Workers that are asked for, else one for each core. */
+export const countOf = ({ threads }) => Math.min(threads || navigator.hardwareConcurrency || 1, MOST);
+
+/** {run(samples, rows, width), count, name} of the network for so many colours. `settings`: {threads, device}. */
+export async function networkOf(colors, settings) {
+  const count = countOf(settings), cpu = poolOf("cpu", count);
+  const made = (pool, name) => ({ run: (...strip) => pool.run(colors, ...strip), count: pool.count, name });
+  if (settings.device !== "cpu" && (await hasGpu())) {
+    const gpu = poolOf("gpu", 1);
+    gpu.agrees ??= await agree(made(gpu), made(cpu)).catch((error) => console.warn("the graphics processor failed", error));
+    if (gpu.agrees) return made(gpu, "graphics processor");
+  }
+  await Promise.all(Array.from({ length: count }, () => cpu.run(colors, new Float32Array(2 * 32 * 32), 32, 32)));  // opens all
+  return made(cpu, count > 1 ? `processor, ${count} cores` : "processor, 1 core");
 }
 
 async function hasGpu() {
@@ -37,43 +76,6 @@ async function hasGpu() {
   }
 }
 
-/** A session, opened once. */
-function open(kind, colors, threads) {
-  const key = `${kind}${colors}`;
-  if (!sessions.has(key)) sessions.set(key, start(kind, colors, threads).catch((error) => { sessions.delete(key); throw error; }));
-  return sessions.get(key);
-}
-
-const modules = new Map();
-
-async function load(kind, threads) {
-  const { module, binary } = KINDS[kind];
-  const ort = await import(new URL(module, self.location.href).href);
-  ort.env.wasm.numThreads = threads;
-  ort.env.wasm.wasmBinary = await unpacked(binary);
-  ort.env.logLevel = "error";
-  return ort;
-}
-
-async function start(kind, colors, threads) {
-  if (!modules.has(kind)) modules.set(kind, load(kind, threads));
-  const ort = await modules.get(kind);
-  const model = await fetched(colors === 3 ? "joint-fast.onnx" : "joint-fast-mono.onnx");
-  const session = await ort.InferenceSession.create(new Uint8Array(await model.arrayBuffer()),
-    { executionProviders: [KINDS[kind].provider], graphOptimizationLevel: "all" });
-  async function run(samples, rows, width) {
-    const input = new ort.Tensor("float32", samples, [1, 2, rows, width]);
-    const found = await session.run({ frame: input });
-    const images = {};
-    for (const [name, tensor] of Object.entries(found)) {
-      images[name] = await tensor.getData();
-      tensor.dispose();
-    }
-    return images;
-  }
-  return { run };
-}
-
 /** True if two runtimes make the same images of a test frame with clipped samples. */
 async function agree(one, other) {
   const n = TEST_SIDE ** 2, light = (k) => 0.35 + 0.3 * Math.sin(0.37 * (k % TEST_SIDE)) *
@@ -81,17 +83,4 @@ async function agree(one, other) {
   const frame = () => Float32Array.from({ length: 2 * n }, (_, k) => (k < n ? Math.min(light(k), 1) : +(light(k - n) >= 1)));
   const [a, b] = [await one.run(frame(), TEST_SIDE, TEST_SIDE), await other.run(frame(), TEST_SIDE, TEST_SIDE)];
   return ["diffuse", "specular", "s1", "s2"].every((name) => a[name].every((value, k) => Math.abs(value - b[name][k]) < AGREEMENT));
-}
-
-async function fetched(name) {
-  const answer = await fetch(new URL(name, self.location.href));
-  if (!answer.ok) throw new Error(`expected ${name} beside the page, found status ${answer.status}`);
-  return answer;
-}
-
-/** The bytes of a file that is gzip-compressed, unless the host has unpacked it on the way. */
-async function unpacked(name) {
-  const bytes = new Uint8Array(await (await fetched(name)).arrayBuffer());
-  if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) return bytes.buffer;
-  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
 }

@@ -23,6 +23,12 @@ let frame = null, separated = null;
 const tell = (share, text) => postMessage({ progress: { share, text } });
 
 const JOBS = {
+  /** Begin to load the network, before it is needed; other jobs need not wait for it. */
+  async warm({ settings }) {
+    networkOf(3, settings).catch((error) => console.warn(error));
+    return {};
+  },
+
   /** Read a file; {needsFormat} where it has no header and nothing was stated of it. */
   async open({ name, file, stated }) {
     tell(0.02, "Reading");
@@ -36,30 +42,34 @@ const JOBS = {
 
   /** Separate the frame that was read. `settings`: {method, layout, black, white, light, threads, device}. */
   async separate({ settings }) {
-    const begin = performance.now(), { mosaic, notes, defects } = prepare(settings);
+    const steps = {}, clock = stopwatch(steps), { mosaic, notes, defects } = prepare(settings);
+    clock("check");
     tell(0.12, "Finding the light");
     const light = lightOf(settings.light, mosaic);
+    clock("light");
     const network = settings.method === "joint-fast";
-    let images, device = "", load = 0;
+    let images, device = "";
     if (network) {
       tell(0.15, "Loading the network");
-      const start = performance.now(), { run, name } = await networkOf(channelsOf(mosaic.layout), settings);
-      load = performance.now() - start;
-      device = name;
+      const found = await networkOf(channelsOf(mosaic.layout), settings);
+      clock("load");
+      device = found.name;
       tell(0.2, "Separating");
-      images = await separateJoint(mosaic, light.color, run, (share) => tell(0.2 + 0.75 * share, "Separating"));
+      images = await separateJoint(mosaic, light.color, found, (share) => tell(0.2 + 0.75 * share, "Separating"));
     } else {
       tell(0.3, "Separating");
       images = separateAnalytic(mosaic, light.color);
     }
+    clock("separate");
     addPolarization(images);
-    const sums = tallyOf(images, network), colored = network ? colorSpecular(images, mosaic, light.color, sums) : {};
+    const sums = tallyOf(images), colored = network ? colorSpecular(images, mosaic, light.color, sums) : {};
     const { statistics, warnings } = describe(sums, network, images.colors);
     intoLight(images, light.color);
+    clock("report");
     const report = {
       method: settings.method, layout: specOf(mosaic.layout), white_level: mosaic.white, black_level: mosaic.black,
       light_color: light.color, light, defects, statistics, ...colored.report,
-      seconds: (performance.now() - begin) / 1000, load_seconds: load / 1000, device,
+      seconds: steps, device,
     };
     const said = [...notes, ...[...light.remarks, ...(colored.remark ? [colored.remark] : []), ...warnings].map((text) => ({ text }))];
     separated = { images, report: { ...report, warnings: said.map(({ text }) => text) } };
@@ -76,6 +86,16 @@ const JOBS = {
     return { blob: encodeExr(layersOf(images), width, height, notes) };
   },
 };
+
+/** Call the result with a name after each step of the work: the seconds that it took go to `steps`. */
+function stopwatch(steps) {
+  let before = performance.now();
+  return (name) => {
+    const now = performance.now();
+    steps[name] = (now - before) / 1000;
+    before = now;
+  };
+}
 
 /** The frame as a mosaic, put right where that is sure, with notes for its owner: {text, white, layout}. */
 function prepare(settings) {
@@ -121,10 +141,13 @@ function lightOf(said, mosaic) {
   return findLight(mosaic);
 }
 
-onmessage = async ({ data }) => {
-  try {
-    postMessage({ done: data.job, ...(await JOBS[data.job](data)) });
-  } catch (error) {
-    postMessage({ failed: error.message.split("\n")[0], stack: error.stack });
-  }
+let before = Promise.resolve();
+onmessage = ({ data }) => {
+  before = before.then(async () => {
+    try {
+      postMessage({ done: data.job, ...(await JOBS[data.job](data)) });
+    } catch (error) {
+      postMessage({ failed: String(error.message).split("\n")[0] });
+    }
+  });
 };

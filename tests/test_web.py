@@ -1,0 +1,233 @@
+"""The browser page of web/ in Chromium: the numbers of the library, its warnings, its files, no host but its own."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import imagecodecs
+import numpy as np
+import pytest
+import tifffile
+
+import polsep
+from polsep.io.raw.genicam import pack_frame
+from polsep.io.results.exr import read_exr_layers
+from polsep.networks import openvino_engine
+from polsep.pipeline import PolsepWarning
+from tools.web_page import CHROMIUM, DEMO, FLAGS, HAS_PACKAGES, NODE, WEB, build_page, change, send, served
+
+WAIT_MS = 120_000
+#: Largest difference to the library's images, white = 1.
+AGREES = 1e-3
+#: Largest size of the page on a host.
+LARGEST = 25_000_000
+
+needs_packages = pytest.mark.skipif(not HAS_PACKAGES, reason="needs node and its packages: npm --prefix web ci")
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None or importlib.util.find_spec("playwright") is None, reason="needs playwright and chromium"
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page as ``make web`` builds it."""
+    pytest.importorskip("onnx", reason="exporting needs the extra 'export'")
+    return build_page(tmp_path_factory.mktemp("web"))
+
+
+@pytest.fixture
+def address(site: Path) -> Iterator[str]:
+    """The page on a host."""
+    with served(site) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def page(browser: Any, address: str) -> Iterator[Any]:
+    """The page, freshly loaded; afterwards, nothing was asked of anybody else, and no script failed."""
+    asked: list[str] = []
+    failed: list[str] = []
+    context = browser.new_context(viewport={"width": 1400, "height": 900}, accept_downloads=True)
+    opened = context.new_page()
+    opened.set_default_timeout(WAIT_MS)
+    context.on("request", lambda request: asked.append(request.url))
+    opened.on("pageerror", lambda error: failed.append(str(error)))
+    opened.goto(f"{address}?threads=2")
+    yield opened
+    context.close()
+    assert [url for url in asked if not url.startswith((address, "blob:"))] == []
+    assert failed == []
+
+
+def crop() -> np.ndarray[Any, Any]:
+    """A part of the demo capture with a highlight, dead pixels and clipped ones."""
+    return np.ascontiguousarray(imagecodecs.png_decode(DEMO.read_bytes())[752:1040, 1064:1384])
+
+
+def fetch(page: Any, form: str, folder: Path) -> Path:
+    """A file that the page offers."""
+    page.click("#download summary")
+    with page.expect_download() as waiting:
+        page.click(f"[data-format={form}]")
+    path = folder / waiting.value.suggested_filename
+    waiting.value.save_as(path)
+    return path
+
+
+def separated(codes: Any, method: str, **said: Any) -> Any:
+    """What Python makes of a frame."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PolsepWarning)
+        return polsep.separate(codes, method=method, white_level=4095, **said)
+
+
+def assert_agrees(path: Path, truth: Any) -> None:
+    """Raise unless the layers of an EXR file are the library's images."""
+    layers = read_exr_layers(path)
+    for k, color in enumerate("RGB"):
+        for name in ("diffuse", "specular"):
+            np.testing.assert_allclose(layers[f"{name}.{color}"], getattr(truth, name)[..., k], rtol=0, atol=AGREES)
+    np.testing.assert_allclose(layers["dolp.Y"], truth.dolp, rtol=0, atol=AGREES)
+    np.testing.assert_array_equal(layers["valid.Y"] > 0, truth.valid)
+    strong = truth.dolp > 0.05
+    turned = np.abs(np.sin(layers["aolp.Y"] - truth.aolp))[strong]
+    assert turned.max() < 1e-2
+    if truth.error is not None:
+        np.testing.assert_allclose(layers["error.specular"], truth.error[..., 1], rtol=0.01, atol=AGREES)
+
+
+@needs_packages
+@needs_browser
+def test_the_page_gives_what_the_library_gives(page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A 12-bit frame, start to end: the level that the page recommends, both methods, a lamp's colour, the files."""
+    monkeypatch.setattr(openvino_engine, "usual_precision", lambda: "f32")
+    codes = crop()
+    codes[100, 100:102] = 0, 4095  # two dead pixels in a dark part
+    send(page, "shot.png", bytes(imagecodecs.png_encode(codes)))
+    assert "looks like 12-bit right-justified data" in page.inner_text("#notes")
+    change(page, lambda: page.click("text=Use white level 4095"))
+    assert page.locator("#notes li").count() == 0
+    assert_agrees(fetch(page, "exr", tmp_path), separated(codes, "joint-fast"))
+    page.fill("#color", "0.8,1,1.25")
+    change(page, lambda: page.select_option("#light", "stated"))
+    lit = separated(codes, "joint-fast", light_color=(0.8, 1, 1.25))
+    assert_agrees(fetch(page, "exr", tmp_path), lit)
+    change(page, lambda: page.select_option("#method", "analytic"))
+    truth = separated(codes, "analytic", light_color=(0.8, 1, 1.25))
+    assert_agrees(fetch(page, "exr", tmp_path), truth)
+    linear = imagecodecs.png_decode(fetch(page, "specular", tmp_path).read_bytes())
+    assert linear.dtype == np.uint16
+    np.testing.assert_allclose(linear / 65535 * 2, truth.specular.clip(0, 2), rtol=0, atol=AGREES)
+    shown = imagecodecs.png_decode(fetch(page, "right", tmp_path).read_bytes())
+    assert shown.shape[:2] == truth.valid.shape and shown.dtype == np.uint8
+    assert page.evaluate("crossOriginIsolated")
+
+
+@needs_packages
+@needs_browser
+def test_orders_of_filters_are_checked_and_kept(page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A transposed crop: the page says which layout fits, and turns the frame for the network as the library does."""
+    monkeypatch.setattr(openvino_engine, "usual_precision", lambda: "f32")
+    codes = np.ascontiguousarray(imagecodecs.png_decode(DEMO.read_bytes())[741:1301, 1064:1465])
+    page.fill("#white", "4095")
+    send(page, "cropped.png", bytes(imagecodecs.png_encode(codes)))
+    with pytest.warns(PolsepWarning, match="contradicts layout") as said:
+        polsep.separate(codes, "analytic", white_level=4095)
+    (line,) = (str(one.message) for one in said if "contradicts" in str(one.message))
+    wanted = line.partition("--layout ")[2].split()[0]
+    change(page, lambda: page.click(f"text=Use {wanted}"))
+    assert "contradicts" not in page.inner_text("#notes")
+    found = page.evaluate("({d: Array.from(window.polsep.images.diffuse), a: Array.from(window.polsep.images.aolp)})")
+    truth = separated(codes, "joint-fast", layout=wanted)
+    np.testing.assert_allclose(np.reshape(found["d"], truth.diffuse.shape), truth.diffuse, rtol=0, atol=AGREES)
+    strong = truth.dolp > 0.05
+    assert np.abs(np.sin(np.reshape(found["a"], truth.aolp.shape) - truth.aolp))[strong].max() < 1e-2
+
+
+@needs_packages
+@needs_browser
+def test_the_page_works_without_its_host(browser: Any, site: Path) -> None:
+    """Loaded once, it needs nobody: not its host either. Packed frames are read by the format that is stated."""
+    context = browser.new_context(viewport={"width": 390, "height": 844})
+    opened = context.new_page()
+    opened.set_default_timeout(WAIT_MS)
+    with served(site) as address:
+        opened.goto(address)
+        opened.evaluate("navigator.serviceWorker.ready.then(() => 0)")
+    opened.reload()
+    codes = crop()
+    opened.set_input_files("#file", {"name": "a.raw", "mimeType": "", "buffer": pack_frame(codes, "BayerRG12p")})
+    opened.wait_for_selector("#raw:visible")
+    for part, value in (("width", codes.shape[1]), ("height", codes.shape[0])):
+        opened.fill(f"#{part}", str(value))
+    change(opened, lambda: opened.click("#raw button"))
+    found = opened.evaluate("Array.from(window.polsep.images.specular)")
+    truth = separated(codes, "joint-fast").specular
+    np.testing.assert_allclose(np.reshape(found, truth.shape), truth, rtol=0, atol=0.02)
+    assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    send(opened, "broken.png", b"\x89PNG and nothing else")
+    assert "expected a complete PNG file" in opened.inner_text("#notes")
+    context.close()
+
+
+def lost_bits(name: str) -> int:
+    """Bits that a file called so has less than 12."""
+    return 4 if "8" in name else 2 if "10" in name else 0
+
+
+@needs_packages
+def test_files_are_read_as_the_library_reads_them(tmp_path: Path) -> None:
+    """TIFF of every compression and depth, and every packing of GenICam, sample by sample."""
+    codes = crop()[:50, :70]
+    writings: dict[str, dict[str, Any]] = {
+        "plain": {"byteorder": ">"},
+        "lzw": {"compression": "lzw", "predictor": True, "rowsperstrip": 7},
+        "deflate": {"compression": "zlib", "tile": (16, 32)},
+        "packbits": {"compression": "packbits"},
+    }
+    for name, how in writings.items():
+        tifffile.imwrite(tmp_path / f"{name}.tif", codes, photometric="minisblack", **how)
+    tifffile.imwrite(tmp_path / "8.tif", (codes >> 4).astype(np.uint8), photometric="minisblack", compression="lzw")
+    formats = ["Mono16", "Mono12p", "Mono12Packed", "BayerRG12p", "Mono10p", "Mono10Packed", "Mono8"]
+    for name in formats:
+        (tmp_path / f"{name}.raw").write_bytes(pack_frame(codes >> lost_bits(name), name))
+    script = f"""
+      import {{ readFileSync, readdirSync }} from "node:fs";
+      import {{ readFrame }} from {json.dumps((WEB / "src" / "read.js").as_uri())};
+      const found = {{}};
+      for (const name of readdirSync(".").filter((own) => /tif|raw/.test(own))) {{
+        const stated = name.endsWith("raw") && {{ format: name.split(".")[0], width: 70, height: 50 }};
+        const {{ data, width, height, white }} = readFrame(name, new Uint8Array(readFileSync(name)), stated);
+        found[name] = {{ data: Array.from(data), width, height, white }};
+      }}
+      console.log(JSON.stringify(found));"""
+    done = subprocess.run(
+        [str(NODE), "--input-type=module", "-e", script], cwd=tmp_path, capture_output=True, check=True, timeout=60
+    )
+    found = json.loads(done.stdout)
+    assert len(found) == len(writings) + len(formats) + 1
+    for name, frame in found.items():
+        np.testing.assert_array_equal(np.reshape(frame["data"], (50, 70)), codes >> lost_bits(name), err_msg=name)
+
+
+@needs_packages
+def test_the_page_is_small(site: Path) -> None:
+    """All that a host serves, the example and both runtimes included."""
+    assert sum(path.stat().st_size for path in site.iterdir()) < LARGEST

@@ -1,0 +1,58 @@
+// A worker that runs the network on one strip after the other: ONNX Runtime Web, by WebAssembly (SIMD) or WebGPU.
+//
+// Messages in: {id, kind: "cpu" or "gpu", colors, samples, rows, width}; out: {id, images} or {id, failed}.
+
+const KINDS = {
+  cpu: { module: "ort.wasm.bundle.min.mjs", binary: "ort-cpu.bin", provider: "wasm" },
+  gpu: { module: "ort.webgpu.bundle.min.mjs", binary: "ort-gpu.bin", provider: "webgpu" },
+};
+const sessions = new Map();
+let runtime = null;
+
+/** The runtime of this worker, which is of one kind. One thread: strips are what runs side by side. */
+async function load(kind) {
+  const { module, binary } = KINDS[kind], ort = await import(new URL(module, self.location.href).href);
+  ort.env.wasm.numThreads = 1;
+  ort.env.wasm.wasmBinary = await unpacked(binary);
+  ort.env.logLevel = "error";
+  return ort;
+}
+
+async function start(kind, colors) {
+  const ort = await (runtime ??= load(kind)), model = await fetched(colors === 3 ? "joint-fast.onnx" : "joint-fast-mono.onnx");
+  return ort.InferenceSession.create(new Uint8Array(await model.arrayBuffer()),
+    { executionProviders: [KINDS[kind].provider], graphOptimizationLevel: "all", enableMemPattern: false });
+}
+
+async function run({ kind, colors, samples, rows, width }) {
+  if (!sessions.has(colors)) sessions.set(colors, start(kind, colors));
+  const session = await sessions.get(colors), { Tensor } = await runtime, images = {};
+  const found = await session.run({ frame: new Tensor("float32", samples, [1, 2, rows, width]) });
+  for (const [name, tensor] of Object.entries(found)) {
+    images[name] = Float32Array.from(await tensor.getData());
+    tensor.dispose();
+  }
+  return images;
+}
+
+onmessage = async ({ data }) => {
+  try {
+    const images = await run(data);
+    postMessage({ id: data.id, images }, Object.values(images).map(({ buffer }) => buffer));
+  } catch (error) {
+    postMessage({ id: data.id, failed: error.message });
+  }
+};
+
+async function fetched(name) {
+  const answer = await fetch(new URL(name, self.location.href));
+  if (!answer.ok) throw new Error(`expected ${name} beside the page, found status ${answer.status}`);
+  return answer;
+}
+
+/** The bytes of a file that is gzip-compressed, unless the host has unpacked it on the way. */
+async function unpacked(name) {
+  const bytes = new Uint8Array(await (await fetched(name)).arrayBuffer());
+  if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) return bytes.buffer;
+  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+}

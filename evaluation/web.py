@@ -107,7 +107,7 @@ def _measure(page: Any, address: str, what: tuple[str, str, int], profile: Path)
         others = []
         for k in range(again):
             # Another level, as little, separates the frame anew.
-            change(page, lambda k=k: page.fill("#black", f"0.{k + 1}") or page.press("#black", "Enter"))  # type: ignore[misc]
+            change(page, lambda k=k: page.fill("#black", f"0.{k + 1}") or page.press("#black", "Enter"))
             others.append(_seconds(page))
     yield Row("web", case, method, "first frame", first, "s")
     yield Row("web", case, method, "next frame, least", min(others), "s")

@@ -104,11 +104,11 @@ def assert_agrees(path: Path, truth: Any) -> None:
     for k, color in enumerate("RGB"):
         for name in ("diffuse", "specular"):
             np.testing.assert_allclose(layers[f"{name}.{color}"], getattr(truth, name)[..., k], rtol=0, atol=AGREES)
-    np.testing.assert_allclose(layers["dolp.Y"], truth.dolp, rtol=0, atol=AGREES)
     np.testing.assert_array_equal(layers["valid.Y"] > 0, truth.valid)
-    strong = truth.dolp > 0.05
-    turned = np.abs(np.sin(layers["aolp.Y"] - truth.aolp))[strong]
-    assert turned.max() < 1e-2
+    # Where there is no light, polarization is that of rounding.
+    lit = (truth.diffuse + truth.specular).mean(axis=-1) > AGREES
+    np.testing.assert_allclose(layers["dolp.Y"][lit], truth.dolp[lit], rtol=0, atol=AGREES)
+    assert np.abs(np.sin(layers["aolp.Y"] - truth.aolp))[lit & (truth.dolp > 0.05)].max() < 1e-2
     if truth.error is not None:
         np.testing.assert_allclose(layers["error.specular"], truth.error[..., 1], rtol=0.01, atol=AGREES)
 
@@ -125,8 +125,9 @@ def test_the_page_gives_what_the_library_gives(page: Any, tmp_path: Path, monkey
     change(page, lambda: page.click("text=Use white level 4095"))
     assert page.locator("#notes li").count() == 0
     assert_agrees(fetch(page, "exr", tmp_path), separated(codes, "joint-fast"))
-    page.fill("#color", "0.8,1,1.25")
     change(page, lambda: page.select_option("#light", "stated"))
+    page.fill("#color", "0.8,1,1.25")
+    change(page, lambda: page.press("#color", "Enter"))
     lit = separated(codes, "joint-fast", light_color=(0.8, 1, 1.25))
     assert_agrees(fetch(page, "exr", tmp_path), lit)
     change(page, lambda: page.select_option("#method", "analytic"))
@@ -143,9 +144,9 @@ def test_the_page_gives_what_the_library_gives(page: Any, tmp_path: Path, monkey
 @needs_packages
 @needs_browser
 def test_orders_of_filters_are_checked_and_kept(page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A transposed crop: the page says which layout fits, and turns the frame for the network as the library does."""
+    """A crop off the period: the page says which layout fits, and turns the frame for the network as polsep does."""
     monkeypatch.setattr(openvino_engine, "usual_precision", lambda: "f32")
-    codes = np.ascontiguousarray(imagecodecs.png_decode(DEMO.read_bytes())[741:1301, 1064:1465])
+    codes = np.ascontiguousarray(imagecodecs.png_decode(DEMO.read_bytes())[741:1301, 1067:1467])
     page.fill("#white", "4095")
     send(page, "cropped.png", bytes(imagecodecs.png_encode(codes)))
     with pytest.warns(PolsepWarning, match="contradicts layout") as said:
@@ -157,7 +158,7 @@ def test_orders_of_filters_are_checked_and_kept(page: Any, monkeypatch: pytest.M
     found = page.evaluate("({d: Array.from(window.polsep.images.diffuse), a: Array.from(window.polsep.images.aolp)})")
     truth = separated(codes, "joint-fast", layout=wanted)
     np.testing.assert_allclose(np.reshape(found["d"], truth.diffuse.shape), truth.diffuse, rtol=0, atol=AGREES)
-    strong = truth.dolp > 0.05
+    strong = (truth.dolp > 0.05) & (truth.specular[..., 0] > AGREES)
     assert np.abs(np.sin(np.reshape(found["a"], truth.aolp.shape) - truth.aolp))[strong].max() < 1e-2
 
 

@@ -73,7 +73,6 @@ def write_models(folder: Path) -> None:
                 output_names=list(OUTPUTS),
                 dynamic_axes={"frame": {2: "H", 3: "W"}},
                 opset_version=OPERATORS,
-                do_constant_folding=False,
             )
 
 

@@ -36,8 +36,9 @@ function findCandidates({ data, height, width, layout, black }, { noise }) {
     const up = (i >= p ? -p : p) * width, down = (i + p < height ? p : -p) * width;
     for (let j = 0, at = i * width; j < width; j++, at++) {
       const left = j >= p ? -p : p, right = j + p < width ? p : -p, x = data[at];
-      const a = data[at + left], b = data[at + right];
-      if (x <= a && x >= b || x >= a && x <= b) continue;  // between two neighbours: most samples
+      const a = data[at + left], b = data[at + right], c = data[at + up], d = data[at + down];
+      // Two of four neighbours as large, and two as small: so are most samples.
+      if ((a >= x) + (b >= x) + (c >= x) + (d >= x) > 1 && (a <= x) + (b <= x) + (c <= x) + (d <= x) > 1) continue;
       let high = -Infinity, second = -Infinity, low = Infinity, other = Infinity;
       for (let k = 0; k < 8; k++) {
         const row = k < 3 ? up : k < 5 ? 0 : down, col = k < 3 ? k : k < 5 ? 2 * (k - 3) : k - 5;

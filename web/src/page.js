@@ -1,7 +1,7 @@
 // The page: files in, settings, pictures, files out. Everything is computed by the worker.
 
 import { PIXEL_FORMATS } from "./read.js";
-import { drawView, fittingGain } from "./tone.js";
+import { clearnessOf, drawView, fittingGain } from "./tone.js";
 import { Viewer } from "./viewer.js";
 
 const VIEWS = { input: "Input", diffuse: "Diffuse", specular: "Specular", dolp: "DoLP", aolp: "AoLP" };
@@ -47,7 +47,7 @@ const settings = () => ({
   layout: part("sensor").value === "other" ? part("layout").value || part("layout").placeholder : part("sensor").value || null,
   light: part("light").value === "stated" ? part("color").value.split(",").map(Number) : part("light").value,
   threads: Number(options.get("threads")) || 0,
-  device: part("device").value,
+  device: options.get("device") || part("device").value,
 });
 
 /** Read a file and separate it. `stated`: format and size of files without a header. */
@@ -88,7 +88,8 @@ async function separate() {
   try {
     do {
       state.again = false;
-      showResult(await ask("separate", { settings: settings() }));
+      const found = await ask("separate", { settings: settings() });
+      if (!state.again) showResult(found);
     } while (state.again);
   } catch (error) {
     fail(error);
@@ -99,7 +100,7 @@ async function separate() {
 
 function showResult({ images, report, notes }) {
   const first = !state.images;
-  Object.assign(state, { images, report, gain: fittingGain(images) });
+  Object.assign(state, { images: { ...images, clearness: clearnessOf(images) }, report, gain: fittingGain(images) });
   part("empty").hidden = true;
   document.body.classList.remove("empty");
   clearNotes();
@@ -184,15 +185,16 @@ function draw() {
     const picture = (view) => new ImageData(drawView(view, images, gain), images.width, images.height);
     const [left, right] = [part("left").value, part("right").value], one = picture(left);
     viewer.show(one, left === right ? one : picture(right));
-    drawLegend([left, right].find((view) => view === "dolp" || view === "aolp"));
+    drawLegend(part("legend-left"), left);
+    drawLegend(part("legend-right"), right);
   });
 }
 
 /** What the colours of a map mean: a bar from 0 to 1 for DoLP, a disc of angles for AoLP. */
-function drawLegend(view) {
-  const canvas = part("legend"), side = canvas.width, context = canvas.getContext("2d");
-  canvas.hidden = !view;
-  if (!view) return;
+function drawLegend(canvas, view) {
+  const side = canvas.width, context = canvas.getContext("2d");
+  canvas.hidden = view !== "dolp" && view !== "aolp";
+  if (canvas.hidden) return;
   const n = side * side, dolp = new Float32Array(n), aolp = new Float32Array(n), alpha = new Uint8Array(n);
   for (let r = 0, k = 0; r < side; r++)
     for (let c = 0; c < side; c++, k++) {

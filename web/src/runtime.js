@@ -59,18 +59,24 @@ export const countOf = ({ threads }) => Math.min(threads || navigator.hardwareCo
 export async function networkOf(colors, settings) {
   const count = countOf(settings), cpu = poolOf("cpu", count);
   const made = (pool, name) => ({ run: (...strip) => pool.run(colors, ...strip), count: pool.count, name });
-  if (settings.device !== "cpu" && (await hasGpu())) {
+  if (settings.device !== "cpu" && (await hasGpu(settings))) {
     const gpu = poolOf("gpu", 1);
-    gpu.agrees ??= await agree(made(gpu), made(cpu)).catch((error) => console.warn("the graphics processor failed", error));
+    gpu.agrees ??= await agree(made(gpu), made(cpu)).catch((error) => {
+      console.warn("the graphics processor failed:", error.message);
+      return false;
+    });
     if (gpu.agrees) return made(gpu, "graphics processor");
   }
   await Promise.all(Array.from({ length: count }, () => cpu.run(colors, new Float32Array(2 * 32 * 32), 32, 32)));  // opens all
   return made(cpu, count > 1 ? `processor, ${count} cores` : "processor, 1 core");
 }
 
-async function hasGpu() {
+/** True where there is a graphics processor, not one that the processor plays. */
+async function hasGpu({ device }) {
   try {
-    return Boolean(self.navigator.gpu && (await self.navigator.gpu.requestAdapter()));
+    const adapter = await self.navigator.gpu?.requestAdapter(), info = adapter?.info;
+    const played = adapter?.isFallbackAdapter || info?.isFallbackAdapter || info?.architecture === "swiftshader";
+    return Boolean(adapter) && (!played || device === "gpu");
   } catch {
     return false;
   }

@@ -6,6 +6,7 @@ import { separateAnalytic } from "./analytic.js";
 import { colorSpecular } from "./colored.js";
 import { removeDefects } from "./defects.js";
 import { encodingWarning } from "./encoding.js";
+import { fillUnderHighlights } from "./highlights.js";
 import { separateJoint } from "./joint.js";
 import { checkLayout, seePhases } from "./layout_check.js";
 import { channelsOf, parseLayout, specOf } from "./layout.js";
@@ -63,6 +64,7 @@ const JOBS = {
     clock("separate");
     addPolarization(images);
     const sums = tallyOf(images), colored = network ? colorSpecular(images, mosaic, light.color, sums) : {};
+    if (network) colored.report.filled_under_highlights = fillUnderHighlights(images, mosaic, light.color);
     const { statistics, warnings } = describe(sums, network, images.colors);
     intoLight(images, light.color);
     clock("report");

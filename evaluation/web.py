@@ -115,7 +115,7 @@ def _measure(page: Any, address: str, what: tuple[str, str, int], profile: Path)
 
 
 def _seconds(page: Any) -> float:
-    """What the page says of its last separation. Raises ValueError where it failed."""
+    """Seconds that the page says of its last separation. Raises ValueError where it failed."""
     if page.get_attribute("body", "data-state") != "done":
         raise ValueError(f"expected a separated frame, found: {page.inner_text('#notes')}")
     steps = page.evaluate("window.polsep.report.seconds")

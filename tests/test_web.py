@@ -92,7 +92,7 @@ def fetch(page: Any, form: str, folder: Path) -> Path:
 
 
 def separated(codes: Any, method: str, **said: Any) -> Any:
-    """What Python makes of a frame."""
+    """A frame by the library."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PolsepWarning)
         return polsep.separate(codes, method=method, white_level=4095, **said)

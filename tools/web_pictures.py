@@ -1,4 +1,4 @@
-"""The picture of docs/web.md: `python -m tools.web_pictures`. Needs node with the packages of web/, and chromium."""
+"""Pictures of docs/web.md: `python -m tools.web_pictures`. Needs node with the packages of web/, and chromium."""
 
 from __future__ import annotations
 
@@ -27,6 +27,9 @@ def main() -> None:
             page.goto(address)
             page.fill("#white", "4095")
             send(page, "still_life.png", read_bytes(DEMO))
+            page.locator("#white").blur()  # which separates once more
+            page.wait_for_timeout(1000)
+            page.wait_for_selector("body[data-state=done]")
             page.wait_for_timeout(1000)
             picture = Image.open(BytesIO(page.screenshot())).convert("RGB")
             picture.save(ROOT / "docs" / "images" / name, quality=85, optimize=True)

@@ -29,7 +29,7 @@ async function run({ kind, colors, samples, rows, width }) {
   const session = await sessions.get(colors), { Tensor } = await runtime, images = {};
   const found = await session.run({ frame: new Tensor("float32", samples, [1, 2, rows, width]) });
   for (const [name, tensor] of Object.entries(found)) {
-    images[name] = Float32Array.from(await tensor.getData());
+    images[name] = (await tensor.getData()).slice();
     tensor.dispose();
   }
   return images;

@@ -4,6 +4,7 @@
 import { mirroredAcross, mirroredDown, rolled, sameLayout, SONY, SONY_MONO, specOf, transposed } from "./layout.js";
 import { CLIP_MARGIN } from "./levels.js";
 import { mean, median, quantile } from "./numbers.js";
+import { checkSlopes } from "./slope_check.js";
 
 const MIN_CONTRADICTION = 0.006, GAIN_TOLERANCE = 0.03, MIN_RATIO = 2;
 const MIN_COLOR = 0.03, MAX_MONO = 0.02, EVEN = 0.007;
@@ -167,9 +168,9 @@ export function checkLayout(mosaic, phases) {
     !(color && Math.abs(greens) > 0.5 && ["RGGB", "BGGR"].includes(own.bayer) !== greens > 0) &&
     (pairs === null || [pairs, null].includes(crossedPairs(own)));
   const fits = candidates(layout).filter(([own]) => agrees(own));
-  const turned = SENSORS.includes(`${mosaic.height}x${mosaic.width}`) && [SONY, SONY_MONO].some((own) => sameLayout(own, layout));
+  const sensor = SENSORS.includes(`${mosaic.height}x${mosaic.width}`), turned = sensor && [SONY, SONY_MONO].some((own) => sameLayout(own, layout));
   if (!fits.length || fits.some(([own]) => sameLayout(own, layout))) {
-    if (!turned) return null;
+    if (!turned) return color && !sensor ? checkSlopes(mosaic) : null;
     const stood = transposed(layout);
     return {
       text: `the frame is ${mosaic.width}x${mosaic.height}, a sensor's ${mosaic.height}x${mosaic.width} turned or ` +

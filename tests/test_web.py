@@ -18,7 +18,6 @@ import tifffile
 import polsep
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
-from polsep.networks import openvino_engine
 from polsep.pipeline import PolsepWarning
 from tools.web_page import CHROMIUM, DEMO, FLAGS, HAS_PACKAGES, NODE, WEB, build_page, change, send, served
 
@@ -104,6 +103,7 @@ def assert_agrees(path: Path, truth: Any) -> None:
     for k, color in enumerate("RGB"):
         for name in ("diffuse", "specular"):
             np.testing.assert_allclose(layers[f"{name}.{color}"], getattr(truth, name)[..., k], rtol=0, atol=AGREES)
+        np.testing.assert_allclose(layers[color], layers[f"diffuse.{color}"] + layers[f"specular.{color}"], atol=1e-6)
     np.testing.assert_array_equal(layers["valid.Y"] > 0, truth.valid)
     # Where there is no light, polarization is that of rounding.
     lit = (truth.diffuse + truth.specular).mean(axis=-1) > AGREES
@@ -117,7 +117,7 @@ def assert_agrees(path: Path, truth: Any) -> None:
 @needs_browser
 def test_the_page_gives_what_the_library_gives(page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A 12-bit frame, start to end: the level that the page recommends, both methods, a lamp's colour, the files."""
-    monkeypatch.setattr(openvino_engine, "usual_precision", lambda: "f32")
+    monkeypatch.setenv("POLSEP_LAYERS", "f32")
     codes = crop()
     codes[100, 100:102] = 0, 4095  # two dead pixels in a dark part
     send(page, "shot.png", bytes(imagecodecs.png_encode(codes)))
@@ -145,7 +145,7 @@ def test_the_page_gives_what_the_library_gives(page: Any, tmp_path: Path, monkey
 @needs_browser
 def test_orders_of_filters_are_checked_and_kept(page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A crop off the period: the page says which layout fits, and turns the frame for the network as polsep does."""
-    monkeypatch.setattr(openvino_engine, "usual_precision", lambda: "f32")
+    monkeypatch.setenv("POLSEP_LAYERS", "f32")
     codes = np.ascontiguousarray(imagecodecs.png_decode(DEMO.read_bytes())[741:1301, 1067:1467])
     page.fill("#white", "4095")
     send(page, "cropped.png", bytes(imagecodecs.png_encode(codes)))
@@ -164,8 +164,9 @@ def test_orders_of_filters_are_checked_and_kept(page: Any, monkeypatch: pytest.M
 
 @needs_packages
 @needs_browser
-def test_the_page_works_without_its_host(browser: Any, site: Path) -> None:
+def test_the_page_works_without_its_host(browser: Any, site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Loaded once, it needs nobody: not its host either. Packed frames are read by the format that is stated."""
+    monkeypatch.setenv("POLSEP_LAYERS", "f32")
     context = browser.new_context(viewport={"width": 390, "height": 844})
     opened = context.new_page()
     opened.set_default_timeout(WAIT_MS)
@@ -181,7 +182,7 @@ def test_the_page_works_without_its_host(browser: Any, site: Path) -> None:
     change(opened, lambda: opened.click("#raw button"))
     found = opened.evaluate("Array.from(window.polsep.images.specular)")
     truth = separated(codes, "joint-fast").specular
-    np.testing.assert_allclose(np.reshape(found, truth.shape), truth, rtol=0, atol=0.02)
+    np.testing.assert_allclose(np.reshape(found, truth.shape), truth, rtol=0, atol=AGREES)
     assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
     send(opened, "broken.png", b"\x89PNG and nothing else")
     assert "expected a complete PNG file" in opened.inner_text("#notes")

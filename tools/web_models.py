@@ -20,7 +20,7 @@ from polsep.io.store.atomic import atomic_path
 from polsep.networks.joint import Joint, limit
 from polsep.networks.taps import pool_outputs
 from polsep.sensor.camera import Layout
-from polsep.shipped import find_joint
+from polsep.shipped import shipped_joint, weights_name
 
 #: Files by the layout of the frames that their network reads.
 FILES = {"joint-fast.onnx": Layout(), "joint-fast-mono.onnx": Layout(bayer=None)}
@@ -60,8 +60,8 @@ def write_models(folder: Path) -> None:
     """Write `FILES`, each under its name once it is whole."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, layout in FILES.items():
-        network, _ = find_joint("joint-fast", layout, None)
-        graph, frame = PageNetwork(Joint.of(network, torch.device("cpu"))).eval(), torch.zeros(1, 2, *SIDES)
+        network = Joint.of(shipped_joint(weights_name("joint-fast", layout)), torch.device("cpu"))
+        graph, frame = PageNetwork(network).eval(), torch.zeros(1, 2, *SIDES)
         with atomic_path(folder / name) as part, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that the exporter is the older one, and remarks about its own parts
             torch.onnx.export(

@@ -8,11 +8,12 @@ const ROWS = 16;  // of a chunk
 /** The layers of separated images by channel name, as polsep's EXR files have them. */
 export function layersOf(images) {
   const { diffuse, specular, colors, dolp, aolp, valid, error } = images, n = dolp.length, layers = {};
-  for (const [name, image, count] of [["diffuse", diffuse, colors], ["specular", specular, colors], ["error", error, 2]])
+  const total = diffuse.map((light, k) => light + specular[k]);  // for programs that know no layers
+  for (const [name, image, count] of [["", total, colors], ["diffuse", diffuse, colors], ["specular", specular, colors], ["error", error, 2]])
     for (let c = 0; image && c < count; c++) {
       const plane = new Float32Array(n), channel = name === "error" ? ["diffuse", "specular"][c] : count === 1 ? "Y" : "RGB"[c];
       for (let k = 0; k < n; k++) plane[k] = image[k * count + c];
-      layers[`${name}.${channel}`] = plane;
+      layers[name ? `${name}.${channel}` : channel] = plane;
     }
   return { ...layers, "dolp.Y": dolp, "aolp.Y": aolp, "valid.Y": Float32Array.from(valid) };
 }

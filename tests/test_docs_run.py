@@ -40,12 +40,14 @@ LEFT_OUT = {
     "polsep calibrate (flat|analysers|light)": "needs pictures of a rig; tests/test_calibration.py",
     "polsep geometry": "needs six lights on one thing; tests/test_geometry_files.py",
     "polsep material": "needs the extra torch and flash frames of one sample; tests/test_material.py",
+    "polsep separate --(parallel|crossed|angles)": "needs photographs through a filter; tests/test_photographs.py",
     "polsep video run.mkv": "needs the extra video; tests/test_video.py",
 }
 #: Commands that the documentation shows to fail, and what they say.
 FAILS = {"polsep separate polsep/data/still_life.png -o out": "found that values never exceed 4095"}
 #: Pages whose Python does not run here, and why. tests/test_docs.py runs those of extending and python.
 NO_PYTHON = {
+    "export": "needs an exported graph; tests/test_export.py",
     "extending": "tests/test_docs.py",
     "python": "tests/test_docs.py",
     "geometry": "needs six lights on one thing; tests/test_geometry.py",

@@ -136,7 +136,6 @@ def test_photographs_do_too(polsep: Cli, tmp_path: Path) -> None:
         (["--name", "a/b"], ["stem"]),
         (["--method", "magic"], ["magic"]),
         (["--mask", "absent.png"], ["absent.png"]),
-        (["--srgb"], ["light0.exr"]),
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(

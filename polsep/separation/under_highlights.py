@@ -206,20 +206,21 @@ def _solve_laplace(holes: _Holes, diffuse: Array, gain: Floats, start: Floats) -
 
     By conjugate gradients from a ``start``. Beyond the image's border there are no neighbours.
     """
-    number, width = _numbers(holes.flat, holes.shape), holes.shape[1]
-    count, right = np.zeros((len(holes.flat), 1)), np.zeros_like(start)
-    links = []
+    number, width, size = _numbers(holes.flat, holes.shape), holes.shape[1], len(holes.flat)
+    count, right = np.zeros((size, 1)), np.zeros_like(start)
+    links, padded = [], np.zeros((size + 1, start.shape[1]))  # the last row stands for what is no pixel of a hole
     for down, across in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         other = _neighbors(number, holes.flat, holes.shape, (down, across))
-        links.append((np.flatnonzero(other >= 0), other[other >= 0]))
+        links.append(np.where(other >= 0, other, size))
         known = np.flatnonzero(other == _OUTSIDE)
         right[known] += to_numpy(_take(diffuse, holes.flat[known] + down * width + across)) / gain
         count[other != _BEYOND] += 1
 
     def apply(x: Floats) -> Floats:
+        padded[:size] = x
         changed = count * x
-        for one, two in links:
-            changed[one] -= x[two]
+        for link in links:
+            changed -= padded.take(link, axis=0)
         return changed
 
     x = start.copy()

@@ -14,14 +14,15 @@ import imagecodecs
 import numpy as np
 import pytest
 import tifffile
+from chromium import WAIT_MS, browser, fresh_page
 
 import polsep
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
 from polsep.pipeline import PolsepWarning
-from tools.web_page import CHROMIUM, DEMO, FLAGS, HAS_PACKAGES, NODE, WEB, build_page, change, send, served
+from tools.web_page import CHROMIUM, DEMO, HAS_PACKAGES, NODE, WEB, build_page, change, send, served
 
-WAIT_MS = 120_000
+__all__ = ["browser"]  # a fixture
 #: Largest difference to the library's images, white = 1.
 AGREES = 1e-3
 #: Largest size of the page on a host.
@@ -47,32 +48,11 @@ def address(site: Path) -> Iterator[str]:
         yield found
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Chromium."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as driver:
-        started = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield started
-        started.close()
-
-
 @pytest.fixture
 def page(browser: Any, address: str) -> Iterator[Any]:
-    """The page, freshly loaded; afterwards, nothing was asked of anybody else, and no script failed."""
-    asked: list[str] = []
-    failed: list[str] = []
-    context = browser.new_context(viewport={"width": 1400, "height": 900}, accept_downloads=True)
-    opened = context.new_page()
-    opened.set_default_timeout(WAIT_MS)
-    context.on("request", lambda request: asked.append(request.url))
-    opened.on("pageerror", lambda error: failed.append(str(error)))
-    opened.goto(f"{address}?threads=2")
-    yield opened
-    context.close()
-    assert [url for url in asked if not url.startswith((address, "blob:"))] == []
-    assert failed == []
+    """The page, freshly loaded."""
+    with fresh_page(browser, f"{address}?threads=2", 1400) as opened:
+        yield opened
 
 
 def crop() -> np.ndarray[Any, Any]:

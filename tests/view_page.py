@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import shutil
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,18 +11,17 @@ from typing import Any
 import imagecodecs
 import numpy as np
 import pytest
+from chromium import WAIT_MS, browser, fresh_page
 from viewer import running
 
 import polsep
 from polsep.pipeline import PolsepWarning
+from tools.web_page import CHROMIUM, DEMO
 
-CHROMIUM = shutil.which("chromium")
+__all__ = ["DEMO", "WAIT_MS", "browser"]  # for tests that use this
+
 READY = CHROMIUM and all(importlib.util.find_spec(name) for name in ("gradio", "playwright"))
 needs_browser = pytest.mark.skipif(not READY, reason="needs the extra view, playwright and chromium")
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
-FLAGS += ["--disable-sync", "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1"]
-DEMO = Path(polsep.__file__).parent / "data" / "still_life.png"
-WAIT_MS = 120_000
 
 
 @pytest.fixture(scope="module")
@@ -39,33 +37,12 @@ def viewer(folder: Path) -> Iterator[str]:
         yield address
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Chromium."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as driver:
-        started = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield started
-        started.close()
-
-
 @pytest.fixture
 def page(browser: Any, viewer: str) -> Iterator[Any]:
-    """The page, freshly loaded; afterwards, nothing was asked of anybody else, and no script failed."""
-    asked: list[str] = []
-    failed: list[str] = []
-    context = browser.new_context(viewport={"width": 1440, "height": 900}, accept_downloads=True)
-    opened = context.new_page()
-    opened.set_default_timeout(WAIT_MS)
-    opened.on("request", lambda request: asked.append(request.url))
-    opened.on("pageerror", lambda error: failed.append(str(error)))
-    opened.goto(viewer)
-    opened.wait_for_selector("#ps-demo")
-    yield opened
-    context.close()
-    assert [url for url in asked if not url.startswith((viewer, "data:", "blob:"))] == []
-    assert failed == []
+    """The page, freshly loaded."""
+    with fresh_page(browser, viewer, 1440) as opened:
+        opened.wait_for_selector("#ps-demo")
+        yield opened
 
 
 def send(page: Any, name: str, data: bytes) -> None:

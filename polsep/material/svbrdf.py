@@ -3,7 +3,7 @@
 Conventions: the plane is x, y in [-1, 1] at z = 0, x right, y up, z toward the camera; maps are ``[..., C, H, W]``,
 row 0 at y = 1. ``diffuse`` and ``specular`` are linear RGB in [0, 1], the latter the reflectance at normal incidence,
 0.04 for glass; roughness r is GGX alpha = r^2. The shading is that of Deschaintre et al. 2018, which game engines and
-glTF share: GGX, Smith with k = alpha / 2, Schlick by a power of two, diffuse (1 - specular) / pi. No polarization.
+glTF share (`physics.gltf`). No polarization.
 
 Source: Deschaintre, Aittala, Durand, Drettakis, Bousseau 2018, doi:10.1145/3197517.3201378; Karis 2013.
 """
@@ -16,12 +16,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from polsep.physics import gltf
 from polsep.physics.optics import dot, normalize
 
-#: Exponents of Schlick's term as a power of two (Karis 2013).
-SCHLICK = (-5.55473, -6.98316)
-#: Least roughness and cosine of the shading.
-MIN_ROUGHNESS, MIN_COSINE = 0.03, 1e-3
 #: Channels of stacked maps: normal x and y, diffuse, roughness, specular.
 STACKED = 9
 
@@ -61,24 +58,11 @@ def plane_points(height: int, width: int) -> Tensor:
 
 
 def reflect(maps: Svbrdf, to_camera: Tensor, to_light: Tensor) -> Tensor:
-    """The BRDF times the light's cosine for unit directions, all ``[..., 3, H, W]``; 0 behind the surface.
-
-    Times pi it is the radiance under a light by which white paper shows 1.
-    """
-    half = normalize(to_camera + to_light)
-    lit, seen = dot(maps.normal, to_light), dot(maps.normal, to_camera)
-    front = ((lit > 0) & (seen > 0)).to(lit)
-    lit, seen = lit.clamp(MIN_COSINE, 1), seen.clamp(MIN_COSINE, 1)
-    vh = dot(to_camera, half).clamp(0, 1)
-    nh = dot(maps.normal, half).clamp(0, 1)
-    alpha = maps.roughness.clamp(min=MIN_ROUGHNESS) ** 2
-    alpha2 = alpha * alpha
-    spread = 1 - nh * nh + nh * nh * alpha2
-    k = alpha / 2
-    smith = (lit * (1 - k) + k) * (seen * (1 - k) + k)
-    fresnel = maps.specular + (1 - maps.specular) * torch.exp2((SCHLICK[0] * vh + SCHLICK[1]) * vh)
-    lobe = alpha2 / (4 * math.pi * spread * spread * smith)
-    return front * lit * (fresnel * lobe + (1 - maps.specular) * maps.diffuse / math.pi)
+    """`gltf.reflect` of maps for unit directions, all ``[..., 3, H, W]``."""
+    found: Tensor = gltf.reflect(
+        gltf.Coat(maps.normal, maps.diffuse, maps.roughness, maps.specular), to_camera, to_light
+    )
+    return found
 
 
 def relight(maps: Svbrdf, points: Tensor, camera: Tensor, light: Tensor) -> Tensor:

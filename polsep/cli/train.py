@@ -12,7 +12,7 @@ from polsep.cli.app import COUNT, DIR, POSITIVE, Word, app, require_extra, requi
 
 #: What can be trained.
 RUNGS = (
-    *("joint-large", "joint", "joint-fast", "material"),
+    *("joint-large", "joint", "joint-fast", "material", "shape"),
     *("paper", "unpolarized", "polarized", "shared", "signed", "no-angle", "stokes"),
 )
 
@@ -41,12 +41,26 @@ RUNGS = (
 )
 @click.option("--ablation", default="none", metavar="NAME", help="Ablation of a joint network.")
 @click.option("--part", default="all", metavar="NAME", help="Part of a joint network to train: all, details or doubt.")
-@click.option("--input", "seen", default="separated", metavar="NAME", help="material: unseparated, separated, perfect.")
-@click.option("--examples", type=COUNT, default=768, metavar="N", help="material: number of training examples.")
+@click.option(
+    "--input",
+    "seen",
+    default="separated",
+    metavar="NAME",
+    help="material: unseparated, separated, perfect; shape: separated, stokes, rgb, perfect.",
+)
+@click.option(
+    "--examples",
+    type=COUNT,
+    metavar="N",
+    help="material, shape: number of training examples.  [default: 768, 3200]",
+)
+@click.option("--side", type=COUNT, default=96, metavar="PX", help="shape: side of the images that the network sees.")
 @click.option("--cues", metavar="NAME,...", help="material: inputs beside the images, such as details.")
-@click.option("--folder", type=DIR, metavar="DIR", help="material: folder of the examples.  [default: DIR/../examples]")
+@click.option(
+    "--folder", type=DIR, metavar="DIR", help="material, shape: folder of the examples.  [default: DIR/../examples]"
+)
 @click.option("--steps", type=COUNT, default=20_000, metavar="N", help="Batches of 8 crops, or of 4 materials.")
-@click.option("--until", type=COUNT, metavar="N", help="material: end at this step of the schedule.")
+@click.option("--until", type=COUNT, metavar="N", help="material, shape: end at this step of the schedule.")
 @click.option("--rate", type=POSITIVE, default=1e-3, metavar="X", help="Peak learning rate.")
 @click.option("--seed", type=int, default=0, metavar="N", help="Random seed of the weights and of the data.")
 @click.option("--workers", type=COUNT, default=1, metavar="N", help="Rendering processes per device.")
@@ -68,8 +82,8 @@ RUNGS = (
 )
 @click.option("--precision", default="bf16-mixed", metavar="NAME", help="bf16-mixed or 32-true.")
 def train(rung: str, output: Path, data: str, **options: Any) -> None:
-    """Train joint-large, joint, joint-fast, material or a rung of the paper's ladder: paper, unpolarized, polarized,
-    shared, signed, no-angle, stokes.
+    """Train joint-large, joint, joint-fast, material, shape or a rung of the paper's ladder: paper, unpolarized,
+    polarized, shared, signed, no-angle, stokes.
 
     Data are rendered while training, from seeds that no test uses. Run the same command again to resume a run that was
     stopped. 'tensorboard --logdir DIR' shows its curves. Needs the extra train.
@@ -79,6 +93,7 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     polsep train paper --data mono -o runs/mono                           for cameras without colour filters
     polsep train paper --width 64 --levels 4 --fold 1 -o runs/unet64      the classic U-Net
     polsep train material --input separated --steps 2000 -o runs/separated
+    polsep train shape --steps 5000 -o runs/shape
     """
     require_extra("train")
     require_paths(*options["start"])
@@ -86,16 +101,22 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     from polsep.train.constants import read_constant
     from polsep.train.loop import Run, Schedule
     from polsep.train.material_command import choose_material, train_material
+    from polsep.train.shape_command import choose_shape, train_shape
     from polsep.train.stream import StreamOptions
 
     shared = {name: options[name] for name in ("workers", "devices", "start", "refit")}
-    if rung == "material":
+    if rung in ("material", "shape"):
         if options["constants"]:
-            raise ValueError(f"expected no --set with material, found --set {options['constants'][0]}")
-        material, schedule = choose_material(options)
+            raise ValueError(f"expected no --set with {rung}, found --set {options['constants'][0]}")
         folder = options["folder"] or output.parent / "examples"
-        run = Run(output, schedule=schedule, until=options["until"], **shared)
-        path = train_material(material, run, folder, _print_log)
+        if rung == "material":
+            material, schedule = choose_material(options | {"examples": options["examples"] or 768})
+            run = Run(output, schedule=schedule, until=options["until"], **shared)
+            path = train_material(material, run, folder, _print_log)
+        else:
+            shape, schedule = choose_shape(options | {"examples": options["examples"] or 3200})
+            run = Run(output, schedule=schedule, until=options["until"], **shared)
+            path = train_shape(shape, run, folder, _print_log)
     else:
         network = choose_options(rung, data, options)
         schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])

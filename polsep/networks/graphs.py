@@ -1,6 +1,7 @@
 """The networks as OpenVINO models, built from their files of weights: no torch, no other files.
 
-Twins: the torch modules `joint.Joint` (its layers), `whole_frame.WholeFrame` and `paper.Refinement`.
+Twins: the torch modules `joint.Joint` (its layers), `whole_frame.WholeFrame`, `paper.Refinement` and
+`shape.ShapeNetwork`.
 
 Layers whose inputs have known ranges (`ranges`) can be rounded to 8 bits: inputs in 256 steps of one size, weights in
 255 steps of one size per output, as processors multiply them (Jacob et al. 2018, arXiv:1712.05877). Blocks whose
@@ -258,3 +259,13 @@ def refinement_model(arrays: Arrays, size: Size, shape: tuple[int, int, int]) ->
     images = [graph.unet(inputs, f"nets.{k}", size) for k in range(count)]
     found = ops.add(images[0] if count == 1 else ops.concat(images, 1), graph.convolve(inputs, "linear"))
     return import_openvino().Model([ops.result(found)], [inputs])
+
+
+def shape_model(arrays: Arrays, size: ResidualSize, shape: tuple[int, int, int]) -> Any:
+    """`shape.ShapeNetwork` for maps ``[1, K, h, w]`` of that ``shape`` (K, h, w), sides a multiple of its fold."""
+    graph = _Graph(arrays)
+    inputs = graph.ops.parameter([1, *shape], np.float32)
+    fold = round((arrays["net.enter.weight"].shape[1] / shape[0]) ** 0.5)
+    features = graph.residual_unet(graph.ops.space_to_depth(inputs, "depth_first", fold), size, ())
+    found = graph.ops.depth_to_space(graph.convolve(features, "last"), "depth_first", fold)
+    return import_openvino().Model([graph.ops.result(found)], [inputs])

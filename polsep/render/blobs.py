@@ -1,0 +1,113 @@
+"""Random smooth bodies: ellipsoids that grow out of each other and melt together, with bumps, as a closed mesh.
+
+Unions of solids (`render.shapes`) meet in creases; animals, figures and fruits do not. A body is the zero level of the
+smooth minimum of distances to ellipsoids (Quilez 2013), displaced by random waves, and is meshed by marching cubes.
+
+Conventions are those of `render.shapes`: centred, about as large as an average random shape. Slots are the patches of a
+random Voronoi diagram, so that a body has several materials. Needs the extra ``train``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from polsep.render.materials import USUAL_SIZE
+from polsep.render.shapes import Floats, Integers, Mesh
+
+#: Number of ellipsoids, and semi-axes of the first and, relative to the one that they grow out of, of the others.
+PARTS, FIRST_AXES, OTHER_AXES = (1, 10), (0.5, 1.1), (0.2, 1.0)
+#: Width over which parts melt together, relative to the first one's mean axis; small ones leave creases.
+MELTING = (0.02, 0.35)
+#: Waves of the bumps, their largest wavelength and height, log-uniform, relative to the body.
+WAVES, WAVELENGTHS, HEIGHTS = 12, (0.08, 1.2), (0.001, 0.06)
+#: Cells along the longest side of the grid, and its margin around the parts.
+CELLS, MARGIN = 88, 0.35
+#: Number of patches.
+PATCHES = (1, 7)
+
+#: Random numbers between two bounds, of a shape.
+Draw = Callable[..., Floats]
+
+
+def random_blob(generator: torch.Generator) -> Mesh:
+    """Return a random body. Source of the smooth minimum: Quilez 2013, "smooth minimum", exponential form."""
+    from skimage.measure import marching_cubes
+
+    def draw(low: float, high: float, *shape: int) -> Floats:
+        numbers = torch.rand(*(shape or (1,)), generator=generator, dtype=torch.float64)
+        found: Floats = (low + (high - low) * numbers).numpy()
+        return found
+
+    count = int(torch.randint(PARTS[0], PARTS[1] + 1, (1,), generator=generator))
+    axes, turns, centers = [draw(*FIRST_AXES, 3)], [_turn(draw(-1, 1, 4))], [np.zeros(3)]
+    for _ in range(count - 1):
+        root = int(torch.randint(len(axes), (1,), generator=generator))
+        way = draw(-1, 1, 3)
+        way = way / max(float(np.linalg.norm(way)), 1e-6)
+        axes.append(draw(*OTHER_AXES, 3) * axes[root].mean())
+        turns.append(_turn(draw(-1, 1, 4)))
+        centers.append(centers[root] + turns[root] @ (axes[root] * way) + 0.4 * axes[-1].mean() * way)
+    reach = np.array([a.max() for a in axes])[:, None] + MARGIN
+    low, high = (np.array(centers) - reach).min(axis=0), (np.array(centers) + reach).max(axis=0)
+    step = float((high - low).max()) / CELLS
+    grid = np.stack(np.meshgrid(*(np.arange(a, b, step) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
+    width = float(draw(*MELTING)[0]) * axes[0].mean()
+    near = np.zeros(grid.shape[:3])
+    for size, turn, center in zip(axes, turns, centers, strict=True):
+        scaled = ((grid - center) @ turn) / size
+        length = np.sqrt((scaled**2).sum(-1))
+        slope = np.sqrt(((scaled / size) ** 2).sum(-1))  # the distance to first order: length (length - 1) / |gradient|
+        near += np.exp(-np.clip(length * (length - 1) / np.maximum(slope, 1e-6) / width, -30, 30))
+    field = -width * np.log(near) + _bumps(grid / float((high - low).max()), draw) * float((high - low).max())
+    meshed = marching_cubes(field, 0.0, spacing=(step,) * 3, gradient_direction="ascent")  # type: ignore[no-untyped-call]
+    vertices, faces, normals, _ = meshed
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    scale = USUAL_SIZE / float((vertices.max(axis=0) - vertices.min(axis=0)).max())
+    placed = ((vertices - middle) * scale).astype(np.float64)
+    return _patched(placed, normals.astype(np.float64), np.ascontiguousarray(faces[:, ::-1], np.int64), draw)
+
+
+def _bumps(points: Floats, draw: Draw) -> Floats:
+    """Random waves at points ``[..., 3]`` in units of the body."""
+    share = draw(0, 1, WAVES + 2)
+    low, high = WAVELENGTHS
+    height = HEIGHTS[0] * (HEIGHTS[1] / HEIGHTS[0]) ** share[-1]
+    total: Floats = np.zeros(points.shape[:-1])
+    for place in share[:WAVES]:
+        length = low * (high / low) ** place
+        way = draw(-1, 1, 3)
+        way = way / max(float(np.linalg.norm(way)), 1e-6)
+        total += length * np.sin(2 * math.pi * (points @ way / length + draw(0, 1)[0]))
+    found: Floats = height * total
+    return found
+
+
+def _patched(vertices: Floats, normals: Floats, faces: Integers, draw: Draw) -> Mesh:
+    """The mesh with a slot per patch; vertices are not shared between slots."""
+    count = round(float(draw(PATCHES[0] - 0.49, PATCHES[1] + 0.49)[0]))
+    seeds = vertices[(draw(0, 1, count) * (len(vertices) - 1)).astype(np.int64)]
+    middles = vertices[faces].mean(axis=1)
+    owner = np.linalg.norm(middles[:, None] - seeds, axis=-1).argmin(axis=1)
+    _, owner = np.unique(owner, return_inverse=True)
+    corners = faces + owner[:, None] * len(vertices)
+    used, numbered = np.unique(corners, return_inverse=True)
+    origin = used % len(vertices)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    unit = (-normals / np.where(length > 0, length, 1))[origin]
+    return Mesh(vertices[origin], unit, np.zeros((len(used), 2)), numbered.reshape(-1, 3), owner.astype(np.int64))
+
+
+def _turn(quaternion: Floats) -> Floats:
+    """The rotation matrix of a quaternion of any length."""
+    x, y, z, w = quaternion / max(float(np.linalg.norm(quaternion)), 1e-6)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

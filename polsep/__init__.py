@@ -14,6 +14,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from polsep.geometry.one_frame import Shape, shape
     from polsep.io.raw.frames import Frame, ReadOptions, read_frames
     from polsep.io.results.separation_reader import read_separated
     from polsep.io.store.calibrations import read_calibration
@@ -39,12 +40,14 @@ __all__ = [
     "Result",
     "SeparatedFrame",
     "Separation",
+    "Shape",
     "Stokes",
     "find_light",
     "read_calibration",
     "read_frames",
     "read_separated",
     "separate",
+    "shape",
 ]
 
 _HOME = {
@@ -60,12 +63,14 @@ _HOME = {
     "Result": "pipeline",
     "SeparatedFrame": "separation.report",
     "Separation": "separation.analytic",
+    "Shape": "geometry.one_frame",
     "Stokes": "physics.stokes",
     "find_light": "light.find",
     "read_calibration": "io.store.calibrations",
     "read_frames": "io.raw.frames",
     "read_separated": "io.results.separation_reader",
     "separate": "pipeline",
+    "shape": "geometry.one_frame",
 }
 
 __version__ = "0.1.0"

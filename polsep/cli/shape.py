@@ -1,0 +1,135 @@
+"""The surface of a thing from one frame: shape."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from polsep.cli.app import (
+    AMBIENT,
+    BLACK_LEVEL,
+    CALIBRATION,
+    DIR,
+    FILE,
+    LAYOUT,
+    LIGHT_COLOR,
+    OVERWRITE,
+    PIXEL_FORMAT,
+    WHITE_LEVEL,
+    Word,
+    app,
+    print_note,
+    read_light,
+    read_options,
+    require_extra,
+    require_paths,
+)
+from polsep.cli.progress import show_progress
+
+
+@app.command()
+@click.argument("file", type=FILE, metavar="FILE")
+@click.option("-o", "--output", type=DIR, default=Path("polsep-shape"), metavar="DIR", help="Folder of the results.")
+@click.option("--name", metavar="STEM", help="Name of the output files.  [default: that of FILE]")
+@click.option(
+    "--light",
+    "lamp",
+    default="auto",
+    metavar="x,y,z|auto",
+    help="Direction toward the lamp: right, up, to the camera; auto: somewhere beside the camera.",
+)
+@click.option(
+    "--mask", type=FILE, metavar="FILE", help="Image that is white on the thing.  [default: where light falls]"
+)
+@click.option(
+    "--method", default="auto", metavar="NAME", help="Method that separates a raw frame; see 'polsep methods'."
+)
+@LAYOUT
+@BLACK_LEVEL
+@WHITE_LEVEL
+@CALIBRATION
+@AMBIENT
+@LIGHT_COLOR
+@click.option("--frame-size", "size", metavar="WxH", help="Size of a headerless raw frame, like 2448x2048.")
+@PIXEL_FORMAT
+@click.option(
+    "--mesh",
+    type=Word("glb", "ply", "none"),
+    default="glb",
+    metavar="glb|ply|none",
+    help="Format of the mesh; none: no depth and no mesh, which need the extra render.",
+)
+@click.option(
+    "--integration",
+    type=Word("bilateral", "smooth"),
+    default="bilateral",
+    metavar="bilateral|smooth",
+    help="Depth with jumps, or one smooth surface.",
+)
+@click.option("--turntable", is_flag=True, help="Also write DIR/STEM.mp4, the turning mesh; needs the extra video.")
+@click.option(
+    "--weights", type=click.Path(path_type=Path), metavar="FILE", help="Weights of 'polsep train'.  [default: shipped]"
+)
+@OVERWRITE
+def shape(file: Path, **options: Any) -> None:
+    """Estimate normals, albedo, roughness, depth and a mesh of a thing from one frame under one polarized lamp.
+
+    FILE is a raw frame, as for 'polsep separate', or an EXR file that it wrote. The thing stands before a dark ground,
+    or --mask says where it is. A network finds the surface in the separated images and in the polarization of the
+    diffuse light, and says how far off it may be.
+
+    DIR/STEM.exr gets normal.X/Y/Z (x right, y up, z to the camera), albedo.R/G/B, roughness, specular, their expected
+    errors, depth.Z and mask.Y; DIR/STEM_normals.png normals for other programs, DIR/STEM.glb a mesh with colours;
+    DIR/STEM.png is a preview with pictures under other lamps, DIR/STEM.html a page where you move the lamp.
+
+    \b
+    polsep shape frame.png -o out
+    polsep shape sep/frame.exr --light 0.3,0.5,0.8 --mask mask.png -o out
+    polsep shape frame.png --layout mono --mesh none -o out          normals alone, without the extra render
+    """
+    if options["mesh"] != "none":
+        require_extra("render")
+    elif options["turntable"]:
+        raise ValueError("expected a mesh with --turntable, found --mesh none")
+    if options["turntable"]:
+        require_extra("video")
+    require_paths(file, *filter(None, [options["mask"], options["weights"]]))
+    lamp, light = _parse_lamp(options["lamp"]), read_light(options)
+    from polsep.io.assets.shapes import shape_targets, write_shape
+    from polsep.io.raw.frames import output_stem
+    from polsep.io.store.atomic import refuse_existing, refuse_inputs
+    from polsep.methods import check_method
+
+    check_method(options["method"])
+    name = options["name"] or output_stem(str(file))
+    targets = shape_targets(options["output"], name, options["mesh"], options["turntable"], True)
+    refuse_inputs(targets, [file, *([options["mask"]] if options["mask"] else [])])
+    refuse_existing(options["output"], targets, options["overwrite"])
+    from polsep.geometry.one_frame_files import ShapeSettings, find_shape_of
+
+    names = ("method", "mask", "mesh", "integration", "turntable", "weights")
+    settings = ShapeSettings(
+        read_options(options), light_color=light, lamp=lamp, **{key: options[key] for key in names}
+    )
+    with show_progress("finding the shape"):
+        files, notes = find_shape_of(file, settings)
+        write_shape(files, targets)
+    for note in notes:
+        print_note(note)
+    for path in targets:
+        print(path)
+
+
+def _parse_lamp(text: str) -> tuple[float, ...] | None:
+    """A direction of ``x,y,z``; None for auto. Raises ValueError."""
+    if text == "auto":
+        return None
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = 0.0
+    if not z > 0 or not all(abs(part) < 1e9 for part in (x, y, z)):
+        raise ValueError(f"expected --light x,y,z with z > 0, like 0.3,0.5,0.8, or auto, found {text!r:.40}")
+    return (x, y, z)

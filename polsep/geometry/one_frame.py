@@ -1,0 +1,246 @@
+"""The surface behind one frame under one polarized lamp: normals, albedo, roughness, strength of its mirror images.
+
+A network looks at the thing as a whole, in a square around its mask, and says how sure it is (`geometry.shape_maps`).
+It was trained on rendered frames that were separated as users' frames are. `polarization.choose_outward` is the same
+task without training.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.compute.resizing import block_means, resize_area, resize_bilinear
+from polsep.geometry.shape_maps import INPUTS, Seen, Surface, decode, encode
+from polsep.io.store.weights import read_weights, shipped_weights
+from polsep.networks.graphs import core, require_own_threads, shape_model
+from polsep.networks.sizes import ResidualSize
+from polsep.separation.report import SeparatedFrame
+
+Floats = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+#: Side of the square that the network sees [pixels], and of the square over the longest side of the mask.
+SIDE, WIDER = 192, 1.1
+#: Without a mask, the thing is where s0 exceeds this share of its 99th percentile.
+OBJECT_SHARE = 0.06
+#: Side of blocks [pixels]: parts of the thing are near one that is mostly bright.
+BLOCK = 8
+#: Least share of the thing's blocks that a connected part has.
+SMALLEST_PART = 0.01
+#: Expected error of ln(roughness), and of ln(strength), from which on they count as unknown.
+UNKNOWN = 0.5
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The surface of a frame, ``[h, w]`` as its images; 0 outside the ``mask``.
+
+    ``normals [h, w, 3]``: unit vectors, x right, y up, z to the camera. ``normal_error``: their expected deviation
+    along each of two axes [rad]. ``albedo [h, w, C]``: relative, 1 where a surface that faces the lamp is as bright as
+    the thing in the mean. ``roughness``: GGX sqrt(alpha); ``specular``: strength of mirror images, 1 = a dielectric of
+    index 1.5; ``roughness_error``, ``specular_error``: expected deviations of their logarithms, unknown from `UNKNOWN`
+    on. ``light [3]``: unit vector toward the lamp, told or found (`find_lamp`); zeros where none was found.
+    """
+
+    normals: Floats
+    normal_error: Floats
+    albedo: Floats
+    roughness: Floats
+    roughness_error: Floats
+    specular: Floats
+    specular_error: Floats
+    mask: Mask
+    light: tuple[float, float, float]
+
+    def __repr__(self) -> str:
+        share, error = float(self.mask.mean()), float(np.degrees(np.median(self.normal_error[self.mask])))
+        size = list(self.mask.shape)
+        return f"Shape(normals {size}, {share:.0%} on the thing, expected error {error:.1f} degrees in the median)"
+
+
+class ShapeEstimator:
+    """The network of a file of weights, for one input. State: its layers compiled, for one frame at a time."""
+
+    def __init__(self, path: Path) -> None:
+        arrays, metadata = read_weights(path)
+        if metadata["method"] != "shape":
+            raise ValueError(f"expected weights of a network for shape in {path}, found {metadata['method']!r}")
+        size = json.loads(metadata["size"])
+        self.size = ResidualSize(size["width"], tuple(size["blocks"]), size["entry"])
+        self.input = "separated" if metadata["input"] == "perfect" else metadata["input"]
+        model = shape_model(arrays, self.size, (INPUTS[self.input], SIDE, SIDE))
+        self._layers = core().compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+
+    def find(self, seen: Seen) -> Surface:
+        """The surface in images ``[C, SIDE, SIDE]``."""
+        require_own_threads()
+        maps = np.ascontiguousarray(encode(seen, self.input), np.float32)[None]
+        outputs = self._layers.create_infer_request().infer([maps])[0][0]
+        return decode(outputs, seen.image, seen.mask)
+
+
+@lru_cache(maxsize=2)
+def load_estimator(path: Path | None = None) -> ShapeEstimator:
+    """The shipped network, or the one in a file of `polsep train shape`. Raises ValueError."""
+    return ShapeEstimator(shipped_weights("shape/separated") if path is None else path)
+
+
+def shape(
+    frame: SeparatedFrame,
+    mask: Mask | None = None,
+    light: Sequence[float] | None = None,
+    weights: Path | None = None,
+) -> Shape:
+    """Find the surface of the thing in a frame that `polsep.separate` separated.
+
+    ``mask [h, w]``: where the thing is; None: where light falls (`find_thing`). ``light``: x, y, z toward the lamp,
+    x right, y up, z to the camera; None: not known, as beside the camera it need not be. Raises ValueError on masks of
+    another size or without pixels, and on frames without polarization.
+    """
+    chosen = find_thing(frame) if mask is None else np.asarray(mask, bool)
+    if chosen.shape != frame.dolp.shape or not chosen.any():
+        raise ValueError(
+            f"expected a mask of {list(frame.dolp.shape)} that holds pixels, found {list(chosen.shape)}, "
+            f"{int(chosen.sum())} set"
+        )
+    if not frame.dolp[chosen].any():
+        raise ValueError("expected a frame with its polarization, found DoLP 0 everywhere")
+    way = _unit(light)
+    window = square_around(chosen)
+    small = gather(images_of(frame, chosen), window, SIDE)
+    told = np.broadcast_to(np.array(way, np.float32)[:, None, None], (3, SIDE, SIDE))
+    seen = Seen(small[:3], small[3:4], small[4:6], small[6:7], (small[7:8] > 0.5).astype(np.float32), told)
+    found = load_estimator(weights).find(seen)
+    planes = np.concatenate([np.asarray(x, np.float32) for x in found])
+    wide = spread(planes, window, chosen.shape)
+    normals = wide[:3] / np.maximum(np.linalg.norm(wide[:3], axis=0), 1e-6)
+    maps = {
+        "normals": np.moveaxis(normals, 0, -1),
+        "albedo": np.moveaxis(wide[3:6], 0, -1)[..., : frame.diffuse.shape[-1]],
+        "roughness": wide[6],
+        "specular": wide[7],
+        "normal_error": wide[8],
+        "roughness_error": wide[9],
+        "specular_error": wide[10],
+    }
+    lamp = way if light is not None else find_lamp(found, seen)
+    return Shape(**{name: _outside_zero(x, chosen) for name, x in maps.items()}, mask=chosen, light=lamp)
+
+
+def find_lamp(surface: Surface, seen: Seen) -> tuple[float, float, float]:
+    """The direction toward a far lamp that explains the shading: diffuse light over albedo is its product with normals.
+
+    Least squares over places that it reaches, the surer ones first; zeros where that points away from the camera.
+    """
+    shading = (seen.image.mean(axis=0) / np.maximum(surface.albedo.mean(axis=0), 1e-6)) * (seen.mask[0] > 0)
+    lit = shading > 0.2 * np.percentile(shading, 99)
+    weight = 1 / surface.normal_error[0][lit]
+    vector, *_ = np.linalg.lstsq((surface.normal[:, lit] * weight).T, shading[lit] * weight, rcond=None)
+    length = float(np.linalg.norm(vector))
+    if not length > 0 or vector[2] <= 0:
+        return (0.0, 0.0, 0.0)
+    x, y, z = (float(part) / length for part in vector)
+    return (x, y, z)
+
+
+def _unit(light: Sequence[float] | None) -> tuple[float, float, float]:
+    """A direction as a unit vector; zeros for None. Raises ValueError."""
+    if light is None:
+        return (0.0, 0.0, 0.0)
+    numbers = [float(x) for x in light]
+    length = float(np.linalg.norm(numbers)) if len(numbers) == 3 else 0.0
+    if not 1e-6 < length < float("inf") or numbers[2] <= 0:
+        raise ValueError(f"expected a lamp's direction x, y, z in front of the thing (z > 0), found {light!r:.60}")
+    x, y, z = (number / length for number in numbers)
+    return (x, y, z)
+
+
+def _outside_zero(image: Floats, mask: Mask) -> Floats:
+    return np.where(mask if image.ndim == 2 else mask[..., None], image, 0).astype(np.float32)
+
+
+def find_thing(frame: SeparatedFrame) -> Mask:
+    """The mask of a thing before a dark ground: where light falls, without specks and thin lines.
+
+    Raises ValueError on a black frame.
+    """
+    s0 = (frame.diffuse + frame.specular).mean(axis=-1)
+    bright: Mask = s0 > OBJECT_SHARE * np.percentile(s0, 99)
+    if not bright.any() or not s0.any():
+        raise ValueError("expected light on a thing, found a black frame")
+    height, width = bright.shape
+    padded = np.pad(bright, ((0, -height % BLOCK), (0, -width % BLOCK)), "edge")
+    solid = _large_parts(block_means(padded.astype(np.float32), BLOCK) > 0.5)
+    near = _widest(solid.astype(np.int64)) > 0
+    found: Mask = bright & near.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[:height, :width]
+    return found if found.any() else bright
+
+
+def _widest(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The largest of each cell and its eight neighbours."""
+    padded = np.pad(cells, 1)
+    rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
+
+
+def _large_parts(solid: Mask) -> Mask:
+    """The connected parts with at least `SMALLEST_PART` of all cells; every cell takes its part's largest number."""
+    label = np.where(solid, np.arange(1, solid.size + 1).reshape(solid.shape), 0)
+    while ((wider := np.where(solid, _widest(label), 0)) != label).any():
+        label = wider
+    counts = np.bincount(label.reshape(-1))
+    counts[0] = 0
+    large: Mask = counts[label] >= max(SMALLEST_PART * counts.sum(), 1)
+    return large
+
+
+def images_of(frame: SeparatedFrame, mask: Mask) -> Floats:
+    """Diffuse (3), specular (1), s1, s2 of all colours, expected error of the diffuse image, mask: ``[8, h, w]``.
+
+    In white light: the lamp's colour that the report names is divided out.
+    """
+    channels = frame.diffuse.shape[-1]
+    gain = np.array(frame.report.get("light_color", (1.0,) * channels), np.float32)[:channels]
+    diffuse, specular = frame.diffuse / gain, (frame.specular / gain).mean(axis=-1)
+    strength = frame.dolp * (diffuse.mean(axis=-1) + specular)
+    error = np.zeros_like(strength) if frame.error is None else frame.error[..., 0] / gain.mean()
+    planes = [*np.moveaxis(np.broadcast_to(diffuse, (*mask.shape, 3)), -1, 0), specular]
+    planes += [strength * np.cos(2 * frame.aolp), strength * np.sin(2 * frame.aolp), error, mask]
+    return np.stack(planes).astype(np.float32)
+
+
+def square_around(mask: Mask) -> tuple[int, int, int]:
+    """First row, first column and side of the square, `WIDER` than the mask's longest side, around its middle."""
+    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    side = max(8, round(WIDER * (max(rows[-1] - rows[0], cols[-1] - cols[0]) + 1)))
+    top, left = ((int(x[0]) + int(x[-1]) + 1 - side) // 2 for x in (rows, cols))
+    return top, left, side
+
+
+def gather(planes: Floats, window: tuple[int, int, int], side: int) -> Floats:
+    """The planes ``[K, h, w]`` of a window at ``side`` pixels, 0 beyond the image; area means where it shrinks."""
+    top, left, width = window
+    height, length = planes.shape[-2:]
+    cut = np.zeros((len(planes), width, width), np.float32)
+    rows, cols = slice(max(top, 0), min(top + width, height)), slice(max(left, 0), min(left + width, length))
+    cut[:, rows.start - top : rows.stop - top, cols.start - left : cols.stop - left] = planes[:, rows, cols]
+    resize = resize_area if width >= side else resize_bilinear
+    found: Floats = np.asarray(resize(cut, (side, side)), np.float32)
+    return found
+
+
+def spread(planes: Floats, window: tuple[int, int, int], shape: tuple[int, ...]) -> Floats:
+    """The twin of `gather`: planes ``[K, side, side]`` at a window of images of a ``shape``, 0 elsewhere."""
+    top, left, width = window
+    large = np.asarray(resize_bilinear(planes, (width, width)), np.float32)
+    found = np.zeros((len(planes), *shape), np.float32)
+    rows, cols = slice(max(top, 0), min(top + width, shape[0])), slice(max(left, 0), min(left + width, shape[1]))
+    found[:, rows, cols] = large[:, rows.start - top : rows.stop - top, cols.start - left : cols.stop - left]
+    return found

@@ -1,0 +1,300 @@
+"""`polsep shape`: the file of one frame in, maps, a mesh and a preview of its surface out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.geometry.one_frame import SIDE, UNKNOWN, Shape, gather, shape, square_around
+from polsep.geometry.shape_maps import Surface, relight
+from polsep.io.assets.maps import read_map
+from polsep.io.assets.relight_page import RelightMaps, encode_relight_page
+from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
+from polsep.io.raw.frames import ReadOptions, read_frames, refuse_forgotten
+from polsep.io.results.films import WATCHABLE, encode_film
+from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
+from polsep.io.results.separation_reader import SUFFIXES, read_separated
+from polsep.io.store.errors import input_error
+from polsep.pipeline import LightColor, separate_capture
+from polsep.separation.report import SeparatedFrame
+
+Floats = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Pixels = NDArray[np.uint8]
+
+#: Side of the square in which depth is integrated and the mesh is spanned, and of a panel of the preview.
+MESH_SIDE, CELL = SIDE, 320
+#: Largest side of the textures of the page.
+PAGE_SIDE = 512
+#: Lamps of the preview's relit pictures: their directions, and words for them.
+LAMPS = {
+    "lamp left": (-0.7, 0.1, 0.7),
+    "lamp right": (0.7, 0.1, 0.7),
+    "lamp above": (0.0, 0.75, 0.65),
+    "lamp below": (0.0, -0.75, 0.65),
+}
+#: Share of the frame's border on the thing, from which on the mask is probably wrong.
+FILLED = 0.2
+#: Errors of normals [degrees] that are white in the preview.
+LARGEST_DEG = 30.0
+#: Colour around the thing in the preview.
+GREY = 40
+
+
+@dataclass(frozen=True)
+class ShapeSettings:
+    """Options of `polsep shape`: ``read``, ``method`` and ``light_color`` of a raw frame; ``lamp``, toward which a
+    direction is told; a file of the ``mask``; format of the ``mesh`` ("none": no depth and mesh), its ``integration``,
+    a ``turntable``; and ``weights`` instead of the shipped ones."""
+
+    read: ReadOptions = field(default_factory=ReadOptions)
+    method: str = "auto"
+    light_color: LightColor | str = "auto"
+    lamp: tuple[float, ...] | None = None
+    mask: Path | None = None
+    mesh: str = "glb"
+    integration: str = "bilateral"
+    turntable: bool = False
+    weights: Path | None = None
+
+
+def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list[str]]:
+    """The files of the shape in a frame, and notes for the user. Raises ValueError."""
+    frame, notes = _read_frame(path, settings)
+    mask = None if settings.mask is None else _read_mask(settings.mask, frame.dolp.shape)
+    try:
+        found = shape(frame, mask, settings.lamp, settings.weights)
+    except ValueError as error:
+        raise input_error(path, error) from error
+    return shape_files(frame, found, settings, path.stem), notes + doubts(found)
+
+
+def _read_frame(path: Path, settings: ShapeSettings) -> tuple[SeparatedFrame, list[str]]:
+    """A separated frame, and what was said about it."""
+    if path.suffix.lower() in SUFFIXES:
+        return read_separated(path), []
+    frames = list(read_frames(path, settings.read))
+    if len(frames) != 1:
+        raise input_error(path, f"expected one frame, found {len(frames)}")
+    refuse_forgotten(path, frames[0])
+    try:
+        frame = separate_capture(frames[0].data, settings.method, settings.light_color)
+    except (ValueError, RuntimeError) as error:
+        raise input_error(path, error) from error
+    return frame, [*frames[0].notes, *frame.report["warnings"]]
+
+
+def _read_mask(path: Path, size: tuple[int, ...]) -> Mask:
+    """The mask of a file of that size, or of twice that, as raw frames have."""
+    found: Mask = np.asarray(read_map(path, "mask") > 0.5)
+    if found.shape == (2 * size[0], 2 * size[1]):
+        found = found.reshape(size[0], 2, size[1], 2).min(axis=(1, 3))
+    if found.shape != size or not found.any():
+        raise input_error(path, f"expected a mask of {list(size)} that holds pixels, found {list(found.shape)}")
+    return found
+
+
+def doubts(found: Shape) -> list[str]:
+    """Lines on what the network does not know."""
+    inside = found.mask
+    unknown = float((found.roughness_error[inside] >= UNKNOWN).mean())
+    error = float(np.degrees(np.median(found.normal_error[inside])))
+    border = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
+    notes = []
+    if border.mean() > FILLED:
+        notes.append(
+            f"one thing before a dark ground was expected, found light on {border.mean():.0%} of the frame's border: "
+            "say where the thing is (--mask)"
+        )
+    if unknown > 0.5:
+        notes.append(f"the roughness of {unknown:.0%} of the thing is unknown: no highlight shows it")
+    if error > LARGEST_DEG / 2:
+        notes.append(f"normals are uncertain: {error:.0f} degrees are expected in the median")
+    return notes
+
+
+def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, title: str) -> ShapeFiles:
+    """The files of a shape; depth and mesh, unless none is wanted, in a square of `MESH_SIDE` around the thing.
+
+    ``title``: of the page that relights it.
+    """
+    facts: dict[str, Any] = {
+        "light": [round(x, 4) for x in found.light],
+        "light_is": "told" if settings.lamp is not None else "found from the shading",
+        "method": frame.report.get("method", "separated before"),
+        "median_normal_error_deg": round(float(np.degrees(np.median(found.normal_error[found.mask]))), 2),
+        "unknown_roughness": round(float((found.roughness_error[found.mask] >= UNKNOWN).mean()), 4),
+    }
+    more = {
+        "normal_error": np.degrees(found.normal_error),
+        "roughness": found.roughness,
+        "roughness_error": found.roughness_error,
+        "specular": found.specular,
+        "specular_error": found.specular_error,
+    }
+    panels, depth, mesh, film = draw_panels(frame, found), None, None, None
+    if settings.mesh != "none":
+        solid = _Solid(found, settings.integration)
+        depth, mesh = solid.depth, solid.encode(settings.mesh)
+        panels.append(solid.draw())
+        facts |= {"integration": settings.integration, "triangles": solid.triangles}
+        if settings.turntable:
+            film = encode_film(solid.turn(), WATCHABLE, 24.0)
+    normals, albedo = (x.astype(np.float64) for x in (found.normals, found.albedo))
+    page = page_of(found, title)
+    return ShapeFiles(normals, albedo, depth, found.mask, mesh, titled_sheet(panels), film, facts, more, page)
+
+
+def page_of(found: Shape, title: str) -> bytes:
+    """The page that relights a shape; its lamp begins where the frame's was, or beside the camera."""
+    return encode_relight_page(_page_maps(found), title, found.light if any(found.light) else (0.0, 0.0, 1.0))
+
+
+def _page_maps(found: Shape) -> RelightMaps:
+    """Maps of a page: a square around the thing, at most `PAGE_SIDE` pixels wide, its albedo brightest at 1."""
+    window = square_around(found.mask)
+    albedo = np.broadcast_to(found.albedo, (*found.mask.shape, 3))
+    planes = [
+        *np.moveaxis(found.normals, -1, 0),
+        *np.moveaxis(albedo, -1, 0),
+        found.roughness,
+        found.specular,
+        found.mask,
+    ]
+    small = gather(np.stack(planes).astype(np.float32), window, min(window[2], PAGE_SIDE))
+    share = np.maximum(small[8], 1e-6)
+    normals = np.moveaxis(small[:3] / np.maximum(np.linalg.norm(small[:3], axis=0), 1e-6), 0, -1)
+    gain = 0.9 / max(float(np.percentile(found.albedo[found.mask], 99)), 1e-9)
+    colors = np.moveaxis(small[3:6] / share * gain, 0, -1)
+    return RelightMaps(normals, colors, small[6] / share, small[7] / share, small[8] > 0.5)
+
+
+class _Solid:
+    """Depth and mesh of a shape. Needs the extra ``render``. State: the mesh."""
+
+    def __init__(self, found: Shape, integration: str) -> None:
+        from polsep.geometry.files import INTEGRATIONS
+        from polsep.geometry.photometric import Appearance
+        from polsep.geometry.surface import span_surface
+
+        window = square_around(found.mask)
+        width = window[2]
+        side = min(width, MESH_SIDE)
+        planes = [*np.moveaxis(found.normals, -1, 0), *np.moveaxis(found.albedo, -1, 0), found.roughness, found.mask]
+        small = gather(np.stack(planes).astype(np.float32), window, side).astype(np.float64)
+        mask = small[-1] > 0.99
+        normals, albedo = np.moveaxis(small[:3], 0, -1), np.moveaxis(small[3:-2], 0, -1)
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9) * mask[..., None]
+        depth = INTEGRATIONS[integration](normals, mask)
+        gain = 1 / max(float(np.percentile(albedo[mask], 99.5)), 1e-9)
+        shown = np.minimum(albedo * gain, 1) * mask[..., None]
+        self.surface = span_surface(Appearance(normals, np.broadcast_to(shown, (side, side, 3)), mask), depth)
+        self.triangles = len(self.surface.faces)
+        self.roughness = float(np.median(found.roughness[found.mask]))
+        self.depth = _enlarged(np.where(mask, depth, np.nan) * (width / side), window, found.mask)
+
+    def encode(self, name: str) -> bytes:
+        """The mesh as a file."""
+        s = self.surface
+        if name == "ply":
+            return encode_ply(s.vertices, s.normals, s.colors, s.faces)
+        return encode_glb(s.vertices, s.normals, s.colors, s.faces, self.roughness)
+
+    def draw(self) -> Sequence[Panel]:
+        """A row of pictures of the mesh."""
+        from polsep.geometry.surface import draw_views
+
+        places = ((-50.0, 5.0), (-20.0, 10.0), (20.0, 10.0), (50.0, 5.0))
+        pictures = np.stack(list(draw_views(self.surface, CELL, places)))
+        gain = exposure_of(pictures[pictures.sum(axis=-1) > 0])
+        sides = [f"{abs(a):g} deg {'left' if a < 0 else 'right'}" for a, _ in places]
+        return [
+            Panel("Mesh", side, _on_grey(toned(x, gain), x.sum(axis=-1) > 0))
+            for side, x in zip(sides, pictures, strict=True)
+        ]
+
+    def turn(self) -> Any:
+        """Pictures of a turntable."""
+        from polsep.geometry.files import draw_turntable
+
+        return draw_turntable(self.surface)
+
+
+def _enlarged(depth: NDArray[np.float64], window: tuple[int, int, int], mask: Mask) -> NDArray[np.float64]:
+    """Depth of the small square at every pixel of the mask, of its nearest known pixel."""
+    from scipy.ndimage import distance_transform_edt
+
+    top, left, width = window
+    side = len(depth)
+    nearest = distance_transform_edt(np.isnan(depth), return_distances=False, return_indices=True)
+    whole = depth[tuple(nearest)]
+    rows, cols = np.nonzero(mask)
+    at = [np.clip(((x - first + 0.5) * side / width - 0.5), 0, side - 1) for x, first in ((rows, top), (cols, left))]
+    low = [np.minimum(x.astype(int), side - 2) for x in at]
+    share = [x - n for x, n in zip(at, low, strict=True)]
+    found = np.full(mask.shape, np.nan)
+    total = np.zeros(len(rows))
+    for i in (0, 1):
+        for j in (0, 1):
+            weight = (share[0] if i else 1 - share[0]) * (share[1] if j else 1 - share[1])
+            total += weight * whole[low[0] + i, low[1] + j]
+    found[mask] = total
+    return found
+
+
+def draw_panels(frame: SeparatedFrame, found: Shape) -> list[Sequence[Panel]]:
+    """Rows of pictures: the frame and its surface; how sure it is, and the thing under other lamps."""
+    mask = found.mask
+    s0, around = frame.diffuse + frame.specular, square_around(mask)
+    light = exposure_of(s0[mask])
+
+    def cell(image: NDArray[Any], gain: float | None) -> Pixels:
+        planes = np.moveaxis(np.broadcast_to(image if image.ndim == 3 else image[..., None], (*mask.shape, 3)), -1, 0)
+        small = gather(np.concatenate([planes, mask[None]]).astype(np.float32), around, min(CELL, around[2]))
+        picture = np.moveaxis(small[:3], 0, -1)
+        shown = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8) if gain is None else toned(picture, gain)
+        return _fit(_on_grey(shown, small[3] > 0.5))
+
+    albedo_gain = 0.9 / max(float(np.percentile(found.albedo[mask], 99)), 1e-9)
+    known = found.roughness_error < UNKNOWN
+    first = [
+        Panel("Frame", "", cell(s0, light)),
+        Panel("Normals", "red right, green up", cell((found.normals + 1) / 2, None)),
+        Panel("Albedo", "relative", cell(found.albedo, albedo_gain)),
+        Panel("Roughness", "white 1, black unknown", cell(np.where(known, found.roughness, 0), None)),
+    ]
+    relit = relit_pictures(found, [np.array(lamp) / np.linalg.norm(lamp) for lamp in LAMPS.values()])
+    gain = exposure_of(relit[:, mask])
+    second = [Panel("Relit", name, cell(picture, gain)) for name, picture in zip(LAMPS, relit, strict=True)]
+    error = np.degrees(found.normal_error) / LARGEST_DEG
+    first.append(Panel("Expected error", f"white {LARGEST_DEG:g} deg", cell(error, None)))
+    second.append(Panel("Specular", "as separated", cell(frame.specular, exposure_of(frame.specular[mask]))))
+    return [first, second]
+
+
+def relit_pictures(found: Shape, lamps: Sequence[NDArray[np.float64]]) -> Floats:
+    """Pictures ``[K, h, w, 3]`` of a shape under far lamps in unit directions, without shadows."""
+    planes = [np.moveaxis(np.broadcast_to(found.albedo, (*found.mask.shape, 3)), -1, 0)]
+    planes += [x[None] for x in (found.roughness, found.specular)]
+    albedo, roughness, specular = (np.asarray(x, np.float32) for x in planes)
+    none = np.zeros_like(roughness)
+    surface = Surface(np.moveaxis(found.normals, -1, 0), albedo, roughness, specular, none, none, none)
+    return np.stack([np.moveaxis(relight(surface, lamp.astype(np.float32)), 0, -1) for lamp in lamps])
+
+
+def _on_grey(picture: Pixels, there: Mask) -> Pixels:
+    return np.where(there[..., None], picture, GREY).astype(np.uint8)
+
+
+def _fit(picture: Pixels) -> Pixels:
+    """The picture at `CELL` pixels, enlarged by nearest pixels where it is smaller."""
+    side = len(picture)
+    if side == CELL:
+        return picture
+    at = np.minimum((np.arange(CELL) * side) // CELL, side - 1)
+    return picture[at][:, at]

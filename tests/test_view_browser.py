@@ -208,3 +208,18 @@ def test_a_recipe_with_images_is_replayed_by_the_command(
     assert set(again) == set(shown)
     for name, plane in again.items():
         np.testing.assert_array_equal(plane, shown[name])
+
+
+def test_a_shape_is_found_and_relit(page: Any) -> None:
+    """The demo's surface appears under a lamp that follows the pointer; another frame takes it away."""
+    open_demo(page)
+    tab(page, "Shape")
+    page.click("#ps-find-shape")
+    inside = page.frame_locator("#ps-shape iframe")
+    inside.locator("canvas[data-ready=yes]").wait_for()
+    before = inside.locator("canvas").evaluate("canvas => canvas.toDataURL()")
+    inside.locator("canvas").click(position={"x": 60, "y": 60})
+    assert inside.locator("canvas").evaluate("canvas => canvas.toDataURL()") != before
+    assert "Expected error of normals" in page.locator("#ps-shape").inner_text()
+    choose(page, "ps-method", "analytic")
+    page.wait_for_function("document.querySelectorAll('#ps-shape iframe').length === 0")

@@ -13,6 +13,7 @@ from polsep.view.opening import UNSAID, OpenedFrame
 
 HINT = '<p class="ps-hint">Point at the picture to read a pixel, click to keep it.</p>'
 NOTHING = '<p class="ps-hint">No frame yet.</p>'
+NO_SHAPE = '<p class="ps-hint">The surface of a thing before a dark ground, under a lamp that you move.</p>'
 #: Labels of the buttons that upload images.
 IMAGES = {"texture": "Texture", "normals": "Normals", "mask": "Mask for all edits"}
 #: Settings that describe a file, where nothing is said: another file begins with these.
@@ -63,6 +64,8 @@ class Components:
     readout: Any
     exposure: Any
     light: Any
+    find_shape: Any
+    shape: Any
     controls: tuple[Any, ...]
     images: dict[str, Any]
     neutral: Any
@@ -72,7 +75,7 @@ class Components:
     def all(self) -> list[Any]:
         """Components that an event may change."""
         one = [self.file, self.progress, self.cancel, self.status, self.stage, self.strip, self.play, self.timer]
-        panels = [self.beside, self.readout, self.exposure, self.light]
+        panels = [self.beside, self.readout, self.exposure, self.light, self.shape]
         many = (self.settings.values(), self.mends, self.view.values(), self.controls, self.images.values())
         return one + panels + [component for group in many for component in group]
 

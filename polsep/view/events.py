@@ -18,6 +18,7 @@ from polsep.view.components import (
     HINT,
     IMAGES,
     MENDS,
+    NO_SHAPE,
     NOTHING,
     OF_FILES,
     SAME,
@@ -32,7 +33,7 @@ from polsep.view.components import (
 from polsep.view.edits import list_controls, recipe_of
 from polsep.view.images import KINDS
 from polsep.view.opening import DEMO, DEMO_WHITE, OpenedFrame, parse_against, parse_settings
-from polsep.view.pictures import Exposure, Picture, Place, Window, exposure_panel, light_panel, stage
+from polsep.view.pictures import Exposure, Picture, Place, Window, exposure_panel, light_panel, shape_panel, stage
 from polsep.view.readout import read_pixel, readout_panel
 from polsep.view.session import Session, Sessions, Superseded
 from polsep.view.style import EMPTY
@@ -165,6 +166,7 @@ class Events:
             parts.readout: self._readout(session),
             parts.exposure: exposure_panel(found.frame, found.histogram),
             parts.light: light_panel(found.frame, found.small),
+            parts.shape: NO_SHAPE,
             parts.strip: gr.update(visible=found.count > 1),
             parts.settings["index"]: gr.update(maximum=max(found.count - 1, 1), value=found.index),
             **self._play_state(session),
@@ -176,7 +178,7 @@ class Events:
         """Show the error in the status; pictures stay if there is still a frame."""
         session.playing, parts = False, self.components
         nothing = {parts.stage: EMPTY, parts.readout: HINT, parts.strip: gr.update(visible=False)}
-        nothing |= {parts.exposure: NOTHING, parts.light: NOTHING}
+        nothing |= {parts.exposure: NOTHING, parts.light: NOTHING, parts.shape: NO_SHAPE}
         return {
             **self._idle(),
             parts.status: failure_line(error),
@@ -300,6 +302,16 @@ class Events:
         status = {} if session.opened is None else {self.components.status: status_line(session.opened, remarks)}
         self._see(session, {**values, **chosen})
         return {**await self._drawn(session), **chosen, **status}
+
+    async def find_shape(self, request: gr.Request) -> Updates:
+        """Find the surface of the opened frame, and show it under a lamp that the pointer moves."""
+        found = self._session(request).opened
+        if found is None:
+            return {self.components.shape: NO_SHAPE}
+        try:
+            return {self.components.shape: await asyncio.to_thread(shape_panel, found.frame, found.stem)}
+        except FAILURES as error:
+            return {self.components.status: failure_line(error)}
 
     def write(self, kind: str) -> Callable[[gr.Request], Updates]:
         """A function that writes one of `DOWNLOADS` and returns its path."""

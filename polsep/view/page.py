@@ -13,7 +13,7 @@ import gradio as gr
 from polsep.io.assets.maps import SUFFIXES
 from polsep.io.raw.genicam import PIXEL_FORMATS
 from polsep.methods import METHODS
-from polsep.view.components import HINT, IMAGES, MENDS, NOTHING, OF_FILES, SAME, Components, Start
+from polsep.view.components import HINT, IMAGES, MENDS, NO_SHAPE, NOTHING, OF_FILES, SAME, Components, Start
 from polsep.view.edits import list_controls
 from polsep.view.events import Events
 from polsep.view.images import KINDS
@@ -80,13 +80,16 @@ def _lay_out(start: Start) -> Components:
                     exposure = gr.HTML(NOTHING)
                 with gr.Tab("Light", id="light"):
                     light = gr.HTML(NOTHING)
+                with gr.Tab("Shape", id="shape"):
+                    find_shape = gr.Button("Find the shape", size="sm", elem_id="ps-find-shape")
+                    shape = gr.HTML(NO_SHAPE, elem_id="ps-shape")
                 with gr.Tab("Edit", id="edit"):
                     controls, images, neutral = _edit_panel()
             fetch, link = _fetch_panel()
     settings["index"] = index
     return Components(
         settings, keep, file, demo, progress, cancel, status, mends, view, picture, strip, play, timer, beside,
-        readout, exposure, light, controls, images, neutral, fetch, link,
+        readout, exposure, light, find_shape, shape, controls, images, neutral, fetch, link,
     )  # fmt: skip
 
 
@@ -206,6 +209,7 @@ def _connect(page: Any, components: Components, events: Events) -> None:
         control.input(events.edit, controls, changed, **_AT_ONCE)
     for kind, button in components.images.items():
         button.upload(events.add_image(kind), {button, *controls}, changed, preprocess=False, **_WRITE)
+    components.find_shape.click(events.find_shape, None, [components.shape, components.status], **_WRITE)
     components.neutral.click(events.undo, picture, changed, **_AT_ONCE)
     played = components.play.click(events.toggle, None, [components.play, components.timer], **_AT_ONCE)
     played.then(events.settle, everything, changed, **_SEPARATE)

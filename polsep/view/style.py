@@ -202,7 +202,7 @@ footer { display: none !important; }
 #ps-mends:not(:has(button:not(.hidden):not(.hide))) { display: none; }
 #ps-body { gap: 14px; }
 #ps-side { flex: 0 0 360px; }
-#ps-beside .tab-container button { padding: 6px 9px; font-size: .86rem; }
+#ps-beside .tab-container button { padding: 6px 6px; font-size: .8rem; }
 #ps-downloads { gap: 6px; }
 #ps-fetch { position: absolute; width: 1px; height: 1px; overflow: hidden; visibility: hidden; }
 .ps-line { font-size: .88rem; color: #c9c9ce; line-height: 1.5; }
@@ -260,6 +260,7 @@ footer { display: none !important; }
 .ps-wheel i:nth-of-type(4) { left: -9px; top: 3px; }
 .ps-mark { position: absolute; width: 15px; height: 15px; margin: -8px 0 0 -8px; border: 2px solid #fff;
   border-radius: 50%; box-shadow: 0 0 0 1.5px #000, inset 0 0 0 1px #000; pointer-events: none; }
+.ps-relit { width: 100%; height: 520px; border: 0; border-radius: 6px; }
 .ps-hint { color: #9a9aa2; font-size: .88rem; line-height: 1.5; }
 .ps-readout, .ps-readout * { border: 0 !important; }
 .ps-readout { width: 100%; border-collapse: collapse; font-size: .84rem; font-variant-numeric: tabular-nums; }

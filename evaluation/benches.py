@@ -8,7 +8,14 @@ from evaluation.appearance import bench_gallery, bench_gallery_real, draw_galler
 from evaluation.calibration import bench_calibration
 from evaluation.dynamic import bench_dynamic, bench_dynamic_quick
 from evaluation.gallery import REAL, draw_paper
-from evaluation.geometry import bench_geometry, bench_geometry_quick, draw_geometry
+from evaluation.geometry import (
+    bench_geometry,
+    bench_geometry_quick,
+    bench_shape,
+    bench_shape_quick,
+    draw_geometry,
+    draw_shape,
+)
 from evaluation.install import bench_install
 from evaluation.joint import bench_joint
 from evaluation.material import PUBLISHED, bench_material, bench_material_quick
@@ -49,6 +56,13 @@ BENCHES: dict[str, Bench] = {
         draw_geometry,
         ("diligent_normals", "meshes"),
         (*SEPARATION, "polsep/geometry"),
+    ),
+    "shape": Bench(
+        bench_shape,
+        bench_shape_quick,
+        draw_shape,
+        ("diligent_normals", "meshes"),
+        (*SEPARATION, "polsep/geometry", "evaluation/weights/shape"),
     ),
     "install": Bench(bench_install, measures=("polsep", "pyproject.toml", "constraints.txt")),
     "view": Bench(bench_view, measures=("polsep/view", "polsep/edit")),

@@ -1,4 +1,4 @@
-"""Shape from six lights: normals with and without separation, and integration of true normals."""
+"""Shape from six lights and from one frame: normals with and without separation, and integration of true normals."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from evaluation.figures import require_matplotlib
 from polsep.bench.rows import Row
+from polsep.io.store.atomic import replace_bytes
 from polsep.io.store.image_codecs import write_jpeg
 
 #: Objects of the quick version.
@@ -45,3 +46,36 @@ def _measure(data: Path, names: Sequence[str] | None) -> Iterator[Row]:
     require_matplotlib()
     yield from measure_depth(data)
     yield from measure_normals(data, names)
+
+
+def bench_shape(data: Path) -> Iterator[Row]:
+    """Shape from one frame by what a network sees, on statues and scans, glossy and matte. Raises ValueError."""
+    yield from _measure_shape(data, None)
+
+
+def bench_shape_quick(data: Path) -> Iterator[Row]:
+    """`bench_shape` on six objects."""
+    yield from _measure_shape(data, QUICK)
+
+
+def draw_shape(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
+    """Write pictures and pages of docs/shape.md, of meshes in the public domain, and give their paths."""
+    del rows
+    from evaluation.one_frame_pictures import draw_thing, relight_thing
+    from evaluation.six_lights import load_subjects
+
+    for number, subject in enumerate(load_subjects(data, SHOWN)):
+        path = folder / f"{subject.name}.jpg"
+        write_jpeg(path, draw_thing(subject, number))
+        yield path
+        replace_bytes(page := folder / f"{subject.name}.html", relight_thing(subject, number))
+        yield page
+
+
+def _measure_shape(data: Path, names: Sequence[str] | None) -> Iterator[Row]:
+    try:
+        from evaluation.one_frame import measure
+    except ImportError as error:
+        raise ValueError(f"expected the extra bench, found no {error.name}") from None
+    require_matplotlib()
+    yield from measure(data, names)

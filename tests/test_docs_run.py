@@ -39,6 +39,7 @@ LEFT_OUT = {
     "polsep capture -o": "needs a camera; tests/test_capture_cameras.py",
     "polsep calibrate (flat|analysers|light)": "needs pictures of a rig; tests/test_calibration.py",
     "polsep geometry": "needs six lights on one thing; tests/test_geometry_files.py",
+    "polsep shape": "needs the extra render and one thing in a frame; tests/test_one_frame.py",
     "polsep material": "needs the extra torch and flash frames of one sample; tests/test_material.py",
     "polsep separate --(parallel|crossed|angles)": "needs photographs through a filter; tests/test_photographs.py",
     "polsep video run.mkv": "needs the extra video; tests/test_video.py",
@@ -51,6 +52,7 @@ NO_PYTHON = {
     "extending": "tests/test_docs.py",
     "python": "tests/test_docs.py",
     "geometry": "needs six lights on one thing; tests/test_geometry.py",
+    "shape": "needs one thing in a frame; tests/test_one_frame.py",
     "testsets": "needs data that cannot ship; tests/test_testsets.py",
 }
 

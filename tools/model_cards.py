@@ -60,6 +60,16 @@ _KINDS = {
         "material",
         "material/relit",
     ),
+    "shape": Kind(
+        "Normals, albedo, roughness and strength of mirror images of a thing, and their expected errors, from one "
+        "separated frame.",
+        "Unions of solids and smooth bodies with random textures, rendered as a model of Sony's IMX250 records them, "
+        "and separated by this package (docs/shape.md). No photographs, no scans, no data of others.",
+        "One dielectric thing under one polarized lamp within some 45 degrees of the camera; detail below a hundredth "
+        "of the thing is lost (docs/shape.md).",
+        "shape",
+        "shape/one frame",
+    ),
 }
 
 
@@ -91,7 +101,7 @@ def _sections(name: str, kind: Kind, facts: dict[str, str]) -> Iterator[str]:
     if "validation" in facts:
         scores = ", ".join(f"{metric} {value:.4g}" for metric, value in json.loads(facts["validation"]).items())
         yield f"On its own validation views, which chose it, before rounding: {scores}.\n"
-    method = Path(name).name if kind.results == "material" else facts["method"]
+    method = Path(name).name if kind.results in ("material", "shape") else facts["method"]
     colors = facts.get("variant") != "mono"
     bench = kind.bench if colors else "joint/mono"
     rows = [row for row in read_rows(RESULTS / f"{bench.partition('/')[0]}.jsonl") if row["bench"] == bench]
@@ -101,7 +111,9 @@ def _sections(name: str, kind: Kind, facts: dict[str, str]) -> Iterator[str]:
 
 
 def _is_main(metric: str) -> bool:
-    return metric.removesuffix(", standard error").endswith("PSNR") or "relit" in metric or "loss" in metric
+    return metric.removesuffix(", standard error").endswith("PSNR") or any(
+        word in metric for word in ("relit", "loss", "angular")
+    )
 
 
 def main() -> None:

@@ -1,0 +1,270 @@
+"""Scores of shape from one frame on the things of selection set (b): by what a network sees, and without a network.
+
+Every thing of `six_lights.load_subjects` is photographed twice, glossy (strength 1, its own roughness) and matte
+(`MATTE`), each by one lamp within `LARGEST_DEG` of the camera, behind a polarizer at any angle, in 512 x 512 raw pixels
+with noise; the mask is given, the lamp is not told unless a row says so. Networks of equal size and training see the
+separated images and their polarization, the measured Stokes images, or s0 alone; "perfect" sees true images. Needs the
+extra ``bench``.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import flip_evaluator
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn.functional import avg_pool2d
+
+from evaluation.six_lights import ROWS_AT_ONCE, SEED, Subject, load_subjects
+from evaluation.testsets.casting import LENS_BLUR, SAMPLES, random_light_near
+from polsep.bench.rows import Row
+from polsep.demosaic.measured_stokes import measured_stokes
+from polsep.geometry.one_frame import SIDE, UNKNOWN, gather, images_of, load_estimator, square_around
+from polsep.geometry.polarization import Polarized, choose_outward, find_diffuse_polarization, normals_from_polarization
+from polsep.geometry.shape_maps import Seen, Surface, relight
+from polsep.io.store.weights import shipped_weights
+from polsep.physics.stokes import Stokes
+from polsep.pipeline import separate_capture
+from polsep.render.raycast import find_hits, is_lit
+from polsep.render.simulate import blur, capture, expose_to_clip, half_resolution
+from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Scene, camera_axes, shade
+from polsep.sensor.camera import IMX250, Layout
+from polsep.separation.report import SeparatedFrame
+from polsep.train.shape_losses import gained, random_lamps
+
+Floats = NDArray[np.float32]
+
+#: Strength of mirror images of matte things; share of samples that clip; raw pixels per side.
+MATTE, CLIPPED, RAW_SIDE = 0.05, 0.005, 512
+#: Largest angle of the lamp from the camera, and its distance relative to the camera's.
+LARGEST_DEG, DISTANCES = 45.0, (0.7, 1.4)
+#: A distant lamp for things whose camera is many radii away, in radii.
+LAMP_DISTANCE = 8.0
+#: Networks of other inputs, trained like the shipped one.
+WEIGHTS = Path(__file__).parent / "weights" / "shape"
+#: Lamps of relit pictures, and their seed. Angles between azimuths that count as a flip.
+LAMPS, LAMP_SEED, FLIP_DEG = 20, 77, 90.0
+
+
+class Truth(NamedTuple):
+    """A frame's true surface at half resolution, and the direction toward its lamp."""
+
+    surface: Surface
+    mask: NDArray[np.bool_]
+    light: NDArray[np.float64]
+
+
+class Photograph(NamedTuple):
+    """A subject's frame, separated and as measured, the same without errors, and the truth."""
+
+    name: str
+    frame: SeparatedFrame
+    stokes: Floats
+    perfect: SeparatedFrame
+    truth: Truth
+
+
+def photograph(subject: Subject, number: int, strength: float) -> Photograph:
+    """One frame of a subject under one lamp; ``number`` makes its seed."""
+    generator = torch.Generator().manual_seed(SEED + 5000 + number)
+    lamp = _lamp(subject, generator)
+    scene, planes = _render(subject, lamp, strength)
+    exposed = expose_to_clip(blur(scene, LENS_BLUR), CLIPPED, Layout(), IMX250)
+    mosaic = capture(exposed, Layout(), IMX250, generator).mosaic
+    mosaic = replace(mosaic, data=mosaic.data.numpy().astype(np.float32))
+    frame = separate_capture(mosaic, "joint", "white")
+    stokes = np.moveaxis(measured_stokes(mosaic, (1.0, 1.0, 1.0)), -1, 1).reshape(9, *frame.dolp.shape)
+    mask, normal, albedo, rough, strong = np.split(avg_pool2d(planes, 2).numpy(), [1, 4, 7, 8])
+    whole = mask[0] > 0.999
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=0), 1e-9)
+    none = np.zeros_like(rough)
+    surface = Surface(normal, albedo, rough, strong, none, none, none)
+    way = _axes(subject) @ (np.array(lamp.position) / np.linalg.norm(lamp.position))
+    return Photograph(subject.name, frame, stokes, _perfect(exposed), Truth(surface, whole, way))
+
+
+def _axes(subject: Subject) -> NDArray[np.float64]:
+    axes = camera_axes(subject.camera).double().numpy()
+    return np.stack([axes[0], axes[1], -axes[2]])
+
+
+def _lamp(subject: Subject, generator: torch.Generator) -> PointLight:
+    """A lamp near the camera; where the camera is far away, at `LAMP_DISTANCE` in its direction."""
+    camera = subject.camera
+    away = float(np.linalg.norm(camera.position))
+    if away > LAMP_DISTANCE:
+        x, y, z = (LAMP_DISTANCE / away * c for c in camera.position)
+        camera = PinholeCamera((x, y, z), camera.target)
+    return random_light_near(camera, generator, (0.0, LARGEST_DEG), DISTANCES)
+
+
+def _render(subject: Subject, lamp: PointLight, strength: float) -> tuple[Scene, torch.Tensor]:
+    """The exact scene, and planes of mask, normals in the camera's frame, albedo, roughness and strength."""
+    toward = torch.from_numpy(_axes(subject)).float()
+    bands = []
+    for first in range(0, RAW_SIDE, ROWS_AT_ONCE):
+        rows = first + (torch.arange(ROWS_AT_ONCE * SAMPLES) + 0.5) / SAMPLES
+        cols = (torch.arange(RAW_SIDE * SAMPLES) + 0.5) / SAMPLES
+        points = tuple(g.flatten() for g in torch.meshgrid(rows, cols, indexing="ij"))
+        hits = find_hits(subject.mesh, subject.camera, (points[0], points[1]), (RAW_SIDE, RAW_SIDE))
+        one = torch.ones_like(hits.position[:1])
+        albedo = subject.albedo(hits.position)
+        buffer = GBuffer(hits.position, hits.normal, albedo, subject.roughness * one, strength * one, one > 0)
+        diffuse, specular = shade(buffer, subject.camera, lamp, is_lit(subject.mesh, hits, lamp))
+        values = [one, (toward @ hits.normal[..., 0])[..., None], albedo, subject.roughness * one, strength * one]
+        values += [s for lobe in (diffuse, specular) for s in (lobe.s0, lobe.s1, lobe.s2)]
+        image = torch.zeros(sum(v.shape[0] for v in values), len(points[0]))
+        image[:, hits.ray] = torch.cat(values)[..., 0]
+        bands.append(avg_pool2d(image.view(1, len(image), -1, RAW_SIDE * SAMPLES), SAMPLES)[0])
+    whole = torch.cat(bands, dim=1)
+    lobes = [Stokes(*torch.split(whole[9 + 9 * k : 18 + 9 * k], 3)) for k in range(2)]
+    return Scene(lobes[0], lobes[1], whole[0] == 1), whole[:9]
+
+
+def _perfect(scene: Scene) -> SeparatedFrame:
+    """The true images of a scene as a separated frame."""
+    diffuse, specular, _ = half_resolution(scene)
+    total = scene.diffuse + scene.specular
+    s0, s1, s2 = (avg_pool2d(s.mean(dim=0, keepdim=True), 2)[0].numpy() for s in (total.s0, total.s1, total.s2))
+    dolp = np.hypot(s1, s2) / np.maximum(s0, 1e-9)
+    images = [np.ascontiguousarray(x.permute(1, 2, 0).numpy()) for x in (diffuse, specular)]
+    aolp = np.mod(np.arctan2(s2, s1) / 2, np.pi)
+    return SeparatedFrame(images[0], images[1], s0 > 0, dolp, aolp, {"warnings": []})
+
+
+def seen_by(name: str, shot: Photograph, told: bool) -> tuple[Seen, Surface]:
+    """Images that an input sees of a photograph in the network's square, and the truth there."""
+    mask = shot.truth.mask
+    window = square_around(mask)
+    truth = np.concatenate([np.asarray(x, np.float32) for x in shot.truth.surface[:4]] + [mask[None]])
+    small = gather(truth * mask, window, SIDE)
+    inside = (small[-1:] > 0.99).astype(np.float32)
+    surface = _as_surface(small)
+    light = np.array(shot.truth.light if told else np.zeros(3), np.float32)
+    lamp = np.broadcast_to(light[:, None, None], (3, SIDE, SIDE))
+    if name in ("separated", "perfect"):
+        images = gather(images_of(shot.frame if name == "separated" else shot.perfect, mask), window, SIDE)
+        return Seen(images[:3], images[3:4], images[4:6], images[6:7], inside, lamp), surface
+    images = gather(shot.stokes, window, SIDE)
+    return Seen(images[:3], None, images[3:], None, inside, lamp), surface
+
+
+def _as_surface(planes: Floats) -> Surface:
+    normal = planes[:3] / np.maximum(np.linalg.norm(planes[:3], axis=0), 1e-9)
+    none = np.zeros_like(planes[6:7])
+    share = np.maximum(planes[-1:], 1e-6)
+    return Surface(normal, planes[3:6] / share, planes[6:7] / share, planes[7:8] / share, none, none, none)
+
+
+def estimate(name: str, shot: Photograph, told: bool) -> tuple[Surface, Surface, Floats]:
+    """A network's surface, the truth and the mask, in the network's square."""
+    seen, truth = seen_by(name, shot, told)
+    path = shipped_weights("shape/separated") if name == "separated" else WEIGHTS / f"{name}.safetensors"
+    return load_estimator(path).find(seen), truth, seen.mask
+
+
+def classical(shot: Photograph) -> tuple[Surface, Surface, Floats]:
+    """Normals from the diffuse light's polarization, chosen outward from the outline; albedo is the diffuse image."""
+    seen, truth = seen_by("separated", shot, False)
+    assert seen.specular is not None and seen.polarized is not None
+    inside = seen.mask[0] > 0
+    planes = (seen.image.mean(axis=0), seen.specular[0], seen.polarized[0], seen.polarized[1], np.ones(inside.shape))
+    polarized = Polarized(*(np.asarray(x, np.float64)[None] for x in planes))
+    cue = normals_from_polarization(find_diffuse_polarization(polarized, inside))
+    normal = np.moveaxis(choose_outward(cue, inside), -1, 0).astype(np.float32)
+    return truth._replace(normal=normal, albedo=np.maximum(seen.image, 1e-6)), truth, seen.mask
+
+
+def score(found: Surface, truth: Surface, mask: Floats) -> dict[str, float]:
+    """Scores of one frame; see `measure`."""
+    inside = mask[0] > 0
+    cosine = (found.normal * truth.normal).sum(axis=0)[inside]
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    steep = truth.normal[2][inside] < math.cos(math.radians(30))
+    across = (found.normal[:2] * truth.normal[:2]).sum(axis=0)[inside][steep]
+    rough = np.abs(np.log(found.roughness[0][inside] / truth.roughness[0][inside]))
+    known = found.roughness_error[0][inside] < UNKNOWN
+    pairs = [torch.from_numpy(np.stack([np.asarray(x, np.float32)])) for x in (*found, *truth, mask)]
+    first, second = Surface(*pairs[:7]), Surface(*pairs[7:14])
+    first = gained(first, second, pairs[14])
+    logs, flips = [], []
+    for lamp in random_lamps(LAMPS, torch.Generator().manual_seed(LAMP_SEED)):
+        pictures = [relight(x, lamp)[0].numpy() * mask for x in (first, second)]
+        level = 0.1 * float(pictures[1][:, inside].mean())
+        logs.append(float(np.abs(np.log(pictures[0] + level) - np.log(pictures[1] + level))[:, inside].mean()))
+        shown = [np.clip(0.5 / (10 * level) * x, 0, 1) ** (1 / 2.2) for x in pictures]
+        flips.append(_flip(shown[0], shown[1], inside))
+    return {
+        "mean angular error": float(angle.mean()),
+        "median angular error": float(np.median(angle)),
+        "azimuth flips": 100 * float((across < 0).mean()) if steep.any() else 0.0,
+        "relit, log-L1": statistics.fmean(logs),
+        "relit, FLIP": statistics.fmean(flips),
+        "roughness known": 100 * float(known.mean()),
+        **({"roughness, median error": 100 * float(np.expm1(np.median(rough[known])))} if known.any() else {}),
+    }
+
+
+def _flip(found: Floats, truth: Floats, inside: NDArray[np.bool_]) -> float:
+    images = [np.ascontiguousarray(np.moveaxis(x, 0, -1), np.float32) for x in (truth, found)]
+    error, _, _ = flip_evaluator.evaluate(*images, "LDR", applyMagma=False, inputsRGB=True)
+    return float(np.asarray(error)[..., 0][inside].mean())
+
+
+#: Units of the scores.
+UNITS = {"relit, log-L1": "1", "relit, FLIP": "1"}
+UNITS |= dict.fromkeys(("azimuth flips", "roughness known", "roughness, median error"), "%")
+
+
+def measure(data: Path, names: Sequence[str] | None = None) -> Iterator[Row]:
+    """Rows of scores per method, over glossy and matte things and per kind, and of expected errors."""
+    found: dict[tuple[str, str], list[dict[str, float]]] = {}
+    tenths: list[tuple[Floats, Floats]] = []
+    methods = ["separated", "separated, lamp told"]
+    methods += [name for name in ("stokes", "rgb", "perfect") if (WEIGHTS / f"{name}.safetensors").is_file()]
+    for number, subject in enumerate(load_subjects(data, names)):
+        for kind, strength in (("glossy", 1.0), ("matte", MATTE)):
+            shot = photograph(subject, 2 * number + (kind == "matte"), strength)
+            for method in (*methods, "classical"):
+                told = method.endswith("told")
+                results = classical(shot) if method == "classical" else estimate(method.split(",")[0], shot, told)
+                scores = score(*results)
+                found.setdefault((kind, method), []).append(scores)
+                case, metric = f"{subject.name}, {kind}", "mean angular error"
+                yield Row("shape/things", case, method, metric, scores[metric], "deg")
+                if method == "separated":
+                    surface, truth, mask = results
+                    inside = mask[0] > 0
+                    cosine = np.clip((surface.normal * truth.normal).sum(axis=0)[inside], -1, 1)
+                    tenths.append((np.degrees(np.arccos(cosine)), np.degrees(surface.normal_error[0][inside])))
+    for kind in ("glossy", "matte"):
+        for method in (*methods, "classical"):
+            rows = found[kind, method]
+            for metric in dict.fromkeys(name for row in rows for name in row):
+                if method == "classical" and metric.startswith("roughness"):
+                    continue
+                value = statistics.fmean(row[metric] for row in rows if metric in row)
+                case, unit = f"{len(rows)} {kind} things", UNITS.get(metric, "deg")
+                yield Row("shape/one frame", case, method, metric, value, unit)
+    yield from _expected(tenths)
+
+
+def _expected(pairs: Sequence[tuple[Floats, Floats]]) -> Iterator[Row]:
+    """Rows by tenths of the expected error: its rms, that of the angles, and how far both are apart in octaves."""
+    angle, expected = (np.concatenate(x) for x in zip(*pairs, strict=True))
+    order = np.argsort(expected)
+    octaves = []
+    for k, part in enumerate(np.array_split(order, 10)):
+        wanted, real = (float(np.sqrt(np.mean(x[part] ** 2))) for x in (math.sqrt(2) * expected, angle))
+        octaves.append(math.log2(wanted / real))
+        yield Row("shape/expected", f"tenth {k + 1}", "separated", "expected", wanted, "deg")
+        yield Row("shape/expected", f"tenth {k + 1}", "separated", "found", real, "deg")
+    rms = math.sqrt(statistics.fmean(x * x for x in octaves))
+    yield Row("shape/expected", "all", "separated", "rms distance", rms, "octaves")

@@ -1,0 +1,362 @@
+"""Shape from one frame: what the network sees turns with the frame and not with the exposure; its twin; its files."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from test_cli import Run, assert_refused, run_here
+from torch import Tensor
+
+pytest.importorskip("scipy")
+pytest.importorskip("embreex")
+pytest.importorskip("skimage")
+
+import trimesh
+from test_geometry import cap
+
+import polsep
+from polsep.geometry import one_frame
+from polsep.geometry.one_frame import SIDE, ShapeEstimator, gather, shape, spread, square_around
+from polsep.geometry.one_frame_files import doubts
+from polsep.geometry.polarization import Cue, choose_outward
+from polsep.geometry.shape_maps import INPUTS, USUAL, Seen, Surface, decode, encode, projected_normal
+from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.separation_writer import write_separation
+from polsep.io.store.weights import write_weights
+from polsep.networks.shape import ShapeNetwork
+from polsep.networks.sizes import ResidualSize
+from polsep.physics.fresnel import diffuse_dolp
+from polsep.render.blobs import random_blob
+from polsep.separation.report import SeparatedFrame
+from polsep.train.shape_examples import COUNT, PLANES, random_shape_example
+from polsep.train.shape_losses import random_lamps, shape_loss
+from polsep.train.shape_task import angles_deg, cut_example, score_shapes, seen_of, truth_of, turn_example
+
+Cli = Callable[..., Run]
+#: A small network, for what does not depend on weights.
+SMALL = ResidualSize(4, (1, 1))
+
+
+def sphere_planes(side: int = 48) -> Tensor:
+    """An example of a sphere with the diffuse polarization of its normals, lit from the camera."""
+    normals, mask = cap(side, 80)
+    n = torch.from_numpy(np.moveaxis(normals, -1, 0)).float()
+    inside = torch.from_numpy(mask).float()[None]
+    planes = torch.zeros(COUNT, side, side)
+    shading = n[2:] * inside
+    twice = torch.polar(torch.from_numpy(diffuse_dolp(n[2].numpy())), 2 * torch.atan2(n[1], n[0])) * shading[0]
+    planes[PLANES["stokes"]] = torch.cat([shading, twice.real[None], twice.imag[None]]).repeat_interleave(3, dim=0)
+    for name in ("found", "true"):
+        planes[PLANES[name]] = torch.cat([shading.expand(3, -1, -1), 0 * shading])
+        planes[PLANES[f"{name}_polarized"]] = torch.stack([twice.real, twice.imag])
+    planes[PLANES["found_error"]] = 0.01
+    planes[PLANES["mask"]], planes[PLANES["normal"]] = inside, n * inside
+    planes[PLANES["albedo"]], planes[PLANES["roughness"]], planes[PLANES["specular"]] = inside, 0.4 * inside, inside
+    planes[PLANES["light"]] = torch.tensor([0.0, 0.0, 1.0])[:, None, None]
+    return planes
+
+
+@pytest.mark.parametrize("ways", list(itertools.product((False, True), repeat=3)))
+def test_a_turned_sphere_is_the_same_sphere(ways: tuple[bool, bool, bool]) -> None:
+    """Normals, lamp, s1 and s2 turn with the image: a sphere lit from the camera looks alike in all eight ways."""
+    planes = sphere_planes()
+    torch.testing.assert_close(turn_example(planes, *ways), planes, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_what_is_seen_does_not_depend_on_the_exposure(name: str) -> None:
+    """Twice the light gives the same maps, up to the floor that keeps logarithms finite; there are as many as said."""
+    planes = sphere_planes()[None]
+    first, second = (encode(seen_of(x, name), name) for x in (planes, _brighter(planes, 4.0)))
+    assert first.shape[1] == INPUTS[name]
+    torch.testing.assert_close(first, second, rtol=0, atol=0.02)
+
+
+def _brighter(planes: Tensor, gain: float) -> Tensor:
+    brighter = planes.clone()
+    brighter[:, : PLANES["mask"].start] *= gain
+    return brighter
+
+
+def test_projected_normals_are_those_of_fresnel() -> None:
+    """The sine of the zenith, at twice the azimuth, comes back from the diffuse polarization that it makes."""
+    zeniths, azimuths = np.meshgrid(np.radians(np.arange(2, 85)), np.radians(np.arange(0, 360, 15)))
+    dolp = diffuse_dolp(np.cos(zeniths))
+    seen = np.stack([dolp * np.cos(2 * azimuths), dolp * np.sin(2 * azimuths)]).astype(np.float32)
+    wanted = np.sin(zeniths) * np.stack([np.cos(2 * azimuths), np.sin(2 * azimuths)])
+    np.testing.assert_allclose(projected_normal(seen), wanted, atol=5e-3)
+    torch.testing.assert_close(projected_normal(torch.from_numpy(seen)).numpy(), projected_normal(seen))
+
+
+def test_the_engine_is_the_network(tmp_path: Path) -> None:
+    """OpenVINO's layers and torch's give the same surface; outputs mean unit normals toward the camera."""
+    estimator, network = _untrained(tmp_path)
+    planes = cut_example(sphere_planes(), 1.1, SIDE)[None]
+    seen = seen_of(planes, "separated")
+    with torch.no_grad():
+        wanted = decode(network(encode(seen, "separated")), seen.image, seen.mask)
+    found = estimator.find(Seen(*(x[0].numpy() for x in seen)))
+    for name in found._fields:
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name)[0].numpy(), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(found.normal, axis=0), 1, atol=1e-6)
+    assert (found.normal[2] > 0).all()
+
+
+def _untrained(folder: Path) -> tuple[ShapeEstimator, ShapeNetwork]:
+    torch.manual_seed(3)
+    network = ShapeNetwork(INPUTS["separated"], USUAL, SMALL)
+    for weight in network.parameters():
+        torch.nn.init.normal_(weight, std=0.1)
+    arrays = {name: value.half().float() for name, value in network.state_dict().items()}
+    network.load_state_dict(arrays)
+    path = folder / "small.safetensors"
+    write_weights(path, arrays, {"method": "shape", "input": "separated", "size": json.dumps(asdict(SMALL))})
+    return ShapeEstimator(path), network
+
+
+def test_losses_are_least_at_the_truth() -> None:
+    """Nothing but expected errors is left at the truth; a tilted normal, another albedo or roughness costs."""
+    planes = sphere_planes()[None]
+    truth, mask = truth_of(planes), planes[:, PLANES["mask"]]
+    one = torch.ones_like(truth.roughness)
+    truth = truth._replace(roughness=0.4 * one, specular=one, normal_error=one, roughness_error=one, specular_error=one)
+    inside = torch.tensor([0.0, 0.0, 1.0]).view(1, 3, 1, 1)
+    exact = truth._replace(normal=torch.where(mask > 0, truth.normal, inside), albedo=truth.albedo + 1e-3)
+
+    def loss(**changed: Tensor) -> float:
+        return float(shape_loss(exact._replace(**changed), exact, mask, torch.Generator().manual_seed(5)))
+
+    least = loss()
+    tilted = torch.nn.functional.normalize(exact.normal + torch.tensor([0.2, 0.0, 0.0]).view(1, 3, 1, 1), dim=1)
+    ramp = torch.linspace(0.5, 2.0, mask.shape[-1]).expand_as(exact.albedo)
+    assert least < 0.02
+    assert loss(albedo=2 * exact.albedo) == pytest.approx(least, abs=5e-3)  # albedo is relative
+    assert min(loss(normal=tilted), loss(albedo=ramp * exact.albedo), loss(roughness=0.8 * one)) > least + 0.05
+
+
+def test_the_lamp_is_found_in_the_shading() -> None:
+    """Of a matte sphere with its true normals, whatever its albedo is."""
+    normals, mask = cap(64, 80)
+    lamp = np.array([0.3, -0.2, 0.93])
+    albedo = np.where(np.arange(64) % 8 < 4, 0.8, 0.3)
+    image = np.broadcast_to(albedo * np.maximum(normals @ lamp, 0), (3, 64, 64))
+    none = np.full((1, 64, 64), 0.1)
+    planes = (np.moveaxis(normals, -1, 0), np.broadcast_to(albedo, (3, 64, 64)), none, none, none, none, none)
+    found = one_frame.find_lamp(Surface(*planes), Seen(image, None, None, None, mask[None], np.zeros((3, 1, 1))))
+    np.testing.assert_allclose(found, lamp / np.linalg.norm(lamp), atol=0.02)
+
+
+def test_squares_come_back() -> None:
+    """A smooth image survives the way into the network's square and back, also where the thing touches the border."""
+    rows, cols = np.mgrid[:90, :120] / 100.0
+    image = np.stack([rows, np.sin(3 * cols)]).astype(np.float32)
+    mask = np.zeros((90, 120), np.bool_)
+    mask[5:90, 60:118] = True
+    window = square_around(mask)
+    again = spread(gather(image, window, SIDE), window, mask.shape)
+    inner = mask.copy()
+    inner[84:] = False  # beyond the border there is no light
+    np.testing.assert_allclose(again[:, inner], image[:, inner], atol=0.02)
+
+
+def test_polarization_alone_finds_a_sphere() -> None:
+    """From exact azimuths up to half a turn, those that point outward are a sphere's."""
+    normals, mask = cap(64, 80)
+    turned = normals * np.array([-1.0, -1.0, 1.0])
+    swap = np.random.default_rng(1).random(mask.shape) < 0.5
+    cue = Cue(
+        np.where(swap[..., None], turned, normals),
+        np.where(swap[..., None], normals, turned),
+        np.full(mask.shape, 0.1),
+    )
+    cosine = (choose_outward(cue, mask) * normals).sum(axis=-1)[mask]
+    assert float((cosine > 0.99).mean()) > 0.97
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_bodies_are_closed_and_face_outward(seed: int) -> None:
+    """Every edge belongs to two triangles, which wind counter-clockwise seen from outside, as their normals do."""
+    body = random_blob(torch.Generator().manual_seed(seed))
+    mesh = trimesh.Trimesh(body.vertices, body.faces, process=True, merge_norm=True, merge_tex=True)
+    _, shared = np.unique(mesh.edges_unique_inverse, return_counts=True)
+    assert float((shared == 2).mean()) > 0.9995 and mesh.is_winding_consistent and mesh.volume > 0  # slivers merge
+    corners = body.vertices[body.faces]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert float(((facing * body.normals[body.faces].mean(axis=1)).sum(axis=1) > 0).mean()) > 0.995
+    np.testing.assert_allclose(np.linalg.norm(body.normals, axis=1), 1, atol=1e-6)
+
+
+def test_examples_depend_on_their_numbers_alone() -> None:
+    """The same numbers give the same planes; images and surface belong together, finite, inside the mask."""
+    first, second, other = (random_shape_example("test", 5, n, 96) for n in (1, 1, 3))
+    torch.testing.assert_close(first, second, rtol=0, atol=0)
+    assert first.shape == (COUNT, 48, 48) and not torch.equal(first, other)
+    mask = first[PLANES["mask"]][0] > 0
+    assert bool(torch.isfinite(first).all()) and 0.02 < float(mask.float().mean()) < 1
+    length = first[PLANES["normal"]].norm(dim=0)[mask]
+    torch.testing.assert_close(length, torch.ones_like(length), rtol=0, atol=1e-4)
+    true, found = first[PLANES["true"]][:3, mask], first[PLANES["found"]][:3, mask]
+    assert float((true - found).abs().mean()) < 0.3 * float(true.abs().mean())
+
+
+def sphere_frame() -> SeparatedFrame:
+    """The sphere as a separated frame."""
+    planes = sphere_planes(64)
+    found, (s1, s2) = planes[PLANES["found"]].numpy(), planes[PLANES["found_polarized"]].numpy()
+    diffuse, specular = (np.ascontiguousarray(np.moveaxis(x, 0, -1)) for x in (found[:3], found[3:].repeat(3, axis=0)))
+    dolp = np.hypot(s1, s2) / np.maximum(found[0], 1e-6)
+    aolp = np.mod(np.arctan2(s2, s1) / 2, np.pi)
+    error = np.full((64, 64, 2), 0.01, np.float32)
+    return SeparatedFrame(diffuse, specular, dolp >= 0, dolp, aolp, {"warnings": []}, error)
+
+
+def test_the_shipped_network_finds_a_sphere() -> None:
+    """Normals of an unseen sphere, its expected errors, and an albedo without its shading."""
+    frame = sphere_frame()
+    normals, mask = cap(64, 80)
+    found = polsep.shape(frame, mask, (0.0, 0.0, 1.0))
+    angle = angles_deg(
+        torch.from_numpy(found.normals).movedim(-1, 0)[None], torch.from_numpy(normals).movedim(-1, 0)[None]
+    )
+    inside = angle[0][torch.from_numpy(mask)]
+    assert float(inside.mean()) < 6
+    assert (
+        0.3
+        < float(np.degrees(np.sqrt(2 * (found.normal_error[mask] ** 2).mean()))) / float(inside.square().mean().sqrt())
+        < 4
+    )
+    assert np.log(found.albedo[mask] + 1e-3).std() < 0.6 * np.log(frame.diffuse[mask] + 1e-3).std()
+    assert "Shape(normals [64, 64]" in repr(found) and not found.normals[~mask].any()
+
+
+def test_floor_of_the_shipped_weights() -> None:
+    """On things that no training saw, made here, the shipped network is no worse than when it was shipped."""
+    examples = [cut_example(random_shape_example("test", 11, n, 256), 1.1, SIDE) for n in (0, 1, 2, 3)]
+    network = ShapeNetwork(INPUTS["separated"], USUAL, one_frame.load_estimator().size)
+    arrays = polsep_weights()
+    network.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})
+    scores = score_shapes(network.eval(), examples, "separated")
+    assert scores["normals, mean deg"] < FLOOR_DEG, scores
+
+
+#: Mean angular error of the shipped weights on four things, and a tenth more.
+FLOOR_DEG = 20.0
+
+
+def polsep_weights() -> dict[str, NDArray[np.float32]]:
+    from polsep.io.store.weights import read_weights, shipped_weights
+
+    return read_weights(shipped_weights("shape/separated"))[0]
+
+
+def test_bad_arguments_are_refused() -> None:
+    """Masks of another size or empty ones, lamps behind the thing, frames without polarization or light."""
+    frame = sphere_frame()
+    with pytest.raises(ValueError, match="expected a mask of"):
+        shape(frame, np.ones((3, 3), np.bool_))
+    with pytest.raises(ValueError, match="holds pixels"):
+        shape(frame, np.zeros((64, 64), np.bool_))
+    with pytest.raises(ValueError, match="lamp's direction"):
+        shape(frame, light=(0.0, 0.0, -1.0))
+    dark = replace(frame, diffuse=0 * frame.diffuse, specular=0 * frame.specular)
+    with pytest.raises(ValueError, match="black frame"):
+        shape(dark)
+    with pytest.raises(ValueError, match="with its polarization"):
+        shape(replace(frame, dolp=0 * frame.dolp))
+
+
+def test_a_frame_that_is_full_is_said() -> None:
+    """A mask that reaches around the border has a line that says what to do; a thing inside has none."""
+    one = np.ones((64, 64), np.float32)
+    found = one_frame.Shape(
+        np.dstack([0 * one, 0 * one, one]),
+        0.05 * one,
+        np.dstack([one] * 3),
+        one,
+        0.1 * one,
+        one,
+        one,
+        one > 0,
+        (0, 0, 1),
+    )
+    assert any("--mask" in line for line in doubts(found))
+    assert doubts(replace(found, mask=cap(64, 80)[1])) == []
+
+
+def test_specks_and_lines_are_not_the_thing() -> None:
+    """The mask is the sphere alone, whole, though a bright line and a speck are beside it."""
+    frame = sphere_frame()
+    diffuse = np.pad(frame.diffuse, ((16, 16), (0, 64), (0, 0)))
+    diffuse[4:6, :] = diffuse[60:63, 100:104] = 1
+    grown = replace(frame, diffuse=diffuse, specular=0 * diffuse)
+    found = one_frame.find_thing(grown)
+    sphere = np.pad(frame.diffuse.mean(axis=-1), ((16, 16), (0, 64))) > 0.1
+    np.testing.assert_array_equal(found[sphere], True)
+    assert not found[:8].any() and not found[:, 80:].any()
+
+
+def test_lamps_are_in_front() -> None:
+    """Random lamps are unit vectors toward the camera's side."""
+    lamps = random_lamps(50, torch.Generator().manual_seed(1))
+    torch.testing.assert_close(lamps.norm(dim=1), torch.ones(50))
+    assert float(lamps[:, 2].min()) >= math.cos(math.radians(70)) - 1e-6
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Cli:
+    """Run `polsep shape ARGS` inside this process."""
+    return partial(run_here, monkeypatch, capfd, "shape")
+
+
+def test_a_file_becomes_maps_and_a_mesh(run: Cli, tmp_path: Path) -> None:
+    """All files appear, maps agree with the function's, and a second run is refused without --overwrite."""
+    frame = sphere_frame()
+    path = write_separation(frame, tmp_path / "in", "ball")[0]
+    out = tmp_path / "out"
+    done = run(path, "-o", out, "--light", "0,0,1")
+    names = ["ball.exr", "ball_normals.png", "ball.glb", "ball.png", "ball.html", "ball.json"]
+    assert (done.status, done.out.split()) == (0, [str(out / name) for name in names]), done
+    planes = read_exr_layers(out / "ball.exr")
+    found = shape(polsep.read_separated(path), light=(0.0, 0.0, 1.0))
+    np.testing.assert_allclose(planes["normal.X"], found.normals[..., 0], atol=1e-6)
+    np.testing.assert_allclose(planes["normal_error.Y"], np.degrees(found.normal_error), rtol=1e-5)
+    assert np.isfinite(planes["depth.Z"]).all() and np.ptp(planes["depth.Z"][found.mask]) > 10
+    facts = json.loads((out / "ball.json").read_text())
+    assert (facts["light"], facts["light_is"]) == ([0, 0, 1], "told") and set(facts["units"]) == {
+        name.split(".")[0] for name in planes
+    }
+    assert_refused(run(path, "-o", out), "--overwrite")
+
+
+def test_a_mesh_is_left_out_on_request(run: Cli, tmp_path: Path) -> None:
+    """Without a mesh there are no depth and no mesh file."""
+    path = write_separation(sphere_frame(), tmp_path, "ball")[0]
+    done = run(path, "-o", tmp_path / "out", "--mesh", "none")
+    assert done.status == 0 and not (tmp_path / "out" / "ball.glb").exists(), done
+    assert "depth.Z" not in read_exr_layers(tmp_path / "out" / "ball.exr")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--light", "0,0,-1"), "z > 0"),
+        (("--light", "left"), "x,y,z"),
+        (("--mesh", "none", "--turntable"), "--turntable"),
+        (("--mesh", "obj"), "glb"),
+    ],
+)
+def test_wrong_options_are_refused(run: Cli, tmp_path: Path, words: tuple[str, ...], said: str) -> None:
+    """In one line, before any work, and without a file."""
+    path = write_separation(sphere_frame(), tmp_path, "ball")[0]
+    assert_refused(run(path, "-o", tmp_path / "out", *words), said)
+    assert not (tmp_path / "out").exists()

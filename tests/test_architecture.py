@@ -76,6 +76,8 @@ HOMES = {
     "gi": "capture",
     "pypylon": "capture",
     "gradio": "view",
+    "magicgui": "view",
+    "napari": "view",
 }
 #: Calls that touch files, by name of the function or method.
 FILE_CALLS = {"open", "read_bytes", "write_bytes", "read_text", "write_text", "imread", "imwrite", "fromfile", "tofile"}

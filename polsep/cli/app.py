@@ -208,6 +208,7 @@ EXTRAS = {
     "export": ("onnx", "onnxscript", "torch"),
     "view": ("gradio",),
     "photos": ("cv2", "rawpy"),
+    "napari": ("napari",),
     "camera": ("pypylon",),
     "bench": ("embreex", "flip_evaluator", "matplotlib", "numba", "scipy", "torch"),
     "mitsuba": ("mitsuba",),

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from polsep import __version__
 from polsep.io.store.atomic import OutputError, write_checked, write_set
+from polsep.io.store.json_text import parse_json, read_text
 
 #: Attributes of EXR files by the keys of a report.
 _REPORTED = {
@@ -68,6 +69,16 @@ def write_with_sidecar(
         write_checked(folder / f"{stem}.json", (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
 
     write_set(targets, stem, write)
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """The report in a sidecar of `polsep separate`, to be shown; empty where there is no such file."""
+    try:
+        sidecar = parse_json(read_text(path))
+    except (OSError, ValueError):
+        return {}
+    report = sidecar.get("report") if isinstance(sidecar, dict) else None
+    return report if isinstance(report, dict) else {}
 
 
 def require_same_settings(path: Path, settings: Mapping[str, Any], owner: str, advice: str = "") -> None:

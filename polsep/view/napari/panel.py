@@ -47,9 +47,7 @@ class Panel:
         self.fields = {
             "method": ComboBox(label="Method", choices=("auto", *METHODS), tooltip="auto: the best for the frame"),
             "black": LineEdit(label="Black level", value="0"),
-            "white": LineEdit(
-                label="White level", tooltip="4095 for 12 bits; empty: the type's largest"
-            ),
+            "white": LineEdit(label="White level", tooltip="4095 for 12 bits; empty: the type's largest"),
             "light": LineEdit(label="Light colour", value="auto", tooltip="auto, white, or the lamp's raw R,G,B"),
             "resolution": ComboBox(label="Resolution", choices=(HALF, FULL)),
         }

@@ -31,6 +31,8 @@ from tests.test_docs import PAGES, ROOT, blocks, commands
 LEFT_OUT = {
     "make": "sets up an environment, or tests the whole",
     "python -m evaluation": "takes minutes to hours, and data that cannot ship",
+    "python -m zipfile": "packs the add-on of Blender; tests/test_places.py runs it",
+    "python examples/polsep_": "need cameras, GStreamer and ROS; tests/test_places.py",
     "polsep bench": "takes minutes to hours",
     "polsep train": "takes hours",
     "polsep render": "renders for hours; tests/test_dataset.py runs it small",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -117,7 +115,9 @@ class Panel:
             viewer.reset_view()
         for remark in found.remarks:
             show_warning(remark)
-        said = f"Separated by {found.frame.report['method']} in {found.seconds:.1f} s."
+        report = found.frame.report
+        clipped, angle = (report["statistics"][name] for name in ("clipped_fraction", "light_polarizer_deg"))
+        said = f"Separated by {report['method']}. {clipped:.2%} of the pixels clip; light polarizer at {angle:.0f}°."
         self._end("\n\n".join([said, *found.remarks]))
 
     def _fail(self, error: BaseException) -> None:
@@ -129,10 +129,9 @@ class Panel:
 
 def separate_samples(samples: NDArray[Any], name: str, settings: Settings) -> OpenedFrame:
     """The separation of a raw frame ``[H, W]``. Raises ValueError as `polsep.separate` does."""
-    begin, read = time.perf_counter(), settings.read
+    read = settings.read
     mosaic, notes = as_mosaic(samples, read.layout, read.black_level, read.white_level)
-    found = open_frame((Source(Path(name), name, False),), settings, Frame(name, mosaic, notes))
-    return replace(found, seconds=time.perf_counter() - begin)
+    return open_frame((Source(Path(name), name, False),), settings, Frame(name, mosaic, notes))
 
 
 def shown_samples(layer: Any, viewer: Any) -> NDArray[Any]:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute import pages
 from polsep.compute.compiling import ONE, ZERO, compiled, entry
 from polsep.compute.rows_kernel import AT_ONCE, add_product, add_up, copy
 from polsep.compute.threads import RowRange
@@ -72,9 +73,9 @@ class Targets(NamedTuple):
     def empty(cls, shape: tuple[int, int], colors: int) -> Targets:
         """Buffers for images of that ``shape``, and sums of 0."""
         h, w = shape
-        diffuse, specular, error = (np.empty((h, w * n), np.float32) for n in (colors, colors, 2))
-        dolp, aolp = (np.empty((h, w), np.float32) for _ in range(2))
-        return cls(diffuse, specular, error, np.empty((h, w), np.bool_), dolp, aolp, np.zeros((h, SUMS)))
+        diffuse, specular, error = (pages.empty((h, w * n), np.float32) for n in (colors, colors, 2))
+        dolp, aolp = (pages.empty((h, w), np.float32) for _ in range(2))
+        return cls(diffuse, specular, error, pages.empty((h, w), np.bool_), dolp, aolp, np.zeros((h, SUMS)))
 
 
 @compiled

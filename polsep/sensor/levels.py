@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute import pages
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, WrongType
 
@@ -266,4 +267,6 @@ def _require_span(samples: NDArray[Any], black: float, white: float) -> None:
 
 def _as_float32(samples: NDArray[Any]) -> NDArray[np.float32]:
     """A contiguous float32 copy, so that later changes of the caller's array don't reach the mosaic."""
-    return np.array(samples, dtype=np.float32, order="C")
+    copy = pages.empty(samples.shape, np.float32)
+    copy[...] = samples
+    return copy

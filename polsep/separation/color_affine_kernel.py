@@ -16,6 +16,7 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute import pages
 from polsep.compute.threads import RowRange, get_threads, run_over_rows
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import EDGE, Source, read_grid
@@ -110,7 +111,7 @@ def _separate(
     height = strip_height(pattern.h)
     clips = any(run_over_rows(partial(rows_clip, samples, pattern), pattern.h, height))
     lines, clipped = (
-        np.empty((4, h, w) if clips else (4, 0, 0), np.float32),
+        pages.empty((4, h, w) if clips else (4, 0, 0), np.float32),
         np.zeros((h, w) if clips else (0, 0), np.uint16),
     )
     diffuse, specular = (image.reshape(h, 3 * w) for image in (out.diffuse, out.specular))
@@ -136,8 +137,8 @@ def _separate(
     if places.size:
         tally += _complete(gather, layout, conversion.inverses, targets, places, out)
     if clips and options.in_light:
-        out.diffuse[...] *= gains
-        out.specular[...] *= gains
+        for image in (diffuse, specular):
+            image *= np.tile(gains, w)  # long rows: NumPy multiplies three numbers at a time slowly
     return replace(out, tally=tally) if options.report else out
 
 

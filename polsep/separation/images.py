@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute import pages
 from polsep.sensor.camera import Layout
 
 
@@ -68,9 +69,9 @@ class FrameImages:
         """
         size = 2 if full else 1
         h, w = ((n - start) // 2 * size for n, start in zip(shape, layout.origin, strict=True))
-        diffuse, specular = (np.empty((h, w, layout.channels), np.float32) for _ in range(2))
-        dolp, aolp = (np.empty((h, w), np.float32) if report else None for _ in range(2))
-        return cls(diffuse, specular, np.empty((h, w), np.bool_), dolp, aolp)
+        diffuse, specular = (pages.empty((h, w, layout.channels), np.float32) for _ in range(2))
+        dolp, aolp = (pages.empty((h, w), np.float32) if report else None for _ in range(2))
+        return cls(diffuse, specular, pages.empty((h, w), np.bool_), dolp, aolp)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The images that there are, by name."""

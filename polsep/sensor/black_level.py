@@ -18,8 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
+from polsep.compute.warm_up import make_ready
+from polsep.sensor import periods_kernel
 from polsep.sensor.camera import CLIP_MARGIN, Mosaic
-from polsep.sensor.noise import BLOCK, blocks_of
+from polsep.sensor.noise import BLOCK
+from polsep.sensor.periods_kernel import measure_blocks
 
 Floats = NDArray[np.float32]
 
@@ -53,7 +56,8 @@ def check_black_level(mosaic: Mosaic) -> BlackLevel:
     if min(mosaic.data.shape[-2:]) < 4 * BLOCK:
         return BlackLevel(None, None)
     rows = _some_rows(mosaic)
-    below = float(np.mean(rows < said - LEAST_EXCESS * span)) if float(rows.min()) >= 0 else 0.0
+    least, lowest = said - LEAST_EXCESS * span, float(rows.min())
+    below = float(np.mean(rows < least)) if 0 <= lowest < least else 0.0
     if below > BELOW:
         excess = f"{below:.1%} of the samples lie below the black level {said:g}, which only noise should"
         return BlackLevel(None, f"{excess}: the darkest are at {np.quantile(rows, 0.001):g}, say a lower --black-level")
@@ -77,15 +81,12 @@ def _some_rows(mosaic: Mosaic) -> Floats:
 def _black_of(mosaic: Mosaic, rows: Floats) -> float | None:
     """The level of the darkest parts if they are black, by their noise; None where that is not shown."""
     said, span = float(mosaic.black_level), float(mosaic.white_level - mosaic.black_level)
-    x = blocks_of(rows)
-    kept = _usable(mosaic, x)
-    level = x.mean(axis=-1)[:, 1:-1][kept]
+    level, variance = smooth_blocks(mosaic, rows)
     if level.size < 4 * MIN_BLOCKS or not _is_codes(mosaic, rows):
         return None
     count = max(MIN_BLOCKS, int(DARKEST * level.size))
     if float(np.median(np.partition(level, count - 1)[:count])) - said < LEAST * span:
         return None
-    variance = _variance(x)[kept]
     order = np.argsort(level)
     level, variance = level[order], variance[order]
     dark, quiet = float(np.median(level[:count])), float(np.median(variance[:count]))
@@ -113,23 +114,14 @@ def _is_codes(mosaic: Mosaic, rows: Floats) -> bool:
     return mosaic.white_level - mosaic.black_level >= MIN_SPAN and bool((rows == np.floor(rows)).all())
 
 
-def smooth_blocks(mosaic: Mosaic) -> tuple[Floats, Floats]:
-    """Mean level and variance of unclipped blocks, without what is common to all samples of a block: texture."""
-    x = blocks_of(_some_rows(mosaic))
-    kept = _usable(mosaic, x)
-    return x.mean(axis=-1)[:, 1:-1][kept], _variance(x)[kept]
+def smooth_blocks(mosaic: Mosaic, rows: Floats | None = None) -> tuple[Floats, Floats]:
+    """Mean level and variance of unclipped blocks, without what is common to all samples of a block: texture.
 
-
-def _usable(mosaic: Mosaic, x: Floats) -> NDArray[np.bool_]:
-    """Blocks ``x [K, N, 16]`` that are not clipped, nor their neighbours on both sides ``[K, N - 2]``."""
+    Of blocks whose neighbours on both sides are not clipped either. ``rows``: `_some_rows`, where they are known.
+    """
+    make_ready(periods_kernel.warm_up)
+    blocks = measure_blocks(_some_rows(mosaic) if rows is None else rows)
     clip = np.float32(mosaic.black_level + (1 - CLIP_MARGIN) * (mosaic.white_level - mosaic.black_level))
-    unclipped = x.max(axis=-1) < clip
-    kept: NDArray[np.bool_] = unclipped[:, 1:-1] & unclipped[:, :-2] & unclipped[:, 2:]
-    return kept
-
-
-def _variance(x: Floats) -> Floats:
-    """Variance of the difference of blocks to their neighbours, over that of one sample ``[K, N - 2]``."""
-    across = x[:, 1:-1] - np.float32(0.5) * (x[:, :-2] + x[:, 2:])
-    variance: Floats = across.var(axis=-1) / np.float32(1.5)
-    return variance
+    unclipped = blocks.most < clip
+    kept = unclipped[:, 1:-1] & unclipped[:, :-2] & unclipped[:, 2:]
+    return blocks.mean[:, 1:-1][kept], blocks.variance[:, 1:-1][kept]

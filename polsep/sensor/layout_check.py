@@ -25,7 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
+from polsep.compute.warm_up import make_ready
+from polsep.sensor import periods_kernel
 from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
+from polsep.sensor.periods_kernel import sum_periods
 from polsep.sensor.slope_check import lies_across, turned_across
 
 Floats = NDArray[np.float32]
@@ -101,10 +104,7 @@ def crossed_pairs(layout: Layout) -> str | None:
 
 
 def _strips(mosaic: Mosaic) -> list[Floats]:
-    """The first frame's samples; of a large one `STRIPS` of them: as reliable, in an eighth of the time.
-
-    Everything else is NumPy, in this thread: waking other threads would take longer than a step.
-    """
+    """The first frame's samples; of a large one `STRIPS` of them: as reliable, in an eighth of the time."""
     frame = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0]
     height = frame.shape[0]
     step = height // STRIPS // STRIP * STRIP
@@ -119,11 +119,8 @@ def _phase_means(mosaic: Mosaic, data: Floats) -> Floats:
     made linear: no copy of the frame.
     """
     side = 16 if min(data.shape) >= 64 else 4
-    rows, cols = (n // side for n in data.shape)
-    data = data[: rows * side, : cols * side]
-    sums = data.reshape(rows, side // 4, 4, -1).sum(1).reshape(rows, 4, cols, side // 4, 4).sum(3)
-    means = _linear(mosaic, sums / (side // 4) ** 2).transpose(1, 3, 0, 2)
-    brightest = data.reshape(rows, side, -1).max(1).reshape(rows, cols, side).max(2)
+    sums, brightest = sum_periods(data, side, side)
+    means = _linear(mosaic, sums / np.float32((side // 4) ** 2))
     brightness = means.mean((0, 1))
     slope_y, slope_x = _gradient(brightness, 0) / side, _gradient(brightness, 1) / side
     average = float(brightness.mean())
@@ -201,6 +198,7 @@ def see_phases(mosaic: Mosaic) -> Floats:
     """Means ``[4, 4, blocks]`` that all checks of filters look at: of the first frame, of a large one some strips."""
     if min(mosaic.data.shape[-2:]) < 16:
         return np.zeros((4, 4, 0), np.float32)
+    make_ready(periods_kernel.warm_up)
     return np.concatenate([_phase_means(mosaic, strip) for strip in _strips(mosaic)], -1)
 
 

@@ -19,6 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.warm_up import make_ready
+from polsep.sensor import periods_kernel
+from polsep.sensor.periods_kernel import measure_blocks
+
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
@@ -88,17 +92,17 @@ def estimate_noise(now: NDArray[Any], before: tuple[Floats, Floats] | None, leve
     rows, cols = (n // BLOCK for n in now.shape)
     step = max(1, rows * cols // BLOCKS)
     kept = slice(turn % step, None, step)
-    x = blocks_of(_rows(now, kept)).astype(np.float32)
-    unclipped: NDArray[np.bool_] = np.all((x > 0) & (x < levels.clip), axis=-1)
-    across = x[:, 1:-1] - np.float32(0.5) * (x[:, :-2] + x[:, 2:])
+    make_ready(periods_kernel.warm_up)
+    samples = _rows(now, kept).astype(np.float32)
+    blocks = measure_blocks(samples)
+    unclipped = (blocks.least > 0) & (blocks.most < levels.clip)
     spread = np.full(unclipped.shape, np.inf, np.float32)
-    spread[:, 1:-1] = np.square(across).mean(axis=-1) / np.float32(1.5)
-    spread[:, 1:-1][~(unclipped[:, :-2] & unclipped[:, 2:])] = np.inf
-    signal = x.mean(axis=-1) - np.float32(levels.black)
+    spread[:, 1:-1] = np.where(unclipped[:, :-2] & unclipped[:, 2:], blocks.square[:, 1:-1], np.float32(np.inf))
+    signal = blocks.mean - np.float32(levels.black)
     changes = [spread]
     if before is not None:
         spread *= np.float32(MARGIN)
-        mean, count = blocks_of(_rows(before[0], kept)), before[1][kept]
+        x, mean, count = blocks_of(samples), blocks_of(_rows(before[0], kept)), before[1][kept]
         unclipped &= np.all((mean > 0) & (mean < levels.clip), axis=-1)
         changes.append(np.square(x - mean).mean(axis=-1) / (1 + 1 / count))
         signal = mean.mean(axis=-1) - np.float32(levels.black)
@@ -167,7 +171,8 @@ def _fit(points: Doubles, levels: Levels) -> Noise:
 
 def _line(x: Doubles, y: Doubles, weight: Doubles, least: float) -> Noise:
     """Weighted least squares of y = gain x + floor with a gain of 0 or more and a floor of ``least`` or more."""
-    middle, height = np.average(x, weights=weight), np.average(y, weights=weight)
+    whole = weight.sum()
+    middle, height = (x * weight).sum() / whole, (y * weight).sum() / whole
     spread = float((weight * (x - middle) ** 2).sum())
     gain = float((weight * (x - middle) * (y - height)).sum()) / spread if spread > 0 else 0.0
     floor = float(height - gain * middle)

@@ -17,7 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
+from polsep.compute.warm_up import make_ready
+from polsep.sensor import periods_kernel
 from polsep.sensor.camera import CLIP_MARGIN, Filter, Layout, Mosaic
+from polsep.sensor.periods_kernel import PERIOD, sum_periods
 
 Floats = NDArray[np.float32]
 
@@ -46,6 +49,7 @@ def lies_across(mosaic: Mosaic) -> bool:
     most = 1 << SIZES - 1
     if mosaic.layout.bayer is None or min(frame.shape) < 4 * most * side:
         return False
+    make_ready(periods_kernel.warm_up)
     layout = replace(mosaic.layout, origin=(0, 0))
     levels = [_block_means(mosaic, to_numpy(frame), side, most)]
     for _ in range(1, SIZES):
@@ -70,15 +74,10 @@ def _block_means(mosaic: Mosaic, frame: NDArray[np.generic], side: int, most: in
     Numbers of blocks are multiples of ``most``. Of blocks of several periods the first rows alone are read.
     """
     rows, cols = (n // (side * most) * most for n in frame.shape)
-    lines = frame[: rows * side].reshape(rows, side, -1)[:, :4, : cols * side].astype(np.float32)
-    periods = lines.reshape(rows, 4, cols, side // 4, 4)
-    span = np.float32(mosaic.white_level - mosaic.black_level)
-    tops = lines.max(1)  # then by slices: NumPy reduces short last axes slowly
-    brightest = np.maximum.reduce([tops[:, col::side] for col in range(side)])
-    total: Floats = np.add.reduce([periods[:, :, :, k] for k in range(side // 4)])
-    means = total.transpose(1, 3, 0, 2) / np.float32(side // 4)
-    black = np.float32(mosaic.black_level)
-    usable: NDArray[np.bool_] = (brightest - black) / span < 1 - CLIP_MARGIN
+    sums, brightest = sum_periods(frame[: rows * side], side, PERIOD)
+    span, black = np.float32(mosaic.white_level - mosaic.black_level), np.float32(mosaic.black_level)
+    means = sums[..., :cols] / np.float32(side // PERIOD)
+    usable: NDArray[np.bool_] = (brightest[:, :cols] - black) / span < 1 - CLIP_MARGIN
     return (means - black) / span, usable
 
 

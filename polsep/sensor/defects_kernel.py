@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute import pages
 from polsep.compute.compiling import HALF, ONE, ZERO, compiled, entry, read_only
 from polsep.compute.threads import RowRange, run_over_rows
 
@@ -68,10 +69,11 @@ class Predictor(NamedTuple):
 
 def find_candidates(x: NDArray[np.float32], rules: Rules) -> NDArray[np.int64]:
     """Row and column ``[N, 2]`` of samples of ``x [H, W]`` that stand out of their own kind, in reading order."""
-    marks = np.zeros((x.shape[0], -(-x.shape[1] // 8) * 8), np.uint8)
+    marks = pages.empty((x.shape[0], -(-x.shape[1] // 8) * 8), np.uint8)
+    marks[:, x.shape[1] :] = 0
     run_over_rows(partial(_mark_rows, read_only(x), rules, marks), x.shape[0], STRIP)
     # Few samples are marked: eight are looked at together.
-    at = np.flatnonzero(marks.view(np.uint64))
+    at = np.flatnonzero(marks.view(np.uint64) != 0)
     which, inside = np.nonzero(marks.reshape(-1, 8)[at])
     return np.stack(np.divmod(8 * at[which] + inside, marks.shape[1]), axis=1)
 
@@ -164,32 +166,48 @@ def _start(i: int, n: int) -> int:
 
 
 @compiled
-def _table(x: Any, clip: Any, i: int, j: int) -> int:
-    """Table of the coefficients of pixel (i, j): 1, own kind only, where samples of its window are clipped, else 0.
+def _choose_tables(x: Any, clip: Any, i: int, first: int, tables: Any) -> None:
+    """Tables of the coefficients of pixels (i, first), (i, first + 1) ...: 1, own kind only, where their windows clip.
 
     A clipped sample tells nothing of other kinds. Fewer than `MIN_CLIPPED` may be defects themselves.
     """
-    top, left = _start(i, x.shape[0]), _start(j, x.shape[1])
-    count = 0
+    height, width = x.shape
+    top, left = _start(i, height), _start(first, width)
+    windows = x[top : top + SIDE, left : _start(first + tables.size - 1, width) + SIDE]
+    whole = 0
     for a in range(SIDE):
-        row = x[top + a, left : left + SIDE]
-        for b in range(SIDE):
-            count += row[b] >= clip
-    return 1 if count >= MIN_CLIPPED else 0
+        row = windows[a]
+        for b in range(row.size):
+            whole += row[b] >= clip
+    for k in range(tables.size):
+        count = whole
+        if whole >= MIN_CLIPPED and tables.size > 1:
+            own, count = _start(first + k, width) - left, 0
+            for a in range(SIDE):
+                row = windows[a, own : own + SIDE]
+                for b in range(SIDE):
+                    count += row[b] >= clip
+        tables[k] = 1 if count >= MIN_CLIPPED else 0
 
 
 @compiled
-def _residual(x: Any, coefficients: Any, table: int, i: int, j: int) -> Any:
-    """Sample minus prediction."""
+def _residuals_of(x: Any, coefficients: Any, tables: Any, i: int, first: int, residuals: Any) -> None:
+    """Write sample minus prediction of pixels (i, first), (i, first + 1) ... with their ``tables``.
+
+    Row after row of their windows, so that the processor adds up several pixels at once.
+    """
     height, width = x.shape
-    own = coefficients[table, _case(i, height), _case(j, width)]
-    top, left = _start(i, height), _start(j, width)
-    total = ZERO
+    top, case = _start(i, height), _case(i, height)
+    for k in range(residuals.size):
+        residuals[k] = ZERO
     for a in range(SIDE):
-        row, factor = x[top + a, left : left + SIDE], own[SIDE * a : SIDE * a + SIDE]
-        for b in range(SIDE):
-            total += row[b] * factor[b]
-    return total
+        for k in range(residuals.size):
+            own, left = coefficients[tables[k], case, _case(first + k, width)], _start(first + k, width)
+            row, factor = x[top + a, left : left + SIDE], own[SIDE * a : SIDE * a + SIDE]
+            total = residuals[k]
+            for b in range(SIDE):
+                total += row[b] * factor[b]
+            residuals[k] = total
 
 
 @compiled
@@ -212,8 +230,8 @@ def _confirm_some(x: Any, predictor: Predictor, rules: Rules, candidates: Any, f
         for size in range(1, MOST + 1):
             last = size - 1
             places[last, 0], places[last, 1] = i, j
-            tables[last] = _table(x, rules.clip, i, j)
-            residuals[last] = _residual(x, predictor.coefficients, tables[last], i, j)
+            _choose_tables(x, rules.clip, i, j, tables[last:size])
+            _residuals_of(x, predictor.coefficients, tables[last:size], i, j, residuals[last:size])
             _solve(x, predictor.coefficients, places[:size], tables, residuals, excess)
             least = _least_excess(x, predictor, rules, places[:size], tables, excess)
             if least == ZERO:
@@ -288,12 +306,15 @@ def _search_ring(x: Any, coefficients: Any, clip: Any, places: Any, excess: Any,
     left, end = _ring_range(places[:, 1], x.shape[1])
     count, worst, row, col = 0, ZERO, top, left
     light, power, near, far = ZERO, ZERO, 0, 0
+    tables, residuals = np.empty(end - left, np.int64), np.empty(end - left, np.float32)
     for a in range(top, stop):
+        _choose_tables(x, clip, a, left, tables)
+        _residuals_of(x, coefficients, tables, a, left, residuals)
         for b in range(left, end):
             distance, nearest = _distance(places, a, b)
             if distance == 0:
                 continue
-            rest = _rest(x, coefficients, _table(x, clip, a, b), a, b, places, excess)
+            rest = _rest(x, coefficients, tables[b - left], (a, b), residuals[b - left], places, excess)
             if distance == 1:
                 light += rest if excess[nearest] > ZERO else -rest
                 near += 1
@@ -335,25 +356,25 @@ def _distance(places: Any, a: int, b: int) -> tuple[int, int]:
 
 
 @compiled
-def _rest(x: Any, coefficients: Any, table: int, i: int, j: int, places: Any, excess: Any) -> Any:
+def _rest(x: Any, coefficients: Any, table: int, place: Any, residual: Any, places: Any, excess: Any) -> Any:
     """Residual of a pixel once ``places`` are repaired."""
-    rest = _residual(x, coefficients, table, i, j)
     for k in range(places.shape[0]):
-        rest -= _coefficient(x, coefficients, table, i, j, places[k]) * excess[k]
-    return rest
+        residual -= _coefficient(x, coefficients, table, place[0], place[1], places[k]) * excess[k]
+    return residual
 
 
 @entry
 def _fill_places(x: Any, predictor: Predictor, clip: Any, places: Any) -> None:
     """Gauss-Seidel rounds: every place at its prediction, given all others."""
-    largest = ZERO
+    largest, table, residual = ZERO, np.empty(1, np.int64), np.empty(1, np.float32)
     for _ in range(SWEEPS):
         change = ZERO
         for n in range(places.shape[0]):
             i, j = places[n, 0], places[n, 1]
-            residual = _residual(x, predictor.coefficients, _table(x, clip, i, j), i, j)
-            x[i, j] -= residual
-            change = max(change, abs(residual))
+            _choose_tables(x, clip, i, j, table)
+            _residuals_of(x, predictor.coefficients, table, i, j, residual)
+            x[i, j] -= residual[0]
+            change = max(change, abs(residual[0]))
         largest = max(largest, change)
         if change <= _TOLERANCE * largest:
             break

@@ -8,9 +8,9 @@ from __future__ import annotations
 from polsep.compute.threads import get_threads, set_threads
 from polsep.light import color_kernel, tiles_kernel
 from polsep.networks import details_kernel, images_kernel
-from polsep.sensor import defects_kernel
+from polsep.sensor import defects_kernel, periods_kernel
 from polsep.sensor.unpack_kernel import PackedFrame
-from polsep.separation import analytic_kernel, color_affine_kernel, places_kernel
+from polsep.separation import analytic_kernel, color_affine_kernel, highlights_kernel, places_kernel
 from polsep.separation.analytic_kernel import AnalyticOptions, separate_analytic_full, separate_analytic_half
 from polsep.separation.color_affine_kernel import (
     ColorAffineOptions,
@@ -47,10 +47,12 @@ def warm_up() -> None:
         images_kernel,
         details_kernel,
         temporal_kernel,
+        periods_kernel,
         defects_kernel,
         tiles_kernel,
         color_kernel,
         places_kernel,
+        highlights_kernel,
     )
     for kernel in kernels:
         kernel.warm_up()

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout, Mosaic
+from polsep.separation.highlights_kernel import solve_laplace
 from polsep.separation.images import FrameImages, Tally
 from polsep.separation.under_highlights import SPOILED, fill_under_highlights
 
@@ -172,3 +173,20 @@ def test_statistics_know_of_the_fill() -> None:
     assert out.error is not None and out.report["filled_under_highlights"] > 0
     typical = float(np.sqrt(np.square(out.error[..., 0], dtype=np.float64).mean())) / np.mean(LIGHT)
     assert out.report["statistics"]["expected_diffuse_error"] == pytest.approx(typical, rel=1e-4)
+
+
+@pytest.mark.parametrize("colors", [1, 3])
+def test_laplace_is_solved(colors: int) -> None:
+    """A square hole in a harmonic image, x^2 - y^2 plus a plane, is filled with it."""
+    y, x = np.mgrid[:13, :13].astype(np.float64)
+    image = ((x**2 - y**2) / 50 + 0.1 * x - 0.05 * y + 4)[..., None] * np.arange(1, colors + 1)
+    inside = np.zeros((13, 13), np.bool_)
+    inside[1:-1, 1:-1] = True
+    rows, cols = np.nonzero(inside)
+    number = np.full((13, 13), len(rows), np.uint32)
+    number[inside] = np.arange(len(rows))
+    steps = ((0, 1), (0, -1), (1, 0), (-1, 0))
+    links = np.stack([number[rows + i, cols + j] for i, j in steps])
+    known = sum(np.where(inside[..., None], 0, image)[rows + i, cols + j] for i, j in steps)
+    found = solve_laplace(links, np.full(len(rows), 4.0), known, np.zeros((len(rows), colors)), (1e-10, 200))
+    np.testing.assert_allclose(found, image[inside], rtol=1e-8)

@@ -24,8 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import Array, namespace, of_kind, to_numpy, to_numpy_together
+from polsep.compute.warm_up import make_ready
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import clip_level
+from polsep.separation import highlights_kernel
+from polsep.separation.highlights_kernel import find_rings, solve_laplace
 from polsep.separation.images import FrameImages
 
 Floats = NDArray[np.float64]
@@ -73,6 +76,7 @@ def fill_under_highlights(images: FrameImages, mosaic: Mosaic, light: tuple[floa
     clipped = _clipped_cells(mosaic)
     if not 0 < len(clipped) <= MAX_CLIPPED * height * width / scale**2:
         return images, 0.0
+    make_ready(highlights_kernel.warm_up)
     holes = _find_holes(clipped, (height, width), scale)
     gain = np.array(light[:colors], np.float64)
     diffuse, expected = images.diffuse.reshape(-1, colors), error.reshape(-1, 2)[:, 0]
@@ -133,19 +137,16 @@ def _clipped_cells(mosaic: Mosaic) -> Places:
     at = to_numpy(namespace(data).nonzero(data >= level)[0]).astype(np.int64)
     places = np.stack(np.divmod(at, width), axis=1) - np.array(mosaic.layout.origin)
     count = (np.array(mosaic.data.shape) - mosaic.layout.origin) // 2
-    cells = places[(places >= 0).all(axis=1)] // 2
-    cells = cells[(cells < count).all(axis=1)]
-    return np.stack(np.divmod(np.unique(cells[:, 0] * count[1] + cells[:, 1]), count[1]), axis=1)
+    return _distinct(places // 2, (int(count[0]), int(count[1])))
 
 
 def _find_holes(clipped: Places, shape: tuple[int, int], scale: int) -> _Holes:
     """Connected pixels, also over corners, of what clipped cells spoil in an image of that shape."""
-    cells = _grow(clipped, (shape[0] // scale, shape[1] // scale), SPOILED)
-    within = np.stack(np.divmod(np.arange(scale**2), scale), axis=1)
-    pixels = (scale * cells[:, None] + within).reshape(-1, 2)
-    flat = np.sort(pixels[:, 0] * shape[1] + pixels[:, 1])
-    number = _numbers(flat, shape)
-    pairs = [_neighbors(number, flat, shape, step) for step in ((0, 1), (1, -1), (1, 0), (1, 1))]
+    size = (shape[0] // scale, shape[1] // scale)
+    cells = _distinct(_around(clipped, SPOILED), size)
+    flat = cells[:, 0] * size[1] + cells[:, 1]
+    number = _numbers(flat, size)
+    pairs = [_neighbors(number, flat, size, step) for step in ((0, 1), (1, -1), (1, 0), (1, 1))]
     one = np.concatenate([np.flatnonzero(other >= 0) for other in pairs])
     two = np.concatenate([other[other >= 0] for other in pairs])
     label, before = np.arange(len(flat)), None
@@ -156,7 +157,11 @@ def _find_holes(clipped: Places, shape: tuple[int, int], scale: int) -> _Holes:
             np.minimum.at(label, place, low)
         label = label[label]
     roots, of = np.unique(label, return_inverse=True)
-    return _Holes(flat, of, len(roots), shape, scale)
+    within = np.stack(np.divmod(np.arange(scale**2), scale), axis=1)
+    pixels = (scale * cells[:, None] + within).reshape(-1, 2)
+    flat = pixels[:, 0] * shape[1] + pixels[:, 1]
+    order = np.argsort(flat)
+    return _Holes(flat[order], np.repeat(of, scale**2)[order], len(roots), shape, scale)
 
 
 def _fit_planes(holes: _Holes, diffuse: Array, gain: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
@@ -164,16 +169,13 @@ def _fit_planes(holes: _Holes, diffuse: Array, gain: Floats) -> tuple[Floats, Fl
 
     The rms ``[total, C]``, and whether a hole may be filled, ``[total]``.
     """
-    (height, width), reach = holes.shape, RING * holes.scale
+    width, reach = holes.shape[1], RING * holes.scale
     number = _numbers(holes.flat, holes.shape)
     edge = np.zeros(len(holes.flat), np.bool_)
     for step in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         edge |= _neighbors(number, holes.flat, holes.shape, step) < 0
-    near = _around(np.stack(np.divmod(holes.flat[edge], width), axis=1), reach)
-    inside = (near >= 0).all(axis=-1) & (near < (height, width)).all(axis=-1)
-    keys = (holes.of[edge][:, None] * height + near[..., 0]) * width + near[..., 1]
-    of, flat = np.divmod(np.unique(keys[inside]), height * width)
-    free = number[flat] < 0
+    flat, of = find_rings(holes.flat[edge], holes.of[edge], holes.shape, reach)
+    free = number[flat] == 0
     of, flat = of[free], flat[free]
     values = to_numpy(_take(diffuse, flat)) / gain
     count = np.bincount(of, minlength=holes.total)
@@ -207,54 +209,34 @@ def _solve_laplace(holes: _Holes, diffuse: Array, gain: Floats, start: Floats) -
     By conjugate gradients from a ``start``. Beyond the image's border there are no neighbours.
     """
     number, width, size = _numbers(holes.flat, holes.shape), holes.shape[1], len(holes.flat)
-    count, right = np.zeros((size, 1)), np.zeros_like(start)
-    links, padded = [], np.zeros((size + 1, start.shape[1]))  # the last row stands for what is no pixel of a hole
-    for down, across in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+    count, known = np.zeros(size), np.zeros_like(start)
+    links = np.empty((4, size), np.uint32)
+    for link, (down, across) in zip(links, ((0, 1), (0, -1), (1, 0), (-1, 0)), strict=True):
         other = _neighbors(number, holes.flat, holes.shape, (down, across))
-        links.append(np.where(other >= 0, other, size))
-        known = np.flatnonzero(other == _OUTSIDE)
-        right[known] += to_numpy(_take(diffuse, holes.flat[known] + down * width + across)) / gain
-        count[other != _BEYOND] += 1
-
-    def apply(x: Floats) -> Floats:
-        padded[:size] = x
-        changed = count * x
-        for link in links:
-            changed -= padded.take(link, axis=0)
-        return changed
-
-    x = start.copy()
-    rest = right - apply(x)
-    step, power = rest.copy(), float((rest**2).sum())
-    for _ in range(STEPS):
-        if not rest.size or np.abs(rest).max() <= TOLERANCE:
-            break
-        moved = apply(step)
-        length = power / max(float((step * moved).sum()), 1e-30)
-        x += length * step
-        rest -= length * moved
-        before, power = power, float((rest**2).sum())
-        step = rest + power / before * step
-    return np.maximum(x, 0)
+        link[:] = np.where(other >= 0, other, size)
+        beside = np.flatnonzero(other == _OUTSIDE)
+        known[beside] += to_numpy(_take(diffuse, holes.flat[beside] + down * width + across)) / gain
+        count += other != _BEYOND
+    return np.maximum(solve_laplace(links, count, known, start, (TOLERANCE, STEPS)), 0)
 
 
 #: Numbers of neighbours that are not pixels of holes: other pixels, and none.
 _OUTSIDE, _BEYOND = -1, -2
 
 
-def _numbers(flat: Places, shape: tuple[int, int]) -> Places:
-    """The number of each pixel of a hole at its place in an image, elsewhere -1."""
-    number = np.full(shape[0] * shape[1], _OUTSIDE, np.int64)
-    number[flat] = np.arange(len(flat))
+def _numbers(flat: Places, shape: tuple[int, int]) -> NDArray[np.int32]:
+    """The number of each pixel of a hole, from 1 on, at its place in an image; elsewhere 0, in memory never touched."""
+    number = np.zeros(shape[0] * shape[1], np.int32)
+    number[flat] = np.arange(1, len(flat) + 1)
     return number
 
 
-def _neighbors(number: Places, flat: Places, shape: tuple[int, int], step: tuple[int, int]) -> Places:
+def _neighbors(number: NDArray[np.int32], flat: Places, shape: tuple[int, int], step: tuple[int, int]) -> Places:
     """The numbers of the pixels one ``step`` (rows, columns) on; `_BEYOND` the image's border."""
     rows, cols = np.divmod(flat, shape[1])
     rows, cols = rows + step[0], cols + step[1]
     inside = (rows >= 0) & (rows < shape[0]) & (cols >= 0) & (cols < shape[1])
-    found: Places = np.where(inside, number[np.where(inside, rows * shape[1] + cols, 0)], _BEYOND)
+    found: Places = np.where(inside, number[np.where(inside, rows * shape[1] + cols, 0)] - 1, _BEYOND)
     return found
 
 
@@ -265,11 +247,13 @@ def _around(places: Places, reach: int) -> Places:
     return near
 
 
-def _grow(places: Places, shape: tuple[int, int], reach: int) -> Places:
-    """Places up to ``reach`` from some, inside of an image of that shape, each once."""
-    near = _around(places, reach).reshape(-1, 2)
-    near = near[(near >= 0).all(axis=1) & (near < shape).all(axis=1)]
-    return np.stack(np.divmod(np.unique(near[:, 0] * shape[1] + near[:, 1]), shape[1]), axis=1)
+def _distinct(places: Places, shape: tuple[int, int]) -> Places:
+    """Places ``[..., 2]`` inside of an image of that shape, each once and in reading order."""
+    rows, cols = places[..., 0], places[..., 1]
+    inside = (rows >= 0) & (rows < shape[0]) & (cols >= 0) & (cols < shape[1])
+    found = np.zeros(shape[0] * shape[1], np.bool_)
+    found[(rows * shape[1] + cols)[inside]] = True
+    return np.stack(np.divmod(np.flatnonzero(found), shape[1]), axis=1)
 
 
 def _sums(of: Places, values: NDArray[Any], count: int) -> Floats:

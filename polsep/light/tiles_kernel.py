@@ -69,9 +69,9 @@ def tile_raw(raw: RawFrame, layout: Layout, black_level: float, white_level: flo
     run_over_rows(partial(_sum_rows, as_samples(raw), period, sums), rows, 2)
     flat = sums.reshape(rows * cols, -1).astype(np.float64)
     place = np.stack(np.divmod(np.arange(rows * cols), cols), axis=1)
-    moments = flat[:, : size * size].reshape(-1, size, size)
-    upper = np.triu(moments)
-    return twin.keep_tiles(upper + np.triu(moments, 1).swapaxes(1, 2), flat[:, size * size : -1], flat[:, -1], place)
+    one, other = np.indices((size, size))
+    upper = size * np.minimum(one, other) + np.maximum(one, other)  # the kernel makes one half of these matrices
+    return twin.keep_tiles(flat[:, upper], flat[:, size * size : -1], flat[:, -1], place)
 
 
 def warm_up() -> None:

@@ -161,9 +161,10 @@ def clipped_share(samples: NDArray[Any], black_level: float, white: float) -> fl
     height = len(rows) // ROWS * ROWS
     every = SKIPPED if height >= LARGE else 1
     kept = rows[:height].reshape(-1, ROWS, rows.shape[-1])[::every] if height else rows
-    span = white - black_level
-    lit = int(np.count_nonzero(kept > black_level + LIT * span))
-    return int(np.count_nonzero(kept >= black_level + (1 - CLIP_MARGIN) * span)) / max(lit, 1)
+    lit, clip = (black_level + share * (white - black_level) for share in (LIT, 1 - CLIP_MARGIN))
+    if samples.dtype.kind == "u":  # whole numbers are compared in half of the time
+        lit, clip = math.floor(lit), math.ceil(clip)
+    return int(np.count_nonzero(kept >= clip)) / max(int(np.count_nonzero(kept > lit)), 1)
 
 
 def _depth_notes(samples: NDArray[Any], high: int) -> Notes:

@@ -1,4 +1,4 @@
-"""Kernels of `under_highlights`: the rings of holes, and the solution of Laplace's equation in them."""
+"""Kernels of `under_highlights`: holes, their rings, and the solution of Laplace's equation in them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,16 @@ Places = NDArray[np.int64]
 
 #: Products that are added up side by side.
 _LANES = 8
+
+
+def find_parts(flat: Places, number: NDArray[np.int32], width: int) -> tuple[Places, int]:
+    """The connected part, also over corners, that each place of an image belongs to, and how many there are.
+
+    ``flat [N]``: places, ascending, in an image of that ``width`` whose rows are joined; ``number``: their numbers from
+    1 on in that image, elsewhere 0. Parts are numbered in the order of their first places.
+    """
+    part, waiting = np.full(flat.size, -1, np.int64), np.empty(flat.size, np.int64)
+    return part, _spread_parts(flat, number, width, part, waiting)
 
 
 def find_rings(edge: Places, of: Places, shape: tuple[int, int], reach: int) -> tuple[Places, Places]:
@@ -48,9 +58,31 @@ def solve_laplace(
 def warm_up() -> None:
     """Load the kernels, or compile them."""
     place = np.zeros(1, np.int64)
+    find_parts(place, np.ones(1, np.int32), 1)
     find_rings(place, place, (2, 2), 1)
     for colors in (1, 3):
         solve_laplace(np.ones((4, 1), np.uint32), np.ones(1), np.ones((1, colors)), np.zeros((1, colors)), (0.0, 1))
+
+
+@entry
+def _spread_parts(flat: Any, number: Any, width: int, part: Any, waiting: Any) -> int:
+    """Fill ``part``, which is -1, from every place on that no part has reached; return how many parts there are."""
+    total, height = 0, number.size // width
+    for n in range(flat.size):
+        if part[n] >= 0:
+            continue
+        part[n], waiting[0], count = total, n, 1
+        while count > 0:
+            count -= 1
+            row, col = flat[waiting[count]] // width, flat[waiting[count]] % width
+            for i in range(max(row - 1, 0), min(row + 2, height)):
+                for j in range(max(col - 1, 0), min(col + 2, width)):
+                    other = number[i * width + j] - 1
+                    if other >= 0 and part[other] < 0:
+                        part[other], waiting[count] = total, other
+                        count += 1
+        total += 1
+    return total
 
 
 @entry

@@ -28,7 +28,7 @@ from polsep.compute.warm_up import make_ready
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import clip_level
 from polsep.separation import highlights_kernel
-from polsep.separation.highlights_kernel import find_rings, solve_laplace
+from polsep.separation.highlights_kernel import find_parts, find_rings, solve_laplace
 from polsep.separation.images import FrameImages
 
 Floats = NDArray[np.float64]
@@ -145,23 +145,12 @@ def _find_holes(clipped: Places, shape: tuple[int, int], scale: int) -> _Holes:
     size = (shape[0] // scale, shape[1] // scale)
     cells = _distinct(_around(clipped, SPOILED), size)
     flat = cells[:, 0] * size[1] + cells[:, 1]
-    number = _numbers(flat, size)
-    pairs = [_neighbors(number, flat, size, step) for step in ((0, 1), (1, -1), (1, 0), (1, 1))]
-    one = np.concatenate([np.flatnonzero(other >= 0) for other in pairs])
-    two = np.concatenate([other[other >= 0] for other in pairs])
-    label, before = np.arange(len(flat)), None
-    while before is None or not np.array_equal(before, label):  # the lowest number of a hole spreads, and its roots'
-        before, low = label, np.minimum(label[one], label[two])
-        label = label.copy()
-        for place in (one, two, before[one], before[two]):
-            np.minimum.at(label, place, low)
-        label = label[label]
-    roots, of = np.unique(label, return_inverse=True)
+    of, total = find_parts(flat, _numbers(flat, size), size[1])
     within = np.stack(np.divmod(np.arange(scale**2), scale), axis=1)
     pixels = (scale * cells[:, None] + within).reshape(-1, 2)
     flat = pixels[:, 0] * shape[1] + pixels[:, 1]
     order = np.argsort(flat)
-    return _Holes(flat[order], np.repeat(of, scale**2)[order], len(roots), shape, scale)
+    return _Holes(flat[order], np.repeat(of, scale**2)[order], total, shape, scale)
 
 
 def _fit_planes(holes: _Holes, diffuse: Array, gain: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:

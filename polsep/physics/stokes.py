@@ -115,9 +115,7 @@ def measure(stokes: Stokes, angles: Sequence[float]) -> Measurements:
 def _combine(weights: Doubles, data: Array) -> Array:
     """Sums ``[n, ..., C, H, W]`` over the analysers of ``[..., K, C, H, W]``, weighted by each row of ``[n, K]``."""
     matrix = constant(weights, data)
-    if isinstance(
-        data, np.ndarray
-    ):  # threads of BLAS go on waiting for work, for 30 ms, on other cores
+    if isinstance(data, np.ndarray):  # threads of BLAS go on waiting for work, for 30 ms, on other cores
         return np.einsum("nk,...kchw->n...chw", matrix, data, order="C")
     return namespace(data).tensordot(matrix, data, axes=([1], [-4]))
 

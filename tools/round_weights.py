@@ -2,8 +2,9 @@
 
 Of joint networks these are the layers that run in 8 bits where the processor multiplies those, and which compute the
 same there from rounded weights, and those that see the whole frame. Of others, layers of `LEAST` numbers or more but
-for the first and the last: small layers at high resolution cost most. docs/weights.md says what all this costs. A file
-that is rounded already stays as it is.
+for the first and the last: small layers at high resolution cost most. The largest layers, deep in a network where
+images are small, and all of smaller networks, take still fewer values, which wheels compress. docs/weights.md says
+what all this costs. A file that is rounded already stays as it is.
 """
 
 from __future__ import annotations
@@ -14,12 +15,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.store.weights import read_weights, write_weights
 
 #: Fewest numbers of a layer that is rounded where no ranges are known.
 LEAST = 30_000
+#: Fewest numbers of a layer that takes fewer values, and how many on each side of 0, by method.
+COARSE = {"joint-large": (130_000, 31), "paper": (200_000, 31), "material": (0, 15), "shape": (0, 7)}
 #: Parts of the names of first and last layers.
 ENDS = ("encoders.0.0.", "last.")
 
@@ -33,6 +37,13 @@ def names_to_round(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, st
     return {name for name in large if not any(end in name for end in ENDS)}
 
 
+def coarsened(array: NDArray[Any], count: int) -> NDArray[Any]:
+    """The array with ``count`` values on each side of 0 for each output, its first axis, up to the largest one."""
+    step = np.maximum(np.abs(array).max(axis=tuple(range(1, array.ndim)), keepdims=True), 1e-12) / count
+    found: NDArray[Any] = (np.round(array / step) * step).astype(np.float32)
+    return found
+
+
 def main(paths: list[str]) -> None:
     """Round and write."""
     for path in map(Path, paths):
@@ -41,6 +52,9 @@ def main(paths: list[str]) -> None:
             continue
         names, before = names_to_round(arrays, metadata), path.stat().st_size
         exact = metadata.pop("sha256")
+        large, count = COARSE.get(metadata["method"], (0, 0))
+        coarse = {name for name in names if count and arrays[name].size >= large}
+        arrays |= {name: coarsened(arrays[name], count) for name in coarse}
         write_weights(path, arrays, metadata | {"rounded_from": exact}, names)
         share = sum(arrays[name].size for name in names) / sum(array.size for array in arrays.values())
         print(f"{path}: {len(names)} arrays, {share:.0%} of the numbers, {before} to {path.stat().st_size} bytes")

@@ -221,5 +221,8 @@ def test_a_shape_is_found_and_relit(page: Any) -> None:
     inside.locator("canvas").click(position={"x": 60, "y": 60})
     assert inside.locator("canvas").evaluate("canvas => canvas.toDataURL()") != before
     assert "Expected error of normals" in page.locator("#ps-shape").inner_text()
+    tab(page, "Settings")
     choose(page, "ps-method", "analytic")
+    page.wait_for_function("document.querySelector('#ps-status').innerText.includes('analytic')")
+    tab(page, "Shape")
     page.wait_for_function("document.querySelectorAll('#ps-shape iframe').length === 0")

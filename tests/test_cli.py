@@ -545,8 +545,9 @@ def test_words_of_options_are_those_of_the_library() -> None:
     assert words("video", "--filter") == set(FILTERS) and words("video", "--engine") == set(ENGINES)
     assert words("edit", "--damaged") == words("video", "--damaged") == set(ON_DAMAGE)
     assert words("geometry", "--integration") == set(INTEGRATIONS)
+    assert words("shape", "--integration") == set(INTEGRATIONS)
     assert words("render", "--split") == set(splits)
-    assert words("train", "rung") == {*RUNGS, *NAMES, "material"}
+    assert words("train", "rung") == {*RUNGS, *NAMES, "material", "shape"}
 
 
 @pytest.mark.parametrize(

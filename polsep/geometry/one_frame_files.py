@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +55,7 @@ class ShapeSettings:
     a ``turntable``; and ``weights`` instead of the shipped ones."""
 
     read: ReadOptions = field(default_factory=ReadOptions)
-    method: str = "auto"
+    method: str = "joint"
     light_color: LightColor | str = "auto"
     lamp: tuple[float, ...] | None = None
     mask: Path | None = None
@@ -65,6 +67,8 @@ class ShapeSettings:
 
 def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list[str]]:
     """The files of the shape in a frame, and notes for the user. Raises ValueError."""
+    if settings.mesh != "none":  # torch comes with it, in a second beside the separation
+        threading.Thread(target=import_module, args=("polsep.geometry.surface",), daemon=True).start()
     frame, notes = _read_frame(path, settings)
     mask = None if settings.mask is None else _read_mask(settings.mask, frame.dolp.shape)
     try:
@@ -156,22 +160,11 @@ def page_of(found: Shape, title: str) -> bytes:
 
 
 def _page_maps(found: Shape) -> RelightMaps:
-    """Maps of a page: a square around the thing, at most `PAGE_SIDE` pixels wide, its albedo brightest at 1."""
-    window = square_around(found.mask)
-    albedo = np.broadcast_to(found.albedo, (*found.mask.shape, 3))
-    planes = [
-        *np.moveaxis(found.normals, -1, 0),
-        *np.moveaxis(albedo, -1, 0),
-        found.roughness,
-        found.specular,
-        found.mask,
-    ]
-    small = gather(np.stack(planes).astype(np.float32), window, min(window[2], PAGE_SIDE))
-    share = np.maximum(small[8], 1e-6)
-    normals = np.moveaxis(small[:3] / np.maximum(np.linalg.norm(small[:3], axis=0), 1e-6), 0, -1)
+    """Maps of a page, at most `PAGE_SIDE` pixels wide, the albedo brightest at 0.9."""
+    surface, share = in_square(found, PAGE_SIDE)
     gain = 0.9 / max(float(np.percentile(found.albedo[found.mask], 99)), 1e-9)
-    colors = np.moveaxis(small[3:6] / share * gain, 0, -1)
-    return RelightMaps(normals, colors, small[6] / share, small[7] / share, small[8] > 0.5)
+    normals, colors = (np.moveaxis(x, 0, -1) for x in (surface.normal, surface.albedo * gain))
+    return RelightMaps(normals, colors, surface.roughness[0], surface.specular[0], share > 0.5)
 
 
 class _Solid:
@@ -183,20 +176,16 @@ class _Solid:
         from polsep.geometry.surface import span_surface
 
         window = square_around(found.mask)
-        width = window[2]
-        side = min(width, MESH_SIDE)
-        planes = [*np.moveaxis(found.normals, -1, 0), *np.moveaxis(found.albedo, -1, 0), found.roughness, found.mask]
-        small = gather(np.stack(planes).astype(np.float32), window, side).astype(np.float64)
-        mask = small[-1] > 0.99
-        normals, albedo = np.moveaxis(small[:3], 0, -1), np.moveaxis(small[3:-2], 0, -1)
-        normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9) * mask[..., None]
+        surface, share = in_square(found, MESH_SIDE)
+        mask, side = share > 0.99, len(share)
+        normals, albedo = (np.moveaxis(x, 0, -1).astype(np.float64) * mask[..., None] for x in surface[:2])
         depth = INTEGRATIONS[integration](normals, mask)
         gain = 1 / max(float(np.percentile(albedo[mask], 99.5)), 1e-9)
         shown = np.minimum(albedo * gain, 1) * mask[..., None]
         self.surface = span_surface(Appearance(normals, np.broadcast_to(shown, (side, side, 3)), mask), depth)
         self.triangles = len(self.surface.faces)
         self.roughness = float(np.median(found.roughness[found.mask]))
-        self.depth = _enlarged(np.where(mask, depth, np.nan) * (width / side), window, found.mask)
+        self.depth = _enlarged(np.where(mask, depth, np.nan) * (window[2] / side), window, found.mask)
 
     def encode(self, name: str) -> bytes:
         """The mesh as a file."""
@@ -247,44 +236,54 @@ def _enlarged(depth: NDArray[np.float64], window: tuple[int, int, int], mask: Ma
     return found
 
 
+def in_square(found: Shape, side: int) -> tuple[Surface, Floats]:
+    """The surface ``[C, n, n]`` in the square around the thing, n at most ``side``, and its share of pixels ``[n, n]``.
+
+    Maps are means over the thing alone, where pixels are merged.
+    """
+    window = square_around(found.mask)
+    albedo = np.broadcast_to(found.albedo, (*found.mask.shape, 3))
+    planes = [*np.moveaxis(found.normals, -1, 0), *np.moveaxis(albedo, -1, 0), found.roughness, found.specular]
+    planes += [found.normal_error, found.roughness_error, found.specular_error, found.mask]
+    small = gather(np.stack(planes).astype(np.float32), window, min(window[2], side))
+    share = small[-1]
+    maps = small[:-1] / np.maximum(share, 1e-6)
+    normal = maps[:3] / np.maximum(np.linalg.norm(maps[:3], axis=0), 1e-6)
+    return Surface(normal, maps[3:6], *(maps[k : k + 1] for k in range(6, 11))), share
+
+
 def draw_panels(frame: SeparatedFrame, found: Shape) -> list[Sequence[Panel]]:
-    """Rows of pictures: the frame and its surface; how sure it is, and the thing under other lamps."""
-    mask = found.mask
-    s0, around = frame.diffuse + frame.specular, square_around(mask)
-    light = exposure_of(s0[mask])
+    """Rows of pictures: the frame and its surface; the thing under other lamps."""
+    surface, share = in_square(found, CELL)
+    there, mask = share > 0.5, found.mask
+    images = np.concatenate([frame.diffuse + frame.specular, frame.specular], axis=-1)
+    small = gather(np.moveaxis(images, -1, 0), square_around(mask), len(share))
+    seen, mirrored = (np.broadcast_to(x, (3, *share.shape)) for x in np.split(small, 2))
 
-    def cell(image: NDArray[Any], gain: float | None) -> Pixels:
-        planes = np.moveaxis(np.broadcast_to(image if image.ndim == 3 else image[..., None], (*mask.shape, 3)), -1, 0)
-        small = gather(np.concatenate([planes, mask[None]]).astype(np.float32), around, min(CELL, around[2]))
-        picture = np.moveaxis(small[:3], 0, -1)
+    def cell(planes: NDArray[Any], gain: float | None = None) -> Pixels:
+        picture = np.moveaxis(np.broadcast_to(planes, (3, *share.shape)), 0, -1)
         shown = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8) if gain is None else toned(picture, gain)
-        return _fit(_on_grey(shown, small[3] > 0.5))
+        return _fit(_on_grey(shown, there))
 
-    albedo_gain = 0.9 / max(float(np.percentile(found.albedo[mask], 99)), 1e-9)
-    known = found.roughness_error < UNKNOWN
-    first = [
-        Panel("Frame", "", cell(s0, light)),
-        Panel("Normals", "red right, green up", cell((found.normals + 1) / 2, None)),
-        Panel("Albedo", "relative", cell(found.albedo, albedo_gain)),
-        Panel("Roughness", "white 1, black unknown", cell(np.where(known, found.roughness, 0), None)),
+    albedo_gain = 0.9 / max(float(np.percentile(surface.albedo[:, there], 99)), 1e-9)
+    lamps = [np.array(lamp, np.float32) / np.float32(np.linalg.norm(lamp)) for lamp in LAMPS.values()]
+    relit = np.stack([relight(surface, lamp) for lamp in lamps])
+    gain = exposure_of(relit[..., there])
+    roughness = np.where(surface.roughness_error < UNKNOWN, surface.roughness, 0)
+    error = np.degrees(surface.normal_error) / LARGEST_DEG
+    return [
+        [
+            Panel("Frame", "", cell(seen, exposure_of(seen[:, there]))),
+            Panel("Normals", "red right, green up", cell((surface.normal + 1) / 2)),
+            Panel("Albedo", "relative", cell(surface.albedo, albedo_gain)),
+            Panel("Roughness", "white 1, black unknown", cell(roughness)),
+            Panel("Expected error", f"white {LARGEST_DEG:g} deg", cell(error)),
+        ],
+        [
+            *(Panel("Relit", name, cell(picture, gain)) for name, picture in zip(LAMPS, relit, strict=True)),
+            Panel("Specular", "as separated", cell(mirrored, exposure_of(mirrored[:, there]))),
+        ],
     ]
-    relit = relit_pictures(found, [np.array(lamp) / np.linalg.norm(lamp) for lamp in LAMPS.values()])
-    gain = exposure_of(relit[:, mask])
-    second = [Panel("Relit", name, cell(picture, gain)) for name, picture in zip(LAMPS, relit, strict=True)]
-    error = np.degrees(found.normal_error) / LARGEST_DEG
-    first.append(Panel("Expected error", f"white {LARGEST_DEG:g} deg", cell(error, None)))
-    second.append(Panel("Specular", "as separated", cell(frame.specular, exposure_of(frame.specular[mask]))))
-    return [first, second]
-
-
-def relit_pictures(found: Shape, lamps: Sequence[NDArray[np.float64]]) -> Floats:
-    """Pictures ``[K, h, w, 3]`` of a shape under far lamps in unit directions, without shadows."""
-    planes = [np.moveaxis(np.broadcast_to(found.albedo, (*found.mask.shape, 3)), -1, 0)]
-    planes += [x[None] for x in (found.roughness, found.specular)]
-    albedo, roughness, specular = (np.asarray(x, np.float32) for x in planes)
-    none = np.zeros_like(roughness)
-    surface = Surface(np.moveaxis(found.normals, -1, 0), albedo, roughness, specular, none, none, none)
-    return np.stack([np.moveaxis(relight(surface, lamp.astype(np.float32)), 0, -1) for lamp in lamps])
 
 
 def _on_grey(picture: Pixels, there: Mask) -> Pixels:

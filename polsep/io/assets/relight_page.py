@@ -46,7 +46,7 @@ def encode_relight_page(maps: RelightMaps, title: str, lamp: Sequence[float]) ->
     page = files("polsep.io.assets").joinpath("relight.html").read_text("utf-8")
     for name, image in textures.items():
         pixels = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
-        page = page.replace(f"__{name}__", "data:image/png;base64," + base64.b64encode(encode_png(pixels)).decode())
+        page = page.replace(f"__{name}__", "data:image/png;base64," + base64.b64encode(encode_png(pixels, 3)).decode())
     words = {
         "SIDE": str(len(maps.mask)),
         "LAMP": ", ".join(f"{x:.5f}" for x in lamp),

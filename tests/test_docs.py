@@ -90,7 +90,7 @@ def check_command(words: list[str]) -> None:
     else:
         command = app.get_command(click.Context(app), words[1])
         assert command is not None, f"no command {words[1]}"
-        context = command.make_context(words[1], words[2:])
+        context = command.make_context(words[1], words[2:], **app.context_settings)
         if words[1] == "bench":
             assert context.params["name"] in {*polsep.bench.BENCHES, "list", "readme"}
 

@@ -254,11 +254,11 @@ def test_digests_change_with_any_source(monkeypatch: pytest.MonkeyPatch) -> None
 )
 def test_commands_are_described_as_click_reads_them(asked: list[str]) -> None:
     """What is left to defaults is written out."""
-    given = cli.train.train.make_context("train", list(asked)).params
+    given = cli.train.train.make_context("train", list(asked), **cli.app.context_settings).params
     options, run = plan(given)
     words = shlex.split(describe_command(options, run))
     assert words[:2] == ["polsep", "train"]
-    read = cli.train.train.make_context("train", words[2:]).params
+    read = cli.train.train.make_context("train", words[2:], **cli.app.context_settings).params
     assert {name: value for name, value in read.items() if given[name] is not None} == {
         name: value for name, value in given.items() if value is not None
     }

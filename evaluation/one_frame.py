@@ -252,7 +252,7 @@ def measure(data: Path, names: Sequence[str] | None = None) -> Iterator[Row]:
                     continue
                 value = statistics.fmean(row[metric] for row in rows if metric in row)
                 case, unit = f"{len(rows)} {kind} things", UNITS.get(metric, "deg")
-                yield Row("shape/one frame", case, method, metric, value, unit)
+                yield Row("shape/normals", case, method, metric, value, unit)
     yield from _expected(tenths)
 
 

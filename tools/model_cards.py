@@ -68,7 +68,7 @@ _KINDS = {
         "One dielectric thing under one polarized lamp within some 45 degrees of the camera; detail below a hundredth "
         "of the thing is lost (docs/shape.md).",
         "shape",
-        "shape/one frame",
+        "shape/normals",
     ),
 }
 

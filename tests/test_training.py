@@ -221,10 +221,16 @@ def test_digests_cover_every_module_that_makes_examples() -> None:
     """Optics, Stokes algebra, sensor and all of the renderer; of the package, nothing that only trains."""
     drawn, separated = find_sources("polsep.train.stream"), find_sources("polsep.material.examples")
     render = {f"polsep.render.{path.stem}" for path in Path(polsep.__file__).parent.glob("render/*.py")}
-    unused = {"polsep.render.__init__", "polsep.render.distances"}  # the demo's scenes
+    unused = {
+        "polsep.render.__init__",
+        "polsep.render.distances",
+        "polsep.render.blobs",
+    }  # the demo's scenes; for shape
     common = {"polsep.physics.optics", "polsep.physics.stokes", "polsep.sensor.camera"}
     assert common | (render - unused) | {"polsep.train.variety", "polsep.train.reality"} <= set(drawn)
     assert common | {"polsep.material.shots", "polsep.demosaic.guided"} <= set(separated)
+    shaped = find_sources("polsep.train.shape_examples")
+    assert common | {"polsep.render.blobs", "polsep.train.reality", "polsep.separation.report"} <= set(shaped)
     thumbnail = {f"polsep.networks.{name}" for name in ("channels", "thumbnails", "whole_frame")}
     other = {name for name in drawn if name.startswith(("polsep.networks", "polsep.separation", "polsep.train.t"))}
     assert other == thumbnail

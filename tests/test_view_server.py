@@ -140,6 +140,8 @@ def test_a_large_upload_is_refused_at_once(viewer: str) -> None:
             "Content-Type: multipart/form-data; boundary=x\r\n\r\n".encode()
         )
         answer = line.recv(4096)
+        while b"MB" not in answer and (more := line.recv(4096)):  # the body may come after the head
+            answer += more
     assert answer.startswith(b"HTTP/1.1 413") and b"expected a file of at most 16 MB" in answer
     head = b'--x\r\nContent-Disposition: form-data; name="files"; filename="a.png"\r\n\r\n'
     body = head + bytes((LIMIT_MB << 20) + 1) + b"\r\n--x--\r\n"

@@ -68,8 +68,9 @@ def draw_shape(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
         path = folder / f"{subject.name}.jpg"
         write_jpeg(path, draw_thing(subject, number))
         yield path
-        replace_bytes(page := folder / f"{subject.name}.html", relight_thing(subject, number))
-        yield page
+        if subject.name == SHOWN[0]:
+            replace_bytes(page := folder / f"{subject.name}.html", relight_thing(subject, number))
+            yield page
 
 
 def _measure_shape(data: Path, names: Sequence[str] | None) -> Iterator[Row]:

@@ -49,8 +49,8 @@ LARGEST_DEG, DISTANCES = 45.0, (0.7, 1.4)
 LAMP_DISTANCE = 8.0
 #: Networks of other inputs, trained like the shipped one.
 WEIGHTS = Path(__file__).parent / "weights" / "shape"
-#: Lamps of relit pictures, and their seed. Angles between azimuths that count as a flip.
-LAMPS, LAMP_SEED, FLIP_DEG = 20, 77, 90.0
+#: Lamps of relit pictures, and their seed; zenith [degrees] from which on an azimuth turned by more than 90 is a flip.
+LAMPS, LAMP_SEED, STEEP_DEG = 20, 77, 30.0
 
 
 class Truth(NamedTuple):
@@ -187,7 +187,7 @@ def score(found: Surface, truth: Surface, mask: Floats) -> dict[str, float]:
     inside = mask[0] > 0
     cosine = (found.normal * truth.normal).sum(axis=0)[inside]
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    steep = truth.normal[2][inside] < math.cos(math.radians(30))
+    steep = truth.normal[2][inside] < math.cos(math.radians(STEEP_DEG))
     across = (found.normal[:2] * truth.normal[:2]).sum(axis=0)[inside][steep]
     rough = np.abs(np.log(found.roughness[0][inside] / truth.roughness[0][inside]))
     known = found.roughness_error[0][inside] < UNKNOWN

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
@@ -27,7 +28,6 @@ from test_geometry import cap
 import polsep
 from polsep.geometry import one_frame
 from polsep.geometry.one_frame import SIDE, ShapeEstimator, gather, shape, spread, square_around
-from polsep.geometry.one_frame_files import doubts
 from polsep.geometry.polarization import Cue, choose_outward
 from polsep.geometry.shape_maps import INPUTS, USUAL, Seen, Surface, decode, encode, projected_normal
 from polsep.io.results.exr import read_exr_layers
@@ -224,7 +224,10 @@ def test_the_shipped_network_finds_a_sphere() -> None:
     """Normals of an unseen sphere, its expected errors, and an albedo without its shading."""
     frame = sphere_frame()
     normals, mask = cap(64, 80)
-    found = polsep.shape(frame, mask, (0.0, 0.0, 1.0))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = polsep.shape(frame, mask, (0.0, 0.0, 1.0))
+    assert [str(note.message) for note in said] == found.doubts()
     angle = angles_deg(
         torch.from_numpy(found.normals).movedim(-1, 0)[None], torch.from_numpy(normals).movedim(-1, 0)[None]
     )
@@ -289,8 +292,8 @@ def test_a_frame_that_is_full_is_said() -> None:
         one > 0,
         (0, 0, 1),
     )
-    assert any("--mask" in line for line in doubts(found))
-    assert doubts(replace(found, mask=cap(64, 80)[1])) == []
+    assert any("(mask)" in line for line in found.doubts())
+    assert replace(found, mask=cap(64, 80)[1]).doubts() == []
 
 
 def test_specks_and_lines_are_not_the_thing() -> None:
@@ -327,7 +330,7 @@ def test_a_file_becomes_maps_and_a_mesh(run: Cli, tmp_path: Path) -> None:
     names = ["ball.exr", "ball_normals.png", "ball.glb", "ball.png", "ball.html", "ball.json"]
     assert (done.status, done.out.split()) == (0, [str(out / name) for name in names]), done
     planes = read_exr_layers(out / "ball.exr")
-    found = shape(polsep.read_separated(path), light=(0.0, 0.0, 1.0))
+    found = one_frame.find_shape(polsep.read_separated(path), None, (0.0, 0.0, 1.0), None)
     np.testing.assert_allclose(planes["normal.X"], found.normals[..., 0], atol=1e-6)
     np.testing.assert_allclose(planes["normal_error.Y"], np.degrees(found.normal_error), rtol=1e-5)
     assert np.isfinite(planes["depth.Z"]).all() and np.ptp(planes["depth.Z"][found.mask]) > 10
@@ -336,6 +339,22 @@ def test_a_file_becomes_maps_and_a_mesh(run: Cli, tmp_path: Path) -> None:
         name.split(".")[0] for name in planes
     }
     assert_refused(run(path, "-o", out), "--overwrite")
+
+
+def test_the_lamp_of_a_separated_file_is_read_beside_it(run: Cli, tmp_path: Path) -> None:
+    """A tinted lamp whose colour the sidecar names is divided out: the same normals; without one, a line says so."""
+    frame, tint = sphere_frame(), np.array([0.5, 1.0, 0.7], np.float32)
+    tinted = replace(frame, diffuse=frame.diffuse * tint, report={"warnings": [], "light_color": tint.tolist()})
+    tinted = replace(tinted, error=frame.error * tint.mean())
+    planes = []
+    for name, one in (("white", frame), ("tinted", tinted)):
+        path = write_separation(one, tmp_path, name)[0]
+        assert run(path, "-o", tmp_path / "out", "--mesh", "none").status == 0
+        planes.append(read_exr_layers(tmp_path / "out" / f"{name}.exr"))
+    np.testing.assert_allclose(planes[1]["normal.X"], planes[0]["normal.X"], atol=1e-3)
+    (tmp_path / "tinted.json").unlink()
+    alone = run(tmp_path / "tinted.exr", "-o", tmp_path / "other", "--mesh", "none")
+    assert alone.status == 0 and "colour is not known" in alone.err
 
 
 def test_a_mesh_is_left_out_on_request(run: Cli, tmp_path: Path) -> None:

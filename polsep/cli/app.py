@@ -204,7 +204,7 @@ EXTRAS = {
     "render": ("embreex", "numba", "scipy", "torch"),
     "ray": ("ray",),
     "video": ("av",),
-    "train": ("embreex", "lightning_fabric", "numba", "tensorboard", "torch"),
+    "train": ("embreex", "lightning_fabric", "numba", "skimage", "tensorboard", "torch"),
     "export": ("onnx", "onnxscript", "torch"),
     "view": ("gradio",),
     "photos": ("cv2", "rawpy"),

@@ -87,6 +87,7 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
         require_extra("video")
     require_paths(*files, *filter(None, [options["mask"]]))
     from polsep.geometry.lights import parse_lights
+    from polsep.io.assets.maps import read_object
     from polsep.io.assets.shapes import shape_targets, write_shape
     from polsep.io.store.atomic import refuse_existing, refuse_inputs
     from polsep.methods import check_method
@@ -104,7 +105,6 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
         Source,
         find_object,
         find_shape,
-        read_object,
         read_views,
         shrink,
     )

@@ -127,18 +127,6 @@ def _require_one_shape(paths: Sequence[Path], images: Sequence[NDArray[Any]]) ->
             raise input_error(path, "expected finite light, found NaN or infinite samples")
 
 
-def read_object(path: Path, size: tuple[int, int]) -> Mask:
-    """The mask ``[H, W]`` of a file of that size, or of twice that: raw frames become half as large."""
-    found: Mask = np.asarray(read_map(path, "mask") > 0.5)
-    if found.shape == (2 * size[0], 2 * size[1]):
-        found = found.reshape(size[0], 2, size[1], 2).min(axis=(1, 3))
-    if found.shape != size:
-        raise input_error(path, f"expected a mask of {list(size)}, found {list(found.shape)}")
-    if not found.any():
-        raise input_error(path, "expected a mask that holds pixels, found none")
-    return found
-
-
 def shrink(views: Views, mask: Mask, longest: int) -> tuple[Views, Mask]:
     """Means over square blocks, so that no side exceeds ``longest``; the mask keeps blocks entirely on the object."""
     factor = -(-max(mask.shape) // longest)

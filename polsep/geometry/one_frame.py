@@ -8,6 +8,7 @@ task without training.
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,6 +22,8 @@ from polsep.geometry.shape_maps import INPUTS, Seen, Surface, decode, encode
 from polsep.io.store.weights import read_weights, shipped_weights
 from polsep.networks.graphs import core, require_own_threads, shape_model
 from polsep.networks.sizes import ResidualSize
+from polsep.pipeline import PolsepWarning
+from polsep.separation.highlights_kernel import find_parts
 from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float32]
@@ -36,6 +39,9 @@ BLOCK = 8
 SMALLEST_PART = 0.01
 #: Expected error of ln(roughness), and of ln(strength), from which on they count as unknown.
 UNKNOWN = 0.5
+#: Share of the frame's border on the thing from which on the mask is probably wrong; expected error of normals
+#: [degrees], in the median, from which on they are called uncertain.
+FILLED, UNCERTAIN_DEG = 0.2, 15.0
 
 
 @dataclass(frozen=True)
@@ -63,6 +69,24 @@ class Shape:
         share, error = float(self.mask.mean()), float(np.degrees(np.median(self.normal_error[self.mask])))
         size = list(self.mask.shape)
         return f"Shape(normals {size}, {share:.0%} on the thing, expected error {error:.1f} degrees in the median)"
+
+    def doubts(self) -> list[str]:
+        """Lines on what the network does not know, or what it was not made for."""
+        inside = self.mask
+        unknown = float((self.roughness_error[inside] >= UNKNOWN).mean())
+        error = float(np.degrees(np.median(self.normal_error[inside])))
+        border = float(np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]]).mean())
+        notes = []
+        if border > FILLED:
+            notes.append(
+                f"one thing before a dark ground was expected, found light on {border:.0%} of the frame's border: say "
+                "where the thing is (mask)"
+            )
+        if unknown > 0.5:
+            notes.append(f"the roughness of {unknown:.0%} of the thing is unknown: no highlight shows it")
+        if error > UNCERTAIN_DEG:
+            notes.append(f"normals are uncertain: {error:.0f} degrees are expected in the median")
+        return notes
 
 
 class ShapeEstimator:
@@ -98,12 +122,20 @@ def shape(
     light: Sequence[float] | None = None,
     weights: Path | None = None,
 ) -> Shape:
-    """Find the surface of the thing in a frame that `polsep.separate` separated.
+    """Find the surface of the thing in a frame that `polsep.separate` separated; its `doubts` are issued as warnings.
 
     ``mask [h, w]``: where the thing is; None: where light falls (`find_thing`). ``light``: x, y, z toward the lamp,
     x right, y up, z to the camera; None: not known, as beside the camera it need not be. Raises ValueError on masks of
     another size or without pixels, and on frames without polarization.
     """
+    found = find_shape(frame, mask, light, weights)
+    for note in found.doubts():
+        warnings.warn(note, PolsepWarning, stacklevel=2)
+    return found
+
+
+def find_shape(frame: SeparatedFrame, mask: Mask | None, light: Sequence[float] | None, weights: Path | None) -> Shape:
+    """`shape` without warnings."""
     chosen = find_thing(frame) if mask is None else np.asarray(mask, bool)
     if chosen.shape != frame.dolp.shape or not chosen.any():
         raise ValueError(
@@ -178,27 +210,21 @@ def find_thing(frame: SeparatedFrame) -> Mask:
     height, width = bright.shape
     padded = np.pad(bright, ((0, -height % BLOCK), (0, -width % BLOCK)), "edge")
     solid = _large_parts(block_means(padded.astype(np.float32), BLOCK) > 0.5)
-    near = _widest(solid.astype(np.int64)) > 0
+    around = np.pad(solid, 1)
+    rows = around[:-2] | around[1:-1] | around[2:]
+    near = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
     found: Mask = bright & near.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[:height, :width]
     return found if found.any() else bright
 
 
-def _widest(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The largest of each cell and its eight neighbours."""
-    padded = np.pad(cells, 1)
-    rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
-    return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
-
-
 def _large_parts(solid: Mask) -> Mask:
-    """The connected parts with at least `SMALLEST_PART` of all cells; every cell takes its part's largest number."""
-    label = np.where(solid, np.arange(1, solid.size + 1).reshape(solid.shape), 0)
-    while ((wider := np.where(solid, _widest(label), 0)) != label).any():
-        label = wider
-    counts = np.bincount(label.reshape(-1))
-    counts[0] = 0
-    large: Mask = counts[label] >= max(SMALLEST_PART * counts.sum(), 1)
-    return large
+    """The connected parts with at least `SMALLEST_PART` of all cells."""
+    flat, number = np.flatnonzero(solid), np.zeros(solid.size, np.int32)
+    number[flat] = np.arange(1, flat.size + 1)
+    part, _ = find_parts(flat, number, solid.shape[1])
+    large = np.zeros(solid.size, np.bool_)
+    large[flat] = np.bincount(part)[part] >= SMALLEST_PART * flat.size if flat.size else False
+    return large.reshape(solid.shape)
 
 
 def images_of(frame: SeparatedFrame, mask: Mask) -> Floats:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from importlib import import_module
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.geometry.one_frame import SIDE, UNKNOWN, Shape, gather, shape, square_around
+from polsep.geometry.one_frame import SIDE, UNKNOWN, Shape, find_shape, gather, square_around
 from polsep.geometry.shape_maps import Surface, relight
-from polsep.io.assets.maps import read_map
+from polsep.io.assets.maps import read_object
 from polsep.io.assets.relight_page import RelightMaps, encode_relight_page
 from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
 from polsep.io.raw.frames import ReadOptions, read_frames, refuse_forgotten
 from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
 from polsep.io.results.separation_reader import SUFFIXES, read_separated
+from polsep.io.results.sidecars import read_report
 from polsep.io.store.errors import input_error
 from polsep.pipeline import LightColor, separate_capture
 from polsep.separation.report import SeparatedFrame
@@ -40,8 +39,6 @@ LAMPS = {
     "lamp above": (0.0, 0.75, 0.65),
     "lamp below": (0.0, -0.75, 0.65),
 }
-#: Share of the frame's border on the thing, from which on the mask is probably wrong.
-FILLED = 0.2
 #: Errors of normals [degrees] that are white in the preview.
 LARGEST_DEG = 30.0
 #: Colour around the thing in the preview.
@@ -67,21 +64,23 @@ class ShapeSettings:
 
 def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list[str]]:
     """The files of the shape in a frame, and notes for the user. Raises ValueError."""
-    if settings.mesh != "none":  # torch comes with it, in a second beside the separation
-        threading.Thread(target=import_module, args=("polsep.geometry.surface",), daemon=True).start()
     frame, notes = _read_frame(path, settings)
-    mask = None if settings.mask is None else _read_mask(settings.mask, frame.dolp.shape)
+    mask = None if settings.mask is None else read_object(settings.mask, frame.dolp.shape)
     try:
-        found = shape(frame, mask, settings.lamp, settings.weights)
+        found = find_shape(frame, mask, settings.lamp, settings.weights)
     except ValueError as error:
         raise input_error(path, error) from error
-    return shape_files(frame, found, settings, path.stem), notes + doubts(found)
+    return shape_files(frame, found, settings, path.stem), notes + found.doubts()
 
 
 def _read_frame(path: Path, settings: ShapeSettings) -> tuple[SeparatedFrame, list[str]]:
     """A separated frame, and what was said about it."""
     if path.suffix.lower() in SUFFIXES:
-        return read_separated(path), []
+        frame = replace(read_separated(path), report=read_report(path.with_suffix(".json")))
+        notes = list(frame.report.get("warnings", ()))
+        if "light_color" not in frame.report:
+            notes.append(f"the lamp's colour is not known without {path.stem}.json beside the file: taken for white")
+        return frame, notes
     frames = list(read_frames(path, settings.read))
     if len(frames) != 1:
         raise input_error(path, f"expected one frame, found {len(frames)}")
@@ -91,35 +90,6 @@ def _read_frame(path: Path, settings: ShapeSettings) -> tuple[SeparatedFrame, li
     except (ValueError, RuntimeError) as error:
         raise input_error(path, error) from error
     return frame, [*frames[0].notes, *frame.report["warnings"]]
-
-
-def _read_mask(path: Path, size: tuple[int, ...]) -> Mask:
-    """The mask of a file of that size, or of twice that, as raw frames have."""
-    found: Mask = np.asarray(read_map(path, "mask") > 0.5)
-    if found.shape == (2 * size[0], 2 * size[1]):
-        found = found.reshape(size[0], 2, size[1], 2).min(axis=(1, 3))
-    if found.shape != size or not found.any():
-        raise input_error(path, f"expected a mask of {list(size)} that holds pixels, found {list(found.shape)}")
-    return found
-
-
-def doubts(found: Shape) -> list[str]:
-    """Lines on what the network does not know."""
-    inside = found.mask
-    unknown = float((found.roughness_error[inside] >= UNKNOWN).mean())
-    error = float(np.degrees(np.median(found.normal_error[inside])))
-    border = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
-    notes = []
-    if border.mean() > FILLED:
-        notes.append(
-            f"one thing before a dark ground was expected, found light on {border.mean():.0%} of the frame's border: "
-            "say where the thing is (--mask)"
-        )
-    if unknown > 0.5:
-        notes.append(f"the roughness of {unknown:.0%} of the thing is unknown: no highlight shows it")
-    if error > LARGEST_DEG / 2:
-        notes.append(f"normals are uncertain: {error:.0f} degrees are expected in the median")
-    return notes
 
 
 def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, title: str) -> ShapeFiles:
@@ -196,12 +166,12 @@ class _Solid:
 
     def draw(self) -> Sequence[Panel]:
         """A row of pictures of the mesh."""
+        from polsep.geometry.files import VIEWS
         from polsep.geometry.surface import draw_views
 
-        places = ((-50.0, 5.0), (-20.0, 10.0), (20.0, 10.0), (50.0, 5.0))
-        pictures = np.stack(list(draw_views(self.surface, CELL, places)))
+        pictures = np.stack(list(draw_views(self.surface, CELL, VIEWS)))
         gain = exposure_of(pictures[pictures.sum(axis=-1) > 0])
-        sides = [f"{abs(a):g} deg {'left' if a < 0 else 'right'}" for a, _ in places]
+        sides = [f"{abs(a):g} deg {'left' if a < 0 else 'right'}" for a, _ in VIEWS]
         return [
             Panel("Mesh", side, _on_grey(toned(x, gain), x.sum(axis=-1) > 0))
             for side, x in zip(sides, pictures, strict=True)

@@ -352,17 +352,15 @@ def exposure_panel(frame: SeparatedFrame, found: Histogram | None) -> str:
 
 def shape_panel(frame: SeparatedFrame, stem: str) -> str:
     """The surface of a frame's thing on a page of its own, and how sure it is. Raises ValueError."""
-    from polsep.geometry.one_frame import UNKNOWN, shape
+    from polsep.geometry.one_frame import find_shape
     from polsep.geometry.one_frame_files import page_of
 
-    surface = shape(frame)
+    surface = find_shape(frame, None, None, None)
     error = float(np.degrees(np.median(surface.normal_error[surface.mask])))
-    unknown = float((surface.roughness_error[surface.mask] >= UNKNOWN).mean())
-    page = html.escape(page_of(surface, stem).decode(), quote=True)
-    text = f"Expected error of normals {error:.0f}° in the median; roughness unknown on {unknown:.0%} of the thing."
-    title = f"Relit {html.escape(stem)}"
+    page, title = html.escape(page_of(surface, stem).decode(), quote=True), f"Relit {html.escape(stem)}"
     window = f'<iframe class="ps-relit" title="{title}" sandbox="allow-scripts" srcdoc="{page}"></iframe>'
-    return f'{window}<p class="ps-hint">{text}</p>'
+    remarks = "".join(f'<div class="ps-remark">{html.escape(line)}</div>' for line in surface.doubts())
+    return f'{window}<p class="ps-hint">Expected error of normals {error:.0f}° in the median.</p>{remarks}'
 
 
 def light_panel(frame: SeparatedFrame, small: Small) -> str:

@@ -55,6 +55,21 @@ def read_map(path: Path, kind: str) -> Floats:
     return kept
 
 
+def read_object(path: Path, size: tuple[int, ...]) -> NDArray[np.bool_]:
+    """The mask ``[H, W]`` of a thing, in a file of that size, or of twice that: raw frames become half as large.
+
+    Raises InputError.
+    """
+    found: NDArray[np.bool_] = np.asarray(read_map(path, "mask") > 0.5)
+    if found.shape == (2 * size[0], 2 * size[1]):
+        found = found.reshape(size[0], 2, size[1], 2).min(axis=(1, 3))
+    if found.shape != size:
+        raise input_error(path, f"expected a mask of {list(size)}, found {list(found.shape)}")
+    if not found.any():
+        raise input_error(path, "expected a mask that holds pixels, found none")
+    return found
+
+
 def hash_map(path: Path) -> str:
     """The sha256 of a file. Raises InputError."""
     with naming(path):

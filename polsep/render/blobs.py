@@ -1,7 +1,8 @@
 """Random smooth bodies: ellipsoids that grow out of each other and melt together, with bumps, as a closed mesh.
 
 Unions of solids (`render.shapes`) meet in creases; animals, figures and fruits do not. A body is the zero level of the
-smooth minimum of distances to ellipsoids (Quilez 2013), displaced by random waves, and is meshed by marching cubes.
+smooth minimum of distances to ellipsoids (Quilez 2013), displaced by random waves and folds, and is meshed by marching
+cubes. Half of them stand, +y up, on a foot that is cut flat, as figures do.
 
 Conventions are those of `render.shapes`: centred, about as large as an average random shape. Slots are the patches of a
 random Voronoi diagram, so that a body has several materials. Needs the extra ``train``.
@@ -9,45 +10,35 @@ random Voronoi diagram, so that a body has several materials. Needs the extra ``
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-
 import numpy as np
 import torch
 
 from polsep.render.materials import USUAL_SIZE
 from polsep.render.shapes import Floats, Integers, Mesh
+from polsep.render.waves import Draw, bumps, draw_one, draw_way, drawn_from, folds
 
 #: Number of ellipsoids, and semi-axes of the first and, relative to the one that they grow out of, of the others.
 PARTS, FIRST_AXES, OTHER_AXES = (1, 10), (0.5, 1.1), (0.2, 1.0)
 #: Width over which parts melt together, relative to the first one's mean axis; small ones leave creases.
 MELTING = (0.02, 0.35)
-#: Waves of the bumps, their largest wavelength and height, log-uniform, relative to the body.
-WAVES, WAVELENGTHS, HEIGHTS = 12, (0.08, 1.2), (0.001, 0.06)
+#: Shares of bodies with folds, and of those that stand; share of the height that is cut off below these.
+FOLDED_SHARE, STANDING_SHARE, CUT_OFF = 0.35, 0.5, (0.03, 0.35)
 #: Cells along the longest side of the grid, and its margin around the parts.
-CELLS, MARGIN = 88, 0.35
+CELLS, MARGIN = 96, 0.35
 #: Number of patches.
 PATCHES = (1, 7)
-
-#: Random numbers between two bounds, of a shape.
-Draw = Callable[..., Floats]
 
 
 def random_blob(generator: torch.Generator) -> Mesh:
     """Return a random body. Source of the smooth minimum: Quilez 2013, "smooth minimum", exponential form."""
     from skimage.measure import marching_cubes
 
-    def draw(low: float, high: float, *shape: int) -> Floats:
-        numbers = torch.rand(*(shape or (1,)), generator=generator, dtype=torch.float64)
-        found: Floats = (low + (high - low) * numbers).numpy()
-        return found
-
+    draw = drawn_from(generator)
     count = int(torch.randint(PARTS[0], PARTS[1] + 1, (1,), generator=generator))
     axes, turns, centers = [draw(*FIRST_AXES, 3)], [_turn(draw(-1, 1, 4))], [np.zeros(3)]
     for _ in range(count - 1):
         root = int(torch.randint(len(axes), (1,), generator=generator))
-        way = draw(-1, 1, 3)
-        way = way / max(float(np.linalg.norm(way)), 1e-6)
+        way = draw_way(draw)
         axes.append(draw(*OTHER_AXES, 3) * axes[root].mean())
         turns.append(_turn(draw(-1, 1, 4)))
         centers.append(centers[root] + turns[root] @ (axes[root] * way) + 0.4 * axes[-1].mean() * way)
@@ -62,7 +53,7 @@ def random_blob(generator: torch.Generator) -> Mesh:
         length = np.sqrt((scaled**2).sum(-1))
         slope = np.sqrt(((scaled / size) ** 2).sum(-1))  # the distance to first order: length (length - 1) / |gradient|
         near += np.exp(-np.clip(length * (length - 1) / np.maximum(slope, 1e-6) / width, -30, 30))
-    field = -width * np.log(near) + _bumps(grid / float((high - low).max()), draw) * float((high - low).max())
+    field = _relieved(-width * np.log(near), grid, float((high - low).max()), draw)
     meshed = marching_cubes(field, 0.0, spacing=(step,) * 3, gradient_direction="ascent")  # type: ignore[no-untyped-call]
     vertices, faces, normals, _ = meshed
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
@@ -71,18 +62,17 @@ def random_blob(generator: torch.Generator) -> Mesh:
     return _patched(placed, normals.astype(np.float64), np.ascontiguousarray(faces[:, ::-1], np.int64), draw)
 
 
-def _bumps(points: Floats, draw: Draw) -> Floats:
-    """Random waves at points ``[..., 3]`` in units of the body."""
-    share = draw(0, 1, WAVES + 2)
-    low, high = WAVELENGTHS
-    height = HEIGHTS[0] * (HEIGHTS[1] / HEIGHTS[0]) ** share[-1]
-    total: Floats = np.zeros(points.shape[:-1])
-    for place in share[:WAVES]:
-        length = low * (high / low) ** place
-        way = draw(-1, 1, 3)
-        way = way / max(float(np.linalg.norm(way)), 1e-6)
-        total += length * np.sin(2 * math.pi * (points @ way / length + draw(0, 1)[0]))
-    found: Floats = height * total
+def _relieved(field: Floats, grid: Floats, size: float, draw: Draw) -> Floats:
+    """The field of a body of a ``size`` with bumps, folds and a flat foot."""
+    field = field + size * bumps(grid / size, draw)
+    if draw_one(draw) < FOLDED_SHARE:
+        field += size * folds(grid / size, draw)
+    share, stands = draw_one(draw, CUT_OFF), draw_one(draw) < STANDING_SHARE
+    inside = grid[..., 1][field < 0]
+    if not stands or not inside.size:
+        return field
+    foot = inside.min() + share * (inside.max() - inside.min())
+    found: Floats = np.maximum(field, foot - grid[..., 1])
     return found
 
 

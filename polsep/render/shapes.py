@@ -102,7 +102,7 @@ def look_up(heights: Floats, uv: Floats) -> Floats:
 
 def ellipsoid(axes: Floats, heights: list[Floats]) -> Mesh:
     """Return an ellipsoid, one slot; u is the polar angle from +y, v the azimuth."""
-    uv = _grid(*ELLIPSOID_GRID)
+    uv = uv_grid(*ELLIPSOID_GRID)
     polar, azimuth = math.pi * uv[..., 0], 2 * math.pi * uv[..., 1]
     sine = np.sin(polar)
     direction = np.stack([sine * np.cos(azimuth), np.cos(polar), -sine * np.sin(azimuth)], axis=-1)
@@ -111,7 +111,7 @@ def ellipsoid(axes: Floats, heights: list[Floats]) -> Mesh:
 
 def box(axes: Floats, heights: list[Floats]) -> Mesh:
     """Return a box of half sizes ``axes``, one slot per face in the order +x, -x, +y, -y, +z, -z."""
-    uv = _grid(*FACE_GRID)
+    uv = uv_grid(*FACE_GRID)
     patches = []
     for face, height in enumerate(heights[:6]):
         axis, sign = face // 2, 1 - 2 * (face % 2)
@@ -126,12 +126,12 @@ def box(axes: Floats, heights: list[Floats]) -> Mesh:
 
 def cylinder(axes: Floats, heights: list[Floats]) -> Mesh:
     """Return an elliptic cylinder about y, three slots: side, upper and lower cap. u of the side runs downward."""
-    uv = _grid(*SIDE_GRID)
+    uv = uv_grid(*SIDE_GRID)
     azimuth = 2 * math.pi * uv[..., 1]
     around = np.stack([np.cos(azimuth), np.zeros_like(azimuth), -np.sin(azimuth)], axis=-1)
     side = around + (1 - 2 * uv[..., :1]) * np.array([0.0, 1.0, 0.0])
     patches = [_patch(side * axes, around / axes, uv, heights[0])]
-    uv = _grid(*CAP_GRID)
+    uv = uv_grid(*CAP_GRID)
     disk = _square_to_disk(2 * uv - 1)
     for sign, height in ((1.0, heights[1]), (-1.0, heights[2])):
         points = np.stack([disk[..., 1], np.full(disk.shape[:-1], sign), sign * disk[..., 0]], axis=-1)
@@ -177,8 +177,8 @@ def _random_pose(mesh: Mesh, reach: float, generator: torch.Generator) -> Mesh:
     return moved(mesh, rotation, _uniform(3, 0.0, reach, generator))
 
 
-def _grid(rows: int, cols: int) -> Floats:
-    """(u, v) of the corners of rows x cols cells, ``[rows + 1, cols + 1, 2]``."""
+def uv_grid(rows: int, cols: int) -> Floats:
+    """Return (u, v) of the corners of rows x cols cells, ``[rows + 1, cols + 1, 2]``."""
     return np.stack(np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, cols + 1), indexing="ij"), axis=-1)
 
 
@@ -195,7 +195,12 @@ def _square_to_disk(square: Floats) -> Floats:
 def _patch(points: Floats, normals: Floats, uv: Floats, heights: Floats) -> Mesh:
     """One slot: a grid of points ``[n, m, 3]``, displaced along its normals by a height field, in triangles."""
     unit = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-    vertices = (points + look_up(heights, uv)[..., None] * unit).reshape(-1, 3)
+    return smooth_patch(points + look_up(heights, uv)[..., None] * unit, uv)
+
+
+def smooth_patch(points: Floats, uv: Floats) -> Mesh:
+    """Return one slot of a grid of points ``[n, m, 3]``: down and right along it run counter-clockwise from outside."""
+    vertices = points.reshape(-1, 3)
     rows, cols = uv.shape[0] - 1, uv.shape[1] - 1
     corner = (np.arange(rows)[:, None] * (cols + 1) + np.arange(cols)).reshape(-1)
     right, below = corner + 1, corner + cols + 1

@@ -82,7 +82,11 @@ def random_camera(vertices: Floats, generator: torch.Generator) -> PinholeCamera
     """
     azimuth = _uniform((0.0, 2 * math.pi), generator)
     limit = math.sin(LARGEST_ELEVATION)
-    sine = _uniform((-limit, limit), generator)
+    return random_camera_from(vertices, azimuth, _uniform((-limit, limit), generator), generator)
+
+
+def random_camera_from(vertices: Floats, azimuth: float, sine: float, generator: torch.Generator) -> PinholeCamera:
+    """Return `random_camera` of an azimuth [rad] and of the sine of an elevation below a right angle."""
     fov, fill = _uniform(FIELDS_OF_VIEW, generator), _uniform(FILLS, generator)
     cosine = math.sqrt(1 - sine**2)
     back = np.array([cosine * math.sin(azimuth), sine, cosine * math.cos(azimuth)])

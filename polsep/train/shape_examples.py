@@ -1,9 +1,11 @@
 """Training examples of shape from one frame: a raw frame of a random thing, separated, and the truth of its surface.
 
-Half of the things are unions of solids (`render.shapes`), half smooth bodies (`render.blobs`); lights, looks and
-disturbances are those of the separation's training (`variety`, `reality`). The lamp is mostly beside the camera. Frames
-are exposed, recorded with noise and separated by `METHODS`, as users' frames are; networks never see true images, but
-for the input "perfect", which measures what better separation could gain.
+A third of the things are unions of solids (`render.shapes`), a third smooth bodies (`render.blobs`), a third vessels
+(`render.vessels`). Solids are seen from all sides; bodies and vessels stand, and cameras look at them as users do
+(`random_upright_camera`). Lights, looks and disturbances are those of the separation's training (`variety`, `reality`).
+The lamp is mostly beside the camera. Frames are exposed, recorded with noise and separated by `METHODS`, as users'
+frames are; networks never see true images, but for the input "perfect", which measures what better separation could
+gain.
 
 Conventions: images at half resolution, the lamp's colour divided out, 1 = white level of one measurement; normals x
 right, y up, z to the camera.
@@ -27,15 +29,17 @@ from polsep.pipeline import separate_capture
 from polsep.render.blobs import random_blob
 from polsep.render.materials import Materials, random_materials
 from polsep.render.raycast import MeshScene, View, build_gbuffer, find_lit, find_view, shade_view
-from polsep.render.shapes import random_mesh
+from polsep.render.shapes import Floats, random_mesh
 from polsep.render.simulate import blur, capture, expose_to_clip, expose_to_level
 from polsep.render.sphere_tracing import PinholeCamera, PointLight, Scene, camera_axes
+from polsep.render.vessels import random_vessel
 from polsep.render.views import (
     MIN_LEVEL,
     MIN_LIT,
     Shot,
     lit_share,
     random_camera,
+    random_camera_from,
     random_clip,
     scene_seed,
 )
@@ -79,14 +83,31 @@ NEAR_SHARE, NEAR_DEG, LARGEST_DEG, DISTANCES = 0.5, 20.0, 60.0, (3.0, 12.0)
 CLOSE_SHARE, REAL_SHARE, DEPOLARIZED_SHARE = 0.4, 0.6, 0.5
 #: Standard deviation of the lens's point spread in raw pixels.
 BLURS = (0.3, 1.0)
+#: Elevations of cameras about things that stand [degrees]; share of those that look down, and their elevations.
+ELEVATIONS_DEG, DOWN_SHARE, DOWN_DEG = (-5.0, 70.0), 0.1, (70.0, 88.0)
+#: Kinds of things in turn; all but the first stand.
+KINDS = (random_mesh, random_blob, random_vessel)
 #: Most draws of a view that shows much of the thing lit.
 MAX_DRAWS = 20
 
 
 def random_thing(split: str, seed: int, number: int) -> MeshScene:
-    """Return random thing ``number`` of a split: of even numbers a union of solids, of odd ones a smooth body."""
+    """Return random thing ``number`` of a split; the number says of which of `KINDS`."""
     generator = torch.Generator().manual_seed(scene_seed(split, seed, number))
-    return MeshScene(random_blob(generator) if number % 2 else random_mesh(generator))
+    return MeshScene(KINDS[number % len(KINDS)](generator))
+
+
+def stands(number: int) -> bool:
+    """Whether the thing of example ``number`` stands, +y up, and its camera is upright."""
+    return number % len(KINDS) != 0
+
+
+def random_upright_camera(vertices: Floats, generator: torch.Generator) -> PinholeCamera:
+    """Return a camera that looks at a thing that stands: mostly from `ELEVATIONS_DEG`, sometimes straight down."""
+    turn, down, height = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
+    low, high = DOWN_DEG if down < DOWN_SHARE else ELEVATIONS_DEG
+    elevation = math.radians(low + (high - low) * height)
+    return random_camera_from(vertices, 2 * math.pi * turn, math.sin(elevation), generator)
 
 
 def random_lamp(camera: PinholeCamera, radius: float, generator: torch.Generator) -> PointLight:
@@ -101,10 +122,11 @@ def random_lamp(camera: PinholeCamera, radius: float, generator: torch.Generator
     return PointLight((x, y, z), distance**2, math.pi * angle)
 
 
-def random_shape_shot(thing: MeshScene, generator: torch.Generator) -> Shot:
+def random_shape_shot(thing: MeshScene, upright: bool, generator: torch.Generator) -> Shot:
     """Return a view of a thing under a lamp that reaches much of it. Raises ValueError where none of the draws does."""
+    draw_camera = random_upright_camera if upright else random_camera
     for _ in range(MAX_DRAWS):
-        camera = random_camera(thing.mesh.vertices, generator)
+        camera = draw_camera(thing.mesh.vertices, generator)
         lamp = random_lamp(camera, thing.size / 2, generator)
         softness, close = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
         shot = Shot(camera, lamp, random_clip(generator), log_between(BLURS, softness))
@@ -117,7 +139,7 @@ def random_shape_example(split: str, seed: int, number: int, side: int = SIDE) -
     """Return planes ``[COUNT, side/2, side/2]`` (`PLANES`) of example ``number``; it depends on these numbers alone."""
     thing = random_thing(split, seed, number)
     generator = torch.Generator().manual_seed(scene_seed(split, seed, number, 0))
-    shot = random_shape_shot(thing, generator)
+    shot = random_shape_shot(thing, stands(number), generator)
     view = vary_normals(find_view(thing, shot.camera, (side, side), SAMPLES), generator)
     materials = random_materials(thing.mesh.slot_count, generator, thing.size)
     materials = vary_gloss(vary_colors(materials, generator), generator)
@@ -189,6 +211,11 @@ def _surface(view: View, materials: Materials, shot: Shot) -> Tensor:
 def example_path(folder: Path, split: str, seed: int, number: int) -> Path:
     """The file of an example."""
     return folder / f"shape-{split}-{seed}-{number:06d}.npy"
+
+
+def example_number(path: Path) -> int:
+    """The number of the example in a file of `example_path`."""
+    return int(path.stem.rpartition("-")[2])
 
 
 def make_examples(folder: Path, split: str, seed: int, numbers: range) -> Iterator[int]:

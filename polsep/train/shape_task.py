@@ -1,5 +1,9 @@
 """Training of the network for shape, on examples from a folder: turned, mirrored, cut to the thing.
 
+Frames of things that stand are mostly mirrored across alone, so that the network learns where down is: users' things
+stand, and a flat thing's normals are known but for the side to which it tips. `HELD_SHARE` of these frames and all of
+solids are turned in eight ways, so that a thing held at any angle still works.
+
 Batch number n depends on the options and n alone, so that a resumed training uses the same batches.
 """
 
@@ -21,7 +25,7 @@ from polsep.geometry.shape_maps import INPUTS, USUAL, Seen, Surface, decode, enc
 from polsep.networks.shape import ShapeNetwork
 from polsep.networks.sizes import ResidualSize
 from polsep.train.loop import Training
-from polsep.train.shape_examples import PLANES, load_example
+from polsep.train.shape_examples import PLANES, example_number, load_example, stands
 from polsep.train.shape_losses import gained, pictures_loss, random_lamps, shape_loss
 from polsep.train.tasks import find
 
@@ -31,6 +35,9 @@ TRAINED = (*INPUTS, "perfect")
 UNTOLD, TOLD_ERROR = 0.3, 0.05
 #: Side of a cut over the longest side of the thing, in training; and in validation.
 CUTS, CUT = (1.04, 1.5), 1.1
+#: Share of frames of things that stand which are turned in eight ways, as frames of things held at any angle: with all
+#: of the solids, every second frame (a third and a quarter of two thirds).
+HELD_SHARE = 0.25
 #: A batch's seed is its step times this, plus the rank of the process.
 RANKS = 1024
 #: Seed and number of validation's lamps.
@@ -158,10 +165,12 @@ def batches(options: ShapeOptions, paths: Sequence[Path], step: int, process: tu
         generator = torch.Generator().manual_seed((options.seed << 24) ^ (step * RANKS + process[0]))
         found = []
         for number in torch.randint(len(paths), (options.batch,), generator=generator).tolist():
-            draws = torch.rand(3, generator=generator).tolist()
+            draws = torch.rand(4, generator=generator).tolist()
             wider = CUTS[0] + (CUTS[1] - CUTS[0]) * draws[0]
             planes = cut_example(load_example(paths[number]), wider, options.side, (draws[1], draws[2]))
-            across, down, transposed = (bool(way) for way in torch.randint(2, (3,), generator=generator))
+            across, *others = (bool(way) for way in torch.randint(2, (3,), generator=generator))
+            any_way = not stands(example_number(paths[number])) or draws[3] < HELD_SHARE
+            down, transposed = (way and any_way for way in others)
             found.append(tell_light(turn_example(planes, across, down, transposed), generator))
         yield ShapeBatch(torch.stack(found))
         step += 1

@@ -2,9 +2,9 @@
 
 Every thing of `six_lights.load_subjects` is photographed twice, glossy (strength 1, its own roughness) and matte
 (`MATTE`), each by one lamp within `LARGEST_DEG` of the camera, behind a polarizer at any angle, in 512 x 512 raw pixels
-with noise; the mask is given, the lamp is not told unless a row says so. Networks of equal size and training see the
-separated images and their polarization, the measured Stokes images, or s0 alone; "perfect" sees true images. Needs the
-extra ``bench``.
+with noise; the mask is given, the lamp is not told unless a row says so. "separated" is what ships. Networks of equal
+size and training, less than that of what ships, see the separated images and their polarization (`EQUAL`), the measured
+Stokes images, or s0 alone; "perfect" sees true images. Needs the extra ``bench``.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ MATTE, CLIPPED, RAW_SIDE = 0.05, 0.005, 512
 LARGEST_DEG, DISTANCES = 45.0, (0.7, 1.4)
 #: A distant lamp for things whose camera is many radii away, in radii.
 LAMP_DISTANCE = 8.0
-#: Networks of other inputs, trained like the shipped one.
+#: Networks of all inputs, of equal training; the method of the one that sees separated images; and what a method's name
+#: ends with where the lamp is told.
+EQUAL, TOLD = "separated, equal training", ", lamp told"
 WEIGHTS = Path(__file__).parent / "weights" / "shape"
 #: Lamps of relit pictures, and their seed; zenith [degrees] from which on an azimuth turned by more than 90 is a flip.
 LAMPS, LAMP_SEED, STEEP_DEG = 20, 77, 30.0
@@ -163,11 +165,23 @@ def _as_surface(planes: Floats) -> Surface:
     return Surface(normal, planes[3:6] / share, planes[6:7] / share, planes[7:8] / share, none, none, none)
 
 
-def estimate(name: str, shot: Photograph, told: bool) -> tuple[Surface, Surface, Floats]:
-    """A network's surface, the truth and the mask, in the network's square."""
+def estimate(method: str, shot: Photograph) -> tuple[Surface, Surface, Floats]:
+    """The surface by a network of `list_methods`, the truth and the mask, in the network's square."""
+    name, told = method.split(",")[0], method.endswith(TOLD)
     seen, truth = seen_by(name, shot, told)
-    path = shipped_weights("shape/separated") if name == "separated" else WEIGHTS / f"{name}.safetensors"
+    ships = name == "separated" and method != EQUAL
+    path = shipped_weights("shape/separated") if ships else WEIGHTS / f"{name}.safetensors"
     return load_estimator(path).find(seen), truth, seen.mask
+
+
+def list_methods() -> list[str]:
+    """What ships, with and without the lamp told, and the networks of equal training that are there."""
+    equal = [
+        name
+        for name in (EQUAL, "stokes", "rgb", "perfect")
+        if (WEIGHTS / f"{name.split(',')[0]}.safetensors").is_file()
+    ]
+    return ["separated", f"separated{TOLD}", *equal]
 
 
 def classical(shot: Photograph) -> tuple[Surface, Surface, Floats]:
@@ -227,14 +241,12 @@ def measure(data: Path, names: Sequence[str] | None = None) -> Iterator[Row]:
     """Rows of scores per method, over glossy and matte things and per kind, and of expected errors."""
     found: dict[tuple[str, str], list[dict[str, float]]] = {}
     tenths: list[tuple[Floats, Floats]] = []
-    methods = ["separated", "separated, lamp told"]
-    methods += [name for name in ("stokes", "rgb", "perfect") if (WEIGHTS / f"{name}.safetensors").is_file()]
+    methods = list_methods()
     for number, subject in enumerate(load_subjects(data, names)):
         for kind, strength in (("glossy", 1.0), ("matte", MATTE)):
             shot = photograph(subject, 2 * number + (kind == "matte"), strength)
             for method in (*methods, "classical"):
-                told = method.endswith("told")
-                results = classical(shot) if method == "classical" else estimate(method.split(",")[0], shot, told)
+                results = classical(shot) if method == "classical" else estimate(method, shot)
                 scores = score(*results)
                 found.setdefault((kind, method), []).append(scores)
                 case, metric = f"{subject.name}, {kind}", "mean angular error"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.figures import Panel, Pixels, draw_grid, tone
-from evaluation.one_frame import MATTE, WEIGHTS, classical, estimate, photograph
+from evaluation.one_frame import MATTE, classical, estimate, list_methods, photograph
 from evaluation.six_lights import Subject
 from polsep.geometry.shape_maps import Surface, relight
 from polsep.io.assets.relight_page import RelightMaps, encode_relight_page
@@ -27,9 +27,9 @@ def draw_thing(subject: Subject, number: int) -> Pixels:
     for kind, strength in (("glossy", 1.0), ("matte", MATTE)):
         shot = photograph(subject, 900 + 2 * number + (kind == "matte"), strength)
         for name, title in ROWS.items():
-            if name in ("rgb", "stokes") and not (WEIGHTS / f"{name}.safetensors").is_file():
+            if name not in (*list_methods(), "classical"):
                 continue
-            found, truth, mask = classical(shot) if name == "classical" else estimate(name, shot, False)
+            found, truth, mask = classical(shot) if name == "classical" else estimate(name, shot)
             rows.append(list(_row(f"{kind}, {title}", found, truth, mask)))
         rows.append(list(_row(f"{kind}, truth", truth, truth, mask)))
     return draw_grid(rows, f"{subject.name}: shape from one frame")
@@ -37,7 +37,7 @@ def draw_thing(subject: Subject, number: int) -> Pixels:
 
 def relight_thing(subject: Subject, number: int) -> bytes:
     """The page that relights a glossy thing, from one frame of it."""
-    found, _, mask = estimate("separated", photograph(subject, 900 + 2 * number, 1.0), False)
+    found, _, mask = estimate("separated", photograph(subject, 900 + 2 * number, 1.0))
     inside = mask[0] > 0
     albedo = np.moveaxis(found.albedo * (0.9 / np.percentile(found.albedo[:, inside], 99)), 0, -1)
     maps = RelightMaps(np.moveaxis(found.normal, 0, -1), albedo, found.roughness[0], found.specular[0], inside)

@@ -156,7 +156,7 @@ def random_shape_example(split: str, seed: int, number: int, side: int = SIDE) -
         return blur(shade_view(view, materials, lamp, lit), shot.blur)
 
     found = disturb(scene, rerender, generator) if real < REAL_SHARE else as_ideal(scene)
-    return torch.cat([_photograph(found, shot.clip, generator), _surface(view, materials, shot)])
+    return torch.cat([_photograph(found, shot.clip, generator), surface_planes(view, materials, shot)])
 
 
 def _photograph(real: RealScene, clip: float, generator: torch.Generator) -> Tensor:
@@ -184,8 +184,8 @@ def _photograph(real: RealScene, clip: float, generator: torch.Generator) -> Ten
     return torch.cat([seen, avg_pool2d(truth, 2)])
 
 
-def _surface(view: View, materials: Materials, shot: Shot) -> Tensor:
-    """Mask, normal, albedo, roughness, specular strength, and the lamp's direction: means over 2x2 raw pixels."""
+def surface_planes(view: View, materials: Materials, shot: Shot) -> Tensor:
+    """Return mask, normal, albedo, roughness, specular strength, and the lamp's direction: means over 2x2 raw pixels."""
     height, width = view.size
     planes = torch.zeros(9, height * width)
     axes = camera_axes(shot.camera)

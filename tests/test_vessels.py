@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -67,7 +68,7 @@ def test_profiles_join_and_insides_stay_inside() -> None:
     for seed in range(100):
         parts, place = random_profile(drawn_from(seeded(seed)))
         assert parts[0][0, 0] == parts[-1][0, -1] == 0 and not parts[-1][1].any()
-        for first, second in zip(parts, parts[1:], strict=False):
+        for first, second in itertools.pairwise(parts):
             np.testing.assert_array_equal(first[:, -1], second[:, 0])
         assert 0 < place[0] < 1.001 and place[1] > 0
         if len(parts) < 4:

@@ -175,7 +175,7 @@ def estimate(method: str, shot: Photograph) -> tuple[Surface, Surface, Floats]:
 
 
 def list_methods() -> list[str]:
-    """What ships, with and without the lamp told, and the networks of equal training that are there."""
+    """Return what ships, with and without the lamp told, and the networks of equal training that are there."""
     equal = [
         name
         for name in (EQUAL, "stokes", "rgb", "perfect")

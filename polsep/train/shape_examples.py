@@ -98,7 +98,7 @@ def random_thing(split: str, seed: int, number: int) -> MeshScene:
 
 
 def stands(number: int) -> bool:
-    """Whether the thing of example ``number`` stands, +y up, and its camera is upright."""
+    """Return True where the thing of example ``number`` stands, +y up, before an upright camera."""
     return number % len(KINDS) != 0
 
 

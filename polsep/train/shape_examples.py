@@ -29,7 +29,7 @@ from polsep.render.materials import Materials, random_materials
 from polsep.render.raycast import MeshScene, View, build_gbuffer, find_lit, find_view, shade_view
 from polsep.render.shapes import random_mesh
 from polsep.render.simulate import blur, capture, expose_to_clip, expose_to_level
-from polsep.render.sphere_tracing import PinholeCamera, PointLight, Scene, camera_axes
+from polsep.render.sphere_tracing import PinholeCamera, PointLight, camera_axes
 from polsep.render.views import (
     MIN_LEVEL,
     MIN_LIT,
@@ -41,6 +41,7 @@ from polsep.render.views import (
 )
 from polsep.sensor.camera import Layout
 from polsep.train.reality import RealScene, as_ideal, disturb
+from polsep.train.stream import relit_of
 from polsep.train.variety import (
     LitView,
     log_between,
@@ -127,13 +128,9 @@ def random_shape_example(split: str, seed: int, number: int, side: int = SIDE) -
     if depolarized < DEPOLARIZED_SHARE:
         scene = vary_polarization(scene, generator)
 
-    def rerender(everywhere: bool) -> Scene:
-        lamp = random_lamp(shot.camera, thing.size / 2, generator)
-        lit = find_lit(thing, view, lamp)
-        lit = tuple(torch.ones_like(band) for band in lit) if everywhere else lit
-        return blur(shade_view(view, materials, lamp, lit), shot.blur)
-
-    found = disturb(scene, rerender, generator) if real < REAL_SHARE else as_ideal(scene)
+    second = LitView(view, materials, random_lamp(shot.camera, thing.size / 2, generator), lit_view.lit)
+    relit = relit_of(thing, second, shot.blur)
+    found = disturb(scene, relit, generator) if real < REAL_SHARE else as_ideal(scene)
     return torch.cat([_photograph(found, shot.clip, generator), _surface(view, materials, shot)])
 
 

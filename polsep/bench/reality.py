@@ -53,7 +53,7 @@ class RealityOptions:
     split: str = "test"
     rows: tuple[str, ...] = ()
     methods: tuple[str, ...] = ()
-    scenes: int = 8
+    scenes: int = 24
     size: int = 512
 
 
@@ -100,8 +100,8 @@ def find_kinds() -> tuple[Kind, ...]:
     objects = reality.DISTURBANCES | {f"8 bits, JPEG {JPEG_QUALITY}": compress, "bad sensor": calibrate}
     corner = {"inter-reflections": corners.corner_frame} if importlib.util.find_spec("mitsuba") else {}
     return (
-        Kind("objects", reality.build_stage, 8, reality.ideal_frame, objects),
-        Kind("mannequins", reality.build_mannequin, 4, reality.ideal_mannequin, reality.SHEENS),
+        Kind("objects", reality.build_stage, 24, reality.ideal_frame, objects),
+        Kind("mannequins", reality.build_mannequin, 8, reality.ideal_mannequin, reality.SHEENS),
         Kind("corners", build_corner, 3, reality.ideal_frame, corner),
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 import torch
@@ -13,9 +12,7 @@ from polsep.physics.stokes import Stokes, aolp, dolp
 from polsep.render.disturbances import (
     METALS,
     IndirectLight,
-    RoomLight,
     add_indirect_light,
-    add_room_light,
     add_scenes,
     add_veiling_glare,
     as_color,
@@ -25,11 +22,11 @@ from polsep.render.disturbances import (
     random_lamp_color,
     retain_polarization,
     scale_light,
-    shade_room,
     shift_colors,
     specular_angle,
 )
-from polsep.render.sphere_tracing import Scene
+from polsep.render.room import Around, as_room, even_directions, light_from_around
+from polsep.render.sphere_tracing import PointLight, Scene
 
 SIZE = (24, 32)
 
@@ -58,7 +55,6 @@ NEUTRAL: dict[str, Callable[[Scene], Scene]] = {
     "polarizer": lambda scene: depolarize_lamp(scene, 1.0),
     "polarizer, crossed": lambda scene: depolarize_lamp(scene, 1.0, lit_scene(scene.mask.shape[:-2], 5)),
     "retention": lambda scene: retain_polarization(scene, 0.0),
-    "room": lambda scene: add_room_light(scene, RoomLight(0.0)),
     "indirect": lambda scene: add_indirect_light(scene, IndirectLight(0.0, 0.0, as_color((1, 0, 0)))),
     "metal": lambda scene: make_metal(scene, torch.zeros(1, *SIZE), as_color(METALS["gold"])),
     "glare": lambda scene: add_veiling_glare(scene, 0.0),
@@ -70,7 +66,6 @@ ACTIVE: dict[str, Callable[[Scene, torch.Tensor], Scene]] = {
     "exposure": scale_light,
     "polarizer": depolarize_lamp,
     "retention": lambda scene, x: retain_polarization(scene, 0.1 * x, 0.5),
-    "room": lambda scene, x: add_room_light(scene, RoomLight(x, as_color((0.6, 1, 1.2)), mirror=0.3)),
     "indirect": lambda scene, x: add_indirect_light(scene, IndirectLight(x, 0.2 * x, as_color((1, 0.2, 0)), lamp=0.3)),
     "metal": lambda scene, x: make_metal(scene, (x > 0.5).float(), as_color(METALS["copper"])),
     "glare": lambda scene, x: add_veiling_glare(scene, 0.1 * x),
@@ -126,21 +121,34 @@ def test_retention_moves_light() -> None:
     assert float(torch.sin(aolp(moved) - expected).abs().max()) < 1e-2
 
 
-def test_room_light_has_its_share_and_no_polarization() -> None:
-    """Its mean over the mask is the share of the lamp's, plus the mirror image's; all of it is diffuse."""
-    scene = lit_scene()
-    shading = random_field((1, *SIZE), 3, 0.5, torch.Generator().manual_seed(1))
-    found = add_room_light(scene, RoomLight(0.3, shading=shading, mirror=0.25))
-    ratio = found.diffuse.s0[:, scene.mask].mean() / scene.diffuse.s0[:, scene.mask].mean()
-    assert float(ratio) == pytest.approx(1 + 0.3 * 1.25, rel=1e-4)
-    assert_same(replace(found, diffuse=replace(found.diffuse, s0=scene.diffuse.s0)), scene)
+def test_room_light_has_its_share_and_is_all_diffuse() -> None:
+    """The diffusely reflected part has its share of the lamp's on the mask; mirror images keep their polarization."""
+    lamp, around = lit_scene(), lit_scene(seed=3)
+    room = as_room(around, lamp, 0.3, 1.0)
+    gain = 0.3 * lamp.diffuse.s0[:, lamp.mask].mean() / around.diffuse.s0[:, lamp.mask].mean()
+    assert_same(room, Scene((around.diffuse + around.specular) * gain, around.specular * 0.0, lamp.mask))
+    tinted = as_room(around, lamp, 0.3, as_color((0.8, 1.0, 1.2)))
+    assert_same(tinted, scale_light(room, as_color((0.8, 1.0, 1.2))))
 
 
-def test_room_is_brightest_toward_its_windows() -> None:
-    """Irradiance is 1 + contrast toward the bright side, 1 - contrast behind, 1 across."""
-    normals = torch.tensor([[0.0, 0, 1], [0, 0, -1], [1, 0, 0]]).T[:, None, :]
-    found = shade_room(normals, torch.tensor([0.0, 0, 1]), 0.4)
-    torch.testing.assert_close(found, torch.tensor([[[1.4, 0.6, 1.0]]]))
+def test_light_from_around_is_unpolarized_and_falls_evenly() -> None:
+    """Every direction is lit from its distance with its strength, by light of all polarizations in equal parts."""
+    lights: list[PointLight] = []
+
+    def light_by(light: PointLight) -> Scene:
+        lights.append(light)
+        one = torch.full((1, 2, 2), light.intensity)
+        angle = 2 * light.polarizer
+        arriving = Stokes(one, one * math.cos(angle), one * math.sin(angle))
+        return Scene(arriving, arriving * 0.04, one[0] > 0)
+
+    directions, strengths = even_directions(64), 1 + torch.arange(64) / 64
+    found = light_from_around(light_by, Around(directions, strengths, 5.0))
+    torch.testing.assert_close(found.diffuse.s0, torch.full((1, 2, 2), 2 * 25 * float(strengths.sum())))
+    torch.testing.assert_close(dolp(found.diffuse), torch.zeros(1, 2, 2), rtol=0, atol=1e-6)
+    places = torch.tensor([light.position for light in lights])
+    torch.testing.assert_close(places.norm(dim=1), torch.full((128,), 5.0), rtol=1e-5, atol=0)
+    assert float(directions.mean(dim=0).norm()) < 0.01
 
 
 def test_unpolarized_lamp_is_the_mean_of_two() -> None:

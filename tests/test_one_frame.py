@@ -27,7 +27,15 @@ from test_geometry import cap
 
 import polsep
 from polsep.geometry import one_frame
-from polsep.geometry.one_frame import SIDE, ShapeEstimator, gather, shape, spread, square_around
+from polsep.geometry.one_frame import (
+    SIDE,
+    ShapeEstimator,
+    gather,
+    polarized_as_usual,
+    shape,
+    spread,
+    square_around,
+)
 from polsep.geometry.polarization import Cue, choose_outward
 from polsep.geometry.shape_maps import INPUTS, USUAL, Seen, Surface, decode, encode, projected_normal
 from polsep.io.results.exr import read_exr_layers
@@ -96,6 +104,21 @@ def test_projected_normals_are_those_of_fresnel() -> None:
     wanted = np.sin(zeniths) * np.stack([np.cos(2 * azimuths), np.sin(2 * azimuths)])
     np.testing.assert_allclose(projected_normal(seen), wanted, atol=5e-3)
     torch.testing.assert_close(projected_normal(torch.from_numpy(seen)).numpy(), projected_normal(seen))
+
+
+@pytest.mark.parametrize("index", [1.33, 1.5, 1.8])
+def test_other_indices_are_seen_as_the_usual_one(index: float) -> None:
+    """Diffuse light of a sphere of any index looks like that of index 1.5, beside highlights of one AoLP."""
+    normals, mask = (np.asarray(x) for x in cap(48, 75))
+    cosine, twice = normals[..., 2], np.exp(2j * np.arctan2(normals[..., 1], normals[..., 0]))
+    specular = np.where(mask, cosine**40, 0).astype(np.float32)
+
+    def polarized(eta: float) -> NDArray[np.float32]:
+        light = np.where(mask, cosine * diffuse_dolp(cosine, eta) * twice, 0) + specular * np.exp(1j)
+        return np.stack([light.real, light.imag]).astype(np.float32)
+
+    found = polarized_as_usual(polarized(index), np.where(mask, cosine, 0), specular[None], index)
+    np.testing.assert_allclose(found, polarized(1.5), rtol=0, atol=1e-2)
 
 
 def test_the_engine_is_the_network(tmp_path: Path) -> None:
@@ -372,6 +395,7 @@ def test_a_mesh_is_left_out_on_request(run: Cli, tmp_path: Path) -> None:
         (("--light", "left"), "x,y,z"),
         (("--mesh", "none", "--turntable"), "--turntable"),
         (("--mesh", "obj"), "glb"),
+        (("--index", "1"), "refractive index"),
     ],
 )
 def test_wrong_options_are_refused(run: Cli, tmp_path: Path, words: tuple[str, ...], said: str) -> None:

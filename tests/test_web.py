@@ -145,6 +145,20 @@ def test_orders_of_filters_are_checked_and_kept(page: Any, monkeypatch: pytest.M
 
 @needs_packages
 @needs_browser
+def test_files_chosen_at_work_wait_and_the_last_one_wins(page: Any) -> None:
+    """Three files, one right after the other: nothing is lost but what nobody waits for any more."""
+    page.fill("#white", "4095")
+    page.press("#white", "Enter")
+    codes = crop()
+    for k, rows in enumerate((288, 200, 120)):
+        png = bytes(imagecodecs.png_encode(np.ascontiguousarray(codes[:rows])))
+        page.set_input_files("#file", {"name": f"{k}.png", "mimeType": "image/png", "buffer": png})
+    page.wait_for_function("document.getElementById('status').textContent.match(/^2.png .* s$/)")
+    assert page.evaluate("[polsep.images.height, document.body.dataset.state]") == [60, "done"]
+
+
+@needs_packages
+@needs_browser
 def test_the_page_works_without_its_host(browser: Any, site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Loaded once, it needs nobody: not its host either. Packed frames are read by the format that is stated."""
     monkeypatch.setenv("POLSEP_LAYERS", "f32")

@@ -53,7 +53,7 @@ class RealityOptions:
     split: str = "test"
     rows: tuple[str, ...] = ()
     methods: tuple[str, ...] = ()
-    scenes: int = 8
+    scenes: int = 24
     size: int = 512
 
 
@@ -73,6 +73,15 @@ class Score(NamedTuple):
     diffuse: float
     specular: float
     warnings: tuple[str, ...]
+
+
+class Trial(NamedTuple):
+    """Scores of a method on one disturbed frame, on its ideal twin, and of the formula on the disturbed one."""
+
+    number: int
+    ideal: Score
+    found: Score
+    formula: Score
 
 
 @lru_cache(maxsize=1)
@@ -100,8 +109,8 @@ def find_kinds() -> tuple[Kind, ...]:
     objects = reality.DISTURBANCES | {f"8 bits, JPEG {JPEG_QUALITY}": compress, "bad sensor": calibrate}
     corner = {"inter-reflections": corners.corner_frame} if importlib.util.find_spec("mitsuba") else {}
     return (
-        Kind("objects", reality.build_stage, 8, reality.ideal_frame, objects),
-        Kind("mannequins", reality.build_mannequin, 4, reality.ideal_mannequin, reality.SHEENS),
+        Kind("objects", reality.build_stage, 24, reality.ideal_frame, objects),
+        Kind("mannequins", reality.build_mannequin, 8, reality.ideal_mannequin, reality.SHEENS),
         Kind("corners", build_corner, 3, reality.ideal_frame, corner),
     )
 
@@ -135,7 +144,7 @@ def select_reality(bench: Bench, options: RealityOptions, data: Path | None) -> 
 
 def _bench_kind(kind: Kind, methods: Sequence[str], options: RealityOptions) -> Iterator[Row]:
     ideal: dict[str, list[Score]] = {}
-    found: dict[tuple[str, str], list[Score]] = {}
+    found: dict[tuple[str, str], list[Trial]] = {}
     wanted = tuple(dict.fromkeys(("analytic", *methods)))
     for number in range(min(kind.stages, options.scenes)):
         stage = kind.build(options.split, number, options.size)
@@ -144,14 +153,18 @@ def _bench_kind(kind: Kind, methods: Sequence[str], options: RealityOptions) -> 
             ideal.setdefault(method, []).append(score(twin, method, True))
         for name, make in kind.rows.items():
             frame = make(stage)
+            if not bool(frame.mask.any()):  # one body, all of metal, has nothing beside it
+                continue
             for told in _calls(name, frame):
+                scores = {method: score(frame, method, told) for method in wanted}
                 for method in wanted:
-                    found.setdefault((name + TOLD * told, method), []).append(score(frame, method, told))
+                    trial = Trial(number, ideal[method][-1], scores[method], scores["analytic"])
+                    found.setdefault((name + TOLD * told, method), []).append(trial)
     for method in methods:
         yield from _means("reality/ideal", f"{kind.name}, undisturbed", method, "PSNR", ideal[method])
-    for (name, method), scores in found.items():
+    for (name, method), trials in found.items():
         if method in methods:
-            yield from _summarize(name, method, (ideal[method], scores, found[name, "analytic"]))
+            yield from _summarize(name, method, trials)
 
 
 def _calls(name: str, frame: Frame) -> tuple[bool, ...]:
@@ -161,22 +174,26 @@ def _calls(name: str, frame: Frame) -> tuple[bool, ...]:
     return (True,) if "ambient" in frame.told else (False, True)
 
 
-def _summarize(name: str, method: str, scores: tuple[list[Score], list[Score], list[Score]]) -> Iterator[Row]:
-    """Rows of one disturbance and method from its ideal, its disturbed and the formula's scores."""
-    ideal, found, formula = scores
+def _summarize(name: str, method: str, trials: list[Trial]) -> Iterator[Row]:
+    """Rows of one disturbance and method."""
     part = "told" if name.endswith(TOLD) else "loss"
+    found = [trial.found for trial in trials]
     losses = [
-        Score(a.diffuse - b.diffuse, a.specular - b.specular, b.warnings) for a, b in zip(ideal, found, strict=True)
+        Score(a.diffuse - b.diffuse, a.specular - b.specular, b.warnings)
+        for a, b in ((t.ideal, t.found) for t in trials)
     ]
     yield from _means(f"reality/{part}", name, method, "loss", losses)
     yield from _means(f"reality/{part}_psnr", name, method, "PSNR", found)
     for output in ("diffuse", "specular"):
         worst = max(getattr(loss, output) for loss in losses)
         yield Row(f"reality/{part}_worst", name, method, f"{output} loss, worst scene", round(worst, 2), "dB")
-    for k, loss in enumerate(losses):
+    for trial, loss in zip(trials, losses, strict=True):
         for output in ("diffuse", "specular"):
-            yield Row("reality/scenes", f"{name}, scene {k}", method, f"{output} loss", getattr(loss, output), "dB")
-    behind = [min(a.diffuse - b.diffuse, a.specular - b.specular) < -WORSE for a, b in zip(found, formula, strict=True)]
+            yield Row(
+                "reality/scenes", f"{name}, scene {trial.number}", method, f"{output} loss", getattr(loss, output), "dB"
+            )
+    pairs = ((trial.found, trial.formula) for trial in trials)
+    behind = [min(a.diffuse - b.diffuse, a.specular - b.specular) < -WORSE for a, b in pairs]
     if method != "analytic":
         yield Row(f"reality/{part}_below", name, method, "frames below analytic", 100 * statistics.fmean(behind), "%")
     warned = [bool(one.warnings) for one in found]

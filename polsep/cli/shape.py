@@ -44,6 +44,14 @@ from polsep.cli.progress import show_progress
     "--mask", type=FILE, metavar="FILE", help="Image that is white on the thing.  [default: where light falls]"
 )
 @click.option(
+    "--index",
+    type=float,
+    default=1.5,
+    show_default=True,
+    metavar="N",
+    help="Refractive index of the thing: 1.33 wet, 1.4 skin, 1.5 most paints and plastics, 1.7 and more glazes.",
+)
+@click.option(
     "--method",
     default="joint",
     metavar="NAME",
@@ -112,7 +120,7 @@ def shape(file: Path, **options: Any) -> None:
     refuse_existing(options["output"], targets, options["overwrite"])
     from polsep.geometry.one_frame_files import ShapeSettings, find_shape_of
 
-    names = ("method", "mask", "mesh", "integration", "turntable", "weights")
+    names = ("method", "mask", "mesh", "integration", "turntable", "weights", "index")
     settings = ShapeSettings(
         read_options(options), light_color=light, lamp=lamp, **{key: options[key] for key in names}
     )

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, reduce
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,7 @@ from polsep.render.disturbances import (
 )
 from polsep.render.materials import Materials, random_materials
 from polsep.render.raycast import MeshScene, View, find_lit, find_view, shade_view
+from polsep.render.room import Around, as_room, even_directions, light_from_around, roughen
 from polsep.render.sensor_errors import SensorErrors, encode_gamma, record
 from polsep.render.simulate import blur, expose_to_clip, expose_to_level, half_resolution
 from polsep.render.sphere_tracing import PointLight, Scene
@@ -168,38 +169,19 @@ def light_room(stage: Stage, share: float) -> Scene:
     `ROOM_LIGHTS` distant lights all around, brighter on one side, of one colour. ``share``: mean of the light that
     they reflect diffusely over that of the lamp, on the mask.
     """
-    room = _light_from_around(stage)
-    mask = room.mask
-    gain = share * light_stage(stage).diffuse.s0[:, mask].mean() / room.diffuse.s0[:, mask].mean()
     low, high = ROOM_COLORS
     red, blue = (low + (high - low) * torch.rand(2, generator=stage.draw(2))).tolist()
-    lit = scale_light(room, gain * as_color((red, 1.0, blue)))
-    return Scene(lit.diffuse + lit.specular, lit.specular * 0.0, mask)
+    return as_room(_light_around(stage), light_stage(stage), share, as_color((red, 1.0, blue)))
 
 
 @lru_cache(maxsize=1)
-def _light_from_around(stage: Stage) -> Scene:
-    """The stage under white lights all around, without a lamp; each is two lamps with crossed polarizers."""
+def _light_around(stage: Stage) -> Scene:
+    """The stage under white lights all around, without a lamp."""
     bright = torch.nn.functional.normalize(torch.randn(3, generator=stage.draw(6)), dim=0)
-    materials = replace(stage.materials, roughness=stage.materials.roughness.clamp(min=ROOM_ROUGHNESS))
-    if materials.textures is not None:
-        rough = materials.textures.roughness.clamp(min=ROOM_ROUGHNESS)
-        materials = replace(materials, textures=replace(materials.textures, roughness=rough))
-    far, scenes = 50 * stage.shape.size, []
-    for direction in _spiral(ROOM_LIGHTS):
-        strength = 1 + ROOM_CONTRAST * float(direction @ bright)
-        x, y, z = (far * direction).tolist()
-        light = PointLight((x, y, z), strength * far**2, 0.0)
-        scenes += [light_stage(stage, light, materials), light_stage(stage, _turned(light), materials)]
-    return reduce(add_scenes, scenes)
-
-
-def _spiral(count: int) -> Tensor:
-    """Unit vectors ``[count, 3]`` evenly over the sphere (Fibonacci)."""
-    k = torch.arange(count) + 0.5
-    height, turn = 1 - 2 * k / count, math.pi * (1 + 5**0.5) * k
-    around = (1 - height**2).sqrt()
-    return torch.stack([around * turn.cos(), height, around * turn.sin()], dim=1)
+    directions = even_directions(ROOM_LIGHTS)
+    around = Around(directions, 1 + ROOM_CONTRAST * (directions @ bright), 50 * stage.shape.size)
+    rough = roughen(stage.materials, ROOM_ROUGHNESS)
+    return light_from_around(lambda light: light_stage(stage, light, rough), around)
 
 
 def expose_frame(

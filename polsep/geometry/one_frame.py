@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.resizing import block_means, resize_area, resize_bilinear
-from polsep.geometry.shape_maps import INPUTS, Seen, Surface, decode, encode
+from polsep.geometry.shape_maps import INPUTS, Seen, Surface, decode, encode, lamp_direction
 from polsep.io.store.weights import read_weights, shipped_weights
 from polsep.networks.graphs import core, require_own_threads, shape_model
 from polsep.networks.sizes import ResidualSize
+from polsep.physics.fresnel import ETA, diffuse_dolp
 from polsep.pipeline import PolsepWarning
 from polsep.separation.highlights_kernel import find_parts
 from polsep.separation.report import SeparatedFrame
@@ -39,6 +40,8 @@ BLOCK = 8
 SMALLEST_PART = 0.01
 #: Expected error of ln(roughness), and of ln(strength), from which on they count as unknown.
 UNKNOWN = 0.5
+#: Refractive indices of dielectrics, from water to diamond.
+INDICES = (1.3, 2.5)
 #: Share of the frame's border on the thing from which on the mask is probably wrong; expected error of normals
 #: [degrees], in the median, from which on they are called uncertain.
 FILLED, UNCERTAIN_DEG = 0.2, 15.0
@@ -121,21 +124,31 @@ def shape(
     mask: Mask | None = None,
     light: Sequence[float] | None = None,
     weights: Path | None = None,
+    index: float = ETA,
 ) -> Shape:
     """Find the surface of the thing in a frame that `polsep.separate` separated; its `doubts` are issued as warnings.
 
     ``mask [h, w]``: where the thing is; None: where light falls (`find_thing`). ``light``: x, y, z toward the lamp,
-    x right, y up, z to the camera; None: not known, as beside the camera it need not be. Raises ValueError on masks of
-    another size or without pixels, and on frames without polarization.
+    x right, y up, z to the camera; None: not known, as beside the camera it need not be. ``index``: refractive index of
+    the thing, in `INDICES`. Raises ValueError on masks of another size or without pixels, and on frames without
+    polarization.
     """
-    found = find_shape(frame, mask, light, weights)
+    found = find_shape(frame, mask, light, weights, index)
     for note in found.doubts():
         warnings.warn(note, PolsepWarning, stacklevel=2)
     return found
 
 
-def find_shape(frame: SeparatedFrame, mask: Mask | None, light: Sequence[float] | None, weights: Path | None) -> Shape:
+def find_shape(
+    frame: SeparatedFrame,
+    mask: Mask | None,
+    light: Sequence[float] | None,
+    weights: Path | None = None,
+    index: float = ETA,
+) -> Shape:
     """`shape` without warnings."""
+    if not INDICES[0] <= index <= INDICES[1]:
+        raise ValueError(f"expected a refractive index from {INDICES[0]} to {INDICES[1]}, found {index:g}")
     chosen = find_thing(frame) if mask is None else np.asarray(mask, bool)
     if chosen.shape != frame.dolp.shape or not chosen.any():
         raise ValueError(
@@ -147,6 +160,7 @@ def find_shape(frame: SeparatedFrame, mask: Mask | None, light: Sequence[float] 
     way = _unit(light)
     window = square_around(chosen)
     small = gather(images_of(frame, chosen), window, SIDE)
+    small[4:6] = polarized_as_usual(small[4:6], small[:3].mean(axis=0), small[3:4] * (small[7:8] > 0.5), index)
     told = np.broadcast_to(np.array(way, np.float32)[:, None, None], (3, SIDE, SIDE))
     seen = Seen(small[:3], small[3:4], small[4:6], small[6:7], (small[7:8] > 0.5).astype(np.float32), told)
     found = load_estimator(weights).find(seen)
@@ -164,6 +178,23 @@ def find_shape(frame: SeparatedFrame, mask: Mask | None, light: Sequence[float] 
     }
     lamp = way if light is not None else find_lamp(found, seen)
     return Shape(**{name: _outside_zero(x, chosen) for name, x in maps.items()}, mask=chosen, light=lamp)
+
+
+def polarized_as_usual(polarized: Floats, diffuse: Floats, specular: Floats, index: float) -> Floats:
+    """The polarized light ``[2, h, w]`` that the same surface of index 1.5, for which the network is made, would have.
+
+    ``diffuse [h, w]`` and ``specular [1, h, w]`` light. What mirror images leave of the polarization (`encode`) is
+    diffuse light of one zenith angle: its DoLP there is exchanged (`fresnel.diffuse_dolp`), its AoLP stays.
+    """
+    if index == ETA:
+        return polarized
+    lamp, _ = lamp_direction(polarized, specular)
+    left = polarized - specular * lamp
+    strength = np.hypot(*left) / np.maximum(diffuse, 1e-6)
+    cosines = np.cos(np.linspace(0, np.radians(89.0), 500))
+    usual = np.interp(strength, diffuse_dolp(cosines, index), diffuse_dolp(cosines))
+    found: Floats = polarized + left * (usual / np.maximum(strength, 1e-6) - 1)
+    return found
 
 
 def find_lamp(surface: Surface, seen: Seen) -> tuple[float, float, float]:

@@ -21,6 +21,7 @@ from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
 from polsep.io.results.separation_reader import SUFFIXES, read_separated
 from polsep.io.results.sidecars import read_report
 from polsep.io.store.errors import input_error
+from polsep.physics.fresnel import ETA
 from polsep.pipeline import LightColor, separate_capture
 from polsep.separation.report import SeparatedFrame
 
@@ -49,7 +50,7 @@ GREY = 40
 class ShapeSettings:
     """Options of `polsep shape`: ``read``, ``method`` and ``light_color`` of a raw frame; ``lamp``, toward which a
     direction is told; a file of the ``mask``; format of the ``mesh`` ("none": no depth and mesh), its ``integration``,
-    a ``turntable``; and ``weights`` instead of the shipped ones."""
+    a ``turntable``; ``weights`` instead of the shipped ones; and the refractive ``index`` of the thing."""
 
     read: ReadOptions = field(default_factory=ReadOptions)
     method: str = "joint"
@@ -60,6 +61,7 @@ class ShapeSettings:
     integration: str = "bilateral"
     turntable: bool = False
     weights: Path | None = None
+    index: float = ETA
 
 
 def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list[str]]:
@@ -67,7 +69,7 @@ def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list
     frame, notes = _read_frame(path, settings)
     mask = None if settings.mask is None else read_object(settings.mask, frame.dolp.shape)
     try:
-        found = find_shape(frame, mask, settings.lamp, settings.weights)
+        found = find_shape(frame, mask, settings.lamp, settings.weights, settings.index)
     except ValueError as error:
         raise input_error(path, error) from error
     return shape_files(frame, found, settings, path.stem), notes + found.doubts()

@@ -105,39 +105,6 @@ def retain_polarization(scene: Scene, share: Number, whiteness: Number = 0.0) ->
     return replace(scene, diffuse=scene.diffuse * (1 - share), specular=scene.specular + more)
 
 
-@dataclass(frozen=True)
-class RoomLight:
-    """Unpolarized light around, all of it counted as diffuse.
-
-    ``share``: mean of its diffusely reflected s0 over that of the lamp, on the mask, 0 to 1. ``color``: its raw colour
-    over the lamp's. ``shading [..., 1, H, W]``: relative irradiance over the frame, scaled here (`shade_room`,
-    `random_field`). ``reflectance [..., C, H, W]``: albedo times any constant; None takes the diffuse s0 for it, as
-    where the lamp is near the camera. ``mirror``: mean s0 of its mirror image, which has the room's colour everywhere,
-    over that of its diffusely reflected light: 0.09 over the albedo for smooth dielectrics in an even room.
-    """
-
-    share: Number
-    color: Number = 1.0
-    shading: Number = 1.0
-    reflectance: Tensor | None = None
-    mirror: Number = 0.2
-
-
-def add_room_light(scene: Scene, room: RoomLight) -> Scene:
-    """Return the scene in a room that is not dark: unpolarized s0, added to the diffuse light.
-
-    Not done: the polarization that mirroring and leaving the surface at a slant give to unpolarized light, a few
-    percent of it. `datasets.reality` renders rooms with it.
-    """
-    base = scene.diffuse.s0
-    body = base if room.reflectance is None else room.reflectance
-    inside = scene.mask[..., None, :, :]
-    mean = room.share * _mean_over(base, inside)
-    lit = _scaled_to(mean, body * room.shading, inside)
-    mirrored = _scaled_to(mean * room.mirror, torch.ones_like(base) * room.shading, inside) * inside
-    return replace(scene, diffuse=replace(scene.diffuse, s0=base + room.color * (lit + mirrored)))
-
-
 def _scaled_to(mean: Tensor, image: Tensor, inside: Tensor) -> Tensor:
     """The image times what gives it this mean over all colours of the pixels inside."""
     return image * (mean / _mean_over(image, inside).clamp(min=1e-12))
@@ -147,15 +114,6 @@ def _mean_over(image: Tensor, inside: Tensor) -> Tensor:
     """Mean ``[..., 1, 1, 1]`` over all colours of the pixels inside."""
     count = inside.sum(dim=(-3, -2, -1), keepdim=True) * image.shape[-3]
     return (image * inside).sum(dim=(-3, -2, -1), keepdim=True) / count.clamp(min=1)
-
-
-def shade_room(normals: Tensor, toward: Tensor, contrast: Number) -> Tensor:
-    """Return the irradiance ``[..., 1, H, W]`` of an environment that is brighter on one side: 1 + contrast n.d.
-
-    ``normals [..., 3, H, W]`` and the direction ``toward [..., 3]`` of the brighter side are unit vectors; ``contrast``
-    in [0, 1]. Source: Ramamoorthi and Hanrahan 2001: irradiance is a polynomial of low degree of the normal.
-    """
-    return 1 + contrast * (normals * toward[..., None, None]).sum(dim=-3, keepdim=True)
 
 
 def random_field(size: tuple[int, ...], cells: int, contrast: float, generator: torch.Generator) -> Tensor:

@@ -18,9 +18,7 @@ from torch import Tensor
 from polsep.render.disturbances import (
     METALS,
     IndirectLight,
-    RoomLight,
     add_indirect_light,
-    add_room_light,
     add_scenes,
     add_veiling_glare,
     as_color,
@@ -31,6 +29,7 @@ from polsep.render.disturbances import (
     scale_light,
     shift_colors,
 )
+from polsep.render.room import as_room
 from polsep.render.sensor_errors import SensorErrors
 from polsep.render.sphere_tracing import Scene
 
@@ -43,8 +42,9 @@ TINTED_SHARE, TINTS = 0.7, (0.3, 1.7)
 COLOR_ERRORS, COLOR_ERROR_SHARES = (0.0, 0.015, 0.05, 0.2), (0.25, 0.45, 0.22, 0.08)
 #: Share of scenes whose lamp is not polarized completely, and its degree of polarization.
 IMPERFECT_SHARE, DEGREES = 0.4, (0.75, 1.0)
-#: Share of scenes with room light, its s0 over the lamp's diffuse one, log-uniform, and contrast of its shading.
-ROOM_SHARE, ROOMS, ROOM_CONTRAST = 0.45, (0.01, 0.6), 0.8
+#: Share of scenes with room light, its diffuse light over the lamp's, log-uniform, number of its lights, range of their
+#: strengths, and least roughness of surfaces to them, log-uniform: windows and ceilings are large.
+ROOM_SHARE, ROOMS, ROOM_LIGHTS, STRENGTHS, ROOM_ROUGHNESS = 0.45, (0.01, 0.6), (2, 6), (0.2, 1.8), (0.15, 0.7)
 #: Share of scenes with a second lamp, and its strength over the first one's.
 SECOND_SHARE, SECOND = 0.12, (0.1, 1.0)
 #: Share of scenes in which a part of the diffuse light keeps the lamp's polarization, beside `variety.RETAINED`; that
@@ -63,8 +63,15 @@ DARK_SHARE, DARK = 0.15, (0.05, 0.7)
 ERRORS_SHARE, ERRORS = 0.5, SensorErrors(angles_deg=1.5, gains=0.015, period_gains=0.01, cross_talk=0.025, black=0.006)
 BLACK_SHARE = 0.3
 
-#: Renders the scene again under another lamp; True: without shadows.
-Rerender = Callable[[bool], Scene]
+
+class Relit(NamedTuple):
+    """Renderers of a scene's surfaces: under a ``second`` lamp alone, and in unpolarized light from ``around``.
+
+    The latter takes the lights' directions ``[N, 3]`` with strengths ``[N]``, and the least roughness.
+    """
+
+    second: Callable[[], Scene]
+    around: Callable[[tuple[Tensor, Tensor], float], Scene]
 
 
 class RealScene(NamedTuple):
@@ -97,7 +104,7 @@ def describe_light(color_error: Tensor, dolp: float, room: float) -> Tensor:
 MIN_ROOM = 0.01
 
 
-def disturb(scene: Scene, rerender: Rerender, generator: torch.Generator) -> RealScene:
+def disturb(scene: Scene, relit: Relit, generator: torch.Generator) -> RealScene:
     """Return a scene with random disturbances, in the order in which light meets them, or as it is."""
     draw = _Draw(generator)
     if draw.happens(IDEAL_SHARE):
@@ -107,17 +114,15 @@ def disturb(scene: Scene, rerender: Rerender, generator: torch.Generator) -> Rea
     if draw.happens(METAL_SHARE):
         scene = make_metal(scene, draw.patches(scene, draw.between(METAL_AREA)), draw.metal())
     if draw.happens(SECOND_SHARE):
-        scene = add_scenes(scene, scale_light(rerender(False), draw.between(SECOND)))
+        scene = add_scenes(scene, scale_light(relit.second(), draw.between(SECOND)))
     if draw.happens(INDIRECT_SHARE):
         scene = add_indirect_light(scene, draw.indirect_light(scene))
     dolp = draw.between(DEGREES) if draw.happens(IMPERFECT_SHARE) else 1.0
     scene = depolarize_lamp(scene, dolp)
     room = draw.log_between(ROOMS) if draw.happens(ROOM_SHARE) else 0.0
     if room:
-        body = rerender(True).diffuse.s0
-        shading = draw.field(scene, ROOM_CONTRAST)
-        mirror = draw.log_between((0.03, 0.5))
-        scene = add_room_light(scene, RoomLight(room, draw.tint(0.25), shading, body, mirror))
+        around = relit.around(draw.lights(), draw.log_between(ROOM_ROUGHNESS))
+        scene = add_scenes(scene, as_room(around, scene, room, draw.tint(0.25)))
     lamp = draw.lamp_color()
     scene = scale_light(scene, lamp[:, None, None])
     if draw.happens(GLARE_SHARE):
@@ -177,6 +182,13 @@ class _Draw:
         """A colour ``[3, 1, 1]``, log-normal, green = 1."""
         tint = torch.exp(deviation * torch.randn(3, generator=self.generator))
         return as_color(tint / tint[1])
+
+    def lights(self) -> tuple[Tensor, Tensor]:
+        """Directions ``[N, 3]`` and strengths ``[N]`` of a room's lights."""
+        low, high = ROOM_LIGHTS
+        count = low + int((high + 1 - low) * self.uniform())
+        directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=self.generator), dim=1)
+        return directions, STRENGTHS[0] + (STRENGTHS[1] - STRENGTHS[0]) * torch.rand(count, generator=self.generator)
 
     def lamp_color(self) -> Tensor:
         """Raw colour ``[3]`` of a lamp, its largest channel 1."""

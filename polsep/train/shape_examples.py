@@ -31,7 +31,7 @@ from polsep.render.materials import Materials, random_materials
 from polsep.render.raycast import MeshScene, View, build_gbuffer, find_lit, find_view, shade_view
 from polsep.render.shapes import Floats, random_mesh
 from polsep.render.simulate import blur, capture, expose_to_clip, expose_to_level
-from polsep.render.sphere_tracing import PinholeCamera, PointLight, Scene, camera_axes
+from polsep.render.sphere_tracing import PinholeCamera, PointLight, camera_axes
 from polsep.render.vessels import random_vessel
 from polsep.render.views import (
     MIN_LEVEL,
@@ -45,6 +45,7 @@ from polsep.render.views import (
 )
 from polsep.sensor.camera import Layout
 from polsep.train.reality import RealScene, as_ideal, disturb
+from polsep.train.stream import relit_of
 from polsep.train.variety import (
     LitView,
     log_between,
@@ -149,13 +150,9 @@ def random_shape_example(split: str, seed: int, number: int, side: int = SIDE) -
     if depolarized < DEPOLARIZED_SHARE:
         scene = vary_polarization(scene, generator)
 
-    def rerender(everywhere: bool) -> Scene:
-        lamp = random_lamp(shot.camera, thing.size / 2, generator)
-        lit = find_lit(thing, view, lamp)
-        lit = tuple(torch.ones_like(band) for band in lit) if everywhere else lit
-        return blur(shade_view(view, materials, lamp, lit), shot.blur)
-
-    found = disturb(scene, rerender, generator) if real < REAL_SHARE else as_ideal(scene)
+    second = LitView(view, materials, random_lamp(shot.camera, thing.size / 2, generator), lit_view.lit)
+    relit = relit_of(thing, second, shot.blur)
+    found = disturb(scene, relit, generator) if real < REAL_SHARE else as_ideal(scene)
     return torch.cat([_photograph(found, shot.clip, generator), surface_planes(view, materials, shot)])
 
 
@@ -185,7 +182,7 @@ def _photograph(real: RealScene, clip: float, generator: torch.Generator) -> Ten
 
 
 def surface_planes(view: View, materials: Materials, shot: Shot) -> Tensor:
-    """Return mask, normal, albedo, roughness, specular strength, and the lamp's direction: means over 2x2 raw pixels."""
+    """Return mask, normal, albedo, roughness, specular strength and the lamp's direction: means over 2x2 pixels."""
     height, width = view.size
     planes = torch.zeros(9, height * width)
     axes = camera_axes(shot.camera)

@@ -26,15 +26,16 @@ from torch.utils.data import IterableDataset, get_worker_info
 from polsep.networks.channels import PERIOD
 from polsep.networks.whole_frame import make_thumbnail
 from polsep.physics.stokes import Stokes
-from polsep.render.materials import random_materials
+from polsep.render.materials import Materials, random_materials
 from polsep.render.raycast import MeshScene, find_lit, find_view, shade_view
+from polsep.render.room import Around, light_from_around, roughen
 from polsep.render.sensor_errors import SensorErrors, cross_talk, filter_with_errors, random_analyser_angles, vary_gains
 from polsep.render.simulate import HEADROOM, blur, filter_light
-from polsep.render.sphere_tracing import Scene
+from polsep.render.sphere_tracing import PointLight, Scene
 from polsep.render.views import MIN_LEVEL, random_shot, scene_seed, seeded_shape
 from polsep.sensor.camera import CLIP_MARGIN, IMX250, Layout, Sensor
 from polsep.train.constants import Constant, check_constant, constants_set
-from polsep.train.reality import RealScene, as_ideal, disturb, random_darkness, random_errors
+from polsep.train.reality import RealScene, Relit, as_ideal, disturb, random_darkness, random_errors
 from polsep.train.variety import (
     LitView,
     random_sensor,
@@ -50,6 +51,8 @@ from polsep.train.variety import (
 
 #: Views of a shape; lights, each with new materials, per view.
 VIEWS, LIGHTS = 2, 3
+#: Distance of a room's lights, in sizes of the shape.
+ROOM_DISTANCE = 20.0
 #: The brightest object samples of a scene are kept as quantiles: from this share on, and how many.
 LOWEST_QUANTILE, QUANTILES = 0.94, 601
 #: Share of examples without clipping, and the range of their brightest sample, as a share of white.
@@ -238,7 +241,7 @@ def _render_view(shape: MeshScene, options: StreamOptions, generator: torch.Gene
         if varied:
             scene = vary_retention(vary_polarization(scene, generator), partial(render_sheen, lit_view), generator)
         if options.looks == "real":
-            real = disturb(scene, partial(_rerender, shape, lit_view._replace(light=other), shot.blur), generator)
+            real = disturb(scene, relit_of(shape, lit_view._replace(light=other), shot.blur), generator)
         else:
             real = as_ideal(scene)
         scenes.append(_as_pooled(real, options.looks == "real"))
@@ -246,12 +249,18 @@ def _render_view(shape: MeshScene, options: StreamOptions, generator: torch.Gene
     return scenes
 
 
-def _rerender(shape: MeshScene, lit_view: LitView, sigma: float, everywhere: bool) -> Scene:
-    """The view under its light, or with this light ``everywhere``, also in its shadows."""
-    lit = find_lit(shape, lit_view.view, lit_view.light)
-    if everywhere:
-        lit = tuple(torch.ones_like(band) for band in lit)
-    return blur(shade_view(*lit_view._replace(lit=lit)), sigma)
+def relit_of(shape: MeshScene, lit_view: LitView, sigma: float) -> Relit:
+    """Return the renderers of a view behind a lens of blur ``sigma`` [pixels]; its light is the second lamp."""
+
+    def light_by(light: PointLight, materials: Materials = lit_view.materials) -> Scene:
+        lit = find_lit(shape, lit_view.view, light)
+        return blur(shade_view(lit_view.view, materials, light, lit), sigma)
+
+    def around(lights: tuple[Tensor, Tensor], roughness: float) -> Scene:
+        rough = roughen(lit_view.materials, roughness)
+        return light_from_around(partial(light_by, materials=rough), Around(*lights, ROOM_DISTANCE * shape.size))
+
+    return Relit(lambda: light_by(lit_view.light), around)
 
 
 def _as_pooled(real: RealScene, dark: bool) -> PooledScene:

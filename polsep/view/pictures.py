@@ -355,7 +355,7 @@ def shape_panel(frame: SeparatedFrame, stem: str) -> str:
     from polsep.geometry.one_frame import find_shape
     from polsep.geometry.one_frame_files import page_of
 
-    surface = find_shape(frame, None, None, None)
+    surface = find_shape(frame, None, None)
     error = float(np.degrees(np.median(surface.normal_error[surface.mask])))
     page, title = html.escape(page_of(surface, stem).decode(), quote=True), f"Relit {html.escape(stem)}"
     window = f'<iframe class="ps-relit" title="{title}" sandbox="allow-scripts" srcdoc="{page}"></iframe>'

@@ -9,7 +9,7 @@ const part = (id) => document.getElementById(id);
 const options = new URLSearchParams(location.search);
 const worker = new Worker(new URL("worker.js", location.href), { type: "module" });
 const viewer = new Viewer(part("stage"), part("canvas"), part("handle"), showScale);
-const state = { file: null, images: null, report: null, gain: 1, busy: false, again: false, name: "" };
+const state = { file: null, images: null, report: null, gain: 1, busy: false, again: false, next: null, name: "" };
 
 for (const [id, start] of [["left", "diffuse"], ["right", "specular"]])
   part(id).append(...Object.entries(VIEWS).map(([value, text]) => new Option(text, value, value === start, value === start)));
@@ -50,24 +50,36 @@ const settings = () => ({
   device: options.get("device") || part("device").value,
 });
 
-/** Read a file and separate it. `stated`: format and size of files without a header. */
-async function open(file, stated = null) {
-  if (state.busy) return;
-  Object.assign(state, { file, name: file.name, busy: true });
-  part("raw").hidden = true;
-  clearNotes();
+/** Read a file and separate it; after what is at work, of several files the last. `stated`: format and size. */
+function open(file, stated = null) {
+  if (!state.busy) return work(() => read(file, stated));
+  state.next = [file, stated];
+  part("status").textContent = `${file.name} · next …`;
+}
+
+/** Do one thing at a time, then what was asked for meanwhile: another file, or other settings. */
+async function work(act) {
+  state.busy = true;
   try {
-    const found = await ask("open", { file, name: file.name, stated });
-    if (found.needsFormat) askFormat(found);
-    else {
-      state.busy = false;
-      await separate();
-    }
+    await act();
   } catch (error) {
     fail(error);
   } finally {
     state.busy = false;
   }
+  const next = state.next;
+  state.next = null;
+  if (next) await open(...next);
+  else if (state.again) separate();
+}
+
+async function read(file, stated) {
+  Object.assign(state, { file, name: file.name });
+  part("raw").hidden = true;
+  clearNotes();
+  const found = await ask("open", { file, name: file.name, stated });
+  if (found.needsFormat) askFormat(found);
+  else await separateOpen();
 }
 
 function askFormat({ size, guesses }) {
@@ -80,22 +92,19 @@ function askFormat({ size, guesses }) {
 }
 
 /** Separate the frame that is open, by the settings as they are; once more where these change meanwhile. */
-async function separate() {
+function separate() {
   if (!state.file) return;
-  if (state.busy) return void (state.again = true);
-  state.busy = true;
+  if (state.busy) state.again = true;
+  else work(separateOpen);
+}
+
+async function separateOpen() {
   document.body.dataset.state = "busy";
-  try {
-    do {
-      state.again = false;
-      const found = await ask("separate", { settings: settings() });
-      if (!state.again) showResult(found);
-    } while (state.again);
-  } catch (error) {
-    fail(error);
-  } finally {
-    state.busy = false;
-  }
+  do {
+    state.again = false;
+    const found = await ask("separate", { settings: settings() });
+    if (!state.again && !state.next) showResult(found);
+  } while (state.again && !state.next);
 }
 
 function showResult({ images, report, notes }) {
@@ -242,16 +251,11 @@ async function download(format) {
     return save(await canvas.convertToBlob({ type: "image/png" }), `${stem}_${part(format).value}_preview.png`);
   }
   const status = part("status").textContent;
-  state.busy = true;
-  try {
+  await work(async () => {
     const { blob } = await ask("write", { format });
     save(blob, format === "exr" ? `${stem}.exr` : `${stem}_${format}.png`);
     part("status").textContent = status;
-  } catch (error) {
-    fail(error);
-  } finally {
-    state.busy = false;
-  }
+  });
 }
 
 /** Values under the pointer. */

@@ -48,7 +48,7 @@ from polsep.render.blobs import random_blob
 from polsep.separation.report import SeparatedFrame
 from polsep.train.shape_examples import COUNT, PLANES, random_shape_example
 from polsep.train.shape_losses import random_lamps, shape_loss
-from polsep.train.shape_task import angles_deg, cut_example, score_shapes, seen_of, truth_of, turn_example
+from polsep.train.shape_task import angles_deg, cut_example, score_shapes, seen_of, shift_errors, truth_of, turn_example
 
 Cli = Callable[..., Run]
 #: A small network, for what does not depend on weights.
@@ -145,6 +145,20 @@ def _untrained(folder: Path) -> tuple[ShapeEstimator, ShapeNetwork]:
     path = folder / "small.safetensors"
     write_weights(path, arrays, {"method": "shape", "input": "separated", "size": json.dumps(asdict(SMALL))})
     return ShapeEstimator(path), network
+
+
+def test_expected_errors_are_shifted_alone() -> None:
+    """All expected errors of normals are times a factor, and nothing else changes."""
+    network = ShapeNetwork(INPUTS["separated"], USUAL, SMALL)
+    planes = cut_example(sphere_planes(), 1.1, 48)[None]
+    seen = seen_of(planes, "separated")
+    with torch.no_grad():
+        before = decode(network(encode(seen, "separated")), seen.image, seen.mask)
+        shift_errors(network, 0.8)
+        after = decode(network(encode(seen, "separated")), seen.image, seen.mask)
+    torch.testing.assert_close(after.normal_error, 0.8 * before.normal_error)
+    for name in set(before._fields) - {"normal_error"}:
+        assert torch.equal(getattr(before, name), getattr(after, name))
 
 
 def test_losses_are_least_at_the_truth() -> None:

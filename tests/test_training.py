@@ -468,7 +468,7 @@ def test_without_tensorboard_the_extra_is_named(
         (["joint", "--ablation", "x"], "expected an ablation of none"),
         (["joint", "--part", "x"], "expected a part of all, details"),
         (["joint-fast", "--data", "co-sited"], "expected a variant of mosaic, mono"),
-        (["paper", "--steps", "0"], "'--steps': expected a whole number"),
+        (["paper", "--steps", "0"], "expected at least 1 step"),
         (["joint", "--refit"], "expected a network with a linear filter to refit, found joint for mosaic"),
         (["paper", "--workers", "-1"], "'--workers': expected a whole number"),
         (["paper", "--devices", "0"], "'--devices': expected a whole number"),

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from polsep.cli.app import COUNT, DIR, POSITIVE, Word, app, require_extra, require_paths
+from polsep.cli.app import COUNT, DIR, POSITIVE, Number, Word, app, require_extra, require_paths
 
 #: What can be trained.
 RUNGS = (
@@ -59,7 +59,13 @@ RUNGS = (
 @click.option(
     "--folder", type=DIR, metavar="DIR", help="material, shape: folder of the examples.  [default: DIR/../examples]"
 )
-@click.option("--steps", type=COUNT, default=20_000, metavar="N", help="Batches of 8 crops, or of 4 materials.")
+@click.option(
+    "--steps",
+    type=Number(int, 0),
+    default=20_000,
+    metavar="N",
+    help="Batches of 8 crops, or of 4 materials; 0 with --start: write and score that mean alone.",
+)
 @click.option("--until", type=COUNT, metavar="N", help="material, shape: end at this step of the schedule.")
 @click.option("--rate", type=POSITIVE, default=1e-3, metavar="X", help="Peak learning rate.")
 @click.option("--seed", type=int, default=0, metavar="N", help="Random seed of the weights and of the data.")

@@ -37,6 +37,8 @@ STEPS = 512
 #: Outputs: normal x, y, z before scaling; logarithms of the variance of its error [rad^2], of albedo over the seen
 #: image, of roughness and its variance, of the specular strength and its variance.
 USUAL = (0.0, 0.0, 0.5, -2.5, 0.3, 0.3, 0.3, -0.9, -1.5, -0.5, -0.5)
+#: The output that is the logarithm of the variance of the normal's error.
+NORMAL_VARIANCE = 3
 #: Reflectance at normal incidence of strength 1: a dielectric of index 1.5.
 GLASS = 0.04
 #: Range of logarithms of variances, and of other logarithms.
@@ -172,7 +174,7 @@ def decode(outputs: Array, image: Array, mask: Array) -> Surface:
     up = xp.log(1 + xp.exp(z.clip(-20, 20))) + 1e-3  # positive: a camera sees what faces it
     length = xp.sqrt(x * x + y * y + up * up)
     normal = xp.concat([x / length, y / length, up / length], axis=-3)
-    deviation = [xp.exp(outputs[..., k : k + 1, :, :].clip(*LOG_VARIANCES) / 2) for k in (3, 8, 10)]
+    deviation = [xp.exp(outputs[..., k : k + 1, :, :].clip(*LOG_VARIANCES) / 2) for k in (NORMAL_VARIANCE, 8, 10)]
     light = image.clip(0, None) / level + FLOOR
     albedo = light * xp.exp(outputs[..., 4:7, :, :].clip(*LOGARITHMS))
     roughness = xp.exp(outputs[..., 7:8, :, :].clip(LOGARITHMS[0], 0))

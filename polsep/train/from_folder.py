@@ -51,21 +51,24 @@ def train_recipe(recipe: Recipe, run: Run, report: Callable[[dict[str, Any]], No
     path = run.out / f"{recipe.method}-{options.input}.safetensors"
     if average is None:
         return path
-    halves = {name: value.cpu().half().float() for name, value in average.items()}
-    training.network.cpu().load_state_dict(halves)
+    network = training.network.cpu()
+    network.load_state_dict(average)
+    training.finish(network)
+    halves = {name: value.half().float() for name, value in network.state_dict().items()}
+    network.load_state_dict(halves)
     metadata = recipe.facts | {
         "method": recipe.method,
         "input": options.input,
         "size": json.dumps(asdict(options.size)),
         "seed": str(options.seed),
-        "parameters": str(count_parameters(training.network)),
+        "parameters": str(count_parameters(network)),
         "schedule": json.dumps(asdict(run.schedule)),
         "options": json.dumps(asdict(options)),
         "data": recipe.data,
         "steps": str(run.last),
         "start": json.dumps(starts),
         "command": describe_recipe(recipe, run),
-        "validation": json.dumps(training.score(training.network)),
+        "validation": json.dumps(training.score(network)),
         "curve": json.dumps([[line["step"], round(line["loss"], 5)] for line in read_log(run.out) if line["step"]]),
     }
     write_weights(path, halves, metadata)

@@ -110,7 +110,7 @@ class Training:
 
     Batches are named tuples of tensors; the third argument of the loss is the completed share of the training.
     ``score``: the scores of a network in a line of the log; ``begin``: called before the first step; ``references``:
-    scores in the log's first line.
+    scores in the log's first line; ``finish``: fits what is not trained to the averaged network, on validation data.
     """
 
     network: nn.Module
@@ -119,6 +119,7 @@ class Training:
     score: Callable[[nn.Module], dict[str, float]]
     begin: Callable[[], None] = field(default=lambda: None)
     references: Callable[[], dict[str, float]] = field(default=dict)
+    finish: Callable[[nn.Module], None] = field(default=lambda _: None)
 
 
 def train(task: Task[Inputs], run: Run, report: Report) -> dict[str, Tensor] | None:

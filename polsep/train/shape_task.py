@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, normalize
 
-from polsep.geometry.shape_maps import INPUTS, USUAL, Seen, Surface, decode, encode
+from polsep.geometry.shape_maps import INPUTS, NORMAL_VARIANCE, USUAL, Seen, Surface, decode, encode
 from polsep.networks.shape import ShapeNetwork
 from polsep.networks.sizes import ResidualSize
 from polsep.train.loop import Training
@@ -231,4 +231,16 @@ def shape_training(options: ShapeOptions, folder: Path) -> Training:
         examples = [cut_example(load_example(p), CUT, options.side) for p in paths("validation", options.validation)]
         return score_shapes(net, examples, options.input)
 
-    return Training(network, partial(batches, options, paths("train", options.examples)), loss, score)
+    def finish(net: nn.Module) -> None:
+        assert isinstance(net, ShapeNetwork)
+        shift_errors(net, 1 / score(net)["expected / rms"])
+
+    return Training(network, partial(batches, options, paths("train", options.examples)), loss, score, finish=finish)
+
+
+def shift_errors(network: ShapeNetwork, factor: float) -> None:
+    """Multiply the errors of normals that a network expects by a factor: a shift of their log variance, an output."""
+    assert network.last.bias is not None
+    with torch.no_grad():
+        outputs = network.last.bias.view(len(USUAL), -1)
+        outputs[NORMAL_VARIANCE] += 2 * math.log(factor)

@@ -221,16 +221,14 @@ def test_digests_cover_every_module_that_makes_examples() -> None:
     """Optics, Stokes algebra, sensor and all of the renderer; of the package, nothing that only trains."""
     drawn, separated = find_sources("polsep.train.stream"), find_sources("polsep.material.examples")
     render = {f"polsep.render.{path.stem}" for path in Path(polsep.__file__).parent.glob("render/*.py")}
-    unused = {
-        "polsep.render.__init__",
-        "polsep.render.distances",
-        "polsep.render.blobs",
-    }  # the demo's scenes; for shape
+    demo, for_shape = {"distances"}, {"blobs", "vessels", "waves"}
+    unused = {f"polsep.render.{name}" for name in {"__init__"} | demo | for_shape}
     common = {"polsep.physics.optics", "polsep.physics.stokes", "polsep.sensor.camera"}
     assert common | (render - unused) | {"polsep.train.variety", "polsep.train.reality"} <= set(drawn)
     assert common | {"polsep.material.shots", "polsep.demosaic.guided"} <= set(separated)
     shaped = find_sources("polsep.train.shape_examples")
-    assert common | {"polsep.render.blobs", "polsep.train.reality", "polsep.separation.report"} <= set(shaped)
+    bodies = {f"polsep.render.{name}" for name in for_shape}
+    assert common | bodies | {"polsep.train.reality", "polsep.separation.report"} <= set(shaped)
     thumbnail = {f"polsep.networks.{name}" for name in ("channels", "thumbnails", "whole_frame")}
     other = {name for name in drawn if name.startswith(("polsep.networks", "polsep.separation", "polsep.train.t"))}
     assert other == thumbnail

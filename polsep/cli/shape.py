@@ -49,7 +49,7 @@ from polsep.cli.progress import show_progress
     default=1.5,
     show_default=True,
     metavar="N",
-    help="Refractive index of the thing: 1.33 wet, 1.4 skin, 1.5 most paints and plastics, 1.7 and more glazes.",
+    help="Refractive index of the thing: 1.33 water, 1.4 skin, 1.5 glass and most paints, 1.6 polycarbonate.",
 )
 @click.option(
     "--method",

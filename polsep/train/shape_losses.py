@@ -18,6 +18,8 @@ from polsep.geometry.shape_maps import Surface, relight
 NORMALS, EXPECTED, ALBEDO, GLOSS, PICTURES = 1.0, 0.05, 0.3, 0.3, 0.3
 #: Number of lamps of pictures, and their largest angle from the camera.
 LAMPS, LARGEST_DEG = 2, 70.0
+#: Pictures are computed at every so many pixels across and down: they took most of a step.
+SPARSE = 2
 #: Added to pictures, relative to their mean, before their logarithm is taken; and to albedos.
 FLOOR, ALBEDO_FLOOR = 0.1, 0.02
 
@@ -33,7 +35,9 @@ def shape_loss(found: Surface, truth: Surface, mask: Tensor, generator: torch.Ge
         off = torch.log(getattr(found, name)) - torch.log(getattr(truth, name).clamp(min=1e-3))
         total = total + GLOSS * _mean(off.abs(), mask)
         total = total + EXPECTED * _mean(_likelihood(off.detach().square(), getattr(found, f"{name}_error")), mask)
-    return total + PICTURES * pictures_loss(found, truth, mask, random_lamps(LAMPS, generator))
+    rows, cols = (slice(n, None, SPARSE) for n in torch.randint(SPARSE, (2,), generator=generator).tolist())
+    found, truth = (Surface(*(x[..., rows, cols] for x in surface)) for surface in (found, truth))
+    return total + PICTURES * pictures_loss(found, truth, mask[..., rows, cols], random_lamps(LAMPS, generator))
 
 
 def _likelihood(square: Tensor, deviation: Tensor) -> Tensor:

@@ -30,6 +30,7 @@ from polsep.geometry import one_frame
 from polsep.geometry.one_frame import (
     SIDE,
     ShapeEstimator,
+    find_lamp,
     gather,
     polarized_as_usual,
     shape,
@@ -37,7 +38,18 @@ from polsep.geometry.one_frame import (
     square_around,
 )
 from polsep.geometry.polarization import Cue, choose_outward
-from polsep.geometry.shape_maps import INPUTS, USUAL, Seen, Surface, decode, encode, projected_normal
+from polsep.geometry.shape_maps import (
+    INPUTS,
+    USUAL,
+    Seen,
+    Surface,
+    decode,
+    encode,
+    mean_surface,
+    mirror_seen,
+    mirror_surface,
+    projected_normal,
+)
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.weights import write_weights
@@ -128,11 +140,53 @@ def test_the_engine_is_the_network(tmp_path: Path) -> None:
     seen = seen_of(planes, "separated")
     with torch.no_grad():
         wanted = decode(network(encode(seen, "separated")), seen.image, seen.mask)
-    found = estimator.find(Seen(*(x[0].numpy() for x in seen)))
+    found = estimator.look(_as_seen(planes))
     for name in found._fields:
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name)[0].numpy(), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=0), 1, atol=1e-6)
     assert (found.normal[2] > 0).all()
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_mirrored_frames_give_mirrored_surfaces(tmp_path: Path, told: bool) -> None:
+    """Of a random frame: mirror images are seen alike, as s2 and the lamp's x change their signs."""
+    estimator, _ = _untrained(tmp_path)
+    planes = cut_example(random_planes(), 1.1, SIDE)
+    planes[PLANES["light"]] *= told
+    mirrored = turn_example(planes, True, False, False)
+    seen, other = (_as_seen(p[None]) for p in (planes, mirrored))
+    for first, second in zip(other, mirror_seen(seen), strict=True):
+        np.testing.assert_array_equal(first, second)
+    found, wanted = estimator.find(other), mirror_surface(estimator.find(seen))
+    for name in found._fields:
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(found.normal, axis=0), 1, atol=1e-6)
+
+
+def _as_seen(planes: Tensor) -> Seen:
+    return Seen(*(np.asarray(x)[0] for x in seen_of(planes, "separated")))
+
+
+def random_planes() -> Tensor:
+    """The sphere's example with other light everywhere: no part of it is symmetric."""
+    planes = sphere_planes()
+    noise = torch.rand(planes.shape, generator=torch.Generator().manual_seed(4))
+    planes[: PLANES["mask"].start] *= 0.5 + noise[: PLANES["mask"].start]
+    planes[PLANES["light"]] = torch.tensor([0.6, 0.0, 0.8])[:, None, None]
+    return planes
+
+
+def test_a_lamp_that_is_not_told_is_looked_for(tmp_path: Path) -> None:
+    """The surface of an untold lamp is that of the lamp which the first looks imply."""
+    estimator, _ = _untrained(tmp_path)
+    planes = cut_example(random_planes(), 1.1, SIDE)[None]
+    seen = _as_seen(planes)
+    untold = seen._replace(light=0 * seen.light)
+    first = mean_surface(estimator.look(untold), mirror_surface(estimator.look(mirror_seen(untold))))
+    lamp = np.array(find_lamp(first, untold), np.float32)
+    assert lamp[2] > 0
+    wanted = estimator.find(untold._replace(light=lamp[:, None, None] + 0 * seen.light))
+    np.testing.assert_array_equal(estimator.find(untold).normal, wanted.normal)
 
 
 def _untrained(folder: Path) -> tuple[ShapeEstimator, ShapeNetwork]:

@@ -1,6 +1,7 @@
 """The surface behind one frame under one polarized lamp: normals, albedo, roughness, strength of its mirror images.
 
 A network looks at the thing as a whole, in a square around its mask, and says how sure it is (`geometry.shape_maps`).
+It looks at the thing and at its mirror image, and again when it has found the lamp (`ShapeEstimator.find`).
 It was trained on rendered frames that were separated as users' frames are. `polarization.choose_outward` is the same
 task without training.
 """
@@ -18,7 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.resizing import block_means, resize_area, resize_bilinear
-from polsep.geometry.shape_maps import INPUTS, Seen, Surface, decode, encode, lamp_direction
+from polsep.geometry.shape_maps import (
+    INPUTS,
+    Seen,
+    Surface,
+    decode,
+    encode,
+    lamp_direction,
+    mean_surface,
+    mirror_seen,
+    mirror_surface,
+)
 from polsep.io.store.weights import read_weights, shipped_weights
 from polsep.networks.graphs import core, require_own_threads, shape_model
 from polsep.networks.sizes import ResidualSize
@@ -106,7 +117,21 @@ class ShapeEstimator:
         self._layers = core().compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
 
     def find(self, seen: Seen) -> Surface:
-        """The surface in images ``[C, SIDE, SIDE]``."""
+        """The surface in images ``[C, SIDE, SIDE]``: the mean of what they and their mirror image say.
+
+        Where the lamp is not told, that is done twice: the second time with the lamp that the first surface implies.
+        """
+        found = self._find_mirrored(seen)
+        if np.any(seen.light):
+            return found
+        lamp = np.array(find_lamp(found, seen), np.float32)
+        return self._find_mirrored(seen._replace(light=lamp[:, None, None] + 0 * seen.light)) if lamp.any() else found
+
+    def _find_mirrored(self, seen: Seen) -> Surface:
+        return mean_surface(self.look(seen), mirror_surface(self.look(mirror_seen(seen))))
+
+    def look(self, seen: Seen) -> Surface:
+        """The surface by one look of the network at images ``[C, SIDE, SIDE]``."""
         require_own_threads()
         maps = np.ascontiguousarray(encode(seen, self.input), np.float32)[None]
         outputs = self._layers.create_infer_request().infer([maps])[0][0]

@@ -182,6 +182,36 @@ def decode(outputs: Array, image: Array, mask: Array) -> Surface:
     return Surface(normal, albedo, roughness, specular, *deviation)
 
 
+def mirror_seen(seen: Seen) -> Seen:
+    """Images mirrored across: the signs of s2 and of the lamp's x change (`stokes.flip_horizontal`). NumPy only."""
+    image, specular, polarized, error, mask, light = (None if x is None else x[..., ::-1] for x in seen)
+    if polarized is not None:
+        first, second = np.split(polarized, 2, axis=-3)
+        polarized = np.concatenate([first, -second], axis=-3)
+    return Seen(image, specular, polarized, error, mask, _x_turned(light))
+
+
+def mirror_surface(surface: Surface) -> Surface:
+    """A surface mirrored across. NumPy only."""
+    mirrored = Surface(*(x[..., ::-1] for x in surface))
+    return mirrored._replace(normal=_x_turned(mirrored.normal))
+
+
+def _x_turned(vectors: Array) -> Array:
+    return vectors * np.array([-1, 1, 1], np.float32).reshape(3, 1, 1)
+
+
+def mean_surface(first: Surface, second: Surface) -> Surface:
+    """The mean of two estimates: of normals by their expected variances, of logarithms of all else.
+
+    Expected errors are of estimates that err alike.
+    """
+    means = Surface(*((x * y) ** 0.5 if k else x for k, (x, y) in enumerate(zip(first, second, strict=True))))
+    xp = namespace(first.normal)
+    normal = first.normal / first.normal_error**2 + second.normal / second.normal_error**2
+    return means._replace(normal=normal / xp.sqrt(xp.sum(normal * normal, axis=-3, keepdims=True)))
+
+
 def relight(surface: Surface, lamp: Array) -> Array:
     """The picture ``[..., 3, h, w]`` of a surface under a far lamp in a unit direction ``[3]``, without shadows.
 

@@ -13,7 +13,21 @@ import torch
 import polsep
 from polsep.light.color import axis_of, iterate, planes_along
 from polsep.light.color_kernel import iterate_fast
-from polsep.light.find import UNKNOWN_DEG, Light, combine, distance_to_lamps, find_light, find_tiles
+from polsep.light.find import (
+    ANY_SHARE,
+    RAW_LAMPS,
+    RAW_SHARE,
+    UNKNOWN_DEG,
+    WARM_SHARE,
+    WHITE_SHARE,
+    Light,
+    _usual_lamps,
+    combine,
+    distance_to_lamps,
+    find_light,
+    find_tiles,
+    likely_lamp,
+)
 from polsep.light.tiles import taps, tile_measurements, tile_mosaic
 from polsep.physics.stokes import Measurements, Stokes, measure
 from polsep.pipeline import separate_capture
@@ -146,6 +160,25 @@ def test_white_is_assumed_where_the_fit_is_led_astray() -> None:
     one = scene(gloss=0.0).map(lambda image: image.mean(0, keepdim=True) * color)
     found = find_light(expose(one, Layout(), IMX250, torch.Generator().manual_seed(1)))
     assert found.color == (1, 1, 1) and not found.sure and found.remarks == ()
+
+
+def test_the_likely_lamp_follows_the_evidence() -> None:
+    """A fit that cannot be wrong is believed, one that says nothing is not, and the frame's mean decides between."""
+    tungsten, white = np.log([0.9, 0.35]), np.zeros(2)
+    np.testing.assert_allclose(likely_lamp(tungsten, 0.0, 0.02, white), tungsten, atol=1e-9)
+    np.testing.assert_allclose(likely_lamp(np.array([0.01, -0.01]), 0.05, 0.02, white), 0)
+    np.testing.assert_allclose(likely_lamp(np.array([0.7, 0.5]), 1.0, 0.02, white), 0)
+    body = np.array([-0.3, -1.6])
+    found = likely_lamp(body, 1.0, 0.1, tungsten)
+    assert np.hypot(*(found - tungsten)) < min(np.hypot(*tungsten), np.hypot(*(body - tungsten)))
+
+
+def test_chances_of_lamps_add_up() -> None:
+    """Over the grid, but for lamps beyond it, the shares of lamps that are not white."""
+    lamps, prior = _usual_lamps()
+    assert prior.sum() == pytest.approx(RAW_SHARE + WARM_SHARE + ANY_SHARE, abs=0.01)
+    assert prior.sum() + WHITE_SHARE == pytest.approx(1, abs=0.01)
+    assert not (lamps[prior > prior.max() / 2] > RAW_LAMPS[:, 1] + 0.5).any()
 
 
 def test_raw_colours_without_balance_are_remarked_on() -> None:

@@ -322,9 +322,20 @@ def test_chunks_of_tiff_that_hold_larger_pictures(tmp_path: Path, compression: s
         tags = tif.pages.first.tags
         for code, side in ((256, 64), (257, 48), (278, 48)):
             struct.pack_into({3: "<H", 4: "<I"}[int(tags[code].dtype)], data, tags[code].valueoffset, side)
-    assert "chunk of at most 48x64 as the TIFF says, found 640x640" in assert_frames_refused(
+    assert "chunk of at most 48x64x1 as the TIFF says, found 640x640x1" in assert_frames_refused(
         tmp_path / "a.tiff", bytes(data)
     )
+
+
+@pytest.mark.parametrize(("compression", "form", "place"), [("jpeg2000", ">H", 40), ("lerc", "<i", 22)])
+def test_chunks_of_tiff_with_more_samples(tmp_path: Path, compression: str, form: str, place: int) -> None:
+    """So would thousands of samples per pixel."""
+    data = bytearray(tiff(compression=compression, metadata=None))
+    with tifffile.TiffFile(io.BytesIO(data)) as tif:
+        start = tif.pages.first.dataoffsets[0]
+    assert struct.unpack_from(form, data, start + place) == (1,)
+    struct.pack_into(form, data, start + place, 9000)
+    assert "x9000" in assert_frames_refused(tmp_path / "a.tiff", bytes(data))
 
 
 def test_more_pictures_and_samples_can_be_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from polsep.compute.arrays import to_numpy
 from polsep.compute.averages import weighted_median
 from polsep.compute.warm_up import make_ready
-from polsep.light.color import ColorFit, axis_of, fit_color, planes_along, strongest
+from polsep.light.color import ColorFit, Doubles, axis_of, fit_color, planes_along, strongest
 from polsep.light.metals import MIN_MIRRORS, beside, is_metal, metal_share, only_mirrors, select
 from polsep.light.tiles import Tiles, tile_measurements, tile_mosaic
 from polsep.physics.stokes import Measurements
@@ -40,17 +41,22 @@ ASTRAY_LEAN, ASTRAY_DISTANCE, MAX_DISTANCE, ASTRAY_BIAS = 1.39, 25.0, 0.12, -2.4
 RAW_LAMPS = np.array([[-1.05, 0.13], [-1.35, 0.03]])
 #: Direction from cold to warm lamps after a white balance, how far they lie along it, and beside it.
 WARM, ALONG_WARM, BESIDE_WARM = np.array([0.524, -0.852]), 1.0, 0.1
-#: Chance above which a colour costs more than white does: it is not used.
-MAX_ASTRAY = 0.55
+#: Chances of lamps before a frame is seen: white (balanced for the lamp); even among `RAW_LAMPS`; along `WARM` after
+#: another balance; any colour. Standard deviations of log-ratios along and beside `WARM`, and of any colour.
+WHITE_SHARE, RAW_SHARE, WARM_SHARE, ANY_SHARE = 0.6, 0.2, 0.15, 0.05
+WARM_SPREAD, ANY_SPREAD = (0.4, 0.1), 0.5
+#: Standard deviations of log-ratios: of the mean of a frame around its lamp, as bodies are coloured; of fits that went
+#: astray around the lamp; of the others, least, and over what is expected of them.
+BODIES_SPREAD, ASTRAY_SPREAD, GOOD_SPREAD = 0.8, 0.5, (0.01, 3.0)
+#: Chance from which on a frame's lamp counts as white.
+LIKELY_WHITE = 0.5
+#: Steps of the grid of lamps: from, to [log-ratio], count.
+GRID = (-1.5, 0.8, 47)
 #: Mean error of fits that went astray [degrees], and of the others: power law of the two last quantities.
 ASTRAY_DEG, GOOD = 11.5, (1.25 * math.exp(0.28), 0.126, 0.563)
 #: What calls for a remark: least expected error of a colour [degrees], least share of coloured metal, and, where white
 #: is assumed, largest sum of the log-ratios of the frame's mean: raw frames without white balance are that green.
 UNCERTAIN_DEG, LEAST_METAL, GREENISH = 5.5, 0.02, -1.2
-#: Colours within this many expected errors of white are white: exact where it is, and hardly wrong where it is not.
-WHITE_ERRORS = 1.5
-#: Standard deviation of log-ratios of lamps around white, toward which unsure estimates are drawn.
-DRAWN = 0.25
 
 
 @dataclass(frozen=True)
@@ -100,8 +106,8 @@ def find_light(
     """Find the light of a raw frame ``[H, W]``, a `Mosaic` or co-sited `Measurements`; of a batch, of the first frame.
 
     Arguments as of `polsep.separate`; levels and layout only count for arrays. Mono frames have no colour. Where a
-    frame shows little, ``sure`` is False and the colour is drawn toward white. Deterministic. Raises ValueError on
-    input that is not a mosaic.
+    frame shows little, ``sure`` is False and the colour is the likeliest of usual lamps. Deterministic. Raises
+    ValueError on input that is not a mosaic.
     """
     capture = raw if isinstance(raw, Mosaic | Measurements) else as_mosaic(raw, layout, black_level, white_level)[0]
     tiles = find_tiles(capture)
@@ -124,13 +130,13 @@ def _light_of_tiles(tiles: Tiles, axis: NDArray[np.float64]) -> Light:
     mirrors = only_mirrors(tiles, axis)
     bodies = select(tiles, ~beside(tiles, mirrors))
     if mirrors.sum() < MIN_MIRRORS or len(bodies.counts) < MIN_TILES:
-        return _as_light(fit, _angle_of(axis))
+        return _as_light(fit, tiles, _angle_of(axis))
     mirrored = iterate_fast(planes_along(strongest(select(tiles, mirrors)), axis))[0]
     own_axis, _ = axis_of(strongest(bodies))
     own = fit_color(strongest(bodies), own_axis, iterate_fast)
     if not is_metal(mirrored - own.x):
-        return _as_light(fit, _angle_of(axis))
-    return replace(_as_light(own, _angle_of(own_axis)), metal=metal_share(tiles, own_axis, own.x))
+        return _as_light(fit, tiles, _angle_of(axis))
+    return replace(_as_light(own, bodies, _angle_of(own_axis)), metal=metal_share(tiles, own_axis, own.x))
 
 
 def _remarks_on(light: Light, tiles: Tiles) -> Iterator[str]:
@@ -203,22 +209,72 @@ def combine(lights: Sequence[Light]) -> Light:
     return replace(surest, log_ratio=(float(mean[0]), float(mean[1])))
 
 
-def _as_light(fit: ColorFit, aolp: float) -> Light:
-    """The light of a fit: white where that explains it or costs less, else drawn toward white if unsure."""
-    x = fit.x
-    error, astray = _expected_error(fit)
+def _as_light(fit: ColorFit, tiles: Tiles, aolp: float) -> Light:
+    """The light of a fit to a frame of these tiles."""
+    good, astray = _expected_errors(fit)
+    error = min((1 - astray) * good + astray * ASTRAY_DEG, UNKNOWN_DEG)
     variance = _variance_of(error)
-    sure = error <= SURE_DEG
-    if angle_deg(x) <= WHITE_ERRORS * error or astray > MAX_ASTRAY:
-        x = np.zeros(2)
-    elif not sure:
-        x = x / (1 + variance / DRAWN**2)
-        variance = variance / (1 + variance / DRAWN**2)
-    return Light((float(x[0]), float(x[1])), (variance, 0.0, variance), error, sure, aolp)
+    x = likely_lamp(fit.x, astray, GOOD_SPREAD[0] + GOOD_SPREAD[1] * math.radians(good), _mean_color(tiles))
+    return Light((float(x[0]), float(x[1])), (variance, 0.0, variance), error, error <= SURE_DEG, aolp)
 
 
-def _expected_error(fit: ColorFit) -> tuple[float, float]:
-    """Mean angle [degrees] by which fits like this one are off, and the chance that it was led astray."""
+def likely_lamp(fitted: Doubles, astray: float, spread: float, mean: Doubles) -> Doubles:
+    """The likely lamp ``[2]`` of a frame: white, or the mean of what else is likely, by Bayes' rule. Log-ratios.
+
+    ``fitted``: the fit, within ``spread`` of the lamp unless it went astray; ``mean``: of the frame, that of coloured
+    bodies under the lamp. Lamps are as likely before as the shares above say.
+    """
+
+    def chance(lamps: Doubles) -> tuple[Doubles, Doubles]:
+        seen = _normal(lamps - mean, BODIES_SPREAD)
+        return (1 - astray) * seen, astray * seen * _normal(lamps - fitted, ASTRAY_SPREAD)
+
+    white = np.zeros((1, 2))
+    right, wrong = chance(white)
+    of_white = WHITE_SHARE * float((right * _normal(white - fitted, spread) + wrong)[0])
+    lamps, prior = _usual_lamps()
+    # Near a fit that is right, all else hardly varies.
+    of_fit = float(_prior_density(fitted[None])[0] * chance(fitted[None])[0][0])
+    of_others = prior * chance(lamps)[1]
+    if of_white > LIKELY_WHITE * (of_white + of_fit + float(of_others.sum())):
+        return np.zeros(2)
+    likely: Doubles = (of_fit * fitted + of_others @ lamps) / (of_fit + float(of_others.sum()))
+    return likely
+
+
+def _normal(offset: Doubles, spread: float) -> Doubles:
+    """Density of offsets ``[N, 2]`` of log-ratios, each of this standard deviation."""
+    density: Doubles = np.exp(-(offset**2).sum(axis=-1) / (2 * spread**2)) / (2 * math.pi * spread**2)
+    return density
+
+
+def _prior_density(lamps: Doubles) -> Doubles:
+    """Density of lamps ``[N, 2]`` before a frame is seen, but for exactly white ones."""
+    least, most = RAW_LAMPS.T
+    raw = ((lamps >= least) & (lamps <= most)).all(axis=1) / float((most - least).prod())
+    along, across = lamps @ WARM, lamps[:, 0] * WARM[1] - lamps[:, 1] * WARM[0]
+    length, width = WARM_SPREAD
+    warm = np.exp(-((along / length) ** 2 + (across / width) ** 2) / 2) / (2 * math.pi * length * width)
+    density: Doubles = RAW_SHARE * raw + WARM_SHARE * warm + ANY_SHARE * _normal(lamps, ANY_SPREAD)
+    return density
+
+
+@cache
+def _usual_lamps() -> tuple[Doubles, Doubles]:
+    """A grid of lamps ``[N, 2]``, and the chance of each before a frame is seen."""
+    steps, size = np.linspace(*GRID, retstep=True)
+    lamps = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    return lamps, _prior_density(lamps) * float(size) ** 2
+
+
+def _mean_color(tiles: Tiles) -> Doubles:
+    """Log-ratios ``[2]`` of the mean s0 of tiles of a colour frame."""
+    red, green, blue = tiles.moments[:, 0, 1:4].sum(axis=0).clip(1e-9)
+    return np.array([math.log(red / green), math.log(blue / green)])
+
+
+def _expected_errors(fit: ColorFit) -> tuple[float, float]:
+    """Mean angle [degrees] by which fits like this one are off that were not led astray; the chance that it was."""
     change = angle_deg(fit.change)
     scatter = _spread_deg(fit.x, fit.scatter)
     shown = (fit.across, fit.gloss, change, scatter)
@@ -226,7 +282,7 @@ def _expected_error(fit: ColorFit) -> tuple[float, float]:
     logit += ASTRAY_LEAN * fit.lean + ASTRAY_DISTANCE * min(distance_to_lamps(fit.x), MAX_DISTANCE)
     chance = 1 / (1 + math.exp(-logit))
     good: float = GOOD[0] * (change + 0.1) ** GOOD[1] * (scatter + 0.03) ** GOOD[2]
-    return min((1 - chance) * good + chance * ASTRAY_DEG, UNKNOWN_DEG), chance
+    return good, chance
 
 
 def distance_to_lamps(log_ratio: NDArray[np.float64]) -> float:

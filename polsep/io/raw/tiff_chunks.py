@@ -38,23 +38,30 @@ def check_chunks(stream: BinaryIO, page: tifffile.TiffPage) -> None:
         if count:
             stream.seek(offset)
             found = _size_in(int(page.compression), stream.read(min(count, 64)))
-            if found is None or found[0] > height or found[1] > width:
-                raise InputError(f"expected a chunk of at most {height}x{width} as the TIFF says, found {_said(found)}")
+            most = (height, width, page.samplesperpixel)
+            if found is None or any(own > said for own, said in zip(found, most, strict=True)):
+                raise InputError(f"expected a chunk of at most {_said(most)} as the TIFF says, found {_said(found)}")
 
 
-def _said(size: tuple[int, int] | None) -> str:
-    return "a damaged one" if size is None else f"{size[0]}x{size[1]}"
+def _said(size: tuple[int, ...] | None) -> str:
+    return "a damaged one" if size is None else "x".join(map(str, size))
 
 
-def _size_in(compression: int, head: bytes) -> tuple[int, int] | None:
-    """Height and width by a chunk's own header; None where that is not of the ``compression``."""
+def _size_in(compression: int, head: bytes) -> tuple[int, int, int] | None:
+    """Height, width and samples per pixel by a chunk's own header; None where that is not of the ``compression``.
+
+    PNG has four samples at most, of which nothing is said here.
+    """
+    samples = 1
     if compression == PNG and head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR" and len(head) >= 24:
         width, height = struct.unpack_from(">2I", head, 16)
-    elif compression in JPEG_2000 and head[:4] == b"\xff\x4f\xff\x51" and len(head) >= 24:
+    elif compression in JPEG_2000 and head[:4] == b"\xff\x4f\xff\x51" and len(head) >= 42:
         width, height = struct.unpack_from(">2I", head, 8)
-    elif compression == LERC and head[:6] == b"Lerc2 " and len(head) >= 22:
+        (samples,) = struct.unpack_from(">H", head, 40)
+    elif compression == LERC and head[:6] == b"Lerc2 " and len(head) >= 26:
         (version,) = struct.unpack_from("<i", head, 6)
-        height, width = struct.unpack_from("<2i", head, 14 if version >= 3 else 10)
+        height, width, samples = struct.unpack_from("<3i", head, 14 if version >= 3 else 10)
+        samples = samples if version >= 4 else 1
     else:
         return None
-    return height, width
+    return height, width, samples

@@ -1,10 +1,11 @@
 """Scores of shape from one frame on the things of selection set (b): by what a network sees, and without a network.
 
-Every thing of `six_lights.load_subjects` is photographed twice, glossy (strength 1, its own roughness) and matte
-(`MATTE`), each by one lamp within `LARGEST_DEG` of the camera, behind a polarizer at any angle, in 512 x 512 raw pixels
-with noise; the mask is given, the lamp is not told unless a row says so. "separated" is what ships. Networks of equal
-size and training, less than that of what ships, see the separated images and their polarization (`EQUAL`), the measured
-Stokes images, or s0 alone; "perfect" sees true images. Needs the extra ``bench``.
+Every thing of `six_lights.load_subjects` is photographed as `KINDS` say, each time by one lamp within `LARGEST_DEG` of
+the camera, behind a polarizer at any angle, in 512 x 512 raw pixels with noise; the mask is given, the lamp's direction
+is not told unless a row says so. Frames of a usual rig are those of glossy things, in light of the room, by a lamp that
+is not white to the sensor, behind an imperfect polarizer, with a sensor's errors, and nothing told. "separated" is what
+ships. Networks of equal size and training, less than that of what ships, see the separated images and their
+polarization (`EQUAL`), the measured Stokes images, or s0 alone; "perfect" sees true images. Needs the extra ``bench``.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from torch.nn.functional import avg_pool2d
 from evaluation.six_lights import ROWS_AT_ONCE, SEED, Subject, load_subjects
 from evaluation.testsets.casting import LENS_BLUR, SAMPLES, random_light_near
 from polsep.bench.rows import Row
+from polsep.datasets.reality import RIG
 from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.geometry.one_frame import SIDE, UNKNOWN, gather, images_of, load_estimator, square_around
 from polsep.geometry.polarization import Polarized, choose_outward, find_diffuse_polarization, normals_from_polarization
@@ -32,7 +34,10 @@ from polsep.geometry.shape_maps import Seen, Surface, relight
 from polsep.io.store.weights import shipped_weights
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
-from polsep.render.raycast import find_hits, is_lit
+from polsep.render.disturbances import LAMPS, add_scenes, as_color, depolarize_lamp, scale_light
+from polsep.render.raycast import Hits, find_hits, is_lit
+from polsep.render.room import Around, as_room, even_directions, light_from_around
+from polsep.render.sensor_errors import record
 from polsep.render.simulate import blur, capture, expose_to_clip, half_resolution
 from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Scene, camera_axes, shade
 from polsep.sensor.camera import IMX250, Layout
@@ -43,6 +48,10 @@ Floats = NDArray[np.float32]
 
 #: Strength of mirror images of matte things; share of samples that clip; raw pixels per side.
 MATTE, CLIPPED, RAW_SIDE = 0.05, 0.005, 512
+#: Of a usual rig: room light over the lamp's; its lights' number, distance in radii, and colour over the lamp's; the
+#: lamp's degree of polarization and raw colour.
+ROOM, ROOM_LIGHTS, ROOM_DISTANCE, ROOM_COLOR = 0.1, 6, 30.0, (1.15, 1.0, 0.85)
+DEGREE, RIG_COLOR = 0.98, LAMPS["daylight"]
 #: Largest angle of the lamp from the camera, and its distance relative to the camera's.
 LARGEST_DEG, DISTANCES = 45.0, (0.7, 1.4)
 #: A distant lamp for things whose camera is many radii away, in radii.
@@ -52,7 +61,18 @@ LAMP_DISTANCE = 8.0
 EQUAL, TOLD = "separated, equal training", ", lamp told"
 WEIGHTS = Path(__file__).parent / "weights" / "shape"
 #: Lamps of relit pictures, and their seed; zenith [degrees] from which on an azimuth turned by more than 90 is a flip.
-LAMPS, LAMP_SEED, STEEP_DEG = 20, 77, 30.0
+COUNT, LAMP_SEED, STEEP_DEG = 20, 77, 30.0
+
+
+class Kind(NamedTuple):
+    """How things are photographed: the ``strength`` of their mirror images, and whether in a usual ``rig``."""
+
+    strength: float
+    rig: bool = False
+
+
+#: Kinds of photographs; those of a thing in the dark and in a rig have the same lamp.
+KINDS = {"glossy": Kind(1.0), "matte": Kind(MATTE), "glossy, in a usual rig": Kind(1.0, rig=True)}
 
 
 class Truth(NamedTuple):
@@ -73,16 +93,26 @@ class Photograph(NamedTuple):
     truth: Truth
 
 
-def photograph(subject: Subject, number: int, strength: float) -> Photograph:
-    """One frame of a subject under one lamp; ``number`` makes its seed."""
-    generator = torch.Generator().manual_seed(SEED + 5000 + number)
+def photograph(subject: Subject, number: int, kind: Kind) -> Photograph:
+    """One frame of subject ``number`` under one lamp."""
+    seed = SEED + 5000 + 2 * number + (kind.strength == MATTE)
+    generator = torch.Generator().manual_seed(seed)
     lamp = _lamp(subject, generator)
-    scene, planes = _render(subject, lamp, strength)
+    hits = _find_hits(subject)
+    scene, planes = _render(subject, hits, lamp, kind.strength)
     exposed = expose_to_clip(blur(scene, LENS_BLUR), CLIPPED, Layout(), IMX250)
-    mosaic = capture(exposed, Layout(), IMX250, generator).mosaic
+    if kind.rig:
+        gain = float(exposed.diffuse.s0.double().sum() / scene.diffuse.s0.double().sum())
+        around = scale_light(blur(_in_rig(subject, hits, lamp, scene), LENS_BLUR), gain / (1 + ROOM))
+        lit = scale_light(around, as_color(RIG_COLOR))
+        mosaic = record(lit.diffuse + lit.specular, Layout(), IMX250, replace(RIG, specimen=seed % 1000), seed)
+    else:
+        mosaic = capture(exposed, Layout(), IMX250, generator).mosaic
     mosaic = replace(mosaic, data=mosaic.data.numpy().astype(np.float32))
-    frame = separate_capture(mosaic, "joint", "white")
-    stokes = np.moveaxis(measured_stokes(mosaic, (1.0, 1.0, 1.0)), -1, 1).reshape(9, *frame.dolp.shape)
+    frame = separate_capture(mosaic, "joint", "auto" if kind.rig else "white")
+    color = tuple(frame.report["light_color"])
+    stokes = np.moveaxis(measured_stokes(mosaic, color), -1, 1) / np.array(color, np.float32)[:, None, None]
+    stokes = stokes.reshape(9, *frame.dolp.shape)
     mask, normal, albedo, rough, strong = np.split(avg_pool2d(planes, 2).numpy(), [1, 4, 7, 8])
     whole = mask[0] > 0.999
     normal = normal / np.maximum(np.linalg.norm(normal, axis=0), 1e-9)
@@ -90,6 +120,18 @@ def photograph(subject: Subject, number: int, strength: float) -> Photograph:
     surface = Surface(normal, albedo, rough, strong, none, none, none)
     way = _axes(subject) @ (np.array(lamp.position) / np.linalg.norm(lamp.position))
     return Photograph(subject.name, frame, stokes, _perfect(exposed), Truth(surface, whole, way))
+
+
+def _in_rig(subject: Subject, hits: list[Hits], lamp: PointLight, scene: Scene) -> Scene:
+    """A scene behind an imperfect polarizer, with light of the room."""
+
+    def light_by(light: PointLight) -> Scene:
+        return _render(subject, hits, light, 1.0)[0]
+
+    crossed = light_by(replace(lamp, polarizer=lamp.polarizer + math.pi / 2))
+    around = Around(even_directions(ROOM_LIGHTS), torch.ones(ROOM_LIGHTS), ROOM_DISTANCE)
+    room = as_room(light_from_around(light_by, around), scene, ROOM, as_color(ROOM_COLOR))
+    return add_scenes(depolarize_lamp(scene, DEGREE, crossed), room)
 
 
 def _axes(subject: Subject) -> NDArray[np.float64]:
@@ -107,23 +149,30 @@ def _lamp(subject: Subject, generator: torch.Generator) -> PointLight:
     return random_light_near(camera, generator, (0.0, LARGEST_DEG), DISTANCES)
 
 
-def _render(subject: Subject, lamp: PointLight, strength: float) -> tuple[Scene, torch.Tensor]:
-    """The exact scene, and planes of mask, normals in the camera's frame, albedo, roughness and strength."""
-    toward = torch.from_numpy(_axes(subject)).float()
+def _find_hits(subject: Subject) -> list[Hits]:
+    """What every ray hits, in bands of `ROWS_AT_ONCE` rows."""
     bands = []
     for first in range(0, RAW_SIDE, ROWS_AT_ONCE):
         rows = first + (torch.arange(ROWS_AT_ONCE * SAMPLES) + 0.5) / SAMPLES
         cols = (torch.arange(RAW_SIDE * SAMPLES) + 0.5) / SAMPLES
         points = tuple(g.flatten() for g in torch.meshgrid(rows, cols, indexing="ij"))
-        hits = find_hits(subject.mesh, subject.camera, (points[0], points[1]), (RAW_SIDE, RAW_SIDE))
-        one = torch.ones_like(hits.position[:1])
-        albedo = subject.albedo(hits.position)
-        buffer = GBuffer(hits.position, hits.normal, albedo, subject.roughness * one, strength * one, one > 0)
-        diffuse, specular = shade(buffer, subject.camera, lamp, is_lit(subject.mesh, hits, lamp))
-        values = [one, (toward @ hits.normal[..., 0])[..., None], albedo, subject.roughness * one, strength * one]
+        bands.append(find_hits(subject.mesh, subject.camera, (points[0], points[1]), (RAW_SIDE, RAW_SIDE)))
+    return bands
+
+
+def _render(subject: Subject, hits: list[Hits], lamp: PointLight, strength: float) -> tuple[Scene, torch.Tensor]:
+    """The exact scene, and planes of mask, normals in the camera's frame, albedo, roughness and strength."""
+    toward = torch.from_numpy(_axes(subject)).float()
+    bands = []
+    for band in hits:
+        one = torch.ones_like(band.position[:1])
+        albedo = subject.albedo(band.position)
+        buffer = GBuffer(band.position, band.normal, albedo, subject.roughness * one, strength * one, one > 0)
+        diffuse, specular = shade(buffer, subject.camera, lamp, is_lit(subject.mesh, band, lamp))
+        values = [one, (toward @ band.normal[..., 0])[..., None], albedo, subject.roughness * one, strength * one]
         values += [s for lobe in (diffuse, specular) for s in (lobe.s0, lobe.s1, lobe.s2)]
-        image = torch.zeros(sum(v.shape[0] for v in values), len(points[0]))
-        image[:, hits.ray] = torch.cat(values)[..., 0]
+        image = torch.zeros(sum(v.shape[0] for v in values), ROWS_AT_ONCE * RAW_SIDE * SAMPLES**2)
+        image[:, band.ray] = torch.cat(values)[..., 0]
         bands.append(avg_pool2d(image.view(1, len(image), -1, RAW_SIDE * SAMPLES), SAMPLES)[0])
     whole = torch.cat(bands, dim=1)
     lobes = [Stokes(*torch.split(whole[9 + 9 * k : 18 + 9 * k], 3)) for k in range(2)]
@@ -209,7 +258,7 @@ def score(found: Surface, truth: Surface, mask: Floats) -> dict[str, float]:
     first, second = Surface(*pairs[:7]), Surface(*pairs[7:14])
     first = gained(first, second, pairs[14])
     logs, flips = [], []
-    for lamp in random_lamps(LAMPS, torch.Generator().manual_seed(LAMP_SEED)):
+    for lamp in random_lamps(COUNT, torch.Generator().manual_seed(LAMP_SEED)):
         pictures = [relight(x, lamp)[0].numpy() * mask for x in (first, second)]
         level = 0.1 * float(pictures[1][:, inside].mean())
         logs.append(float(np.abs(np.log(pictures[0] + level) - np.log(pictures[1] + level))[:, inside].mean()))
@@ -243,27 +292,28 @@ def measure(data: Path, names: Sequence[str] | None = None) -> Iterator[Row]:
     tenths: list[tuple[Floats, Floats]] = []
     methods = list_methods()
     for number, subject in enumerate(load_subjects(data, names)):
-        for kind, strength in (("glossy", 1.0), ("matte", MATTE)):
-            shot = photograph(subject, 2 * number + (kind == "matte"), strength)
+        for kind, how in KINDS.items():
+            shot = photograph(subject, number, how)
             for method in (*methods, "classical"):
                 results = classical(shot) if method == "classical" else estimate(method, shot)
                 scores = score(*results)
                 found.setdefault((kind, method), []).append(scores)
                 case, metric = f"{subject.name}, {kind}", "mean angular error"
                 yield Row("shape/things", case, method, metric, scores[metric], "deg")
-                if method == "separated":
+                if method == "separated" and not how.rig:
                     surface, truth, mask = results
                     inside = mask[0] > 0
                     cosine = np.clip((surface.normal * truth.normal).sum(axis=0)[inside], -1, 1)
                     tenths.append((np.degrees(np.arccos(cosine)), np.degrees(surface.normal_error[0][inside])))
-    for kind in ("glossy", "matte"):
+    for kind in KINDS:
         for method in (*methods, "classical"):
             rows = found[kind, method]
             for metric in dict.fromkeys(name for row in rows for name in row):
                 if method == "classical" and metric.startswith("roughness"):
                     continue
                 value = statistics.fmean(row[metric] for row in rows if metric in row)
-                case, unit = f"{len(rows)} {kind} things", UNITS.get(metric, "deg")
+                look, *rig = kind.split(", ")
+                case, unit = ", ".join([f"{len(rows)} {look} things", *rig]), UNITS.get(metric, "deg")
                 yield Row("shape/normals", case, method, metric, value, unit)
     yield from _expected(tenths)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.figures import Panel, Pixels, draw_grid, tone
-from evaluation.one_frame import MATTE, classical, estimate, list_methods, photograph
+from evaluation.one_frame import KINDS, classical, estimate, list_methods, photograph
 from evaluation.six_lights import Subject
 from polsep.geometry.shape_maps import Surface, relight
 from polsep.io.assets.relight_page import RelightMaps, encode_relight_page
@@ -17,6 +17,8 @@ Floats = NDArray[np.float32]
 
 #: Rows: what a network sees, and what the row is called.
 ROWS = {"rgb": "s0 alone", "stokes": "s0, s1, s2", "separated": "separated", "classical": "no network"}
+#: Added to a subject's number: lamps of pictures are not those of scores.
+OTHER_LAMPS = 450
 #: Error that is white [degrees]; the lamp of the relit pictures.
 LARGEST_DEG, LAMP = 30.0, (-0.6, 0.35, 0.72)
 
@@ -24,8 +26,8 @@ LARGEST_DEG, LAMP = 30.0, (-0.6, 0.35, 0.72)
 def draw_thing(subject: Subject, number: int) -> Pixels:
     """Normals, their errors, albedo and another lamp for a glossy thing and a matte one, by input, and the truth."""
     rows = []
-    for kind, strength in (("glossy", 1.0), ("matte", MATTE)):
-        shot = photograph(subject, 900 + 2 * number + (kind == "matte"), strength)
+    for kind in ("glossy", "matte"):
+        shot = photograph(subject, OTHER_LAMPS + number, KINDS[kind])
         for name, title in ROWS.items():
             if name not in (*list_methods(), "classical"):
                 continue
@@ -37,7 +39,7 @@ def draw_thing(subject: Subject, number: int) -> Pixels:
 
 def relight_thing(subject: Subject, number: int) -> bytes:
     """The page that relights a glossy thing, from one frame of it."""
-    found, _, mask = estimate("separated", photograph(subject, 900 + 2 * number, 1.0))
+    found, _, mask = estimate("separated", photograph(subject, OTHER_LAMPS + number, KINDS["glossy"]))
     inside = mask[0] > 0
     albedo = np.moveaxis(found.albedo * (0.9 / np.percentile(found.albedo[:, inside], 99)), 0, -1)
     maps = RelightMaps(np.moveaxis(found.normal, 0, -1), albedo, found.roughness[0], found.specular[0], inside)

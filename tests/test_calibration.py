@@ -221,6 +221,18 @@ def test_frames_that_show_no_turned_polarizer_are_refused() -> None:
             measure_analysers(some)
 
 
+def test_polarized_flat_frames_are_refused() -> None:
+    """Gains that hide a lamp's polarization would take it out of every frame; a tenth of that is told, not refused."""
+    sensor = BadSensor(Layout(), dead=0)
+
+    def flat(dolp: float) -> Calibration:
+        return measure_flat([replace(sensor.expose(sensor.sees(np.full(SIZE, 1.0), dolp)), black_level=LEVEL)])
+
+    with pytest.raises(ValueError, match="expected unpolarized light on the flat frames, found an apparent DoLP of"):
+        flat(0.3)
+    assert flat(0.03).details["flat"]["apparent_dolp"] < 0.06
+
+
 def test_one_frame_gives_tables_and_no_map() -> None:
     """Where noise hides the pixels, no pixel is corrected: a single flat frame changes filters and vignetting only."""
     sensor = BadSensor(Layout(), dead=0)

@@ -100,7 +100,8 @@ def _line_offsets(residual: Floats, pixel_variance: float) -> Floats:
 def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) -> Calibration:
     """``before`` with gains, falloff and dead pixels of frames of evenly lit, unpolarized white.
 
-    ``frames`` are as the camera wrote them less ``before``'s black level. Raises ValueError on dark or clipped ones.
+    ``frames`` are as the camera wrote them less ``before``'s black level. Raises ValueError on dark, clipped or
+    polarized ones.
     """
     flat = average_frames(frames)
     require_same_sensor(before, flat.first)
@@ -129,6 +130,11 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
         share = signal_share(residual, float(relative[relative <= limit].mean()) / flat.count)
     pixels = 1 + np.float32(share) * np.where(dead, 0, residual - 1)
     polarized = _apparent_dolp(gains, layout)
+    if polarized > POLARIZED_FLAT:
+        raise ValueError(
+            f"expected unpolarized light on the flat frames, found an apparent DoLP of {polarized:.0%}: take the "
+            "polarizer off the lamp"
+        )
     details = {
         "frames": flat.count,
         "brightness": round(brightness, 4),

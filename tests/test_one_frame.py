@@ -28,6 +28,7 @@ from test_geometry import cap
 import polsep
 from polsep.geometry import one_frame
 from polsep.geometry.one_frame import (
+    HALF,
     SIDE,
     ShapeEstimator,
     find_lamp,
@@ -185,8 +186,8 @@ def test_a_lamp_that_is_not_told_is_looked_for(tmp_path: Path) -> None:
     first = mean_surface(estimator.look(untold), mirror_surface(estimator.look(mirror_seen(untold))))
     lamp = np.array(find_lamp(first, untold), np.float32)
     assert lamp[2] > 0
-    wanted = estimator.find(untold._replace(light=lamp[:, None, None] + 0 * seen.light))
-    np.testing.assert_array_equal(estimator.find(untold).normal, wanted.normal)
+    wanted = estimator._find_at(untold._replace(light=lamp[:, None, None] + 0 * seen.light))
+    np.testing.assert_array_equal(estimator._find_at(untold).normal, wanted.normal)
 
 
 def _untrained(folder: Path) -> tuple[ShapeEstimator, ShapeNetwork]:
@@ -335,7 +336,7 @@ def test_the_shipped_network_finds_a_sphere() -> None:
 
 def test_floor_of_the_shipped_weights() -> None:
     """On things that no training saw, made here, the shipped network is no worse than when it was shipped."""
-    examples = [cut_example(random_shape_example("test", 11, n, 256), 1.1, SIDE) for n in range(6)]
+    examples = [cut_example(random_shape_example("test", 11, n, 256), 1.1, SIDE // HALF) for n in range(6)]
     network = ShapeNetwork(INPUTS["separated"], USUAL, one_frame.load_estimator().size)
     arrays = polsep_weights()
     network.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})

@@ -1,7 +1,8 @@
 """The surface behind one frame under one polarized lamp: normals, albedo, roughness, strength of its mirror images.
 
 A network looks at the thing as a whole, in a square around its mask, and says how sure it is (`geometry.shape_maps`).
-It looks at the thing and at its mirror image, and again when it has found the lamp (`ShapeEstimator.find`).
+It looks at the thing and at its mirror image, twice as fine and as it was trained, and again when it has found the lamp
+(`ShapeEstimator.find`).
 It was trained on rendered frames that were separated as users' frames are. `polarization.choose_outward` is the same
 task without training.
 """
@@ -41,8 +42,9 @@ from polsep.separation.report import SeparatedFrame
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Side of the square that the network sees [pixels], and of the square over the longest side of the mask.
-SIDE, WIDER = 192, 1.1
+#: Side of the square around the thing [pixels], of which the network also sees means over `HALF` x `HALF` pixels, as it
+#: was trained; and of the square over the longest side of the mask.
+SIDE, HALF, WIDER = 384, 2, 1.1
 #: Without a mask, the thing is where s0 exceeds this share of its 99th percentile.
 OBJECT_SHARE = 0.06
 #: Side of blocks [pixels]: parts of the thing are near one that is mostly bright.
@@ -113,14 +115,21 @@ class ShapeEstimator:
         size = json.loads(metadata["size"])
         self.size = ResidualSize(size["width"], tuple(size["blocks"]), size["entry"])
         self.input = "separated" if metadata["input"] == "perfect" else metadata["input"]
-        model = shape_model(arrays, self.size, (INPUTS[self.input], SIDE, SIDE))
-        self._layers = core().compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+        self._layers = {}
+        for side in (SIDE, SIDE // HALF):
+            model = shape_model(arrays, self.size, (INPUTS[self.input], side, side))
+            self._layers[side] = core().compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
 
     def find(self, seen: Seen) -> Surface:
-        """The surface in images ``[C, SIDE, SIDE]``: the mean of what they and their mirror image say.
+        """The surface in images ``[C, SIDE, SIDE]``: the mean of what they say and what their means over pixels say.
 
-        Where the lamp is not told, that is done twice: the second time with the lamp that the first surface implies.
+        The first holds the detail, the second the whole. Each is the mean of looks at the thing and at its mirror
+        image. Where the lamp is not told, they look again with the lamp that the first surface implies.
         """
+        halves = self._find_at(_means(seen))
+        return mean_surface(self._find_at(seen), Surface(*(resize_bilinear(x, (SIDE, SIDE)) for x in halves)))
+
+    def _find_at(self, seen: Seen) -> Surface:
         found = self._find_mirrored(seen)
         if np.any(seen.light):
             return found
@@ -131,11 +140,17 @@ class ShapeEstimator:
         return mean_surface(self.look(seen), mirror_surface(self.look(mirror_seen(seen))))
 
     def look(self, seen: Seen) -> Surface:
-        """The surface by one look of the network at images ``[C, SIDE, SIDE]``."""
+        """The surface by one look of the network at images ``[C, side, side]``, as in `find` or half as wide."""
         require_own_threads()
         maps = np.ascontiguousarray(encode(seen, self.input), np.float32)[None]
-        outputs = self._layers.create_infer_request().infer([maps])[0][0]
+        outputs = self._layers[maps.shape[-1]].create_infer_request().infer([maps])[0][0]
         return decode(outputs, seen.image, seen.mask)
+
+
+def _means(seen: Seen) -> Seen:
+    """Means over `HALF` x `HALF` pixels; the mask is where all are of the thing."""
+    means = Seen(*(None if x is None else np.asarray(block_means(x, HALF), np.float32) for x in seen))
+    return means._replace(mask=(means.mask > 0.99).astype(np.float32))
 
 
 @lru_cache(maxsize=2)

@@ -65,7 +65,7 @@ COUNT, LAMP_SEED, STEEP_DEG = 20, 77, 30.0
 
 
 class Kind(NamedTuple):
-    """How things are photographed: the ``strength`` of their mirror images, and whether in a usual ``rig``."""
+    """A way to photograph things: the ``strength`` of their mirror images, and whether in a usual ``rig``."""
 
     strength: float
     rig: bool = False
@@ -150,7 +150,7 @@ def _lamp(subject: Subject, generator: torch.Generator) -> PointLight:
 
 
 def _find_hits(subject: Subject) -> list[Hits]:
-    """What every ray hits, in bands of `ROWS_AT_ONCE` rows."""
+    """Hits of all rays, in bands of `ROWS_AT_ONCE` rows."""
     bands = []
     for first in range(0, RAW_SIDE, ROWS_AT_ONCE):
         rows = first + (torch.arange(ROWS_AT_ONCE * SAMPLES) + 0.5) / SAMPLES

@@ -169,9 +169,11 @@ def test_a_sequence_plays_under_edits(page: Any, tmp_path: Path) -> None:
     page.wait_for_function(f"document.querySelector('.ps-right').src !== {before!r}")
     page.click("#ps-play")
     page.wait_for_selector("#ps-play:has-text('Play')")
-    page.wait_for_function(f"document.querySelector('#ps-status').innerText.startsWith('s' + {index})")
-    edited = read_exr_layers(fetch(page, "edited", tmp_path))
-    place = int(page.evaluate(index))
+    path = fetch(page, "edited", tmp_path)
+    while not path.name.startswith(f"s{page.evaluate(index)}"):  # until the numbers of the shown frame are there
+        page.wait_for_timeout(100)
+        path = fetch(page, "edited", tmp_path)
+    edited, place = read_exr_layers(path), int(path.name[1])
     truth = separated(imagecodecs.png_decode(small_frame(4 * place)))
     np.testing.assert_array_equal(edited["combined.G"], truth.diffuse[..., 1])
 

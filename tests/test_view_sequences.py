@@ -70,6 +70,7 @@ def stacked(sessions: Sessions) -> Session:
     sessions.open_upload("a", [(str(sent), sent.name)])
     page = sessions.find("a")
     page.separate(parse_settings(ANALYTIC))
+    page.toggle()
     return page
 
 
@@ -90,6 +91,8 @@ def test_a_stack_plays_in_order_and_around(sessions: Sessions) -> None:
     assert page.separate(parse_settings({**ANALYTIC, "index": 1})).stem == "stack_0001"
     until(page.play)
     assert page.place == 2
+    page.toggle()
+    assert not page.play() and page.place == 2
 
 
 def test_edits_apply_while_it_plays(sessions: Sessions) -> None:
@@ -137,6 +140,7 @@ def test_separated_sequences_play(sessions: Sessions, tmp_path: Path) -> None:
     page = sessions.find("a")
     page.begin_own(tmp_path)
     assert page.separate(Settings(index=2)).stem == "take_000002"
+    page.toggle()
     until(page.play)
     assert page.place == 3 and page.shown is not None
     np.testing.assert_allclose(page.shown.diffuse, light[3], rtol=1e-3)

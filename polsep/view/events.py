@@ -271,7 +271,7 @@ class Events:
     def toggle(self, request: gr.Request) -> Updates:
         """Play or pause."""
         session = self._session(request)
-        session.playing = not session.playing and session.opened is not None and session.opened.count > 1
+        session.toggle()
         return self._play_state(session)
 
     async def settle(self, values: Values, request: gr.Request) -> AsyncIterator[Updates]:
@@ -288,7 +288,7 @@ class Events:
         """Show the next frame of a playing sequence, if it is ready."""
         session = self._session(request)
         try:
-            if not session.playing or not await asyncio.to_thread(session.play):
+            if not await asyncio.to_thread(session.play):
                 return self._kept()
         except FAILURES as error:
             session.playing = False

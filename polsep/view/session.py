@@ -231,12 +231,19 @@ class Session:
             edits = (edit for edit in self.recipe.edits if sent.name not in (name for _, name in edit.images()))
             self.recipe = Recipe(tuple(edits))
 
+    def toggle(self) -> None:
+        """Begin to play if a sequence is open, or stop."""
+        with self.lock:
+            self.playing = not self.playing and self.opened is not None and self.opened.count > 1
+
     def play(self) -> bool:
         """Show the next frame of the sequence if it is ready, and request those after it; True if it was ready.
 
-        Raises ValueError if there is no sequence, or a frame of it cannot be read.
+        After a pause there is no next frame. Raises ValueError if there is no sequence, or a frame cannot be read.
         """
         with self.lock:
+            if not self.playing:
+                return False
             found, settings = self.opened, self._settings
             if found is None or settings is None or found.count < 2:
                 raise ValueError("expected a sequence to play, found none")

@@ -8,10 +8,12 @@ const MOST_TILES = 640, MIN_TILES = 6, LEAST_K = 0.006, OWN_K = 0.8, MEAN_K = 0.
 const LEAST_JITTER = 0.005, OWN_JITTER = 0.3, MEAN_JITTER = 0.08, INDEPENDENT = 5, LEAK = 0.43, ACROSS = 1;
 const VOTE_ERROR = 0.0045, FREEDOM = 3.6, SPREAD = 0.5, STEPS = 15, LARGEST_STEP = 0.4, LAST_STEP = 3e-4, MAX_K = 0.4;
 const SURE_DEG = 1.5, UNKNOWN_DEG = 20, ASTRAY = [[0.703, 0.02], [-0.785, 0.02], [0.753, 0.1], [0.086, 0.03]];
-const ASTRAY_LEAN = 1.39, ASTRAY_DISTANCE = 25, MAX_DISTANCE = 0.12, ASTRAY_BIAS = -2.42, MAX_ASTRAY = 0.55;
+const ASTRAY_LEAN = 1.39, ASTRAY_DISTANCE = 25, MAX_DISTANCE = 0.12, ASTRAY_BIAS = -2.42;
 const RAW_LAMPS = [[-1.05, 0.13], [-1.35, 0.03]], WARM = [0.524, -0.852], ALONG_WARM = 1, BESIDE_WARM = 0.1;
 const ASTRAY_DEG = 11.5, GOOD = [1.25 * Math.exp(0.28), 0.126, 0.563], UNCERTAIN_DEG = 5.5, LEAST_METAL = 0.02;
-const GREENISH = -1.2, WHITE_ERRORS = 1.5, DRAWN = 0.25, MIRROR = 1, MIN_MIRRORS = 3, METAL_DISTANCE = 0.28;
+const WHITE_SHARE = 0.6, RAW_SHARE = 0.2, WARM_SHARE = 0.15, ANY_SHARE = 0.05, WARM_SPREAD = [0.4, 0.1], ANY_SPREAD = 0.5;
+const BODIES_SPREAD = 0.8, ASTRAY_SPREAD = 0.5, GOOD_SPREAD = [0.01, 3], LIKELY_WHITE = 0.5, GRID = [-1.5, 0.8, 47];
+const GREENISH = -1.2, MIRROR = 1, MIN_MIRRORS = 3, METAL_DISTANCE = 0.28;
 const COPPER = [0.403, -0.17], GOLD = [0.246, -0.821];
 /** Two directions beside grey. */
 const BESIDE = [[1, -1, 0].map((v) => v / Math.SQRT2), [1, 1, -2].map((v) => v / Math.sqrt(6))];
@@ -50,11 +52,11 @@ function lightOfTiles(tiles, axis) {
   const marked = new Set(tiles.filter((_, k) => mirrors[k]).map(({ row, col }) => `${row},${col}`));
   const touches = ({ row, col }) => [-1, 0, 1].some((i) => [-1, 0, 1].some((j) => marked.has(`${row + i},${col + j}`)));
   const bodies = tiles.filter((tile) => !touches(tile));
-  if (marked.size < MIN_MIRRORS || bodies.length < MIN_TILES) return asLight(fit);
+  if (marked.size < MIN_MIRRORS || bodies.length < MIN_TILES) return asLight(fit, tiles);
   const mirrored = iterate(planesAlong(strongest(tiles.filter((_, k) => mirrors[k])), axis)).x;
   const ownAxis = axisOf(strongest(bodies)), own = fitColor(strongest(bodies), ownAxis);
-  if (!isMetal([mirrored[0] - own.x[0], mirrored[1] - own.x[1]])) return asLight(fit);
-  return { ...asLight(own), metal: metalShare(tiles, ownAxis, own.x) };
+  if (!isMetal([mirrored[0] - own.x[0], mirrored[1] - own.x[1]])) return asLight(fit, tiles);
+  return { ...asLight(own, bodies), metal: metalShare(tiles, ownAxis, own.x) };
 }
 
 function remarksOn(light, tiles) {
@@ -212,22 +214,53 @@ function fitColor(tiles, axis) {
     gloss: Math.exp(weigh(glossy.map((v) => Math.log(v + 1e-3)))), across: weigh(planes.map(({ across }) => Math.min(across, 3))) };
 }
 
-/** The light of a fit: white where that explains it or costs less, else drawn toward white if unsure. */
-function asLight(fit) {
-  let x = fit.x;
-  const { error, chance } = expectedError(fit), sure = error <= SURE_DEG;
-  const variance = (((error * Math.PI) / 180) * (3 / (2 * Math.SQRT2 * Math.sqrt(Math.PI / 2)))) ** 2;
-  if (angleDeg(x) <= WHITE_ERRORS * error || chance > MAX_ASTRAY) x = [0, 0];
-  else if (!sure) x = x.map((v) => v / (1 + variance / DRAWN ** 2));
-  return { x, error, sure, metal: 0 };
+/** The light of a fit to a frame of these tiles. */
+function asLight(fit, tiles) {
+  const { good, chance } = expectedErrors(fit), error = Math.min((1 - chance) * good + chance * ASTRAY_DEG, UNKNOWN_DEG);
+  const [red, green, blue] = [1, 2, 3].map((k) => Math.max(sum(tiles.map(({ moments }) => moments[k])), 1e-9));
+  const spread = GOOD_SPREAD[0] + (GOOD_SPREAD[1] * good * Math.PI) / 180;
+  const x = likelyLamp(fit.x, chance, spread, [Math.log(red / green), Math.log(blue / green)]);
+  return { x, error, sure: error <= SURE_DEG, metal: 0 };
 }
 
-function expectedError({ x, scatter, gloss, across, change, lean }) {
+/** Log-ratios of the likely lamp of a frame of this mean colour: white, or the mean of what else is likely. */
+function likelyLamp(fitted, astray, spread, mean) {
+  const chances = (lamp) => {
+    const seen = normal(lamp, mean, BODIES_SPREAD);
+    return [(1 - astray) * seen, astray * seen * normal(lamp, fitted, ASTRAY_SPREAD)];
+  };
+  const [right, wrong] = chances([0, 0]), ofWhite = WHITE_SHARE * (right * normal([0, 0], fitted, spread) + wrong);
+  const [from, to, count] = GRID, step = (to - from) / (count - 1), ofFit = priorDensity(fitted) * chances(fitted)[0];
+  let all = ofFit, total = fitted.map((v) => ofFit * v);
+  for (let k = 0; k < count * count; k++) {
+    const lamp = [from + (k % count) * step, from + Math.floor(k / count) * step];
+    const own = priorDensity(lamp) * step ** 2 * chances(lamp)[1];
+    all += own;
+    total = total.map((v, i) => v + own * lamp[i]);
+  }
+  return ofWhite > LIKELY_WHITE * (ofWhite + all) ? [0, 0] : total.map((v) => v / all);
+}
+
+/** Density of log-ratios around a center, each of this standard deviation. */
+const normal = ([r, b], center, spread) =>
+  Math.exp(-((r - center[0]) ** 2 + (b - center[1]) ** 2) / (2 * spread ** 2)) / (2 * Math.PI * spread ** 2);
+
+/** Density of lamps before a frame is seen, but for exactly white ones. */
+function priorDensity(x) {
+  const inside = x.every((v, k) => v >= RAW_LAMPS[k][0] && v <= RAW_LAMPS[k][1]), [length, width] = WARM_SPREAD;
+  const raw = inside ? 1 / RAW_LAMPS.reduce((area, [least, most]) => area * (most - least), 1) : 0;
+  const along = x[0] * WARM[0] + x[1] * WARM[1], across = x[0] * WARM[1] - x[1] * WARM[0];
+  const warm = Math.exp(-((along / length) ** 2 + (across / width) ** 2) / 2) / (2 * Math.PI * length * width);
+  return RAW_SHARE * raw + WARM_SHARE * warm + ANY_SHARE * normal(x, [0, 0], ANY_SPREAD);
+}
+
+/** Mean angle [degrees] by which fits like this one are off that were not led astray; the chance that it was. */
+function expectedErrors({ x, scatter, gloss, across, change, lean }) {
   const moved = angleDeg(change), spread = spreadDeg(x, scatter), shown = [across, gloss, moved, spread];
   let logit = ASTRAY_BIAS + ASTRAY_LEAN * lean + ASTRAY_DISTANCE * Math.min(distanceToLamps(x), MAX_DISTANCE);
   ASTRAY.forEach(([a, b], k) => (logit += a * Math.log(shown[k] + b)));
   const chance = 1 / (1 + Math.exp(-logit)), good = GOOD[0] * (moved + 0.1) ** GOOD[1] * (spread + 0.03) ** GOOD[2];
-  return { error: Math.min((1 - chance) * good + chance * ASTRAY_DEG, UNKNOWN_DEG), chance };
+  return { good, chance };
 }
 
 function distanceToLamps(x) {

@@ -22,8 +22,13 @@ from polsep.io.store.weights import read_weights, write_weights
 
 #: Fewest numbers of a layer that is rounded where no ranges are known.
 LEAST = 30_000
-#: Fewest numbers of a layer that takes fewer values, and how many on each side of 0, by method.
-COARSE = {"joint-large": (130_000, 31), "paper": (200_000, 31), "material": (0, 15), "shape": (0, 7)}
+#: Fewest numbers of layers that take fewer values, and how many on each side of 0, by method; larger ones last.
+COARSE = {
+    "joint-large": ((130_000, 31),),
+    "paper": ((200_000, 31),),
+    "material": ((0, 15),),
+    "shape": ((0, 7), (500_000, 4)),
+}
 #: Parts of the names of first and last layers.
 ENDS = ("encoders.0.0.", "last.")
 
@@ -52,9 +57,9 @@ def main(paths: list[str]) -> None:
             continue
         names, before = names_to_round(arrays, metadata), path.stat().st_size
         exact = metadata.pop("sha256")
-        large, count = COARSE.get(metadata["method"], (0, 0))
-        coarse = {name for name in names if count and arrays[name].size >= large}
-        arrays |= {name: coarsened(arrays[name], count) for name in coarse}
+        for name in names:
+            counts = [count for least, count in COARSE.get(metadata["method"], ()) if arrays[name].size >= least]
+            arrays[name] = coarsened(arrays[name], counts[-1]) if counts else arrays[name]
         write_weights(path, arrays, metadata | {"rounded_from": exact}, names)
         share = sum(arrays[name].size for name in names) / sum(array.size for array in arrays.values())
         print(f"{path}: {len(names)} arrays, {share:.0%} of the numbers, {before} to {path.stat().st_size} bytes")

@@ -52,7 +52,7 @@ class ShapeOptions:
     """
 
     input: str = "separated"
-    size: ResidualSize = field(default_factory=lambda: ResidualSize(16, (1, 1, 2, 1, 1)))
+    size: ResidualSize = field(default_factory=lambda: ResidualSize(32, (1, 2, 2, 2)))
     seed: int = 0
     batch: int = 8
     side: int = 96

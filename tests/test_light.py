@@ -173,6 +173,18 @@ def test_the_likely_lamp_follows_the_evidence() -> None:
     assert np.hypot(*(found - tungsten)) < min(np.hypot(*tungsten), np.hypot(*(body - tungsten)))
 
 
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_light_of_one_channel_has_a_color(channel: int) -> None:
+    """Under one LED the other channels may be dark: its own is the strongest of a finite lamp, white at the least."""
+    light = [0.0, 0.0, 0.0]
+    light[channel] = 1.0
+    one = frame(light=tuple(light))
+    found = find_light(one)
+    assert np.isfinite(found.color).all() and max(found.color) == found.color[channel]
+    images = separate_capture(one, "analytic")
+    assert np.isfinite(images.diffuse).all() and np.isfinite(images.specular).all()
+
+
 def test_chances_of_lamps_add_up() -> None:
     """Over the grid, but for lamps beyond it, the shares of lamps that are not white."""
     lamps, prior = _usual_lamps()

@@ -169,11 +169,15 @@ def test_a_sequence_plays_under_edits(page: Any, tmp_path: Path) -> None:
     page.wait_for_function(f"document.querySelector('.ps-right').src !== {before!r}")
     page.click("#ps-play")
     page.wait_for_selector("#ps-play:has-text('Play')")
-    path = fetch(page, "edited", tmp_path)
-    while not path.name.startswith(f"s{page.evaluate(index)}"):  # until the numbers of the shown frame are there
-        page.wait_for_timeout(100)
+    for _ in range(100):
         path = fetch(page, "edited", tmp_path)
-    edited, place = read_exr_layers(path), int(path.name[1])
+        place = int(path.name[1])
+        if page.evaluate(index) == str(place):  # the numbers of the shown frame are there
+            break
+        page.wait_for_timeout(100)
+    assert page.evaluate(index) == str(place)
+    assert page.inner_text("#ps-status").startswith(f"s{place}")
+    edited = read_exr_layers(path)
     truth = separated(imagecodecs.png_decode(small_frame(4 * place)))
     np.testing.assert_array_equal(edited["combined.G"], truth.diffuse[..., 1])
 

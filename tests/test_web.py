@@ -19,7 +19,9 @@ from chromium import WAIT_MS, browser, fresh_page
 import polsep
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
+from polsep.light.find import find_light
 from polsep.pipeline import PolsepWarning
+from polsep.sensor.camera import Layout
 from tools.web_page import CHROMIUM, DEMO, HAS_PACKAGES, NODE, WEB, build_page, change, send, served
 
 __all__ = ["browser"]  # a fixture
@@ -222,6 +224,35 @@ def test_files_are_read_as_the_library_reads_them(tmp_path: Path) -> None:
     assert len(found) == len(writings) + len(formats) + 1
     for name, frame in found.items():
         np.testing.assert_array_equal(np.reshape(frame["data"], (50, 70)), codes >> lost_bits(name), err_msg=name)
+
+
+@needs_packages
+def test_the_page_finds_the_lamp_that_the_library_finds(tmp_path: Path) -> None:
+    """Lamps of a sensor without balance, a bulb, two that no light is like, and light that one colour alone sees."""
+    gains = [(1, 1, 1), (0.55, 1, 0.65), (1, 0.625, 0.3), (0.3, 1, 0.3), (1, 0.4, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    codes, layout = crop(), Layout()
+    rows, cols = np.indices(codes.shape)
+    channel = np.array([own for row in layout.table() for _, own in row]).reshape(4, 4)[rows % 4, cols % 4]
+    frames = [(codes * np.array(own)[channel]).astype(np.uint16) for own in gains]
+    (tmp_path / "frames").write_bytes(b"".join(one.astype("<u2").tobytes() for one in frames))
+    script = f"""
+      import {{ readFileSync }} from "node:fs";
+      import {{ findLight }} from {json.dumps((WEB / "src" / "light.js").as_uri())};
+      import {{ parseLayout }} from {json.dumps((WEB / "src" / "layout.js").as_uri())};
+      const [height, width] = {json.dumps(codes.shape)}, bytes = readFileSync("frames"), layout = parseLayout("color");
+      const all = new Uint16Array(bytes.buffer, bytes.byteOffset, bytes.length / 2);
+      console.log(JSON.stringify(Array.from({{ length: all.length / height / width }}, (_, k) => {{
+        const data = Float32Array.from(all.subarray(k * height * width, (k + 1) * height * width));
+        return findLight({{ data, height, width, layout, black: 0, white: 4095 }});
+      }})));"""
+    done = subprocess.run(
+        [str(NODE), "--input-type=module", "-e", script], cwd=tmp_path, capture_output=True, check=True, timeout=60
+    )
+    for own, one, found in zip(gains, frames, json.loads(done.stdout), strict=True):
+        light = find_light(one, white_level=4095)
+        np.testing.assert_allclose(found["color"], light.color, rtol=1e-3, err_msg=str(own))
+        assert found["error_deg"] == pytest.approx(light.error_deg, rel=0.01), own
+        assert (found["sure"], len(found["remarks"])) == (light.sure, len(light.remarks)), own
 
 
 @needs_packages

@@ -66,7 +66,7 @@ _KINDS = {
         "Unions of solids, smooth bodies and vessels with random textures, rendered as a model of Sony's IMX250 "
         "records them, and separated by this package (docs/shape.md). No photographs, no scans, no data of others.",
         "One dielectric thing under one polarized lamp within some 45 degrees of the camera; detail below a "
-        "two-hundredth of the thing is lost (docs/shape.md). The scores are those of the weights that shipped before.",
+        "hundredth of the thing is lost or faint (docs/shape.md).",
         "shape",
         "shape/normals",
     ),

@@ -50,6 +50,8 @@ WARM_SPREAD, ANY_SPREAD = (0.4, 0.1), 0.5
 BODIES_SPREAD, ASTRAY_SPREAD, GOOD_SPREAD = 0.8, 0.5, (0.01, 3.0)
 #: Chance from which on a frame's lamp counts as white.
 LIKELY_WHITE = 0.5
+#: Largest log-ratio of a colour, either way: beyond it a channel is dark, as under one LED, and says no more.
+LARGEST_RATIO = 5.0
 #: Steps of the grid of lamps: from, to [log-ratio], count.
 GRID = (-1.5, 0.8, 47)
 #: Mean error of fits that went astray [degrees], and of the others: power law of the two last quantities.
@@ -149,10 +151,9 @@ def _remarks_on(light: Light, tiles: Tiles) -> Iterator[str]:
     if light.sure:
         return
     mean = (tiles.moments[:, 0, 1:4] / tiles.moments[:, :1, 0]).mean(0)
-    if light.color != (1.0, 1.0, 1.0):
-        unclear = light.error_deg > UNCERTAIN_DEG
-    else:
-        unclear = light.error_deg > UNCERTAIN_DEG and float(mean[0] * mean[2] / mean[1] ** 2) < math.exp(GREENISH)
+    unclear = light.error_deg > UNCERTAIN_DEG
+    if light.color == (1.0, 1.0, 1.0):
+        unclear &= float(mean[0] * mean[2]) < math.exp(GREENISH) * float(mean[1]) ** 2
     if unclear:
         color = ",".join(f"{c:.2f}" for c in light.color)
         yield (
@@ -224,6 +225,8 @@ def likely_lamp(fitted: Doubles, astray: float, spread: float, mean: Doubles) ->
     ``fitted``: the fit, within ``spread`` of the lamp unless it went astray; ``mean``: of the frame, that of coloured
     bodies under the lamp. Lamps are as likely before as the shares above say.
     """
+
+    fitted, mean = (x.clip(-LARGEST_RATIO, LARGEST_RATIO) for x in (fitted, mean))
 
     def chance(lamps: Doubles) -> tuple[Doubles, Doubles]:
         seen = _normal(lamps - mean, BODIES_SPREAD)

@@ -13,6 +13,7 @@ const RAW_LAMPS = [[-1.05, 0.13], [-1.35, 0.03]], WARM = [0.524, -0.852], ALONG_
 const ASTRAY_DEG = 11.5, GOOD = [1.25 * Math.exp(0.28), 0.126, 0.563], UNCERTAIN_DEG = 5.5, LEAST_METAL = 0.02;
 const WHITE_SHARE = 0.6, RAW_SHARE = 0.2, WARM_SHARE = 0.15, ANY_SHARE = 0.05, WARM_SPREAD = [0.4, 0.1], ANY_SPREAD = 0.5;
 const BODIES_SPREAD = 0.8, ASTRAY_SPREAD = 0.5, GOOD_SPREAD = [0.01, 3], LIKELY_WHITE = 0.5, GRID = [-1.5, 0.8, 47];
+const LARGEST_RATIO = 5;
 const GREENISH = -1.2, MIRROR = 1, MIN_MIRRORS = 3, METAL_DISTANCE = 0.28;
 const COPPER = [0.403, -0.17], GOLD = [0.246, -0.821];
 /** Two directions beside grey. */
@@ -67,7 +68,7 @@ function remarksOn(light, tiles) {
   if (light.sure) return remarks;
   const [r, g, b] = [1, 2, 3].map((k) => mean(tiles.map(({ moments }) => moments[k] / moments[0])));
   const white = light.x[0] === 0 && light.x[1] === 0;
-  if (light.error > UNCERTAIN_DEG && (!white || (r * b) / g ** 2 < Math.exp(GREENISH)))
+  if (light.error > UNCERTAIN_DEG && (!white || r * b < Math.exp(GREENISH) * g ** 2))
     remarks.push(`highlights that show the lamp's colour were expected, found too few; ${color.map((v) => v.toFixed(2))} is ` +
       "assumed: show a shiny thing, or measure a grey card and state the lamp's colour");
   return remarks;
@@ -225,6 +226,7 @@ function asLight(fit, tiles) {
 
 /** Log-ratios of the likely lamp of a frame of this mean colour: white, or the mean of what else is likely. */
 function likelyLamp(fitted, astray, spread, mean) {
+  [fitted, mean] = [fitted, mean].map((x) => x.map((v) => Math.min(Math.max(v, -LARGEST_RATIO), LARGEST_RATIO)));
   const chances = (lamp) => {
     const seen = normal(lamp, mean, BODIES_SPREAD);
     return [(1 - astray) * seen, astray * seen * normal(lamp, fitted, ASTRAY_SPREAD)];

@@ -35,8 +35,8 @@ def find_ablations() -> dict[str, Path]:
     return {name: found[name] for name in sorted(found, key=lambda name: (name != "none", name))}
 
 
-def ablation_entry(name: str, path: Path) -> Entry:
-    """A network without ``name``, at half resolution."""
+def network_at_half(name: str, path: Path) -> Entry:
+    """A joint network at half resolution, called ``name``."""
     network = load_joint(path, torch.device("cpu"))
 
     def separate(capture: Capture) -> Separation:
@@ -55,7 +55,7 @@ def bench_ablations(data: Path) -> Iterator[Row]:
     for name, path in found.items():
         for metric, value in json.loads(read_weights(path)[1]["validation"]).items():
             yield Row("ablations", "validation views", name, metric, value, "dB")
-    entries = tuple(ablation_entry(name, path) for name, path in found.items())
+    entries = tuple(network_at_half(name, path) for name, path in found.items())
     for row in score_sets("ablations", sets, data, [Protocol("noisy", capture_noisy, entries)]):
         if row.bench == "ablations/noisy" and row.metric.removesuffix(SPREAD) in TABLED:
             yield Row("ablations", row.case.partition(",")[0], row.method, row.metric, row.value, row.unit)

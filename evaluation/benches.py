@@ -22,6 +22,7 @@ from evaluation.material import PUBLISHED, bench_material, bench_material_quick
 from evaluation.material_gallery import draw_material
 from evaluation.paper import bench_paper, bench_paper_quick
 from evaluation.rendering import bench_rendering
+from evaluation.repeats import bench_repeats
 from evaluation.sets import bench_sets
 from evaluation.video import bench_video, bench_video_quick
 from evaluation.viewing import bench_view
@@ -40,6 +41,7 @@ BENCHES: dict[str, Bench] = {
     "sets": Bench(bench_sets, data=SET_DATA, measures=SCENES),
     "joint": Bench(bench_joint, data=SET_DATA, measures=SCENES),
     "ablations": Bench(bench_ablations, data=SET_DATA, measures=(*SCENES, "evaluation/weights/ablations")),
+    "repeats": Bench(bench_repeats, data=SET_DATA, measures=(*SCENES, "polsep/train")),
     "dynamic": Bench(bench_dynamic, bench_dynamic_quick, measures=(*SCENES, "polsep/video")),
     "calibration": Bench(bench_calibration, measures=SCENES),
     "material": Bench(

@@ -13,8 +13,8 @@ pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 pytest.importorskip("scipy", reason="meshes need the extra 'render'")
 pytest.importorskip("flip_evaluator", reason="FLIP needs the extra 'bench'")
 
-from evaluation import testsets
-from evaluation.ablations import ablation_entry, find_ablations
+from evaluation import WEIGHTS, testsets
+from evaluation.ablations import find_ablations, network_at_half
 from evaluation.joint import (
     BINS,
     capture_full,
@@ -25,9 +25,11 @@ from evaluation.joint import (
     measure_reliability,
 )
 from evaluation.rendering import bench_rendering
+from evaluation.repeats import RECIPES, as_entry, spread_over_seeds
 from evaluation.scoring import Entry, Protocol, capture_clean, capture_co_sited, capture_noisy, score_case, score_sets
 from evaluation.sets import bench_sets
 from evaluation.testsets import Recipe, build_case
+from polsep.bench.rows import Row
 from polsep.demosaic.bilinear import demosaic_bilinear_half, mean_cells
 from polsep.io.store.weights import read_weights
 from polsep.methods import METHODS, compose
@@ -195,7 +197,23 @@ def test_ablations_differ_in_what_they_go_without_alone() -> None:
     for key in ("method", "variant", "seed", "schedule", "stream", "data", "size"):
         assert len({record[key] for record in records}) == 1, key
     case = build_case(GREY)
-    entries = tuple(ablation_entry(name, path) for name, path in found.items())
+    entries = tuple(network_at_half(name, path) for name, path in found.items())
     scores = list(score_case(case, [Protocol("noisy", capture_noisy, entries)]))
     psnrs = [score.value for score in scores if score.metric == "specular PSNR"]
     assert len(set(psnrs)) == len(found)
+
+
+def test_spread_over_seeds_is_that_of_single_trainings() -> None:
+    """Mean and standard deviation of each network's scores on each set; who is trained is who can be scored."""
+    values = {"paper:1": 30.0, "paper:2": 31.0, "paper:3": 35.0, "stokes:1": 28.0, "stokes:2": 28.0, "stokes:3": 28.0}
+    rows = [Row("repeats/noisy", "objects, noisy", name, "diffuse PSNR", value, "dB") for name, value in values.items()]
+    assert list(spread_over_seeds(rows)) == [
+        Row("repeats", "objects", "paper", "diffuse PSNR", 32.0, "dB"),
+        Row("repeats", "objects", "stokes", "diffuse PSNR", 28.0, "dB"),
+        Row("repeats", "objects", "paper", "diffuse PSNR, between seeds", 7**0.5, "dB"),
+        Row("repeats", "objects", "stokes", "diffuse PSNR, between seeds", 0.0, "dB"),
+    ]
+    places = {"joint-fast": "ablations/none", "paper": "ladder/paper-mosaic"}
+    for network in RECIPES:
+        path = WEIGHTS / f"{places.get(network, f'ladder/{network}-mosaic')}.safetensors"
+        assert as_entry(network, path, 7).name == f"{network}:7"

@@ -21,7 +21,8 @@ from evaluation import WEIGHTS
 from polsep.bench.rows import Row
 from polsep.io.assets.materials import find_panels, read_panels
 from polsep.material.estimate import Estimator, load_estimator
-from polsep.material.shots import CAMERA_HEIGHT, INPUTS, MAP_SIZE, Example, make_example, random_example
+from polsep.material.procedural import MAP_SIZE
+from polsep.material.shots import CAMERA_HEIGHT, INPUTS, Example, make_example, random_example
 from polsep.material.svbrdf import Svbrdf, plane_points, relight, unstack
 from polsep.metrics import flip, psnr, require_flip
 from polsep.physics.optics import dot

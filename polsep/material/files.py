@@ -19,7 +19,8 @@ from polsep.io.results.separation_reader import read_separated
 from polsep.io.store.atomic import refuse_existing, refuse_inputs
 from polsep.io.store.errors import InputError, input_error
 from polsep.material.estimate import load_estimator
-from polsep.material.shots import CAMERA_HEIGHT, MAP_SIZE
+from polsep.material.procedural import MAP_SIZE
+from polsep.material.shots import CAMERA_HEIGHT
 from polsep.material.svbrdf import Svbrdf, plane_points, relight
 from polsep.pipeline import LightColor, separate_capture
 

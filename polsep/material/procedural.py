@@ -30,7 +30,7 @@ GLASS = 0.04
 GAINS = (0.5, 2.5)
 #: Least roughness: below it, the reflection of a small flash is a point.
 MIN_ROUGHNESS = 0.12
-#: Share of samples with metal, and of those that are metal all over; in the others one layer is, beside or under others.
+#: Share of samples with metal, and of those that are metal all over; in the others one layer is metal.
 METAL_SHARE, ALL_METAL_SHARE = 0.2, 0.5
 #: Reflectance of metals at normal incidence, share of grey ones, largest difference of their colours, and ratios of
 #: green to red and blue to green of the others, as from copper to gold; the factor of the second material of a texture.
@@ -97,7 +97,8 @@ def _draw(interval: tuple[float, float], generator: torch.Generator) -> float:
 
 def _transmitted(albedo: Tensor) -> Tensor:
     """Diffuse reflectance of an albedo in `optics`, where light passes the surface twice, at normal incidence."""
-    return albedo * fresnel(torch.ones(1)).t_plus ** 2
+    diffuse: Tensor = albedo * fresnel(torch.ones(1)).t_plus ** 2
+    return diffuse
 
 
 def _metal_layers(count: int, generator: torch.Generator) -> list[bool]:

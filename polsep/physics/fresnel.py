@@ -43,10 +43,10 @@ def fresnel(cos_theta: Array, eta: float = ETA) -> Fresnel:
 def conductor(cos_theta: Array, reflectance: Array) -> Fresnel:
     """Fresnel coefficients of a metal of ``reflectance`` in (0, 1) at normal incidence; nothing is transmitted.
 
-    The index of refraction is taken as 1 + ik, k = 2 sqrt(R / (1 - R)): real parts of 0.2 to 3 give the same reflectance
-    with other k, and hardly another angle dependence below 60 degrees. r_cross is the real part of r_s r_p*; the
-    imaginary part makes light circular, which linear analysers do not see. Source: Born and Wolf, Principles of Optics,
-    14.2; k from the reflectance as Gulbrandsen 2014, Artist Friendly Metallic Fresnel, Eq. 4.
+    The index of refraction is taken as 1 + ik, k = 2 sqrt(R / (1 - R)), as near aluminium's; other real parts with the
+    same R differ little below 60 degrees. r_cross is the real part of r_s r_p*: the imaginary part makes light
+    circular, which linear analysers do not see. Source: Born and Wolf, Principles of Optics, 14.2; k from R as in
+    Gulbrandsen 2014, Artist Friendly Metallic Fresnel.
     """
     xp = namespace(cos_theta)
     c = xp.clip(cos_theta, min=0, max=1)

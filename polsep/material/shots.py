@@ -21,6 +21,7 @@ from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.material.procedural import GLASS, MAP_SIZE, halve, random_svbrdf
 from polsep.material.svbrdf import Svbrdf, plane_points
 from polsep.physics.fresnel import fresnel
+from polsep.physics.gltf import metalness
 from polsep.physics.optics import Geometry, dot, metal_stokes, normalize
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
@@ -38,8 +39,6 @@ FLASH, AROUND, HEIGHTS = 0.15, 1.4, (1.8, 3.2)
 LARGEST_CLIPPED, MIN_LEVEL = 0.03, 0.06
 #: Method that separates the frames: the best that polsep ships.
 METHOD = "joint"
-#: Largest mean reflectance at normal incidence of dielectrics, and least of metals: gems reach 0.17, iron has 0.56.
-DIELECTRICS, METALS = 0.2, 0.32
 #: Standard deviation of the logarithm of the error of the level of white paper.
 WHITE_ERROR = 0.05
 #: Channels of each input, by name, among the 15 of an example's views.
@@ -78,12 +77,6 @@ def _light(position: Vector, generator: torch.Generator) -> PointLight:
     return PointLight(position, 1.0, turn)
 
 
-def metal_share(specular: Tensor) -> Tensor:
-    """The share ``[1, H, W]`` of metal in pixels of reflectances ``[3, H, W]`` at normal incidence."""
-    mean = specular.mean(dim=0, keepdim=True)
-    return ((mean - DIELECTRICS) / (METALS - DIELECTRICS)).clamp(0, 1)
-
-
 def shade_metal(maps: Svbrdf, light: PointLight) -> Stokes:
     """The light ``[3, H, W]`` that a plane of metal mirrors to the camera, as `sphere_tracing.shade` of dielectrics."""
     points, up = plane_points(*maps.roughness.shape[-2:]), torch.tensor([0.0, 1.0, 0.0]).view(3, 1, 1)
@@ -98,13 +91,12 @@ def shade_metal(maps: Svbrdf, light: PointLight) -> Stokes:
 def shade_plane(maps: Svbrdf, light: PointLight) -> tuple[Stokes, Stokes]:
     """Diffuse and specular light ``[3, H, W]`` of a plane, for the camera.
 
-    Where the specular map is brighter than `DIELECTRICS` it is of metal, and from `METALS` on of nothing else; between
-    them pixels hold both.
+    Which pixels are of metal the specular map says, by `gltf.metalness`.
     """
     height, width = maps.roughness.shape[-2:]
     albedo = maps.diffuse * (1 - maps.specular) / fresnel(torch.ones(1)).t_plus ** 2
     everywhere = torch.ones(1, height, width, dtype=torch.bool)
-    metal = metal_share(maps.specular)
+    metal: Tensor = metalness(maps.specular)
     strength = (1 - metal) * maps.specular / GLASS
     buffer = GBuffer(plane_points(height, width), maps.normal, albedo, maps.roughness, strength, everywhere)
     diffuse, specular = shade(buffer, CAMERA, light, everywhere)

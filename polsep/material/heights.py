@@ -114,7 +114,7 @@ def rough_noise(place: Place) -> Tensor:
     """A sum of octaves of `smooth_noise`."""
     size, gain = place.x.shape[-1], place.between(*GAINS)
     first = 2 ** place.between(1.5, 4)
-    octaves = [n for n in range(OCTAVES) if first * 2**n < size / 4]
+    octaves = [n for n in range(OCTAVES) if n == 0 or first * 2**n < size / 4]
     return sum(
         (gain**n * smooth_noise(size, first * 2**n, place.generator) for n in octaves), torch.zeros_like(place.x)
     )

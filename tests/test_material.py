@@ -32,7 +32,7 @@ from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
 from polsep.io.store.weights import write_weights
 from polsep.material.estimate import load_estimator
-from polsep.material.files import Photographs, flatness_notes
+from polsep.material.files import Photographs, find_white, flatness_notes
 from polsep.material.network import MaterialNetwork, MaterialSize, detail_cues, encode_images
 from polsep.material.procedural import halve, random_svbrdf
 from polsep.material.shots import CAMERA, CAMERA_HEIGHT, INPUTS, photograph, random_example, random_flash
@@ -421,3 +421,12 @@ def test_samples_that_are_not_flat_are_warned_of() -> None:
     views = torch.stack([light.expand(6, -1, -1) for light in (solid, paper)])
     (note,) = flatness_notes(Photographs(views, ("ball.png", "paper.png"), ()))
     assert note.startswith("ball.png: ") and "flat" in note
+
+
+def test_white_is_guessed_of_metal_too() -> None:
+    """By the diffuse light of a dielectric, and by all light of what hardly has any; or as said."""
+    views = torch.full((3, 6, 8, 8), 0.1)
+    views[1, :3], views[2, 3:] = 0.002, 0.0
+    levels = find_white(views, ())
+    assert levels == pytest.approx((0.1 / 0.25, 0.102 / 0.14, 0.1 / 0.25))
+    assert find_white(views, (0.7,)) == (0.7, 0.7, 0.7)

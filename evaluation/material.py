@@ -1,12 +1,14 @@
 """Materials from unseparated, separated and perfectly separated photographs: maps, relit pictures, Fig. 9's failure.
 
-Held-out materials are procedural ones of the test split and, where they are, published maps below the data folder, of
-which only the white part of the specular map counts, as our camera's materials are dielectrics. Relit pictures compare
-the maps found with the true ones under `LIGHTS` lights that no photograph had, by one renderer; white paper shows 1.
+Held-out materials are procedural ones of the test split, of which some are metal, further ones that are all metal or
+hold some, and, where they are, published maps below the data folder, of which only the white part of the specular map
+counts, as they are of dielectrics. Relit pictures compare the maps found with the true ones under `LIGHTS` lights that
+no photograph had, by one renderer; white paper shows 1.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import statistics
 from collections.abc import Iterator, Sequence
@@ -21,14 +23,18 @@ from evaluation import WEIGHTS
 from polsep.bench.rows import Row
 from polsep.io.assets.materials import find_panels, read_panels
 from polsep.material.estimate import Estimator, load_estimator
-from polsep.material.shots import CAMERA_HEIGHT, INPUTS, MAP_SIZE, Example, make_example, random_example
+from polsep.material.procedural import MAP_SIZE, halve, random_svbrdf
+from polsep.material.shots import CAMERA_HEIGHT, INPUTS, RAW_SIZE, Example, make_example, random_example
 from polsep.material.svbrdf import Svbrdf, plane_points, relight, unstack
 from polsep.metrics import flip, psnr, require_flip
+from polsep.physics.gltf import metalness
 from polsep.physics.optics import dot
 from polsep.render.views import scene_seed
 
 #: Held-out materials, those of the quick version, and photographs of each: one by a flash, the others by moved lights.
 PROCEDURAL, QUICK, VIEWS = 12, 2, 4
+#: Samples with metal are those of which it is at least this share.
+METAL_SHARE = 0.2
 #: Raw pixels along the side of small frames, and of those of published maps.
 SMALL = 2 * MAP_SIZE
 #: Published maps are every so many of the pictures in this folder.
@@ -64,6 +70,7 @@ def _measure(data: Path, count: int) -> Iterator[Row]:
     require_flip()
     estimators = load_estimators()
     sets = {"procedural": procedural_examples(count), "procedural, small frames": small_examples(count)}
+    sets["procedural, metals"] = metal_examples(count)
     published = published_examples(data, count)
     if published:
         sets["published"] = published
@@ -88,7 +95,21 @@ def procedural_examples(count: int) -> list[Example]:
 
 def small_examples(count: int) -> list[Example]:
     """The same materials in frames of as many cells as the maps have pixels."""
-    return [random_example("test", 0, number, VIEWS, SMALL) for number in range(count)]
+    generators = [torch.Generator().manual_seed(scene_seed("test", 0, number)) for number in range(count)]
+    return [make_example(halve(random_svbrdf(RAW_SIZE, generator)), VIEWS, generator) for generator in generators]
+
+
+def metal_examples(count: int) -> list[Example]:
+    """The first held-out procedural materials of another seed that hold metal."""
+
+    def draw() -> Iterator[Example]:
+        for number in itertools.count():
+            generator = torch.Generator().manual_seed(scene_seed("test", 2, number))
+            maps = random_svbrdf(RAW_SIZE, generator)
+            if float(metalness(maps.specular).mean()) >= METAL_SHARE:
+                yield make_example(maps, VIEWS, generator)
+
+    return list(itertools.islice(draw(), count))
 
 
 def published_examples(data: Path, count: int) -> list[Example]:
@@ -145,14 +166,16 @@ def score_maps(found: Svbrdf, truth: Svbrdf) -> Iterator[Score]:
 
 
 def score_failure(found: Svbrdf, truth: Svbrdf) -> Iterator[Score]:
-    """Fig. 9's failure in numbers: colour in the specular map, and normals that are too flat.
+    """Fig. 9's failure in numbers: colour in the specular map of dielectrics, and normals that are too flat.
 
     Detail of normals is what differs from the mean around; how much of it there is, found over true, and how well it
     goes with the true one, where there is some.
     """
     spread = found.specular.amax(dim=0) - found.specular.amin(dim=0)
     chroma = spread / found.specular.mean(dim=0).clamp(min=MIN_SPECULAR)
-    yield Score("failure", "specular chroma", "1", float(chroma.mean()))
+    dielectric = metalness(truth.specular)[0] == 0
+    if bool(dielectric.any()):
+        yield Score("failure", "specular chroma", "1", float(chroma[dielectric].mean()))
     fine, true = detail(found.normal), detail(truth.normal)
     energy, found_energy = (float(x.square().sum(dim=0).mean()) for x in (true, fine))
     if energy > MIN_DETAIL**2:

@@ -1,4 +1,4 @@
-"""How far trainings of one recipe lie apart that differ in their seed alone: in first weights and in all examples.
+"""The spread of trainings of one recipe that differ in their seed alone: in first weights and in all examples.
 
 Smaller differences between networks trained once say nothing. Each of `RECIPES` is trained by ``polsep train`` from
 nothing with each of `SEEDS`, in ``runs/repeats`` below the working folder; what was trained there before is kept. The

@@ -20,12 +20,19 @@ from torch import Tensor
 
 from evaluation.material import novel_lights, score_failure, score_maps, score_relit
 from polsep.cli.app import main
-from polsep.io.assets.materials import DIELECTRIC, encode_glb, encode_materialx, specular_scale, texture_pixels
+from polsep.io.assets.materials import (
+    DIELECTRIC,
+    encode_glb,
+    encode_materialx,
+    metallic_maps,
+    specular_scale,
+    texture_pixels,
+)
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
 from polsep.io.store.weights import write_weights
 from polsep.material.estimate import load_estimator
-from polsep.material.files import Photographs, flatness_notes
+from polsep.material.files import Photographs, find_white, flatness_notes
 from polsep.material.network import MaterialNetwork, MaterialSize, detail_cues, encode_images
 from polsep.material.procedural import halve, random_svbrdf
 from polsep.material.shots import CAMERA, CAMERA_HEIGHT, INPUTS, photograph, random_example, random_flash
@@ -59,7 +66,7 @@ def frame(tmp_path: Path) -> Path:
     """A raw frame of a random material, 64x64, 12 bits in 16."""
     mosaic, _, _ = photograph(random_svbrdf(64, seeded(4)), random_flash(seeded(5)), seeded(6))
     path = tmp_path / "flash.npy"
-    np.save(path, mosaic.data.numpy().astype(np.uint16))
+    np.save(path, mosaic.data.astype(np.uint16))
     return path
 
 
@@ -73,9 +80,9 @@ def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     return 0
 
 
-def test_random_materials_are_dielectrics() -> None:
-    """Unit normals that look up, albedos within bounds, white specular maps; the same seed is the same material."""
-    for seed in range(4):
+def test_random_materials_are_materials() -> None:
+    """Unit normals that look up, all else within bounds, white specular maps but for metals; a seed is a material."""
+    for seed in range(6):
         maps = random_svbrdf(48, seeded(seed))
         again = random_svbrdf(48, seeded(seed))
         assert torch.equal(maps.stack(), again.stack())
@@ -83,8 +90,10 @@ def test_random_materials_are_dielectrics() -> None:
         assert float(maps.normal[2].min()) > 0.3
         assert float(maps.diffuse.min()) >= 0 and float(maps.diffuse.max()) <= 1
         assert float(maps.roughness.min()) >= 0.1199 and float(maps.roughness.max()) <= 1
-        assert float(maps.specular.min()) > 0.005 and float(maps.specular.max()) < 0.11
-        assert bool((maps.specular == maps.specular[:1]).all())
+        assert float(maps.specular.min()) > 0.005
+        if float(maps.specular.max()) < 0.2:  # a dielectric
+            assert float(maps.specular.max()) < 0.11
+            assert bool((maps.specular == maps.specular[:1]).all())
 
 
 def test_halving_keeps_what_is_even() -> None:
@@ -186,7 +195,8 @@ def test_the_network_learns_one_material() -> None:
 
 
 def some_maps() -> dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
-    maps = random_svbrdf(16, seeded(3))
+    """Maps of a random dielectric."""
+    maps = random_svbrdf(16, seeded(4))
     return {name: np.ascontiguousarray(x.movedim(0, -1).numpy()) for name, x in vars(maps).items()}
 
 
@@ -205,7 +215,7 @@ def test_textures_hold_the_maps() -> None:
 def test_a_glb_is_one_textured_square() -> None:
     """Its chunks have the lengths they say, and trimesh finds two triangles with the textures on them."""
     maps = some_maps()
-    data = encode_glb(texture_pixels(maps), specular_scale(maps["specular"]), "stone")
+    data = encode_glb(maps, "stone")
     magic, version, length = struct.unpack_from("<4sII", data)
     assert (magic, version, length) == (b"glTF", 2, len(data))
     size = struct.unpack_from("<I", data, 12)[0]
@@ -238,6 +248,29 @@ def test_a_glb_is_one_textured_square() -> None:
     # The upper left corner of the square is the upper left pixel.
     corner = int(np.argmin(np.abs(mesh.vertices - np.array([-1, 1, 0])).sum(axis=1)))
     np.testing.assert_allclose(mesh.visual.uv[corner], [0, 1])  # trimesh counts v up
+
+
+def test_files_say_what_is_metal() -> None:
+    """In glTF's terms metal is metallic, with its reflectance as base colour, and glass is not; both render as before.
+
+    MaterialX says it by the specular colour.
+    """
+    maps = some_maps()
+    for kind, (diffuse, specular) in {"metal": (0.0, (0.9, 0.7, 0.4)), "glass": (0.5, (0.04, 0.04, 0.04))}.items():
+        maps["diffuse"] = np.full_like(maps["diffuse"], diffuse)
+        maps["specular"] = np.ones_like(maps["specular"]) * np.float32(specular)
+        found = metallic_maps(maps)
+        assert found["metallic"].shape == (16, 16, 1) and (found["metallic"] == (kind == "metal")).all()
+        np.testing.assert_allclose(found["diffuse"], maps["specular" if kind == "metal" else "diffuse"], rtol=1e-6)
+        # Appendix B of glTF: reflectance at normal incidence and diffuse colour.
+        reflectance = found["specular"] + found["metallic"] * (found["diffuse"] - found["specular"])
+        np.testing.assert_allclose(reflectance, maps["specular"], rtol=1e-6)
+        np.testing.assert_allclose((1 - found["metallic"]) * found["diffuse"], maps["diffuse"], atol=1e-6)
+        mesh = trimesh.load(BytesIO(encode_glb(maps, kind)), file_type="glb").geometry[kind]
+        pixels = np.asarray(mesh.visual.material.metallicRoughnessTexture.convert("RGB"))
+        assert (pixels[..., 2] == (255 if kind == "metal" else 0)).all()
+        assert mesh.visual.material.metallicFactor in (None, 1.0)
+    assert specular_scale(maps["specular"]) == pytest.approx(0.04)
 
 
 def test_materialx_is_xml_that_names_its_files() -> None:
@@ -388,3 +421,12 @@ def test_samples_that_are_not_flat_are_warned_of() -> None:
     views = torch.stack([light.expand(6, -1, -1) for light in (solid, paper)])
     (note,) = flatness_notes(Photographs(views, ("ball.png", "paper.png"), ()))
     assert note.startswith("ball.png: ") and "flat" in note
+
+
+def test_white_is_guessed_of_metal_too() -> None:
+    """By the diffuse light of a dielectric, and by all light of what hardly has any; or as said."""
+    views = torch.full((3, 6, 8, 8), 0.1)
+    views[1, :3], views[2, 3:] = 0.002, 0.0
+    levels = find_white(views, ())
+    assert levels == pytest.approx((0.1 / 0.25, 0.102 / 0.14, 0.1 / 0.25))
+    assert find_white(views, (0.7,)) == (0.7, 0.7, 0.7)

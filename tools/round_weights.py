@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from polsep.io.store.weights import read_weights, write_weights
 
 #: Fewest numbers of a layer that is rounded where no ranges are known.
-LEAST = 30_000
+LEAST = 12_000
 #: Fewest numbers of layers that take fewer values, and how many on each side of 0, by method; larger ones last.
 COARSE = {
     "joint-large": ((130_000, 31),),
     "paper": ((200_000, 31),),
-    "material": ((0, 15),),
+    "material": ((0, 7), (50_000, 5)),
     "shape": ((0, 7), (500_000, 4)),
 }
 #: Parts of the names of first and last layers.

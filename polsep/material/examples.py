@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from polsep.io.store.examples import read_example, write_example
-from polsep.material.shots import INPUTS, Example, random_example
+from polsep.material.shots import INPUTS, RAW_SIZE, SMALL_SIZE, Example, random_example
 from polsep.material.svbrdf import STACKED
 
 #: Planes of one view.
@@ -21,11 +21,14 @@ def example_path(folder: Path, split: str, seed: int, number: int) -> Path:
 
 
 def make_examples(folder: Path, split: str, seed: int, count: int, views: int) -> Iterator[int]:
-    """Render the missing ones of the first ``count`` examples; yield how many exist, after each."""
+    """Render the missing ones of the first ``count`` examples; yield how many exist, after each.
+
+    Even ones are of frames of `RAW_SIZE`, odd ones of `SMALL_SIZE`.
+    """
     for number in range(count):
         path = example_path(folder, split, seed, number)
         if not path.is_file():
-            example = random_example(split, seed, number, views)
+            example = random_example(split, seed, number, views, SMALL_SIZE if number % 2 else RAW_SIZE)
             write_example(path, torch.cat([example.views.flatten(0, 1), example.maps]))
         yield number + 1
 

@@ -19,18 +19,23 @@ from polsep.io.results.separation_reader import read_separated
 from polsep.io.store.atomic import refuse_existing, refuse_inputs
 from polsep.io.store.errors import InputError, input_error
 from polsep.material.estimate import load_estimator
-from polsep.material.shots import CAMERA_HEIGHT, MAP_SIZE
+from polsep.material.procedural import MAP_SIZE
+from polsep.material.shots import CAMERA_HEIGHT
 from polsep.material.svbrdf import Svbrdf, plane_points, relight
 from polsep.pipeline import LightColor, separate_capture
 
 Floats = NDArray[np.float32]
 
-#: Median of the separated diffuse images of training, 1 = white paper: assumed where the exposure is unknown.
-USUAL_DIFFUSE = 0.29
+#: Median of the separated diffuse images of training's dielectrics, 1 = white paper: assumed of unknown exposures.
+USUAL_DIFFUSE = 0.25
+#: The same of all light of training's metals, and least median of all light over that of diffuse light of a metal;
+#: training's dielectrics: 99 % below 3.2, metals: 99 % above 6.
+USUAL_METAL, MIRRORS = 0.14, 4.0
 #: Smallest and largest side of maps.
 MIN_SIZE, LARGEST_SIZE = 32, 1024
 #: Parts along a side of the square, and the least light of one relative to the brightest that a flat sample shows.
-#: Random flat materials: 0.06 and more; objects on black: 0.000, spheres that fill the square 0.02 to 0.04.
+#: Random dielectrics: 95 % above 0.06; objects on black: 0.000, spheres that fill the square 0.02 to 0.04. Polished
+#: metal has dark corners, too.
 FLAT_PARTS, MIN_PART = 8, 0.05
 #: Positions of the lights of the preview, and the side of its pictures in pixels.
 PREVIEW_LIGHTS = ((0.0, 0.0, 2.75), (-1.2, 0.8, 1.8), (1.3, 0.9, 1.5), (1.0, -1.3, 1.2), (-1.6, -0.6, 0.9))
@@ -134,7 +139,7 @@ def flatness_notes(photographs: Photographs) -> list[str]:
     shares = (parts.amin(dim=1) / parts.amax(dim=1)).tolist()
     return [
         f"{source}: a part of the middle square has {share:.1%} of the light of the brightest part: "
-        "is the sample flat, does it fill the square, and is it lit everywhere?"
+        "is the sample flat, does it fill the square, is it lit everywhere? (polished metal may be dark)"
         for source, share in zip(photographs.sources, shares, strict=True)
         if share < MIN_PART
     ]
@@ -152,7 +157,7 @@ def _middle_square(image: Tensor, size: int) -> Tensor:
 
 
 def find_white(views: Tensor, given: tuple[float, ...]) -> tuple[float, ...]:
-    """The level of white paper for each view ``[V, 6, h, w]``: as given, or for a material of `USUAL_DIFFUSE`.
+    """The level of white paper for each view ``[V, 6, h, w]``: as given, or for a usual dielectric or metal.
 
     Raises ValueError unless there is one number, or one for each view.
     """
@@ -161,8 +166,12 @@ def find_white(views: Tensor, given: tuple[float, ...]) -> tuple[float, ...]:
         raise ValueError(f"expected one level of white, or {count}, one for each photograph, found {len(given)}")
     if given:
         return given * count if len(given) == 1 else given
-    levels = views[:, :3].mean(dim=1).flatten(1).median(dim=1).values
-    return tuple(max(float(level) / USUAL_DIFFUSE, 1e-6) for level in levels)
+    levels = []
+    for view in views:
+        diffuse, total = (float(x.mean(dim=0).median()) for x in (view[:3], view[:3] + view[3:]))
+        level = total / USUAL_METAL if total > MIRRORS * diffuse else diffuse / USUAL_DIFFUSE
+        levels.append(max(level, 1e-6))
+    return tuple(levels)
 
 
 def draw_material(maps: Svbrdf, views: Tensor) -> Pixels:

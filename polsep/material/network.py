@@ -8,7 +8,7 @@ Conventions are those of `polsep.material.svbrdf`; images are linear, 1 = white 
 three channels those that show albedo: the photograph, or its diffuse part. Source: Deschaintre et al. 2018,
 doi:10.1145/3197517.3201378 (network, global track); Deschaintre et al. 2019, doi:10.1111/cgf.13765 (pooling over
 views). Notes, which allow training in an hour on a CPU where the source's takes days on a GPU: widths
-are a quarter of the source's; the decoder's convolutions are 3x3, one before and one after it enlarges, instead of two
+are a third of the source's; the decoder's convolutions are 3x3, one before and one after it enlarges, instead of two
 of 4x4, its last one has the photograph as another input, and the last layers its mean and minimum over the views; there
 is no instance normalization, which removes colours and is slow to learn them again; the diffuse map is a difference to
 the mean photograph, and albedos are squares of outputs, as most of them are small.
@@ -50,7 +50,7 @@ class MaterialSize:
     ``cues``: of `CUES`, further inputs of every image. Raises ValueError on sizes that cannot be built.
     """
 
-    width: int = 16
+    width: int = 20
     growth: tuple[int, ...] = (1, 2, 4, 4, 4, 4)
     cues: tuple[str, ...] = ()
 

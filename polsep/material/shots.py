@@ -10,17 +10,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from polsep.demosaic.guided import demosaic_guided_half
-from polsep.material.procedural import GLASS, halve, random_svbrdf
+from polsep.demosaic.measured_stokes import measured_stokes
+from polsep.material.procedural import GLASS, MAP_SIZE, halve, random_svbrdf
 from polsep.material.svbrdf import Svbrdf, plane_points
-from polsep.methods import METHODS
 from polsep.physics.fresnel import fresnel
+from polsep.physics.gltf import metalness
+from polsep.physics.optics import Geometry, dot, metal_stokes, normalize
+from polsep.physics.stokes import Stokes
+from polsep.pipeline import separate_capture
 from polsep.render.simulate import blur, capture, expose_to_clip, expose_to_level, half_resolution
 from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Scene, Vector, shade
 from polsep.render.views import BLURS, scene_seed
@@ -39,9 +43,12 @@ METHOD = "joint"
 WHITE_ERROR = 0.05
 #: Channels of each input, by name, among the 15 of an example's views.
 INPUTS: dict[str, slice] = {"unseparated": slice(0, 3), "separated": slice(3, 9), "perfect": slice(9, 15)}
-#: Raw pixels along the side of a frame, and pixels of the maps, to which images are averaged, as frames of real
-#: cameras are.
-RAW_SIZE, MAP_SIZE = 512, 128
+#: Raw pixels along the side of a frame; images are averaged to `MAP_SIZE` pixels, as frames of real cameras are.
+RAW_SIZE = 512
+#: Raw pixels of every other example of training: large maps and parts of frames have as few for a pixel.
+SMALL_SIZE = 2 * MAP_SIZE
+#: The colour of a white lamp.
+WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -70,39 +77,59 @@ def _light(position: Vector, generator: torch.Generator) -> PointLight:
     return PointLight(position, 1.0, turn)
 
 
-def photograph(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> tuple[Mosaic, Scene, float]:
-    """A raw frame of a plane, the exposed light behind it, and s0 of white paper in the plane's middle.
+def shade_metal(maps: Svbrdf, light: PointLight) -> Stokes:
+    """The light ``[3, H, W]`` that a plane of metal mirrors to the camera, as `sphere_tracing.shade` of dielectrics."""
+    points, up = plane_points(*maps.roughness.shape[-2:]), torch.tensor([0.0, 1.0, 0.0]).view(3, 1, 1)
+    to_light = torch.tensor(light.position).view(3, 1, 1) - points
+    distance = torch.sqrt(dot(to_light, to_light))
+    to_camera = normalize(torch.tensor(CAMERA.position).view(3, 1, 1) - points)
+    geometry = Geometry(maps.normal, to_camera, to_light / distance, up, up)
+    irradiance = light.intensity / distance**2
+    return metal_stokes(geometry, torch.tensor(light.polarizer), irradiance, maps.roughness, maps.specular)
 
-    The specular map is that of a dielectric: its mean colour counts.
+
+def shade_plane(maps: Svbrdf, light: PointLight) -> tuple[Stokes, Stokes]:
+    """Diffuse and specular light ``[3, H, W]`` of a plane, for the camera.
+
+    Which pixels are of metal the specular map says, by `gltf.metalness`.
     """
     height, width = maps.roughness.shape[-2:]
-    strength = maps.specular.mean(dim=0, keepdim=True)
-    albedo = maps.diffuse * (1 - strength) / fresnel(torch.ones(1)).t_plus ** 2
-    points = plane_points(height, width)
+    albedo = maps.diffuse * (1 - maps.specular) / fresnel(torch.ones(1)).t_plus ** 2
     everywhere = torch.ones(1, height, width, dtype=torch.bool)
-    buffer = GBuffer(points, maps.normal, albedo, maps.roughness, strength / GLASS, everywhere)
+    metal: Tensor = metalness(maps.specular)
+    strength = (1 - metal) * maps.specular / GLASS
+    buffer = GBuffer(plane_points(height, width), maps.normal, albedo, maps.roughness, strength, everywhere)
     diffuse, specular = shade(buffer, CAMERA, light, everywhere)
+    if bool((metal > 0).any()):
+        specular = specular + shade_metal(maps, light) * metal
+    return diffuse, specular
+
+
+def photograph(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> tuple[Mosaic, Scene, float]:
+    """A raw frame of a plane, the exposed light behind it, and s0 of white paper in the plane's middle."""
+    diffuse, specular = shade_plane(maps, light)
+    everywhere = torch.ones(maps.roughness.shape[-2:], dtype=torch.bool)
     low, high = BLURS
     place, share = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
-    scene = blur(Scene(diffuse, specular, everywhere[0]), low + (high - low) * place)
+    scene = blur(Scene(diffuse, specular, everywhere), low + (high - low) * place)
     exposed = expose_to_clip(scene, LARGEST_CLIPPED * share, Layout(), IMX250)
     exposed = expose_to_level(exposed, MIN_LEVEL, Layout(), IMX250)
-    gain = float(exposed.diffuse.s0.mean() / scene.diffuse.s0.mean())
+    gain = float((exposed.diffuse + exposed.specular).s0.mean() / (scene.diffuse + scene.specular).s0.mean())
     distance = math.dist(light.position, (0, 0, 0))
     white = gain * light.intensity / distance**2 * light.position[2] / distance / math.pi
-    return capture(exposed, Layout(), IMX250, generator).mosaic, exposed, white
+    mosaic = capture(exposed, Layout(), IMX250, generator).mosaic
+    return replace(mosaic, data=mosaic.data.numpy().astype(np.float32)), exposed, white
 
 
 def unseparated_image(mosaic: Mosaic) -> Tensor:
     """The image of a camera without analysers, ``[3, h, w]``: s0, with clipped samples as they are."""
-    image: Tensor = 2 * demosaic_guided_half(mosaic).data.mean(dim=-4)
-    return image
+    return torch.from_numpy(measured_stokes(mosaic, WHITE)[0]).movedim(-1, 0)
 
 
 def separated_images(mosaic: Mosaic) -> Tensor:
-    """Diffuse and specular image of `METHOD`, ``[6, h, w]``."""
-    images = METHODS[METHOD].run(mosaic, (1.0, 1.0, 1.0), False)
-    planes = (torch.from_numpy(x).movedim(-1, 0) for x in (images.diffuse, images.specular))
+    """Diffuse and specular image of `METHOD`, ``[6, h, w]``, as users get them who say that the lamp is white."""
+    frame = separate_capture(mosaic, METHOD, WHITE, "cpu")
+    planes = (torch.from_numpy(x).movedim(-1, 0) for x in (frame.diffuse, frame.specular))
     return torch.cat([x.expand(3, -1, -1) for x in planes])
 
 

@@ -1,4 +1,4 @@
-"""Fresnel coefficients of an air-dielectric interface, for NumPy arrays and torch tensors.
+"""Fresnel coefficients of air-dielectric and air-metal interfaces, for NumPy arrays and torch tensors.
 
 They follow Verdet's convention (r_p = -r_s at normal incidence), with the angle on the AIR side, also for light that
 leaves the material; Stokes vectors carry no eta^2 factor on leaving (reciprocal, as Mitsuba 3).
@@ -38,6 +38,26 @@ def fresnel(cos_theta: Array, eta: float = ETA) -> Fresnel:
     power_s, power_p = rs * rs, rp * rp
     plus, minus = 0.5 * (power_s + power_p), 0.5 * (power_s - power_p)
     return Fresnel(plus, minus, rs * rp, 1 - plus, -minus)
+
+
+def conductor(cos_theta: Array, reflectance: Array) -> Fresnel:
+    """Fresnel coefficients of a metal of ``reflectance`` in (0, 1) at normal incidence; nothing is transmitted.
+
+    The index of refraction is taken as 1 + ik, k = 2 sqrt(R / (1 - R)), as near aluminium's; other real parts with the
+    same R differ little below 60 degrees. r_cross is the real part of r_s r_p*: the imaginary part makes light
+    circular, which linear analysers do not see. Source: Born and Wolf, Principles of Optics, 14.2; k from R as in
+    Gulbrandsen 2014, Artist Friendly Metallic Fresnel.
+    """
+    xp = namespace(cos_theta)
+    c = xp.clip(cos_theta, min=0, max=1)
+    k2 = 4 * reflectance / (1 - reflectance)
+    square = 1 - k2 + 2j * xp.sqrt(k2)
+    inside = xp.sqrt(square - (1 - c * c))
+    rs, rp = (c - inside) / (c + inside), (square * c - inside) / (square * c + inside)
+    power_s, power_p = xp.abs(rs) ** 2, xp.abs(rp) ** 2
+    cross = xp.real(rs) * xp.real(rp) + xp.imag(rs) * xp.imag(rp)
+    nothing = 0 * power_s
+    return Fresnel(0.5 * (power_s + power_p), 0.5 * (power_s - power_p), cross, nothing, nothing)
 
 
 def diffuse_dolp(cos_theta: Array, eta: float = ETA) -> Array:

@@ -16,6 +16,8 @@ from polsep.compute.arrays import Array, namespace
 SCHLICK = (-5.55473, -6.98316)
 #: Least roughness and cosine of the shading.
 MIN_ROUGHNESS, MIN_COSINE = 0.03, 1e-3
+#: Largest mean reflectance at normal incidence of dielectrics, and least of metals: gems reach 0.17, iron has 0.56.
+DIELECTRICS, METALS = 0.2, 0.32
 
 
 class Coat(NamedTuple):
@@ -50,6 +52,15 @@ def reflect(coat: Coat, to_camera: Array, to_light: Array) -> Array:
     fresnel = coat.specular + (1 - coat.specular) * xp.exp2((SCHLICK[0] * vh + SCHLICK[1]) * vh)
     lobe = alpha2 / (4 * math.pi * spread * spread * smith)
     return front * lit * (fresnel * lobe + (1 - coat.specular) * coat.diffuse / math.pi)
+
+
+def metalness(specular: Array) -> Array:
+    """The share ``[..., 1, H, W]`` of metal in pixels of reflectances ``[..., 3, H, W]`` at normal incidence.
+
+    0 up to `DIELECTRICS`, 1 from `METALS` on; between them pixels hold both.
+    """
+    mean = namespace(specular).mean(specular, axis=-3, keepdims=True)
+    return ((mean - DIELECTRICS) / (METALS - DIELECTRICS)).clip(0, 1)
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polsep.physics.fresnel import Fresnel, fresnel
+from polsep.physics.fresnel import Fresnel, conductor, fresnel
 from polsep.physics.stokes import Stokes
 
 
@@ -135,13 +135,32 @@ def specular_stokes(g: Geometry, polarizer: Tensor, irradiance: Tensor, roughnes
     Arguments as `diffuse_stokes`; ``roughness`` ``[..., 1, H, W]``, above 0. Linear light stays fully polarized:
     s1^2 + s2^2 = s0^2. Multiply the result by a specular strength or colour. Source: Eqs. 7-8 corrected.
     """
-    camera, light = _camera_and_light_beams(g)
+    shading, cosine = _facets(g, irradiance, roughness)
+    return _mirror(g, polarizer, shading, fresnel(cosine))
+
+
+def metal_stokes(g: Geometry, polarizer: Tensor, irradiance: Tensor, roughness: Tensor, reflectance: Tensor) -> Stokes:
+    """Stokes image of a metal, which has no diffuse lobe: `fresnel.conductor` off GGX microfacets.
+
+    Arguments as `specular_stokes`; ``reflectance`` ``[..., C, H, W]`` at normal incidence, in (0, 1). A little of the
+    light becomes circular, so that s1^2 + s2^2 <= s0^2.
+    """
+    shading, cosine = _facets(g, irradiance, roughness)
+    return _mirror(g, polarizer, shading, conductor(cosine, reflectance))
+
+
+def _facets(g: Geometry, irradiance: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
+    """Light that facets would send to the camera if they reflected all of it; the cosine between them and the light."""
     cos_i, cos_o, lit = _lit(g)
     h = normalize(torch.where(lit > 0, g.to_camera + g.to_light, g.normal))
     alpha = roughness**2
     lobe = ggx_distribution(g.normal, h, alpha) * smith_shadowing(cos_i, alpha) * smith_shadowing(cos_o, alpha)
-    shading = lit * irradiance * lobe / (4 * cos_o.clamp(min=1e-4))
-    f = fresnel(dot(h, g.to_light))
+    return lit * irradiance * lobe / (4 * cos_o.clamp(min=1e-4)), dot(h, g.to_light)
+
+
+def _mirror(g: Geometry, polarizer: Tensor, shading: Tensor, f: Fresnel) -> Stokes:
+    """The mirrored light of facets with Fresnel coefficients ``f``."""
+    camera, light = _camera_and_light_beams(g)
     axis = _mirror_axis(g, camera)
     # The azimuth of h is that of the s axis turned by 90 degrees in either frame, hence the minus signs.
     ci, si = (-x for x in double_angle(axis, light))

@@ -6,7 +6,9 @@ square with these textures) and NAME.mtlx are the material for renderers, the la
 preview and NAME.json a sidecar.
 
 glTF's dielectrics are GGX with alpha = roughness^2 and a reflectance of 0.04 at normal incidence, times the specular
-colour of KHR_materials_specular: the shading of `polsep.material.svbrdf`. Colours are in sRGB, the rest is linear.
+colour of KHR_materials_specular: the shading of `polsep.material.svbrdf`. Where the reflectance is that of a metal
+(`gltf.metalness`), NAME.glb says metallic, with the reflectance as base colour; NAME.mtlx, whose specular colour has no
+limit, says the same by the specular colour alone. Colours are in sRGB, the rest is linear.
 Sources: Khronos, glTF 2.0 Specification, 3.9 and Appendix B; KHR_materials_specular; MaterialX 1.38, gltf_pbr.
 """
 
@@ -35,6 +37,7 @@ from polsep.io.results.sidecars import EncodedFile, exr_notes, require_finite, r
 from polsep.io.store.atomic import refuse_existing
 from polsep.io.store.errors import naming
 from polsep.io.store.image_codecs import encode_png
+from polsep.physics.gltf import metalness
 
 Floats = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
@@ -90,7 +93,7 @@ def _encoded_files(material: MaterialFiles, name: str, scale: float) -> Iterator
     files = {texture: f"{name}_{texture}.png" for texture in TEXTURES}
     for texture, pixels in textures.items():
         yield files[texture], encode_png(pixels[..., 0] if texture == "roughness" else pixels)
-    yield f"{name}.glb", encode_glb(textures, scale, plain)
+    yield f"{name}.glb", encode_glb(maps, plain)
     yield f"{name}.mtlx", encode_materialx(files, scale, plain).encode()
     yield f"{name}.png", encode_png(material.preview)
 
@@ -111,21 +114,32 @@ def texture_pixels(maps: Mapping[str, Floats]) -> dict[str, Pixels]:
     return {name: np.rint(np.clip(linear[name], 0, 1) * 255).astype(np.uint8) for name in TEXTURES}
 
 
-def encode_glb(textures: Mapping[str, Pixels], scale: float, name: str) -> bytes:
-    """A GLB file of a square of side 2 in the plane z = 0 that faces +z, with a material of these textures.
+def metallic_maps(maps: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Maps ``[h, w, C]`` in glTF's terms: base colour as diffuse, ``metallic`` [h, w, 1], specular of dielectrics."""
+    specular = np.ascontiguousarray(np.moveaxis(maps["specular"], -1, 0))
+    metallic = np.moveaxis(metalness(specular), 0, -1).astype(np.float32)
+    base = maps["diffuse"] + metallic * (maps["specular"] - maps["diffuse"])
+    dielectric = maps["specular"] + metallic * (DIELECTRIC - maps["specular"])
+    return {**maps, "diffuse": base, "specular": dielectric, "metallic": metallic}
 
-    ``scale``: the reflectance of white in the specular texture.
+
+def encode_glb(maps: Mapping[str, Floats], name: str) -> bytes:
+    """A GLB file of a square of side 2 in the plane z = 0 that faces +z, with a material of maps ``[h, w, C]``.
+
     Note: trimesh knows neither specular textures nor tangents. The specular texture is given to it as the one of
     occlusion, tangents as an attribute of their own, and both are renamed in the document.
     """
-    dielectric = np.array([0, 1, 0], np.uint8)  # roughness is in green, metalness in blue
+    maps = metallic_maps(maps)
+    textures, scale = texture_pixels(maps), specular_scale(maps["specular"])
+    rough = textures["roughness"] * np.array([0, 1, 0], np.uint8)  # roughness is in green, metalness in blue
+    rough[..., 2] = np.rint(255 * maps["metallic"][..., 0])
     material = PBRMaterial(
         name=name,
         baseColorTexture=Image.fromarray(textures["diffuse"]),
-        metallicRoughnessTexture=Image.fromarray(textures["roughness"] * dielectric),
+        metallicRoughnessTexture=Image.fromarray(rough),
         normalTexture=Image.fromarray(textures["normal"]),
         occlusionTexture=Image.fromarray(textures["specular"]),
-        metallicFactor=0.0,
+        metallicFactor=1.0,
         roughnessFactor=1.0,
     )
     square = trimesh.Trimesh(

@@ -200,7 +200,7 @@ def test_a_lamp_that_objects_do_not_show_is_refused() -> None:
     channels = np.array([[Layout().filter_at(r % 4, c % 4).channel for c in range(SIZE[1])] for r in range(SIZE[0])])
     y = np.linspace(-1, 1, SIZE[0])[:, None]
     frame = correct_mosaic(sensor.expose(sensor.sees(body[channels], 0.12 * y**2, 0.5)), sensor.calibration())
-    with pytest.raises(ValueError, match=r"shows the lamp's colour to 1\.5 degrees, found .*grey card"):
+    with pytest.raises(ValueError, match=r"shows the lamp's colour to 2\.5 degrees, found .*grey card"):
         measure_lamp([frame])
 
 

@@ -43,7 +43,6 @@ STEPS, LARGEST_STEP, LAST_STEP = 15, 0.4, 3e-4
 #: Largest k.
 MAX_K = 0.4
 #: Groups of tiles along each axis, left out in turn to see how much a fit depends on them.
-GROUPS = 4
 
 #: Rows: two directions beside grey. Derivative of a colour by the log-ratios.
 _BESIDE = np.array([[1.0, -1, 0], [1, 1, -2]]) / np.sqrt(np.array([[2.0], [6.0]]))
@@ -53,17 +52,14 @@ _RATIOS = np.array([[1.0, 0], [0, 0], [0, 1]])
 class ColorFit(NamedTuple):
     """Log-ratios ``x`` (ln R/G, ln B/G) of the lamp and what the fit shows about their error.
 
-    ``scatter``, ``regional [2, 2]``: covariance from the scatter of the votes, and from leaving out regions of the
-    frame. Of the tiles, as their votes count: ``gloss``, polarized over diffuse light, ``across``, polarization across
-    over along the axis. ``change [2]``: difference of x between the quarter of the tiles
-    with the clearest specular light and the others. ``lean``: mean of k over its root mean square. Diffuse light is
-    polarized to all sides of a body, so a lean says that k holds specular light, or that x is wrong.
+    ``scatter [2, 2]``: covariance from the scatter of the votes. ``across``: polarization across over along the axis, a
+    mean over tiles, as their votes count. ``change [2]``: difference of x between the quarter of the tiles with the
+    clearest specular light and the others. ``lean``: mean of k over its root mean square. Diffuse light is polarized to
+    all sides of a body, so a lean says that k holds specular light, or that x is wrong.
     """
 
     x: Doubles
     scatter: Doubles
-    regional: Doubles
-    gloss: float
     across: float
     change: Doubles
     lean: float
@@ -168,12 +164,10 @@ def fit_color(tiles: Tiles, axis: Doubles, run: Callable[[Planes], Iterated]) ->
     values = np.linalg.eigvalsh(cast.information).clip(0)
     power = (values / (1 + VOTE_ERROR**2 * values)).sum(1)
     power = power / max(float(power.sum()), 1e-12)
-    gloss = math.exp(float(power @ np.log(glossy + 1e-3)))
     k, light = cast.known / cast.certainty, np.einsum("tii,i->t", planes.dd, scale**2)
     light = np.minimum(light, np.median(light)).clip(0)
     lean = float(light @ k) / max(math.sqrt(float(light.sum()) * float(light @ k**2)), 1e-12)
-    regional = _leave_out(_regions(tiles), votes, rest, prior)
-    return ColorFit(x, scatter, regional, gloss, float(power @ np.minimum(planes.across, 3)), change, lean)
+    return ColorFit(x, scatter, float(power @ np.minimum(planes.across, 3)), change, lean)
 
 
 def iterate(planes: Planes) -> Iterated:
@@ -239,23 +233,3 @@ def _cast_votes(planes: Planes, x: Doubles, k: Doubles) -> Votes:
     information = information - coupling[:, :, None] * (coupling / certainty[:, None])[:, None, :]
     pull = pull - coupling * (known / certainty)[:, None]
     return Votes(information, pull, known, coupling, certainty)
-
-
-def _regions(tiles: Tiles) -> NDArray[np.int64]:
-    """Region of every tile: equal shares of the tiles along rows and along columns."""
-    inner = np.linspace(0, 1, GROUPS + 1)[1:-1]
-    down, across = (np.searchsorted(np.quantile(line, inner), line, side="right") for line in tiles.place.T)
-    regions: NDArray[np.int64] = down * GROUPS + across
-    return regions
-
-
-def _leave_out(regions: NDArray[np.int64], votes: Doubles, rest: Doubles, prior: Doubles) -> Doubles:
-    """Jackknife covariance ``[2, 2]`` over regions, to first order; ``rest``: pulls at the solution."""
-    total = votes.sum(0) + prior
-    names = np.unique(regions)
-    changes = np.zeros((len(names), 2))
-    for row, name in enumerate(names):
-        own = regions == name
-        changes[row] = np.linalg.solve(total - votes[own].sum(0), -rest[own].sum(0))
-    found: Doubles = (len(names) - 1) / len(names) * (changes.T @ changes)
-    return found

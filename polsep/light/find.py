@@ -27,35 +27,33 @@ from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.levels import as_mosaic
 
 #: Largest expected error of a colour that counts as found [degrees].
-SURE_DEG = 1.5
+SURE_DEG = 2.5
 #: Fewest tiles of an estimate.
 MIN_TILES = 6
 #: Expected error of a colour that nothing shows [degrees]: the mean distance of lamps and raw balances from white.
 UNKNOWN_DEG = 20.0
-#: Logistic model of the chance that a fit is led astray: of the logarithms of polarization across over along, of gloss,
-#: of the disagreement of clear and dull tiles [degrees] and of the scatter of votes [degrees], each with an offset; of
-#: the lean of the diffuse polarization; and of the distance from usual lamps, up to a limit.
-ASTRAY = ((0.703, 0.02), (-0.785, 0.02), (0.753, 0.1), (0.086, 0.03))
-ASTRAY_LEAN, ASTRAY_DISTANCE, MAX_DISTANCE, ASTRAY_BIAS = 1.39, 25.0, 0.12, -2.42
+#: Logistic model of the chance that a fit is led astray: of the logarithms of polarization across over along and of the
+#: disagreement of clear and dull tiles [degrees], each with an offset; and of the lean of the diffuse polarization.
+ASTRAY, ASTRAY_LEAN, ASTRAY_BIAS = ((0.938, 0.02), (0.323, 0.1)), -0.674, 0.017
 #: Log-ratios of lamps before usual sensors, least and most: of bluish LEDs to bulbs (`render.disturbances.RED, BLUE`).
 RAW_LAMPS = np.array([[-1.05, 0.13], [-1.35, 0.03]])
-#: Direction from cold to warm lamps after a white balance, how far they lie along it, and beside it.
-WARM, ALONG_WARM, BESIDE_WARM = np.array([0.524, -0.852]), 1.0, 0.1
-#: Chances of lamps before a frame is seen: white (balanced for the lamp); even among `RAW_LAMPS`; along `WARM` after
-#: another balance; any colour. Standard deviations of log-ratios along and beside `WARM`, and of any colour.
-WHITE_SHARE, RAW_SHARE, WARM_SHARE, ANY_SHARE = 0.6, 0.2, 0.15, 0.05
-WARM_SPREAD, ANY_SPREAD = (0.4, 0.1), 0.5
+#: Direction from cold to warm lamps after a white balance.
+WARM = np.array([0.524, -0.852])
+#: Chances of lamps before a frame is seen: white (balanced for the lamp); even among `RAW_LAMPS`, of soft edges; along
+#: `WARM` after another balance; any colour. Standard deviations of log-ratios along and beside `WARM`, of any colour.
+WHITE_SHARE, RAW_SHARE, WARM_SHARE, ANY_SHARE = 0.6, 0.27, 0.08, 0.05
+RAW_EDGE, WARM_SPREAD, ANY_SPREAD = 0.06, (0.5, 0.08), 0.5
 #: Standard deviations of log-ratios: of the mean of a frame around its lamp, as bodies are coloured; of fits that went
-#: astray around the lamp; of the others, least, and over what is expected of them.
-BODIES_SPREAD, ASTRAY_SPREAD, GOOD_SPREAD = 0.8, 0.5, (0.01, 3.0)
-#: Chance from which on a frame's lamp counts as white.
-LIKELY_WHITE = 0.5
+#: astray around the lamp; of the others, over their mean error [rad].
+BODIES_SPREAD, ASTRAY_SPREAD, GOOD_SPREAD = 1.0, 0.5, 2.03
+#: Chance from which on a frame's lamp counts as white; least chance that the fit did not go astray of a sure colour.
+LIKELY_WHITE, LIKELY_RIGHT = 0.5, 0.5
 #: Largest log-ratio of a colour, either way: beyond it a channel is dark, as under one LED, and says no more.
 LARGEST_RATIO = 5.0
 #: Steps of the grid of lamps: from, to [log-ratio], count.
 GRID = (-1.5, 0.8, 47)
-#: Mean error of fits that went astray [degrees], and of the others: power law of the two last quantities.
-ASTRAY_DEG, GOOD = 11.5, (1.25 * math.exp(0.28), 0.126, 0.563)
+#: Mean error of fits that did not go astray [degrees]: power law of that disagreement and of the scatter of votes.
+GOOD = (1.25 * math.exp(0.28), 0.126, 0.563)
 #: What calls for a remark: least expected error of a colour [degrees], least share of coloured metal, and, where white
 #: is assumed, largest sum of the log-ratios of the frame's mean: raw frames without white balance are that green.
 UNCERTAIN_DEG, LEAST_METAL, GREENISH = 5.5, 0.02, -1.2
@@ -213,19 +211,22 @@ def combine(lights: Sequence[Light]) -> Light:
 def _as_light(fit: ColorFit, tiles: Tiles, aolp: float) -> Light:
     """The light of a fit to a frame of these tiles."""
     good, astray = _expected_errors(fit)
-    error = min((1 - astray) * good + astray * ASTRAY_DEG, UNKNOWN_DEG)
+    x, error, right = likely_lamp(fit.x, good, astray, _mean_color(tiles))
+    error = min(error, UNKNOWN_DEG)
     variance = _variance_of(error)
-    x = likely_lamp(fit.x, astray, GOOD_SPREAD[0] + GOOD_SPREAD[1] * math.radians(good), _mean_color(tiles))
-    return Light((float(x[0]), float(x[1])), (variance, 0.0, variance), error, error <= SURE_DEG, aolp)
+    sure = error <= SURE_DEG and right >= LIKELY_RIGHT
+    return Light((float(x[0]), float(x[1])), (variance, 0.0, variance), error, sure, aolp)
 
 
-def likely_lamp(fitted: Doubles, astray: float, spread: float, mean: Doubles) -> Doubles:
-    """The likely lamp ``[2]`` of a frame: white, or the mean of what else is likely, by Bayes' rule. Log-ratios.
+def likely_lamp(fitted: Doubles, good: float, astray: float, mean: Doubles) -> tuple[Doubles, float, float]:
+    """The likely lamp ``[2]`` of a frame, its mean error [degrees], and the chance that the fit did not go astray.
 
-    ``fitted``: the fit, within ``spread`` of the lamp unless it went astray; ``mean``: of the frame, that of coloured
-    bodies under the lamp. Lamps are as likely before as the shares above say.
+    The lamp is white, or the mean of what else is likely.
+
+    By Bayes' rule; lamps are as likely before as the shares above say. Log-ratios ``fitted``: of the fit, which is off
+    by ``good`` degrees on average unless it went ``astray``; ``mean``: of the frame, that of coloured bodies under the
+    lamp.
     """
-
     fitted, mean = (x.clip(-LARGEST_RATIO, LARGEST_RATIO) for x in (fitted, mean))
 
     def chance(lamps: Doubles) -> tuple[Doubles, Doubles]:
@@ -234,15 +235,30 @@ def likely_lamp(fitted: Doubles, astray: float, spread: float, mean: Doubles) ->
 
     white = np.zeros((1, 2))
     right, wrong = chance(white)
-    of_white = WHITE_SHARE * float((right * _normal(white - fitted, spread) + wrong)[0])
+    of_white = WHITE_SHARE * float((right * _normal(white - fitted, GOOD_SPREAD * math.radians(good)) + wrong)[0])
     lamps, prior = _usual_lamps()
     # Near a fit that is right, all else hardly varies.
     of_fit = float(_prior_density(fitted[None])[0] * chance(fitted[None])[0][0])
     of_others = prior * chance(lamps)[1]
-    if of_white > LIKELY_WHITE * (of_white + of_fit + float(of_others.sum())):
-        return np.zeros(2)
-    likely: Doubles = (of_fit * fitted + of_others @ lamps) / (of_fit + float(of_others.sum()))
-    return likely
+    of_colored = of_fit + float(of_others.sum())
+    if of_white > LIKELY_WHITE * (of_white + of_colored):
+        likely = np.zeros(2)
+    else:
+        likely = (of_fit * fitted + of_others @ lamps) / of_colored
+    to_fit = math.hypot(good, float(_angles_deg(fitted[None], likely)[0]))
+    to_white, to_others = float(_angles_deg(white, likely)[0]), _angles_deg(lamps, likely)
+    off = of_white * to_white + of_fit * to_fit + float(of_others @ to_others)
+    of_right, of_all = of_white - WHITE_SHARE * float(wrong[0]) + of_fit, of_white + of_colored
+    return likely, off / of_all, of_right / of_all
+
+
+def _angles_deg(lamps: Doubles, lamp: Doubles) -> Doubles:
+    """Angles [degrees] between colours of log-ratios ``[N, 2]`` and one of log-ratios ``[2]``."""
+    limited = (np.insert(x.clip(-LARGEST_RATIO, LARGEST_RATIO), 1, 0.0, axis=-1) for x in (lamps, lamp))
+    colors, color = (np.exp(x) for x in limited)
+    cosine = colors @ color / np.linalg.norm(colors, axis=-1) / np.linalg.norm(color)
+    angles: Doubles = np.degrees(np.arccos(cosine.clip(-1, 1)))
+    return angles
 
 
 def _normal(offset: Doubles, spread: float) -> Doubles:
@@ -254,7 +270,8 @@ def _normal(offset: Doubles, spread: float) -> Doubles:
 def _prior_density(lamps: Doubles) -> Doubles:
     """Density of lamps ``[N, 2]`` before a frame is seen, but for exactly white ones."""
     least, most = RAW_LAMPS.T
-    raw = ((lamps >= least) & (lamps <= most)).all(axis=1) / float((most - least).prod())
+    inside = (np.tanh((lamps - least) / (2 * RAW_EDGE)) - np.tanh((lamps - most) / (2 * RAW_EDGE))) / 2
+    raw = (inside / (most - least)).prod(axis=1)
     along, across = lamps @ WARM, lamps[:, 0] * WARM[1] - lamps[:, 1] * WARM[0]
     length, width = WARM_SPREAD
     warm = np.exp(-((along / length) ** 2 + (across / width) ** 2) / 2) / (2 * math.pi * length * width)
@@ -278,30 +295,13 @@ def _mean_color(tiles: Tiles) -> Doubles:
 
 def _expected_errors(fit: ColorFit) -> tuple[float, float]:
     """Mean angle [degrees] by which fits like this one are off that were not led astray; the chance that it was."""
-    change = angle_deg(fit.change)
+    change = float(_angles_deg(fit.change[None], np.zeros(2))[0])
     scatter = _spread_deg(fit.x, fit.scatter)
-    shown = (fit.across, fit.gloss, change, scatter)
-    logit = ASTRAY_BIAS + sum(a * math.log(v + b) for (a, b), v in zip(ASTRAY, shown, strict=True))
-    logit += ASTRAY_LEAN * fit.lean + ASTRAY_DISTANCE * min(distance_to_lamps(fit.x), MAX_DISTANCE)
+    logit = ASTRAY_BIAS + ASTRAY_LEAN * fit.lean
+    logit += sum(a * math.log(v + b) for (a, b), v in zip(ASTRAY, (fit.across, change), strict=True))
     chance = 1 / (1 + math.exp(-logit))
     good: float = GOOD[0] * (change + 0.1) ** GOOD[1] * (scatter + 0.03) ** GOOD[2]
     return good, chance
-
-
-def distance_to_lamps(log_ratio: NDArray[np.float64]) -> float:
-    """Return how far log-ratios are from those of usual lamps: 0 among them, before or after a white balance.
-
-    Sensors are made so that green is the strongest colour of usual lamps. Colours of bodies know no such limit.
-    """
-    raw = float(np.maximum(RAW_LAMPS[:, 0] - log_ratio, log_ratio - RAW_LAMPS[:, 1]).max())
-    along, across = abs(float(log_ratio @ WARM)), abs(float(log_ratio[0] * WARM[1] - log_ratio[1] * WARM[0]))
-    return max(min(raw, math.hypot(across, max(along - ALONG_WARM, 0)) - BESIDE_WARM), 0)
-
-
-def angle_deg(log_ratio: NDArray[np.float64] | Sequence[float]) -> float:
-    """Return the angle [degrees] between a colour of these log-ratios and white."""
-    r, b = (math.exp(min(max(float(v), -5.0), 5.0)) for v in log_ratio)
-    return math.degrees(math.acos(min(1.0, (r + 1 + b) / math.sqrt(3 * (r * r + 1 + b * b)))))
 
 
 def _spread_deg(x: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:

@@ -7,12 +7,11 @@ import { tilesOf } from "./tiles.js";
 const MOST_TILES = 640, MIN_TILES = 6, LEAST_K = 0.006, OWN_K = 0.8, MEAN_K = 0.03;
 const LEAST_JITTER = 0.005, OWN_JITTER = 0.3, MEAN_JITTER = 0.08, INDEPENDENT = 5, LEAK = 0.43, ACROSS = 1;
 const VOTE_ERROR = 0.0045, FREEDOM = 3.6, SPREAD = 0.5, STEPS = 15, LARGEST_STEP = 0.4, LAST_STEP = 3e-4, MAX_K = 0.4;
-const SURE_DEG = 1.5, UNKNOWN_DEG = 20, ASTRAY = [[0.703, 0.02], [-0.785, 0.02], [0.753, 0.1], [0.086, 0.03]];
-const ASTRAY_LEAN = 1.39, ASTRAY_DISTANCE = 25, MAX_DISTANCE = 0.12, ASTRAY_BIAS = -2.42;
-const RAW_LAMPS = [[-1.05, 0.13], [-1.35, 0.03]], WARM = [0.524, -0.852], ALONG_WARM = 1, BESIDE_WARM = 0.1;
-const ASTRAY_DEG = 11.5, GOOD = [1.25 * Math.exp(0.28), 0.126, 0.563], UNCERTAIN_DEG = 5.5, LEAST_METAL = 0.02;
-const WHITE_SHARE = 0.6, RAW_SHARE = 0.2, WARM_SHARE = 0.15, ANY_SHARE = 0.05, WARM_SPREAD = [0.4, 0.1], ANY_SPREAD = 0.5;
-const BODIES_SPREAD = 0.8, ASTRAY_SPREAD = 0.5, GOOD_SPREAD = [0.01, 3], LIKELY_WHITE = 0.5, GRID = [-1.5, 0.8, 47];
+const SURE_DEG = 2.5, UNKNOWN_DEG = 20, ASTRAY = [[0.938, 0.02], [0.323, 0.1]], ASTRAY_LEAN = -0.674, ASTRAY_BIAS = 0.017;
+const RAW_LAMPS = [[-1.05, 0.13], [-1.35, 0.03]], RAW_EDGE = 0.06, WARM = [0.524, -0.852], WARM_SPREAD = [0.5, 0.08];
+const GOOD = [1.25 * Math.exp(0.28), 0.126, 0.563], UNCERTAIN_DEG = 5.5, LEAST_METAL = 0.02;
+const WHITE_SHARE = 0.6, RAW_SHARE = 0.27, WARM_SHARE = 0.08, ANY_SHARE = 0.05, ANY_SPREAD = 0.5;
+const BODIES_SPREAD = 1, ASTRAY_SPREAD = 0.5, GOOD_SPREAD = 2.03, LIKELY_WHITE = 0.5, LIKELY_RIGHT = 0.5, GRID = [-1.5, 0.8, 47];
 const LARGEST_RATIO = 5;
 const GREENISH = -1.2, MIRROR = 1, MIN_MIRRORS = 3, METAL_DISTANCE = 0.28;
 const COPPER = [0.403, -0.17], GOLD = [0.246, -0.821];
@@ -190,7 +189,7 @@ function iterate(planes) {
   return { x, votes, rest };
 }
 
-/** Log-ratios of the lamp and what the fit shows about their error: scatter, gloss, across, change, lean. */
+/** Log-ratios of the lamp and what the fit shows about their error: scatter, across, change, lean. */
 function fitColor(tiles, axis) {
   const planes = planesAlong(tiles, axis), { x, votes, rest } = iterate(planes), prior = 1 / SPREAD ** 2;
   const total = [prior, 0, 0, prior], remains = [prior, 0, 0, prior];
@@ -212,35 +211,40 @@ function fitColor(tiles, axis) {
   const limit = median(lit), light = lit.map((v) => Math.max(Math.min(v, limit), 0)), weighed = (f) => light.reduce((found, v, t) => found + v * f(k[t]), 0);
   const lean = weighed((v) => v) / Math.max(Math.sqrt(sum(light) * weighed((v) => v * v)), 1e-12);
   return { x, scatter, lean, change: [best[0] - others[0], best[1] - others[1]],
-    gloss: Math.exp(weigh(glossy.map((v) => Math.log(v + 1e-3)))), across: weigh(planes.map(({ across }) => Math.min(across, 3))) };
+    across: weigh(planes.map(({ across }) => Math.min(across, 3))) };
 }
 
 /** The light of a fit to a frame of these tiles. */
 function asLight(fit, tiles) {
-  const { good, chance } = expectedErrors(fit), error = Math.min((1 - chance) * good + chance * ASTRAY_DEG, UNKNOWN_DEG);
+  const { good, chance } = expectedErrors(fit);
   const [red, green, blue] = [1, 2, 3].map((k) => Math.max(sum(tiles.map(({ moments }) => moments[k])), 1e-9));
-  const spread = GOOD_SPREAD[0] + (GOOD_SPREAD[1] * good * Math.PI) / 180;
-  const x = likelyLamp(fit.x, chance, spread, [Math.log(red / green), Math.log(blue / green)]);
-  return { x, error, sure: error <= SURE_DEG, metal: 0 };
+  const { x, off, right } = likelyLamp(fit.x, good, chance, [Math.log(red / green), Math.log(blue / green)]);
+  const error = Math.min(off, UNKNOWN_DEG);
+  return { x, error, sure: error <= SURE_DEG && right >= LIKELY_RIGHT, metal: 0 };
 }
 
-/** Log-ratios of the likely lamp of a frame of this mean colour: white, or the mean of what else is likely. */
-function likelyLamp(fitted, astray, spread, mean) {
-  [fitted, mean] = [fitted, mean].map((x) => x.map((v) => Math.min(Math.max(v, -LARGEST_RATIO), LARGEST_RATIO)));
+/** The likely lamp of a frame of this mean colour: white, or the mean of what else is likely; its mean error, and
+ *  the chance that the fit did not go astray. */
+function likelyLamp(fitted, good, astray, mean) {
+  [fitted, mean] = [fitted, mean].map((x) => x.map(limited));
   const chances = (lamp) => {
     const seen = normal(lamp, mean, BODIES_SPREAD);
     return [(1 - astray) * seen, astray * seen * normal(lamp, fitted, ASTRAY_SPREAD)];
   };
-  const [right, wrong] = chances([0, 0]), ofWhite = WHITE_SHARE * (right * normal([0, 0], fitted, spread) + wrong);
+  const [right, wrong] = chances([0, 0]), spread = (GOOD_SPREAD * good * Math.PI) / 180;
+  const ofWhite = WHITE_SHARE * (right * normal([0, 0], fitted, spread) + wrong);
   const [from, to, count] = GRID, step = (to - from) / (count - 1), ofFit = priorDensity(fitted) * chances(fitted)[0];
-  let all = ofFit, total = fitted.map((v) => ofFit * v);
-  for (let k = 0; k < count * count; k++) {
+  const others = Array.from({ length: count * count }, (_, k) => {
     const lamp = [from + (k % count) * step, from + Math.floor(k / count) * step];
-    const own = priorDensity(lamp) * step ** 2 * chances(lamp)[1];
-    all += own;
-    total = total.map((v, i) => v + own * lamp[i]);
-  }
-  return ofWhite > LIKELY_WHITE * (ofWhite + all) ? [0, 0] : total.map((v) => v / all);
+    return { lamp, own: priorDensity(lamp) * step ** 2 * chances(lamp)[1] };
+  });
+  const colored = ofFit + sum(others.map(({ own }) => own));
+  const x = ofWhite > LIKELY_WHITE * (ofWhite + colored) ? [0, 0]
+    : fitted.map((v, i) => (ofFit * v + sum(others.map(({ lamp, own }) => own * lamp[i]))) / colored);
+  const off = ofWhite * angleDeg([0, 0], x) + ofFit * Math.hypot(good, angleDeg(fitted, x)) +
+    sum(others.map(({ lamp, own }) => own * angleDeg(lamp, x)));
+  const all = ofWhite + colored;
+  return { x, off: off / all, right: (ofWhite - WHITE_SHARE * wrong + ofFit) / all };
 }
 
 /** Density of log-ratios around a center, each of this standard deviation. */
@@ -249,31 +253,26 @@ const normal = ([r, b], center, spread) =>
 
 /** Density of lamps before a frame is seen, but for exactly white ones. */
 function priorDensity(x) {
-  const inside = x.every((v, k) => v >= RAW_LAMPS[k][0] && v <= RAW_LAMPS[k][1]), [length, width] = WARM_SPREAD;
-  const raw = inside ? 1 / RAW_LAMPS.reduce((area, [least, most]) => area * (most - least), 1) : 0;
+  const [length, width] = WARM_SPREAD, soft = (v) => Math.tanh(v / (2 * RAW_EDGE));
+  const raw = RAW_LAMPS.reduce((all, [least, most], k) => (all * (soft(x[k] - least) - soft(x[k] - most))) / 2 / (most - least), 1);
   const along = x[0] * WARM[0] + x[1] * WARM[1], across = x[0] * WARM[1] - x[1] * WARM[0];
   const warm = Math.exp(-((along / length) ** 2 + (across / width) ** 2) / 2) / (2 * Math.PI * length * width);
   return RAW_SHARE * raw + WARM_SHARE * warm + ANY_SHARE * normal(x, [0, 0], ANY_SPREAD);
 }
 
 /** Mean angle [degrees] by which fits like this one are off that were not led astray; the chance that it was. */
-function expectedErrors({ x, scatter, gloss, across, change, lean }) {
-  const moved = angleDeg(change), spread = spreadDeg(x, scatter), shown = [across, gloss, moved, spread];
-  let logit = ASTRAY_BIAS + ASTRAY_LEAN * lean + ASTRAY_DISTANCE * Math.min(distanceToLamps(x), MAX_DISTANCE);
-  ASTRAY.forEach(([a, b], k) => (logit += a * Math.log(shown[k] + b)));
-  const chance = 1 / (1 + Math.exp(-logit)), good = GOOD[0] * (moved + 0.1) ** GOOD[1] * (spread + 0.03) ** GOOD[2];
-  return { good, chance };
+function expectedErrors({ x, scatter, across, change, lean }) {
+  const moved = angleDeg(change, [0, 0]), spread = spreadDeg(x, scatter), shown = [across, moved];
+  const logit = ASTRAY.reduce((found, [a, b], k) => found + a * Math.log(shown[k] + b), ASTRAY_BIAS + ASTRAY_LEAN * lean);
+  return { good: GOOD[0] * (moved + 0.1) ** GOOD[1] * (spread + 0.03) ** GOOD[2], chance: 1 / (1 + Math.exp(-logit)) };
 }
 
-function distanceToLamps(x) {
-  const raw = Math.max(...x.flatMap((v, k) => [RAW_LAMPS[k][0] - v, v - RAW_LAMPS[k][1]]));
-  const along = Math.abs(x[0] * WARM[0] + x[1] * WARM[1]), beside = Math.abs(x[0] * WARM[1] - x[1] * WARM[0]);
-  return Math.max(Math.min(raw, Math.hypot(beside, Math.max(along - ALONG_WARM, 0)) - BESIDE_WARM), 0);
-}
+const limited = (ratio) => Math.min(Math.max(ratio, -LARGEST_RATIO), LARGEST_RATIO);
 
-function angleDeg(x) {
-  const [r, b] = x.map((v) => Math.exp(Math.min(Math.max(v, -5), 5)));
-  return (Math.acos(Math.min(1, (r + 1 + b) / Math.sqrt(3 * (r * r + 1 + b * b)))) * 180) / Math.PI;
+/** Angle [degrees] between two colours of log-ratios. */
+function angleDeg(one, other) {
+  const [p, q] = [one, other].map(([r, b]) => [Math.exp(limited(r)), 1, Math.exp(limited(b))]), dot = (u, v) => sum(u.map((value, i) => value * v[i]));
+  return (Math.acos(Math.min(1, dot(p, q) / Math.sqrt(dot(p, p) * dot(q, q)))) * 180) / Math.PI;
 }
 
 /** Root mean square angle of colours whose log-ratios have a covariance around x. */

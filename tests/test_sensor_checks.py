@@ -125,7 +125,7 @@ def test_a_mono_frame_read_as_colour_is_told_what_to_say() -> None:
 def test_separate_corrects_the_black_level() -> None:
     """The default call gives with an unknown black level nearly what it gives when it is said."""
     raw: Tensor = frame(COLOR, 240.0).data
-    said = polsep.separate(raw.numpy(), "analytic", black_level=240, white_level=4095)
+    said = polsep.separate(raw.numpy(), "analytic", black_level=240, white_level=4095, light_color="white")
     with pytest.warns(polsep.PolsepWarning, match="--black-level"):
-        found = polsep.separate(raw.numpy(), "analytic", white_level=4095)
+        found = polsep.separate(raw.numpy(), "analytic", white_level=4095, light_color="white")
     assert float(np.abs(found.diffuse - said.diffuse).max()) < 2e-3

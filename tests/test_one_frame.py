@@ -28,7 +28,6 @@ from test_geometry import cap
 import polsep
 from polsep.geometry import one_frame
 from polsep.geometry.one_frame import (
-    HALF,
     SIDE,
     ShapeEstimator,
     find_lamp,
@@ -336,7 +335,7 @@ def test_the_shipped_network_finds_a_sphere() -> None:
 
 def test_floor_of_the_shipped_weights() -> None:
     """On things that no training saw, made here, the shipped network is no worse than when it was shipped."""
-    examples = [cut_example(random_shape_example("test", 11, n, 256), 1.1, SIDE // HALF) for n in range(6)]
+    examples = [cut_example(random_shape_example("test", 11, n, 256), 1.1, SIDE // 2) for n in range(6)]
     network = ShapeNetwork(INPUTS["separated"], USUAL, one_frame.load_estimator().size)
     arrays = polsep_weights()
     network.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})

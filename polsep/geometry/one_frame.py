@@ -42,9 +42,9 @@ from polsep.separation.report import SeparatedFrame
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Side of the square around the thing [pixels], of which the network also sees means over `HALF` x `HALF` pixels, as it
-#: was trained; and of the square over the longest side of the mask.
-SIDE, HALF, WIDER = 384, 2, 1.1
+#: Side of the square around the thing [pixels]; over the longest side of the mask; sides of the blocks of pixels whose
+#: means the network sees (training shows it squares of ``SIDE / 2``).
+SIDE, WIDER, SCALES = 384, 1.1, (1, 2, 3)
 #: Without a mask, the thing is where s0 exceeds this share of its 99th percentile.
 OBJECT_SHARE = 0.06
 #: Side of blocks [pixels]: parts of the thing are near one that is mostly bright.
@@ -116,18 +116,18 @@ class ShapeEstimator:
         self.size = ResidualSize(size["width"], tuple(size["blocks"]), size["entry"])
         self.input = "separated" if metadata["input"] == "perfect" else metadata["input"]
         self._layers = {}
-        for side in (SIDE, SIDE // HALF):
+        for side in (SIDE // block for block in SCALES):
             model = shape_model(arrays, self.size, (INPUTS[self.input], side, side))
             self._layers[side] = core().compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
 
     def find(self, seen: Seen) -> Surface:
-        """The surface in images ``[C, SIDE, SIDE]``: the mean of what they say and what their means over pixels say.
+        """The surface in images ``[C, SIDE, SIDE]``: the mean of what they and their means over `SCALES` say.
 
-        The first holds the detail, the second the whole. Each is the mean of looks at the thing and at its mirror
+        Small blocks show the detail, large ones the whole. Each says the mean of looks at the thing and at its mirror
         image. Where the lamp is not told, they look again with the lamp that the first surface implies.
         """
-        halves = self._find_at(_means(seen))
-        return mean_surface(self._find_at(seen), Surface(*(resize_bilinear(x, (SIDE, SIDE)) for x in halves)))
+        found = (self._find_at(_means(seen, block)) for block in SCALES)
+        return mean_surface(*(Surface(*(resize_bilinear(x, (SIDE, SIDE)) for x in surface)) for surface in found))
 
     def _find_at(self, seen: Seen) -> Surface:
         found = self._find_mirrored(seen)
@@ -140,16 +140,16 @@ class ShapeEstimator:
         return mean_surface(self.look(seen), mirror_surface(self.look(mirror_seen(seen))))
 
     def look(self, seen: Seen) -> Surface:
-        """The surface by one look of the network at images ``[C, side, side]``, as in `find` or half as wide."""
+        """The surface by one look of the network at images of ``SIDE`` over one of `SCALES`."""
         require_own_threads()
         maps = np.ascontiguousarray(encode(seen, self.input), np.float32)[None]
         outputs = self._layers[maps.shape[-1]].create_infer_request().infer([maps])[0][0]
         return decode(outputs, seen.image, seen.mask)
 
 
-def _means(seen: Seen) -> Seen:
-    """Means over `HALF` x `HALF` pixels; the mask is where all are of the thing."""
-    means = Seen(*(None if x is None else np.asarray(block_means(x, HALF), np.float32) for x in seen))
+def _means(seen: Seen, block: int) -> Seen:
+    """Means over blocks of pixels; the mask is where all are of the thing."""
+    means = Seen(*(None if x is None else np.asarray(block_means(x, block), np.float32) for x in seen))
     return means._replace(mask=(means.mask > 0.99).astype(np.float32))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.geometry.one_frame import HALF, SIDE, UNKNOWN, Shape, find_shape, gather, square_around
+from polsep.geometry.one_frame import SIDE, UNKNOWN, Shape, find_shape, gather, square_around
 from polsep.geometry.shape_maps import Surface, relight
 from polsep.io.assets.maps import read_object
 from polsep.io.assets.relight_page import RelightMaps, encode_relight_page
@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 Pixels = NDArray[np.uint8]
 
 #: Side of the square in which depth is integrated and the mesh is spanned, and of a panel of the preview.
-MESH_SIDE, CELL = SIDE // HALF, 320
+MESH_SIDE, CELL = SIDE // 2, 320
 #: Largest side of the textures of the page.
 PAGE_SIDE = 512
 #: Lamps of the preview's relit pictures: their directions, and words for them.

@@ -201,15 +201,15 @@ def _x_turned(vectors: Array) -> Array:
     return vectors * np.array([-1, 1, 1], np.float32).reshape(3, 1, 1)
 
 
-def mean_surface(first: Surface, second: Surface) -> Surface:
-    """The mean of two estimates: of normals by their expected variances, of logarithms of all else.
+def mean_surface(*surfaces: Surface) -> Surface:
+    """The mean of estimates: of normals by their expected variances, of logarithms of all else.
 
     Expected errors are of estimates that err alike.
     """
-    means = Surface(*((x * y) ** 0.5 if k else x for k, (x, y) in enumerate(zip(first, second, strict=True))))
-    xp = namespace(first.normal)
-    normal = first.normal / first.normal_error**2 + second.normal / second.normal_error**2
-    return means._replace(normal=normal / xp.sqrt(xp.sum(normal * normal, axis=-3, keepdims=True)))
+    logs = (math.prod(values) ** (1 / len(surfaces)) for values in zip(*(s[1:] for s in surfaces), strict=True))
+    xp = namespace(surfaces[0].normal)
+    normal = sum(s.normal / s.normal_error**2 for s in surfaces)
+    return Surface(normal / xp.sqrt(xp.sum(normal * normal, axis=-3, keepdims=True)), *logs)
 
 
 def relight(surface: Surface, lamp: Array) -> Array:

@@ -27,7 +27,7 @@ PROPORTIONS, LOW = (0.06, 3.0), 0.35
 #: Share of straight walls; the others' number of knots, and the smallest radius there, of 1.
 STRAIGHT_SHARE, KNOTS, NARROWEST = 0.3, (2, 6), 0.35
 #: Share of vessels with an inside; thickness of their walls over the radius, and depth of the inside over the height.
-HOLLOW_SHARE, THICKNESSES, DEPTHS = 0.6, (0.02, 0.12), (0.08, 0.97)
+HOLLOW_SHARE, THICKNESSES, DEPTHS = 0.8, (0.02, 0.12), (0.08, 0.97)
 #: Share of flat lids; height of the others over the radius; exponents of the superellipses of these and of insides.
 FLAT_SHARE, DOMES, ROUNDINGS = 0.5, (0.05, 0.8), (1.5, 8.0)
 #: Shares of squared cross sections and exponents of their superellipses, of oval ones and their other axis, and of

@@ -79,7 +79,7 @@ SIDE, SAMPLES = 384, 2
 #: Methods that separate frames, and their shares.
 METHODS, METHOD_SHARES = ("joint", "joint-fast", "color-affine"), (0.7, 0.2, 0.1)
 #: Share of lamps near the camera, largest angle of these and of the others, and distances in radii of the thing.
-NEAR_SHARE, NEAR_DEG, LARGEST_DEG, DISTANCES = 0.5, 20.0, 60.0, (3.0, 12.0)
+NEAR_SHARE, NEAR_DEG, LARGEST_DEG, DISTANCES = 0.3, 20.0, 60.0, (3.0, 12.0)
 #: Shares of views that may be close-ups, of scenes with disturbances, and with another diffuse polarization.
 CLOSE_SHARE, REAL_SHARE, DEPOLARIZED_SHARE = 0.4, 0.6, 0.5
 #: Standard deviation of the lens's point spread in raw pixels.

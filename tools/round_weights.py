@@ -1,52 +1,15 @@
-"""``python -m tools.round_weights FILE...``: write large layers of weights in 8 bits, which halves the file.
+"""``python -m tools.round_weights FILE...``: write large layers of weights in 8 bits (`polsep.io.store.rounding`).
 
-Of joint networks these are the layers that run in 8 bits where the processor multiplies those, and which compute the
-same there from rounded weights, and those that see the whole frame. Of others, layers of `LEAST` numbers or more but
-for the first and the last: small layers at high resolution cost most. The largest layers, deep in a network where
-images are small, and all of smaller networks, take still fewer values, which wheels compress. docs/weights.md says
-what all this costs. A file that is rounded already stays as it is.
+That halves the file. A file that is rounded already stays as it is.
 """
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from polsep.io.store.rounding import coarsened, names_to_round, steps_of
 from polsep.io.store.weights import read_weights, write_weights
-
-#: Fewest numbers of a layer that is rounded where no ranges are known.
-LEAST = 12_000
-#: Fewest numbers of layers that take fewer values, and how many on each side of 0, by method; larger ones last.
-COARSE = {
-    "joint-large": ((130_000, 31),),
-    "paper": ((200_000, 31),),
-    "material": ((0, 7), (50_000, 5)),
-    "shape": ((0, 7), (500_000, 4)),
-}
-#: Parts of the names of first and last layers.
-ENDS = ("encoders.0.0.", "last.")
-
-
-def names_to_round(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> set[str]:
-    """The names of the arrays that are written in 8 bits."""
-    if "ranges" in metadata:
-        whole = {name for name in arrays if name.startswith("whole_frame.") and arrays[name].ndim > 1}
-        return whole | {f"{layer}.weight" for layer in json.loads(metadata["ranges"])} & arrays.keys()
-    large = {name for name, array in arrays.items() if array.ndim > 1 and array.size >= LEAST}
-    return {name for name in large if not any(end in name for end in ENDS)}
-
-
-def coarsened(array: NDArray[Any], count: int) -> NDArray[Any]:
-    """The array with ``count`` values on each side of 0 for each output, its first axis, up to the largest one."""
-    step = np.maximum(np.abs(array).max(axis=tuple(range(1, array.ndim)), keepdims=True), 1e-12) / count
-    found: NDArray[Any] = (np.round(array / step) * step).astype(np.float32)
-    return found
 
 
 def main(paths: list[str]) -> None:
@@ -58,8 +21,8 @@ def main(paths: list[str]) -> None:
         names, before = names_to_round(arrays, metadata), path.stat().st_size
         exact = metadata.pop("sha256")
         for name in names:
-            counts = [count for least, count in COARSE.get(metadata["method"], ()) if arrays[name].size >= least]
-            arrays[name] = coarsened(arrays[name], counts[-1]) if counts else arrays[name]
+            if (count := steps_of(arrays[name], metadata["method"])) < 127:
+                arrays[name] = coarsened(arrays[name], count)
         write_weights(path, arrays, metadata | {"rounded_from": exact}, names)
         share = sum(arrays[name].size for name in names) / sum(array.size for array in arrays.values())
         print(f"{path}: {len(names)} arrays, {share:.0%} of the numbers, {before} to {path.stat().st_size} bytes")

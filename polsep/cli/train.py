@@ -55,6 +55,9 @@ RUNGS = (
     help="material, shape: number of training examples.  [default: 768, 3200]",
 )
 @click.option("--side", type=COUNT, default=96, metavar="PX", help="shape: side of the images that the network sees.")
+@click.option(
+    "--stored", default="half", metavar="NAME", help="shape: trained in the values that files hold, half or rounded."
+)
 @click.option("--cues", metavar="NAME,...", help="material: inputs beside the images, such as details.")
 @click.option(
     "--folder", type=DIR, metavar="DIR", help="material, shape: folder of the examples.  [default: DIR/../examples]"

@@ -40,7 +40,12 @@ RUNGS = (
     "--entry", type=int, metavar="N", help="Channels after a joint network's first layer; 0 keeps all inputs."
 )
 @click.option("--ablation", default="none", metavar="NAME", help="Ablation of a joint network.")
-@click.option("--part", default="all", metavar="NAME", help="Part of a joint network to train: all, details or doubt.")
+@click.option(
+    "--part",
+    default="all",
+    metavar="NAME",
+    help="Part to train: all; joint networks: details or doubt; shape: small, layers that are not rounded.",
+)
 @click.option(
     "--input",
     "seen",
@@ -55,9 +60,6 @@ RUNGS = (
     help="material, shape: number of training examples.  [default: 768, 3200]",
 )
 @click.option("--side", type=COUNT, default=96, metavar="PX", help="shape: side of the images that the network sees.")
-@click.option(
-    "--stored", default="half", metavar="NAME", help="shape: trained in the values that files hold, half or rounded."
-)
 @click.option("--cues", metavar="NAME,...", help="material: inputs beside the images, such as details.")
 @click.option(
     "--folder", type=DIR, metavar="DIR", help="material, shape: folder of the examples.  [default: DIR/../examples]"

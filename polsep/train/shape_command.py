@@ -21,7 +21,7 @@ def choose_shape(asked: dict[str, Any]) -> tuple[ShapeOptions, Schedule]:
     """Return options and schedule from those of the command line; see `polsep train`."""
     usual = ShapeOptions()
     size = usual.size if asked["width"] is None else replace(usual.size, width=asked["width"])
-    kind = {name: asked[name] for name in ("side", "examples", "stored")}
+    kind = {name: asked[name] for name in ("side", "examples", "part")}
     options = ShapeOptions(asked["seen"], size, asked["seed"], **kind)
     due = {"checkpoint_every": 200, "validate_every": 500}
     return options, Schedule(asked["steps"], asked["rate"], WARM_UP, AVERAGE, precision=asked["precision"], **due)
@@ -38,5 +38,5 @@ def train_shape(options: ShapeOptions, run: Run, folder: Path, report: Callable[
         return shape_training(options, folder)
 
     data = digest_examples([options.seed, options.examples], "polsep.train.shape_examples")
-    words: dict[str, object] = {"side": options.side, "stored": options.stored}
+    words: dict[str, object] = {"side": options.side, "part": options.part}
     return train_recipe(Recipe("shape", options, make, data, words, {"side": str(options.side)}), run, report)

@@ -19,11 +19,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call
 from torch.nn.functional import interpolate, normalize
 
 from polsep.geometry.shape_maps import INPUTS, NORMAL_VARIANCE, USUAL, Seen, Surface, decode, encode
-from polsep.io.store.rounding import coarsened, names_to_round, steps_of
+from polsep.io.store.rounding import names_to_round
 from polsep.networks.shape import ShapeNetwork
 from polsep.networks.sizes import ResidualSize
 from polsep.train.loop import Training
@@ -33,8 +32,9 @@ from polsep.train.tasks import find
 
 #: Inputs of trainings: those of frames, and "perfect", the input "separated" of true images.
 TRAINED = (*INPUTS, "perfect")
-#: Values of large layers in training: any, or those that `io.store.rounding` writes.
-STORED = ("half", "rounded")
+#: Parts that are trained: all layers, or small ones alone, which make up for it that large ones were rounded before
+#: (`io.store.rounding`).
+PARTS = ("all", "small")
 #: Share of frames whose lamp's direction is not told, and deviation of the others' [rad].
 UNTOLD, TOLD_ERROR = 0.3, 0.05
 #: Side of a cut over the longest side of the thing, in training; and in validation.
@@ -52,7 +52,7 @@ LAMP_SEED, VALIDATION_LAMPS = 31, 20
 class ShapeOptions:
     """Options of a training for an ``input`` of `TRAINED`: crops of ``side`` pixels of the first ``examples``.
 
-    ``stored``: one of `STORED`. Raises ValueError on unknown inputs and values, and on counts below 1.
+    ``part``: one of `PARTS`. Raises ValueError on unknown inputs and parts, and on counts below 1.
     """
 
     input: str = "separated"
@@ -62,17 +62,21 @@ class ShapeOptions:
     side: int = 96
     examples: int = 3200
     validation: int = 64
-    stored: str = "half"
+    part: str = "all"
 
     def __post_init__(self) -> None:
         find(dict.fromkeys(TRAINED), "an input", self.input)
-        find(dict.fromkeys(STORED), "stored as", self.stored)
+        find(dict.fromkeys(PARTS), "a part", self.part)
         if min(self.batch, self.side, self.examples, self.validation) < 1:
             raise ValueError(f"expected a batch, side, examples and validation of at least 1, found {self}")
 
     def network(self) -> ShapeNetwork:
-        """Return the network, untrained."""
-        return ShapeNetwork(INPUTS[encoding_of(self.input)], USUAL, self.size)
+        """Return the network, untrained; layers that are not part of the training take no gradients."""
+        network = ShapeNetwork(INPUTS[encoding_of(self.input)], USUAL, self.size)
+        arrays = {name: value.detach().numpy() for name, value in network.named_parameters()}
+        for name in names_to_round(arrays, {}) if self.part == "small" else ():
+            network.get_parameter(name).requires_grad_(False)
+        return network
 
 
 class ShapeBatch(NamedTuple):
@@ -229,10 +233,7 @@ def shape_training(options: ShapeOptions, folder: Path) -> Training:
     def loss(net: nn.Module, batch: ShapeBatch, done: float) -> Tensor:
         seen = seen_of(batch.planes, options.input)
         maps = encode(seen, name).contiguous(memory_format=torch.channels_last)
-        outputs = (
-            net(maps) if options.stored == "half" else functional_call(net, rounded(net), (maps,), tie_weights=False)
-        )
-        found = decode(outputs.float(), seen.image, seen.mask)
+        found = decode(net(maps).float(), seen.image, seen.mask)
         generator = torch.Generator().manual_seed(int(done * 2**31))
         return shape_loss(found, truth_of(batch.planes), seen.mask, generator)
 
@@ -245,16 +246,6 @@ def shape_training(options: ShapeOptions, folder: Path) -> Training:
         shift_errors(net, 1 / score(net)["expected / rms"])
 
     return Training(network, partial(batches, options, paths("train", options.examples)), loss, score, finish=finish)
-
-
-def rounded(network: nn.Module) -> dict[str, Tensor]:
-    """Large layers in the values that files hold; gradients pass as if they were not rounded."""
-    arrays = {name: value.detach().cpu().numpy() for name, value in network.named_parameters()}
-    found, exact = {}, dict(network.named_parameters())
-    for name in names_to_round(arrays, {}):
-        near = torch.from_numpy(coarsened(arrays[name], steps_of(arrays[name], "shape"))).to(exact[name])
-        found[name] = exact[name] + (near - exact[name]).detach()
-    return found
 
 
 def shift_errors(network: ShapeNetwork, factor: float) -> None:

@@ -77,7 +77,7 @@ def test_profiles_join_and_insides_stay_inside() -> None:
         inside, _, outside, _ = parts
         wall = np.interp(inside[1], outside[1, ::-1], outside[0, ::-1])
         assert (inside[0] < wall).all() and inside[1].min() > 0
-    assert 45 < hollow < 75
+    assert 65 < hollow < 95
 
 
 def test_vessels_and_bodies_repeat() -> None:

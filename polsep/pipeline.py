@@ -264,7 +264,9 @@ def find_device(name: str) -> str:
     except (ImportError, RuntimeError, TypeError, AssertionError, NotImplementedError) as error:
         if name == "auto":
             return "cpu"
-        reason = "install polsep[torch]" if isinstance(error, ImportError) else str(error).splitlines()[0][:120]
+        if isinstance(error, ImportError):
+            raise ValueError(f"device {name!r} needs torch: install polsep[torch]") from None
+        reason = str(error).splitlines()[0][:120]
         raise ValueError(f"expected a device like auto, cpu or cuda, found {name!r}: {reason}") from None
     return name
 

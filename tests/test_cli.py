@@ -234,7 +234,7 @@ def test_warnings_are_lines_on_stderr(tmp_path: Path, polsep: Cli) -> None:
     odd = frame()[:, :-1]
     run = polsep("separate", png(tmp_path / "odd.png", odd), "-o", tmp_path / "o")
     assert run.status == 0
-    assert run.err.startswith(f"polsep: {tmp_path / 'odd.png'}: odd size 31x32")
+    assert run.err.startswith(f"polsep: {tmp_path / 'odd.png'}: size 31x32 cuts polarizer cells")
     assert run.err.count("\n") == 1 and run.out.splitlines()[1].endswith("; 1 warning")
 
 

@@ -329,7 +329,7 @@ def test_exposure_notes() -> None:
 def test_shapes_that_are_made_to_fit() -> None:
     codes = random_codes("uint8", (13, 17))
     mosaic, notes = as_mosaic(codes)
-    assert notes == ("odd size 17x13: cropped to 16x12, whole polarizer cells",)
+    assert notes == ("size 17x13 cuts polarizer cells of the layout: cropped to 16x12, whole cells",)
     assert_samples(mosaic, codes[:12, :16])
     codes = random_codes("uint8")
     assert_samples(as_mosaic(codes[..., None])[0], codes)

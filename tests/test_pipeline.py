@@ -311,7 +311,7 @@ def test_extreme_frames(method: str) -> None:
 def test_odd_sizes_are_cropped_aloud() -> None:
     """An odd last row or column is left out, with a note, and nothing else changes."""
     raw = raw_frame()
-    with pytest.warns(polsep.PolsepWarning, match="odd size 95x93: cropped to 94x92"):
+    with pytest.warns(polsep.PolsepWarning, match="size 95x93 cuts polarizer cells of the layout: cropped to 94x92"):
         out = polsep.separate(raw[:93, :95], light_color="white")
     assert float(np.abs(out.diffuse - quietly(raw[:92, :94]).diffuse).max()) == 0
 

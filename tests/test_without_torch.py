@@ -84,7 +84,7 @@ def test_commands_of_the_bare_install(frames: Path) -> None:
         assert done.returncode == 0, done.stderr
     done = run(COMMANDS, "blocked", "", "separate", str(stem), "-o", still, "--overwrite", "--device", "cuda")
     assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].endswith("found 'cuda': install polsep[torch]")
+    assert done.stderr.splitlines()[-1].endswith("device 'cuda' needs torch: install polsep[torch]")
     done = run(COMMANDS, "blocked", "", "train", "joint", "-o", str(frames / "run"))
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1] == (

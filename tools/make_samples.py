@@ -25,8 +25,8 @@ from polsep.sensor.camera import IMX250, Layout, add_noise, expose, measure_with
 
 #: Rows and columns of mosaics; the four angle images have half as many.
 SIZE = (344, 408)
-#: Places of the wrong layout: the first three rows and the first column of the sensor were cut off.
-CUT = Layout().rolled(3, 1)
+#: Places of the wrong layout: the first row and the first three columns of the sensor were cut off.
+CUT = Layout().rolled(-1, -3)
 
 
 def light_scene() -> tuple[Stokes, Stokes]:

@@ -18,7 +18,7 @@ from polsep.bench.separation import bench_separation
 from polsep.bench.speed import bench_speed, bench_speed_quick
 
 #: Code that formulas consist of, and that every method does.
-FORMULAS = ("polsep/physics", "polsep/sensor", "polsep/demosaic", "polsep/separation")
+FORMULAS = ("polsep/physics", "polsep/sensor", "polsep/demosaic", "polsep/light", "polsep/separation")
 SEPARATION = (*FORMULAS, "polsep/networks", "polsep/shipped.py", "polsep/methods.py", "polsep/weights")
 
 BENCHES: dict[str, Bench] = {

@@ -232,10 +232,14 @@ def _is_installed(module: str) -> bool:
         return False
 
 
-def require_extra(extra: str) -> None:
-    """Raise ValueError, which names the extra to install, unless it is there. To call before any work."""
+def require_extra(extra: str, otherwise: str = "") -> None:
+    """Raise ValueError, which names the extra to install, unless it is there. To call before any work.
+
+    ``otherwise``: options that need no extra.
+    """
     if (missing := missing_module(extra)) is not None:
-        raise ValueError(f"expected the extra {extra!r} (pip install 'polsep[{extra}]'), found no {missing}")
+        other = f" or {otherwise}" if otherwise else ""
+        raise ValueError(f"expected the extra {extra!r} (pip install 'polsep[{extra}]'){other}, found no {missing}")
 
 
 def require_paths(*paths: str | Path) -> None:

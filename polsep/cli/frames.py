@@ -216,7 +216,7 @@ def demo(output: Path, every: bool) -> None:
         for outcome in separate_files([str(capture)], ReadOptions(white_level=4095.0), SeparateOptions(name), write):
             if _report(outcome):
                 sys.exit(2)
-    print("In the scene the polarizer is at 25 deg.")
+    print("The lamp's polarizer is at 25 deg; highlights show a few degrees more, as the lamp is not at the camera.")
     print(f"Compare {output / best / 'still_life.png'} with {output / 'analytic' / 'still_life.png'}:")
     print("  in 'specular', the analytic split leaves coloured rims of the objects, and holes where highlights clip;")
     print("  the networks remove the rims and fill most of the holes. The EXR files hold the linear images for")

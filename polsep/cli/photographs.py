@@ -86,7 +86,7 @@ def find_photographs(files: tuple[str, ...], options: Mapping[str, Any]) -> list
     from polsep.io.raw.extensions import is_film, needs_rawpy
 
     if options["align"] != "none" or needs_rawpy(paths):
-        require_extra("photos")
+        require_extra("photos", "" if needs_rawpy(paths) else "--align none")
     if is_film(paths[0]):
         require_extra("video")
     return paths

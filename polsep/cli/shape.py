@@ -101,7 +101,7 @@ def shape(file: Path, **options: Any) -> None:
     polsep shape frame.png --layout mono --mesh none -o out          normals alone, without the extra render
     """
     if options["mesh"] != "none":
-        require_extra("render")
+        require_extra("render", "--mesh none")
     elif options["turntable"]:
         raise ValueError("expected a mesh with --turntable, found --mesh none")
     if options["turntable"]:

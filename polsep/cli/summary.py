@@ -24,8 +24,9 @@ def _color(light: dict[str, Any]) -> str:
     """The light's colour and where it is from."""
     color = ",".join(f"{c:.2f}" for c in light["color"])
     error = light.get("error_deg")
-    found = light["source"] if error is None else f"{light['source']}, +- {error:.2g} deg"
-    return f"colour {color} ({found})"
+    if error is None:
+        return f"colour {color} ({light['source']})"
+    return f"colour {color} ({light['source']}, colour error {'below 0.1' if error < 0.1 else f'{error:.1f}'} deg)"
 
 
 def _percent(share: float) -> str:

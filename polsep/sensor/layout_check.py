@@ -344,7 +344,7 @@ def _candidates(layout: Layout) -> tuple[tuple[Layout, str], ...]:
 def _cropped(layout: Layout) -> list[tuple[Layout, str]]:
     """The layout of frames whose crop starts a few rows and columns inside the sensor's, the smallest crops first."""
     starts = sorted(((row, col) for row in range(4) for col in range(4) if row or col), key=lambda start: sum(start))
-    return [(layout.rolled(-row, -col), f"cropped by {row} rows, {col} columns") for row, col in starts]
+    return [(layout.rolled(-row, -col), f"cropped from row {row}, column {col} on") for row, col in starts]
 
 
 def _mirrored(layout: Layout) -> list[tuple[Layout, str]]:

@@ -75,7 +75,8 @@ def as_mosaic(
     odd_rows, odd_cols = ((n - start) % 2 for n, start in zip((height, width), layout.origin, strict=True))
     if odd_rows or odd_cols:
         plane = plane[: height - odd_rows, : width - odd_cols]
-        notes += (f"odd size {width}x{height}: cropped to {plane.shape[1]}x{plane.shape[0]}, whole polarizer cells",)
+        size = f"{plane.shape[1]}x{plane.shape[0]}"
+        notes += (f"size {width}x{height} cuts polarizer cells of the layout: cropped to {size}, whole cells",)
     rows, cols = (layout.period + start for start in layout.origin)
     if plane.shape[0] < rows or plane.shape[1] < cols:
         raise ValueError(f"expected a mosaic of at least {cols}x{rows} pixels, found {width}x{height}")

@@ -133,7 +133,7 @@ function candidates(layout) {
   const crops = [];
   for (let r = 0; r < 4; r++) for (let c = 0; c < 4; c++) if (r || c) crops.push([r, c]);
   crops.sort((a, b) => a[0] + a[1] - b[0] - b[1]);
-  const cropped = (own) => crops.map(([r, c]) => [rolled(own, -r, -c), `cropped by ${r} rows, ${c} columns`]);
+  const cropped = (own) => crops.map(([r, c]) => [rolled(own, -r, -c), `cropped from row ${r}, column ${c} on`]);
   const bayer = layout.bayer ? "RGGB" : null, found = [[layout, "as given"], [{ ...SONY, bayer }, "Sony's order"]];
   found.push(...cropped(layout).slice(0, 3), [mirroredAcross(layout, 4), "mirrored left-right"],
     [mirroredDown(layout, 4), "mirrored top-bottom"], [transposed(layout), "transposed"], ...cropped(layout).slice(3));

@@ -106,7 +106,7 @@ function prepare(settings) {
   if (!(white > black)) throw new Error(`expected a white level above the black level, found white ${white}, black ${black}`);
   const [top, left] = layout.origin, height = frame.height - ((frame.height - top) % 2), width = frame.width - ((frame.width - left) % 2);
   if (height !== frame.height || width !== frame.width)
-    notes.push({ text: `odd size ${frame.width}x${frame.height}: cropped to ${width}x${height}, whole polarizer cells` });
+    notes.push({ text: `size ${frame.width}x${frame.height} cuts polarizer cells of the layout: cropped to ${width}x${height}, whole cells` });
   if (Math.min(height, width) < 16) throw new Error(`expected a mosaic of at least 16x16 pixels, found ${frame.width}x${frame.height}`);
   const data = new Float32Array(height * width);
   for (let r = 0; r < height; r++) data.set(frame.data.subarray(r * frame.width, r * frame.width + width), r * width);

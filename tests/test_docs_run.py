@@ -41,7 +41,7 @@ LEFT_OUT = {
     "polsep capture -o": "needs a camera; tests/test_capture_cameras.py",
     "polsep calibrate (flat|analysers|light)": "needs pictures of a rig; tests/test_calibration.py",
     "polsep geometry": "needs six lights on one thing; tests/test_geometry_files.py",
-    "polsep shape": "needs the extra render and one thing in a frame; tests/test_one_frame.py",
+    "polsep shape": "needs the extra mesh and one thing in a frame; tests/test_one_frame.py",
     "polsep material": "needs the extra torch and flash frames of one sample; tests/test_material.py",
     "polsep separate --(parallel|crossed|angles)": "needs photographs through a filter; tests/test_photographs.py",
     "polsep video run.mkv": "needs the extra video; tests/test_video.py",

@@ -8,8 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from polsep.geometry.lights import NAMED
+from polsep.io.results.previews import srgb
+from polsep.io.results.separation_writer import write_separation
+from polsep.io.store.image_codecs import encode_png
 from polsep.methods import METHODS
+from polsep.separation.report import SeparatedFrame
 
 #: Refuses to find torch, as where it is not installed, if it is told to.
 BLOCK = """
@@ -67,6 +73,32 @@ def frames(tmp_path: Path) -> Path:
         raw = np.random.default_rng(k).integers(100, 60000, (64, 96)).astype(np.uint16)
         np.save(tmp_path / f"raw{k}.npy", raw)
     return tmp_path
+
+
+def ball() -> NDArray[np.float32]:
+    """Grey pictures ``[6, 64, 64, 3]`` of a ball under the six lamps of `polsep geometry`."""
+    x, y = np.meshgrid(*2 * [(np.arange(64) - 31.5) / 28])
+    normals = np.stack([x, -y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))], axis=-1)
+    lamps = np.array(list(NAMED.values()))
+    shading = np.maximum(normals @ lamps.T, 0) * (x**2 + y**2 < 1)[..., None]
+    return np.repeat(0.6 * np.moveaxis(shading, -1, 0)[..., None], 3, axis=-1).astype(np.float32)
+
+
+@pytest.mark.usefixtures("compiled")
+def test_shapes_need_no_torch(tmp_path: Path) -> None:
+    """`polsep geometry` and `polsep shape` with their meshes and pictures."""
+    pytest.importorskip("embreex", reason="needs the extra mesh")
+    pictures = ball()
+    paths = [tmp_path / f"{k}.png" for k in range(6)]
+    for path, picture in zip(paths, pictures, strict=True):
+        path.write_bytes(encode_png(np.rint(255 * srgb(picture)).astype(np.uint8)))
+    flat = np.full((64, 64), 0.05, np.float32)
+    frame = SeparatedFrame(pictures[2], 0 * pictures[2], np.ones((64, 64), np.bool_), flat, flat, {"warnings": []})
+    one = write_separation(frame, tmp_path, "ball")[0]
+    for words in (("geometry", "--srgb", *map(str, paths)), ("shape", str(one))):
+        done = run(COMMANDS, "blocked", "", *words, "-o", str(tmp_path / words[0]))
+        assert done.returncode == 0, done.stderr
+        assert len(list((tmp_path / words[0]).glob("*.glb"))) == 1
 
 
 @pytest.mark.usefixtures("compiled")

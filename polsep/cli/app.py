@@ -201,6 +201,7 @@ def read_options(options: Mapping[str, Any]) -> ReadOptions:
 #: A module of each extra by which it is known; several where an extra has several uses.
 EXTRAS = {
     "torch": ("torch",),
+    "mesh": ("embreex", "scipy"),
     "render": ("embreex", "numba", "scipy", "torch"),
     "ray": ("ray",),
     "video": ("av",),

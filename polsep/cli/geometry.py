@@ -75,14 +75,14 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     DIR/STEM_normals.png normals for other programs, DIR/STEM.glb a mesh with colours, DIR/STEM.png is a preview.
 
     Light directions may be off by 10 degrees. Each is a name (right, front-right, front, front-left, left, above), or
-    x,y,z toward the light. Needs the extra render.
+    x,y,z toward the light. Needs the extra mesh.
 
     \b
     polsep geometry right.png fr.png front.png fl.png left.png above.png -o out
     polsep geometry sep/*.exr --lights "0,0,1 0.5,0,0.9 -0.5,0,0.9 0,0.6,0.8" -o out
     polsep geometry --srgb [0-5].JPG --mask mask.png --turntable -o out
     """
-    require_extra("render")
+    require_extra("mesh")
     if options["turntable"]:
         require_extra("video")
     require_paths(*files, *filter(None, [options["mask"]]))

@@ -70,7 +70,7 @@ from polsep.cli.progress import show_progress
     type=Word("glb", "ply", "none"),
     default="glb",
     metavar="glb|ply|none",
-    help="Format of the mesh; none: no depth and no mesh, which need the extra render.",
+    help="Format of the mesh; none: no depth and no mesh, which need the extra mesh.",
 )
 @click.option(
     "--integration",
@@ -98,10 +98,10 @@ def shape(file: Path, **options: Any) -> None:
     \b
     polsep shape frame.png -o out
     polsep shape sep/frame.exr --light 0.3,0.5,0.8 --mask mask.png -o out
-    polsep shape frame.png --layout mono --mesh none -o out          normals alone, without the extra render
+    polsep shape frame.png --layout mono --mesh none -o out          normals alone, without the extra mesh
     """
     if options["mesh"] != "none":
-        require_extra("render", "--mesh none")
+        require_extra("mesh", "--mesh none")
     elif options["turntable"]:
         raise ValueError("expected a mesh with --turntable, found --mesh none")
     if options["turntable"]:

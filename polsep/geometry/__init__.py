@@ -1,4 +1,4 @@
 """Shape from separated images: normals and albedo under some lights, and the surface that normals span.
 
-Needs the extra ``render``.
+Needs the extra ``mesh``.
 """

@@ -13,7 +13,7 @@ smooth one of the two sides: w = sigmoid(k ((q dz-)^2 - (q dz+)^2)) of the forwa
 Source: Cao, Santo, Shi, Okura, Matsushita 2022, Bilateral normal integration, ECCV, Eqs. 12-18, arXiv:2207.05063.
 Note: where a pixel has only one neighbour along an axis, its equation has weight 1. The paper sets the missing
 difference to 0, so that slopes at the outline lose weight.
-Needs the extra ``render``.
+Needs the extra ``mesh``.
 """
 
 from __future__ import annotations

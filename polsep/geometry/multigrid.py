@@ -10,7 +10,7 @@ pyamg's smoothed_aggregation_solver (5.4.1) as the preconditioner, and 19.5 s an
 As each round is solved roughly, another solver also gives another depth, by 1e-4 to 0.2 of its range. ``python -m
 evaluation geometry`` measures conjugate gradients with this preconditioner and with Jacobi's.
 Source: Vanek, Mandel, Brezina 1996, Algebraic multigrid by smoothed aggregation, doi:10.1007/BF02238511.
-Needs the extra ``render``.
+Needs the extra ``mesh``.
 """
 
 from __future__ import annotations

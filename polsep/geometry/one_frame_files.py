@@ -140,7 +140,7 @@ def _page_maps(found: Shape) -> RelightMaps:
 
 
 class _Solid:
-    """Depth and mesh of a shape. Needs the extra ``render``. State: the mesh."""
+    """Depth and mesh of a shape. Needs the extra ``mesh``. State: the mesh."""
 
     def __init__(self, found: Shape, integration: str) -> None:
         from polsep.geometry.files import INTEGRATIONS

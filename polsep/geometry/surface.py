@@ -1,7 +1,7 @@
 """A mesh with colours from depth, and its pictures under another light and from other sides.
 
 Meshes have x right, y up, z to the camera, are centred and have a largest extent of 1. Where the depth jumps by more
-than the normals explain, triangles are left out: the surface there is not known. Needs the extra ``render``.
+than the normals explain, triangles are left out: the surface there is not known. Needs the extra ``mesh``.
 """
 
 from __future__ import annotations
@@ -11,16 +11,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from polsep.geometry.integration import MIN_COSINE
 from polsep.geometry.photometric import Appearance
-from polsep.render.raycast import MeshScene, find_hits
-from polsep.render.shapes import Mesh
-from polsep.render.sphere_tracing import PinholeCamera
+from polsep.render.tracer import Tracer
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -127,25 +124,27 @@ def draw_views(surface: Surface, size: int, views: Sequence[tuple[float, float]]
 
     They are 0 outside the mesh. Back faces are drawn too.
     """
-    count = len(surface.faces)
-    flat = np.zeros((len(surface.vertices), 2))
-    scene = MeshScene(Mesh(surface.vertices, surface.normals, flat, surface.faces, np.arange(count, dtype=np.int64)))
+    tracer = Tracer(surface.vertices, surface.faces)
     colors = surface.colors[surface.faces].mean(axis=1)
-    ticks = torch.arange(size * 2) / 2 + 0.25
-    rows, cols = (g.flatten() for g in torch.meshgrid(ticks, ticks, indexing="ij"))
+    reach = math.tan(math.radians(FOV_DEG / 2))
+    ticks = reach * ((np.arange(2 * size) + 0.5) / size - 1)  # of four rays per pixel, on a plane at distance 1
+    down, across = (grid.reshape(-1, 1) for grid in np.meshgrid(ticks, ticks, indexing="ij"))
+    light = np.array(PICTURE_LIGHT) / math.hypot(*PICTURE_LIGHT)
     for azimuth_deg, elevation_deg in views:
         azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
         back = np.array(
             [math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)]
         )
         right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
-        x, y, z = DISTANCE * back
-        hits = find_hits(scene, PinholeCamera((x, y, z), (0.0, 0.0, 0.0), FOV_DEG), (rows, cols), (size, size))
-        light = np.array(PICTURE_LIGHT) / math.hypot(*PICTURE_LIGHT)
-        toward = light[0] * right + light[1] * np.cross(back, right) + light[2] * back
-        shading = np.maximum(hits.normal[..., 0].double().numpy().T @ toward, 0) + AMBIENT
-        fine = np.zeros((rows.numel(), 3))
-        fine[hits.ray.numpy()] = colors[hits.slot.numpy()] * shading[:, None]
+        up = np.cross(back, right)
+        directions = across * right - down * up - back
+        ray, face, weights = tracer.look(DISTANCE * back, directions)
+        normals = (weights[..., None] * surface.normals[surface.faces[face]]).sum(axis=1)
+        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+        normals *= np.where((normals * directions[ray]).sum(axis=-1, keepdims=True) > 0, -1, 1)  # toward the camera
+        toward = light[0] * right + light[1] * up + light[2] * back
+        fine = np.zeros((len(directions), 3))
+        fine[ray] = colors[face] * (np.maximum(normals @ toward, 0) + AMBIENT)[:, None]
         cells = fine.reshape(size, 2, size, 2, 3)
         picture: Floats = 0.25 * (cells[:, 0, :, 0] + cells[:, 0, :, 1] + cells[:, 1, :, 0] + cells[:, 1, :, 1])
         yield picture

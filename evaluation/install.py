@@ -25,6 +25,8 @@ from polsep.io.store.rows import read_peak_memory
 COMMITS = {"before": "b4601b5", "now": "HEAD"}
 #: Methods whose first frame is timed, and how often they are started once they have run.
 METHODS, AGAIN = ("analytic", "color-affine", "joint-fast", "joint", "joint-large"), 3
+#: Methods that are timed at full resolution, too.
+FULL = METHODS[:4]
 #: How often the import and the help are timed; the fastest counts. Seconds between two looks at a program.
 STARTS, LOOK = 5, 0.005
 #: The frame, which comes with the package: 2448x2048 colour samples of 12 bits.
@@ -58,10 +60,11 @@ def _measure(name: str, commit: str, folder: Path) -> Iterator[Row]:
         best = min(_run(*command, settings=settings)[0] for _ in range(STARTS))
         yield Row("install", case, name, f"seconds, best of {STARTS}", best, "s")
     frame = subprocess.run([python, "-c", FRAME], capture_output=True, text=True, check=True).stdout.strip()
-    for method in METHODS:
-        case = f"polsep separate --method {method}, 2448x2048 colour"
-        separate = (program, "separate", frame, "--white-level", "4095", "--method", method, "--overwrite", "-o")
-        own = settings | {"NUMBA_CACHE_DIR": str(folder / f"cache-{method}")}
+    for method, full in [(method, "") for method in METHODS] + [(method, " --full") for method in FULL]:
+        case = f"polsep separate --method {method}{full}, 2448x2048 colour"
+        words = ("separate", frame, "--white-level", "4095", "--method", method, *full.split())
+        separate = (program, *words, "--overwrite", "-o")
+        own = settings | {"NUMBA_CACHE_DIR": str(folder / f"cache-{method}{full.strip()}")}
         runs = [_run(*separate, str(folder / method), settings=own) for _ in range(1 + AGAIN)]
         yield Row("install", case, name, "seconds, never run before", runs[0][0], "s")
         yield Row("install", case, name, f"seconds afterwards, best of {AGAIN}", min(s for s, _ in runs[1:]), "s")

@@ -78,7 +78,10 @@ def _open_exr(data: bytes) -> Any:
 
 
 def encode_exr(planes: Mapping[str, NDArray[Any]], notes: Notes, compression: str = "zip") -> memoryview:
-    """One part of scanlines: channels ``[H, W]``, float16 or float32, by name; ``notes``: attributes."""
+    """One part of scanlines: channels ``[H, W]``, float16 or float32, by name; ``notes``: attributes.
+
+    ``[H, W, 3]`` is three channels, name.R, name.G and name.B, which are not copied.
+    """
     header = {**notes, "compression": COMPRESSIONS[compression], "type": OpenEXR.scanlineimage}
     # A fresh dict, because OpenEXR replaces its arrays, and contiguous planes, because it misreads others silently.
     channels = {name: np.ascontiguousarray(plane) for name, plane in planes.items()}

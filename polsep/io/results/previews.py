@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import builtins
 import textwrap
-from collections.abc import Sequence
-from functools import cache, reduce
+from collections.abc import Callable, Sequence
+from functools import cache, partial, reduce
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 Values = NDArray[np.floating[Any]]
 Pixels = NDArray[np.uint8]
 Picture: TypeAlias = Image.Image
+#: Some rows of an image, made when asked for: whole images of large frames are not made a second time.
+Rows: TypeAlias = Callable[[slice], Values | NDArray[np.bool_]]
 
 PANEL = 640  # longest side of a panel in pixels
 COLUMNS = 4  # panels in a row of the contact sheet
@@ -129,9 +131,8 @@ def contact_sheet(frame: SeparatedFrame) -> Pixels:
     every pixel as 2x2. The mask marks pixels that are not valid, sums above the measurable 2, and DoLP above 1, with
     their shares.
     """
-    total = np.maximum(frame.diffuse, 0) + np.maximum(frame.specular, 0)
-    flags = _flags(frame, total)
-    panels = _panels(frame, total, flags)
+    flags = _flags(frame)
+    panels = _panels(frame, flags)
     height, width = panels[0].pixels.shape[:2]
     scale = 2 if 2 * max(height, width) <= PANEL else 1
     cell_width, cell_height = max(scale * width, NARROWEST), TITLE + scale * height + GUTTER
@@ -162,21 +163,23 @@ def show_frame(frame: SeparatedFrame) -> Picture:
 
 def live_sheet(frame: SeparatedFrame) -> Pixels:
     """Input, diffuse and specular side by side, ``uint8 [h, w, 3]``, with one gain; fast enough for a live view."""
-    diffuse, specular = (_shrunk(np.maximum(image, 0)) for image in (frame.diffuse, frame.specular))
+    diffuse, specular = _shrunk_parts(frame)
     total = diffuse + specular
     gain = exposure_of(total)
     gap = np.full((total.shape[0], GUTTER, 3), BACKGROUND, np.uint8)
     return np.concatenate([toned(total, gain), gap, toned(diffuse, gain), gap, toned(specular, gain)], axis=1)
 
 
-def _panels(frame: SeparatedFrame, total: Values, flags: list[Flag]) -> list[Panel]:
-    """The pictures of the contact sheet in reading order, all of one size; ``total`` is the linear input."""
-    gain, own = exposure_of(total), exposure_of(frame.specular)
-    light = reduce(np.add, np.moveaxis(total, -1, 0)) / total.shape[-1]
-    s1, s2 = (light * frame.dolp * turn(2 * frame.aolp) for turn in (np.cos, np.sin))
-    dolp, aolp = _shrunk_polarization(light, s1, s2)
-    shown = _clearness(light, s1)[..., None]
-    parts = [_shrunk(np.maximum(image, 0)) for image in (frame.diffuse, frame.specular)]
+def _panels(frame: SeparatedFrame, flags: list[Flag]) -> list[Panel]:
+    """The pictures of the contact sheet in reading order, all of one size."""
+    size, seldom = frame.valid.shape, slice(None, None, _block(frame.valid.shape))
+    gain, own = exposure_of(_total(frame, seldom)), exposure_of(frame.specular[seldom])
+    light = _shrunk(partial(_brightness, frame), size)
+    s1, s2 = (_shrunk(partial(_polarized, frame, turn), size) for turn in (np.cos, np.sin))
+    dolp = np.hypot(s1, s2) / np.where(light > 0, light, 1)
+    aolp = np.mod(np.arctan2(s2, s1) / 2, np.pi)
+    shown = _clearness(frame, light)[..., None]
+    parts = _shrunk_parts(frame)
     combined, diffuse, specular = (toned(image, gain) for image in (parts[0] + parts[1], *parts))
     exposure = f"exposure x {gain:.3g}"
     panels = [
@@ -193,23 +196,59 @@ def _panels(frame: SeparatedFrame, total: Values, flags: list[Flag]) -> list[Pan
         Panel("Mask", "", _flagged(combined, flags)),
     ]
     if frame.error is not None:
-        error = _shrunk(np.maximum(frame.error[..., 0], frame.error[..., 1]))
+        error = _shrunk(partial(_largest_error, frame.error), size)
         top = max(float(np.percentile(error, 99)), 1e-9)
         panels.append(Panel("Expected error", f"yellow: {top:.2g} or more", dolp_map(error / top)))
     return panels
 
 
-def _clearness(light: Values, s1: Values) -> NDArray[np.float64]:
-    """From 0 where the light ``[H, W]`` is at its noise to 1 where polarization can be seen, shrunk.
+def _total(frame: SeparatedFrame, rows: slice) -> Values:
+    """All light ``[h, W, C]`` of some rows."""
+    total: Values = np.maximum(frame.diffuse[rows], 0) + np.maximum(frame.specular[rows], 0)
+    return total
 
-    The noise is that of s1 in the darkest quarter, as neighbours on the diagonal differ there.
+
+def _brightness(frame: SeparatedFrame, rows: slice) -> Values:
+    """The mean over colours of all light ``[h, W]`` of some rows."""
+    total = _total(frame, rows)
+    mean: Values = reduce(np.add, np.moveaxis(total, -1, 0)) / total.shape[-1]
+    return mean
+
+
+def _polarized(frame: SeparatedFrame, turn: Callable[[Values], Values], rows: slice) -> Values:
+    """s1 (cosine) or s2 (sine) ``[h, W]`` of some rows, the mean over colours."""
+    return _brightness(frame, rows) * frame.dolp[rows] * turn(2 * frame.aolp[rows])
+
+
+def _largest_error(error: Values, rows: slice) -> Values:
+    """The larger one of both expected errors ``[h, W]`` of some rows."""
+    return np.maximum(error[rows, :, 0], error[rows, :, 1])
+
+
+def _shrunk_parts(frame: SeparatedFrame) -> list[NDArray[np.float64]]:
+    """Diffuse and specular light, shrunk."""
+    size = frame.valid.shape
+
+    def lit(image: Values, rows: slice) -> Values:
+        return np.maximum(image[rows], 0)
+
+    return [_shrunk(partial(lit, image), size) for image in (frame.diffuse, frame.specular)]
+
+
+def _clearness(frame: SeparatedFrame, light: Values) -> NDArray[np.float64]:
+    """From 0 where the shrunk ``light`` is at the frame's noise to 1 where polarization can be seen.
+
+    The noise is that of s1 in the darkest quarter, as neighbours on the diagonal differ there, in two rows of a block.
     """
-    dark = light <= np.percentile(light, 25)
-    steps = np.abs(s1[1:, 1:] - s1[:-1, :-1])[dark[1:, 1:]]
+    k = _block(frame.valid.shape)
+    upper, lower = slice(0, -1, k), slice(1, None, k)
+    bright = _brightness(frame, lower)
+    dark = bright <= np.percentile(bright, 25) if bright.size else bright > 0
+    steps = np.abs(_polarized(frame, np.cos, lower)[:, 1:] - _polarized(frame, np.cos, upper)[:, :-1])[dark[:, 1:]]
     noise = float(steps.mean()) * np.sqrt(np.pi) / 2 if steps.size else 0.0
     if noise == 0:
-        return np.ones_like(_shrunk(light))
-    clear: NDArray[np.float64] = np.clip((_shrunk(light) / noise - AT_NOISE) / (CLEAR - AT_NOISE), 0, 1)
+        return np.ones_like(light, np.float64)
+    clear: NDArray[np.float64] = np.clip((light / noise - AT_NOISE) / (CLEAR - AT_NOISE), 0, 1)
     return clear
 
 
@@ -229,14 +268,20 @@ def toned(image: Values, gain: float) -> Pixels:
     return _to_bytes(np.broadcast_to(srgb(gain * image), (*image.shape[:2], 3)))
 
 
-def _shrunk(image: Values | NDArray[np.bool_]) -> NDArray[np.float64]:
+def _block(size: tuple[int, int]) -> int:
+    """Side of the blocks that `_shrunk` averages."""
+    return -(-max(size) // PANEL)
+
+
+def _shrunk(rows: Rows, size: tuple[int, int]) -> NDArray[np.float64]:
     """Area average over square blocks, cut at the border, so that neither side of ``[H, W, ...]`` exceeds `PANEL`."""
-    height, width = image.shape[:2]
-    k = -(-max(height, width) // PANEL)
+    (height, width), k = size, _block(size)
     low, wide = np.arange(0, height, k), np.arange(0, width, k)
-    bands = np.zeros((len(low), width, image.size // (height * width)), np.float32)
-    for first in range(k):  # whole rows at a time
-        own = image[first::k].reshape(-1, *bands.shape[1:])
+    bands = np.asarray(rows(slice(0, None, k)), np.float32)
+    shape = bands.shape[2:]
+    bands = bands.reshape(*bands.shape[:2], -1)
+    for first in range(1, k):  # whole rows at a time
+        own = rows(slice(first, None, k)).reshape(-1, *bands.shape[1:])
         bands[: len(own)] += own
     sums = np.zeros((len(low), len(wide), bands.shape[2]))
     for channel in range(bands.shape[2]):
@@ -245,25 +290,16 @@ def _shrunk(image: Values | NDArray[np.bool_]) -> NDArray[np.float64]:
             sums[:, : part.shape[1], channel] += part
     count = np.diff(low, append=height)[:, None] * np.diff(wide, append=width)
     mean: NDArray[np.float64] = sums / count[..., None]
-    return mean.reshape(*count.shape, *image.shape[2:])
+    return mean.reshape(*count.shape, *shape)
 
 
-def _shrunk_polarization(*stokes: Values) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """DoLP and AoLP ``[h, w]`` of averaged Stokes vectors s0, s1, s2 ``[H, W]``; DoLP 0 where there is no light."""
-    light, s1, s2 = map(_shrunk, stokes)
-    dolp = np.hypot(s1, s2) / np.where(light > 0, light, 1)
-    return dolp, np.mod(np.arctan2(s2, s1) / 2, np.pi)
-
-
-def _flags(frame: SeparatedFrame, total: Values) -> list[Flag]:
+def _flags(frame: SeparatedFrame) -> list[Flag]:
     """The flags of the mask panel; later ones are drawn over earlier ones."""
+    starts = range(0, len(frame.valid), PANEL // 4)
+    above = [(_total(frame, slice(start, start + PANEL // 4)) > 2).any(axis=-1) for start in starts]
     return [
         Flag(frame.dolp > 1, ABOVE_ONE, "DoLP above 1"),
-        Flag(
-            reduce(np.logical_or, (total[..., k] > 2 for k in range(total.shape[-1]))),
-            ABOVE_RANGE,
-            "above the measurable range",
-        ),
+        Flag(np.concatenate(above), ABOVE_RANGE, "above the measurable range"),
         Flag(~frame.valid, NOT_VALID, "not valid"),
     ]
 
@@ -273,7 +309,7 @@ def _flagged(picture: Pixels, flags: list[Flag]) -> Pixels:
     grey = picture.mean(axis=-1, keepdims=True) * 0.55
     out: NDArray[np.float64] = np.repeat(grey, picture.shape[-1], axis=-1)
     for flag in flags:
-        share = _shrunk(flag.where)
+        share = _shrunk(flag.where.__getitem__, flag.where.shape)
         opacity = 0.45 + 0.4 * share[share > 0][:, None]
         out[share > 0] += opacity * (np.array(flag.color) - out[share > 0])
     return np.rint(out).astype(np.uint8)

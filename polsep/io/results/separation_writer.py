@@ -182,12 +182,14 @@ def _encode_exr(frame: SeparatedFrame) -> memoryview:
 
     Layers that others show or measure in, `TOTAL` and `STOKES`, are half floats: half the size, 11 bits.
     """
-    planes: dict[str, NDArray[Any]] = as_planes({"diffuse": frame.diffuse, "specular": frame.specular})
+    lobes = {"diffuse": frame.diffuse, "specular": frame.specular}
+    planes: dict[str, NDArray[Any]] = {**lobes} if frame.diffuse.shape[2] == 3 else as_planes(lobes)
     planes |= {"dolp.Y": frame.dolp, "aolp.Y": frame.aolp, "valid.Y": frame.valid.astype(np.float32)}
     if frame.error is not None:
         planes |= {f"{ERROR}.{image}": frame.error[..., k] for k, image in enumerate(("diffuse", "specular"))}
-    shown = {TOTAL: frame.diffuse + frame.specular, **stokes_layers(frame.stokes)}
-    planes |= {name: as_halves(plane) for name, plane in as_planes(shown).items()}
+    mirrored = as_planes({TOTAL: frame.specular})
+    planes |= {name: as_halves(plane + mirrored[name]) for name, plane in as_planes({TOTAL: frame.diffuse}).items()}
+    planes |= {name: as_halves(plane) for name, plane in as_planes(stokes_layers(frame.stokes)).items()}
     return encode_exr(planes, exr_notes(_units(frame, "exr"), frame.report))
 
 

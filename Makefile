@@ -1,6 +1,6 @@
 # make demo   set up and separate the embedded capture
 # make test   set up and run the suite: lint, types, and all tests whose needs are installed
-# make optional  also what optional tests need: the viewer and a browser's driver, Ray, cameras, manifests of napari
+# make optional  also what optional tests need: the viewer and a browser's driver, Ray, cameras, manifests of napari, OpenImageIO
 # make kernels  compile the kernels anew, after a change of them
 # make docs   build the documentation site into site/
 # make web    build the page that separates in a browser into web/dist; needs node and npm
@@ -29,7 +29,7 @@ test: $(VENV)/.installed-dev
 	$(BIN)/pytest -n auto --dist loadfile
 
 optional: $(VENV)/.installed-dev
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[view,ray,camera]" npe2 playwright
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[view,ray,camera]" npe2 openimageio playwright
 
 kernels: $(VENV)/.installed-dev
 	PYTHONHASHSEED=0 nice $(BIN)/python -m tools.build_kernels

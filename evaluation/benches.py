@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import polsep.bench
 from evaluation.ablations import bench_ablations
+from evaluation.agreement import bench_agreement, bench_agreement_quick
 from evaluation.appearance import bench_gallery, bench_gallery_real, draw_gallery, draw_gallery_real
 from evaluation.calibration import bench_calibration
 from evaluation.dynamic import bench_dynamic, bench_dynamic_quick
@@ -69,6 +70,9 @@ BENCHES: dict[str, Bench] = {
     "install": Bench(bench_install, measures=("polsep", "pyproject.toml", "constraints.txt")),
     "view": Bench(bench_view, measures=("polsep/view", "polsep/edit")),
     "web": Bench(bench_web, bench_web_quick, measures=("web", "tools/web_models.py")),
+    "agreement": Bench(
+        bench_agreement, bench_agreement_quick, measures=(*SEPARATION, "polsep/io/store/onnx.py", "web")
+    ),
     "warned": Bench(
         bench_warned,
         bench_warned_quick,

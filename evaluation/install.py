@@ -47,17 +47,17 @@ def _measure(name: str, commit: str, folder: Path) -> Iterator[Row]:
     archive = subprocess.run(["git", "archive", commit], capture_output=True, check=True).stdout
     with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
         tar.extractall(checkout, filter="data")
-    seconds, _ = _run(sys.executable, "-m", "venv", str(environment))
+    seconds, _ = run_program(sys.executable, "-m", "venv", str(environment))
     python, program = str(environment / "bin" / "python"), str(environment / "bin" / "polsep")
     install = (python, "-m", "pip", "install", "--quiet", "--constraint", "constraints.txt", ".")
-    seconds += _run(*install, cwd=checkout)[0]
+    seconds += run_program(*install, cwd=checkout)[0]
     yield Row("install", "bare install", name, "seconds of pip and venv", seconds, "s")
     size = sum(path.stat().st_size for path in environment.rglob("*") if path.is_file() and not path.is_symlink())
     yield Row("install", "bare install", name, "size on disk", size / 2**20, "MiB")
     settings = {"NUMBA_CACHE_DIR": str(folder / "cache")}
     starts = {"import polsep": (python, "-c", "import polsep"), "polsep --help": (program, "--help")}
     for case, command in starts.items():
-        best = min(_run(*command, settings=settings)[0] for _ in range(STARTS))
+        best = min(run_program(*command, settings=settings)[0] for _ in range(STARTS))
         yield Row("install", case, name, f"seconds, best of {STARTS}", best, "s")
     frame = subprocess.run([python, "-c", FRAME], capture_output=True, text=True, check=True).stdout.strip()
     for method, full in [(method, "") for method in METHODS] + [(method, " --full") for method in FULL]:
@@ -65,13 +65,15 @@ def _measure(name: str, commit: str, folder: Path) -> Iterator[Row]:
         words = ("separate", frame, "--white-level", "4095", "--method", method, *full.split())
         separate = (program, *words, "--overwrite", "-o")
         own = settings | {"NUMBA_CACHE_DIR": str(folder / f"cache-{method}{full.strip()}")}
-        runs = [_run(*separate, str(folder / method), settings=own) for _ in range(1 + AGAIN)]
+        runs = [run_program(*separate, str(folder / method), settings=own) for _ in range(1 + AGAIN)]
         yield Row("install", case, name, "seconds, never run before", runs[0][0], "s")
         yield Row("install", case, name, f"seconds afterwards, best of {AGAIN}", min(s for s, _ in runs[1:]), "s")
         yield Row("install", case, name, "peak memory afterwards", max(m for _, m in runs[1:]), "MiB")
 
 
-def _run(*command: str, cwd: Path | None = None, settings: Mapping[str, str] | None = None) -> tuple[float, float]:
+def run_program(
+    *command: str, cwd: Path | None = None, settings: Mapping[str, str] | None = None
+) -> tuple[float, float]:
     """Seconds and peak memory [MiB] of a command, which must succeed; as from a shell, without this checkout.
 
     The peak is asked for while it runs: the one that it leaves behind counts its parent's, too.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -69,36 +70,54 @@ def bench_web_quick() -> Iterator[Row]:
 
 
 def _bench(cores: tuple[int, ...], again: int) -> Iterator[Row]:
+    with TemporaryDirectory() as folder, served_page(Path(folder)) as (site, driver, address):
+        size = sum(path.stat().st_size for path in site.iterdir())
+        yield Row("web", "page", "all files", "size", size / 1e6, "MB")
+        for count in cores:
+            for method in METHODS:
+                profile = Path(folder) / f"{method}{count}"
+                case = CASE.format(count, "s" * (count > 1))
+                with opened(driver, profile, f"{address}?threads={count}", method) as page:
+                    yield from _measure(page, (case, method, again), profile)
+
+
+@contextmanager
+def served_page(folder: Path) -> Iterator[tuple[Path, Any, str]]:
+    """The page, built below a folder and on a host: its own folder, a driver of browsers, the address.
+
+    Raises ValueError without its needs.
+    """
     try:
         from playwright.sync_api import sync_playwright
     except ModuleNotFoundError:
         raise ValueError("expected playwright (pip install playwright), found none") from None
     if CHROMIUM is None:
         raise ValueError("expected chromium, found none")
-    with TemporaryDirectory() as folder, sync_playwright() as driver:
-        site = build_page(Path(folder))
-        size = sum(path.stat().st_size for path in site.iterdir())
-        yield Row("web", "page", "all files", "size", size / 1e6, "MB")
+    with sync_playwright() as driver:
+        site = build_page(folder)
         with served(site) as address:
-            for count in cores:
-                for method in METHODS:
-                    profile = Path(folder) / f"{method}{count}"
-                    context = driver.chromium.launch_persistent_context(
-                        profile, executable_path=CHROMIUM, args=FLAGS, viewport={"width": 1400, "height": 900}
-                    )
-                    case = CASE.format(count, "s" * (count > 1))
-                    yield from _measure(context.pages[0], f"{address}?threads={count}", (case, method, again), profile)
-                    context.close()
+            yield site, driver, address
 
 
-def _measure(page: Any, address: str, what: tuple[str, str, int], profile: Path) -> Iterator[Row]:
-    """Rows of one method on a page of its own."""
-    case, method, again = what
+@contextmanager
+def opened(driver: Any, profile: Path, address: str, method: str) -> Iterator[Any]:
+    """The page in a browser of its own, for frames of `WHITE`, with its network loaded."""
+    context = driver.chromium.launch_persistent_context(
+        profile, executable_path=CHROMIUM, args=FLAGS, viewport={"width": 1400, "height": 900}
+    )
+    page = context.pages[0]
     page.set_default_timeout(WAIT_MS)
     page.goto(address)
     page.select_option("#method", method)
     page.fill("#white", WHITE)
     page.wait_for_timeout(5000)  # the network loads meanwhile
+    yield page
+    context.close()
+
+
+def _measure(page: Any, what: tuple[str, str, int], profile: Path) -> Iterator[Row]:
+    """Rows of one method on a page of its own."""
+    case, method, again = what
     memory = Memory(str(profile))
     empty = memory.now()
     with memory:

@@ -60,6 +60,7 @@ def examine(extras: Mapping[str, Sequence[str]]) -> dict[str, Any]:
     facts["extras"] = {
         name: [module for module in modules if not _is_there(module)] for name, modules in extras.items()
     }
+    facts["extra_packages"] = find_extra_packages(extras)
     names = _attempt(tests, "methods", _methods) or ()
     tests = {name: found for name, found in tests.items() if found["error"]}  # facts that could not be found
     for name in names:
@@ -81,6 +82,14 @@ def find_packages() -> dict[str, str | None]:
         versions = {name: _version(name) for name in names}
         return {name: found for name, found in versions.items() if found or name != "numba" or _kernels() != "library"}
     return {}
+
+
+def find_extra_packages(extras: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Versions of the installed packages that extras are known by, by name."""
+    owners = metadata.packages_distributions()
+    modules = {module for modules in extras.values() for module in modules if _is_there(module)}
+    names = sorted({owners[module][0] for module in modules if module in owners})
+    return {name: metadata.version(name) for name in names}
 
 
 def check_method(name: str) -> None:

@@ -131,7 +131,8 @@ def read_measurements(
         missed = contradictions(Measurements(seen[:, None, None], angles))
         facts["contradiction"] = round(float(np.sqrt((missed**2).mean()) / seen.mean()), 5)
     remarks = tuple(_remarks(facts, options))
-    return Frame(output_stem(paths[0]), data, (*photos.notes, *notes, *remarks)), facts
+    frame = Frame(output_stem(paths[0]), data, (*photos.notes, *notes, *remarks))
+    return replace(frame, exposure=photos.exposure, captured=photos.captured), facts
 
 
 def _to_light(photos: Photographs, options: PhotoOptions, read: ReadOptions) -> tuple[Measurements, tuple[str, ...]]:

@@ -6,6 +6,7 @@ import json
 import sys
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
@@ -39,6 +40,7 @@ def test_an_installation_that_works(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert facts["extras"] == {name: ["gradio"] if name == "view" else [] for name in EXTRAS}
     assert facts["cameras"]["found"] == doctor_cameras.cameras
     assert facts["packages"]["numpy"] == np.__version__
+    assert facts["extra_packages"]["numba"] == numba.__version__ and "gradio" not in facts["extra_packages"]
     assert set(doctor.MEANS) == set(METHODS)
 
 

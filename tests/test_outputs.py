@@ -87,6 +87,26 @@ def test_exr_is_one_zip_part_that_states_units_and_version(tmp_path: Path) -> No
     assert header["polsepVersion"] == sidecar(tmp_path)["polsep"]
 
 
+def test_openimageio_reads_every_channel_and_what_the_header_says(tmp_path: Path) -> None:
+    """The library under Blender, Houdini and other programs."""
+    oiio = pytest.importorskip("OpenImageIO", reason="not installed: make optional")
+    frame = replace(random_frame(), stokes=np.random.default_rng(1).random((3, 37, 53, 3), np.float32))
+    facts = {"method": "analytic", "white_level": 4095.0, "light_color": [0.5, 1, 0.7], "exposure_s": 0.25}
+    facts |= {"layout": "90,45,135,0/RGGB", "captured": "2026-05-04T12:13:14+00:00"}
+    path = write_separation(replace(frame, report=facts), tmp_path, "shot")[0]
+    file = oiio.ImageInput.open(str(path))
+    spec, pixels = file.spec(), file.read_image("float")
+    file.close()
+    planes = dict(zip(spec.channelnames, np.moveaxis(pixels, -1, 0), strict=True))
+    for name in ("diffuse", "specular"):
+        npt.assert_array_equal(np.stack([planes[f"{name}.{c}"] for c in "RGB"], axis=-1), getattr(frame, name))
+    npt.assert_allclose(np.stack([planes[c] for c in "RGB"], axis=-1), frame.diffuse + frame.specular, rtol=1e-3)
+    npt.assert_allclose(np.stack([planes[f"S1.{c}"] for c in "RGB"], axis=-1), frame.stokes[1], atol=1e-3)
+    said = {name: spec.getattribute(f"polsep{name}") for name in ("Method", "WhiteLevel", "LightColor", "Layout")}
+    assert said == {"Method": "analytic", "WhiteLevel": 4095, "LightColor": "0.5,1,0.7", "Layout": facts["layout"]}
+    assert (spec.getattribute("ExposureTime"), spec.getattribute("DateTime")) == (0.25, "2026:05:04 12:13:14")
+
+
 def test_exr_does_not_depend_on_threads() -> None:
     """Any number of threads makes the same bytes, and so do several writers at once."""
     plane = np.random.default_rng(0).random((200, 300), np.float32)

@@ -216,7 +216,7 @@ def test_srgb_is_decoded_only_where_it_is_said(tmp_path: Path, suffix: str) -> N
 
 
 def write_dng(path: Path, codes: NDArray[np.uint16], black: int, white: int) -> Path:
-    """The least DNG of an RGGB mosaic, exposed 1/60 s at f/8. Source: Adobe, Digital Negative Specification 1.7."""
+    """The least DNG of an RGGB mosaic, exposed 1/60 s at f/8 in May 2026. Source: Adobe, Digital Negative 1.7."""
     matrix = [n for row in np.eye(3, dtype=int) for value in row for n in (int(value), 1)]
     tags: list[tuple[int, Any, int, Any, bool]] = [
         (50706, "B", 4, (1, 4, 0, 0), True),
@@ -230,13 +230,13 @@ def write_dng(path: Path, codes: NDArray[np.uint16], black: int, white: int) -> 
         (33434, "2I", 1, (1, 60), True),
         (33437, "2I", 1, (8, 1), True),
     ]
-    tifffile.imwrite(path, codes, photometric=32803, metadata=None, extratags=tags)
+    tifffile.imwrite(path, codes, photometric=32803, metadata=None, extratags=tags, datetime="2026:05:04 12:13:14")
     return path
 
 
 @pytest.mark.parametrize("full", [False, True])
 def test_camera_raw_is_linear_light_in_the_cameras_colours(tmp_path: Path, full: bool) -> None:
-    """Black 0, white 1, no balance and no curve; what clips is white or more; time and aperture are read."""
+    """Black 0, white 1, no balance and no curve; what clips is white or more; time, aperture and clock are read."""
     pytest.importorskip("rawpy")
     y, x = np.mgrid[:128, :128]
     light = np.stack(
@@ -250,6 +250,7 @@ def test_camera_raw_is_linear_light_in_the_cameras_colours(tmp_path: Path, full:
     expected = light if full else light.reshape(64, 2, 64, 2, 3).mean((1, 3))
     clipped = image >= 1
     assert image.shape == expected.shape and photos.exposures == (pytest.approx(1 / 60 / 64),)
+    assert photos.exposure == pytest.approx(1 / 60) and str(photos.captured).startswith("2026-05-04T12:13:14")
     assert bool(clipped[60 // scale : 64 // scale, 60 // scale : 64 // scale].all()) and clipped.mean() < 0.01
     inside = (slice(4, -4), slice(4, -4))
     away = ~clipped.any(axis=-1)[inside] & (np.abs(np.indices(clipped.shape[:2])[1] - 62 / scale) > 8)[inside]

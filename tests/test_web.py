@@ -22,7 +22,7 @@ from polsep.io.results.exr import read_exr_layers
 from polsep.light.find import find_light
 from polsep.pipeline import PolsepWarning
 from polsep.sensor.camera import Layout
-from tools.web_page import CHROMIUM, DEMO, HAS_PACKAGES, NODE, WEB, build_page, change, send, served
+from tools.web_page import CHROMIUM, DEMO, HAS_PACKAGES, NODE, WEB, build_page, change, fetch, send, served
 
 __all__ = ["browser"]  # a fixture
 #: Largest difference to the library's images, white = 1.
@@ -60,16 +60,6 @@ def page(browser: Any, address: str) -> Iterator[Any]:
 def crop() -> np.ndarray[Any, Any]:
     """A part of the demo capture with a highlight, dead pixels and clipped ones."""
     return np.ascontiguousarray(imagecodecs.png_decode(DEMO.read_bytes())[752:1040, 1064:1384])
-
-
-def fetch(page: Any, form: str, folder: Path) -> Path:
-    """A file that the page offers."""
-    page.click("#download summary")
-    with page.expect_download() as waiting:
-        page.click(f"[data-format={form}]")
-    path = folder / waiting.value.suggested_filename
-    waiting.value.save_as(path)
-    return path
 
 
 def separated(codes: Any, method: str, **said: Any) -> Any:

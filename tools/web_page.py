@@ -77,3 +77,13 @@ def change(page: Any, act: Any) -> None:
     page.evaluate("document.body.dataset.state = 'sent'")
     act()
     page.wait_for_selector("body[data-state=done], body[data-state=failed]")
+
+
+def fetch(page: Any, form: str, folder: Path) -> Path:
+    """A file that the page offers."""
+    page.click("#download summary")
+    with page.expect_download() as waiting:
+        page.click(f"[data-format={form}]")
+    path: Path = folder / waiting.value.suggested_filename
+    waiting.value.save_as(path)
+    return path

@@ -55,6 +55,8 @@ def _lines(facts: dict[str, Any]) -> list[str]:
     lines += [f"            no {name}: {reason}" for name, reason in cameras["missing"].items()]
     present = [name for name, missing in facts["extras"].items() if not missing]
     lines.append(f"extras      {', '.join(present) or 'none'}")
+    if facts["extra_packages"]:
+        lines.append(f"            {', '.join(f'{name} {found}' for name, found in facts['extra_packages'].items())}")
     for name, missing in facts["extras"].items():
         if missing:
             lines.append(f"            no {name} (no {', '.join(missing)}): pip install 'polsep[{name}]'")

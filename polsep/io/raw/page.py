@@ -26,9 +26,10 @@ class MergedFacts(NamedTuple):
 class Page:
     """One picture of a file: ``array`` ``[H, W]`` or ``[H, W, C]``; with ``angles`` a leading axis of 0, 45, 90, 135.
 
-    ``exposure``: its time in seconds; ``captured``: when it was taken, in ISO 8601. ``merged``: facts of a frame of
-    `polsep merge`. ``index`` of ``count`` pictures. ``white_level`` and ``layout`` are those that the file itself
-    names, or None. ``sampled``: the angle planes were taken from one mosaic, so their pixels lie at different points.
+    ``exposure``: its time in seconds; ``captured``: when it was taken, in ISO 8601; ``let_in``: light that the camera
+    let in (time, sensitivity, aperture), up to a factor. ``merged``: facts of a frame of `polsep merge`. ``index`` of
+    ``count`` pictures. ``white_level`` and ``layout`` are those that the file itself names, or None. ``sampled``: the
+    angle planes were taken from one mosaic, so their pixels lie at different points.
     """
 
     array: NDArray[Any]
@@ -41,4 +42,5 @@ class Page:
     notes: tuple[str, ...] = ()
     exposure: float | None = None
     captured: str | None = None
+    let_in: float | None = None
     merged: MergedFacts | None = None

@@ -32,6 +32,8 @@ from polsep.io.store.header_checks import SAMPLES, limit, require_signature, req
 MOST_FRAMES = 24
 #: Reach of LibRaw's interpolation in pixels, within which a clipped sample counts.
 REACH = 2
+#: Year of a camera's clock that was never set: seconds count from its beginning.
+UNKNOWN_YEAR = 1970
 #: Channel of LibRaw's colour numbers: 3 is the second green.
 _CHANNEL = np.array([0, 1, 2, 1])
 
@@ -41,7 +43,8 @@ class Photographs:
     """K photographs as codes ``[K, H, W]`` or ``[K, H, W, 3]``, and ``names`` of them for messages.
 
     ``white_level``: what the files themselves say, else None. ``exposures``: how much light each one let in, up to a
-    factor (time, sensitivity and aperture), where all say it.
+    factor (time, sensitivity and aperture), where all say it. Of the first one, where it says them, ``exposure``: its
+    time in seconds, and ``captured``: when it was taken, in ISO 8601.
     """
 
     array: NDArray[Any]
@@ -49,6 +52,8 @@ class Photographs:
     white_level: float | None = None
     exposures: tuple[float, ...] | None = None
     notes: tuple[str, ...] = ()
+    exposure: float | None = None
+    captured: str | None = None
 
 
 def read_photographs(paths: Sequence[Path], encoded: bool = False, full: bool = False) -> Photographs:
@@ -68,9 +73,10 @@ def read_photographs(paths: Sequence[Path], encoded: bool = False, full: bool = 
     if len(levels) != 1:
         raise ValueError(f"expected photographs of one bit depth, found white levels {sorted(map(str, levels))}")
     array = stack_angles({f"{k}: {name}": page.array for k, (name, page) in enumerate(pages)}, "photographs")
-    said = tuple(page.exposure for _, page in pages if page.exposure is not None)
+    said, first = tuple(page.let_in for _, page in pages if page.let_in is not None), pages[0][1]
     notes = tuple(dict.fromkeys(note for _, page in pages for note in page.notes))
-    return Photographs(array, names, levels.pop(), said if len(said) == len(pages) else None, notes)
+    exposures = said if len(said) == len(pages) else None
+    return Photographs(array, names, levels.pop(), exposures, notes, first.exposure, first.captured)
 
 
 def _read_pages(path: Path, encoded: bool, full: bool) -> list[Page]:
@@ -116,7 +122,7 @@ def _read_camera_raw(path: Path, full: bool) -> Page:
             adjust_maximum_thr=0.0,
             user_flip=0,
         )
-        samples, exposure = raw.raw_image_visible, _light_of(raw.other)
+        samples, facts = raw.raw_image_visible, _capture_facts(raw.other)
         clipped = samples >= raw.white_level
         channels = _CHANNEL[raw.raw_colors_visible] if samples.ndim == 2 else None
     planes = np.moveaxis(image.astype(np.float32) / 65535, -1, 0)
@@ -128,13 +134,22 @@ def _read_camera_raw(path: Path, full: bool) -> Page:
         height, width = (n // 2 * 2 for n in planes.shape[1:])
         whole = planes[:, :height, :width]
         planes = np.where(halve((whole >= 1).astype(np.float32)) > 0, 1, halve(whole)).astype(np.float32)
-    return Page(np.ascontiguousarray(np.moveaxis(planes, 0, -1)), white_level=1.0, exposure=exposure)
+    return Page(np.ascontiguousarray(np.moveaxis(planes, 0, -1)), white_level=1.0, **facts)
 
 
-def _light_of(facts: Any) -> float | None:
-    """Time times sensitivity over the square of the f-number (1 where a lens tells none); None without a time."""
+def _capture_facts(facts: Any) -> dict[str, Any]:
+    """Fields of a `Page` that camera raw says.
+
+    Light let in is time times sensitivity over the square of the f-number (1 where a lens tells none). The camera's
+    clock has no time zone: it is taken for this machine's, as LibRaw does.
+    """
     time, iso, stop = float(facts.shutter_speed), float(facts.iso_speed), float(facts.aperture)
-    return time * (iso or 1) / (stop or 1) ** 2 if time > 0 else None
+    found: dict[str, Any] = {}
+    if time > 0:
+        found |= {"exposure": time, "let_in": time * (iso or 1) / (stop or 1) ** 2}
+    if facts.timestamp.year > UNKNOWN_YEAR:
+        found["captured"] = facts.timestamp.astimezone().isoformat()
+    return found
 
 
 def _read_film(path: Path, encoded: bool) -> list[Page]:

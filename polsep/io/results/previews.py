@@ -174,12 +174,12 @@ def _panels(frame: SeparatedFrame, flags: list[Flag]) -> list[Panel]:
     """The pictures of the contact sheet in reading order, all of one size."""
     size, seldom = frame.valid.shape, slice(None, None, _block(frame.valid.shape))
     gain, own = exposure_of(_total(frame, seldom)), exposure_of(frame.specular[seldom])
-    light = _shrunk(partial(_brightness, frame), size)
-    s1, s2 = (_shrunk(partial(_polarized, frame, turn), size) for turn in (np.cos, np.sin))
+    parts = _shrunk_parts(frame)
+    light = (parts[0] + parts[1]).mean(axis=-1)
+    s1, s2 = np.moveaxis(_shrunk(partial(_polarized, frame), size), -1, 0)
     dolp = np.hypot(s1, s2) / np.where(light > 0, light, 1)
     aolp = np.mod(np.arctan2(s2, s1) / 2, np.pi)
     shown = _clearness(frame, light)[..., None]
-    parts = _shrunk_parts(frame)
     combined, diffuse, specular = (toned(image, gain) for image in (parts[0] + parts[1], *parts))
     exposure = f"exposure x {gain:.3g}"
     panels = [
@@ -215,9 +215,10 @@ def _brightness(frame: SeparatedFrame, rows: slice) -> Values:
     return mean
 
 
-def _polarized(frame: SeparatedFrame, turn: Callable[[Values], Values], rows: slice) -> Values:
-    """s1 (cosine) or s2 (sine) ``[h, W]`` of some rows, the mean over colours."""
-    return _brightness(frame, rows) * frame.dolp[rows] * turn(2 * frame.aolp[rows])
+def _polarized(frame: SeparatedFrame, rows: slice) -> Values:
+    """s1 and s2 ``[h, W, 2]`` of some rows, the mean over colours."""
+    power, angle = _brightness(frame, rows) * frame.dolp[rows], 2 * frame.aolp[rows]
+    return np.stack([power * np.cos(angle), power * np.sin(angle)], axis=-1)
 
 
 def _largest_error(error: Values, rows: slice) -> Values:
@@ -244,7 +245,8 @@ def _clearness(frame: SeparatedFrame, light: Values) -> NDArray[np.float64]:
     upper, lower = slice(0, -1, k), slice(1, None, k)
     bright = _brightness(frame, lower)
     dark = bright <= np.percentile(bright, 25) if bright.size else bright > 0
-    steps = np.abs(_polarized(frame, np.cos, lower)[:, 1:] - _polarized(frame, np.cos, upper)[:, :-1])[dark[:, 1:]]
+    below, above = (_polarized(frame, rows)[..., 0] for rows in (lower, upper))
+    steps = np.abs(below[:, 1:] - above[:, :-1])[dark[:, 1:]]
     noise = float(steps.mean()) * np.sqrt(np.pi) / 2 if steps.size else 0.0
     if noise == 0:
         return np.ones_like(light, np.float64)

@@ -111,6 +111,9 @@ def test_the_page_gives_what_the_library_gives(page: Any, tmp_path: Path, monkey
     shown = imagecodecs.png_decode(fetch(page, "right", tmp_path).read_bytes())
     assert shown.shape[:2] == truth.valid.shape and shown.dtype == np.uint8
     assert page.evaluate("crossOriginIsolated")
+    page.fill("#black", "20")  # the click on the menu leaves the field, and the file waits for what that changes
+    darker = separated(codes, "analytic", light_color=(0.8, 1, 1.25), black_level=20)
+    assert_agrees(fetch(page, "exr", tmp_path), darker)
 
 
 @needs_packages

@@ -244,7 +244,8 @@ function save(blob, name) {
 
 async function download(format) {
   part("download").open = false;
-  if (!state.images || state.busy) return;
+  while (state.busy) await new Promise((resolve) => setTimeout(resolve, 50)); // a setting that has just been left
+  if (!state.images) return;
   const stem = state.name.replace(/\.[^.]*$/, "");
   if (format === "left" || format === "right") {
     const canvas = viewer.pictures[format === "left" ? 0 : 1];

@@ -233,6 +233,35 @@ def test_sliders_agree_with_their_boxes(page: Any, frame: Any) -> None:
     assert page.evaluate(inner) == []
 
 
+def test_the_picture_stays_while_a_panel_is_scrolled(page: Any, frame: Any) -> None:
+    """All edits are longer than the screen; the picture keeps its size, and can be seen from the last one."""
+    tab(page, "Edit")
+    height = page.locator(".ps-stage").bounding_box()["height"]
+    for title in page.locator("#ps-edits > div > button").all():
+        title.click()
+    last = page.locator("#ps-edits > div > button").last
+    page.mouse.move(1300, 600)
+    page.mouse.wheel(0, 5000)
+    page.wait_for_function("scrollY > 300")
+    last.click()
+    page.wait_for_timeout(300)
+    box = page.locator(".ps-stage").bounding_box()
+    assert box["height"] == height and 0 <= box["y"] and box["y"] + height <= 900
+
+
+def test_lists_show_what_they_hold(page: Any, frame: Any) -> None:
+    """A longer value than its list is cut off before the arrow, not under it."""
+    choose(page, "ps-against", "analytic, full")
+    page.wait_for_selector(".ps-name-right:has-text('analytic, full')")
+    script = """() => [...document.querySelectorAll('input[role=combobox]')].filter((e) => e.offsetParent).map((e) => {
+      const style = getComputedStyle(e), arrow = e.parentElement.querySelector('svg').getBoundingClientRect();
+      const box = e.getBoundingClientRect();
+      return [style.textOverflow, box.right - parseFloat(style.paddingRight) - arrow.left];
+    })"""
+    found = page.evaluate(script)
+    assert len(found) > 5 and all(cut == "ellipsis" and beyond < 4 for cut, beyond in found), found
+
+
 def test_the_page_fits_its_screen(page: Any, frame: Any) -> None:
     """At 1440x900 nothing scrolls, in any panel."""
     for name in ("Settings", "Pixel", "Exposure", "Light", "Edit"):
@@ -285,6 +314,21 @@ def test_a_phone_shows_the_picture_first(phone: Any) -> None:
     box = phone.locator(".ps-stage").bounding_box()
     assert box["width"] > 300 and box["y"] + box["height"] < 700
     assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_a_phone_shows_the_wait(phone: Any, page: Any) -> None:
+    """How long, and the button that ends it, lie within the screen."""
+    open_demo(page)
+    choose(page, "ps-method", "paper")
+    page.wait_for_selector("#ps-progress:has-text('Separating')")
+    phone.tap("#ps-demo")
+    phone.wait_for_selector("#ps-progress:has-text('Waiting')")
+    for part in ("#ps-file", "#ps-demo", "#ps-progress [role=status]", "#ps-cancel"):
+        box = phone.locator(part).bounding_box()
+        assert 0 <= box["x"] and box["x"] + box["width"] <= 390, part
+    phone.tap("#ps-cancel")
+    phone.wait_for_selector("#ps-progress:has-text('Cancelled')")
+    page.click("#ps-cancel")
 
 
 def test_fingers_pinch(phone: Any) -> None:

@@ -109,7 +109,7 @@ def _view_row() -> dict[str, Any]:
     with gr.Row(equal_height=True, elem_id="ps-view"):
         left = gr.Dropdown(list(VIEWS), value="Input", label="Left", elem_id="ps-left", **lists)
         right = gr.Dropdown(list(VIEWS), value="Diffuse", label="Right", elem_id="ps-right", **lists)
-        against = gr.Dropdown(makers, value=SAME, label="Right by", elem_id="ps-against", **lists)
+        against = gr.Dropdown(makers, value=SAME, label="Right by", elem_id="ps-against", **lists | {"min_width": 190})
         stops = gr.Slider(label="Exposure [stops]", elem_id="ps-stops", **sliders)
         specular = gr.Slider(label="Specular [stops]", elem_id="ps-specular-stops", **sliders)
     return {

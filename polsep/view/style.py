@@ -168,7 +168,8 @@ element.addEventListener('keydown', (event) => {
 });
 const room = () => {  // the height that remains above the controls of the picture
   const parts = ['#ps-view', '#ps-strip'].map((part) => document.querySelector(part)?.offsetHeight ?? 0);
-  const rest = innerHeight - element.getBoundingClientRect().top - scrollY - parts[0] - parts[1] - 42;
+  const body = document.querySelector('#ps-body');  // where the picture is while nothing is scrolled
+  const rest = innerHeight - body.getBoundingClientRect().top - scrollY - parts[0] - parts[1] - 52;
   if (innerWidth > 900) element.style.setProperty('--room', Math.max(rest, 300) + 'px');
   else element.style.removeProperty('--room');
 };
@@ -189,7 +190,7 @@ EMPTY = """<div class="ps-nothing"><div><b>No frame yet</b>
 The demo capture shows what polsep does.</p></div></div>"""
 
 CSS = """
-.gradio-container { max-width: none !important; padding: 0 !important; }
+.gradio-container { max-width: none !important; padding: 0 !important; overflow: clip !important; }
 .gradio-container .fillable { max-width: none !important; padding: 10px 16px !important; }
 footer { display: none !important; }
 .gradio-container .column, .gradio-container .gap { gap: 8px; }
@@ -240,8 +241,8 @@ footer { display: none !important; }
 .ps-name-left { left: 10px; }
 .ps-name-right { right: 10px; }
 .ps-tools { position: absolute; bottom: 10px; left: 50%; transform: translateX(-50%); display: flex; gap: 2px;
-  align-items: center; padding: 2px; border-radius: 6px; background: #000b; color: #ddd; font-size: .8rem;
-  cursor: default; }
+  align-items: center; padding: 2px; border-radius: 6px; background: #111; color: #ddd; font-size: .8rem;
+  cursor: default; z-index: 1; }
 .ps-tools button { min-width: 30px; height: 28px; border: 0; border-radius: 4px; background: none; color: #fff;
   font-size: .85rem; cursor: pointer; }
 .ps-tools button:hover, .ps-tools button:focus-visible { background: #3b82f6; outline: none; }
@@ -289,8 +290,16 @@ footer { display: none !important; }
 .ps-swatch { display: inline-block; width: 14px; height: 14px; margin: 0 6px -2px 0; border-radius: 3px; }
 #ps-edits { gap: 4px; }
 #ps-view { gap: 8px; }
+.gradio-container input[role=combobox] { padding-right: 22px; text-overflow: ellipsis; }
 #ps-marks { padding: 8px 12px; }
+@media (min-width: 901px) {  /* the picture stays where it is while a long panel is scrolled */
+  #ps-main { position: sticky; top: 8px; align-self: flex-start; }
+}
 @media (max-width: 900px) {
+  #ps-top { flex-wrap: wrap; }
+  #ps-demo { min-width: 116px !important; }
+  #ps-progress { flex: 1 1 200px; }
+  #ps-top #ps-progress:not(:has([role=status])) { display: none; }
   .gradio-container .fillable { padding: 8px 10px !important; }
   #ps-side { flex: 1 1 100%; }
   #ps-against { min-width: 100% !important; }

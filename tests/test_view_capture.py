@@ -92,6 +92,8 @@ def test_the_page_shows_what_setting_up_a_shot_needs(shot: Shot, browser: Any) -
             assert "light of <b>many</b> angles" in said
             assert page.locator("#histogram polyline").count() == 3
             page.wait_for_function("document.querySelector('#marked').naturalWidth > 0")
+            box = page.locator("#marked").bounding_box()
+            assert box["y"] + box["height"] <= height
             page.check("#sharp")
             page.wait_for_function("document.querySelector('#marked').src.includes('clipped,sharp')")
             assert page.evaluate("document.documentElement.scrollWidth") <= width

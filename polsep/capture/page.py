@@ -25,7 +25,8 @@ PAGE = b"""<!doctype html><html lang="en"><meta charset="utf-8"><title>polsep ca
 body { background: #161618; color: #ebebeb; font: 15px/1.45 system-ui, sans-serif; margin: 12px 16px; }
 main { display: flex; flex-wrap: wrap; gap: 18px; }
 #left { flex: 1 1 480px; min-width: 0; } #right { flex: 0 0 300px; }
-img { max-width: 100%; display: block; border-radius: 4px; background: #000; } #marked { width: 100%; }
+img { max-width: 100%; display: block; border-radius: 4px; background: #000; object-fit: contain; }
+#marked { width: 100%; max-height: 62vh; } #picture { max-height: 27vh; margin: auto; }
 label { margin-right: 16px; } p { margin: 8px 0; } b { font-weight: 600; }
 #remarks p { border-left: 3px solid #e0b13c; background: #2f2a1c; color: #f3e3b5; padding: 5px 10px; }
 #histogram svg { width: 100%; height: 130px; background: #202024; border-radius: 4px; }

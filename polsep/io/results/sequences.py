@@ -29,7 +29,14 @@ from polsep.io.results.exr import COMPRESSIONS, encode_exr_halves
 from polsep.io.results.films import LOSSLESS, WATCHABLE, Film, FilmKind, join_films
 from polsep.io.results.separation_writer import TOTAL, UNITS, stokes_layers
 from polsep.io.results.sidecars import exr_notes, require_same_settings
-from polsep.io.store.atomic import OutputError, atomic_path, release_cache, replace_bytes, replace_text
+from polsep.io.store.atomic import (
+    OutputError,
+    atomic_path,
+    release_cache,
+    replace_bytes,
+    replace_text,
+    require_writable,
+)
 
 #: Frames per part, about a second; films have a key frame at least as often.
 PART = 25
@@ -97,6 +104,7 @@ class SequenceWriter:
         self._overwrite = overwrite
         self._parts = directory / f".polsep-{stem}"
         self._report = directory / f"{stem}.json"
+        require_writable(directory)
         if overwrite:
             shutil.rmtree(self._parts, ignore_errors=True)
         elif self._report.exists():

@@ -81,11 +81,18 @@ def release_cache(file: int | Path) -> None:
             os.posix_fadvise(file, 0, 0, os.POSIX_FADV_DONTNEED)
 
 
-def refuse_existing(directory: Path, targets: Sequence[Path], overwrite: bool) -> None:
-    """Raise OutputError where files would be replaced without ``overwrite``, or a directory at all. Call it first."""
+def require_writable(directory: Path) -> None:
+    """Raise OutputError where nothing may be written into a directory, or into the one to make it in. Call it first."""
     nearest = next((d for d in (directory, *directory.parents) if os.path.lexists(d)), None)
     if nearest is not None and not os.path.isdir(nearest):
         raise OutputError(f"expected a directory to write into, found a file: {nearest}")
+    if nearest is not None and not os.access(nearest, os.W_OK | os.X_OK):
+        raise OutputError(f"expected a directory to write into, found one without permission to write: {nearest}")
+
+
+def refuse_existing(directory: Path, targets: Sequence[Path], overwrite: bool) -> None:
+    """Raise OutputError where files would be replaced without ``overwrite``, or none can be written. Call it first."""
+    require_writable(directory)
     for target in targets:
         if os.path.isdir(target) and not os.path.islink(target):
             raise OutputError(f"expected a file or nothing at {target}, found a directory")

@@ -13,9 +13,15 @@ import signal
 import tempfile
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 #: Seconds after which a hidden folder of a set is nobody's any more: a set of files is written in far less.
 FORGOTTEN = 3600.0
@@ -79,6 +85,28 @@ def release_cache(file: int | Path) -> None:
                 release_cache(stream.fileno())
         else:
             os.posix_fadvise(file, 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def hold_lock(owner: object, path: Path) -> Callable[[], object]:
+    """Hold a file, made if missing, until the function returned is called or ``owner`` or its process is gone.
+
+    Raises BlockingIOError where another holds it, or has just removed it. Does nothing where the system, or that of the
+    disk, has no such locks.
+    """
+    if fcntl is None:
+        return lambda: None
+    file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    let_go = weakref.finalize(owner, os.close, file)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not os.path.exists(path) or os.stat(path).st_ino != os.fstat(file).st_ino:
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN), str(path))
+    except BlockingIOError:
+        let_go()
+        raise
+    except OSError:
+        pass
+    return let_go
 
 
 def require_writable(directory: Path) -> None:

@@ -1,4 +1,4 @@
-"""How far images of other programs lie from those of `polsep separate`: exported graphs, and the browser page.
+"""Distances of images of other programs from those of `polsep separate`: exported graphs, and the browser page.
 
 Graphs are written by `polsep export` and run in ONNX Runtime; the page runs in Chromium. All see a part of the demo
 capture with clipped highlights; a mono frame is its cells behind one green filter of each period. Layers are in float32

@@ -27,7 +27,7 @@ from polsep.io.store.calibrations import read_calibration
 from polsep.light.find import find_light
 from polsep.methods import Capture, Method, find_method
 from polsep.physics.stokes import Measurements
-from polsep.sensor.calibration import Calibration, Corrections, falloff_image, mean_mosaic, subtract_ambient
+from polsep.sensor.calibration import Calibration, Corrections, falloff_image, mean_mosaic
 from polsep.sensor.camera import Layout, Mosaic, WrongType
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
@@ -141,10 +141,11 @@ def separate(
     capture, notes = _as_capture(raw, *levels)
     if isinstance(capture, Mosaic):
         corrections = Corrections(measured)
-        capture = corrections.apply(capture)
         if ambient is not None:
             rooms = [corrections.apply(as_mosaic(room, *levels)[0]) for room in _ambient_frames(ambient)]
-            capture = subtract_ambient(capture, mean_mosaic(rooms))
+            corrections = Corrections(measured, mean_mosaic(rooms))
+        capture, more = corrections.apply_noting(capture)
+        notes += more
     elif measured is not None or ambient is not None:
         raise ValueError("expected a raw mosaic to calibrate or to subtract room light from, found four angle images")
     frame = separate_capture(capture, method, light_color, device, full)
@@ -266,8 +267,9 @@ def find_device(name: str) -> str:
             return "cpu"
         if isinstance(error, ImportError):
             raise ValueError(f"device {name!r} needs torch: install polsep[torch]") from None
-        reason = str(error).splitlines()[0][:120]
-        raise ValueError(f"expected a device like auto, cpu or cuda, found {name!r}: {reason}") from None
+        known = name.partition(":")[0] in ("cuda", "mps", "xpu")  # of other words torch lists all that it knows
+        reason = f": {str(error).splitlines()[0].partition('. ')[0]}" if known else ""
+        raise ValueError(f"expected a device like auto, cpu or cuda, found {name!r:.40}{reason}") from None
     return name
 
 
@@ -301,6 +303,11 @@ def is_calibrated(capture: Capture) -> bool:
     return isinstance(capture, Mosaic) and any(gain != 1 for gain in capture.light_color)
 
 
+def is_to_be_found(light_color: LightColor | str) -> bool:
+    """True if a light's colour, of any type, is one of `FOUND_WORDS`."""
+    return isinstance(light_color, str) and light_color in FOUND_WORDS
+
+
 def resolve_light(
     light_color: LightColor | str, capture: Capture
 ) -> tuple[tuple[float, ...], dict[str, Any], tuple[str, ...]]:
@@ -312,7 +319,7 @@ def resolve_light(
     channels = capture.layout.channels if isinstance(capture, Mosaic) else capture.data.shape[-3]
     if isinstance(light_color, str) and light_color not in LIGHT_WORDS:
         raise ValueError(f'expected a light colour of three numbers, "white" or "auto", found {light_color!r}')
-    if light_color in FOUND_WORDS and not is_calibrated(capture):
+    if is_to_be_found(light_color) and not is_calibrated(capture):
         found = find_light(capture)
         return found.color if channels == 3 else (1.0,), {"source": "found", **found.describe()}, found.remarks
     told = light_color

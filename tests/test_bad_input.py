@@ -18,6 +18,7 @@ import pytest
 import tifffile
 
 from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.results.separation_reader import read_separated
 from polsep.io.store.errors import InputError
 from polsep.sensor.camera import Layout
 from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
@@ -255,6 +256,16 @@ def test_missing_files_and_directories(tmp_path: Path, suffix: str) -> None:
     assert_refused(path, RAW if suffix == ".raw" else {}, "found nothing at this path")
     path.mkdir()
     assert_refused(path, {}, "expected a file, found a directory")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".npy", ".npz", ".raw", ".exr"])
+def test_pipes_are_refused_at_once(tmp_path: Path, suffix: str) -> None:
+    """No reader waits for whoever might write into a named pipe."""
+    pipe = tmp_path / f"pipe{suffix}"
+    os.mkfifo(pipe)
+    with pytest.raises(InputError, match="expected a file, found a pipe"):
+        list(read_frames(pipe)) if suffix != ".exr" else read_separated(pipe)
 
 
 def test_unreadable_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

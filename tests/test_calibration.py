@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -363,6 +364,8 @@ def test_commands_measure_and_apply(tmp_path: Path, run_polsep: Cli) -> None:  #
     paper = [save(tmp_path / f"paper{i}.tiff", sensor.expose(sensor.sees(np.full(SIZE, 1.0)))) for i in range(4)]
     shot = save(tmp_path / "shot.tiff", sensor.expose(sensor.sees(np.full(SIZE, 0.7), 0.2, 1.0)))
     room = save(tmp_path / "room.tiff", sensor.expose(sensor.sees(np.full(SIZE, 0.1))))
+    forgotten = run_polsep("calibrate", "dark", *caps, "-o", rig)
+    assert forgotten.status == 2 and "expected --white-level N" in forgotten.err and not rig.exists()
     done = run_polsep("calibrate", "dark", *caps, "--white-level", 4095, "-o", rig)
     assert done.status == 0 and done.out.count("\n") == 1 and "read noise" in done.out
     done = run_polsep("calibrate", "flat", *paper, "-o", rig)
@@ -393,6 +396,19 @@ def test_commands_measure_and_apply(tmp_path: Path, run_polsep: Cli) -> None:  #
             run_polsep(*arguments, "-o", tmp_path / "none") if arguments[0] == "separate" else run_polsep(*arguments)
         )
         assert failed.status == 2 and failed.err.count("\n") == 1 and expected in failed.err, failed
+
+
+def test_an_ambient_frame_with_the_lamp_on_is_said() -> None:
+    """Such a frame leaves hardly any light; one of a dimmer room, or of none, says nothing."""
+    scene = np.random.default_rng(3).integers(500, 3000, SIZE).astype(np.uint16)
+
+    def said(room: NDArray[np.uint16]) -> bool:
+        with warnings.catch_warnings(action="ignore"):
+            out = polsep.separate(scene, "analytic", white_level=4095, ambient=room)
+        return any("was the lamp off in it?" in warning for warning in out.report["warnings"])
+
+    assert said(scene) and said(scene + np.uint16(9))
+    assert not said(scene // 2) and not said(scene // 10) and not said(np.zeros_like(scene))
 
 
 def test_recordings_are_corrected(tmp_path: Path) -> None:

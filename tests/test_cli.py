@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from test_bad_input import FILES
 
 from polsep import cli
+from polsep.cli.app import has_extra, print_note
 from polsep.cli.progress import Progress
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
@@ -588,6 +589,55 @@ def test_bad_output_directories(tmp_path: Path, polsep: Cli, place: str) -> None
     assert_refused(polsep("separate", source, "-o", folders[place]), "expected", "found")
     assert (tmp_path / "taken").read_bytes() == b"precious"
     assert sorted(contents(tmp_path)) == ["a.png", "taken"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "separate a.png -o out/deep",
+        "video frames -o out",
+        "demo -o out",
+        "samples -o out",
+        "merge a.png -o out/m.tiff",
+        "calibrate dark a.png -o out/rig.json",
+        "calibrate dark a.png -o out/deep/rig.json",
+        "shape a.png --mesh none -o out",
+        "export joint-fast -o out/a.onnx",
+        "render --shapes 1 --views 1 -o out",
+        "train joint -o out",
+    ],
+)
+def test_folders_without_permission_are_refused_before_work(
+    tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch, words: str
+) -> None:
+    """In one line, before anything is read, compiled or trained, and with nothing made there."""
+    if missing := {"shape", "export", "render", "train"} & {words.partition(" ")[0]} - set(_usable()):
+        pytest.skip(f"needs what {missing.pop()} needs")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "frames").mkdir()
+    png(tmp_path / "a.png", frame())
+    png(tmp_path / "frames" / "a.png", frame())
+    allowed = os.access
+
+    def refuse_writing(path: Any, mode: int, **more: Any) -> bool:
+        return allowed(path, mode, **more) and not (mode & os.W_OK and Path(path).name == "out")
+
+    monkeypatch.setattr(os, "access", refuse_writing)
+    assert_refused(polsep(*words.split()), "expected a directory to write into", "found one without permission")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def _usable() -> list[str]:
+    """Commands whose extras are installed."""
+    needs = {"export": "export", "render": "render", "train": "train"}
+    return ["shape", *(command for command, extra in needs.items() if has_extra(extra))]
+
+
+def test_notes_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """Also those with a name of several."""
+    print_note("a\nb.png: \x1b[2J")
+    assert capsys.readouterr().err == "polsep: a\\nb.png: \\x1b[2J\n"
 
 
 def test_commands_without_their_files(tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,6 +107,8 @@ def test_the_command_leaves_nothing_to_type(tmp_path: Path, run_polsep: Cli) -> 
         tifffile.imwrite(files[-1], codes, photometric="minisblack", metadata=None, extratags=tags)
     levels = ("--white-level", WHITE, "--black-level", BLACK, "--layout", "0,45,90,135/RGGB")
     out = tmp_path / "merged.tiff"
+    forgotten = run_polsep("merge", *files, "-o", out)
+    assert forgotten.status == 2 and "expected a white level" in forgotten.err and not out.exists()
     done = run_polsep("merge", *files, *levels, "-o", out)
     assert done.status == 0 and "exposure times 0.01, 0.04 (of the files)" in done.out and done.out.count("\n") == 1
     (frame,) = read_frames(out, ReadOptions())
@@ -118,7 +120,10 @@ def test_the_command_leaves_nothing_to_type(tmp_path: Path, run_polsep: Cli) -> 
         (("merge", *files, "-o", out), "--overwrite replaces it"),
         (("merge", *files, "-o", tmp_path / "a.png"), "expected an output that ends in .tiff"),
         (("merge", *files, "-o", tmp_path / "a.tiff", "--times", "1,x"), "expected --times T,T,..."),
-        (("merge", *files, "-o", tmp_path / "a.tiff", "--times", "1,2,3"), "expected 2 positive exposure times"),
+        (
+            ("merge", *files, *levels, "-o", tmp_path / "a.tiff", "--times", "1,2,3"),
+            "expected 2 positive exposure times",
+        ),
         (("merge", tmp_path / "none.tiff", "-o", tmp_path / "a.tiff"), "expected a file, found nothing"),
     ):
         failed = run_polsep(*arguments)

@@ -468,6 +468,21 @@ def test_said_light_color_undoes_the_light(method: str) -> None:
     assert float(np.abs(colored.diffuse - white.diffuse * gain).max()) < 1e-5
 
 
+def test_the_light_color_may_be_an_array() -> None:
+    """A NumPy array of three numbers is a light colour as a tuple is."""
+    raw = raw_frame()
+    told = quietly(raw, method="analytic", light_color=ODD_LIGHT)
+    assert (told.specular == quietly(raw, method="analytic", light_color=np.array(ODD_LIGHT)).specular).all()
+    with pytest.raises(ValueError, match="light colour of three positive numbers"):
+        polsep.separate(raw, light_color=np.ones(4))  # type: ignore[arg-type]
+
+
+def test_a_device_that_is_none_is_refused_in_few_words() -> None:
+    """Without torch's list of all devices that it knows."""
+    with pytest.raises(ValueError, match=r"expected a device like auto, cpu or cuda, found 'gpu'$"):
+        find_device("gpu")
+
+
 def test_mono_ignores_the_light_color() -> None:
     """One channel has no colour: the light's colour changes nothing."""
     mono = Layout(bayer=None)

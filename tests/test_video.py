@@ -13,6 +13,7 @@ import time
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -311,6 +312,28 @@ def test_an_error_of_a_thread_that_writes_ends_the_run(
     assert [path.name for path in (tmp_path / ".polsep-run").glob("0*.json")] == ["000000.json"]
     monkeypatch.setattr(sequences, "write_exr", write_exr)
     assert run(monkeypatch, *command(recording, tmp_path)) == 0
+
+
+def test_a_second_run_into_the_same_files_is_refused(tmp_path: Path) -> None:
+    """While the first is under way, also one that would replace it; not where that was closed or is gone."""
+    black = Picture(np.zeros((4, 4, 3), np.float32), np.zeros((4, 4, 3), np.float32), None, {"frame": 0})
+    for overwrite in (False, True):
+        begin = partial(SequenceWriter, tmp_path, "run", SequenceKind(preview=False), {"colors": 3}, overwrite)
+        first = begin()
+        first.append(0, black)
+        for _ in range(2):
+            with pytest.raises(OutputError, match=r"expected no other run that writes .*run, found one"):
+                begin()
+        first.end_part()
+        first.close()
+        second = begin()
+        assert second.first == (0 if overwrite else PART)
+        del second
+        last = begin()
+        last.append(0, black)
+        last.end_part()
+        last.finish({})
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["run.json", "run.jsonl", "run_000000.exr"]
 
 
 def test_a_recording_goes_on_from_any_frame(recording: Path, tmp_path: Path) -> None:

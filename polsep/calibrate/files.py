@@ -10,9 +10,9 @@ from polsep import __version__
 from polsep.calibrate.exposures import merge_exposures
 from polsep.compute.arrays import to_numpy
 from polsep.io.raw.corrections import read_mosaics
-from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.frames import Frame, ReadOptions, forgets_level, read_frames, refuse_forgotten
 from polsep.io.raw.tiff import write_merged
-from polsep.io.store.atomic import refuse_existing, refuse_inputs
+from polsep.io.store.atomic import refuse_existing, refuse_inputs, require_writable
 from polsep.io.store.calibrations import maps_path, read_calibration, write_calibration
 from polsep.io.store.errors import input_error
 from polsep.sensor.calibration import Calibration, Corrections
@@ -28,13 +28,21 @@ def calibrate_files(paths: Sequence[Path], read: ReadOptions, output: Path, kind
     Other sections of ``output`` stay, and those that come before in `ORDER` correct the frames. Raises ValueError.
     """
     refuse_inputs([output, maps_path(output)], paths)
+    require_writable(output.parent)
     before = read_calibration(output) if output.exists() else None
     if before is not None and read.layout is None:
         read = replace(read, layout=before.layout)
     used = None if before is None else corrections_for(kind, before)
-    found = measure(read_mosaics(paths, replace(read, corrections=used)), before)
+    found = measure(read_mosaics(paths, replace(read, corrections=used), _require_white_level), before)
     written = write_calibration(output, found, __version__)
     return f"{kind}: {describe(found, kind)} -> {', '.join(str(path) for path in written)}"
+
+
+def _require_white_level(path: Path, frame: Frame) -> None:
+    """Raise InputError where nobody said the white level of a frame: the calibration would say it of all others."""
+    if forgets_level(frame):
+        wanted = "--white-level N, which the calibration keeps for all frames, such as 4095 for 12-bit values"
+        raise input_error(path, f"expected {wanted} in 16-bit words, or 65535 for 16-bit ones; found none")
 
 
 def merge_files(
@@ -49,14 +57,17 @@ def merge_files(
     refuse_inputs([output], paths)
     refuse_existing(output.parent, [output], overwrite)
     frames, notes = list[Mosaic](), list[str]()
-    recorded = list[float | None]()
+    recorded, forgotten = list[float | None](), list[tuple[Path, Frame]]()
     for path in paths:
         for frame in read_frames(path, read):
             if not isinstance(frame.data, Mosaic):
                 raise input_error(path, "expected a raw mosaic, found four angle images")
             frames.append(frame.data)
             recorded.append(frame.exposure)
+            forgotten += [(path, frame)] if forgets_level(frame) else []
             notes += [f"{frame.stem}: {note}" for note in frame.notes]
+    if len(forgotten) == len(frames) > 0:  # a short exposure alone may be dark
+        refuse_forgotten(*forgotten[0])
     known = [time for time in recorded if time is not None]
     said = "as stated" if times is not None else "of the files" if len(known) == len(frames) else "found in the frames"
     merged = merge_exposures(frames, known if times is None and len(known) == len(frames) else times)

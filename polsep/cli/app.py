@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from polsep import __version__
-from polsep.io.store.errors import MOST, one_line
+from polsep.io.store.errors import MOST, one_line, printable
 
 if TYPE_CHECKING:
     from polsep.io.raw.frames import ReadOptions
@@ -139,7 +139,7 @@ def app() -> None:
 
 def print_note(line: str) -> None:
     """Print one line for the user on stderr; stdout is for results."""
-    print(f"polsep: {line}", file=sys.stderr)
+    print(f"polsep: {printable(line)}", file=sys.stderr)
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:

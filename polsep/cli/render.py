@@ -47,7 +47,9 @@ def render(output: Path, workers: int | None, engine: str, **options: Any) -> No
         require_extra("ray")
     from polsep.datasets.rendered import RenderOptions, default_workers, render_dataset
     from polsep.io.results.dataset import read_fingerprint
+    from polsep.io.store.atomic import require_writable
 
+    require_writable(output)
     dataset = RenderOptions(**options)
     total = dataset.shapes * dataset.views
     counts = render_dataset(dataset, output, default_workers() if workers is None else workers, engine)

@@ -108,6 +108,9 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     """
     require_extra("train")
     require_paths(*options["start"])
+    from polsep.io.store.atomic import require_writable
+
+    require_writable(output)
     from polsep.train.command import choose_options, plan_run, train_weights
     from polsep.train.constants import read_constant
     from polsep.train.loop import Run, Schedule

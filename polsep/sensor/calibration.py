@@ -32,6 +32,9 @@ from polsep.sensor.defects import MIN_SIZE, repair
 from polsep.sensor.levels import WHITE_LEVELS
 
 Floats = NDArray[np.float32]
+#: A part of the white level from which on a sample is lit, and the part of its light that no ambient light leaves; in
+#: so many lit samples, such a frame is no ambient one: it was taken with the lamp on.
+LIT, LEAST_LEFT, MOST_GONE = 0.02, 0.05, 0.5
 #: Numbers per place of one period of filters, ``[period][period]``.
 Table = tuple[tuple[float, ...], ...]
 
@@ -159,6 +162,20 @@ def subtract_ambient(mosaic: Mosaic, ambient: Mosaic) -> Mosaic:
     data = data - namespace(data).astype(as_floats(other.data) - black, data.dtype, copy=False)
     hidden = (mosaic.clipped() | other.clipped()) & (data < black + (1 - CLIP_MARGIN) * (white - black))
     return replace(mosaic, data=namespace(data).where(hidden, white, data))
+
+
+def ambient_notes(frame: Mosaic, less: Mosaic) -> tuple[str, ...]:
+    """A note where most of a frame's light is gone in the frame ``less`` its ambient light: the lamp was on in both.
+
+    In every fifth sample of every fifth row, which are samples of all filters.
+    """
+    black, white = float(frame.black_level), float(frame.white_level)
+    was, left = (to_numpy(mosaic.data[..., ::5, ::5]) - black for mosaic in (frame, less))
+    lit = was > LIT * (white - black)
+    gone = float(np.mean(left[lit] < LEAST_LEFT * was[lit])) if lit.any() else 0.0
+    if gone < MOST_GONE:
+        return ()
+    return (f"the ambient frame is as bright as this one in {gone:.0%} of what is lit: was the lamp off in it?",)
 
 
 def mean_mosaic(mosaics: list[Mosaic]) -> Mosaic:
@@ -349,3 +366,11 @@ class Corrections:
         if self.calibration is not None:
             mosaic = correct_mosaic(mosaic, self.calibration)
         return mosaic if self.ambient is None else subtract_ambient(mosaic, self.ambient)
+
+    def apply_noting(self, mosaic: Mosaic) -> tuple[Mosaic, tuple[str, ...]]:
+        """`apply`, and notes for the user. Raises ValueError."""
+        calibrated = replace(self, ambient=None).apply(mosaic)
+        if self.ambient is None:
+            return calibrated, ()
+        less = subtract_ambient(calibrated, self.ambient)
+        return less, ambient_notes(calibrated, less)

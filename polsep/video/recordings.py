@@ -33,10 +33,10 @@ from polsep.io.store.errors import InputError
 from polsep.light.find import Light, combine, find_light
 from polsep.methods import Capture, find_method
 from polsep.pipeline import (
-    FOUND_WORDS,
     LightColor,
     find_device,
     is_calibrated,
+    is_to_be_found,
     make_frame,
     move_capture,
     separate_capture,
@@ -237,7 +237,7 @@ def _light_of(recording: FrameSequence, options: VideoOptions) -> tuple[LightCol
 
     None where nothing is to be found: the colour was told, or a calibration says it, or frames are mono.
     """
-    if options.light_color not in FOUND_WORDS:
+    if not is_to_be_found(options.light_color):
         return options.light_color, None
     frames = islice(recording.begin(0), 0, PART, LIGHT_STEP)
     captures = [frame.data for frame in frames if isinstance(frame, Frame)]

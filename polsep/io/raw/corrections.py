@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.frames import Frame, ReadOptions, read_frames
 from polsep.io.raw.sequences import DamagedFrame, open_sequence
 from polsep.io.store.calibrations import read_calibration
 from polsep.io.store.errors import InputError, input_error
 from polsep.sensor.calibration import Corrections, mean_mosaic
 from polsep.sensor.camera import Mosaic
+
+#: Looks at a frame of a file before it is used.
+Check = Callable[[Path, Frame], None]
 
 
 def with_corrections(read: ReadOptions, calibration: Path | None, ambient: Sequence[Path] = ()) -> ReadOptions:
@@ -45,8 +48,11 @@ def _read_corrected(
     return replace(read, corrections=corrections)
 
 
-def read_mosaics(paths: Sequence[Path], read: ReadOptions) -> Iterator[Mosaic]:
-    """All frames of files and folders, one after the other. Raises InputError on what is not a raw mosaic."""
+def read_mosaics(paths: Sequence[Path], read: ReadOptions, check: Check | None = None) -> Iterator[Mosaic]:
+    """All frames of files and folders, one after the other. Raises InputError on what is not a raw mosaic.
+
+    ``check``: is called with the file or folder and the frame before it is used.
+    """
     for path in paths:
         frames = open_sequence(path, read).begin(0) if path.is_dir() else read_frames(path, read)
         for frame in frames:
@@ -54,4 +60,6 @@ def read_mosaics(paths: Sequence[Path], read: ReadOptions) -> Iterator[Mosaic]:
                 raise InputError(frame.reason)
             if not isinstance(frame.data, Mosaic):
                 raise input_error(path, "expected a raw mosaic, found four angle images")
+            if check is not None:
+                check(path, frame)
             yield frame.data

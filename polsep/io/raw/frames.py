@@ -30,7 +30,7 @@ from polsep.io.raw.png import read_png
 from polsep.io.raw.recording import RECORD, read_recording
 from polsep.io.raw.tiff import read_tiff
 from polsep.io.raw.videos import read_video
-from polsep.io.store.errors import InputError, input_error, naming
+from polsep.io.store.errors import InputError, input_error, naming, refuse_pipe
 from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
 from polsep.sensor.calibration import Corrections
@@ -43,6 +43,7 @@ __all__ = [
     "InputError",
     "ReadOptions",
     "decode_frame",
+    "forgets_level",
     "output_stem",
     "read_frames",
     "read_pages",
@@ -180,6 +181,7 @@ def read_pages(path: Path, options: ReadOptions | None = None, first: int = 0) -
     with naming(path):
         if path.is_dir():
             raise ValueError("expected a file, found a directory")
+        refuse_pipe(path)
         suffix = path.suffix.lower()
         if suffix in READERS:
             described = options.size is not None or options.pixel_format is not None
@@ -195,6 +197,11 @@ def read_pages(path: Path, options: ReadOptions | None = None, first: int = 0) -
             with path.open("rb") as stream:
                 found = describe(stream.read(64))
             raise ValueError(f"expected {SUPPORTED}, found extension {path.suffix!r} and {found}")
+
+
+def forgets_level(frame: Frame) -> bool:
+    """True if nobody said the white level of a frame of a file, and it is likely another than assumed."""
+    return any(isinstance(note, ForgottenLevel) for note in frame.notes)
 
 
 def refuse_forgotten(path: str | Path, frame: Frame) -> None:
@@ -234,7 +241,8 @@ def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, t
         return data, notes
     if isinstance(data, Measurements):
         raise ValueError("expected a raw mosaic to calibrate or to subtract room light from, found four angle images")
-    return options.corrections.apply(data), notes
+    data, more = options.corrections.apply_noting(data)
+    return data, notes + more
 
 
 def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:

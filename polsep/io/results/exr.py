@@ -25,7 +25,7 @@ from polsep.compute.compiling import read_only
 from polsep.compute.threads import get_threads, run_over_rows
 from polsep.io.results.exr_header import EXPECTED, Notes, check_exr_header, packed_note
 from polsep.io.results.pixels_kernel import CHUNK, HEAD, LARGEST, ROWS, STORED, fill_rows, pack_chunks
-from polsep.io.store.errors import InputError, naming
+from polsep.io.store.errors import InputError, naming, refuse_pipe
 from polsep.io.store.header_checks import require_signature
 from polsep.io.store.quiet import quiet
 
@@ -58,6 +58,7 @@ def read_exr_layers(path: Path) -> dict[str, NDArray[np.float32]]:
     when pixels are missing), and on too large sizes in the header, before any pixel is read.
     """
     with naming(path):
+        refuse_pipe(path)
         with Path(path).open("rb") as stream:
             require_signature(stream, (_SIGNATURE,), "an OpenEXR")
             data = stream.read()

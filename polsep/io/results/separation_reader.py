@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polsep.io.raw.npy import read_arrays
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.store.errors import InputError, input_error, naming
+from polsep.io.store.errors import InputError, input_error, naming, refuse_pipe
 from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float32]
@@ -60,6 +60,7 @@ def read_separated(path: str | Path) -> SeparatedFrame:
         )
     planes = read_exr_layers(path) if suffix == ".exr" else None
     with naming(path):
+        refuse_pipe(path)
         images = _from_archive(path) if planes is None else _from_layers(planes)
         return _as_frame(images, path.name)
 

@@ -29,7 +29,15 @@ from polsep.io.results.exr import COMPRESSIONS, encode_exr_halves
 from polsep.io.results.films import LOSSLESS, WATCHABLE, Film, FilmKind, join_films
 from polsep.io.results.separation_writer import TOTAL, UNITS, stokes_layers
 from polsep.io.results.sidecars import exr_notes, require_same_settings
-from polsep.io.store.atomic import OutputError, atomic_path, release_cache, replace_bytes, replace_text
+from polsep.io.store.atomic import (
+    OutputError,
+    atomic_path,
+    hold_lock,
+    release_cache,
+    replace_bytes,
+    replace_text,
+    require_writable,
+)
 
 #: Frames per part, about a second; films have a key frame at least as often.
 PART = 25
@@ -41,6 +49,8 @@ LOSSLESS_CODECS = FORMATS[1:3]
 _WRITERS = 3
 #: EXR files after which one of them is on the disk.
 _CACHED = 8
+#: The file by which a run holds its parts.
+LOCK = "lock"
 #: The value of code 65535 in lossless films.
 FILM_WHITE = {"diffuse": 2.0, "specular": 8.0}
 
@@ -97,14 +107,17 @@ class SequenceWriter:
         self._overwrite = overwrite
         self._parts = directory / f".polsep-{stem}"
         self._report = directory / f"{stem}.json"
-        if overwrite:
-            shutil.rmtree(self._parts, ignore_errors=True)
-        elif self._report.exists():
+        require_writable(directory)
+        if not overwrite and self._report.exists():
             raise OutputError(f"expected no {self._report}, found one from before; --overwrite replaces it")
         self._kinds = self._film_kinds()
         if self._kinds:
             load_library()  # fail before the first frame is separated
         self._parts.mkdir(parents=True, exist_ok=True)
+        self._unlock = self._lock()
+        if overwrite:
+            for path in self._parts.iterdir():
+                path.unlink() if path.name != LOCK else None
         begun = self._parts / "run.json"
         if begun.exists():
             require_same_settings(begun, settings, f"{directory / stem}", "; --overwrite begins anew")
@@ -117,6 +130,14 @@ class SequenceWriter:
         self._log: list[dict[str, Any]] = []
         self._pool: ThreadPoolExecutor | None = None
         self._begun: list[Future[None]] = []
+
+    def _lock(self) -> Callable[[], object]:
+        """Hold the parts for this run; return what lets them go. Raises OutputError where another run has them."""
+        try:
+            return hold_lock(self, self._parts / LOCK)
+        except BlockingIOError:
+            found = "found one that is under way"
+            raise OutputError(f"expected no other run that writes {self.directory / self.stem}, {found}") from None
 
     def _film_kinds(self) -> dict[str, FilmKind]:
         """The kinds of the films of a run, by the images they show."""
@@ -214,6 +235,7 @@ class SequenceWriter:
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
+        self._unlock()
 
     def _close_films(self) -> None:
         films, self._films = self._films, {}
@@ -226,6 +248,8 @@ class SequenceWriter:
 
     def finish(self, report: dict[str, Any]) -> list[Path]:
         """Join the films, write report and log, remove the parts; return the files of the run but for single frames."""
+        self._unlock()
+        self._unlock = self._lock()
         written = []
         for image, kind in self._kinds.items():
             target = self.directory / f"{self.stem}_{image}{kind.suffix}"
@@ -242,6 +266,7 @@ class SequenceWriter:
         if self._overwrite:
             self._remove_older_frames()
         shutil.rmtree(self._parts)
+        self._unlock()
         return [*written, log, self._report]
 
     def _remove_older_frames(self) -> None:

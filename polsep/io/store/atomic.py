@@ -13,9 +13,15 @@ import signal
 import tempfile
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 #: Seconds after which a hidden folder of a set is nobody's any more: a set of files is written in far less.
 FORGOTTEN = 3600.0
@@ -81,11 +87,40 @@ def release_cache(file: int | Path) -> None:
             os.posix_fadvise(file, 0, 0, os.POSIX_FADV_DONTNEED)
 
 
-def refuse_existing(directory: Path, targets: Sequence[Path], overwrite: bool) -> None:
-    """Raise OutputError where files would be replaced without ``overwrite``, or a directory at all. Call it first."""
+def hold_lock(owner: object, path: Path) -> Callable[[], object]:
+    """Hold a file, made if missing, until the function returned is called or ``owner`` or its process is gone.
+
+    Raises BlockingIOError where another holds it, or has just removed it. Does nothing where the system, or that of the
+    disk, has no such locks.
+    """
+    if fcntl is None:
+        return lambda: None
+    file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    let_go = weakref.finalize(owner, os.close, file)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not os.path.exists(path) or os.stat(path).st_ino != os.fstat(file).st_ino:
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN), str(path))
+    except BlockingIOError:
+        let_go()
+        raise
+    except OSError:
+        pass
+    return let_go
+
+
+def require_writable(directory: Path) -> None:
+    """Raise OutputError where nothing may be written into a directory, or into the one to make it in. Call it first."""
     nearest = next((d for d in (directory, *directory.parents) if os.path.lexists(d)), None)
     if nearest is not None and not os.path.isdir(nearest):
         raise OutputError(f"expected a directory to write into, found a file: {nearest}")
+    if nearest is not None and not os.access(nearest, os.W_OK | os.X_OK):
+        raise OutputError(f"expected a directory to write into, found one without permission to write: {nearest}")
+
+
+def refuse_existing(directory: Path, targets: Sequence[Path], overwrite: bool) -> None:
+    """Raise OutputError where files would be replaced without ``overwrite``, or none can be written. Call it first."""
+    require_writable(directory)
     for target in targets:
         if os.path.isdir(target) and not os.path.islink(target):
             raise OutputError(f"expected a file or nothing at {target}, found a directory")

@@ -6,6 +6,8 @@ that knows the path wraps them, once, in `naming`. Libraries quote what they rea
 
 from __future__ import annotations
 
+import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,17 +29,17 @@ def one_line(text: object, most: int = MOST) -> str:
     whole = str(text)
     if len(whole) > 8 * most:  # so that huge texts cost nothing; what is cut here would be cut below
         whole = whole[: 4 * most] + _CUT + whole[-4 * most :]
-    return _shortened(_escaped(" ".join(whole.split())), most)
+    return _shortened(printable(" ".join(whole.split())), most)
 
 
 def input_error(path: str | Path, reason: object) -> InputError:
     """An `InputError` with the file in front: ``shot.png: expected ..., found ...``, always one line."""
-    name = _shortened(_escaped(str(path)), MOST_OF_NAME)
+    name = _shortened(printable(str(path)), MOST_OF_NAME)
     return InputError(f"{name}: {one_line(reason, MOST - len(name) - 2)}")
 
 
-def _escaped(text: str) -> str:
-    """Unprintable characters as ``\\x1b``."""
+def printable(text: str) -> str:
+    """One line: unprintable characters, such as line ends in names of files, as ``\\x1b``."""
     return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
@@ -46,6 +48,16 @@ def _shortened(text: str, most: int) -> str:
         return text
     end = (most - len(_CUT)) // 2
     return text[: most - len(_CUT) - end] + _CUT + text[-end:]
+
+
+def refuse_pipe(path: str | Path) -> None:
+    """Raise ValueError on a pipe or socket: it cannot be rewound, and its writer might be waited for in vain."""
+    try:
+        mode = os.stat(path).st_mode
+    except OSError:  # left to whoever opens it
+        return
+    if stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode):
+        raise ValueError("expected a file, found a pipe: save what comes through it first")
 
 
 @contextmanager

@@ -664,7 +664,9 @@ def test_full_disk_leaves_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "o").exists()
 
 
-@pytest.mark.parametrize(("sent", "said"), [(signal.SIGINT, "polsep: stopped"), (signal.SIGTERM, "")])
+@pytest.mark.parametrize(
+    ("sent", "said"), [(signal.SIGINT, "polsep: stopped"), (signal.SIGTERM, ""), (signal.SIGHUP, "")]
+)
 def test_interrupt_leaves_whole_frames_only(tmp_path: Path, sent: signal.Signals, said: str) -> None:
     """Ctrl-C or a system's end in the middle of many frames: every frame's files are all there or all absent."""
     np.save(tmp_path / "run.npy", np.stack([frame(size=64)] * 400))

@@ -147,13 +147,16 @@ def test_what_cannot_be_is_said_in_a_line(
 
 
 def test_files_that_do_not_fit_are_named(polsep: Cli, separated: list[Path], tmp_path: Path) -> None:
-    """Another size, a damaged file, a mask of another size, an input in the place of an output."""
+    """Another size, a damaged file, one picture twice, a mask of another size, an input in the place of an output."""
     small = tmp_path / "small.png"
     small.write_bytes(encode_png(np.full((8, 8), 255, np.uint8)))
     damaged = tmp_path / "damaged.exr"
     damaged.write_bytes(separated[0].read_bytes()[:200])
     out = ["-o", tmp_path / "out"]
     assert_refused(polsep(*separated[:5], damaged, *out), "damaged.exr")
+    again = tmp_path / "again.exr"
+    again.write_bytes(separated[1].read_bytes())
+    assert_refused(polsep(*separated[:5], again, *out), "again.exr", "under different lights", separated[1].name)
     assert_refused(polsep(*separated, "--mask", small, *out), "small.png", "[40, 40]")
     assert_refused(polsep(*separated, "-o", tmp_path / "in", "--name", "light0", "--overwrite"), "is an input")
     assert_refused(polsep(*out), "6 files")

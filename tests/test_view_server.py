@@ -6,6 +6,7 @@ import http.client
 import importlib.util
 import json
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -252,9 +253,10 @@ def test_the_pinned_gradio_was_checked() -> None:
 
 
 @needs_gradio
-def test_temporary_files_go_with_the_program(tmp_path: Path) -> None:
-    """What was uploaded and never opened is gone after the end."""
-    with running(tmp_path / "t", "--method", "analytic") as address:
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGHUP])
+def test_temporary_files_go_with_the_program(tmp_path: Path, ending: signal.Signals) -> None:
+    """What was uploaded and never opened is gone after the end, also where the terminal is closed."""
+    with running(tmp_path / "t", "--method", "analytic", ending=ending) as address:
         body = b'--x\r\nContent-Disposition: form-data; name="files"; filename="a.png"\r\n\r\nabc\r\n--x--\r\n'
         status, said = ask(address, "POST", "/gradio_api/upload", body, content_type="multipart/form-data; boundary=x")
         assert status == 200 and Path(json.loads(said)[0]).exists()

@@ -14,7 +14,7 @@ from pathlib import Path
 
 
 @contextmanager
-def running(folder: Path, *options: str) -> Iterator[str]:
+def running(folder: Path, *options: str, ending: signal.Signals = signal.SIGTERM) -> Iterator[str]:
     """The address of a viewer whose temporary files lie below ``folder``; ended as a terminal or a system ends it."""
     folder.mkdir(exist_ok=True)
     environment = {**os.environ, "TMPDIR": str(folder), "PYTHONWARNINGS": "ignore"}
@@ -24,7 +24,7 @@ def running(folder: Path, *options: str) -> Iterator[str]:
         try:
             yield _address(process, said)
         finally:
-            process.send_signal(signal.SIGTERM)
+            process.send_signal(ending)
             process.wait(120)
 
 

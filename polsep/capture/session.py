@@ -132,7 +132,7 @@ class Session:
     def run(self, report: Callable[[Status], None], every_s: float = 0.5) -> Status:
         """Capture until the limits, the end of the source or `stop`; ``report`` receives the status regularly.
 
-        Ctrl-C and SIGTERM call `stop`; the second one ends the program. Raises CameraError if the camera is missing or
+        Ctrl-C, SIGTERM and SIGHUP call `stop`; the second one ends. Raises CameraError if the camera is missing or
         does not come back, OutputError if the disk is full, ValueError if the method does not fit the frames. The
         recording up to then is complete.
         """
@@ -367,11 +367,12 @@ class Session:
 
 @contextmanager
 def _stopping(stop: Callable[[], None]) -> Iterator[None]:
-    """Call ``stop`` on Ctrl-C and SIGTERM inside the block; a second signal has its usual effect."""
+    """Call ``stop`` on Ctrl-C, SIGTERM or where the terminal is closed; a second signal has its usual effect."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {number: handler for number in numbers if (handler := signal.getsignal(number)) is not signal.SIG_IGN}
 
     def caught(number: int, frame: FrameType | None) -> None:
         del frame

@@ -1,7 +1,7 @@
 """The group of commands, the options that several commands share, and how failures are reported.
 
 Exit status: 0 only when everything asked for was written; 2 after bad input, with one line per failure on stderr;
-130 after Ctrl-C, 143 after SIGTERM.
+130 after Ctrl-C, 143 after SIGTERM, 129 where the terminal was closed.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ else:
     _ParamType = click.ParamType  # generic from click 8.4 on
 
 SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True, "max_content_width": 100}
+
+#: Signals that ask the program to end, Ctrl-C apart: by the system, and where the terminal is closed (not on Windows).
+ENDINGS = ("SIGTERM", "SIGHUP")
 
 DIR = click.Path(path_type=Path)
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -252,7 +255,10 @@ def require_paths(*paths: str | Path) -> None:
 
 def main() -> None:
     """Run the program: bad input is one line on stderr and exit status 2."""
-    signal.signal(signal.SIGTERM, _exit_on_signal)
+    for name in ENDINGS:
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # as by nohup
+            signal.signal(number, _exit_on_signal)
     try:
         app(standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -276,5 +282,5 @@ def main() -> None:
 
 
 def _exit_on_signal(number: int, frame: FrameType | None) -> NoReturn:
-    """Exit on SIGTERM as on Ctrl-C, so that temporary files are removed."""
+    """Exit on one of `ENDINGS` as on Ctrl-C, so that temporary files are removed."""
     sys.exit(128 + number)

@@ -125,6 +125,10 @@ def _require_one_shape(paths: Sequence[Path], images: Sequence[NDArray[Any]]) ->
             raise input_error(path, f"expected {list(images[0].shape)} as {paths[0]} has, found {list(image.shape)}")
         if not np.isfinite(image).all():
             raise input_error(path, "expected finite light, found NaN or infinite samples")
+    for k, path in enumerate(paths):
+        same = [other for other, image in zip(paths, images[:k], strict=False) if np.array_equal(image, images[k])]
+        if same:
+            raise input_error(path, f"expected pictures under different lights, found that of {same[0]} again")
 
 
 def shrink(views: Views, mask: Mask, longest: int) -> tuple[Views, Mask]:

@@ -162,8 +162,9 @@ def write_set(targets: Sequence[Path], name: str, write: Callable[[Path], None])
 
 @contextmanager
 def _delayed_signals() -> Iterator[None]:
-    """Ctrl-C and the system's request to end take effect after the block, so that they do not interrupt its cleanup."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    """Ctrl-C, a closed terminal and the system's request to end wait for the end of the block and its cleanup."""
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in numbers}
     if threading.current_thread() is not threading.main_thread() or None in before.values():  # no signal arrives here
         yield
         return

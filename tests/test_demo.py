@@ -54,7 +54,9 @@ def test_demo_works_offline(
         files = {p.name for p in (tmp_path / "o" / method).iterdir()}
         assert files == {"still_life.exr", "still_life.png", "still_life.json"}
         assert str(tmp_path / "o" / method / "still_life.png") in said.out
-        match = re.search(rf"{method}; .*polarizer at (\d+) deg.*The lamp.s polarizer is at (\d+) deg", said.out, re.DOTALL)
+        match = re.search(
+            rf"{method}; .*polarizer at (\d+) deg.*The lamp.s polarizer is at (\d+) deg", said.out, re.DOTALL
+        )
         assert match is not None
     assert "Compare " in said.out
 

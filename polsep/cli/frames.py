@@ -146,6 +146,7 @@ def _report(outcome: Outcome) -> int:
 @click.option("-o", "--output", type=FILE, required=True, metavar="FILE.onnx")
 @click.option("--mono", is_flag=True, help="For cameras without colour filters.")
 @click.option("--full", is_flag=True, help="Images of the mosaic's own resolution.")
+@click.option("--no-fill", is_flag=True, help="No loops: nothing fills diffuse light under clipped highlights.")
 @click.option(
     "--weights", type=click.Path(path_type=Path), metavar="FILE", help="Weights of 'polsep train'.  [default: shipped]"
 )
@@ -156,8 +157,8 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     METHOD is joint, joint-fast or joint-large (both of its networks). The file runs in onnxruntime and similar programs
     without polsep. Frames [N, H, W] are in Sony's order with sides that are multiples of 4; black_level and white_level
     are in their units; light_color is camera RGB of the light, 1, 1, 1 if it is white (graphs for mono have none).
-    Images equal those of 'polsep separate' with layers in float32 (POLSEP_LAYERS=f32), where that finds no defects,
-    metals or holes to fill. Needs the extra export.
+    Images equal those of 'polsep separate' with layers in float32 (POLSEP_LAYERS=f32), where that finds no defects and
+    no metals. Needs the extra export.
     """
     require_extra("export")
     if weights is not None:
@@ -177,7 +178,8 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
         from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork, describe_graph
         from polsep.networks.joint import Joint
 
-        graph = ExportedNetwork([Joint.of(network, torch.device("cpu")) for network in networks], options["full"])
+        members = [Joint.of(network, torch.device("cpu")) for network in networks]
+        graph = ExportedNetwork(members, options["full"], not options["no_fill"])
         metadata |= describe_graph(method, layout, options["full"], polsep.__version__)
         for number, step in enumerate(write_onnx(output, graph, OUTPUT_NAMES, metadata), 1):
             progress.update(0, None, f"exporting {method}, step {number} of {len(STEPS)}: {step}")

@@ -2,9 +2,9 @@
 
 A graph is what the method makes of a frame: levels, clip mask and colour of the light, demosaicking and closed form,
 layers in float32, all networks of the method weighed by their expected errors, the four shifts of mono networks that
-average them: the twin of `run.run_joint` and, in float32, of `engines.run_engine`. Around it, `pipeline.separate`
-repairs defects, finds black level and light, and moves what metals, bodies and weak polarizers leave in the diffuse
-image; graphs do none of that. `io.store.onnx` writes them to files.
+average them: the twin of `run.run_joint` and, in float32, of `engines.run_engine`; then diffuse light under clipped
+highlights is filled. Around it, `pipeline.separate` repairs defects, finds black level and light, and moves what
+metals, bodies and weak polarizers leave in the diffuse image; graphs do none of that. `io.store.onnx` writes them.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from polsep.networks.channels import PERIOD
+from polsep.networks.fill import fill_holes
 from polsep.networks.joint import Joint
 from polsep.networks.run import cells_near_clipping, combine, repeat, run_images
 from polsep.physics.stokes import Stokes
@@ -53,12 +54,12 @@ class ExportedNetwork(nn.Module):
     ``black_level [1]``, ``white_level [1]`` in the units of the samples; ``light_color [3]``, of colour networks alone:
     camera RGB of the light. ``diffuse``, ``specular [N, h, w, C]`` in that light, not negative; ``error [N, H/2, W/2,
     2]``: expected standard deviation of the error of both at half resolution; ``valid [N, h, w]``. h = H / 2, or H with
-    ``full``.
+    ``full``. ``fill``: diffuse light under clipped highlights is filled, which takes two loops.
     """
 
-    def __init__(self, networks: Sequence[Joint], full: bool) -> None:
+    def __init__(self, networks: Sequence[Joint], full: bool, fill: bool = True) -> None:
         super().__init__()
-        self.members, self.full, self.colors = nn.ModuleList(networks), full, networks[0].colors
+        self.members, self.full, self.fill, self.colors = nn.ModuleList(networks), full, fill, networks[0].colors
         filters = [networks[0].layout.filter_at(k // PERIOD, k % PERIOD) for k in range(PERIOD**2)]
         #: The colour of each sample of a period.
         self.channels = [min(filter.channel, self.colors - 1) for filter in filters]
@@ -76,11 +77,17 @@ class ExportedNetwork(nn.Module):
         for network in self.members:
             assert isinstance(network, Joint)
             found += (self._run_shifted if network.averages_shifts else self._run)(network, samples, clipped)
-        whole, color = combine(found), light.view(1, -1, 1, 1)
+        whole = combine(found)
         assert whole.expected_error is not None
-        error = whole.expected_error[..., :: self._scale, :: self._scale] * light.mean()
-        images = (whole.diffuse * color, whole.specular * color, error)
-        return (*(image.permute(0, 2, 3, 1) for image in images), whole.valid)
+        diffuse, specular, error = (
+            x.permute(0, 2, 3, 1) for x in (whole.diffuse, whole.specular, whole.expected_error)
+        )
+        if self.fill:
+            cells = [self.channels[k] for k in (0, 2, 2 * PERIOD, 2 * PERIOD + 2)]
+            diffuse, own = fill_holes((diffuse, error[..., 0]), samples, clipped, cells, self._scale)
+            error = torch.stack([own, error[..., 1]], -1)
+        error = error[:, :: self._scale, :: self._scale] * light.mean()
+        return diffuse * light, specular * light, error, whole.valid
 
     @property
     def _scale(self) -> int:

@@ -26,16 +26,17 @@ STEPS = ("tracing", "translating", "simplifying", "writing")
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence torch's remarks about its own parts, such as a library that is not needed here."""
-    log = logging.getLogger("torch.onnx")
-    before = log.level
-    log.setLevel(logging.ERROR)
+    """Silence exporters' remarks about their own parts, such as a library that is not needed here."""
+    before = {log: log.level for log in (logging.getLogger("torch.onnx"), logging.getLogger("onnx_ir"))}
+    for log in before:
+        log.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        log.setLevel(before)
+        for log, level in before.items():
+            log.setLevel(level)
 
 
 def write_onnx(path: Path, network: nn.Module, outputs: tuple[str, ...], metadata: dict[str, str]) -> Iterator[str]:

@@ -2,7 +2,8 @@
 
 Graphs are written by `polsep export` and run in ONNX Runtime; the page runs in Chromium. All see a part of the demo
 capture with clipped highlights; a mono frame is its cells behind one green filter of each period. Layers are in float32
-on both sides. Differences are in units of white, over every pixel and both images.
+on both sides. Differences are in units of white, over every pixel and both images. Graphs repair nothing, so what polsep
+takes for defects, single bright rays of the rendering, is repaired before.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ from evaluation.install import run_program
 from evaluation.web import opened, served_page
 from polsep.bench.rows import Row
 from polsep.io.results.exr import read_exr_layers
+from polsep.sensor.camera import Layout
+from polsep.sensor.checks import check_mosaic
+from polsep.sensor.levels import as_mosaic
 from tools.web_page import DEMO, fetch, send
 
 Floats = NDArray[np.float32]
@@ -87,7 +91,8 @@ def _compare_graph(method: str, layout: str, full: bool, path: Path) -> Iterator
 
 def _part(layout: str) -> NDArray[np.uint16]:
     """The raw frame of a layout."""
-    raw: NDArray[np.uint16] = np.ascontiguousarray(imagecodecs.imread(DEMO)[PART])
+    capture = as_mosaic(np.ascontiguousarray(imagecodecs.imread(DEMO)[PART]), Layout(), 0, WHITE)[0]
+    raw: NDArray[np.uint16] = np.rint(check_mosaic(capture).mosaic.data.clip(0, WHITE)).astype(np.uint16)
     if layout == "color":
         return raw
     height, width = raw.shape

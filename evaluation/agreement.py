@@ -2,8 +2,8 @@
 
 Graphs are written by `polsep export` and run in ONNX Runtime; the page runs in Chromium. All see a part of the demo
 capture with clipped highlights; a mono frame is its cells behind one green filter of each period. Layers are in float32
-on both sides. Differences are in units of white, over every pixel and both images. Graphs repair nothing, so what polsep
-takes for defects, single bright rays of the rendering, is repaired before.
+on both sides. Differences are in units of white, over every pixel and both images. Graphs repair nothing, so what
+polsep takes for defects, single bright rays of the rendering, is repaired before.
 """
 
 from __future__ import annotations

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_device
 from polsep.demosaic.measured_stokes import measured_stokes
+from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration
 from polsep.light.find import find_light
 from polsep.methods import Capture, Method, find_method
@@ -97,8 +98,11 @@ class Result(SeparatedFrame):
         stem = target.stem if target.suffix.lower() in _ENDINGS else target.name
         if target.suffix and stem == target.name:
             raise ValueError(f"expected a file name that ends in {', '.join(_ENDINGS)}, found {target.name!r:.80}")
-        frame = self.with_stokes() if stokes else self
-        return write_separation(frame, target.parent, stem, _ENDINGS.get(target.suffix.lower(), "exr"), overwrite)
+        frame, kind = self.with_stokes() if stokes else self, _ENDINGS.get(target.suffix.lower(), "exr")
+        try:
+            return write_separation(frame, target.parent, stem, kind, overwrite)
+        except OutputError as error:
+            raise OutputError(str(error).replace("--overwrite replaces", "overwrite=True replaces")) from None
 
     def show(self) -> Picture:
         """Show the preview in the system's picture viewer and return it, which notebooks display instead."""

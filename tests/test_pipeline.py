@@ -414,7 +414,7 @@ def test_results_are_saved(tmp_path: Path, name: str) -> None:
     out = quietly(raw_frame(), method="analytic")
     written = out.save(tmp_path / "new" / name)
     assert {path.name for path in written} >= {"shot.png", "shot.json"} and all(path.is_file() for path in written)
-    with pytest.raises(ValueError, match="found one from before"):
+    with pytest.raises(ValueError, match="found one from before; overwrite=True replaces it"):
         out.save(tmp_path / "new" / name)
     assert out.save(tmp_path / "new" / name, overwrite=True) == written
     if name.endswith(("exr", "npz")):

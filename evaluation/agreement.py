@@ -91,13 +91,14 @@ def _compare_graph(method: str, layout: str, full: bool, path: Path) -> Iterator
 
 def _part(layout: str) -> NDArray[np.uint16]:
     """The raw frame of a layout."""
-    capture = as_mosaic(np.ascontiguousarray(imagecodecs.imread(DEMO)[PART]), Layout(), 0, WHITE)[0]
-    raw: NDArray[np.uint16] = np.rint(check_mosaic(capture).mosaic.data.clip(0, WHITE)).astype(np.uint16)
-    if layout == "color":
-        return raw
-    height, width = raw.shape
-    cells = raw.reshape(height // 4, 2, 2, width // 4, 2, 2)[:, 0, :, :, 1]
-    return np.ascontiguousarray(cells.reshape(height // 2, width // 2))
+    raw = np.ascontiguousarray(imagecodecs.imread(DEMO)[PART])
+    if layout == "mono":
+        height, width = raw.shape
+        cells = raw.reshape(height // 4, 2, 2, width // 4, 2, 2)[:, 0, :, :, 1]
+        raw = np.ascontiguousarray(cells.reshape(height // 2, width // 2))
+    repaired = check_mosaic(as_mosaic(raw, Layout.parse(layout), 0, WHITE)[0]).mosaic.data
+    codes: NDArray[np.uint16] = np.rint(repaired.clip(0, WHITE)).astype(np.uint16)
+    return codes
 
 
 def _separate(raw: NDArray[np.uint16], method: str, layout: str, full: bool) -> polsep.SeparatedFrame:

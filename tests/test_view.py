@@ -441,12 +441,14 @@ def test_a_result_that_nobody_waits_for_is_dropped(sessions: Sessions) -> None:
     begun.wait(60)
     assert first.describe().startswith("Separating") and second.describe() == "Waiting, 1 before this one"
     page.edit(Recipe((Metallic(amount=0.5),)))
+    line.leave("a", by_user=True)
     line.leave("a")
-    assert first.future.cancelled()
+    assert first.future.cancelled() and first.by_user
     go_on.set()
     assert second.future.result(60) == "done" and page.opened is found
     again, later = line.join("c", lambda ticket: 1), line.join("c", lambda ticket: 2)
     assert later.future.result(60) == 2 and (again.future.cancelled() or again.future.result() == 1)
+    assert not again.by_user
     failed = line.join("d", lambda ticket: 1 // 0)
     with pytest.raises(ZeroDivisionError):
         failed.future.result(60)

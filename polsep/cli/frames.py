@@ -170,7 +170,7 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     refuse_existing(output.parent, [output], options["overwrite"])
     layout = Layout(bayer=None) if options["mono"] else Layout()
     networks, metadata = find_joint(method, layout, weights)
-    print_note(f"exporting {method}, which takes a minute or a few")
+    print_note(f"exporting {method}, which takes minutes")
     with show_progress(f"exporting {method}") as progress:
         import torch
 

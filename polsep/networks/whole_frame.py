@@ -10,11 +10,12 @@ The small network also predicts `thumbnails.LIGHT` with a variance; training sup
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, conv2d
+from torch.nn.functional import conv2d
 
 from polsep.networks.thumbnails import COMMON, LIGHT, SIDE, WIDTHS, scale_thumbnail, thumbnail_channels
 from polsep.sensor.camera import Layout
@@ -43,10 +44,38 @@ def make_thumbnail(planes: Tensor, masks: Tensor, layout: Layout) -> Tensor:
     stokes = conv2d(planes, analysis_weights(layout).to(planes))
     s0, s1, s2 = stokes.chunk(3, dim=1)
     polarized = torch.sqrt(s1 * s1 + s2 * s2)
-    means = adaptive_avg_pool2d(torch.cat([stokes, masks.mean(dim=1, keepdim=True)], dim=1), SIDE)
-    largest = adaptive_max_pool2d(torch.cat([s0, polarized], dim=1), SIDE)
+    means = _pool(torch.cat([stokes, masks.mean(dim=1, keepdim=True)], dim=1), _mean_of_parts)
+    largest = _pool(torch.cat([s0, polarized], dim=1), _largest_of_parts)
     thumbnail: Tensor = scale_thumbnail(means[:, :-1], largest, means[:, -1:])
     return thumbnail
+
+
+def _pool(image: Tensor, pool: Callable[[Tensor], Tensor]) -> Tensor:
+    """Images ``[N, K, h, w]`` to ``[N, K, SIDE, SIDE]``; ``pool``: the last axis to `SIDE` parts.
+
+    As torch's adaptive pooling, which its exporter to ONNX writes for no frame of any size.
+    """
+    return pool(pool(image).mT).mT
+
+
+def _parts(length: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """First place of each of `SIDE` parts of an axis, and the place after its last; parts meet or overlap by one."""
+    number = torch.arange(SIDE, device=device)
+    return number * length // SIDE, ((number + 1) * length + SIDE - 1) // SIDE
+
+
+def _mean_of_parts(image: Tensor) -> Tensor:
+    first, end = _parts(image.shape[-1], image.device)
+    place = torch.arange(image.shape[-1], device=image.device)[:, None]
+    return image @ (((place >= first) & (place < end)).to(image) / (end - first))
+
+
+def _largest_of_parts(image: Tensor) -> Tensor:
+    first, end = _parts(image.shape[-1], image.device)
+    longest = (image.shape[-1] + SIDE - 1) // SIDE + 1
+    places = torch.minimum(first[:, None] + torch.arange(longest, device=image.device), end[:, None] - 1)
+    parts = image.index_select(-1, places.flatten()).reshape(*image.shape[:-1], SIDE, -1)
+    return parts.amax(dim=-1)
 
 
 class WholeFrame(nn.Module):

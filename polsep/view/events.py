@@ -129,12 +129,11 @@ class Events:
             while not (await asyncio.wait({task}, timeout=WORD_S))[0]:
                 words = f'<span role="status">{ticket.describe()}</span>'
                 yield {parts.progress: words, parts.cancel: gr.update(visible=True)}
-            if task.cancelled():
-                yield self._kept()
-            else:
-                yield await asyncio.to_thread(self._show, session, task.result())
-        except Superseded:
-            yield self._kept()
+            if task.cancelled() or not ticket.wanted:
+                raise Superseded
+            yield await asyncio.to_thread(self._show, session, task.result())
+        except Superseded:  # said here too: words on their way to the page would replace what `cancel` says
+            yield self._cancelled(session) if ticket.by_user else self._kept()
         except FAILURES as error:
             yield self._failed(error, session)
         finally:
@@ -142,8 +141,10 @@ class Events:
 
     def cancel(self, request: gr.Request) -> Updates:
         """Leave the line, or drop what is being separated."""
-        self.sessions.line.leave(_key(request))
-        session = self._session(request)
+        self.sessions.line.leave(_key(request), by_user=True)
+        return self._cancelled(self._session(request))
+
+    def _cancelled(self, session: Session) -> Updates:
         kept = "" if session.opened is None else ": the picture is as before"
         return {**self._idle(), self.components.progress: f'<span role="status">Cancelled{kept}</span>'}
 

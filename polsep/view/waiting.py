@@ -10,15 +10,16 @@ from typing import Any
 
 
 class Ticket:
-    """A job of a page. State: when it began, and whether its result is still wanted."""
+    """A job of a page. State: when it began, whether its result is still wanted, and whether the user cancelled it."""
 
     def __init__(self, line: Line, key: str, about: object = None) -> None:
         self._line, self.key, self.about = line, key, about
         self.future: Future[Any] = Future()
-        self.wanted, self.begun_s = True, 0.0
+        self.wanted, self.by_user, self.begun_s = True, False, 0.0
 
-    def cancel(self) -> None:
+    def cancel(self, by_user: bool = False) -> None:
         """Leave the line. A job that has begun runs to its end, but nobody gets its result."""
+        self.by_user = self.by_user or (by_user and self.wanted)
         self.wanted = False
         self.future.cancel()
 
@@ -52,12 +53,12 @@ class Line:
         self._pool.submit(self._run, ticket, work)
         return ticket
 
-    def leave(self, key: str) -> None:
+    def leave(self, key: str, by_user: bool = False) -> None:
         """Cancel the job of a page, if there is one."""
         with self._lock:
             found = [ticket for ticket in self._tickets if ticket.key == key]
         for ticket in found:
-            ticket.cancel()
+            ticket.cancel(by_user)
 
     def before(self, ticket: Ticket) -> int:
         """Number of jobs that come first: those that are wanted, and the one that runs."""

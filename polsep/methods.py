@@ -15,12 +15,13 @@ from typing import Protocol
 
 import numpy as np
 
+from polsep.compute import pages
 from polsep.compute.arrays import namespace, on_cpu, to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import MIN_CELLS, demosaic_guided, demosaic_guided_half
 from polsep.io.store.weights import is_shipped
-from polsep.networks.engines import combine_images, run_engine
+from polsep.networks.engines import ENGINES, combine_images, run_engine
 from polsep.physics.stokes import Measurements, behind_angles, fit_stokes, is_pair
 from polsep.sensor.camera import Layout, Mosaic, WrongType, sample_fine_mosaic
 from polsep.separation import analytic_kernel, color_affine_kernel
@@ -292,3 +293,9 @@ def check_method(name: str) -> None:
         raise WrongType(f"expected the name of a method, found {type(name).__name__}")
     if name not in _CHOICES and name not in METHODS:
         raise ValueError(f"expected a method of {', '.join([*_CHOICES, *METHODS])}, found {name!r}")
+
+
+def release_memory() -> None:
+    """Give back the memory that methods on the CPU keep for the next frame: call it after the last one."""
+    ENGINES.clear()
+    pages.release()

@@ -308,9 +308,9 @@ def test_huge_frames_are_separated_in_strips(
     """The same as whole ones, by engines for two heights at most; also where the height is no multiple of strips."""
     mosaic = random_frame(1452, 36, layout)
     whole = run_engine(WEIGHTS[mosaic.layout.channels], mosaic, full)
-    monkeypatch.setattr(strips, "MAX_PIXELS", 36 * 720)
+    monkeypatch.setattr(strips, "MAX_PIXELS", 36 * 720 * (1 + full))
     network = NETS[mosaic.layout.channels]
-    heights = {bottom - top for (top, bottom), _ in engines._strips((1452, 36), network.size)}
+    heights = {bottom - top for (top, bottom), _ in engines._strips((1452, 36), network.size, full)}
     assert len(heights) == 2 and max(heights) <= 720 + PERIOD * network.size.grid
     parts = run_engine(WEIGHTS[mosaic.layout.channels], mosaic, full)
     assert whole is not None and parts is not None

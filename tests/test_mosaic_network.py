@@ -138,8 +138,8 @@ def test_mono_cells_of_other_frames_are_their_own() -> None:
 def test_strips_are_the_whole_frame(layout: Layout, full: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     network, mosaic = random_network(layout), random_mosaic(layout, 720, 36)
     whole = run_joint(network, mosaic, full)
-    monkeypatch.setattr(strips, "MAX_PIXELS", 36 * 600)
-    assert len(list(cut_rows((720, 36), network.size))) > 5
+    monkeypatch.setattr(strips, "MAX_PIXELS", 36 * 600 * (1 + full))
+    assert len(list(cut_rows((720, 36), network.size, full))) > 5
     parts = run_joint(network, mosaic, full)
     assert torch.equal(parts.valid, whole.valid)
     for name in ("diffuse", "specular", "expected_error"):

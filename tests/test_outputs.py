@@ -9,8 +9,9 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -342,7 +343,7 @@ def test_writing_twice_gives_the_same_bytes_and_needs_overwrite(tmp_path: Path) 
 
 def test_an_existing_output_is_refused_by_name_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "shot.png").write_text("a picture of mine")
-    monkeypatch.setattr(separation_writer, "_encode_exr", lambda frame: pytest.fail("worked before looking"))
+    monkeypatch.setattr(separation_writer, "_write_exr", lambda frame, stream: pytest.fail("worked before looking"))
     with pytest.raises(OutputError, match=r"shot\.png.*--overwrite"):
         write_separation(random_frame(), tmp_path, "shot")
     assert contents(tmp_path) == {"shot.png": b"a picture of mine"}
@@ -536,8 +537,15 @@ def run_interrupted(folder: Path, *more: str) -> subprocess.CompletedProcess[str
 
 
 def test_a_short_write_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = Path.write_bytes
-    monkeypatch.setattr(Path, "write_bytes", lambda path, data: real(path, data[:-1]))
+    real = Path.open
+
+    @contextmanager
+    def losing(path: Path, mode: str) -> Iterator[Any]:
+        with real(path, mode) as stream:
+            yield stream
+        os.truncate(path, path.stat().st_size - 1)
+
+    monkeypatch.setattr(Path, "open", losing)
     with pytest.raises(OutputError, match=r"expected \d+ bytes, found \d+: .*shot\.exr"):
         write_separation(random_frame(), tmp_path, "shot")
     assert list(tmp_path.iterdir()) == []

@@ -48,3 +48,8 @@ def empty(shape: tuple[int, ...], dtype: type[Kind]) -> NDArray[Kind]:
     except LookupError:
         memory = np.empty(size, np.uint8)
     return np.asarray(_Lease(memory)).view(dtype).reshape(shape)
+
+
+def release() -> None:
+    """Give the memory that waits back to the system."""
+    _WAITING.clear()

@@ -24,8 +24,9 @@ from polsep.demosaic.bilinear import mean_cells
 from polsep.networks import details_kernel, images_kernel
 from polsep.networks.channels import PERIOD
 from polsep.networks.graphs import require_own_threads
+from polsep.networks.images_kernel import Targets
 from polsep.networks.joint_weights import JointWeights
-from polsep.networks.openvino_engine import OpenVinoEngine, asked_precision, modulation_of
+from polsep.networks.openvino_engine import OpenVinoEngine, RawRows, as_images, asked_precision, modulation_of
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of, own_order
 from polsep.sensor.camera import Mosaic
@@ -34,6 +35,8 @@ from polsep.separation.images import FrameImages
 
 #: Engines that are kept at least, each with the memory that its frames need.
 KEPT = 2
+#: Rows of several networks' images that become one at a time.
+COMBINED = 64
 
 
 class _Job(NamedTuple):
@@ -130,23 +133,32 @@ def _mean_cells(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def combine_images(images: list[FrameImages]) -> FrameImages:
-    """Images of one frame, weighed as `run.combine` does; the tally is that of all of them."""
+    """Images of one frame, weighed as `run.combine` does, in the arrays of the first; the tally is that of all."""
     first = images[0]
     if len(images) == 1:
         return first
-    arrays = {name: np.stack([one.arrays()[name] for one in images]) for name in first.arrays()}
+    together = first.arrays()
+    for top in range(0, len(first.valid), COMBINED):
+        rows = slice(top, top + COMBINED)
+        part = _combine({name: np.stack([one.arrays()[name][rows] for one in images]) for name in together})
+        for name, image in together.items():
+            image[rows] = part[name]
+    return replace(first, tally=reduce(add, (one.tally for one in images if one.tally is not None)))
+
+
+def _combine(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Images of several networks, stacked, as one."""
     weights = np.maximum(arrays["error"], np.float32(LEAST_ERROR)) ** -2
     weights /= weights.sum(axis=0)
     polarization = (arrays["dolp"] * np.exp(2j * arrays["aolp"])).mean(axis=0).astype(np.complex64)
-    return FrameImages(
-        (weights[..., :1] * arrays["diffuse"]).sum(axis=0),
-        (weights[..., 1:] * arrays["specular"]).sum(axis=0),
-        np.asarray(arrays["valid"].all(axis=0)),
-        np.abs(polarization),
-        _wrap(np.angle(polarization) / 2),
-        reduce(add, (one.tally for one in images if one.tally is not None)),
-        (weights * arrays["error"]).sum(axis=0),
-    )
+    return {
+        "diffuse": (weights[..., :1] * arrays["diffuse"]).sum(axis=0),
+        "specular": (weights[..., 1:] * arrays["specular"]).sum(axis=0),
+        "valid": arrays["valid"].all(axis=0),
+        "dolp": np.abs(polarization),
+        "aolp": _wrap(np.angle(polarization) / 2),
+        "error": (weights * arrays["error"]).sum(axis=0),
+    }
 
 
 def _run_turned(network: JointWeights, mosaic: Mosaic, orientation: Orientation, full: bool) -> FrameImages:
@@ -156,37 +168,33 @@ def _run_turned(network: JointWeights, mosaic: Mosaic, orientation: Orientation,
     readable = data.dtype in (np.uint8, np.uint16, np.float32)
     floats = data if as_it_is and readable else data.astype(np.float32)
     turned = floats if as_it_is else np.ascontiguousarray(orientation.turn(floats))
-    cells, parts, levels = 1 if full else 2, [], (mosaic.black_level, mosaic.white_level)
+    cells, levels = 1 if full else 2, (mosaic.black_level, mosaic.white_level)
     modulation = modulation_of(network, turned, levels, mosaic.light_color)
-    for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), network.size):
-        job = _Job(network, full, (bottom - top, turned.shape[1]), get_threads(), asked_precision())
+    targets = Targets.empty((turned.shape[0] // cells, turned.shape[1] // cells), network.colors)
+    for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), network.size, full):
+        seen = RawRows(turned[top:bottom], levels, mosaic.light_color, modulation)
+        own = Targets._make(image[top // cells : bottom // cells] for image in targets)
+        job = _Job(network, full, seen.raw.shape, get_threads(), asked_precision())
         with ENGINES.borrow(job) as engine:
-            rows = slice(*((row - top) // cells for row in kept))
-            parts.append(engine.run(turned[top:bottom], levels, mosaic.light_color, modulation, rows))
-    images = _join(parts)
+            engine.fill(seen, own, ((kept[0] - top) // PERIOD, (kept[1] - top) // PERIOD))
+    images = as_images(targets)
     return images if as_it_is else _turn_back(images, orientation, 2 if full else 1)
 
 
-def _strips(shape: tuple[int, int], size: ResidualSize) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+def _strips(
+    shape: tuple[int, int], size: ResidualSize, full: bool
+) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
     """Raw rows that an engine sees and those that it makes images of: one strip, or several of at most two heights."""
     grid, margin = PERIOD * size.grid, margin_of(size)
-    height, pieces = shape[0], list(cut_rows(shape, size))
+    height, pieces = shape[0], list(cut_rows(shape, size, full))
     if len(pieces) == 1:
         yield pieces[0], pieces[0]
         return
-    rows = pieces[0][1] + 2 * margin
+    rows = pieces[0][1] + margin * min(len(pieces) - 1, 2)
     for first, last in pieces:
         top = max(min(first - margin, (height - rows) // grid * grid), 0)
         bottom = height if height - top - rows < grid else top + rows
         yield (top, bottom), (first, last)
-
-
-def _join(parts: list[FrameImages]) -> FrameImages:
-    """Strips as one frame."""
-    if len(parts) == 1:
-        return parts[0]
-    images = {name: np.concatenate([part.arrays()[name] for part in parts]) for name in parts[0].arrays()}
-    return FrameImages(**images, tally=reduce(add, (part.tally for part in parts if part.tally is not None)))
 
 
 def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> FrameImages:

@@ -10,13 +10,13 @@ from __future__ import annotations
 import os
 import threading
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.processor import cpu_flags
-from polsep.compute.threads import get_threads, run_over_rows
+from polsep.compute.threads import RowRange, get_threads, run_over_rows
 from polsep.demosaic.bilinear_kernel import Pattern, read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
 from polsep.networks.buffers import ClosedFormRows, LayerInput, Maps
@@ -38,6 +38,18 @@ Floats = NDArray[np.float32]
 PRECISIONS = ("bf16", "f32", "i8")
 #: Packed rows that a thread processes at a time.
 _ROWS = 16
+
+
+class RawRows(NamedTuple):
+    """Rows ``raw [H, W]`` of a frame, with black and white ``levels`` and a ``light`` of one gain per colour.
+
+    ``modulation``: `modulation_of` the frame that they are of; None where it is all of it.
+    """
+
+    raw: RawFrame
+    levels: tuple[float, float]
+    light: tuple[float, ...]
+    modulation: Floats | None
 
 
 class OpenVinoEngine:
@@ -78,39 +90,34 @@ class OpenVinoEngine:
         self._request = _compile(model, self.inputs, outputs, "f32" if precision == "i8" else precision)
 
     def run(
-        self,
-        raw: RawFrame,
-        levels: tuple[float, float],
-        light: tuple[float, ...],
-        modulation: Floats | None = None,
-        kept: slice = slice(None),
+        self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...], modulation: Floats | None = None
     ) -> FrameImages:
-        """Images of a frame ``[H, W]`` with black and white ``levels`` and a ``light`` of one gain per colour.
+        """Images of a frame ``[H, W]``; arguments as of `RawRows`."""
+        cells = 1 if self._full else 2
+        targets = Targets.empty((raw.shape[0] // cells, raw.shape[1] // cells), self._colors)
+        self.fill(RawRows(raw, levels, light, modulation), targets, (0, raw.shape[0] // PERIOD))
+        return as_images(targets)
 
-        ``modulation``: `modulation_of` the frame that this is a strip of; None where it is a whole one. ``kept``: rows
-        of the images that are wanted; others are left out, and do not count in the tally.
-        """
-        shape = (raw.shape[0], raw.shape[1])
-        h, w = shape if self._full else (shape[0] // 2, shape[1] // 2)
-        targets, gains = Targets.empty((h, w), self._colors), np.array(light[: self._colors], np.float32)
-        with self._lock:
-            self.prepare(raw, levels, light, modulation)
-            rows = shape[0] // PERIOD
-            self._request.infer()
+    def fill(self, seen: RawRows, targets: Targets, kept: RowRange) -> None:
+        """Fill images of what is seen, in packed rows from ``kept[0]`` to before ``kept[1]``; leave others alone."""
+        first, gains = kept[0], np.array(seen.light[: self._colors], np.float32)
+
+        def write(rows: RowRange) -> None:
+            own = (first + rows[0], first + rows[1])
             if self._full:
-                run_over_rows(
-                    lambda row_range: write_pixels(self._outputs, self._details, gains, targets, row_range), rows, _ROWS
-                )
+                write_pixels(self._outputs, self._details, gains, targets, own)
             else:
-                run_over_rows(lambda row_range: write_rows(self._outputs, gains, targets, row_range), rows, _ROWS)
-        targets = Targets._make(image[kept] for image in targets)
-        diffuse, specular, error = (image.reshape(image.shape[0], w, -1) for image in targets[:3])
-        return FrameImages(diffuse, specular, targets.valid, targets.dolp, targets.aolp, _tally(targets), error)
+                write_rows(self._outputs, gains, targets, own)
+
+        with self._lock:
+            self.prepare(*seen)
+            self._request.infer()
+            run_over_rows(write, kept[1] - first, _ROWS)
 
     def prepare(
         self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...], modulation: Floats | None = None
     ) -> None:
-        """Fill the layers' inputs, and the closed form, of a frame; arguments as of `run`."""
+        """Fill the layers' inputs, and the closed form, of a frame; arguments as of `RawRows`."""
         if modulation is None:
             modulation = modulation_of(self._network, raw, levels, light)
         if modulation is not None:
@@ -188,6 +195,13 @@ def usual_precision() -> str:
     if name == "bf16" and "amx_bf16" not in cpu_flags():
         name = "f32"
     return "i8" if name == "f32" and cpu_flags() & {"avx512_vnni", "avx_vnni"} else name
+
+
+def as_images(targets: Targets) -> FrameImages:
+    """Filled images of a frame."""
+    h, w = targets.dolp.shape
+    diffuse, specular, error = (image.reshape(h, w, -1) for image in targets[:3])
+    return FrameImages(diffuse, specular, targets.valid, targets.dolp, targets.aolp, _tally(targets), error)
 
 
 def _tally(targets: Any) -> Tally:

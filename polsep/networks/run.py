@@ -84,7 +84,7 @@ def _run_turned(network: Joint, mosaic: Mosaic, orientation: Orientation, full: 
     raw, clipped = (x.reshape(-1, 1, height, width) for x in (raw, clipped))
     parts, thumbnail = [], network.thumbnail(raw, clipped)
     margin = margin_of(network.size)
-    for first, last in cut_rows((height, width), network.size):
+    for first, last in cut_rows((height, width), network.size, full):
         top, bottom = max(first - margin, 0), min(last + margin, height)
         strip = (raw[..., top:bottom, :], clipped[..., top:bottom, :])
         images = _run_layers(network, strip, thumbnail, full)

@@ -12,8 +12,8 @@ from polsep.networks.channels import PERIOD
 from polsep.networks.sizes import ResidualSize
 from polsep.sensor.camera import Layout
 
-#: Raw pixels of a frame, or of a strip with its margins, that are processed at once: some 250 bytes of memory each.
-MAX_PIXELS = 6_000_000
+#: Raw pixels of a frame, or of a strip with its margins, that are processed at once; half as many at full resolution.
+MAX_PIXELS = 6_200_000
 #: Raw rows beyond the reach of the U-Net that demosaicking and the closed form see (a test measures that).
 OTHER_REACH = 128
 #: Least expected error that counts when separations are weighed.
@@ -31,9 +31,12 @@ def margin_of(size: ResidualSize) -> int:
     return -(-(PERIOD * size.reach + OTHER_REACH) // grid) * grid
 
 
-def cut_rows(shape: tuple[int, int], size: ResidualSize) -> Iterator[tuple[int, int]]:
+def cut_rows(shape: tuple[int, int], size: ResidualSize, full: bool) -> Iterator[tuple[int, int]]:
     """First and last row of the strips of a frame of ``shape``: one, or several that begin at multiples of the grid."""
     (height, width), grid, margin = shape, PERIOD * size.grid, margin_of(size)
-    rows = height if height * width <= MAX_PIXELS else max(MAX_PIXELS // width - 2 * margin, grid) // grid * grid
+    most, rows, count = MAX_PIXELS // (2 if full else 1) // width, height, 1
+    while rows > grid and rows + margin * min(count - 1, 2) > most:
+        count += 1
+        rows = -(-height // (count * grid)) * grid
     for first in range(0, height, rows):
         yield first, min(first + rows, height)

@@ -15,7 +15,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import OpenEXR  # a bare extension module without stubs
@@ -79,21 +79,26 @@ def _open_exr(data: bytes) -> Any:
 
 
 def encode_exr(planes: Mapping[str, NDArray[Any]], notes: Notes, compression: str = "zip") -> memoryview:
+    """The file that `write_exr` writes."""
+    stream = io.BytesIO()
+    write_exr(stream, planes, notes, compression)
+    return stream.getbuffer()
+
+
+def write_exr(stream: BinaryIO, planes: Mapping[str, NDArray[Any]], notes: Notes, compression: str = "zip") -> None:
     """One part of scanlines: channels ``[H, W]``, float16 or float32, by name; ``notes``: attributes.
 
-    ``[H, W, 3]`` is three channels, name.R, name.G and name.B, which are not copied.
+    ``[H, W, 3]`` is three channels, name.R, name.G and name.B, which are not copied. Raises the OSError of the stream.
     """
     header = {**notes, "compression": COMPRESSIONS[compression], "type": OpenEXR.scanlineimage}
     # A fresh dict, because OpenEXR replaces its arrays, and contiguous planes, because it misreads others silently.
     channels = {name: np.ascontiguousarray(plane) for name, plane in planes.items()}
-    stream = io.BytesIO()
     with _WRITING:
         OpenEXR.set_global_thread_count(get_threads())
         try:
             OpenEXR.File(header, channels).write(stream)
         finally:
             OpenEXR.set_global_thread_count(0)
-    return stream.getbuffer()
 
 
 def as_planes(layers: Mapping[str, NDArray[Number]]) -> dict[str, NDArray[Number]]:

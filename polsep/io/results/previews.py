@@ -10,6 +10,7 @@ angle atan2(-d_row, d_col). Shrinking averages light, and polarization as Stokes
 from __future__ import annotations
 
 import builtins
+import math
 import textwrap
 from collections.abc import Callable, Sequence
 from functools import cache, partial, reduce
@@ -29,6 +30,7 @@ Picture: TypeAlias = Image.Image
 Rows: TypeAlias = Callable[[slice], Values | NDArray[np.bool_]]
 
 PANEL = 640  # longest side of a panel in pixels
+STRIP = 32  # rows of a panel that are averaged at a time
 COLUMNS = 4  # panels in a row of the contact sheet
 TITLE, GUTTER, MARGIN, LEGEND = 34, 12, 16, 116  # heights and gaps of the contact sheet in pixels
 HEADER, LINE = 38, 22  # heights of its first line, and of one of the warnings below
@@ -45,9 +47,10 @@ NOT_VALID, ABOVE_RANGE, ABOVE_ONE = (213, 94, 0), (86, 180, 233), (240, 228, 66)
 
 
 class Flag(NamedTuple):
-    """A kind of pixel that the mask panel marks: a mask ``where [H, W]``, its colour and its name."""
+    """A kind of pixel that the mask panel marks: its ``share`` of each block ``[h, w]``, and of the frame."""
 
-    where: NDArray[np.bool_]
+    share: NDArray[np.float64]
+    of_frame: float
     color: tuple[int, int, int]
     name: str
 
@@ -191,27 +194,29 @@ def _panels(frame: SeparatedFrame, flags: list[Flag]) -> list[Panel]:
             f"exposure x {own:.3g}",
             toned(parts[1], own),
         ),
-        Panel("DoLP", "degree of linear polarization", _faded(dolp_map(dolp), shown)),
-        Panel("AoLP", "angle of linear polarization", _faded(aolp_wheel(aolp, dolp), shown)),
+        Panel("DoLP", "degree of linear polarization", _faded(_in_strips(dolp_map, dolp), shown)),
+        Panel("AoLP", "angle of linear polarization", _faded(_in_strips(aolp_wheel, aolp, dolp), shown)),
         Panel("Mask", "", _flagged(combined, flags)),
     ]
     if frame.error is not None:
         error = _shrunk(partial(_largest_error, frame.error), size)
         top = max(float(np.percentile(error, 99)), 1e-9)
-        panels.append(Panel("Expected error", f"yellow: {top:.2g} or more", dolp_map(error / top)))
+        panels.append(Panel("Expected error", f"yellow: {top:.2g} or more", _in_strips(dolp_map, error / top)))
     return panels
 
 
 def _total(frame: SeparatedFrame, rows: slice) -> Values:
     """All light ``[h, W, C]`` of some rows."""
-    total: Values = np.maximum(frame.diffuse[rows], 0) + np.maximum(frame.specular[rows], 0)
+    total: Values = np.maximum(frame.diffuse[rows], 0)
+    total += np.maximum(frame.specular[rows], 0)
     return total
 
 
 def _brightness(frame: SeparatedFrame, rows: slice) -> Values:
-    """The mean over colours of all light ``[h, W]`` of some rows."""
-    total = _total(frame, rows)
-    mean: Values = reduce(np.add, np.moveaxis(total, -1, 0)) / total.shape[-1]
+    """The mean over colours of all light ``[h, W]`` of some rows, a colour at a time."""
+    channels = range(frame.diffuse.shape[-1])
+    parts = (np.maximum(frame.diffuse[rows, :, k], 0) + np.maximum(frame.specular[rows, :, k], 0) for k in channels)
+    mean: Values = reduce(np.add, parts) / len(channels)
     return mean
 
 
@@ -242,11 +247,15 @@ def _clearness(frame: SeparatedFrame, light: Values) -> NDArray[np.float64]:
     The noise is that of s1 in the darkest quarter, as neighbours on the diagonal differ there, in two rows of a block.
     """
     k = _block(frame.valid.shape)
-    upper, lower = slice(0, -1, k), slice(1, None, k)
-    bright = _brightness(frame, lower)
+    bright = _brightness(frame, slice(1, None, k))
     dark = bright <= np.percentile(bright, 25) if bright.size else bright > 0
-    below, above = (_polarized(frame, rows)[..., 0] for rows in (lower, upper))
-    steps = np.abs(below[:, 1:] - above[:, :-1])[dark[:, 1:]]
+    found = [np.zeros(0, np.float32)]
+    for first in range(0, len(dark), STRIP):
+        strip = dark[first : first + STRIP, 1:]
+        upper, lower = (slice(k * first + y, k * (first + len(strip)) + y, k) for y in (0, 1))
+        above, below = (_polarized(frame, rows)[..., 0] for rows in (upper, lower))
+        found.append(np.abs(below[:, 1:] - above[:, :-1])[strip])
+    steps = np.concatenate(found)
     noise = float(steps.mean()) * np.sqrt(np.pi) / 2 if steps.size else 0.0
     if noise == 0:
         return np.ones_like(light, np.float64)
@@ -267,7 +276,13 @@ def _to_bytes(display: Values) -> Pixels:
 
 def toned(image: Values, gain: float) -> Pixels:
     """A linear image ``[H, W, C]``, times ``gain``, as sRGB ``uint8 [H, W, 3]``."""
-    return _to_bytes(np.broadcast_to(srgb(gain * image), (*image.shape[:2], 3)))
+    return _in_strips(lambda part: _to_bytes(np.broadcast_to(srgb(gain * part), (*part.shape[:2], 3))), image)
+
+
+def _in_strips(draw: Callable[..., Pixels], *images: Values) -> Pixels:
+    """Images drawn pixel by pixel, some rows at a time, since ``draw`` needs several times their memory."""
+    strips = range(0, len(images[0]), STRIP)
+    return np.concatenate([draw(*(image[top : top + STRIP] for image in images)) for top in strips])
 
 
 def _block(size: tuple[int, int]) -> int:
@@ -277,33 +292,46 @@ def _block(size: tuple[int, int]) -> int:
 
 def _shrunk(rows: Rows, size: tuple[int, int]) -> NDArray[np.float64]:
     """Area average over square blocks, cut at the border, so that neither side of ``[H, W, ...]`` exceeds `PANEL`."""
-    (height, width), k = size, _block(size)
-    low, wide = np.arange(0, height, k), np.arange(0, width, k)
-    bands = np.asarray(rows(slice(0, None, k)), np.float32)
-    shape = bands.shape[2:]
-    bands = bands.reshape(*bands.shape[:2], -1)
-    for first in range(1, k):  # whole rows at a time
-        own = rows(slice(first, None, k)).reshape(-1, *bands.shape[1:])
+    height, k = size[0], _block(size)
+    strips = range(0, height, STRIP * k)
+    sums = np.concatenate([_block_sums(rows, (top, min(top + STRIP * k, height)), k) for top in strips])
+    mean: NDArray[np.float64] = sums / _counts(size).reshape(*sums.shape[:2], *[1] * (sums.ndim - 2))
+    return mean
+
+
+def _counts(size: tuple[int, int]) -> NDArray[np.int64]:
+    """Pixels of each block of `_shrunk`."""
+    high, wide = (np.diff(np.arange(0, n, _block(size)), append=n) for n in size)
+    return np.asarray(high[:, None] * wide)
+
+
+def _block_sums(rows: Rows, strip: tuple[int, int], k: int) -> NDArray[np.float64]:
+    """Sums over blocks of k x k pixels of some rows of an image."""
+    first, last = strip
+    bands = np.array(rows(slice(first, last, k)), np.float32)
+    for row in range(first + 1, first + k):  # whole rows at a time
+        own = rows(slice(row, last, k))
         bands[: len(own)] += own
-    sums = np.zeros((len(low), len(wide), bands.shape[2]))
-    for channel in range(bands.shape[2]):
-        for first in range(k):
-            part = bands[:, first::k, channel]
-            sums[:, : part.shape[1], channel] += part
-    count = np.diff(low, append=height)[:, None] * np.diff(wide, append=width)
-    mean: NDArray[np.float64] = sums / count[..., None]
-    return mean.reshape(*count.shape, *shape)
+    sums = np.zeros((len(bands), -(-bands.shape[1] // k), *bands.shape[2:]))
+    for column in range(k):
+        part = bands[:, column::k]
+        sums[:, : part.shape[1]] += part
+    return sums
 
 
 def _flags(frame: SeparatedFrame) -> list[Flag]:
     """The flags of the mask panel; later ones are drawn over earlier ones."""
-    starts = range(0, len(frame.valid), PANEL // 4)
-    above = [(_total(frame, slice(start, start + PANEL // 4)) > 2).any(axis=-1) for start in starts]
-    return [
-        Flag(frame.dolp > 1, ABOVE_ONE, "DoLP above 1"),
-        Flag(np.concatenate(above), ABOVE_RANGE, "above the measurable range"),
-        Flag(~frame.valid, NOT_VALID, "not valid"),
+    size = frame.valid.shape
+    kinds: list[tuple[Rows, tuple[int, int, int], str]] = [
+        (lambda rows: frame.dolp[rows] > 1, ABOVE_ONE, "DoLP above 1"),
+        (lambda rows: _total(frame, rows).max(axis=-1) > 2, ABOVE_RANGE, "above the measurable range"),
+        (lambda rows: ~frame.valid[rows], NOT_VALID, "not valid"),
     ]
+    found = []
+    for where, color, name in kinds:
+        share = _shrunk(where, size)
+        found.append(Flag(share, float((share * _counts(size)).sum()) / math.prod(size), color, name))
+    return found
 
 
 def _flagged(picture: Pixels, flags: list[Flag]) -> Pixels:
@@ -311,9 +339,9 @@ def _flagged(picture: Pixels, flags: list[Flag]) -> Pixels:
     grey = picture.mean(axis=-1, keepdims=True) * 0.55
     out: NDArray[np.float64] = np.repeat(grey, picture.shape[-1], axis=-1)
     for flag in flags:
-        share = _shrunk(flag.where.__getitem__, flag.where.shape)
-        opacity = 0.45 + 0.4 * share[share > 0][:, None]
-        out[share > 0] += opacity * (np.array(flag.color) - out[share > 0])
+        there = flag.share > 0
+        opacity = 0.45 + 0.4 * flag.share[there][:, None]
+        out[there] += opacity * (np.array(flag.color) - out[there])
     return np.rint(out).astype(np.uint8)
 
 
@@ -382,14 +410,13 @@ def _draw_flag_legend(sheet: Image.Image, corner: tuple[int, int], flags: list[F
     for k, flag in enumerate(reversed(flags)):
         y = top + 26 * k
         draw.rectangle((left, y + 1, left + 15, y + 16), fill=flag.color)
-        text = f"{flag.name}: {_percent(flag.where)}"
+        text = f"{flag.name}: {_percent(flag.of_frame)}"
         draw.text((left + 26, y + 9), text, fill=TEXT, font=_font(15), anchor="lm")
 
 
-def _percent(where: NDArray[np.bool_]) -> str:
-    """The share of True in percent; a few pixels never read as none."""
-    share = 100 * float(np.mean(where))
-    return "none" if share == 0 else f"{share:.3g} %" if share >= 0.01 else "below 0.01 %"
+def _percent(share: float) -> str:
+    """A share in percent; a few pixels never read as none."""
+    return "none" if share == 0 else f"{100 * share:.3g} %" if share >= 1e-4 else "below 0.01 %"
 
 
 def titled_sheet(rows: Sequence[Sequence[Panel]]) -> Pixels:

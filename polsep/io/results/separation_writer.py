@@ -9,8 +9,8 @@ Conventions: images are linear light with 1.0 = one measurement at the white lev
 aolp is in radians in [0, pi), from image-right toward image-up. Files hold the very float32 values of the frame,
 except the PNG set, whose scales are in `PNG_UNITS` and whose limited samples the sidecar counts.
 
-Every file is encoded in memory and written by Python: OpenEXR's own writes report a full disk, but a short file only as
-a warning on the terminal.
+Every file is written by Python, encoded in memory or, large ones, piece by piece: OpenEXR's own writes report a full
+disk, but a short file only as a warning on the terminal.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial, reduce
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import imagecodecs
 import numpy as np
@@ -27,7 +28,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from polsep import __version__
-from polsep.io.results.exr import LARGEST_HALF, as_planes, encode_exr
+from polsep.io.results.exr import LARGEST_HALF, as_planes, write_exr
 from polsep.io.results.previews import contact_sheet
 from polsep.io.results.sidecars import (
     EncodedFile,
@@ -50,6 +51,8 @@ ERROR = "error"
 #: Layers of EXR files alone: all light, for programs that know no layers; Stokes images of frames that have some.
 TOTAL, STOKES = "", ("S0", "S1", "S2")
 
+#: Rows of an image that become half floats at a time.
+ROWS = 64
 #: The unit of images.
 LIGHT = "linear light, 1.0 = one measurement at the white level (an unclipped s0 = diffuse + specular reaches 2)"
 #: Meaning of the numbers in EXR, NPZ and TIFF files.
@@ -166,9 +169,9 @@ def _encoded_files(frame: SeparatedFrame, stem: str, format: str) -> Iterator[En
 def _encoded_images(frame: SeparatedFrame, stem: str, format: str) -> Iterator[EncodedFile]:
     """Name and contents of each image file."""
     if format == "exr":
-        yield f"{stem}.exr", _encode_exr(frame)
+        yield f"{stem}.exr", partial(_write_exr, frame)
     elif format == "npz":
-        yield f"{stem}.npz", _encode_npz(frame)
+        yield f"{stem}.npz", partial(_write_npz, frame)
     elif format == "tiff":
         for layer in _layers(frame):
             yield f"{stem}_{layer}.tiff", _encode_tiff(frame, layer)
@@ -177,7 +180,7 @@ def _encoded_images(frame: SeparatedFrame, stem: str, format: str) -> Iterator[E
             yield f"{stem}_{layer}.png", encode_png(_png_codes(frame, layer))
 
 
-def _encode_exr(frame: SeparatedFrame) -> memoryview:
+def _write_exr(frame: SeparatedFrame, stream: BinaryIO) -> None:
     """One part, ZIP compressed, with units and settings as header attributes: float32 channels.
 
     Layers that others show or measure in, `TOTAL` and `STOKES`, are half floats: half the size, 11 bits.
@@ -188,14 +191,18 @@ def _encode_exr(frame: SeparatedFrame) -> memoryview:
     if frame.error is not None:
         planes |= {f"{ERROR}.{image}": frame.error[..., k] for k, image in enumerate(("diffuse", "specular"))}
     mirrored = as_planes({TOTAL: frame.specular})
-    planes |= {name: as_halves(plane + mirrored[name]) for name, plane in as_planes({TOTAL: frame.diffuse}).items()}
+    planes |= {name: as_halves(plane, mirrored[name]) for name, plane in as_planes({TOTAL: frame.diffuse}).items()}
     planes |= {name: as_halves(plane) for name, plane in as_planes(stokes_layers(frame.stokes)).items()}
-    return encode_exr(planes, exr_notes(_units(frame, "exr"), frame.report))
+    write_exr(stream, planes, exr_notes(_units(frame, "exr"), frame.report))
 
 
-def as_halves(plane: NDArray[np.float32]) -> NDArray[np.float16]:
-    """A plane in half floats; values beyond the largest of them become that."""
-    return np.clip(plane, -LARGEST_HALF, LARGEST_HALF).astype(np.float16)
+def as_halves(*planes: NDArray[np.float32]) -> NDArray[np.float16]:
+    """The sum of planes ``[H, W]`` in half floats, some rows at a time; values beyond the largest become that."""
+    halves = np.empty(planes[0].shape, np.float16)
+    for top in range(0, len(halves), ROWS):
+        total = reduce(np.add, (plane[top : top + ROWS] for plane in planes))
+        halves[top : top + ROWS] = np.clip(total, -LARGEST_HALF, LARGEST_HALF)
+    return halves
 
 
 def stokes_layers(stokes: NDArray[np.float32] | None) -> dict[str, NDArray[np.float32]]:
@@ -203,11 +210,9 @@ def stokes_layers(stokes: NDArray[np.float32] | None) -> dict[str, NDArray[np.fl
     return {} if stokes is None else dict(zip(STOKES, stokes, strict=True))
 
 
-def _encode_npz(frame: SeparatedFrame) -> bytes:
+def _write_npz(frame: SeparatedFrame, stream: BinaryIO) -> None:
     """The layers as they are, deflated."""
-    stream = io.BytesIO()
     np.savez_compressed(stream, **{layer: getattr(frame, layer) for layer in _layers(frame)})
-    return stream.getvalue()
 
 
 def _encode_tiff(frame: SeparatedFrame, layer: str) -> bytes:

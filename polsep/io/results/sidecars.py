@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep import __version__
-from polsep.io.store.atomic import OutputError, write_checked, write_set
+from polsep.io.store.atomic import Contents, OutputError, write_checked, write_set
 from polsep.io.store.json_text import parse_json, read_text
 
 #: Attributes of EXR files by the keys of a report.
@@ -25,7 +25,7 @@ _REPORTED = {
     "exposure_s": "expTime",
 }
 #: A file name and the file's contents.
-EncodedFile = tuple[str, bytes | memoryview]
+EncodedFile = tuple[str, Contents]
 
 
 def require_stem(stem: str) -> None:
@@ -58,7 +58,9 @@ def write_with_sidecar(
         listed = []
         for name, data in files:
             write_checked(folder / name, data)
-            listed.append({"name": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()})
+            with (folder / name).open("rb") as stream:
+                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            listed.append({"name": name, "bytes": (folder / name).stat().st_size, "sha256": digest})
         sidecar = {
             "polsep": __version__,
             **facts,

@@ -17,12 +17,15 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
+#: What a file is to hold: bytes, or a function that writes them into a stream, so that memory never holds them all.
+Contents = bytes | memoryview | Callable[[BinaryIO], object]
 #: Seconds after which a hidden folder of a set is nobody's any more: a set of files is written in far less.
 FORGOTTEN = 3600.0
 
@@ -60,15 +63,20 @@ def replace_text(path: Path, text: str) -> None:
     replace_bytes(path, text.encode())
 
 
-def write_checked(path: Path, data: bytes | memoryview) -> None:
+def write_checked(path: Path, data: Contents) -> None:
     """Write a file and check its size; raises an OSError that names it. The write itself is not atomic."""
     try:
-        path.write_bytes(data)
+        with path.open("wb") as stream:
+            if callable(data):
+                data(stream)
+            else:
+                stream.write(data)
+            size = len(data) if isinstance(data, bytes | memoryview) else stream.seek(0, os.SEEK_END)
     except OSError as error:  # names the file where it cannot be opened, but not where the disk is full
         raise OSError(error.errno, error.strerror, str(path)) from error
     found = path.stat().st_size
-    if found != len(data):
-        raise OSError(errno.EIO, f"expected {len(data)} bytes, found {found}", str(path))
+    if found != size:
+        raise OSError(errno.EIO, f"expected {size} bytes, found {found}", str(path))
 
 
 def release_cache(file: int | Path) -> None:

@@ -158,7 +158,8 @@ def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameIma
         return run_joint_co_sited(name, capture, light)
     if isinstance(capture, Mosaic) and capture.data.ndim == 2 and on_cpu(capture.data):
         networks = [shipped_joint(member) for member in member_names(name, capture.layout)]
-        return combine_images([run_engine(network, replace(capture, light_color=light), full) for network in networks])
+        lit = replace(capture, light_color=light)
+        return combine_images([run_engine(network, lit, full) for network in networks], light)
     return run_reference(partial(joint_reference, name), capture, light, full)
 
 

@@ -74,6 +74,9 @@ def test_metal_keeps_its_color(metal: str, side: int, layout: Layout) -> None:
     found, share = color_specular(separated(diffuse + specular - white, white, side), mosaic, (1.0, 1.0, 1.0))
     assert share.share == pytest.approx(0.5, abs=0.08)
     half, edge = SIZE // 2 // side, 8 // side
+    before = float((diffuse + specular)[:, ::side, ::side].mean(dim=0).sum())
+    gained = float(np.mean(found.diffuse + found.specular, axis=-1).sum()) - before
+    assert found.tally is not None and found.tally.s0 == pytest.approx(gained, abs=1e-2)
     inside, outside = slice(edge, half - 2 * edge), slice(half + 2 * edge, None)
     truth = specular[:, ::side, ::side].movedim(0, -1).numpy()
     np.testing.assert_allclose(found.specular[inside], truth[inside], rtol=0.01)

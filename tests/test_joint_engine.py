@@ -249,7 +249,7 @@ def test_angles_that_were_turned_back_stay_below_pi(turned: dict[str, bool]) -> 
     colors, one = np.zeros((2, 2, 3), np.float32), np.ones((2, 2), np.float32)
     for near in (0, np.pi / 2):
         aolp = np.nextafter(np.float32(near), np.float32(4)) * one
-        images = FrameImages(colors, colors, one > 0, one, aolp, Tally(), colors[..., :2])
+        images = FrameImages(colors, colors, one > 0, one, aolp, Tally(4), colors[..., :2])
         found = engines._turn_back(images, Orientation(4, 4, **turned), 1).aolp
         assert found.min() >= 0 and found.max() < np.pi
 

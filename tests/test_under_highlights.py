@@ -163,13 +163,15 @@ def test_reports_say_how_much_was_filled() -> None:
     assert 0 < out.report["filled_under_highlights"] < 0.05
 
 
-def test_statistics_know_of_the_fill() -> None:
-    """The report's rms of expected errors is that of the map, also where holes were filled."""
+@pytest.mark.parametrize("method", ["joint-fast", "joint-large"])
+def test_statistics_know_of_the_fill(method: str) -> None:
+    """The report's rms of expected errors is that of the map, also where holes were filled; of one network or two."""
     data = np.full((128, 128), 1200, np.uint16)
     rows, cols = np.mgrid[:128, :128]
     highlight = 4000 * np.exp(-((rows - 64) ** 2 + (cols - 64) ** 2) / 50)
     data = np.minimum(data + highlight * np.tile([[0.5, 0.15], [0.85, 0.5]], (64, 64)), 4095).astype(np.uint16)
-    out = separate_capture(Mosaic(data, Layout(), 0.0, WHITE), "joint-fast", LIGHT)
+    out = separate_capture(Mosaic(data, Layout(), 0.0, WHITE), method, LIGHT)
+    assert out.report["statistics"]["valid_fraction"] == pytest.approx(out.valid.mean())
     assert out.error is not None and out.report["filled_under_highlights"] > 0
     typical = float(np.sqrt(np.square(out.error[..., 0], dtype=np.float64).mean())) / np.mean(LIGHT)
     assert out.report["statistics"]["expected_diffuse_error"] == pytest.approx(typical, rel=1e-4)

@@ -106,13 +106,13 @@ def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages
     if full:
         make_ready(details_kernel.warm_up)
     ways = shifts_of(orientation) if network.averages_shifts else (orientation,)
-    return combine_images([_run_turned(network, mosaic, way, full) for way in ways])
+    return combine_images([_run_turned(network, mosaic, way, full) for way in ways], mosaic.light_color)
 
 
 def _halve(images: FrameImages, light: tuple[float, ...]) -> FrameImages:
     """Means over 2x2 cells of images at full resolution, in a ``light``; a cell is valid if all of its pixels are.
 
-    The tally is of the pixels at full resolution.
+    The tally has the means over the pixels at full resolution.
     """
     assert images.dolp is not None and images.aolp is not None and images.error is not None
     colors = images.diffuse.shape[-1]
@@ -123,7 +123,8 @@ def _halve(images: FrameImages, light: tuple[float, ...]) -> FrameImages:
     diffuse, specular, error = (_mean_cells(image) for image in (images.diffuse, images.specular, images.error))
     valid = _mean_cells(images.valid.astype(np.float32)) == 1
     aolp = _wrap((np.angle(polarized) / 2).astype(np.float32))
-    return replace(images, diffuse=diffuse, specular=specular, valid=valid, dolp=dolp, aolp=aolp, error=error)
+    assert images.tally is not None
+    return FrameImages(diffuse, specular, valid, dolp, aolp, images.tally.of_pixels(valid.size), error)
 
 
 def _mean_cells(image: NDArray[Any]) -> NDArray[Any]:
@@ -132,18 +133,28 @@ def _mean_cells(image: NDArray[Any]) -> NDArray[Any]:
     return np.moveaxis(mean_cells(np.moveaxis(image[:height, :width], (0, 1), (-2, -1))), (-2, -1), (0, 1))
 
 
-def combine_images(images: list[FrameImages]) -> FrameImages:
-    """Images of one frame, weighed as `run.combine` does, in the arrays of the first; the tally is that of all."""
+def combine_images(images: list[FrameImages], light: tuple[float, ...]) -> FrameImages:
+    """Images of one frame in a ``light``, weighed as `run.combine` does, in the arrays of the first.
+
+    The tally is of what they became, but for the polarization of highlights, which is the mean of theirs.
+    """
     first = images[0]
     if len(images) == 1:
         return first
-    together = first.arrays()
+    together, sums = first.arrays(), np.zeros(4)
+    gain = np.array(light[: first.diffuse.shape[-1]], np.float32)
     for top in range(0, len(first.valid), COMBINED):
         rows = slice(top, top + COMBINED)
         part = _combine({name: np.stack([one.arrays()[name][rows] for one in images]) for name in together})
         for name, image in together.items():
             image[rows] = part[name]
-    return replace(first, tally=reduce(add, (one.tally for one in images if one.tally is not None)))
+        lobes = [(part[name] / gain).mean(axis=-1).sum(dtype=np.float64) for name in ("diffuse", "specular")]
+        sums += [*lobes, *np.square(part["error"] / gain.mean(), dtype=np.float64).sum(axis=(0, 1))]
+    tally = reduce(add, (one.tally for one in images if one.tally is not None)).of_pixels(first.valid.size)
+    valid, above_one = (int(np.count_nonzero(mask)) for mask in (first.valid, together["dolp"] > 1))
+    diffuse, specular, *variances = sums.tolist()
+    tally = replace(tally, valid=valid, above_one=above_one, s0=diffuse + specular, specular=specular)
+    return replace(first, tally=replace(tally, diffuse_variance=variances[0], specular_variance=variances[1]))
 
 
 def _combine(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -200,7 +211,7 @@ def _strips(
 def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> FrameImages:
     """Images of a turned frame, ``scale`` pixels along a cell's side, as those of the frame itself.
 
-    The tally is of all pixels that the network saw.
+    The tally has the means over all pixels that the network saw.
     """
 
     def turn(image: NDArray[Any]) -> NDArray[Any]:
@@ -214,7 +225,7 @@ def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> Fra
         turned["aolp"], tally = _wrap(np.float32(np.pi / 2) - turned["aolp"]), replace(tally, along=-tally.along)
     if orientation.down != orientation.across:
         turned["aolp"], tally = _wrap(-turned["aolp"]), replace(tally, across=-tally.across)
-    return FrameImages(**turned, tally=tally)
+    return FrameImages(**turned, tally=tally.of_pixels(turned["valid"].size))
 
 
 def _wrap(angle: NDArray[np.float32]) -> NDArray[np.float32]:

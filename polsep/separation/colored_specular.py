@@ -111,7 +111,7 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     white = replace(mosaic, data=data, layout=layout, light_color=light, falloff=None)
     diffuse, before = (xp.moveaxis(x, -1, 0) for x in (images.diffuse, images.specular))
     side = 2 if 2 * diffuse.shape[-1] <= data.shape[-1] else PERIOD
-    unpolarized, specular = find_unpolarized(_measure_places(images, light, side // 2)), before
+    unpolarized, specular = find_unpolarized(_measure_places(images, light, side // 2), max(light)), before
     if unpolarized:
         left = xp.minimum(unpolarized * before, diffuse)
         diffuse, specular = diffuse - left, before + left
@@ -138,6 +138,9 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     changed = [contiguous(xp.moveaxis(x, 0, -1)) for x in (body, mirrored)]
     more = float(xp.sum(xp.mean((mirrored - before) / gain, axis=0), dtype=xp.float64))
     tally = replace(tally, specular=tally.specular + more, valid=int(xp.sum(valid)))
+    if share is not None:  # all light of metals is what their polarization says, which changes the sum
+        gained = body + mirrored - diffuse - specular
+        tally = replace(tally, s0=tally.s0 + float(xp.sum(xp.mean(gained / gain, axis=0), dtype=xp.float64)))
     images = replace(images, diffuse=changed[0], specular=changed[1], valid=valid, tally=tally)
     return images, Colored(0.0 if share is None else float(xp.mean(share)), retained, unpolarized)
 
@@ -172,7 +175,9 @@ def _see(mosaic: Mosaic, diffuse: Array, specular: Array, tally: Tally) -> Perio
     length = max((tally.along**2 + tally.across**2) ** 0.5, 1e-30)
     polarized = (stokes.s1 * tally.along + stokes.s2 * tally.across) / length
     across = (stokes.s2 * tally.along - stokes.s1 * tally.across) / length
-    diffuse, specular = (resize_area(x, stokes.s0.shape[-2:]) for x in (diffuse, specular))
+    rows, cols = stokes.s0.shape[-2:]
+    side = round(diffuse.shape[-1] / cols)  # a last row or column that is no whole period is left out, as in `stokes`
+    diffuse, specular = (resize_area(x[..., : rows * side, : cols * side], (rows, cols)) for x in (diffuse, specular))
     return Periods(stokes.s0, polarized, across, diffuse, diffuse + specular)
 
 

@@ -42,6 +42,15 @@ class Tally:
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return Tally(*(theirs if mine is None else mine if theirs is None else mine + theirs for mine, theirs in pairs))
 
+    def of_pixels(self, pixels: int) -> Tally:
+        """The same means over so many pixels: of a frame seen by several networks, or with a border around it."""
+        if pixels == self.pixels:
+            return self
+        share = pixels / self.pixels
+        counts = (round(share * count) for count in (self.clipped, self.valid, self.above_one))
+        sums = [*vars(self).values()][4:]
+        return Tally(pixels, *counts, *(None if total is None else share * total for total in sums))
+
 
 @dataclass(frozen=True)
 class FrameImages:

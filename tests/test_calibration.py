@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import warnings
+import weakref
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +22,7 @@ import polsep
 from polsep.calibrate.analysers import measure_analysers
 from polsep.calibrate.dark_flat import measure_dark, measure_flat
 from polsep.calibrate.lamp import measure_lamp
+from polsep.calibrate.statistics import robust_deviation, robust_mean
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.store.calibrations import read_calibration, write_calibration
@@ -323,6 +326,40 @@ def test_ambient_light_is_subtracted() -> None:
 
     less = subtract_ambient(frame(lamp + room), mean_mosaic([frame(room * k) for k in (0.8, 0.9, 1.1, 1.2)]))
     np.testing.assert_allclose(less.data.numpy(), lamp + LEVEL, atol=1e-3)
+
+
+def test_a_mean_takes_frames_one_at_a_time() -> None:
+    """Ambient frames of a long recording are never all in memory."""
+    alive: list[weakref.ref[torch.Tensor]] = []
+
+    def frames() -> Iterator[Mosaic]:
+        for k in range(6):
+            data = torch.full(SIZE, 100.0 + k)
+            alive.append(weakref.ref(data))
+            yield Mosaic(data, Layout(), 0.0, WHITE)
+            del data
+            assert sum(ref() is not None for ref in alive) <= 3
+
+    assert float(mean_mosaic(frames()).data.mean()) == pytest.approx(102.5)
+    with pytest.raises(ValueError, match="expected at least one frame"):
+        mean_mosaic([])
+
+
+def test_coarse_codes_have_their_mean() -> None:
+    """Where most codes are equal, the others still count: 64.3 is not 64, and its noise is not 0."""
+    rng = np.random.default_rng(0)
+    codes = np.round(rng.normal(64.3, 0.3, 20_000)).astype(np.float32)
+    assert robust_mean(codes) == pytest.approx(float(codes.mean()), abs=0.01) and robust_deviation(codes) > 0.3
+
+
+def test_black_of_float_frames_is_kept(tmp_path: Path) -> None:
+    """A pattern of a code in frames whose white level is 1 survives its file."""
+    black = (np.arange(SIZE[0] * SIZE[1]).reshape(SIZE) % 3 - 1).astype(np.float32) / 4095
+    written = Calibration(Layout(), 1.0, SIZE, black_level=0.0, read_noise=1e-3, black_map=black)
+    write_calibration(tmp_path / "rig.json", written, "1")
+    found = read_calibration(tmp_path / "rig.json").black_map
+    assert found is not None
+    np.testing.assert_allclose(found, black, atol=2e-6)
 
 
 def test_files_return_what_was_written(tmp_path: Path) -> None:

@@ -56,6 +56,13 @@ def test_a_good_polarizer_changes_nothing(degree: float) -> None:
     assert found_in(body + (1 - degree) * mirrored, degree * mirrored) == 0
 
 
+def test_what_clips_in_a_strong_colour_shows_nothing() -> None:
+    """Samples of a colour in which the lamp is brightest clip first: at 1 over its gain in white light."""
+    body, mirrored = bodies()
+    places = measure_places((body + 0.2 * mirrored).numpy(), (0.8 * mirrored).numpy())
+    assert find_unpolarized(places, 1.0) > 0 == find_unpolarized(places, 3.0)
+
+
 def test_grey_bodies_show_nothing() -> None:
     """White light on grey bodies is not told from shading."""
     body, mirrored = bodies(saturation=0.05)

@@ -22,7 +22,9 @@ from polsep.light.find import (
     WARM_SHARE,
     WHITE_SHARE,
     Light,
+    _spread_deg,
     _usual_lamps,
+    _variance_of,
     combine,
     find_light,
     find_tiles,
@@ -304,3 +306,10 @@ def test_finding_is_deterministic_and_public() -> None:
     one, two = polsep.find_light(codes, white_level=4095), polsep.find_light(codes, white_level=4095)
     assert one == two
     assert one.color == pytest.approx(find_light(mosaic).color, abs=1e-5)
+
+
+def test_errors_and_variances_are_of_one_spread() -> None:
+    """Log-ratios with the variance of a mean error are off by that angle on average, near white."""
+    for error in (0.5, 3.0):
+        spread = _spread_deg(np.zeros(2), _variance_of(error) * np.eye(2) * np.array([[1, 0.5], [0.5, 1]]))
+        assert spread == pytest.approx(error * 2 / math.sqrt(math.pi), rel=0.15)

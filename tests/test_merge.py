@@ -40,8 +40,10 @@ def expose(scene: NDArray[np.float64], time: float, seed: int) -> Mosaic:
 def test_one_frame_stays_itself() -> None:
     """Merging a single frame returns its samples, in units of the white level, to the bit."""
     frame = expose(light(), 2.0, 1)
-    merged = merge_exposures([frame]).mosaic
-    assert torch.equal(merged.linear(), frame.linear()) and torch.equal(merged.clipped(), frame.clipped())
+    for color in ((1.0, 1.0, 1.0), (0.5, 1.0, 0.25)):  # of a calibrated lamp, which is divided out once
+        lit = replace(frame, light_color=color)
+        merged = merge_exposures([lit]).mosaic
+        assert torch.equal(merged.linear(), lit.linear()) and torch.equal(merged.clipped(), lit.clipped())
 
 
 def test_equal_exposures_average() -> None:

@@ -16,7 +16,8 @@ from polsep.render.simulate import filter_light
 from polsep.sensor.black_level import check_black_level
 from polsep.sensor.camera import IMX250, Layout, Mosaic, Sensor
 from polsep.sensor.checks import check_mosaic
-from polsep.sensor.encoding import block_ratio, encoding_warning, gamma_slope
+from polsep.sensor.encoding import block_ratio, encoding_warning, gamma_slope, noise_exponent
+from polsep.sensor.levels import level_notes
 
 COLOR, MONO = Layout(), Layout(bayer=None)
 LAYOUTS = pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
@@ -97,6 +98,30 @@ def test_gamma_curves_are_seen(layout: Layout, power: float) -> None:
     assert gamma_slope(bent) == pytest.approx((power - 1) / power, rel=0.35)
     assert gamma_slope(frame(layout)) == pytest.approx(0, abs=0.1)
     assert "gamma" in (encoding_warning(bent) or "")
+
+
+@LAYOUTS
+def test_the_noise_of_floats_is_that_of_their_codes(layout: Layout) -> None:
+    """Samples of white 1 have the noise exponent of the codes that they were."""
+    codes = frame(layout)
+    floats = Mosaic(codes.data / 4095, layout, 0.0, 1.0)
+    assert noise_exponent(codes) == pytest.approx(noise_exponent(floats), abs=0.01)
+    assert (noise_exponent(codes) or 0) > 0.4
+
+
+def test_a_frame_less_another_has_noise_below_black() -> None:
+    """Parts that only the room lights are black with the noise of both frames, which is no wrong black level."""
+    rng = np.random.default_rng(4)
+    codes = rng.normal(64, 12, (SIZE, SIZE)).clip(0).round().astype(np.float32)
+    mosaic = Mosaic(torch.from_numpy(codes), COLOR, 64.0, 4095.0)
+    assert "lower" in (check_black_level(mosaic).warning or "")
+    assert check_black_level(replace(mosaic, less_ambient=True)).warning is None
+
+
+def test_overexposure_is_seen_in_codes_moved_to_the_left() -> None:
+    """12 bits in 16-bit words end at 65520 of 65535, and clip there."""
+    codes = np.where(np.arange(64)[:, None] < 32, 4095, 1000) * np.ones((1, 64), int) << 4
+    assert any("overexposed: 50%" in note for note in level_notes(codes.astype(np.uint16), 0.0, None))
 
 
 @LAYOUTS

@@ -60,7 +60,8 @@ def merge_exposures(frames: Sequence[Mosaic], times: Sequence[float] | None = No
     _require_same(frames)
     if times is not None and (len(times) != len(frames) or not all(0 < t < float("inf") for t in times)):
         raise ValueError(f"expected {len(frames)} positive exposure times, one per frame, found {list(times)}")
-    linear = [to_numpy(frame.linear()) for frame in frames]
+    # A calibrated lamp's colour stays in the samples: `replace` keeps it for what reads the merged frame.
+    linear = [to_numpy(replace(frame, light_color=(1.0, 1.0, 1.0)).linear()) for frame in frames]
     clipped = [to_numpy(frame.clipped()) for frame in frames]
     found, notes = _find_times(linear, clipped, times)
     order = sorted(range(len(frames)), key=lambda i: found[i])

@@ -16,6 +16,8 @@ Doubles = NDArray[np.float64]
 
 #: Standard deviations of a normal variable per median absolute deviation.
 PER_MAD = 1.4826
+#: Standard deviation over the mean absolute deviation of normal deviates.
+PER_MEAN = 1.2533
 #: Deviations from the median beyond which a value is left out of a mean, in robust standard deviations.
 OUTLIER = 5.0
 #: Share of the pixels that count for the noise: the most variable ones are left out.
@@ -77,18 +79,19 @@ def average_frames(frames: Iterable[Mosaic]) -> FrameMean:
 
 def robust_mean(values: NDArray[np.floating]) -> float:
     """Mean without values that are more than `OUTLIER` robust deviations from the median."""
-    middle = np.median(values)
-    spread = PER_MAD * np.median(np.abs(values - middle))
-    kept = np.abs(values - middle) <= OUTLIER * spread
-    return float(values[kept].mean(dtype=np.float64))
+    return float(values[_usual(values)].mean(dtype=np.float64))
 
 
 def robust_deviation(values: NDArray[np.floating]) -> float:
     """Standard deviation without the values that `robust_mean` leaves out."""
-    middle = np.median(values)
-    spread = PER_MAD * np.median(np.abs(values - middle))
-    kept = np.abs(values - middle) <= OUTLIER * spread
-    return float(values[kept].std(dtype=np.float64))
+    return float(values[_usual(values)].std(dtype=np.float64))
+
+
+def _usual(values: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Values near the median: by their median distance from it, or by the mean one where most codes are equal."""
+    away = np.abs(values - np.median(values))
+    spread = PER_MAD * np.median(away) or PER_MEAN * away.mean(dtype=np.float64)
+    return np.asarray(away <= OUTLIER * spread)
 
 
 def place_means(image: Floats, period: int) -> Doubles:

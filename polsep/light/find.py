@@ -314,7 +314,7 @@ def _spread_deg(x: NDArray[np.float64], covariance: NDArray[np.float64]) -> floa
 
 def _variance_of(error_deg: float) -> float:
     """Variance of each log-ratio of colours near white that are off by this angle on average."""
-    per_ratio = 3 / (2 * math.sqrt(2) * math.sqrt(math.pi / 2))  # mean of a Rayleigh variate
+    per_ratio = 3 / (math.sqrt(2) * math.sqrt(math.pi / 2))  # the angle's square is 2/9 (x^2 + y^2 - x y)
     return float((math.radians(error_deg) * per_ratio) ** 2)
 
 

@@ -57,7 +57,7 @@ def check_black_level(mosaic: Mosaic) -> BlackLevel:
         return BlackLevel(None, None)
     rows = _some_rows(mosaic)
     least, lowest = said - LEAST_EXCESS * span, float(rows.min())
-    below = float(np.mean(rows < least)) if 0 <= lowest < least else 0.0
+    below = float(np.mean(rows < least)) if 0 <= lowest < least and not mosaic.less_ambient else 0.0
     if below > BELOW:
         excess = f"{below:.1%} of the samples lie below the black level {said:g}, which only noise should"
         return BlackLevel(None, f"{excess}: the darkest are at {np.quantile(rows, 0.001):g}, say a lower --black-level")

@@ -18,7 +18,7 @@ Model of a sample without noise, t its analyser's angle and D = (ER - 1) / (ER +
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -107,7 +107,8 @@ class Calibration:
 def correct_mosaic(mosaic: Mosaic, calibration: Calibration) -> Mosaic:
     """One raw frame ``[H, W]`` as a sensor without the measured errors would give it; see the module.
 
-    Raises ValueError on a frame of another size, layout or white level than the calibration's.
+    Codes of another white level are those of the calibration in another unit. Raises ValueError on a frame of another
+    size or layout.
     """
     _check_match(mosaic, calibration)
     raw = to_numpy(mosaic.data)
@@ -161,7 +162,7 @@ def subtract_ambient(mosaic: Mosaic, ambient: Mosaic) -> Mosaic:
     data = as_floats(mosaic.data)
     data = data - namespace(data).astype(as_floats(other.data) - black, data.dtype, copy=False)
     hidden = (mosaic.clipped() | other.clipped()) & (data < black + (1 - CLIP_MARGIN) * (white - black))
-    return replace(mosaic, data=namespace(data).where(hidden, white, data))
+    return replace(mosaic, data=namespace(data).where(hidden, white, data), less_ambient=True)
 
 
 def ambient_notes(frame: Mosaic, less: Mosaic) -> tuple[str, ...]:
@@ -178,21 +179,26 @@ def ambient_notes(frame: Mosaic, less: Mosaic) -> tuple[str, ...]:
     return (f"the ambient frame is as bright as this one in {gone:.0%} of what is lit: was the lamp off in it?",)
 
 
-def mean_mosaic(mosaics: list[Mosaic]) -> Mosaic:
-    """The mean of frames of one exposure; a sample is clipped where any frame's is. Raises ValueError on mixed ones."""
-    first = mosaics[0]
-    for other in mosaics[1:]:
+def mean_mosaic(mosaics: Iterable[Mosaic]) -> Mosaic:
+    """The mean of frames of one exposure, one at a time; a sample is clipped where any frame's is.
+
+    Raises ValueError on none, and on mixed ones.
+    """
+    frames = iter(mosaics)
+    first = next(frames, None)
+    if first is None:
+        raise ValueError("expected at least one frame, found none")
+    xp = namespace(first.data)
+    total, clipped, count = xp.astype(first.data, xp.float64), first.clipped(), 1
+    for other in frames:
         if (other.layout, other.black_level, other.white_level) != (first.layout, first.black_level, first.white_level):
             raise ValueError("expected frames of one layout and of the same levels, found different ones")
         if other.data.shape != first.data.shape:
             raise ValueError(f"expected frames of one size, found {_size(first)} and {_size(other)}")
-    if len(mosaics) == 1:
+        total, clipped, count = total + other.data, clipped | other.clipped(), count + 1
+    if count == 1:
         return first
-    xp = namespace(first.data)
-    total, clipped = xp.astype(first.data, xp.float64), first.clipped()
-    for other in mosaics[1:]:
-        total, clipped = total + other.data, clipped | other.clipped()
-    mean = xp.astype(total / len(mosaics), xp.float32)
+    mean = xp.astype(total / count, xp.float32)
     return replace(first, data=xp.where(clipped, mean.clip(float(first.white_level), None), mean))
 
 

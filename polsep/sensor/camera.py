@@ -198,8 +198,8 @@ class Mosaic:
     ``black_level`` and ``white_level`` are in the units of ``data``. Samples within `CLIP_MARGIN` of the white level
     count as clipped. ``light_color``: one gain per channel that `linear` divides out, so that what follows sees white
     light. ``falloff``: the smooth part of a calibrated sensor's flat frame (`calibration.falloff_image`), by which
-    separated images are divided. Raises ValueError when white is not above black or the frame is smaller than one
-    period.
+    separated images are divided. ``less_ambient``: another frame was subtracted, and noise goes far below black.
+    Raises ValueError when white is not above black or the frame is smaller than one period.
     """
 
     data: Array
@@ -208,6 +208,7 @@ class Mosaic:
     white_level: float
     light_color: tuple[float, ...] = (1.0, 1.0, 1.0)
     falloff: tuple[tuple[float, ...], ...] | None = None
+    less_ambient: bool = False
 
     __repr__ = short_repr
 

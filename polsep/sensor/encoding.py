@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
-from polsep.sensor.black_level import smooth_blocks
+from polsep.sensor.black_level import MIN_SPAN, smooth_blocks
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.layout_check import crossed_pairs, phase_cells, see_phases
 
@@ -32,6 +32,8 @@ MAX_EXPONENT = 0.3
 BINS, MIN_BLOCKS, MIN_LEVEL, MIN_RANGE = 12, 32, 0.02, 0.25
 #: Strongest polarization, relative to brightness, that the second order describes; weakest that says anything.
 MAX_DOLP, MIN_DOLP = 0.9, 0.05
+#: White level of the codes that light given as floats once was.
+USUAL_CODES = 4095.0
 #: Fewest blocks with polarized light, and the side of the least frame.
 MIN_CELLS, MIN_SIDE = 64, 64
 #: White level of JPEG files.
@@ -99,7 +101,9 @@ def noise_exponent(mosaic: Mosaic) -> float | None:
         return None
     order = np.argsort(level)
     parts = np.array_split(order, BINS)
-    points = np.log([[np.median(level[part]), np.quantile(variance[part], 0.1) + 1 / 12] for part in parts])
+    span = mosaic.white_level - mosaic.black_level
+    step = 1.0 if span >= MIN_SPAN else span / USUAL_CODES  # floats of white 1 once were codes
+    points = np.log([[np.median(level[part]), np.quantile(variance[part], 0.1) + step**2 / 12] for part in parts])
     if np.ptp(points[:, 0]) < MIN_RANGE:
         return None
     return float(np.polyfit(points[:, 0], points[:, 1], 1)[0])

@@ -5,7 +5,7 @@ A cell is 2x2 pixels under the four analysers, the unit of half resolution.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ class Histogram:
 
 def histogram(mosaic: Mosaic, bins: int = 128) -> Histogram:
     """Histogram of raw samples from black to white; samples beyond count in the first and last bins."""
+    mosaic = replace(mosaic, light_color=(1.0, 1.0, 1.0))  # a calibrated lamp's colour is not in raw samples
     samples, clipped = to_numpy(mosaic.linear()), to_numpy(mosaic.clipped())
     layout, period = mosaic.layout, mosaic.layout.period
     count = np.zeros((layout.channels, bins))

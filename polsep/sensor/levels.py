@@ -58,6 +58,10 @@ class ForgottenLevel(str):
     """
 
 
+class BlackFrame(str):
+    """A note on samples that all are black, which say nothing of their levels."""
+
+
 def as_mosaic(
     array: NDArray[Any], layout: Layout | str | None = None, black_level: float = 0.0, white_level: float | None = None
 ) -> tuple[Mosaic, Notes]:
@@ -132,11 +136,12 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
     white = WHITE_LEVELS[samples.dtype.name] if white_level is None else white_level
     low, high = float(samples.min()), float(samples.max())
     if high <= black_level:
-        return (f"black frame: no sample exceeds the black level {black_level:g} (largest {high:g})",)
+        return (BlackFrame(f"black frame: no sample exceeds the black level {black_level:g} (largest {high:g})"),)
     notes: Notes = ()
-    if low - black_level >= (1 - CLIP_MARGIN) * (white - black_level):
+    clip = black_level + (1 - CLIP_MARGIN) * (white - black_level)
+    if low >= clip:
         notes += (f"every sample is clipped: the smallest is {low:g} of white level {white:g}",)
-    elif high >= white and (share := clipped_share(samples, black_level, white)) > MAX_CLIPPED:
+    elif high >= clip and (share := clipped_share(samples, black_level, white)) > MAX_CLIPPED:
         notes += (
             f"overexposed: {share:.0%} of the lit samples are clipped, what they hide is estimated: expose less, "
             "or merge several exposures (polsep merge)",

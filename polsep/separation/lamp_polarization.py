@@ -59,14 +59,17 @@ def measure_places(diffuse: Array, specular: Array) -> Places:
     return Places(color, light, square, product, largest.reshape(-1))
 
 
-def find_unpolarized(places: Places) -> float:
-    """The part of the specular image that is left in the diffuse one, (1 - p) / p; 0 where none is proven."""
+def find_unpolarized(places: Places, gain: float = 1.0) -> float:
+    """The part of the specular image that is left in the diffuse one, (1 - p) / p; 0 where none is proven.
+
+    ``gain``: the lamp's largest, of a colour that clips at 1 / gain in its light.
+    """
     color, light, square, product, largest = places
     variance, covariance = (square - light**2)[0], product - light * color
     body = color / np.linalg.norm(color, axis=0).clip(1e-9)
     white = 1 - body * body.sum(axis=0)
     power = (white**2).sum(axis=0)
-    shown = (variance > MIN_VARIANCE) & (power > MIN_WHITE) & (largest < MAX_SAMPLE)
+    shown = (variance > MIN_VARIANCE) & (power > MIN_WHITE) & (largest * max(gain, 1.0) < MAX_SAMPLE)
     body, white, power, covariance = (x[..., shown] for x in (body, white, power, covariance))
     if len(power) < MIN_PLACES or not has_hues(body):
         return 0.0

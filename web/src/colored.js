@@ -20,7 +20,7 @@ export function colorSpecular(images, mosaic, light, sums) {
   const [top, left] = mosaic.layout.origin, sides = [mosaic.height - top, mosaic.width - left];
   if (channelsOf(mosaic.layout) !== 3 || Math.min(...sides) < MIN_SIZE) return { report };
   const { diffuse, specular, valid } = images;
-  const unpolarized = findUnpolarized(images), before = sum(specular);
+  const unpolarized = findUnpolarized(images, Math.max(...light, 1)), before = sum(specular);
   if (unpolarized)
     for (let k = 0; k < diffuse.length; k++) {
       const moved = Math.min(unpolarized * specular[k], diffuse[k]);
@@ -91,7 +91,7 @@ function seePeriods(images, mosaic, light, sums, thin) {
   const names = ["s0", "polarized", "across", "diffuse", "total"];
   const seen = { height: h, width: w, ...Object.fromEntries(names.map((name) => [name, new Float32Array(3 * h * w)])) };
   const length = Math.max(Math.hypot(sums.along, sums.across), 1e-30), [a, b] = [sums.along / length, sums.across / length];
-  const range = (k, n, count) => (thin ? [6 * k, 6 * k + 2] : [Math.floor((k * n) / count), Math.ceil(((k + 1) * n) / count)]);
+  const range = (k) => [2 * step * k, 2 * step * k + 2]; // a last row or column that is no whole period is left out
   const stokes = new Float64Array(9), light6 = new Float64Array(6);
   for (let i = 0, at = 0; i < h; i++)
     for (let j = 0; j < w; j++, at += 3) {
@@ -101,7 +101,7 @@ function seePeriods(images, mosaic, light, sums, thin) {
         for (let s = 0; s < 3; s++) stokes[3 * s + channel] += part[s] * value;
       }
       light6.fill(0);
-      const [r0, r1] = range(i, images.height, h), [c0, c1] = range(j, images.width, w), share = 1 / ((r1 - r0) * (c1 - c0));
+      const [r0, r1] = range(i), [c0, c1] = range(j), share = 1 / ((r1 - r0) * (c1 - c0));
       for (let r = r0; r < r1; r++)
         for (let c = c0, k = 3 * (r * images.width + c0); c < c1; c++, k += 3)
           for (let channel = 0; channel < 3; channel++) {
@@ -158,7 +158,7 @@ function hasHues(bodies) {
 const lower = (values) => [...values].sort((a, b) => a - b)[(values.length - 1) >> 1];
 
 /** The part of the specular image that is left in the diffuse one, (1 - p) / p; 0 where none is proven. */
-function findUnpolarized({ diffuse, specular, height, width }) {
+function findUnpolarized({ diffuse, specular, height, width }, gain) {
   const shown = [], n = LAMP.side ** 2;
   for (let top = 0; top + LAMP.side <= height; top += LAMP.side)
     for (let left = 0; left + LAMP.side <= width; left += LAMP.side) {
@@ -177,7 +177,7 @@ function findUnpolarized({ diffuse, specular, height, width }) {
         }
       const size = Math.max(Math.hypot(...color), 1e-9), body = color.map((v) => v / size), variance = square - light ** 2;
       const white = body.map((v) => 1 - v * sum(body)), power = dot(white, white);
-      if (variance > LAMP.variance && power > LAMP.white && largest < LAMP.sample) {
+      if (variance > LAMP.variance && power > LAMP.white && largest * gain < LAMP.sample) {
         const slope = color.map((v, i) => (product[i] - light * v) / variance);
         const cross = [body[1] * white[2] - body[2] * white[1], body[2] * white[0] - body[0] * white[2], body[0] * white[1] - body[1] * white[0]];
         shown.push({ body, along: dot(slope, white) / power, beside: dot(slope, cross) / power });

@@ -4,6 +4,7 @@ import { seePhases } from "./layout_check.js";
 import { median, quantile } from "./numbers.js";
 import { smoothBlocks } from "./noise.js";
 
+const MIN_SPAN = 100, USUAL_CODES = 4095;
 const MIN_SLOPE = -2, MAX_SLOPE = -0.55, MIN_ERRORS = 2.5, MAX_EXPONENT = 0.3, BINS = 12, MIN_BLOCKS = 32, MIN_LEVEL = 0.02;
 const MIN_RANGE = 0.25, MAX_DOLP = 0.9, MIN_DOLP = 0.05, MIN_CELLS = 64, MIN_SIDE = 64, SIDE = 8, BLOCKS = 8192, MAX_RATIO = 0.87;
 
@@ -51,10 +52,11 @@ function noiseExponent(mosaic) {
   const blocks = smoothBlocks(mosaic).map(([level, variance]) => [level - mosaic.black, variance]).filter(([level]) => level > least);
   if (blocks.length < BINS * MIN_BLOCKS) return null;
   blocks.sort((a, b) => a[0] - b[0]);
+  const span = mosaic.white - mosaic.black, step = span >= MIN_SPAN ? 1 : span / USUAL_CODES;
   const points = [], extra = blocks.length % BINS, each = Math.floor(blocks.length / BINS);
   for (let bin = 0, at = 0; bin < BINS; bin++) {
     const part = blocks.slice(at, (at += each + (bin < extra)));
-    points.push([Math.log(median(part.map(([level]) => level))), Math.log(quantile(part.map(([, own]) => own), 0.1) + 1 / 12)]);
+    points.push([Math.log(median(part.map(([level]) => level))), Math.log(quantile(part.map(([, own]) => own), 0.1) + step ** 2 / 12)]);
   }
   if (points[BINS - 1][0] - points[0][0] < MIN_RANGE) return null;
   const [x, y] = [0, 1].map((k) => points.reduce((total, own) => total + own[k] / BINS, 0));

@@ -27,7 +27,7 @@ export function levelNotes(samples, width, black, said) {
   const shown = Number(white.toPrecision(6));
   if (low - black >= (1 - CLIP_MARGIN) * (white - black))
     notes.push({ text: `every sample is clipped: the smallest is ${low} of white level ${shown}` });
-  else if (high >= white) {
+  else if (high >= black + (1 - CLIP_MARGIN) * (white - black)) {
     const share = clippedShare(samples, width, black, white);
     if (share > MAX_CLIPPED)
       notes.push({

@@ -9,7 +9,12 @@ const part = (id) => document.getElementById(id);
 const options = new URLSearchParams(location.search);
 const worker = new Worker(new URL("worker.js", location.href), { type: "module" });
 const viewer = new Viewer(part("stage"), part("canvas"), part("handle"), showScale);
-const state = { file: null, images: null, report: null, gain: 1, busy: false, again: false, next: null, name: "" };
+// name: of the images shown; frame: name of the frame that the worker holds, once there is one; pending: the file that is
+// being read, or whose format is asked for; subject: name of the file at work.
+const state = {
+  images: null, report: null, gain: 1, name: "", frame: "", pending: null,
+  subject: "", busy: false, again: false, next: null,
+};
 
 for (const [id, start] of [["left", "diffuse"], ["right", "specular"]])
   part(id).append(...Object.entries(VIEWS).map(([value, text]) => new Option(text, value, value === start, value === start)));
@@ -37,7 +42,7 @@ function ask(job, message = {}) {
 function showProgress({ share, text }) {
   part("progress").hidden = false;
   part("progress").value = share;
-  part("status").textContent = `${state.name} · ${text} …`;
+  part("status").textContent = `${state.subject} · ${text} …`;
 }
 
 const settings = () => ({
@@ -50,16 +55,17 @@ const settings = () => ({
   device: options.get("device") || part("device").value,
 });
 
-/** Read a file and separate it; after what is at work, of several files the last. `stated`: format and size. */
-function open(file, stated = null) {
-  if (!state.busy) return work(() => read(file, stated));
-  state.next = [file, stated];
+/** Read a file and separate it; after what is at work, of several files the last. `stated`: format and size; `white`:
+ * its white level where that is known. */
+function open(file, stated = null, white = null) {
+  if (!state.busy) return work(() => read(file, stated, white), file.name);
+  state.next = [file, stated, white];
   part("status").textContent = `${file.name} · next …`;
 }
 
-/** Do one thing at a time, then what was asked for meanwhile: another file, or other settings. */
-async function work(act) {
-  state.busy = true;
+/** Do one thing for a file at a time, then what was asked for meanwhile: another file, or other settings. */
+async function work(act, subject) {
+  Object.assign(state, { busy: true, subject });
   try {
     await act();
   } catch (error) {
@@ -73,18 +79,39 @@ async function work(act) {
   else if (state.again) separate();
 }
 
-async function read(file, stated) {
-  Object.assign(state, { file, name: file.name });
-  part("raw").hidden = true;
+async function read(file, stated, white) {
+  state.pending = file;
+  document.body.dataset.state = "busy";
+  part("raw").hidden = !stated;
   clearNotes();
-  const found = await ask("open", { file, name: file.name, stated });
-  if (found.needsFormat) askFormat(found);
-  else await separateOpen();
+  const found = await ask("open", { file, name: file.name, stated }).catch((error) => {
+    if (!stated) state.pending = null;  // else the format can be put right
+    throw error;
+  });
+  if (!stated && (state.frame || white)) beginSettings(white);
+  if (found.needsFormat) return askFormat(found);
+  Object.assign(state, { pending: null, frame: file.name });
+  part("raw").hidden = true;
+  await separateOpen();
+}
+
+/** The settings that describe a file, as the page begins with them: another file has others. */
+function beginSettings(white) {
+  for (const id of ["black", "sensor", "layout"]) part(id).value = "";
+  part("white").value = white ?? "";
+  part("light").value = "auto";
+  showFields();
+}
+
+function showFields() {
+  part("order").hidden = part("sensor").value !== "other";
+  part("rgb").hidden = part("light").value !== "stated";
 }
 
 function askFormat({ size, guesses }) {
   part("raw").hidden = false;
-  part("status").textContent = `${state.name}: ${size} bytes without a header. Which format and size?`;
+  document.body.dataset.state = "asking";
+  part("status").textContent = `${state.subject}: ${size} bytes without a header. Which format and size?`;
   if (!guesses.length) return;
   part("format").value = guesses[0].format;
   part("width").value = guesses[0].width;
@@ -93,26 +120,24 @@ function askFormat({ size, guesses }) {
 
 /** Separate the frame that is open, by the settings as they are; once more where these change meanwhile. */
 function separate() {
-  if (!state.file) return;
   if (state.busy) state.again = true;
-  else work(separateOpen);
+  else if (state.frame && !state.pending) work(separateOpen, state.frame);  // else the settings are of a file to come
 }
 
 async function separateOpen() {
-  document.body.dataset.state = "busy";
   do {
     state.again = false;
-    const found = await ask("separate", { settings: settings() });
-    if (!state.again && !state.next) showResult(found);
+    document.body.dataset.state = "busy";
+    showResult(await ask("separate", { settings: settings() }));  // always: the worker writes files of its last result
   } while (state.again && !state.next);
 }
 
-function showResult({ images, report, notes }) {
+function showResult({ images, report, notes, name }) {
   const first = !state.images;
-  Object.assign(state, { images: { ...images, clearness: clearnessOf(images) }, report, gain: fittingGain(images) });
+  Object.assign(state, { images: { ...images, clearness: clearnessOf(images) }, report, gain: fittingGain(images), name });
   part("empty").hidden = true;
   document.body.classList.remove("empty");
-  clearNotes();
+  clearNotes(name);
   part("notes").append(...notes.map(noteItem));
   draw();
   if (first) viewer.fit();
@@ -168,15 +193,20 @@ function useLayout(layout) {
   const known = ["color", "mono"].includes(layout);
   part("sensor").value = known ? layout : "other";
   part("layout").value = known ? "" : layout;
-  part("order").hidden = known;
+  showFields();
 }
 
-const clearNotes = () => part("notes").replaceChildren();
+/** Remove the notes, but for what is wrong with another file than the one given. */
+function clearNotes(name = null) {
+  const kept = name === null ? [] : [...part("notes").querySelectorAll(".failed")].filter((item) => item.dataset.file !== name);
+  part("notes").replaceChildren(...kept);
+}
 
-function fail(error) {
+function fail(error, file = state.subject) {
   const item = document.createElement("li");
   item.className = "failed";
-  item.textContent = `${state.name}: ${error.message}`;
+  item.dataset.file = file;
+  item.textContent = `${file}: ${error.message}`;
   part("notes").replaceChildren(item);
   part("status").textContent = "";
   part("progress").hidden = true;
@@ -256,7 +286,7 @@ async function download(format) {
     const { blob } = await ask("write", { format });
     save(blob, format === "exr" ? `${stem}.exr` : `${stem}_${format}.png`);
     part("status").textContent = status;
-  });
+  }, state.name);
 }
 
 /** Values under the pointer. */
@@ -276,18 +306,16 @@ part("file").onchange = () => {
 };
 part("example").onclick = async () => {
   const answer = await fetch("example.png").catch(() => null);
-  if (!answer?.ok) return fail(new Error("expected the example beside the page, found none"));
-  part("white").value = 4095;
-  open(new File([await answer.blob()], "example.png"));
+  if (!answer?.ok) return fail(new Error("expected the example beside the page, found none"), "example.png");
+  open(new File([await answer.blob()], "example.png"), null, 4095);
 };
 part("raw").onsubmit = (event) => {
   event.preventDefault();
-  open(state.file, { format: part("format").value, width: part("width").valueAsNumber, height: part("height").valueAsNumber });
+  open(state.pending, { format: part("format").value, width: part("width").valueAsNumber, height: part("height").valueAsNumber });
 };
 part("settings").onsubmit = (event) => event.preventDefault();
 part("settings").onchange = () => {
-  part("order").hidden = part("sensor").value !== "other";
-  part("rgb").hidden = part("light").value !== "stated";
+  showFields();
   separate();
 };
 for (const id of ["left", "right"]) part(id).onchange = draw;

@@ -3,7 +3,9 @@
 const CACHE = "polsep-VERSION", FILES = ["./", ...FILES_OF_THE_PAGE];
 
 self.addEventListener("install", (event) => {
-  event.waitUntil(caches.open(CACHE).then((cache) => cache.addAll(FILES)));
+  // Not from the browser's own cache: soon after a new build it has files of the old one.
+  const requests = FILES.map((name) => new Request(name, { cache: "reload" }));
+  event.waitUntil(caches.open(CACHE).then((cache) => cache.addAll(requests)));
 });
 
 self.addEventListener("activate", (event) => {

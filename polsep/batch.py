@@ -19,6 +19,7 @@ from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import one_line
 from polsep.methods import find_method, release_memory
 from polsep.pipeline import LightColor, Result, separate_capture
+from polsep.sensor.levels import BlackFrame, ForgottenLevel
 
 if TYPE_CHECKING:
     from polsep.photographs import PhotoOptions
@@ -38,13 +39,15 @@ class SeparateOptions:
 class WriteOptions:
     """Directory and ``format`` of the results, one of `io.results.separation_writer.FORMATS`.
 
-    ``stokes``: with Stokes images, for EXR files alone. Raises OutputError on others.
+    ``stokes``: with Stokes images, for EXR files alone. ``kept``: files that no output may replace, besides frames.
+    Raises OutputError on Stokes images in others.
     """
 
     directory: Path = Path("polsep-out")
     format: str = "exr"
     overwrite: bool = False
     stokes: bool = False
+    kept: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         if self.stokes and self.format != "exr":
@@ -53,13 +56,17 @@ class WriteOptions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of one frame, or of a file that could not be read: the files written, or the error in one line."""
+    """Result of one frame, or of a file that could not be read: the files written, or the error in one line.
+
+    ``last``: nothing more comes of that file.
+    """
 
     source: str
     written: tuple[Path, ...] = ()
     warnings: tuple[str, ...] = ()
     report: dict[str, Any] = field(default_factory=dict)
     error: str | None = None
+    last: bool = True
 
 
 def separate_files(
@@ -69,32 +76,40 @@ def separate_files(
 
     Raises OutputError before any work when two inputs have one name. A frame whose outputs would replace an input, or
     one of another frame, is refused, also with ``overwrite``. So is one whose white level was likely forgotten, unless
-    a frame before it used its range.
+    a frame before it used the range of that level. A failure ends its file.
     """
     _refuse_equal_names(paths)
     angles = ("0", "45", "90", "135")
     claimed = {realpath(path.replace("{angle}", angle)): "is an input" for path in paths for angle in angles}
-    trusted = False
+    claimed |= {realpath(path): "is an input" for path in write.kept}
+    trusted: set[float | None] = set()  # white levels
     for path in paths:
+        left: int | None = None  # frames of the file
         try:
             for frame in read_frames(path, read):
-                trusted = trusted or not frame.notes
-                if not trusted:
+                left, level = frame.count - frame.index, getattr(frame.data, "white_level", None)
+                if not any(isinstance(note, ForgottenLevel | BlackFrame) for note in frame.notes):
+                    trusted.add(level)
+                if level not in trusted:
                     refuse_forgotten(path, frame)
                 outputs = planned_outputs(write.directory, frame.stem, write.format)
                 if clash := sorted({realpath(output) for output in outputs} & claimed.keys()):
                     raise OutputError(f"{path}: expected outputs of its own, found that {clash[0]} {claimed[clash[0]]}")
                 refuse_existing(write.directory, outputs, write.overwrite)
-                stem, last = frame.stem, path == paths[-1] and frame.index + 1 >= frame.count
+                stem, last = frame.stem, path == paths[-1] and left <= 1
                 separated = _separate_frame(path, frame, read, options, write.stokes)
                 del frame  # like the rest, memory that the writer can use
                 if last:
                     release_memory()
                 outcome = _write_frame(path, stem, separated, write)
                 claimed |= {realpath(output): f"is of {path}" for output in outcome.written}
-                yield outcome
+                left -= 1
+                yield replace(outcome, last=left <= 0)
+            if left is None:
+                raise ValueError(f"{path}: expected frames, found none")
         except (ValueError, OSError, MemoryError, RuntimeError) as error:
-            yield Outcome(path, error=one_line(error) or type(error).__name__)
+            more = f"; {left - 1} frames behind it are left out" if left and left > 1 else ""
+            yield Outcome(path, error=(one_line(error) or type(error).__name__) + more)
 
 
 def separate_photographs(
@@ -122,8 +137,8 @@ def _separate_frame(path: str, frame: Frame, read: ReadOptions, options: Separat
     """A frame's images with all that its file says, without its capture; ``stokes``: with Stokes images."""
     try:
         separated = separate_capture(frame.data, options.method, options.light_color, options.device, options.full)
-    except (ValueError, RuntimeError) as error:
-        raise ValueError(f"{path}: {error}") from error
+    except (ValueError, RuntimeError, MemoryError) as error:
+        raise ValueError(f"{path}: {str(error) or 'out of memory'}") from error
     separated.report["source"] = Path(path).name
     separated.report["settings"] = read.settings()
     separated.report["warnings"] = [*frame.notes, *separated.report["warnings"]]

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
+import socket
+import struct
 import threading
 import time
 import urllib.error
 import urllib.request
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from itertools import count, islice, pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import imagecodecs
@@ -22,10 +27,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from test_cli import Cli, assert_refused, frame, png
+from test_cli import Cli, assert_refused, contents, frame, png
 from test_cli import polsep as polsep  # the fixture
 
-from polsep.capture import find, session
+from polsep.capture import find, session, sources
 from polsep.capture.folder import FolderSource
 from polsep.capture.live import LiveView, Shown, advise
 from polsep.capture.page import serve_page
@@ -40,6 +45,7 @@ from polsep.capture.sources import (
     EndOfFrames,
     FrameIds,
     Loss,
+    SoftwareTrigger,
 )
 from polsep.io.raw.frames import Frame, ReadOptions, read_frames
 from polsep.io.raw.genicam import pack_frame
@@ -151,6 +157,31 @@ def test_ids_that_go_back_are_another_count() -> None:
     assert [ids.lost_before(i) for i in (100, 101, 90, 92)] == [0, 0, 0, 1]
     ids = FrameIds()
     assert [ids.lost_before(i) for i in (2**40, 5, 6)] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("rate_hz", [2.0, 5.0, 20.0, 60.0])
+def test_software_triggers_come_at_their_rate(monkeypatch: pytest.MonkeyPatch, rate_hz: float) -> None:
+    """Frames come 10 ms after them, however long a read may wait; after a stall, what was due meanwhile is left out."""
+    now, frame_s, found = 100.0, math.inf, list[float]()
+    monkeypatch.setattr(sources, "time", SimpleNamespace(monotonic=lambda: now))
+    trigger = SoftwareTrigger(CameraSettings(frame_rate_hz=rate_hz, trigger="Software"))
+    trigger.start()
+    while len(found) < 20:
+        if trigger.is_due():
+            found.append(now)
+            frame_s = now + 0.01
+        end = now + trigger.limit_wait(0.2)
+        now, frame_s = (frame_s, math.inf) if frame_s <= end else (end, frame_s)
+    np.testing.assert_allclose(np.diff(found), 1 / rate_hz, rtol=1e-9)
+    now += 60.0
+    assert trigger.is_due() and not trigger.is_due()
+    assert trigger.limit_wait(10.0) == pytest.approx(1 / rate_hz)
+
+
+def test_other_triggers_are_not_waited_for() -> None:
+    trigger = SoftwareTrigger(CameraSettings(trigger="Line0"))
+    trigger.start()
+    assert not trigger.is_due() and trigger.limit_wait(0.2) == 0.2
 
 
 @given(st.integers(1, 5), st.lists(st.booleans(), max_size=60))
@@ -337,6 +368,23 @@ def test_a_recording_can_be_begun_anywhere(recording: Path) -> None:
     assert isinstance(later, Frame) and np.array_equal(later.data.data, codes(4))
 
 
+@pytest.mark.parametrize("name", [RAW, INDEX])
+def test_missing_parts_are_named(recording: Path, name: str) -> None:
+    (recording / name).unlink()
+    with pytest.raises(InputError, match=rf"recording\.json: expected .* beside it, found no {name}"):
+        next(read_frames(recording / RECORD))
+
+
+def test_a_recording_is_not_replaced_by_its_results(recording: Path, polsep: Cli) -> None:
+    """Neither the index nor the record gives way to a log or a report of its name."""
+    before = {path.name: path.read_bytes() for path in recording.iterdir()}
+    folder = recording.rename(recording.with_name("recording"))
+    for source in ([folder / RAW, "--size", f"{WIDTH}x{HEIGHT}", "--pixel-format", PACKED], [folder]):
+        run = polsep("video", *source, "-o", folder, "--method", "analytic", "--white-level", "4095", "--overwrite")
+        assert run.status == 2 and "is an input" in run.err
+        assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
 def test_damage_is_seen(recording: Path) -> None:
     damaged = bytearray((recording / RAW).read_bytes())
     damaged[2 * HEADER.frame_bytes + 5] ^= 1
@@ -492,6 +540,44 @@ def test_a_camera_that_stays_away_ends_the_run(tmp_path: Path) -> None:
     assert not record["finished"] and record["counters"]["recorded"] == 1 and record["counters"]["away_s"] >= 0.1
 
 
+@pytest.fixture
+def pass_time(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Let seconds pass for a run."""
+    passed = [0.0]
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + sum(passed), sleep=time.sleep)
+    monkeypatch.setattr(session, "time", clock)
+    return passed.append
+
+
+def test_a_camera_is_waited_for_from_its_loss(tmp_path: Path, pass_time: Callable[[float], None]) -> None:
+    """A camera that waits for triggers may have been silent for long, also when it has just come back."""
+
+    def quiet(*images: RawImage) -> Iterator[Event]:
+        yield from images
+        pass_time(60.0)
+        yield CameraLost("unplugged")
+
+    absent = CameraError("expected a camera, found none")
+    triggered = replace(INFO, patience_s=math.inf)
+    source = Scripted(quiet(image(1)), absent, quiet(), absent, [image(2)], info=triggered)
+    status, said = run(source, CapturePlan(tmp_path, None), frames=2)
+    assert (status.counters.recorded, status.counters.interruptions) == (2, 1)
+    assert sum(line == "camera lost: unplugged; trying again every second for 30 s" for line in said) == 2
+    assert 120 <= status.counters.away_s < 150  # from the last frame to the next one
+
+
+def test_a_camera_that_comes_back_silent_ends_the_run(tmp_path: Path, pass_time: Callable[[float], None]) -> None:
+    """One that runs freely is back with its first frame, not where it can merely be connected to."""
+
+    def silent() -> Iterator[Event]:
+        pass_time(10.0)
+        yield CameraLost("no frame for 10 s")
+
+    source = Scripted([image(1), CameraLost("gone")], *(silent() for _ in range(9)))
+    with pytest.raises(CameraError, match="expected the camera back within 30 s, found: no frame for 10 s"):
+        run(source, CapturePlan(tmp_path, None))
+
+
 def test_a_camera_that_comes_back_as_another_is_refused(tmp_path: Path) -> None:
     source = Scripted([image(1), CameraLost("gone")], [image(2)])
 
@@ -593,11 +679,35 @@ def test_the_page_shows_the_latest_picture_to_this_machine() -> None:
             get("live.jpg")
         shown[0] = Shown(b"jpeg", 7, 25.0, ())
         assert get("live.jpg?7") == b"jpeg" and json.loads(get("state.json"))["frame_id"] == 7
-        with pytest.raises(urllib.error.HTTPError, match="403"):
-            get("live.jpg", Host="elsewhere.example:80")
+        for host in ("127.0.0.1", "localhost", "localhost:80"):  # browsers do not name port 80
+            assert get("live.jpg", Host=host) == b"jpeg"
+        for host in ("elsewhere.example:80", "elsewhere.example", "127.0.0.1.example", ""):
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                get("live.jpg", Host=host)
         port = int(address.rpartition(":")[2].strip("/"))
         with pytest.raises(CameraError, match="expected a free port for --show"), serve_page(port, lambda: None, str):
             pass
+
+
+def test_a_tab_that_was_closed_is_no_error(capfd: pytest.CaptureFixture[str]) -> None:
+    """Nothing is printed over the status line, wherever in the answer the browser goes."""
+    asked, closed = threading.Event(), threading.Event()
+
+    def latest() -> None:
+        asked.set()
+        assert closed.wait(10)
+
+    with serve_page(0, latest, str) as address:
+        port = int(address.rpartition(":")[2].strip("/"))
+        with socket.create_connection(("127.0.0.1", port)) as tab:
+            tab.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closing it is a reset
+            tab.sendall(b"GET /state.json HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert asked.wait(10)
+        closed.set()
+        for thread in threading.enumerate():
+            if "process_request_thread" in thread.name:
+                thread.join(10)
+    assert capfd.readouterr().err == ""
 
 
 # the command
@@ -612,6 +722,20 @@ def test_the_command_records_and_says_where(tmp_path: Path, polsep: Cli) -> None
     again = polsep("capture", f"loop:{tmp_path}", "-o", tmp_path / "take", *words)
     assert_refused(again, "expected no", "found one from before; --overwrite replaces it")
     assert polsep("capture", f"loop:{tmp_path}", "-o", tmp_path / "take", *words, "--overwrite").status == 0
+
+
+@pytest.mark.parametrize("source", ["take", "loop:take", "folder:take/recording.json"])
+def test_a_recording_is_not_recorded_over_itself(
+    monkeypatch: pytest.MonkeyPatch, recording: Path, polsep: Cli, source: str
+) -> None:
+    monkeypatch.chdir(recording.parent)
+    before = contents(recording)
+    done = polsep("capture", source, "-o", "take", "--overwrite", "--method", "none")
+    assert_refused(done, "expected outputs apart from inputs, found that", "recording.json is an input")
+    png(recording.parent / "shot.png", codes(5))
+    done = polsep("capture", "shot.png", "-o", "take", "--overwrite", "--ambient", "take/frames.raw")
+    assert_refused(done, "expected outputs apart from inputs, found that", "frames.raw is an input")
+    assert contents(recording) == before
 
 
 @pytest.mark.parametrize(

@@ -252,8 +252,13 @@ def test_forgotten_white_level_is_refused(tmp_path: Path, polsep: Cli) -> None:
     for level in ("4095", "65535"):
         run = polsep("separate", dim, "-o", tmp_path / level, "--white-level", level)
         assert run.status == 0 and "--white-level" not in run.err
-    run = polsep("separate", png(tmp_path / "bright.png", frame()), dim, "-o", tmp_path / "o")
-    assert run.status == 0 and "--white-level 4095 if so" in run.err
+    clipped = np.where(np.arange(32)[:, None] < 16, 65535, frame()).astype(np.uint16)  # which has a note of its own
+    for name, codes in (("bright", frame()), ("over", clipped)):
+        run = polsep("separate", png(tmp_path / f"{name}.png", codes), dim, "-o", tmp_path / name)
+        assert run.status == 0 and "--white-level 4095 if so" in run.err
+    eight = png(tmp_path / "eight.png", (frame() >> 8).astype(np.uint8))  # whose white level is another one
+    run = polsep("separate", eight, dim, "-o", tmp_path / "o")
+    assert run.status == 2 and "expected a white level" in run.err and not list((tmp_path / "o").glob("dim*"))
 
 
 def test_folders_are_separated(tmp_path: Path, polsep: Cli) -> None:
@@ -267,6 +272,44 @@ def test_folders_are_separated(tmp_path: Path, polsep: Cli) -> None:
     assert sources == [str(tmp_path / "in" / name) for name in ("set_{angle}.png", "shot9.png", "shot10.png")]
     (tmp_path / "none").mkdir()
     assert_refused(polsep("separate", tmp_path / "none", "-o", tmp_path / "o"), "expected a folder of frames")
+    run = polsep("separate", tmp_path / "none", png(tmp_path / "good.png", frame()), "-o", tmp_path / "beside")
+    assert run.status == 2 and "expected a folder of frames" in run.err and (tmp_path / "beside" / "good.exr").exists()
+
+
+def test_a_frame_that_fails_ends_its_file(tmp_path: Path, polsep: Cli) -> None:
+    """The line says how many frames behind it are left out; those before it are written."""
+    np.save(tmp_path / "run.npy", np.stack([frame(k) for k in range(4)]))
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / "run_0001.exr").write_bytes(b"precious")
+    run = polsep("separate", tmp_path / "run.npy", "-o", tmp_path / "o", "--method", "analytic")
+    assert run.status == 2 and LINE.fullmatch(run.err) and run.err.endswith("; 2 frames behind it are left out\n")
+    assert set(contents(tmp_path / "o")) == {"run_0001.exr", *(f"run_0000.{s}" for s in ("exr", "png", "json"))}
+
+
+def test_a_calibration_is_not_replaced(tmp_path: Path, polsep: Cli) -> None:
+    """No output takes the place of a file that corrects the frames, not even with --overwrite."""
+    for name in ("rig", "dark"):
+        png(tmp_path / f"{name}.png", frame() if name == "rig" else np.zeros((32, 32), np.uint16))
+    kept = tmp_path / "rig.json"
+    command = ("calibrate", "dark", tmp_path / "dark.png", "--white-level", "65535", "-o", kept)
+    assert polsep(*command).status == 0
+    before = kept.read_bytes()
+    more = ("--calibration", kept, "-o", tmp_path, "--overwrite", "--format", "npz")
+    run = polsep("separate", tmp_path / "rig.png", *more)
+    assert run.status == 2 and "is an input" in run.err and kept.read_bytes() == before
+
+
+def test_names_of_any_bytes_are_printed(tmp_path: Path) -> None:
+    """A name that is no text, and one that the terminal cannot show, stop nothing."""
+    names = [os.fsencode(tmp_path) + b"/caf\xe9.png", os.fsencode(tmp_path) + "/日本.png".encode()]
+    for name in names:
+        with open(name, "wb") as file:
+            file.write(png(tmp_path / "a.png", frame()).read_bytes())
+    command = [sys.executable, "-m", "polsep", "separate", *names, "-o", str(tmp_path / "o"), "--method", "analytic"]
+    settings = {**os.environ, "PYTHONIOENCODING": "ascii:strict", "PYTHONUTF8": "1"}
+    run = subprocess.run(command, capture_output=True, env=settings, timeout=100)
+    assert run.returncode == 0, run.stderr
+    assert len(list((tmp_path / "o").iterdir())) == 6
 
 
 def test_good_files_are_written_beside_bad_ones(tmp_path: Path, polsep: Cli) -> None:

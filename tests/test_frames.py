@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from polsep.io.raw.frames import Frame, ReadOptions, read_frames
 from polsep.io.raw.genicam import PIXEL_FORMATS, pack_frame
+from polsep.io.store.errors import InputError
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic, sample_mosaic
 from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
@@ -140,6 +141,23 @@ def test_pages_come_lazily_and_are_numbered(tmp_path: Path) -> None:
         assert [frame.stem for frame in frames] == [f"{stem}_0000", f"{stem}_0001", f"{stem}_0002"]
         for frame, page in zip(frames, codes, strict=True):
             assert_samples(mosaic_of(frame), page)
+
+
+def test_damage_in_one_of_four_pages_comes_after_the_good_ones(tmp_path: Path) -> None:
+    """Also where four pages might be four angles."""
+    path = tmp_path / "run.tiff"
+    with tifffile.TiffWriter(path) as file:
+        for page in random_codes("uint16", (4, 32, 32)):
+            file.write(page, compression="zlib", contiguous=False)
+    with tifffile.TiffFile(path) as file:
+        place = file.pages[2].dataoffsets[0]  # type: ignore[union-attr]  # a page, not a frame of it
+    data = bytearray(path.read_bytes())
+    data[place : place + 8] = bytes(8)
+    path.write_bytes(data)
+    frames = read_frames(path)
+    assert [next(frames).index, next(frames).index] == [0, 1]
+    with pytest.raises(InputError, match="damage"):
+        next(frames)
 
 
 def test_damage_in_a_later_page_comes_after_the_good_ones(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ Exit status: 0 only when everything asked for was written; 2 after bad input, wi
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import signal
@@ -145,13 +146,13 @@ def print_note(line: str) -> None:
     print(f"polsep: {printable(line)}", file=sys.stderr)
 
 
-def parse_size(text: str | None) -> tuple[int, int] | None:
-    """Width and height from ``WIDTHxHEIGHT``."""
+def parse_size(text: str | None, option: str = "--size") -> tuple[int, int] | None:
+    """Width and height from ``WIDTHxHEIGHT``, the value of an ``option``."""
     if text is None:
         return None
     width, x, height = text.lower().partition("x")
     if not (x and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise ValueError(f"expected --size WIDTHxHEIGHT like 2448x2048, found {text!r}")
+        raise ValueError(f"expected {option} WIDTHxHEIGHT like 2448x2048, found {text!r}")
     return int(width), int(height)
 
 
@@ -255,10 +256,7 @@ def require_paths(*paths: str | Path) -> None:
 
 def main() -> None:
     """Run the program: bad input is one line on stderr and exit status 2."""
-    for name in ENDINGS:
-        number = getattr(signal, name, None)
-        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # as by nohup
-            signal.signal(number, _exit_on_signal)
+    _prepare()
     try:
         app(standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -275,10 +273,21 @@ def main() -> None:
             raise
         print_note("error: expected the extra 'torch' (pip install 'polsep[torch]'), found no torch")
         sys.exit(2)
-    except (click.ClickException, ValueError, RuntimeError, OSError) as error:
-        message = error.format_message() if isinstance(error, click.ClickException) else str(error)
+    except (click.ClickException, ValueError, RuntimeError, OSError, MemoryError) as error:
+        message = error.format_message() if isinstance(error, click.ClickException) else str(error) or "out of memory"
         print_note(f"error: {one_line(message, 2 * MOST)}")
         sys.exit(2)
+
+
+def _prepare() -> None:
+    """Have requests to end remove temporary files, and names of files printed that do not fit the terminal."""
+    for name in ENDINGS:
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # as by nohup
+            signal.signal(number, _exit_on_signal)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _exit_on_signal(number: int, frame: FrameType | None) -> NoReturn:

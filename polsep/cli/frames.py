@@ -112,18 +112,26 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     find_device(options["device"])
     light = read_light(options)
     run = SeparateOptions(options["method"], light, options["device"], options["full"])
-    write = WriteOptions(options["output"], options["format"], options["overwrite"], options["stokes"])
+    kept = tuple(filter(None, [options["calibration"], *options["ambient"]]))
+    write = WriteOptions(options["output"], options["format"], options["overwrite"], options["stokes"], kept)
     if photographs:
         with show_progress(f"separating {len(photographs)} photographs"):
             outcome = separate_photographs(photographs, read_photo_options(options), read, run, write)
         _report(outcome)
         return
-    paths = expand_folders(files)
-    failures, sources = 0, set[str]()
-    with show_progress(f"separating {paths[0]}" if len(paths) == 1 else "separating", len(paths)) as progress:
+    paths, done, failures = list[str](), 0, 0
+    for file in files:
+        try:
+            paths += expand_folders([file])
+        except (ValueError, OSError) as error:
+            if len(files) == 1:  # of several the others are separated all the same
+                raise
+            print_note(f"error: {error}")
+            failures += 1
+    with show_progress(f"separating {files[0]}" if len(files) == 1 else "separating", len(paths)) as progress:
         for outcome in separate_files(paths, read, run, write):
-            sources.add(outcome.source)
-            progress.update(len(sources))
+            done += outcome.last
+            progress.update(done)
             failures += _report(outcome)
     if failures:
         sys.exit(2)

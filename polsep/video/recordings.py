@@ -26,9 +26,10 @@ from polsep.compute.cluster import map_ordered
 from polsep.compute.threads import get_threads, own_threads
 from polsep.compute.workers import DEPTH, ahead, map_ahead
 from polsep.io.raw.frames import Frame, ReadOptions, refuse_forgotten
-from polsep.io.raw.sequences import DamagedFrame, FrameSequence, open_sequence
+from polsep.io.raw.sequences import DamagedFrame, FrameSequence, input_files, open_sequence
 from polsep.io.results.previews import exposure_of, srgb
 from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWriter, State
+from polsep.io.store.atomic import refuse_inputs
 from polsep.io.store.errors import InputError
 from polsep.light.find import Light, combine, find_light
 from polsep.methods import Capture, find_method
@@ -176,6 +177,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     if options.stokes and target.kind.format != "exr":
         raise ValueError(f"expected the format exr for Stokes images, found {target.kind.format}")
     recording = open_sequence(path, read)
+    refuse_inputs([target.directory / f"{recording.stem}{end}" for end in (".json", ".jsonl")], input_files(path))
     count = recording.count if options.frames is None else min(recording.count, options.frames)
     first = separate_first(recording, options)
     settings = {

@@ -43,7 +43,7 @@ def _read_corrected(
         sources["calibration"] = calibration.name
     corrections = Corrections(measured, None, sources)
     if ambient:
-        room = mean_mosaic(list(read_mosaics(ambient, replace(read, corrections=corrections))))
+        room = mean_mosaic(read_mosaics(ambient, replace(read, corrections=corrections)))
         corrections = Corrections(measured, room, {**sources, "ambient": [path.name for path in ambient]})
     return replace(read, corrections=corrections)
 

@@ -308,7 +308,13 @@ def _look_for_angles(path: Path, options: ReadOptions, first: int) -> Iterator[P
         yield start
         yield from pages
         return
-    group = [start, *islice(pages, 3)]
+    group = [start]
+    try:
+        for page in islice(pages, 3):
+            group.append(page)
+    except (ValueError, OSError):  # those before a damaged page are frames
+        yield from group
+        raise
     if len(group) == 4 and _are_angles([page.array for page in group]):
         note = "its four pages are read as the angles 0, 45, 90, 135: say --pages frames if they are frames"
         page = _stacked(group, [f"page {p.index}" for p in group])

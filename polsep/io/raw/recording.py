@@ -163,6 +163,19 @@ def read_header(path: Path) -> Header:
     return Header(width, height, name, camera, settings if isinstance(settings, dict) else {}, layout, began)
 
 
+def recording_files(path: Path) -> list[Path]:
+    """The files of the recording that a file belongs to; none of other files."""
+    names = (RECORD, RAW, INDEX)
+    return [path.with_name(name) for name in names] if path.name in names and path.with_name(RECORD).is_file() else []
+
+
+def _require_parts(path: Path) -> None:
+    """Raise ValueError where frames or index of a ``recording.json`` are missing."""
+    missing = [name for name in (RAW, INDEX) if not path.with_name(name).is_file()]
+    if missing:
+        raise ValueError(f"expected {RAW} and {INDEX} beside it, found no {missing[0]}")
+
+
 def _is_time(text: Any) -> bool:
     """True for a time with its zone, in ISO 8601."""
     try:
@@ -178,6 +191,7 @@ def read_images(path: Path, first: int = 0) -> Iterator[RawImage]:
     Raises ValueError when there is none, or a payload differs from the checksum that was taken of it.
     """
     size = read_header(path).frame_bytes
+    _require_parts(path)
     raw, lines = path.with_name(RAW), _read_index(path.with_name(INDEX))
     total = raw.stat().st_size
     if total < size:
@@ -196,6 +210,7 @@ def read_images(path: Path, first: int = 0) -> Iterator[RawImage]:
 def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
     """The frames of a ``recording.json`` from ``first`` on, as pages. Raises ValueError as `read_images`."""
     header = read_header(path)
+    _require_parts(path)
     count, rest = divmod(path.with_name(RAW).stat().st_size, header.frame_bytes)
     notes = (f"{RAW} ends within a frame: {rest} bytes after frame {count - 1} are left out",) if rest else ()
     size = (header.width, header.height)

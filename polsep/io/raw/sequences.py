@@ -11,10 +11,11 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
-from polsep.io.raw.recording import RECORD
+from polsep.io.raw.recording import RECORD, recording_files
 from polsep.io.store.errors import input_error, one_line
 
 _NUMBER = re.compile(r"(\d+)")
@@ -64,6 +65,13 @@ def _frame_files(folder: Path) -> list[Path]:
     return sorted(files, key=natural_order)
 
 
+def input_files(path: Path) -> list[Path]:
+    """The files that `open_sequence` reads, and their index: those that no output may replace."""
+    if path.is_dir() and not (path / RECORD).is_file():
+        return _frame_files(path)
+    return [path, *recording_files(path / RECORD if path.is_dir() else path)]
+
+
 def expand_folders(paths: Sequence[str]) -> list[str]:
     """The paths with each folder replaced by its frames: a recording, or its files of all kinds in natural order.
 
@@ -106,9 +114,10 @@ def _read_files(files: list[Path], options: ReadOptions, first: int) -> Iterator
     """One frame of each file."""
     for index, path in enumerate(files[first:], first):
         try:
-            frames = list(read_frames(path, options))
+            frames = list(islice(read_frames(path, options), 2))
             if len(frames) != 1:
-                raise input_error(path, f"expected one frame per file of a folder, found {len(frames)}")
+                found = max(frames[0].count, 2) if frames else 0
+                raise input_error(path, f"expected one frame per file of a folder, found {found}")
         except (ValueError, OSError) as error:
             yield DamagedFrame(index, one_line(error))
             continue

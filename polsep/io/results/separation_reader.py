@@ -30,6 +30,8 @@ _MAPS = ("dolp", "aolp", "valid")
 #: Shapes behind height and width, of all but the images.
 _BESIDE: dict[str, tuple[tuple[int, ...], ...]] = {**dict.fromkeys(_MAPS, ((),)), "error": ((2,),)}
 _NUMBERED = re.compile(r"(?P<stem>.+)_(?P<number>\d{4,})\.(exr|npz)")
+#: Numbers from the first to the last of a sequence: at most so many for each file, and so many besides.
+_SPARSE, _GAP = 10, 1000
 
 
 @dataclass(frozen=True)
@@ -65,9 +67,16 @@ def read_separated(path: str | Path) -> SeparatedFrame:
         return _as_frame(images, path.name)
 
 
+def is_separated(path: Path) -> bool:
+    """True for a name of an EXR file, and for an NPZ archive that `holds_separated`: raw frames come in NPZ too."""
+    suffix = path.suffix.lower()
+    return suffix == ".exr" or (suffix == ".npz" and holds_separated(path))
+
+
 def holds_separated(path: Path) -> bool:
     """True for an NPZ archive with the names of a separated frame's arrays, False for any other."""
     try:
+        refuse_pipe(path)
         return {"diffuse", "specular"} <= set(read_arrays(path, ())[1])
     except (ValueError, OSError):
         return False
@@ -124,10 +133,13 @@ def _as_frame(images: Images, source: str) -> SeparatedFrame:
 
 
 def find_numbered(folder: Path) -> NumberedFiles:
-    """The sequence in a folder, as `polsep video` writes it: STEM_000123.exr. Raises InputError unless there is one."""
+    """The sequence in a folder, as `polsep video` writes it: STEM_000123.exr. Hidden files are not of it.
+
+    Raises InputError unless there is one, and where most numbers lack a file, as in names with the time.
+    """
     found: dict[str, dict[int, Path]] = {}
     for path in sorted(folder.iterdir()):
-        if (match := _NUMBERED.fullmatch(path.name)) is not None:
+        if not path.name.startswith(".") and (match := _NUMBERED.fullmatch(path.name)) is not None:
             frames = found.setdefault(match["stem"] + path.suffix, {})
             if frames.setdefault(int(match["number"]), path) != path:
                 raise input_error(
@@ -141,4 +153,9 @@ def find_numbered(folder: Path) -> NumberedFiles:
         raise input_error(folder, f"expected one sequence, found {len(found)}: {', '.join(found)}")
     ((name, frames),) = found.items()
     first, last = min(frames), max(frames)
+    if last - first >= _SPARSE * len(frames) + _GAP:
+        raise input_error(
+            folder,
+            f"expected consecutive numbers, found {len(frames)} from {first} to {last}; name single files themselves",
+        )
     return NumberedFiles(Path(name).stem, first, tuple(frames.get(number) for number in range(first, last + 1)))

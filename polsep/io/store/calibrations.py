@@ -30,8 +30,8 @@ from polsep.sensor.calibration import Analyser, Calibration, LampFacts, Table
 from polsep.sensor.camera import Layout
 
 FORMAT = "polsep calibration 1"
-#: Least steps of the maps: of black in codes, and of gains.
-BLACK_STEP, GAIN_STEP = 2.0**-10, 2.0**-17
+#: Least steps of the maps: of black as a part of the white level, at most in codes, and of gains.
+BLACK_PART, BLACK_STEP, GAIN_STEP = 2.0**-22, 2.0**-10, 2.0**-17
 #: Angles of analysers lie within two turns.
 MOST_DEGREES = 720.0
 #: Arrays of the NPZ file.
@@ -125,12 +125,17 @@ def _read_maps(path: Path, entry: Mapping[str, Any] | None) -> dict[str, NDArray
 def _arrays(c: Calibration) -> dict[str, NDArray[Any]]:
     arrays: dict[str, NDArray[Any]] = {}
     if c.black_map is not None:
-        arrays["black_offset_codes"] = _halves(c.black_map - np.float32(c.black_level or 0), BLACK_STEP)
+        arrays["black_offset_codes"] = _halves(c.black_map - np.float32(c.black_level or 0), _black_step(c))
     if c.gain_map is not None:
         arrays["gain_minus_1"] = _halves(c.gain_map - np.float32(1), GAIN_STEP)
     if c.dead is not None and c.dead.size:
         arrays["defective_pixels"] = c.dead
     return arrays
+
+
+def _black_step(c: Calibration) -> float:
+    """The step of black: a power of two, 2^-10 from 12 bits on."""
+    return float(min(BLACK_STEP, BLACK_PART * 2.0 ** math.ceil(math.log2(c.white_level))))
 
 
 def _halves(values: NDArray[np.float32], step: float) -> NDArray[np.float16]:

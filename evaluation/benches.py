@@ -24,6 +24,7 @@ from evaluation.material_gallery import draw_material
 from evaluation.paper import bench_paper, bench_paper_quick
 from evaluation.rendering import bench_rendering
 from evaluation.repeats import bench_repeats
+from evaluation.sensors import bench_sensors, bench_sensors_quick
 from evaluation.sets import bench_sets
 from evaluation.video import bench_video, bench_video_quick
 from evaluation.viewing import bench_view
@@ -45,6 +46,9 @@ BENCHES: dict[str, Bench] = {
     "repeats": Bench(bench_repeats, data=SET_DATA, measures=(*SCENES, "polsep/train")),
     "dynamic": Bench(bench_dynamic, bench_dynamic_quick, measures=(*SCENES, "polsep/video")),
     "calibration": Bench(bench_calibration, measures=SCENES),
+    "sensors": Bench(
+        bench_sensors, bench_sensors_quick, measures=(*SCENES, "polsep/datasets/reality.py", "polsep/calibrate")
+    ),
     "material": Bench(
         bench_material,
         bench_material_quick,

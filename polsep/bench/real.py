@@ -14,7 +14,7 @@ from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.physics.stokes import aolp, fit_stokes
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.layout_check import check_layout, crossed_pairs
+from polsep.sensor.layout_check import SENSOR_SIZES, check_layout, crossed_pairs
 
 #: The labelled polarizers of polarizer_IMX250MZR.png: label [deg], centre (row, col) and radius at half resolution.
 REFERENCE_POLARIZERS = ((0, 544, 189, 88), (45, 544, 502, 88), (90, 544, 778, 88), (135, 553, 1055, 78))
@@ -59,7 +59,7 @@ def _layout_verdicts(mosaic: Mosaic) -> Iterator[bool]:
     """Verdicts of the check, right or wrong: all 24 orders, transposed, mirrored, cropped, mono for colour.
 
     Right is silence under the true layout and under those that no frame can tell from it (see `layout_check`), and a
-    warning whose fitting layouts hold the true one otherwise.
+    warning whose fitting layouts hold the true one, or that names it, otherwise.
     """
     true, (height, width) = mosaic.layout, mosaic.data.shape[-2:]
     for a, b, c, d in permutations((0, 45, 90, 135)):
@@ -76,9 +76,13 @@ def _layout_verdicts(mosaic: Mosaic) -> Iterator[bool]:
         (mosaic.data[2:, :], true.rolled(-2, 0)),
     )
     for data, layout in changed:
+        stands = (
+            true.bayer is None and data.shape[-2:] in SENSOR_SIZES
+        )  # of a whole frame the size says that it is turned
         seen = true.bayer is not None and (layout.origin != true.origin or _greens(layout) != _greens(true))
         yield _right(Mosaic(data, layout, 0, 255), layout, False)
-        yield _right(Mosaic(data, true, 0, 255), layout, seen)
+        claimed = Mosaic(data, true, 0, 255)
+        yield layout.spec in (check_layout(claimed).warning or "") if stands else _right(claimed, layout, seen)
 
 
 def _greens(layout: Layout) -> bool:

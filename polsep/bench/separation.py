@@ -9,6 +9,7 @@ from polsep.bench.rows import Row, with_spread
 from polsep.bench.truth import SCENE_SEEDS, captures, render_scene
 from polsep.methods import METHODS
 from polsep.metrics import psnr
+from polsep.physics.stokes import Measurements
 
 
 def bench_separation() -> Iterator[Row]:
@@ -19,7 +20,7 @@ def bench_separation() -> Iterator[Row]:
             scene = render_scene(seed, saturation)
             for capture, frame, mask, (diffuse, specular) in captures(scene, seed):
                 for name, method in METHODS.items():
-                    if not method.accepts(frame):
+                    if not method.accepts(frame) or (method.reads_mosaic and isinstance(frame, Measurements)):
                         continue
                     found = method.reference(frame)
                     for output, image, truth in (

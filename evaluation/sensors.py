@@ -1,4 +1,4 @@
-"""What each calibration wins: a bad sensor, and a lamp that is not white, before and after `polsep calibrate`.
+"""Losses before a bad sensor and under a lamp that is not white, before and after each `polsep calibrate`.
 
 Scenes of `datasets.reality`, split test, as `polsep bench reality` has them, each before a `BAD` sensor of its own with
 vignetting, a black level and a black pattern. Ten frames of each kind are recorded, too, and measured as the command

@@ -14,15 +14,18 @@ import sys
 import sysconfig
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import imagecodecs
 import numpy as np
 import pytest
-from test_capture import index_of, record_of, run
+from test_capture import INFO, index_of, record_of, run
 from test_cli import png
 
 import polsep
+from polsep.capture import aravis, pylon
 from polsep.capture.pylon import PylonSource, list_pylon
 from polsep.capture.session import CapturePlan
 from polsep.capture.sources import CameraError, CameraSettings
@@ -124,6 +127,28 @@ def test_a_gige_camera_that_is_unplugged(tmp_path: Path, alone: list[str]) -> No
     assert done.stderr.count("camera lost: ") == done.stderr.count("camera back after ") == 1
     print(done.stderr, json.dumps(count))
     (tmp_path / "unplugged" / "frames.raw").unlink()
+
+
+@pytest.mark.parametrize("library", [aravis, pylon])
+def test_a_read_ends_when_a_trigger_is_due(monkeypatch: pytest.MonkeyPatch, library: Any) -> None:
+    """Of both libraries: the read triggers, and waits no longer than until the next trigger."""
+    monkeypatch.setattr(library, "_apply", lambda *given: None)
+    monkeypatch.setattr(library, "_describe", lambda *given: INFO)
+    settings, device = CameraSettings(frame_rate_hz=50, trigger="Software"), MagicMock()
+    camera: Any
+    if library is aravis:
+        read, unit = device.create_stream().timeout_pop_buffer, 1e-6
+        read.return_value = None
+        camera = aravis._AravisCamera(MagicMock(), OSError, device, settings)
+    else:
+        read, unit = device.RetrieveResult, 1e-3
+        read().__enter__().IsValid.return_value = device.IsCameraDeviceRemoved.return_value = False
+        read.reset_mock()
+        camera = pylon._PylonCamera(MagicMock(), SimpleNamespace(GenericException=OSError), device, settings)
+    camera.start()
+    assert camera.read(0.2) is None
+    assert device.software_trigger.call_count + device.ExecuteSoftwareTrigger.call_count == 1
+    assert read.call_count == 1 and 0 <= read.call_args.args[0] * unit <= 1 / 50
 
 
 @pytest.fixture

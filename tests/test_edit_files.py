@@ -25,6 +25,7 @@ from test_edit import only, random_images, sphere
 from polsep import cli
 from polsep.edit import EDITS, Metallic, Recipe, Rougher, SeparatedImages, Sharper, SpecularGain, Texture, apply
 from polsep.edit.files import EditTarget, Work, edit_sequence, load_work, read_recipe
+from polsep.edit.recipe import recipe_as_text
 from polsep.io.assets.maps import read_map
 from polsep.io.results.exr import encode_exr, read_exr_layers
 from polsep.io.results.previews import linear_from_srgb, srgb
@@ -243,6 +244,44 @@ def test_bad_calls_leave_nothing(
     assert contents(tmp_path) == before
 
 
+@pytest.mark.parametrize("overwrite", [(), ("--overwrite",)])
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["shot.exr", "--rougher", "1", "--save-recipe", "out/shot.json"], "expected --save-recipe apart from"),
+        (["film", "--rougher", "1", "--save-recipe", "out/../out/take.json"], "expected --save-recipe apart from"),
+        (["shot.exr", "--rougher", "1", "--save-recipe", "shot.exr"], "shot.exr is an input"),
+        (["shot.exr", "--rougher", "1", "--mask", "out/shot.png"], "shot.png is an input"),
+        (["shot.exr", "--rougher", "1", "--mask", "out/shot.png", "--save-recipe", "out/shot.png"], "is an input"),
+        (["film", "--texture", "out/take.png"], "take.png is an input"),
+        (["film", "--texture", "out/take_000001.exr"], "take_000001.exr is an input"),
+        (["shot.exr", "empty", "film", "--recipe", "out/take.json"], "take.json is an input"),
+    ],
+)
+def test_results_do_not_replace_what_made_them(
+    tmp_path: Path,
+    polsep: Cli,
+    monkeypatch: pytest.MonkeyPatch,
+    args: list[str],
+    words: str,
+    overwrite: tuple[str, ...],
+) -> None:
+    """Recipes, masks and textures in the folder of the results are refused by name, before anything is written."""
+    monkeypatch.chdir(tmp_path)
+    separated(tmp_path)
+    film(tmp_path / "film", 2)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "out").mkdir()
+    for name in ("shot.png", "take.png"):
+        png(tmp_path / "out" / name, np.full((21, 26), 255, np.uint8))
+    write_exr(tmp_path / "out" / "take_000001.exr", Picture(*2 * [np.ones((4, 4, 3), np.float32)], None, {}), "none")
+    recipe = recipe_as_text(Recipe((Rougher(sigma=2.0),)))
+    (tmp_path / "out" / "take.json").write_text(recipe)
+    before = contents(tmp_path)
+    assert_refused(polsep(*args, "-o", "out", "--no-preview", *overwrite), words)
+    assert contents(tmp_path) == before
+
+
 def test_good_files_go_on_beside_bad_ones(tmp_path: Path, polsep: Cli) -> None:
     """One bad frame costs exit status 2, not the others."""
     good, bad = separated(tmp_path), tmp_path / "bad.exr"
@@ -338,6 +377,34 @@ def test_gaps_and_damage_are_never_silent(tmp_path: Path, polsep: Cli) -> None:
     assert_refused(polsep(folder, "-o", tmp_path / "c", "--rougher", "1", "--no-preview"), "found [5, 6, 3]")
 
 
+def test_a_gap_of_an_earlier_run_still_counts(tmp_path: Path) -> None:
+    """A run that leaves a frame out, is stopped behind it and goes on, ends as damaged: the command fails."""
+    folder, work = film(tmp_path / "in"), Work(Recipe((Rougher(sigma=2.0),)))
+    os.remove(folder / "take_000003.exr")
+    target = EditTarget(tmp_path / "out", kind=SILENT, damaged="skip")
+    with closing(edit_sequence(folder, work, target)) as steps:
+        assert sum(step.damaged for step in islice(steps, PART + 2)) == 1
+    *again, last = edit_sequence(folder, work, target)
+    assert again[0].done == PART and not any(step.damaged for step in again)
+    assert last.written and last.damaged
+    film(tmp_path / "whole", 3)
+    assert not list(edit_sequence(tmp_path / "whole", work, EditTarget(tmp_path / "fine", kind=SILENT)))[-1].damaged
+
+
+def test_good_folders_go_on_beside_bad_ones(tmp_path: Path, polsep: Cli) -> None:
+    """A folder with a gap costs a line and exit status 2, not the next folder; nor does a folder without a sequence."""
+    gap, good, empty = film(tmp_path / "gap", 4), tmp_path / "good", tmp_path / "empty"
+    os.remove(gap / "take_000001.exr")
+    empty.mkdir()
+    film(good, 3)
+    run = polsep(gap, empty, good, "-o", tmp_path / "out", "--rougher", "1", "--no-preview")
+    first, second = run.err.splitlines()
+    assert run.status == 2 and first.startswith(f"polsep: error: {gap}: expected frames without gaps, found none of")
+    assert second.startswith(f"polsep: error: {empty}: expected a sequence")
+    assert run.out.splitlines() == [str(tmp_path / "out" / f"take.{s}") for s in ("png", "jsonl", "json")]
+    assert json.loads((tmp_path / "out" / "take.json").read_text())["settings"]["source"] == "good"
+
+
 def test_films_to_watch(tmp_path: Path, polsep: Cli) -> None:
     """With the extra video, a sequence gets its film."""
     pytest.importorskip("av", reason="needs the extra 'video'")
@@ -358,6 +425,29 @@ def test_sequences_are_found(tmp_path: Path) -> None:
     os.remove(tmp_path / "a_00010.npz")
     (tmp_path / "b_0001.exr").touch()
     with pytest.raises(InputError, match=r"expected one sequence, found 2: a.npz, b.exr"):
+        find_numbered(tmp_path)
+
+
+def test_hidden_files_are_no_sequence(tmp_path: Path) -> None:
+    """macOS leaves ._NAME beside each file on other disks; they do not count."""
+    for name in ("film_000001.exr", "._film_000001.exr", "film_000002.exr", "._film_000002.exr"):
+        (tmp_path / name).touch()
+    found = find_numbered(tmp_path)
+    assert (found.stem, found.first) == ("film", 1)
+    assert [path.name for path in found.files if path is not None] == ["film_000001.exr", "film_000002.exr"]
+
+
+def test_times_are_no_numbers_of_frames(tmp_path: Path) -> None:
+    """Numbers far apart are refused at once, without a place for each in between; a gap of a thousand is one."""
+    for name in ("cam_0001.exr", "cam_1020.exr"):
+        (tmp_path / name).touch()
+    assert len(find_numbered(tmp_path).missing()) == 1018
+    os.rename(tmp_path / "cam_1020.exr", tmp_path / "cam_1021.exr")
+    with pytest.raises(InputError, match=r"expected consecutive numbers, found 2 from 1 to 1021; name single files"):
+        find_numbered(tmp_path)
+    (tmp_path / "cam_1021.exr").unlink()
+    (tmp_path / "cam_1699999999123456789.exr").touch()
+    with pytest.raises(InputError, match=r"found 2 from 1 to 1699999999123456789"):
         find_numbered(tmp_path)
 
 

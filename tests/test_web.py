@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import importlib.util
 import json
 import subprocess
@@ -22,6 +23,7 @@ from polsep.io.results.exr import read_exr_layers
 from polsep.light.find import find_light
 from polsep.pipeline import PolsepWarning
 from polsep.sensor.camera import Layout
+from tools import web_page
 from tools.web_page import CHROMIUM, DEMO, HAS_PACKAGES, NODE, WEB, build_page, change, fetch, send, served
 
 __all__ = ["browser"]  # a fixture
@@ -29,6 +31,13 @@ __all__ = ["browser"]  # a fixture
 AGREES = 1e-3
 #: Largest size of the page on a host.
 LARGEST = 25_000_000
+BROKEN = b"\x89PNG and nothing else"
+#: Drop files on the page, [name, base64] each, one right after the other.
+DROP = """(files) => files.forEach(([name, text]) => {
+  const transfer = new DataTransfer();
+  transfer.items.add(new File([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))], name));
+  dispatchEvent(new DragEvent("drop", { dataTransfer: transfer, cancelable: true }));
+})"""
 
 needs_packages = pytest.mark.skipif(not HAS_PACKAGES, reason="needs node and its packages: npm --prefix web ci")
 needs_browser = pytest.mark.skipif(
@@ -152,6 +161,124 @@ def test_files_chosen_at_work_wait_and_the_last_one_wins(page: Any) -> None:
     assert page.evaluate("[polsep.images.height, document.body.dataset.state]") == [60, "done"]
 
 
+def shot(rows: int = 64) -> bytes:
+    """A PNG file of the first rows of `crop`, to be told from others by its height."""
+    return bytes(imagecodecs.png_encode(np.ascontiguousarray(crop()[:rows])))
+
+
+def state_of(page: Any) -> Any:
+    """The state that the page is in, and the height of its images."""
+    return page.evaluate("[document.body.dataset.state, window.polsep?.images.height]")
+
+
+def ask_format(page: Any, name: str, data: bytes) -> None:
+    """Give the page a file without a header, and wait until it asks for its format."""
+    page.set_input_files("#file", {"name": name, "mimeType": "", "buffer": data})
+    page.wait_for_selector("#raw:visible")
+
+
+def state_format(page: Any, width: int, height: int) -> None:
+    """Answer the page, and wait for what it makes of that."""
+    page.fill("#width", str(width))
+    page.fill("#height", str(height))
+    change(page, lambda: page.click("#raw button"))
+
+
+@needs_packages
+@needs_browser
+def test_a_file_that_fails_leaves_the_one_before(page: Any, tmp_path: Path) -> None:
+    """Its name, its files and its settings stay, and so does what is said of the other one."""
+    page.select_option("#method", "analytic")
+    send(page, "good.png", shot())
+    change(page, lambda: page.click("text=Use white level 4095"))
+    send(page, "broken.png", BROKEN)
+    said = page.inner_text("#notes")
+    assert said.startswith("broken.png: expected a complete PNG file") and page.input_value("#white") == "4095"
+    assert fetch(page, "exr", tmp_path).name == "good.exr"
+    change(page, lambda: page.select_option("#light", "white"))
+    assert page.inner_text("#status").startswith("good.png · ") and page.inner_text("#notes") == said
+    ask_format(page, "other.raw", pack_frame(crop()[:96], "BayerRG12p"))
+    page.select_option("#light", "auto")  # of the file to come
+    assert state_of(page) == ["asking", 32] and page.inner_text("#status").startswith("other.raw: ")
+    assert fetch(page, "exr", tmp_path).name == "good.exr"
+    state_format(page, 320, 95)
+    assert page.inner_text("#notes").startswith("other.raw: expected 45600 bytes for 320x95 BayerRG12p, found 46080")
+    state_format(page, 320, 96)  # it may be put right
+    assert state_of(page) == ["done", 48] and page.is_hidden("#raw") and "other.raw" not in page.inner_text("#notes")
+    assert fetch(page, "exr", tmp_path).name == "other.exr"
+
+
+@needs_packages
+@needs_browser
+def test_settings_wait_for_a_frame(page: Any) -> None:
+    """Of a first file that cannot be read, or of one whose format is still asked for, nothing is separated."""
+    page.select_option("#method", "analytic")
+    send(page, "broken.png", BROKEN)
+    page.select_option("#light", "white")
+    assert page.inner_text("#notes").startswith("broken.png: expected") and state_of(page) == ["failed", None]
+    ask_format(page, "first.raw", pack_frame(crop()[:96], "BayerRG12p"))
+    page.fill("#white", "4000")
+    page.press("#white", "Enter")
+    assert page.locator("#notes li").count() == 0 and state_of(page) == ["asking", None]
+    state_format(page, 320, 96)
+    assert page.evaluate("[polsep.report.white_level, polsep.report.light.source]") == [4000, "told"]
+
+
+@needs_packages
+@needs_browser
+def test_the_files_of_the_page_are_of_what_it_shows(page: Any, tmp_path: Path) -> None:
+    """Two files at once while a third is shown, the last one broken: the one between is shown and written."""
+    page.select_option("#method", "analytic")
+    send(page, "shown.png", shot())
+    page.evaluate("document.body.dataset.state = 'sent'")
+    files = [("between.png", shot(96)), ("broken.png", BROKEN)]
+    page.evaluate(DROP, [[name, base64.b64encode(data).decode()] for name, data in files])
+    page.wait_for_selector("body[data-state=failed]")
+    assert state_of(page) == ["failed", 48] and page.inner_text("#notes").startswith("broken.png: ")
+    path = fetch(page, "exr", tmp_path)
+    assert path.name == "between.exr" and read_exr_layers(path)["valid.Y"].shape == (48, 160)
+
+
+@needs_packages
+@needs_browser
+def test_another_file_has_settings_of_its_own(page: Any) -> None:
+    """The example's level, and what was said of it, do not stay for the next file; the method does."""
+    page.select_option("#method", "analytic")
+    change(page, lambda: page.click("#example"))
+    assert page.input_value("#white") == "4095" and page.locator("#notes li").count() == 0
+    change(page, lambda: page.select_option("#light", "stated"))
+    send(page, "next.png", shot())
+    assert "looks like 12-bit right-justified data" in page.inner_text("#notes")
+    found = [page.input_value(f"#{name}") for name in ("white", "black", "sensor", "light", "method")]
+    assert found == ["", "", "", "auto", "analytic"] and page.is_hidden("#rgb")
+
+
+@needs_browser
+def test_a_new_build_is_kept_whole(browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service worker does not keep what the browser's own cache still has of the build before."""
+
+    class Remembered(web_page.Handler):
+        """A host whose files are good for an hour."""
+
+        def end_headers(self) -> None:
+            """Add that."""
+            self.send_header("Cache-Control", "max-age=3600")
+            super().end_headers()
+
+    monkeypatch.setattr(web_page, "Handler", Remembered)
+    worker = (WEB / "src" / "sw.js").read_text().replace("VERSION", "1").replace("FILES_OF_THE_PAGE", '["part.txt"]')
+    for name, text in (("index.html", "<!doctype html><title>a page</title>"), ("part.txt", "old"), ("sw.js", worker)):
+        (tmp_path / name).write_text(text)
+    with served(tmp_path) as address, fresh_page(browser, address, 800) as opened:
+        read = "fetch('part.txt').then((answer) => answer.text())"
+        assert opened.evaluate(read) == "old"
+        (tmp_path / "part.txt").write_text("new")
+        assert opened.evaluate(read) == "old"
+        opened.evaluate("navigator.serviceWorker.register('sw.js').then(() => 0)")
+        opened.evaluate("navigator.serviceWorker.ready.then(() => 0)")
+        assert opened.evaluate("caches.match('part.txt').then((found) => found.text())") == "new"
+
+
 @needs_packages
 @needs_browser
 def test_the_page_works_without_its_host(browser: Any, site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,7 +301,7 @@ def test_the_page_works_without_its_host(browser: Any, site: Path, monkeypatch: 
     truth = separated(codes, "joint-fast").specular
     np.testing.assert_allclose(np.reshape(found, truth.shape), truth, rtol=0, atol=AGREES)
     assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    send(opened, "broken.png", b"\x89PNG and nothing else")
+    send(opened, "broken.png", BROKEN)
     assert "expected a complete PNG file" in opened.inner_text("#notes")
     context.close()
 

@@ -76,13 +76,11 @@ def _layout_verdicts(mosaic: Mosaic) -> Iterator[bool]:
         (mosaic.data[2:, :], true.rolled(-2, 0)),
     )
     for data, layout in changed:
-        stands = (
-            true.bayer is None and data.shape[-2:] in SENSOR_SIZES
-        )  # of a whole frame the size says that it is turned
+        stands = true.bayer is None and data.shape[-2:] in SENSOR_SIZES  # so it was turned
         seen = true.bayer is not None and (layout.origin != true.origin or _greens(layout) != _greens(true))
         yield _right(Mosaic(data, layout, 0, 255), layout, False)
-        claimed = Mosaic(data, true, 0, 255)
-        yield layout.spec in (check_layout(claimed).warning or "") if stands else _right(claimed, layout, seen)
+        said = Mosaic(data, true, 0, 255)
+        yield layout.spec in (check_layout(said).warning or "") if stands else _right(said, layout, seen)
 
 
 def _greens(layout: Layout) -> bool:

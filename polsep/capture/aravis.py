@@ -123,7 +123,7 @@ class _AravisCamera:
                 self._device.software_trigger()
             except self._error as error:
                 raise CameraLost(_line(error)) from None
-        buffer = self._stream.timeout_pop_buffer(int(timeout_s * 1e6))
+        buffer = self._stream.timeout_pop_buffer(int(self._trigger.limit_wait(timeout_s) * 1e6))
         if buffer is None:
             return None
         try:

@@ -43,7 +43,7 @@ class FolderSource:
             if value is not None:
                 raise CameraError(f"{path}: expected a camera to set its {name}, found files")
         self._path, self._settings, self._loop = path, settings, loop
-        self._files = _files_of(path)
+        self.files = _files_of(path)
 
     @contextmanager
     def connect(self) -> Iterator[_Files]:
@@ -52,7 +52,7 @@ class FolderSource:
 
     def _frames(self) -> Iterator[tuple[bytes, CameraInfo]]:
         for _ in repeat(None) if self._loop else (None,):
-            for path in self._files:
+            for path in self.files:
                 with naming(path):
                     yield from _recorded(path) if path.name == RECORD else self._packed(path)
 

@@ -95,9 +95,14 @@ def serve_page(port: int, latest: Callable[[], Shown | None], line: Callable[[],
     class Handler(BaseHTTPRequestHandler):
         """Responses for the page, its pictures and its state."""
 
+        def handle(self) -> None:
+            """Read and answer requests until the browser has gone on: nothing is said of that."""
+            with suppress(ConnectionError):
+                super().handle()
+
         def do_GET(self) -> None:
             """Send the page, the state or a picture."""
-            if self.headers.get("Host", "").rpartition(":")[0] not in (HOST, "localhost"):
+            if self.headers.get("Host", "").partition(":")[0] not in (HOST, "localhost"):  # port 80 is not named
                 self.send_error(HTTPStatus.FORBIDDEN)
             elif (found := _content(self.path, latest(), line())) is None:
                 self.send_error(HTTPStatus.NOT_FOUND)
@@ -110,8 +115,7 @@ def serve_page(port: int, latest: Callable[[], Shown | None], line: Callable[[],
             self.send_header("Content-Length", str(len(body)))
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
-            with suppress(ConnectionError):  # the browser has gone on
-                self.wfile.write(body)
+            self.wfile.write(body)
 
         def log_message(self, format: str, *args: Any) -> None:
             """Log nothing: the terminal shows the capture."""

@@ -7,6 +7,7 @@ reads the high bits of 16-bit files. Tested with pypylon 26.9.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 import warnings
@@ -110,7 +111,8 @@ class _PylonCamera:
                 raise CameraLost("the camera was removed")
             if self._trigger.is_due():
                 self._device.ExecuteSoftwareTrigger()
-            with self._device.RetrieveResult(int(timeout_s * 1000), self._pylon.TimeoutHandling_Return) as result:
+            wait_ms = math.ceil(self._trigger.limit_wait(timeout_s) * 1000)
+            with self._device.RetrieveResult(wait_ms, self._pylon.TimeoutHandling_Return) as result:
                 return self._read_result(result) if result.IsValid() else None
         except self._genicam.GenericException as error:
             raise CameraLost(_line(error)) from None

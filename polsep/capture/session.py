@@ -10,6 +10,7 @@ recorded + dropped. After a camera is lost, connecting is tried every second, an
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
@@ -21,12 +22,13 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from polsep.capture.folder import FolderSource
 from polsep.capture.live import LiveView, Shown
 from polsep.capture.page import serve_page
 from polsep.capture.ring import Ring
 from polsep.capture.sources import Camera, CameraError, CameraInfo, CameraLost, CameraSource, EndOfFrames, Loss
-from polsep.io.raw.recording import PICTURE, Header, RawImage, RecordingWriter, refuse_recording
-from polsep.io.store.atomic import OutputError
+from polsep.io.raw.recording import INDEX, PICTURE, RAW, RECORD, Header, RawImage, RecordingWriter, refuse_recording
+from polsep.io.store.atomic import OutputError, refuse_inputs
 from polsep.sensor.camera import Layout
 
 #: Seconds between attempts to connect to a lost camera.
@@ -109,8 +111,14 @@ class Session:
     """The state that the threads of one run share; callers only use `run`, `stop` and `status`."""
 
     def __init__(self, source: CameraSource, plan: CapturePlan, limits: Limits, notify: Callable[[str], None]) -> None:
-        """``notify`` receives lines for the user. Raises OutputError if a recording exists and may not be replaced."""
+        """``notify`` receives lines for the user.
+
+        Raises OutputError if a recording exists and may not be replaced, or is what the run reads.
+        """
         if plan.output is not None:
+            read = [*plan.ambient, *([plan.calibration] if plan.calibration is not None else [])]
+            read += source.files if isinstance(source, FolderSource) else []
+            refuse_inputs([plan.output / name for name in (RAW, INDEX, RECORD, PICTURE)], read)
             refuse_recording(plan.output, plan.overwrite)
         self._source, self._plan, self._limits, self._notify = source, plan, limits, notify
         picture = plan.output / PICTURE if plan.output is not None else None
@@ -123,7 +131,8 @@ class Session:
         self._info: CameraInfo | None = None
         self._writer: RecordingWriter | None = None
         self._counters, self._interruptions = Counters(), list[dict[str, Any]]()
-        self._started, self._last, self._away_since = 0.0, 0.0, 0.0
+        self._started, self._last = 0.0, 0.0
+        self._away_since, self._lost_at = 0.0, 0.0  # last frame before an interruption; the loss that is waited out
         self._incomplete = 0  # incomplete frames since the last complete one
         self._unwritten = 0  # frames queued for a recorder that failed
         self._began, self._line, self._reason = "", "waiting for the camera", ""
@@ -211,6 +220,8 @@ class Session:
                     try:
                         self._prepare(camera.info)
                         camera.start()
+                        if math.isinf(camera.info.patience_s):  # back, though it may send nothing for any time
+                            self._lost_at = 0.0
                         self._started = self._started or time.monotonic()
                         self._pump(camera)
                         return
@@ -228,15 +239,15 @@ class Session:
         """The connected camera; after a loss, retry until the timeout. None if the run ends meanwhile."""
         limit = self._limits.timeout_s
         while True:
-            if self._away_since:
-                if time.monotonic() - self._away_since > limit:
+            if self._lost_at:
+                if time.monotonic() - self._lost_at > limit:
                     raise CameraError(f"expected the camera back within {limit:g} s, found: {self._reason}")
                 if self._stop.wait(RETRY_S) or self._over():
                     return None
             try:
                 return stack.enter_context(self._source.connect())
             except CameraError as error:
-                if not self._away_since:
+                if not self._lost_at:
                     raise
                 self._reason = str(error)
 
@@ -288,7 +299,7 @@ class Session:
             self._count_lost(lost - self._incomplete, f"ids are missing before frame {image.frame_id}")
         self._incomplete, image = 0, replace(image, lost_before=lost)
         if self._away_since:
-            away, self._away_since = now - self._away_since, 0.0
+            away, self._away_since, self._lost_at = now - self._away_since, 0.0, 0.0
             self._counters.away_s += away
             self._interruptions.append({"received_before": self._counters.received, "seconds": round(away, 3)})
             self._notify(f"camera back after {away:.1f} s, frames in between are not counted as lost")
@@ -307,12 +318,14 @@ class Session:
         self._counters.lost += frames
 
     def _note_loss(self, error: CameraLost) -> None:
-        """Notify the user of a lost camera, once per interruption."""
-        self._reason = str(error)
-        if self._away_since:
+        """Notify the user of a lost camera, until it is back, and count the interruption."""
+        self._reason, now = str(error), time.monotonic()
+        if not self._away_since:
+            self._away_since = self._last or now
+            self._counters.interruptions += 1
+        if self._lost_at:
             return
-        self._away_since = self._last or time.monotonic()
-        self._counters.interruptions += 1
+        self._lost_at = now
         self._notify(f"camera lost: {error}; trying again every second for {self._limits.timeout_s:g} s")
 
     def _record(self) -> None:

@@ -158,7 +158,7 @@ class FrameIds:
 
 
 class SoftwareTrigger:
-    """A schedule of software triggers, where the settings ask for them.
+    """A schedule of software triggers, where the settings ask for them; triggers that came too late are left out.
 
     State: when the next trigger is due.
     """
@@ -176,5 +176,11 @@ class SoftwareTrigger:
         now = time.monotonic()
         if not self._used or now < self._due_s:
             return False
-        self._due_s = max(self._due_s + self._period_s, now)
+        self._due_s += self._period_s
+        if self._due_s <= now:
+            self._due_s = now + self._period_s
         return True
+
+    def limit_wait(self, timeout_s: float) -> float:
+        """Seconds to wait for a frame: until the next trigger is due, and at most the time given."""
+        return min(timeout_s, max(self._due_s - time.monotonic(), 0.0)) if self._used else timeout_s

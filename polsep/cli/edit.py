@@ -13,6 +13,7 @@ import click
 from polsep.cli.app import COMPRESSION, DAMAGED, DIR, FILE, OVERWRITE, RATE, app, print_note, require_paths
 from polsep.cli.progress import report_step, show_progress
 from polsep.cli.video import with_preview
+from polsep.io.store.errors import MOST, one_line
 
 if TYPE_CHECKING:
     from polsep.edit.files import EditTarget, Work
@@ -88,24 +89,38 @@ def edit(inputs: tuple[Path, ...], **options: Any) -> None:
     if len(inputs) == 1:  # of several the others are edited all the same
         require_paths(*inputs)
     from polsep.compute.workers import keep_memory
-    from polsep.edit.files import EditTarget, load_work
+    from polsep.edit.files import EditTarget, load_work, planned_edits
     from polsep.io.results.sequences import SequenceKind
+    from polsep.io.store.atomic import refuse_inputs
 
     keep_memory()
     recipe, folder = _find_recipe(options)
-    work = load_work(recipe, folder)
+    images = [folder / name for name in recipe.images()]
     preview = with_preview(options["preview"]) if any(path.is_dir() for path in inputs) else False
     kind = SequenceKind("exr", options["compression"], preview, options["rate"])
     target = EditTarget(options["output"], options["overwrite"], kind, options["damaged"])
-    if options["save_recipe"] is not None:
-        _save_recipe(recipe, folder, options["save_recipe"], options["overwrite"])
+    recipe_file, saved = options["recipe_file"], options["save_recipe"]
+    planned = planned_edits(inputs, target)
+    refuse_inputs(planned, images if recipe_file is None else [*images, recipe_file])
+    if saved is not None:
+        refuse_inputs([saved], [*inputs, *images])
+        _refuse_result(saved, planned)
+    work = load_work(recipe, folder)
+    if saved is not None:
+        _save_recipe(recipe, folder, saved, options["overwrite"])
     failures = _edit_all(inputs, work, target)
     if failures:
         sys.exit(2)
 
 
+def _refuse_result(saved: Path, planned: list[Path]) -> None:
+    """Raise ValueError where the recipe that is saved has the name of a result."""
+    if os.path.realpath(saved) in map(os.path.realpath, planned):
+        raise ValueError(f"expected --save-recipe apart from the results, found {saved}, which is one of them")
+
+
 def _edit_all(inputs: tuple[Path, ...], work: Work, target: EditTarget) -> int:
-    """Edit single frames, then folders; return how many frames failed."""
+    """Edit single frames, then folders, past those that fail; return the number of failures."""
     from polsep.edit.files import edit_files, edit_sequence
 
     files = [path for path in inputs if not path.is_dir()]
@@ -119,8 +134,14 @@ def _edit_all(inputs: tuple[Path, ...], work: Work, target: EditTarget) -> int:
         else:
             print(f"{outcome.source} -> {', '.join(map(str, outcome.written))}")
     for path in (path for path in inputs if path.is_dir()):
-        with show_progress(f"editing {path}") as progress:
-            failures += sum(report_step(step, progress) for step in edit_sequence(path, work, target))
+        try:
+            with show_progress(f"editing {path}") as progress:
+                failures += sum(report_step(step, progress) for step in edit_sequence(path, work, target))
+        except BrokenPipeError:  # nobody reads our output any more
+            raise
+        except (ValueError, OSError, MemoryError) as error:
+            print_note(f"error: {one_line(error, 2 * MOST) or type(error).__name__}")
+            failures += 1
     return failures
 
 

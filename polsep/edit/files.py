@@ -87,6 +87,22 @@ def load_work(recipe: Recipe, folder: Path) -> Work:
     return Work(recipe, maps, {name: hash_map(path) for name, path in paths.items()})
 
 
+def planned_edits(paths: Sequence[Path], target: EditTarget) -> list[Path]:
+    """Every file that edits of these frames and folders may write; none of those that cannot be edited."""
+    planned = list[Path]()
+    for path in paths:
+        try:
+            if path.is_dir():
+                found = find_numbered(path)
+                names = (f"{found.stem}{end}" for end in (".png", ".jsonl", ".json", "_preview.mp4"))
+                planned += [*_frame_paths(found, target), *(target.directory / name for name in names)]
+            else:
+                planned += planned_outputs(target.directory, path.stem, "exr")
+        except (ValueError, OSError):  # its own edit says so, and the others go on
+            continue
+    return planned
+
+
 def edit_files(paths: Sequence[Path], work: Work, target: EditTarget) -> Iterator[Edited]:
     """Edit single frames; a bad file gives an outcome with an error, and the rest are edited.
 
@@ -181,7 +197,7 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
     lines = writer.lines()
     damaged = [line for line in lines if "damaged" in line]
     report = {"frames": len(lines), "damaged": damaged, "settings": settings, "warnings": work.recipe.cautions()}
-    yield Progress(count, count, written=(preview, *writer.finish(report)))
+    yield Progress(count, count, damaged=bool(damaged), written=(preview, *writer.finish(report)))
 
 
 def _first_frame(found: NumberedFiles, work: Work, on_damage: str) -> tuple[SeparatedImages, SeparatedImages]:
@@ -205,9 +221,14 @@ def _refuse_frames(folder: Path, found: NumberedFiles, target: EditTarget) -> No
         raise OutputError(f"expected another directory than that of the input, found {target.directory}")
     if target.overwrite or (target.directory / f".polsep-{found.stem}").exists():
         return
+    targets = [*_frame_paths(found, target), target.directory / f"{found.stem}.png"]
+    refuse_existing(target.directory, targets, overwrite=False)
+
+
+def _frame_paths(found: NumberedFiles, target: EditTarget) -> list[Path]:
+    """The edited frames of a sequence, also of numbers that are missing."""
     numbers = range(found.first, found.first + len(found.files))
-    frames = [target.directory / f"{found.stem}_{number:06d}.exr" for number in numbers]
-    refuse_existing(target.directory, [*frames, target.directory / f"{found.stem}.png"], overwrite=False)
+    return [target.directory / f"{found.stem}_{number:06d}.exr" for number in numbers]
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,10 +39,14 @@ from polsep.sensor.levels import as_measurements
 ANY_PAIR = Measurements(np.zeros((2, 3, 1, 1), np.float32), (0.0, math.pi / 2))
 ENCODINGS = ("linear", "srgb")
 ALIGNMENTS = ("none", *MOTIONS)
-#: Angles of two photographs through a parallel and a crossed filter, in degrees from the specular light's direction.
-PAIR = (0.0, 90.0)
+#: In place of angles: two photographs through a parallel and a crossed filter. No degrees say it, for these count from
+#: the specular light's direction, which nobody measures.
+PAIR: Final = "pair"
+#: Their angles in degrees from there.
+PAIR_DEG = (0.0, 90.0)
+Angles = tuple[float, ...] | Literal["pair"] | None
 #: Where angles count from, by the angles that were told: in all other cases from the picture's right.
-_FRAMES: dict[tuple[float, ...] | None, str] = {None: "the first photograph", PAIR: "the specular light's direction"}
+_FRAMES: dict[Angles, str] = {None: "the first photograph", PAIR: "the specular light's direction"}
 
 #: Largest logarithm of the ratio of a pair's exposures that counts as none: finding it may err by as much.
 EQUAL = 0.12
@@ -69,7 +73,7 @@ class PhotoOptions:
     one of `ENCODINGS`. ``full``: camera raw at full resolution. Raises ValueError on anything else.
     """
 
-    angles_deg: tuple[float, ...] | None = None
+    angles_deg: Angles = None
     exposures: tuple[float, ...] | None = None
     extinction: float = math.inf
     align: str = "rigid"
@@ -85,8 +89,15 @@ class PhotoOptions:
             raise ValueError(f"expected an extinction ratio above 1, found {self.extinction:g}")
         if self.exposures is not None and not all(1e-3 < e < 1e3 for e in self.exposures):
             raise ValueError(f"expected positive exposures like 1,1.5, found {self.exposures}")
-        if self.angles_deg is not None and self.angles_deg != PAIR:
+        if isinstance(self.angles_deg, str):
+            if self.angles_deg != PAIR:
+                raise ValueError(f"expected angles in degrees, None or {PAIR!r}, found {self.angles_deg!r:.40}")
+        elif self.angles_deg is not None:
             stokes_inverse([math.radians(angle) for angle in self.angles_deg])  # raises on too few
+
+    def known_deg(self) -> tuple[float, ...] | None:
+        """The angle of each photograph [degrees]; None where they are to be found."""
+        return PAIR_DEG if isinstance(self.angles_deg, str) else self.angles_deg
 
 
 def read_measurements(
@@ -100,7 +111,7 @@ def read_measurements(
     read = ReadOptions() if read is None else read
     photos = read_photographs([Path(path) for path in paths], options.encoding == "srgb", options.full)
     number = len(photos.array)
-    for name, given in (("angles", options.angles_deg), ("exposures", options.exposures)):
+    for name, given in (("angles", options.known_deg()), ("exposures", options.exposures)):
         if given is not None and len(given) != number:
             raise ValueError(f"expected {number} {name} for {number} photographs, found {len(given)}")
     with naming(paths[0]):
@@ -240,8 +251,9 @@ def _divide(images: Measurements, exposures: Sequence[float]) -> Measurements:
 
 def _angles(images: Measurements, options: PhotoOptions) -> tuple[tuple[float, ...], float | None]:
     """Angles [rad], told or found; found ones with their error."""
-    if options.angles_deg is not None:
-        return tuple(math.radians(angle) for angle in options.angles_deg), None
+    known = options.known_deg()
+    if known is not None:
+        return tuple(math.radians(angle) for angle in known), None
     found = find_angles(*gram(_samples(images)))
     if not found.error < MAX_ANGLE_ERROR:
         raise ValueError(

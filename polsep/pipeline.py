@@ -127,12 +127,13 @@ def separate(
 
     Images are ``[H/2, W/2, C]``, the mean over each 2x2 polarizer cell; ``full=True`` gives ``[H, W, C]``. ``layout``
     None is Sony's colour order; text is "color", "mono" or a `Layout.spec`. ``white_level`` None is the dtype's maximum
-    (1.0 for float): 12-bit codes in uint16 need 4095 said; moved to the left, to 65520, they need nothing. ``calibration``: a file of `polsep calibrate`,
-    applied first. ``ambient``: a raw frame with the lamp off, or several, subtracted. ``light_color``: "auto" finds it
-    in the frame (`find_light`), or "white", or camera RGB of the light. ``raw`` may also be four angle images at 0, 45,
-    90, 135 degrees, ``[4, H, W]`` or ``[4, H, W, 3]``, which keep their resolution, or what `read_frames` read. What
-    the owner should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises ValueError, with one line
-    of what was expected and what was found, on other input; of wrong types it is also a TypeError.
+    (1.0 for float): 12-bit codes in uint16 need 4095 said; moved to the left, to 65520, they need nothing.
+    ``calibration``: a file of `polsep calibrate`, applied first. ``ambient``: a raw frame with the lamp off, or
+    several, subtracted. ``light_color``: "auto" finds it in the frame (`find_light`), or "white", or camera RGB of the
+    light. ``raw`` may also be four angle images at 0, 45, 90, 135 degrees, ``[4, H, W]`` or ``[4, H, W, 3]``, which
+    keep their resolution, or what `read_frames` read. What the owner should know is in ``report["warnings"]`` and
+    issued as `PolsepWarning`. Raises ValueError, with one line of what was expected and what was found, on other input;
+    of wrong types it is also a TypeError.
     """
     if not isinstance(full, bool | np.bool_):
         raise WrongType(f"expected full as True or False, found {full!r:.40}")

@@ -6,12 +6,14 @@ import io
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from test_cli import Run, assert_refused, contents, run_here
 
@@ -26,10 +28,13 @@ from polsep.geometry.integration import integrate_bilateral
 from polsep.geometry.photometric import Appearance
 from polsep.geometry.surface import draw_views, relight, span_surface
 from polsep.io.assets.shapes import encode_glb, encode_ply
+from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
 from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.image_codecs import encode_png
+from polsep.physics.stokes import Stokes
+from polsep.sensor.camera import IDEAL, Layout, expose
 from polsep.separation.report import SeparatedFrame
 
 Cli = Callable[..., Run]
@@ -87,6 +92,37 @@ def test_separated_files_become_maps_and_a_mesh(polsep: Cli, separated: list[Pat
     assert contents(out) == before
     assert polsep(*separated, "-o", out, "--name", "ball", "--mask", tmp_path / "mask.png", "--overwrite").status == 0
     assert contents(out) == before
+
+
+def raw_files(folder: Path, gain: float) -> list[Path]:
+    """The sphere under six lights as raw frames in NPZ files of 16 bits; a large ``gain`` clips them."""
+    normals, mask = cap(2 * SIDE, 70)
+    slope, paths = slope_of(normals) * mask, []
+    for number, image in enumerate(dielectric(normals, SIX, np.broadcast_to([0.5, 0.3, 0.2], (*mask.shape, 3)))):
+        light = gain * np.moveaxis(image, -1, 0)
+        stokes = Stokes(*(torch.from_numpy(light * part).float() for part in (1, slope.real, slope.imag)))
+        codes = expose(stokes, Layout(), IDEAL).data * 65535
+        paths.append(folder / f"raw{number}.npz")
+        np.savez(paths[-1], raw=codes.round().to(torch.int32).numpy().astype(np.uint16))
+    return paths
+
+
+def test_raw_frames_are_separated_and_their_warnings_kept(polsep: Cli, tmp_path: Path) -> None:
+    """Of overexposed frames every file has its line, on stderr and in the sidecar; separated ones have none."""
+    paths = raw_files(tmp_path, 8.0)
+    run = polsep(*paths, "-o", tmp_path / "out", "--method", "analytic")
+    assert run.status == 0, run
+    kept = json.loads((tmp_path / "out" / "shape.json").read_text())["warnings"]
+    assert run.err.splitlines() == [f"polsep: {line}" for line in kept]
+    assert all(any(line.startswith(f"{path}: ") and "clip" in line for line in kept) for path in paths)
+
+
+def test_notes_stay_with_views_that_shrink(separated: list[Path]) -> None:
+    """Separated files have no notes; those of others are not lost where maps are made smaller."""
+    views = files.read_views(separated, files.Source("frames", ReadOptions(), "analytic"))
+    assert views.notes == ()
+    small, _ = files.shrink(replace(views, notes=("a: b",)), np.ones((SIDE, SIDE), np.bool_), SIDE // 2)
+    assert small.notes == ("a: b",) and small.images.shape[1:3] == (SIDE // 2, SIDE // 2)
 
 
 def test_a_turntable_is_a_film_of_the_mesh(

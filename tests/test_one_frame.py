@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ import trimesh
 from test_geometry import cap
 
 import polsep
-from polsep.geometry import one_frame
+from polsep.geometry import frames, one_frame, one_frame_files
 from polsep.geometry.one_frame import (
     SIDE,
     ShapeEstimator,
@@ -50,13 +50,17 @@ from polsep.geometry.shape_maps import (
     mirror_surface,
     projected_normal,
 )
+from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.separation_writer import write_separation
+from polsep.io.store.errors import InputError
 from polsep.io.store.weights import write_weights
 from polsep.networks.shape import ShapeNetwork
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.fresnel import diffuse_dolp
+from polsep.physics.stokes import Stokes
 from polsep.render.blobs import random_blob
+from polsep.sensor.camera import IDEAL, Layout, Mosaic, expose
 from polsep.separation.report import SeparatedFrame
 from polsep.train.shape_examples import COUNT, PLANES, random_shape_example
 from polsep.train.shape_losses import random_lamps, shape_loss
@@ -446,6 +450,67 @@ def test_the_lamp_of_a_separated_file_is_read_beside_it(run: Cli, tmp_path: Path
     (tmp_path / "tinted.json").unlink()
     alone = run(tmp_path / "tinted.exr", "-o", tmp_path / "other", "--mesh", "none")
     assert alone.status == 0 and "colour is not known" in alone.err
+
+
+@pytest.mark.parametrize("beside", ["nothing", "another colour"])
+def test_a_lamp_that_is_told_goes_before_the_file_beside(run: Cli, tmp_path: Path, beside: str) -> None:
+    """--light-color of a separated file is divided out, and nobody says that it is not known; white is told too."""
+    frame, tint = sphere_frame(), np.array([0.5, 1.0, 0.7], np.float32)
+    report = {"warnings": [], "light_color": [1.0, 0.3, 0.3]}
+    tinted = replace(frame, diffuse=frame.diffuse * tint, error=frame.error * tint.mean(), report=report)
+    planes = []
+    for name, one, told in (("white", frame, "white"), ("tinted", tinted, "0.5,1,0.7")):
+        path = write_separation(one, tmp_path, name)[0]
+        if beside == "nothing":
+            (tmp_path / f"{name}.json").unlink()
+        done = run(path, "-o", tmp_path / "out", "--mesh", "none", "--light-color", told)
+        assert done.status == 0 and "colour is not known" not in done.err
+        planes.append(read_exr_layers(tmp_path / "out" / f"{name}.exr"))
+    np.testing.assert_allclose(planes[1]["normal.X"], planes[0]["normal.X"], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("light", "channels", "gains"), [("white", 3, [1, 1, 1]), ((2, 1, 0.5), 3, [2, 1, 0.5]), ((2, 1, 0.5), 1, [1])]
+)
+def test_told_lamps_have_a_gain_per_channel(light: str | tuple[float, ...], channels: int, gains: list[float]) -> None:
+    """Mono has one, whatever the colour."""
+    assert one_frame_files._told_color(light, channels) == gains
+
+
+def raw_sphere() -> NDArray[np.uint16]:
+    """The sphere as a mosaic of 16 bits."""
+    planes = sphere_planes(128)[PLANES["stokes"]]
+    codes = expose(Stokes(planes[:3], planes[3:6], planes[6:]), Layout(), IDEAL).data * 65535
+    return codes.round().to(torch.int32).numpy().astype(np.uint16)
+
+
+def test_raw_frames_come_in_npz_too(run: Cli, tmp_path: Path) -> None:
+    """Archives with a raw frame are separated, those with separated images are taken as they are, others refused."""
+    np.savez(tmp_path / "raw.npz", raw=raw_sphere())
+    write_separation(sphere_frame(), tmp_path, "separated", "npz")
+    np.savez(tmp_path / "other.npz", a=np.zeros((4, 4)), b=np.zeros((4, 4)))
+    words = ("-o", tmp_path / "out", "--mesh", "none", "--method", "analytic")
+    for name, method in (("raw", "analytic"), ("separated", "separated before")):
+        done = run(tmp_path / f"{name}.npz", *words)
+        assert done.status == 0, done
+        assert json.loads((tmp_path / "out" / f"{name}.json").read_text())["method"] == method
+    assert_refused(run(tmp_path / "other.npz", *words), "other.npz: expected one array, or raw", "found arrays: a, b")
+
+
+def test_of_many_frames_two_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file of several frames is refused as soon as the second is there; one of none, too."""
+    one = Frame("film_0000", Mosaic(raw_sphere(), Layout(), 0.0, 65535.0), (), count=9000)
+
+    def film(path: Path, options: ReadOptions) -> Iterator[Frame]:
+        yield from (one, one)
+        pytest.fail("a third frame was read")
+
+    monkeypatch.setattr(frames, "read_frames", film)
+    with pytest.raises(InputError, match=r"film.npy: expected one frame, found 9000"):
+        frames.separate_file(tmp_path / "film.npy", ReadOptions(), "analytic")
+    monkeypatch.setattr(frames, "read_frames", lambda path, options: iter(()))
+    with pytest.raises(InputError, match=r"film.npy: expected one frame, found 0"):
+        frames.separate_file(tmp_path / "film.npy", ReadOptions(), "analytic")
 
 
 def test_a_mesh_is_left_out_on_request(run: Cli, tmp_path: Path) -> None:

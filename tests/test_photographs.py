@@ -22,7 +22,7 @@ from polsep.io.raw.photographs import MOST_FRAMES, read_photographs
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
 from polsep.methods import METHODS
-from polsep.photographs import PAIR, PhotoOptions, read_measurements
+from polsep.photographs import PAIR, PAIR_DEG, PhotoOptions, read_measurements
 from polsep.physics.stokes import Measurements, fit_stokes
 from polsep.sensor.camera import Mosaic
 
@@ -114,6 +114,26 @@ def test_pictures_of_nothing_are_not_aligned() -> None:
         find_motion(photograph(0).mean(axis=0), np.zeros((SIDE, SIDE), np.float32), "shift")
 
 
+@pytest.mark.parametrize("shape", [(1, 40), (40, 1), (15, 400), (16, 4096)])
+def test_photographs_too_small_to_align_are_refused(shape: tuple[int, int]) -> None:
+    """In one line, with the size; strips are, whose coarse pictures are a few pixels wide."""
+    pytest.importorskip("cv2")
+    least, image = (32 if max(shape) > 4000 else 16), np.full(shape, 0.5, np.float32)
+    said = f"at least {least}x{least} pixels to align, found {shape[1]}x{shape[0]}: --align none"
+    with pytest.raises(ValueError, match=said):
+        find_motion(image, image)
+
+
+def test_two_angles_are_no_pair() -> None:
+    """Degrees are told from the picture's right, those of a pair from a direction that nobody measures."""
+    for angles in (PAIR_DEG, (90.0, 0.0)):
+        with pytest.raises(ValueError, match="need three analysers"):
+            PhotoOptions(angles)
+    assert PhotoOptions(PAIR).known_deg() == PAIR_DEG and PhotoOptions(None).known_deg() is None
+    with pytest.raises(ValueError, match="expected angles in degrees, None or 'pair', found 'crossed'"):
+        PhotoOptions("crossed")  # type: ignore[arg-type]
+
+
 def test_a_pair_comes_back_as_diffuse_and_specular(tmp_path: Path, polsep: Cli) -> None:
     """Aligned, exposures found: the lobes of the scene; named after the first; all in the report."""
     pytest.importorskip("cv2")
@@ -156,7 +176,7 @@ def test_photographs_that_stand_still_are_not_resampled(tmp_path: Path) -> None:
 
 def test_swapped_pairs_are_doubted(tmp_path: Path) -> None:
     """The parallel photograph has the highlights, so it is the brighter one."""
-    paths = [str(write_tiff(tmp_path / f"{angle:g}.tif", photograph(angle))) for angle in PAIR]
+    paths = [str(write_tiff(tmp_path / f"{angle:g}.tif", photograph(angle))) for angle in PAIR_DEG]
     for order, count in ((paths, 0), (paths[::-1], 1)):
         frame, _ = read_measurements(order, PhotoOptions(PAIR, exposures=(1, 1), align="none"))
         assert sum("are they swapped?" in note for note in frame.notes) == count
@@ -198,7 +218,7 @@ def test_a_film_of_a_turning_filter(tmp_path: Path) -> None:
 def test_srgb_is_decoded_only_where_it_is_said(tmp_path: Path, suffix: str) -> None:
     """8-bit pictures with the curve give the scene's light; taken as linear they are noted, JPEG is refused."""
     paths = []
-    for k, angle in enumerate(PAIR):
+    for k, angle in enumerate(PAIR_DEG):
         codes = np.round(255 * srgb(np.moveaxis(photograph(angle), 0, -1))).astype(np.uint8)
         encode = imagecodecs.png_encode if suffix == ".png" else lambda x: imagecodecs.jpeg_encode(x, level=98)
         paths.append(str(tmp_path / f"{k}{suffix}"))
@@ -288,6 +308,8 @@ def test_stacks_of_four_angles_are_read_as_such(tmp_path: Path, pages: str) -> N
         (["--parallel", "p.tif", "--crossed", "c.tif", "--method", "joint"], "two crossed photographs"),
         (["--parallel", "p.tif", "--crossed", "c.tif", "--layout", "mono"], "photographs without --layout"),
         (["--angles", "0,60", "p.tif", "c.tif"], "need three analysers"),
+        (["--angles", "0,90", "p.tif", "c.tif"], "need three analysers"),
+        (["--angles", "90,0", "p.tif", "c.tif"], "need three analysers"),
         (["--angles", "0,60,120", "p.tif", "c.tif"], "expected 2 angles for 2 photographs, found 3"),
         (["--angles", "0,x", "p.tif", "c.tif"], "expected --angles as numbers"),
         (["--angles", "unknown", "p.tif", "c.tif"], "expected at least 5 photographs"),

@@ -553,9 +553,10 @@ def test_without_the_library_films_are_refused_before_any_work(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    for asked in ("--preview", "--format=ffv1"):
+    for asked in ("--preview", "--format=ffv1", "--format=ffvhuff"):
         assert run(monkeypatch, *command(recording, tmp_path / "o", asked)) == 2
-        assert "expected the extra 'video'" in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert "expected the extra 'video'" in said and said.count("\n") == 1
         assert not (tmp_path / "o").exists()
     assert run(monkeypatch, *command(recording, tmp_path / "o", "--frames", "1")) == 0
     assert "no video to watch is written: it needs the extra 'video'" in capsys.readouterr().err

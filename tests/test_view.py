@@ -7,6 +7,7 @@ import json
 import math
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.exposure import histogram
 from polsep.separation.report import SeparatedFrame
-from polsep.view import guard, opening, session
+from polsep.view import guard, opening
 from polsep.view.edits import at_scale, edit_small, list_controls, recipe_of
 from polsep.view.guard import Guard, host_name, names_address
 from polsep.view.opening import Settings, parse_settings, plain_name
@@ -49,7 +50,8 @@ from polsep.view.pictures import (
 )
 from polsep.view.playback import Prefetcher
 from polsep.view.readout import read_pixel, readout_panel
-from polsep.view.session import Session, Sessions
+from polsep.view.session import Session, Superseded
+from polsep.view.sessions import Sessions
 from polsep.view.waiting import Ticket
 
 WHITE = 4095
@@ -244,7 +246,7 @@ def test_sessions_are_apart_and_leave_nothing(sessions: Sessions) -> None:
 
 def test_the_page_idle_for_longest_makes_room(sessions: Sessions, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory is bounded: one page too many ends another."""
-    monkeypatch.setattr(session, "MAX_SESSIONS", 2)
+    monkeypatch.setattr("polsep.view.sessions.MAX_SESSIONS", 2)
     first = sessions.find("a")
     sessions.find("b")
     assert sessions.find("a") is first
@@ -426,9 +428,11 @@ def test_a_result_that_nobody_waits_for_is_dropped(sessions: Sessions) -> None:
     """A cancelled separation leaves the page as it was; the page is usable while another one is made."""
     page, found = sessions.find("a"), opened(sessions)
     other = parse_settings({"method": "analytic", "white": "4095"})
-    with pytest.raises(session.Superseded):
-        page.separate(other, wanted=lambda: False)
-    assert page.opened is found
+    size = page.size()
+    for k in range(3):
+        with pytest.raises(Superseded):
+            page.separate(replace(other, light_color=(1.0, 1.0, 1.0 + k)), wanted=lambda: False)
+    assert page.opened is found and page.size() == size
     begun, go_on = threading.Event(), threading.Event()
     line = sessions.line
 
@@ -537,6 +541,26 @@ def test_edits_are_shown_small_and_written_large(sessions: Sessions) -> None:
     assert json.loads(page.write("recipe").read_text())["edits"][0]["edit"] == "rougher"
     page.edit(Recipe())
     assert page.opened.small.edited is None
+
+
+def test_edits_that_do_not_fit_are_left_out(sessions: Sessions) -> None:
+    """Edits in colour of a frame without any: a remark on each, and the picture, the numbers and the files agree."""
+    page = sessions.find("a")
+    opened(sessions)
+    page.edit(Recipe((Rougher(sigma=3.0), Metallic(amount=0.5))))
+    found = opened(sessions, layout="mono")
+    assert page.opened is found and page.recipe == Recipe((Rougher(sigma=3.0),))
+    assert page.dropped == (Metallic(amount=0.5),)
+    assert [r for r in found.remarks if "left out" in r] == [
+        f"{Metallic.title} is left out: expected images in colour for metallic, found one channel"
+    ]
+    assert page.shown is not None and page.shown.edited is not None
+    np.testing.assert_array_equal(page.shown.edited, edit_small(found.small, page.recipe))
+    layers = read_exr_layers(page.write("edited"))
+    np.testing.assert_array_equal(layers["combined.Y"], apply_edits(found.frame, page.recipe).combined[..., 0])
+    page.edit(Recipe((Rougher(sigma=2.0),)))
+    settings = parse_settings({"method": "color-affine", "white": "4095", "layout": "mono"})
+    assert page.separate(settings) is found and page.dropped == ()  # said once
 
 
 def test_requests_name_this_machine() -> None:

@@ -7,6 +7,7 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,8 @@ from polsep.view.edits import edit_small
 from polsep.view.opening import Settings, find_sources, parse_settings
 from polsep.view.pictures import Small, shrink, shrink_frame
 from polsep.view.playback import Prefetcher, Reel, pack, unpack
-from polsep.view.session import Session, Sessions
+from polsep.view.session import Session
+from polsep.view.sessions import Sessions
 
 COUNT = 4
 ANALYTIC = {"white": "4095", "method": "analytic"}
@@ -93,6 +95,17 @@ def test_a_stack_plays_in_order_and_around(sessions: Sessions) -> None:
     assert page.place == 2
     page.toggle()
     assert not page.play() and page.place == 2
+
+
+def test_what_plays_has_its_marks(sessions: Sessions) -> None:
+    """The flags of a frame that plays are those of the frame when it is opened, at both resolutions."""
+    for more in ({}, {"resolution": "full"}):
+        page = stacked(sessions)
+        page.separate(parse_settings({**ANALYTIC, **more}))
+        until(page.play)
+        assert page.shown is not None and page.shown.flags is not None and page.shown.flags.any()
+        found = page.separate(parse_settings({**ANALYTIC, **more, "index": 1}))
+        np.testing.assert_array_equal(page.shown.flags, found.small.flags)
 
 
 def test_edits_apply_while_it_plays(sessions: Sessions) -> None:
@@ -202,6 +215,13 @@ def test_half_floats_keep_what_is_seen() -> None:
     for name in ("diffuse", "specular", "dolp", "aolp"):
         np.testing.assert_allclose(getattr(unpack(pack(frame)), name), getattr(frame, name), rtol=5e-4)
     assert np.isfinite(unpack(pack(small_frame(1e6))).diffuse).all()
+    assert unpack(pack(frame)).error is None and unpack(pack(frame)).flags is None
+    error = np.random.default_rng(0).random((*frame.size, 2), dtype=np.float32) / 100
+    whole = replace(frame, error=error, flags=np.arange(error[..., 0].size, dtype=np.uint8).reshape(frame.size) % 4)
+    back = unpack(pack(whole))
+    assert back.error is not None and pack(whole).size == pack(frame).size + 5 * error[..., 0].size
+    np.testing.assert_allclose(back.error, error, rtol=5e-4, atol=1e-7)
+    np.testing.assert_array_equal(back.flags, whole.flags)
 
 
 # Images that edits name.
@@ -295,6 +315,41 @@ def test_bad_images_are_refused_in_one_line(sessions: Sessions, kind: str, name:
         add(sessions, kind, name, data)
     assert "\n" not in str(caught.value) and str(sessions.scratch.root) not in str(caught.value)
     assert sessions.find("a").images == {}
+
+
+def test_a_bad_image_leaves_the_one_before(sessions: Sessions) -> None:
+    """With its file, its edits and the picture; the next good one takes its place, and its file goes."""
+    found, page = opened(sessions), sessions.find("a")
+    add(sessions, "texture", "t.png", checks(8, 8))
+    add(sessions, "mask", "m.png", png(np.full(found.frame.valid.shape, 255, np.uint8)))
+    page.edit(recipe := Recipe((Texture(image="t.png", mask="m.png"),)))
+    before, shown = dict(page.images), page.shown
+    kept = sorted(page.kept.iterdir())
+    for kind, name, data in (
+        ("texture", "t.png", b"hello"),
+        ("texture", "film.mkv", b""),
+        ("mask", "m2.png", png(np.zeros((5, 7), np.uint8))),
+    ):
+        with pytest.raises(ValueError, match=name):
+            add(sessions, kind, name, data)
+    assert page.images == before and page.recipe == recipe and page.shown is shown
+    assert sorted(page.kept.iterdir()) == kept and page.write("recipe").suffix == ".zip"
+    add(sessions, "texture", "t.png", checks(16, 16))
+    assert page.images["texture"].size == (16, 16) and page.recipe == Recipe()
+    assert page.shown is not None and page.shown.edited is None  # until the recipe is said again
+    assert page.images["texture"].path.exists() and not before["texture"].path.exists()
+    page.edit(recipe)
+    page.drop_images()
+    assert [path for path in page.kept.rglob("*") if path.suffix == ".png" and "frames" not in path.parts] == []
+
+
+def test_textures_fit_the_colours_of_the_frame(sessions: Sessions) -> None:
+    """A texture in colour is refused for a frame of one channel, before it replaces a grey one."""
+    opened(sessions, layout="mono")
+    add(sessions, "texture", "grey.png", png(np.full((8, 8), 128, np.uint8)))
+    with pytest.raises(ValueError, match=r"expected texture 'c.png' as float32 \[h, w, 1\], found"):
+        add(sessions, "texture", "c.png", checks(8, 8))
+    assert sessions.find("a").images["texture"].name == "grey.png"
 
 
 def test_images_need_a_frame_and_an_upload(sessions: Sessions, tmp_path: Path) -> None:

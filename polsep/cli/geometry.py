@@ -20,6 +20,7 @@ from polsep.cli.app import (
     Number,
     Word,
     app,
+    print_note,
     read_options,
     require_extra,
     require_paths,
@@ -116,5 +117,7 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
         mask = find_object(views) if options["mask"] is None else read_object(options["mask"], size)
         views, mask = shrink(views, mask, options["longest"])
         write_shape(find_shape(views, directions, mask, shape_options), targets)
+    for note in views.notes:
+        print_note(note)
     for path in targets:
         print(path)

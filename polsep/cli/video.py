@@ -101,7 +101,7 @@ def video(recording: Path, output: Path, **options: Any) -> None:
     require_paths(recording)
     if options["engine"] == "ray":
         require_extra("ray")
-    if options["format"] == "ffv1" or recording.suffix.lower() in (".mkv", ".avi", ".mov", ".nut"):
+    if options["format"] in ("ffv1", "ffvhuff") or recording.suffix.lower() in (".mkv", ".avi", ".mov", ".nut"):
         require_extra("video")
     read = read_options(options)
     from polsep.compute.workers import keep_memory

@@ -22,6 +22,8 @@ Doubles = NDArray[np.float64]
 MOTIONS = ("shift", "rigid", "affine", "homography")
 #: Side of the coarsest pyramid level in pixels, and the longest side of the finest: larger pictures are halved.
 COARSEST, FINEST = 96, 2048
+#: Least side of the coarsest level: a smaller one is all border.
+LEAST = 16
 #: Standard deviations of the band of details that is compared, in pixels of a level.
 FINE, SLOW = 0.8, 6.0
 #: Share of pixels that later rounds on a level keep, those whose details agree best, and the number of these rounds.
@@ -47,13 +49,19 @@ class Motion(NamedTuple):
 def find_motion(reference: Floats, moved: Floats, kind: str = "rigid") -> Motion:
     """The motion of ``moved [H, W]`` against ``reference [H, W]``, linear light. ``kind``: one of `MOTIONS`.
 
-    Raises ValueError where the pictures show nothing in common.
+    Raises ValueError where the pictures show nothing in common, and on pictures that are too small or too narrow.
     """
     import cv2
 
     pyramid = [(reference, moved)]
     while max(pyramid[-1][0].shape) > FINEST or min(pyramid[-1][0].shape) > 2 * COARSEST:
         pyramid.append((_halved(pyramid[-1][0]), _halved(pyramid[-1][1])))
+    if min(pyramid[-1][0].shape) < LEAST:
+        least, (height, width) = LEAST << (len(pyramid) - 1), reference.shape
+        raise ValueError(
+            f"expected photographs of at least {least}x{least} pixels to align, found {width}x{height}: "
+            "--align none takes them as they are"
+        )
     matrix = np.eye(3)
     matrix[:2, 2] = _coarse_shift(*pyramid[-1])
     model = {"shift": cv2.MOTION_TRANSLATION, "rigid": cv2.MOTION_EUCLIDEAN, "affine": cv2.MOTION_AFFINE}.get(

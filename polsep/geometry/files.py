@@ -8,26 +8,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.geometry.frames import separate_file
 from polsep.geometry.integration import integrate_bilateral, integrate_smooth
 from polsep.geometry.photometric import Appearance, fit_robust
 from polsep.geometry.polarization import Polarized, find_diffuse_polarization, normals_from_polarization
 from polsep.geometry.surface import Surface, draw_views, relight, span_surface
 from polsep.io.assets.maps import read_map
 from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
-from polsep.io.raw.frames import ReadOptions, read_frames, refuse_forgotten
+from polsep.io.raw.frames import ReadOptions
 from polsep.io.raw.videos import load_library
 from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
-from polsep.io.results.separation_reader import SUFFIXES, read_separated
+from polsep.io.results.separation_reader import is_separated, read_separated
 from polsep.io.store.errors import InputError, input_error
-from polsep.pipeline import separate_capture
 from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float64]
@@ -49,10 +49,11 @@ GREY = 40
 
 @dataclass(frozen=True)
 class Views:
-    """Linear ``images [L, H, W, C]`` under different lights, and their polarization if known."""
+    """Linear ``images [L, H, W, C]`` under different lights, their polarization if known, ``notes`` for the user."""
 
     images: Floats
     polarized: Polarized | None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -87,9 +88,13 @@ def read_views(paths: Sequence[Path], source: Source) -> Views:
         images = [read_map(path, "texture") for path in paths]
         _require_one_shape(paths, images)
         return Views(np.stack(images).astype(np.float64), None)
-    frames = [_read_frame(path, source) for path in paths]
+    frames, notes = [], list[str]()
+    for path in paths:
+        frame, said = _read_frame(path, source)
+        frames.append(frame)
+        notes += [f"{path}: {note}" for note in said]
     _require_one_shape(paths, [frame.diffuse for frame in frames])
-    return views_of(frames)
+    return replace(views_of(frames), notes=tuple(notes))
 
 
 def views_of(frames: Sequence[SeparatedFrame]) -> Views:
@@ -102,21 +107,14 @@ def views_of(frames: Sequence[SeparatedFrame]) -> Views:
     return Views(diffuse, Polarized(grey, highlight, strength * np.cos(2 * aolp), strength * np.sin(2 * aolp), valid))
 
 
-def _read_frame(path: Path, source: Source) -> SeparatedFrame:
-    """One frame, separated."""
-    if path.suffix.lower() in SUFFIXES:
-        frame = read_separated(path)
-        if not frame.dolp.any():
-            raise input_error(path, "expected a file of polsep separate with its polarization, found none in it")
-        return frame
-    frames = list(read_frames(path, source.options))
-    if len(frames) != 1:
-        raise input_error(path, f"expected one frame under one light, found {len(frames)}")
-    refuse_forgotten(path, frames[0])
-    try:
-        return separate_capture(frames[0].data, source.method)
-    except (ValueError, RuntimeError) as error:
-        raise input_error(path, error) from error
+def _read_frame(path: Path, source: Source) -> tuple[SeparatedFrame, list[str]]:
+    """One frame, separated, and notes on a raw one."""
+    if not is_separated(path):
+        return separate_file(path, source.options, source.method)
+    frame = read_separated(path)
+    if not frame.dolp.any():
+        raise input_error(path, "expected a file of polsep separate with its polarization, found none in it")
+    return frame, []
 
 
 def _require_one_shape(paths: Sequence[Path], images: Sequence[NDArray[Any]]) -> None:
@@ -147,7 +145,7 @@ def shrink(views: Views, mask: Mask, longest: int) -> tuple[Views, Mask]:
     if not small.any():
         raise InputError(f"expected an object that is wider than {factor} pixels, found none")
     states = None if views.polarized is None else Polarized(*(mean(image) for image in vars(views.polarized).values()))
-    return Views(mean(views.images), states), small
+    return replace(views, images=mean(views.images), polarized=states), small
 
 
 def find_object(views: Views) -> Mask:
@@ -179,6 +177,7 @@ def find_shape(views: Views, directions: Floats, mask: Mask, options: ShapeOptio
         "integration": options.integration,
         "triangles": len(surface.faces),
         "albedo_of_mesh": f"albedo x {gain:.6g}, limited to 1",
+        "warnings": list(views.notes),
     }
     sheet, film = draw_sheet(views, shown, surface), None
     if options.turntable:

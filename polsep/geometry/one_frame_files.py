@@ -10,19 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.geometry.frames import separate_file
 from polsep.geometry.one_frame import SIDE, UNKNOWN, Shape, find_shape, gather, square_around
 from polsep.geometry.shape_maps import Surface, relight
 from polsep.io.assets.maps import read_object
 from polsep.io.assets.relight_page import RelightMaps, encode_relight_page
 from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
-from polsep.io.raw.frames import ReadOptions, read_frames, refuse_forgotten
+from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
-from polsep.io.results.separation_reader import SUFFIXES, read_separated
+from polsep.io.results.separation_reader import is_separated, read_separated
 from polsep.io.results.sidecars import read_report
 from polsep.io.store.errors import input_error
 from polsep.physics.fresnel import ETA
-from polsep.pipeline import LightColor, separate_capture
+from polsep.pipeline import LightColor, is_to_be_found
 from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float32]
@@ -48,9 +49,10 @@ GREY = 40
 
 @dataclass(frozen=True)
 class ShapeSettings:
-    """Options of `polsep shape`: ``read``, ``method`` and ``light_color`` of a raw frame; ``lamp``, toward which a
-    direction is told; a file of the ``mask``; format of the ``mesh`` ("none": no depth and mesh), its ``integration``,
-    a ``turntable``; ``weights`` instead of the shipped ones; and the refractive ``index`` of the thing."""
+    """Options of `polsep shape`: ``read`` and ``method`` of a raw frame; ``light_color``, of a separated one too, where
+    it goes before that of its report; ``lamp``, toward which a direction is told; a file of the ``mask``; format of the
+    ``mesh`` ("none": no depth and mesh), its ``integration``, a ``turntable``; ``weights`` instead of the shipped ones;
+    and the refractive ``index`` of the thing."""
 
     read: ReadOptions = field(default_factory=ReadOptions)
     method: str = "joint"
@@ -77,21 +79,20 @@ def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list
 
 def _read_frame(path: Path, settings: ShapeSettings) -> tuple[SeparatedFrame, list[str]]:
     """A separated frame, and what was said about it."""
-    if path.suffix.lower() in SUFFIXES:
-        frame = replace(read_separated(path), report=read_report(path.with_suffix(".json")))
-        notes = list(frame.report.get("warnings", ()))
-        if "light_color" not in frame.report:
-            notes.append(f"the lamp's colour is not known without {path.stem}.json beside the file: taken for white")
-        return frame, notes
-    frames = list(read_frames(path, settings.read))
-    if len(frames) != 1:
-        raise input_error(path, f"expected one frame, found {len(frames)}")
-    refuse_forgotten(path, frames[0])
-    try:
-        frame = separate_capture(frames[0].data, settings.method, settings.light_color)
-    except (ValueError, RuntimeError) as error:
-        raise input_error(path, error) from error
-    return frame, [*frames[0].notes, *frame.report["warnings"]]
+    if not is_separated(path):
+        return separate_file(path, settings.read, settings.method, settings.light_color)
+    frame = replace(read_separated(path), report=read_report(path.with_suffix(".json")))
+    notes = list(frame.report.get("warnings", ()))
+    if not is_to_be_found(settings.light_color):
+        frame.report["light_color"] = _told_color(settings.light_color, frame.diffuse.shape[-1])
+    elif "light_color" not in frame.report:
+        notes.append(f"the lamp's colour is not known without {path.stem}.json beside the file: taken for white")
+    return frame, notes
+
+
+def _told_color(light_color: LightColor | str, channels: int) -> list[float]:
+    """One gain per channel of a light whose colour is told: three numbers or "white"; mono has one channel."""
+    return [1.0] * channels if isinstance(light_color, str) or channels == 1 else [float(gain) for gain in light_color]
 
 
 def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, title: str) -> ShapeFiles:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from polsep.edit import EDITS, Edit, Parameter, Recipe, SeparatedImages, apply, make_edit
+from polsep.edit import EDITS, Edit, EditError, Parameter, Recipe, SeparatedImages, apply, make_edit
 from polsep.edit.images import Maps
 from polsep.io.results.previews import linear_from_srgb, srgb
 from polsep.view.pictures import Floats, Small
@@ -94,6 +94,19 @@ def edit_small(small: Small, recipe: Recipe, maps: Maps | None = None) -> Floats
     Raises EditError.
     """
     return apply(SeparatedImages(small.diffuse, small.specular), at_scale(recipe, small.step), maps).combined
+
+
+def keep_fitting(small: Small, recipe: Recipe, maps: Maps) -> tuple[Recipe, tuple[str, ...]]:
+    """The edits of a recipe that fit a frame at screen size, and a remark on each of the others."""
+    kept, remarks, images = [], [], SeparatedImages(small.diffuse, small.specular)
+    for edit in recipe.edits:
+        try:
+            _at_scale(edit, small.step).change(images, maps)
+        except EditError as error:
+            remarks.append(f"{edit.title} is left out: {error}")
+        else:
+            kept.append(edit)
+    return Recipe(tuple(kept)), tuple(remarks)
 
 
 def at_scale(recipe: Recipe, step: int) -> Recipe:

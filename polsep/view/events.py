@@ -21,6 +21,7 @@ from polsep.view.components import (
     NO_SHAPE,
     NOTHING,
     OF_FILES,
+    PAUSE,
     SAME,
     Components,
     Start,
@@ -35,7 +36,8 @@ from polsep.view.images import KINDS
 from polsep.view.opening import DEMO, DEMO_WHITE, OpenedFrame, parse_against, parse_settings
 from polsep.view.pictures import Exposure, Picture, Place, Window, exposure_panel, light_panel, shape_panel, stage
 from polsep.view.readout import read_pixel, readout_panel
-from polsep.view.session import Session, Sessions, Superseded
+from polsep.view.session import Session, Superseded
+from polsep.view.sessions import Sessions
 from polsep.view.style import EMPTY
 
 #: Errors of files, settings and disks; each message is one line.
@@ -92,9 +94,11 @@ class Events:
         try:
             await asyncio.to_thread(prepare)
         except FAILURES as error:
-            session.forget()
+            await asyncio.to_thread(session.forget)
+            self.sessions.line.leave(_key(request))
             yield emptied | self._failed(error, session)
             return
+        self.sessions.line.leave(_key(request))  # the job of the files before, whatever its settings
         if said is None:
             names = [] if first or values[self.components.keep] else list(OF_FILES)
             if any(source.path.suffix.lower() in (".raw", ".bin") for source in session.sources):
@@ -120,8 +124,10 @@ class Events:
             return
         if session.made(settings) is not None and (against is None or session.made(against) is not None):
             self.sessions.line.leave(key)
-            found = await asyncio.to_thread(session.separate, settings, against)
-            yield await asyncio.to_thread(self._show, session, found)
+            try:
+                yield await self._show(session, await asyncio.to_thread(session.separate, settings, against))
+            except Superseded:  # by other files
+                yield self._kept()
             return
         ticket = self.sessions.line.join(key, lambda ticket: session.separate(*about, lambda: ticket.wanted), about)
         task = asyncio.wrap_future(ticket.future)
@@ -131,9 +137,10 @@ class Events:
                 yield {parts.progress: words, parts.cancel: gr.update(visible=True)}
             if task.cancelled() or not ticket.wanted:
                 raise Superseded
-            yield await asyncio.to_thread(self._show, session, task.result())
+            yield await self._show(session, task.result())
         except Superseded:  # said here too: words on their way to the page would replace what `cancel` says
-            yield self._cancelled(session) if ticket.by_user else self._kept()
+            ended = self._kept() if session.sources else self._idle()
+            yield self._cancelled(session) if ticket.by_user else ended
         except FAILURES as error:
             yield self._failed(error, session)
         finally:
@@ -155,9 +162,19 @@ class Events:
     def _idle(self) -> Updates:
         return {self.components.progress: "", self.components.cancel: gr.update(visible=False)}
 
-    def _show(self, session: Session, found: OpenedFrame) -> Updates:
+    async def _show(self, session: Session, found: OpenedFrame) -> Updates:
+        """Show a frame; without its picture if a later one was begun meanwhile, and not at all if it was closed."""
         session.turn += 1
+        turn = session.turn
+        shown = await asyncio.to_thread(self._panels, session, found)
+        if session.opened is not found:
+            return self._kept()
+        return shown if turn == session.turn else shown | self._kept()
+
+    def _panels(self, session: Session, found: OpenedFrame) -> Updates:
         parts, mends = self.components, found.mends()
+        unfit = {type(edit) for edit in session.dropped}
+        controls = zip(parts.controls, list_controls(), strict=True)
         offered = [gr.update(visible=True, value=mend.words) for mend in mends[:MENDS]]
         offered += [gr.update(visible=False)] * (MENDS - len(offered))
         return {
@@ -172,6 +189,7 @@ class Events:
             parts.settings["index"]: gr.update(maximum=max(found.count - 1, 1), value=found.index),
             **self._play_state(session),
             **self._image_names(session),
+            **{component: control.start for component, control in controls if control.edit in unfit},
             **dict(zip(parts.mends, offered, strict=True)),
         }
 
@@ -243,8 +261,8 @@ class Events:
     async def undo(self, values: Values, request: gr.Request) -> Updates:
         """Remove all edits and their images."""
         session, starts = self._session(request), [control.start for control in list_controls()]
-        session.edit(recipe_of(starts))
-        session.drop_images()
+        await asyncio.to_thread(session.edit, recipe_of(starts))
+        await asyncio.to_thread(session.drop_images)
         controls = dict(zip(self.components.controls, starts, strict=True))
         return await self._edited(session, values) | self._image_names(session) | controls
 
@@ -260,7 +278,8 @@ class Events:
                 await asyncio.to_thread(self.sessions.add_image, _key(request), kind, *sent)
                 await asyncio.to_thread(session.edit, self._recipe(session, values))
             except FAILURES as error:
-                return {self.components.status: failure_line(error)} | self._image_names(session)
+                said = {self.components.status: failure_line(error)} | self._image_names(session)
+                return await self._drawn(session) | said
             return await self._edited(session, values) | self._image_names(session) | {amount: values[amount]}
 
         return answer
@@ -340,12 +359,14 @@ class Events:
         said = session.view
         exposure = Exposure(float(said["stops"]), float(said["specular_stops"]), bool(said["marks"]))
         sharp = session.sharp or (None, None)
-        makers = session.makers if other is not None else ("", "")
-        still = other is not None and session.place == found.index
-        second = replace(other.small, gain=shown.gain) if other is not None and still else shown
+        second, right, makers = shown, str(said["right"]), ("", "")
+        if other is not None and session.place == found.index:  # what plays is of one method
+            second, makers = replace(other.small, gain=shown.gain), session.makers
+            if right == "Edited" and shown.edited is not None:  # only the other picture is
+                right = "Input"
         pictures = (
             Picture(str(said["left"]), shown, makers[0], sharp[0]),
-            Picture(str(said["right"]), second, makers[1], sharp[1]),
+            Picture(right, second, makers[1], sharp[1]),
         )
         width = max(frame.frame.valid.shape[1] for frame in (found, other) if frame is not None)
         return stage(pictures, exposure, Place(width, session.mark, session.window))
@@ -355,6 +376,8 @@ class Events:
         found, other = session.opened, session.against
         if place is None or found is None:
             return HINT
+        if session.place != found.index:
+            return PAUSE
         pairs = [(found, session.makers[0] if other is not None else ""), (other, session.makers[1])]
         tables = []
         for frame, maker in pairs:

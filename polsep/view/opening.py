@@ -247,15 +247,17 @@ def open_frame(sources: tuple[Source, ...], settings: Settings, read: Frame | Se
     frame.report["warnings"] = list(advice)
     remarks = tuple(re.sub(rf"--({'|'.join(OPTIONS)})", lambda found: OPTIONS[found[1]][0], text) for text in advice)
     mosaic = read.data if isinstance(read.data, Mosaic) else None
-    flags = None if mosaic is None else _flags(mosaic, frame.valid.shape)
+    flags = _flags(read.data, frame.valid.shape)
     counted = None if mosaic is None else histogram(mosaic)
     stem = stem if len(sources) > 1 or read.count == 1 else f"{stem}_{read.index:04d}"
     small, place = shrink_frame(frame, flags), (read.index, read.count)
     return OpenedFrame(frame, small, mosaic, counted, remarks, stem, *place, flags=flags, advice=advice)
 
 
-def _flags(mosaic: Mosaic, shape: tuple[int, ...]) -> Pixels:
-    """`exposure_flags` for a separated frame of a shape: of its cells, or of the samples in them."""
+def _flags(mosaic: object, shape: tuple[int, ...]) -> Pixels | None:
+    """`exposure_flags` for a separated frame of a shape: of its cells, or of the samples in them; None for others."""
+    if not isinstance(mosaic, Mosaic):
+        return None
     cells = exposure_flags(mosaic)
     if cells.shape == shape:
         return cells
@@ -270,7 +272,8 @@ def open_small(sources: tuple[Source, ...], settings: Settings) -> Small:
     read = read_source(sources, settings.read, settings.index)
     if isinstance(read, SeparatedFrame):
         return shrink_frame(read)
-    return shrink_frame(separate_capture(read.data, settings.method, settings.light_color, full=settings.full))
+    frame = separate_capture(read.data, settings.method, settings.light_color, full=settings.full)
+    return shrink_frame(frame, _flags(read.data, frame.valid.shape))
 
 
 @contextmanager

@@ -19,7 +19,8 @@ from polsep.view.events import Events
 from polsep.view.images import KINDS
 from polsep.view.opening import FULL, HALF, UNSAID
 from polsep.view.pictures import VIEWS
-from polsep.view.session import DOWNLOADS, Sessions
+from polsep.view.session import DOWNLOADS
+from polsep.view.sessions import Sessions
 from polsep.view.style import EMPTY, FETCH, STAGE
 
 #: Largest number of events of all pages that wait; one more gets an error.

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.view.pictures import Small
+from polsep.view.pictures import Pixels, Small
 
-#: Bytes of all cached frames: about 90 colour frames.
+#: Bytes of all cached frames: about 90 colour frames, 70 with expected errors.
 MAX_BYTES = 512 << 20
 #: Number of frames separated in advance.
 AHEAD = 12
@@ -30,29 +30,32 @@ Make = Callable[[int], Small]
 
 @dataclass(frozen=True)
 class Packed:
-    """A `Small` of half floats: ``images`` are diffuse, specular, dolp and aolp."""
+    """A `Small` of half floats: ``images`` are diffuse, specular, dolp and aolp, then the error if there is one."""
 
     step: int
     gain: float
     images: tuple[NDArray[np.float16], ...]
+    flags: Pixels | None
 
     @property
     def size(self) -> int:
         """Bytes."""
-        return sum(image.nbytes for image in self.images)
+        return sum(image.nbytes for image in self.images) + (0 if self.flags is None else self.flags.nbytes)
 
 
 def pack(small: Small) -> Packed:
     """The frame in half floats, limited to their largest value."""
-    images = (small.diffuse, small.specular, small.dolp, small.aolp)
+    images = (small.diffuse, small.specular, small.dolp, small.aolp, *(() if small.error is None else (small.error,)))
     largest = np.finfo(np.float16).max
-    return Packed(small.step, small.gain, tuple(np.minimum(image, largest).astype(np.float16) for image in images))
+    halves = tuple(np.minimum(image, largest).astype(np.float16) for image in images)
+    return Packed(small.step, small.gain, halves, small.flags)
 
 
 def unpack(packed: Packed) -> Small:
     """The frame in float32, for drawing."""
-    diffuse, specular, dolp, aolp = (image.astype(np.float32) for image in packed.images)
-    return Small(packed.step, diffuse, specular, dolp, aolp, None, packed.gain)
+    diffuse, specular, dolp, aolp, *errors = (image.astype(np.float32) for image in packed.images)
+    error = errors[0] if errors else None
+    return Small(packed.step, diffuse, specular, dolp, aolp, error, packed.gain, None, packed.flags)
 
 
 class Reel:

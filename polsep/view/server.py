@@ -18,7 +18,7 @@ from polsep.io.store.temporary import make_temporary_folders, remove_folder
 from polsep.methods import find_method
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.view.guard import LOOPBACK, Guard
-from polsep.view.session import Sessions
+from polsep.view.sessions import Sessions
 from polsep.view.style import CSS, FONTS, MONOSPACE, ON_LOAD
 
 #: Upload limit: 24 frames of 2448x2048 in 16 bits.

@@ -114,7 +114,7 @@ def test_raw_frames_are_separated_and_their_warnings_kept(polsep: Cli, tmp_path:
     assert run.status == 0, run
     kept = json.loads((tmp_path / "out" / "shape.json").read_text())["warnings"]
     assert run.err.splitlines() == [f"polsep: {line}" for line in kept]
-    assert all(any(line.startswith(f"{path}: ") and "clip" in line for line in kept) for path in paths)
+    assert all(any(line.startswith(f"{path}: ") and "overexposed" in line for line in kept) for path in paths)
 
 
 def test_notes_stay_with_views_that_shrink(separated: list[Path]) -> None:

@@ -453,20 +453,22 @@ def test_the_lamp_of_a_separated_file_is_read_beside_it(run: Cli, tmp_path: Path
 
 
 @pytest.mark.parametrize("beside", ["nothing", "another colour"])
-def test_a_lamp_that_is_told_goes_before_the_file_beside(run: Cli, tmp_path: Path, beside: str) -> None:
-    """--light-color of a separated file is divided out, and nobody says that it is not known; white is told too."""
+def test_a_lamp_that_is_told_goes_before_the_file_beside(tmp_path: Path, beside: str) -> None:
+    """The colour told of a separated file is divided out, and nobody says that it is not known; white is told too."""
     frame, tint = sphere_frame(), np.array([0.5, 1.0, 0.7], np.float32)
     report = {"warnings": [], "light_color": [1.0, 0.3, 0.3]}
-    tinted = replace(frame, diffuse=frame.diffuse * tint, error=frame.error * tint.mean(), report=report)
-    planes = []
-    for name, one, told in (("white", frame, "white"), ("tinted", tinted, "0.5,1,0.7")):
+    specular, error = frame.specular * tint, frame.error * tint.mean()
+    tinted = replace(frame, diffuse=frame.diffuse * tint, specular=specular, error=error, report=report)
+    seen = []
+    for name, one, told in (("white", replace(frame, report=report), "white"), ("tinted", tinted, (0.5, 1.0, 0.7))):
         path = write_separation(one, tmp_path, name)[0]
         if beside == "nothing":
             (tmp_path / f"{name}.json").unlink()
-        done = run(path, "-o", tmp_path / "out", "--mesh", "none", "--light-color", told)
-        assert done.status == 0 and "colour is not known" not in done.err
-        planes.append(read_exr_layers(tmp_path / "out" / f"{name}.exr"))
-    np.testing.assert_allclose(planes[1]["normal.X"], planes[0]["normal.X"], atol=1e-3)
+        settings = one_frame_files.ShapeSettings(light_color=told)
+        found, notes = one_frame_files._read_frame(path, settings)
+        assert notes == []
+        seen.append(one_frame.images_of(found, frame.valid))
+    np.testing.assert_allclose(seen[1], seen[0], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(

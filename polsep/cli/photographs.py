@@ -94,9 +94,11 @@ def find_photographs(files: tuple[str, ...], options: Mapping[str, Any]) -> list
 
 def read_photo_options(options: Mapping[str, Any]) -> PhotoOptions:
     """Options of reading photographs, from the options of a command. Raises ValueError."""
-    from polsep.photographs import PAIR, PhotoOptions
+    from polsep.photographs import PAIR, Angles, PhotoOptions
 
-    angles = PAIR if options["angles"] is None else _numbers("angles", options["angles"])
+    angles: Angles = PAIR
+    if options["angles"] is not None:
+        angles = _numbers("angles", options["angles"])
     exposures = None if options["exposures"] is None else _numbers("exposures", options["exposures"])
     told = {name: options[name] for name in ("extinction", "align", "encoding") if options[name] is not None}
     return PhotoOptions(angles, exposures, full=options["full"], **told)

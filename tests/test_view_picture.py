@@ -37,7 +37,20 @@ VIEW = """() => {
   const style = document.querySelector('.ps-stage').closest('[style*="--z"]').style;
   return ['--z', '--x', '--y'].map((name) => parseFloat(style.getPropertyValue(name)));
 }"""
-#: Lists that hang open, and how much of the page lies beyond the screen to the right.
+#: The source and style of a side's sharp picture as soon as it is of what is seen, and another one than before.
+SHARP = """([side, before]) => {
+  const stage = document.querySelector('.ps-stage'), image = stage?.querySelector(`.ps-layer-${side} .ps-sharp`);
+  if (!image || image.src === before) return null;
+  const f = stage.getBoundingClientRect(), w = stage.querySelector('.ps-world').getBoundingClientRect();
+  const part = (length, size, round) => Math.min(Math.max(round(10000 * length / size), 0), 10000);
+  const left = part(f.left - w.left, w.width, Math.floor), right = part(f.right - w.left, w.width, Math.ceil);
+  const top = part(f.top - w.top, w.height, Math.floor), bottom = part(f.bottom - w.top, w.height, Math.ceil);
+  const pixels = Math.ceil((right - left) / 10000 * w.width * devicePixelRatio);
+  const seen = stage.dataset.window.split(',').map(Number);
+  const near = [left, top, right, bottom, pixels].every((number, k) => Math.abs(number - seen[k]) <= 1);
+  return near ? [image.src, image.getAttribute('style')] : null;
+}"""
+#: How many lists hang open.
 OPEN = "[...document.querySelectorAll('ul[role=listbox], ul.options')].filter((u) => u.getClientRects().length).length"
 
 
@@ -50,13 +63,17 @@ def frame(page: Any) -> Any:
     return imagecodecs.png_decode(small_frame())
 
 
-def sharp(page: Any, side: str = "left") -> tuple[Any, list[float]]:
-    """The pixels of the picture's sharp part, and its place in percent, as soon as the page rests."""
-    page.wait_for_timeout(600)
-    image = page.locator(f".ps-layer-{side} .ps-sharp")
-    kind, data = image.get_attribute("src").split(",", 1)
+def source(page: Any, side: str = "left") -> str:
+    """The picture's sharp part as text, to tell another one from."""
+    return str(page.get_attribute(f".ps-layer-{side} .ps-sharp", "src"))
+
+
+def sharp(page: Any, side: str = "left", before: str = "") -> tuple[Any, list[float]]:
+    """The pixels of the picture's sharp part, and its place in percent: of what is seen, and not the one ``before``."""
+    found, style = page.wait_for_function(SHARP, arg=[side, before]).json_value()
+    kind, data = found.split(",", 1)
     decode = imagecodecs.png_decode if "png" in kind else imagecodecs.jpeg8_decode
-    style = dict(part.split(":") for part in image.get_attribute("style").replace(" ", "").rstrip(";").split(";"))
+    style = dict(part.split(":") for part in style.replace(" ", "").rstrip(";").split(";"))
     return decode(base64.b64decode(data)), [float(style[k].rstrip("%")) for k in ("left", "top", "width", "height")]
 
 
@@ -146,15 +163,15 @@ def test_specular_has_its_own_exposure_and_clipping_is_marked(page: Any, frame: 
     """One slider for the specular alone; red where a sample clips."""
     choose(page, "ps-right", "Specular")
     page.wait_for_selector(".ps-right[alt=Specular]")
-    (left, _), (right, _) = sharp(page), sharp(page, "right")
+    (left, _), (right, _), before = sharp(page), sharp(page, "right"), source(page, "right")
     set_slider(page, "ps-specular-stops", 3)
-    (same, _), (brighter, _) = sharp(page), sharp(page, "right")
+    (brighter, _), (same, _), before = sharp(page, "right", before), sharp(page), source(page, "right")
     np.testing.assert_array_equal(same, left)
     assert brighter.mean() > 1.5 * right.mean()
     tab(page, "Exposure")
     assert page.locator(".ps-histogram polyline").count() == 3
     page.click("#ps-marks input")
-    marked, _ = sharp(page, "right")  # the specular, which is grey
+    marked, _ = sharp(page, "right", before)  # the specular, which is grey
     clipped = (frame >= 4091).reshape(160, 2, 192, 2).any(axis=(1, 3))
     red = (marked.astype(int) - (255, 40, 40)).__abs__().sum(axis=2) < 120
     assert clipped.sum() > 20 and red[clipped].mean() > 0.95 and (red & ~clipped).sum() < clipped.sum()
@@ -197,6 +214,7 @@ def test_four_angle_files_are_one_frame(page: Any) -> None:
 
 def test_waiting_is_said_and_ended(page: Any) -> None:
     """A long separation says so, and Cancel ends the wait at once; the picture and its numbers stay."""
+    choose(page, "ps-resolution", "full")  # which separates longer
     open_demo(page)
     before = page.inner_text("#ps-status")
     choose(page, "ps-method", "paper")
@@ -264,12 +282,14 @@ def test_lists_show_what_they_hold(page: Any, frame: Any) -> None:
 
 
 def test_the_page_fits_its_screen(page: Any, frame: Any) -> None:
-    """At 1440x900 nothing scrolls, in any panel."""
+    """At 1440x900 nothing scrolls, in any panel, as soon as its sizes have been observed."""
+    frames = "new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))"
+    fits = "document.documentElement.scrollHeight <= 900 && document.documentElement.scrollWidth <= 1440"
     for name in ("Settings", "Pixel", "Exposure", "Light", "Edit"):
         tab(page, name)
-        page.wait_for_timeout(100)
-        assert page.evaluate("document.documentElement.scrollHeight") <= 900, name
-        assert page.evaluate("document.documentElement.scrollWidth") <= 1440, name
+        page.get_by_role("tab", name=name, exact=True, selected=True).wait_for()
+        page.evaluate(frames)
+        assert page.wait_for_function(fits), name
 
 
 def test_the_keyboard_goes_from_top_to_bottom(page: Any, frame: Any) -> None:
@@ -290,8 +310,7 @@ def test_the_keyboard_goes_from_top_to_bottom(page: Any, frame: Any) -> None:
         page.keyboard.press("Tab")
     assert list(dict.fromkeys(seen)) == ["ps-top", "ps-picture", "ps-view", "ps-side"]
     assert seen == sorted(seen, key=["ps-top", "ps-picture", "ps-view", "ps-side"].index) and len(seen) > 25
-    page.wait_for_timeout(400)
-    assert page.evaluate(OPEN) == 0
+    page.wait_for_function(f"{OPEN} === 0")
 
 
 @pytest.fixture
@@ -319,10 +338,11 @@ def test_a_phone_shows_the_picture_first(phone: Any) -> None:
 
 def test_a_phone_shows_the_wait(phone: Any, page: Any) -> None:
     """How long, and the button that ends it, lie within the screen."""
-    open_demo(page)
-    choose(page, "ps-method", "paper")
+    for opened in (page, phone):  # long, so that neither ends before it is cancelled, or its page is closed
+        choose(opened, "ps-resolution", "full")
+        choose(opened, "ps-method", "paper")
+    page.click("#ps-demo")
     page.wait_for_selector("#ps-progress:has-text('Separating')")
-    choose(phone, "ps-method", "paper")  # long, so that it does not end before it is cancelled
     phone.tap("#ps-demo")
     phone.wait_for_selector("#ps-progress:has-text('ing')")
     for part in ("#ps-file", "#ps-demo", "#ps-progress [role=status]", "#ps-cancel"):
@@ -330,7 +350,6 @@ def test_a_phone_shows_the_wait(phone: Any, page: Any) -> None:
         assert box["x"] >= 0 and box["x"] + box["width"] <= 390, part
     phone.tap("#ps-cancel")
     phone.wait_for_selector("#ps-progress:has-text('Cancelled')")
-    page.click("#ps-cancel")
 
 
 def test_fingers_pinch(phone: Any) -> None:

@@ -238,7 +238,7 @@ def test_the_docs_name_what_is_on_the_page(viewer: str) -> None:
     small = Small(1, ones, ones, ones[..., 0], ones[..., 0], None, 1.0)
     drawn = stage((Picture("Input", small), Picture("Input", small)), Exposure(), Place(4))
     page = ask(viewer, "GET", "/config")[1].decode() + drawn
-    assert len(labels) > 10 and panels == ["Settings", "Pixel", "Exposure", "Light", "Edit"]
+    assert len(labels) > 10 and panels == ["Settings", "Pixel", "Exposure", "Light", "Shape", "Edit"]
     assert [label for label in [*labels, *panels] if f'"{label}"' not in page and f">{label}<" not in page] == []
 
 

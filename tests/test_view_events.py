@@ -1,0 +1,303 @@
+"""Events of the viewer's page without a browser: files that overtake each other, edits, comparison, playback."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import re
+import threading
+import time
+import warnings
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from test_view import mosaic_codes, opened, png, upload
+
+from polsep.edit import Metallic, Recipe, Rougher
+from polsep.io.store.temporary import make_temporary_folders, remove_folder
+from polsep.view.components import MENDS, OF_FILES, PAUSE, SAME, Components, Start, Updates
+from polsep.view.edits import list_controls
+from polsep.view.images import KINDS
+from polsep.view.opening import parse_against, parse_settings
+from polsep.view.session import DOWNLOADS, Session
+from polsep.view.sessions import Sessions
+
+GRADIO = importlib.util.find_spec("gradio") is not None
+pytestmark = pytest.mark.skipif(not GRADIO, reason="needs the extra view")
+if GRADIO:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import gradio as gr
+
+        from polsep.view import events as module
+        from polsep.view.events import Events
+
+SETTINGS = ("method", "resolution", "layout", "light", "white", "black", "size", "pixel_format", "index")
+VIEW = {"left": "Input", "right": "Diffuse", "against": SAME, "stops": 0, "specular_stops": 0, "marks": False}
+VALUES = {**OF_FILES, **VIEW, "method": "analytic", "resolution": "half", "index": 0, "keep": False}
+LEVELS = {"white": "4095", "method": "analytic"}
+REQUEST: Any = SimpleNamespace(session_hash="a")
+
+
+def components() -> Components:
+    """Components that are their own names."""
+    plain = (
+        "keep file demo progress cancel status stage strip play timer beside readout exposure light find_shape shape "
+        "neutral link"
+    )
+    return Components(
+        settings={name: name for name in SETTINGS},
+        mends=tuple(f"mend-{k}" for k in range(MENDS)),
+        view={name: name for name in VIEW},
+        controls=tuple(f"{c.edit.name}.{c.parameter.name}" for c in list_controls()),
+        images={kind: kind for kind in KINDS},
+        fetch={kind: kind for kind in DOWNLOADS},
+        **{name: name for name in plain.split()},
+    )
+
+
+@pytest.fixture
+def sessions() -> Iterator[Sessions]:
+    """No page open yet; afterwards, nothing is left to be made."""
+    scratch = make_temporary_folders()
+    made = Sessions(scratch, 10 << 20)
+    yield made
+    made.close()
+    remove_folder(scratch.root)
+
+
+@pytest.fixture
+def events(sessions: Sessions, monkeypatch: pytest.MonkeyPatch) -> Events:
+    """Events of pages that tell their progress often."""
+    monkeypatch.setattr(module, "WORD_S", 0.02)
+    return Events(sessions, components(), Start({}))
+
+
+class Held:
+    """Separations of a file named slow: one has begun, and all may go on."""
+
+    def __init__(self) -> None:
+        self.begun, self.go_on = threading.Event(), threading.Event()
+
+
+@pytest.fixture
+def held(sessions: Sessions, monkeypatch: pytest.MonkeyPatch) -> Iterator[Held]:
+    """Separations of a file named slow last until they may go on."""
+    from polsep.view import session
+
+    found, real = Held(), session.open_frame
+
+    def open_frame(sources: Any, settings: Any, read: Any) -> Any:
+        if sources[0].stem == "slow":
+            found.begun.set()
+            assert found.go_on.wait(60)
+        return real(sources, settings, read)
+
+    monkeypatch.setattr(session, "open_frame", open_frame)
+    yield found
+    found.go_on.set()
+
+
+async def collect(updates: AsyncIterator[Updates]) -> list[Updates]:
+    """All that an event tells the page."""
+    return [update async for update in updates]
+
+
+async def reached(flag: threading.Event) -> None:
+    """Wait for a flag of another thread."""
+    assert await asyncio.to_thread(flag.wait, 60)
+
+
+def file(folder: Path, name: str) -> Path:
+    """A small frame of the owner."""
+    path = folder / f"{name}.png"
+    path.write_bytes(png(mosaic_codes()))
+    return path
+
+
+def until(ready: Callable[[], Any]) -> None:
+    """Wait until a function is true."""
+    for _ in range(3000):
+        if ready():
+            return
+        time.sleep(0.01)
+    raise AssertionError("expected truth, found none for half a minute")
+
+
+def playing(sessions: Sessions, against: str = SAME) -> Session:
+    """A page that has played the second frame of a stack, the first being separated."""
+    np.save(sent := upload(sessions, "stack.npy", b""), np.stack([mosaic_codes(seed=k) for k in range(2)]))
+    sessions.open_upload("a", [(str(sent), sent.name)])
+    page, settings = sessions.find("a"), parse_settings({**LEVELS, "method": "color-affine"})
+    page.separate(settings, parse_against(against, settings))
+    page.toggle()
+    until(page.play)
+    assert page.place == 1
+    return page
+
+
+def names(update: Updates) -> tuple[str, str]:
+    """The names of the two pictures."""
+    left, right = re.findall(r'<span class="ps-name ps-name-\w+">(.*?)</span>', update["stage"])
+    return left, right
+
+
+def test_the_file_that_was_sent_last_is_shown(events: Events, held: Held, tmp_path: Path) -> None:
+    """Also while another one with the same settings is separated, whose result is dropped."""
+
+    async def act() -> tuple[list[Updates], list[Updates]]:
+        first = asyncio.create_task(collect(events.open_own(file(tmp_path, "slow"), VALUES, REQUEST)))
+        await reached(held.begun)
+        second = events.open_own(file(tmp_path, "next"), VALUES, REQUEST)
+        told = [await anext(second)]
+        before = await asyncio.wait_for(first, 60)
+        held.go_on.set()
+        return before, told + await collect(second)
+
+    before, told = asyncio.run(act())
+    assert "Waiting, 1 before this one" in told[0]["progress"]
+    assert "<b>next</b>" in told[-1]["status"] and told[-1]["progress"] == ""
+    assert told[-1]["cancel"] == gr.update(visible=False)
+    assert all("status" not in update for update in before)
+
+
+def test_a_file_that_fails_ends_the_wait_for_the_one_before(
+    events: Events, sessions: Sessions, held: Held, tmp_path: Path
+) -> None:
+    """The page says what failed, waits for nothing, and has no frame."""
+    sent = upload(sessions, "notes.txt", b"hello")
+
+    async def act() -> tuple[list[Updates], list[Updates]]:
+        first = asyncio.create_task(collect(events.open_own(file(tmp_path, "slow"), VALUES, REQUEST)))
+        await reached(held.begun)
+        claimed = {"path": str(sent), "orig_name": sent.name}
+        told = await collect(events.open_upload({**VALUES, "file": [claimed]}, REQUEST))
+        return await asyncio.wait_for(first, 60), told
+
+    before, (told,) = asyncio.run(act())
+    assert "notes.txt: expected" in told["status"] and told["cancel"] == gr.update(visible=False)
+    assert before[-1]["progress"] == "" and all("status" not in update for update in before)
+    held.go_on.set()
+    assert sessions.line.join("b", lambda ticket: "done").future.result(60) == "done"  # after the one before
+    assert sessions.find("a").opened is None
+
+
+def test_frames_without_colour_reset_the_controls_of_colour(events: Events, sessions: Sessions) -> None:
+    """Edits that are left out have a remark, and their controls stand where they start; others stay."""
+    opened(sessions)
+    sessions.find("a").edit(Recipe((Rougher(sigma=3.0), Metallic(amount=0.5))))
+    told = asyncio.run(collect(events.separate({**VALUES, **LEVELS, "layout": "mono"}, REQUEST)))[-1]
+    assert f"{Metallic.title} is left out" in told["status"] and isinstance(told["stage"], str)
+    starts = {f"{c.edit.name}.{c.parameter.name}": c.start for c in list_controls()}
+    reset = {name: value for name, value in told.items() if name in starts}
+    assert reset == {name: starts[name] for name in starts if name.startswith("metallic.")}
+
+
+def test_no_numbers_of_another_frame_while_it_plays(events: Events, sessions: Sessions) -> None:
+    """A pixel is read from the frame that is seen, or not at all."""
+    page = playing(sessions)
+    events._see(page, VALUES)
+    at: Any = SimpleNamespace(x=0.5, y=0.25)
+    assert events.hover(REQUEST, at) == {"readout": PAUSE}
+    assert asyncio.run(events.point(REQUEST, at))["readout"] == PAUSE
+    page.toggle()
+    told = asyncio.run(collect(events.settle({**VALUES, **LEVELS}, REQUEST)))[-1]
+    assert told["index"]["value"] == 1
+    assert "row 12, column 32" in events.hover(REQUEST, at)["readout"]
+
+
+def test_what_plays_is_of_one_method(events: Events, sessions: Sessions) -> None:
+    """The compared method has its name while its picture is there, and no other picture has it."""
+    page = playing(sessions, "analytic, half")
+    assert names(asyncio.run(events.draw(VALUES, REQUEST))) == ("Input", "Diffuse")
+    until(page.play)
+    assert page.place == 0
+    expected = ("Input · color-affine, half", "Diffuse · analytic, half")
+    assert names(asyncio.run(events.draw(VALUES, REQUEST))) == expected
+
+
+def test_the_compared_method_is_not_edited(events: Events, sessions: Sessions) -> None:
+    """Its picture is named as what it is, also at the screen's resolution; without edits both are one."""
+    opened(sessions)
+    page, settings = sessions.find("a"), parse_settings({**LEVELS, "method": "color-affine"})
+    page.separate(settings, parse_against("analytic, half", settings))
+    edited = {**VALUES, "left": "Edited", "right": "Edited"}
+    assert names(asyncio.run(events.draw(edited, REQUEST)))[1] == "Edited · analytic, half"
+    page.edit(Recipe((Metallic(amount=0.5),)))
+    told = asyncio.run(events.draw(edited, REQUEST))
+    assert names(told) == ("Edited · color-affine, half", "Input · analytic, half")
+    plain = asyncio.run(events.draw({**edited, "right": "Input"}, REQUEST))
+    assert told["stage"] == plain["stage"]
+
+
+def test_a_later_picture_stays(events: Events, sessions: Sessions, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The exposure is moved while panels of a new frame are drawn: its picture has been sent then."""
+    opened(sessions)
+    real, drawn = module.light_panel, list[Updates]()
+
+    async def act() -> Updates:
+        loop = asyncio.get_running_loop()
+
+        def light_panel(*said: Any) -> str:
+            later = events.draw({**VALUES, "stops": 2}, REQUEST)
+            drawn.append(asyncio.run_coroutine_threadsafe(later, loop).result(60))
+            return real(*said)
+
+        monkeypatch.setattr(module, "light_panel", light_panel)
+        return (await collect(events.separate({**VALUES, **LEVELS}, REQUEST)))[-1]
+
+    told = asyncio.run(act())
+    assert isinstance(drawn[0]["stage"], str) and told["stage"] == gr.skip()
+    assert "analytic" in told["status"] and told["progress"] == ""
+
+
+def test_a_frame_that_was_closed_is_not_shown(
+    events: Events, sessions: Sessions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another file was opened while its panels were drawn: nothing of them reaches the page."""
+    opened(sessions)
+    real = module.light_panel
+
+    def light_panel(*said: Any) -> str:
+        sessions.find("a").forget()
+        return real(*said)
+
+    monkeypatch.setattr(module, "light_panel", light_panel)
+    told = asyncio.run(collect(events.separate({**VALUES, **LEVELS}, REQUEST)))[-1]
+    assert told == {"stage": gr.skip()}
+
+
+@pytest.mark.parametrize("action", ["undo", "a wrong file"])
+def test_other_pages_go_on_while_one_waits_for_its_session(events: Events, sessions: Sessions, action: str) -> None:
+    """A download that is being written holds its own page's edits and files, not the server."""
+    opened(sessions)
+    page, holds, release = sessions.find("a"), threading.Event(), threading.Event()
+    events._see(page, VALUES)
+
+    def hold() -> None:
+        with page.lock:
+            holds.set()
+            release.wait(20)
+
+    async def undo() -> Any:
+        return await events.undo(VALUES, REQUEST)
+
+    async def send() -> Any:
+        claimed = {"path": str(upload(sessions, "notes.txt", b"hello")), "orig_name": "notes.txt"}
+        return await collect(events.open_upload({**VALUES, "file": [claimed]}, REQUEST))
+
+    async def act() -> bool:
+        holder = asyncio.create_task(asyncio.to_thread(hold))
+        await reached(holds)
+        waits = asyncio.create_task((undo if action == "undo" else send)())
+        _, pending = await asyncio.wait({waits}, timeout=0.1)
+        free = not holder.done()
+        release.set()
+        await waits
+        return bool(pending) and free
+
+    assert asyncio.run(act())

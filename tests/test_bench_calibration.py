@@ -13,6 +13,7 @@ from tolerances import assert_close, assert_same_angle, assert_within
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 pytest.importorskip("scipy", reason="meshes need the extra 'render'")
 
+from evaluation import sensors
 from evaluation.calibration import (
     DEBEVEC,
     DING,
@@ -133,3 +134,13 @@ def test_sweeps_tell_the_change_and_the_range(monkeypatch: pytest.MonkeyPatch) -
 def test_sweeps_begin_without_error() -> None:
     with pytest.raises(ValueError, match="expected errors that begin at 0 degrees"):
         Sweep(1, (5, 10))
+
+
+def test_calibrations_win_what_the_sensor_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each one measured leaves less of the loss before a bad sensor, all of them nearly nothing."""
+    monkeypatch.setattr(sensors, "SIDE", 192)
+    monkeypatch.setattr(sensors, "METHODS", ("analytic",))
+    rows = {row.case: row.value for row in sensors.bench_sensors_quick() if row.metric == "diffuse loss"}
+    before, dark, flat, all_of_it = (rows[f"bad sensor: {known}"] for known in sensors.KNOWN)
+    assert before > 1 and dark > 1 and abs(flat) < 0.7 and abs(all_of_it) < 0.7
+    assert abs(rows["daylight lamp: light"]) < 0.3

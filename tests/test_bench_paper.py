@@ -345,7 +345,7 @@ def test_the_command_measures_and_draws(weights: Path, tiny_sets: None, tmp_path
 
 
 def test_benches_without_a_quick_version_say_so() -> None:
-    names = "dynamic, material, video, geometry, shape, web, agreement, warned, paper"
+    names = "dynamic, sensors, material, video, geometry, shape, web, agreement, warned, paper"
     expected = rf"expected a benchmark with a quick version for --quick \({names}\), found 'sets'"
     with pytest.raises(ClickException, match=expected):
         laboratory(["sets", "--quick"], standalone_mode=False)

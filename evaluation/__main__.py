@@ -14,6 +14,7 @@ from evaluation.sealed import sealed
 from evaluation.soak import soak
 from polsep.bench.rows import accept_partial
 from polsep.bench.run import Folders, fill_tables_of_docs, run_bench
+from polsep.cli.app import said_command
 
 DIR = click.Path(file_okay=False, path_type=Path)
 RESULTS = click.Option(["-o", "--output"], type=DIR, default=Path("results"), metavar="DIR", help="Of NAME.jsonl.")
@@ -35,7 +36,7 @@ def measure(data: Path | None, output: Path, quick: bool, images: Path | None) -
     """Run the benchmark that the command is called after."""
     name = click.get_current_context().info_name or ""
     try:
-        run_bench(BENCHES, name, "python -m evaluation", Folders(data, output, images), quick)
+        run_bench(BENCHES, name, said_command("python -m evaluation"), Folders(data, output, images), quick)
     except ValueError as error:
         raise InputFailure(str(error)) from None
 

@@ -30,13 +30,11 @@ from evaluation.video import bench_video, bench_video_quick
 from evaluation.viewing import bench_view
 from evaluation.warned import bench_warned, bench_warned_quick
 from evaluation.web import bench_web, bench_web_quick
-from polsep.bench import FORMULAS, SEPARATION
+from polsep.bench import FORMULAS, SCENES, SEPARATION
 from polsep.bench.run import Bench
 
 #: Data of the selection sets, below the data folder.
 SET_DATA = ("crossed_polarizers", "diligent_normals", "meshes")
-#: What separates rendered scenes and scores what it separated.
-SCENES = (*SEPARATION, "polsep/render", "polsep/metrics.py")
 
 BENCHES: dict[str, Bench] = {
     "rendering": Bench(bench_rendering, measures=("polsep/render", "polsep/datasets", "polsep/train/stream.py")),
@@ -54,7 +52,7 @@ BENCHES: dict[str, Bench] = {
         bench_material_quick,
         draw_material,
         (PUBLISHED,),
-        (*SEPARATION, "polsep/material", "evaluation/weights/material"),
+        (*SEPARATION, "polsep/render", "polsep/material", "evaluation/weights/material"),
     ),
     "video": Bench(bench_video, bench_video_quick, measures=(*SEPARATION, "polsep/compute", "polsep/video")),
     "geometry": Bench(
@@ -62,14 +60,14 @@ BENCHES: dict[str, Bench] = {
         bench_geometry_quick,
         draw_geometry,
         ("diligent_normals", "meshes"),
-        (*SEPARATION, "polsep/geometry"),
+        (*SEPARATION, "polsep/render", "polsep/geometry"),
     ),
     "shape": Bench(
         bench_shape,
         bench_shape_quick,
         draw_shape,
         ("diligent_normals", "meshes"),
-        (*SEPARATION, "polsep/geometry", "evaluation/weights/shape"),
+        (*SCENES, "polsep/datasets/reality.py", "polsep/geometry", "evaluation/weights/shape"),
     ),
     "install": Bench(bench_install, measures=("polsep", "pyproject.toml", "constraints.txt")),
     "view": Bench(bench_view, measures=("polsep/view", "polsep/edit")),
@@ -81,7 +79,7 @@ BENCHES: dict[str, Bench] = {
         bench_warned,
         bench_warned_quick,
         data=("raw", "four_angle", "polarized_light", "crossed_polarizers"),
-        measures=(*SEPARATION, "polsep/light", "polsep/sensor"),
+        measures=(*SEPARATION, "polsep/render", "polsep/datasets"),
     ),
     "gallery": Bench(bench_gallery, None, draw_gallery, ("meshes/spot.obj", "meshes/fish.obj"), SCENES),
     "gallery_real": Bench(

@@ -30,7 +30,8 @@ from typing import NamedTuple
 import click
 import numpy as np
 
-from polsep.bench.rows import Row, replace_rows
+from polsep.bench.rows import Row, read_commit, replace_rows
+from polsep.cli.app import said_command
 from polsep.io.store.rows import read_bytes, write_array
 
 #: Files by their names below a folder.
@@ -245,7 +246,7 @@ def faults(kills: int, every: int, seed: int, output: Path) -> None:
     from evaluation.full_disk import DISK_METRICS, DISK_WORKS, fill_elsewhere
 
     with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(2) as pool:
-        folder, rows, faulty = Path(scratch), list[Row](), 0
+        folder, rows, faulty, commit = Path(scratch), list[Row](), 0, read_commit()
 
         def kill_work(name: str) -> Counter[str]:
             make_inputs(folder / name)
@@ -265,7 +266,7 @@ def faults(kills: int, every: int, seed: int, output: Path) -> None:
                 total += counts
             rows += count_rows(bench, "all", total, metrics)
             faulty += sum(total[metric] for metric in metrics if metric in FAULTS)
-    replace_rows(output, "reliability", rows, f"python -m evaluation faults --kills {kills} --every {every}")
+    replace_rows(output, "reliability", rows, said_command("python -m evaluation"), commit)
     if faulty:
         raise SystemExit(1)
 

@@ -31,7 +31,8 @@ import numpy as np
 
 from evaluation.damage import damage
 from evaluation.damage_seeds import READERS, Files, Reader, seeds_of
-from polsep.bench.rows import Row, replace_rows
+from polsep.bench.rows import Row, read_commit, replace_rows
+from polsep.cli.app import said_command
 from polsep.io.store.errors import MOST
 from polsep.io.store.rows import read_peak_memory
 
@@ -205,7 +206,7 @@ def count_rows(name: str, counts: Counter[str]) -> Iterator[Row]:
 def reliability(**options: Any) -> None:
     """Read damaged files with every reader, and count what goes wrong; exit status 1 where something does."""
     names = [options["only"]] if options["only"] else list(READERS)
-    rows, total, first = list[Row](), Counter[str](), options["first"]
+    rows, total, first, begun = list[Row](), Counter[str](), options["first"], read_commit()
     for name in names:
         counts: Counter[str] = Counter()
         for index, found in judge_damaged(name, first, first + options["inputs"], options["seconds"] / len(names)):
@@ -219,8 +220,6 @@ def reliability(**options: Any) -> None:
         total += counts
     if not options["only"]:
         rows += count_rows("all readers", total)
-        replace_rows(
-            options["output"], "reliability", rows, f"python -m evaluation reliability --inputs {options['inputs']}"
-        )
+        replace_rows(options["output"], "reliability", rows, said_command("python -m evaluation"), begun)
     if any(total[fault] for fault in FAULTS):
         raise SystemExit(1)

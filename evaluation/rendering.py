@@ -112,7 +112,7 @@ def _bench_images() -> Iterator[Row]:
         yield Row("rendering", CASE, name, "time per image", seconds, "s")
         yield Row("rendering", CASE, name, "rate", 60 / seconds, "images/min")
     yield Row("rendering", CASE, OURS, f"times as fast as {THEIRS}", totals[THEIRS] / totals[OURS], "x")
-    yield Row("rendering", CASE, OURS, "pixels that agree to 0.1 %, least", 100 * agreeing, "%")
+    yield Row("rendering", CASE, OURS, "pixels within 0.1 % of the brightest, least", 100 * agreeing, "%")
 
 
 def _stacked(stokes: Stokes) -> Tensor:

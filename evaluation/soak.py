@@ -127,7 +127,7 @@ def soak(minutes: float, recording: Path | None, white_level: float, output: Pat
 
 
 def _save(case: str, passes: Sequence[Pass], others: int, seconds: float, output: Path) -> list[Row]:
-    """Print and write the rows so far."""
+    """Print and write the rows so far; the time is what was played, which may be less than was asked for."""
     rows = list(soak_rows(case, passes, others, seconds))
     print("; ".join(f"{row.metric} {row.value:.4g} {row.unit}".strip() for row in rows), flush=True)
     replace_rows(output, "reliability", rows, f"python -m evaluation soak --minutes {seconds / 60:.0f}")

@@ -188,13 +188,13 @@ def test_compiled_networks_are_the_same(monkeypatch: pytest.MonkeyPatch, generat
 
     def network(*arguments: Any) -> list[Tensor]:
         compiled.append(len(arguments))
-        return run._images(*arguments)
+        return run.run_images(*arguments)
 
     exact = METHODS["joint-fast"].reference(frame, False)
     monkeypatch.setattr(run, "_compiled", lambda: network)
     monkeypatch.setattr(run.State, "compiled", True)
     assert torch.equal(METHODS["joint-fast"].reference(frame, False).diffuse, exact.diffuse)
-    assert compiled == [4]
+    assert compiled == [4] and run.State.compiled
 
 
 def test_networks_that_do_not_compile_run(

@@ -55,3 +55,11 @@ def test_a_program_that_ends_with_images_ends_silently() -> None:
     code = "import numpy, polsep; out = polsep.separate(numpy.eye(1024, dtype=numpy.float32), 'analytic')"
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
     assert not done.stderr
+
+
+def test_memory_beyond_all_that_may_wait_is_given_back() -> None:
+    """A huge array's memory waits for no other one."""
+    size = pages.MOST + 1
+    array = pages.empty((size,), np.uint8)
+    del array
+    assert not pages._WAITING.get(size)

@@ -13,7 +13,7 @@ import torch
 pytest.importorskip("embreex", reason="needs the extra render")
 
 from polsep.bench.period import measure_pattern
-from polsep.bench.reality import RealityOptions, bench_reality, score
+from polsep.bench.reality import Kind, RealityOptions, _bench_kind, bench_reality, score
 from polsep.datasets.corners import add_traced
 from polsep.datasets.reality import (
     DISTURBANCES,
@@ -144,3 +144,13 @@ def test_patterns_of_the_period_are_found() -> None:
     assert found.place == (64, 128)
     assert found.worst > 15
     assert found.amplitude == pytest.approx(0.05 / 0.5, rel=0.2)
+
+
+def test_rows_of_fewer_pixels_are_compared_on_those(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame that is its own ideal twin loses nothing on a part of its mask."""
+    twin = ideal_frame(stage())
+    some = replace(twin, mask=twin.mask & (torch.arange(twin.mask.shape[-1]) > twin.mask.shape[-1] // 2))
+    kind = Kind("objects", lambda split, number, size: stage(), 1, lambda _: twin, {"part": lambda _: some})
+    rows = list(_bench_kind(kind, ("analytic",), RealityOptions(scenes=1)))
+    losses = [row.value for row in rows if row.bench == "reality/told" and "loss" in row.metric]
+    assert losses == [0, 0]

@@ -104,6 +104,7 @@ def test_single_scenes_have_a_file_of_their_own(tmp_path: Path) -> None:
         write_rows(tmp_path, "a", [], "c")
     assert (tmp_path / "a.jsonl").read_bytes() == before
     assert provenance("c")["command"] == "c"
+    assert provenance("c", "abc+")["commit"] == "abc+" and provenance("c", "abc")["commit"] in ("abc", "abc+")
 
 
 def test_a_part_never_replaces_the_whole(tmp_path: Path) -> None:

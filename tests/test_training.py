@@ -29,6 +29,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import polsep
 from polsep import cli
+from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.in_torch import load_refinement
 from polsep.io.store.checkpoints import read_checkpoint, read_lines, write_checkpoint, write_lines
 from polsep.io.store.weights import read_weights
@@ -36,6 +37,7 @@ from polsep.methods import METHODS
 from polsep.networks.rungs import RUNGS
 from polsep.networks.sizes import Size
 from polsep.physics.stokes import Stokes, measure
+from polsep.sensor.camera import Layout, Mosaic
 from polsep.train import digest
 from polsep.train.command import (
     Options,
@@ -46,7 +48,7 @@ from polsep.train.command import (
     train_weights,
 )
 from polsep.train.digest import digest_examples, find_sources
-from polsep.train.inputs import LadderInputs, co_sited_inputs, mono_inputs, mosaic_inputs
+from polsep.train.inputs import LadderInputs, co_sited_inputs, demosaic_lit, mono_inputs, mosaic_inputs
 from polsep.train.log import open_log, read_log
 from polsep.train.loop import Run, Schedule, Training, run_training, train
 from polsep.train.losses import FIRST_WEIGHT, first_specular_loss
@@ -505,3 +507,21 @@ def test_rungs_without_a_first_guess_begin_with_squared_errors(rung: str) -> Non
         early, late, last = (float(task.loss(task.network, seen, done)) for done in (0.0, FIRST_SHARE, 1.0))
     assert late == last
     assert (early == late) == (rung in ("paper", "shared", "signed", "no-angle"))
+
+
+def test_a_new_training_begins_its_log_anew(tmp_path: Path) -> None:
+    """Lines of another run that was stopped before its first checkpoint go."""
+    (tmp_path / "log.jsonl").write_text('{"step": 0, "score": 1.0}\n')
+    with open_log(tmp_path, 0, lambda line: None, lambda: {"score": 2.0}):
+        pass
+    assert read_log(tmp_path) == [{"step": 0, "score": 2.0}]
+
+
+def test_clipping_is_that_of_the_sensor_under_any_lamp() -> None:
+    """Samples less the lamp's colour clip where the sensor did, at 1 over its gain."""
+    channels = torch.tensor([[Layout().filter_at(row, col).channel for col in range(4)] for row in range(4)])
+    gain, codes = torch.tensor([0.3, 1.0, 1.7])[channels].repeat(8, 8), torch.full((32, 32), 0.5)
+    codes[8:16, 8:16] = 1
+    found = demosaic_lit((codes / gain)[None], (codes == 1)[None], Layout()).clipped
+    expected = demosaic_bilinear_half(Mosaic(codes[None], Layout(), 0.0, 1.0)).clipped
+    assert found is not None and expected is not None and torch.equal(found, expected)

@@ -20,13 +20,18 @@ from polsep.bench.speed import bench_speed, bench_speed_quick
 #: Code that formulas consist of, and that every method does.
 FORMULAS = ("polsep/physics", "polsep/sensor", "polsep/demosaic", "polsep/light", "polsep/separation")
 SEPARATION = (*FORMULAS, "polsep/networks", "polsep/shipped.py", "polsep/methods.py", "polsep/weights")
+#: What separates rendered scenes and scores what it separated.
+SCENES = (*SEPARATION, "polsep/render", "polsep/metrics.py")
 
 BENCHES: dict[str, Bench] = {
-    "separation": Bench(bench_separation, measures=(*SEPARATION, "polsep/render")),
+    "separation": Bench(bench_separation, measures=SCENES),
     "exactness": Bench(bench_exactness, measures=("polsep/physics", "polsep/separation")),
     "real": Bench(bench_real, data=("raw",), measures=("polsep/sensor", "polsep/demosaic")),
     "reality": Bench(
-        bench_reality, bench_reality, draw_reality, measures=(*SEPARATION, "polsep/datasets", "polsep/pipeline.py")
+        bench_reality,
+        bench_reality,
+        draw_reality,
+        measures=(*SCENES, "polsep/datasets", "polsep/calibrate", "polsep/pipeline.py"),
     ),
     "speed": Bench(bench_speed, bench_speed_quick, measures=(*SEPARATION, "polsep/compute", "polsep/pipeline.py")),
     "gpu": Bench(bench_gpu, measures=(*SEPARATION, "polsep/in_torch.py", "polsep/pipeline.py")),
@@ -34,6 +39,6 @@ BENCHES: dict[str, Bench] = {
         bench_frontend,
         bench_frontend_quick,
         data=("four_angle",),
-        measures=FORMULAS,
+        measures=(*FORMULAS, "polsep/render", "polsep/metrics.py"),
     ),
 }

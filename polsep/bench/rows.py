@@ -16,6 +16,8 @@ from polsep.bench.history import ask_git
 from polsep.io.store.atomic import replace_text
 from polsep.io.store.rows import SPREAD, move_rows, read_rows, remove_rows
 
+#: Paths whose changes make a commit another one.
+CODE = ("polsep", "evaluation", "web", "tools", "pyproject.toml", "constraints.txt")
 #: Tables of single scenes, objects and points of curves, "NAME/PART", which are too long for the repository.
 SCENE_PARTS = ("scenes", "objects", "curve", "films")
 
@@ -32,10 +34,19 @@ class Row:
     unit: str
 
 
-def provenance(command: str) -> dict[str, str]:
-    """The command, the commit (with "+" if the tree had changes) and the machine that made rows."""
-    changed = ask_git("status", "--porcelain", "--untracked-files=no", "--", "polsep", "evaluation")
-    commit = (ask_git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")
+def read_commit() -> str:
+    """The commit of the tree, with "+" if it has changes; ask for it before a long run."""
+    changed = ask_git("status", "--porcelain", "--untracked-files=no", "--", *CODE)
+    return (ask_git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")
+
+
+def provenance(command: str, begun: str | None = None) -> dict[str, str]:
+    """The command, the commit and the machine that made rows; ``begun``: `read_commit` when the run began.
+
+    The commit has "+" if the tree had changes then, or has some now.
+    """
+    now = read_commit()
+    commit = now if begun is None else begun if begun.endswith("+") or not now.endswith("+") else f"{begun}+"
     machine = f"{torch.get_num_threads()} threads, {platform.machine()}, torch {torch.__version__}"
     return {"command": command, "commit": commit, "machine": machine}
 
@@ -46,24 +57,25 @@ def to_jsonl(rows: Sequence[Row], made_by: dict[str, str]) -> str:
     return "".join(json.dumps(line) + "\n" for line in lines)
 
 
-def write_rows(folder: Path, name: str, rows: Sequence[Row], command: str) -> None:
+def write_rows(folder: Path, name: str, rows: Sequence[Row], command: str, begun: str | None = None) -> None:
     """Replace ``folder``/NAME.jsonl, and ``folder``/scenes/NAME.jsonl with the rows of `SCENE_PARTS`, not committed.
 
     Raises ValueError where there are no rows, and where the file has results of more cases or methods: then what was
     measured goes to NAME-partial.jsonl, and nothing replaces what was measured before. Quick runs may have fewer.
+    ``begun``: as of `provenance`.
     """
     if not rows:
         raise ValueError(f"expected rows of {name}, found none: {folder / name}.jsonl stays as it is")
-    made_by = provenance(command)
+    made_by = provenance(command, begun)
     tables: dict[bool, list[Row]] = {True: [], False: []}
     for row in rows:
         tables[row.bench.partition("/")[2] in SCENE_PARTS].append(row)
     scenes, means = tables[True], tables[False]
     path = folder / f"{name}.jsonl"
     lost = [] if name.endswith("-quick") else find_lost(path, means)
-    if scenes:
-        replace_text(folder / "scenes" / path.name, to_jsonl(scenes, made_by))
     partial = path.with_stem(f"{name}-partial")
+    if scenes:
+        replace_text(folder / "scenes" / (partial if lost else path).name, to_jsonl(scenes, made_by))
     if lost:
         path = partial
     else:
@@ -89,6 +101,8 @@ def accept_partial(folder: Path, name: str) -> list[str]:
     names = [field.name for field in fields(Row)]
     lost = find_lost(path, [Row(**{key: row[key] for key in names}) for row in read_rows(partial)])
     move_rows(partial, path)
+    if (scenes := folder / "scenes" / partial.name).is_file():
+        move_rows(scenes, scenes.with_name(path.name))
     return lost
 
 
@@ -113,7 +127,7 @@ def find_lost(path: Path, rows: Sequence[Row]) -> list[str]:
     return [f"{bench}: {case}, {method}" for bench, case, method in kept if (bench, case, method) not in measured]
 
 
-def replace_rows(folder: Path, name: str, rows: Sequence[Row], command: str) -> None:
+def replace_rows(folder: Path, name: str, rows: Sequence[Row], command: str, begun: str | None = None) -> None:
     """Replace the rows of these benches, or add them, in ``folder``/NAME.jsonl; all others stay with what made them.
 
     Raises ValueError where there are no rows.
@@ -125,7 +139,7 @@ def replace_rows(folder: Path, name: str, rows: Sequence[Row], command: str) -> 
     for old in read_rows(path) if path.is_file() else ():
         made_by = {key: value for key, value in old.items() if key not in names}
         tables.setdefault(old["bench"], ([], made_by))[0].append(Row(**{key: old[key] for key in names}))
-    made_by = provenance(command)
+    made_by = provenance(command, begun)
     for bench in {row.bench: None for row in rows}:
         tables[bench] = ([row for row in rows if row.bench == bench], made_by)
     replace_text(path, "".join(to_jsonl(*table) for table in tables.values()))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polsep.bench.history import TIMED, find_changes
-from polsep.bench.rows import Row, write_rows
+from polsep.bench.rows import Row, read_commit, write_rows
 from polsep.io.store.rows import fill_page
 
 #: Yields rows; called with the data folder where the benchmark needs one, else without.
@@ -61,7 +61,7 @@ def fill_tables_of_docs(output: Path, measures: Mapping[str, tuple[str, ...]]) -
 
 
 def run_bench(benches: Mapping[str, Bench], name: str, command: str, folders: Folders, quick: bool) -> None:
-    """Measure ``name``, print its rows and write them to NAME.jsonl with the ``command`` that made them.
+    """Measure ``name``, print its rows and write them to NAME.jsonl with the ``command`` that makes them.
 
     Nothing is written unless all is measured. Raises ValueError on a name that is not in ``benches``, on data that are
     not there, and with ``quick`` where there is no quick version.
@@ -75,11 +75,11 @@ def run_bench(benches: Mapping[str, Bench], name: str, command: str, folders: Fo
         raise ValueError(f"expected a benchmark with a quick version for --quick ({known}), found {name!r}")
     data = find_data(bench, folders.data, quick)
     stem = f"{name}-quick" if quick else name
-    rows = []
+    rows, begun = [], read_commit()
     for row in measure(data) if bench.data else measure():
         print(f"{row.case:48} {row.method:20} {row.metric:28} {row.value:10.4g} {row.unit}", flush=True)
         rows.append(row)
-    write_rows(folders.output, stem, rows, f"{command} {name}{' --quick' if quick else ''}")
+    write_rows(folders.output, stem, rows, command, begun)
     images = folders.images or (folders.output / stem if quick else Path("docs/images") / name)
     for path in bench.draw(rows, data, images) if bench.draw else ():
         print(path, flush=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Mapping
@@ -144,6 +145,22 @@ def app() -> None:
 def print_note(line: str) -> None:
     """Print one line for the user on stderr; stdout is for results."""
     print(f"polsep: {printable(line)}", file=sys.stderr)
+
+
+def said_command(program: str) -> str:
+    """The command that runs, with its arguments and the options given to it, but for files and folders."""
+    context = click.get_current_context()
+    words = [program, context.info_name or ""]
+    for parameter in context.command.params:
+        name, given = parameter.name or "", context.params.get(parameter.name or "")
+        if isinstance(parameter, click.Argument):
+            words.append(str(given))
+        elif context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE:
+            if getattr(parameter, "is_flag", False):
+                words.append(max(parameter.opts, key=len))
+            elif not isinstance(parameter.type, click.Path):
+                words += [max(parameter.opts, key=len), shlex.quote(str(given))]
+    return " ".join(words)
 
 
 def parse_size(text: str | None, option: str = "--size") -> tuple[int, int] | None:

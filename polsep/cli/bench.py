@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from polsep.cli.app import DIR, app
+from polsep.cli.app import DIR, app, said_command
 
 
 @app.command()
@@ -60,7 +60,7 @@ def bench(
                 benches = BENCHES | {name: select_reality(BENCHES[name], options, data)}
             elif rows or methods or split:
                 raise ValueError(f"expected --rows, --methods and --split with reality, found them with {name!r}")
-            run_bench(benches, name, "polsep bench", Folders(data, output, images), quick)
+            run_bench(benches, name, said_command("polsep"), Folders(data, output, images), quick)
         except ValueError as error:
             raise click.ClickException(f"{error}{_evaluation_hint(name)}") from None
 

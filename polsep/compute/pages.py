@@ -33,6 +33,8 @@ class _Lease:
 
 def _let_wait(memory: NDArray[np.uint8]) -> None:
     """Keep memory for later; where too much waits, give all other back to the system."""
+    if memory.nbytes > MOST:
+        return
     if sum(size * len(waiting) for size, waiting in tuple(_WAITING.items())) + memory.nbytes > MOST:
         _WAITING.clear()
     _WAITING.setdefault(memory.nbytes, deque()).append(memory)

@@ -195,17 +195,17 @@ def _run_turned(network: JointWeights, mosaic: Mosaic, orientation: Orientation,
 def _strips(
     shape: tuple[int, int], size: ResidualSize, full: bool
 ) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """Raw rows that an engine sees and those that it makes images of: one strip, or several of at most two heights."""
+    """Raw rows that an engine sees and those that it makes images of: one strip, or several of one height."""
     grid, margin = PERIOD * size.grid, margin_of(size)
     height, pieces = shape[0], list(cut_rows(shape, size, full))
     if len(pieces) == 1:
         yield pieces[0], pieces[0]
         return
     rows = pieces[0][1] + margin * min(len(pieces) - 1, 2)
+    rows += (height - rows) % grid  # so that the last strip, too, begins at a multiple of the grid
     for first, last in pieces:
-        top = max(min(first - margin, (height - rows) // grid * grid), 0)
-        bottom = height if height - top - rows < grid else top + rows
-        yield (top, bottom), (first, last)
+        top = max(min(first - margin, height - rows), 0)
+        yield (top, top + rows), (first, last)
 
 
 def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> FrameImages:

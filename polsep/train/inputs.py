@@ -6,12 +6,13 @@ truth is the mean over each cell of 2 x 2 pixels, and a cell is in the mask if a
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from polsep.demosaic.bilinear import demosaic_bilinear_half
+from polsep.demosaic.bilinear import demosaic_bilinear_half, interpolate_analysers_half
 from polsep.physics.stokes import Measurements, Stokes, measure
 from polsep.render.simulate import whole_cells
 from polsep.sensor.camera import Layout, Mosaic
@@ -55,8 +56,14 @@ Inputs = TypeVar("Inputs", bound=LadderInputs | JointInputs)
 def mosaic_inputs(examples: Examples) -> LadderInputs:
     """Return noisy mosaics, demosaicked bilinearly to half resolution, and the mean truth of every cell."""
     diffuse, specular = (avg_pool2d(x.float(), 2).expand(-1, 3, -1, -1) for x in (examples.diffuse, examples.specular))
-    measurements = demosaic_bilinear_half(Mosaic(examples.raw, Layout(), 0.0, 1.0))
+    measurements = demosaic_lit(examples.raw, examples.clipped, Layout())
     return LadderInputs(measurements, diffuse, specular, whole_cells(examples.mask))
+
+
+def demosaic_lit(raw: Tensor, clipped: Tensor, layout: Layout) -> Measurements:
+    """Samples ``[N, H, W]`` whose lamp was divided out, demosaicked to half resolution; ``clipped``: before that."""
+    found = demosaic_bilinear_half(Mosaic(raw, layout, 0.0, 1.0))
+    return replace(found, clipped=interpolate_analysers_half(clipped.float(), layout) > 0)
 
 
 def mono_inputs(examples: Examples) -> LadderInputs:

@@ -11,15 +11,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d, pad, pixel_unshuffle, unfold
 
-from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.networks.channels import INPUTS
 from polsep.networks.guide import guide_batch
 from polsep.networks.joint import Demosaicker, Joint, bilinear_filter
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.stokes import Measurements, Stokes
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Layout
 from polsep.separation.analytic import Separation
-from polsep.train.inputs import JointInputs, joint_inputs, joint_mono_inputs
+from polsep.train.inputs import JointInputs, demosaic_lit, joint_inputs, joint_mono_inputs
 from polsep.train.joint_losses import Goal, joint_loss, paper_difference
 from polsep.train.stream import StreamOptions, stream_lane
 from polsep.train.tasks import Task
@@ -99,7 +98,7 @@ def joint_task(
         return Separation(diffuse, specular, inputs.mask, Stokes(diffuse + specular, images.s1, images.s2))
 
     def measure(inputs: JointInputs) -> Measurements:
-        return demosaic_bilinear_half(Mosaic(inputs.raw[:, 0], inputs.layout, 0.0, 1.0))
+        return demosaic_lit(inputs.raw[:, 0], inputs.clipped[:, 0], inputs.layout)
 
     def begin(stream: StreamOptions) -> None:
         if network.demosaic is None:

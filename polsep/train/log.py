@@ -67,7 +67,8 @@ def open_log(folder: Path, step: int, report: Report, first: Callable[[], dict[s
     Lines of later steps are removed. If there is no line of step 0, ``first`` returns its scores.
     """
     path = folder / "log.jsonl"
-    lines = [line for line in read_log(folder) if line["step"] <= step]
+    # Without a checkpoint, lines that are there are of another run, which was stopped.
+    lines = [line for line in read_log(folder) if line["step"] <= step] if step else []
     with open_events(folder, step) as events:
         if not lines or lines[0]["step"] != 0:
             scores = first()

@@ -72,8 +72,8 @@ def gained(surface: Surface, truth: Surface, mask: Tensor) -> Surface:
 
 def pictures_loss(found: Surface, truth: Surface, mask: Tensor, lamps: Tensor) -> Tensor:
     """Return the mean difference of the logarithms of pictures under lamps ``[K, 3]``."""
-    scaled, total = gained(found, truth, mask), torch.zeros(())
-    for lamp in lamps:
+    scaled, total = gained(found, truth, mask), torch.zeros((), device=mask.device)
+    for lamp in lamps.to(mask.device):
         first, second = (relight(x, lamp) for x in (scaled, truth))
         level = FLOOR * _frame_mean(second, mask)
         off = (torch.log(first + level) - torch.log(second + level)).abs().mean(dim=1, keepdim=True)

@@ -197,7 +197,7 @@ def score_shapes(network: nn.Module, examples: Sequence[Tensor], name: str) -> d
     lamps = random_lamps(VALIDATION_LAMPS, torch.Generator().manual_seed(LAMP_SEED))
     scores: dict[str, list[float]] = {}
     with torch.no_grad():
-        for planes in examples:
+        for planes in (example.to(next(network.parameters()).device) for example in examples):
             seen = seen_of(planes[None], name)
             mask, truth = seen.mask, truth_of(planes[None])
             found = decode(network(encode(seen, encoding_of(name))).float(), seen.image, mask)

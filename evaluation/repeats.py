@@ -1,8 +1,8 @@
 """The spread of trainings of one recipe that differ in their seed alone: in first weights and in all examples.
 
 Smaller differences between networks trained once say nothing. Each of `RECIPES` is trained by ``polsep train`` from
-nothing with each of `SEEDS`, in ``runs/repeats`` below the working folder; what was trained there before is kept. The
-networks are smaller than most that ship and are trained for far fewer steps, so that all takes an hour of two
+nothing with each of `SEEDS`, in ``runs/repeats`` below the working folder; what the same code trained there before is
+kept. The networks are smaller than most that ship and are trained for far fewer steps, so that all takes an hour of two
 cores; later on, and in larger networks, trainings of two seeds may lie closer.
 """
 
@@ -19,6 +19,7 @@ from evaluation.ablations import network_at_half
 from evaluation.ladder import MOSAIC, Weights, network_entry
 from evaluation.scoring import Entry, Protocol, capture_noisy, score_sets
 from evaluation.sets import load_sets
+from polsep.bench.history import ask_git
 from polsep.bench.rows import Row
 from polsep.networks.rungs import RUNGS
 
@@ -32,6 +33,8 @@ RECIPES = {
 SEEDS = (1, 2, 3)
 STEPS = 1000
 FOLDER = Path("runs/repeats")
+#: Code whose change makes other weights.
+TRAINED_BY = ("polsep/train", "polsep/networks", "polsep/render", "evaluation/repeats.py")
 METRICS = ("diffuse PSNR", "specular PSNR")
 #: Scenes of each selection set that are scored: the first ones.
 SCENES = 12
@@ -49,8 +52,8 @@ def bench_repeats(data: Path) -> Iterator[Row]:
 
 
 def train(network: str, seed: int) -> Path:
-    """Train a network, or go on with it, and return the file of its weights."""
-    folder = FOLDER / f"{network}-{seed}"
+    """Train a network, or go on with it, and return the file of its weights; those of older recipes are left alone."""
+    folder = FOLDER / (ask_git("log", "-1", "--format=%h", "--", *TRAINED_BY) or "unknown") / f"{network}-{seed}"
     path = folder / f"{network}-{MOSAIC}.safetensors"
     if not path.is_file():
         options = ("--steps", str(STEPS), "--seed", str(seed), *RECIPES[network], "-o", str(folder))

@@ -289,6 +289,29 @@ def move_capture(capture: Capture, device: str) -> Capture:
     return replace(capture, **moved)
 
 
+def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[SeparatedFrame, list[str]]:
+    """A frame that was separated before, with the report beside its file, and notes for the user, a line each.
+
+    ``light_color`` of the report is the one that is told here, else the one beside the file; where nobody says it, it
+    is left out and a note says so. Raises InputError on what cannot be read.
+    """
+    from polsep.io.results.separation_reader import read_separated
+    from polsep.io.results.sidecars import read_report
+
+    frame = replace(read_separated(path), report=read_report(path.with_suffix(".json")))
+    notes = list(frame.report.get("warnings", ()))
+    if not is_to_be_found(light_color):
+        frame.report["light_color"] = told_gains(light_color, frame.diffuse.shape[-1])
+    elif "light_color" not in frame.report:
+        notes.append(f"the lamp's colour is not known without {path.stem}.json beside the file: taken for white")
+    return frame, notes
+
+
+def told_gains(light_color: LightColor | str, channels: int) -> list[float]:
+    """One gain per channel of a light whose colour is told: three numbers or "white"; mono has one channel."""
+    return [1.0] * channels if isinstance(light_color, str) or channels == 1 else [float(gain) for gain in light_color]
+
+
 def parse_light_color(text: str) -> LightColor | str:
     """The light's colour as people write it: ``R,G,B``, ``white``, ``auto`` or ``estimate``. Raises ValueError."""
     if text in LIGHT_WORDS:

@@ -414,6 +414,15 @@ def test_small_texels_are_averaged() -> None:
     assert_near(sample(checks, (8 * x, 8 * y), 8.0), np.full((9, 9, 1), 0.5), PAPER)
 
 
+@pytest.mark.parametrize("texels", [1.0, 2.5, 4.0, 7.3])
+def test_small_textures_keep_their_period(texels: float) -> None:
+    """Also of odd sizes, which lose a row or column when they are halved: many repeats away all is the same."""
+    texture = np.random.default_rng(3).random((45, 61, 3), np.float32)
+    x, y = (np.float32(texels) * places for places in flat_coordinates((9, 12)))
+    moved = x + np.float32(61 * 16), y + np.float32(45 * 16)
+    assert_near(sample(texture, moved, texels), sample(texture, (x, y), texels), 1e-3)
+
+
 def test_coordinates_follow_a_slope() -> None:
     """On a plane that leans by 60 degrees, neighbouring pixels are two pixels apart along it, one across."""
     lean = math.radians(60)

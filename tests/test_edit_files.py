@@ -17,6 +17,7 @@ from typing import Any
 import imagecodecs
 import numpy as np
 import pytest
+import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 from test_cli import Run, assert_refused, contents, run_here
@@ -63,11 +64,11 @@ def separated(folder: Path, stem: str = "shot", colors: int = 3, format: str = "
     return write_separation(frame_of(random_images(colors=colors)), folder, stem, format)[0]
 
 
-def film(folder: Path, count: int = COUNT, first: int = 0) -> Path:
+def film(folder: Path, count: int = COUNT, first: int = 0, stem: str = "take") -> Path:
     """A sequence as `polsep video` writes it."""
     for k in range(count):
         images = random_images(k)
-        write_exr(folder / f"take_{first + k:06d}.exr", Picture(images.diffuse, images.specular, None, {}), "none")
+        write_exr(folder / f"{stem}_{first + k:06d}.exr", Picture(images.diffuse, images.specular, None, {}), "none")
     return folder
 
 
@@ -396,13 +397,38 @@ def test_good_folders_go_on_beside_bad_ones(tmp_path: Path, polsep: Cli) -> None
     gap, good, empty = film(tmp_path / "gap", 4), tmp_path / "good", tmp_path / "empty"
     os.remove(gap / "take_000001.exr")
     empty.mkdir()
-    film(good, 3)
+    film(good, 3, stem="other")
     run = polsep(gap, empty, good, "-o", tmp_path / "out", "--rougher", "1", "--no-preview")
     first, second = run.err.splitlines()
     assert run.status == 2 and first.startswith(f"polsep: error: {gap}: expected frames without gaps, found none of")
     assert second.startswith(f"polsep: error: {empty}: expected a sequence")
-    assert run.out.splitlines() == [str(tmp_path / "out" / f"take.{s}") for s in ("png", "jsonl", "json")]
-    assert json.loads((tmp_path / "out" / "take.json").read_text())["settings"]["source"] == "good"
+    assert run.out.splitlines() == [str(tmp_path / "out" / f"other.{s}") for s in ("png", "jsonl", "json")]
+    assert json.loads((tmp_path / "out" / "other.json").read_text())["settings"]["source"] == "good"
+
+
+@pytest.mark.parametrize(
+    ("inputs", "shared"),
+    [
+        (["a", "b"], "take.png"),
+        (["take.exr", "a"], "take.png"),
+        (["take_000001.exr", "a"], "take_000001.exr"),
+        (["a", "a"], "take_000000.exr"),
+    ],
+)
+def test_inputs_of_one_name_are_refused(
+    tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch, inputs: list[str], shared: str
+) -> None:
+    """Folders and files whose results would replace each other's, also with --overwrite, before any work."""
+    monkeypatch.chdir(tmp_path)
+    film(tmp_path / "a", 2)
+    film(tmp_path / "b", 2, first=5)
+    for stem in ("take", "take_000001"):
+        separated(tmp_path, stem)
+    before = contents(tmp_path)
+    run = polsep(*inputs, "-o", "out", "--rougher", "1", "--no-preview", "--overwrite")
+    same = f"found {inputs[0]}, {inputs[1]}: both would write {Path('out', shared)}"
+    assert_refused(run, f"expected inputs of different names, {same}")
+    assert contents(tmp_path) == before
 
 
 def test_films_to_watch(tmp_path: Path, polsep: Cli) -> None:
@@ -479,6 +505,33 @@ def test_textures_are_decoded_once(tmp_path: Path) -> None:
     Image.new("RGB", (8, 8), (188, 188, 188)).save(stream, "JPEG", quality=95)
     (tmp_path / "e.jpg").write_bytes(stream.getvalue())
     np.testing.assert_allclose(read_map(tmp_path / "e.jpg", "texture"), linear_from_srgb(188 / 255), atol=0.01)
+
+
+@pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, 3), (8, 1)])
+def test_photographs_are_turned_upright(tmp_path: Path, orientation: int, turns: int) -> None:
+    """By the EXIF data of the JPEG, as people see them; masks too."""
+    stored = np.zeros((16, 32), np.uint8)
+    stored[:8, :8] = 255
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.fromarray(stored).save(tmp_path / "a.jpg", quality=95, exif=exif)
+    for kind in ("texture", "mask"):
+        found = read_map(tmp_path / "a.jpg", kind).reshape(np.rot90(stored, turns).shape)
+        np.testing.assert_array_equal(found > 0.5, np.rot90(stored, turns) > 0)
+
+
+@pytest.mark.parametrize("bits", [12, 16])
+def test_white_is_the_largest_value_of_the_bits(tmp_path: Path, bits: int) -> None:
+    """Of 12 bits 4095 is 1: textures, masks, and normals."""
+    white = 2**bits - 1
+    grey, ball = np.linspace(0, 1, 64, dtype=np.float32).reshape(8, 8), sphere()
+    tifffile.imwrite(tmp_path / "g.tiff", np.rint(grey * white).astype(np.uint16), bitspersample=bits)
+    for kind in ("texture", "mask"):
+        np.testing.assert_allclose(read_map(tmp_path / "g.tiff", kind).reshape(8, 8), grey, atol=1e-3)
+    codes = np.rint((ball + 1) / 2 * white).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "n.tiff", codes, bitspersample=bits, photometric="rgb")
+    found, solid = read_map(tmp_path / "n.tiff", "normals"), ball[..., 2] > 0.05
+    np.testing.assert_allclose(found[solid], ball[solid], atol=1e-3)
 
 
 def test_masks_and_normals_are_read(tmp_path: Path) -> None:

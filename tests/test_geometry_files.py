@@ -182,6 +182,24 @@ def test_what_cannot_be_is_said_in_a_line(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("--white-level", "4095"),
+        ("--black-level", "64"),
+        ("--layout", "mono"),
+        ("--calibration", "c.json"),
+        ("--ambient", "dark.png"),
+        ("--method", "analytic"),
+    ],
+)
+def test_photographs_have_no_options_of_frames(polsep: Cli, tmp_path: Path, given: tuple[str, str]) -> None:
+    """Options that would be ignored are refused by name, before files are looked for."""
+    paths = [tmp_path / f"{number}.png" for number in range(6)]
+    refused = polsep("--srgb", *paths, *given, "-o", tmp_path / "out")
+    assert_refused(refused, f"expected --srgb without {given[0]}, which is of raw frames, found both")
+
+
 def test_files_that_do_not_fit_are_named(polsep: Cli, separated: list[Path], tmp_path: Path) -> None:
     """Another size, a damaged file, one picture twice, a mask of another size, an input in the place of an output."""
     small = tmp_path / "small.png"

@@ -28,16 +28,19 @@ from polsep.io.assets.materials import (
     specular_scale,
     texture_pixels,
 )
+from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
+from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.weights import write_weights
 from polsep.material.estimate import load_estimator
-from polsep.material.files import Photographs, find_white, flatness_notes
+from polsep.material.files import MaterialOptions, Photographs, find_white, flatness_notes, read_photographs
 from polsep.material.network import MaterialNetwork, MaterialSize, detail_cues, encode_images
 from polsep.material.procedural import halve, random_svbrdf
 from polsep.material.shots import CAMERA, CAMERA_HEIGHT, INPUTS, photograph, random_example, random_flash
 from polsep.material.svbrdf import Svbrdf, plane_points, relight, unstack
 from polsep.render.sphere_tracing import PointLight
+from polsep.separation.report import SeparatedFrame
 from polsep.train.material_losses import material_loss
 
 SMALL = MaterialSize(4, (1, 2, 2))
@@ -283,6 +286,17 @@ def test_materialx_is_xml_that_names_its_files() -> None:
     assert {i.get("value") for i in root.iter("input") if i.get("type") == "filename"} == set(files.values())
 
 
+@pytest.mark.parametrize("name", ["wood", "2024-05 Tür", "shader", "normal_image", "木"])
+def test_materialx_names_are_plain_and_unique(name: str) -> None:
+    """Letters, digits, underscores, no digit first; no two elements of one name (MaterialX 1.38, Names)."""
+    files = {kind: f"{name}_{kind}.png" for kind in ("normal", "diffuse", "roughness", "specular")}
+    root = ElementTree.fromstring(encode_materialx(files, 0.1, name))
+    names = [node.get("name") for node in root]
+    assert len(set(names)) == len(names)
+    assert all(re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", str(name)) for name in names)
+    assert any(str(name).startswith("material_") for name in names)
+
+
 def test_a_photograph_becomes_files(
     tmp_path: Path, weights: Path, frame: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -430,3 +444,47 @@ def test_white_is_guessed_of_metal_too() -> None:
     levels = find_white(views, ())
     assert levels == pytest.approx((0.1 / 0.25, 0.102 / 0.14, 0.1 / 0.25))
     assert find_white(views, (0.7,)) == (0.7, 0.7, 0.7)
+
+
+TINT = np.array([0.55, 1, 0.7], np.float32)
+
+
+def grey_paper(folder: Path, format: str, report: dict[str, object]) -> str:
+    """A separated file of paper whose s0 is 0.4 under a lamp of the colour `TINT`, and its report beside it."""
+    diffuse, specular = (np.full((40, 40, 3), level, np.float32) * TINT / TINT.mean() for level in (0.3, 0.1))
+    zero = np.zeros((40, 40), np.float32)
+    frame = SeparatedFrame(diffuse, specular, zero == 0, zero, zero, {"warnings": [], **report})
+    return str(write_separation(frame, folder, "paper", format)[0])
+
+
+@pytest.mark.parametrize("format", ["exr", "npz"])
+def test_grey_paper_is_grey_under_any_lamp(tmp_path: Path, format: str) -> None:
+    """The colour told or in the report is divided out of both lobes, told before reported, and the mean s0 stays."""
+    for report, told in (({"light_color": TINT.tolist()}, "auto"), ({"light_color": [1, 1, 1]}, (0.55, 1, 0.7))):
+        path = grey_paper(tmp_path / str(told), format, report)
+        found = read_photographs([path], MaterialOptions(light_color=told, size=32))
+        assert found.notes == () and found.lights == (pytest.approx((0.55, 1, 0.7)),)
+        torch.testing.assert_close(found.views[0, :3], torch.full((3, 32, 32), 0.3))
+        torch.testing.assert_close(found.views[0, 3:], torch.full((3, 32, 32), 0.1))
+
+
+def test_a_lamp_of_no_known_colour_is_said(tmp_path: Path) -> None:
+    """Separated files without their report are taken as lit by white light."""
+    path = grey_paper(tmp_path, "exr", {"light_color": TINT.tolist()})
+    Path(path).with_suffix(".json").unlink()
+    found = read_photographs([path], MaterialOptions(size=32))
+    (note,) = found.notes
+    assert note.startswith(f"{path}: the lamp's colour is not known without paper.json")
+    assert found.lights == ((1, 1, 1),) and float(found.views[0, 1].mean() / found.views[0, 0].mean()) > 1.5
+
+
+def test_raw_frames_lose_the_colour_that_is_told(frame: Path) -> None:
+    """A raw frame of a white lamp, told to be tinted, is what is separated over that colour."""
+    read = ReadOptions(white_level=4095)
+    told, white = (
+        read_photographs([str(frame)], MaterialOptions(read, "analytic", light, size=32))
+        for light in (tuple(TINT.tolist()), "white")
+    )
+    sums = [x.views[0, :3] + x.views[0, 3:] for x in (told, white)]
+    gains = torch.from_numpy(TINT / TINT.mean()).view(3, 1, 1)
+    torch.testing.assert_close(sums[0] * gains, sums[1], rtol=0.02, atol=0.002)

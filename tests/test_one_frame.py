@@ -59,6 +59,7 @@ from polsep.networks.shape import ShapeNetwork
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.fresnel import diffuse_dolp
 from polsep.physics.stokes import Stokes
+from polsep.pipeline import told_gains
 from polsep.render.blobs import random_blob
 from polsep.sensor.camera import IDEAL, Layout, Mosaic, expose
 from polsep.separation.report import SeparatedFrame
@@ -476,7 +477,7 @@ def test_a_lamp_that_is_told_goes_before_the_file_beside(tmp_path: Path, beside:
 )
 def test_told_lamps_have_a_gain_per_channel(light: str | tuple[float, ...], channels: int, gains: list[float]) -> None:
     """Mono has one, whatever the colour."""
-    assert one_frame_files._told_color(light, channels) == gains
+    assert told_gains(light, channels) == gains
 
 
 def raw_sphere() -> NDArray[np.uint16]:
@@ -513,6 +514,26 @@ def test_of_many_frames_two_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(frames, "read_frames", lambda path, options: iter(()))
     with pytest.raises(InputError, match=r"film.npy: expected one frame, found 0"):
         frames.separate_file(tmp_path / "film.npy", ReadOptions(), "analytic")
+
+
+@pytest.mark.parametrize(("wide", "meshed"), [(1, False), (4, False), (14, True)])
+def test_thin_things_have_maps_but_no_mesh(run: Cli, tmp_path: Path, wide: int, meshed: bool) -> None:
+    """A line of a few pixels has its maps; of a mesh a line says, with the file, how wide things have to be."""
+    ones = np.ones((48, 600), np.float32)
+    light = 0.3 * ones[..., None].repeat(3, axis=2)
+    frame = SeparatedFrame(light, 0.2 * light, ones > 0, 0.2 * ones, 0.5 * ones, {"warnings": []})
+    path = write_separation(frame, tmp_path, "wire")[0]
+    mask = np.zeros((48, 600), np.float32)
+    mask[20 : 20 + wide] = 1
+    np.save(tmp_path / "mask.npy", mask)
+    words = (path, "-o", tmp_path / "out", "--mask", tmp_path / "mask.npy", "--overwrite")
+    done = run(*words)
+    if meshed:
+        assert done.status == 0, done
+        return
+    assert_refused(done, f"{path}: expected a thing of 11 pixels across or more for a mesh", "say --mesh none")
+    assert run(*words, "--mesh", "none").status == 0
+    assert (read_exr_layers(tmp_path / "out" / "wire.exr")["normal.Z"][mask > 0] > 0).all()
 
 
 def test_a_mesh_is_left_out_on_request(run: Cli, tmp_path: Path) -> None:

@@ -17,11 +17,13 @@ import types
 import warnings
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
 import polsep
+from polsep.io.assets.materials import metallic_maps
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
 from polsep.io.store.samples import sample_folder
@@ -100,6 +102,38 @@ def test_the_addon_says_what_blender_wants() -> None:
     assert len(manifest["tagline"]) <= 64
     assert not manifest["tagline"].endswith(".")
     assert re.fullmatch(r"[a-z_]+", manifest["id"])
+
+
+def addon_maps(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The add-on's `principled_maps`, which needs no Blender: stand-ins for what the module imports."""
+    stand_in, helper = MagicMock(), types.SimpleNamespace(ImportHelper=type("ImportHelper", (), {}))
+    stand_in.types.Operator = type("Operator", (), {})
+    for name, module in (("bpy", stand_in), ("bpy_extras", MagicMock()), ("bpy_extras.io_utils", helper)):
+        monkeypatch.setitem(sys.modules, name, module)
+    return runpy.run_path(str(EXAMPLES / "blender" / "__init__.py"))["principled_maps"]
+
+
+def test_blender_gets_metal_as_the_glb_file_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gold is metallic with its reflectance as colour, glass is not; level times tint is the reflectance over 0.08."""
+    random = np.random.default_rng(1).random((2, 5, 3), np.float32)
+    specular = np.concatenate(
+        [random, [[(0.04, 0.04, 0.04), (1.0, 0.7, 0.3), (0, 0, 0), (0.1, 0.15, 0.2), (0.3,) * 3]]]
+    )
+    layers = {"diffuse": 0.5 * specular[::-1].astype(np.float32), "specular": specular.astype(np.float32)}
+    found, wanted = addon_maps(monkeypatch)(layers), metallic_maps(layers)
+    np.testing.assert_allclose(found["metallic"], wanted["metallic"], atol=1e-6)
+    np.testing.assert_allclose(found["base color"], wanted["diffuse"], atol=1e-6)
+    np.testing.assert_allclose(0.08 * found["level"] * found["tint"], wanted["specular"], atol=1e-6)
+    np.testing.assert_allclose(found["base color"][2, 1], (1, 0.7, 0.3), atol=1e-6)
+    assert found["level"][2, 0] == pytest.approx(0.5) and found["metallic"][2, 0] == 0 and found["tint"][2, 2, 0] == 1
+
+
+def test_blender_gets_the_strength_of_shapes_as_glass(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A strength of 1 is the Principled node's default level 0.5; files of `polsep geometry` have none."""
+    maps, albedo = addon_maps(monkeypatch), np.ones((2, 2, 3), np.float32)
+    found = maps({"albedo": albedo, "specular": np.full((2, 2, 1), 1, np.float32)})
+    assert list(found) == ["level"] and (found["level"] == 0.5).all()
+    assert maps({"albedo": albedo}) == {}
 
 
 @pytest.mark.skipif(not BLENDER, reason="no Blender: POLSEP_BLENDER names a Python with bpy, see docs/places.md")

@@ -13,11 +13,22 @@ import numpy as np
 from bpy_extras.io_utils import ImportHelper
 
 #: Layers that are light or colour; others are numbers.
-LIGHT = ("diffuse", "specular", "albedo")
+LIGHT = ("diffuse", "specular", "albedo", "base color", "tint")
+#: Inputs of the Principled node by the maps that go there.
+SOCKETS = {
+    "albedo": "Base Color",
+    "base color": "Base Color",
+    "metallic": "Metallic",
+    "roughness": "Roughness",
+    "level": "Specular IOR Level",
+    "tint": "Specular Tint",
+}
 #: Channels of a layer in their order, one set of them.
 CHANNELS = ("RGB", "XYZ", "Y", "Z")
 #: Reflectance at normal incidence where the specular level of the Principled node is 1.
 FULL_LEVEL = 0.08
+#: The same of glass, and the largest mean of dielectrics and the least of metals: those of polsep's GLB files.
+GLASS, DIELECTRICS, METALS = 0.04, 0.2, 0.32
 
 
 def read_layers(path):
@@ -52,6 +63,23 @@ def make_image(name, layer, pixels):
     image.update()
     image.pack()
     return image
+
+
+def principled_maps(layers):
+    """Maps for inputs of the Principled node, besides the layers of a surface that go there as they are.
+
+    `polsep material` writes the reflectance at normal incidence: that of a metal becomes metallic and base color, as in
+    its GLB files, that of others a level times a tint. `polsep shape` writes its strength, 1 for glass.
+    """
+    if "albedo" in layers:
+        return {"level": layers["specular"] * np.float32(GLASS / FULL_LEVEL)} if "specular" in layers else {}
+    diffuse, specular = layers["diffuse"], layers["specular"]
+    metallic = np.clip((specular.mean(axis=2, keepdims=True) - DIELECTRICS) / (METALS - DIELECTRICS), 0, 1)
+    dielectric = specular + metallic * (GLASS - specular)
+    mean = dielectric.mean(axis=2, keepdims=True)
+    tint = np.where(mean > 0, dielectric / np.where(mean > 0, mean, 1), 1)
+    base = diffuse + metallic * (specular - diffuse)
+    return {"base color": base, "metallic": metallic, "level": mean / FULL_LEVEL, "tint": tint}
 
 
 class Nodes:
@@ -122,25 +150,22 @@ def separation_material(name, images):
 
 
 def surface_material(name, images):
-    """A material of maps: colour, normals, and where there are, roughness and reflectance at normal incidence."""
+    """A material of maps: normals, `principled_maps`, and where there is, roughness."""
     nodes = Nodes(name)
     textures = {
         layer: nodes.add("ShaderNodeTexImage", layer, -1, image=image, extension="EXTEND")
         for layer, image in images.items()
     }
     surface = nodes.add("ShaderNodeBsdfPrincipled", "Surface", 3)
-    nodes.join(textures.get("diffuse") or textures["albedo"], surface.inputs["Base Color"])
+    for layer, socket in SOCKETS.items():
+        if layer in textures:
+            nodes.join(textures[layer], surface.inputs[socket])
     up = nodes.add("ShaderNodeVectorMath", "to 0 ... 1", 1, operation="MULTIPLY_ADD")
     up.inputs[1].default_value = up.inputs[2].default_value = (0.5, 0.5, 0.5)
     nodes.join(textures["normal"], up.inputs[0])
     bump = nodes.add("ShaderNodeNormalMap", "Normals", 2)
     nodes.join(up, bump.inputs["Color"])
     nodes.join(bump, surface.inputs["Normal"])
-    if "roughness" in textures:
-        nodes.join(textures["roughness"], surface.inputs["Roughness"])
-    if "specular" in textures:
-        level = nodes.scaled("Specular level", textures["specular"], nodes.value("1 / full level", 1 / FULL_LEVEL))
-        nodes.join(level, surface.inputs["Specular IOR Level"])
     nodes.join(surface, nodes.add("ShaderNodeOutputMaterial", "Output", 4).inputs["Surface"])
     return nodes.material
 
@@ -166,8 +191,10 @@ def import_file(path):
         before = set(bpy.data.objects)
         bpy.ops.import_scene.gltf(filepath=str(mesh), merge_vertices=False)
         return next(thing for thing in bpy.data.objects if thing not in before and thing.type == "MESH")
-    images = {layer: make_image(f"{path.stem} {layer}", layer, pixels) for layer, pixels in layers.items()}
-    material = (surface_material if "normal" in layers else separation_material)(path.stem, images)
+    surface = "normal" in layers
+    maps = {**layers, **principled_maps(layers)} if surface else layers
+    images = {layer: make_image(f"{path.stem} {layer}", layer, pixels) for layer, pixels in maps.items()}
+    material = (surface_material if surface else separation_material)(path.stem, images)
     height, width = next(iter(layers.values())).shape[:2]
     return make_plane(path.stem, material, width / height)
 

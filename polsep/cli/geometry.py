@@ -29,6 +29,15 @@ from polsep.cli.progress import show_progress
 
 #: The order of photographs without --lights.
 ORDER = "right front-right front front-left left above"
+#: Options that say something of raw frames alone, with the value that says nothing.
+_OF_FRAMES = {
+    "white_level": None,
+    "black_level": 0.0,
+    "layout": None,
+    "calibration": None,
+    "ambient": (),
+    "method": "auto",
+}
 
 
 @app.command()
@@ -86,6 +95,8 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     require_extra("mesh")
     if options["turntable"]:
         require_extra("video")
+    if options["srgb"] and (given := [name for name, nothing in _OF_FRAMES.items() if options[name] != nothing]):
+        raise ValueError(f"expected --srgb without --{given[0].replace('_', '-')}, which is of raw frames, found both")
     require_paths(*files, *filter(None, [options["mask"]]))
     from polsep.geometry.lights import parse_lights
     from polsep.io.assets.maps import read_object

@@ -59,10 +59,10 @@ from polsep.cli.progress import show_progress
 def material(files: tuple[str, ...], **options: Any) -> None:
     """Estimate normals, diffuse colour, roughness and specular reflectance of a flat material.
 
-    FILE is a raw frame, as for 'polsep separate', or a separated one (.exr). All are photographs of one material from
-    above by a camera that does not move, each under one polarized light: a flash beside the lens, or several lights in
-    turn, in any order. The middle square is used. Of bare metal, say the lamp's colour (--light-color white). Needs the
-    extra torch.
+    FILE is a raw frame, as for 'polsep separate', or a separated one (.exr, .npz). All are photographs of one material
+    from above by a camera that does not move, each under one polarized light: a flash beside the lens, or several
+    lights in turn, in any order. The middle square is used. The lamp's colour is divided out; of bare metal, say it
+    (--light-color white). Needs the extra torch.
 
     DIR/NAME.exr gets all maps; NAME_normal.png, NAME_diffuse.png, NAME_roughness.png and NAME_specular.png are
     textures; NAME.glb opens in Blender, NAME.mtlx in MaterialX viewers; NAME.png shows the maps and the material under

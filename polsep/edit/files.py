@@ -88,19 +88,30 @@ def load_work(recipe: Recipe, folder: Path) -> Work:
 
 
 def planned_edits(paths: Sequence[Path], target: EditTarget) -> list[Path]:
-    """Every file that edits of these frames and folders may write; none of those that cannot be edited."""
-    planned = list[Path]()
+    """Every file that edits of these frames and folders may write; none of those that cannot be edited.
+
+    Raises OutputError where two of them would write one file.
+    """
+    planned = dict[Path, Path]()
     for path in paths:
         try:
-            if path.is_dir():
-                found = find_numbered(path)
-                names = (f"{found.stem}{end}" for end in (".png", ".jsonl", ".json", "_preview.mp4"))
-                planned += [*_frame_paths(found, target), *(target.directory / name for name in names)]
-            else:
-                planned += planned_outputs(target.directory, path.stem, "exr")
+            outputs = _planned_edit(path, target)
         except (ValueError, OSError):  # its own edit says so, and the others go on
             continue
-    return planned
+        if shared := [output for output in outputs if output in planned]:
+            same = f"{planned[shared[0]]}, {path}: both would write {shared[0]}"
+            raise OutputError(f"expected inputs of different names, found {same}")
+        planned |= dict.fromkeys(outputs, path)
+    return list(planned)
+
+
+def _planned_edit(path: Path, target: EditTarget) -> list[Path]:
+    """The files of the edit of one frame or folder. Raises ValueError or OSError where it cannot be edited."""
+    if not path.is_dir():
+        return planned_outputs(target.directory, path.stem, "exr")
+    found = find_numbered(path)
+    names = (f"{found.stem}{end}" for end in (".png", ".jsonl", ".json", "_preview.mp4"))
+    return [*_frame_paths(found, target), *(target.directory / name for name in names)]
 
 
 def edit_files(paths: Sequence[Path], work: Work, target: EditTarget) -> Iterator[Edited]:

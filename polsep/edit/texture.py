@@ -105,14 +105,14 @@ def sample(texture: Floats, at: tuple[Floats, Floats], texels: float) -> Floats:
     10.1145/964967.801126): continuous in everything.
     """
     level = float(np.log2(max(texels, 1.0)))
-    lower = int(level)
+    lower, whole = int(level), texture.shape[:2]
     for _ in range(lower):
         texture = _halve(texture)
-    sharp = _between_texels(texture, at, 2.0**-lower)
+    sharp = _between_texels(texture, at, whole)
     share = np.float32(level - lower)
     if share == 0:
         return sharp
-    return (1 - share) * sharp + share * _between_texels(_halve(texture), at, 2.0 ** -(lower + 1))
+    return (1 - share) * sharp + share * _between_texels(_halve(texture), at, whole)
 
 
 def _halve(texture: Floats) -> Floats:
@@ -126,11 +126,14 @@ def _halve(texture: Floats) -> Floats:
     return texture
 
 
-def _between_texels(texture: Floats, at: tuple[Floats, Floats], scale: float) -> Floats:
-    """Linear interpolation of a repeated texture at ``scale`` times ``at``; texel centres are at halves."""
+def _between_texels(texture: Floats, at: tuple[Floats, Floats], whole: tuple[int, int]) -> Floats:
+    """Linear interpolation of a repeated texture at places in texels of its ``whole`` size, centres at halves.
+
+    Halved sizes spread over the whole period, also where odd rows or columns were left out.
+    """
     height, width, colors = texture.shape
-    left, right, x = _neighbours(np.float32(scale) * at[0] - np.float32(0.5), width)
-    top, bottom, y = _neighbours(np.float32(scale) * at[1] - np.float32(0.5), height)
+    left, right, x = _neighbours(np.float32(width / whole[1]) * at[0] - np.float32(0.5), width)
+    top, bottom, y = _neighbours(np.float32(height / whole[0]) * at[1] - np.float32(0.5), height)
     planes = np.ascontiguousarray(texture.transpose(2, 0, 1)).reshape(colors, height * width)  # gathers single numbers
     top, bottom = width * top, width * bottom
     upper = _mixed(planes, (top + left, top + right), x)

@@ -200,9 +200,9 @@ def find_shape(
     way = _unit(light)
     window = square_around(chosen)
     small = gather(images_of(frame, chosen), window, SIDE)
-    small[4:6] = polarized_as_usual(small[4:6], small[:3].mean(axis=0), small[3:4] * (small[7:8] > 0.5), index)
+    small[4:6] = polarized_as_usual(small[4:6], small[:3].mean(axis=0), small[3:4] * on_thing(small[7:8]), index)
     told = np.broadcast_to(np.array(way, np.float32)[:, None, None], (3, SIDE, SIDE))
-    seen = Seen(small[:3], small[3:4], small[4:6], small[6:7], (small[7:8] > 0.5).astype(np.float32), told)
+    seen = Seen(small[:3], small[3:4], small[4:6], small[6:7], on_thing(small[7:8]).astype(np.float32), told)
     found = load_estimator(weights).find(seen)
     planes = np.concatenate([np.asarray(x, np.float32) for x in found])
     wide = spread(planes, window, chosen.shape)
@@ -331,6 +331,11 @@ def gather(planes: Floats, window: tuple[int, int, int], side: int) -> Floats:
     resize = resize_area if width >= side else resize_bilinear
     found: Floats = np.asarray(resize(cut, (side, side)), np.float32)
     return found
+
+
+def on_thing(share: Floats) -> Mask:
+    """Pixels that count as the thing's, by its share of each: more than half, or of thin things half the largest."""
+    return share > min(0.5, float(share.max()) / 2)
 
 
 def spread(planes: Floats, window: tuple[int, int, int], shape: tuple[int, ...]) -> Floats:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.geometry.frames import separate_file
-from polsep.geometry.one_frame import SIDE, UNKNOWN, Shape, find_shape, gather, square_around
+from polsep.geometry.one_frame import SIDE, UNKNOWN, Shape, find_shape, gather, on_thing, square_around
 from polsep.geometry.shape_maps import Surface, relight
 from polsep.io.assets.maps import read_object
 from polsep.io.assets.relight_page import RelightMaps, encode_relight_page
@@ -19,11 +20,10 @@ from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
-from polsep.io.results.separation_reader import is_separated, read_separated
-from polsep.io.results.sidecars import read_report
+from polsep.io.results.separation_reader import is_separated
 from polsep.io.store.errors import input_error
 from polsep.physics.fresnel import ETA
-from polsep.pipeline import LightColor, is_to_be_found
+from polsep.pipeline import LightColor, open_separated
 from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float32]
@@ -72,27 +72,17 @@ def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list
     mask = None if settings.mask is None else read_object(settings.mask, frame.dolp.shape)
     try:
         found = find_shape(frame, mask, settings.lamp, settings.weights, settings.index)
+        files = shape_files(frame, found, settings, path.stem)
     except ValueError as error:
         raise input_error(path, error) from error
-    return shape_files(frame, found, settings, path.stem), notes + found.doubts()
+    return files, notes + found.doubts()
 
 
 def _read_frame(path: Path, settings: ShapeSettings) -> tuple[SeparatedFrame, list[str]]:
     """A separated frame, and what was said about it."""
     if not is_separated(path):
         return separate_file(path, settings.read, settings.method, settings.light_color)
-    frame = replace(read_separated(path), report=read_report(path.with_suffix(".json")))
-    notes = list(frame.report.get("warnings", ()))
-    if not is_to_be_found(settings.light_color):
-        frame.report["light_color"] = _told_color(settings.light_color, frame.diffuse.shape[-1])
-    elif "light_color" not in frame.report:
-        notes.append(f"the lamp's colour is not known without {path.stem}.json beside the file: taken for white")
-    return frame, notes
-
-
-def _told_color(light_color: LightColor | str, channels: int) -> list[float]:
-    """One gain per channel of a light whose colour is told: three numbers or "white"; mono has one channel."""
-    return [1.0] * channels if isinstance(light_color, str) or channels == 1 else [float(gain) for gain in light_color]
+    return open_separated(path, settings.light_color)
 
 
 def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, title: str) -> ShapeFiles:
@@ -137,11 +127,11 @@ def _page_maps(found: Shape) -> RelightMaps:
     surface, share = in_square(found, PAGE_SIDE)
     gain = 0.9 / max(float(np.percentile(found.albedo[found.mask], 99)), 1e-9)
     normals, colors = (np.moveaxis(x, 0, -1) for x in (surface.normal, surface.albedo * gain))
-    return RelightMaps(normals, colors, surface.roughness[0], surface.specular[0], share > 0.5)
+    return RelightMaps(normals, colors, surface.roughness[0], surface.specular[0], on_thing(share))
 
 
 class _Solid:
-    """Depth and mesh of a shape. Needs the extra ``mesh``. State: the mesh."""
+    """Depth and mesh of a shape. Needs the extra ``mesh``. State: the mesh. Raises ValueError on too thin things."""
 
     def __init__(self, found: Shape, integration: str) -> None:
         from polsep.geometry.files import INTEGRATIONS
@@ -151,6 +141,12 @@ class _Solid:
         window = square_around(found.mask)
         surface, share = in_square(found, MESH_SIDE)
         mask, side = share > 0.99, len(share)
+        corners = np.lib.stride_tricks.sliding_window_view(mask, (2, 2))
+        if corners.sum(axis=(2, 3)).max() < 3:  # of four neighbours a triangle needs three
+            least = math.ceil(3 * window[2] / side)
+            raise ValueError(
+                f"expected a thing of {least} pixels across or more for a mesh, found less; say --mesh none"
+            )
         normals, albedo = (np.moveaxis(x, 0, -1).astype(np.float64) * mask[..., None] for x in surface[:2])
         depth = INTEGRATIONS[integration](normals, mask)
         gain = 1 / max(float(np.percentile(albedo[mask], 99.5)), 1e-9)
@@ -228,7 +224,7 @@ def in_square(found: Shape, side: int) -> tuple[Surface, Floats]:
 def draw_panels(frame: SeparatedFrame, found: Shape) -> list[Sequence[Panel]]:
     """Rows of pictures: the frame and its surface; the thing under other lamps."""
     surface, share = in_square(found, CELL)
-    there, mask = share > 0.5, found.mask
+    there, mask = on_thing(share), found.mask
     images = np.concatenate([frame.diffuse + frame.specular, frame.specular], axis=-1)
     small = gather(np.moveaxis(images, -1, 0), square_around(mask), len(share))
     seen, mirrored = (np.broadcast_to(x, (3, *share.shape)) for x in np.split(small, 2))

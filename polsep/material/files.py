@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,14 +15,15 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate
 from polsep.io.assets.materials import MaterialFiles, material_targets, write_material
 from polsep.io.raw.frames import ReadOptions, output_stem, read_frames, refuse_forgotten
 from polsep.io.results.previews import Panel, Pixels, titled_sheet, toned
-from polsep.io.results.separation_reader import read_separated
+from polsep.io.results.separation_reader import is_separated
 from polsep.io.store.atomic import refuse_existing, refuse_inputs
 from polsep.io.store.errors import InputError, input_error
 from polsep.material.estimate import load_estimator
 from polsep.material.procedural import MAP_SIZE
 from polsep.material.shots import CAMERA_HEIGHT
 from polsep.material.svbrdf import Svbrdf, plane_points, relight
-from polsep.pipeline import LightColor, separate_capture
+from polsep.pipeline import LightColor, open_separated, separate_capture
+from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float32]
 
@@ -67,11 +68,15 @@ class MaterialOptions:
 
 @dataclass(frozen=True)
 class Photographs:
-    """Separated views ``[V, 6, size, size]`` of one material and their source files; ``notes`` for the user."""
+    """Separated views ``[V, 6, size, size]`` of one material and their source files; ``notes`` for the user.
+
+    Views are in white light of the same mean: ``lights``, the lamp's colour of each, is divided out (`white_lobes`).
+    """
 
     views: Tensor
     sources: tuple[str, ...]
     notes: tuple[str, ...]
+    lights: tuple[tuple[float, ...], ...] = ()
 
 
 def estimate_files(
@@ -98,6 +103,7 @@ def estimate_files(
         "input": estimator.input,
         "method": options.method,
         "white": list(white),
+        "light_color": [list(light) for light in photographs.lights],
         "warnings": notes,
     }
     arrays = {kind: np.ascontiguousarray(x.movedim(0, -1).numpy()) for kind, x in vars(maps).items()}
@@ -107,28 +113,45 @@ def estimate_files(
 
 def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photographs:
     """Separate every frame of the files and resize its middle square to the maps. Raises InputError."""
-    views, sources, notes = [], [], list[str]()
+    views, sources, lights, notes = [], [], [], list[str]()
     for path in paths:
-        lobes: list[tuple[Floats, Floats]] = []
-        if Path(path).suffix.lower() == ".exr":
-            frame = read_separated(Path(path))
-            lobes.append((frame.diffuse, frame.specular))
-        else:
-            for raw in read_frames(path, options.read):
-                refuse_forgotten(path, raw)
-                frame = separate_capture(raw.data, options.method, options.light_color)
-                lobes.append((frame.diffuse, frame.specular))
-                notes += [f"{path}: {note}" for note in (*raw.notes, *frame.report["warnings"])]
-        for pair in lobes:
-            planes = [torch.from_numpy(x).movedim(-1, 0).expand(3, -1, -1) for x in pair]
+        for frame, said in _separated(path, options):
+            planes = [torch.from_numpy(x).movedim(-1, 0).expand(3, -1, -1) for x in white_lobes(frame)]
             view = torch.cat([_middle_square(x, options.size) for x in planes])
             if not float(view.sum()) > 0:
                 raise input_error(path, "expected light in the middle of a photograph, found a black one")
             views.append(view)
             sources.append(Path(path).name)
+            lights.append(_light_of(frame))
+            notes += [f"{path}: {note}" for note in said]
     if not views:
         raise InputError("expected photographs of a material, found none")
-    return Photographs(torch.stack(views), tuple(sources), tuple(notes))
+    return Photographs(torch.stack(views), tuple(sources), tuple(notes), tuple(lights))
+
+
+def _separated(path: str, options: MaterialOptions) -> Iterator[tuple[SeparatedFrame, Sequence[str]]]:
+    """Every frame of a file, separated here or before, and what was said about it."""
+    if is_separated(Path(path)):
+        yield open_separated(Path(path), options.light_color)
+        return
+    for raw in read_frames(path, options.read):
+        refuse_forgotten(path, raw)
+        frame = separate_capture(raw.data, options.method, options.light_color)
+        yield frame, (*raw.notes, *frame.report["warnings"])
+
+
+def white_lobes(frame: SeparatedFrame) -> tuple[Floats, Floats]:
+    """Diffuse and specular image under white light of the same mean, as training's are: the lamp's colour over its mean
+    is divided out, so that grey paper is grey and its mean s0 stays."""
+    light = np.array(_light_of(frame), np.float32)
+    gains = light / light.mean()
+    return frame.diffuse / gains, frame.specular / gains
+
+
+def _light_of(frame: SeparatedFrame) -> tuple[float, ...]:
+    """The lamp's colour by the report, a gain per channel; white where it says none."""
+    channels = frame.diffuse.shape[-1]
+    return tuple(frame.report.get("light_color", (1.0,) * channels))[:channels]
 
 
 def flatness_notes(photographs: Photographs) -> list[str]:

@@ -1,8 +1,9 @@
 """Textures, masks and normal maps that edits name, as files of any program.
 
 Textures in 8-bit PNG and JPEG are decoded from sRGB to linear light; 16-bit PNG and TIFF, EXR and NPY are linear
-already. Integers are scaled so that their largest value is 1. Masks are never decoded. Normals in PNG and TIFF are
-2 c - 1 for c in [0, 1] (x right, y up, z to the camera), in EXR and NPY the vectors themselves.
+already. Integers are scaled so that the largest of their bits is 1. JPEG is turned as its EXIF data say. Masks are
+never decoded. Normals in PNG and TIFF are 2 c - 1 for c in [0, 1] (x right, y up, z to the camera), in EXR and NPY the
+vectors themselves.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 
 from polsep.io.raw.frames import read_pages
 from polsep.io.results.exr import read_exr_layers
@@ -43,11 +44,11 @@ def read_map(path: Path, kind: str) -> Floats:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise input_error(path, f"expected an image ({', '.join(SUFFIXES)}), found {suffix or 'no extension'!r}")
-    read = _read(path, suffix)
+    read, white = _read(path, suffix)
     with naming(path):
         codes = _checked(_from_planes(read) if isinstance(read, Mapping) else read)
         decode = {"texture": _as_texture, "mask": _as_mask, "normals": _as_normals}[kind]
-        found = decode(codes)
+        found = decode(codes, white)
         if not np.isfinite(found).all():
             raise InputError("expected finite values, found NaN or infinite ones")
     kept = np.ascontiguousarray(found, dtype=np.float32)
@@ -76,21 +77,25 @@ def hash_map(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _read(path: Path, suffix: str) -> NDArray[Any] | Mapping[str, NDArray[Any]]:
-    """The one image of a file, or its channels by name."""
+def _read(path: Path, suffix: str) -> tuple[NDArray[Any] | Mapping[str, NDArray[Any]], float | None]:
+    """The one image of a file, or its channels by name, and its white level where it names one.
+
+    Photographs are turned as their EXIF data say.
+    """
     if suffix == ".exr":
-        return read_exr_layers(path)
+        return read_exr_layers(path), None
     if suffix in _PHOTOS:
         with naming(path), path.open("rb") as stream:
             require_signature(stream, (b"\xff\xd8\xff",), "a JPEG")
             unwarned = warnings.catch_warnings(action="ignore")  # of large pictures, which have a limit of their own
             with decoding("JPEG"), unwarned, Image.open(stream, formats=["JPEG"]) as picture:
                 require_size((picture.height, picture.width, 3))
-                return np.asarray(picture.convert("L" if picture.mode == "L" else "RGB"))
+                upright = ImageOps.exif_transpose(picture)
+                return np.asarray(upright.convert("L" if upright.mode == "L" else "RGB")), None
     page = next(read_pages(path))
     if page.count != 1:
         raise input_error(path, f"expected one image, found {page.count}")
-    return page.array
+    return page.array, page.white_level
 
 
 def _checked(codes: NDArray[Any]) -> NDArray[Any]:
@@ -107,17 +112,17 @@ def _from_planes(planes: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
     raise InputError(f"expected channels R, G and B, or X, Y and Z, or Y, found {', '.join(sorted(planes)[:8])}")
 
 
-def _in_unit(codes: NDArray[Any]) -> NDArray[Any]:
-    """Integers in [0, 1], other values as they are."""
+def _in_unit(codes: NDArray[Any], white: float | None) -> NDArray[Any]:
+    """Integers in [0, 1], 1 = the white level or else the largest of their type; other values as they are."""
     if codes.dtype.kind == "u":
-        return codes / np.float32(np.iinfo(codes.dtype).max)
+        return codes / np.float32(np.iinfo(codes.dtype).max if white is None else white)
     if codes.dtype.kind in "fb":
         return codes.astype(np.float32)
     raise InputError(f"expected unsigned integers or floats, found {codes.dtype}")
 
 
-def _as_texture(codes: NDArray[Any]) -> NDArray[Any]:
-    values = _in_unit(codes)
+def _as_texture(codes: NDArray[Any], white: float | None) -> NDArray[Any]:
+    values = _in_unit(codes, white)
     values = values[..., None] if values.ndim == 2 else values
     if codes.dtype == np.uint8:
         return linear_from_srgb(values)
@@ -126,8 +131,8 @@ def _as_texture(codes: NDArray[Any]) -> NDArray[Any]:
     return values
 
 
-def _as_mask(codes: NDArray[Any]) -> NDArray[Any]:
-    values = _in_unit(codes)
+def _as_mask(codes: NDArray[Any], white: float | None) -> NDArray[Any]:
+    values = _in_unit(codes, white)
     if values.ndim == 3:
         if (values != values[..., :1]).any():
             raise InputError("expected a grey image as mask, found colours")
@@ -137,10 +142,10 @@ def _as_mask(codes: NDArray[Any]) -> NDArray[Any]:
     return values
 
 
-def _as_normals(codes: NDArray[Any]) -> NDArray[Any]:
+def _as_normals(codes: NDArray[Any], white: float | None) -> NDArray[Any]:
     if codes.ndim != 3 or codes.shape[2] != 3:
         raise InputError(f"expected normals of three channels, found shape {list(codes.shape)}")
-    vectors = _in_unit(codes)
+    vectors = _in_unit(codes, white)
     vectors = 2 * vectors - 1 if codes.dtype.kind == "u" else vectors
     if not (largest := float(np.abs(vectors).max())) <= _LONGEST:
         raise InputError(f"expected vectors of about unit length, found components of {largest:g}")

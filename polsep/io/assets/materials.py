@@ -89,12 +89,12 @@ def _encoded_files(material: MaterialFiles, name: str, scale: float) -> Iterator
     maps = material.maps
     planes = {f"{kind}.{c}": maps[kind][..., k] for kind, names in CHANNELS.items() for k, c in enumerate(names)}
     yield f"{name}.exr", encode_exr(planes, exr_notes(UNITS))
-    textures, plain = texture_pixels(maps), re.sub(r"\W", "_", name)
+    textures = texture_pixels(maps)
     files = {texture: f"{name}_{texture}.png" for texture in TEXTURES}
     for texture, pixels in textures.items():
         yield files[texture], encode_png(pixels[..., 0] if texture == "roughness" else pixels)
-    yield f"{name}.glb", encode_glb(maps, plain)
-    yield f"{name}.mtlx", encode_materialx(files, scale, plain).encode()
+    yield f"{name}.glb", encode_glb(maps, re.sub(r"\W", "_", name))
+    yield f"{name}.mtlx", encode_materialx(files, scale, name).encode()
     yield f"{name}.png", encode_png(material.preview)
 
 
@@ -171,7 +171,11 @@ def encode_glb(maps: Mapping[str, Floats], name: str) -> bytes:
 
 
 def encode_materialx(files: Mapping[str, str], scale: float, name: str) -> str:
-    """A MaterialX document with the node gltf_pbr and an image node for each of `TEXTURES`' ``files``."""
+    """A MaterialX document with the node gltf_pbr and an image node for each of `TEXTURES`' ``files``.
+
+    Names of MaterialX are ASCII letters, digits and underscores, not a digit first, and unique: the material's is
+    material_NAME, with underscores for other characters.
+    """
     root = ElementTree.Element("materialx", version="1.38", colorspace="lin_rec709")
 
     def node(kind: str, node_name: str, type: str, *inputs: dict[str, str]) -> None:
@@ -199,7 +203,8 @@ def encode_materialx(files: Mapping[str, str], scale: float, name: str) -> str:
         link("normal", "vector3", "normal_map"),
         link("specular_color", "color3", "specular_color"),
     )
-    node("surfacematerial", name, "material", link("surfaceshader", "surfaceshader", "shader"))
+    material = "material_" + re.sub(r"[^0-9A-Za-z_]", "_", name)
+    node("surfacematerial", material, "material", link("surfaceshader", "surfaceshader", "shader"))
     ElementTree.indent(root)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 

@@ -19,6 +19,7 @@ from evaluation.ablations import network_at_half
 from evaluation.ladder import MOSAIC, Weights, network_entry
 from evaluation.scoring import Entry, Protocol, capture_noisy, score_sets
 from evaluation.sets import load_sets
+from polsep.bench import SCENES as SEPARATION
 from polsep.bench.history import ask_git
 from polsep.bench.rows import Row
 from polsep.networks.rungs import RUNGS
@@ -34,7 +35,7 @@ SEEDS = (1, 2, 3)
 STEPS = 1000
 FOLDER = Path("runs/repeats")
 #: Code whose change makes other weights.
-TRAINED_BY = ("polsep/train", "polsep/networks", "polsep/render", "evaluation/repeats.py")
+TRAINED_BY = (*SEPARATION, "polsep/train", "evaluation/repeats.py")
 METRICS = ("diffuse PSNR", "specular PSNR")
 #: Scenes of each selection set that are scored: the first ones.
 SCENES = 12

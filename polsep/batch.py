@@ -96,7 +96,7 @@ def separate_files(
                 if clash := sorted({realpath(output) for output in outputs} & claimed.keys()):
                     raise OutputError(f"{path}: expected outputs of its own, found that {clash[0]} {claimed[clash[0]]}")
                 refuse_existing(write.directory, outputs, write.overwrite)
-                stem, last = frame.stem, path == paths[-1] and left <= 1
+                stem, last = frame.stem, path == paths[-1] and frame.count == 1
                 separated = _separate_frame(path, frame, read, options, write.stokes)
                 del frame  # like the rest, memory that the writer can use
                 if last:

@@ -303,7 +303,7 @@ def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[
     if not is_to_be_found(light_color):
         frame.report["light_color"] = told_gains(light_color, frame.diffuse.shape[-1])
     elif "light_color" not in frame.report:
-        notes.append(f"the lamp's colour is not known without {path.stem}.json beside the file: taken for white")
+        notes.append(f"the lamp's colour is not told, nor known from {path.stem}.json beside the file: taken for white")
     return frame, notes
 
 

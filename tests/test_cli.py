@@ -302,9 +302,12 @@ def test_a_calibration_is_not_replaced(tmp_path: Path, polsep: Cli) -> None:
 def test_names_of_any_bytes_are_printed(tmp_path: Path) -> None:
     """A name that is no text, and one that the terminal cannot show, stop nothing."""
     names = [os.fsencode(tmp_path) + b"/caf\xe9.png", os.fsencode(tmp_path) + "/日本.png".encode()]
-    for name in names:
-        with open(name, "wb") as file:
-            file.write(png(tmp_path / "a.png", frame()).read_bytes())
+    data = png(tmp_path / "a.png", frame()).read_bytes()
+    try:
+        for name in names:
+            Path(os.fsdecode(name)).write_bytes(data)
+    except OSError:
+        pytest.skip("the disk takes names in UTF-8 alone")
     command = [sys.executable, "-m", "polsep", "separate", *names, "-o", str(tmp_path / "o"), "--method", "analytic"]
     settings = {**os.environ, "PYTHONIOENCODING": "ascii:strict", "PYTHONUTF8": "1"}
     run = subprocess.run(command, capture_output=True, env=settings, timeout=100)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import shutil
@@ -41,6 +42,7 @@ def kill_at(name: str, calls: int, work: Callable[[], object]) -> bool:
     """Do something in a child that is killed after so many calls of a function of `os`; False if it was not."""
     child = os.fork()
     if child == 0:
+        gc.disable()  # garbage of other tests may hold threads, which a child has not
         real, count = getattr(os, name), [0]
 
         def call_or_die(*arguments: Any, **options: Any) -> Any:

@@ -474,7 +474,7 @@ def test_a_lamp_of_no_known_colour_is_said(tmp_path: Path) -> None:
     Path(path).with_suffix(".json").unlink()
     found = read_photographs([path], MaterialOptions(size=32))
     (note,) = found.notes
-    assert note.startswith(f"{path}: the lamp's colour is not known without paper.json")
+    assert note.startswith(f"{path}: the lamp's colour is not told, nor known from paper.json")
     assert found.lights == ((1, 1, 1),) and float(found.views[0, 1].mean() / found.views[0, 0].mean()) > 1.5
 
 

@@ -210,6 +210,21 @@ def test_a_file_that_fails_leaves_the_one_before(page: Any, tmp_path: Path) -> N
 
 @needs_packages
 @needs_browser
+def test_a_file_whose_format_nobody_says_leaves_settings(page: Any) -> None:
+    """Those of the frame that is shown come back when another file takes the place of the one that was asked about."""
+    page.select_option("#method", "analytic")
+    send(page, "good.png", shot())
+    change(page, lambda: page.click("text=Use white level 4095"))
+    ask_format(page, "other.raw", pack_frame(crop()[:96], "BayerRG12p"))
+    assert page.input_value("#white") == ""
+    send(page, "broken.png", BROKEN)
+    assert page.input_value("#white") == "4095" and page.is_hidden("#raw")
+    change(page, lambda: page.select_option("#light", "white"))
+    assert page.evaluate("polsep.report.white_level") == 4095
+
+
+@needs_packages
+@needs_browser
 def test_settings_wait_for_a_frame(page: Any) -> None:
     """Of a first file that cannot be read, or of one whose format is still asked for, nothing is separated."""
     page.select_option("#method", "analytic")

@@ -79,7 +79,8 @@ def write_rows(folder: Path, name: str, rows: Sequence[Row], command: str, begun
     if lost:
         path = partial
     else:
-        remove_rows(partial)  # older ones
+        for older in (partial, folder / "scenes" / partial.name):
+            remove_rows(older)
     if means:
         replace_text(path, to_jsonl(means, made_by))
     if lost:

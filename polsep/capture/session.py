@@ -132,6 +132,7 @@ class Session:
         self._writer: RecordingWriter | None = None
         self._counters, self._interruptions = Counters(), list[dict[str, Any]]()
         self._started, self._last = 0.0, 0.0
+        self._back_at = math.inf
         self._away_since, self._lost_at = 0.0, 0.0  # last frame before an interruption; the loss that is waited out
         self._incomplete = 0  # incomplete frames since the last complete one
         self._unwritten = 0  # frames queued for a recorder that failed
@@ -220,8 +221,8 @@ class Session:
                     try:
                         self._prepare(camera.info)
                         camera.start()
-                        if math.isinf(camera.info.patience_s):  # back, though it may send nothing for any time
-                            self._lost_at = 0.0
+                        # A triggered camera is back with its start, if it stays: it may send nothing for any time.
+                        self._back_at = time.monotonic() if math.isinf(camera.info.patience_s) else math.inf
                         self._started = self._started or time.monotonic()
                         self._pump(camera)
                         return
@@ -323,7 +324,7 @@ class Session:
         if not self._away_since:
             self._away_since = self._last or now
             self._counters.interruptions += 1
-        if self._lost_at:
+        if self._lost_at and now - self._back_at <= self._limits.timeout_s:
             return
         self._lost_at = now
         self._notify(f"camera lost: {error}; trying again every second for {self._limits.timeout_s:g} s")

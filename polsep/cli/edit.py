@@ -103,7 +103,8 @@ def edit(inputs: tuple[Path, ...], **options: Any) -> None:
     planned = planned_edits(inputs, target)
     refuse_inputs(planned, images if recipe_file is None else [*images, recipe_file])
     if saved is not None:
-        refuse_inputs([saved], [*inputs, *images])
+        frames = [file for path in inputs for file in (path.iterdir() if path.is_dir() else [path])]
+        refuse_inputs([saved], [*frames, *images])
         _refuse_result(saved, planned)
     work = load_work(recipe, folder)
     if saved is not None:

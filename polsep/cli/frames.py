@@ -103,7 +103,7 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
         require_paths(*files)
     check_read_options(options)
     from polsep.batch import SeparateOptions, WriteOptions, separate_files, separate_photographs
-    from polsep.io.raw.sequences import expand_folders
+    from polsep.io.raw.sequences import expand_folders, input_files
     from polsep.methods import check_method
     from polsep.pipeline import find_device
 
@@ -112,14 +112,14 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     find_device(options["device"])
     light = read_light(options)
     run = SeparateOptions(options["method"], light, options["device"], options["full"])
-    kept = tuple(filter(None, [options["calibration"], *options["ambient"]]))
+    kept = tuple(file for path in (options["calibration"], *options["ambient"]) if path for file in input_files(path))
     write = WriteOptions(options["output"], options["format"], options["overwrite"], options["stokes"], kept)
     if photographs:
         with show_progress(f"separating {len(photographs)} photographs"):
             outcome = separate_photographs(photographs, read_photo_options(options), read, run, write)
         _report(outcome)
         return
-    paths, done, failures = list[str](), 0, 0
+    paths, seen, failures = list[str](), list[str](), 0
     for file in files:
         try:
             paths += expand_folders([file])
@@ -130,8 +130,9 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
             failures += 1
     with show_progress(f"separating {files[0]}" if len(files) == 1 else "separating", len(paths)) as progress:
         for outcome in separate_files(paths, read, run, write):
-            done += outcome.last
-            progress.update(done)
+            if outcome.source not in seen:
+                seen.append(outcome.source)
+            progress.update(len(seen) - 1 + outcome.last)  # of videos, the number of frames may be a guess
             failures += _report(outcome)
     if failures:
         sys.exit(2)

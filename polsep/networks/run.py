@@ -4,9 +4,10 @@ Frames are turned into the order of filters that the network was trained on (`or
 rows where they are large (`strips`), and turned back. Twin on CPUs: `engines`.
 
 On GPUs, layers run in float16, whose 11 bits lose nothing: the noise that they add is 60 dB below white and more, and
-bfloat16 adds ten times as much (tests/test_gpu.py measures both). The closed form and all that makes images of features
-stay in float32. Where the environment variable POLSEP_COMPILE is 1, torch compiles networks and replays them as CUDA
-graphs: minutes at first, for streams of frames of one size.
+bfloat16 adds ten times as much (tests/test_gpu.py measures both). The closed form and all that makes images of
+features stay in float32, or in TF32 where torch's own settings allow it. Where the environment variable
+POLSEP_COMPILE is 1, torch compiles networks and replays them as CUDA graphs: minutes at first, for streams of frames
+of one size.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 
@@ -82,28 +83,16 @@ def _run_turned(network: Joint, mosaic: Mosaic, orientation: Orientation, full: 
     raw, clipped = (orientation.turn(x) for x in (mosaic.linear().float(), mosaic.clipped()))
     batch, (height, width) = raw.shape[:-2], raw.shape[-2:]
     raw, clipped = (x.reshape(-1, 1, height, width) for x in (raw, clipped))
-    parts, margin = [], margin_of(network.size)
-    with all_bits():
-        thumbnail = network.thumbnail(raw, clipped)
-        for first, last in cut_rows((height, width), network.size, full):
-            top, bottom = max(first - margin, 0), min(last + margin, height)
-            strip = (raw[..., top:bottom, :], clipped[..., top:bottom, :])
-            images = _run_layers(network, strip, thumbnail, full)
-            parts.append([_rows(x, (first - top, last - top), bottom - top) for x in images])
+    parts, thumbnail = [], network.thumbnail(raw, clipped)
+    margin = margin_of(network.size)
+    for first, last in cut_rows((height, width), network.size, full):
+        top, bottom = max(first - margin, 0), min(last + margin, height)
+        strip = (raw[..., top:bottom, :], clipped[..., top:bottom, :])
+        images = _run_layers(network, strip, thumbnail, full)
+        parts.append([_rows(x, (first - top, last - top), bottom - top) for x in images])
     joined = (torch.cat(strips, dim=-2) for strips in zip(*parts, strict=True))
     images = [image.reshape(*batch, *image.shape[1:]) for image in joined]
     return _as_separation(images, cells_near_clipping(clipped).reshape(*batch, 2, height // 2, width // 2), orientation)
-
-
-@contextmanager
-def all_bits() -> Iterator[None]:
-    """Convolutions of float32 in all of its bits: torch's default on GPUs, TF32, has 11 of 24."""
-    before = torch.backends.cudnn.allow_tf32
-    torch.backends.cudnn.allow_tf32 = False
-    try:
-        yield
-    finally:
-        torch.backends.cudnn.allow_tf32 = before
 
 
 def _halve(separation: Separation) -> Separation:

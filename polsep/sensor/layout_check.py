@@ -248,7 +248,7 @@ def _upright(mosaic: Mosaic) -> str | None:
 
 
 def _across(mosaic: Mosaic) -> str | None:
-    """A warning of a colour frame whose AoLP is 90 degrees off; `_upright` speaks of whole frames that stand."""
+    """A warning of a colour frame whose AoLP is 90 degrees off; whole frames that stand are `_upright`'s."""
     layout = mosaic.layout
     if mosaic.data.shape[-2:] in SENSOR_SIZES or not lies_across(mosaic):
         return None

@@ -377,7 +377,7 @@ class Events:
         if place is None or found is None:
             return HINT
         if session.place != found.index:
-            return PAUSE
+            return PAUSE if session.playing else HINT
         pairs = [(found, session.makers[0] if other is not None else ""), (other, session.makers[1])]
         tables = []
         for frame, maker in pairs:

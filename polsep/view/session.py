@@ -113,7 +113,7 @@ class Session:
         made, other = [(sources, settings, found)], None
         if against is not None:
             other = found if against == settings else self._find(sources, against)
-            made.append((sources, against, other))
+            made += [(sources, against, other)] if other is not found else []
         with self.lock:
             if self._sources is not sources or not wanted():
                 raise Superseded

@@ -37,6 +37,7 @@ export function colorSpecular(images, mosaic, light, sums) {
     share = mean(found.map((v) => +(v > 0.5))) >= MIN_SHARE ? found : null;
     if (!share) report.colored_specular = 0;
   }
+  const all = share ? sum(diffuse) + sum(specular) : 0;
   if (share) metallic(images, seen, share, retained);
   else if (retained)
     for (let k = 0; k < diffuse.length; k++) {
@@ -45,6 +46,7 @@ export function colorSpecular(images, mosaic, light, sums) {
     }
   Object.assign(report, { retained_polarization: retained, lamp_dolp: 1 / (1 + unpolarized) });
   sums.specular += (sum(specular) - before) / 3;
+  if (share) sums.s0 += (sum(diffuse) + sum(specular) - all) / 3; // all light of metals is what their polarization says
   sums.valid = sum(valid);
   const remark = unpolarized && `a fully polarized lamp was expected, found one of ${Math.round(100 / (1 + unpolarized))}%: what ` +
     "its highlights leave in the diffuse image was moved to the specular one; a better polarizer before the lamp separates more";

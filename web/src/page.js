@@ -9,10 +9,12 @@ const part = (id) => document.getElementById(id);
 const options = new URLSearchParams(location.search);
 const worker = new Worker(new URL("worker.js", location.href), { type: "module" });
 const viewer = new Viewer(part("stage"), part("canvas"), part("handle"), showScale);
+/** Settings that describe a file. */
+const OF_FILES = ["black", "white", "sensor", "layout", "light"];
 // name: of the images shown; frame: name of the frame that the worker holds, once there is one; pending: the file that is
-// being read, or whose format is asked for; subject: name of the file at work.
+// being read, or whose format is asked for; subject: name of the file at work; kept: settings of the frame meanwhile.
 const state = {
-  images: null, report: null, gain: 1, name: "", frame: "", pending: null,
+  images: null, report: null, gain: 1, name: "", frame: "", pending: null, kept: null,
   subject: "", busy: false, again: false, next: null,
 };
 
@@ -80,6 +82,7 @@ async function work(act, subject) {
 }
 
 async function read(file, stated, white) {
+  if (!stated && state.kept) restoreSettings(); // the file whose format was asked for is dropped
   state.pending = file;
   document.body.dataset.state = "busy";
   part("raw").hidden = !stated;
@@ -88,11 +91,19 @@ async function read(file, stated, white) {
     if (!stated) state.pending = null;  // else the format can be put right
     throw error;
   });
+  if (found.needsFormat && state.frame) state.kept = Object.fromEntries(OF_FILES.map((id) => [id, part(id).value]));
   if (!stated && (state.frame || white)) beginSettings(white);
   if (found.needsFormat) return askFormat(found);
-  Object.assign(state, { pending: null, frame: file.name });
+  Object.assign(state, { pending: null, frame: file.name, kept: null });
   part("raw").hidden = true;
   await separateOpen();
+}
+
+/** The settings of the frame that is shown, as they were before another file asked for its format. */
+function restoreSettings() {
+  for (const [id, value] of Object.entries(state.kept)) part(id).value = value;
+  state.kept = null;
+  showFields();
 }
 
 /** The settings that describe a file, as the page begins with them: another file has others. */

@@ -450,7 +450,7 @@ def test_the_lamp_of_a_separated_file_is_read_beside_it(run: Cli, tmp_path: Path
     np.testing.assert_allclose(planes[1]["normal.X"], planes[0]["normal.X"], atol=1e-3)
     (tmp_path / "tinted.json").unlink()
     alone = run(tmp_path / "tinted.exr", "-o", tmp_path / "other", "--mesh", "none")
-    assert alone.status == 0 and "colour is not known" in alone.err
+    assert alone.status == 0 and "colour is not told, nor known" in alone.err
 
 
 @pytest.mark.parametrize("beside", ["nothing", "another colour"])

@@ -82,10 +82,14 @@ def separated(codes: Any, **said: Any) -> Any:
 
 
 def set_slider(page: Any, part: str, value: float) -> None:
-    """Type a number beside a slider."""
+    """Type a number beside a slider; once more where the slider, just unfolded, takes its own value again."""
     field = page.locator(f"#{part} input[type=number]")
-    field.fill(f"{value:g}")
-    field.press("Enter")
+    for _ in range(10):
+        field.fill(f"{value:g}")
+        field.press("Enter")
+        page.wait_for_timeout(150)
+        if float(field.input_value() or "nan") == float(f"{value:g}"):
+            break
 
 
 def fetch(page: Any, kind: str, folder: Path) -> Path:

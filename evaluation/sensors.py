@@ -86,7 +86,7 @@ def _before_bad_sensor(stage: Stage) -> dict[str, Frame]:
     known: list[dict[str, Any]] = [{"black_level": BAD.black * WORN.white_level}]
     known += [{"calibration": one} for one in (dark, flat, measure_analysers(turned, flat))]
     white = {"light_color": (1.0, 1.0, 1.0)}
-    return {f"bad sensor: {name}": replace(frame, told=white | told) for name, told in zip(KNOWN, known, strict=True)}
+    return {f"worn sensor: {name}": replace(frame, told=white | told) for name, told in zip(KNOWN, known, strict=True)}
 
 
 def _under_lamp(stage: Stage) -> dict[str, Frame]:

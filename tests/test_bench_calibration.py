@@ -141,6 +141,6 @@ def test_calibrations_win_what_the_sensor_lost(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(sensors, "SIDE", 192)
     monkeypatch.setattr(sensors, "METHODS", ("analytic",))
     rows = {row.case: row.value for row in sensors.bench_sensors_quick() if row.metric == "diffuse loss"}
-    before, dark, flat, all_of_it = (rows[f"bad sensor: {known}"] for known in sensors.KNOWN)
+    before, dark, flat, all_of_it = (rows[f"worn sensor: {known}"] for known in sensors.KNOWN)
     assert before > 1 and dark > 1 and abs(flat) < 0.7 and abs(all_of_it) < 0.7
     assert abs(rows["daylight lamp: light"]) < 0.3

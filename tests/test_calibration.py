@@ -39,6 +39,7 @@ from polsep.sensor.calibration import (
     subtract_ambient,
 )
 from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.exposure import histogram
 
 SIZE = (128, 160)
 WHITE = 4095.0
@@ -326,6 +327,13 @@ def test_ambient_light_is_subtracted() -> None:
 
     less = subtract_ambient(frame(lamp + room), mean_mosaic([frame(room * k) for k in (0.8, 0.9, 1.1, 1.2)]))
     np.testing.assert_allclose(less.data.numpy(), lamp + LEVEL, atol=1e-3)
+
+
+def test_histograms_are_of_raw_samples() -> None:
+    """The colour of a calibrated lamp moves no sample toward white."""
+    mosaic = Mosaic(torch.full(SIZE, 2000.0), Layout(), 0.0, WHITE)
+    lit = replace(mosaic, light_color=(0.5, 1.0, 0.7))
+    np.testing.assert_array_equal(histogram(lit).shares, histogram(mosaic).shares)
 
 
 def test_a_mean_takes_frames_one_at_a_time() -> None:

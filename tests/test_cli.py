@@ -25,13 +25,14 @@ import torch
 from numpy.typing import NDArray
 from test_bad_input import FILES
 
-from polsep import cli
+from polsep import batch, cli
 from polsep.cli.app import has_extra, print_note
 from polsep.cli.progress import Progress
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.separation_writer import FORMATS, LAYERS
 from polsep.methods import BEST, METHODS
+from polsep.networks.engines import ENGINES
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import IDEAL, Layout, expose
 from polsep.shipped import NAMES
@@ -274,6 +275,22 @@ def test_folders_are_separated(tmp_path: Path, polsep: Cli) -> None:
     assert_refused(polsep("separate", tmp_path / "none", "-o", tmp_path / "o"), "expected a folder of frames")
     run = polsep("separate", tmp_path / "none", png(tmp_path / "good.png", frame()), "-o", tmp_path / "beside")
     assert run.status == 2 and "expected a folder of frames" in run.err and (tmp_path / "beside" / "good.exr").exists()
+
+
+def test_memory_of_networks_is_given_back_before_the_last_frame_is_written(
+    tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not before others are, which use it again."""
+    idle, write = [], batch.write_separation
+
+    def noting(*arguments: Any, **options: Any) -> Any:
+        idle.append(len(ENGINES._idle))
+        return write(*arguments, **options)
+
+    monkeypatch.setattr(batch, "write_separation", noting)
+    files = [png(tmp_path / f"{name}.png", frame()) for name in "ab"]
+    assert polsep("separate", *files, "-o", tmp_path / "o", "--method", "joint-fast").status == 0
+    assert idle[0] > 0 == idle[1]
 
 
 def test_a_frame_that_fails_ends_its_file(tmp_path: Path, polsep: Cli) -> None:

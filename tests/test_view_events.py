@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 from test_view import mosaic_codes, opened, png, upload
+from test_view_sequences import sessions
 
 from polsep.edit import Metallic, Recipe, Rougher
-from polsep.io.store.temporary import make_temporary_folders, remove_folder
 from polsep.view.components import MENDS, OF_FILES, PAUSE, SAME, Components, Start, Updates
 from polsep.view.edits import list_controls
 from polsep.view.images import KINDS
@@ -26,6 +26,7 @@ from polsep.view.opening import parse_against, parse_settings
 from polsep.view.session import DOWNLOADS, Session
 from polsep.view.sessions import Sessions
 
+__all__ = ["sessions"]  # fixtures
 GRADIO = importlib.util.find_spec("gradio") is not None
 pytestmark = pytest.mark.skipif(not GRADIO, reason="needs the extra view")
 if GRADIO:
@@ -58,16 +59,6 @@ def components() -> Components:
         fetch={kind: kind for kind in DOWNLOADS},
         **{name: name for name in plain.split()},
     )
-
-
-@pytest.fixture
-def sessions() -> Iterator[Sessions]:
-    """No page open yet; afterwards, nothing is left to be made."""
-    scratch = make_temporary_folders()
-    made = Sessions(scratch, 10 << 20)
-    yield made
-    made.close()
-    remove_folder(scratch.root)
 
 
 @pytest.fixture

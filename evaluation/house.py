@@ -136,7 +136,8 @@ def house(repo: Path, case: str, output: Path) -> None:
     for row in rows:
         print(f"{row.method:8} {row.metric:56} {row.value:10.4g} {row.unit}")
     path, tables = output / "house.jsonl", dict[str, list[dict[str, Any]]]()
-    commit = run(repo, "git", "rev-parse", "--short", "HEAD").strip()
+    changed = run(repo, "git", "status", "--porcelain", "--untracked-files=no", "--", "polsep", "evaluation", "tests")
+    commit = run(repo, "git", "rev-parse", "--short", "HEAD").strip() + ("+" if changed else "")
     made_by = provenance(f"python -m evaluation house --case {case}") | {"commit": commit}
     for old in read_rows(path) if path.is_file() else ():
         tables.setdefault(old["method"], []).append(old)

@@ -53,7 +53,12 @@ def bench_repeats(data: Path) -> Iterator[Row]:
 
 
 def train(network: str, seed: int) -> Path:
-    """Train a network, or go on with it, and return the file of its weights; those of older recipes are left alone."""
+    """Train a network, or go on with it, and return the file of its weights; those of older recipes are left alone.
+
+    Raises ValueError on changes that are not committed: their weights would count as the commit's.
+    """
+    if ask_git("status", "--porcelain", "--untracked-files=no", "--", *TRAINED_BY):
+        raise ValueError("expected a commit of the code that trains, found changes that are not committed")
     folder = FOLDER / (ask_git("log", "-1", "--format=%h", "--", *TRAINED_BY) or "unknown") / f"{network}-{seed}"
     path = folder / f"{network}-{MOSAIC}.safetensors"
     if not path.is_file():

@@ -118,7 +118,9 @@ class _BadSensor:
         """A frame of light ``[3, H, W]``."""
         self._seed += 1
         mosaic = record(light * self._falloff, Layout(), WORN, self._errors, self._seed if seed is None else seed)
-        return replace(mosaic, data=torch.round(mosaic.data + self._pattern).clamp(0, WORN.white_level))
+        codes = torch.round(mosaic.data + self._pattern).clamp(0, WORN.white_level)
+        # The pattern is there before the codes are made: what saturates is white, whatever the pattern adds.
+        return replace(mosaic, data=torch.where(mosaic.data >= WORN.white_level, mosaic.data, codes))
 
     def even(self, level: float, turn: float | None) -> Mosaic:
         """A frame of even light: unpolarized, or behind a polarizer with its axis at ``turn`` [rad]."""

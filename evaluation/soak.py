@@ -21,7 +21,7 @@ import numpy as np
 
 import polsep
 from evaluation.faults import Contents, read_contents
-from polsep.bench.rows import Row, replace_rows
+from polsep.bench.rows import Row, read_commit, replace_rows
 from polsep.compute.arrays import to_numpy
 from polsep.compute.workers import keep_memory
 from polsep.io.raw.frames import ReadOptions, read_frames
@@ -106,6 +106,12 @@ def soak(minutes: float, recording: Path | None, white_level: float, output: Pat
     Rows are written every ten minutes, so that a run that is stopped has some.
     """
     keep_memory()
+    begun = read_commit()
+
+    def say(seconds: float) -> str:  # what was played, which may be less than was asked for
+        levels = "" if white_level == 4095 else f" --white-level {white_level:g}"
+        return f"python -m evaluation soak --minutes {seconds / 60:.0f}{levels}"
+
     passes, others, start, written = list[Pass](), 0, time.monotonic(), 0.0
     with tempfile.TemporaryDirectory() as scratch:
         if recording is None:
@@ -119,16 +125,16 @@ def soak(minutes: float, recording: Path | None, white_level: float, output: Pat
             elapsed = time.monotonic() - start
             if elapsed - written >= 600:
                 written = elapsed
-                _save(recording.name, passes, others, elapsed, output)
-    rows = _save(recording.name, passes, others, time.monotonic() - start, output)
+                _save(list(soak_rows(recording.name, passes, others, elapsed)), say(elapsed), output, begun)
+    played = time.monotonic() - start
+    rows = _save(list(soak_rows(recording.name, passes, others, played)), say(played), output, begun)
     if grown := find_growth(rows):
         print(f"grown or changed: {', '.join(grown)}")
         raise SystemExit(1)
 
 
-def _save(case: str, passes: Sequence[Pass], others: int, seconds: float, output: Path) -> list[Row]:
-    """Print and write the rows so far; the time is what was played, which may be less than was asked for."""
-    rows = list(soak_rows(case, passes, others, seconds))
+def _save(rows: list[Row], command: str, output: Path, begun: str) -> list[Row]:
+    """Print and write the rows so far."""
     print("; ".join(f"{row.metric} {row.value:.4g} {row.unit}".strip() for row in rows), flush=True)
-    replace_rows(output, "reliability", rows, f"python -m evaluation soak --minutes {seconds / 60:.0f}")
+    replace_rows(output, "reliability", rows, command, begun)
     return rows

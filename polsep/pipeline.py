@@ -298,7 +298,7 @@ def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[
     from polsep.io.results.separation_reader import read_separated
     from polsep.io.results.sidecars import read_report
 
-    frame = replace(read_separated(path), report=read_report(path.with_suffix(".json")))
+    frame = replace(read_separated(path), report=read_report(path))
     notes = list(frame.report.get("warnings", ()))
     if not is_to_be_found(light_color):
         frame.report["light_color"] = told_gains(light_color, frame.diffuse.shape[-1])

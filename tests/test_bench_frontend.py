@@ -149,7 +149,7 @@ def test_failing_program_is_one_line() -> None:
 def test_tables_of_parts(tmp_path: Path) -> None:
     """A table takes the rows of its part, turned where asked; without results it says what makes them."""
     markdown = "<!-- table: a/x by method -->\n<!-- end -->\n"
-    assert "Not measured yet: `polsep bench a`." in fill_tables(markdown, tmp_path)
+    assert "Not measured yet: `a` of `polsep bench`" in fill_tables(markdown, tmp_path)
     rows = [
         Row("a/x", "case", "m", "diffuse PSNR", 30.0, "dB"),
         Row("a/x", "case", "m", "specular PSNR", 31.0, "dB"),
@@ -161,4 +161,4 @@ def test_tables_of_parts(tmp_path: Path) -> None:
     assert "| case | method | diffuse / specular PSNR [dB] |\n| --- | --- | --- |\n| case | m | 30 / 31 |" in filled
     assert fill_tables(filled, tmp_path) == filled
     assert "| n |" not in filled
-    assert "Not measured yet: `polsep bench a`." in fill_tables(markdown.replace("a/x", "a/z"), tmp_path)
+    assert "Not measured yet: `a` of `polsep bench`" in fill_tables(markdown.replace("a/x", "a/z"), tmp_path)

@@ -370,4 +370,4 @@ def test_readme_fills_all_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         (tmp_path / page).write_text("<!-- table: paper/costs -->\n<!-- end -->\n", encoding="utf-8")
     app(["bench", "readme"], standalone_mode=False)
     for page in ("README.md", "docs/joint.md", "docs/paper.md"):
-        assert "Not measured yet: `polsep bench paper`." in (tmp_path / page).read_text(encoding="utf-8")
+        assert "Not measured yet: `paper` of `polsep bench`" in (tmp_path / page).read_text(encoding="utf-8")

@@ -25,6 +25,7 @@ from polsep.calibrate.lamp import measure_lamp
 from polsep.calibrate.statistics import robust_deviation, robust_mean
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration, write_calibration
 from polsep.sensor.calibration import (
     Analyser,
@@ -454,6 +455,32 @@ def test_an_ambient_frame_with_the_lamp_on_is_said() -> None:
 
     assert said(scene) and said(scene + np.uint16(9))
     assert not said(scene // 2) and not said(scene // 10) and not said(np.zeros_like(scene))
+
+
+def test_maps_replace_no_file_of_something_else(tmp_path: Path) -> None:
+    """Raw frames in rig.npz stay when rig.json is written, with maps and without; maps of before do not."""
+    sensor, rig, maps = BadSensor(Layout()), tmp_path / "rig.json", tmp_path / "rig.npz"
+    plain = replace(sensor.calibration(), dead=None, black_map=None, gain_map=None)
+    maps.write_bytes(b"frames")
+    for calibration in (plain, sensor.calibration()):
+        with pytest.raises(OutputError, match=r"expected no .*rig\.npz"):
+            write_calibration(rig, calibration, "0")
+        assert maps.read_bytes() == b"frames" and not rig.exists()
+    maps.unlink()
+    write_calibration(rig, sensor.calibration(), "0")
+    assert maps.exists()
+    write_calibration(rig, plain, "0")
+    assert not maps.exists()
+
+
+def test_an_ambient_folder_is_read_again_when_its_files_change(tmp_path: Path) -> None:
+    """A file that is written anew leaves the folder's own time as it was."""
+    codes = np.full((16, 16), 10, np.uint8)
+    for value in (10, 90):
+        np.save(tmp_path / "room.npy", np.full_like(codes, value))
+        read = with_corrections(ReadOptions(), None, [tmp_path])
+        assert read.corrections is not None and read.corrections.ambient is not None
+        assert float(read.corrections.ambient.data.mean()) == value
 
 
 def test_recordings_are_corrected(tmp_path: Path) -> None:

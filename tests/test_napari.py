@@ -127,7 +127,7 @@ def test_a_file_without_a_report_is_read(folder: Path, tmp_path: Path) -> None:
     assert all("scale" not in shown for _, shown, _ in plain)
     for text in ("{", "[]", '{"report": 3}'):
         path.with_suffix(".json").write_text(text)
-        assert read_report(path.with_suffix(".json")) == {}
+        assert read_report(path) == {}
 
 
 def test_several_files_are_a_stack(folder: Path) -> None:

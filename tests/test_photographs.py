@@ -304,6 +304,8 @@ def test_stacks_of_four_angles_are_read_as_such(tmp_path: Path, pages: str) -> N
         (["--parallel", "p.tif"], "expected --parallel and --crossed together"),
         (["--parallel", "p.tif", "--crossed", "c.tif", "x.tif"], "expected two photographs"),
         (["--parallel", "p.tif", "--crossed", "no.tif"], "no.tif: expected a file, found nothing"),
+        (["--parallel", "p.tif", "--crossed", "cut.png"], "cut.png: expected a PNG header"),
+        (["--angles", "unknown", "film.mp4"], "film.mp4: expected lossless RGB or grey, or --encoding srgb"),
         (["--parallel", "p.tif", "--crossed", "small.tif"], "expected photographs of one size and type"),
         (["--parallel", "p.tif", "--crossed", "c.tif", "--method", "joint"], "two crossed photographs"),
         (["--parallel", "p.tif", "--crossed", "c.tif", "--layout", "mono"], "photographs without --layout"),
@@ -327,6 +329,13 @@ def test_wrong_photographs_get_one_line(
     for name, image in (("p", photograph(0)), ("c", photograph(90)), ("x", photograph(45))):
         write_tiff(Path(f"{name}.tif"), image)
     write_tiff(Path("small.tif"), photograph(90)[:, 1:])
+    Path("cut.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    av = pytest.importorskip("av")
+    with av.open("film.mp4", "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+        container.mux(stream.encode(av.VideoFrame(64, 64, "yuv420p")))
+        container.mux(stream.encode())
     aligned = ["--align", "none"] if "--angles" in words or "--parallel" in words else []
     assert_refused(polsep("separate", *words, *aligned, "-o", "o"), said)
     assert not Path("o").exists()

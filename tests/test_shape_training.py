@@ -33,7 +33,7 @@ def test_a_stopped_training_goes_on(tmp_path: Path) -> None:
     """Two steps and then two are four; the file says how it came about; examples are made once."""
     folder = tmp_path / "examples"
     whole = train_shape(OPTIONS, Run(tmp_path / "whole", schedule=SCHEDULE), folder, lambda _: None)
-    made = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    made = {path: path.stat().st_mtime_ns for path in folder.glob("*.npy")}
     part = Run(tmp_path / "part", schedule=SCHEDULE, until=2)
     train_shape(OPTIONS, part, folder, lambda _: None)
     resumed = train_shape(OPTIONS, replace(part, until=None), folder, lambda _: None)
@@ -41,7 +41,7 @@ def test_a_stopped_training_goes_on(tmp_path: Path) -> None:
     assert first[0].keys() == second[0].keys()
     for array in first[0]:
         np.testing.assert_array_equal(first[0][array], second[0][array], err_msg=array)
-    assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == made and len(made) == 3
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("*.npy")} == made and len(made) == 3
     facts = second[1]
     assert (facts["method"], facts["input"], facts["steps"], facts["side"]) == ("shape", "separated", "4", "32")
     assert facts["command"].startswith("polsep train shape --input separated --width 2 ")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import random
@@ -34,6 +35,7 @@ from polsep.io.results.exr import half_rows, read_exr_layers, zip_rows
 from polsep.io.results.pixels_kernel import CHUNK, HEAD
 from polsep.io.results.sequences import FILM_WHITE, PART, Picture, SequenceKind, SequenceWriter, write_exr
 from polsep.io.store.atomic import OutputError
+from polsep.io.store.errors import InputError
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
 from polsep.sensor.camera import IDEAL, Layout, expose
@@ -181,6 +183,19 @@ def test_files_hold_half_floats(colors: int, compression: str, tmp_path: Path) -
         assert layers[name].dtype == np.float16
         np.testing.assert_array_equal(layers[name], plane)
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+@pytest.mark.parametrize("colors", [1, 3])
+@pytest.mark.parametrize("compression", ["none", "zip", "piz"])
+def test_every_channel_has_its_own_name(colors: int, compression: str, tmp_path: Path) -> None:
+    """Stokes layers and the layer without a name, too: in mono, Y lies behind S0, in colour B before it."""
+    images = np.random.default_rng(3).random((5, 7, 5, colors), np.float32)
+    write_exr(tmp_path / "a.exr", Picture(images[0], images[1], None, {}, stokes=images[2:]), compression)
+    layers = read_exr_layers(tmp_path / "a.exr")
+    named = {"S0.": images[2], "S1.": images[3], "S2.": images[4], "": images[0] + images[1], "diffuse.": images[0]}
+    for name, image in named.items():
+        for k, color in enumerate("RGB" if colors == 3 else "Y"):
+            np.testing.assert_array_equal(layers[f"{name}{color}"], image[..., k].astype(np.float16))
 
 
 def test_half_floats_are_rounded_to_even() -> None:
@@ -461,6 +476,87 @@ def test_damage_in_the_middle_of_a_film_costs_its_frame_only(tmp_path: Path) -> 
         if isinstance(frame, Frame):
             np.testing.assert_array_equal(frame.data.data, frames()[frame.index])
     assert [frame.index for frame in seen] == list(range(FRAMES))
+
+
+class Pipe(io.RawIOBase):
+    """Takes bytes and cannot go back."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        self.data += data
+        return len(data)
+
+
+def piped_film(images: NDArray[np.uint16], between: int) -> bytearray:
+    """A film whose file does not say how long it is, with a key frame after every ``between`` frames."""
+    pipe = Pipe()
+    with av.open(pipe, "w", format="matroska") as container:
+        stream: Any = container.add_stream("ffv1", rate=50)
+        stream.height, stream.width, stream.pix_fmt = images.shape[1], images.shape[2], "gray12le"
+        stream.options = {"level": "3", "slicecrc": "1", "g": str(between)}
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray12le")))
+        container.mux(stream.encode())
+    return pipe.data
+
+
+@pytest.mark.parametrize("between", [1, 12])
+def test_films_of_unknown_length_are_read_to_their_end(between: int, tmp_path: Path) -> None:
+    """From any frame on, behind a damaged one, and where the file is cut off."""
+    path, data = tmp_path / "run.mkv", piped_film(frames(), between)
+    path.write_bytes(data)
+    film = open_sequence(path, ReadOptions())
+    assert film.count < FRAMES
+    for first in (0, PART, FRAMES):
+        assert [frame.index for frame in film.begin(first)] == list(range(first, FRAMES))
+    place = len(data) // 50
+    path.write_bytes(data[:place] + bytes(255 - b for b in data[place : place + 8]) + data[place + 8 :])
+    seen = list(open_sequence(path, ReadOptions()).begin(0))
+    assert [frame.index for frame in seen] == list(range(FRAMES))
+    assert [frame.index for frame in seen if isinstance(frame, DamagedFrame)] == list(range(between))
+    path.write_bytes(data[: len(data) // 2])
+    cut = list(open_sequence(path, ReadOptions()).begin(0))
+    assert 1 < len(cut) < FRAMES and all(isinstance(frame, Frame) for frame in cut[:-1])
+
+
+def test_a_damaged_first_frame_is_one_of_many(tmp_path: Path) -> None:
+    codes = np.full((3, 12, 16), 0.5, np.float32)
+    codes[0, 3, 5] = np.nan
+    np.save(tmp_path / "run.npy", codes)
+    found = open_sequence(tmp_path / "run.npy", ReadOptions(pages="frames"))
+    kinds = [type(frame) for frame in found.begin(0)]
+    assert found.count == 3 and kinds == [DamagedFrame, Frame, Frame]
+    codes[:] = np.nan
+    np.save(tmp_path / "run.npy", codes)
+    with pytest.raises(InputError, match=r"run\.npy: expected finite values"):
+        open_sequence(tmp_path / "run.npy", ReadOptions(pages="frames"))
+
+
+def test_a_damaged_page_costs_its_four_angles_only(tmp_path: Path) -> None:
+    pages = np.full((12, 6, 6), 0.5, np.float32)
+    pages[5, 0, 0] = np.nan
+    np.save(tmp_path / "run.npy", pages)
+    seen = list(open_sequence(tmp_path / "run.npy", ReadOptions(pages="angles")).begin(0))
+    assert [(frame.index, type(frame)) for frame in seen] == [(0, Frame), (1, DamagedFrame), (2, Frame)]
+
+
+def test_results_of_other_commands_are_not_replaced_unasked(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Single frames and logs without a report of a recording beside them; a run that was stopped goes on."""
+    for name in (f"{recording.stem}_000002.exr", f"{recording.stem}.jsonl"):
+        folder = tmp_path / Path(name).suffix[1:]
+        folder.mkdir()
+        (folder / name).write_bytes(b"mine")
+        assert run(monkeypatch, *command(recording, folder, "--frames", "3")) == 2
+        assert f"expected no {folder / name}" in capsys.readouterr().err
+        assert contents(folder) == {name: b"mine"}
+        assert run(monkeypatch, *command(recording, folder, "--frames", "3", "--overwrite")) == 0
 
 
 def test_what_is_there_is_not_replaced_unasked(

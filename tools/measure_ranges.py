@@ -19,7 +19,7 @@ from polsep.networks.ranges import measure_ranges
 from polsep.sensor.camera import IMX250, Layout, Mosaic, expose
 from polsep.sensor.levels import as_mosaic
 
-#: Numbers of the objects; 'polsep bench reality' draws the first eight. Pixels along their frames' sides.
+#: Numbers of the objects; 'polsep bench reality' draws the first 24. Pixels along their frames' sides.
 STAGES, SIZE = range(100, 106), 512
 DISTURBANCES = ("white lamp", "tungsten", "room light 30 %", "clipped 5 %", "a tenth of the exposure", "metals")
 

@@ -18,7 +18,12 @@ TIMED = frozenset(("gpu", "rendering", "speed", "video", "view"))
 
 
 def ask_git(*arguments: str) -> str:
-    """The output of git in the folder that holds the package; "" where git or the repository is missing."""
+    """The output of git in the folder that holds the package; "" where git or a repository of polsep is missing.
+
+    A package that is installed inside the repository of something else has that repository around it, not its own.
+    """
+    if not (ROOT / ".git").exists():
+        return ""
     try:
         done = subprocess.run(["git", *arguments], capture_output=True, text=True, check=False, cwd=ROOT)
     except OSError:

@@ -13,7 +13,7 @@ from polsep.io.raw.corrections import read_mosaics
 from polsep.io.raw.frames import Frame, ReadOptions, forgets_level, read_frames, refuse_forgotten
 from polsep.io.raw.tiff import write_merged
 from polsep.io.store.atomic import refuse_existing, refuse_inputs, require_writable
-from polsep.io.store.calibrations import maps_path, read_calibration, write_calibration
+from polsep.io.store.calibrations import maps_path, read_calibration, refuse_foreign_maps, write_calibration
 from polsep.io.store.errors import input_error
 from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Mosaic
@@ -27,6 +27,7 @@ def calibrate_files(paths: Sequence[Path], read: ReadOptions, output: Path, kind
 
     Other sections of ``output`` stay, and those that come before in `ORDER` correct the frames. Raises ValueError.
     """
+    refuse_foreign_maps(output)
     refuse_inputs([output, maps_path(output)], paths)
     require_writable(output.parent)
     before = read_calibration(output) if output.exists() else None

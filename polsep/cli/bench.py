@@ -73,4 +73,5 @@ def _words(text: str | None, separator: str) -> tuple[str, ...]:
 def _evaluation_hint(name: str) -> str:
     """The command of a benchmark that is in ``evaluation``, outside the package."""
     known = "rendering sets joint ablations dynamic calibration material video geometry view gallery gallery_real paper"
+    known += " repeats sensors shape install web agreement warned"
     return f"; in a checkout of polsep: python -m evaluation {name}" if name in known.split() else ""

@@ -15,6 +15,12 @@ RUNGS = (
     *("joint-large", "joint", "joint-fast", "material", "shape"),
     *("paper", "unpolarized", "polarized", "shared", "signed", "no-angle", "stokes"),
 )
+_JOINT, _FROM_FOLDER, _LADDER = RUNGS[:3], RUNGS[3:5], RUNGS[5:]
+#: Options that only some rungs have, and those rungs.
+OWN: dict[str, tuple[str, ...]] = dict.fromkeys(("data", "looks", "workers", "constants"), (*_JOINT, *_LADDER))
+OWN |= dict.fromkeys(("levels", "fold"), _LADDER) | dict.fromkeys(("blocks", "entry", "ablation"), _JOINT)
+OWN |= dict.fromkeys(("seen", "examples", "folder", "until"), _FROM_FOLDER)
+OWN |= {"part": (*_JOINT, "shape"), "side": ("shape",), "cues": ("material",)}
 
 
 @app.command()
@@ -106,6 +112,7 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     polsep train material --input separated --steps 2000 -o runs/separated
     polsep train shape --steps 5000 -o runs/shape
     """
+    refuse_foreign(rung)
     require_extra("train")
     require_paths(*options["start"])
     from polsep.io.store.atomic import require_writable
@@ -119,9 +126,7 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     from polsep.train.stream import StreamOptions
 
     shared = {name: options[name] for name in ("workers", "devices", "start", "refit")}
-    if rung in ("material", "shape"):
-        if options["constants"]:
-            raise ValueError(f"expected no --set with {rung}, found --set {options['constants'][0]}")
+    if rung in _FROM_FOLDER:
         folder = options["folder"] or output.parent / "examples"
         if rung == "material":
             material, schedule = choose_material(options | {"examples": options["examples"] or 768})
@@ -139,6 +144,16 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
         run = Run(output, stream=stream, schedule=schedule, **shared)
         path = train_weights(network, plan_run(run, network), _print_log)
     print(path)
+
+
+def refuse_foreign(rung: str) -> None:
+    """Raise ValueError on an option that was given and is none of a rung: it would change nothing."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        rungs = OWN.get(parameter.name or "", RUNGS)
+        given = context.get_parameter_source(parameter.name or "") == click.core.ParameterSource.COMMANDLINE
+        if given and rung not in rungs:
+            raise ValueError(f"expected {parameter.opts[0]} with {', '.join(rungs)}, found it with {rung}")
 
 
 def _print_log(line: dict[str, Any]) -> None:

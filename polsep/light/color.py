@@ -42,7 +42,6 @@ SPREAD = 0.5
 STEPS, LARGEST_STEP, LAST_STEP = 15, 0.4, 3e-4
 #: Largest k.
 MAX_K = 0.4
-#: Groups of tiles along each axis, left out in turn to see how much a fit depends on them.
 
 #: Rows: two directions beside grey. Derivative of a colour by the log-ratios.
 _BESIDE = np.array([[1.0, -1, 0], [1, 1, -2]]) / np.sqrt(np.array([[2.0], [6.0]]))

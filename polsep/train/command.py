@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from polsep.io.store.weights import read_weights, write_weights
+from polsep.io.store.weights import write_weights
 from polsep.networks.joint import Demosaicker
 from polsep.networks.rungs import RUNGS
 from polsep.networks.sizes import ResidualSize, Size
@@ -30,7 +30,7 @@ from polsep.train.joint_task import (
     joint_task,
 )
 from polsep.train.log import curve_of, read_log, references_of
-from polsep.train.loop import Run, train
+from polsep.train.loop import Run, hash_starts, train
 from polsep.train.tasks import VARIANTS, Task, find, ladder_task
 from polsep.train.validation import score, score_averaged, validation_batches
 
@@ -188,11 +188,6 @@ def describe_command(options: Options, run: Run) -> str:
     for name, values in run.stream.constants:
         words += ["--set", f"{name}={','.join(f'{value:g}' for value in values)}"]
     return shlex.join(["polsep", "train", options.name, *words, *describe_start(run)])
-
-
-def hash_starts(run: Run) -> list[list[str]]:
-    """Name and sha256 of the tensors of every file that a training started from, as `read_weights` checks it."""
-    return [[path.name, read_weights(path)[1]["sha256"]] for path in run.start]
 
 
 def describe_start(run: Run) -> list[str]:

@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shlex
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 
+from polsep.io.store.atomic import replace_text
 from polsep.io.store.weights import write_weights
 from polsep.networks.unet import count_parameters
-from polsep.train.command import check_run, describe_start, hash_starts
+from polsep.train.command import check_run, describe_start
+from polsep.train.digest import digest_examples
 from polsep.train.log import read_log
-from polsep.train.loop import Run, Training, run_training
+from polsep.train.loop import Run, Training, hash_starts, run_training
 
 
 class Recipe(NamedTuple):
     """A training of a ``method`` with its ``options``, a dataclass with ``input``, ``size``, ``seed`` and ``examples``.
 
-    ``make`` makes the examples that are missing, and the training; ``data``: digest of the examples; ``words``: options
-    of the command line besides those that both methods have; ``facts``: further metadata.
+    ``make`` makes the examples that are missing, and the training; ``data`` tells the digest of the examples then;
+    ``words``: options of the command line besides those that both methods have; ``facts``: further metadata.
     """
 
     method: str
     options: Any
     make: Callable[[], Training]
-    data: str
+    data: Callable[[], str]
     words: dict[str, object]
     facts: dict[str, str]
 
@@ -64,7 +67,7 @@ def train_recipe(recipe: Recipe, run: Run, report: Callable[[dict[str, Any]], No
         "parameters": str(count_parameters(network)),
         "schedule": json.dumps(asdict(run.schedule)),
         "options": json.dumps(asdict(options)),
-        "data": recipe.data,
+        "data": recipe.data(),
         "steps": str(run.last),
         "start": json.dumps(starts),
         "command": describe_recipe(recipe, run),
@@ -73,6 +76,39 @@ def train_recipe(recipe: Recipe, run: Run, report: Callable[[dict[str, Any]], No
     }
     write_weights(path, halves, metadata)
     return path
+
+
+@dataclass(frozen=True)
+class Makers:
+    """Digests of the code that made a folder's examples for a ``method``, one per line of a file in the folder.
+
+    Examples stay when the code changes; these lines say so. ``maker``: the module that makes them today.
+    """
+
+    folder: Path
+    method: str
+    maker: str
+
+    def note(self, paths: Iterable[Path]) -> None:
+        """Add today's code if it is to make any of the examples ``paths``; "unknown" made those that nobody noted."""
+        there, said = [path.is_file() for path in paths], self._lines()
+        lines = said or (["unknown"] if any(there) else [])
+        if not all(there):
+            lines = list(dict.fromkeys([*lines, digest_examples([], self.maker)]))
+        if lines != said:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            replace_text(self._path, "".join(f"{line}\n" for line in lines))
+
+    def digest(self, options: object) -> str:
+        """The sha256 of ``options`` and of all code that made the examples."""
+        return hashlib.sha256(json.dumps([options, self._lines()]).encode()).hexdigest()
+
+    @property
+    def _path(self) -> Path:
+        return self.folder / f"{self.method}-made-by.txt"
+
+    def _lines(self) -> list[str]:
+        return self._path.read_text("utf-8").split() if self._path.is_file() else []
 
 
 def describe_recipe(recipe: Recipe, run: Run) -> str:

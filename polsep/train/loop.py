@@ -197,13 +197,20 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
     return average if fabric.is_global_zero else None
 
 
+def hash_starts(run: Run) -> list[list[str]]:
+    """Name and sha256 of the tensors of every file that a training started from, as `read_weights` checks it."""
+    return [[path.name, read_weights(path)[1]["sha256"]] for path in run.start]
+
+
 def load_mean(paths: Sequence[Path], network: nn.Module) -> None:
     """Load the mean of files of weights, if any, into a network; those of smaller joint networks grow (`growth`).
 
     Raises ValueError on weights of another network.
     """
     mean: dict[str, Tensor] = {}
+    initial = {name: value.clone() for name, value in network.state_dict().items()}
     for count, path in enumerate(paths, start=1):
+        network.load_state_dict(initial)  # what a smaller network lacks is not to come from the file before
         tensors = {name: torch.from_numpy(array) for name, array in read_weights(path)[0].items()}
         try:
             network.load_state_dict(grow(tensors, network) if isinstance(network, Joint) else tensors)
@@ -227,7 +234,7 @@ def _describe(run: Run) -> str:
     described["stream"] |= {"constants": list(run.stream.constants)}
     if not run.stream.constants:
         del described["stream"]["constants"]
-    described |= {"start": [path.name for path in run.start]} if run.start else {}
+    described |= {"start": hash_starts(run)} if run.start else {}
     described |= {"refit": True} if run.refit else {}
     return json.dumps(described | {"workers": run.workers, "devices": run.devices})
 

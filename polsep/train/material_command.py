@@ -7,10 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from polsep.material.examples import make_examples
+from polsep.material.examples import example_path, make_examples
 from polsep.material.network import MaterialSize
-from polsep.train.digest import digest_examples
-from polsep.train.from_folder import Recipe, train_recipe
+from polsep.train.from_folder import Makers, Recipe, train_recipe
 from polsep.train.loop import Run, Schedule, Training
 from polsep.train.material_task import MaterialOptions, material_training
 
@@ -30,8 +29,12 @@ def choose_material(asked: dict[str, Any]) -> tuple[MaterialOptions, Schedule]:
 def train_material(options: MaterialOptions, run: Run, folder: Path, report: Callable[[dict[str, Any]], None]) -> Path:
     """`from_folder.train_recipe` on examples in a ``folder``, which are made where they are missing."""
 
+    makers = Makers(folder, "material", "polsep.material.examples")
+    sizes = {"train": options.examples, "validation": options.validation}
+
     def make() -> Training:
-        for split, count in (("train", options.examples), ("validation", options.validation)):
+        makers.note(example_path(folder, name, options.seed, k) for name in sizes for k in range(sizes[name]))
+        for split, count in sizes.items():
             for made in make_examples(folder, split, options.seed, count, options.views):
                 if made % 100 == 0:
                     report({f"{split} examples": made})
@@ -39,5 +42,4 @@ def train_material(options: MaterialOptions, run: Run, folder: Path, report: Cal
 
     counts = [options.seed, options.examples, options.views, options.validation]
     words: dict[str, object] = {"cues": ",".join(options.size.cues)} if options.size.cues else {}
-    data = digest_examples(counts, "polsep.material.examples")
-    return train_recipe(Recipe("material", options, make, data, words, {}), run, report)
+    return train_recipe(Recipe("material", options, make, lambda: makers.digest(counts), words, {}), run, report)

@@ -225,7 +225,8 @@ def shape_training(options: ShapeOptions, folder: Path) -> Training:
     network, name = options.network(), encoding_of(options.input)
 
     def paths(split: str, count: int) -> list[Path]:
-        found = sorted(folder.glob(f"shape-{split}-{options.seed}-*.npy"))[:count]
+        found = sorted(folder.glob(f"shape-{split}-{options.seed}-*.npy"))
+        found = [path for path in found if example_number(path) < count]
         if not found:
             raise ValueError(f"expected examples in {folder}, found none")
         return found

@@ -1,9 +1,9 @@
 """Textures, masks and normal maps that edits name, as files of any program.
 
-Textures in 8-bit PNG and JPEG are decoded from sRGB to linear light; 16-bit PNG and TIFF, EXR and NPY are linear
-already. Integers are scaled so that the largest of their bits is 1. JPEG is turned as its EXIF data say. Masks are
-never decoded. Normals in PNG and TIFF are 2 c - 1 for c in [0, 1] (x right, y up, z to the camera), in EXR and NPY the
-vectors themselves.
+The type of the samples decides, whatever the format. Textures of 8-bit integers are decoded from sRGB to linear light;
+16-bit integers and floats are linear already. Integers are scaled so that the largest of their bits is 1. JPEG is
+turned as its EXIF data say. Masks are never decoded. Normals (x right, y up, z to the camera) are 2 c - 1 for integers
+c in [0, 1]; floats are the vectors themselves.
 """
 
 from __future__ import annotations

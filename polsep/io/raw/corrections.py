@@ -8,7 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from polsep.io.raw.frames import Frame, ReadOptions, read_frames
-from polsep.io.raw.sequences import DamagedFrame, open_sequence
+from polsep.io.raw.sequences import DamagedFrame, input_files, open_sequence
 from polsep.io.store.calibrations import read_calibration
 from polsep.io.store.errors import InputError, input_error
 from polsep.sensor.calibration import Corrections, mean_mosaic
@@ -29,13 +29,14 @@ def with_corrections(read: ReadOptions, calibration: Path | None, ambient: Seque
     missing = [path for path in paths if not path.exists()]
     if missing:
         raise input_error(missing[0], "expected a file, found nothing at this path")
-    stamps = tuple(path.stat().st_mtime_ns for path in paths)
+    files = [file for path in paths for file in input_files(path)]
+    stamps = tuple((file, (found := file.stat()).st_mtime_ns, found.st_size) for file in files)
     return _read_corrected(read, calibration, tuple(ambient), stamps)
 
 
 @lru_cache(maxsize=4)  # viewers ask with every frame
 def _read_corrected(
-    read: ReadOptions, calibration: Path | None, ambient: tuple[Path, ...], stamps: tuple[int, ...]
+    read: ReadOptions, calibration: Path | None, ambient: tuple[Path, ...], stamps: tuple[tuple[Path, int, int], ...]
 ) -> ReadOptions:
     sources: dict[str, object] = {}
     measured = None if calibration is None else read_calibration(calibration)

@@ -159,7 +159,7 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
     elif options.pages == "frames":
         pages = read_pages(Path(path), options, first)
     elif options.pages == "angles":
-        pages = _group_angles(Path(path), options)
+        pages = _group_angles(Path(path), options, first)
     else:
         pages = _look_for_angles(Path(path), options, first)
     for page in pages:
@@ -282,12 +282,14 @@ def _noting_layout(page: Page, options: ReadOptions) -> Page:
     return replace(page, notes=(note,))
 
 
-def _group_angles(path: Path, options: ReadOptions) -> Iterator[Page]:
+def _group_angles(path: Path, options: ReadOptions, first: int) -> Iterator[Page]:
     """Every four pages of a file as one page of angles; pages that are angles already pass."""
     group: list[Page] = []
-    for page in read_pages(path, options):
+    for page in read_pages(path, options, 4 * first):
         if page.angles:
-            yield page
+            yield from read_pages(path, options, first)
+            return
+        if page.index < 4 * first:
             continue
         if page.count % 4:
             raise input_error(path, f"expected four pages for the angles 0, 45, 90, 135, found {page.count}")

@@ -25,7 +25,7 @@ from polsep.io.raw.frames import read_pages
 from polsep.io.raw.npy import stack_angles
 from polsep.io.raw.page import Page
 from polsep.io.raw.videos import load_library
-from polsep.io.store.errors import decoding, input_error, naming
+from polsep.io.store.errors import InputError, decoding, input_error, naming
 from polsep.io.store.header_checks import SAMPLES, limit, require_signature, require_size
 
 #: Most frames of a film that are used, evenly spaced: more of them add little and fill the memory.
@@ -164,10 +164,11 @@ def _read_film(path: Path, encoded: bool) -> list[Page]:
         with av.open(f"file:{path}", options={"max_pixels": str(limit(SAMPLES))}) as container:
             stream = container.streams.video[0]
             context = stream.codec_context
-            exact = context.codec.lossless and str(context.pix_fmt).startswith(("gray", "gbr", "rgb", "bgr"))
+            codec, pixels = context.codec, str(context.pix_fmt)
+            exact = codec.lossless and not codec.lossy and pixels.startswith(("gray", "gbr", "rgb", "bgr"))
             if not (exact or encoded):
                 kind = f"{context.pix_fmt} of {context.name}"
-                raise ValueError(f"expected lossless RGB or grey, or --encoding srgb for other films, found {kind}")
+                raise InputError(f"expected lossless RGB or grey, or --encoding srgb for other films, found {kind}")
             for index, frame in enumerate(islice(container.decode(stream), number)):
                 if index in wanted:
                     pages.append(Page(_as_codes(frame), len(pages), len(wanted)))

@@ -11,14 +11,18 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD, recording_files
-from polsep.io.store.errors import input_error, one_line
+from polsep.io.raw.videos import CONTAINERS
+from polsep.io.store.errors import InputError, input_error, one_line
 
 _NUMBER = re.compile(r"(\d+)")
+#: Most frames of a film between two key frames; damage may spoil all of them.
+KEY_FRAMES = 300
 
 
 @dataclass(frozen=True)
@@ -47,10 +51,12 @@ def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
     if path.is_dir():
         files = _frame_files(path)
         return FrameSequence(path.resolve().name, len(files), lambda first: _read_files(files, options, first))
-    start = next(read_frames(path, options), None)
-    if start is None:
-        raise input_error(path, "expected frames, found none")
-    return FrameSequence(output_stem(path), start.count, lambda first: _read_stack(path, options, first, start.count))
+    unread: str | None = None
+    for frame in _read_stack(path, options, 1, 0):
+        if isinstance(frame, Frame):
+            return FrameSequence(output_stem(path), frame.count, partial(_read_stack, path, options, frame.count))
+        unread = unread or frame.reason
+    raise input_error(path, "expected frames, found none") if unread is None else InputError(unread)
 
 
 def _frame_files(folder: Path) -> list[Path]:
@@ -124,14 +130,22 @@ def _read_files(files: list[Path], options: ReadOptions, first: int) -> Iterator
         yield replace(frames[0], index=index, count=len(files))
 
 
-def _read_stack(path: Path, options: ReadOptions, first: int, count: int) -> Iterator[Frame | DamagedFrame]:
-    """The frames of one file of about ``count`` from ``first`` on; reading starts anew behind a damaged one."""
-    while first < count:
+def _read_stack(path: Path, options: ReadOptions, count: int, first: int) -> Iterator[Frame | DamagedFrame]:
+    """The frames of one file of about ``count`` from ``first`` on; reading starts anew behind a damaged one.
+
+    It ends where the file does, as films need not say their length. Beyond ``count`` it gives up behind as many damaged
+    frames in turn as there may be before the next key frame.
+    """
+    patience, good = KEY_FRAMES if path.suffix.lower() in CONTAINERS else 1, first
+    while True:
         try:
             for frame in read_frames(path, options, first):
-                first, count = frame.index + 1, frame.count
+                good = first = frame.index + 1
+                count = frame.count
                 yield frame
             return
         except (ValueError, OSError) as error:
+            if first >= max(count, good + patience):
+                return
             yield DamagedFrame(first, one_line(error))
             first += 1

@@ -23,7 +23,7 @@ from polsep.io.store.quiet import mute
 #: FFmpeg's pixel formats that hold a mosaic: gray, gray10le, ...; the number of bits is 8 unless named.
 _GREY = re.compile(r"gray(\d*)(?:le|be)?")
 #: FFmpeg's name of each container. It would look for any, also for lists that name other files or addresses.
-_CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mov": "mov", ".nut": "nut"}
+CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mov": "mov", ".nut": "nut"}
 
 mute("libav")
 
@@ -43,7 +43,7 @@ def read_video(path: Path, first: int = 0) -> Iterator[Page]:
     av = load_library()
     options = {"max_pixels": str(limit(SAMPLES))}
     with decoding("video"):
-        container = av.open(f"file:{path}", format=_CONTAINERS[path.suffix.lower()], options=options)
+        container = av.open(f"file:{path}", format=CONTAINERS[path.suffix.lower()], options=options)
     with container:
         with decoding("video"):
             kind = _grey_stream(container, path.stat().st_size)

@@ -118,10 +118,11 @@ def encode_exr_halves(layers: Mapping[str, NDArray[np.float32]], notes: Notes, c
 
     Light above the largest half float becomes that.
     """
-    ordered = sorted(layers)
-    names = sorted(as_planes(layers))  # as half_rows puts them: by layer, and B before G before R
-    height, width = layers[ordered[0]].shape[:2]
-    rows = half_rows([layers[name] for name in ordered])
+    # Channels by name, as the format wants them and as half_rows puts them: B before G before R.
+    ordered = sorted(([*as_planes({name: image})][::-1], name) for name, image in layers.items())
+    names = [channel for channels, _ in ordered for channel in channels]
+    rows = half_rows([layers[name] for _, name in ordered])
+    height, width = next(iter(layers.values())).shape[:2]
     if compression not in _NUMBERS:
         planes = (rows[:, HEAD + width * k : HEAD + width * (k + 1)] for k in range(len(names)))
         halves = {name: np.ascontiguousarray(plane).view(np.float16) for name, plane in zip(names, planes, strict=True)}

@@ -33,6 +33,7 @@ from polsep.io.store.atomic import (
     OutputError,
     atomic_path,
     hold_lock,
+    refuse_existing,
     release_cache,
     replace_bytes,
     replace_text,
@@ -97,7 +98,7 @@ class SequenceWriter:
     """Writer of the outputs ``stem`` in a directory; ``settings`` decide about every byte of them. To be closed.
 
     State: which parts are complete, and the films and log of the part that is being written. Raises OutputError where
-    ``overwrite`` is False and finished outputs exist, or parts of a run with other settings.
+    ``overwrite`` is False and files of its outputs exist that are not of a run to resume, or parts of other settings.
     """
 
     def __init__(
@@ -106,11 +107,14 @@ class SequenceWriter:
         self.directory, self.stem, self.kind, self._settings = directory, stem, kind, settings
         self._overwrite = overwrite
         self._parts = directory / f".polsep-{stem}"
-        self._report = directory / f"{stem}.json"
+        self._report, self._log_path = directory / f"{stem}.json", directory / f"{stem}.jsonl"
         require_writable(directory)
         if not overwrite and self._report.exists():
             raise OutputError(f"expected no {self._report}, found one from before; --overwrite replaces it")
         self._kinds = self._film_kinds()
+        begun = self._parts / "run.json"
+        if not begun.exists():
+            refuse_existing(directory, self._targets(), overwrite)
         if self._kinds:
             load_library()  # fail before the first frame is separated
         self._parts.mkdir(parents=True, exist_ok=True)
@@ -118,7 +122,6 @@ class SequenceWriter:
         if overwrite:
             for path in self._parts.iterdir():
                 path.unlink() if path.name != LOCK else None
-        begun = self._parts / "run.json"
         if begun.exists():
             require_same_settings(begun, settings, f"{directory / stem}", "; --overwrite begins anew")
         else:
@@ -146,6 +149,18 @@ class SequenceWriter:
             lossless = LOSSLESS[self.kind.format, self._settings["colors"]]
             kinds |= {"diffuse": lossless, "specular": lossless}
         return kinds | ({"preview": WATCHABLE} if self.kind.preview else {})
+
+    def _targets(self) -> list[Path]:
+        """Files that would be replaced: films and the log, and frames of before."""
+        films = [self._film(image) for image in self._kinds]
+        return [*films, self._log_path, *(self._frames() if self.kind.format == "exr" else ())]
+
+    def _film(self, image: str) -> Path:
+        return self.directory / f"{self.stem}_{image}{self._kinds[image].suffix}"
+
+    def _frames(self) -> list[Path]:
+        """EXR files of single frames that are there."""
+        return sorted(self.directory.glob(f"{glob.escape(self.stem)}_{6 * '[0-9]'}.exr"))
 
     def _record(self, part: int) -> Path:
         return self._parts / f"{part:06d}.json"
@@ -252,13 +267,12 @@ class SequenceWriter:
         self._unlock = self._lock()
         written = []
         for image, kind in self._kinds.items():
-            target = self.directory / f"{self.stem}_{image}{kind.suffix}"
+            target = self._film(image)
             parts = [path for k in range(self._done) if (path := self._film_path(k, image)).exists()]
             with atomic_path(target) as joined:
                 join_films(parts, joined, kind, self.kind.rate)
             written.append(target)
-        log = self.directory / f"{self.stem}.jsonl"
-        replace_bytes(log, b"".join(self._record(k).read_bytes() for k in range(self._done)))
+        replace_bytes(self._log_path, b"".join(self._record(k).read_bytes() for k in range(self._done)))
         units = {name: UNITS[name] for name in ("diffuse", "specular")}
         if self.kind.format in LOSSLESS_CODECS:
             units = {name: f"{units[name]}; code 65535 is {white:g}" for name, white in FILM_WHITE.items()}
@@ -267,12 +281,12 @@ class SequenceWriter:
             self._remove_older_frames()
         shutil.rmtree(self._parts)
         self._unlock()
-        return [*written, log, self._report]
+        return [*written, self._log_path, self._report]
 
     def _remove_older_frames(self) -> None:
         """Remove single frames of the run that this one replaces, where it has none of that number."""
         own = {self._exr_path(line["frame"]) for line in self.lines() if "damaged" not in line}
-        for path in self.directory.glob(f"{glob.escape(self.stem)}_{6 * '[0-9]'}.exr"):
+        for path in self._frames():
             if self.kind.format != "exr" or path not in own:
                 path.unlink()
 

@@ -74,13 +74,25 @@ def write_with_sidecar(
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """The report in a sidecar of `polsep separate`, to be shown; empty where there is no such file."""
+    """The report on a file of `polsep separate`, in the sidecar beside it; empty where there is none.
+
+    A sidecar that lists other files is of another run, in another format.
+    """
     try:
-        sidecar = parse_json(read_text(path))
+        sidecar = parse_json(read_text(path.with_suffix(".json")))
     except (OSError, ValueError):
         return {}
-    report = sidecar.get("report") if isinstance(sidecar, dict) else None
+    if not isinstance(sidecar, dict) or path.name not in _listed(sidecar.get("files"), path.name):
+        return {}
+    report = sidecar.get("report")
     return report if isinstance(report, dict) else {}
+
+
+def _listed(files: object, unless: str) -> list[object]:
+    """The names in a sidecar's list of files; ``unless`` where it has no such list."""
+    if not isinstance(files, list):
+        return [unless]
+    return [entry.get("name") if isinstance(entry, dict) else entry for entry in files]
 
 
 def require_same_settings(path: Path, settings: Mapping[str, Any], owner: str, advice: str = "") -> None:

@@ -49,8 +49,7 @@ def write_calibration(path: Path, calibration: Calibration, version: str) -> lis
     Whenever the program is killed, the calibration is the one before or the new one: maps wait under a hidden name,
     where they are read too, until the JSON file is replaced. Raises OutputError, and leaves the one before.
     """
-    if path.suffix.lower() != ".json":
-        raise ValueError(f"expected a calibration file that ends in .json, found {path.name!r}")
+    refuse_foreign_maps(path)
     arrays, maps = _arrays(calibration), maps_path(path)
     record = _record(calibration) | {"polsep": version}
     try:
@@ -68,6 +67,18 @@ def write_calibration(path: Path, calibration: Calibration, version: str) -> lis
     else:
         maps.unlink(missing_ok=True)
     return [path, maps] if arrays else [path]
+
+
+def refuse_foreign_maps(path: Path) -> None:
+    """Raise ValueError if ``path`` is no name of a calibration, OutputError on an NPZ file beside it of something else.
+
+    Maps that the calibration of before names, and those that a killed program left without it, are its own.
+    """
+    if path.suffix.lower() != ".json":
+        raise ValueError(f"expected a calibration file that ends in .json, found {path.name!r}")
+    maps = maps_path(path)
+    if maps.exists() and not (path.exists() and _read_record(path).get("maps")):
+        raise OutputError(f"expected no {maps}, where maps of {path.name} belong, found a file of something else")
 
 
 def _waiting(maps: Path) -> Path:

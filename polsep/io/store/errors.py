@@ -34,8 +34,12 @@ def one_line(text: object, most: int = MOST) -> str:
 
 def input_error(path: str | Path, reason: object) -> InputError:
     """An `InputError` with the file in front: ``shot.png: expected ..., found ...``, always one line."""
-    name = _shortened(printable(str(path)), MOST_OF_NAME)
+    name = _name_of(path)
     return InputError(f"{name}: {one_line(reason, MOST - len(name) - 2)}")
+
+
+def _name_of(path: str | Path) -> str:
+    return _shortened(printable(str(path)), MOST_OF_NAME)
 
 
 def printable(text: str) -> str:
@@ -62,10 +66,12 @@ def refuse_pipe(path: str | Path) -> None:
 
 @contextmanager
 def naming(path: str | Path) -> Iterator[None]:
-    """Turn ValueError and OSError raised inside into an `InputError` that names the file."""
+    """Turn ValueError and OSError raised inside into an `InputError` that names the file; once, where they nest."""
     try:
         yield
     except ValueError as error:
+        if isinstance(error, InputError) and str(error).startswith(f"{_name_of(path)}: "):
+            raise
         raise input_error(path, error) from error
     except FileNotFoundError as error:
         raise input_error(path, "expected a file, found nothing at this path") from error

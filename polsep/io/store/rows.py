@@ -133,7 +133,8 @@ def fill_tables(markdown: str, results: Path, find_changes: FindChanges = lambda
             names = (metric, f"diffuse {metric}", f"specular {metric}")
             rows = [row for row in rows if row["metric"].removesuffix(SPREAD) in names]
         if not rows:
-            return f"{match[1]}Not measured yet: `polsep bench {match['name']}`.\n{match['end']}"
+            places = "`polsep bench` or `python -m evaluation`"
+            return f"{match[1]}Not measured yet: `{match['name']}` of {places}.\n{match['end']}"
         made = method_table(rows) if match["turned"] else markdown_table(rows)
         changed = find_changes(match["name"], {row["commit"] for row in rows})
         older = _OLDER.search(match["before"])
@@ -198,6 +199,7 @@ def _table(cells: list[list[str]], rows: list[dict[str, Any]]) -> str:
 
 def _number(value: float) -> str:
     """One decimal from 10 on, else three significant digits; whole numbers as they are."""
+    value += 0.0  # no minus before zero
     if value == int(value) or abs(value) >= 200:
         return f"{value:.0f}"
     return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3g}"

@@ -107,7 +107,7 @@ def _place(report: Mapping[str, Any]) -> dict[str, Any]:
 def _read_frame(path: Path) -> SeparatedFrame:
     """The frame of a file with the report beside it."""
     frame = read_separated(path)
-    frame.report.update(read_report(path.with_suffix(".json")))
+    frame.report.update(read_report(path))
     return frame
 
 

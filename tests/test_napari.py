@@ -7,6 +7,7 @@ import sys
 import time
 import tomllib
 import warnings
+from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +20,7 @@ import polsep
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.previews import aolp_wheel
 from polsep.io.results.separation_reader import read_separated
+from polsep.io.results.separation_writer import write_separation
 from polsep.io.results.sidecars import read_report
 from polsep.io.store.errors import InputError
 from polsep.io.store.samples import sample_folder
@@ -139,6 +141,15 @@ def test_several_files_are_a_stack(folder: Path) -> None:
     assert (shown["scale"], shown["translate"]) == ((1, 2, 2), (0, 0.5, 0.5))
     with pytest.raises(ValueError, match="expected images of one size to stack"):
         read_layers([paths[0], str(folder / "full.exr")])
+
+
+def test_stacks_have_the_layers_that_all_frames_have(folder: Path, tmp_path: Path) -> None:
+    """A black frame among them has no polarization to show."""
+    frame = read_separated(folder / "frame_000001.exr")
+    black = replace(frame, diffuse=0 * frame.diffuse, specular=0 * frame.specular, dolp=0 * frame.dolp, report={})
+    write_separation(black, tmp_path, "black", "exr")
+    both = read_layers([str(folder / "frame_000001.exr"), str(tmp_path / "black.exr")])
+    assert [shown["name"].split()[-1] for _, shown, _ in both] == ["specular", "diffuse"]
 
 
 def test_archives_hold_separated_or_raw_frames(folder: Path) -> None:

@@ -507,6 +507,49 @@ def test_a_pixel_reads_its_own_cell(sessions: Sessions) -> None:
         read_pixel(found.frame, found.mosaic, (48, 0))
 
 
+def test_numbers_are_of_what_was_separated(tmp_path: Path) -> None:
+    """Samples, histogram and marks have the black level that was found; pixels a calibrated lamp's light."""
+    rng = np.random.default_rng(0)
+    light = np.repeat([0.0, 0.0, 200.0, 800.0, 2000.0, 5000.0, 5000.0, 8000.0], 64)[:, None]
+    codes = 240 + 0.4 * rng.poisson(light, (512, 512)) + rng.normal(0, 1.5, (512, 512))
+    codes = np.clip(np.rint(codes), 0, WHITE).astype(np.uint16)
+    (tmp_path / "dark.png").write_bytes(png(codes))
+    settings = parse_settings({"method": "analytic", "white": "4095"})
+    sources = opening.find_sources(tmp_path / "dark.png")
+    found = opening.open_frame(sources, settings, opening.read_source(sources, settings.read, 0))
+    assert found.mosaic is not None and found.histogram is not None and found.flags is not None
+    assert found.mosaic.black_level == found.frame.report["black_level"] == pytest.approx(240, abs=2)
+    assert found.histogram.shares[:, 0].min() > 0.2
+    frame = opening.read_source(sources, settings.read, 0)
+    lit = replace(frame, data=replace(frame.data, light_color=(0.5, 1.0, 0.7)))
+    found = opening.open_frame(sources, settings, lit)
+    seen = read_pixel(found.frame, found.mosaic, (240, 100))
+    assert seen.stokes is not None and seen.color == "R"
+    assert seen.stokes[0] == pytest.approx(seen.diffuse[0] + seen.specular[0], rel=0.02)
+
+
+def test_folders_are_read_as_other_commands_read_them(tmp_path: Path) -> None:
+    """A recording by its index, no hidden files; previews of results are no raw frames, padded angles no template."""
+    codes = png(mosaic_codes())
+    (tmp_path / "take").mkdir()
+    for name in ("recording.json", "frames.raw", "frames.jsonl"):
+        (tmp_path / "take" / name).write_bytes(b"")
+    (source,) = opening.find_sources(tmp_path / "take")
+    assert (source.path.name, source.stem) == ("recording.json", "take")
+    for folder, names, stems in (
+        ("hidden", ("._a1.png", "a1.png", "a2.png"), ["a1", "a2"]),
+        ("padded", ("s_000.png", "s_045.png", "s_090.png", "s_135.png"), ["s_000", "s_045", "s_090", "s_135"]),
+        ("angles", ("s_0.png", "s_45.png", "s_90.png", "s_135.png"), ["s"]),
+    ):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            (tmp_path / folder / name).write_bytes(codes)
+        assert [source.stem for source in opening.find_sources(tmp_path / folder)] == stems
+    (tmp_path / "hidden" / "a1.exr").write_bytes(b"result")
+    with pytest.raises(InputError, match="name single files themselves"):
+        opening.find_sources(tmp_path / "hidden")
+
+
 def test_controls_are_generated_from_the_registry() -> None:
     """Every edit has its controls; where they start, nothing is edited, and edits without their image do nothing."""
     controls = list_controls()
@@ -565,7 +608,7 @@ def test_edits_that_do_not_fit_are_left_out(sessions: Sessions) -> None:
 
 def test_requests_name_this_machine() -> None:
     """Host headers lose port and brackets."""
-    assert [host_name(h) for h in ("127.0.0.1:7860", "localhost", "[::1]:80", "evil.example:7860")] == [
+    assert [host_name(h) for h in ("127.0.0.1:7860", "LocalHost", "[::1]:80", "evil.example:7860")] == [
         "127.0.0.1",
         "localhost",
         "::1",

@@ -292,3 +292,36 @@ def test_other_pages_go_on_while_one_waits_for_its_session(events: Events, sessi
         return bool(pending) and free
 
     assert asyncio.run(act())
+
+
+def test_the_demo_is_by_another_sensor_than_the_owners(sessions: Sessions, tmp_path: Path) -> None:
+    """The owner's calibration and lamp-off frame are for the owner's files, not for the example frame."""
+    room, demo = file(tmp_path, "room"), file(tmp_path, "demo")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "DEMO", demo)
+        events = Events(sessions, components(), Start({"ambient": (room,)}))
+        last = asyncio.run(collect(events.open_demo({**VALUES, **LEVELS}, REQUEST)))[-1]
+        assert "analytic" in last["status"]
+        page = sessions.find("a").opened
+        assert page is not None and page.frame.diffuse.mean() > 0.05
+        asyncio.run(collect(events.open_own(file(tmp_path, "own"), {**VALUES, **LEVELS}, REQUEST)))
+        page = sessions.find("a").opened
+        assert page is not None and page.stem == "own" and page.frame.diffuse.mean() == 0  # less itself
+
+
+def test_a_shape_of_a_frame_that_was_closed_is_not_shown(
+    events: Events, sessions: Sessions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another file was opened while it was found."""
+    opened(sessions)
+
+    def shape_panel(*said: Any) -> str:
+        if later:
+            sessions.find("a").forget()
+        return "surface"
+
+    monkeypatch.setattr(module, "shape_panel", shape_panel)
+    later = False
+    assert asyncio.run(events.find_shape(REQUEST))["shape"] == "surface"
+    later = True
+    assert "surface" not in asyncio.run(events.find_shape(REQUEST)).values()

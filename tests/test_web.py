@@ -18,11 +18,14 @@ import tifffile
 from chromium import WAIT_MS, browser, fresh_page
 
 import polsep
+from polsep.io.raw.frames import read_frames
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
 from polsep.light.find import find_light
 from polsep.pipeline import PolsepWarning
 from polsep.sensor.camera import Layout
+from polsep.sensor.encoding import encoding_warning
+from polsep.sensor.levels import as_mosaic
 from tools import web_page
 from tools.web_page import CHROMIUM, DEMO, HAS_PACKAGES, NODE, WEB, build_page, change, fetch, send, served
 
@@ -282,7 +285,9 @@ def test_a_new_build_is_kept_whole(browser: Any, tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(web_page, "Handler", Remembered)
     worker = (WEB / "src" / "sw.js").read_text().replace("VERSION", "1").replace("FILES_OF_THE_PAGE", '["part.txt"]')
-    for name, text in (("index.html", "<!doctype html><title>a page</title>"), ("part.txt", "old"), ("sw.js", worker)):
+    page, other = "<!doctype html><title>a page</title>", "of another page of this host"
+    texts = {"index.html": page, "part.txt": "old", "other.txt": other}
+    for name, text in (texts | {"sw.js": worker.replace("FILES_FOR_SOME", '["large.txt"]')}).items():
         (tmp_path / name).write_text(text)
     with served(tmp_path) as address, fresh_page(browser, address, 800) as opened:
         read = "fetch('part.txt').then((answer) => answer.text())"
@@ -292,6 +297,10 @@ def test_a_new_build_is_kept_whole(browser: Any, tmp_path: Path, monkeypatch: py
         opened.evaluate("navigator.serviceWorker.register('sw.js').then(() => 0)")
         opened.evaluate("navigator.serviceWorker.ready.then(() => 0)")
         assert opened.evaluate("caches.match('part.txt').then((found) => found.text())") == "new"
+        opened.reload()
+        assert opened.evaluate(read) == "new"
+        opened.evaluate("fetch('other.txt').then((answer) => answer.text())")
+        assert opened.evaluate("caches.match('other.txt').then((found) => found === undefined)")
 
 
 @needs_packages
@@ -359,6 +368,70 @@ def test_files_are_read_as_the_library_reads_them(tmp_path: Path) -> None:
     assert len(found) == len(writings) + len(formats) + 1
     for name, frame in found.items():
         np.testing.assert_array_equal(np.reshape(frame["data"], (50, 70)), codes >> lost_bits(name), err_msg=name)
+
+
+@needs_packages
+def test_files_that_the_library_refuses_are_refused(tmp_path: Path) -> None:
+    """Damage that only checksums show, TIFF of other meanings or several pages; names of bytes are no headers."""
+    codes = crop()[:50, :70]
+    whole = bytearray(imagecodecs.png_encode(codes, level=0))
+    (tmp_path / "whole.png").write_bytes(whole)
+    whole[len(whole) // 2] ^= 1
+    (tmp_path / "damaged.png").write_bytes(whole)
+    tifffile.imwrite(tmp_path / "negative.tif", codes, photometric="miniswhite")
+    tifffile.imwrite(tmp_path / "pages.tif", np.stack([codes] * 4), photometric="minisblack")
+    tifffile.imwrite(tmp_path / "turned.tif", codes, photometric="minisblack", extratags=[(274, 3, 1, 6, True)])
+    (tmp_path / "II.raw").write_bytes(b"II" + bytes(62))
+    script = f"""
+      import {{ readFileSync }} from "node:fs";
+      import {{ readFrame }} from {json.dumps((WEB / "src" / "read.js").as_uri())};
+      const said = {{}}, stated = {{ format: "Mono8", width: 8, height: 8 }};
+      for (const name of ["whole.png", "damaged.png", "negative.tif", "pages.tif", "turned.tif", "II.raw"])
+        try {{
+          said[name] = readFrame(name, new Uint8Array(readFileSync(name)), stated).notes.join();
+        }} catch (error) {{
+          said[name] = error.message;
+        }}
+      console.log(JSON.stringify(said));"""
+    done = subprocess.run(
+        [str(NODE), "--input-type=module", "-e", script], cwd=tmp_path, capture_output=True, check=True, timeout=60
+    )
+    said = json.loads(done.stdout)
+    assert "complete PNG file" in said["damaged.png"] and "photometric 0" in said["negative.tif"]
+    assert said["pages.tif"] == "expected a TIFF file of one picture, found several"
+    assert said["turned.tif"] == next(read_frames(tmp_path / "turned.tif")).notes[0]
+    assert said["whole.png"] == said["II.raw"] == ""
+
+
+@needs_packages
+@pytest.mark.parametrize("angles", ["90,45,135,0", "0,90,45,135", "0,45,90,135"])
+def test_gamma_is_seen_in_all_orders_of_analysers(angles: str, tmp_path: Path) -> None:
+    """As the library sees it: crossed pairs on diagonals, in rows and in columns of a cell."""
+    sony, places = (90, 45, 135, 0), [divmod(k, 2) for k in range(4)]
+    codes = (
+        (255 * (imagecodecs.png_decode(DEMO.read_bytes())[400:1424, 600:1624] / 4095) ** (1 / 2.2))
+        .round()
+        .astype(np.uint8)
+    )
+    turned = np.zeros_like(codes)
+    for place, angle in zip(places, map(int, angles.split(",")), strict=True):
+        source = places[sony.index(angle)]
+        turned[place[0] :: 2, place[1] :: 2] = codes[source[0] :: 2, source[1] :: 2]
+    layout = f"{angles}/RGGB"
+    expected = encoding_warning(as_mosaic(turned, Layout.parse(layout))[0])
+    assert expected is not None
+    (tmp_path / "frame").write_bytes(turned.tobytes())
+    script = f"""
+      import {{ readFileSync }} from "node:fs";
+      import {{ encodingWarning }} from {json.dumps((WEB / "src" / "encoding.js").as_uri())};
+      import {{ parseLayout }} from {json.dumps((WEB / "src" / "layout.js").as_uri())};
+      const [height, width] = {json.dumps(turned.shape)}, data = Float32Array.from(readFileSync("frame"));
+      const mosaic = {{ data, height, width, layout: parseLayout({json.dumps(layout)}), black: 0, white: 255 }};
+      console.log(JSON.stringify(encodingWarning(mosaic)));"""
+    done = subprocess.run(
+        [str(NODE), "--input-type=module", "-e", script], cwd=tmp_path, capture_output=True, check=True, timeout=60
+    )
+    assert json.loads(done.stdout) == expected
 
 
 @needs_packages

@@ -38,8 +38,9 @@ writeFileSync(join(out, "licences.txt"), licences.join("\n\n"));
 const files = readdirSync(out).filter((name) => name !== "sw.js").sort(), hash = createHash("sha256");
 for (const name of files) hash.update(name).update(readFileSync(join(out, name)));
 // What not everybody needs is kept once it was asked for (sw.js).
-const kept = files.filter((name) => !/gpu/.test(name));
+const isKept = (name) => !/gpu/.test(name), asJson = (names) => JSON.stringify(names);
 writeFileSync(join(out, "sw.js"), readFileSync(source("sw.js"), "utf8")
-  .replace("VERSION", hash.digest("hex").slice(0, 12)).replace("FILES_OF_THE_PAGE", JSON.stringify(kept)));
+  .replace("VERSION", hash.digest("hex").slice(0, 12)).replace("FILES_OF_THE_PAGE", asJson(files.filter(isKept)))
+  .replace("FILES_FOR_SOME", asJson(files.filter((name) => !isKept(name)))));
 const bytes = readdirSync(out).reduce((total, name) => total + readFileSync(join(out, name)).length, 0);
 console.log(`${out}: ${files.length + 1} files, ${(bytes / 1e6).toFixed(1)} MB`);

@@ -112,7 +112,8 @@ class Events:
         session, parts = self._session(request), self.components
         try:
             said = {name: values[component] for name, component in parts.settings.items()}
-            settings = parse_settings(self.start.corrections() | said)
+            demo = [source.path for source in session.sources] == [DEMO]  # by another sensor than the owner's
+            settings = parse_settings(said if demo else self.start.corrections() | said)
             against = parse_against(values[parts.view["against"]], settings)
         except FAILURES as error:
             yield self._failed(error, session)
@@ -325,13 +326,15 @@ class Events:
 
     async def find_shape(self, request: gr.Request) -> Updates:
         """Find the surface of the opened frame, and show it under a lamp that the pointer moves."""
-        found = self._session(request).opened
+        session = self._session(request)
+        found = session.opened
         if found is None:
             return {self.components.shape: NO_SHAPE}
         try:
-            return {self.components.shape: await asyncio.to_thread(shape_panel, found.frame, found.stem)}
+            panel = await asyncio.to_thread(shape_panel, found.frame, found.stem)
         except FAILURES as error:
             return {self.components.status: failure_line(error)}
+        return self._kept() if session.opened is not found else {self.components.shape: panel}
 
     def write(self, kind: str) -> Callable[[gr.Request], Updates]:
         """A function that writes one of `DOWNLOADS` and returns its path."""

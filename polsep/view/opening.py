@@ -17,6 +17,7 @@ import numpy as np
 
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
+from polsep.io.raw.recording import RECORD
 from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
 from polsep.io.store.errors import InputError
 from polsep.io.store.header_checks import at_most
@@ -144,16 +145,18 @@ def find_sources(path: Path) -> tuple[Source, ...]:
     """The owner's own file, four of a template with ``{angle}``, or a folder: frames as `polsep video` writes them, or
     raw ones. Raises InputError.
     """
+    path = path / RECORD if (path / RECORD).is_file() else path
     if not path.is_dir():
         return (as_source(path, output_stem(path)),)
     try:
         return tuple(as_source(file, file.stem) for file in find_numbered(path).files if file is not None)
     except InputError:
-        files = sorted((f for f in path.iterdir() if f.suffix.lower() in FRAME_FILES), key=lambda f: in_numbers(f.name))
-        if not files:
+        seen = [file for file in path.iterdir() if not file.name.startswith(".")]
+        files = sorted((f for f in seen if f.suffix.lower() in FRAME_FILES), key=lambda f: in_numbers(f.name))
+        if not files or any(file.suffix.lower() == ".exr" for file in seen):  # whose PNG files are previews
             raise
         groups = group_angles([file.name for file in files])
-        if groups is None:
+        if groups is None or not all(file.is_file() for name in groups for file in four_angles(path / name)):
             return tuple(as_source(file, file.stem) for file in files)
         return tuple(as_source(path / template, output_stem(template)) for template in groups)
 
@@ -246,18 +249,23 @@ def open_frame(sources: tuple[Source, ...], settings: Settings, read: Frame | Se
     advice = (*read.notes, *frame.report["warnings"])
     frame.report["warnings"] = list(advice)
     remarks = tuple(re.sub(rf"--({'|'.join(OPTIONS)})", lambda found: OPTIONS[found[1]][0], text) for text in advice)
-    mosaic = read.data if isinstance(read.data, Mosaic) else None
-    flags = _flags(read.data, frame.valid.shape)
+    mosaic = _as_separated(read.data, frame.capture)
+    flags = None if mosaic is None else _flags(mosaic, frame.valid.shape)
     counted = None if mosaic is None else histogram(mosaic)
     stem = stem if len(sources) > 1 or read.count == 1 else f"{stem}_{read.index:04d}"
     small, place = shrink_frame(frame, flags), (read.index, read.count)
     return OpenedFrame(frame, small, mosaic, counted, remarks, stem, *place, flags=flags, advice=advice)
 
 
-def _flags(mosaic: object, shape: tuple[int, ...]) -> Pixels | None:
-    """`exposure_flags` for a separated frame of a shape: of its cells, or of the samples in them; None for others."""
-    if not isinstance(mosaic, Mosaic):
+def _as_separated(read: object, capture: object) -> Mosaic | None:
+    """A raw frame as it was read, with the black level that was separated; None for other captures."""
+    if not isinstance(read, Mosaic) or not isinstance(capture, Mosaic):
         return None
+    return read if read.black_level == capture.black_level else replace(read, black_level=capture.black_level)
+
+
+def _flags(mosaic: Mosaic, shape: tuple[int, ...]) -> Pixels:
+    """`exposure_flags` for a separated frame of a shape: of its cells, or of the samples in them."""
     cells = exposure_flags(mosaic)
     if cells.shape == shape:
         return cells
@@ -273,7 +281,8 @@ def open_small(sources: tuple[Source, ...], settings: Settings) -> Small:
     if isinstance(read, SeparatedFrame):
         return shrink_frame(read)
     frame = separate_capture(read.data, settings.method, settings.light_color, full=settings.full)
-    return shrink_frame(frame, _flags(read.data, frame.valid.shape))
+    mosaic = _as_separated(read.data, frame.capture)
+    return shrink_frame(frame, None if mosaic is None else _flags(mosaic, frame.valid.shape))
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import html
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -82,7 +82,8 @@ def _read_cell(mosaic: Mosaic, row: int, col: int) -> tuple[tuple[Sample, ...], 
     """Samples by angle, the colour over them, and their Stokes vector."""
     top, left = (2 * n + start for n, start in zip((row, col), mosaic.layout.origin, strict=True))
     cell, clipped = mosaic.data[top : top + 2, left : left + 2], mosaic.clipped()[top : top + 2, left : left + 2]
-    linear = mosaic.linear()[top : top + 2, left : left + 2]
+    as_measured = replace(mosaic, light_color=(1.0, 1.0, 1.0))  # as the images are: in a calibrated lamp's light
+    linear = as_measured.linear()[top : top + 2, left : left + 2]
     filters = {(r, c): mosaic.layout.filter_at(top + r, left + c) for r in (0, 1) for c in (0, 1)}
     order = sorted(filters, key=lambda at: filters[at].angle_deg)
     samples = tuple(Sample(filters[at].angle_deg, float(cell[at]), bool(clipped[at])) for at in order)

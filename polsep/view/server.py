@@ -95,7 +95,7 @@ def _build(options: ViewOptions, sessions: Sessions):  # type: ignore[no-untyped
 def _launch(page, options: ViewOptions) -> str:  # type: ignore[no-untyped-def]
     import gradio as gr
 
-    hosts = None if options.host in ANY_HOST else (*LOOPBACK, options.host)
+    hosts = None if options.host in ANY_HOST else (*LOOPBACK, options.host.lower())
     most_bytes = options.most_mb << 20
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -1,6 +1,6 @@
 // Samples that are no longer linear light: gamma curves and JPEG. Twin of polsep/sensor/encoding.py, which explains it.
 
-import { seePhases } from "./layout_check.js";
+import { crossedPairs, seePhases } from "./layout_check.js";
 import { median, quantile } from "./numbers.js";
 import { smoothBlocks } from "./noise.js";
 
@@ -8,7 +8,7 @@ const MIN_SPAN = 100, USUAL_CODES = 4095;
 const MIN_SLOPE = -2, MAX_SLOPE = -0.55, MIN_ERRORS = 2.5, MAX_EXPONENT = 0.3, BINS = 12, MIN_BLOCKS = 32, MIN_LEVEL = 0.02;
 const MIN_RANGE = 0.25, MAX_DOLP = 0.9, MIN_DOLP = 0.05, MIN_CELLS = 64, MIN_SIDE = 64, SIDE = 8, BLOCKS = 8192, MAX_RATIO = 0.87;
 
-/** A line on samples that are gamma-encoded or were JPEG files, or null. Of Sony's order of analysers alone. */
+/** A line on samples that are gamma-encoded or were JPEG files, or null. */
 export function encodingWarning(mosaic, phases = seePhases(mosaic)) {
   const slope = gammaSlope(mosaic, phases), bent = slope !== null && MIN_SLOPE < slope && slope < MAX_SLOPE;
   const rise = bent ? noiseExponent(mosaic) : null;
@@ -24,13 +24,14 @@ export function encodingWarning(mosaic, phases = seePhases(mosaic)) {
 
 /** Slope of the analysers' contradiction, (g - 1) / g for samples encoded by m^g; null where light shows none. */
 function gammaSlope({ layout, height, width }, phases) {
-  const [a, b, c, d] = layout.polarizer, crossed = (x, y) => Math.abs((((x - y) % 180) + 180) % 180 - 90) < 1e-6;
-  if (!crossed(a, d) || !crossed(b, c) || Math.min(height, width) < MIN_SIDE) return null;
+  const order = { diagonals: [0, 3, 1, 2], rows: [0, 1, 2, 3], columns: [0, 2, 1, 3] }[crossedPairs(layout)];
+  if (!order || Math.min(height, width) < MIN_SIDE) return null;
   const [top, left] = layout.origin, pairs = [];
   for (let cell = 0; cell < 4; cell++)
     for (let k = 0; k < phases[0].length; k++) {
       const at = (r, col) => phases[((r + top + 2 * (cell >> 1)) & 3) * 4 + ((col + left + 2 * (cell & 1)) & 3)][k];
-      const [p, s, t, r] = [at(0, 0), at(0, 1), at(1, 0), at(1, 1)], middle = (p + r + s + t) / 4, q = p - r, u = s - t;
+      const cells = [at(0, 0), at(0, 1), at(1, 0), at(1, 1)], [p, r, s, t] = order.map((n) => cells[n]);
+      const middle = (p + r + s + t) / 4, q = p - r, u = s - t;
       const polarized = Math.hypot(q, u) / (2 * middle);
       if (middle > 0.02 && polarized < MAX_DOLP && polarized > MIN_DOLP) pairs.push([(q ** 2 - u ** 2) / (4 * middle), p + r - s - t]);
     }

@@ -16,7 +16,7 @@ const PAIRINGS = { diagonals: [1, -1, -1, 1], rows: [1, 1, -1, -1], columns: [1,
 const ORDERS = { diagonals: [90, 45, 135, 0], rows: [0, 90, 45, 135], columns: [0, 45, 90, 135] };
 
 /** Position of a layout's crossed analysers in the cell, or null. */
-function crossedPairs({ polarizer: [a, b, c, d] }) {
+export function crossedPairs({ polarizer: [a, b, c, d] }) {
   const crossed = (x) => Math.abs((((x % 180) + 180) % 180) - 90) < 1e-6;
   const pairs = { diagonals: [a - d, b - c], rows: [a - b, c - d], columns: [a - c, b - d] };
   return Object.keys(pairs).find((name) => pairs[name].every(crossed)) || null;

@@ -19,13 +19,21 @@ async function load(kind) {
 }
 
 async function start(kind, colors) {
-  const ort = await (runtime ??= load(kind)), model = await fetched(colors === 3 ? "joint-fast.onnx" : "joint-fast-mono.onnx");
+  runtime ??= load(kind).catch((error) => {
+    runtime = null;  // the network may be back for the next frame
+    throw error;
+  });
+  const ort = await runtime, model = await fetched(colors === 3 ? "joint-fast.onnx" : "joint-fast-mono.onnx");
   return ort.InferenceSession.create(new Uint8Array(await model.arrayBuffer()),
     { executionProviders: [KINDS[kind].provider], graphOptimizationLevel: "all", enableMemPattern: false });
 }
 
 async function run({ kind, colors, samples, rows, width }) {
-  if (!sessions.has(colors)) sessions.set(colors, start(kind, colors));
+  if (!sessions.has(colors))
+    sessions.set(colors, start(kind, colors).catch((error) => {
+      sessions.delete(colors);
+      throw error;
+    }));
   const session = await sessions.get(colors), { Tensor } = await runtime, images = {};
   const found = await session.run({ frame: new Tensor("float32", samples, [1, 2, rows, width]) });
   for (const [name, tensor] of Object.entries(found)) {

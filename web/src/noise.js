@@ -119,7 +119,7 @@ function fitLine(x, y, weight, least) {
 }
 
 /**
- * The black level that the darkest parts of a frame show by their noise, {level, text}; null where they show none, or
+ * The black level that the darkest parts of a frame show by their noise, {level, shown, text}; null where they show none, or
  * what was said. `level` null: only a warning.
  */
 export function checkBlackLevel(mosaic) {
@@ -154,7 +154,7 @@ export function checkBlackLevel(mosaic) {
   const found = codes && span >= 100 ? blackOf(level, variance, black, span) : null;
   if (found === null || found - black < 0.0015 * span) return null;
   const shown = Number(found.toPrecision(4)), text = `black lies at ${shown}, not at ${black}, as the noise of dark parts shows`;
-  return { level: found, text: `${text}: ${black === 0 ? "taken so, say" : "say"} black level ${shown}` };
+  return { level: found, shown, text: `${text}: ${black === 0 ? "taken so, say" : "say"} black level ${shown}` };
 }
 
 function blackOf(levels, variances, black, span) {

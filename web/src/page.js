@@ -182,7 +182,7 @@ function showFacts({ light, light_color: color, statistics: s, defects, colored_
 }
 
 /** A note with a button for what it recommends. */
-function noteItem({ text, white, layout }) {
+function noteItem({ text, white, black, layout }) {
   const item = document.createElement("li");
   item.textContent = text;
   const offer = (label, act) => {
@@ -196,6 +196,7 @@ function noteItem({ text, white, layout }) {
     item.append(button);
   };
   if (white) offer(`Use white level ${white}`, () => (part("white").value = white));
+  if (black != null) offer(`Use black level ${black}`, () => (part("black").value = black));
   if (layout) offer(`Use ${layout}`, () => useLayout(layout));
   return item;
 }

@@ -1,6 +1,7 @@
 // The service worker: the page works offline once it was loaded, and may use threads on hosts that send no headers.
 
-const CACHE = "polsep-VERSION", FILES = ["./", ...FILES_OF_THE_PAGE];
+const CACHE = "polsep-VERSION", FILES = ["./", ...FILES_OF_THE_PAGE], LATER = FILES_FOR_SOME;
+const OWN = new Set([...FILES, ...LATER].map((name) => new URL(name, self.location.href).href));
 
 self.addEventListener("install", (event) => {
   // Not from the browser's own cache: soon after a new build it has files of the old one.
@@ -15,7 +16,8 @@ self.addEventListener("activate", (event) => {
 
 self.addEventListener("fetch", (event) => {
   const url = new URL(event.request.url);
-  if (event.request.method !== "GET" || url.origin !== self.location.origin) return;
+  url.search = url.hash = "";
+  if (event.request.method !== "GET" || !OWN.has(url.href)) return;  // other pages of the host are not ours
   event.respondWith(answer(event.request));
 });
 
@@ -24,7 +26,7 @@ async function answer(request) {
   let found = await caches.match(request, { ignoreSearch: true, cacheName: CACHE });
   if (!found) {
     found = await fetch(request);
-    if (found.status === 200) await (await caches.open(CACHE)).put(request, found.clone());
+    if (found.status === 200) await (await caches.open(CACHE)).put(request, found.clone()).catch(() => {});  // no room: it works without
   }
   const headers = new Headers(found.headers);
   headers.set("Cross-Origin-Opener-Policy", "same-origin");

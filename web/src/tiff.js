@@ -6,15 +6,20 @@ import { unzlibSync } from "fflate";
 const SIZES = { 1: 1, 2: 1, 3: 2, 4: 4, 6: 1, 7: 1, 13: 4 };
 const COMPRESSIONS = { 1: (x) => x, 5: unpackLzw, 8: (x) => unzlibSync(x), 32946: (x) => unzlibSync(x), 32773: unpackBits };
 
-/** The first page: {data, height, width, white}; `white` where the file says its bits. Throws on others. */
+/** Meanings of samples with black at zero: MinIsBlack, and of Digital Negatives colour filters and linear raw. */
+const PHOTOMETRIC = [1, 32803, 34892];
+
+/** The one page: {data, height, width, white}; `white` where the file says its bits. Throws on others. */
 export function readTiff(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength), little = bytes[0] === 0x49;
   if (view.getUint16(2, little) !== 42) throw new Error("expected a classic TIFF file, found another kind (BigTIFF?)");
-  const tags = readTags(view, view.getUint32(4, little), little), one = (tag, usual) => (tags[tag] ?? [usual])[0];
+  const { tags, next } = readTags(view, view.getUint32(4, little), little), one = (tag, usual) => (tags[tag] ?? [usual])[0];
   const width = one(256), height = one(257), bits = one(258, 1), channels = one(277, 1);
   const unpack = COMPRESSIONS[one(259, 1)], predictor = one(317, 1);
   if (!width || !height) throw new Error("expected a TIFF file with a size, found none");
   if (channels !== 1) throw new Error(`expected one channel, found ${channels}: a demosaicked picture is not a raw mosaic`);
+  if (next) throw new Error("expected a TIFF file of one picture, found several");
+  if (!PHOTOMETRIC.includes(one(262, 1))) throw new Error(`expected gray samples with black at zero, found TIFF photometric ${one(262)}`);
   if (bits < 8 || bits > 16 || one(339, 1) !== 1) throw new Error(`expected samples of 8 to 16 bits, found ${bits} of another kind`);
   if (!unpack) throw new Error(`expected a TIFF file without compression, LZW, deflate or PackBits, found number ${one(259)}`);
   if (one(266, 1) !== 1 || (predictor !== 1 && (predictor !== 2 || bits % 8)))
@@ -36,19 +41,21 @@ export function readTiff(bytes) {
       data.set(row.subarray(0, Math.min(boxWidth, width - left)), (top + r) * width + left);
     }
   });
-  return { data, height, width, white: bits > 8 && bits < 16 ? 2 ** bits - 1 : null };
+  const turned = one(274, 1), notes = turned === 1 ? [] : [`TIFF orientation ${turned} is not applied: pixels stay as stored`];
+  return { data, height, width, white: bits > 8 && bits < 16 ? 2 ** bits - 1 : null, notes };
 }
 
 function readTags(view, at, little) {
-  const tags = {};
-  for (let k = 0, count = view.getUint16(at, little); k < count; k++) {
+  const tags = {}, count = view.getUint16(at, little);
+  for (let k = 0; k < count; k++) {
     const entry = at + 2 + 12 * k, kind = view.getUint16(entry + 2, little), size = SIZES[kind], n = view.getUint32(entry + 4, little);
     if (!size || n > 1e6) continue;
     const place = size * n <= 4 ? entry + 8 : view.getUint32(entry + 8, little);
     tags[view.getUint16(entry, little)] = Array.from({ length: n }, (_, i) =>
       size === 1 ? view.getUint8(place + i) : size === 2 ? view.getUint16(place + 2 * i, little) : view.getUint32(place + 4 * i, little));
   }
-  return tags;
+  const end = at + 2 + 12 * count;
+  return { tags, next: end + 4 <= view.byteLength ? view.getUint32(end, little) : 0 };
 }
 
 function readRow(bytes, bits, little, row) {

@@ -99,7 +99,7 @@ function stopwatch(steps) {
   };
 }
 
-/** The frame as a mosaic, put right where that is sure, with notes for its owner: {text, white, layout}. */
+/** The frame as a mosaic, put right where that is sure, with notes for its owner: {text, white, black, layout}. */
 function prepare(settings) {
   const layout = parseLayout(settings.layout || frame.layout || "color"), notes = frame.notes.map((text) => ({ text }));
   const said = settings.white ?? frame.white, white = said ?? whiteOf(frame.data), black = settings.black || 0;
@@ -116,8 +116,9 @@ function prepare(settings) {
   let phases = seePhases(mosaic);
   const level = checkBlackLevel(mosaic), encoded = encodingWarning(mosaic, phases);
   if (encoded) notes.push({ text: encoded });
-  if (level) notes.push({ text: level.text, black: level.level });
-  if (level?.level != null && black === 0) {
+  const taken = level?.level != null && black === 0;
+  if (level) notes.push({ text: level.text, black: taken ? null : level.shown });
+  if (taken) {
     mosaic.black = level.level;
     phases = seePhases(mosaic);
   }

@@ -48,7 +48,10 @@ def read_layers(path: str | Sequence[str]) -> list[LayerData]:
     stacks = [frame_layers(_read_frame(p), paths[0].stem) for p in paths]
     if len(stacks) == 1:
         return stacks[0]
-    return [_stacked(layers) for layers in zip(*stacks, strict=True)]
+    names = [{shown["name"] for _, shown, _ in layers} for layers in stacks]
+    shared = set.intersection(*names)  # a black frame has no polarization
+    kept = [[layer for layer in layers if layer[1]["name"] in shared] for layers in stacks]
+    return [_stacked(layers) for layers in zip(*kept, strict=True)]
 
 
 def read_demo() -> list[LayerData]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from polsep.io.store.atomic import replace_text
+from polsep.io.store.examples import read_makers, write_makers
 from polsep.io.store.weights import write_weights
 from polsep.networks.unet import count_parameters
 from polsep.train.command import check_run, describe_start
@@ -96,19 +96,14 @@ class Makers:
         if not all(there):
             lines = list(dict.fromkeys([*lines, digest_examples([], self.maker)]))
         if lines != said:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            replace_text(self._path, "".join(f"{line}\n" for line in lines))
+            write_makers(self.folder, self.method, lines)
 
     def digest(self, options: object) -> str:
         """The sha256 of ``options`` and of all code that made the examples."""
         return hashlib.sha256(json.dumps([options, self._lines()]).encode()).hexdigest()
 
-    @property
-    def _path(self) -> Path:
-        return self.folder / f"{self.method}-made-by.txt"
-
     def _lines(self) -> list[str]:
-        return self._path.read_text("utf-8").split() if self._path.is_file() else []
+        return read_makers(self.folder, self.method)
 
 
 def describe_recipe(recipe: Recipe, run: Run) -> str:

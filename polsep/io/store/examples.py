@@ -1,14 +1,15 @@
-"""Examples of materials on disk: one array per file, in half precision, written atomically."""
+"""Examples of trainings on disk: one array per file, in half precision, written atomically, and what made them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from polsep.io.store.atomic import atomic_path
+from polsep.io.store.atomic import atomic_path, replace_text
 
 
 def write_example(path: Path, planes: Tensor) -> None:
@@ -27,3 +28,19 @@ def read_example(path: Path) -> Tensor:
     if planes.dtype != np.float16 or planes.ndim != 3:
         raise ValueError(f"expected planes [K, h, w] of float16 in {path}, found {planes.dtype} {planes.shape}")
     return torch.from_numpy(planes)
+
+
+def read_makers(folder: Path, method: str) -> list[str]:
+    """Digests of the code that made a folder's examples for a method; empty where nobody noted any."""
+    path = _makers_path(folder, method)
+    return path.read_text("utf-8").split() if path.is_file() else []
+
+
+def write_makers(folder: Path, method: str, digests: Sequence[str]) -> None:
+    """Replace what `read_makers` reads; the folder is made if missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    replace_text(_makers_path(folder, method), "".join(f"{digest}\n" for digest in digests))
+
+
+def _makers_path(folder: Path, method: str) -> Path:
+    return folder / f"{method}-made-by.txt"

@@ -87,7 +87,7 @@ def separate_files(
         left: int | None = None  # frames of the file
         try:
             for frame in read_frames(path, read):
-                left, level = frame.count - frame.index, getattr(frame.data, "white_level", None)
+                left, level = frame.count - frame.index, frame.white_level
                 if not any(isinstance(note, ForgottenLevel | BlackFrame) for note in frame.notes):
                     trusted.add(level)
                 if level not in trusted:

@@ -22,7 +22,7 @@ from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import MIN_CELLS, demosaic_guided, demosaic_guided_half
 from polsep.io.store.weights import is_shipped
 from polsep.networks.engines import ENGINES, combine_images, run_engine
-from polsep.physics.stokes import Measurements, behind_angles, fit_stokes, is_pair
+from polsep.physics.stokes import Measurements, behind_angles, bounded_below_white, fit_stokes, is_pair
 from polsep.sensor.camera import Layout, Mosaic, WrongType, sample_fine_mosaic
 from polsep.separation import analytic_kernel, color_affine_kernel
 from polsep.separation.analytic import Separation, separate_analytic
@@ -30,7 +30,7 @@ from polsep.separation.analytic_kernel import AnalyticOptions
 from polsep.separation.color_affine import separate_color_affine
 from polsep.separation.color_affine_kernel import ColorAffineOptions
 from polsep.separation.images import FrameImages
-from polsep.separation.report import images_of, in_light, under_white_light
+from polsep.separation.report import images_of, in_light, tally_again, under_white_light
 from polsep.shipped import (
     NAMES,
     accepts_mosaic,
@@ -179,7 +179,7 @@ def run_joint_co_sited(name: str, samples: Measurements, light: Light) -> FrameI
         s0, unknown, xp = to_numpy(s0), to_numpy(unknown), np
     specular = xp.minimum(images.specular, s0)
     diffuse = xp.where(unknown, images.diffuse, s0 - specular)
-    return replace(images, diffuse=diffuse, specular=xp.where(unknown, images.specular, specular))
+    return tally_again(replace(images, diffuse=diffuse, specular=xp.where(unknown, images.specular, specular)), light)
 
 
 def _is_plain(mosaic: Mosaic) -> bool:
@@ -205,7 +205,8 @@ def _accepts_joint(name: str, capture: Capture) -> bool:
     if isinstance(capture, Mosaic):
         return accepts_mosaic(name, capture)
     layout = Layout(bayer=None) if capture.data.shape[-3] == 1 else Layout()
-    return _sees_all(capture) and capture.data.ndim == 4 and is_shipped(weights_name(name, layout))
+    known = _sees_all(capture) and capture.data.ndim == 4 and is_shipped(weights_name(name, layout))
+    return known and not bounded_below_white(capture)  # networks take what clipped for white at least
 
 
 def _joint(name: str, summary: str) -> Method:

@@ -28,13 +28,20 @@ from polsep.io.store.calibrations import read_calibration
 from polsep.light.find import find_light
 from polsep.methods import Capture, Method, find_method
 from polsep.physics.stokes import Measurements
-from polsep.sensor.calibration import Calibration, Corrections, falloff_image, mean_mosaic
+from polsep.sensor.calibration import Calibration, Corrections, Table, falloff_image, mean_mosaic
 from polsep.sensor.camera import Layout, Mosaic, WrongType
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.images import FrameImages
-from polsep.separation.report import SeparatedFrame, describe, error_quantiles, on_host
+from polsep.separation.report import (
+    SeparatedFrame,
+    describe,
+    error_quantiles,
+    light_statistics,
+    on_host,
+    tally_again,
+)
 from polsep.separation.under_highlights import fill_under_highlights
 
 if TYPE_CHECKING:
@@ -121,7 +128,7 @@ def separate(
     device: str = "auto",
     full: bool = False,
     calibration: Calibration | str | PathLike[str] | None = None,
-    ambient: NDArray[Any] | Sequence[NDArray[Any]] | None = None,
+    ambient: NDArray[Any] | Mosaic | Sequence[NDArray[Any] | Mosaic] | None = None,
 ) -> Result:
     """Separate one raw mosaic ``[H, W]`` (uint8, uint16, float32) into diffuse and specular.
 
@@ -147,7 +154,8 @@ def separate(
     if isinstance(capture, Mosaic):
         corrections = Corrections(measured)
         if ambient is not None:
-            rooms = [corrections.apply(as_mosaic(room, *levels)[0]) for room in _ambient_frames(ambient)]
+            four = isinstance(raw, np.ndarray) and raw.ndim == 3 and raw.shape[0] == 4
+            rooms = [corrections.apply(_as_room(room, capture)) for room in _ambient_frames(ambient, four)]
             corrections = Corrections(measured, mean_mosaic(rooms))
         capture, more = corrections.apply_noting(capture)
         notes += more
@@ -174,13 +182,29 @@ def _as_capture(
     layout = Layout.parse(layout) if isinstance(layout, str) else layout
     if raw.ndim == 3 and layout is not None and layout.bayer is not None:
         return as_mosaic(interleave_planes(raw, layout), layout, black_level, white_level)
+    if layout not in (None, Layout(), Layout(bayer=None)):
+        raise ValueError(f"expected no layout with images at 0, 45, 90, 135 degrees, found {layout.spec}")
     return as_measurements(raw, black_level, white_level)
 
 
-def _ambient_frames(ambient: NDArray[Any] | Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
-    """One frame or several as a list."""
+def _as_room(room: NDArray[Any] | Mosaic, capture: Mosaic) -> Mosaic:
+    """A frame with the lamp off, of the layout and the levels of the frame with it, before both are corrected."""
+    if isinstance(room, Mosaic):
+        return room
+    found, _ = _as_capture(room, capture.layout, capture.black_level, capture.white_level)
+    if not isinstance(found, Mosaic):
+        raise ValueError(f"expected a raw frame with the lamp off, found shape {'x'.join(map(str, room.shape))}")
+    return found
+
+
+def _ambient_frames(
+    ambient: NDArray[Any] | Mosaic | Sequence[NDArray[Any] | Mosaic], four: bool
+) -> list[NDArray[Any] | Mosaic]:
+    """One frame or several as a list; ``four``: a frame is four planes of a mosaic."""
+    if isinstance(ambient, Mosaic):
+        return [ambient]
     if isinstance(ambient, np.ndarray):
-        return [ambient] if ambient.ndim == 2 else list(ambient)
+        return [ambient] if ambient.ndim == 2 + four else list(ambient)
     if isinstance(ambient, str) or not isinstance(ambient, Sequence):
         raise WrongType(f"expected a raw frame with the lamp off, or several, found {type(ambient).__name__}")
     return list(ambient)
@@ -220,8 +244,13 @@ def make_frame(
 ) -> Result:
     """Images that a method made of a capture, in the computer's own memory, with their report."""
     images = on_host(images)
-    assert images.dolp is not None and images.aolp is not None and images.tally is not None
+    dolp, aolp = images.dolp, images.aolp
+    assert dolp is not None and aolp is not None and images.tally is not None
     report = describe(images.tally, method.expects_errors)
+    if isinstance(capture, Mosaic) and capture.falloff is not None:
+        images = without_falloff(images, capture.falloff, light)
+        assert images.tally is not None
+        report["statistics"] |= light_statistics(images.tally)
     if images.error is not None:
         report["statistics"] |= error_quantiles(images.error, math.fsum(light) / len(light))
     layout = capture.layout.spec if isinstance(capture, Mosaic) else _describe_angles(capture)
@@ -230,11 +259,15 @@ def make_frame(
         report |= {"black_level": float(capture.black_level), "white_level": float(capture.white_level)}
     if not _is_finite(report):
         raise ValueError(f"expected finite images of {method.name}, found others: is the white level far too low?")
-    diffuse, specular, error = images.diffuse, images.specular, images.error
-    if isinstance(capture, Mosaic) and capture.falloff is not None:
-        fall = falloff_image(capture.falloff, *diffuse.shape[:2])[..., None]
-        diffuse, specular, error = diffuse / fall, specular / fall, None if error is None else error / fall
-    return Result(diffuse, specular, images.valid, images.dolp, images.aolp, report, error)
+    return Result(images.diffuse, images.specular, images.valid, dolp, aolp, report, images.error)
+
+
+def without_falloff(images: FrameImages, falloff: Table, light: tuple[float, ...]) -> FrameImages:
+    """Images as a lens without a ``falloff`` would give them, with sums of their own."""
+    fall = falloff_image(falloff, *images.diffuse.shape[:2])[..., None]
+    error = None if images.error is None else images.error / fall
+    even = replace(images, diffuse=images.diffuse / fall, specular=images.specular / fall, error=error)
+    return tally_again(even, light)
 
 
 def _describe_angles(samples: Measurements) -> str:

@@ -260,6 +260,12 @@ def test_forgotten_white_level_is_refused(tmp_path: Path, polsep: Cli) -> None:
     eight = png(tmp_path / "eight.png", (frame() >> 8).astype(np.uint8))  # whose white level is another one
     run = polsep("separate", eight, dim, "-o", tmp_path / "o")
     assert run.status == 2 and "expected a white level" in run.err and not list((tmp_path / "o").glob("dim*"))
+    for name, codes in (("eight", (frame() >> 8).astype(np.uint8)), ("dark", frame() >> 4)):  # angle images, too
+        np.save(tmp_path / f"{name}.npy", np.stack([np.stack([codes] * 3, -1)] * 4))
+    run = polsep(
+        "separate", tmp_path / "eight.npy", tmp_path / "dark.npy", "-o", tmp_path / "p", "--method", "analytic"
+    )
+    assert run.status == 2 and "expected a white level" in run.err and not list((tmp_path / "p").glob("dark*"))
 
 
 def test_folders_are_separated(tmp_path: Path, polsep: Cli) -> None:

@@ -398,6 +398,45 @@ def test_captures_and_four_angle_images_are_separated_as_files_are() -> None:
     assert quietly(np.stack([planes] * 3, -1), method="analytic").diffuse.shape == (*raw.shape, 3)
     cells = np.stack([raw[1::2, 1::2], raw[::2, 1::2], raw[::2, ::2], raw[1::2, ::2]])
     assert (quietly(cells, "analytic", layout="color").diffuse == quietly(raw, "analytic").diffuse).all()
+    with pytest.raises(ValueError, match="expected no layout with images at 0, 45, 90, 135 degrees"):
+        polsep.separate(planes, layout="0,60,90,150/mono")
+
+
+def test_lamp_off_frames_come_as_the_frame_does() -> None:
+    """Beside a `Mosaic` and beside planes, arrays have its layout and levels; a `Mosaic` its own."""
+    raw, room = raw_frame(), raw_frame(exposure=0.1)
+    plain = quietly(raw, "analytic", ambient=room, light_color="white").diffuse
+    assert plain.mean() < 0.95 * quietly(raw, "analytic", light_color="white").diffuse.mean()
+
+    def cells(codes: NDArray[Any]) -> NDArray[Any]:
+        return np.stack([codes[1::2, 1::2], codes[::2, 1::2], codes[::2, ::2], codes[1::2, ::2]])
+
+    mosaics = [as_mosaic(codes)[0] for codes in (raw, room)]
+    for frame, ambient, options in (
+        (mosaics[0], room, {}),
+        (mosaics[0], mosaics[1], {}),
+        (mosaics[0], [room, mosaics[1]], {}),
+        (cells(raw), cells(room), {"layout": "color"}),
+        (cells(raw), [cells(room)] * 2, {"layout": "color"}),
+    ):
+        found = quietly(frame, "analytic", ambient=ambient, light_color="white", **options)
+        np.testing.assert_allclose(found.diffuse, plain, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["analytic", "joint-fast"])
+def test_statistics_are_of_images_without_falloff(method: str) -> None:
+    """The mean light and the expected errors of a frame whose lens darkens corners are those of what is returned."""
+    mosaic = replace(as_mosaic(raw_frame(light=ODD_LIGHT))[0], falloff=((0.8, 0.0), (0.0, 0.0), (-0.2, 0.0)))
+    found = separate_capture(mosaic, method, ODD_LIGHT)
+    facts, gain = found.report["statistics"], np.array(ODD_LIGHT, np.float32)
+    light = (found.diffuse + found.specular) / gain
+    assert facts["mean_s0"] == pytest.approx(float(light.mean()), rel=1e-4)
+    share = float((found.specular / gain).mean() / light.mean())
+    assert facts["specular_fraction"] == pytest.approx(share, rel=1e-4)
+    if found.error is not None:
+        for k, name in enumerate(("diffuse", "specular")):
+            rms = float(np.sqrt(np.square(found.error[..., k], dtype=np.float64).mean()) / gain.mean())
+            assert facts[f"expected_{name}_error"] == pytest.approx(rms, rel=1e-4)
 
 
 def test_results_are_short_texts() -> None:

@@ -14,6 +14,7 @@ from polsep.physics.stokes import (
     Stokes,
     analyser_matrix,
     behind_angles,
+    bounded_below_white,
     complete_pair,
     contradictions,
     correct_extinction,
@@ -144,6 +145,41 @@ def test_light_is_seen_behind_other_angles() -> None:
     assert found.clipped is not None
     known = ~found.clipped
     assert float((found.data - four.data)[known].abs().max()) < 1e-9 and 0.8 < float(known.double().mean()) < 1
+
+
+def test_angles_are_the_same_half_a_turn_away() -> None:
+    turned = seen((0.0, math.pi / 4, -math.pi / 2, 7 * math.pi / 4))
+    asked = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)
+    found = behind_angles(turned, asked)
+    assert found.angles == asked and found.data is turned.data
+
+
+def test_what_clips_below_white_is_solved_or_refused() -> None:
+    """Photographs of longer exposures clip at less than white: three others say what one hides, two do not."""
+    four, angles = seen(Layout().angles), Layout().angles
+    for number, bounded in ((1, False), (2, True)):
+        clipped = (four.data > 0.3) & (torch.arange(4) < number)[:, None, None, None]
+        hidden = Measurements(torch.where(clipped, 0.3, four.data), angles, clipped)
+        assert bounded_below_white(hidden) == bounded
+        found = behind_angles(hidden, angles)
+        assert found.clipped is not None
+        assert float((found.data - four.data)[~found.clipped].abs().max()) < 1e-9
+        assert bool(found.clipped.any()) == bounded
+    assert not bounded_below_white(four)
+    whole = Measurements(four.data.clamp(max=0.3), angles, four.data > 0.3)
+    assert bounded_below_white(whole)
+
+
+def test_extinction_is_undone_beside_clipped_samples() -> None:
+    """What one analyser hides is not taken at its word for the others' sum."""
+    ideal, loss = seen(Layout().angles), (10 - 1) / (10 + 1)
+    half = fit_stokes(ideal).s0 / 2
+    leaking = half + loss * (ideal.data - half)
+    clipped = (leaking > 0.3) & (torch.arange(4) == 1)[:, None, None, None]
+    found = correct_extinction(
+        Measurements(leaking.where(~clipped, torch.tensor(0.3).double()), ideal.angles, clipped), 10
+    )
+    assert clipped.any() and float((found.data - ideal.data)[~clipped].abs().max()) < 1e-9
 
 
 @pytest.mark.parametrize("number", [2, 3, 5])

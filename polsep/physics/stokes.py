@@ -28,6 +28,8 @@ Doubles = NDArray[np.float64]
 
 #: Largest DoLP of separated frames: that of least squares with one bright analyser among four. Methods whose s0 comes
 #: from other samples than their s1 and s2 would have any number in the dark.
+#: Samples this much below white did not clip there: more than rounding and the margin of the sensor's codes.
+BELOW_WHITE = 2.0**-8
 MAX_DOLP = 2.0
 
 
@@ -251,19 +253,48 @@ def complete_pair(pair: Measurements) -> Measurements:
 
 
 def behind_angles(measurements: Measurements, angles: tuple[float, ...]) -> Measurements:
-    """The same light behind analysers at other ``angles`` [rad], by `fit_stokes_unclipped`; as it is at the same ones.
+    """The same light behind analysers at other ``angles`` [rad], by `fit_stokes_unclipped`.
 
-    A sample counts as clipped from white on, and where clipping leaves it unknown, and is white at least there.
+    A sample counts as clipped from white on, and where clipping leaves it unknown, and is white at least there
+    (`bounded_below_white` says where that is not known). At the same angles samples stay as they are, but those that
+    clipped below white.
     """
     turns = [t % math.pi for t in angles]
-    if len(turns) == len(measurements.angles) and np.allclose(
+    same = len(turns) == len(measurements.angles) and np.allclose(
         [t % math.pi for t in measurements.angles], turns, 0, 1e-9
-    ):
-        return measurements
+    )
+    below, xp = _clipped_below_white(measurements), namespace(measurements.data)
+    if same and below is None:
+        return measurements if tuple(measurements.angles) == tuple(angles) else replace(measurements, angles=angles)
     stokes, determined = fit_stokes_unclipped(measurements)
-    found, xp = measure(stokes, angles), namespace(measurements.data)
+    found = measure(stokes, angles)
     clipped = (found.data >= 1) | ~determined[..., None, :, :, :]
-    return replace(found, data=xp.where(clipped, found.data.clip(1, None), found.data), clipped=clipped)
+    data = xp.where(clipped, found.data.clip(1, None), found.data)
+    if same:
+        data = xp.where(below, data, measurements.data)
+        clipped = xp.where(below, clipped, measurements.clipped)
+    return replace(found, data=data, clipped=clipped)
+
+
+def bounded_below_white(measurements: Measurements) -> bool:
+    """True where clipping leaves light unknown that may be less than white: of photographs of several exposures.
+
+    Where all samples of a pixel clip it is unknown anyway.
+    """
+    below, clipped = _clipped_below_white(measurements), measurements.clipped
+    if below is None or clipped is None:
+        return False
+    xp = namespace(measurements.data)
+    unknown = ~fit_stokes_unclipped(measurements)[1] & ~xp.all(clipped, axis=-4)
+    return bool(xp.any(unknown & xp.any(below, axis=-4)))
+
+
+def _clipped_below_white(measurements: Measurements) -> Array | None:
+    """Samples that clipped at less than white, ``[..., N, C, H, W]``; None where there are none."""
+    if measurements.clipped is None:
+        return None
+    below, xp = measurements.clipped & (measurements.data < 1 - BELOW_WHITE), namespace(measurements.data)
+    return below if bool(xp.any(below)) else None
 
 
 def correct_extinction(measurements: Measurements, extinction: float) -> Measurements:
@@ -277,7 +308,7 @@ def correct_extinction(measurements: Measurements, extinction: float) -> Measure
     if math.isinf(extinction):
         return measurements
     whole = complete_pair(measurements) if is_pair(measurements) else measurements
-    half, loss = fit_stokes(whole).s0 / 2, (extinction + 1) / (extinction - 1)
+    half, loss = fit_stokes_unclipped(whole)[0].s0 / 2, (extinction + 1) / (extinction - 1)
     half = half[..., None, :, :, :]
     return replace(measurements, data=half + (measurements.data - half) * loss)
 

@@ -103,6 +103,19 @@ def tally(separation: Separation) -> Tally:
     return Tally(math.prod(separation.valid.shape), **values)
 
 
+def tally_again(images: FrameImages, light: tuple[float, ...]) -> FrameImages:
+    """Images in a ``light`` that were changed, with sums of their light and of their expected errors taken anew."""
+    assert images.tally is not None
+    gain, xp = constant([*light], images.diffuse), namespace(images.diffuse)
+    diffuse, specular = (_total(xp.mean(image / gain, axis=-1)) for image in (images.diffuse, images.specular))
+    sums: dict[str, Any] = {"s0": float(diffuse + specular), "specular": float(specular)}
+    if images.error is not None:
+        for k, name in enumerate(("diffuse_variance", "specular_variance")):
+            deviation = _doubles(images.error[..., k]) * (len(light) / math.fsum(light))
+            sums[name] = float(_total(deviation**2))
+    return replace(images, tally=replace(images.tally, **sums))
+
+
 def _doubles(image: Array) -> Array:
     xp = namespace(image)
     return xp.astype(image, xp.float64)
@@ -208,8 +221,7 @@ def describe(sums: Tally, expects_errors: bool) -> dict[str, Any]:
     statistics: dict[str, Any] = {
         "clipped_fraction": sums.clipped / pixels,
         "valid_fraction": sums.valid / pixels,
-        "mean_s0": brightness,
-        "specular_fraction": sums.specular / sums.s0 if sums.s0 > 0 else 0.0,
+        **light_statistics(sums),
         "dolp_above_1_fraction": sums.above_one / pixels,
         "specular_aolp_deg": math.degrees(angle),
         "specular_aolp_concentration": concentration,
@@ -225,7 +237,14 @@ def describe(sums: Tally, expects_errors: bool) -> dict[str, Any]:
             )
     if sums.noise is not None:
         statistics["sample_noise"] = sums.noise / pixels
-    if sums.diffuse_variance is not None and sums.specular_variance is not None:
-        statistics["expected_diffuse_error"] = math.sqrt(sums.diffuse_variance / pixels)
-        statistics["expected_specular_error"] = math.sqrt(sums.specular_variance / pixels)
     return {"statistics": statistics, "warnings": remarks}
+
+
+def light_statistics(sums: Tally) -> dict[str, float]:
+    """The statistics of a frame that are of its light, and of errors in it."""
+    pixels = max(sums.pixels, 1)
+    found = {"mean_s0": sums.s0 / pixels, "specular_fraction": sums.specular / sums.s0 if sums.s0 > 0 else 0.0}
+    if sums.diffuse_variance is not None and sums.specular_variance is not None:
+        found["expected_diffuse_error"] = math.sqrt(sums.diffuse_variance / pixels)
+        found["expected_specular_error"] = math.sqrt(sums.specular_variance / pixels)
+    return found

@@ -94,6 +94,8 @@ def fill_under_highlights(images: FrameImages, mosaic: Mosaic, light: tuple[floa
     _put(diffuse, holes.flat, gain * (own + weights * (fill - own)))
     _put(expected, holes.flat, gain.mean() * deviation * np.sqrt(1 - weight))
     tally = images.tally
+    if tally is not None:
+        tally = replace(tally, s0=tally.s0 + float((weights * (fill - own)).mean(axis=1).sum()))
     if tally is not None and tally.diffuse_variance is not None:
         less = float((weight * deviation**2).sum())
         tally = replace(tally, diffuse_variance=max(tally.diffuse_variance - less, 0.0))

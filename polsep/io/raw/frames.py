@@ -129,7 +129,8 @@ class Frame:
     """One frame of a file: ``stem`` names its outputs, ``notes`` are one-line remarks for the user.
 
     It is number ``index`` of ``count`` (approximate where a video does not say). Where the file says them,
-    ``exposure``: its time in seconds, and ``captured``: when it was taken, in ISO 8601.
+    ``exposure``: its time in seconds, and ``captured``: when it was taken, in ISO 8601. ``white_level``: in the units
+    of the file, said or of its type.
     """
 
     stem: str
@@ -139,6 +140,7 @@ class Frame:
     count: int = 1
     exposure: float | None = None
     captured: str | None = None
+    white_level: float | None = None
 
     def taken(self) -> dict[str, Any]:
         """Facts of the capture, for reports: those that the file says."""
@@ -169,7 +171,8 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
             data, notes = _convert(page, options)
         stem = output_stem(path)
         name = stem if page.count == 1 else f"{stem}_{page.index:04d}"
-        yield Frame(name, data, page.notes + notes, page.index, page.count, page.exposure, page.captured)
+        taken = (page.exposure, page.captured, _white_level(page, options))
+        yield Frame(name, data, page.notes + notes, page.index, page.count, *taken)
 
 
 def read_pages(path: Path, options: ReadOptions | None = None, first: int = 0) -> Iterator[Page]:
@@ -247,10 +250,7 @@ def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, t
 
 def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
     layout = page.layout if options.layout is None else options.layout
-    white = page.white_level if options.white_level is None else options.white_level
-    array = page.array
-    if white is None and options.corrections is not None and options.corrections.calibration is not None:
-        white = options.corrections.calibration.white_level_of(array)
+    white, array = _said_white_level(page, options), page.array
     if not page.angles:
         return as_mosaic(array, layout, options.black_level, white)
     if array.ndim == 4 and array.shape[-1] == 1:
@@ -259,6 +259,20 @@ def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, 
         mosaic = interleave_planes(array, Layout() if layout is None else layout)
         return as_mosaic(mosaic, layout, options.black_level, white)
     return as_measurements(array, options.black_level, white)
+
+
+def _said_white_level(page: Page, options: ReadOptions) -> float | None:
+    """The white level that the user says, or the file, or a calibration; None where nobody does."""
+    white = page.white_level if options.white_level is None else options.white_level
+    if white is None and options.corrections is not None and options.corrections.calibration is not None:
+        return options.corrections.calibration.white_level_of(page.array)
+    return white
+
+
+def _white_level(page: Page, options: ReadOptions) -> float | None:
+    """`_said_white_level`, else that of the samples' type."""
+    white = _said_white_level(page, options)
+    return WHITE_LEVELS.get(page.array.dtype.name) if white is None else white
 
 
 def _headerless_format(options: ReadOptions) -> tuple[tuple[int, int], str]:

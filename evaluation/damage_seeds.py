@@ -320,7 +320,7 @@ def calibration_seeds() -> Seeds:
         gains=ones,
         gain_map=np.ones_like(black),
         falloff=((0.9, 0.01), (0.01, -0.05)),
-        dead=np.array([5, 70], np.int32),
+        hot=np.array([5, 70], np.int32),
         analysers=table,
         lamp=lamp,
         details={"dark": {"frames": 16}},

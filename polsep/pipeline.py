@@ -149,6 +149,9 @@ def separate(
     measured = calibration if isinstance(calibration, Calibration | None) else read_calibration(Path(calibration))
     if white_level is None and measured is not None and isinstance(raw, np.ndarray):
         white_level = measured.white_level_of(raw)
+    if black_level and measured is not None and measured.black_level is not None:
+        found = f"found black_level {black_level:g}"
+        raise ValueError(f"expected the black level of the calibration ({measured.black_level:.4g}), {found}")
     levels = (layout, black_level, white_level)
     capture, notes = _as_capture(raw, *levels)
     if isinstance(capture, Mosaic):

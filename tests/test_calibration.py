@@ -118,7 +118,7 @@ def test_dark_and_flat_recover_a_sensor(layout: Layout) -> None:
     assert np.std((dark.black_map - sensor.black)[sound]) < 0.35
     assert abs(dark.black_level - sensor.black.mean()) < 0.2
     assert dark.read_noise == pytest.approx(math.hypot(READ * (WHITE - LEVEL) / WELL, 12**-0.5), rel=0.05)
-    used = Corrections(replace(dark, dead=None))
+    used = Corrections(replace(dark, hot=None))
     light = sensor.sees(np.full(SIZE, 1.0))
     flat = measure_flat((used.apply(sensor.expose(light)) for _ in range(10)), dark)
     assert flat.gain_map is not None and flat.falloff is not None and flat.dead is not None
@@ -455,6 +455,91 @@ def test_an_ambient_frame_with_the_lamp_on_is_said() -> None:
 
     assert said(scene) and said(scene + np.uint16(9))
     assert not said(scene // 2) and not said(scene // 10) and not said(np.zeros_like(scene))
+
+
+def test_paper_that_does_not_fill_the_frame_is_refused() -> None:
+    """A border in half the light, and a corner in none: neither is a lens, nor are so many pixels dead."""
+    sensor = BadSensor(MONO, dead=0)
+    used, light = (
+        Corrections(replace(sensor.calibration(), gains=None, gain_map=None, falloff=None)),
+        np.full(SIZE, 1.0),
+    )
+    for part in (np.s_[:16], np.s_[:, :24]):
+        dim = light.copy()
+        dim[part] *= 0.3
+        with pytest.raises(ValueError, match="expected evenly lit white over the whole frame"):
+            measure_flat((used.apply(sensor.expose(sensor.sees(dim))) for _ in range(4)), None)
+
+
+def test_what_cannot_be_read_again_is_not_written(tmp_path: Path) -> None:
+    """The calibration of before stays."""
+    good = BadSensor(Layout()).calibration()
+    write_calibration(tmp_path / "rig.json", good, "0")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match="expected a falloff"):
+        write_calibration(tmp_path / "rig.json", replace(good, falloff=((0.4, 0.6),)), "0")
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_measuring_again_replaces_defects_of_its_own_kind() -> None:
+    """A second flat forgets the dead pixels of the first, and keeps the hot ones of the dark."""
+    sensor = BadSensor(MONO, dead=3)
+    hot = np.array([7, 99], np.int32)
+    base = replace(sensor.calibration(), hot=hot, dead=np.array([1000], np.int32))
+    used = Corrections(replace(base, gains=None, gain_map=None, falloff=None, hot=None, dead=None, analysers=None))
+    found = measure_flat((used.apply(sensor.expose(sensor.sees(np.full(SIZE, 1.0)))) for _ in range(4)), base)
+    assert found.hot is hot and found.dead is not None
+    assert found.dead.tolist() == sorted(sensor.dead.tolist())
+    assert found.defects.tolist() == sorted({*hot.tolist(), *sensor.dead.tolist()})
+
+
+def test_gains_are_undone_once_in_any_order() -> None:
+    """Analysers measured before the flat hold the gains of places; the flat then takes them over."""
+    sensor = BadSensor(MONO, dead=0)
+    plain = replace(sensor.calibration(), gains=None, gain_map=None, falloff=None, dead=None, analysers=None)
+    aolps = np.linspace(0, np.pi, 10, endpoint=False)
+    used = Corrections(plain)
+    turned = [used.apply(sensor.expose(sensor.sees(np.full(SIZE, 0.8), 1.0, aolp))) for aolp in aolps]
+    first = measure_analysers(turned, plain)
+    found = measure_flat((used.apply(sensor.expose(sensor.sees(np.full(SIZE, 1.0)))) for _ in range(10)), first)
+    even = correct_mosaic(sensor.expose(sensor.sees(np.full(SIZE, 0.8)), noise=False), found)
+    assert even.falloff is not None
+    light = even.linear().numpy() / falloff_image(even.falloff, *SIZE)
+    places = np.array([light[r::2, c::2].mean() for r in (0, 1) for c in (0, 1)])
+    np.testing.assert_allclose(places / places.mean(), 1, atol=0.005)
+
+
+def test_a_small_part_of_a_card_is_enough() -> None:
+    mosaic = Mosaic(torch.full((16, 16), 0.5), Layout(), 0.0, 1.0)
+    lamp = measure_lamp([mosaic], None, True).lamp
+    assert lamp is not None and lamp.color == (1.0, 1.0, 1.0)
+
+
+def test_a_black_level_that_nobody_says_is_asked_for(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
+    """Where frames show that black is not at 0: the lamp's colour and exposure times would be wrong without a word."""
+    rng = np.random.default_rng(0)
+    light = np.repeat([0.0, 0.0, 200.0, 800.0, 2000.0, 5000.0, 5000.0, 7000.0], 64)[:, None]
+    codes = [240 + 0.4 * rng.poisson(k * light, (512, 512)) + rng.normal(0, 1.5, (512, 512)) for k in (0.5, 1)]
+    names = [tmp_path / f"{k}.tiff" for k in range(2)]
+    for name, frame in zip(names, codes, strict=True):
+        tifffile.imwrite(name, np.rint(frame).clip(0, 4095).astype(np.uint16))
+    for command in (("calibrate", "light", "--card"), ("calibrate", "analysers"), ("merge",)):
+        output = tmp_path / ("m.tiff" if command[0] == "merge" else "rig.json")
+        done = run_polsep(*command, *names, "--white-level", 4095, "-o", output)
+        assert done.status == 2 and "expected black at 0, found it at 24" in done.err and not output.exists(), done
+    done = run_polsep("merge", *names, "--white-level", 4095, "--black-level", 240, "-o", tmp_path / "m.tiff")
+    assert done.status == 0
+
+
+def test_levels_of_the_dark_are_said_once(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
+    """A black level beside a calibration that has one is refused: one of them would be ignored."""
+    write_calibration(tmp_path / "rig.json", BadSensor(Layout()).calibration(), "0")
+    shot = save(tmp_path / "shot.tiff", BadSensor(Layout()).expose(np.full(SIZE, 0.4)))
+    words = ("--calibration", tmp_path / "rig.json", "--black-level", 100, "-o", tmp_path / "out")
+    done = run_polsep("separate", shot, *words)
+    assert done.status == 2 and "expected the black level of the calibration (64), found --black-level 100" in done.err
+    with pytest.raises(ValueError, match=r"calibration \(64\), found black_level 100"):
+        polsep.separate(tifffile.imread(shot), calibration=tmp_path / "rig.json", black_level=100)
 
 
 def test_maps_replace_no_file_of_something_else(tmp_path: Path) -> None:

@@ -341,6 +341,7 @@ def test_exposure_notes() -> None:
     assert "they count as clipped" in notes_of(random_codes("float32") * np.float32(1.5))
     assert notes_of(random_codes("float32") * 4095, white_level=4095.0) == ""
     assert "is white 1? Then leave out --white-level" in notes_of(random_codes("float32"), white_level=4095.0)
+    assert "leave out" not in notes_of(0.004 * random_codes("float32"))
     assert notes_of(random_codes("float32") * 30, white_level=4095.0) == ""
 
 

@@ -446,8 +446,8 @@ def test_maps_of_calibrations_are_checked(tmp_path: Path) -> None:
     good = Calibration(Layout(), 4095.0, size, gains=ONES, gain_map=np.ones(size, np.float32), falloff=((1.0,),))
     for index, changes in enumerate(({"gain_map": np.zeros(size, np.float32)}, {"dead": np.array([64], np.int32)})):
         path = tmp_path / f"cal{index}.json"
-        write_calibration(path, Calibration(**{**vars(good), **changes}), "0.1")
-        assert_refused(path, read_calibration)
+        with pytest.raises(ValueError, match=r"expected (gains of pixels|defective pixels)"):
+            write_calibration(path, Calibration(**{**vars(good), **changes}), "0.1")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])

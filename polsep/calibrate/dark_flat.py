@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +30,9 @@ HOT, HOT_DEVIATIONS = 0.01, 12.0
 MOST_HOT = 0.05
 #: Least deviation of a defective pixel's gain, and in robust deviations of all pixels.
 DEAD, DEAD_DEVIATIONS = 0.25, 8.0
+#: Share of dead pixels above which something lies over the paper, and the least falloff of a lens; what is expected.
+MOST_DEAD, LEAST_FALLOFF = 0.01, 0.05
+WHOLE_FRAME = "expected evenly lit white over the whole frame"
 #: Brightest black level that a dark frame may have, relative to white; least signal and most clipping of a flat one.
 BRIGHTEST_DARK, DARKEST_FLAT, MOST_CLIPPED = 0.25, 0.02, 0.005
 #: Largest degree of the polynomial of the falloff, and blocks of a period along a side that each degree needs.
@@ -76,9 +78,10 @@ def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) ->
         "pixels_rms_codes": round(share**0.5 * robust_deviation(kept), 4),
         "hot_pixels": int(hot.sum()),
     }
-    base = _base(before, mosaic, hot)
+    base = _base(before, mosaic)
     return replace(
         base,
+        hot=np.flatnonzero(hot).astype(np.int32),
         black_level=level,
         black_pattern=_as_table(table - level),
         black_map=(tile(table, dark.mean.shape) + pattern).astype(np.float32) if varies else None,
@@ -117,12 +120,17 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
     if means.min() <= 0:
         raise ValueError("expected light on every place of the filters' period, found none on some")
     falloff = fit_falloff(signal / tile(means, signal.shape), layout.period)
-    even = signal / falloff_image(falloff, *signal.shape)
+    fall = falloff_image(falloff, *signal.shape)
+    if (least := float(fall.min())) < LEAST_FALLOFF:
+        raise ValueError(f"{WHOLE_FRAME}, found light that falls to {max(least, 0):.0%} at its border")
+    even = signal / fall
     means = place_means(even, layout.period)
     gains = means / _color_means(means, layout)
     residual = even / tile(means, signal.shape)
     spread = robust_deviation(residual)
     dead = np.abs(residual - 1) > max(DEAD, DEAD_DEVIATIONS * spread)
+    if dead.mean() > MOST_DEAD:
+        raise ValueError(f"{WHOLE_FRAME}, found {dead.mean():.1%} of the pixels far brighter or darker than others")
     share = 0.0
     if flat.variance is not None:
         relative = flat.variance / np.maximum(signal, 1e-6 * span) ** 2
@@ -140,13 +148,16 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
         "brightness": round(brightness, 4),
         "pixel_gains_rms": round(share**0.5 * spread, 5),
         "place_gains_error": round(float(spread / (signal.size / layout.period**2) ** 0.5), 6),
-        "falloff_least": round(float(falloff_image(falloff, 65, 65).min()), 4),
+        "falloff_least": round(least, 4),
         "apparent_dolp": round(polarized, 4),
         "dead_pixels": int(dead.sum()),
     }
-    base = _base(before, mosaic, dead)
+    base = _base(before, mosaic)
+    if base.analysers is not None and base.gains is None:  # their gains are those of the places, now measured here
+        base = replace(base, analysers=tuple(tuple(a._replace(gain=1.0) for a in row) for row in base.analysers))
     return replace(
         base,
+        dead=np.flatnonzero(dead).astype(np.int32),
         gains=_as_table(gains),
         gain_map=(tile(gains, signal.shape) * pixels).astype(np.float32) if share else None,
         falloff=falloff,
@@ -194,13 +205,10 @@ def _apparent_dolp(gains: Doubles, layout: Layout) -> float:
     return float(np.hypot(*found))
 
 
-def _base(before: Calibration | None, mosaic: Mosaic, defects: NDArray[np.bool_]) -> Calibration:
-    """The calibration to add to: of the frames' sensor, with the union of known defects."""
+def _base(before: Calibration | None, mosaic: Mosaic) -> Calibration:
+    """The calibration to add to: of the frames' sensor."""
     size = (int(mosaic.data.shape[0]), int(mosaic.data.shape[1]))
-    base = Calibration(mosaic.layout, mosaic.white_level, size) if before is None else before
-    known: Any = [] if base.dead is None else base.dead
-    dead = np.union1d(known, np.flatnonzero(defects)).astype(np.int32)
-    return replace(base, size=size, dead=dead)
+    return replace(Calibration(mosaic.layout, mosaic.white_level, size) if before is None else before, size=size)
 
 
 def require_same_sensor(base: Calibration | None, mosaic: Mosaic) -> None:

@@ -15,8 +15,10 @@ from polsep.io.raw.tiff import write_merged
 from polsep.io.store.atomic import refuse_existing, refuse_inputs, require_writable
 from polsep.io.store.calibrations import maps_path, read_calibration, refuse_foreign_maps, write_calibration
 from polsep.io.store.errors import input_error
+from polsep.sensor.black_level import check_black_level
 from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Mosaic
+from polsep.sensor.levels import Overexposed
 
 #: A measurement: frames and the calibration so far to a calibration with one more section.
 Measure = Callable[[Iterator[Mosaic], Calibration | None], Calibration]
@@ -34,7 +36,8 @@ def calibrate_files(paths: Sequence[Path], read: ReadOptions, output: Path, kind
     if before is not None and read.layout is None:
         read = replace(read, layout=before.layout)
     used = None if before is None else corrections_for(kind, before)
-    found = measure(read_mosaics(paths, replace(read, corrections=used), _require_white_level), before)
+    check = _require_white_level if kind == "dark" else _require_levels
+    found = measure(read_mosaics(paths, replace(read, corrections=used), check), before)
     written = write_calibration(output, found, __version__)
     return f"{kind}: {describe(found, kind)} -> {', '.join(str(path) for path in written)}"
 
@@ -44,6 +47,21 @@ def _require_white_level(path: Path, frame: Frame) -> None:
     if forgets_level(frame):
         wanted = "--white-level N, which the calibration keeps for all frames, such as 4095 for 12-bit values"
         raise input_error(path, f"expected {wanted} in 16-bit words, or 65535 for 16-bit ones; found none")
+
+
+def _require_levels(path: Path, frame: Frame) -> None:
+    """`_require_white_level` and `require_black_level`."""
+    _require_white_level(path, frame)
+    if isinstance(frame.data, Mosaic):
+        require_black_level(path, frame.data)
+
+
+def require_black_level(path: Path, mosaic: Mosaic) -> None:
+    """Raise InputError where a frame of a file shows black above 0 and nobody says a level."""
+    level = check_black_level(mosaic).level
+    if level is not None and mosaic.black_level == 0:
+        advice = f"say --black-level {level:.4g}, or measure it first ('polsep calibrate dark')"
+        raise input_error(path, f"expected black at 0, found it at {level:.4g} by the noise of dark parts: {advice}")
 
 
 def merge_files(
@@ -63,10 +81,11 @@ def merge_files(
         for frame in read_frames(path, read):
             if not isinstance(frame.data, Mosaic):
                 raise input_error(path, "expected a raw mosaic, found four angle images")
+            require_black_level(path, frame.data)
             frames.append(frame.data)
             recorded.append(frame.exposure)
             forgotten += [(path, frame)] if forgets_level(frame) else []
-            notes += [f"{frame.stem}: {note}" for note in frame.notes]
+            notes += [f"{frame.stem}: {note}" for note in frame.notes if not isinstance(note, Overexposed)]
     if len(forgotten) == len(frames) > 0:  # a short exposure alone may be dark
         refuse_forgotten(*forgotten[0])
     known = [time for time in recorded if time is not None]
@@ -89,7 +108,9 @@ def merge_files(
 
 def corrections_for(kind: str, before: Calibration) -> Corrections:
     """The corrections of frames that measure a ``kind``: all that do not depend on it."""
-    used = replace(before, lamp=None, dead=None if kind in ("dark", "flat") else before.dead)
+    used = replace(before, lamp=None)
+    if kind in ("dark", "flat"):
+        used = replace(used, hot=None, dead=None)
     if kind == "dark":
         used = replace(used, black_level=None, black_pattern=None, black_map=None)
     if kind in ("dark", "flat"):
@@ -114,7 +135,8 @@ def describe(found: Calibration, kind: str) -> str:
         return (
             f"gains of filters {min(gains):.3f} to {max(gains):.3f} +- {facts['place_gains_error']:.2g}, of pixels "
             f"{facts['pixel_gains_rms']:.2%} rms, falloff to {facts['falloff_least']:.2f}, {facts['dead_pixels']} dead "
-            f"pixels, {facts['frames']} frames at {facts['brightness']:.0%} of white{facts.get('remark', '')}"
+            f"pixels, apparent DoLP {facts['apparent_dolp']:.1%}, {facts['frames']} frames at "
+            f"{facts['brightness']:.0%} of white"
         )
     if kind == "analysers":
         ratios = sorted(a.extinction for row in found.analysers or () for a in row)

@@ -110,7 +110,8 @@ def _card_colors(mosaic: Mosaic) -> list[Doubles]:
     light = to_numpy(measurements.data)[middle].mean(axis=-4, dtype=np.float64)
     if float(light.mean()) < DARKEST_CARD:
         raise ValueError(f"expected a lit card in the middle of the frame, found {float(light.mean()):.1%} of white")
-    return [part.reshape(part.shape[0], -1).mean(axis=1) for part in np.array_split(light, PARTS, axis=1)]
+    parts = np.array_split(light, min(PARTS, light.shape[1]), axis=1)
+    return [part.reshape(part.shape[0], -1).mean(axis=1) for part in parts]
 
 
 def _mean_color(colors: Doubles) -> tuple[tuple[float, float, float], float]:

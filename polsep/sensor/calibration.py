@@ -68,8 +68,9 @@ class Calibration:
 
     Levels are in codes of ``white_level``. ``black_map``: code without light of each pixel ``[H, W]``, and
     ``black_pattern`` its mean on each place of the period. ``gain_map [H, W]``: of each pixel, without the ``falloff``,
-    which is a polynomial (`falloff_image`); ``gains``: its mean on each place. ``dead``: indices of defective pixels in
-    reading order. ``details``: what each measurement found, for people, JSON-able.
+    which is a polynomial (`falloff_image`); ``gains``: its mean on each place. ``hot``, ``dead``: indices of defective
+    pixels in reading order, of dark and of flat frames. ``details``: what each measurement found, for people,
+    JSON-able.
     """
 
     layout: Layout
@@ -86,6 +87,7 @@ class Calibration:
     analysers: tuple[tuple[Analyser, ...], ...] | None = None
     lamp: LampFacts | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
+    hot: NDArray[np.int32] | None = None
 
     def __post_init__(self) -> None:
         period = self.layout.period
@@ -97,6 +99,12 @@ class Calibration:
             values = getattr(self, name)
             if values is not None and values.shape != self.size:
                 raise ValueError(f"expected a {name} of the size {self.size}, found {values.shape}")
+
+    @property
+    def defects(self) -> NDArray[np.int32]:
+        """Indices of all defective pixels."""
+        known = [pixels for pixels in (self.hot, self.dead) if pixels is not None]
+        return np.unique(np.concatenate(known)).astype(np.int32) if known else np.zeros(0, np.int32)
 
     def white_level_of(self, array: NDArray[Any]) -> float | None:
         """The calibrated white level for raw frames that do not say theirs; None where their type cannot hold it."""
@@ -121,7 +129,7 @@ def correct_mosaic(mosaic: Mosaic, calibration: Calibration) -> Mosaic:
         if factor is not None:
             samples *= factor
         samples += np.float32(black)
-    dead = calibration.dead if calibration.dead is not None and calibration.dead.size else None
+    dead = defects if (defects := calibration.defects).size else None
     if dead is None and calibration.analysers is None and samples is raw:
         return _with_facts(mosaic, black, calibration)
     clipped = to_numpy(mosaic.clipped())

@@ -58,6 +58,10 @@ class ForgottenLevel(str):
     """
 
 
+class Overexposed(str):
+    """A note on many clipped samples, which a merge of several exposures replaces."""
+
+
 class BlackFrame(str):
     """A note on samples that all are black, which say nothing of their levels."""
 
@@ -142,14 +146,12 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
     if low >= clip:
         notes += (f"every sample is clipped: the smallest is {low:g} of white level {white:g}",)
     elif high >= clip and (share := clipped_share(samples, black_level, white)) > MAX_CLIPPED:
-        notes += (
-            f"overexposed: {share:.0%} of the lit samples are clipped, what they hide is estimated: expose less, "
-            "or merge several exposures (polsep merge)",
-        )
+        hidden = f"overexposed: {share:.0%} of the lit samples are clipped, what they hide is estimated"
+        notes += (Overexposed(f"{hidden}: expose less, or merge several exposures (polsep merge)"),)
     if white_level is None and samples.dtype.kind == "f" and high > 2:
         said = f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white"
         return (*notes, ForgottenLevel(said))
-    if samples.dtype.kind == "f" and high <= 2 and high - black_level < MIN_USED * (white - black_level):
+    if samples.dtype.kind == "f" and high <= 2 < white and high - black_level < MIN_USED * (white - black_level):
         notes += (f"float values reach {high:g} of white level {white:g}: is white 1? Then leave out --white-level",)
     if high > white:
         above = int(np.count_nonzero(samples > white))

@@ -114,6 +114,10 @@ class ReadOptions:
     def __post_init__(self) -> None:
         if self.pages not in ("auto", "frames", "angles"):
             raise ValueError(f'expected pages "auto", "frames" or "angles", found {self.pages!r}')
+        measured = self.corrections.calibration if self.corrections is not None else None
+        if self.black_level and measured is not None and measured.black_level is not None:
+            found = f"found --black-level {self.black_level:g}"
+            raise ValueError(f"expected the black level of the calibration ({measured.black_level:.4g}), {found}")
         if self.size is not None and (len(self.size) != 2 or min(self.size) < 1):
             raise ValueError(f"expected a size of positive width and height, found {self.size}")
 

@@ -34,8 +34,8 @@ FORMAT = "polsep calibration 1"
 BLACK_PART, BLACK_STEP, GAIN_STEP = 2.0**-22, 2.0**-10, 2.0**-17
 #: Angles of analysers lie within two turns.
 MOST_DEGREES = 720.0
-#: Arrays of the NPZ file.
-ARRAYS = ("black_offset_codes", "gain_minus_1", "defective_pixels")
+#: Arrays of the NPZ file. "defective_pixels" are hot and dead ones of older files, which do not tell them apart.
+ARRAYS = ("black_offset_codes", "gain_minus_1", "hot_pixels", "dead_pixels", "defective_pixels")
 
 
 def maps_path(path: Path) -> Path:
@@ -47,9 +47,11 @@ def write_calibration(path: Path, calibration: Calibration, version: str) -> lis
     """Write a calibration as ``path``, and its maps beside it; the files written. ``version``: of polsep.
 
     Whenever the program is killed, the calibration is the one before or the new one: maps wait under a hidden name,
-    where they are read too, until the JSON file is replaced. Raises OutputError, and leaves the one before.
+    where they are read too, until the JSON file is replaced. Raises OutputError, and ValueError on a calibration that
+    could not be read again, and leaves the one before.
     """
     refuse_foreign_maps(path)
+    _require_plausible(calibration)
     arrays, maps = _arrays(calibration), maps_path(path)
     record = _record(calibration) | {"polsep": version}
     try:
@@ -139,8 +141,9 @@ def _arrays(c: Calibration) -> dict[str, NDArray[Any]]:
         arrays["black_offset_codes"] = _halves(c.black_map - np.float32(c.black_level or 0), _black_step(c))
     if c.gain_map is not None:
         arrays["gain_minus_1"] = _halves(c.gain_map - np.float32(1), GAIN_STEP)
-    if c.dead is not None and c.dead.size:
-        arrays["defective_pixels"] = c.dead
+    for name, pixels in (("hot_pixels", c.hot), ("dead_pixels", c.dead)):
+        if pixels is not None and pixels.size:
+            arrays[name] = pixels
     return arrays
 
 
@@ -187,7 +190,7 @@ def _from_record(record: dict[str, Any], maps: dict[str, NDArray[Any]]) -> Calib
     size = (int(record["height"]), int(record["width"])) if "height" in record else None
     black_map, gain_map = maps.get("black_offset_codes"), maps.get("gain_minus_1")
     level = None if dark is None else float(dark["black_level_codes"])
-    lamp = None
+    lamp, older = None, maps.get("defective_pixels")
     if light is not None:
         r, g, b = (float(x) for x in light["color_rgb"])
         lamp = LampFacts((r, g, b), *(None if light[k] is None else float(light[k]) for k in ("dolp", "aolp_deg")))
@@ -202,10 +205,11 @@ def _from_record(record: dict[str, Any], maps: dict[str, NDArray[Any]]) -> Calib
         _table(flat and flat["gains"]),
         None if gain_map is None else gain_map.astype(np.float32) + np.float32(1),
         _table(flat and flat["falloff_legendre"]),
-        maps.get("defective_pixels"),
+        maps.get("dead_pixels", older),
         None if analysers is None else _analysers(analysers),
         lamp,
         {name: _details(section) for name, section in record.items() if isinstance(section, dict) and name != "maps"},
+        maps.get("hot_pixels", older),
     )
     _require_plausible(found)
     return found
@@ -227,13 +231,10 @@ def _require_plausible(c: Calibration) -> None:
         require_level("extinction ratio", analyser.extinction if math.isfinite(analyser.extinction) else 1.0)
     if c.lamp is not None:
         require_gains("a lamp's colour", c.lamp.color)
-    if c.dead is not None:
-        count = math.prod(c.size or (0,))
-        if (
-            c.dead.ndim != 1
-            or c.dead.dtype.kind != "i"
-            or (c.dead.size and not 0 <= c.dead.min() <= c.dead.max() < count)
-        ):
+    count = math.prod(c.size or (0,))
+    for pixels in (pixels for pixels in (c.hot, c.dead) if pixels is not None):
+        listed = pixels.ndim == 1 and pixels.dtype.kind == "i"
+        if not listed or (pixels.size and not 0 <= pixels.min() <= pixels.max() < count):
             raise ValueError(f"expected defective pixels as indices below {count}, found others")
 
 

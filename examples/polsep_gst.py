@@ -111,6 +111,8 @@ class Polsep(GstBase.BaseTransform):
         rows = np.frombuffer(before.extract_dup(0, before.get_size()), np.uint8).reshape(height, self.stride)
         raw = np.ascontiguousarray(rows[:, : width * self.type.itemsize]).view(self.type)
         white = self.white_level or float(np.iinfo(self.type).max)
+        if self.image not in ("diffuse", "specular"):
+            raise ValueError(f"expected image=diffuse or image=specular, found image={self.image}")
         images = self.run(raw, self.filters, self.black_level, white, self.options)
         light = images.specular if self.image == "specular" else images.diffuse
         tones = TONES[(np.clip(light * self.gain, 0, 1) * (len(TONES) - 1)).astype(np.intp)]

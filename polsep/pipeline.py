@@ -25,7 +25,7 @@ from polsep.compute.arrays import to_device
 from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration
-from polsep.light.find import find_light
+from polsep.light.find import Light, find_light
 from polsep.methods import Capture, Method, find_method
 from polsep.physics.stokes import Measurements
 from polsep.sensor.calibration import Calibration, Corrections, Table, falloff_image, mean_mosaic
@@ -360,6 +360,11 @@ def parse_light_color(text: str) -> LightColor | str:
     if not all(1e-6 < c < 1e6 for c in (r, g, b)):
         raise ValueError(f"{expected}, all positive, found {text!r:.40}")
     return (r, g, b)
+
+
+def light_of(capture: Capture) -> Light:
+    """`find_light` in a frame whose black level and defects were put right, as `separate_capture` does first."""
+    return find_light(check_mosaic(capture).mosaic if isinstance(capture, Mosaic) else capture)
 
 
 def is_calibrated(capture: Capture) -> bool:

@@ -751,6 +751,7 @@ def test_a_recording_is_not_recorded_over_itself(
         (("loop:.", "-o", "out", "--set", "Width"), "expected --set NAME=VALUE, found 'Width'"),
         (("loop:.", "-o", "out", "--method", "magic"), "expected a method of"),
         (("loop:.", "--show", "0", "--method", "none"), "expected -o DIR to record, or --show PORT"),
+        (("loop:.", "-o", "o", "--method", "none", "--calibration", "no.json"), "expected --calibration with a method"),
     ],
 )
 def test_the_command_refuses_in_one_line(

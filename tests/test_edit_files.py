@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -331,6 +332,18 @@ def test_stopped_runs_go_on_with_the_same_bytes(tmp_path: Path) -> None:
         assert next(edit_sequence(folder, work, target)).done == (PART if stop > PART else 0)
         list(edit_sequence(folder, work, target))
         assert contents(target.directory) == whole
+
+
+def test_a_run_that_damage_stopped_goes_on_without_the_frame(tmp_path: Path) -> None:
+    """No byte of what is done depends on how damage is met."""
+    folder, work = film(tmp_path / "in"), Work(Recipe((Rougher(sigma=2.0),)))
+    path = sorted(folder.glob("*.exr"))[PART + 2]
+    path.write_bytes(b"damaged")
+    target = EditTarget(tmp_path / "out", kind=SILENT)
+    with pytest.raises(InputError):
+        list(edit_sequence(folder, work, target))
+    steps = list(edit_sequence(folder, work, replace(target, damaged="skip")))
+    assert steps[0].done == PART and steps[-1].damaged and steps[-1].written
 
 
 def test_other_settings_are_not_mixed(tmp_path: Path) -> None:

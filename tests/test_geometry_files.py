@@ -197,7 +197,7 @@ def test_photographs_have_no_options_of_frames(polsep: Cli, tmp_path: Path, give
     """Options that would be ignored are refused by name, before files are looked for."""
     paths = [tmp_path / f"{number}.png" for number in range(6)]
     refused = polsep("--srgb", *paths, *given, "-o", tmp_path / "out")
-    assert_refused(refused, f"expected --srgb without {given[0]}, which is of raw frames, found both")
+    assert_refused(refused, f"expected {given[0]} with raw frames, found it with --srgb")
 
 
 def test_files_that_do_not_fit_are_named(polsep: Cli, separated: list[Path], tmp_path: Path) -> None:
@@ -277,6 +277,34 @@ def test_jumps_become_gaps() -> None:
     surface = span_surface(Appearance(normals, np.ones((8, 8, 1)), np.ones((8, 8), np.bool_)), depth)
     assert len(surface.faces) == 2 * (7 * 3 + 7 * 3)
     assert np.ptp(surface.vertices[surface.faces][..., 2], axis=1).max() == 0
+
+
+def test_jumps_become_gaps_before_a_pinhole_too() -> None:
+    """Planes at distances of 1 and 1.6 stay apart; a plane that is steep, but one, stays whole."""
+    size, focal = (24, 30), 60.0
+    intrinsics = np.array([[focal, 0, 14.5], [0, focal, 11.5], [0, 0, 1]])
+    facing, mask = np.broadcast_to([0.0, 0, 1], (*size, 3)), np.ones(size, np.bool_)
+    depth = np.ones(size)
+    whole = len(span_surface(Appearance(facing, np.ones((*size, 1)), mask), depth, intrinsics).faces)
+    depth[:, 15:] = 1.6
+    surface = span_surface(Appearance(facing, np.ones((*size, 1)), mask), depth, intrinsics)
+    assert len(surface.faces) == whole - 2 * (size[0] - 1)
+    normal = np.array([0.8, 0, 0.6])
+    across = (np.arange(size[1]) - 14.5) / focal
+    steep = np.broadcast_to(3 * normal[2] / (normal[2] - normal[0] * across), size).copy()
+    tilted = Appearance(np.broadcast_to(normal, (*size, 3)), np.ones((*size, 1)), mask)
+    assert len(span_surface(tilted, steep, intrinsics).faces) == whole
+
+
+def test_photographs_of_any_unit_give_one_shape() -> None:
+    """Linear light of a small unit is no shadow; the albedo is in the unit of the photographs."""
+    normals, mask = cap(48, 70)
+    images = 0.6 * np.maximum(np.einsum("ijk,lk->lij", normals, SIX), 0)[..., None].repeat(3, axis=-1)
+    found = [
+        files.find_shape(files.Views(gain * images, None), SIX, mask, files.ShapeOptions()) for gain in (1.0, 1e-3)
+    ]
+    np.testing.assert_allclose(found[1].normals, found[0].normals, atol=1e-6)
+    np.testing.assert_allclose(found[1].albedo, 1e-3 * found[0].albedo, rtol=1e-5, atol=1e-9)
 
 
 def test_pictures_show_the_side_that_is_lit() -> None:

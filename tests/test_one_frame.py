@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
@@ -50,6 +51,7 @@ from polsep.geometry.shape_maps import (
     mirror_surface,
     projected_normal,
 )
+from polsep.io.assets.maps import read_object
 from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.separation_writer import write_separation
@@ -279,7 +281,7 @@ def test_polarization_alone_finds_a_sphere() -> None:
     assert float((cosine > 0.99).mean()) > 0.97
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2, 3, 14])
 def test_bodies_are_closed_and_face_outward(seed: int) -> None:
     """Every edge belongs to two triangles, which wind counter-clockwise seen from outside, as their normals do."""
     body = random_blob(torch.Generator().manual_seed(seed))
@@ -374,6 +376,34 @@ def test_bad_arguments_are_refused() -> None:
         shape(replace(frame, dolp=0 * frame.dolp))
 
 
+def test_networks_of_other_inputs_are_refused(tmp_path: Path) -> None:
+    """They would see images that they were not trained on; a file that changes is read again."""
+    frame, path = sphere_frame(), tmp_path / "shape.safetensors"
+    found = []
+    for k, name in enumerate(("separated", "separated", "stokes")):
+        torch.manual_seed(k)
+        network = ShapeNetwork(INPUTS[name], USUAL, SMALL)
+        torch.nn.init.normal_(network.last.weight, std=0.1)
+        arrays = {name: value.detach().numpy() for name, value in network.state_dict().items()}
+        write_weights(path, arrays, {"method": "shape", "input": name, "size": json.dumps(asdict(SMALL))})
+        os.utime(path, ns=(k, k))
+        if name == "stokes":
+            with pytest.raises(ValueError, match="network that sees separated images, found one for 'stokes'"):
+                one_frame.find_shape(frame, cap(64, 80)[1], None, path)
+        else:
+            found.append(one_frame.find_shape(frame, cap(64, 80)[1], None, path).normals)
+    assert not np.array_equal(*found)
+
+
+def test_masks_of_odd_raw_frames_are_taken(tmp_path: Path) -> None:
+    """The last row or column that cuts a cell is in no separated image."""
+    mask = np.zeros((65, 67), np.uint8)
+    mask[10:30, 20:40] = 255
+    np.save(tmp_path / "mask.npy", mask)
+    found = read_object(tmp_path / "mask.npy", (32, 33))
+    assert found.shape == (32, 33) and found[5:15, 10:20].all() and found.sum() == 100
+
+
 def test_a_frame_that_is_full_is_said() -> None:
     """A mask that reaches around the border has a line that says what to do; a thing inside has none."""
     one = np.ones((64, 64), np.float32)
@@ -389,6 +419,7 @@ def test_a_frame_that_is_full_is_said() -> None:
         (0, 0, 1),
     )
     assert any("(mask)" in line for line in found.doubts())
+    assert replace(found, mask_told=True).doubts() == []
     assert replace(found, mask=cap(64, 80)[1]).doubts() == []
 
 
@@ -492,9 +523,9 @@ def test_raw_frames_come_in_npz_too(run: Cli, tmp_path: Path) -> None:
     np.savez(tmp_path / "raw.npz", raw=raw_sphere())
     write_separation(sphere_frame(), tmp_path, "separated", "npz")
     np.savez(tmp_path / "other.npz", a=np.zeros((4, 4)), b=np.zeros((4, 4)))
-    words = ("-o", tmp_path / "out", "--mesh", "none", "--method", "analytic")
+    words = ("-o", tmp_path / "out", "--mesh", "none")
     for name, method in (("raw", "analytic"), ("separated", "separated before")):
-        done = run(tmp_path / f"{name}.npz", *words)
+        done = run(tmp_path / f"{name}.npz", *words, *(("--method", method) if name == "raw" else ()))
         assert done.status == 0, done
         assert json.loads((tmp_path / "out" / f"{name}.json").read_text())["method"] == method
     assert_refused(run(tmp_path / "other.npz", *words), "other.npz: expected one array, or raw", "found arrays: a, b")

@@ -314,6 +314,8 @@ def test_stacks_of_four_angles_are_read_as_such(tmp_path: Path, pages: str) -> N
         (["--angles", "90,0", "p.tif", "c.tif"], "need three analysers"),
         (["--angles", "0,60,120", "p.tif", "c.tif"], "expected 2 angles for 2 photographs, found 3"),
         (["--angles", "0,x", "p.tif", "c.tif"], "expected --angles as numbers"),
+        (["--angles", "nan,60", "p.tif", "c.tif"], "expected --angles as numbers"),
+        (["--angles", "0,inf", "p.tif", "c.tif"], "expected --angles as numbers"),
         (["--angles", "unknown", "p.tif", "c.tif"], "expected at least 5 photographs"),
         (["--angles", "unknown", "{angle}.tif"], "expected angles for a name with {angle}"),
         (["--angles", "0,60,120"], "Missing argument 'FILE...'"),

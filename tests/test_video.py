@@ -35,9 +35,11 @@ from polsep.io.results.exr import half_rows, read_exr_layers, zip_rows
 from polsep.io.results.pixels_kernel import CHUNK, HEAD
 from polsep.io.results.sequences import FILM_WHITE, PART, Picture, SequenceKind, SequenceWriter, write_exr
 from polsep.io.store.atomic import OutputError
+from polsep.io.store.calibrations import write_calibration
 from polsep.io.store.errors import InputError
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
+from polsep.sensor.calibration import Calibration
 from polsep.sensor.camera import IDEAL, Layout, expose
 from polsep.sensor.levels import as_mosaic
 from polsep.separation.report import SeparatedFrame
@@ -543,6 +545,61 @@ def test_a_damaged_page_costs_its_four_angles_only(tmp_path: Path) -> None:
     np.save(tmp_path / "run.npy", pages)
     seen = list(open_sequence(tmp_path / "run.npy", ReadOptions(pages="angles")).begin(0))
     assert [(frame.index, type(frame)) for frame in seen] == [(0, Frame), (1, DamagedFrame), (2, Frame)]
+
+
+def test_a_black_first_frame_says_nothing_of_levels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A lamp that is not on yet: 12-bit codes behind it still need their white level."""
+    images = np.concatenate([np.zeros_like(frames(3)[:1]), frames(3)])
+    folder = write_folder(tmp_path / "run", images)
+    plain = (
+        "video",
+        str(folder),
+        "-o",
+        str(tmp_path / "out"),
+        "--method",
+        "analytic",
+        "--format",
+        "exr",
+        "--no-preview",
+    )
+    assert run(monkeypatch, *plain) == 2
+    assert "expected a white level" in capsys.readouterr().err and not list((tmp_path / "out").glob("*.exr"))
+    assert run(monkeypatch, *plain, "--white-level", str(WHITE)) == 0
+    write_folder(tmp_path / "dark", images[:1].repeat(2, axis=0))
+    assert run(monkeypatch, "video", str(tmp_path / "dark"), "-o", str(tmp_path / "dark-out"), "--no-preview") == 0
+
+
+def test_remarks_on_later_frames_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    images = frames(3)
+    images[1, : SIDE // 2] = WHITE
+    folder = write_folder(tmp_path / "run", images)
+    assert run(monkeypatch, *command(folder, tmp_path / "out", "--format", "none")) == 0
+    lines = [json.loads(line) for line in (tmp_path / "out" / "run.jsonl").read_text().splitlines()]
+    said = [any("overexposed" in text for text in line.get("warnings", [])) for line in lines]
+    assert said == [False, True, False]
+
+
+@pytest.mark.parametrize("size", [(22, 2048), (30, 2400), (6, 1300), (2, 4000), (1300, 6)])
+def test_panels_of_low_and_narrow_frames_hold_nothing_else(size: tuple[int, int]) -> None:
+    """The panel of a black image is black, and an even one is even: nothing from beyond the images is read."""
+    even, black = np.full((*size, 3), 0.25, np.float32), np.zeros((*size, 3), np.float32)
+    panels = video.draw_panels(even, black, 1.0)
+    width = panels.shape[1] // 3
+    assert (panels[:, 2 * width :] == 0).all()
+    assert (panels[:, : 2 * width] == panels[0, 0]).all() and panels[0, 0].min() > 0
+
+
+def test_a_calibration_is_not_replaced_by_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, rig = write_folder(tmp_path / "rig", frames(2)), tmp_path / "rig.json"
+    write_calibration(rig, Calibration(Layout(), float(WHITE), (SIDE, SIDE), black_level=0.0, read_noise=1.0), "0")
+    before = rig.read_bytes()
+    words = ("--calibration", str(rig), "--overwrite", "--method", "analytic", "--no-preview")
+    assert run(monkeypatch, "video", str(folder), "-o", str(tmp_path), *words) == 2
+    assert "is an input" in capsys.readouterr().err and rig.read_bytes() == before
 
 
 def test_results_of_other_commands_are_not_replaced_unasked(

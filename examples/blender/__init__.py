@@ -128,10 +128,7 @@ class Nodes:
 def separation_material(name, images):
     """A material of a separation: emitted light of the photograph, mixed by "Relit" with a lit surface."""
     nodes = Nodes(name)
-    textures = {
-        layer: nodes.add("ShaderNodeTexImage", layer, -1, image=image, extension="EXTEND")
-        for layer, image in images.items()
-    }
+    textures = nodes.textures(images)
     gains = {layer: nodes.value(f"{layer.capitalize()} gain", 1.0) for layer in ("diffuse", "specular")}
     parts = [nodes.scaled(f"{layer} x gain", textures[layer], gains[layer]) for layer in gains]
     total = nodes.add("ShaderNodeVectorMath", "diffuse + specular", 2, operation="ADD")
@@ -152,10 +149,7 @@ def separation_material(name, images):
 def surface_material(name, images):
     """A material of maps: normals, `principled_maps`, and where there is, roughness."""
     nodes = Nodes(name)
-    textures = {
-        layer: nodes.add("ShaderNodeTexImage", layer, -1, image=image, extension="EXTEND")
-        for layer, image in images.items()
-    }
+    textures = nodes.textures(images)
     surface = nodes.add("ShaderNodeBsdfPrincipled", "Surface", 3)
     for layer, socket in SOCKETS.items():
         if layer in textures:

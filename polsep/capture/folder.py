@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
 
@@ -48,7 +50,9 @@ class FolderSource:
     @contextmanager
     def connect(self) -> Iterator[_Files]:
         """Connect a camera that starts at the first frame."""
-        yield _Files(self._path.name or str(self._path), self._frames(), self._settings.frame_rate_hz or RATE_HZ)
+        files = _Files(self._path.name or str(self._path), self._frames(), self._settings.frame_rate_hz or RATE_HZ)
+        files.info = replace(files.info, patience_s=math.inf)  # files do not get lost
+        yield files
 
     def _frames(self) -> Iterator[tuple[bytes, CameraInfo]]:
         for _ in repeat(None) if self._loop else (None,):
@@ -113,7 +117,8 @@ def _files_of(path: Path) -> list[Path]:
         if not path.exists():
             raise CameraError(f"{path}: expected a folder or file of raw frames, found nothing at this path")
         return [path]
-    files = sorted((file for file in path.iterdir() if file.suffix.lower() in KINDS), key=natural_order)
+    seen = (file for file in path.iterdir() if not file.name.startswith("."))
+    files = sorted((file for file in seen if file.suffix.lower() in KINDS), key=natural_order)
     if not files:
         raise CameraError(f"{path}: expected files of {', '.join(KINDS)} or a {RECORD}, found none")
     return files

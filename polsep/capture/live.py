@@ -21,9 +21,9 @@ from polsep.io.raw.recording import RawImage
 from polsep.io.results.previews import live_sheet
 from polsep.io.store.atomic import replace_bytes
 from polsep.io.store.image_codecs import encode_jpeg
-from polsep.light.find import UNKNOWN_DEG, Light, combine, find_light
+from polsep.light.find import UNKNOWN_DEG, Light, combine
 from polsep.methods import Capture
-from polsep.pipeline import LightColor, is_calibrated, separate_capture
+from polsep.pipeline import LightColor, is_calibrated, light_of, separate_capture
 from polsep.sensor.camera import Layout
 from polsep.separation.report import SeparatedFrame
 
@@ -83,7 +83,7 @@ class LiveView:
         if is_calibrated(data):
             return "auto"
         if len(self._lights) < LIGHT_FRAMES:
-            found = find_light(data)
+            found = light_of(data)
             if found.error_deg < UNKNOWN_DEG:
                 self._lights.append(found)
         if not self._lights or self._lights[0].log_ratio is None:

@@ -219,6 +219,26 @@ def read_options(options: Mapping[str, Any]) -> ReadOptions:
     return with_corrections(read, options.get("calibration"), options.get("ambient", ()))
 
 
+#: Options that say something of raw frames alone.
+OF_FRAMES = ("white_level", "black_level", "layout", "calibration", "ambient", "size", "pixel_format", "method")
+
+
+def refuse_frame_options(other: str) -> None:
+    """Raise ValueError on an option of raw frames that was given beside something else: it would change nothing."""
+    context = click.get_current_context()
+    for name in OF_FRAMES:
+        if context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE:
+            raise ValueError(f"expected --{name.replace('_', '-')} with raw frames, found it with {other}")
+
+
+def correcting_files(options: Mapping[str, Any]) -> tuple[Path, ...]:
+    """The files of a calibration and of lamp-off frames, which no output may replace."""
+    from polsep.io.raw.sequences import input_files
+
+    paths = [options.get("calibration"), *options.get("ambient", ())]
+    return tuple(file for path in paths if path is not None for file in input_files(path))
+
+
 #: A module of each extra by which it is known; several where an extra has several uses.
 EXTRAS = {
     "torch": ("torch",),

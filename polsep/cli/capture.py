@@ -83,6 +83,11 @@ def capture(camera: str | None, listing: bool, **options: Any) -> None:
         raise ValueError("expected a method to show, found --method none")
     if method is not None:
         check_method(method)
+    for name in ("calibration", "ambient"):
+        if method is None and options[name]:
+            raise ValueError(
+                f"expected --{name} with a method to show, found --method none: frames are recorded as they are"
+            )
     layout = chosen_layout(options)
     settings = CameraSettings(
         options["exposure"],

@@ -24,6 +24,7 @@ from polsep.cli.app import (
     WHITE_LEVEL,
     app,
     check_read_options,
+    correcting_files,
     print_note,
     read_light,
     read_options,
@@ -103,7 +104,7 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
         require_paths(*files)
     check_read_options(options)
     from polsep.batch import SeparateOptions, WriteOptions, separate_files, separate_photographs
-    from polsep.io.raw.sequences import expand_folders, input_files
+    from polsep.io.raw.sequences import expand_folders
     from polsep.methods import check_method
     from polsep.pipeline import find_device
 
@@ -112,8 +113,9 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     find_device(options["device"])
     light = read_light(options)
     run = SeparateOptions(options["method"], light, options["device"], options["full"])
-    kept = tuple(file for path in (options["calibration"], *options["ambient"]) if path for file in input_files(path))
-    write = WriteOptions(options["output"], options["format"], options["overwrite"], options["stokes"], kept)
+    write = WriteOptions(
+        options["output"], options["format"], options["overwrite"], options["stokes"], correcting_files(options)
+    )
     if photographs:
         with show_progress(f"separating {len(photographs)} photographs"):
             outcome = separate_photographs(photographs, read_photo_options(options), read, run, write)

@@ -20,8 +20,10 @@ from polsep.cli.app import (
     Number,
     Word,
     app,
+    correcting_files,
     print_note,
     read_options,
+    refuse_frame_options,
     require_extra,
     require_paths,
 )
@@ -29,15 +31,6 @@ from polsep.cli.progress import show_progress
 
 #: The order of photographs without --lights.
 ORDER = "right front-right front front-left left above"
-#: Options that say something of raw frames alone, with the value that says nothing.
-_OF_FRAMES = {
-    "white_level": None,
-    "black_level": 0.0,
-    "layout": None,
-    "calibration": None,
-    "ambient": (),
-    "method": "auto",
-}
 
 
 @app.command()
@@ -95,12 +88,13 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     require_extra("mesh")
     if options["turntable"]:
         require_extra("video")
-    if options["srgb"] and (given := [name for name, nothing in _OF_FRAMES.items() if options[name] != nothing]):
-        raise ValueError(f"expected --srgb without --{given[0].replace('_', '-')}, which is of raw frames, found both")
+    if options["srgb"]:
+        refuse_frame_options("--srgb")
     require_paths(*files, *filter(None, [options["mask"]]))
     from polsep.geometry.lights import parse_lights
     from polsep.io.assets.maps import read_object
     from polsep.io.assets.shapes import shape_targets, write_shape
+    from polsep.io.results.separation_reader import is_separated
     from polsep.io.store.atomic import refuse_existing, refuse_inputs
     from polsep.methods import check_method
 
@@ -108,9 +102,11 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     if len(files) != len(directions):
         raise ValueError(f"expected {len(directions)} files, one per light of --lights, found {len(files)}")
     check_method(options["method"])
+    if all(map(is_separated, files)):
+        refuse_frame_options(f"{files[0]}, which is separated")
     read = read_options(options)
     targets = shape_targets(options["output"], options["name"], options["mesh"], options["turntable"])
-    refuse_inputs(targets, [*files, *([options["mask"]] if options["mask"] else [])])
+    refuse_inputs(targets, [*files, *filter(None, [options["mask"]]), *correcting_files(options)])
     refuse_existing(options["output"], targets, options["overwrite"])
     from polsep.geometry.files import (
         ShapeOptions,

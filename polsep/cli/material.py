@@ -19,9 +19,11 @@ from polsep.cli.app import (
     WHITE_LEVEL,
     Number,
     app,
+    correcting_files,
     print_note,
     read_light,
     read_options,
+    refuse_frame_options,
     require_extra,
     require_paths,
 )
@@ -80,7 +82,11 @@ def material(files: tuple[str, ...], **options: Any) -> None:
 
     check_method(options["method"])
     light = read_light(options)
+    from polsep.io.results.separation_reader import is_separated
     from polsep.material.files import MaterialOptions, estimate_files
+
+    if all(is_separated(Path(file)) for file in files):
+        refuse_frame_options(f"{files[0]}, which is separated")
 
     settings = MaterialOptions(
         read,
@@ -90,6 +96,7 @@ def material(files: tuple[str, ...], **options: Any) -> None:
         options["side"],
         options["network_input"],
         options["weights"],
+        kept=correcting_files(options),
     )
     with show_progress("estimating the material"):
         written, notes = estimate_files(files, settings, options["output"], options["name"], options["overwrite"])

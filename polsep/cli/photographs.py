@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -122,6 +123,9 @@ def _numbers(name: str, text: str) -> tuple[float, ...] | None:
     if name == "angles" and text == "unknown":
         return None
     try:
-        return tuple(float(part) for part in text.split(","))
+        found = tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise ValueError(f"expected --{name} as numbers like 0,60,120, found {text!r:.40}") from None
+        found = (math.nan,)
+    if not all(map(math.isfinite, found)):
+        raise ValueError(f"expected --{name} as numbers like 0,60,120, found {text!r:.40}")
+    return found

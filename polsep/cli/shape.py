@@ -20,9 +20,11 @@ from polsep.cli.app import (
     WHITE_LEVEL,
     Word,
     app,
+    correcting_files,
     print_note,
     read_light,
     read_options,
+    refuse_frame_options,
     require_extra,
     require_paths,
 )
@@ -110,13 +112,18 @@ def shape(file: Path, **options: Any) -> None:
     lamp, light = _parse_lamp(options["lamp"]), read_light(options)
     from polsep.io.assets.shapes import shape_targets, write_shape
     from polsep.io.raw.frames import output_stem
+    from polsep.io.results.separation_reader import is_separated
     from polsep.io.store.atomic import refuse_existing, refuse_inputs
     from polsep.methods import check_method
 
     check_method(options["method"])
     name = options["name"] or output_stem(str(file))
     targets = shape_targets(options["output"], name, options["mesh"], options["turntable"], True)
-    refuse_inputs(targets, [file, *([options["mask"]] if options["mask"] else [])])
+    if is_separated(file):
+        refuse_frame_options(f"{file}, which is separated")
+    beside = [file.with_suffix(".json")] if is_separated(file) else []  # its report is read, too
+    more = filter(None, [options["mask"], options["weights"]])
+    refuse_inputs(targets, [file, *beside, *more, *correcting_files(options)])
     refuse_existing(options["output"], targets, options["overwrite"])
     from polsep.geometry.one_frame_files import ShapeSettings, find_shape_of
 

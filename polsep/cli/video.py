@@ -28,6 +28,7 @@ from polsep.cli.app import (
     WHITE_LEVEL,
     Word,
     app,
+    correcting_files,
     has_extra,
     print_note,
     read_light,
@@ -115,7 +116,7 @@ def video(recording: Path, output: Path, **options: Any) -> None:
     shared = {name: options[name] for name in ("method", "device", "damaged", "frames", "engine", "filter", "stokes")}
     run = VideoOptions(light_color=light, **shared)
     kind = SequenceKind(options["format"], options["compression"], with_preview(options["preview"]), options["rate"])
-    target = Target(output, kind, options["overwrite"])
+    target = Target(output, kind, options["overwrite"], correcting_files(options))
     with show_progress(f"separating {recording}") as progress:
         failures = sum(report_step(step, progress) for step in separate_video(recording, read, run, target))
     if failures:

@@ -188,7 +188,6 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
         "first": found.first,
         "count": len(found.files),
         "missing": missing,
-        "damaged": target.damaged,
         "kind": asdict(target.kind),
         "gain": gain,
         "shape": list(size),
@@ -207,7 +206,8 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
     write_preview(preview, toned(after.combined, gain))
     lines = writer.lines()
     damaged = [line for line in lines if "damaged" in line]
-    report = {"frames": len(lines), "damaged": damaged, "settings": settings, "warnings": work.recipe.cautions()}
+    said = {**settings, "damaged": target.damaged}
+    report = {"frames": len(lines), "damaged": damaged, "settings": said, "warnings": work.recipe.cautions()}
     yield Progress(count, count, damaged=bool(damaged), written=(preview, *writer.finish(report)))
 
 

@@ -159,13 +159,16 @@ def find_object(views: Views) -> Mask:
 
 def find_shape(views: Views, directions: Floats, mask: Mask, options: ShapeOptions) -> ShapeFiles:
     """Normals, albedo, depth, mesh and preview. Raises ValueError."""
-    cue = None
+    cue, level = None, 1.0
     if views.polarized is not None:
         cue = normals_from_polarization(find_diffuse_polarization(views.polarized, mask))
-    found = fit_robust(views.images, directions, mask, cue)
+    else:  # photographs of a unit of their own: the brightest light on the object stands for white
+        level = max(float(np.percentile(views.images[:, mask], 99.5)), 1e-30)
+    found = fit_robust(views.images / level, directions, mask, cue)
+    found = replace(found, albedo=found.albedo * level)
     intrinsics = None if options.fov_deg is None else intrinsics_of(options.fov_deg, mask.shape)
     depth = INTEGRATIONS[options.integration](found.normals, mask, intrinsics)
-    gain = 1 / max(float(np.percentile(found.albedo[mask], 99.5)), 1e-9)
+    gain = 1 / max(float(np.percentile(found.albedo[mask], 99.5)), 1e-30)
     shown = Appearance(found.normals, np.minimum(found.albedo * gain, 1), mask)
     surface = span_surface(shown, depth, intrinsics)
     encode = encode_glb if options.mesh == "glb" else encode_ply

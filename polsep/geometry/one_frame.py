@@ -69,6 +69,7 @@ class Shape:
     the thing in the mean. ``roughness``: GGX sqrt(alpha); ``specular``: strength of mirror images, 1 = a dielectric of
     index 1.5; ``roughness_error``, ``specular_error``: expected deviations of their logarithms, unknown from `UNKNOWN`
     on. ``light [3]``: unit vector toward the lamp, told or found (`find_lamp`); zeros where none was found.
+    ``mask_told``: the mask was given, not found.
     """
 
     normals: Floats
@@ -80,6 +81,7 @@ class Shape:
     specular_error: Floats
     mask: Mask
     light: tuple[float, float, float]
+    mask_told: bool = False
 
     def __repr__(self) -> str:
         share, error = float(self.mask.mean()), float(np.degrees(np.median(self.normal_error[self.mask])))
@@ -93,7 +95,7 @@ class Shape:
         error = float(np.degrees(np.median(self.normal_error[inside])))
         border = float(np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]]).mean())
         notes = []
-        if border > FILLED:
+        if border > FILLED and not self.mask_told:
             notes.append(
                 f"one thing before a dark ground was expected, found light on {border:.0%} of the frame's border: say "
                 "where the thing is (mask)"
@@ -153,10 +155,15 @@ def _means(seen: Seen, block: int) -> Seen:
     return means._replace(mask=(means.mask > 0.99).astype(np.float32))
 
 
-@lru_cache(maxsize=2)
 def load_estimator(path: Path | None = None) -> ShapeEstimator:
-    """The shipped network, or the one in a file of `polsep train shape`. Raises ValueError."""
-    return ShapeEstimator(shipped_weights("shape/separated") if path is None else path)
+    """The shipped network, or the one in a file of `polsep train shape`, also when that changes. Raises ValueError."""
+    path = shipped_weights("shape/separated") if path is None else path.resolve()
+    return _load(path, path.stat().st_mtime_ns if path.is_file() else 0)
+
+
+@lru_cache(maxsize=2)
+def _load(path: Path, stamp: int) -> ShapeEstimator:
+    return ShapeEstimator(path)
 
 
 def shape(
@@ -203,7 +210,10 @@ def find_shape(
     small[4:6] = polarized_as_usual(small[4:6], small[:3].mean(axis=0), small[3:4] * on_thing(small[7:8]), index)
     told = np.broadcast_to(np.array(way, np.float32)[:, None, None], (3, SIDE, SIDE))
     seen = Seen(small[:3], small[3:4], small[4:6], small[6:7], on_thing(small[7:8]).astype(np.float32), told)
-    found = load_estimator(weights).find(seen)
+    estimator = load_estimator(weights)
+    if estimator.input != "separated":
+        raise ValueError(f"expected weights of a network that sees separated images, found one for {estimator.input!r}")
+    found = estimator.find(seen)
     planes = np.concatenate([np.asarray(x, np.float32) for x in found])
     wide = spread(planes, window, chosen.shape)
     normals = wide[:3] / np.maximum(np.linalg.norm(wide[:3], axis=0), 1e-6)
@@ -217,7 +227,8 @@ def find_shape(
         "specular_error": wide[10],
     }
     lamp = way if light is not None else find_lamp(found, seen)
-    return Shape(**{name: _outside_zero(x, chosen) for name, x in maps.items()}, mask=chosen, light=lamp)
+    inside = {name: _outside_zero(x, chosen) for name, x in maps.items()}
+    return Shape(**inside, mask=chosen, light=lamp, mask_told=mask is not None)
 
 
 def polarized_as_usual(polarized: Floats, diffuse: Floats, specular: Floats, index: float) -> Floats:

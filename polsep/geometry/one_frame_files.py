@@ -92,7 +92,7 @@ def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, ti
     """
     facts: dict[str, Any] = {
         "light": [round(x, 4) for x in found.light],
-        "light_is": "told" if settings.lamp is not None else "found from the shading",
+        "light_is": _light_source(found, settings),
         "method": frame.report.get("method", "separated before"),
         "median_normal_error_deg": round(float(np.degrees(np.median(found.normal_error[found.mask]))), 2),
         "unknown_roughness": round(float((found.roughness_error[found.mask] >= UNKNOWN).mean()), 4),
@@ -115,6 +115,12 @@ def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, ti
     normals, albedo = (x.astype(np.float64) for x in (found.normals, found.albedo))
     page = page_of(found, title)
     return ShapeFiles(normals, albedo, depth, found.mask, mesh, titled_sheet(panels), film, facts, more, page)
+
+
+def _light_source(found: Shape, settings: ShapeSettings) -> str:
+    if settings.lamp is not None:
+        return "told"
+    return "found from the shading" if any(found.light) else "not found"
 
 
 def page_of(found: Shape, title: str) -> bytes:

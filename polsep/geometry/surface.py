@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from polsep.geometry.integration import MIN_COSINE
+from polsep.geometry.integration import Slopes, find_slopes
 from polsep.geometry.photometric import Appearance
 from polsep.render.tracer import Tracer
 
@@ -49,13 +49,15 @@ def span_surface(appearance: Appearance, depth: Floats, intrinsics: Floats | Non
     mask = appearance.mask & np.isfinite(depth)
     rows, cols = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float64)
     if intrinsics is None:
-        points, scale = np.stack([cols, -rows, -depth], axis=-1), np.ones_like(depth)
+        points, focal, flat = np.stack([cols, -rows, -depth], axis=-1), 1.0, depth
     else:
         across = (cols - intrinsics[0, 2]) / intrinsics[0, 0]
         upward = (intrinsics[1, 2] - rows) / intrinsics[1, 1]
-        points, scale = np.stack([across, upward, -np.ones_like(depth)], axis=-1) * depth[..., None], depth
-        scale = scale / intrinsics[0, 0]
-    faces = _triangles(mask, _steady_links(appearance.normals, depth / scale, mask))
+        points = np.stack([across, upward, -np.ones_like(depth)], axis=-1) * depth[..., None]
+        focal = float(intrinsics[0, 0])
+        flat = focal * np.log(np.where(mask, depth, 1.0))  # rises in pixels, whatever the distance
+    slopes = find_slopes(appearance.normals, mask, intrinsics)
+    faces = _triangles(mask, _steady_links(slopes, focal, flat))
     faces = _without_fragments(faces)
     if not len(faces):
         raise ValueError("expected a surface of three pixels or more, found none")
@@ -67,13 +69,15 @@ def span_surface(appearance: Appearance, depth: Floats, intrinsics: Floats | Non
     return Surface(vertices, appearance.normals[mask][kept], colors, faces.reshape(-1, 3))
 
 
-def _steady_links(normals: Floats, depth: Floats, mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ...]:
-    """Links to the right ``[H, W-1]`` and down ``[H-1, W]`` across which the depth [pixels] is continuous."""
-    cosine = np.maximum(normals[..., 2], MIN_COSINE)
-    steady = []
+def _steady_links(slopes: Slopes, focal: float, depth: Floats) -> tuple[NDArray[np.bool_], ...]:
+    """Links to the right ``[H, W-1]`` and down ``[H-1, W]`` across which the depth [pixels] is continuous.
+
+    ``focal``: of the slopes, in pixels; 1 of an orthographic camera.
+    """
+    mask, cosine, steady = slopes.mask, slopes.cosine / focal, []
     for slope, first, second in (
-        (normals[..., 0] / cosine, np.s_[:, :-1], np.s_[:, 1:]),
-        (-normals[..., 1] / cosine, np.s_[:-1], np.s_[1:]),
+        (slopes.right / cosine, np.s_[:, :-1], np.s_[:, 1:]),
+        (slopes.down / cosine, np.s_[:-1], np.s_[1:]),
     ):
         expected = (slope[first] + slope[second]) / 2
         largest = np.maximum(np.abs(slope[first]), np.abs(slope[second]))

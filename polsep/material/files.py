@@ -48,7 +48,8 @@ class MaterialOptions:
     """Options of `polsep material`.
 
     ``white``: s0 of white paper in the middle of each photograph, or one number for all; empty: unknown. ``size``: side
-    of the maps. ``weights``: a file instead of the shipped ones. Raises ValueError on numbers out of range.
+    of the maps. ``weights``: a file instead of the shipped ones. ``kept``: files that results may not replace, besides
+    photographs. Raises ValueError on numbers out of range.
     """
 
     read: ReadOptions = field(default_factory=ReadOptions)
@@ -58,6 +59,7 @@ class MaterialOptions:
     size: int = MAP_SIZE
     input: str = "separated"
     weights: Path | None = None
+    kept: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         if not MIN_SIZE <= self.size <= LARGEST_SIZE:
@@ -89,7 +91,9 @@ def estimate_files(
     """
     name = output_stem(paths[0]) if name is None else name
     refuse_existing(directory, targets := material_targets(directory, name), overwrite)
-    refuse_inputs(targets, [Path(path) for path in paths])
+    inputs = [Path(path) for path in paths]
+    reports = [path.with_suffix(".json") for path in inputs if is_separated(path)]
+    refuse_inputs(targets, [*inputs, *reports, *options.kept, *filter(None, [options.weights])])
     estimator = load_estimator(options.input, options.weights)
     photographs = read_photographs(paths, options)
     white = find_white(photographs.views, options.white)
@@ -136,7 +140,10 @@ def _separated(path: str, options: MaterialOptions) -> Iterator[tuple[SeparatedF
         return
     for raw in read_frames(path, options.read):
         refuse_forgotten(path, raw)
-        frame = separate_capture(raw.data, options.method, options.light_color)
+        try:
+            frame = separate_capture(raw.data, options.method, options.light_color)
+        except (ValueError, RuntimeError) as error:
+            raise input_error(path, error) from error
         yield frame, (*raw.notes, *frame.report["warnings"])
 
 

@@ -54,6 +54,7 @@ def random_blob(generator: torch.Generator) -> Mesh:
         slope = np.sqrt(((scaled / size) ** 2).sum(-1))  # the distance to first order: length (length - 1) / |gradient|
         near += np.exp(-np.clip(length * (length - 1) / np.maximum(slope, 1e-6) / width, -30, 30))
     field = _relieved(-width * np.log(near), grid, float((high - low).max()), draw)
+    field = np.pad(field, 1, constant_values=step)  # what reaches beyond the grid ends there, closed
     meshed = marching_cubes(field, 0.0, spacing=(step,) * 3, gradient_direction="ascent")  # type: ignore[no-untyped-call]
     vertices, faces, normals, _ = meshed
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2

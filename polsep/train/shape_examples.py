@@ -170,7 +170,7 @@ def _photograph(real: RealScene, clip: float, generator: torch.Generator) -> Ten
     stokes = measured_stokes(mosaic, light) / gain
     diffuse, specular = frame.diffuse / gain, (frame.specular / gain).mean(axis=-1, keepdims=True)
     strength = frame.dolp * (diffuse.mean(axis=-1) + specular[..., 0])
-    error = np.zeros((*strength.shape, 2), np.float32) if frame.error is None else frame.error
+    error = np.zeros((*strength.shape, 2), np.float32) if frame.error is None else frame.error / gain.mean()
     images = [stokes[0], stokes[1], stokes[2], diffuse, specular]
     images += [(strength * f(2 * frame.aolp))[..., None] for f in (np.cos, np.sin)] + [error]
     true = [light.s0 / told[:, None, None] for light in (exposed.diffuse, exposed.specular)]

@@ -89,14 +89,17 @@ def fill_panels(
 def make_panels(
     images: tuple[NDArray[np.float32], NDArray[np.float32]], gain: float, table: NDArray[np.uint8], widest: int
 ) -> NDArray[np.uint8]:
-    """Sum, first and second of ``images [H, W, C]`` side by side, ``[h, 3 w, 3]``; sides even, at most ``widest``.
+    """Sum, first and second of ``images [H, W, C]`` side by side, ``[h, 3 w, 3]``; sides even, at least 2.
+
+    They are at most ``widest``, but for images too narrow to be shrunk so far.
 
     ``table``: codes of `STEPS` + 1 equal steps of the square root of linear light from 0 to 1.
     """
     height, width = images[0].shape[:2]
-    factor = -(-max(height, width) // widest)
-    first, second = (read_only(np.ascontiguousarray(image)) for image in images)
-    curve = read_only(table)
+    factor = min(-(-max(height, width) // widest), max(min(height, width) // 2, 1))
     out = np.empty((max(height // factor // 2 * 2, 2), 3 * max(width // factor // 2 * 2, 2), 3), np.uint8)
+    whole = out.shape[0] * factor  # rows, from which `fill_panels` takes the factor
+    first, second = (read_only(np.ascontiguousarray(image[:whole])) for image in images)
+    curve = read_only(table)
     run_over_rows(lambda rows: fill_panels((first, second), gain, curve, out, rows), out.shape[0], _ROWS)
     return out

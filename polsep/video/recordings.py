@@ -31,19 +31,21 @@ from polsep.io.results.previews import exposure_of, srgb
 from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWriter, State
 from polsep.io.store.atomic import refuse_inputs
 from polsep.io.store.errors import InputError
-from polsep.light.find import Light, combine, find_light
+from polsep.light.find import Light, combine
 from polsep.methods import Capture, find_method
 from polsep.pipeline import (
     LightColor,
     find_device,
     is_calibrated,
     is_to_be_found,
+    light_of,
     make_frame,
     move_capture,
     separate_capture,
 )
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import find_lasting_defects, repair
+from polsep.sensor.levels import BlackFrame
 from polsep.video.panels_kernel import STEPS, make_panels
 from polsep.video.temporal import Images, TemporalState, filter_frame, steady_images
 
@@ -97,11 +99,12 @@ class VideoOptions:
 
 @dataclass(frozen=True)
 class Target:
-    """Place and format in which results are written."""
+    """Place and format in which results are written. ``kept``: files that they may not replace, besides frames."""
 
     directory: Path
     kind: SequenceKind = field(default_factory=SequenceKind)
     overwrite: bool = False
+    kept: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -134,13 +137,17 @@ class Result:
 
 
 class Job(NamedTuple):
-    """A frame to separate on a ``device``, how it was ``taken`` (`Frame.taken`), with Stokes images or without."""
+    """A frame to separate on a ``device``, how it was ``taken`` (`Frame.taken`), with Stokes images or without.
+
+    ``notes``: on its samples (`Frame.notes`).
+    """
 
     data: Capture
     first: FirstFrame
     device: str
     taken: dict[str, Any]
     stokes: bool
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -177,7 +184,8 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     if options.stokes and target.kind.format != "exr":
         raise ValueError(f"expected the format exr for Stokes images, found {target.kind.format}")
     recording = open_sequence(path, read)
-    refuse_inputs([target.directory / f"{recording.stem}{end}" for end in (".json", ".jsonl")], input_files(path))
+    inputs = [*input_files(path), *target.kept]
+    refuse_inputs([target.directory / f"{recording.stem}{end}" for end in (".json", ".jsonl")], inputs)
     count = recording.count if options.frames is None else min(recording.count, options.frames)
     first = separate_first(recording, options)
     settings = {
@@ -213,25 +221,36 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
 
 
 def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFrame:
-    """Separate the first undamaged frame. Raises ValueError if there is none among those of one part."""
-    reason = "none at all"
+    """Separate the first undamaged frame that shows light. Raises ValueError if there is none among those of one part.
+
+    Where all of them are black, it is the first one.
+    """
+    reason, black_frame = "none at all", None
     for _, frame in zip(range(PART), recording.begin(0), strict=False):
         if isinstance(frame, DamagedFrame):
             reason = frame.reason
-            continue
-        refuse_forgotten(recording.stem, frame)
-        told, found = _light_of(recording, options)
-        separated = separate_capture(frame.data, options.method, told, options.device)
-        gain = exposure_of(separated.diffuse + separated.specular)
-        light = tuple(float(c) for c in separated.report["light_color"])
-        size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
-        facts = separated.report["light"] if found is None else {"source": "found", **found.describe()}
-        remarks = () if found is None else found.remarks
-        notes = (*frame.notes, *remarks, *separated.report["warnings"])
-        shape = tuple(frame.data.data.shape)
-        defects, black = _defects_of(recording, shape), separated.report.get("black_level")
-        return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black)
-    raise ValueError(f"expected a frame that can be read, found {reason}")
+        elif any(isinstance(note, BlackFrame) for note in frame.notes):
+            black_frame = black_frame or frame  # which says nothing of levels, nor of the light
+        else:
+            return _separate_first(recording, options, frame)
+    if black_frame is None:
+        raise ValueError(f"expected a frame that can be read, found {reason}")
+    return _separate_first(recording, options, black_frame)
+
+
+def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Frame) -> FirstFrame:
+    refuse_forgotten(recording.stem, frame)
+    told, found = _light_of(recording, options)
+    separated = separate_capture(frame.data, options.method, told, options.device)
+    gain = exposure_of(separated.diffuse + separated.specular)
+    light = tuple(float(c) for c in separated.report["light_color"])
+    size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
+    facts = separated.report["light"] if found is None else {"source": "found", **found.describe()}
+    remarks = () if found is None else found.remarks
+    notes = (*frame.notes, *remarks, *separated.report["warnings"])
+    shape = tuple(frame.data.data.shape)
+    defects, black = _defects_of(recording, shape), separated.report.get("black_level")
+    return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black)
 
 
 def _light_of(recording: FrameSequence, options: VideoOptions) -> tuple[LightColor | str, Light | None]:
@@ -245,7 +264,7 @@ def _light_of(recording: FrameSequence, options: VideoOptions) -> tuple[LightCol
     captures = [frame.data for frame in frames if isinstance(frame, Frame)]
     if not captures or any(is_calibrated(capture) for capture in captures):
         return options.light_color, None
-    found = combine([find_light(capture) for capture in captures])
+    found = combine([light_of(capture) for capture in captures])
     if found.log_ratio is None:
         return options.light_color, None
     return found.color, found
@@ -323,7 +342,7 @@ def separate_here(
         if isinstance(frame, DamagedFrame):
             return Separated(frame.index, frame, after)
         with own_threads(cores // workers):
-            job = Job(frame.data, first, device, frame.taken(), options.stokes)
+            job = Job(frame.data, first, device, frame.taken(), options.stokes, frame.notes)
             return Separated(frame.index, separate_one(job), after)
 
     with closing(ahead(_prepared(recording, options, first, begin, state), 1)) as frames:
@@ -341,7 +360,7 @@ def separate_on_ray(
         for frame, after in frames:
             submitted.append((frame if isinstance(frame, DamagedFrame) else frame.index, after))
             if not isinstance(frame, DamagedFrame):
-                yield Job(frame.data, first, device, frame.taken(), options.stokes)
+                yield Job(frame.data, first, device, frame.taken(), options.stokes, frame.notes)
 
     def damaged_frames() -> Iterator[Separated]:
         while submitted and isinstance(submitted[0][0], DamagedFrame):
@@ -368,7 +387,8 @@ def separate_one(job: Job) -> Result:
     method = find_method(job.first.method, data)
     frame = make_frame(method.run(data, light, False), method, data, light)
     stokes = replace(frame, capture=job.data).with_stokes().stokes if job.stokes else None
-    return Result((frame.diffuse, frame.specular), frame.report | job.taken, stokes)
+    said = {"warnings": [*job.notes, *frame.report["warnings"]]}
+    return Result((frame.diffuse, frame.specular), frame.report | said | job.taken, stokes)
 
 
 def _prepared(

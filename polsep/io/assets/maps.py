@@ -71,12 +71,13 @@ def read_map(path: Path, kind: str) -> Floats:
 
 
 def read_object(path: Path, size: tuple[int, ...]) -> NDArray[np.bool_]:
-    """The mask ``[H, W]`` of a thing, in a file of that size, or of twice that: raw frames become half as large.
+    """The mask ``[H, W]`` of a thing, in a file of that size, or of the raw frame's, which is twice that or odd.
 
     Raises InputError.
     """
     found: NDArray[np.bool_] = np.asarray(read_map(path, "mask") > 0.5)
-    if found.shape == (2 * size[0], 2 * size[1]):
+    if found.shape != size and (found.shape[0] // 2, found.shape[1] // 2) == tuple(size):
+        found = found[: 2 * size[0], : 2 * size[1]]  # cells that are cut are not separated
         found = found.reshape(size[0], 2, size[1], 2).min(axis=(1, 3))
     if found.shape != size:
         raise input_error(path, f"expected a mask of {list(size)}, found {list(found.shape)}")

@@ -84,7 +84,7 @@ def integrate_bilateral(normals: Floats, mask: Mask, intrinsics: Floats | None =
 
 
 def integrate_smooth(normals: Floats, mask: Mask, intrinsics: Floats | None = None) -> Floats:
-    """Depth of a surface without jumps: the same equations, of weight 1/2, and 1 where there is one neighbour (Poisson's)."""
+    """Depth of a surface without jumps: the same equations, each of weight 1/2, or 1 beside a border."""
     system = Equations(find_slopes(normals, mask, intrinsics))
     depth = system.solve(system.even_weights(), np.zeros(system.count), 1e-8)
     return system.as_image(depth, intrinsics is not None)

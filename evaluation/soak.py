@@ -106,11 +106,12 @@ def soak(minutes: float, recording: Path | None, white_level: float, output: Pat
     Rows are written every ten minutes, so that a run that is stopped has some.
     """
     keep_memory()
-    begun = read_commit()
+    begun, given = read_commit(), recording
 
     def say(seconds: float) -> str:  # what was played, which may be less than was asked for
+        played = f" --recording {given.name}" if given else ""
         levels = "" if white_level == 4095 else f" --white-level {white_level:g}"
-        return f"python -m evaluation soak --minutes {seconds / 60:.0f}{levels}"
+        return f"python -m evaluation soak --minutes {seconds / 60:.0f}{played}{levels}"
 
     passes, others, start, written = list[Pass](), 0, time.monotonic(), 0.0
     with tempfile.TemporaryDirectory() as scratch:

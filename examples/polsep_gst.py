@@ -97,6 +97,10 @@ class Polsep(GstBase.BaseTransform):
 
     def do_set_caps(self, sink, source):
         """Begin a stream of frames of one size."""
+        if self.image not in ("diffuse", "specular"):
+            found = GLib.Error(f"expected image=diffuse or image=specular, found image={self.image}")
+            self.post_message(Gst.Message.new_error(self, found, None))
+            return False
         frame = sink.get_structure(0)
         self.stride, self.out_stride = self.row_bytes(frame), self.row_bytes(source.get_structure(0))
         self.size = frame.get_int("height")[1], frame.get_int("width")[1]
@@ -111,8 +115,6 @@ class Polsep(GstBase.BaseTransform):
         rows = np.frombuffer(before.extract_dup(0, before.get_size()), np.uint8).reshape(height, self.stride)
         raw = np.ascontiguousarray(rows[:, : width * self.type.itemsize]).view(self.type)
         white = self.white_level or float(np.iinfo(self.type).max)
-        if self.image not in ("diffuse", "specular"):
-            raise ValueError(f"expected image=diffuse or image=specular, found image={self.image}")
         images = self.run(raw, self.filters, self.black_level, white, self.options)
         light = images.specular if self.image == "specular" else images.diffuse
         tones = TONES[(np.clip(light * self.gain, 0, 1) * (len(TONES) - 1)).astype(np.intp)]

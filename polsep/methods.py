@@ -282,6 +282,7 @@ def find_method(name: str, capture: Capture) -> Method:
     if isinstance(capture, Measurements) and not METHODS[name].accepts(capture):
         able = ", ".join(method.name for method in METHODS.values() if method.accepts(capture))
         kind = "two crossed photographs" if is_pair(capture) else "these images"
+        kind = "images that clip below white, of several exposures" if bounded_below_white(capture) else kind
         raise ValueError(f"expected a method for {kind} ({able}), found {name}")
     if name in NAMES and isinstance(capture, Mosaic) and not is_shipped(weights_name(name, capture.layout)):
         kind = "mono" if capture.layout.bayer is None else "colour"

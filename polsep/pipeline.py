@@ -31,7 +31,7 @@ from polsep.physics.stokes import Measurements
 from polsep.sensor.calibration import Calibration, Corrections, Table, falloff_image, mean_mosaic
 from polsep.sensor.camera import Layout, Mosaic, WrongType
 from polsep.sensor.checks import check_mosaic
-from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
+from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes, require_plane_angles
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.images import FrameImages
 from polsep.separation.report import (
@@ -149,16 +149,16 @@ def separate(
     measured = calibration if isinstance(calibration, Calibration | None) else read_calibration(Path(calibration))
     if white_level is None and measured is not None and isinstance(raw, np.ndarray):
         white_level = measured.white_level_of(raw)
-    if black_level and measured is not None and measured.black_level is not None:
-        found = f"found black_level {black_level:g}"
-        raise ValueError(f"expected the black level of the calibration ({measured.black_level:.4g}), {found}")
+    if measured is not None:
+        measured.require_black_level(black_level, "black_level")
     levels = (layout, black_level, white_level)
     capture, notes = _as_capture(raw, *levels)
     if isinstance(capture, Mosaic):
         corrections = Corrections(measured)
         if ambient is not None:
             four = isinstance(raw, np.ndarray) and raw.ndim == 3 and raw.shape[0] == 4
-            rooms = [corrections.apply(_as_room(room, capture)) for room in _ambient_frames(ambient, four)]
+            kind = None if white_level is not None else getattr(raw, "dtype", None)
+            rooms = [corrections.apply(_as_room(room, capture, kind)) for room in _ambient_frames(ambient, four)]
             corrections = Corrections(measured, mean_mosaic(rooms))
         capture, more = corrections.apply_noting(capture)
         notes += more
@@ -185,15 +185,22 @@ def _as_capture(
     layout = Layout.parse(layout) if isinstance(layout, str) else layout
     if raw.ndim == 3 and layout is not None and layout.bayer is not None:
         return as_mosaic(interleave_planes(raw, layout), layout, black_level, white_level)
-    if layout not in (None, Layout(), Layout(bayer=None)):
-        raise ValueError(f"expected no layout with images at 0, 45, 90, 135 degrees, found {layout.spec}")
+    if layout is not None:
+        require_plane_angles(layout)
     return as_measurements(raw, black_level, white_level)
 
 
-def _as_room(room: NDArray[Any] | Mosaic, capture: Mosaic) -> Mosaic:
-    """A frame with the lamp off, of the layout and the levels of the frame with it, before both are corrected."""
+def _as_room(room: NDArray[Any] | Mosaic, capture: Mosaic, kind: np.dtype[Any] | None) -> Mosaic:
+    """A frame with the lamp off, of the layout and the levels of the frame with it, before both are corrected.
+
+    ``kind``: the type of its samples, where that says the white level. Raises ValueError on samples of other levels.
+    """
     if isinstance(room, Mosaic):
         return room
+    white, most = capture.white_level, float(room.max()) if room.size and room.dtype.kind in "fu" else 0.0
+    if (kind is not None and room.dtype != kind) or (white <= 2) != (room.dtype.kind == "f" and most <= 2):
+        levels = f"white {white:g}" if kind is None else f"{kind}, white {white:g}"
+        raise ValueError(f"expected a lamp-off frame like the frame ({levels}), found {room.dtype} up to {most:g}")
     found, _ = _as_capture(room, capture.layout, capture.black_level, capture.white_level)
     if not isinstance(found, Mosaic):
         raise ValueError(f"expected a raw frame with the lamp off, found shape {'x'.join(map(str, room.shape))}")

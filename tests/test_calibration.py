@@ -529,6 +529,12 @@ def test_a_black_level_that_nobody_says_is_asked_for(tmp_path: Path, run_polsep:
         assert done.status == 2 and "expected black at 0, found it at 24" in done.err and not output.exists(), done
     done = run_polsep("merge", *names, "--white-level", 4095, "--black-level", 240, "-o", tmp_path / "m.tiff")
     assert done.status == 0
+    ones = ((1.02, 0.98) * 2, (0.99, 1.01) * 2) * 2
+    gains = Calibration(Layout(), 4095.0, (512, 512), gains=ones, falloff=((1.0,),))
+    write_calibration(tmp_path / "gains.json", gains, "0")  # samples that gains divide are no codes any more
+    words = ("--white-level", 4095, "--calibration", tmp_path / "gains.json", "-o", tmp_path / "n.tiff")
+    done = run_polsep("merge", *names, *words)
+    assert done.status == 2 and "expected black at 0, found it at 24" in done.err
 
 
 def test_levels_of_the_dark_are_said_once(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
@@ -537,9 +543,11 @@ def test_levels_of_the_dark_are_said_once(tmp_path: Path, run_polsep: Cli) -> No
     shot = save(tmp_path / "shot.tiff", BadSensor(Layout()).expose(np.full(SIZE, 0.4)))
     words = ("--calibration", tmp_path / "rig.json", "--black-level", 100, "-o", tmp_path / "out")
     done = run_polsep("separate", shot, *words)
-    assert done.status == 2 and "expected the black level of the calibration (64), found --black-level 100" in done.err
-    with pytest.raises(ValueError, match=r"calibration \(64\), found black_level 100"):
+    assert done.status == 2 and "expected no --black-level but 64, which a calibration" in done.err
+    with pytest.raises(ValueError, match="expected no black_level but 64"):
         polsep.separate(tifffile.imread(shot), calibration=tmp_path / "rig.json", black_level=100)
+    with warnings.catch_warnings(action="ignore"):  # of an even frame
+        polsep.separate(tifffile.imread(shot), "analytic", calibration=tmp_path / "rig.json", black_level=64)
 
 
 def test_maps_replace_no_file_of_something_else(tmp_path: Path) -> None:
@@ -554,6 +562,10 @@ def test_maps_replace_no_file_of_something_else(tmp_path: Path) -> None:
     maps.unlink()
     write_calibration(rig, sensor.calibration(), "0")
     assert maps.exists()
+    write_calibration(rig, plain, "0")
+    assert not maps.exists()
+    write_calibration(rig, sensor.calibration(), "0")
+    rig.unlink()  # to begin anew: maps of before are none of something else
     write_calibration(rig, plain, "0")
     assert not maps.exists()
 

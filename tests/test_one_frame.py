@@ -402,6 +402,8 @@ def test_masks_of_odd_raw_frames_are_taken(tmp_path: Path) -> None:
     np.save(tmp_path / "mask.npy", mask)
     found = read_object(tmp_path / "mask.npy", (32, 33))
     assert found.shape == (32, 33) and found[5:15, 10:20].all() and found.sum() == 100
+    whole = read_object(tmp_path / "mask.npy", (64, 66))  # full resolution
+    assert whole.shape == (64, 66) and whole.sum() == 400
 
 
 def test_a_frame_that_is_full_is_said() -> None:
@@ -479,6 +481,13 @@ def test_the_lamp_of_a_separated_file_is_read_beside_it(run: Cli, tmp_path: Path
         assert run(path, "-o", tmp_path / "out", "--mesh", "none").status == 0
         planes.append(read_exr_layers(tmp_path / "out" / f"{name}.exr"))
     np.testing.assert_allclose(planes[1]["normal.X"], planes[0]["normal.X"], atol=1e-3)
+    for end in ("exr", "json"):  # also where both were given another name
+        (tmp_path / f"cup.{end}").write_bytes((tmp_path / f"tinted.{end}").read_bytes())
+    renamed = run(tmp_path / "cup.exr", "-o", tmp_path / "out", "--mesh", "none")
+    assert renamed.status == 0 and "colour is not told" not in renamed.err
+    write_separation(frame, tmp_path, "cup", "npz", overwrite=True)  # of another run, in another format
+    other = run(tmp_path / "cup.exr", "-o", tmp_path / "out", "--mesh", "none", "--overwrite")
+    assert other.status == 0 and "colour is not told" in other.err
     (tmp_path / "tinted.json").unlink()
     alone = run(tmp_path / "tinted.exr", "-o", tmp_path / "other", "--mesh", "none")
     assert alone.status == 0 and "colour is not told, nor known" in alone.err

@@ -398,8 +398,9 @@ def test_captures_and_four_angle_images_are_separated_as_files_are() -> None:
     assert quietly(np.stack([planes] * 3, -1), method="analytic").diffuse.shape == (*raw.shape, 3)
     cells = np.stack([raw[1::2, 1::2], raw[::2, 1::2], raw[::2, ::2], raw[1::2, ::2]])
     assert (quietly(cells, "analytic", layout="color").diffuse == quietly(raw, "analytic").diffuse).all()
-    with pytest.raises(ValueError, match="expected no layout with images at 0, 45, 90, 135 degrees"):
+    with pytest.raises(ValueError, match="expected a layout of the angles 0, 45, 90, 135 for four planes"):
         polsep.separate(planes, layout="0,60,90,150/mono")
+    assert quietly(planes, "analytic", layout="0,45,90,135/mono").diffuse.shape == (*raw.shape, 1)
 
 
 def test_lamp_off_frames_come_as_the_frame_does() -> None:
@@ -421,6 +422,19 @@ def test_lamp_off_frames_come_as_the_frame_does() -> None:
     ):
         found = quietly(frame, "analytic", ambient=ambient, light_color="white", **options)
         np.testing.assert_allclose(found.diffuse, plain, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_lamp_off_frames_of_other_levels_are_refused(dtype: str) -> None:
+    """Nothing would be subtracted, or all of it, without a word."""
+    raw, room = raw_frame(), raw_frame(dtype, exposure=0.1)
+    with pytest.raises(ValueError, match="expected a lamp-off frame like the frame"):
+        polsep.separate(raw, "analytic", ambient=room)
+    with pytest.raises(ValueError, match="expected a lamp-off frame like the frame"):
+        polsep.separate(room, "analytic", ambient=raw)
+    if dtype == "float32":
+        with pytest.raises(ValueError, match="expected a lamp-off frame like the frame"):
+            polsep.separate(as_mosaic(raw)[0], "analytic", ambient=room)
 
 
 @pytest.mark.parametrize("method", ["analytic", "joint-fast"])
@@ -528,6 +542,23 @@ def test_mono_ignores_the_light_color() -> None:
     raw = raw_frame(layout=mono)
     one, other = quietly(raw, layout=mono), quietly(raw, layout=mono, light_color=ODD_LIGHT)
     assert float(np.abs(one.specular - other.specular).max()) == 0
+
+
+def test_light_of_a_report_is_that_of_the_images() -> None:
+    """Where highlights were filled, and where s0 of co-sited samples replaces that of a network."""
+    y, x = np.mgrid[:SIZE, :SIZE]
+    glow = 3.0 * np.exp(-((x - 40) ** 2 + (y - 50) ** 2) / 30)
+    light = torch.from_numpy(np.stack([0.3 + 0.1 * np.sin(x / (9 + k)) + glow for k in range(3)]))
+    polarized = torch.from_numpy(0.9 * glow).expand(3, -1, -1)
+    scene = Stokes(light, polarized * 0.6, polarized * 0.8)
+    mosaic = expose(scene, Layout(), IDEAL)
+    samples = measure(scene, tuple(np.radians([0, 45, 90, 135]).tolist()))
+    clipped = replace(samples, data=samples.data.clamp(max=1), clipped=samples.data >= 1)
+    for capture in (replace(mosaic, data=mosaic.data.numpy().astype(np.float32)), clipped):
+        found = separate_capture(capture, "joint-fast", "white")
+        facts = found.report["statistics"]
+        assert facts["mean_s0"] == pytest.approx(float((found.diffuse + found.specular).mean()), rel=2e-5)
+        assert isinstance(capture, Mosaic) == (found.report["filled_under_highlights"] > 0)
 
 
 def test_cosited_captures_keep_their_resolution() -> None:

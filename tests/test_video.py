@@ -14,6 +14,7 @@ import time
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
-from polsep import cli
+from polsep import cli, pipeline
 from polsep.compute.threads import own_threads
 from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.raw.sequences import DamagedFrame, natural_order, open_sequence
@@ -37,10 +38,12 @@ from polsep.io.results.sequences import FILM_WHITE, PART, Picture, SequenceKind,
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import write_calibration
 from polsep.io.store.errors import InputError
+from polsep.light.find import find_light
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
 from polsep.sensor.calibration import Calibration
 from polsep.sensor.camera import IDEAL, Layout, expose
+from polsep.sensor.checks import CheckedMosaic
 from polsep.sensor.levels import as_mosaic
 from polsep.separation.report import SeparatedFrame
 from polsep.video import recordings as video
@@ -579,6 +582,33 @@ def test_remarks_on_later_frames_are_kept(tmp_path: Path, monkeypatch: pytest.Mo
     lines = [json.loads(line) for line in (tmp_path / "out" / "run.jsonl").read_text().splitlines()]
     said = [any("overexposed" in text for text in line.get("warnings", [])) for line in lines]
     assert said == [False, True, False]
+
+
+def test_remarks_that_differ_in_numbers_count_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_folder(tmp_path / "run", frames(4))
+    level = str(int(frames(4).max()) - 40)
+    words = ("video", str(folder), "-o", str(tmp_path / "out"), "--method", "analytic", "--filter", "none")
+    assert run(monkeypatch, *words, "--white-level", level, "--format", "none") == 0
+    found = json.loads((tmp_path / "out" / "run.json").read_text())["warnings"]
+    (count,) = [often for text, often in found.items() if "samples exceed the white level" in text]
+    assert count > 1
+
+
+def test_the_lamp_of_a_film_is_found_in_frames_put_right(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the black level that a frame shows, as separate finds it."""
+    seen = list[float]()
+
+    def checked(mosaic: Any) -> Any:
+        return CheckedMosaic(replace(mosaic, black_level=7.0), {"black_level": 7.0}, ())
+
+    def found(capture: Any) -> Any:
+        seen.append(capture.black_level)
+        return find_light(capture)
+
+    monkeypatch.setattr(pipeline, "check_mosaic", checked)
+    monkeypatch.setattr(pipeline, "find_light", found)
+    video.separate_first(open_sequence(recording, ReadOptions(white_level=WHITE)), video.VideoOptions("analytic"))
+    assert seen and set(seen) == {7.0}
 
 
 @pytest.mark.parametrize("size", [(22, 2048), (30, 2400), (6, 1300), (2, 4000), (1300, 6)])

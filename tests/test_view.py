@@ -545,9 +545,16 @@ def test_folders_are_read_as_other_commands_read_them(tmp_path: Path) -> None:
         for name in names:
             (tmp_path / folder / name).write_bytes(codes)
         assert [source.stem for source in opening.find_sources(tmp_path / folder)] == stems
-    (tmp_path / "hidden" / "a1.exr").write_bytes(b"result")
-    with pytest.raises(InputError, match="name single files themselves"):
-        opening.find_sources(tmp_path / "hidden")
+    (tmp_path / "hidden" / "probe.exr").write_bytes(b"of something else")
+    assert [source.stem for source in opening.find_sources(tmp_path / "hidden")] == ["a1", "a2"]
+    frame = separate_capture(Mosaic(mosaic_codes(), Layout(), 0.0, float(WHITE)), "analytic")
+    for kind in ("exr", "tiff", "png"):
+        write_separation(frame, tmp_path / kind, "shot", kind)
+        with pytest.raises(InputError, match="name single files themselves"):
+            opening.find_sources(tmp_path / kind)
+    write_separation(frame, tmp_path / "npz", "shot", "npz")
+    (source,) = opening.find_sources(tmp_path / "npz")
+    assert source.separated and source.path.name == "shot.npz"
 
 
 def test_controls_are_generated_from_the_registry() -> None:

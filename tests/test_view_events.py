@@ -324,4 +324,5 @@ def test_a_shape_of_a_frame_that_was_closed_is_not_shown(
     later = False
     assert asyncio.run(events.find_shape(REQUEST))["shape"] == "surface"
     later = True
-    assert "surface" not in asyncio.run(events.find_shape(REQUEST)).values()
+    told = asyncio.run(events.find_shape(REQUEST))
+    assert "surface" not in told.values() and set(told) <= {"shape", "status"}  # what the button may change

@@ -36,8 +36,10 @@ def calibrate_files(paths: Sequence[Path], read: ReadOptions, output: Path, kind
     if before is not None and read.layout is None:
         read = replace(read, layout=before.layout)
     used = None if before is None else corrections_for(kind, before)
-    check = _require_white_level if kind == "dark" else _require_levels
-    found = measure(read_mosaics(paths, replace(read, corrections=used), check), before)
+    read = replace(read, corrections=used)
+    if kind != "dark":
+        require_black_level(paths, read)
+    found = measure(read_mosaics(paths, read, _require_white_level), before)
     written = write_calibration(output, found, __version__)
     return f"{kind}: {describe(found, kind)} -> {', '.join(str(path) for path in written)}"
 
@@ -49,19 +51,22 @@ def _require_white_level(path: Path, frame: Frame) -> None:
         raise input_error(path, f"expected {wanted} in 16-bit words, or 65535 for 16-bit ones; found none")
 
 
-def _require_levels(path: Path, frame: Frame) -> None:
-    """`_require_white_level` and `require_black_level`."""
-    _require_white_level(path, frame)
-    if isinstance(frame.data, Mosaic):
-        require_black_level(path, frame.data)
+def require_black_level(paths: Sequence[Path], read: ReadOptions) -> None:
+    """Raise InputError where the first frame of a file shows black above 0, and nobody says or measured a level.
 
-
-def require_black_level(path: Path, mosaic: Mosaic) -> None:
-    """Raise InputError where a frame of a file shows black above 0 and nobody says a level."""
-    level = check_black_level(mosaic).level
-    if level is not None and mosaic.black_level == 0:
-        advice = f"say --black-level {level:.4g}, or measure it first ('polsep calibrate dark')"
-        raise input_error(path, f"expected black at 0, found it at {level:.4g} by the noise of dark parts: {advice}")
+    It is looked for before frames are corrected: samples that are divided by gains are no codes any more.
+    """
+    measured = None if read.corrections is None else read.corrections.calibration
+    if read.black_level or (measured is not None and measured.black_level is not None):
+        return
+    for path in paths:
+        first = next(read_mosaics([path], replace(read, corrections=None)), None)
+        level = None if first is None else check_black_level(first).level
+        if level is not None:
+            advice = f"say --black-level {level:.4g}, or measure it first ('polsep calibrate dark')"
+            raise input_error(
+                path, f"expected black at 0, found it at {level:.4g} by the noise of dark parts: {advice}"
+            )
 
 
 def merge_files(
@@ -75,13 +80,13 @@ def merge_files(
         raise ValueError(f"expected an output that ends in .tiff, found {output.name!r}")
     refuse_inputs([output], paths)
     refuse_existing(output.parent, [output], overwrite)
+    require_black_level(paths, read)
     frames, notes = list[Mosaic](), list[str]()
     recorded, forgotten = list[float | None](), list[tuple[Path, Frame]]()
     for path in paths:
         for frame in read_frames(path, read):
             if not isinstance(frame.data, Mosaic):
                 raise input_error(path, "expected a raw mosaic, found four angle images")
-            require_black_level(path, frame.data)
             frames.append(frame.data)
             recorded.append(frame.exposure)
             forgotten += [(path, frame)] if forgets_level(frame) else []

@@ -226,9 +226,10 @@ OF_FRAMES = ("white_level", "black_level", "layout", "calibration", "ambient", "
 def refuse_frame_options(other: str) -> None:
     """Raise ValueError on an option of raw frames that was given beside something else: it would change nothing."""
     context = click.get_current_context()
-    for name in OF_FRAMES:
-        if context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE:
-            raise ValueError(f"expected --{name.replace('_', '-')} with raw frames, found it with {other}")
+    for option in context.command.params:
+        given = context.get_parameter_source(option.name or "") == click.core.ParameterSource.COMMANDLINE
+        if given and option.name in OF_FRAMES:
+            raise ValueError(f"expected {option.opts[0]} with raw frames, found it with {other}")
 
 
 def correcting_files(options: Mapping[str, Any]) -> tuple[Path, ...]:

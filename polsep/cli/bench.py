@@ -12,7 +12,7 @@ from polsep.cli.app import DIR, app, said_command
 @app.command()
 @click.argument("name", metavar="NAME", default="list")
 @click.option(
-    "--data", type=DIR, envvar="POLSEP_DATA", metavar="DIR", help="Data of real, frontend.  [env: POLSEP_DATA]"
+    "--data", type=DIR, envvar="POLSEP_DATA", metavar="DIR", help="Data of real, frontend, reality.  [env: POLSEP_DATA]"
 )
 @click.option("-o", "--output", type=DIR, default=Path("results"), metavar="DIR", help="Folder of NAME.jsonl.")
 @click.option("--quick", is_flag=True, help="Measure a part in minutes, to DIR/NAME-quick.jsonl.")
@@ -57,6 +57,10 @@ def bench(
 
                 options = RealityOptions(split or "test", _words(rows, ";"), _words(methods, ","))
                 quick = quick or options != RealityOptions()
+                if not quick and (data is None or not (data / "raw").is_dir()):
+                    raise ValueError(
+                        "expected --data DIR with raw frames in DIR/raw, which all of reality needs, found none"
+                    )
                 benches = BENCHES | {name: select_reality(BENCHES[name], options, data)}
             elif rows or methods or split:
                 raise ValueError(f"expected --rows, --methods and --split with reality, found them with {name!r}")

@@ -28,9 +28,10 @@ Doubles = NDArray[np.float64]
 
 #: Largest DoLP of separated frames: that of least squares with one bright analyser among four. Methods whose s0 comes
 #: from other samples than their s1 and s2 would have any number in the dark.
-#: Samples this much below white did not clip there: more than rounding and the margin of the sensor's codes.
-BELOW_WHITE = 2.0**-8
 MAX_DOLP = 2.0
+#: An analyser clips below white if its brightest clipped sample is this much below it: more than rounding and the
+#: margin of the sensor's codes. Share of pixels of which that leaves light unknown from which on it matters.
+BELOW_WHITE, MOST_BOUNDED = 2.0**-8, 1e-3
 
 
 @dataclass(frozen=True, repr=False)
@@ -277,23 +278,29 @@ def behind_angles(measurements: Measurements, angles: tuple[float, ...]) -> Meas
 
 
 def bounded_below_white(measurements: Measurements) -> bool:
-    """True where clipping leaves light unknown that may be less than white: of photographs of several exposures.
+    """True where clipping leaves light of many pixels unknown that may be less than white.
 
-    Where all samples of a pixel clip it is unknown anyway.
+    So it is in photographs of several exposures. Where all samples of a pixel clip it is unknown anyway.
     """
     below, clipped = _clipped_below_white(measurements), measurements.clipped
     if below is None or clipped is None:
         return False
     xp = namespace(measurements.data)
     unknown = ~fit_stokes_unclipped(measurements)[1] & ~xp.all(clipped, axis=-4)
-    return bool(xp.any(unknown & xp.any(below, axis=-4)))
+    bounded = xp.any(unknown & xp.any(below, axis=-4), axis=-3)
+    return float(xp.mean(xp.astype(bounded, xp.float32))) > MOST_BOUNDED
 
 
 def _clipped_below_white(measurements: Measurements) -> Array | None:
-    """Samples that clipped at less than white, ``[..., N, C, H, W]``; None where there are none."""
-    if measurements.clipped is None:
+    """Samples that clipped at less than white, ``[..., N, C, H, W]``; None where there are none.
+
+    Of analysers that clip there: samples beside clipped ones, which were interpolated, are marked whatever their value.
+    """
+    data, clipped, xp = measurements.data, measurements.clipped, namespace(measurements.data)
+    if clipped is None or not bool(xp.any(clipped)):
         return None
-    below, xp = measurements.clipped & (measurements.data < 1 - BELOW_WHITE), namespace(measurements.data)
+    level = xp.max(xp.where(clipped, data, 0.0), axis=(-3, -2, -1), keepdims=True)
+    below = clipped & (level < 1 - BELOW_WHITE)
     return below if bool(xp.any(below)) else None
 
 

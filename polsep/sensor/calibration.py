@@ -37,6 +37,8 @@ Floats = NDArray[np.float32]
 LIT, LEAST_LEFT, MOST_GONE = 0.02, 0.05, 0.5
 #: Numbers per place of one period of filters, ``[period][period]``.
 Table = tuple[tuple[float, ...], ...]
+#: A black level that is said may differ from the measured one by rounding to whole codes.
+ROUNDED_LEVEL = 0.51
 
 
 class Analyser(NamedTuple):
@@ -105,6 +107,12 @@ class Calibration:
         """Indices of all defective pixels."""
         known = [pixels for pixels in (self.hot, self.dead) if pixels is not None]
         return np.unique(np.concatenate(known)).astype(np.int32) if known else np.zeros(0, np.int32)
+
+    def require_black_level(self, said: float, name: str) -> None:
+        """Raise ValueError where a black level is said that is not the measured one; ``name``: of what says it."""
+        if said and self.black_level is not None and abs(said - self.black_level) > ROUNDED_LEVEL:
+            measured = f"{self.black_level:.4g}, which a calibration of the dark measured"
+            raise ValueError(f"expected no {name} but {measured}, found {name} {said:g}")
 
     def white_level_of(self, array: NDArray[Any]) -> float | None:
         """The calibrated white level for raw frames that do not say theirs; None where their type cannot hold it."""

@@ -125,14 +125,19 @@ def interleave_planes(planes: NDArray[Any], layout: Layout) -> NDArray[Any]:
     """
     if planes.ndim != 3 or planes.shape[0] != 4:
         raise ValueError(f"expected four planes [4, H, W] of one mosaic, found shape {_shape(planes)}")
+    require_plane_angles(layout)
     order = [angle % 180 for angle in PLANE_ANGLES_DEG]
-    if sorted(angle % 180 for angle in layout.angles_deg) != order:
-        raise ValueError(f"expected a layout of the angles 0, 45, 90, 135 for four planes, found {layout.spec}")
     mosaic = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), planes.dtype)
     for row in (0, 1):
         for col in (0, 1):
             mosaic[row::2, col::2] = planes[order.index(layout.filter_at(row, col).angle_deg % 180)]
     return mosaic
+
+
+def require_plane_angles(layout: Layout) -> None:
+    """Raise ValueError on a layout of other angles than those of four planes."""
+    if sorted(angle % 180 for angle in layout.angles_deg) != [angle % 180 for angle in PLANE_ANGLES_DEG]:
+        raise ValueError(f"expected a layout of the angles 0, 45, 90, 135 for four planes, found {layout.spec}")
 
 
 def level_notes(samples: NDArray[Any], black_level: float, white_level: float | None) -> Notes:

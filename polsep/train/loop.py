@@ -160,6 +160,7 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
     fabric.launch()
     network = training.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     state = read_checkpoint(run.out / "checkpoint.pt")
+    described = _describe(run, _starts(run, state))
     if state is None:
         load_mean(run.start, network)
         if run.refit or not run.start:
@@ -167,7 +168,7 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
     wrapped = fabric.setup_module(network)
     optimizer = Optimizers(network)
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
-    step = _restore(state, run, network, optimizer, average)
+    step = _restore(state, described, network, optimizer, average)
     batches = training.batches(step, (fabric.global_rank, fabric.world_size)) if step < run.last else iter(())
     with ExitStack() as stack:
         log = (
@@ -191,7 +192,7 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
                 scores = score_averaged(network, average, training.score)
                 log.add_scores(step, run.schedule.rate_at(step), scores)
             if run.schedule.is_due(step, run.schedule.checkpoint_every):
-                state = {"step": step, "run": _describe(run), "network": network.state_dict()}
+                state = {"step": step, "run": described, "network": network.state_dict()}
                 state |= {"optimizer": optimizer.state_dict(), "average": average}
                 write_checkpoint(run.out / "checkpoint.pt", state)
     return average if fabric.is_global_zero else None
@@ -228,25 +229,38 @@ def _to(device: torch.device, batch: Batch) -> Batch:
     return type(batch)(*(x.to(device) for x in batch))
 
 
-def _describe(run: Run) -> str:
+def _starts(run: Run, state: dict[str, Any] | None) -> list[Any]:
+    """What a training started from, as `hash_starts`; as its checkpoint says where files cannot tell any more.
+
+    So it is with those that are gone, with results of the run itself, and in checkpoints that hold names alone.
+    """
+    said = [] if state is None else json.loads(state["run"]).get("start", [])
+    names = [entry if isinstance(entry, str) else entry[0] for entry in said]
+    own = any(not path.exists() or path.resolve().parent == run.out.resolve() for path in run.start)
+    if said and names == [path.name for path in run.start] and (own or isinstance(said[0], str)):
+        return list(said)
+    return hash_starts(run)
+
+
+def _describe(run: Run, starts: list[Any]) -> str:
     """JSON of all that must be equal for a training to resume from a checkpoint."""
     described: dict[str, Any] = {"what": run.what, "stream": asdict(run.stream), "schedule": asdict(run.schedule)}
     described["stream"] |= {"constants": list(run.stream.constants)}
     if not run.stream.constants:
         del described["stream"]["constants"]
-    described |= {"start": hash_starts(run)} if run.start else {}
+    described |= {"start": starts} if run.start else {}
     described |= {"refit": True} if run.refit else {}
     return json.dumps(described | {"workers": run.workers, "devices": run.devices})
 
 
 def _restore(
-    state: dict[str, Any] | None, run: Run, network: nn.Module, optimizer: Optimizers, average: dict[str, Tensor]
+    state: dict[str, Any] | None, described: str, network: nn.Module, optimizer: Optimizers, average: dict[str, Tensor]
 ) -> int:
     """Load network, optimizer and average from a checkpoint, and return its step; 0 without a checkpoint."""
     if state is None:
         return 0
-    if state["run"] != _describe(run):
-        raise ValueError(f"expected the checkpoint of {_describe(run)}, found one of {state['run']}")
+    if state["run"] != described:
+        raise ValueError(f"expected the checkpoint of {described}, found one of {state['run']}")
     network.load_state_dict(state["network"])
     optimizer.load_state_dict(state["optimizer"])
     for name, value in average.items():

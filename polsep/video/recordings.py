@@ -11,8 +11,9 @@ colour from frames spread over the first part, and then fixed, so that they caus
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Generator, Iterator
+import re
+from collections import Counter, deque
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
@@ -431,17 +432,25 @@ def _shared_report(first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, 
     statistics = {name: float(np.mean([line[name] for line in good if name in line])) for name in names}
     turned = np.exp(2j * np.radians([line["light_polarizer_deg"] for line in good])).sum()
     statistics["light_polarizer_deg"] = float(np.degrees(np.angle(turned)) / 2 % 180)
-    warnings = dict.fromkeys([*first.warnings, *(text for line in good for text in line.get("warnings", ()))])
+    warnings = _each_once([*first.warnings, *(text for line in good for text in line.get("warnings", ()))])
     light = {"light_color": list(first.light), "light": first.facts}
-    return {"method": first.method, "statistics": statistics, **light, "warnings": list(warnings)}
+    return {"method": first.method, "statistics": statistics, **light, "warnings": warnings}
+
+
+def _each_once(warnings: Sequence[str]) -> list[str]:
+    """The first of all warnings that differ in numbers alone."""
+    return list({_without_numbers(text): text for text in reversed(warnings)}.values())[::-1]
+
+
+def _without_numbers(text: str) -> str:
+    return re.sub(r"\d[\d.]*", "", text)
 
 
 def _report(settings: dict[str, Any], first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, Any]:
     """The report of a run: settings, number of frames, the damaged ones, and how often frames gave each warning."""
-    warnings: dict[str, int] = {}
-    for line in lines:
-        for warning in line.get("warnings", ()):
-            warnings[warning] = warnings.get(warning, 0) + 1
+    said = [text for line in lines for text in line.get("warnings", ())]
+    often = Counter(map(_without_numbers, said))
+    warnings = {text: often[_without_numbers(text)] for text in _each_once(said)}
     damaged = [line for line in lines if "damaged" in line]
     counts = {"frames": len(lines), "damaged": damaged}
     return {**counts, "settings": settings, "first_frame_warnings": list(first.warnings), "warnings": warnings}

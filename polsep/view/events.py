@@ -334,7 +334,7 @@ class Events:
             panel = await asyncio.to_thread(shape_panel, found.frame, found.stem)
         except FAILURES as error:
             return {self.components.status: failure_line(error)}
-        return self._kept() if session.opened is not found else {self.components.shape: panel}
+        return {self.components.shape: gr.skip() if session.opened is not found else panel}
 
     def write(self, kind: str) -> Callable[[gr.Request], Updates]:
         """A function that writes one of `DOWNLOADS` and returns its path."""

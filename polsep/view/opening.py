@@ -19,6 +19,7 @@ from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD
 from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
+from polsep.io.results.sidecars import result_names
 from polsep.io.store.errors import InputError
 from polsep.io.store.header_checks import at_most
 from polsep.methods import check_method
@@ -152,8 +153,11 @@ def find_sources(path: Path) -> tuple[Source, ...]:
         return tuple(as_source(file, file.stem) for file in find_numbered(path).files if file is not None)
     except InputError:
         seen = [file for file in path.iterdir() if not file.name.startswith(".")]
-        files = sorted((f for f in seen if f.suffix.lower() in FRAME_FILES), key=lambda f: in_numbers(f.name))
-        if not files or any(file.suffix.lower() == ".exr" for file in seen):  # whose PNG files are previews
+        results = {name for file in seen if file.suffix.lower() == ".json" for name in result_names(file)}
+        frames = (f for f in seen if f.suffix.lower() in FRAME_FILES)
+        plain = (f for f in frames if f.name not in results or as_source(f, f.stem).separated)
+        files = sorted(plain, key=lambda f: in_numbers(f.name))
+        if not files:
             raise
         groups = group_angles([file.name for file in files])
         if groups is None or not all(file.is_file() for name in groups for file in four_angles(path / name)):

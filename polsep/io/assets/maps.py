@@ -76,6 +76,8 @@ def read_object(path: Path, size: tuple[int, ...]) -> NDArray[np.bool_]:
     Raises InputError.
     """
     found: NDArray[np.bool_] = np.asarray(read_map(path, "mask") > 0.5)
+    if tuple(n // 2 * 2 for n in found.shape) == tuple(size):
+        found = found[: size[0], : size[1]]
     if found.shape != size and (found.shape[0] // 2, found.shape[1] // 2) == tuple(size):
         found = found[: 2 * size[0], : 2 * size[1]]  # cells that are cut are not separated
         found = found.reshape(size[0], 2, size[1], 2).min(axis=(1, 3))

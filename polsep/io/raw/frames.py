@@ -35,7 +35,14 @@ from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
 from polsep.sensor.calibration import Corrections
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.levels import WHITE_LEVELS, ForgottenLevel, as_measurements, as_mosaic, interleave_planes
+from polsep.sensor.levels import (
+    WHITE_LEVELS,
+    ForgottenLevel,
+    as_measurements,
+    as_mosaic,
+    interleave_planes,
+    require_plane_angles,
+)
 
 __all__ = [
     "READERS",
@@ -114,10 +121,8 @@ class ReadOptions:
     def __post_init__(self) -> None:
         if self.pages not in ("auto", "frames", "angles"):
             raise ValueError(f'expected pages "auto", "frames" or "angles", found {self.pages!r}')
-        measured = self.corrections.calibration if self.corrections is not None else None
-        if self.black_level and measured is not None and measured.black_level is not None:
-            found = f"found --black-level {self.black_level:g}"
-            raise ValueError(f"expected the black level of the calibration ({measured.black_level:.4g}), {found}")
+        if self.corrections is not None and self.corrections.calibration is not None:
+            self.corrections.calibration.require_black_level(self.black_level, "--black-level")
         if self.size is not None and (len(self.size) != 2 or min(self.size) < 1):
             raise ValueError(f"expected a size of positive width and height, found {self.size}")
 
@@ -262,6 +267,8 @@ def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, 
     if array.ndim == 3 and (page.sampled or (layout is not None and layout.bayer is not None)):
         mosaic = interleave_planes(array, Layout() if layout is None else layout)
         return as_mosaic(mosaic, layout, options.black_level, white)
+    if options.layout is not None:
+        require_plane_angles(options.layout)
     return as_measurements(array, options.black_level, white)
 
 

@@ -17,7 +17,6 @@ from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD, recording_files
-from polsep.io.raw.videos import CONTAINERS
 from polsep.io.store.errors import InputError, input_error, one_line
 
 _NUMBER = re.compile(r"(\d+)")
@@ -133,10 +132,10 @@ def _read_files(files: list[Path], options: ReadOptions, first: int) -> Iterator
 def _read_stack(path: Path, options: ReadOptions, count: int, first: int) -> Iterator[Frame | DamagedFrame]:
     """The frames of one file of about ``count`` from ``first`` on; reading starts anew behind a damaged one.
 
-    It ends where the file does, as films need not say their length. Beyond ``count`` it gives up behind as many damaged
-    frames in turn as there may be before the next key frame.
+    It ends where the file does, as films need not say their length. Beyond ``count`` it gives up where the reason stays
+    the same, which is none of a frame, and behind as many damaged frames in turn as a film has between key frames.
     """
-    patience, good = KEY_FRAMES if path.suffix.lower() in CONTAINERS else 1, first
+    good, before = first, ""
     while True:
         try:
             for frame in read_frames(path, options, first):
@@ -145,7 +144,8 @@ def _read_stack(path: Path, options: ReadOptions, count: int, first: int) -> Ite
                 yield frame
             return
         except (ValueError, OSError) as error:
-            if first >= max(count, good + patience):
+            reason = one_line(error)
+            if first >= count and (reason == before or first >= good + KEY_FRAMES):
                 return
-            yield DamagedFrame(first, one_line(error))
-            first += 1
+            yield DamagedFrame(first, reason)
+            first, before = first + 1, reason

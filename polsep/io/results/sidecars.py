@@ -76,23 +76,37 @@ def write_with_sidecar(
 def read_report(path: Path) -> dict[str, Any]:
     """The report on a file of `polsep separate`, in the sidecar beside it; empty where there is none.
 
-    A sidecar that lists other files is of another run, in another format.
+    A sidecar that lists files of other formats alone is of another run.
     """
     try:
         sidecar = parse_json(read_text(path.with_suffix(".json")))
     except (OSError, ValueError):
         return {}
-    if not isinstance(sidecar, dict) or path.name not in _listed(sidecar.get("files"), path.name):
+    if not isinstance(sidecar, dict) or path.suffix.lower() not in _formats(sidecar.get("files"), path.suffix.lower()):
         return {}
     report = sidecar.get("report")
     return report if isinstance(report, dict) else {}
 
 
-def _listed(files: object, unless: str) -> list[object]:
-    """The names in a sidecar's list of files; ``unless`` where it has no such list."""
-    if not isinstance(files, list):
-        return [unless]
-    return [entry.get("name") if isinstance(entry, dict) else entry for entry in files]
+def result_names(path: Path) -> list[str]:
+    """Names of the results that a sidecar lists, its preview among them; none of another JSON file."""
+    try:
+        sidecar = parse_json(read_text(path))
+    except (OSError, ValueError):
+        return []
+    files = _names(sidecar.get("files")) if isinstance(sidecar, dict) and "polsep" in sidecar else []
+    return [*files, f"{path.stem}.png"] if files else []
+
+
+def _formats(files: object, unless: str) -> list[str]:
+    """The endings of names in a sidecar's list of files; ``unless`` where it has no such list."""
+    return [Path(name).suffix.lower() for name in _names(files)] or [unless]
+
+
+def _names(files: object) -> list[str]:
+    """The names in a sidecar's list of files."""
+    entries = files if isinstance(files, list) else []
+    return [str(entry.get("name") if isinstance(entry, dict) else entry) for entry in entries]
 
 
 def require_same_settings(path: Path, settings: Mapping[str, Any], owner: str, advice: str = "") -> None:

@@ -13,6 +13,7 @@ import json
 import math
 import os
 import re
+import zipfile
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -74,13 +75,22 @@ def write_calibration(path: Path, calibration: Calibration, version: str) -> lis
 def refuse_foreign_maps(path: Path) -> None:
     """Raise ValueError if ``path`` is no name of a calibration, OutputError on an NPZ file beside it of something else.
 
-    Maps that the calibration of before names, and those that a killed program left without it, are its own.
+    Maps whose calibration is gone are none of something else.
     """
     if path.suffix.lower() != ".json":
         raise ValueError(f"expected a calibration file that ends in .json, found {path.name!r}")
     maps = maps_path(path)
-    if maps.exists() and not (path.exists() and _read_record(path).get("maps")):
+    if maps.exists() and not _holds_maps(maps):
         raise OutputError(f"expected no {maps}, where maps of {path.name} belong, found a file of something else")
+
+
+def _holds_maps(path: Path) -> bool:
+    """True for an NPZ file of arrays that calibrations have."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {Path(name).stem for name in archive.namelist()} <= set(ARRAYS)
+    except (OSError, zipfile.BadZipFile):
+        return False
 
 
 def _waiting(maps: Path) -> Path:

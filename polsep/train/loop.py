@@ -230,7 +230,7 @@ def _to(device: torch.device, batch: Batch) -> Batch:
 
 
 def _starts(run: Run, state: dict[str, Any] | None) -> list[Any]:
-    """What a training started from, as `hash_starts`; as its checkpoint says where files cannot tell any more.
+    """`hash_starts` of a run, or what its checkpoint says where files cannot tell any more.
 
     So it is with those that are gone, with results of the run itself, and in checkpoints that hold names alone.
     """

@@ -11,9 +11,8 @@ colour from frames spread over the first part, and then fixed, so that they caus
 
 from __future__ import annotations
 
-import re
-from collections import Counter, deque
-from collections.abc import Generator, Iterator, Sequence
+from collections import deque
+from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
@@ -48,6 +47,7 @@ from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import find_lasting_defects, repair
 from polsep.sensor.levels import BlackFrame
 from polsep.video.panels_kernel import STEPS, make_panels
+from polsep.video.reports import describe_run, shared_report
 from polsep.video.temporal import Images, TemporalState, filter_frame, steady_images
 
 Floats = NDArray[np.float32]
@@ -216,9 +216,9 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
             last = step.done
             yield step
     lines = sequence.lines()
-    report = _report({**settings, "damaged": options.damaged}, first, lines)
+    report = describe_run({**settings, "damaged": options.damaged}, first, lines)
     written = tuple(sequence.finish(report))
-    yield Progress(last, last, damaged=bool(report["damaged"]), written=written, report=_shared_report(first, lines))
+    yield Progress(last, last, damaged=bool(report["damaged"]), written=written, report=shared_report(first, lines))
 
 
 def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFrame:
@@ -421,36 +421,3 @@ def black_picture(size: tuple[int, ...], preview: bool, line: dict[str, Any]) ->
     """A black picture in place of a missing frame; ``line``: for the log."""
     black = np.zeros(size, np.float32)
     return Picture(black, black, draw_panels(black, black, 1.0) if preview else None, line)
-
-
-def _shared_report(first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Statistics of all frames as one, and each warning once; None where all frames are damaged."""
-    good = [line for line in lines if "damaged" not in line]
-    if not good:
-        return None
-    names = [name for name in good[0] if name not in ("frame", "warnings")]
-    statistics = {name: float(np.mean([line[name] for line in good if name in line])) for name in names}
-    turned = np.exp(2j * np.radians([line["light_polarizer_deg"] for line in good])).sum()
-    statistics["light_polarizer_deg"] = float(np.degrees(np.angle(turned)) / 2 % 180)
-    warnings = _each_once([*first.warnings, *(text for line in good for text in line.get("warnings", ()))])
-    light = {"light_color": list(first.light), "light": first.facts}
-    return {"method": first.method, "statistics": statistics, **light, "warnings": warnings}
-
-
-def _each_once(warnings: Sequence[str]) -> list[str]:
-    """The first of all warnings that differ in numbers alone."""
-    return list({_without_numbers(text): text for text in reversed(warnings)}.values())[::-1]
-
-
-def _without_numbers(text: str) -> str:
-    return re.sub(r"\d[\d.]*", "", text)
-
-
-def _report(settings: dict[str, Any], first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, Any]:
-    """The report of a run: settings, number of frames, the damaged ones, and how often frames gave each warning."""
-    said = [text for line in lines for text in line.get("warnings", ())]
-    often = Counter(map(_without_numbers, said))
-    warnings = {text: often[_without_numbers(text)] for text in _each_once(said)}
-    damaged = [line for line in lines if "damaged" in line]
-    counts = {"frames": len(lines), "damaged": damaged}
-    return {**counts, "settings": settings, "first_frame_warnings": list(first.warnings), "warnings": warnings}

@@ -1,0 +1,46 @@
+"""Reports of a recording that was separated: of all frames as one, and of the run, with each warning once."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from polsep.video.recordings import FirstFrame
+
+
+def shared_report(first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """Statistics of all frames as one, and each warning once; None where all frames are damaged."""
+    good = [line for line in lines if "damaged" not in line]
+    if not good:
+        return None
+    names = [name for name in good[0] if name not in ("frame", "warnings")]
+    statistics = {name: float(np.mean([line[name] for line in good if name in line])) for name in names}
+    turned = np.exp(2j * np.radians([line["light_polarizer_deg"] for line in good])).sum()
+    statistics["light_polarizer_deg"] = float(np.degrees(np.angle(turned)) / 2 % 180)
+    warnings = _each_once([*first.warnings, *(text for line in good for text in line.get("warnings", ()))])
+    light = {"light_color": list(first.light), "light": first.facts}
+    return {"method": first.method, "statistics": statistics, **light, "warnings": warnings}
+
+
+def _each_once(warnings: Sequence[str]) -> list[str]:
+    """The first of all warnings that differ in numbers alone."""
+    return list({_without_numbers(text): text for text in reversed(warnings)}.values())[::-1]
+
+
+def _without_numbers(text: str) -> str:
+    return re.sub(r"\d[\d.]*", "", text)
+
+
+def describe_run(settings: dict[str, Any], first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """The report of a run: settings, number of frames, the damaged ones, and how often frames gave each warning."""
+    said = [text for line in lines for text in line.get("warnings", ())]
+    often = Counter(map(_without_numbers, said))
+    warnings = {text: often[_without_numbers(text)] for text in _each_once(said)}
+    damaged = [line for line in lines if "damaged" in line]
+    counts = {"frames": len(lines), "damaged": damaged}
+    return {**counts, "settings": settings, "first_frame_warnings": list(first.warnings), "warnings": warnings}

@@ -569,7 +569,10 @@ def test_a_black_first_frame_says_nothing_of_levels(
     )
     assert run(monkeypatch, *plain) == 2
     assert "expected a white level" in capsys.readouterr().err and not list((tmp_path / "out").glob("*.exr"))
+    lit = list[bool]()
+    monkeypatch.setattr(pipeline, "find_light", lambda capture: lit.append(capture.data.any()) or find_light(capture))
     assert run(monkeypatch, *plain, "--white-level", str(WHITE)) == 0
+    assert lit and all(lit)  # nor of the lamp
     write_folder(tmp_path / "dark", images[:1].repeat(2, axis=0))
     assert run(monkeypatch, "video", str(tmp_path / "dark"), "-o", str(tmp_path / "dark-out"), "--no-preview") == 0
 

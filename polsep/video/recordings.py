@@ -241,7 +241,7 @@ def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFram
 
 def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Frame) -> FirstFrame:
     refuse_forgotten(recording.stem, frame)
-    told, found = _light_of(recording, options)
+    told, found = _light_of(recording, options, frame.index)
     separated = separate_capture(frame.data, options.method, told, options.device)
     gain = exposure_of(separated.diffuse + separated.specular)
     light = tuple(float(c) for c in separated.report["light_color"])
@@ -254,14 +254,14 @@ def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Fram
     return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black)
 
 
-def _light_of(recording: FrameSequence, options: VideoOptions) -> tuple[LightColor | str, Light | None]:
-    """Colour of the light as told, or as frames spread over the first part show it; and what was found, for the report.
+def _light_of(recording: FrameSequence, options: VideoOptions, start: int) -> tuple[LightColor | str, Light | None]:
+    """Colour of the light as told, or as frames of a part from ``start`` on show it; and what was found, for reports.
 
     None where nothing is to be found: the colour was told, or a calibration says it, or frames are mono.
     """
     if not is_to_be_found(options.light_color):
         return options.light_color, None
-    frames = islice(recording.begin(0), 0, PART, LIGHT_STEP)
+    frames = islice(recording.begin(start), 0, PART, LIGHT_STEP)
     captures = [frame.data for frame in frames if isinstance(frame, Frame)]
     if not captures or any(is_calibrated(capture) for capture in captures):
         return options.light_color, None

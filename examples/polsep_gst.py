@@ -99,7 +99,7 @@ class Polsep(GstBase.BaseTransform):
         """Begin a stream of frames of one size."""
         if self.image not in ("diffuse", "specular"):
             found = GLib.Error(f"expected image=diffuse or image=specular, found image={self.image}")
-            self.post_message(Gst.Message.new_error(self, found, None))
+            self.post_message(Gst.Message.new_error(self, found, ""))
             return False
         frame = sink.get_structure(0)
         self.stride, self.out_stride = self.row_bytes(frame), self.row_bytes(source.get_structure(0))

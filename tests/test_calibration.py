@@ -532,9 +532,10 @@ def test_a_black_level_that_nobody_says_is_asked_for(tmp_path: Path, run_polsep:
     ones = ((1.02, 0.98) * 2, (0.99, 1.01) * 2) * 2
     gains = Calibration(Layout(), 4095.0, (512, 512), gains=ones, falloff=((1.0,),))
     write_calibration(tmp_path / "gains.json", gains, "0")  # samples that gains divide are no codes any more
-    words = ("--white-level", 4095, "--calibration", tmp_path / "gains.json", "-o", tmp_path / "n.tiff")
-    done = run_polsep("merge", *names, *words)
-    assert done.status == 2 and "expected black at 0, found it at 24" in done.err
+    for white in ((), ("--white-level", 4095)):  # which the calibration says, too
+        words = (*white, "--calibration", tmp_path / "gains.json", "-o", tmp_path / "n.tiff")
+        done = run_polsep("merge", *names, *words)
+        assert done.status == 2 and "expected black at 0, found it at 24" in done.err, done
 
 
 def test_levels_of_the_dark_are_said_once(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811

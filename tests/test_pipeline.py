@@ -437,6 +437,21 @@ def test_lamp_off_frames_of_other_levels_are_refused(dtype: str) -> None:
             polsep.separate(as_mosaic(raw)[0], "analytic", ambient=room)
 
 
+def test_lamp_off_frames_of_the_same_unit_are_taken() -> None:
+    """Means of frames, other byte orders, other floats, black ones and such with a bright spot."""
+    raw, room = raw_frame(), raw_frame(exposure=0.1)
+    plain = quietly(raw, "analytic", ambient=room, light_color="white").diffuse
+    for frame, ambient in ((raw, room.astype(np.float64)), (raw, room.astype(">u2")), (raw.astype(">u2"), room)):
+        found = quietly(frame, "analytic", ambient=ambient, light_color="white").diffuse
+        np.testing.assert_allclose(found, plain, atol=1e-6)
+    light, dark = raw_frame("float32"), raw_frame("float32", exposure=0.1).astype(np.float64)
+    dark[3, 5] = 3.0
+    for frame, ambient, white in ((light, dark, None), (8 * light, dark, 8.0), (raw, 0 * dark, 65535)):
+        assert quietly(frame, "analytic", ambient=ambient, white_level=white).diffuse.any()
+    with pytest.raises(TypeError, match="expected a NumPy array"):
+        polsep.separate(raw, ambient=["dark.tiff"])  # type: ignore[list-item]
+
+
 @pytest.mark.parametrize("method", ["analytic", "joint-fast"])
 def test_statistics_are_of_images_without_falloff(method: str) -> None:
     """The mean light and the expected errors of a frame whose lens darkens corners are those of what is returned."""

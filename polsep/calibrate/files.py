@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 from polsep import __version__
@@ -20,6 +21,8 @@ from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.levels import Overexposed
 
+#: Frames of a file in which black is looked for.
+LOOKS = 8
 #: A measurement: frames and the calibration so far to a calibration with one more section.
 Measure = Callable[[Iterator[Mosaic], Calibration | None], Calibration]
 
@@ -52,16 +55,18 @@ def _require_white_level(path: Path, frame: Frame) -> None:
 
 
 def require_black_level(paths: Sequence[Path], read: ReadOptions) -> None:
-    """Raise InputError where the first frame of a file shows black above 0, and nobody says or measured a level.
+    """Raise InputError where the first frames of a file show black above 0, and nobody says or measured a level.
 
-    It is looked for before frames are corrected: samples that are divided by gains are no codes any more.
+    It is looked for before frames are corrected, but for the white level that a calibration says: samples that are
+    divided by gains are no codes any more.
     """
     measured = None if read.corrections is None else read.corrections.calibration
     if read.black_level or (measured is not None and measured.black_level is not None):
         return
+    plain = None if measured is None else Corrections(Calibration(measured.layout, measured.white_level))
     for path in paths:
-        first = next(read_mosaics([path], replace(read, corrections=None)), None)
-        level = None if first is None else check_black_level(first).level
+        frames = islice(read_mosaics([path], replace(read, corrections=plain)), LOOKS)
+        level = next((level for frame in frames if (level := check_black_level(frame).level) is not None), None)
         if level is not None:
             advice = f"say --black-level {level:.4g}, or measure it first ('polsep calibrate dark')"
             raise input_error(

@@ -29,7 +29,10 @@ def shared_report(first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, A
 
 def _each_once(warnings: Sequence[str]) -> list[str]:
     """The first of all warnings that differ in numbers alone."""
-    return list({_without_numbers(text): text for text in reversed(warnings)}.values())[::-1]
+    found = dict[str, str]()
+    for text in warnings:
+        found.setdefault(_without_numbers(text), text)
+    return list(found.values())
 
 
 def _without_numbers(text: str) -> str:

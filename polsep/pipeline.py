@@ -32,9 +32,9 @@ from polsep.sensor.calibration import Calibration, Corrections, Table, falloff_i
 from polsep.sensor.camera import Layout, Mosaic, WrongType
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.levels import (
-    WHITE_LEVELS,
     as_measurements,
     as_mosaic,
+    has_levels_of,
     interleave_planes,
     require_plane_angles,
 )
@@ -56,8 +56,6 @@ if TYPE_CHECKING:
 LightColor = Sequence[float]
 #: Formats by the endings of file names.
 _ENDINGS = {".exr": "exr", ".npz": "npz", ".tiff": "tiff", ".tif": "tiff", ".png": "png"}
-#: Largest sample of light in floats of white 1, and how many times white is no light of a room any more.
-MOST_FLOAT, MANY_WHITES = 2.0, 100.0
 #: Words for the light's colour: found in the frame (two words for one thing), or white.
 FOUND_WORDS = ("auto", "estimate")
 LIGHT_WORDS = (*FOUND_WORDS, "white")
@@ -205,7 +203,7 @@ def _as_room(room: NDArray[Any] | Mosaic, capture: Mosaic, kind: np.dtype[Any] |
     """
     if isinstance(room, Mosaic):
         return room
-    if isinstance(room, np.ndarray) and not _has_levels_of(room, capture.white_level, kind):
+    if isinstance(room, np.ndarray) and not has_levels_of(room, capture.white_level, kind):
         levels = f"white {capture.white_level:g}" if kind is None else f"{kind}, white {capture.white_level:g}"
         samples = f"{room.dtype} up to {float(room.max()):g}"
         raise ValueError(f"expected a lamp-off frame like the frame ({levels}), found {samples}")
@@ -213,15 +211,6 @@ def _as_room(room: NDArray[Any] | Mosaic, capture: Mosaic, kind: np.dtype[Any] |
     if not isinstance(found, Mosaic):
         raise ValueError(f"expected a raw frame with the lamp off, found shape {'x'.join(map(str, room.shape))}")
     return found
-
-
-def _has_levels_of(room: NDArray[Any], white: float, kind: np.dtype[Any] | None) -> bool:
-    """False for samples of another unit than those of a frame of that white level; ``kind``: as of `_as_room`."""
-    if room.dtype.kind == "u":
-        other = kind is not None and kind.kind == "u" and WHITE_LEVELS[kind.name] != WHITE_LEVELS.get(room.dtype.name)
-        return white > MOST_FLOAT and not other
-    most = float(room.max()) if room.dtype.kind == "f" and room.size else 0.0
-    return not (most > MANY_WHITES * white or (white > MANY_WHITES and 0 < most <= MOST_FLOAT))
 
 
 def _ambient_frames(

@@ -350,7 +350,7 @@ def test_floor_of_the_shipped_weights() -> None:
     assert scores["normals, mean deg"] < FLOOR_DEG, scores
 
 
-#: Mean angular error of the shipped weights on six things, two of each kind, and a tenth more.
+#: Mean angular error of the shipped weights on six things, two of each kind (30.7), and a tenth more.
 FLOOR_DEG = 33.8
 
 

@@ -48,6 +48,9 @@ PLANE_ANGLES_DEG = (0.0, 45.0, 90.0, 135.0)
 #: Bit depths of converters that are stored in 16-bit words.
 _NARROW_BITS = (8, 10, 12, 14)
 
+#: Largest sample of light in floats of white 1, and how many times white is no light any more.
+MOST_FLOAT, MANY_WHITES = 2.0, 100.0
+
 Notes = tuple[str, ...]
 
 
@@ -138,6 +141,20 @@ def require_plane_angles(layout: Layout) -> None:
     """Raise ValueError on a layout of other angles than those of four planes."""
     if sorted(angle % 180 for angle in layout.angles_deg) != [angle % 180 for angle in PLANE_ANGLES_DEG]:
         raise ValueError(f"expected a layout of the angles 0, 45, 90, 135 for four planes, found {layout.spec}")
+
+
+def has_levels_of(samples: NDArray[Any], white: float, kind: np.dtype[Any] | None) -> bool:
+    """False for samples of another unit than those of a frame of that white level.
+
+    ``kind``: the type of the frame's samples, where that says its white level; else None.
+    """
+    if samples.dtype.kind == "u":
+        other = (
+            kind is not None and kind.kind == "u" and WHITE_LEVELS[kind.name] != WHITE_LEVELS.get(samples.dtype.name)
+        )
+        return white > MOST_FLOAT and not other
+    most = float(samples.max()) if samples.dtype.kind == "f" and samples.size else 0.0
+    return not (most > MANY_WHITES * white or (white > MANY_WHITES and 0 < most <= MOST_FLOAT))
 
 
 def level_notes(samples: NDArray[Any], black_level: float, white_level: float | None) -> Notes:

@@ -21,6 +21,7 @@ from polsep.networks.sizes import Size
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import Separation
+from polsep.separation.clipped_pattern import smooth_separation
 from polsep.shipped import member_names, paper_name, read_joint, separate_colors, shipped_joint
 
 _LOADING = threading.Lock()
@@ -48,7 +49,7 @@ def separate_joint(method: str, capture: Mosaic | Measurements, full: bool = Fal
         raise ValueError(f"expected a mosaic for the method {method}, found four co-sited angle images")
     with _LOADING:
         networks = [_shipped(name, capture.data.device) for name in member_names(method, capture.layout)]
-    return combine([run_joint(network, capture, full) for network in networks])
+    return smooth_separation(combine([run_joint(network, capture, full) for network in networks]), capture)
 
 
 def load_refinement(path: Path, device: torch.device) -> tuple[Rung, Refinement]:

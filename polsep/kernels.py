@@ -10,7 +10,13 @@ from polsep.light import color_kernel, tiles_kernel
 from polsep.networks import details_kernel, images_kernel
 from polsep.sensor import defects_kernel, periods_kernel
 from polsep.sensor.unpack_kernel import PackedFrame
-from polsep.separation import analytic_kernel, color_affine_kernel, highlights_kernel, places_kernel
+from polsep.separation import (
+    analytic_kernel,
+    clipped_pattern_kernel,
+    color_affine_kernel,
+    highlights_kernel,
+    places_kernel,
+)
 from polsep.separation.analytic_kernel import AnalyticOptions, separate_analytic_full, separate_analytic_half
 from polsep.separation.color_affine_kernel import (
     ColorAffineOptions,
@@ -53,6 +59,7 @@ def warm_up() -> None:
         color_kernel,
         places_kernel,
         highlights_kernel,
+        clipped_pattern_kernel,
     )
     for kernel in kernels:
         kernel.warm_up()

@@ -27,6 +27,7 @@ from polsep.sensor.camera import Layout, Mosaic, WrongType, sample_fine_mosaic
 from polsep.separation import analytic_kernel, color_affine_kernel
 from polsep.separation.analytic import Separation, separate_analytic
 from polsep.separation.analytic_kernel import AnalyticOptions
+from polsep.separation.clipped_pattern import smooth_clipped
 from polsep.separation.color_affine import separate_color_affine
 from polsep.separation.color_affine_kernel import ColorAffineOptions
 from polsep.separation.images import FrameImages
@@ -159,7 +160,8 @@ def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameIma
     if isinstance(capture, Mosaic) and capture.data.ndim == 2 and on_cpu(capture.data):
         networks = [shipped_joint(member) for member in member_names(name, capture.layout)]
         lit = replace(capture, light_color=light)
-        return combine_images([run_engine(network, lit, full) for network in networks], light)
+        images = combine_images([run_engine(network, lit, full) for network in networks], light)
+        return smooth_clipped(images, capture, light)
     return run_reference(partial(joint_reference, name), capture, light, full)
 
 

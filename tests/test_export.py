@@ -180,7 +180,8 @@ def test_full_graphs_take_batches_of_any_size(tmp_path: Path, monkeypatch: pytes
     network = load_joint(weights, torch.device("cpu"))
     generator = np.random.default_rng(4)
     for shape in ((1, 40, 64), (2, 36, 20), (1, 300, 520)):  # the last has more places than a thumbnail has cells
-        raw = generator.integers(100, 5000, shape).clip(max=4095).astype(np.uint16)
+        # So many cells clip that no hole is filled, and so few samples that nothing is smoothed.
+        raw = generator.integers(100, 4500, shape).clip(max=4095).astype(np.uint16)
         found = [torch.from_numpy(image) for image in images_of(target, raw, (64, 4095), LIGHT)]
         mosaic = Mosaic(torch.from_numpy(raw), Layout(), 64.0, 4095.0, LIGHT)
         expected = in_light(run_joint(network, mosaic, full=True), LIGHT)

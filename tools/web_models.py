@@ -17,9 +17,11 @@ import torch
 from torch import Tensor, nn
 
 from polsep.io.store.atomic import atomic_path
+from polsep.networks.channels import PERIOD
 from polsep.networks.joint import Joint, limit
 from polsep.networks.taps import pool_outputs
 from polsep.sensor.camera import Layout
+from polsep.separation.clipped_pattern import shares_of, smooth_planes, taps_of, weigh_clipped
 from polsep.shipped import shipped_joint, weights_name
 
 #: Files by the layout of the frames that their network reads.
@@ -53,7 +55,10 @@ class PageNetwork(nn.Module):
     def forward(self, frame: Tensor) -> tuple[Tensor, ...]:
         """See the class."""
         images = self.network.half_resolution(frame[:, :1], frame[:, 1:] > 0.5)
-        return (*limit(images), images.s1, images.s2, images.fit_residual)
+        diffuse, specular, error = limit(images)
+        weight = weigh_clipped(frame[:, 1:], taps_of(PERIOD), shares_of(self.network.colors))
+        diffuse, specular = (smooth_planes(image, weight, taps_of(PERIOD // 2)) for image in (diffuse, specular))
+        return diffuse, specular, error, images.s1, images.s2, images.fit_residual
 
 
 def write_models(folder: Path) -> None:

@@ -2,9 +2,10 @@
 
 A graph is what the method makes of a frame: levels, clip mask and colour of the light, demosaicking and closed form,
 layers in float32, all networks of the method weighed by their expected errors, the four shifts of mono networks that
-average them: the twin of `run.run_joint` and, in float32, of `engines.run_engine`; then diffuse light under clipped
-highlights is filled. Around it, `pipeline.separate` repairs defects, finds black level and light, and moves what
-metals, bodies and weak polarizers leave in the diffuse image; graphs do none of that. `io.store.onnx` writes them.
+average them: the twin of `run.run_joint` and, in float32, of `engines.run_engine`; then the mosaic's patterns are
+smoothed out where samples clip, and diffuse light under clipped highlights is filled. Around it, `pipeline.separate`
+repairs defects, finds black level and light, and moves what metals, bodies and weak polarizers leave in the diffuse
+image; graphs do none of that. `io.store.onnx` writes them.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from polsep.networks.run import cells_near_clipping, combine, repeat, run_images
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import CLIP_MARGIN, Layout
 from polsep.separation.analytic import Separation
+from polsep.separation.clipped_pattern import shares_of, smooth_planes, taps_of, weigh_clipped
 
 #: Names of the outputs, in order.
 OUTPUT_NAMES = ("diffuse", "specular", "error", "valid")
@@ -79,9 +81,10 @@ class ExportedNetwork(nn.Module):
             found += (self._run_shifted if network.averages_shifts else self._run)(network, samples, clipped)
         whole = combine(found)
         assert whole.expected_error is not None
-        diffuse, specular, error = (
-            x.permute(0, 2, 3, 1) for x in (whole.diffuse, whole.specular, whole.expected_error)
-        )
+        weight = repeat(weigh_clipped(clipped.float(), taps_of(PERIOD), shares_of(self.colors)), self._scale)
+        along = taps_of(PERIOD * self._scale // 2)
+        images = [smooth_planes(image, weight, along) for image in (whole.diffuse, whole.specular)]
+        diffuse, specular, error = (x.permute(0, 2, 3, 1) for x in (*images, whole.expected_error))
         if self.fill:
             cells = [self.channels[k] for k in (0, 2, 2 * PERIOD, 2 * PERIOD + 2)]
             diffuse, own = fill_holes((diffuse, error[..., 0]), samples, clipped, cells, self._scale)

@@ -357,8 +357,14 @@ def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[
 
 
 def told_gains(light_color: LightColor | str, channels: int) -> list[float]:
-    """One gain per channel of a light whose colour is told: three numbers or "white"; mono has one channel."""
-    return [1.0] * channels if isinstance(light_color, str) or channels == 1 else [float(gain) for gain in light_color]
+    """One gain per channel of a light whose colour is told: three numbers or "white"; mono has one channel.
+
+    Green is 1, as in lights that are found: of a colour only the ratios count, in whatever unit it was measured.
+    """
+    if isinstance(light_color, str) or channels == 1:
+        return [1.0] * channels
+    color = [float(gain) for gain in light_color]
+    return [gain / color[1] for gain in color]
 
 
 def parse_light_color(text: str) -> LightColor | str:
@@ -393,7 +399,7 @@ def is_to_be_found(light_color: LightColor | str) -> bool:
 def resolve_light(
     light_color: LightColor | str, capture: Capture
 ) -> tuple[tuple[float, ...], dict[str, Any], tuple[str, ...]]:
-    """One gain per channel, what the report says of the light, found in the frame or told, and remarks on it.
+    """One gain per channel, green 1, what the report says of the light, found in the frame or told, and remarks on it.
 
     "auto" takes what a calibration says, else what the frame shows. Raises ValueError on anything but three positive
     numbers or one of `LIGHT_WORDS`.
@@ -415,6 +421,6 @@ def resolve_light(
         color = ()
     if len(color) != 3 or not all(1e-6 < c < 1e6 for c in color):
         raise ValueError(f"expected a light colour of three positive numbers, found {light_color!r}")
-    color = color if channels == 3 else (1.0,)
+    color = tuple(told_gains(color, channels))
     source = "calibrated" if isinstance(light_color, str) and light_color != "white" else "told"
     return color, {"source": source, "color": list(color)}, ()

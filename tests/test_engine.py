@@ -26,7 +26,7 @@ from polsep.shipped import NAMES
 SONY = ((90, 45), (135, 0))
 COLOR, MONO = Layout(), Layout(bayer=None)
 CROPPED = Layout(SONY, "GRBG", (1, 1))
-WHITE, ODD_LIGHT = (1.0, 1.0, 1.0), (1.0, 0.8, 0.6)
+WHITE, ODD_LIGHT = (1.0, 1.0, 1.0), (1.25, 1.0, 0.75)
 IMAGES = {"analytic": 2e-6, "color-affine": 2e-5}  # of white; guided demosaicking weighs by what rounding changes
 ANGLE = 2e-5  # [rad], where DoLP is 1
 STATISTICS = 1e-4

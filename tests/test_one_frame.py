@@ -513,10 +513,11 @@ def test_a_lamp_that_is_told_goes_before_the_file_beside(tmp_path: Path, beside:
 
 
 @pytest.mark.parametrize(
-    ("light", "channels", "gains"), [("white", 3, [1, 1, 1]), ((2, 1, 0.5), 3, [2, 1, 0.5]), ((2, 1, 0.5), 1, [1])]
+    ("light", "channels", "gains"),
+    [("white", 3, [1, 1, 1]), ((2, 1, 0.5), 3, [2, 1, 0.5]), ((2, 1, 0.5), 1, [1]), ((512, 256, 128), 3, [2, 1, 0.5])],
 )
 def test_told_lamps_have_a_gain_per_channel(light: str | tuple[float, ...], channels: int, gains: list[float]) -> None:
-    """Mono has one, whatever the colour."""
+    """Mono has one, whatever the colour; green is 1, whatever the unit."""
     assert told_gains(light, channels) == gains
 
 

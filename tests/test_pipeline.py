@@ -37,7 +37,7 @@ from polsep.shipped import NAMES
 SIZE = 96
 #: What layers in bfloat16 make of other inputs by rounding.
 ROUNDED = 2e-3
-ODD_LIGHT = (1.0, 0.8, 0.6)
+ODD_LIGHT = (1.25, 1.0, 0.75)
 
 
 def lit_scene(light: tuple[float, ...] = (1.0, 1.0, 1.0), exposure: float = 1.0) -> Stokes:
@@ -534,6 +534,16 @@ def test_said_light_color_undoes_the_light(method: str) -> None:
     gain = np.array(ODD_LIGHT, np.float32)
     assert float(np.abs(colored.specular - white.specular * gain).max()) < 1e-5
     assert float(np.abs(colored.diffuse - white.diffuse * gain).max()) < 1e-5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_only_the_ratios_of_a_light_color_count(method: str) -> None:
+    """A grey card may be measured in codes: the same colour in another unit gives the same images and report."""
+    raw = raw_frame(light=ODD_LIGHT)
+    one = quietly(raw, method=method, light_color=ODD_LIGHT)
+    other = quietly(raw, method=method, light_color=tuple(2048 * gain for gain in ODD_LIGHT))
+    assert other.report == one.report and one.report["light_color"] == list(ODD_LIGHT)
+    assert (other.diffuse == one.diffuse).all() and (other.specular == one.specular).all()
 
 
 def test_the_light_color_may_be_an_array() -> None:

@@ -39,6 +39,7 @@ from polsep.sensor.camera import (
     measure_with_analysers,
     sample_mosaic,
 )
+from polsep.sensor.orient import Orientation, orient
 
 COLOR_TABLE = """
 R90  R45  G90  G45
@@ -98,6 +99,15 @@ def test_spec_round_trip_of_calibrated_angles() -> None:
     """Angles as a calibration measures them are read back exactly too."""
     layout = Layout(((90.0123456, 45.2), (134.98765432, 0.1)))
     assert Layout.parse(layout.spec) == layout
+
+
+@pytest.mark.parametrize("bayer", ["RGGB", None])
+def test_angles_half_a_turn_apart_are_one_layout(bayer: str | None) -> None:
+    """An analyser at -45 or 315 degrees is one at 135: the same layout, so the same calibration and turn of a frame."""
+    layout = Layout(bayer=bayer)
+    for polarizer in (((90, 45), (-45, 0)), ((-90, 225), (135, 180)), ((450, 45), (315, -360))):
+        assert Layout(polarizer, bayer) == layout and Layout(polarizer, bayer).spec == layout.spec
+        assert orient(Mosaic(torch.zeros(16, 16), Layout(polarizer, bayer), 0, 1), layout) == Orientation(16, 16)
 
 
 def test_named_layouts() -> None:

@@ -55,9 +55,9 @@ class WrongType(TypeError, ValueError):
 class Layout:
     """Order of the filters on a mosaic; data, never a global.
 
-    ``polarizer``: 2x2 analyser angles in degrees, four different ones. ``bayer``: the colours of a 2x2 block of such
-    cells in reading order, or None for mono sensors. ``origin``: row and column (0 or 1) of the first whole cell,
-    for colour frames cropped at an odd offset. Raises ValueError on anything else.
+    ``polarizer``: 2x2 analyser angles in degrees, four different ones, kept in [0, 180): -45 is 135. ``bayer``: the
+    colours of a 2x2 block of such cells in reading order, or None for mono sensors. ``origin``: row and column (0 or
+    1) of the first whole cell, for colour frames cropped at an odd offset. Raises ValueError on anything else.
     """
 
     polarizer: Cell = ((90, 45), (135, 0))
@@ -72,12 +72,13 @@ class Layout:
             raise ValueError(f"a layout's polarizer must be 2x2 angles in degrees, found {self.polarizer!r}") from None
         if not all(math.isfinite(angle) for angle in flat):
             raise ValueError(f"a layout's polarizer must be 2x2 angles in degrees, found {self.polarizer!r}")
-        object.__setattr__(self, "polarizer", ((a, b), (c, d)))
-        around = sorted(angle % 180 for angle in flat)
+        kept = [angle % 180 for angle in flat]
+        around = sorted(kept)
         if min(b - a for a, b in pairwise([*around, around[0] + 180])) < MIN_APART_DEG:
             raise ValueError(
                 f"polarizer must hold four different angles (modulo 180 degrees), found {self.polarizer!r}"
             )
+        object.__setattr__(self, "polarizer", ((kept[0], kept[1]), (kept[2], kept[3])))
         if self.bayer is not None and self.bayer not in BAYER_ORDERS:
             raise ValueError(f"bayer must be one of {', '.join(BAYER_ORDERS)} or None, found {self.bayer!r}")
         if self.origin not in ((0, 0), (0, 1), (1, 0), (1, 1)):

@@ -342,6 +342,7 @@ def test_exposure_notes() -> None:
     assert notes_of(random_codes("float32") * 4095, white_level=4095.0) == ""
     assert "is white 1? Then leave out --white-level" in notes_of(random_codes("float32"), white_level=4095.0)
     assert "leave out" not in notes_of(0.004 * random_codes("float32"))
+    assert "exceed" not in notes_of(np.full((4, 4), 0.1, np.float32), white_level=0.1)  # above it in float64 alone
     assert notes_of(random_codes("float32") * 30, white_level=4095.0) == ""
 
 

@@ -175,7 +175,7 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
         return (*notes, ForgottenLevel(said))
     if samples.dtype.kind == "f" and high <= 2 < white and high - black_level < MIN_USED * (white - black_level):
         notes += (f"float values reach {high:g} of white level {white:g}: is white 1? Then leave out --white-level",)
-    if high > white:
+    if np.float32(high) > np.float32(white):
         above = int(np.count_nonzero(samples > white))
         notes += (f"{above} samples exceed the white level {white:g} (largest {high:g}): they count as clipped",)
     if samples.dtype.kind == "u" and white > WHITE_LEVELS[samples.dtype.name]:

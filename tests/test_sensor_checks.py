@@ -18,6 +18,7 @@ from polsep.sensor.camera import IMX250, Layout, Mosaic, Sensor
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.encoding import block_ratio, encoding_warning, gamma_slope, noise_exponent
 from polsep.sensor.levels import level_notes
+from polsep.sensor.noise import code_step
 
 COLOR, MONO = Layout(), Layout(bayer=None)
 LAYOUTS = pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
@@ -65,6 +66,21 @@ def test_black_level_is_found_and_put_right(layout: Layout, black: float) -> Non
     assert checked.mosaic.black_level == pytest.approx(black, abs=1.5)
     (line,) = checked.warnings
     assert "--black-level" in line and "layout" not in line
+
+
+@LAYOUTS
+@pytest.mark.parametrize("scale", [1 / 4095, 1 / 65535, 16.0, 0.37])
+def test_scaled_codes_are_codes(layout: Layout, scale: float) -> None:
+    """Codes that were divided by white, as floats are, show the same black level and the same defects."""
+    codes = frame(layout, 64.0)
+    codes.data[100:103:2, 120] = codes.data.amax()
+    scaled = Mosaic((codes.data.double() * scale).float(), layout, 0.0, codes.white_level * scale)
+    one, other = check_mosaic(codes), check_mosaic(scaled)
+    assert other.mosaic.black_level == pytest.approx(one.mosaic.black_level * scale, rel=1e-3)
+    assert other.report["defects"] == one.report["defects"] == 2
+    assert len(other.warnings) == len(one.warnings) == 1
+    data = np.linspace(0, 0.9, SIZE * SIZE, dtype=np.float32).reshape(SIZE, SIZE)
+    assert code_step(data, 1.0) == 0, "a rendering has no codes"
 
 
 @LAYOUTS

@@ -21,7 +21,7 @@ from polsep.compute.arrays import to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.sensor import periods_kernel
 from polsep.sensor.camera import CLIP_MARGIN, Mosaic
-from polsep.sensor.noise import BLOCK
+from polsep.sensor.noise import BLOCK, MIN_SPAN, code_step
 from polsep.sensor.periods_kernel import measure_blocks
 
 Floats = NDArray[np.float32]
@@ -34,8 +34,8 @@ DARKEST = 0.004
 QUIET = 0.35
 #: And below this share of what it asks for on a sensor of so many electrons at white, few of which have more.
 LEAST_NOISE, LARGEST_WELL = 0.6, 20_000.0
-#: Least noise of bright parts, over that of the same sensor; least span of integer codes.
-MIN_GAIN, MIN_SPAN = 0.5, 100.0
+#: Least noise of bright parts, over that of the same sensor.
+MIN_GAIN = 0.5
 #: Least black level that is told, and the least excess of one that was said, relative to white.
 LEAST, LEAST_EXCESS = 0.0015, 0.002
 #: Share of codes below black from which on too much is subtracted; corrected samples may be negative.
@@ -110,8 +110,9 @@ def _black_of(mosaic: Mosaic, rows: Floats) -> float | None:
 
 
 def _is_codes(mosaic: Mosaic, rows: Floats) -> bool:
-    """True for integer codes, as converters give; renderings without noise are floats and show no black level."""
-    return mosaic.white_level - mosaic.black_level >= MIN_SPAN and bool((rows == np.floor(rows)).all())
+    """True for codes, as converters give, also scaled; renderings without noise are none and show no black level."""
+    span = float(mosaic.white_level - mosaic.black_level)
+    return 0 < code_step(rows, span) <= span / MIN_SPAN
 
 
 def smooth_blocks(mosaic: Mosaic, rows: Floats | None = None) -> tuple[Floats, Floats]:

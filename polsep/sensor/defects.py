@@ -31,7 +31,17 @@ from numpy.typing import NDArray
 from polsep.compute.arrays import of_kind, to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
-from polsep.sensor.noise import BLOCK, BLOCKS, MIN_BLOCKS, Levels, Noise, blocks_of, estimate_noise, least_noise
+from polsep.sensor.noise import (
+    BLOCK,
+    BLOCKS,
+    MIN_BLOCKS,
+    Levels,
+    Noise,
+    blocks_of,
+    code_step,
+    estimate_noise,
+    least_noise,
+)
 
 if TYPE_CHECKING:
     from polsep.sensor.defects_kernel import Predictor, Rules
@@ -302,9 +312,7 @@ def make_rules(mosaic: Mosaic, x: Floats) -> Rules:
 def measure_noise(mosaic: Mosaic, x: Floats) -> Noise:
     """Noise of samples ``x [H, W]``; that of exact samples where nothing shows it."""
     black, white = float(mosaic.black_level), float(mosaic.white_level)
-    row = x[x.shape[0] // 2]
-    step = 1.0 if white - black >= 100 and bool((row == np.floor(row)).all()) else 0.0
-    levels = Levels(black, white, step, clip_level(mosaic))
+    levels = Levels(black, white, code_step(x, white - black), clip_level(mosaic))
     whole = x[: x.shape[0] // BLOCK * BLOCK, : x.shape[1] // BLOCK * BLOCK]
     noise = estimate_noise(whole, None, levels, 0) or least_noise(levels)
     dark = _dark_variance(whole, levels)

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
-from polsep.sensor.black_level import MIN_SPAN, smooth_blocks
+from polsep.sensor.black_level import smooth_blocks
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.layout_check import crossed_pairs, phase_cells, see_phases
+from polsep.sensor.noise import MIN_SPAN
 
 Floats = NDArray[np.float32]
 

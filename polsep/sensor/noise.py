@@ -38,6 +38,11 @@ OUTLIER = 2.0
 MIN_WELL, LARGEST_FLOOR = 200.0, 0.05
 #: Least deviation of floats, relative to white: noise-free renderings are not exact either.
 ROUNDING = 2.0**-20
+#: Whole numbers are codes if white is at least this far above black.
+MIN_SPAN = 100.0
+#: Rows that show the step between codes, the fewest codes in them, and the least and the largest step of scaled ones,
+#: relative to white: of 15 and of 7 bits.
+CODE_ROWS, MIN_CODES, STEPS = 8, 32, (2.0**-15, 2.0**-7)
 #: Rounds of the robust fit, and the deviation of a bin of one block, relative to its variance: of a median of
 #: chi-squared, 1.25 sqrt(2 / 16). Bins off by more count less, those above the line least: motion and texture only add.
 ROUNDS, DEVIATION = 16, 0.44
@@ -70,6 +75,23 @@ class Noise:
     def variance(self, signal: Any) -> Any:
         """Variance at a ``signal`` above black; float32 stays float32."""
         return np.float32(self.gain) * np.maximum(signal, np.float32(0)) + np.float32(self.floor)
+
+
+def code_step(samples: NDArray[Any], span: float) -> float:
+    """Step between the codes that samples ``[H, W]`` are, as of converters; 0 for others, as of renderings.
+
+    Codes that were divided or moved are still codes: k c + b. ``span``: white above black.
+    """
+    rows = samples[:: max(1, len(samples) // CODE_ROWS)]
+    codes = np.unique(rows).astype(np.float64)
+    gaps = np.diff(codes)
+    if len(codes) >= MIN_CODES and STEPS[0] * span <= gaps.min() <= STEPS[1] * span:
+        step = float(gaps[gaps < 1.5 * gaps.min()].mean())
+        step = float(gaps.sum() / np.rint(gaps / step).sum())
+        places = (codes - codes[0]) / step
+        if float(np.abs(places - np.rint(places)).max()) < 0.05:
+            return step
+    return 1.0 if span >= MIN_SPAN and bool((rows == np.floor(rows)).all()) else 0.0
 
 
 def least_noise(levels: Levels) -> Noise:

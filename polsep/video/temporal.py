@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.arrays import of_kind, to_numpy
 from polsep.sensor.camera import CLIP_MARGIN, Mosaic
-from polsep.sensor.noise import BLOCK, Floats, Levels, Noise, blocks_of, estimate_noise, least_noise
+from polsep.sensor.noise import BLOCK, Floats, Levels, Noise, blocks_of, code_step, estimate_noise, least_noise
 
 if TYPE_CHECKING:
     from polsep.video.temporal_kernel import Rules
@@ -52,8 +52,6 @@ LAG = 0.05
 SLOW_REACH, REACH = 2, 1
 #: The noise is measured in each of the first frames, then in every fourth; number of averaged estimates.
 FIRST_FRAMES, EVERY, ESTIMATES = 8, 4, 16
-#: Samples can be integer codes if white is at least this far above black.
-MIN_SPAN = 100.0
 
 
 @dataclass(frozen=True)
@@ -189,11 +187,10 @@ def _padded(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _levels_of(mosaic: Mosaic, samples: NDArray[Any]) -> Levels:
-    """Levels of a frame; a row of samples shows whether they are integer codes."""
+    """Levels of a frame; a row of samples shows the step between their codes."""
     black, white = float(mosaic.black_level), float(mosaic.white_level)
-    row = samples[samples.shape[0] // 2]
-    whole = white - black >= MIN_SPAN and bool((row == np.floor(row)).all())
-    return Levels(black, white, 1.0 if whole else 0.0, black + (1 - CLIP_MARGIN) * (white - black))
+    step = code_step(samples[samples.shape[0] // 2][None], white - black)
+    return Levels(black, white, step, black + (1 - CLIP_MARGIN) * (white - black))
 
 
 def _next_noise(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -10,10 +12,14 @@ from tolerances import assert_close
 from torch import Tensor
 
 from polsep.compute.resizing import block_means
+from polsep.io.raw.frames import ReadOptions
+from polsep.io.raw.sequences import open_sequence
+from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout, expose
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.lamp_polarization import MIN_PART, SIDE, find_unpolarized, measure_places
 from polsep.separation.places_kernel import measure_places_fast
+from polsep.video.recordings import VideoOptions, separate_first
 
 SIZE = 96
 #: Errors of a slope, since the mean colour of a place holds a little of what is left.
@@ -101,6 +107,18 @@ def test_light_that_is_left_moves_to_the_specular_image(side: int) -> None:
     assert_close(torch.from_numpy(found.diffuse + found.specular), torch.from_numpy(images.diffuse + images.specular))
     truth = white[:, ::side, ::side].movedim(0, -1)
     torch.testing.assert_close(torch.from_numpy(found.specular), truth, rtol=0, atol=SLOPE)
+
+
+def test_films_say_that_nothing_moves(tmp_path: Path) -> None:
+    """Films are made without this step: what is said of a weak polarizer does not claim it."""
+    body, mirrored = (x.repeat_interleave(4, dim=1).repeat_interleave(4, dim=2) for x in bodies())
+    white = mirrored.expand_as(body)
+    mosaic = expose(scene(body + 0.4 * white, 0.6 * white), Layout(), IDEAL)
+    (alone,) = separate_capture(mosaic, "joint-fast", "white").report["warnings"]
+    np.save(tmp_path / "film.npy", mosaic.data.numpy().astype(np.uint16)[None])
+    film = open_sequence(tmp_path / "film.npy", ReadOptions(white_level=mosaic.white_level))
+    (said,) = separate_first(film, VideoOptions("joint-fast", light_color="white")).warnings
+    assert "diffuse image was moved" in alone and "diffuse image stays there in films" in said
 
 
 @pytest.mark.parametrize("cell", [1, 2])

@@ -52,6 +52,8 @@ MIN_SIZE, MANY = 80, 1500
 MIN_CONTRAST, MIN_RELATIVE = 1e-4, 1e-2
 #: Least share of the frame, and the largest gain of an image by its samples.
 MIN_SHARE, MAX_GAIN = 0.002, 1.5
+#: What became of the light that a weak polarizer leaves in the diffuse image: of one frame, and of films.
+MOVED, STAYS = "was moved to the specular one", "stays there in films"
 
 
 class Periods(NamedTuple):
@@ -91,7 +93,7 @@ class Colored(NamedTuple):
             return None
         return (
             f"a fully polarized lamp was expected, found one of {self.lamp_dolp:.0%}: what its highlights leave in the "
-            "diffuse image was moved to the specular one; a better polarizer before the lamp separates more"
+            f"diffuse image {MOVED}; a better polarizer before the lamp separates more"
         )
 
 

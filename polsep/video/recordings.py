@@ -46,6 +46,7 @@ from polsep.pipeline import (
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import find_lasting_defects, repair
 from polsep.sensor.levels import BlackFrame
+from polsep.separation.colored_specular import MOVED, STAYS
 from polsep.video.panels_kernel import STEPS, make_panels
 from polsep.video.reports import describe_run, shared_report
 from polsep.video.temporal import Images, TemporalState, filter_frame, steady_images
@@ -248,7 +249,8 @@ def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Fram
     size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
     facts = separated.report["light"] if found is None else {"source": "found", **found.describe()}
     remarks = () if found is None else found.remarks
-    notes = (*frame.notes, *remarks, *separated.report["warnings"])
+    warnings = (line.replace(MOVED, STAYS) for line in separated.report["warnings"])  # films do without that step
+    notes = (*frame.notes, *remarks, *warnings)
     shape = tuple(frame.data.data.shape)
     defects, black = _defects_of(recording, shape), separated.report.get("black_level")
     return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black)

@@ -157,6 +157,8 @@ def separate(
         white_level = measured.white_level_of(raw)
     if measured is not None:
         measured.require_black_level(black_level, "black_level")
+        if isinstance(raw, np.ndarray):
+            black_level = measured.black_level_of(raw, black_level, white_level)
     levels = (layout, black_level, white_level)
     capture, notes = _as_capture(raw, *levels)
     if isinstance(capture, Mosaic):

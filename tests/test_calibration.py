@@ -551,6 +551,26 @@ def test_levels_of_the_dark_are_said_once(tmp_path: Path, run_polsep: Cli) -> No
         polsep.separate(tifffile.imread(shot), "analytic", calibration=tmp_path / "rig.json", black_level=64)
 
 
+@pytest.mark.parametrize("scale", [1, 16])
+@pytest.mark.parametrize(("name", "lit"), [("black frame", 0), ("overexposed", 1000)])
+def test_exposure_is_judged_above_the_measured_black(tmp_path: Path, scale: int, name: str, lit: int) -> None:
+    """What is said of overexposed and of black frames is the same whether the black level was said or measured."""
+    codes = np.full((96, 96), 240, np.uint16)
+    codes[40:60] += lit
+    codes[40:44] = 4095 if lit else 239
+    codes *= scale
+    tifffile.imwrite(tmp_path / "shot.tiff", codes)
+    measured = Calibration(Layout(), WHITE, black_level=240.0)
+    said = ReadOptions(black_level=240.0 * scale, white_level=WHITE * scale)
+    read = replace(said, black_level=0.0, corrections=Corrections(measured))
+    (one,), (other,) = (list(read_frames(tmp_path / "shot.tiff", options)) for options in (said, read))
+    assert other.notes == one.notes and [note.startswith(name) for note in other.notes] == [True]
+    assert isinstance(other.data, Mosaic) and other.data.black_level == 240 * scale
+    with warnings.catch_warnings(action="ignore"):
+        found = polsep.separate(codes, "analytic", white_level=WHITE * scale, calibration=measured)
+    assert found.report["warnings"][0] == one.notes[0]
+
+
 def test_maps_replace_no_file_of_something_else(tmp_path: Path) -> None:
     """Raw frames in rig.npz stay when rig.json is written, with maps and without; maps of before do not."""
     sensor, rig, maps = BadSensor(Layout()), tmp_path / "rig.json", tmp_path / "rig.npz"

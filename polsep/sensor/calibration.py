@@ -119,6 +119,14 @@ class Calibration:
         fits = self.white_level <= WHITE_LEVELS.get(getattr(array, "dtype", np.dtype(bool)).name, 0.0)
         return self.white_level if fits else None
 
+    def black_level_of(self, array: NDArray[Any], said: float, white_level: float | None) -> float:
+        """The measured black level in the unit of raw frames of a white level, None that of their type; else ``said``.
+
+        So that a frame's exposure is judged by the light above it.
+        """
+        white = WHITE_LEVELS.get(array.dtype.name) if white_level is None else white_level
+        return said if self.black_level is None or white is None else self.black_level * white / self.white_level
+
 
 def correct_mosaic(mosaic: Mosaic, calibration: Calibration) -> Mosaic:
     """One raw frame ``[H, W]`` as a sensor without the measured errors would give it; see the module.

@@ -259,17 +259,19 @@ def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, t
 
 def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
     layout = page.layout if options.layout is None else options.layout
-    white, array = _said_white_level(page, options), page.array
+    white, array, black = _said_white_level(page, options), page.array, options.black_level
+    if options.corrections is not None and options.corrections.calibration is not None:
+        black = options.corrections.calibration.black_level_of(array, black, white)
     if not page.angles:
-        return as_mosaic(array, layout, options.black_level, white)
+        return as_mosaic(array, layout, black, white)
     if array.ndim == 4 and array.shape[-1] == 1:
         array = array[..., 0]
     if array.ndim == 3 and (page.sampled or (layout is not None and layout.bayer is not None)):
         mosaic = interleave_planes(array, Layout() if layout is None else layout)
-        return as_mosaic(mosaic, layout, options.black_level, white)
+        return as_mosaic(mosaic, layout, black, white)
     if options.layout is not None:
         require_plane_angles(options.layout)
-    return as_measurements(array, options.black_level, white)
+    return as_measurements(array, black, white)
 
 
 def _said_white_level(page: Page, options: ReadOptions) -> float | None:

@@ -13,7 +13,7 @@ from torch import Tensor
 import polsep
 from polsep.physics.stokes import Stokes
 from polsep.render.simulate import filter_light
-from polsep.sensor.black_level import check_black_level
+from polsep.sensor.black_level import BELOW, LEAST_EXCESS, check_black_level
 from polsep.sensor.camera import IMX250, Layout, Mosaic, Sensor
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.encoding import block_ratio, encoding_warning, gamma_slope, noise_exponent
@@ -93,6 +93,18 @@ def test_a_black_level_that_was_said_is_kept(layout: Layout) -> None:
         checked = check_mosaic(wrong)
         assert checked.mosaic.black_level == said
         assert any("black" in line for line in checked.warnings)
+
+
+@LAYOUTS
+def test_a_level_that_polsep_advised_is_not_doubted(layout: Layout) -> None:
+    """With much read noise some samples lie far below the black level that the frame shows, which is right."""
+    noisy = frame(layout, 240.0, replace(IMX250, read_noise=10.0))
+    advised = check_black_level(noisy).level
+    assert advised == pytest.approx(240, abs=1.5)
+    told = replace(noisy, black_level=advised)
+    assert np.mean(told.data.numpy() < advised - LEAST_EXCESS * (4095 - advised)) > BELOW
+    assert check_black_level(told).warning is None
+    assert "say a lower" in (check_black_level(replace(noisy, black_level=260.0)).warning or "")
 
 
 @LAYOUTS

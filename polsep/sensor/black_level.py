@@ -12,7 +12,7 @@ Source: photon transfer, Janesick 2007 (doi:10.1117/3.725073); the test is this 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +58,7 @@ def check_black_level(mosaic: Mosaic) -> BlackLevel:
     rows = _some_rows(mosaic)
     least, lowest = said - LEAST_EXCESS * span, float(rows.min())
     below = float(np.mean(rows < least)) if 0 <= lowest < least and not mosaic.less_ambient else 0.0
-    if below > BELOW:
+    if below > BELOW and not _shows(mosaic, said, rows):
         excess = f"{below:.1%} of the samples lie below the black level {said:g}, which only noise should"
         return BlackLevel(None, f"{excess}: the darkest are at {np.quantile(rows, 0.001):g}, say a lower --black-level")
     level = _black_of(mosaic, rows)
@@ -67,6 +67,12 @@ def check_black_level(mosaic: Mosaic) -> BlackLevel:
     shown = f"black lies at {level:.4g}, not at {said:g}, as the noise of dark parts shows"
     advice = "taken so, say" if said == 0 else "say"
     return BlackLevel(level, f"{shown}: {advice} --black-level {level:.4g}")
+
+
+def _shows(mosaic: Mosaic, said: float, rows: Floats) -> bool:
+    """True if the dark parts of a frame show the black level that was said, or more: below are tails of their noise."""
+    level = _black_of(replace(mosaic, black_level=0.0), rows)
+    return level is not None and level > said - LEAST * float(mosaic.white_level - said)
 
 
 def _some_rows(mosaic: Mosaic) -> Floats:

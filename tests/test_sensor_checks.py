@@ -108,6 +108,17 @@ def test_a_level_that_polsep_advised_is_not_doubted(layout: Layout) -> None:
 
 
 @LAYOUTS
+def test_overexposure_is_seen_above_a_black_level_that_is_found(layout: Layout) -> None:
+    """As if the level had been said: samples at black are not lit."""
+    bright = frame(layout, 240.0)
+    bright.data[120:132, 60:200] = 4095.0
+    lines = check_mosaic(bright).warnings
+    said = level_notes(bright.data.numpy(), 240.0, 4095.0)
+    assert level_notes(bright.data.numpy(), 0.0, 4095.0) == ()
+    assert said[0].startswith("overexposed") and lines[0] == said[0] and "black lies at" in lines[1]
+
+
+@LAYOUTS
 def test_light_everywhere_is_no_black_level(layout: Layout) -> None:
     """Room light on the dark parts has its own noise: it is light."""
     light = scene(layout.channels)

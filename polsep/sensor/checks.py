@@ -9,11 +9,13 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
+from polsep.compute.arrays import to_numpy
 from polsep.sensor.black_level import check_black_level
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import remove_defects
 from polsep.sensor.encoding import encoding_warning
 from polsep.sensor.layout_check import check_layout, see_phases
+from polsep.sensor.levels import overexposure_notes
 
 #: Share of pixels that are defects from which on the owner is told.
 MANY_DEFECTS = 5e-4
@@ -37,8 +39,11 @@ def check_mosaic(mosaic: Mosaic) -> CheckedMosaic:
         warning = check_layout(mosaic).warning
         return CheckedMosaic(mosaic, {}, (warning,) if warning else ())
     phases = see_phases(mosaic)
-    black, encoded = check_black_level(mosaic), encoding_warning(mosaic, phases)
+    black, encoded, exposure = check_black_level(mosaic), encoding_warning(mosaic, phases), list[str]()
     if black.level is not None and mosaic.black_level == 0:
+        samples, white = to_numpy(mosaic.data), float(mosaic.white_level)
+        if not overexposure_notes(samples, 0.0, white):  # else it was said where the levels were
+            exposure += overexposure_notes(samples, black.level, white)
         mosaic = replace(mosaic, black_level=black.level)
         phases = see_phases(mosaic)
     understood = encoded is None and (black.warning is None or black.level is not None)
@@ -49,6 +54,6 @@ def check_mosaic(mosaic: Mosaic) -> CheckedMosaic:
         f"{count} dead or hot pixels were repaired ({share:.2%}): a calibration of the dark finds them more surely, "
         "see 'polsep calibrate dark'"
     )
-    lines = (encoded, black.warning, layout, many if share >= MANY_DEFECTS else None)
+    lines = (*exposure, encoded, black.warning, layout, many if share >= MANY_DEFECTS else None)
     report = {"defects": count, "black_level": float(mosaic.black_level)}
     return CheckedMosaic(mosaic, report, tuple(line for line in lines if line))

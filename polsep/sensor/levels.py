@@ -167,9 +167,8 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
     clip = black_level + (1 - CLIP_MARGIN) * (white - black_level)
     if low >= clip:
         notes += (f"every sample is clipped: the smallest is {low:g} of white level {white:g}",)
-    elif high >= clip and (share := clipped_share(samples, black_level, white)) > MAX_CLIPPED:
-        hidden = f"overexposed: {share:.0%} of the lit samples are clipped, what they hide is estimated"
-        notes += (Overexposed(f"{hidden}: expose less, or merge several exposures (polsep merge)"),)
+    elif high >= clip:
+        notes += overexposure_notes(samples, black_level, white)
     if white_level is None and samples.dtype.kind == "f" and high > 2:
         said = f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white"
         return (*notes, ForgottenLevel(said))
@@ -183,6 +182,14 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
     if white_level is None and samples.dtype == np.uint16:
         notes += _depth_notes(samples, int(high))
     return notes
+
+
+def overexposure_notes(samples: NDArray[Any], black_level: float, white: float) -> Notes:
+    """A note on a frame of which too many lit samples clip, or none."""
+    share = clipped_share(samples, black_level, white)
+    hidden = f"overexposed: {share:.0%} of the lit samples are clipped, what they hide is estimated"
+    note = Overexposed(f"{hidden}: expose less, or merge several exposures (polsep merge)")
+    return (note,) if share > MAX_CLIPPED else ()
 
 
 def clipped_share(samples: NDArray[Any], black_level: float, white: float) -> float:

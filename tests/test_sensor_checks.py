@@ -79,6 +79,10 @@ def test_scaled_codes_are_codes(layout: Layout, scale: float) -> None:
     assert other.mosaic.black_level == pytest.approx(one.mosaic.black_level * scale, rel=1e-3)
     assert other.report["defects"] == one.report["defects"] == 2
     assert len(other.warnings) == len(one.warnings) == 1
+    for data, step in ((codes.data.numpy(), 1.0), (scaled.data.numpy(), scale)):
+        repaired = data.copy()
+        repaired[::8, 7] += np.linspace(0.1, 0.4, SIZE // 8) * step
+        assert code_step(repaired, 4095 * step) == pytest.approx(step, rel=1e-5)
     data = np.linspace(0, 0.9, SIZE * SIZE, dtype=np.float32).reshape(SIZE, SIZE)
     assert code_step(data, 1.0) == 0, "a rendering has no codes"
 

@@ -38,8 +38,8 @@ OUTLIER = 2.0
 MIN_WELL, LARGEST_FLOOR = 200.0, 0.05
 #: Least deviation of floats, relative to white: noise-free renderings are not exact either.
 ROUNDING = 2.0**-20
-#: Whole numbers are codes if white is at least this far above black.
-MIN_SPAN = 100.0
+#: Whole numbers are codes if white is at least this far above black; share of samples that may be others.
+MIN_SPAN, MOST_REPAIRED = 100.0, 0.01
 #: Rows that show the step between codes, the fewest codes in them, and the least and the largest step of scaled ones,
 #: relative to white: of 15 and of 7 bits.
 CODE_ROWS, MIN_CODES, STEPS = 8, 32, (2.0**-15, 2.0**-7)
@@ -80,10 +80,12 @@ class Noise:
 def code_step(samples: NDArray[Any], span: float) -> float:
     """Step between the codes that samples ``[H, W]`` are, as of converters; 0 for others, as of renderings.
 
-    Codes that were divided or moved are still codes: k c + b. ``span``: white above black.
+    Codes that were divided or moved are still codes: k c + b; a few samples that were repaired do not count. ``span``:
+    white above black.
     """
     rows = samples[:: max(1, len(samples) // CODE_ROWS)]
-    codes = np.unique(rows).astype(np.float64)
+    values, counts = np.unique(rows, return_counts=True)
+    codes = values[counts > 1].astype(np.float64)
     gaps = np.diff(codes)
     if len(codes) >= MIN_CODES and STEPS[0] * span <= gaps.min() <= STEPS[1] * span:
         step = float(gaps[gaps < 1.5 * gaps.min()].mean())
@@ -91,7 +93,8 @@ def code_step(samples: NDArray[Any], span: float) -> float:
         places = (codes - codes[0]) / step
         if float(np.abs(places - np.rint(places)).max()) < 0.05:
             return step
-    return 1.0 if span >= MIN_SPAN and bool((rows == np.floor(rows)).all()) else 0.0
+    lit = rows[rows != 0]
+    return 1.0 if span >= MIN_SPAN and np.count_nonzero(lit != np.floor(lit)) <= MOST_REPAIRED * lit.size else 0.0
 
 
 def least_noise(levels: Levels) -> Noise:

@@ -316,6 +316,9 @@ def test_odd_sizes_are_cropped_aloud() -> None:
     assert float(np.abs(out.diffuse - quietly(raw[:92, :94]).diffuse).max()) == 0
 
 
+#: A sensor of which the dark was measured.
+DARK = polsep.Calibration(Layout(), 255, black_level=2.0)
+
 REFUSED: list[tuple[Any, dict[str, Any], str]] = [
     (np.full((8, 8), np.nan, np.float32), {}, "expected finite values"),
     (np.full((8, 8), np.inf), {}, "expected finite values"),
@@ -377,6 +380,7 @@ def test_arguments_of_other_kinds_are_one_line(options: dict[str, Any]) -> None:
         (np.zeros((8, 8), np.uint8), {"calibration": 3}, "calibration"),
         (np.zeros((8, 8), np.uint8), {"ambient": 3}, "lamp off"),
         (np.zeros((8, 8), np.uint8), {"full": "yes"}, "True or False"),
+        (np.zeros((8, 8), np.uint8), {"black_level": "8", "calibration": DARK}, "black level that is a number"),
     ],
 )
 def test_wrong_types_are_type_errors(raw: Any, options: dict[str, Any], advice: str) -> None:

@@ -172,7 +172,7 @@ def separate(
         notes += more
     elif measured is not None or ambient is not None:
         raise ValueError("expected a raw mosaic to calibrate or to subtract room light from, found four angle images")
-    frame = separate_capture(capture, method, light_color, device, full)
+    frame = separate_capture(capture, method, light_color, device, bool(full))
     frame.report["warnings"] = [*notes, *frame.report["warnings"]]
     for note in frame.report["warnings"]:
         warnings.warn(note, PolsepWarning, stacklevel=2)

@@ -497,6 +497,7 @@ def test_results_of_unknown_endings_are_refused(tmp_path: Path) -> None:
     """An ending that no format has is refused before anything is written."""
     with pytest.raises(ValueError, match=r"ends in \.exr"):
         quietly(raw_frame(), method="analytic").save(tmp_path / "shot.jpg")
+    assert quietly(raw_frame(), method="analytic", full=np.True_).save(tmp_path / "full" / name)
     assert list(tmp_path.iterdir()) == []
 
 

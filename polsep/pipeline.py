@@ -222,7 +222,8 @@ def _ambient_frames(
     if isinstance(ambient, Mosaic):
         return [ambient]
     if isinstance(ambient, np.ndarray):
-        return [ambient] if ambient.ndim == 2 + four else list(ambient)
+        gray = not four and ambient.ndim == 3 and ambient.shape[-1] in (1, 3)  # as `as_mosaic` takes them
+        return [ambient] if gray or ambient.ndim == 2 + four else list(ambient)
     if isinstance(ambient, str) or not isinstance(ambient, Sequence):
         raise WrongType(f"expected a raw frame with the lamp off, or several, found {type(ambient).__name__}")
     return list(ambient)

@@ -441,6 +441,14 @@ def test_lamp_off_frames_of_other_levels_are_refused(dtype: str) -> None:
             polsep.separate(as_mosaic(raw)[0], "analytic", ambient=room)
 
 
+def test_lamp_off_frames_with_an_axis_of_colours_are_one_frame() -> None:
+    """``[H, W, 1]`` and three equal channels are one frame, as beside the lamp; an axis before them holds several."""
+    raw, room = raw_frame()[..., None], raw_frame(exposure=0.1)[..., None]
+    plain = quietly(raw, "analytic", ambient=room[..., 0]).diffuse
+    for ambient in (room, np.repeat(room, 3, axis=2), np.stack([room, room])):
+        assert (quietly(raw, "analytic", ambient=ambient).diffuse == plain).all()
+
+
 def test_lamp_off_frames_of_the_same_unit_are_taken() -> None:
     """Means of frames, other byte orders, other floats, black ones and such with a bright spot."""
     raw, room = raw_frame(), raw_frame(exposure=0.1)

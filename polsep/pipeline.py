@@ -230,6 +230,7 @@ def _ambient_frames(
 
 
 def separate_capture(
+@np.errstate(under="ignore")  # also for callers to whom NumPy is to raise: small chances are 0
     capture: Capture,
     method: str = "auto",
     light_color: LightColor | str = "auto",

@@ -97,6 +97,7 @@ class Light:
         }
 
 
+@np.errstate(under="ignore")  # also for callers to whom NumPy is to raise: small chances are 0
 def find_light(
     raw: NDArray[Any] | Mosaic | Measurements,
     layout: Layout | str | None = None,

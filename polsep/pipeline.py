@@ -21,7 +21,7 @@ import numpy as np
 from array_api_compat import is_array_api_obj
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import to_device
+from polsep.compute.arrays import namespace, to_device
 from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration
@@ -186,6 +186,8 @@ def _as_capture(
     if isinstance(raw, Mosaic | Measurements):
         if layout is not None or black_level != 0 or white_level is not None:
             raise ValueError(f"expected layout and levels with an array, found them with a {type(raw).__name__}")
+        if bad := int((~namespace(raw.data).isfinite(raw.data)).sum()):
+            raise ValueError(f"expected finite samples, found {bad} that are not")
         return raw, ()
     four = isinstance(raw, np.ndarray) and raw.ndim in (3, 4) and raw.shape[0] == 4
     if not four or (raw.ndim == 3 and raw.shape[2] in (1, 3)):
@@ -229,8 +231,8 @@ def _ambient_frames(
     return list(ambient)
 
 
-def separate_capture(
 @np.errstate(under="ignore")  # also for callers to whom NumPy is to raise: small chances are 0
+def separate_capture(
     capture: Capture,
     method: str = "auto",
     light_color: LightColor | str = "auto",
@@ -238,6 +240,8 @@ def separate_capture(
     full: bool = False,
 ) -> Result:
     """`separate` for a frame that is already a `Mosaic`, or co-sited `Measurements` (which keep their resolution)."""
+    if isinstance(capture, Mosaic) and capture.data.ndim != 2:
+        raise ValueError(f"expected one mosaic [H, W], found a batch of shape {tuple(capture.data.shape)}")
     chosen = find_method(method, capture)
     checked = check_mosaic(capture) if isinstance(capture, Mosaic) else None
     capture, device = checked.mosaic if checked else capture, find_device(device)

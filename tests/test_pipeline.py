@@ -497,6 +497,7 @@ def test_results_are_saved(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match="found one from before; overwrite=True replaces it"):
         out.save(tmp_path / "new" / name)
     assert out.save(tmp_path / "new" / name, overwrite=True) == written
+    assert quietly(raw_frame(), method="analytic", full=np.True_).save(tmp_path / "full" / name)
     if name.endswith(("exr", "npz")):
         assert (polsep.read_separated(written[0]).diffuse == out.diffuse).all()
 
@@ -505,7 +506,6 @@ def test_results_of_unknown_endings_are_refused(tmp_path: Path) -> None:
     """An ending that no format has is refused before anything is written."""
     with pytest.raises(ValueError, match=r"ends in \.exr"):
         quietly(raw_frame(), method="analytic").save(tmp_path / "shot.jpg")
-    assert quietly(raw_frame(), method="analytic", full=np.True_).save(tmp_path / "full" / name)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -636,6 +636,27 @@ def test_mosaic_refuses_what_it_cannot_hold() -> None:
         Mosaic(torch.zeros(3, 8), Layout(), 0.0, 1.0)
     with pytest.raises(ValueError, match="must be above"):
         Mosaic(torch.zeros(8, 8), Layout(), 1.0, 1.0)
+
+
+@pytest.mark.parametrize("method", ["joint-fast", "analytic"])
+def test_captures_that_are_no_frame_are_one_line(method: str) -> None:
+    """Batches, which a `Mosaic` holds too, and samples that no array would be taken with."""
+    mosaic = as_mosaic(raw_frame())[0]
+    with pytest.raises(ValueError, match=r"expected one mosaic \[H, W\], found a batch of shape \(2, 96, 96\)"):
+        polsep.separate(replace(mosaic, data=np.stack([mosaic.data] * 2)), method)
+    mosaic.data[7, 5] = np.nan
+    with pytest.raises(ValueError, match="expected finite samples, found 1 that are not"):
+        polsep.separate(mosaic, method)
+
+
+def test_frames_are_separated_where_numpy_is_to_raise() -> None:
+    """Settings of NumPy for the caller's own code change nothing."""
+    raw = raw_frame(light=ODD_LIGHT)
+    plain = quietly(raw, "joint-fast", light_color="auto")
+    with np.errstate(all="raise"):
+        found = quietly(raw, "joint-fast", light_color="auto")
+        assert polsep.find_light(raw) == polsep.find_light(raw.copy())
+    assert (found.diffuse == plain.diffuse).all()
 
 
 def run_python(code: str) -> str:

@@ -21,13 +21,14 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import as_floats, namespace, of_kind, to_numpy
-from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
+from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, WrongType
 from polsep.sensor.defects import MIN_SIZE, repair
 from polsep.sensor.levels import WHITE_LEVELS
 
@@ -110,6 +111,8 @@ class Calibration:
 
     def require_black_level(self, said: float, name: str) -> None:
         """Raise ValueError where a black level is said that is not the measured one; ``name``: of what says it."""
+        if not isinstance(said, Real):
+            raise WrongType(f"expected a black level that is a number, found {said!r:.40}")
         if said and self.black_level is not None and abs(said - self.black_level) > ROUNDED_LEVEL:
             measured = f"{self.black_level:.4g}, which a calibration of the dark measured"
             raise ValueError(f"expected no {name} but {measured}, found {name} {said:g}")

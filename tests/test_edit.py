@@ -202,6 +202,21 @@ def test_parameters_describe_the_edit(name: str) -> None:
 
 
 @every_edit
+@pytest.mark.parametrize("dtype", ["float32", "float64", "int64"])
+def test_numbers_and_colors_may_be_of_numpy(name: str, dtype: str) -> None:
+    """Edits keep NumPy's numbers and arrays of three as they keep Python's, and so do recipes of them."""
+    images = {p.name: p.kind for p in EDITS[name].parameters() if p.kind not in ("number", "color") and p.required}
+    given = {p.name: p.high for p in EDITS[name].parameters() if p.kind == "number"}
+    given |= {p.name: (p.high,) * 3 for p in EDITS[name].parameters() if p.kind == "color"}
+    kind = np.dtype(dtype).type
+    edit = EDITS[name](
+        **images, **{n: np.array(v, dtype) if isinstance(v, tuple) else kind(v) for n, v in given.items()}
+    )
+    assert edit == EDITS[name](**images, **given)
+    assert recipe_from_text(recipe_as_text(Recipe((edit,)))) == Recipe((edit,))
+
+
+@every_edit
 @given(data=st.data())
 def test_neutral_is_the_identity(name: str, data: st.DataObject) -> None:
     """At the neutral value of an edit, whatever the others are, the same arrays come out; on mono images too."""

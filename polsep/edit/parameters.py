@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 Value = float | str | tuple[float, ...] | None
 
 #: Kinds of images that edits name: any size; ``[h, w]`` in [0, 1]; unit vectors ``[h, w, 3]``.
@@ -46,7 +48,7 @@ class Parameter:
             return self._check_name(value)
         if self.kind == "number":
             return self._check_number(value)
-        if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 3:
+        if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 3:
             raise EditError(f"expected three numbers R, G, B as {self.name}, found {value!r:.60}")
         return tuple(self._check_number(part) for part in value)
 
@@ -58,7 +60,7 @@ class Parameter:
         raise EditError(f"expected the name of an image as {self.name}, found {value!r:.60}")
 
     def _check_number(self, value: object) -> float:
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
+        if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             raise EditError(f"expected a number as {self.name}, found {value!r:.60}")
         if not self.low <= value <= self.high:
             raise EditError(f"expected {self.name} from {self.low:g} to {self.high:g}, found {value!r:.60}")

@@ -67,6 +67,13 @@ def test_paper_separates_colour_and_mono(colors: int, ship: Path) -> None:
     assert torch.equal(~found.valid, clipped.any(dim=0).any(dim=0))
 
 
+def test_paper_takes_samples_of_double_precision(ship: Path) -> None:
+    """Tensors of float64, which a `Mosaic` keeps, give what float32 gives."""
+    write_constant(ship / f"{PAPER}.safetensors")
+    found = separate_paper(Measurements(torch.full((4, 3, 6, 8), 0.5, dtype=torch.float64), ANGLES))
+    assert_close(found.diffuse.float(), torch.full((3, 6, 8), 0.25))
+
+
 def test_mono_has_networks_of_its_own_where_they_are_shipped(ship: Path) -> None:
     write_constant(ship / f"{PAPER}.safetensors")
     write_constant(ship / f"{PAPER_MONO}.safetensors", colors=1, value=0.125)

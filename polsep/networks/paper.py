@@ -43,8 +43,9 @@ class Refinement(nn.Module):
     def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """DiffUNet's and SpecUNet's images."""
         with torch.autocast(inputs.device.type, enabled=False):  # half precision would round small differences away
-            seen = inputs if self.basis is None else conv2d(inputs.float(), self.basis)
+            inputs = inputs.float()
+            seen = inputs if self.basis is None else conv2d(inputs, self.basis)
         images = torch.cat([net(seen) for net in self.nets], dim=1)
         with torch.autocast(inputs.device.type, enabled=False):
-            images = images.float() + self.linear(inputs.float())
+            images = images.float() + self.linear(inputs)
         return images[:, : self.colors], images[:, self.colors :]

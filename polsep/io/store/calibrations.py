@@ -105,7 +105,7 @@ def read_calibration(path: str | Path) -> Calibration:
         record = _read_record(path)
         maps = maps_path(path)
         stamp = os.stat(maps).st_mtime_ns if record.get("maps") and maps.exists() else 0
-        return _read(path, path.stat().st_mtime_ns, stamp)
+        return _read(path.absolute(), path.stat().st_mtime_ns, stamp)  # another folder may be the current one
 
 
 @lru_cache(maxsize=4)  # viewers read it with every frame

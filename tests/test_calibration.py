@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import warnings
 import weakref
 from collections.abc import Iterator
@@ -396,6 +397,29 @@ def test_files_return_what_was_written(tmp_path: Path) -> None:
         read_calibration(tmp_path / "rig.json")
 
 
+def test_maps_cannot_change_behind_what_is_remembered() -> None:
+    """A change in place would be seen by whoever reads the file next, and not by the frames that are corrected."""
+    gains = np.ones(SIZE, np.float32)
+    rig = Calibration(Layout(), WHITE, SIZE, gain_map=gains, dead=np.array([7], np.int32))
+    gains[:] = 2
+    assert rig.gain_map is not None and float(rig.gain_map.max()) == 1 and rig.dead is not None
+    for values in (rig.gain_map, rig.dead):
+        with pytest.raises(ValueError, match="read-only"):
+            values[:] = 0
+
+
+def test_files_are_those_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of one name in two folders, of one time as archives leave them, are told apart."""
+    for level in (1.0, 2.0):
+        folder = tmp_path / str(level)
+        folder.mkdir()
+        written = Calibration(Layout(), WHITE, black_level=level, black_pattern=((level,) * 4,) * 4, read_noise=1.0)
+        write_calibration(folder / "rig.json", written, "0")
+        os.utime(folder / "rig.json", (1e9, 1e9))
+        monkeypatch.chdir(folder)
+        assert read_calibration("rig.json").black_level == level
+
+
 def save(path: Path, mosaic: Mosaic) -> Path:
     """A frame as a 16-bit TIFF."""
     tifffile.imwrite(path, mosaic.data.numpy().astype(np.uint16))
@@ -488,7 +512,7 @@ def test_measuring_again_replaces_defects_of_its_own_kind() -> None:
     base = replace(sensor.calibration(), hot=hot, dead=np.array([1000], np.int32))
     used = Corrections(replace(base, gains=None, gain_map=None, falloff=None, hot=None, dead=None, analysers=None))
     found = measure_flat((used.apply(sensor.expose(sensor.sees(np.full(SIZE, 1.0)))) for _ in range(4)), base)
-    assert found.hot is hot and found.dead is not None
+    assert found.hot is base.hot and found.dead is not None
     assert found.dead.tolist() == sorted(sensor.dead.tolist())
     assert found.defects.tolist() == sorted({*hot.tolist(), *sensor.dead.tolist()})
 

@@ -73,7 +73,8 @@ class Calibration:
     ``black_pattern`` its mean on each place of the period. ``gain_map [H, W]``: of each pixel, without the ``falloff``,
     which is a polynomial (`falloff_image`); ``gains``: its mean on each place. ``hot``, ``dead``: indices of defective
     pixels in reading order, of dark and of flat frames. ``details``: what each measurement found, for people,
-    JSON-able.
+    JSON-able. Arrays are kept as copies that cannot be changed: files that were read, and what is prepared of maps, are
+    remembered.
     """
 
     layout: Layout
@@ -102,6 +103,11 @@ class Calibration:
             values = getattr(self, name)
             if values is not None and values.shape != self.size:
                 raise ValueError(f"expected a {name} of the size {self.size}, found {values.shape}")
+        for name in ("black_map", "gain_map", "hot", "dead"):
+            values = getattr(self, name)
+            if values is not None and values.flags.writeable:
+                object.__setattr__(self, name, values := values.copy())
+                values.flags.writeable = False
 
     @property
     def defects(self) -> NDArray[np.int32]:

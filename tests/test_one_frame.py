@@ -374,6 +374,15 @@ def test_bad_arguments_are_refused() -> None:
         shape(dark)
     with pytest.raises(ValueError, match="with its polarization"):
         shape(replace(frame, dolp=0 * frame.dolp))
+    for light in (5, "0,0,1", [[0, 0, 1]]):
+        with pytest.raises(ValueError, match="expected a lamp's direction x, y, z"):
+            shape(frame, light=light)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"expected a frame that polsep\.separate separated, found ndarray"):
+        shape(frame.diffuse)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"expected a refractive index that is a number, found '1\.5'"):
+        shape(frame, index="1.5")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"expected weights in .*nothing\.safetensors"):
+        shape(frame, weights="nothing.safetensors")
 
 
 def test_networks_of_other_inputs_are_refused(tmp_path: Path) -> None:

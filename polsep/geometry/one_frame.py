@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,7 @@ from polsep.networks.graphs import core, require_own_threads, shape_model
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.fresnel import ETA, diffuse_dolp
 from polsep.pipeline import PolsepWarning
+from polsep.sensor.camera import WrongType
 from polsep.separation.highlights_kernel import find_parts
 from polsep.separation.report import SeparatedFrame
 
@@ -170,17 +172,21 @@ def shape(
     frame: SeparatedFrame,
     mask: Mask | None = None,
     light: Sequence[float] | None = None,
-    weights: Path | None = None,
+    weights: str | Path | None = None,
     index: float = ETA,
 ) -> Shape:
     """Find the surface of the thing in a frame that `polsep.separate` separated; its `doubts` are issued as warnings.
 
     ``mask [h, w]``: where the thing is; None: where light falls (`find_thing`). ``light``: x, y, z toward the lamp,
     x right, y up, z to the camera; None: not known, as beside the camera it need not be. ``index``: refractive index of
-    the thing, in `INDICES`. Raises ValueError on masks of another size or without pixels, and on frames without
-    polarization.
+    the thing, in `INDICES`. Raises ValueError on masks of another size or without pixels, on frames without
+    polarization, and on arguments of wrong types.
     """
-    found = find_shape(frame, mask, light, weights, index)
+    if not isinstance(frame, SeparatedFrame):
+        raise WrongType(f"expected a frame that polsep.separate separated, found {type(frame).__name__}")
+    if not isinstance(index, Real):
+        raise WrongType(f"expected a refractive index that is a number, found {index!r:.40}")
+    found = find_shape(frame, mask, light, None if weights is None else Path(weights), float(index))
     for note in found.doubts():
         warnings.warn(note, PolsepWarning, stacklevel=2)
     return found
@@ -268,7 +274,10 @@ def _unit(light: Sequence[float] | None) -> tuple[float, float, float]:
     """A direction as a unit vector; zeros for None. Raises ValueError."""
     if light is None:
         return (0.0, 0.0, 0.0)
-    numbers = [float(x) for x in light]
+    try:
+        numbers = [float(x) for x in light]
+    except (TypeError, ValueError):
+        numbers = []
     length = float(np.linalg.norm(numbers)) if len(numbers) == 3 else 0.0
     if not 1e-6 < length < float("inf") or numbers[2] <= 0:
         raise ValueError(f"expected a lamp's direction x, y, z in front of the thing (z > 0), found {light!r:.60}")

@@ -420,3 +420,5 @@ def test_inconsistent_images_are_refused() -> None:
         Measurements(torch.ones(3, 1, 2, 2), SONY)
     with pytest.raises(ValueError, match="clipped must have the shape of data"):
         Measurements(torch.ones(4, 1, 2, 2), SONY, torch.ones(4, 3, 2, 2, dtype=torch.bool))
+    with pytest.raises(TypeError, match=r"floating point, white at 1, found torch\.uint8"):
+        Measurements(torch.ones(4, 1, 2, 2, dtype=torch.uint8), SONY)

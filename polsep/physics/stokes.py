@@ -89,6 +89,8 @@ class Measurements:
             raise ValueError(
                 f"clipped must have the shape of data {tuple(self.data.shape)}, found {tuple(self.clipped.shape)}"
             )
+        if not namespace(self.data).isdtype(self.data.dtype, "real floating"):
+            raise TypeError(f"measurements must be floating point, white at 1, found {self.data.dtype}")
 
 
 def analyser_matrix(angles: Sequence[float]) -> Doubles:

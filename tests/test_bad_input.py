@@ -88,6 +88,14 @@ def patched_tiff(tag: int, value: int) -> bytes:
     return bytes(data)
 
 
+def sparse_tiff() -> bytes:
+    """A TIFF file whose strips are said to lie at its beginning, as those of a hole do."""
+    data = tiff(metadata=None)
+    with tifffile.TiffFile(io.BytesIO(data)) as tif:
+        entry = tif.pages.first.tags[273]
+    return data[: entry.valueoffset] + bytes(4) + data[entry.valueoffset + 4 :]
+
+
 def patched_tiff_count(tag: int, count: int) -> bytes:
     """The same TIFF with the number of values of one tag overwritten, so that strips lose offsets or sizes."""
     data = bytearray(tiff(rowsperstrip=16, metadata=None))
@@ -156,6 +164,7 @@ FILES: list[tuple[str, bytes, dict[str, Any], str]] = [
     ("hugewidth.tiff", patched_tiff(256, 65000), {}, "expected"),
     ("zero.tiff", patched_tiff(257, 0), {}, "found 0x64"),
     ("strips.tiff", patched_tiff(278, 8), {}, "expected 6 TIFF strips or tiles, found 3"),
+    ("hole.tiff", sparse_tiff(), {}, "expected 1 TIFF strips or tiles, found 0"),
     ("counts.tiff", patched_tiff_count(279, 2), {}, "expected"),
     ("white0.tiff", tiff(photometric="miniswhite"), {}, "photometric MINISWHITE"),
     ("palette.tiff", tiff(STACK5[0], photometric="palette", colormap=np.zeros((3, 256), np.uint16)), {}, "PALETTE"),

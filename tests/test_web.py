@@ -18,7 +18,7 @@ import tifffile
 from chromium import WAIT_MS, browser, fresh_page
 
 import polsep
-from polsep.io.raw.frames import read_frames
+from polsep.io.raw.frames import InputError, read_frames
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
 from polsep.light.find import find_light
@@ -370,6 +370,31 @@ def test_files_are_read_as_the_library_reads_them(tmp_path: Path) -> None:
         np.testing.assert_array_equal(np.reshape(frame["data"], (50, 70)), codes >> lost_bits(name), err_msg=name)
 
 
+def write_damaged_tiff(folder: Path, codes: Any) -> list[str]:
+    """TIFF files of every compression that end early, or whose strips do, or lie nowhere, or changed; their names."""
+    names = []
+    for kind in ("none", "lzw", "zlib", "packbits"):
+        path = folder / f"{kind}.tif"
+        tifffile.imwrite(path, codes, photometric="minisblack", compression=kind, rowsperstrip=25, metadata=None)
+        whole = path.read_bytes()
+        with tifffile.TiffFile(path) as file:
+            last = file.pages[0].dataoffsets[1]
+            seconds = [(tag.valueoffset, tag.valuebytecount // 2) for tag in map(file.pages[0].tags.get, (273, 279))]
+        (offset, long), (count, short) = seconds
+        damages = {
+            "cut": (len(whole) - 600, b""),
+            "header": (60, b""),
+            "nowhere": (offset + long, bytes(long) + whole[offset + 2 * long :]),
+            "short": (count + short, (100).to_bytes(short, "little") + whole[count + 2 * short :]),
+            "changed": (last + 300, bytes(20) + whole[last + 320 :]),
+        }
+        for damage, (at, rest) in damages.items():
+            if (kind, damage) not in (("none", "changed"), ("packbits", "changed")):  # of which nothing tells
+                names.append(f"{kind}_{damage}.tif")
+                (folder / names[-1]).write_bytes(whole[:at] + rest)
+    return names
+
+
 @needs_packages
 def test_files_that_the_library_refuses_are_refused(tmp_path: Path) -> None:
     """Damage that only checksums show, TIFF of other meanings or several pages; names of bytes are no headers."""
@@ -382,11 +407,13 @@ def test_files_that_the_library_refuses_are_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "pages.tif", np.stack([codes] * 4), photometric="minisblack")
     tifffile.imwrite(tmp_path / "turned.tif", codes, photometric="minisblack", extratags=[(274, 3, 1, 6, True)])
     (tmp_path / "II.raw").write_bytes(b"II" + bytes(62))
+    damaged = write_damaged_tiff(tmp_path, codes)
+    names = ["whole.png", "damaged.png", "negative.tif", "pages.tif", "turned.tif", "II.raw", *damaged]
     script = f"""
       import {{ readFileSync }} from "node:fs";
       import {{ readFrame }} from {json.dumps((WEB / "src" / "read.js").as_uri())};
       const said = {{}}, stated = {{ format: "Mono8", width: 8, height: 8 }};
-      for (const name of ["whole.png", "damaged.png", "negative.tif", "pages.tif", "turned.tif", "II.raw"])
+      for (const name of {json.dumps(names)})
         try {{
           said[name] = readFrame(name, new Uint8Array(readFileSync(name)), stated).notes.join();
         }} catch (error) {{
@@ -401,6 +428,10 @@ def test_files_that_the_library_refuses_are_refused(tmp_path: Path) -> None:
     assert said["pages.tif"] == "expected a TIFF file of one picture, found several"
     assert said["turned.tif"] == next(read_frames(tmp_path / "turned.tif")).notes[0]
     assert said["whole.png"] == said["II.raw"] == ""
+    for name in damaged:
+        with pytest.raises(InputError):
+            next(read_frames(tmp_path / name))
+        assert said[name].startswith("expected"), name
 
 
 @needs_packages

@@ -25,8 +25,7 @@ const SENSORS = [[2448, 2048], [2464, 2056], [4096, 3000], [4112, 3008], [1224, 
 /** A frame of a file's bytes. `stated`: {format, width, height} of files without a header. Throws in one line. */
 export function readFrame(name, bytes, stated) {
   if (bytes.length > 8 && bytes[0] === 0x89 && bytes[1] === 0x50) return readPng(bytes);
-  if (looksLikeTiff(bytes))
-    return { notes: [], layout: null, ...readTiff(bytes) };
+  if (looksLikeTiff(bytes)) return readIntactTiff(bytes);
   if (/\.(jpe?g|gif|webp|heic)$/i.test(name)) throw new Error("expected a raw frame as PNG or TIFF, found a compressed photograph");
   if (!stated) return { needsFormat: true, size: bytes.length, guesses: guessFormats(bytes.length) };
   return readHeaderless(bytes, stated);
@@ -36,6 +35,15 @@ export function readFrame(name, bytes, stated) {
 function looksLikeTiff([first, second, third, fourth]) {
   const little = first === 0x49 && second === 0x49 && fourth === 0, big = first === 0x4d && second === 0x4d && third === 0;
   return (little && [42, 43].includes(third)) || (big && [42, 43].includes(fourth));
+}
+
+function readIntactTiff(bytes) {
+  try {
+    return { layout: null, ...readTiff(bytes) };
+  } catch (error) {
+    if (error.message.startsWith("expected")) throw error;
+    throw new Error(`expected an intact TIFF file, found damage (${error.message})`);
+  }
 }
 
 function readPng(bytes) {

@@ -4,7 +4,7 @@
 import { unzlibSync } from "fflate";
 
 const SIZES = { 1: 1, 2: 1, 3: 2, 4: 4, 6: 1, 7: 1, 13: 4 };
-const COMPRESSIONS = { 1: (x) => x, 5: unpackLzw, 8: (x) => unzlibSync(x), 32946: (x) => unzlibSync(x), 32773: unpackBits };
+const COMPRESSIONS = { 1: (x) => x, 5: unpackLzw, 8: unpackDeflate, 32946: unpackDeflate, 32773: unpackBits };
 
 /** Meanings of samples with black at zero: MinIsBlack, and of Digital Negatives colour filters and linear raw. */
 const PHOTOMETRIC = [1, 32803, 34892];
@@ -19,7 +19,7 @@ export function readTiff(bytes) {
   if (!width || !height) throw new Error("expected a TIFF file with a size, found none");
   if (channels !== 1) throw new Error(`expected one channel, found ${channels}: a demosaicked picture is not a raw mosaic`);
   if (next) throw new Error("expected a TIFF file of one picture, found several");
-  if (!PHOTOMETRIC.includes(one(262, 1))) throw new Error(`expected gray samples with black at zero, found TIFF photometric ${one(262)}`);
+  if (!PHOTOMETRIC.includes(one(262, 0))) throw new Error(`expected gray samples with black at zero, found TIFF photometric ${one(262, 0)}`);
   if (bits < 8 || bits > 16 || one(339, 1) !== 1) throw new Error(`expected samples of 8 to 16 bits, found ${bits} of another kind`);
   if (!unpack) throw new Error(`expected a TIFF file without compression, LZW, deflate or PackBits, found number ${one(259)}`);
   if (one(266, 1) !== 1 || (predictor !== 1 && (predictor !== 2 || bits % 8)))
@@ -27,13 +27,19 @@ export function readTiff(bytes) {
   const tiled = 322 in tags, boxWidth = tiled ? one(322) : width, boxHeight = tiled ? one(323) : one(278, height);
   const offsets = tags[tiled ? 324 : 273], counts = tags[tiled ? 325 : 279];
   if (!offsets || !counts) throw new Error("expected a TIFF file with pixels, found none");
-  const across = Math.ceil(width / boxWidth), data = new (bits === 8 ? Uint8Array : Uint16Array)(width * height);
+  const across = Math.ceil(width / boxWidth), chunks = across * Math.ceil(height / boxHeight);
+  const held = offsets.filter((offset, k) => offset && counts[k]).length;
+  if (held < chunks) throw new Error(`expected ${chunks} TIFF strips or tiles, found ${held}`);
+  const end = offsets.reduce((last, offset, k) => Math.max(last, offset + (counts[k] ?? 0)), 0);
+  if (end > bytes.length)
+    throw new Error(`expected TIFF samples up to byte ${end}, found a file of ${bytes.length} bytes: it is truncated`);
+  const data = new (bits === 8 ? Uint8Array : Uint16Array)(width * height);
   offsets.forEach((offset, k) => {
     const top = Math.floor(k / across) * boxHeight, left = (k % across) * boxWidth;
     const rows = tiled ? boxHeight : Math.min(boxHeight, height - top), rowBytes = Math.ceil((boxWidth * bits) / 8);
     if (top >= height) return;
     const packed = unpack(bytes.subarray(offset, offset + counts[k]), rows * rowBytes);
-    if (packed.length < rows * rowBytes) throw new Error("expected a complete TIFF file, found one that ends early");
+    if (packed.length < rows * rowBytes) throw new Error("expected full TIFF strips or tiles, found one that ends early");
     const row = new data.constructor(boxWidth);
     for (let r = 0; r < Math.min(rows, height - top); r++) {
       readRow(packed.subarray(r * rowBytes, (r + 1) * rowBytes), bits, little, row);
@@ -69,9 +75,20 @@ function readRow(bytes, bits, little, row) {
     }
 }
 
+/** zlib's format, of which the last four bytes are the checksum Adler-32 (RFC 1950). */
+function unpackDeflate(bytes) {
+  const out = unzlibSync(bytes), found = new DataView(bytes.buffer, bytes.byteOffset + bytes.length - 4, 4).getUint32(0);
+  let a = 1, b = 0;
+  for (let k = 0; k < out.length; b %= 65521, a %= 65521)
+    for (const end = Math.min(k + 3800, out.length); k < end; k++) b += a += out[k];
+  if (b * 65536 + a !== found) throw new Error("wrong checksum");
+  return out;
+}
+
 function unpackBits(bytes, size) {
   const out = new Uint8Array(size);
-  for (let k = 0, at = 0; k < bytes.length && at < size; ) {
+  let at = 0;
+  for (let k = 0; k < bytes.length && at < size; ) {
     const n = bytes[k++];
     if (n < 128) {
       out.set(bytes.subarray(k, k + Math.min(n + 1, size - at)), at);
@@ -82,7 +99,8 @@ function unpackBits(bytes, size) {
       at += 257 - n;
     }
   }
-  return out;
+  if (at > size) throw new Error("too many bytes");
+  return out.subarray(0, at);
 }
 
 /** LZW with codes from the highest bit on; 256 clears the table, 257 ends (TIFF 6.0, section 13). */
@@ -100,6 +118,7 @@ function unpackLzw(bytes, size) {
       [next, bits, before] = [258, 9, -1];
       continue;
     }
+    if (code > next || (code > 257 && before < 0)) throw new Error("unknown code");
     const begin = at;  // a table entry is the string before and one byte more: both are in the output already
     if (code < 256) out[at++] = code;
     else {
@@ -113,5 +132,5 @@ function unpackLzw(bytes, size) {
     before = begin;
     bits = next >= 2047 ? 12 : next >= 1023 ? 11 : next >= 511 ? 10 : 9;
   }
-  return out;
+  return out.subarray(0, at);
 }

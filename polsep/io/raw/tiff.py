@@ -161,7 +161,7 @@ def _require_readable(page: tifffile.TiffPage, size: int) -> None:
     if page.dtype is None or page.bitspersample < 8:
         bits, kind = page.bitspersample, page.sampleformat
         raise InputError(f"expected samples of 8 bits or more, found {bits} bits of sample format {kind}")
-    strips = sum(1 for count in page.databytecounts if count)
+    strips = sum(1 for place in zip(page.dataoffsets, page.databytecounts, strict=False) if all(place))
     if strips < math.prod(page.chunked):
         raise InputError(f"expected {math.prod(page.chunked)} TIFF strips or tiles, found {strips}")
     end = max(offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True))

@@ -228,6 +228,22 @@ def test_a_file_whose_format_nobody_says_leaves_settings(page: Any) -> None:
 
 @needs_packages
 @needs_browser
+@pytest.mark.parametrize("missing", ["worker.js", "network.js", "ort-cpu.bin"])
+def test_a_host_without_a_part_of_the_page_is_told(browser: Any, site: Path, tmp_path: Path, missing: str) -> None:
+    """Every file fails with the name of what is missing: none waits for workers that never started."""
+    copied = tmp_path / "site"
+    copied.mkdir()
+    for path in site.iterdir():
+        if path.name != missing:
+            (copied / path.name).symlink_to(path)
+    with served(copied) as address, fresh_page(browser, f"{address}?threads=2&plain", 800) as opened:
+        for name in ("first.png", "second.png"):
+            send(opened, name, shot())
+            assert opened.inner_text("#notes").startswith(f"{name}: expected {missing} beside the page, found")
+
+
+@needs_packages
+@needs_browser
 def test_settings_wait_for_a_frame(page: Any) -> None:
     """Of a first file that cannot be read, or of one whose format is still asked for, nothing is separated."""
     page.select_option("#method", "analytic")

@@ -53,8 +53,8 @@ onmessage = async ({ data }) => {
 };
 
 async function fetched(name) {
-  const answer = await fetch(new URL(name, self.location.href));
-  if (!answer.ok) throw new Error(`expected ${name} beside the page, found status ${answer.status}`);
+  const answer = await fetch(new URL(name, self.location.href)).catch(() => null);
+  if (!answer?.ok) throw new Error(`expected ${name} beside the page, found ${answer ? `status ${answer.status}` : "no answer"}`);
   return answer;
 }
 

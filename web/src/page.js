@@ -31,11 +31,16 @@ worker.onmessage = ({ data }) => {
   if (data.failed) reject(new Error(data.failed));
   else resolve(data);
 };
-worker.onerror = (event) => asked.shift()?.reject(new Error(event.message || "the worker failed"));
+let broken = null;
+worker.onerror = (event) => {  // it did not start, and never will
+  broken = new Error(event.message || "expected worker.js beside the page, found none that runs: reload the page");
+  for (const { reject } of asked.splice(0)) reject(broken);
+};
 
 /** What the worker answers to a job; it takes one after the other. Throws what went wrong, in one line. */
 function ask(job, message = {}) {
   return new Promise((resolve, reject) => {
+    if (broken) throw broken;
     asked.push({ resolve, reject });
     worker.postMessage({ job, ...message });
   });

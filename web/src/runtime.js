@@ -13,7 +13,7 @@ class Pool {
     this.idle = Array.from({ length: count }, () => {
       const worker = new Worker(new URL("network.js", self.location.href), { type: "module" });
       worker.onmessage = ({ data: { id, images, failed } }) => this.finish(worker, id, (job) => failed ? job.reject(new Error(failed)) : job.resolve(images));
-      worker.onerror = (event) => this.finish(worker, worker.job, (job) => job.reject(new Error(event.message || "a worker failed")));
+      worker.onerror = (event) => this.drop(new Error(event.message || "expected network.js beside the page, found none that runs"));
       return worker;
     });
     this.count = count;
@@ -41,6 +41,12 @@ class Pool {
     if (this.jobs.has(id)) settle(this.jobs.get(id));
     this.jobs.delete(id);
     this.give();
+  }
+
+  /** All that was asked for fails, since a worker did not start; the next frame begins with other workers. */
+  drop(error) {
+    for (const [key, pool] of pools) if (pool === this) pools.delete(key);
+    for (const job of [...this.jobs.values(), ...this.waiting]) job.reject(error);
   }
 }
 

@@ -244,6 +244,22 @@ def test_a_host_without_a_part_of_the_page_is_told(browser: Any, site: Path, tmp
 
 @needs_packages
 @needs_browser
+def test_a_folder_or_several_files_are_not_a_frame(page: Any, tmp_path: Path) -> None:
+    """Dropped on the page, they are refused: nothing is taken for all of them."""
+    files = [str(tmp_path / name) for name in ("0.png", "45.png")]
+    for path in files:
+        Path(path).write_bytes(shot())
+    driver = page.context.new_cdp_session(page)
+    for dropped, said in ((files, "0.png: expected one raw frame, found 2 files"), ([str(tmp_path)], "found a folder")):
+        for kind in ("dragEnter", "dragOver", "drop"):
+            data = {"items": [], "files": dropped, "dragOperationsMask": 1}
+            driver.send("Input.dispatchDragEvent", {"type": kind, "x": 300, "y": 300, "data": data})
+        page.wait_for_selector(f"#notes li:has-text({said!r})")
+        assert state_of(page) == ["failed", None]
+
+
+@needs_packages
+@needs_browser
 def test_settings_wait_for_a_frame(page: Any) -> None:
     """Of a first file that cannot be read, or of one whose format is still asked for, nothing is separated."""
     page.select_option("#method", "analytic")
@@ -424,7 +440,10 @@ def test_files_that_the_library_refuses_are_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "turned.tif", codes, photometric="minisblack", extratags=[(274, 3, 1, 6, True)])
     (tmp_path / "II.raw").write_bytes(b"II" + bytes(62))
     damaged = write_damaged_tiff(tmp_path, codes)
-    names = ["whole.png", "damaged.png", "negative.tif", "pages.tif", "turned.tif", "II.raw", *damaged]
+    others = {"photo.png": b"\xff\xd8\xff\xe0", "shot.tiff": b"raw samples", "shot.npy": b"\x93NUMPY", "empty.raw": b""}
+    for name, data in others.items():
+        (tmp_path / name).write_bytes(data)
+    names = [*others, "whole.png", "damaged.png", "negative.tif", "pages.tif", "turned.tif", "II.raw", *damaged]
     script = f"""
       import {{ readFileSync }} from "node:fs";
       import {{ readFrame }} from {json.dumps((WEB / "src" / "read.js").as_uri())};
@@ -444,6 +463,8 @@ def test_files_that_the_library_refuses_are_refused(tmp_path: Path) -> None:
     assert said["pages.tif"] == "expected a TIFF file of one picture, found several"
     assert said["turned.tif"] == next(read_frames(tmp_path / "turned.tif")).notes[0]
     assert said["whole.png"] == said["II.raw"] == ""
+    assert said["empty.raw"] == "expected a raw frame, found an empty file" and said["shot.npy"].endswith("found .npy")
+    assert "as the name says" in said["photo.png"] and "as the name says" in said["shot.tiff"]
     for name in damaged:
         with pytest.raises(InputError):
             next(read_frames(tmp_path / name))

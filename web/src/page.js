@@ -353,7 +353,9 @@ addEventListener("dragleave", (event) => event.relatedTarget || (part("over").hi
 addEventListener("drop", (event) => {
   event.preventDefault();
   part("over").hidden = true;
-  if (event.dataTransfer.files[0]) open(event.dataTransfer.files[0]);
+  const { files } = event.dataTransfer;
+  if (files.length > 1) fail(new Error(`expected one raw frame, found ${files.length} files: drop them one by one`), files[0].name);
+  else if (files.length) open(files[0]);
 });
 
 // The page works offline once it was loaded; the service worker also asks for what threads need (sw.js).

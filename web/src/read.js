@@ -19,6 +19,9 @@ const FAMILIES = [
 export const PIXEL_FORMATS = Object.fromEntries(FAMILIES.flatMap(([family, kinds, bayer]) =>
   kinds.split(" ").map((kind) => [family + kind, { bits: PACKINGS[kind][0], packing: PACKINGS[kind][1], bayer }])));
 
+/** Ends of the names of files that have headers, but are not read here. */
+const OTHER_KINDS = /\.(npy|npz|pgm|exr|json|bmp|zip|mkv|avi|mov|nut|mp4)$/i;
+
 /** Sizes of whole frames of polarization sensors. */
 const SENSORS = [[2448, 2048], [2464, 2056], [4096, 3000], [4112, 3008], [1224, 1024]];
 
@@ -27,6 +30,9 @@ export function readFrame(name, bytes, stated) {
   if (bytes.length > 8 && bytes[0] === 0x89 && bytes[1] === 0x50) return readPng(bytes);
   if (looksLikeTiff(bytes)) return readIntactTiff(bytes);
   if (/\.(jpe?g|gif|webp|heic)$/i.test(name)) throw new Error("expected a raw frame as PNG or TIFF, found a compressed photograph");
+  if (!bytes.length) throw new Error("expected a raw frame, found an empty file");
+  if (/\.(png|tiff?)$/i.test(name)) throw new Error("expected a PNG or TIFF file as the name says, found another one");
+  if (OTHER_KINDS.test(name)) throw new Error(`expected a raw frame as PNG, TIFF or without a header, found ${name.match(OTHER_KINDS)[0]}`);
   if (!stated) return { needsFormat: true, size: bytes.length, guesses: guessFormats(bytes.length) };
   return readHeaderless(bytes, stated);
 }

@@ -33,7 +33,10 @@ const JOBS = {
   /** Read a file; {needsFormat} where it has no header and nothing was stated of it. */
   async open({ name, file, stated }) {
     tell(0.02, "Reading");
-    const found = readFrame(name, new Uint8Array(await file.arrayBuffer()), stated);
+    const bytes = await file.arrayBuffer().catch((error) => {
+      throw new Error(`expected a file, found a folder or one that cannot be read (${error.message})`);
+    });
+    const found = readFrame(name, new Uint8Array(bytes), stated);
     if (found.needsFormat) return found;
     if (found.width * found.height > MAX_SAMPLES)
       throw new Error(`expected a frame of at most ${MAX_SAMPLES / 1e6} million samples, found ${found.width}x${found.height}`);

@@ -291,6 +291,18 @@ def test_frames_of_files_come_at_their_rate(tmp_path: Path) -> None:
     assert time.monotonic() - start >= 4 / 20
 
 
+def test_a_damaged_file_costs_none_before_it(tmp_path: Path) -> None:
+    for k in range(4):
+        png(tmp_path / f"{k}.png", codes(k))
+    (tmp_path / "3.png").write_bytes(b"no picture")
+    source = FolderSource(tmp_path, fast())
+    with pytest.raises(InputError, match=r"3\.png"):
+        run(source, CapturePlan(tmp_path / "out", None))
+    assert len(index_of(tmp_path / "out")) == record_of(tmp_path / "out")["frames"] == 3
+    status, _ = run(source, CapturePlan(tmp_path / "short", None), frames=3)  # which needs no fourth one
+    assert status.counters.recorded == 3
+
+
 def test_a_recording_is_a_camera_byte_for_byte(tmp_path: Path) -> None:
     images = [image(k) for k in (3, 4, 6)]
     run(Scripted([*images, EndOfFrames()]), CapturePlan(tmp_path / "a", None))

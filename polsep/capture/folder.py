@@ -91,6 +91,8 @@ class _Files:
 
     def read(self, timeout_s: float) -> RawImage | None:
         """The next frame, not before it is due; later where reading is slower than the rate."""
+        if self._next is None:  # not sooner: one that cannot be read costs none before it
+            self._next = next(self._frames, None)
         wait = self._due - time.monotonic()
         if wait > timeout_s:
             time.sleep(timeout_s)
@@ -105,7 +107,6 @@ class _Files:
         image = RawImage(payload, self._count, time.time_ns())
         self._count += 1
         self._due = max(self._due + self._period, time.monotonic())
-        self._next = next(self._frames, None)
         return image
 
 

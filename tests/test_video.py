@@ -422,6 +422,39 @@ def test_a_damaged_frame_stops_the_run_until_it_is_repaired(
 
 
 def test_a_run_that_a_damaged_frame_stopped_goes_on_without_it(
+def test_a_damaged_frame_that_others_depend_on_is_repaired(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first one, which shows the exposure; nothing of a run without it is left."""
+    images = frames(3)
+    images[0] //= 2
+    folder, out = write_folder(tmp_path / "run", images), tmp_path / "out"
+    assert run(monkeypatch, *command(folder, tmp_path / "whole")) == 0
+    whole = (folder / "shot0.png").read_bytes()
+    (folder / "shot0.png").write_bytes(b"no picture")
+    assert run(monkeypatch, *command(folder, out)) == 2
+    assert "shot0.png" in capsys.readouterr().err and not out.exists()
+    (folder / "shot0.png").write_bytes(whole)
+    assert run(monkeypatch, *command(folder, out)) == 0
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [b"no picture", imagecodecs.png_encode(np.full((SIDE, SIDE + 4), 900, np.uint16))],
+    ids=["no picture", "another size"],
+)
+def test_the_lamp_is_not_found_without_a_frame_that_ends_the_run(wrong: bytes, tmp_path: Path) -> None:
+    """It would be another one once the frame is repaired."""
+    folder = write_folder(tmp_path / "run", frames(video.LIGHT_STEP + 1))
+    (folder / f"shot{video.LIGHT_STEP}.png").write_bytes(wrong)
+    found, options = open_sequence(folder, ReadOptions(white_level=WHITE)), video.VideoOptions("analytic")
+    with pytest.raises(InputError, match=f"shot{video.LIGHT_STEP}.png|frame {video.LIGHT_STEP}: expected 32x32"):
+        video.separate_first(found, options)
+    for other in ({"damaged": "skip"}, {"frames": video.LIGHT_STEP}):
+        assert video.separate_first(found, replace(options, **other)).shape == (SIDE, SIDE)
+
+
     tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing that is done depends on what becomes of damage; a run that goes on says that a frame is missing."""

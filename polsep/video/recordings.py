@@ -225,12 +225,16 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
 def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFrame:
     """Separate the first undamaged frame that shows light. Raises ValueError if there is none among those of one part.
 
-    Where all of them are black, it is the first one.
+    Where all of them are black, it is the first one. With ``damaged`` "stop", a frame that is looked at and cannot be
+    read is an error here already: what is found without it would not be what is found once it is repaired.
     """
     reason, black_frame = "none at all", None
     for _, frame in zip(range(PART), recording.begin(0), strict=False):
         if isinstance(frame, DamagedFrame):
             reason = frame.reason
+            if _ends_run(frame, options):
+                black_frame = None
+                break
         elif any(isinstance(note, BlackFrame) for note in frame.notes):
             black_frame = black_frame or frame  # which says nothing of levels, nor of the light
         else:
@@ -242,7 +246,9 @@ def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFram
 
 def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Frame) -> FirstFrame:
     refuse_forgotten(recording.stem, frame)
-    told, found = _light_of(recording, options, frame.index)
+    shape = tuple(frame.data.data.shape)
+    spread = islice(recording.begin(frame.index), 0, PART, LIGHT_STEP)
+    told, found = _light_of(_intact(spread, shape, options), options)
     separated = separate_capture(frame.data, options.method, told, options.device)
     gain = exposure_of(separated.diffuse + separated.specular)
     light = tuple(float(c) for c in separated.report["light_color"])
@@ -251,20 +257,43 @@ def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Fram
     remarks = () if found is None else found.remarks
     warnings = (line.replace(MOVED, STAYS) for line in separated.report["warnings"])  # films do without that step
     notes = (*frame.notes, *remarks, *warnings)
-    shape = tuple(frame.data.data.shape)
-    defects, black = _defects_of(recording, shape), separated.report.get("black_level")
+    defects = _defects_of(_intact(islice(recording.begin(0), DEFECT_FRAMES), shape, options))
+    black = separated.report.get("black_level")
     return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black)
 
 
-def _light_of(recording: FrameSequence, options: VideoOptions, start: int) -> tuple[LightColor | str, Light | None]:
-    """Colour of the light as told, or as frames of a part from ``start`` on show it; and what was found, for reports.
+def _ends_run(damaged: DamagedFrame, options: VideoOptions) -> bool:
+    """True for a frame at which the run will stop."""
+    return options.damaged == "stop" and (options.frames is None or damaged.index < options.frames)
+
+
+def _intact(frames: Iterator[Frame | DamagedFrame], shape: tuple[int, ...], options: VideoOptions) -> Iterator[Frame]:
+    """The frames of ``shape`` that are not damaged. Raises InputError at one that ends the run."""
+    for frame in frames:
+        checked = _of_one_size(frame, shape)
+        if isinstance(checked, Frame):
+            yield checked
+        elif _ends_run(checked, options):
+            raise InputError(checked.reason)
+
+
+def _of_one_size(frame: Frame | DamagedFrame, shape: tuple[int, ...]) -> Frame | DamagedFrame:
+    """A frame, which counts as damaged where its samples are not of the ``shape`` of the first one."""
+    if isinstance(frame, DamagedFrame) or tuple(frame.data.data.shape) == shape:
+        return frame
+    wanted, found = ("x".join(map(str, reversed(sides))) for sides in (shape, frame.data.data.shape))
+    reason = f"frame {frame.index}: expected {wanted} samples as in the first one, found {found}"
+    return DamagedFrame(frame.index, reason)
+
+
+def _light_of(frames: Iterator[Frame], options: VideoOptions) -> tuple[LightColor | str, Light | None]:
+    """Colour of the light as told, or as ``frames`` of the first part show it; and what was found, for reports.
 
     None where nothing is to be found: the colour was told, or a calibration says it, or frames are mono.
     """
     if not is_to_be_found(options.light_color):
         return options.light_color, None
-    frames = islice(recording.begin(start), 0, PART, LIGHT_STEP)
-    captures = [frame.data for frame in frames if isinstance(frame, Frame)]
+    captures = [frame.data for frame in frames]
     if not captures or any(is_calibrated(capture) for capture in captures):
         return options.light_color, None
     found = combine([light_of(capture) for capture in captures])
@@ -273,10 +302,9 @@ def _light_of(recording: FrameSequence, options: VideoOptions, start: int) -> tu
     return found.color, found
 
 
-def _defects_of(recording: FrameSequence, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
-    """Mask of the defects that the first frames of a recording share; None where there are none."""
-    frames = (frame.data for frame in islice(recording.begin(0), DEFECT_FRAMES) if isinstance(frame, Frame))
-    mask = find_lasting_defects(data for data in frames if isinstance(data, Mosaic) and tuple(data.data.shape) == shape)
+def _defects_of(frames: Iterator[Frame]) -> NDArray[np.bool_] | None:
+    """Mask of the defects that ``frames`` share; None where there are none."""
+    mask = find_lasting_defects(frame.data for frame in frames if isinstance(frame.data, Mosaic))
     return mask if mask is not None and mask.any() else None
 
 
@@ -400,10 +428,7 @@ def _prepared(
     """Frames from number ``begin`` on, temporally filtered where asked, each with the state after it."""
     count = None if options.frames is None else max(options.frames - begin, 0)
     for frame in islice(recording.begin(begin), count):
-        if not isinstance(frame, DamagedFrame) and tuple(frame.data.data.shape) != first.shape:
-            wanted, found = ("x".join(map(str, reversed(shape))) for shape in (first.shape, frame.data.data.shape))
-            reason = f"frame {frame.index}: expected {wanted} samples as in the first one, found {found}"
-            frame = DamagedFrame(frame.index, reason)
+        frame = _of_one_size(frame, first.shape)
         if first.black_level is not None and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
             frame = replace(frame, data=replace(frame.data, black_level=first.black_level))
         if first.defects is not None and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):

@@ -33,6 +33,7 @@ from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.raw.sequences import DamagedFrame, natural_order, open_sequence
 from polsep.io.results import sequences
 from polsep.io.results.exr import half_rows, read_exr_layers, zip_rows
+from polsep.io.results.films import LOSSLESS, Film, join_films
 from polsep.io.results.pixels_kernel import CHUNK, HEAD
 from polsep.io.results.sequences import FILM_WHITE, PART, Picture, SequenceKind, SequenceWriter, write_exr
 from polsep.io.store.atomic import OutputError
@@ -347,7 +348,7 @@ def test_a_second_run_into_the_same_files_is_refused(tmp_path: Path) -> None:
         first.end_part()
         first.close()
         second = begin()
-        assert second.first == (0 if overwrite else PART)
+        assert second.first == (0 if overwrite else 1)
         del second
         last = begin()
         last.append(0, black)
@@ -472,6 +473,47 @@ def test_the_lamp_is_not_found_without_a_frame_that_ends_the_run(wrong: bytes, t
     assert [line["frame"] for line in report["damaged"]] == [PART + 3] and report["settings"]["damaged"] == "skip"
     found, expected = contents(out), contents(undisturbed)
     assert set(expected) - set(found) == {f"run_{PART + 3:06d}.exr"}
+
+
+def test_a_run_that_was_stopped_behind_its_last_frame_goes_on_there(
+    recording: Path,
+    undisturbed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The last part is a short one."""
+    with monkeypatch.context() as patch:
+        patch.setattr(SequenceWriter, "finish", interrupt)
+        assert run(patch, *command(recording, tmp_path)) == 130
+    capsys.readouterr()
+    assert run(monkeypatch, *command(recording, tmp_path)) == 0
+    said = capsys.readouterr()
+    assert said.err == f"polsep: resuming at frame {FRAMES} of {FRAMES}\n" and f"  {FRAMES} frames: " in said.out
+    assert contents(tmp_path) == contents(undisturbed)
+
+
+def test_films_go_into_folders_with_a_colon(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """FFmpeg takes the word before a colon for a protocol."""
+    monkeypatch.chdir(tmp_path)
+    out = Path("take1:left")
+    assert run(monkeypatch, *command(recording, out, "--frames", "2")) == 0
+    assert (out / "run_preview.mp4").stat().st_size > 0
+
+
+def test_frames_of_joined_films_have_times_of_their_own(tmp_path: Path) -> None:
+    """At a rate at which times of a part, and of its beginning, rounded to milliseconds each, meet."""
+    rate, kind = 783.0, LOSSLESS["ffv1", 1]
+    parts = [tmp_path / f"{k}.mkv" for k in range(6)]
+    for part in parts:
+        film = Film(part, kind, (4, 4), rate)
+        for _ in range(PART):
+            film.write(np.zeros((1, 4, 4), np.uint16))
+        film.close()
+    join_films(parts, tmp_path / "film.mkv", kind, rate)
+    with av.open(str(tmp_path / "film.mkv")) as container:
+        times = [packet.pts for packet in container.demux(video=0) if packet.size]
+    assert times == [round(1000 * k / rate) for k in range(len(parts) * PART)]
 
 
 def interrupt(*arguments: object) -> None:

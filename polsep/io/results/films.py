@@ -169,17 +169,17 @@ def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -
     """Join films of one ``kind`` and ``rate`` in their order by copying the encoded packets."""
     av = load_library()
     stream, frames, sink = None, 0, _Sink(path.open("wb"))
+    per_second = Fraction(rate).limit_denominator(1001)
     with closing(av.open(sink, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)) as output:
         for part in parts:
-            with av.open(str(part)) as source:
+            with av.open(f"file:{part}") as source:  # a colon in the path would name a protocol
                 template = source.streams.video[0]
                 stream = stream or output.add_stream_from_template(template)
-                packets = [packet for packet in source.demux(template) if packet.size]
-                for packet in packets:
-                    # Every part counts its frames from 0.
-                    offset = round(frames / (Fraction(rate).limit_denominator(1001) * packet.time_base))
-                    packet.pts, packet.dts, packet.stream = packet.pts + offset, packet.dts + offset, stream
-                    output.mux(packet)
-                frames += len(packets)
+                for packet in source.demux(template):
+                    if packet.size:  # every part counts its frames from 0, and rounds their times
+                        packet.pts = packet.dts = round(frames / (per_second * packet.time_base))
+                        packet.stream = stream
+                        output.mux(packet)
+                        frames += 1
             sink.check()
     sink.finish()

@@ -177,7 +177,9 @@ class SequenceWriter:
     @property
     def first(self) -> int:
         """The number of the first frame, counted from the beginning of the run, that no complete part has."""
-        return PART * self._done
+        if not self._done:
+            return 0
+        return PART * (self._done - 1) + len(self._record(self._done - 1).read_text().splitlines())
 
     def state(self) -> State:
         """The state that the last complete part left for the next one; empty where there is none."""

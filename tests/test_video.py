@@ -422,7 +422,6 @@ def test_a_damaged_frame_stops_the_run_until_it_is_repaired(
     assert {k: v for k, v in found.items() if k != "run.json"} == {k: v for k, v in expected.items() if k != "run.json"}
 
 
-def test_a_run_that_a_damaged_frame_stopped_goes_on_without_it(
 def test_a_damaged_frame_that_others_depend_on_is_repaired(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -456,6 +455,7 @@ def test_the_lamp_is_not_found_without_a_frame_that_ends_the_run(wrong: bytes, t
         assert video.separate_first(found, replace(options, **other)).shape == (SIDE, SIDE)
 
 
+def test_a_run_that_a_damaged_frame_stopped_goes_on_without_it(
     tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing that is done depends on what becomes of damage; a run that goes on says that a frame is missing."""
@@ -802,6 +802,8 @@ def test_films_that_hold_no_mosaic_are_refused(codec: str, pixels: str, tmp_path
         ({"format": "gif"}, "expected a format of exr, ffv1, ffvhuff, none, found 'gif'"),
         ({"compression": "rar"}, "expected a compression of none, zip, piz, found 'rar'"),
         ({"rate": 0.0}, "expected a rate of 0.001 to 100000 frames per second, found 0"),
+        ({"format": "ffv1", "rate": 1001.0}, "expected at most 1000 frames per second in ffv1, found 1001"),
+        ({"format": "ffvhuff", "rate": 1001.0}, "expected at most 1000 frames per second in ffvhuff, found 1001"),
         ({"format": "none", "preview": False}, "expected something to write"),
     ],
 )

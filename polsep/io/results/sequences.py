@@ -46,6 +46,8 @@ PART = 25
 FORMATS = ("exr", "ffv1", "ffvhuff", "none")
 #: Formats that are films.
 LOSSLESS_CODECS = FORMATS[1:3]
+#: Largest rate of lossless films: Matroska counts milliseconds, and FFmpeg's AVI takes no more.
+_LOSSLESS_RATE = 1000
 #: Threads that write at once: an EXR file or two lossless films, and the film to watch.
 _WRITERS = 3
 #: EXR files after which one of them is on the disk.
@@ -90,6 +92,10 @@ class SequenceKind:
             raise OutputError(f"expected a compression of {', '.join(COMPRESSIONS)}, found {self.compression!r}")
         if not 0.001 <= self.rate <= 100_000:
             raise OutputError(f"expected a rate of 0.001 to 100000 frames per second, found {self.rate:g}")
+        if self.format in LOSSLESS_CODECS and self.rate > _LOSSLESS_RATE:
+            raise OutputError(
+                f"expected at most {_LOSSLESS_RATE} frames per second in {self.format}, found {self.rate:g}"
+            )
         if self.format == "none" and not self.preview:
             raise OutputError("expected something to write, found format none and no preview")
 

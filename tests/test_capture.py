@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import cache
 from itertools import count, islice, pairwise
 from pathlib import Path
@@ -369,6 +370,32 @@ def test_a_recording_cut_anywhere_is_read_to_its_last_whole_frame(
     assert [f.stem for f in frames] == (["take"] if whole == 1 else [f"take_{k:04d}" for k in range(whole)])
     assert all(np.array_equal(f.data.data, codes(k)) for k, f in enumerate(frames))
     assert any("ends within a frame" in note for note in frames[0].notes) == (cut % HEADER.frame_bytes > 0)
+
+
+def test_frames_have_the_time_at_which_they_came(tmp_path: Path) -> None:
+    """Behind a trigger that was waited for, and by a clock that begins again where the camera was without power."""
+
+    def late() -> Iterator[Event]:
+        time.sleep(0.2)
+        yield replace(image(1), timestamp_ns=5_000_000_000)
+        yield replace(image(2), timestamp_ns=5_040_000_000)
+        yield CameraLost("gone")
+
+    def back() -> Iterator[Event]:
+        yield replace(image(1), timestamp_ns=5_001_000_000)
+        yield replace(image(2), timestamp_ns=5_021_000_000)
+        yield EndOfFrames()
+
+    before = datetime.now(UTC)
+    run(Scripted(late(), back()), CapturePlan(tmp_path, None))
+    times = [datetime.fromisoformat(str(frame.captured)) for frame in read_frames(tmp_path / RECORD)]
+    away_s = index_of(tmp_path)[2]["away_s"]
+    assert (times[0] - before).total_seconds() > 0.19
+    steps = [(after - earlier).total_seconds() for earlier, after in pairwise(times)]
+    assert steps == pytest.approx([0.04, away_s, 0.02], abs=0.0011)
+    lines = (tmp_path / INDEX).read_text().replace(f'"away_s": {away_s}', '"away_s": 1e300')
+    (tmp_path / INDEX).write_text(lines)
+    assert [frame.captured is None for frame in read_frames(tmp_path / RECORD)] == [False, False, True, True]
 
 
 def test_a_recording_can_be_begun_anywhere(recording: Path) -> None:

@@ -266,7 +266,6 @@ class Session:
                 return
         if self._plan.output is not None:
             self._writer = RecordingWriter(self._plan.output, header, self._plan.overwrite)
-        self._began = datetime.now(UTC).isoformat(timespec="milliseconds")
         self._notify(f"{info.name}: {info.describe()}")
 
     def _pump(self, camera: Camera) -> None:
@@ -305,6 +304,8 @@ class Session:
             self._interruptions.append({"received_before": self._counters.received, "seconds": round(away, 3)})
             self._notify(f"camera back after {away:.1f} s, frames in between are not counted as lost")
             image = replace(image, away_s=away)
+        if not self._counters.received:  # a trigger may have let it wait for any time
+            self._began = datetime.now(UTC).isoformat(timespec="milliseconds")
         self._counters.received += 1
         self._last = now
         if self._plan.output is not None:
@@ -375,7 +376,7 @@ class Session:
         if self._writer is not None:
             counters = asdict(self.status().counters)
             counters["away_s"] = round(counters["away_s"], 3)
-            remarks = {"began": self._began, "counters": counters, "interruptions": self._interruptions}
+            remarks = {"began": self._began or None, "counters": counters, "interruptions": self._interruptions}
             self._writer.note(remarks, finished)
 
 

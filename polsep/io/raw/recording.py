@@ -216,20 +216,40 @@ def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
     size = (header.width, header.height)
     exposure_us = header.settings.get("exposure_us")
     exposure = exposure_us * 1e-6 if isinstance(exposure_us, int | float) and exposure_us > 0 else None
-    start = _read_index(path.with_name(INDEX)).get(0, {}).get("timestamp_ns", 0)
+    starts = _starts(_read_index(path.with_name(INDEX)))
     for index, image in enumerate(read_images(path, first), first):
         page = headerless_page(image.payload, size, header.pixel_format, index, count)
         if header.layout is not None:
             page = replace(page, layout=Layout.parse(header.layout), notes=())
-        yield replace(page, notes=page.notes + notes, exposure=exposure, captured=_captured(header, start, image))
+        yield replace(
+            page, notes=page.notes + notes, exposure=exposure, captured=_captured(header, starts.get(index), image)
+        )
 
 
-def _captured(header: Header, start: int, image: RawImage) -> str | None:
-    """Time of a frame: by the camera's clock after the first one, whose time stamp is ``start`` [ns]."""
-    after_ns = image.timestamp_ns - start
-    if header.began is None or after_ns < 0 or not start:
+def _starts(lines: Mapping[int, Mapping[str, Any]]) -> dict[int, int]:
+    """The time of the first frame [ns] by the clock of each one: a camera that was away may count from 0 again.
+
+    Nothing where the first frame has no time.
+    """
+    starts, start, before = dict[int, int](), 0, 0
+    for number, line in sorted(lines.items()) if lines.get(0, {}).get("timestamp_ns") else ():
+        stamp, away_s = line.get("timestamp_ns", 0), line.get("away_s", 0)
+        if number == 0:
+            start = stamp
+        elif away_s > 0:
+            start += stamp - before - int(away_s) * 10**9 - round(away_s % 1 * 1e9)
+        starts[number], before = start, stamp
+    return starts
+
+
+def _captured(header: Header, start: int | None, image: RawImage) -> str | None:
+    """Time of a frame: by the camera's clock after the first one, whose time by that clock is ``start`` [ns]."""
+    if header.began is None or start is None or image.timestamp_ns < start:
         return None
-    when = datetime.fromisoformat(header.began) + timedelta(microseconds=after_ns // 1000)
+    try:
+        when = datetime.fromisoformat(header.began) + timedelta(microseconds=(image.timestamp_ns - start) // 1000)
+    except OverflowError:  # away for longer than there are years
+        return None
     return when.isoformat(timespec="milliseconds")
 
 

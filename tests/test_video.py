@@ -10,6 +10,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 import zlib
 from collections.abc import Iterator
@@ -333,6 +334,33 @@ def test_an_error_of_a_thread_that_writes_ends_the_run(
     assert [path.name for path in (tmp_path / ".polsep-run").glob("0*.json")] == ["000000.json"]
     monkeypatch.setattr(sequences, "write_exr", write_exr)
     assert run(monkeypatch, *command(recording, tmp_path)) == 0
+
+
+def test_films_end_behind_the_frame_that_is_being_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where Ctrl-C ends the wait for it: an encoder in two hands ends the process."""
+    black = np.zeros((4, 4, 3), np.float32)
+    closing, done = threading.Event(), list[str]()
+
+    class Slow:
+        def __init__(self, *given: Any) -> None: ...
+
+        def write(self, image: NDArray[Any]) -> None:
+            closing.wait(0.2)  # long enough for whoever closes too soon
+            done.append("written")
+
+        def close(self) -> None:
+            done.append("closed")
+            closing.set()
+
+    monkeypatch.setattr(sequences, "Film", Slow)
+    writer = SequenceWriter(tmp_path, "run", SequenceKind("ffv1", preview=False), {"colors": 3})
+    writer.append(0, Picture(black, black, None, {"frame": 0}))
+    with monkeypatch.context() as patch:
+        patch.setattr(sequences, "wait", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            writer.append(1, Picture(black, black, None, {"frame": 1}))
+    writer.close()
+    assert done == ["written", "written", "closed", "closed"]
 
 
 def test_a_second_run_into_the_same_files_is_refused(tmp_path: Path) -> None:

@@ -252,12 +252,11 @@ class SequenceWriter:
 
     def close(self) -> None:
         """End the films of the part that is being written. The next run writes an incomplete part anew."""
-        wait(self._begun)
+        if self._pool is not None:
+            self._pool.shutdown()  # waits for what writes into films, also where Ctrl-C has ended a wait for it
+            self._pool = None
         self._begun = []
         self._close_films()
-        if self._pool is not None:
-            self._pool.shutdown()
-            self._pool = None
         self._unlock()
 
     def _close_films(self) -> None:

@@ -346,6 +346,30 @@ def test_a_run_that_damage_stopped_goes_on_without_the_frame(tmp_path: Path) -> 
     assert steps[0].done == PART and steps[-1].damaged and steps[-1].written
 
 
+def test_films_that_were_separated_anew_are_not_mixed(tmp_path: Path) -> None:
+    """Their first frames may be equal: a filter changes only later ones. The report tells them apart."""
+    folder, work = film(tmp_path / "in"), Work(Recipe((Rougher(sigma=2.0),)))
+    report = folder / "take.json"
+    report.write_text('{"settings": {"filter": "temporal"}}')
+    target = EditTarget(tmp_path / "out", kind=SILENT)
+
+    def stop() -> None:
+        with closing(edit_sequence(folder, work, target)) as steps:
+            list(islice(steps, PART + 2))
+
+    stop()
+    report.write_text('{"settings": {"filter": "none"}}')
+    with pytest.raises(OutputError, match=r"expected film take\.json .* was begun, found film take\.json"):
+        next(edit_sequence(folder, work, target))
+    report.unlink()
+    target = replace(target, directory=tmp_path / "other")
+    stop()
+    images = random_images(99)
+    write_exr(folder / "take_000000.exr", Picture(images.diffuse, images.specular, None, {}), "none")
+    with pytest.raises(OutputError, match=r"expected film take_000000\.exr .* was begun"):
+        next(edit_sequence(folder, work, target))
+
+
 def test_other_settings_are_not_mixed(tmp_path: Path) -> None:
     """A run begun with another recipe is not gone on with; finished results and strange frames are not replaced."""
     folder = film(tmp_path / "in", 3)

@@ -185,6 +185,7 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
     settings = {
         **work.as_data(),
         "source": folder.resolve().name,
+        "film": _film_hashes(folder, found),
         "first": found.first,
         "count": len(found.files),
         "missing": missing,
@@ -209,6 +210,12 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
     said = {**settings, "damaged": target.damaged}
     report = {"frames": len(lines), "damaged": damaged, "settings": said, "warnings": work.recipe.cautions()}
     yield Progress(count, count, damaged=bool(damaged), written=(preview, *writer.finish(report)))
+
+
+def _film_hashes(folder: Path, found: NumberedFiles) -> dict[str, str]:
+    """The sha256 of the first frame and of any report: a film that was separated anew is another one."""
+    files = [next(path for path in found.files if path is not None), folder / f"{found.stem}.json"]
+    return {path.name: hash_map(path) for path in files if path.is_file()}
 
 
 def _first_frame(found: NumberedFiles, work: Work, on_damage: str) -> tuple[SeparatedImages, SeparatedImages]:

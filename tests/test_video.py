@@ -34,7 +34,7 @@ from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.raw.sequences import DamagedFrame, natural_order, open_sequence
 from polsep.io.results import sequences
 from polsep.io.results.exr import half_rows, read_exr_layers, zip_rows
-from polsep.io.results.films import LOSSLESS, Film, join_films
+from polsep.io.results.films import LOSSLESS, WATCHABLE, Film, encode_film, join_films
 from polsep.io.results.pixels_kernel import CHUNK, HEAD
 from polsep.io.results.sequences import FILM_WHITE, PART, Picture, SequenceKind, SequenceWriter, write_exr
 from polsep.io.store.atomic import OutputError
@@ -527,6 +527,23 @@ def test_films_go_into_folders_with_a_colon(recording: Path, tmp_path: Path, mon
     out = Path("take1:left")
     assert run(monkeypatch, *command(recording, out, "--frames", "2")) == 0
     assert (out / "run_preview.mp4").stat().st_size > 0
+
+
+def test_films_to_watch_have_the_colors_that_players_take_for_granted(tmp_path: Path) -> None:
+    """Those of BT.709, and they say so, also once they are joined."""
+    color = np.array([200, 40, 60])
+    (tmp_path / "part.mp4").write_bytes(encode_film([np.full((16, 16, 3), color, np.uint8)], WATCHABLE, 25.0))
+    join_films([tmp_path / "part.mp4"], tmp_path / "film.mp4", WATCHABLE, 25.0)
+    with av.open(str(tmp_path / "film.mp4")) as container:
+        (frame,) = container.decode(video=0)
+        context = container.streams.video[0].codec_context
+        said = (context.colorspace, context.color_primaries, context.color_trc, context.color_range)
+    assert said == (1, 1, 13, 1)  # BT.709 twice, sRGB; 16 to 235
+    luma, blue, red = (np.frombuffer(plane, np.uint8)[0] for plane in frame.planes)
+    light = (luma - 16.0) / 219, (blue - 128.0) / 224, (red - 128.0) / 224
+    found = np.array([light[0] + 1.5748 * light[2], 0.0, light[0] + 1.8556 * light[1]])  # ITU-R BT.709
+    found[1] = (light[0] - 0.2126 * found[0] - 0.0722 * found[2]) / 0.7152
+    np.testing.assert_allclose(255 * found, color, atol=4)
 
 
 def test_frames_of_joined_films_have_times_of_their_own(tmp_path: Path) -> None:

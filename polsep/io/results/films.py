@@ -29,6 +29,9 @@ from polsep.io.store.atomic import release_cache
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".avi": "avi"}
 #: FFmpeg's options for containers without dates and random numbers.
 _EXACTLY = {"fflags": "+bitexact"}
+#: Colours of films to watch, by their numbers in ITU-T H.273: players take those of BT.709 for granted in large films,
+#: FFmpeg makes others where nobody asks. The third is FFmpeg's number of a range from 16 to 235.
+_BT709, _SRGB, _LIMITED = 1, 13, 1
 #: Bytes of a film that the system keeps in memory, about.
 _RELEASED = 2**25
 
@@ -126,6 +129,9 @@ class Film:
         self._stream.pix_fmt = kind.pixels
         self._stream.codec_context.thread_count = min(kind.threads, get_threads())
         self._stream.codec_context.flags |= av.codec.context.Flags.bitexact
+        if kind is WATCHABLE:
+            self._stream.codec_context.colorspace = self._stream.codec_context.color_primaries = _BT709
+            self._stream.codec_context.color_trc, self._stream.codec_context.color_range = _SRGB, _LIMITED
         self._rate = fraction
 
     def write(self, image: NDArray[Any]) -> None:
@@ -134,7 +140,8 @@ class Film:
 
         frame: Any
         if image.dtype == np.uint8:
-            frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=self._kind.pixels)
+            shown = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame = shown.reformat(format=self._kind.pixels, dst_colorspace=_BT709)
         else:
             frame = av.VideoFrame(image.shape[2], image.shape[1], self._kind.pixels)
             for plane, codes in zip(frame.planes, image, strict=True):  # the library itself copies sample by sample

@@ -142,7 +142,7 @@ function lightOf(said, mosaic) {
   if (Array.isArray(said)) {
     if (said.length !== 3 || !said.every((gain) => gain > 1e-6 && gain < 1e6))
       throw new Error("expected a light colour of three positive numbers like 1,0.9,0.7");
-    return { color: said, source: "told", remarks: [] };
+    return { color: said.map((gain) => gain / said[1]), source: "told", remarks: [] }; // a ratio, as a found one is
   }
   return findLight(mosaic);
 }

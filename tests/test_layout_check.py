@@ -179,6 +179,17 @@ def test_whole_frames_that_stand_upright_are_seen(color_frame: Tensor, mono_fram
     assert read_as(plain[:-4], MONO).warning is None
 
 
+def test_whole_frames_that_were_mirrored_are_no_crops(color_frame: Tensor) -> None:
+    """A frame as large as a sensor was mirrored by the camera (ReverseX, ReverseY): told what to say, then silent."""
+    whole = color_frame.repeat(16, 20)[:2048, :2448]
+    left_right, top_bottom = COLOR.flipped_horizontal(2448), COLOR.flipped_vertical(2048)
+    for axis, own in ((-1, left_right), (-2, top_bottom)):
+        warning = read_as(whole.flip(axis), COLOR).warning
+        assert warning is not None and "cropped" not in warning
+        assert f"--layout {left_right.spec} (mirrored left-right; if top-bottom, {top_bottom.spec})" in warning
+        assert read_as(whole.flip(axis), own).warning is None
+
+
 def test_color_read_as_mono(color_frame: Tensor) -> None:
     """A colour frame under the mono layout is warned of, and the colour layout offered."""
     check = read_as(color_frame, MONO)

@@ -222,6 +222,8 @@ def check_layout(mosaic: Mosaic, seen: Floats | None = None) -> LayoutCheck:
     likely, reason = next(iter(fits.items()))
     if _stands_upright(mosaic):
         likely, reason = next(((turn, why) for turn, why in _turned(mosaic.layout) if turn in fits), (likely, reason))
+    elif color and mosaic.layout == Layout() and mosaic.data.shape[:-3:-1] in SENSOR_SIZES:  # whole: no crop
+        likely, reason = next(((turn, why) for turn, why in _reversed(mosaic.layout) if turn in fits), (likely, reason))
     option = f"--layout {'mono' if likely == Layout(bayer=None) else likely.spec} ({reason})"
     if color is False and mosaic.layout.bayer is not None:
         said = f"the frame shows no colour pattern: unless all it shows is grey, say {option}"
@@ -263,6 +265,12 @@ def _turned(layout: Layout) -> list[tuple[Layout, str]]:
     """The layout of frames turned by a right angle, which swap red and blue: the reason names the other one too."""
     left, right = layout.transposed().flipped_vertical(4), layout.transposed().flipped_horizontal(4)
     return [(left, f"turned to the left; if to the right, {right.spec}")]
+
+
+def _reversed(layout: Layout) -> list[tuple[Layout, str]]:
+    """The layout of mirrored whole frames, which differ in red and blue: the reason names the other one too."""
+    left_right, top_bottom = layout.flipped_horizontal(4), layout.flipped_vertical(4)
+    return [(left_right, f"mirrored left-right; if top-bottom, {top_bottom.spec}")]
 
 
 def _find_color(phases: Floats, layout: Layout) -> tuple[bool | None, tuple[int, int], float]:

@@ -156,6 +156,11 @@ function turns(layout) {
   return [[left, `turned to the left; if to the right, ${specOf(right)}`]];
 }
 
+/** The layout of mirrored whole frames, which differ in red and blue: the reason names the other one too. */
+function reversals(layout) {
+  return [[mirroredAcross(layout, 4), `mirrored left-right; if top-bottom, ${specOf(mirroredDown(layout, 4))}`]];
+}
+
 const optionOf = (layout) => (sameLayout(layout, SONY_MONO) ? "mono" : specOf(layout));
 
 /** What contradicts the mosaic's layout: {text, layout}, the layout being the one to offer; null where nothing does. */
@@ -178,7 +183,9 @@ export function checkLayout(mosaic, phases) {
       layout: specOf(stood),
     };
   }
-  const [likely, reason] = (turned && turns(layout).find(([own]) => agrees(own))) || fits[0];
+  const whole = color && SENSORS.includes(`${mosaic.width}x${mosaic.height}`) && sameLayout(SONY, layout);  // no crop
+  const turn = turned ? turns(layout) : whole ? reversals(layout) : [];
+  const [likely, reason] = turn.find(([own]) => agrees(own)) || fits[0];
   const option = `layout ${optionOf(likely)} (${reason})`;
   if (color === false && layout.bayer)
     return { text: `the frame shows no colour pattern: unless all it shows is grey, say ${option}`, layout: optionOf(likely) };

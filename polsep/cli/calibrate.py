@@ -62,7 +62,7 @@ def calibrate() -> None:
 def dark(files: tuple[Path, ...], output: Path, **options: Any) -> None:
     """Black level, its pattern, read noise and hot pixels, from frames with the lens cap on.
 
-    One frame shows levels, rows and columns; ten or more also every pixel, and the read noise. Use the exposure time
+    One frame shows levels, rows and columns; several also every pixel, and the read noise. Use the exposure time
     and gain of the frames to come.
     """
     require_paths(*files)
@@ -77,7 +77,7 @@ def flat(files: tuple[Path, ...], output: Path, **options: Any) -> None:
     """Gains of pixels, vignetting and dead pixels, from frames of an evenly lit, unpolarized white.
 
     White paper before the lens under daylight or a lamp without polarizer, out of focus, at half of the white level.
-    One frame shows vignetting and the gain of each filter; four or more also every pixel. Turn the camera between
+    One frame shows vignetting and the gain of each filter; several also every pixel. Turn the camera between
     frames if the light may be slightly polarized, as the sky's.
     """
     require_paths(*files)

@@ -32,7 +32,7 @@ from polsep import cli, pipeline
 from polsep.compute.threads import own_threads
 from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.raw.sequences import DamagedFrame, natural_order, open_sequence
-from polsep.io.results import sequences
+from polsep.io.results import films, sequences
 from polsep.io.results.exr import half_rows, read_exr_layers, zip_rows
 from polsep.io.results.films import LOSSLESS, WATCHABLE, Film, encode_film, join_films
 from polsep.io.results.pixels_kernel import CHUNK, HEAD
@@ -361,6 +361,29 @@ def test_films_end_behind_the_frame_that_is_being_written(tmp_path: Path, monkey
             writer.append(1, Picture(black, black, None, {"frame": 1}))
     writer.close()
     assert done == ["written", "written", "closed", "closed"]
+
+
+def test_ctrl_c_while_ffmpeg_writes_costs_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is heard once that is written: raised within, it is lost, and what was to be written too."""
+    kind, write, paths = LOSSLESS["ffv1", 1], films._Sink.write, [tmp_path / "a.mkv", tmp_path / "b.mkv"]
+    presses = list[signal.Signals]()
+
+    def pressed(sink: Any, data: bytes) -> int:
+        for number in presses:
+            signal.raise_signal(number)
+        return write(sink, data)
+
+    monkeypatch.setattr(films._Sink, "write", pressed)
+    started = [Film(path, kind, (4, 4), 25.0) for path in paths]
+    for film in started:
+        film.write(np.arange(16, dtype=np.uint16).reshape(1, 4, 4))
+    started[0].close()
+    presses.append(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        started[1].close()
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    with pytest.raises(KeyboardInterrupt):
+        join_films(paths, tmp_path / "film.mkv", kind, 25.0)
 
 
 def test_a_second_run_into_the_same_files_is_refused(tmp_path: Path) -> None:

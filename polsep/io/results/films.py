@@ -5,13 +5,14 @@ decoding. Containers have no dates and no random numbers. So a film of an interr
 to that of an uninterrupted one.
 
 FFmpeg ends the process where it is asked to go on after a header that did not fit on a full disk, so it never hears of
-a failure: it writes to a `_Sink`, which keeps it for us.
+a failure: it writes to a `_Sink`, which keeps it for us. PyAV loses what is raised while FFmpeg writes, and what was to
+be written: signals wait until it has written.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from io import BytesIO
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.threads import get_threads
 from polsep.io.raw.videos import load_library
-from polsep.io.store.atomic import release_cache
+from polsep.io.store.atomic import delayed_signals, release_cache
 
 #: Containers by suffix.
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".avi": "avi"}
@@ -148,16 +149,18 @@ class Film:
                 np.frombuffer(plane, np.uint16).reshape(image.shape[1], -1)[:, : image.shape[2]] = codes
         frame.pts, frame.time_base = self._count, 1 / self._rate
         self._count += 1
-        self._container.mux(self._stream.encode(frame))
+        with delayed_signals():
+            self._container.mux(self._stream.encode(frame))
         self._sink.check()
 
     def close(self) -> None:
         """Write the frames that the encoder still holds, and end the file; again, say again why it failed."""
-        if self._count:
-            self._count = 0
-            self._container.mux(self._stream.encode())
-        self._container.close()
-        self._sink.finish()
+        with delayed_signals():
+            if self._count:
+                self._count = 0
+                self._container.mux(self._stream.encode())
+            self._container.close()
+            self._sink.finish()
 
 
 def encode_film(images: Iterable[NDArray[Any]], kind: FilmKind, rate: float) -> bytes:
@@ -177,9 +180,9 @@ def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -
     av = load_library()
     stream, frames, sink = None, 0, _Sink(path.open("wb"))
     per_second = Fraction(rate).limit_denominator(1001)
-    with closing(av.open(sink, "w", format=_FORMATS[kind.suffix], options=_EXACTLY)) as output:
+    with _container(sink, kind.suffix) as output:
         for part in parts:
-            with av.open(f"file:{part}") as source:  # a colon in the path would name a protocol
+            with delayed_signals(), av.open(f"file:{part}") as source:  # a colon alone would end a protocol's name
                 template = source.streams.video[0]
                 stream = stream or output.add_stream_from_template(template)
                 for packet in source.demux(template):
@@ -189,4 +192,15 @@ def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -
                         output.mux(packet)
                         frames += 1
             sink.check()
-    sink.finish()
+
+
+@contextmanager
+def _container(sink: _Sink, suffix: str) -> Iterator[Any]:
+    """The container that FFmpeg writes into a sink, by the end of the block. Raises OSError where that failed."""
+    output = load_library().open(sink, "w", format=_FORMATS[suffix], options=_EXACTLY)
+    try:
+        yield output
+    finally:
+        with delayed_signals():
+            output.close()
+            sink.finish()

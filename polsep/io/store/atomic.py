@@ -154,7 +154,7 @@ def write_set(targets: Sequence[Path], name: str, write: Callable[[Path], None])
     missing = [d for d in (directory, *directory.parents) if not os.path.exists(d)]
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        with _delayed_signals():
+        with delayed_signals():
             _write_and_move(targets, write)
     except BaseException as error:
         for path in missing:
@@ -169,7 +169,7 @@ def write_set(targets: Sequence[Path], name: str, write: Callable[[Path], None])
 
 
 @contextmanager
-def _delayed_signals() -> Iterator[None]:
+def delayed_signals() -> Iterator[None]:
     """Ctrl-C, a closed terminal and the system's request to end wait for the end of the block and its cleanup."""
     numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     before = {number: signal.getsignal(number) for number in numbers}

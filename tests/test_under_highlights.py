@@ -74,6 +74,17 @@ def test_even_bodies_go_on_under_their_highlights(scale: int) -> None:
     assert (
         filled.tally.diffuse_variance is not None and filled.tally.diffuse_variance < 0.05 * 0.01 * holes(scale).sum()
     )
+    change = (filled.diffuse.astype(np.float64) - before.diffuse) / np.array(LIGHT)
+    assert filled.tally.s0 == pytest.approx(change.mean(axis=-1).sum(), rel=1e-4)
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_bent_bodies_go_on_under_their_highlights(scale: int) -> None:
+    """What is harmonic and no plane is filled exactly too, where a method knows nothing of its holes."""
+    rows, cols = np.mgrid[: SIZE // 2 * scale, : SIZE // 2 * scale] / scale - 12.5
+    truth = slope(scale) + 1e-3 * (rows**2 - cols**2 + rows * cols)[..., None] + 0.5
+    filled, _ = fill_under_highlights(guessed(truth, scale, error=10.0), mosaic(), LIGHT)
+    np.testing.assert_allclose(filled.diffuse / np.array(LIGHT), truth, rtol=0, atol=1e-3)
 
 
 def test_who_expects_no_error_keeps_its_image() -> None:
@@ -112,9 +123,10 @@ def test_without_clipping_nothing_is_touched() -> None:
 
 @pytest.mark.parametrize("turn", [np.flipud, np.fliplr, np.transpose])
 def test_orientation_does_not_matter(turn: object) -> None:
-    """Holes at the border and elsewhere are filled alike in frames that are flipped or transposed."""
+    """Holes at the border and elsewhere, with texture around, are filled alike in flipped or transposed frames."""
     assert callable(turn)
-    frame, images = mosaic(), guessed(slope(1) ** 2, 1)
+    texture = 0.05 * np.random.default_rng(3).random((SIZE // 2, SIZE // 2, 3))
+    frame, images = mosaic(), guessed(slope(1) ** 2 + texture, 1)
     data = frame.data.copy()
     data[0, :32:2] = 4095
     turned = replace(images, **{n: np.ascontiguousarray(_turn(turn, x)) for n, x in images.arrays().items()})

@@ -77,6 +77,8 @@ def test_metal_keeps_its_color(metal: str, side: int, layout: Layout) -> None:
     before = float((diffuse + specular)[:, ::side, ::side].mean(dim=0).sum())
     gained = float(np.mean(found.diffuse + found.specular, axis=-1).sum()) - before
     assert found.tally is not None and found.tally.s0 == pytest.approx(gained, abs=1e-2)
+    more = float(np.mean(found.specular, axis=-1).sum()) - float(white[0, ::side, ::side].sum())
+    assert found.tally.specular == pytest.approx(more, abs=1e-2)  # of a tally that began at 0
     inside, outside = slice(edge, half - 2 * edge), slice(half + 2 * edge, None)
     truth = specular[:, ::side, ::side].movedim(0, -1).numpy()
     np.testing.assert_allclose(found.specular[inside], truth[inside], rtol=0.01)
@@ -84,6 +86,25 @@ def test_metal_keeps_its_color(metal: str, side: int, layout: Layout) -> None:
     assert not found.valid[inside].any() and found.valid[outside].all()
     body = BODY.expand(3, SIZE, SIZE)[:, ::side, ::side].movedim(0, -1).numpy()
     np.testing.assert_allclose(found.diffuse[outside], body[outside], rtol=1e-5)
+
+
+def test_of_metal_only_what_is_polarized_is_specular() -> None:
+    """Where four fifths of a metal's light are polarized, they are its specular light; tensors give the same."""
+    color = torch.tensor(METALS["gold"]).view(3, 1, 1).expand(3, SIZE, SIZE)
+    mosaic = expose(scene(0.12 * color, 0.48 * color), Layout(), IDEAL)
+    white = (0.48 * color).amin(dim=0, keepdim=True).expand(3, SIZE, SIZE)
+    images = separated(0.6 * color - white, white)
+    found, colored = color_specular(images, mosaic, (1.0, 1.0, 1.0))
+    assert colored.share > 0.9
+    np.testing.assert_allclose(
+        found.specular[8:-8, 8:-8], 0.48 * color[:, 16:-16:2, 16:-16:2].movedim(0, -1), rtol=0.01
+    )
+    tensors = replace(images, **{name: torch.from_numpy(image) for name, image in images.arrays().items()})
+    again, same = color_specular(tensors, mosaic, (1.0, 1.0, 1.0))
+    assert same == colored
+    for name, image in images.arrays().items():
+        np.testing.assert_allclose(np.asarray(getattr(again, name)), getattr(found, name), rtol=1e-5, atol=1e-6)
+        assert isinstance(getattr(again, name), torch.Tensor), image.shape
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.15, 0.3])

@@ -82,7 +82,7 @@ def test_bodies_of_one_hue_show_nothing() -> None:
     assert found_in(skin + 0.2 * mirrored, 0.8 * mirrored) == 0
 
 
-@pytest.mark.parametrize("tint", [(0.3, 0.0, -0.3), (-0.2, 0.2, 0.0), (0.0, -0.3, 0.3)])
+@pytest.mark.parametrize("tint", [(0.3, 0, -0.3), (-0.2, 0.2, 0), (0, -0.3, 0.3), (0.5, 0.1, 0.1), (0.1, 0.3, 0.3)])
 def test_a_wrong_color_of_the_lamp_is_no_polarizer(tint: tuple[float, float, float]) -> None:
     """It leaves coloured light, beside white, in the diffuse image."""
     body, mirrored = bodies()

@@ -55,6 +55,16 @@ def test_equal_exposures_average() -> None:
         assert (merged.linear().numpy() - scene).std() == pytest.approx(single / count**0.5, rel=0.05)
 
 
+def test_weights_are_the_inverse_of_the_variance() -> None:
+    """Of two exposures, 1 and 3, the merged noise is the least that weights can give: photons of both, as counted."""
+    scene = light() * 0.3
+    error = [merge_exposures([expose(scene, t, 2 * seed + t) for t in (1, 3)], [1, 3]).mosaic for seed in range(4)]
+    deviation = np.std([merged.linear().numpy() - scene for merged in error])
+    variance = [scene / (time * WELL) + (READ / WELL / time) ** 2 for time in (1, 3)]
+    best = np.sqrt(np.mean(1 / (1 / variance[0] + 1 / variance[1])))
+    assert deviation == pytest.approx(best, rel=0.03)
+
+
 @pytest.mark.parametrize("times", [None, [1.0, 4.0, 16.0], [0.25, 1.0, 4.0]])
 def test_exposures_extend_the_range(times: list[float] | None) -> None:
     """Three exposures, in any order: nothing is biased, dark parts lose noise as photons add up, only what clips in the

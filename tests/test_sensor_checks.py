@@ -152,6 +152,16 @@ def test_the_noise_of_floats_is_that_of_their_codes(layout: Layout) -> None:
     assert (noise_exponent(codes) or 0) > 0.4
 
 
+@LAYOUTS
+def test_clipped_parts_have_no_noise_to_look_at(layout: Layout) -> None:
+    """The exponent of the others is the frame's, also beside a black level that is known."""
+    whole = replace(frame(layout, 240.0), black_level=240.0)
+    data = whole.data.clone()
+    data[:, : SIZE // 4] = 4095
+    clipped = noise_exponent(replace(whole, data=data))
+    assert clipped == pytest.approx(noise_exponent(replace(whole, data=whole.data[:, SIZE // 4 :])), abs=0.1)
+
+
 def test_a_frame_less_another_has_noise_below_black() -> None:
     """Parts that only the room lights are black with the noise of both frames, which is no wrong black level."""
     rng = np.random.default_rng(4)

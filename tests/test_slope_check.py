@@ -83,6 +83,27 @@ def test_agreement_changes_its_sign(crop: Codes) -> None:
         assert blocks(turned, own) == pytest.approx(upright, rel=1e-3)
 
 
+def test_black_levels_are_subtracted(crop: Codes) -> None:
+    """A frame above a black level that is said shows what it shows above none."""
+    assert slope_agreement_is_along(Mosaic(np.ascontiguousarray(crop + np.uint16(240)), COLOR, 240.0, 4335.0))
+
+
+@pytest.mark.parametrize("across", [False, True])
+def test_slopes_of_shading_polarize_nothing(across: bool) -> None:
+    """Steep ramps of colour with a little polarization along or across them are told apart in every direction."""
+    y, x = np.mgrid[:256, :256] / 256
+    table = COLOR.table()
+    color = np.array([0.5, 0.3, 0.15])
+    for angle in (0, 45, 90, 135, 20):
+        t = np.deg2rad(angle)
+        shade = 0.5 + 0.6 * ((x - 0.5) * np.cos(t) - (y - 0.5) * np.sin(t))
+        seen = np.array([[[f.angle_deg, color[f.channel]] for f in row] for row in table])
+        turned = np.tile(np.deg2rad(seen[..., 0]), (64, 64)) - t - across * np.pi / 2
+        data = shade * np.tile(seen[..., 1], (64, 64)) * (1 + 0.002 * np.cos(2 * turned)) / 2
+        agreement, _ = blocks(data.astype(np.float32), COLOR)
+        assert (-1 if across else 1) * agreement > 0.5, angle
+
+
 def test_nothing_is_said_without_a_lamp_behind_a_polarizer_or_colour(crop: Codes) -> None:
     """Of a transposed frame with a sixth of the polarization, in grey, in mono, or too small."""
     data = crop.T.astype(np.float32) / 4095

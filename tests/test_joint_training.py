@@ -596,3 +596,16 @@ def test_it_learns_a_picture_by_heart() -> None:
     for name, end in score(task.separate, everywhere).items():
         assert end > 40
         assert end > before[name] + 15
+
+
+@pytest.mark.parametrize("demosaicker", ["linear", "guided"])
+def test_processes_agree_on_buffers(demosaicker: Any) -> None:
+    """`--devices 2` copies the buffers of the first process at every step, also where there is but one of them."""
+    torch.distributed.init_process_group("gloo", store=torch.distributed.HashStore(), rank=0, world_size=1)
+    try:
+        network = Joint(3, ResidualSize(8, (0, 1)), demosaicker=demosaicker).to(memory_format=torch.channels_last)
+        before = [buffer.clone() for buffer in network.buffers()]
+        torch.nn.parallel.DistributedDataParallel(network)._sync_buffers()
+        assert before and all(map(torch.equal, network.buffers(), before))
+    finally:
+        torch.distributed.destroy_process_group()

@@ -135,7 +135,8 @@ class Joint(nn.Module):
         # Without the closed form among its inputs the network cannot know how far to trust it.
         self.closed_form_gain = _zero_convolution(width, 4) if "split" in inputs else None
         self.polarization = _zero_convolution(width, 4)
-        largest = torch.tensor(MAX_LOG_VARIANCE).repeat_interleave(4).view(1, 8, 1, 1)
+        # Without sides of 1, whose strides `channels_last` changes: several processes copy such a buffer onto itself.
+        largest = torch.tensor(MAX_LOG_VARIANCE).repeat_interleave(4)
         self.register_buffer("max_log_variance", largest, persistent=False)
         self.log_variance = nn.Sequential(
             nn.Conv2d(width, DOUBT_HIDDEN, 3, padding=1), nn.ReLU(), nn.Conv2d(DOUBT_HIDDEN, 8, 1)
@@ -207,7 +208,8 @@ class Joint(nn.Module):
             changes = split_modulation(modulation, self.size.widths)
         features = self.net(closed.inputs, changes)
         log_variance = self.log_variance(features.detach()).float()
-        return total, closed, features, pixel_shuffle(torch.minimum(log_variance, self.max_log_variance), 2), light
+        largest = self.max_log_variance.view(1, 8, 1, 1)
+        return total, closed, features, pixel_shuffle(torch.minimum(log_variance, largest), 2), light
 
     def _correct(self, closed: ClosedForm, features: Tensor) -> Tensor:
         """Diffuse colours and specular at half resolution ``[N, C + 1, H/2, W/2]``."""

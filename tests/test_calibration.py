@@ -22,6 +22,7 @@ from test_cli import polsep as run_polsep  # noqa: F401
 import polsep
 from polsep.calibrate.analysers import measure_analysers
 from polsep.calibrate.dark_flat import measure_dark, measure_flat
+from polsep.calibrate.files import describe
 from polsep.calibrate.lamp import measure_lamp
 from polsep.calibrate.statistics import robust_deviation, robust_mean
 from polsep.io.raw.corrections import with_corrections
@@ -152,6 +153,9 @@ def test_a_turned_polarizer_shows_the_analysers(layout: Layout, flat: bool) -> N
     assert np.abs(angles).max() < (0.1 if flat else 0.4)
     assert np.abs(off[..., 1]).max() < 1.5
     assert abs(angles.mean()) < 0.02
+    said, loss = found.details["analysers"], off[..., 1] * (1 - 29 / 31) ** 2 / 2
+    assert said["angle_error_deg"] / 2.5 < np.sqrt((angles**2).mean()) < 2.5 * said["angle_error_deg"]
+    assert said["diattenuation_error"] / 6 < np.sqrt((loss**2).mean()) < 2.5 * said["diattenuation_error"]
     again = measure_analysers(frames[::-1], replace(known, analysers=None))
     np.testing.assert_allclose(np.array(again.analysers), np.array(found.analysers), rtol=1e-4)
     imperfect = measure_analysers(frames, replace(known, analysers=None), polarizer_extinction=50.0)
@@ -169,14 +173,28 @@ def test_the_lamp_is_found(card: bool) -> None:
     truth = sensor.calibration()
     sensor.falloff = np.ones(SIZE)
     frame = correct_mosaic(sensor.expose(sensor.sees(s0, 0.0 if card else 0.96, 0.5)), truth)
-    lamp = measure_lamp([frame], replace(truth, lamp=None), card).lamp
-    assert lamp is not None
+    found = measure_lamp([frame], replace(truth, lamp=None), card)
+    lamp, line = found.lamp, describe(found, "light")
+    assert lamp is not None and ("from card" in line if card else "from mirrored light, polarizer at 151" in line)
     cosine = np.array(lamp.color) @ color / np.linalg.norm(lamp.color) / np.linalg.norm(color)
     assert math.degrees(math.acos(min(cosine, 1))) < 0.3
     if not card:
         assert lamp.dolp is not None and lamp.dolp == pytest.approx(0.95, abs=0.03)
         assert lamp.aolp_deg == pytest.approx(math.degrees(0.5), abs=0.5)
     assert correct_mosaic(frame, Calibration(Layout(), WHITE, lamp=lamp)).light_color == lamp.color
+
+
+def test_the_lamp_of_several_frames_is_their_mean() -> None:
+    """Angles on both sides of 0, half of their distance as their spread, and the largest degree of polarization."""
+    sensor = BadSensor(MONO, dead=0)
+    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in SIZE), indexing="ij")
+    s0, truth = 0.01 + 0.9 * np.exp(-8 * (x**2 + y**2)), sensor.calibration()
+    sensor.falloff = np.ones(SIZE)
+    shots = [(0.96, 0.06), (0.8, -0.06)]
+    found = measure_lamp(correct_mosaic(sensor.expose(sensor.sees(s0, *shot)), truth) for shot in shots)
+    assert found.lamp is not None and found.lamp.dolp == pytest.approx(0.96, abs=0.03)
+    assert found.lamp.aolp_deg is not None and abs((found.lamp.aolp_deg + 90) % 180 - 90) < 0.5
+    assert found.details["light"]["aolp_spread_deg"] == pytest.approx(math.degrees(0.06), rel=0.1)
 
 
 def test_a_frame_without_the_lamp_is_refused() -> None:
@@ -336,6 +354,15 @@ def test_histograms_are_of_raw_samples() -> None:
     mosaic = Mosaic(torch.full(SIZE, 2000.0), Layout(), 0.0, WHITE)
     lit = replace(mosaic, light_color=(0.5, 1.0, 0.7))
     np.testing.assert_array_equal(histogram(lit).shares, histogram(mosaic).shares)
+
+
+def test_histograms_count_what_clips_of_each_colour() -> None:
+    """On every place of the period, and no other colour's samples."""
+    blue = np.array([[Layout().filter_at(r, c).channel == 2 for c in range(SIZE[1])] for r in range(SIZE[0])])
+    upper = np.arange(SIZE[0])[:, None] < SIZE[0] // 4
+    found = histogram(Mosaic(np.where(blue & upper, WHITE, 2000.0).astype(np.float32), Layout(), 0.0, WHITE))
+    assert found.clipped == (0.0, 0.0, 0.25) and found.shares[2, -1] == 0.25
+    np.testing.assert_allclose(found.shares.sum(axis=1), 1)
 
 
 def test_a_mean_takes_frames_one_at_a_time() -> None:

@@ -409,6 +409,8 @@ def test_textures_of_reflectance_absorb() -> None:
     assert (only(Texture(image="texture"), images, maps).diffuse <= images.diffuse).all()
     white = {"texture": np.ones((4, 4, 1), np.float32)}
     assert np.array_equal(only(Texture(image="texture", repeats=3.3), images, white).diffuse, images.diffuse)
+    fine = {"texture": np.ones((50, 50, 1), np.float32)}  # six texels on a pixel
+    assert_near(only(Texture(image="texture", repeats=3.3), images, fine).diffuse, images.diffuse, PAPER)
 
 
 # Textures.

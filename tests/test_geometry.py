@@ -17,7 +17,13 @@ from polsep.geometry.integration import SHARPNESS, Equations, find_slopes, integ
 from polsep.geometry.lights import NAMED, parse_lights
 from polsep.geometry.multigrid import Multigrid, solve
 from polsep.geometry.photometric import fit_lambertian, fit_robust
-from polsep.geometry.polarization import Polarized, find_diffuse_polarization, normals_from_polarization
+from polsep.geometry.polarization import (
+    MIN_DEVIATION,
+    POLARIZATION_DEVIATION,
+    Polarized,
+    find_diffuse_polarization,
+    normals_from_polarization,
+)
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -128,6 +134,19 @@ def test_a_slope_has_two_normals_half_a_turn_apart() -> None:
     assert nearer[nearer.size // 4 :].max() < 0.5
     assert np.allclose(cue.first[mask] * np.array([-1.0, -1.0, 1.0]), cue.second[mask])
     assert (cue.deviation[mask] > 0).all()
+
+
+@pytest.mark.parametrize("zenith_deg", [35, 50, 65, 75])
+def test_deviations_of_normals_are_those_that_noise_makes(zenith_deg: int) -> None:
+    """Of each component of the polarization; along each of two axes, beside the least deviation."""
+    zenith = math.radians(zenith_deg)
+    normals, everywhere = np.tile([math.sin(zenith), 0, math.cos(zenith)], (200, 200, 1)), np.ones((200, 200), np.bool_)
+    noise = np.random.default_rng(6).normal(scale=POLARIZATION_DEVIATION, size=(2, 200, 200))
+    exact = slope_of(normals)
+    found = normals_from_polarization(exact + noise[0] + 1j * noise[1]).first
+    off = float(np.square(np.radians(angles(found, normals, everywhere))).mean())
+    said = normals_from_polarization(exact).deviation.mean()
+    assert said == pytest.approx(math.sqrt(off / 2 + MIN_DEVIATION**2), rel=0.15)
 
 
 def test_slopes_ignore_the_frames_whose_light_is_specular() -> None:

@@ -26,7 +26,7 @@ from test_geometry import SIX, cap, dielectric, slope_of
 from polsep.geometry import files
 from polsep.geometry.integration import integrate_bilateral
 from polsep.geometry.photometric import Appearance
-from polsep.geometry.surface import draw_views, relight, span_surface
+from polsep.geometry.surface import Surface, draw_views, relight, span_surface
 from polsep.io.assets.shapes import encode_glb, encode_ply
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.exr import read_exr_layers
@@ -222,6 +222,22 @@ def ball() -> Any:
     normals, mask = cap(SIDE, 60)
     appearance = Appearance(normals, np.full((SIDE, SIDE, 3), 0.5) * mask[..., None], mask)
     return appearance, span_surface(appearance, integrate_bilateral(normals, mask))
+
+
+@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), [(0, 0), (50, 0), (0, 40), (-120, 35), (20, -50)])
+def test_views_come_from_where_they_say(azimuth_deg: float, elevation_deg: float) -> None:
+    """A ball looks alike from all sides, and its blue spot, a little above what faces the camera, is seen there."""
+    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
+    way = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
+    above = np.array([-np.sin(azimuth) * np.sin(elevation), np.cos(elevation), -np.cos(azimuth) * np.sin(elevation)])
+    ball: Any = trimesh.creation.icosphere(4)
+    normals, faces = np.asarray(ball.vertices, np.float64), np.asarray(ball.faces, np.int64)
+    colors = np.ones((len(normals), 3)) - (normals @ (0.8 * way + 0.6 * above) > 0.95)[:, None] * np.array([1.0, 0, 0])
+    (picture,) = draw_views(Surface(normals / 2, normals, colors, faces), 64, ((azimuth_deg, elevation_deg),))
+    (front,) = draw_views(Surface(normals / 2, normals, 0 * colors + 1, faces), 64, ((0, 0),))
+    assert np.abs(picture[..., 2] - front[..., 2]).mean() < 0.01 * front.mean()
+    rows, cols = np.nonzero((picture[..., 2] > 0) & (picture[..., 0] < 0.1 * picture[..., 2]))
+    assert rows.size > 50 and 12 < rows.mean() < 20 and abs(cols.mean() - 31.5) < 1
 
 
 def test_meshes_come_back_through_trimesh() -> None:

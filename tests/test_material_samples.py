@@ -18,7 +18,18 @@ from polsep.material.procedural import (
     random_svbrdf,
     rms_slope,
 )
-from polsep.material.shots import photograph, random_flash, separated_images, shade_plane
+from polsep.material.shots import (
+    AROUND,
+    CAMERA_HEIGHT,
+    FLASH,
+    HEIGHTS,
+    photograph,
+    random_flash,
+    random_light,
+    separated_images,
+    shade_metal,
+    shade_plane,
+)
 from polsep.material.svbrdf import Svbrdf
 from polsep.physics.fresnel import conductor
 from polsep.physics.gltf import DIELECTRICS, METALS, metalness
@@ -56,6 +67,16 @@ def test_reliefs_have_structure(kind: object) -> None:
     relief = random_relief(48, seeded(1))
     assert relief.height.shape == relief.weight.shape == (1, 48, 48)
     assert float(relief.weight.min()) >= 0 and float(relief.weight.max()) <= 1
+
+
+def test_normals_are_of_a_height(samples: list[Svbrdf]) -> None:
+    """Gentle slopes have no curl: how those to the right change upward is how those upward change to the right."""
+    gentle = [maps.normal for maps in samples if 0.01 < rms_slope(maps.normal) < 0.3]
+    assert len(gentle) > COUNT / 4
+    for normal in gentle:
+        right, upward = -normal[:2] / normal[2]
+        bent = (right[:-2, 1:-1] - right[2:, 1:-1], upward[1:-1, 2:] - upward[1:-1, :-2])
+        assert float(torch.corrcoef(torch.stack([x.flatten() for x in bent]))[0, 1]) > 0.9
 
 
 def test_slopes_are_as_wide_as_said(samples: list[Svbrdf]) -> None:
@@ -163,3 +184,30 @@ def test_pixels_between_hold_both() -> None:
     parts = [float(shade_plane(maps, light)[1].s0.sum()) for maps in (glass, metal, half)]
     assert parts[0] < parts[2] < parts[1]
     assert parts[1] == pytest.approx(parts[0] * METALS / 0.04, rel=0.05)
+
+
+def test_lights_fill_their_ranges() -> None:
+    """Flashes lie beside the lens and others above the plane, to the ends of what is stated, behind any polarizer."""
+    generator = seeded(5)
+    for draw, sides, (low, high) in (
+        (random_flash, FLASH, (CAMERA_HEIGHT - FLASH, CAMERA_HEIGHT + FLASH)),
+        (random_light, AROUND, HEIGHTS),
+    ):
+        lights = [draw(generator) for _ in range(400)]
+        across = torch.tensor([light.position[:2] for light in lights])
+        heights, turns = (torch.tensor(x) for x in ([y.position[2] for y in lights], [y.polarizer for y in lights]))
+        for values, least, most in ((across, -sides, sides), (heights, low, high), (turns, 0.0, math.pi)):
+            margin = 0.03 * (most - least)
+            assert least <= float(values.min()) < least + margin and most - margin < float(values.max()) <= most
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, CAMERA_HEIGHT), (0.2, -0.1, 2.0), (-0.3, 0.2, 4.0)])
+def test_metal_near_the_normal_is_a_stronger_dielectric(place: tuple[float, float, float]) -> None:
+    """Of the same lobe, polarized alike: in the ratio of both reflectances, wherever the light is."""
+    light = PointLight(place, 1.0, 0.3)
+    metal = shade_metal(plate((0.9, 0.6, 0.5), 0.5, 24), light)
+    glass = shade_plane(plate((0.04, 0.04, 0.04), 0.5, 24), light)[1]
+    ratio = torch.tensor([0.9, 0.6, 0.5]).view(3, 1, 1) / 0.04
+    for found, expected in zip((metal.s0, metal.s1, metal.s2), (glass.s0, glass.s1, glass.s2), strict=True):
+        off = (found / ratio - expected).abs() / glass.s0
+        assert float(off[:, 9:15, 9:15].max()) < 0.02

@@ -26,6 +26,7 @@ from polsep.render.materials import (
     random_materials,
     rgb_from_hsv,
 )
+from polsep.render.room import roughen
 from polsep.render.textures import pattern_weight
 
 COUNT = 4000
@@ -125,3 +126,13 @@ def test_counts_must_agree() -> None:
     textured = random_materials(2, torch.Generator().manual_seed(0))
     with pytest.raises(ValueError, match="expected textures of 3 slots, found 2"):
         Materials(torch.ones(3, 3), torch.ones(3), torch.ones(3), textured.textures)
+
+
+def test_roughened_materials_are_rough_everywhere() -> None:
+    """Also where a texture mixes in its second material; those that were rougher stay."""
+    before = random_materials(40, torch.Generator().manual_seed(2))
+    after = roughen(before, 0.5)
+    assert before.textures is not None and after.textures is not None
+    for old, new in ((before, after), (before.textures, after.textures)):
+        assert torch.equal(new.roughness, torch.where(old.roughness < 0.5, 0.5, old.roughness))
+        assert torch.equal(new.albedo, old.albedo)

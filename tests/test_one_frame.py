@@ -115,6 +115,30 @@ def _brighter(planes: Tensor, gain: float) -> Tensor:
     return brighter
 
 
+@pytest.mark.parametrize("name", INPUTS)
+def test_lamps_that_are_not_told_are_zeros(name: str) -> None:
+    """One map says whether a lamp is known, three where it is; the last one is the mask."""
+    seen = seen_of(sphere_planes()[None], name)
+    for lamp, known in (((0.0, 0.0, 0.0), 0.0), ((0.6, 0.0, 0.8), 1.0)):
+        maps = encode(seen._replace(light=torch.tensor(lamp).view(1, 3, 1, 1).expand(1, 3, 48, 48)), name)
+        expected = torch.tensor([known, *lamp, 1.0]).view(1, 5, 1, 1) * seen.mask
+        torch.testing.assert_close(maps[:, -5:], expected)
+
+
+def test_means_weigh_normals_by_their_variances() -> None:
+    """Of all else the geometric mean is taken, also of expected errors."""
+    errors, ways = (0.1, 0.2), ((0.0, 0.6, 0.8), (0.6, 0.0, 0.8))
+    looks = [
+        Surface(np.array(way).reshape(3, 1, 1), *[np.full((3, 1, 1), 1 / error)] * 3, *[np.full((1, 1, 1), error)] * 3)
+        for error, way in zip(errors, ways, strict=True)
+    ]
+    mean = mean_surface(*looks)
+    expected = np.array(ways[0]) / 0.1**2 + np.array(ways[1]) / 0.2**2
+    np.testing.assert_allclose(mean.normal[:, 0, 0], expected / np.linalg.norm(expected))
+    np.testing.assert_allclose(mean.albedo, 50**0.5)
+    np.testing.assert_allclose(mean.normal_error, 0.02**0.5)
+
+
 def test_projected_normals_are_those_of_fresnel() -> None:
     """The sine of the zenith, at twice the azimuth, comes back from the diffuse polarization that it makes."""
     zeniths, azimuths = np.meshgrid(np.radians(np.arange(2, 85)), np.radians(np.arange(0, 360, 15)))
@@ -338,6 +362,7 @@ def test_the_shipped_network_finds_a_sphere() -> None:
     )
     assert np.log(found.albedo[mask] + 1e-3).std() < 0.6 * np.log(frame.diffuse[mask] + 1e-3).std()
     assert "Shape(normals [64, 64]" in repr(found) and not found.normals[~mask].any()
+    np.testing.assert_allclose(np.linalg.norm(found.normals[mask], axis=-1), 1, atol=1e-5)
 
 
 def test_floor_of_the_shipped_weights() -> None:

@@ -133,6 +133,21 @@ def test_agrees_with_the_optics_straight_down(roughness: float) -> None:
     torch.testing.assert_close(reflect(maps, up, up), total, rtol=5e-3, atol=1e-9)
 
 
+@pytest.mark.parametrize("size", [(4, 4), (2, 6), (5, 3)])
+def test_points_are_centres_of_pixels(size: tuple[int, int]) -> None:
+    """Half a pixel inside the plane's borders, x to the right and y up, symmetric about its middle."""
+    points = plane_points(*size)
+    assert points.shape == (3, *size)
+    torch.testing.assert_close(points[:2, 0, 0], torch.tensor([1 / size[1] - 1, 1 - 1 / size[0]]))
+    torch.testing.assert_close(points.flip(-1, -2), -points)
+
+
+def test_mirrors_stay_finite() -> None:
+    """Of no roughness at all, seen and lit from where they mirror."""
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).view(3, 1, 1)
+    assert bool(torch.isfinite(reflect(uniform_maps(0.2, 0.0, 0.04), up, up)).all())
+
+
 def test_stacking_has_a_twin() -> None:
     """Maps go through `Svbrdf.stack` and back."""
     maps = unstack(random_stack(7, 5))

@@ -323,6 +323,19 @@ def test_the_noise_is_the_cameras(sensor: Sensor, moving: float) -> None:
         assert float(found.variance(np.float32(4095 * signal))) == pytest.approx(expected, rel=0.2)
 
 
+def test_clipped_parts_say_nothing_of_the_noise() -> None:
+    """It is that of the others, a little more where neighbours alone tell."""
+    light = make_light().clamp(min=0.03)
+    light[: SIZE[0] // 2] = 2
+    frames = [shoot(light, seed).data.float().numpy() for seed in (1, 2)]
+    count = np.ones((SIZE[0] // BLOCK, SIZE[1] // BLOCK), np.float32)
+    for before, more in ((None, 1.2), ((frames[0], count), 1.0)):
+        found = estimate_noise(frames[1], before, CODES, 0)
+        assert found is not None
+        expected = float(IMX250.noise_variance(torch.tensor(0.5))) * 4095**2
+        assert float(found.variance(np.float32(4095 * 0.5))) == pytest.approx(more * expected, rel=0.2)
+
+
 @pytest.mark.parametrize("frames", [1, 9])
 def test_the_noise_over_a_black_level_is_the_same(frames: int) -> None:
     """A signal counts from black on, and means of nine frames have a ninth of the noise."""

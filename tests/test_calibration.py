@@ -131,6 +131,22 @@ def test_dark_and_flat_recover_a_sensor(layout: Layout) -> None:
     assert flat.black_map is dark.black_map
 
 
+@LAYOUTS
+def test_what_all_pixels_share_is_no_noise(layout: Layout) -> None:
+    """A lamp that flickers by 10 %, a camera that is turned, and black that drifts hide neither pixels nor noise."""
+    sensor = BadSensor(layout, dead=0)
+    drift = (2.0 * k for k in range(10))
+    frames = (sensor.expose(np.zeros(SIZE)) for _ in range(10))
+    dark = measure_dark(replace(frame, data=frame.data + step) for frame, step in zip(frames, drift, strict=True))
+    assert dark.read_noise == pytest.approx(math.hypot(READ * (WHITE - LEVEL) / WELL, 12**-0.5), rel=0.05)
+    across = np.linspace(-0.1, 0.1, SIZE[1])
+    lights = (np.broadcast_to(0.9 + 0.1 * (-1) ** k + (-1) ** (k // 2) * across, SIZE) for k in range(10))
+    used = Corrections(replace(sensor.calibration(), gain_map=None, gains=None, analysers=None))
+    flat = measure_flat(used.apply(sensor.expose(sensor.sees(light))) for light in lights)
+    assert flat.gain_map is not None
+    assert np.std(flat.gain_map / sensor.gain) < 0.006
+
+
 @pytest.mark.parametrize("layout", [Layout(), MONO], ids=lambda x: x.spec)
 @pytest.mark.parametrize("flat", [True, False])
 def test_a_turned_polarizer_shows_the_analysers(layout: Layout, flat: bool) -> None:

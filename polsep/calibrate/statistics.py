@@ -83,7 +83,8 @@ def _less_neighbour(image: Floats, period: int) -> Floats:
     """Samples less the next one along the diagonal behind the same filter, over sqrt 2, which keeps their noise."""
     places = (np.arange(n) for n in image.shape)
     rows, cols = (np.where(i < period, i + period, i - period) % len(i) for i in places)
-    return (image - image[rows][:, cols]) * np.float32(0.5**0.5)
+    less: Floats = (image - image[rows][:, cols]) * np.float32(0.5**0.5)
+    return less
 
 
 def robust_mean(values: NDArray[np.floating]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -278,6 +279,24 @@ def test_multigrid_solves_what_sparse_elimination_solves() -> None:
     exact = spsolve(matrix.tocsc(), right)
     assert np.abs(found - exact).max() < 1e-6 * np.abs(exact).max()
     assert steps < 100
+
+
+@pytest.mark.parametrize("integrate", [integrate_bilateral, integrate_smooth])
+def test_specks_beside_a_thing_leave_its_depth(integrate: Callable[..., Floats]) -> None:
+    """Thousands of unlinked specks, as of a noisy ground, lie around the same depth as the thing and change nothing."""
+    generator, side, radius = np.random.default_rng(0), 128, 40
+    v, u = (np.mgrid[:side, :side] - 63.5) / radius
+    height = np.sqrt(np.maximum(1 - u**2 - v**2, 0))
+    thing = u**2 + v**2 < 0.9
+    random = np.array([0, 0, 1]) + generator.normal(0, 0.3, (side, side, 3))
+    normals = np.where(thing[..., None], np.stack([u, -v, height], axis=-1), random)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    alone = integrate(normals, thing)
+    assert np.std((alone + radius * height)[thing]) < 0.1
+    mask = thing | ((u**2 + v**2 > 1) & (generator.random(thing.shape) < 0.25))
+    depth = integrate(normals, mask)
+    assert np.std((depth - alone)[thing]) < 0.1
+    assert np.abs(depth[mask]).max() < radius
 
 
 def test_lights_are_named_or_given() -> None:

@@ -2,7 +2,8 @@
 
 Normals ``[H, W, 3]`` have x right, y up, z to the camera, as in `polsep.render.sphere_tracing`. Depth counts away from
 the camera along its axis: in pixels around a mean of 0 for an orthographic camera, relative to a mean of 1 for a
-pinhole. In either case q dz/du = a and q dz/dv = b (u right, v down) with
+pinhole. Unlinked parts of a mask have the same mean each (of the logarithm, for a pinhole): where they are to each
+other, normals do not tell. In either case q dz/du = a and q dz/dv = b (u right, v down) with
 
 * orthographic: z = depth, q = n_z, a = n_x, b = -n_y;
 * pinhole: z = log(depth), q = -f_u n.r, a = n_x, b = -n_y f_u / f_v, r = ((u - c_u) / f_u, (c_v - v) / f_v, -1) the
@@ -22,6 +23,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.ndimage
 import scipy.sparse
 from numpy.typing import NDArray
 
@@ -140,7 +142,8 @@ class Equations:
     def as_image(self, depth: Floats, logarithmic: bool) -> Floats:
         """The solution as a depth image."""
         image = np.full(self.mask.shape, np.nan)
-        centred = depth - depth.mean()
+        part = scipy.ndimage.label(self.mask)[0][self.mask] - 1  # of unlinked parts each has a constant of its own
+        centred = depth - (np.bincount(part, depth) / np.bincount(part))[part]
         if logarithmic:
             centred = np.exp(centred)
             centred = centred / centred.mean()

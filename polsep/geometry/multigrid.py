@@ -37,7 +37,8 @@ STRONG = 0.02
 COARSEST = 400
 #: Damping of the Jacobi sweeps, and of the smoothed prolongation (4/3 over the largest eigenvalue, which is below 2).
 DAMPING = 2 / 3
-#: Added to the diagonal of the coarsest level, relative: constants there are free.
+#: Added to the diagonal of the coarsest level, relative to that of the finest: constants there are free, and their
+#: equations nothing but rounding.
 SHIFT = 1e-8
 
 
@@ -57,22 +58,23 @@ class Multigrid:
     def __init__(self, matrix: Any, rows: Integers, cols: Integers) -> None:
         """``matrix``: symmetric CSR over pixels whose places in the image are ``rows [N]`` and ``cols [N]``."""
         self.levels: list[_Level] = []
+        _, part = scipy.sparse.csgraph.connected_components(matrix, directed=False)
+        shift = SHIFT * max(float(matrix.diagonal().max(initial=0.0)), np.finfo(float).tiny)
         while matrix.shape[0] > COARSEST:
             diagonal = matrix.diagonal()
-            inverse = np.where(diagonal > 0, 1 / np.where(diagonal > 0, diagonal, 1), 0)
-            owner, rows, cols = _gather(matrix, diagonal, rows // BLOCK, cols // BLOCK)
-            if rows.size == diagonal.size:  # no more pixels to gather
+            linked = (diagonal > 0) & (np.bincount(part)[part] > 1)  # else a free constant, its equation rounding
+            inverse = np.where(linked, 1 / np.where(linked, diagonal, 1), 0)
+            owner, member = _gather(matrix, diagonal, rows // BLOCK, cols // BLOCK)
+            if member.size == diagonal.size:  # no more pixels to gather
                 break
-            count = diagonal.size
+            rows, cols, part, count = rows[member] // BLOCK, cols[member] // BLOCK, part[member], diagonal.size
             tentative = scipy.sparse.csr_array((np.ones(count), owner, np.arange(count + 1)), (count, rows.size))
             up = (tentative - scipy.sparse.diags_array(DAMPING * inverse) @ (matrix @ tentative)).tocsr()
             down = up.T.tocsr()
             single = (x.astype(np.float32) for x in (matrix, DAMPING * inverse, down, up))
             self.levels.append(_Level(*single))
             matrix = (down @ (matrix @ up)).tocsr()
-        diagonal = matrix.diagonal()
-        shift = SHIFT * max(float(diagonal.max(initial=0.0)), np.finfo(float).tiny)
-        self.coarsest = scipy.sparse.linalg.splu((matrix + shift * scipy.sparse.eye_array(diagonal.size)).tocsc())
+        self.coarsest = scipy.sparse.linalg.splu((matrix + shift * scipy.sparse.eye_array(matrix.shape[0])).tocsc())
 
     def __call__(self, residual: Floats) -> Floats:
         """One V-cycle from zero, in single precision, which is enough for a search direction."""
@@ -90,8 +92,8 @@ class Multigrid:
         return found
 
 
-def _gather(matrix: Any, diagonal: Floats, rows: Integers, cols: Integers) -> tuple[Integers, Integers, Integers]:
-    """The unknown of the next level of each unknown, and rows and cols of these.
+def _gather(matrix: Any, diagonal: Floats, rows: Integers, cols: Integers) -> tuple[Integers, Integers]:
+    """The unknown of the next level of each unknown, and one of its members for each of these.
 
     ``rows``, ``cols``: the block of each. Unknowns of a block are joined where strong links connect them inside it.
     """
@@ -104,7 +106,7 @@ def _gather(matrix: Any, diagonal: Floats, rows: Integers, cols: Integers) -> tu
     count, owner = scipy.sparse.csgraph.connected_components(graph, directed=False)
     member = np.empty(count, np.int64)
     member[owner] = np.arange(owner.size)
-    return owner.astype(np.int64), rows[member], cols[member]
+    return owner.astype(np.int64), member
 
 
 def solve(

@@ -366,6 +366,7 @@ def test_missing_data_are_one_line_and_keep_what_was_measured(name: str, tmp_pat
 def test_readme_fills_all_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "docs").mkdir()
+    (tmp_path / "results").mkdir()
     for page in ("README.md", "docs/joint.md", "docs/paper.md"):
         (tmp_path / page).write_text("<!-- table: paper/costs -->\n<!-- end -->\n", encoding="utf-8")
     app(["bench", "readme"], standalone_mode=False)

@@ -713,8 +713,14 @@ def test_commands_without_their_files(tmp_path: Path, polsep: Cli, monkeypatch: 
     """bench refuses in one line what it cannot measure or find."""
     monkeypatch.chdir(tmp_path)
     assert_refused(polsep("bench", "nothing"), "expected a benchmark of")
-    assert_refused(polsep("bench", "readme"), "README.md")
-    assert list(tmp_path.iterdir()) == []
+    assert_refused(polsep("bench", "readme"), "expected a folder of measured rows, found no results")
+    (page := tmp_path / "README.md").write_text(
+        table := "<!-- table: speed -->\n| 1 |\n<!-- end -->\n", encoding="utf-8"
+    )
+    assert_refused(polsep("bench", "readme", "-o", "result"), "found no result")
+    assert page.read_text(encoding="utf-8") == table and list(tmp_path.iterdir()) == [page]
+    page.unlink()
+    assert_refused(polsep("bench", "readme", "-o", str(tmp_path)), "README.md")
 
 
 def test_full_disk_leaves_nothing(tmp_path: Path) -> None:

@@ -48,8 +48,11 @@ def list_benches(benches: Mapping[str, Bench]) -> Iterator[str]:
 def fill_tables_of_docs(output: Path, measures: Mapping[str, tuple[str, ...]]) -> None:
     """Make the tables of README.md and docs/ from the rows in ``output``.
 
-    Tables of what ``measures`` names, paths by benchmark, say whether they are older than the code.
+    Tables of what ``measures`` names, paths by benchmark, say whether they are older than the code. Raises ValueError
+    where there is no such folder, before tables are replaced by none.
     """
+    if not output.is_dir():
+        raise ValueError(f"expected a folder of measured rows, found no {output}")
     for page in (Path("README.md"), *sorted(Path("docs").rglob("*.md"))):
         fill_page(
             page,

@@ -70,6 +70,8 @@ def test_what_repeats_with_the_mosaic_is_gone(layout: Layout, scale: int, analys
         found.diffuse[deep, deep], np.broadcast_to(mean, found.diffuse[deep, deep].shape), atol=1e-6
     )
     np.testing.assert_allclose(found.specular, 2 * found.diffuse, atol=1e-6)
+    plain = smooth_clipped(replace(images_of(before), tally=None), frame(layout, analysers), LIGHT)
+    assert np.array_equal(plain.diffuse, found.diffuse) and plain.tally is None
     far = inside(scale, -PERIOD // 2 - 1)
     outside = np.ones(before.shape[:2], np.bool_)
     outside[far, far] = False

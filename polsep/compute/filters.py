@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 from array_api_compat import device
 
-from polsep.compute.arrays import Array, is_exporting, namespace, window
+from polsep.compute.arrays import Array, is_exporting, namespace, pad_repeat, window
 
 
 def box_mean(x: Array, radius: int) -> Array:
@@ -31,4 +33,12 @@ def box_mean(x: Array, radius: int) -> Array:
         count = 1 + place.clip(None, radius) + (n - 1 - place).clip(None, radius)
         total /= xp.astype(count if axis == -1 else count[:, None], x.dtype)
         x = total
+    return x
+
+
+def largest_around(x: Array, radius: int) -> Array:
+    """The largest of the (2 radius + 1)^2 pixels around each of ``[..., h, w]``, of those that there are."""
+    for axis in (-1, -2):
+        padded, n = pad_repeat(x, radius, axis), x.shape[axis]
+        x = reduce(namespace(x).maximum, [window(padded, first, n, axis) for first in range(2 * radius + 1)])
     return x

@@ -1,25 +1,24 @@
 """Patterns of the mosaic's period in images of networks, smoothed out where samples clip.
 
-Networks have weights of their own for each of the `PERIOD` squared places of a mosaic. Where all samples of an analyser
-clip, they see the same numbers in every period, and what they make of them repeats with it: dots, stripes. Little
-detail is lost with them: each analyser that is left is measured once in a 2x2 cell. So images are averaged there by a
-filter whose response is zero at the period's frequencies. It has its full weight where half of the samples around a
-cell clip. In mono frames a quarter is enough if that goes on for `REACH` cells to all sides, where no edges of small
-highlights are; in colour frames a quarter may be one colour, and others keep the detail. All other pixels keep every
-bit.
+Networks have weights of their own for each of the `PERIOD` squared places of a colour mosaic, those for mono frames too.
+Where all samples of an analyser clip, they see the same numbers in every period, and what they make of them repeats
+with it: dots, stripes. Little detail is lost with them: each analyser that is left is measured once in a 2x2 cell. So
+images are averaged there by a filter whose response is zero at the period's frequencies. It has its full weight where
+half of the samples around a cell clip. In mono frames a quarter is enough if that goes on for `REACH` cells to all
+sides, where no edges of small highlights are; in colour frames a quarter may be one colour, and others keep the detail.
+All other pixels keep every bit.
 
 Constants are of validation frames (docs/experiments.md, "Patterns where samples clip"). Source: this project's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
 
 import numpy as np
 
 from polsep.compute.arrays import Array, namespace, pad_repeat, to_numpy, window
+from polsep.compute.filters import largest_around
 from polsep.compute.resizing import block_means
 from polsep.compute.warm_up import make_ready
 from polsep.sensor.camera import Mosaic
@@ -27,10 +26,9 @@ from polsep.sensor.defects import clip_level
 from polsep.separation import clipped_pattern_kernel
 from polsep.separation.analytic import Separation
 from polsep.separation.clipped_pattern_kernel import change_cells, weigh_cells
+from polsep.separation.colored_specular import PERIOD
 from polsep.separation.images import FrameImages
 
-#: Samples along a side of the networks' period: that of colour mosaics, which networks for mono ones have, too.
-PERIOD = 4
 #: Shares of clipped samples around a cell between which the filter's weight rises; the same where they go on, in mono.
 SHARES, WIDE_SHARES = (0.4, 0.5), (0.2, 0.25)
 #: Cells to each side over which the smaller share goes on.
@@ -62,7 +60,7 @@ def smooth_clipped(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     colors, tally, along = images.diffuse.shape[2], images.tally, taps_of(PERIOD * scale // 2)
     gain = np.array(light[:colors], np.float32)
     weight = weigh_cells(clipped, taps_of(PERIOD), shares_of(colors), REACH)
-    changes = (change_cells(image, weight, along) for image in (images.diffuse, images.specular))
+    changes = [change_cells(image, weight, along) for image in (images.diffuse, images.specular)]
     if tally is not None:
         diffuse, specular = (float((change / gain).sum()) / colors for change in changes)
         tally = replace(tally, s0=tally.s0 + diffuse + specular, specular=tally.specular + specular)
@@ -84,7 +82,7 @@ def weigh_clipped(clipped: Array, taps: tuple[float, ...], shares: tuple[float, 
     """
     share = add_taps(block_means(clipped, 2), taps)
     near, wide = (((share - low) / (high - low)).clip(0, 1) for low, high in (shares[:2], shares[2:]))
-    return namespace(share).maximum(near, _over_windows(wide, 2 * REACH + 1, namespace(share).minimum))
+    return namespace(share).maximum(near, -largest_around(-wide, REACH))
 
 
 def smooth_planes(image: Array, weight: Array, taps: tuple[float, ...]) -> Array:
@@ -107,12 +105,4 @@ def add_taps(image: Array, taps: tuple[float, ...]) -> Array:
     for axis in (-1, -2):
         n, padded = image.shape[axis], pad_repeat(image, len(taps) // 2, axis)
         image = sum(tap * window(padded, first, n, axis) for first, tap in enumerate(taps))
-    return image
-
-
-def _over_windows(image: Array, side: int, choose: Callable[[Array, Array], Array]) -> Array:
-    """The one that ``choose`` takes of the ``side`` times ``side`` pixels around each, of those that there are."""
-    for axis in (-1, -2):
-        n, padded = image.shape[axis], pad_repeat(image, side // 2, axis)
-        image = reduce(choose, [window(padded, first, n, axis) for first in range(side)])
     return image

@@ -16,7 +16,6 @@ and dielectrics do not is the dichromatic model (Shafer 1985, doi:10.1002/col.50
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -27,11 +26,10 @@ from polsep.compute.arrays import (
     constant,
     contiguous,
     namespace,
-    pad_repeat,
     to_numpy,
     to_numpy_together,
-    window,
 )
+from polsep.compute.filters import largest_around
 from polsep.compute.resizing import block_means, resize_area, resize_bilinear
 from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import split_analysers
@@ -52,8 +50,6 @@ MIN_SIZE, MANY = 80, 1500
 MIN_CONTRAST, MIN_RELATIVE = 1e-4, 1e-2
 #: Least share of the frame, and the largest gain of an image by its samples.
 MIN_SHARE, MAX_GAIN = 0.002, 1.5
-#: What became of the light that a weak polarizer leaves in the diffuse image: of one frame, and of films.
-MOVED, STAYS = "was moved to the specular one", "stays there in films"
 
 
 class Periods(NamedTuple):
@@ -93,7 +89,8 @@ class Colored(NamedTuple):
             return None
         return (
             f"a fully polarized lamp was expected, found one of {self.lamp_dolp:.0%}: what its highlights leave in the "
-            f"diffuse image {MOVED}; a better polarizer before the lamp separates more"
+            "diffuse image moves to the specular one, but not in films; a better polarizer before the lamp separates "
+            "more"
         )
 
 
@@ -186,16 +183,8 @@ def _see(mosaic: Mosaic, diffuse: Array, specular: Array, tally: Tally) -> Perio
 def find_colored(seen: Periods) -> Array:
     """The part ``[1, h, w]``, 0 to 1, of the diffuse image that is specular."""
     part = _part(seen)
-    solid = _largest_around(-_largest_around(-part))
+    solid = largest_around(-largest_around(-part, 1), 1)
     return namespace(part).minimum(part, solid)
-
-
-def _largest_around(image: Array) -> Array:
-    """The largest of 3x3 pixels, or of those that there are."""
-    for axis in (-2, -1):
-        padded, n = pad_repeat(image, 1, axis), image.shape[axis]
-        image = reduce(namespace(image).maximum, [window(padded, first, n, axis) for first in range(3)])
-    return image
 
 
 def _part(seen: Periods) -> Array:

@@ -46,7 +46,6 @@ from polsep.pipeline import (
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import find_lasting_defects, repair
 from polsep.sensor.levels import BlackFrame
-from polsep.separation.colored_specular import MOVED, STAYS
 from polsep.video.panels_kernel import STEPS, make_panels
 from polsep.video.reports import describe_run, shared_report
 from polsep.video.temporal import Images, TemporalState, filter_frame, steady_images
@@ -255,8 +254,7 @@ def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Fram
     size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
     facts = separated.report["light"] if found is None else {"source": "found", **found.describe()}
     remarks = () if found is None else found.remarks
-    warnings = (line.replace(MOVED, STAYS) for line in separated.report["warnings"])  # films do without that step
-    notes = (*frame.notes, *remarks, *warnings)
+    notes = (*frame.notes, *remarks, *separated.report["warnings"])
     defects = _defects_of(_intact(islice(recording.begin(0), DEFECT_FRAMES), shape, options))
     black = separated.report.get("black_level")
     return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black)

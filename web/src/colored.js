@@ -49,7 +49,7 @@ export function colorSpecular(images, mosaic, light, sums) {
   if (share) sums.s0 += (sum(diffuse) + sum(specular) - all) / 3; // all light of metals is what their polarization says
   sums.valid = sum(valid);
   const remark = unpolarized && `a fully polarized lamp was expected, found one of ${Math.round(100 / (1 + unpolarized))}%: what ` +
-    "its highlights leave in the diffuse image was moved to the specular one; a better polarizer before the lamp separates more";
+    "its highlights leave in the diffuse image moves to the specular one, but not in films; a better polarizer before the lamp separates more";
   return { report, remark };
 }
 

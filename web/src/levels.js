@@ -27,20 +27,23 @@ export function levelNotes(samples, width, black, said) {
   const shown = Number(white.toPrecision(6));
   if (low - black >= (1 - CLIP_MARGIN) * (white - black))
     notes.push({ text: `every sample is clipped: the smallest is ${low} of white level ${shown}` });
-  else if (high >= black + (1 - CLIP_MARGIN) * (white - black)) {
-    const share = clippedShare(samples, width, black, white);
-    if (share > MAX_CLIPPED)
-      notes.push({
-        text: `overexposed: ${Math.round(100 * share)}% of the lit samples are clipped, what they hide is estimated: ` +
-          "expose less, or merge several exposures (polsep merge)",
-      });
-  }
+  else if (high >= black + (1 - CLIP_MARGIN) * (white - black)) notes.push(...overexposureNotes(samples, width, black, white));
   if (high > white)
     notes.push({ text: `${above} samples exceed the white level ${shown} (largest ${high}): they count as clipped` });
   if (white > whiteOf(samples))
     notes.push({ text: `white level ${shown} is beyond the file's samples: no sample can count as clipped` });
   if (said == null && samples instanceof Uint16Array) notes.push(...depthNotes(used, high));
   return notes;
+}
+
+/** A note on a frame of which too many lit samples clip, or none. */
+export function overexposureNotes(samples, width, black, white) {
+  const share = clippedShare(samples, width, black, white);
+  if (share <= MAX_CLIPPED) return [];
+  return [{
+    text: `overexposed: ${Math.round(100 * share)}% of the lit samples are clipped, what they hide is estimated: ` +
+      "expose less, or merge several exposures (polsep merge)",
+  }];
 }
 
 function clippedShare(samples, width, black, white) {

@@ -10,7 +10,7 @@ import { fillUnderHighlights } from "./highlights.js";
 import { separateJoint } from "./joint.js";
 import { checkLayout, seePhases } from "./layout_check.js";
 import { channelsOf, parseLayout, specOf } from "./layout.js";
-import { levelNotes, whiteOf } from "./levels.js";
+import { levelNotes, overexposureNotes, whiteOf } from "./levels.js";
 import { findLight } from "./light.js";
 import { checkBlackLevel } from "./noise.js";
 import { readFrame } from "./read.js";
@@ -122,6 +122,8 @@ function prepare(settings) {
   const taken = level?.level != null && black === 0;
   if (level) notes.push({ text: level.text, black: taken ? null : level.shown });
   if (taken) {
+    if (!overexposureNotes(frame.data, frame.width, 0, white).length)  // else it was said where the levels were
+      notes.push(...overexposureNotes(frame.data, frame.width, level.level, white));
     mosaic.black = level.level;
     phases = seePhases(mosaic);
   }

@@ -1,7 +1,7 @@
 """Patterns of the mosaic's period in images of networks, smoothed out where samples clip.
 
-Networks have weights of their own for each of the `PERIOD` squared places of a colour mosaic, those for mono frames too.
-Where all samples of an analyser clip, they see the same numbers in every period, and what they make of them repeats
+Networks have weights of their own for each of the `PERIOD` squared places of a colour mosaic, those for mono too. Where
+all samples of an analyser clip, they see the same numbers in every period, and what they make of them repeats
 with it: dots, stripes. Little detail is lost with them: each analyser that is left is measured once in a 2x2 cell. So
 images are averaged there by a filter whose response is zero at the period's frequencies. It has its full weight where
 half of the samples around a cell clip. In mono frames a quarter is enough if that goes on for `REACH` cells to all

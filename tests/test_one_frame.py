@@ -65,7 +65,7 @@ from polsep.pipeline import told_gains
 from polsep.render.blobs import random_blob
 from polsep.sensor.camera import IDEAL, Layout, Mosaic, expose
 from polsep.separation.report import SeparatedFrame
-from polsep.train.shape_examples import COUNT, PLANES, random_shape_example
+from polsep.train.shape_examples import COUNT, PLANES, Examples, random_shape_example
 from polsep.train.shape_losses import random_lamps, shape_loss
 from polsep.train.shape_task import angles_deg, cut_example, score_shapes, seen_of, shift_errors, truth_of, turn_example
 
@@ -320,7 +320,7 @@ def test_bodies_are_closed_and_face_outward(seed: int) -> None:
 
 def test_examples_depend_on_their_numbers_alone() -> None:
     """The same numbers give the same planes; images and surface belong together, finite, inside the mask."""
-    first, second, other = (random_shape_example("test", 5, n, 96) for n in (1, 1, 3))
+    first, second, other = (random_shape_example(Examples("test", 5), n, 96) for n in (1, 1, 3))
     torch.testing.assert_close(first, second, rtol=0, atol=0)
     assert first.shape == (COUNT, 48, 48) and not torch.equal(first, other)
     mask = first[PLANES["mask"]][0] > 0
@@ -367,7 +367,7 @@ def test_the_shipped_network_finds_a_sphere() -> None:
 
 def test_floor_of_the_shipped_weights() -> None:
     """On things that no training saw, made here, the shipped network is no worse than when it was shipped."""
-    examples = [cut_example(random_shape_example("test", 11, n, 256), 1.1, SIDE // 2) for n in range(6)]
+    examples = [cut_example(random_shape_example(Examples("test", 11), n, 256), 1.1, SIDE // 2) for n in range(6)]
     network = ShapeNetwork(INPUTS["separated"], USUAL, one_frame.load_estimator().size)
     arrays = polsep_weights()
     network.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})
@@ -469,6 +469,20 @@ def test_specks_and_lines_are_not_the_thing() -> None:
     sphere = np.pad(frame.diffuse.mean(axis=-1), ((16, 16), (0, 64))) > 0.1
     np.testing.assert_array_equal(found[sphere], True)
     assert not found[:8].any() and not found[:, 80:].any()
+
+
+def test_a_small_thing_is_found_in_a_noisy_frame() -> None:
+    """A thousandth of the frame is enough: noise around it is not the thing, and its highlight is no other level."""
+    rows, cols = np.mgrid[:640, :768] - np.array([[[300]], [[200]]])
+    radius = np.hypot(rows, cols) / 14
+    light = np.where(radius < 1, 0.3 * np.sqrt(np.maximum(1 - radius**2, 0.05)), 0.0)
+    noisy = light + 0.002 * np.abs(np.random.default_rng(0).standard_normal(light.shape))
+    highlight = np.where(radius < 0.2, 2.0, 0.0)
+    color = [np.repeat(image[..., None], 3, axis=-1).astype(np.float32) for image in (noisy, highlight)]
+    frame = replace(sphere_frame(), diffuse=color[0], specular=color[1])
+    found = one_frame.find_thing(frame)
+    assert float((found & (radius < 1)).sum() / (found | (radius < 1)).sum()) > 0.97
+    assert 0.0012 < (radius < 1).mean() < 0.0013
 
 
 def test_lamps_are_in_front() -> None:

@@ -47,8 +47,11 @@ Mask = NDArray[np.bool_]
 #: Side of the square around the thing [pixels]; over the longest side of the mask; sides of the blocks of pixels whose
 #: means the network sees (training shows it squares of ``SIDE / 2``).
 SIDE, WIDER, SCALES = 384, 1.1, (1, 2, 3)
-#: Without a mask, the thing is where s0 exceeds this share of its 99th percentile.
+#: Without a mask, the thing is where s0 exceeds this share of a level, its 99th percentile.
 OBJECT_SHARE = 0.06
+#: A thing may be smaller than a hundredth of the frame: the level is at least this share of the diffuse light of this
+#: block, counted from the brightest one.
+SMALL_SHARE, SMALL_BLOCKS = 0.5, 4
 #: Side of blocks [pixels]: parts of the thing are near one that is mostly bright.
 BLOCK = 8
 #: Least share of the thing's blocks that a connected part has.
@@ -294,18 +297,26 @@ def find_thing(frame: SeparatedFrame) -> Mask:
 
     Raises ValueError on a black frame.
     """
-    s0 = (frame.diffuse + frame.specular).mean(axis=-1)
-    bright: Mask = s0 > OBJECT_SHARE * np.percentile(s0, 99)
+    diffuse = frame.diffuse.mean(axis=-1)
+    s0 = diffuse + frame.specular.mean(axis=-1)
+    blocks = _means(diffuse)
+    level = max(np.percentile(s0, 99), SMALL_SHARE * np.sort(blocks, axis=None)[-SMALL_BLOCKS:][0])
+    bright: Mask = s0 > OBJECT_SHARE * level
     if not bright.any() or not s0.any():
         raise ValueError("expected light on a thing, found a black frame")
     height, width = bright.shape
-    padded = np.pad(bright, ((0, -height % BLOCK), (0, -width % BLOCK)), "edge")
-    solid = _large_parts(block_means(padded.astype(np.float32), BLOCK) > 0.5)
+    solid = _large_parts(_means(bright) > 0.5)
     around = np.pad(solid, 1)
     rows = around[:-2] | around[1:-1] | around[2:]
     near = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
     found: Mask = bright & near.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[:height, :width]
     return found if found.any() else bright
+
+
+def _means(image: Floats | Mask) -> Floats:
+    """Means over blocks of `BLOCK` pixels, the last ones with the border's values."""
+    height, width = image.shape
+    return block_means(np.pad(image, ((0, -height % BLOCK), (0, -width % BLOCK)), "edge").astype(np.float32), BLOCK)
 
 
 def _large_parts(solid: Mask) -> Mask:

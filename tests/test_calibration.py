@@ -147,6 +147,24 @@ def test_what_all_pixels_share_is_no_noise(layout: Layout) -> None:
     assert np.std(flat.gain_map / sensor.gain) < 0.006
 
 
+@pytest.mark.parametrize("flat", [True, False])
+def test_a_lamp_that_flickers_is_told_from_the_analysers(flat: bool) -> None:
+    """Light that varies by 8 %: after a flat frame angles are as exact as ever; without one, the error said grows."""
+    sensor = BadSensor(Layout(), dead=0)
+    truth = sensor.calibration()
+    known = replace(truth, gains=truth.gains if flat else None, gain_map=truth.gain_map if flat else None)
+    used = Corrections(replace(known, analysers=None))
+    aolps, levels = np.arange(10) * np.deg2rad(20), 0.75 * (1 + 0.08 * np.cos(np.arange(10) ** 2))
+    pairs = zip(levels, aolps, strict=True)
+    frames = [used.apply(sensor.expose(sensor.sees(np.full(SIZE, level), 1.0, aolp))) for level, aolp in pairs]
+    found = measure_analysers(frames, replace(known, analysers=None))
+    assert found.analysers is not None and truth.analysers is not None
+    off = ((np.array(found.analysers) - np.array(truth.analysers))[..., 0] + 90) % 180 - 90
+    said = found.details["analysers"]["angle_error_deg"]
+    assert np.abs(off).max() < (0.1 if flat else 4 * said)
+    assert said < 0.1 if flat else said > 0.2  # 0.13 under a steady lamp
+
+
 @pytest.mark.parametrize("layout", [Layout(), MONO], ids=lambda x: x.spec)
 @pytest.mark.parametrize("flat", [True, False])
 def test_a_turned_polarizer_shows_the_analysers(layout: Layout, flat: bool) -> None:
@@ -272,6 +290,9 @@ def test_polarized_flat_frames_are_refused() -> None:
     with pytest.raises(ValueError, match="expected unpolarized light on the flat frames, found an apparent DoLP of"):
         flat(0.3)
     assert flat(0.03).details["flat"]["apparent_dolp"] < 0.06
+    turned = [sensor.sees(np.full(SIZE, 1.0), 1.0, aolp) for aolp in np.arange(4) * np.pi / 4]
+    with pytest.raises(ValueError, match="off the lamp and the lens"):
+        measure_flat(replace(sensor.expose(light), black_level=LEVEL) for light in turned)
 
 
 def test_one_frame_gives_tables_and_no_map() -> None:

@@ -322,6 +322,18 @@ def test_a_calibration_is_not_replaced(tmp_path: Path, polsep: Cli) -> None:
     assert run.status == 2 and "is an input" in run.err and kept.read_bytes() == before
 
 
+def test_a_calibration_says_that_black_was_taken_to_be_at_0(tmp_path: Path, polsep: Cli) -> None:
+    """Unless it was measured before or is said."""
+    png(tmp_path / "flat.png", np.full((64, 64), 30_000, np.uint16))
+    png(tmp_path / "dark.png", np.full((64, 64), 100, np.uint16))
+    measure = ("calibrate", "flat", tmp_path / "flat.png", "--white-level", "65535", "-o")
+    assert "black was taken to be at 0" in polsep(*measure, tmp_path / "a.json").out
+    assert "black was" not in polsep(*measure, tmp_path / "b.json", "--black-level", "100").out
+    dark = ("calibrate", "dark", tmp_path / "dark.png", "--white-level", "65535", "-o", tmp_path / "c.json")
+    assert polsep(*dark).status == 0
+    assert "black was" not in polsep(*measure, tmp_path / "c.json").out
+
+
 def test_names_of_any_bytes_are_printed(tmp_path: Path) -> None:
     """A name that is no text, and one that the terminal cannot show, stop nothing."""
     names = [os.fsencode(tmp_path) + b"/caf\xe9.png", os.fsencode(tmp_path) + "/日本.png".encode()]
@@ -720,7 +732,7 @@ def test_commands_without_their_files(tmp_path: Path, polsep: Cli, monkeypatch: 
     assert_refused(polsep("bench", "readme", "-o", "result"), "found no result")
     assert page.read_text(encoding="utf-8") == table and list(tmp_path.iterdir()) == [page]
     page.unlink()
-    assert_refused(polsep("bench", "readme", "-o", str(tmp_path)), "README.md")
+    assert_refused(polsep("bench", "readme", "-o", str(tmp_path)), "expected the checkout of polsep")
 
 
 def test_full_disk_leaves_nothing(tmp_path: Path) -> None:

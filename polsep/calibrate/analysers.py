@@ -39,6 +39,8 @@ Ints = NDArray[np.int64]
 #: Expected deviations of gains with and without a flat frame before, of the light over frames (all relative), and of a
 #: mean of samples from the model, relative to the brightest.
 GAIN_SPREAD, LOOSE_GAIN_SPREAD, LIGHT_SPREAD, MISFIT = 0.003, 0.05, 0.01, 5e-4
+#: Most solutions for a light that varies more; it does if it is found to by this factor.
+MOST_LOOKS, AGREE = 6, 1.1
 #: Deviation that holds where a mean is fixed by definition.
 FIXED = 1e-6
 #: Fewest frames, and least eigenvalue of their mean sources (1, cos 2 phi, sin 2 phi), 0.5 for evenly spread angles.
@@ -172,7 +174,26 @@ def _start(means: Doubles, colors: Ints, nominal: Doubles) -> Fit:
 
 
 def _solve(means: Doubles, start: Fit, colors: Ints, nominal: Doubles, gain_spread: float) -> tuple[Fit, Errors, float]:
-    """The fit, its errors, and the rms residual relative to the light."""
+    """The fit, its errors, and the rms residual relative to the light.
+
+    A light that is found to vary more than `LIGHT_SPREAD` may vary so much: it is found again until both agree.
+    """
+    allowed = LIGHT_SPREAD
+    for _ in range(MOST_LOOKS):
+        found = _solve_once(means, start, colors, nominal, (gain_spread, allowed))
+        logs = np.log(found[0].light)
+        varies = float((logs - logs.mean(axis=0)).std())
+        if varies <= AGREE * allowed:
+            break
+        allowed = varies
+    return found
+
+
+def _solve_once(
+    means: Doubles, start: Fit, colors: Ints, nominal: Doubles, spreads: tuple[float, float]
+) -> tuple[Fit, Errors, float]:
+    """`_solve` for relative ``spreads`` of the gains and of the light."""
+    gain_spread, light_spread = spreads
     k, f, c = len(nominal), len(means), start.light.shape[1]
     index = np.searchsorted(np.unique(colors), colors)
     scale = MISFIT * float(start.light.max())
@@ -198,7 +219,7 @@ def _solve(means: Doubles, start: Fit, colors: Ints, nominal: Doubles, gain_spre
             ((model - means) / scale).reshape(-1),
             logs / gain_spread,
             np.array(fixed) / FIXED,
-            uneven / LIGHT_SPREAD,
+            uneven / light_spread,
         ]
         return np.concatenate(parts)
 

@@ -6,7 +6,7 @@ noisy to tell is shrunk or left out: one frame shows levels and tables, several 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from polsep.calibrate.statistics import (
     signal_share,
     tile,
 )
+from polsep.compute.arrays import to_numpy
 from polsep.sensor.calibration import Calibration, Table, falloff_image
 from polsep.sensor.camera import Layout, Mosaic
 
@@ -37,8 +38,9 @@ WHOLE_FRAME = "expected evenly lit white over the whole frame"
 BRIGHTEST_DARK, DARKEST_FLAT, MOST_CLIPPED = 0.25, 0.02, 0.005
 #: Largest degree of the polynomial of the falloff, and blocks of a period along a side that each degree needs.
 DEGREE, BLOCKS_PER_DEGREE = 6, 4
-#: Apparent degree of polarization of a flat frame from which its gains are not believed.
-POLARIZED_FLAT = 0.1
+#: Apparent degree of polarization of the mean of flat frames, and of one of them, from which gains are not believed:
+#: the sky's light averages out where the camera is turned, a polarizer does not belong there.
+POLARIZED_FLAT, POLARIZER = 0.1, 0.85
 
 
 def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) -> Calibration:
@@ -106,7 +108,7 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
     ``frames`` are as the camera wrote them less ``before``'s black level. Raises ValueError on dark, clipped or
     polarized ones.
     """
-    flat = average_frames(frames)
+    flat = average_frames(_unpolarized(frames))
     require_same_sensor(before, flat.first)
     mosaic, layout = flat.first, flat.first.layout
     span = mosaic.white_level - mosaic.black_level
@@ -138,11 +140,7 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
         share = signal_share(residual, float(relative[relative <= limit].mean()) / flat.count)
     pixels = 1 + np.float32(share) * np.where(dead, 0, residual - 1)
     polarized = _apparent_dolp(gains, layout)
-    if polarized > POLARIZED_FLAT:
-        raise ValueError(
-            f"expected unpolarized light on the flat frames, found an apparent DoLP of {polarized:.0%}: take the "
-            "polarizer off the lamp"
-        )
+    _refuse_polarized(polarized, POLARIZED_FLAT)
     details = {
         "frames": flat.count,
         "brightness": round(brightness, 4),
@@ -163,6 +161,24 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
         falloff=falloff,
         details={**base.details, "flat": details},
     )
+
+
+def _unpolarized(frames: Iterable[Mosaic]) -> Iterator[Mosaic]:
+    """The frames, none of them behind a polarizer, whose turns might cancel in their mean. Raises ValueError."""
+    for mosaic in frames:
+        means = place_means(to_numpy(mosaic.linear()), mosaic.layout.period)
+        if means.min() > 0:
+            dolp = _apparent_dolp(means / _color_means(means, mosaic.layout), mosaic.layout)
+            _refuse_polarized(dolp, POLARIZER)
+        yield mosaic
+
+
+def _refuse_polarized(dolp: float, most: float) -> None:
+    if dolp > most:
+        raise ValueError(
+            f"expected unpolarized light on the flat frames, found an apparent DoLP of {dolp:.0%}: take the polarizer "
+            "off the lamp and the lens"
+        )
 
 
 def fit_falloff(image: Floats, period: int) -> Table:

@@ -23,6 +23,8 @@ from polsep.sensor.levels import Overexposed
 
 #: Frames of a file in which black is looked for.
 LOOKS = 8
+#: Words of a measurement before which nobody measured or said a level.
+ASSUMED_BLACK = "; black was taken to be at 0: if it is not, measure it first ('polsep calibrate dark') and this again"
 #: A measurement: frames and the calibration so far to a calibration with one more section.
 Measure = Callable[[Iterator[Mosaic], Calibration | None], Calibration]
 
@@ -44,7 +46,8 @@ def calibrate_files(paths: Sequence[Path], read: ReadOptions, output: Path, kind
         require_black_level(paths, read)
     found = measure(read_mosaics(paths, read, _require_white_level), before)
     written = write_calibration(output, found, __version__)
-    return f"{kind}: {describe(found, kind)} -> {', '.join(str(path) for path in written)}"
+    black = "" if kind == "dark" or read.black_level or found.black_level is not None else ASSUMED_BLACK
+    return f"{kind}: {describe(found, kind)}{black} -> {', '.join(str(path) for path in written)}"
 
 
 def _require_white_level(path: Path, frame: Frame) -> None:

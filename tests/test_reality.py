@@ -125,9 +125,11 @@ def test_traced_light_is_counted_as_behind_crossed_polarizers() -> None:
 
 def test_bench_measures_losses() -> None:
     """An ideal twin loses nothing; names that there are not are one line."""
-    rows = list(bench_reality(RealityOptions("train", ("white lamp",), ("analytic",), 1, SIZE)))
+    rows = list(bench_reality(RealityOptions("validation", ("white lamp",), ("analytic",), 1, SIZE)))
     losses = [row.value for row in rows if row.bench == "reality/loss"]
     assert losses == pytest.approx([0.0, 0.0], abs=2.0)
+    with pytest.raises(ValueError, match="test or validation, found 'train'"):
+        RealityOptions("train")
     with pytest.raises(ValueError, match=r"expected rows of white lamp; .*, found moon"):
         next(bench_reality(RealityOptions(rows=("moon",))))
 

@@ -47,7 +47,7 @@ TOLD = ", told"
 class RealityOptions:
     """Measured parts: ``rows`` and ``methods`` by name, empty for all; ``scenes``: at most so many of each kind.
 
-    ``size``: of frames; corners, which take long, have half of it.
+    ``size``: of frames; corners, which take long, have half of it. Raises ValueError on other splits.
     """
 
     split: str = "test"
@@ -55,6 +55,10 @@ class RealityOptions:
     methods: tuple[str, ...] = ()
     scenes: int = 24
     size: int = 512
+
+    def __post_init__(self) -> None:
+        if self.split not in ("test", "validation"):
+            raise ValueError(f"expected the split test or validation, found {self.split!r}")
 
 
 class Kind(NamedTuple):

@@ -299,13 +299,13 @@ def find_thing(frame: SeparatedFrame) -> Mask:
     """
     diffuse = frame.diffuse.mean(axis=-1)
     s0 = diffuse + frame.specular.mean(axis=-1)
-    blocks = _means(diffuse)
+    blocks = _cell_means(diffuse)
     level = max(np.percentile(s0, 99), SMALL_SHARE * np.sort(blocks, axis=None)[-SMALL_BLOCKS:][0])
     bright: Mask = s0 > OBJECT_SHARE * level
     if not bright.any() or not s0.any():
         raise ValueError("expected light on a thing, found a black frame")
     height, width = bright.shape
-    solid = _large_parts(_means(bright) > 0.5)
+    solid = _large_parts(_cell_means(bright) > 0.5)
     around = np.pad(solid, 1)
     rows = around[:-2] | around[1:-1] | around[2:]
     near = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
@@ -313,10 +313,12 @@ def find_thing(frame: SeparatedFrame) -> Mask:
     return found if found.any() else bright
 
 
-def _means(image: Floats | Mask) -> Floats:
+def _cell_means(image: Floats | Mask) -> Floats:
     """Means over blocks of `BLOCK` pixels, the last ones with the border's values."""
     height, width = image.shape
-    return block_means(np.pad(image, ((0, -height % BLOCK), (0, -width % BLOCK)), "edge").astype(np.float32), BLOCK)
+    padded = np.pad(image.astype(np.float32), ((0, -height % BLOCK), (0, -width % BLOCK)), "edge")
+    means: Floats = block_means(padded, BLOCK)
+    return means
 
 
 def _large_parts(solid: Mask) -> Mask:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 pytest.importorskip("embreex")
 pytest.importorskip("skimage")
@@ -16,12 +17,13 @@ pytest.importorskip("lightning_fabric")
 pytest.importorskip("tensorboard")
 
 from polsep.geometry.one_frame import ShapeEstimator
+from polsep.io.assets.objects import hash_files
 from polsep.io.store.rounding import names_to_round, steps_of
 from polsep.io.store.weights import read_weights
 from polsep.networks.sizes import ResidualSize
 from polsep.train.loop import Run, Schedule
 from polsep.train.shape_command import train_shape
-from polsep.train.shape_examples import example_path, load_example
+from polsep.train.shape_examples import MESHES, PLANES, Examples, load_example
 from polsep.train.shape_task import ShapeOptions
 from tools import round_weights
 
@@ -49,9 +51,30 @@ def test_a_stopped_training_goes_on(tmp_path: Path) -> None:
     assert ShapeEstimator(resumed).size == OPTIONS.size
 
 
+def test_meshes_of_files_are_shown_too(tmp_path: Path) -> None:
+    """As many examples again show them; the file says which meshes; a folder without meshes is refused."""
+    folder, meshes = tmp_path / "examples", tmp_path / "meshes"
+    meshes.mkdir()
+    train = partial(train_shape, OPTIONS, folder=folder, report=lambda _: None)
+    with pytest.raises(ValueError, match="expected meshes"):
+        train(Run(tmp_path / "none", schedule=SCHEDULE), meshes=meshes)
+    trimesh.creation.capsule(1, 0.4).export(meshes / "capsule.ply")
+    trimesh.creation.box((1, 2, 3)).export(meshes / "box.obj")
+    weights = train(Run(tmp_path / "run", schedule=SCHEDULE), meshes=meshes)
+    shown = Examples(MESHES, OPTIONS.seed)
+    names = {path.name for path in folder.glob("*.npy")}
+    assert {shown.path(folder, number).name for number in range(2)} < names and len(names) == 5
+    planes = load_example(shown.path(folder, 0)).float()
+    length = planes[PLANES["normal"]].norm(dim=0)[planes[PLANES["mask"]][0] > 0]
+    assert len(length) > 500 and float((length - 1).abs().max()) < 0.01
+    facts = read_weights(weights)[1]
+    found = hash_files([meshes / "box.obj", meshes / "capsule.ply"])
+    assert json.loads(facts["options"])["meshes"] == found and facts["command"].endswith("--meshes meshes")
+
+
 def test_other_files_are_no_examples(tmp_path: Path) -> None:
     """An array of other planes is refused, and so is fitting a filter that there is none of."""
-    path = example_path(tmp_path, "train", 0, 0)
+    path = Examples("train", 0).path(tmp_path, 0)
     np.save(path, np.zeros((3, 8, 8), np.float16))
     with pytest.raises(ValueError, match="example of 35 planes"):
         load_example(path)

@@ -34,11 +34,11 @@ from polsep.train.shape_examples import (
     DOWN_SHARE,
     ELEVATIONS_DEG,
     KINDS,
+    MESHES,
     PLANES,
-    example_number,
-    example_path,
+    Examples,
+    find_example,
     random_upright_camera,
-    stands,
     surface_planes,
 )
 from polsep.train.shape_task import ShapeOptions, batches, turn_example
@@ -145,8 +145,9 @@ def test_frames_of_things_that_stand_stay_upright(tmp_path: Path, monkeypatch: p
     planes[PLANES["normal"]] = torch.tensor([0.48, 0.6, 0.64])[:, None, None] * planes[PLANES["mask"]]
     signs = {}
     for number in (0, 1, 2):
-        write_example(path := example_path(tmp_path, "train", 0, number), planes)
-        assert example_number(path) == number and stands(number) == (number > 0)
+        write_example(path := Examples("train", 0).path(tmp_path, number), planes)
+        assert find_example(path) == (Examples("train", 0), number)
+        assert Examples("train", 0).stands(number) == (number > 0) and Examples(MESHES, 0).stands(number)
         found = batches(ShapeOptions(batch=16, side=16), [path], 0, (0, 1))
         normals = torch.cat([next(found).planes[:, PLANES["normal"], 8, 8] for _ in range(3)])
         signs[number] = {tuple(round(x, 1) for x in normal) for normal in normals.tolist()}

@@ -20,7 +20,7 @@ _JOINT, _FROM_FOLDER, _LADDER = RUNGS[:3], RUNGS[3:5], RUNGS[5:]
 OWN: dict[str, tuple[str, ...]] = dict.fromkeys(("data", "looks", "workers", "constants"), (*_JOINT, *_LADDER))
 OWN |= dict.fromkeys(("levels", "fold"), _LADDER) | dict.fromkeys(("blocks", "entry", "ablation"), _JOINT)
 OWN |= dict.fromkeys(("seen", "examples", "folder", "until"), _FROM_FOLDER)
-OWN |= {"part": (*_JOINT, "shape"), "side": ("shape",), "cues": ("material",)}
+OWN |= {"part": (*_JOINT, "shape"), "side": ("shape",), "meshes": ("shape",), "cues": ("material",)}
 
 
 @app.command()
@@ -66,6 +66,12 @@ OWN |= {"part": (*_JOINT, "shape"), "side": ("shape",), "cues": ("material",)}
     help="material, shape: number of training examples.  [default: 768, 3200]",
 )
 @click.option("--side", type=COUNT, default=96, metavar="PX", help="shape: side of the images that the network sees.")
+@click.option(
+    "--meshes",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    metavar="DIR",
+    help="shape: folder of GLB, OBJ, OFF, PLY or STL files, +y up, which as many examples again show.",
+)
 @click.option("--cues", metavar="NAME,...", help="material: inputs beside the images, such as details.")
 @click.option(
     "--folder", type=DIR, metavar="DIR", help="material, shape: folder of the examples.  [default: DIR/../examples]"
@@ -135,7 +141,7 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
         else:
             shape, schedule = choose_shape(options | {"examples": options["examples"] or 3200})
             run = Run(output, schedule=schedule, until=options["until"], **shared)
-            path = train_shape(shape, run, folder, _print_log)
+            path = train_shape(shape, run, folder, _print_log, options["meshes"])
     else:
         network = choose_options(rung, data, options)
         schedule = Schedule(options["steps"], options["rate"], precision=options["precision"])

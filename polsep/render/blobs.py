@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from polsep.render.materials import USUAL_SIZE
-from polsep.render.shapes import Floats, Integers, Mesh
+from polsep.render.shapes import Floats, Mesh
 from polsep.render.waves import Draw, bumps, draw_one, draw_way, drawn_from, folds
 
 #: Number of ellipsoids, and semi-axes of the first and, relative to the one that they grow out of, of the others.
@@ -60,7 +60,8 @@ def random_blob(generator: torch.Generator) -> Mesh:
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     scale = USUAL_SIZE / float((vertices.max(axis=0) - vertices.min(axis=0)).max())
     placed = ((vertices - middle) * scale).astype(np.float64)
-    return _patched(placed, normals.astype(np.float64), np.ascontiguousarray(faces[:, ::-1], np.int64), draw)
+    outward, faces = -normals.astype(np.float64), np.ascontiguousarray(faces[:, ::-1], np.int64)
+    return patched(Mesh(placed, outward, np.zeros((len(placed), 2)), faces, np.zeros(len(faces), np.int64)), draw)
 
 
 def _relieved(field: Floats, grid: Floats, size: float, draw: Draw) -> Floats:
@@ -77,19 +78,19 @@ def _relieved(field: Floats, grid: Floats, size: float, draw: Draw) -> Floats:
     return found
 
 
-def _patched(vertices: Floats, normals: Floats, faces: Integers, draw: Draw) -> Mesh:
-    """The mesh with a slot per patch; vertices are not shared between slots."""
+def patched(mesh: Mesh, draw: Draw) -> Mesh:
+    """The mesh with a slot per patch, unit normals and no (u, v); vertices are not shared between slots."""
     count = round(float(draw(PATCHES[0] - 0.49, PATCHES[1] + 0.49)[0]))
-    seeds = vertices[(draw(0, 1, count) * (len(vertices) - 1)).astype(np.int64)]
-    middles = vertices[faces].mean(axis=1)
+    seeds = mesh.vertices[(draw(0, 1, count) * (len(mesh.vertices) - 1)).astype(np.int64)]
+    middles = mesh.vertices[mesh.faces].mean(axis=1)
     owner = np.linalg.norm(middles[:, None] - seeds, axis=-1).argmin(axis=1)
     _, owner = np.unique(owner, return_inverse=True)
-    corners = faces + owner[:, None] * len(vertices)
+    corners = mesh.faces + owner[:, None] * len(mesh.vertices)
     used, numbered = np.unique(corners, return_inverse=True)
-    origin = used % len(vertices)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    unit = (-normals / np.where(length > 0, length, 1))[origin]
-    return Mesh(vertices[origin], unit, np.zeros((len(used), 2)), numbered.reshape(-1, 3), owner.astype(np.int64))
+    origin = used % len(mesh.vertices)
+    length = np.linalg.norm(mesh.normals, axis=1, keepdims=True)
+    unit = (mesh.normals / np.where(length > 0, length, 1))[origin]
+    return Mesh(mesh.vertices[origin], unit, np.zeros((len(used), 2)), numbered.reshape(-1, 3), owner.astype(np.int64))
 
 
 def _turn(quaternion: Floats) -> Floats:

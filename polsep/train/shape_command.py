@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from polsep.io.assets.objects import hash_files, list_meshes, read_mesh
+from polsep.render.models import creased
 from polsep.train.from_folder import Makers, Recipe, train_recipe
 from polsep.train.loop import Run, Schedule, Training
-from polsep.train.shape_examples import example_path, make_examples
+from polsep.train.shape_examples import Examples, make_examples
 from polsep.train.shape_task import ShapeOptions, shape_training
 
 #: Steps of warm-up, and decay of the moving average.
@@ -26,22 +28,32 @@ def choose_shape(asked: dict[str, Any]) -> tuple[ShapeOptions, Schedule]:
     return options, Schedule(asked["steps"], asked["rate"], WARM_UP, AVERAGE, precision=asked["precision"], **due)
 
 
-def train_shape(options: ShapeOptions, run: Run, folder: Path, report: Callable[[dict[str, Any]], None]) -> Path:
-    """`from_folder.train_recipe` on examples in a ``folder``, which are made where they are missing."""
+def train_shape(
+    options: ShapeOptions, run: Run, folder: Path, report: Callable[[dict[str, Any]], None], meshes: Path | None = None
+) -> Path:
+    """`from_folder.train_recipe` on examples in a ``folder``, which are made where they are missing.
 
+    ``meshes``: a folder of meshes, +y up, which as many examples again show.
+    """
+    found = [] if meshes is None else list_meshes(meshes)
+    if found:
+        options = replace(options, meshes=hash_files(found))
     makers = Makers(folder, "shape", "polsep.train.shape_examples")
-    counts = {"train": options.examples, "validation": options.validation}
+    counts = dict.fromkeys(options.splits, options.examples) | {"validation": options.validation}
 
     def make() -> Training:
-        makers.note(example_path(folder, name, options.seed, k) for name in counts for k in range(counts[name]))
-        for split, count in counts.items():
-            for number in make_examples(folder, split, options.seed, range(count)):
+        shown = [creased(read_mesh(path)) for path in found]
+        every = {split: Examples(split, options.seed, shown) for split in counts}
+        makers.note(every[split].path(folder, k) for split in counts for k in range(counts[split]))
+        for split, examples in every.items():
+            for number in make_examples(examples, folder, range(counts[split])):
                 if number % 100 == 99:
                     report({f"{split} examples": number + 1})
         return shape_training(options, folder)
 
     def data() -> str:
-        return makers.digest([options.seed, options.examples])
+        return makers.digest([options.seed, options.examples, options.meshes])
 
     words: dict[str, object] = {"side": options.side, "part": options.part}
+    words |= {} if meshes is None else {"meshes": meshes.name}
     return train_recipe(Recipe("shape", options, make, data, words, {"side": str(options.side)}), run, report)

@@ -2,10 +2,10 @@
 
 A third of the things are unions of solids (`render.shapes`), a third smooth bodies (`render.blobs`), a third vessels
 (`render.vessels`). Solids are seen from all sides; bodies and vessels stand, and cameras look at them as users do
-(`random_upright_camera`). Lights, looks and disturbances are those of the separation's training (`variety`, `reality`).
-The lamp is mostly beside the camera. Frames are exposed, recorded with noise and separated by `METHODS`, as users'
-frames are; networks never see true images, but for the input "perfect", which measures what better separation could
-gain.
+(`random_upright_camera`). Examples of the split `MESHES` show meshes of files (`render.models`), which stand, too.
+Lights, looks and disturbances are those of the separation's training (`variety`, `reality`). The lamp is mostly beside
+the camera. Frames are exposed, recorded with noise and separated by `METHODS`, as users' frames are; networks never see
+true images, but for the input "perfect", which measures what better separation could gain.
 
 Conventions: images at half resolution, the lamp's colour divided out, 1 = white level of one measurement; normals x
 right, y up, z to the camera.
@@ -14,9 +14,10 @@ right, y up, z to the camera.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,8 +29,9 @@ from polsep.io.store.examples import read_example, write_example
 from polsep.pipeline import separate_capture
 from polsep.render.blobs import random_blob
 from polsep.render.materials import Materials, random_materials
+from polsep.render.models import random_model
 from polsep.render.raycast import MeshScene, View, build_gbuffer, find_lit, find_view, shade_view
-from polsep.render.shapes import Floats, random_mesh
+from polsep.render.shapes import Floats, Mesh, random_mesh
 from polsep.render.simulate import blur, capture, expose_to_clip, expose_to_level
 from polsep.render.sphere_tracing import PinholeCamera, PointLight, camera_axes
 from polsep.render.vessels import random_vessel
@@ -88,19 +90,38 @@ BLURS = (0.3, 1.0)
 ELEVATIONS_DEG, DOWN_SHARE, DOWN_DEG = (-5.0, 70.0), 0.1, (70.0, 88.0)
 #: Kinds of things in turn; all but the first stand.
 KINDS = (random_mesh, random_blob, random_vessel)
+#: The split of training examples that show meshes of files, beside those of `render.views.SPLITS`.
+MESHES = "meshes"
 #: Most draws of a view that shows much of the thing lit.
 MAX_DRAWS = 20
 
 
-def random_thing(split: str, seed: int, number: int) -> MeshScene:
-    """Return random thing ``number`` of a split; the number says of which of `KINDS`."""
-    generator = torch.Generator().manual_seed(scene_seed(split, seed, number))
-    return MeshScene(KINDS[number % len(KINDS)](generator))
+class Examples(NamedTuple):
+    """Examples of a ``split`` and a ``seed``; ``meshes``, with creases, are those that the split `MESHES` shows."""
 
+    split: str
+    seed: int
+    meshes: Sequence[Mesh] = ()
 
-def stands(number: int) -> bool:
-    """Return True where the thing of example ``number`` stands, +y up, before an upright camera."""
-    return number % len(KINDS) != 0
+    def generator(self, number: int, view: int | None = None) -> torch.Generator:
+        """Return the generator of the thing of example ``number``, or of a view of it."""
+        split = "train" if self.split == MESHES else self.split
+        return torch.Generator().manual_seed(scene_seed(split, self.seed, number, view))
+
+    def thing(self, number: int) -> MeshScene:
+        """Return random thing ``number``; but for meshes, the number says of which of `KINDS`."""
+        generator = self.generator(number)
+        if self.split == MESHES:
+            return MeshScene(random_model(self.meshes, generator))
+        return MeshScene(KINDS[number % len(KINDS)](generator))
+
+    def stands(self, number: int) -> bool:
+        """Return True where the thing of example ``number`` stands, +y up, before an upright camera."""
+        return self.split == MESHES or number % len(KINDS) != 0
+
+    def path(self, folder: Path, number: int) -> Path:
+        """The file of example ``number``."""
+        return folder / f"shape-{self.split}-{self.seed}-{number:06d}.npy"
 
 
 def random_upright_camera(vertices: Floats, generator: torch.Generator) -> PinholeCamera:
@@ -136,11 +157,10 @@ def random_shape_shot(thing: MeshScene, upright: bool, generator: torch.Generato
     raise ValueError(f"expected a view that shows {MIN_LIT:.0%} of the thing lit, found none in {MAX_DRAWS} draws")
 
 
-def random_shape_example(split: str, seed: int, number: int, side: int = SIDE) -> Tensor:
-    """Return planes ``[COUNT, side/2, side/2]`` (`PLANES`) of example ``number``; it depends on these numbers alone."""
-    thing = random_thing(split, seed, number)
-    generator = torch.Generator().manual_seed(scene_seed(split, seed, number, 0))
-    shot = random_shape_shot(thing, stands(number), generator)
+def random_shape_example(examples: Examples, number: int, side: int = SIDE) -> Tensor:
+    """Return planes ``[COUNT, side/2, side/2]`` (`PLANES`) of example ``number``; it depends on the arguments alone."""
+    thing, generator = examples.thing(number), examples.generator(number, 0)
+    shot = random_shape_shot(thing, examples.stands(number), generator)
     view = vary_normals(find_view(thing, shot.camera, (side, side), SAMPLES), generator)
     materials = random_materials(thing.mesh.slot_count, generator, thing.size)
     materials = vary_gloss(vary_colors(materials, generator), generator)
@@ -205,23 +225,19 @@ def surface_planes(view: View, materials: Materials, shot: Shot) -> Tensor:
     return torch.cat([mask, normal * mask, *(means[k : k + 1] / share * mask for k in range(4, 9)), direction])
 
 
-def example_path(folder: Path, split: str, seed: int, number: int) -> Path:
-    """The file of an example."""
-    return folder / f"shape-{split}-{seed}-{number:06d}.npy"
+def find_example(path: Path) -> tuple[Examples, int]:
+    """The examples to which a file of `Examples.path` belongs, without their meshes, and its number."""
+    _, split, seed, number = path.stem.split("-")
+    return Examples(split, int(seed)), int(number)
 
 
-def example_number(path: Path) -> int:
-    """The number of the example in a file of `example_path`."""
-    return int(path.stem.rpartition("-")[2])
-
-
-def make_examples(folder: Path, split: str, seed: int, numbers: range) -> Iterator[int]:
+def make_examples(examples: Examples, folder: Path, numbers: range) -> Iterator[int]:
     """Render the missing ones of some examples; yield their numbers. Views that no lamp reaches are left out."""
     for number in numbers:
-        path = example_path(folder, split, seed, number)
+        path = examples.path(folder, number)
         if not path.is_file():
             try:
-                write_example(path, random_shape_example(split, seed, number))
+                write_example(path, random_shape_example(examples, number))
             except ValueError:
                 continue
         yield number

@@ -26,7 +26,7 @@ from polsep.io.store.rounding import names_to_round
 from polsep.networks.shape import ShapeNetwork
 from polsep.networks.sizes import ResidualSize
 from polsep.train.loop import Training
-from polsep.train.shape_examples import PLANES, example_number, load_example, stands
+from polsep.train.shape_examples import MESHES, PLANES, Examples, find_example, load_example
 from polsep.train.shape_losses import gained, pictures_loss, random_lamps, shape_loss
 from polsep.train.tasks import find
 
@@ -52,7 +52,8 @@ LAMP_SEED, VALIDATION_LAMPS = 31, 20
 class ShapeOptions:
     """Options of a training for an ``input`` of `TRAINED`: crops of ``side`` pixels of the first ``examples``.
 
-    ``part``: one of `PARTS`. Raises ValueError on unknown inputs and parts, and on counts below 1.
+    ``part``: one of `PARTS`. ``meshes``: the sha256 of the files that as many examples again show, "" for none. Raises
+    ValueError on unknown inputs and parts, and on counts below 1.
     """
 
     input: str = "separated"
@@ -63,12 +64,18 @@ class ShapeOptions:
     examples: int = 3200
     validation: int = 64
     part: str = "all"
+    meshes: str = ""
 
     def __post_init__(self) -> None:
         find(dict.fromkeys(TRAINED), "an input", self.input)
         find(dict.fromkeys(PARTS), "a part", self.part)
         if min(self.batch, self.side, self.examples, self.validation) < 1:
             raise ValueError(f"expected a batch, side, examples and validation of at least 1, found {self}")
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """Splits of training examples, each of which has ``examples``."""
+        return ("train", MESHES) if self.meshes else ("train",)
 
     def network(self) -> ShapeNetwork:
         """Return the network, untrained; layers that are not part of the training take no gradients."""
@@ -179,7 +186,8 @@ def batches(options: ShapeOptions, paths: Sequence[Path], step: int, process: tu
             wider = CUTS[0] + (CUTS[1] - CUTS[0]) * draws[0]
             planes = cut_example(load_example(paths[number]), wider, options.side, (draws[1], draws[2]))
             across, *others = (bool(way) for way in torch.randint(2, (3,), generator=generator))
-            any_way = not stands(example_number(paths[number])) or draws[3] < HELD_SHARE
+            examples, shown = find_example(paths[number])
+            any_way = not examples.stands(shown) or draws[3] < HELD_SHARE
             down, transposed = (way and any_way for way in others)
             found.append(tell_light(turn_example(planes, across, down, transposed), generator))
         yield ShapeBatch(torch.stack(found))
@@ -225,8 +233,8 @@ def shape_training(options: ShapeOptions, folder: Path) -> Training:
     network, name = options.network(), encoding_of(options.input)
 
     def paths(split: str, count: int) -> list[Path]:
-        found = sorted(folder.glob(f"shape-{split}-{options.seed}-*.npy"))
-        found = [path for path in found if example_number(path) < count]
+        examples = Examples(split, options.seed)
+        found = [path for number in range(count) if (path := examples.path(folder, number)).is_file()]
         if not found:
             raise ValueError(f"expected examples in {folder}, found none")
         return found
@@ -246,7 +254,8 @@ def shape_training(options: ShapeOptions, folder: Path) -> Training:
         assert isinstance(net, ShapeNetwork)
         shift_errors(net, 1 / score(net)["expected / rms"])
 
-    return Training(network, partial(batches, options, paths("train", options.examples)), loss, score, finish=finish)
+    shown = [path for split in options.splits for path in paths(split, options.examples)]
+    return Training(network, partial(batches, options, shown), loss, score, finish=finish)
 
 
 def shift_errors(network: ShapeNetwork, factor: float) -> None:

@@ -22,6 +22,8 @@ from polsep.io.raw.png import read_png
 from polsep.io.store.errors import decoding
 from polsep.render.shapes import Floats, Mesh
 
+#: Endings of files of meshes.
+MESHES = (".glb", ".obj", ".off", ".ply", ".stl")
 #: Connected parts of a scan with less than this share of its triangles are loose fragments, which are dropped.
 SMALLEST_PART = 0.01
 #: Vertices closer than this share of the mesh's radius are one vertex.
@@ -60,6 +62,14 @@ def read_mesh(path: Path) -> Mesh:
         raise ValueError(f"expected connected triangles in {path}, found loose fragments only")
     normals = smooth_normals(vertices, faces)
     return Mesh(vertices, normals, np.zeros((len(vertices), 2)), faces, np.zeros(len(faces), np.int64))
+
+
+def list_meshes(folder: Path) -> list[Path]:
+    """The files of `MESHES` in a folder, in the order of their names. Raises ValueError where there are none."""
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in MESHES)
+    if not paths:
+        raise ValueError(f"expected meshes ({', '.join(MESHES)}) in {folder}, found none")
+    return paths
 
 
 def _without_fragments(faces: NDArray[np.int64]) -> NDArray[np.int64]:

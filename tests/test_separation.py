@@ -18,6 +18,7 @@ from polsep.compute.filters import box_mean
 from polsep.physics.stokes import (
     Measurements,
     Stokes,
+    aolp_of,
     dolp,
     fit_stokes,
     flip_horizontal,
@@ -30,6 +31,7 @@ from polsep.render.sphere_tracing import Part, PinholeCamera, PointLight, render
 from polsep.separation.analytic import Separation, light_polarizer_angle, separate_analytic, separate_analytic_unclipped
 from polsep.separation.closed_form import MAX_DIFFUSE_DOLP, white_specular
 from polsep.separation.color_affine import separate_color_affine
+from polsep.separation.images import Tally
 from polsep.separation.report import dominant_angle, in_light, tally, under_white_light
 
 SONY = tuple(math.radians(t) for t in (0, 45, 90, 135))
@@ -445,6 +447,13 @@ def test_dominant_angle_at_special_points() -> None:
         assert concentration == pytest.approx(expected, abs=1e-6)
         if expected:
             assert angle == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("tiny", [1e-300, 1e-20, 1e-17, 1e-16])
+def test_angles_a_hair_below_zero_are_below_pi(tiny: float) -> None:
+    """The half-open range [0, pi) holds for single angles too, where rounding would give pi itself."""
+    for angle in (aolp_of(1.0, -tiny), dominant_angle(Tally(along=1.0, across=-tiny))[0], light_polarizer_angle(tiny)):
+        assert 0 <= angle < math.pi
 
 
 @pytest.mark.parametrize("radius", [0, 1, 3, 40])

@@ -22,7 +22,7 @@ from polsep.compute.warm_up import make_ready
 from polsep.light.color import ColorFit, Doubles, axis_of, fit_color, planes_along, strongest
 from polsep.light.metals import MIN_MIRRORS, beside, is_metal, metal_share, only_mirrors, select
 from polsep.light.tiles import Tiles, tile_measurements, tile_mosaic
-from polsep.physics.stokes import Measurements
+from polsep.physics.stokes import Measurements, aolp_of
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.levels import as_mosaic
 
@@ -117,7 +117,7 @@ def find_light(
         return unknown_light(colors)
     axis, _ = axis_of(strongest(tiles))
     if colors != 3:
-        return Light(None, None, 0.0, True, _angle_of(axis))
+        return Light(None, None, 0.0, True, aolp_of(*axis))
     make_ready(_warm_up)
     light = _light_of_tiles(tiles, axis)
     return replace(light, remarks=tuple(_remarks_on(light, tiles)))
@@ -131,13 +131,13 @@ def _light_of_tiles(tiles: Tiles, axis: NDArray[np.float64]) -> Light:
     mirrors = only_mirrors(tiles, axis)
     bodies = select(tiles, ~beside(tiles, mirrors))
     if mirrors.sum() < MIN_MIRRORS or len(bodies.counts) < MIN_TILES:
-        return _as_light(fit, tiles, _angle_of(axis))
+        return _as_light(fit, tiles, aolp_of(*axis))
     mirrored = iterate_fast(planes_along(strongest(select(tiles, mirrors)), axis))[0]
     own_axis, _ = axis_of(strongest(bodies))
     own = fit_color(strongest(bodies), own_axis, iterate_fast)
     if not is_metal(mirrored - own.x):
-        return _as_light(fit, tiles, _angle_of(axis))
-    return replace(_as_light(own, bodies, _angle_of(own_axis)), metal=metal_share(tiles, own_axis, own.x))
+        return _as_light(fit, tiles, aolp_of(*axis))
+    return replace(_as_light(own, bodies, aolp_of(*own_axis)), metal=metal_share(tiles, own_axis, own.x))
 
 
 def _remarks_on(light: Light, tiles: Tiles) -> Iterator[str]:
@@ -159,11 +159,6 @@ def _remarks_on(light: Light, tiles: Tiles) -> Iterator[str]:
             f"highlights that show the lamp's colour were expected, found too few; {color} is assumed: show a shiny "
             "thing, or measure a grey card and say --light-color"
         )
-
-
-def _angle_of(axis: NDArray[np.float64]) -> float:
-    """AoLP [rad, in [0, pi)] of light along an axis of (s1, s2)."""
-    return 0.5 * math.atan2(axis[1], axis[0]) % math.pi
 
 
 def find_tiles(capture: Mosaic | Measurements) -> Tiles:

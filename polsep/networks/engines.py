@@ -29,6 +29,7 @@ from polsep.networks.joint_weights import JointWeights
 from polsep.networks.openvino_engine import OpenVinoEngine, RawRows, as_images, asked_precision, modulation_of
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of, own_order
+from polsep.physics.stokes import wrap_aolp
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.orient import Orientation, orient, shifts_of
 from polsep.separation.images import FrameImages
@@ -122,7 +123,7 @@ def _halve(images: FrameImages, light: tuple[float, ...]) -> FrameImages:
     dolp = np.where(s0 > 0, np.abs(polarized) / np.where(s0 > 0, s0, 1), 0).astype(np.float32)
     diffuse, specular, error = (_mean_cells(image) for image in (images.diffuse, images.specular, images.error))
     valid = _mean_cells(images.valid.astype(np.float32)) == 1
-    aolp = _wrap((np.angle(polarized) / 2).astype(np.float32))
+    aolp = wrap_aolp((np.angle(polarized) / 2).astype(np.float32))
     assert images.tally is not None
     return FrameImages(diffuse, specular, valid, dolp, aolp, images.tally.of_pixels(valid.size), error)
 
@@ -167,7 +168,7 @@ def _combine(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         "specular": (weights[..., 1:] * arrays["specular"]).sum(axis=0),
         "valid": arrays["valid"].all(axis=0),
         "dolp": np.abs(polarization),
-        "aolp": _wrap(np.angle(polarization) / 2),
+        "aolp": wrap_aolp(np.angle(polarization) / 2),
         "error": (weights * arrays["error"]).sum(axis=0),
     }
 
@@ -222,15 +223,7 @@ def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> Fra
     turned, tally = {name: turn(image) for name, image in images.arrays().items()}, images.tally
     assert tally is not None
     if orientation.transposed:
-        turned["aolp"], tally = _wrap(np.float32(np.pi / 2) - turned["aolp"]), replace(tally, along=-tally.along)
+        turned["aolp"], tally = wrap_aolp(np.float32(np.pi / 2) - turned["aolp"]), replace(tally, along=-tally.along)
     if orientation.down != orientation.across:
-        turned["aolp"], tally = _wrap(-turned["aolp"]), replace(tally, across=-tally.across)
+        turned["aolp"], tally = wrap_aolp(-turned["aolp"]), replace(tally, across=-tally.across)
     return FrameImages(**turned, tally=tally.of_pixels(turned["valid"].size))
-
-
-def _wrap(angle: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The same AoLP in [0, pi); values that rounding takes to pi become 0."""
-    pi = np.float32(np.pi)
-    wrapped: NDArray[np.float32] = np.mod(angle, pi)
-    wrapped[wrapped >= pi] = 0
-    return wrapped

@@ -343,9 +343,19 @@ def aolp(stokes: Stokes) -> Array:
 
     Eq. 2 with the two-argument arctangent, which the paper's tan^-1 leaves out.
     """
-    xp = namespace(stokes.s1)
-    angle = xp.remainder(0.5 * xp.atan2(stokes.s2 + 0.0, stokes.s1 + 0.0), math.pi)  # + 0.0 turns -0 into 0
-    return xp.where(angle >= math.pi, 0.0, angle)
+    return wrap_aolp(0.5 * namespace(stokes.s1).atan2(stokes.s2 + 0.0, stokes.s1 + 0.0))  # + 0.0 turns -0 into 0
+
+
+def wrap_aolp(angles: Array) -> Array:
+    """Angles [rad] as AoLP in [0, pi); those that rounding takes to pi become 0."""
+    xp = namespace(angles)
+    wrapped = xp.remainder(angles, math.pi)
+    return xp.where(wrapped >= math.pi, 0.0, wrapped)
+
+
+def aolp_of(s1: float, s2: float) -> float:
+    """`aolp` of light whose s1 and s2, or sums of them, are two numbers."""
+    return 0.5 * math.atan2(s2, s1) % math.pi % math.pi  # twice: rounding takes tiny negative angles to pi
 
 
 def rotate_frame(stokes: Stokes, angle: float | Array) -> Stokes:

@@ -97,4 +97,4 @@ def light_polarizer_angle(specular_angle: float) -> float:
 
     Exact for light and camera in line with one up vector; farther off it holds for the facets that face both.
     """
-    return -specular_angle % math.pi
+    return -specular_angle % math.pi % math.pi  # twice: rounding takes tiny negative angles to pi

@@ -15,7 +15,7 @@ from array_api_compat import is_array_api_obj
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import Array, constant, contiguous, namespace, on_cpu, to_numpy, to_numpy_together
-from polsep.physics.stokes import MAX_DOLP, Measurements, Stokes, aolp, dolp
+from polsep.physics.stokes import MAX_DOLP, Measurements, Stokes, aolp, aolp_of, dolp
 from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import Separation, light_polarizer_angle
 from polsep.separation.images import FrameImages, Tally
@@ -199,7 +199,7 @@ def dominant_angle(sums: Tally) -> tuple[float, float]:
 
     Concentration 1: one AoLP everywhere, as under one polarized light; near 0: no common direction.
     """
-    angle = (0.5 * math.atan2(sums.across, sums.along)) % math.pi
+    angle = aolp_of(sums.along, sums.across)
     return angle, math.hypot(sums.along, sums.across) / sums.power if sums.power > 0 else 0.0
 
 

@@ -49,6 +49,7 @@ from polsep.sensor.checks import CheckedMosaic
 from polsep.sensor.levels import as_mosaic
 from polsep.separation.report import SeparatedFrame
 from polsep.video import recordings as video
+from polsep.video.reports import shared_report
 
 av = pytest.importorskip("av", reason="needs the extra 'video'")
 
@@ -738,6 +739,17 @@ def test_remarks_that_differ_in_numbers_count_as_one(tmp_path: Path, monkeypatch
     found = json.loads((tmp_path / "out" / "run.json").read_text())["warnings"]
     (count,) = [often for text, often in found.items() if "samples exceed the white level" in text]
     assert count > 1
+
+
+def test_angles_of_a_film_are_averaged_around_the_circle() -> None:
+    """The mean of 179 and 1 degree is 0, not 90; of 44 and 46 it is 45."""
+    first = video.FirstFrame("joint", (1.0,), 1.0, (1, 1, 1), (2, 2), ())
+    for angles, mean in (((179.0, 1.0), 0.0), ((44.0, 46.0), 45.0)):
+        lines = [{"frame": k, "specular_aolp_deg": t, "light_polarizer_deg": 180 - t} for k, t in enumerate(angles)]
+        report = shared_report(first, lines)
+        assert report is not None
+        for name, expected in (("specular_aolp_deg", mean), ("light_polarizer_deg", -mean)):
+            assert (report["statistics"][name] - expected + 90) % 180 == pytest.approx(90)
 
 
 def test_the_lamp_of_a_film_is_found_in_frames_put_right(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from polsep.physics.stokes import aolp_of
 
 if TYPE_CHECKING:
     from polsep.video.recordings import FirstFrame
@@ -20,8 +23,9 @@ def shared_report(first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, A
         return None
     names = [name for name in good[0] if name not in ("frame", "warnings")]
     statistics = {name: float(np.mean([line[name] for line in good if name in line])) for name in names}
-    turned = np.exp(2j * np.radians([line["light_polarizer_deg"] for line in good])).sum()
-    statistics["light_polarizer_deg"] = float(np.degrees(np.angle(turned)) / 2 % 180)
+    for name in ("specular_aolp_deg", "light_polarizer_deg"):
+        turned = np.exp(2j * np.radians([line[name] for line in good])).sum()
+        statistics[name] = math.degrees(aolp_of(turned.real, turned.imag))
     warnings = _each_once([*first.warnings, *(text for line in good for text in line.get("warnings", ()))])
     light = {"light_color": list(first.light), "light": first.facts}
     return {"method": first.method, "statistics": statistics, **light, "warnings": warnings}

@@ -222,6 +222,13 @@ def test_mono_has_no_color() -> None:
     assert found.aolp == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.parametrize("side", [2, 8, 12, 40])
+def test_mono_frames_without_tiles_have_no_color(side: int) -> None:
+    """However small: one gain, and nothing to be unsure of."""
+    found = find_light(np.full((side, side), 90, np.uint8), layout="mono")
+    assert found.color == (1.0,) and found.log_ratio is None and found.sure
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_kernel_agrees_with_its_twin(dtype: type[np.generic]) -> None:
     """Same tiles and sums to rounding, for every dtype, odd sizes and black levels included."""

@@ -88,8 +88,7 @@ def axis_of(tiles: Tiles) -> tuple[Doubles, float]:
 
     The polarized part is positively correlated with s0 along it.
     """
-    size = (tiles.moments.shape[1] - 1) // 3
-    blocks = tiles.moments[:, 1:, 1:].sum(0).reshape(3, size, 3, size)
+    blocks = tiles.moments[:, 1:, 1:].sum(0).reshape(3, tiles.colors, 3, tiles.colors)
     sums = np.einsum("icjc->ij", blocks)
     noise = 2 * float(tiles.noise.sum())
     along, across, mixed = sums[1, 1] - noise, sums[2, 2] - noise, sums[1, 2]
@@ -135,11 +134,9 @@ def strongest(tiles: Tiles) -> Tiles:
     """Return the tiles of the most polarized light, `MOST_TILES` at most, in their order."""
     if len(tiles.counts) <= MOST_TILES:
         return tiles
-    size = (tiles.moments.shape[1] - 1) // 3
     diagonal = np.diagonal(tiles.moments, axis1=1, axis2=2)
-    power = diagonal[:, 1 + size :].sum(1) - 4 * tiles.noise.sum(1)
-    kept = np.sort(np.argsort(-power, kind="stable")[:MOST_TILES])
-    return Tiles(tiles.moments[kept], tiles.noise[kept], tiles.counts[kept], tiles.place[kept])
+    power = diagonal[:, 1 + tiles.colors :].sum(1) - 4 * tiles.noise.sum(1)
+    return tiles.select(np.sort(np.argsort(-power, kind="stable")[:MOST_TILES]))
 
 
 def fit_color(tiles: Tiles, axis: Doubles, run: Callable[[Planes], Iterated]) -> ColorFit:

@@ -20,7 +20,7 @@ from polsep.compute.arrays import to_numpy
 from polsep.compute.averages import weighted_median
 from polsep.compute.warm_up import make_ready
 from polsep.light.color import ColorFit, Doubles, axis_of, fit_color, planes_along, strongest
-from polsep.light.metals import MIN_MIRRORS, beside, is_metal, metal_share, only_mirrors, select
+from polsep.light.metals import MIN_MIRRORS, beside, is_metal, metal_share, only_mirrors
 from polsep.light.tiles import Tiles, tile_measurements, tile_mosaic
 from polsep.physics.stokes import Measurements, aolp_of
 from polsep.sensor.camera import Layout, Mosaic
@@ -112,11 +112,10 @@ def find_light(
     """
     capture = raw if isinstance(raw, Mosaic | Measurements) else as_mosaic(raw, layout, black_level, white_level)[0]
     tiles = find_tiles(capture)
-    colors = (tiles.moments.shape[1] - 1) // 3
     if len(tiles.counts) < MIN_TILES:
-        return unknown_light(colors)
+        return unknown_light(tiles.colors)
     axis, _ = axis_of(strongest(tiles))
-    if colors != 3:
+    if tiles.colors != 3:
         return Light(None, None, 0.0, True, aolp_of(*axis))
     make_ready(_warm_up)
     light = _light_of_tiles(tiles, axis)
@@ -129,10 +128,10 @@ def _light_of_tiles(tiles: Tiles, axis: NDArray[np.float64]) -> Light:
 
     fit = fit_color(strongest(tiles), axis, iterate_fast)
     mirrors = only_mirrors(tiles, axis)
-    bodies = select(tiles, ~beside(tiles, mirrors))
+    bodies = tiles.select(~beside(tiles, mirrors))
     if mirrors.sum() < MIN_MIRRORS or len(bodies.counts) < MIN_TILES:
         return _as_light(fit, tiles, aolp_of(*axis))
-    mirrored = iterate_fast(planes_along(strongest(select(tiles, mirrors)), axis))[0]
+    mirrored = iterate_fast(planes_along(strongest(tiles.select(mirrors)), axis))[0]
     own_axis, _ = axis_of(strongest(bodies))
     own = fit_color(strongest(bodies), own_axis, iterate_fast)
     if not is_metal(mirrored - own.x):
@@ -167,7 +166,9 @@ def find_tiles(capture: Mosaic | Measurements) -> Tiles:
         return tile_measurements(capture)
     array = to_numpy(capture.data.reshape(-1, *capture.data.shape[-2:])[0])
     if min(array.shape) < 12:
-        return Tiles(np.zeros((0, 10, 10)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2), np.int64))
+        colors = capture.layout.channels
+        moments = np.zeros((0, 1 + 3 * colors, 1 + 3 * colors))
+        return Tiles(moments, np.zeros((0, colors)), np.zeros(0), np.zeros((0, 2), np.int64))
     if array.dtype not in (np.uint8, np.uint16, np.float32):
         return tile_mosaic(capture)
     make_ready(_warm_up)

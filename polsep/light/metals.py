@@ -35,11 +35,6 @@ def only_mirrors(tiles: Tiles, axis: Doubles) -> Flags:
     return found
 
 
-def select(tiles: Tiles, chosen: Flags) -> Tiles:
-    """Return the chosen tiles."""
-    return Tiles(tiles.moments[chosen], tiles.noise[chosen], tiles.counts[chosen], tiles.place[chosen])
-
-
 def beside(tiles: Tiles, chosen: Flags) -> Flags:
     """Return which tiles are chosen or touch a chosen one, also at a corner."""
     rows, cols = (int(n) + 3 for n in tiles.place.max(0))

@@ -57,6 +57,15 @@ class Tiles(NamedTuple):
     counts: Doubles
     place: NDArray[np.int64]
 
+    @property
+    def colors(self) -> int:
+        """C: 3, or 1 for mono."""
+        return self.noise.shape[1]
+
+    def select(self, chosen: NDArray[np.bool_ | np.int64]) -> Tiles:
+        """Return the ``chosen`` tiles: a mask ``[T]``, or their numbers."""
+        return Tiles(*(values[chosen] for values in self))
+
 
 def taps(offset: int) -> tuple[float, float, float]:
     """Return the weights of the samples one period before, at and one after a period, of the filter at ``offset``."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from polsep.compute.arrays import to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.sensor import periods_kernel
-from polsep.sensor.camera import CLIP_MARGIN, Mosaic
+from polsep.sensor.camera import Mosaic
 from polsep.sensor.noise import BLOCK, MIN_SPAN, code_step
 from polsep.sensor.periods_kernel import measure_blocks
 
@@ -128,7 +128,7 @@ def smooth_blocks(mosaic: Mosaic, rows: Floats | None = None) -> tuple[Floats, F
     """
     make_ready(periods_kernel.warm_up)
     blocks = measure_blocks(_some_rows(mosaic) if rows is None else rows)
-    clip = np.float32(mosaic.black_level + (1 - CLIP_MARGIN) * (mosaic.white_level - mosaic.black_level))
+    clip = np.float32(mosaic.clip_level)
     unclipped = blocks.most < clip
     kept = unclipped[:, 1:-1] & unclipped[:, :-2] & unclipped[:, 2:]
     return blocks.mean[:, 1:-1][kept], blocks.variance[:, 1:-1][kept]

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import as_floats, namespace, of_kind, to_numpy
-from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, WrongType
+from polsep.sensor.camera import Layout, Mosaic, WrongType, clip_level
 from polsep.sensor.defects import MIN_SIZE, repair
 from polsep.sensor.levels import WHITE_LEVELS
 
@@ -194,7 +194,7 @@ def subtract_ambient(mosaic: Mosaic, ambient: Mosaic) -> Mosaic:
     black, white = float(mosaic.black_level), float(mosaic.white_level)
     data = as_floats(mosaic.data)
     data = data - namespace(data).astype(as_floats(other.data) - black, data.dtype, copy=False)
-    hidden = (mosaic.clipped() | other.clipped()) & (data < black + (1 - CLIP_MARGIN) * (white - black))
+    hidden = (mosaic.clipped() | other.clipped()) & (data < clip_level(black, white))
     return replace(mosaic, data=namespace(data).where(hidden, white, data), less_ambient=True)
 
 
@@ -386,9 +386,7 @@ def _tiled(table: Any, shape: tuple[int, ...]) -> Any:
 
 def _keep_clipped(samples: Floats, clipped: NDArray[np.bool_], levels: tuple[float, float]) -> Floats:
     """Corrected samples; those that were clipped and fell below the clip level are set to the white level."""
-    black, white = levels
-    least = np.float32(black + (1 - CLIP_MARGIN) * (white - black))
-    samples[clipped & (samples < least)] = white
+    samples[clipped & (samples < np.float32(clip_level(*levels)))] = levels[1]
     return samples
 
 

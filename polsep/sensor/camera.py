@@ -192,6 +192,11 @@ def check_frame(shape: tuple[int, ...], layout: Layout, black_level: float, whit
         raise ValueError(f"white_level must be above black_level, found {white_level} and {black_level}")
 
 
+def clip_level(black_level: float, white_level: float) -> float:
+    """The least sample that counts as clipped, in the unit of the samples; see `CLIP_MARGIN`."""
+    return black_level + (1 - CLIP_MARGIN) * (white_level - black_level)
+
+
 @dataclass(frozen=True, repr=False)
 class Mosaic:
     """One raw frame (or a batch): linear sensor values ``data [..., H, W]`` with what is needed to read them.
@@ -215,6 +220,11 @@ class Mosaic:
 
     def __post_init__(self) -> None:
         check_frame(tuple(self.data.shape), self.layout, self.black_level, self.white_level)
+
+    @property
+    def clip_level(self) -> float:
+        """The least sample of ``data`` that counts as clipped."""
+        return clip_level(self.black_level, self.white_level)
 
     def linear(self) -> Array:
         """Samples with black at 0 and white at 1, under white light; float32 (float64 for float64 data)."""

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.arrays import of_kind, to_numpy
 from polsep.compute.warm_up import make_ready
-from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
+from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.noise import (
     BLOCK,
     BLOCKS,
@@ -115,7 +115,7 @@ def repair(mosaic: Mosaic, mask: NDArray[np.bool_]) -> Mosaic:
         raise ValueError(f"expected a frame of at least {MIN_SIZE}x{MIN_SIZE} and a mask of its size, found {sizes}")
     make_ready(kernel.warm_up)
     x = x.copy()
-    kernel.fill(x, make_predictor(mosaic.layout, x.shape), clip_level(mosaic), np.argwhere(mask))
+    kernel.fill(x, make_predictor(mosaic.layout, x.shape), mosaic.clip_level, np.argwhere(mask))
     return replace(mosaic, data=of_kind(x, mosaic.data))
 
 
@@ -266,7 +266,7 @@ def _light_around(rest: dict[Place, float], places: list[Place], excess: NDArray
 
 def repair_reference(mosaic: Mosaic, mask: NDArray[np.bool_]) -> Mosaic:
     """`repair` by one system of equations: at the repaired samples all their residuals are 0."""
-    window = Window(_samples(mosaic).copy(), make_predictor(mosaic.layout, mask.shape), clip_level(mosaic))
+    window = Window(_samples(mosaic).copy(), make_predictor(mosaic.layout, mask.shape), mosaic.clip_level)
     places = [(int(i), int(j)) for i, j in np.argwhere(mask)]
     factors = np.array([[window.factor(one, other) for other in places] for one in places])
     excess = np.linalg.solve(factors, [window.residual(one) for one in places])
@@ -294,17 +294,12 @@ def _near(candidates: Places, new: Places, known: Places, shape: tuple[int, ...]
     return near[~np.isin(numbers, taken)]
 
 
-def clip_level(mosaic: Mosaic) -> float:
-    """The least clipped sample."""
-    return mosaic.black_level + (1 - CLIP_MARGIN) * (mosaic.white_level - mosaic.black_level)
-
-
 def make_rules(mosaic: Mosaic, x: Floats) -> Rules:
     """The numbers of the kernels for samples ``x [H, W]``, by the noise that the frame shows."""
     from polsep.sensor.defects_kernel import Rules
 
     noise = measure_noise(mosaic, x)
-    levels = (noise.gain, noise.floor, mosaic.black_level, clip_level(mosaic))
+    levels = (noise.gain, noise.floor, mosaic.black_level, mosaic.clip_level)
     numbers = (*levels, CANDIDATE, CONFIRMED, RATIO, CLUSTER_RATIO, SPREAD)
     return Rules._make([*(np.float32(number) for number in numbers), mosaic.layout.period])
 
@@ -312,7 +307,7 @@ def make_rules(mosaic: Mosaic, x: Floats) -> Rules:
 def measure_noise(mosaic: Mosaic, x: Floats) -> Noise:
     """Noise of samples ``x [H, W]``; that of exact samples where nothing shows it."""
     black, white = float(mosaic.black_level), float(mosaic.white_level)
-    levels = Levels(black, white, code_step(x, white - black), clip_level(mosaic))
+    levels = Levels(black, white, code_step(x, white - black), mosaic.clip_level)
     whole = x[: x.shape[0] // BLOCK * BLOCK, : x.shape[1] // BLOCK * BLOCK]
     noise = estimate_noise(whole, None, levels, 0) or least_noise(levels)
     dark = _dark_variance(whole, levels)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from polsep.compute import pages
 from polsep.physics.stokes import Measurements
-from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, WrongType
+from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, WrongType, clip_level
 
 #: Accepted samples and the white level that their type implies.
 WHITE_LEVELS = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0, "float64": 1.0}
@@ -164,7 +164,7 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
     if high <= black_level:
         return (BlackFrame(f"black frame: no sample exceeds the black level {black_level:g} (largest {high:g})"),)
     notes: Notes = ()
-    clip = black_level + (1 - CLIP_MARGIN) * (white - black_level)
+    clip = clip_level(black_level, white)
     if low >= clip:
         notes += (f"every sample is clipped: the smallest is {low:g} of white level {white:g}",)
     elif high >= clip:
@@ -198,7 +198,7 @@ def clipped_share(samples: NDArray[Any], black_level: float, white: float) -> fl
     height = len(rows) // ROWS * ROWS
     every = SKIPPED if height >= LARGE else 1
     kept = rows[:height].reshape(-1, ROWS, rows.shape[-1])[::every] if height else rows
-    lit, clip = (black_level + share * (white - black_level) for share in (LIT, 1 - CLIP_MARGIN))
+    lit, clip = black_level + LIT * (white - black_level), clip_level(black_level, white)
     if samples.dtype.kind == "u":  # whole numbers are compared in half of the time
         lit, clip = math.floor(lit), math.ceil(clip)
     return int(np.count_nonzero(kept >= clip)) / max(int(np.count_nonzero(kept > lit)), 1)
@@ -212,7 +212,7 @@ def _depth_notes(samples: NDArray[Any], high: int) -> Notes:
     if left is not None:
         largest = (2**left - 1) << (16 - left)
         seen = f"the lowest {16 - left} bits are always zero: {left}-bit left-justified data"
-        if largest >= (1 - CLIP_MARGIN) * 65535:
+        if largest >= clip_level(0, 65535):
             return (f"{seen}; white level 65535 fits",)
         return (f"{seen}; say --white-level {largest} if so",)
     right = next((bits for bits in _NARROW_BITS if high < 2**bits), None)

@@ -22,7 +22,6 @@ from polsep.compute.filters import largest_around
 from polsep.compute.resizing import block_means
 from polsep.compute.warm_up import make_ready
 from polsep.sensor.camera import Mosaic
-from polsep.sensor.defects import clip_level
 from polsep.separation import clipped_pattern_kernel
 from polsep.separation.analytic import Separation
 from polsep.separation.clipped_pattern_kernel import change_cells, weigh_cells
@@ -53,7 +52,7 @@ def smooth_separation(separation: Separation, mosaic: Mosaic) -> Separation:
 def smooth_clipped(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> FrameImages:
     """`smooth_separation` of one frame by kernels, in a ``light`` (camera RGB); arrays of images are written to."""
     scale, rows, cols = _cells(mosaic, images.diffuse.shape[:2])
-    clipped = to_numpy(mosaic.data)[rows, cols] >= clip_level(mosaic)
+    clipped = to_numpy(mosaic.data)[rows, cols] >= mosaic.clip_level
     if not clipped.any():
         return images
     make_ready(clipped_pattern_kernel.warm_up)

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from polsep.compute.arrays import Array, namespace, of_kind, to_numpy, to_numpy_together
 from polsep.compute.warm_up import make_ready
 from polsep.sensor.camera import Mosaic
-from polsep.sensor.defects import clip_level
 from polsep.separation import highlights_kernel
 from polsep.separation.highlights_kernel import find_parts, find_rings, solve_laplace
 from polsep.separation.images import FrameImages
@@ -135,7 +134,7 @@ def _contrast(holes: _Holes, mosaic: Mosaic, fill: Floats, gain: Floats) -> Floa
 def _clipped_cells(mosaic: Mosaic) -> Places:
     """Row and column ``[N, 2]`` of the 2x2 cells with a clipped sample."""
     width = mosaic.data.shape[1]
-    level, data = clip_level(mosaic), mosaic.data.reshape(-1)
+    level, data = mosaic.clip_level, mosaic.data.reshape(-1)
     at = to_numpy(namespace(data).nonzero(data >= level)[0]).astype(np.int64)
     places = np.stack(np.divmod(at, width), axis=1) - np.array(mosaic.layout.origin)
     count = (np.array(mosaic.data.shape) - mosaic.layout.origin) // 2

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import of_kind, to_numpy
-from polsep.sensor.camera import CLIP_MARGIN, Mosaic
+from polsep.sensor.camera import Mosaic, clip_level
 from polsep.sensor.noise import BLOCK, Floats, Levels, Noise, blocks_of, code_step, estimate_noise, least_noise
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ def _levels_of(mosaic: Mosaic, samples: NDArray[Any]) -> Levels:
     """Levels of a frame; a row of samples shows the step between their codes."""
     black, white = float(mosaic.black_level), float(mosaic.white_level)
     step = code_step(samples[samples.shape[0] // 2][None], white - black)
-    return Levels(black, white, step, black + (1 - CLIP_MARGIN) * (white - black))
+    return Levels(black, white, step, clip_level(black, white))
 
 
 def _next_noise(

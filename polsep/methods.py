@@ -25,7 +25,7 @@ from polsep.networks.engines import ENGINES, combine_images, run_engine
 from polsep.physics.stokes import Measurements, behind_angles, bounded_below_white, fit_stokes, is_pair
 from polsep.sensor.camera import Layout, Mosaic, WrongType, sample_fine_mosaic
 from polsep.separation import analytic_kernel, color_affine_kernel
-from polsep.separation.analytic import Separation, separate_analytic
+from polsep.separation.analytic import Separation, clipped_pixels, separate_analytic
 from polsep.separation.analytic_kernel import AnalyticOptions
 from polsep.separation.clipped_pattern import smooth_clipped
 from polsep.separation.color_affine import separate_color_affine
@@ -83,9 +83,7 @@ def compose(
 
     def separate_samples(capture: Capture) -> Separation:
         samples = capture if isinstance(capture, Measurements) else demosaic(capture)
-        clipped = samples.clipped
-        clipped = None if clipped is None else namespace(clipped).any(clipped, axis=(-4, -3))
-        return replace(split(samples), clipped=clipped)
+        return replace(split(samples), clipped=clipped_pixels(samples))
 
     return separate_samples
 
@@ -157,7 +155,7 @@ def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameIma
     """The joint networks of that name: kernels and OpenVINO, on other devices torch."""
     if isinstance(capture, Measurements):
         return run_joint_co_sited(name, capture, light)
-    if isinstance(capture, Mosaic) and capture.data.ndim == 2 and on_cpu(capture.data):
+    if capture.data.ndim == 2 and on_cpu(capture.data):
         networks = [shipped_joint(member) for member in member_names(name, capture.layout)]
         lit = replace(capture, light_color=light)
         images = combine_images([run_engine(network, lit, full) for network in networks], light)
@@ -171,7 +169,7 @@ def run_joint_co_sited(name: str, samples: Measurements, light: Light) -> FrameI
     Better than a mosaic of the samples themselves, which lacks three analysers and two colours in every pixel
     (docs/experiments.md). s0 is that of the samples: the networks say how it splits.
     """
-    layout = Layout(bayer=None) if samples.data.shape[-3] == 1 else Layout()
+    layout = Layout.sony(samples.data.shape[-3])
     mosaic = sample_fine_mosaic(behind_angles(samples, layout.angles), layout)
     images = run_joint(name, mosaic, light, False)
     light_of_samples, clipped, xp = fit_stokes(samples).s0.clip(0, None), samples.clipped, namespace(samples.data)
@@ -206,13 +204,13 @@ def _accepts_joint(name: str, capture: Capture) -> bool:
     """True for mosaics that the networks of that name know, and for co-sited samples whose colours have weights."""
     if isinstance(capture, Mosaic):
         return accepts_mosaic(name, capture)
-    layout = Layout(bayer=None) if capture.data.shape[-3] == 1 else Layout()
+    layout = Layout.sony(capture.data.shape[-3])
     known = _sees_all(capture) and capture.data.ndim == 4 and is_shipped(weights_name(name, layout))
     return known and not bounded_below_white(capture)  # networks take what clipped for white at least
 
 
 def _joint(name: str, summary: str) -> Method:
-    colors = "colour or mono" if is_shipped(weights_name(name, Layout(bayer=None))) else "colour"
+    colors = "colour or mono" if is_shipped(weights_name(name, Layout.sony(1))) else "colour"
     return Method(
         name,
         summary,

@@ -14,10 +14,9 @@ from pathlib import Path
 from polsep.compute.arrays import namespace
 from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
 from polsep.networks.joint_weights import JointWeights, joint_weights
-from polsep.networks.paper_engine import Refiner, refiner_of
-from polsep.networks.rungs import Refine, Rung, separate_refined
+from polsep.networks.paper_engine import Refiner
+from polsep.networks.rungs import RUNGS, Refine, Rung, separate_refined
 from polsep.networks.sizes import Size
-from polsep.networks.strips import own_order
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import orient
@@ -82,12 +81,12 @@ def member_names(method: str, layout: Layout) -> tuple[str, ...]:
     return tuple(weights_name(member, layout) for member in MEMBERS.get(method, (method,)))
 
 
-def accepts_mosaic(method: str, capture: Mosaic | Measurements) -> bool:
+def accepts_mosaic(method: str, mosaic: Mosaic) -> bool:
     """True for a mosaic in an order that the method knows, with weights shipped for its colours."""
-    if isinstance(capture, Measurements) or not is_shipped(weights_name(method, capture.layout)):
+    if not is_shipped(weights_name(method, mosaic.layout)):
         return False
     try:
-        orient(capture, own_order(capture.layout))
+        orient(mosaic, Layout.sony(mosaic.layout.channels))
     except ValueError:
         return False
     return True
@@ -97,7 +96,7 @@ def read_refiner(path: Path) -> Refiner:
     """The paper's networks in a file of weights. Raises ValueError when the file is damaged or of another network."""
     arrays, metadata = read_weights(path)
     try:
-        return refiner_of(arrays, metadata, Size(**json.loads(metadata["size"])))
+        return Refiner(RUNGS[metadata["rung"]], arrays, Size(**json.loads(metadata["size"])))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"expected weights of a refinement in {path}, found {type(error).__name__}") from None
 

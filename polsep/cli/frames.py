@@ -179,7 +179,7 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     from polsep.shipped import find_joint
 
     refuse_existing(output.parent, [output], options["overwrite"])
-    layout = Layout(bayer=None) if options["mono"] else Layout()
+    layout = Layout.sony(1 if options["mono"] else 3)
     networks, metadata = find_joint(method, layout, weights)
     print_note(f"exporting {method}, which may take minutes")
     with show_progress(f"exporting {method}") as progress:

@@ -28,9 +28,9 @@ from polsep.networks.images_kernel import Targets
 from polsep.networks.joint_weights import JointWeights
 from polsep.networks.openvino_engine import OpenVinoEngine, RawRows, as_images, asked_precision, modulation_of
 from polsep.networks.sizes import ResidualSize
-from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of, own_order
+from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of
 from polsep.physics.stokes import wrap_aolp
-from polsep.sensor.camera import Mosaic
+from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation, orient, shifts_of
 from polsep.separation.images import FrameImages
 
@@ -100,7 +100,7 @@ def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages
     Sony's in any orientation, and RuntimeError as `require_own_threads`.
     """
     require_own_threads()
-    orientation = orient(mosaic, own_order(mosaic.layout))
+    orientation = orient(mosaic, Layout.sony(mosaic.layout.channels))
     if not full and not orientation.keeps_cells:  # then the network's cells are not the frame's
         return _halve(run_engine(network, mosaic, full=True), mosaic.light_color)
     make_ready(images_kernel.warm_up)

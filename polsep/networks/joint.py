@@ -127,7 +127,7 @@ class Joint(nn.Module):
         self.averages_shifts = False
         #: Faster twin of `_guide_once`, which training on CPUs sets (`networks.guide`).
         self.guide: Callable[[Tensor, Layout], tuple[Tensor, Tensor]] | None = None
-        self.layout = Layout(bayer="RGGB" if colors == 3 else None)
+        self.layout = Layout.sony(colors)
         self.register_buffer("demosaic", bilinear_filter(self.layout) if demosaicker == "linear" else None)
         width = size.widths[0]
         self.net = ResidualUNet(input_channels(colors, inputs).total, size)

@@ -55,7 +55,7 @@ class JointWeights:
     @property
     def layout(self) -> Layout:
         """The order of filters that it was trained on."""
-        return Layout(bayer="RGGB" if self.colors == 3 else None)
+        return Layout.sony(self.colors)
 
     @property
     def demosaic(self) -> NDArray[np.float32] | None:

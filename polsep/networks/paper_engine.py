@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.networks.graphs import core, refinement_model, require_own_threads
-from polsep.networks.rungs import RUNGS, Rung
+from polsep.networks.rungs import Rung
 from polsep.networks.sizes import Size
 
 Floats = NDArray[np.float32]
@@ -45,8 +45,3 @@ class Refiner:
     def _compiled(self, shape: tuple[int, int, int]) -> Any:
         options = {"INFERENCE_PRECISION_HINT": "f32"}
         return core().compile_model(refinement_model(self._arrays, self._size, shape), "CPU", options)
-
-
-def refiner_of(arrays: Mapping[str, Floats], metadata: Mapping[str, str], size: Size) -> Refiner:
-    """The networks of a file's arrays and metadata. Raises KeyError or ValueError when it is of others."""
-    return Refiner(RUNGS[metadata["rung"]], arrays, size)

@@ -26,9 +26,9 @@ from torch.nn.functional import max_pool2d
 
 from polsep.demosaic.bilinear import mean_cells
 from polsep.networks.joint import Joint, limit
-from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of, own_order
+from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of
 from polsep.physics.stokes import Stokes, stokes_inverse
-from polsep.sensor.camera import Mosaic
+from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation, orient, shifts_of
 from polsep.separation.analytic import Separation
 
@@ -49,7 +49,7 @@ def run_joint(network: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
     which all samples clip. ``expected_error``: see `Separation`. Raises ValueError on layouts that are not
     Sony's in any orientation.
     """
-    orientation = orient(mosaic, own_order(mosaic.layout))
+    orientation = orient(mosaic, Layout.sony(mosaic.layout.channels))
     if not full and not orientation.keeps_cells:  # then the network's cells are not the frame's
         return _halve(run_joint(network, mosaic, full=True))
     ways = shifts_of(orientation) if network.averages_shifts else (orientation,)

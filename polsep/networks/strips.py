@@ -10,7 +10,6 @@ from collections.abc import Iterator
 
 from polsep.networks.channels import PERIOD
 from polsep.networks.sizes import ResidualSize
-from polsep.sensor.camera import Layout
 
 #: Raw pixels of a frame, or of a strip with its margins, that are processed at once; half as many at full resolution.
 MAX_PIXELS = 6_200_000
@@ -18,11 +17,6 @@ MAX_PIXELS = 6_200_000
 OTHER_REACH = 128
 #: Least expected error that counts when separations are weighed.
 LEAST_ERROR = 1e-5
-
-
-def own_order(layout: Layout) -> Layout:
-    """Sony's order, in colour or mono as the layout is, on which networks are trained."""
-    return Layout(bayer=None) if layout.bayer is None else Layout()
 
 
 def margin_of(size: ResidualSize) -> int:

@@ -17,6 +17,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d
 
+from polsep.light.tiles import filter_weights
+from polsep.networks.channels import PERIOD
 from polsep.networks.thumbnails import COMMON, LIGHT, SIDE, WIDTHS, scale_thumbnail, thumbnail_channels
 from polsep.sensor.camera import Layout
 
@@ -26,14 +28,10 @@ def analysis_weights(layout: Layout) -> Tensor:
 
     s0 = half the sum of the four analysers, s1 = m0 - m90, s2 = m45 - m135; means over the cells of a colour.
     """
-    colors = layout.channels
-    weights = torch.zeros(3, colors, 16)
-    rows = {0.0: (0.5, 1.0, 0.0), 90.0: (0.5, -1.0, 0.0), 45.0: (0.5, 0.0, 1.0), 135.0: (0.5, 0.0, -1.0)}
-    places = [layout.filter_at(k // 4, k % 4) for k in range(16)]
-    for k, (angle_deg, channel) in enumerate(places):
-        cells = sum(other.channel == channel for other in places) / 4
-        weights[:, channel, k] = torch.tensor(rows[angle_deg % 180]) / cells
-    return weights.reshape(3 * colors, 16, 1, 1)
+    weights, colors = torch.zeros(3, layout.channels, PERIOD**2), [f.channel for row in layout.table() for f in row]
+    for k, part in enumerate(filter_weights(layout).values()):
+        weights[:, colors[k], k] = torch.from_numpy(part[:3])
+    return weights.reshape(-1, PERIOD**2, 1, 1)
 
 
 def make_thumbnail(planes: Tensor, masks: Tensor, layout: Layout) -> Tensor:

@@ -88,6 +88,11 @@ class Layout:
             raise ValueError("a mono layout needs no origin: permute its polarizer cell instead")
 
     @classmethod
+    def sony(cls, channels: int) -> Layout:
+        """Sony's order for sensors of 3 colours, or 1 (mono)."""
+        return cls(bayer=None if channels == 1 else "RGGB")
+
+    @classmethod
     def parse(cls, spec: str) -> Layout:
         """A layout from ``color``, ``mono`` or ``"90,45,135,0/RGGB"``: angles in reading order, Bayer order or mono."""
         if not isinstance(spec, str):

@@ -235,7 +235,7 @@ def check_layout(mosaic: Mosaic, seen: Floats | None = None) -> LayoutCheck:
 
 def _stands_upright(mosaic: Mosaic) -> bool:
     """True for a whole frame of a known sensor that was turned or transposed, under a layout that sensors have."""
-    return mosaic.data.shape[-2:] in SENSOR_SIZES and mosaic.layout in (Layout(), Layout(bayer=None))
+    return mosaic.data.shape[-2:] in SENSOR_SIZES and mosaic.layout == Layout.sony(mosaic.layout.channels)
 
 
 def _upright(mosaic: Mosaic) -> str | None:
@@ -331,7 +331,7 @@ def _fitting(
 @lru_cache(maxsize=8)
 def _candidates(layout: Layout) -> tuple[tuple[Layout, str], ...]:
     """The layout and what common mistakes make of it; then other orders of the analysers and mono for colour."""
-    sony = Layout(bayer=layout.bayer and "RGGB")
+    sony = Layout.sony(layout.channels)
     mistakes = [
         (layout, "as given"),
         (sony, "Sony's order"),

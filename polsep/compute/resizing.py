@@ -33,6 +33,12 @@ def block_means(x: Array, side: int) -> Array:
     return xp.mean(xp.mean(blocks_of(x, side), axis=-3), axis=-1)
 
 
+def repeat_pixels(x: Array, times: int) -> Array:
+    """Every pixel so many times in both directions, ``[..., h, w]`` to ``[..., times h, times w]``."""
+    xp = namespace(x)
+    return x if times == 1 else xp.repeat(xp.repeat(x, times, axis=-1), times, axis=-2)
+
+
 def resize_bilinear(x: Array, size: tuple[int, int]) -> Array:
     """The image at ``size`` (height, width), linear between the middles of its pixels and constant beyond them."""
     for axis, count in zip((-1, -2), size[::-1], strict=True):

@@ -37,6 +37,7 @@ from array_api_compat import device
 
 from polsep.compute.arrays import Array, constant, namespace
 from polsep.compute.filters import box_mean
+from polsep.compute.resizing import repeat_pixels
 from polsep.demosaic.bilinear import (
     aligned,
     correlate,
@@ -233,14 +234,14 @@ def _fill_green(mosaic: Array, masks: Array, mask_cells: Array) -> Array:
     total, weights, precision = 0.0, 0.0, 0.0
     for axis in (-1, -2):
         around, second = _across_pairs(mosaic, axis)
-        other = around + _repeat(_slope_of_other(cells, mask_cells[1], axis)) * second
+        other = around + repeat_pixels(_slope_of_other(cells, mask_cells[1], axis), 2) * second
         difference = correlate(xp.where(is_green, mosaic - other, other - mosaic), _GENTLE, axis)
         weight = 1 / (box_mean(mean_cells(correlate(difference, (-1.0, 0.0, 1.0), axis) ** 2), 1) + 1e-6)
-        total, weights = total + _repeat(weight) * difference, weights + weight
+        total, weights = total + repeat_pixels(weight, 2) * difference, weights + weight
         precision = precision + 1 / (box_mean(mean_cells(second) ** 2, 1) + 1e-12)
-    difference = _without_error(total / _repeat(weights), 1 / precision, mask_cells)
+    difference = _without_error(total / repeat_pixels(weights, 2), 1 / precision, mask_cells)
     beside = 0.5 * (correlate(cells, (0.5, 0.0, 0.5), -1) + correlate(cells, (0.5, 0.0, 0.5), -2))
-    return xp.where(is_green, mosaic, _at_least(mosaic + difference, _repeat(beside)))
+    return xp.where(is_green, mosaic, _at_least(mosaic + difference, repeat_pixels(beside, 2)))
 
 
 def _without_error(difference: Array, error: Array, mask_cells: Array) -> Array:
@@ -250,11 +251,11 @@ def _without_error(difference: Array, error: Array, mask_cells: Array) -> Array:
     found = 0.0
     for mask in (mask_cells[0], mask_cells[2]):
         share = box_mean(mask, DIFFERENCE_RADIUS)
-        smooth = _repeat(box_mean(mean_cells(difference) * mask, DIFFERENCE_RADIUS) / share)
+        smooth = repeat_pixels(box_mean(mean_cells(difference) * mask, DIFFERENCE_RADIUS) / share, 2)
         detail = difference - smooth
         variance, noise = (box_mean(x * mask, DIFFERENCE_RADIUS) / share for x in (mean_cells(detail**2), error))
         kept = ((variance - DIFFERENCE_MARGIN * noise) / (variance + 1e-12)).clip(0.0, None)
-        found = found + _repeat(mask) * (smooth + _repeat(kept) * detail)
+        found = found + repeat_pixels(mask, 2) * (smooth + repeat_pixels(kept, 2) * detail)
     return found
 
 
@@ -329,12 +330,6 @@ def _blur(image: Array, taps: tuple[float, ...]) -> Array:
 
 def _blur_stokes(stokes: Stokes, taps: tuple[float, ...]) -> Stokes:
     return stokes.map(lambda image: _blur(image, taps))
-
-
-def _repeat(cells: Array) -> Array:
-    """Every cell's value at its four pixels."""
-    xp = namespace(cells)
-    return xp.repeat(xp.repeat(cells, 2, axis=-1), 2, axis=-2)
 
 
 def _enlarge(image: Array) -> Array:

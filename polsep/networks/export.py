@@ -16,10 +16,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
+from polsep.compute.resizing import repeat_pixels
 from polsep.networks.channels import PERIOD
 from polsep.networks.fill import fill_holes
 from polsep.networks.joint import Joint
-from polsep.networks.run import cells_near_clipping, combine, repeat, run_images
+from polsep.networks.run import cells_near_clipping, combine, run_images
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import CLIP_MARGIN, Layout
 from polsep.separation.analytic import Separation
@@ -81,7 +82,7 @@ class ExportedNetwork(nn.Module):
             found += (self._run_shifted if network.averages_shifts else self._run)(network, samples, clipped)
         whole = combine(found)
         assert whole.expected_error is not None
-        weight = repeat(weigh_clipped(clipped.float(), taps_of(PERIOD), shares_of(self.colors)), self._scale)
+        weight = repeat_pixels(weigh_clipped(clipped.float(), taps_of(PERIOD), shares_of(self.colors)), self._scale)
         along = taps_of(PERIOD * self._scale // 2)
         images = [smooth_planes(image, weight, along) for image in (whole.diffuse, whole.specular)]
         diffuse, specular, error = (x.permute(0, 2, 3, 1) for x in (*images, whole.expected_error))
@@ -101,7 +102,7 @@ class ExportedNetwork(nn.Module):
         """A network's images of whole frames ``[N, 1, H, W]``."""
         diffuse, specular, *_, error, _ = run_images(network, (samples, clipped), None, self.full)
         near = cells_near_clipping(clipped)[:, 1:]
-        error, near = (repeat(x, self._scale) for x in (error, near))
+        error, near = (repeat_pixels(x, self._scale) for x in (error, near))
         return [_separation(diffuse, specular.expand_as(diffuse), ~near[:, 0], error)]
 
     def _run_shifted(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:

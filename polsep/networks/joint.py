@@ -27,6 +27,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, pad, pixel_shuffle, pixel_unshuffle
 
+from polsep.compute.resizing import repeat_pixels
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import MARGIN, guide_once
 from polsep.networks.channels import (
@@ -375,8 +376,7 @@ def _filter(planes: Tensor, weight: Tensor) -> Tensor:
 
 def limit(output: JointOutput) -> tuple[Tensor, Tensor, Tensor]:
     """Diffuse and specular without negative light, and the standard deviation of their errors ``[N, 2, H/2, W/2]``."""
-    brightness = output.local_brightness.repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)
-    error = brightness * torch.exp(0.5 * output.log_variance)
+    error = repeat_pixels(output.local_brightness, 2) * torch.exp(0.5 * output.log_variance)
     return output.diffuse.clamp(min=0), output.specular.clamp(min=0), error
 
 

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from polsep.compute.resizing import repeat_pixels
 from polsep.demosaic.bilinear import mean_cells
 from polsep.networks.joint import Joint, limit
 from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of
@@ -141,12 +142,7 @@ def run_images(network: Joint, strip: tuple[Tensor, Tensor], thumbnail: Tensor |
     """Diffuse, specular, s1, s2, the standard deviations of the errors of both, and the fit residual, of a strip."""
     output = network(*strip, thumbnail)[0] if full else network.half_resolution(*strip, thumbnail)
     diffuse, specular, error = limit(output)
-    return [diffuse, specular, output.s1, output.s2, error, repeat(output.fit_residual, 2)]
-
-
-def repeat(image: Tensor, times: int) -> Tensor:
-    """Every pixel's value ``times`` in both directions."""
-    return image.repeat_interleave(times, dim=-1).repeat_interleave(times, dim=-2) if times > 1 else image
+    return [diffuse, specular, output.s1, output.s2, error, repeat_pixels(output.fit_residual, 2)]
 
 
 def _rows(image: Tensor, rows: tuple[int, int], height: int) -> Tensor:
@@ -169,7 +165,7 @@ def _as_separation(images: list[Tensor], cells: Tensor, orientation: Orientation
     """Turn everything back to the frame's own orientation, and the masks and Stokes images to the images' size."""
     diffuse, specular = images[0], images[1].expand_as(images[0])
     scale = 2 if diffuse.shape[-1] > cells.shape[-1] else 1
-    s1, s2, error, residual, cells = (repeat(x, scale) for x in (*images[2:], cells))
+    s1, s2, error, residual, cells = (repeat_pixels(x, scale) for x in (*images[2:], cells))
     stokes = Stokes(diffuse + specular, s1, s2)
     turned = [orientation.turn_back(x, scale) for x in (diffuse, specular, cells, error, math.sqrt(2) * residual)]
     diffuse, specular, cells, error, residual = turned

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from array_api_compat import device
 
 from polsep.compute.arrays import Array, as_floats, constant, namespace, short_repr
-from polsep.compute.resizing import resize_bilinear
+from polsep.compute.resizing import repeat_pixels, resize_bilinear
 from polsep.physics.stokes import Measurements, Stokes
 
 if TYPE_CHECKING:
@@ -337,7 +337,7 @@ def sample_fine_mosaic(measurements: Measurements, layout: Layout) -> Mosaic:
         k = degrees.index(round(angle, 6))
         fine = resize_bilinear(data[..., k, channel, :, :], (height, width))
         if clipped is not None:
-            mask = xp.repeat(xp.repeat(clipped[..., k, channel, :, :], 2, axis=-1), 2, axis=-2)
+            mask = repeat_pixels(clipped[..., k, channel, :, :], 2)
             fine = xp.where(mask, fine.clip(1, None), fine.clip(None, 1 - 2 * CLIP_MARGIN))
         for row, col in places:
             out[..., row::period, col::period] = fine[..., row::period, col::period]

@@ -19,7 +19,7 @@ import numpy as np
 
 from polsep.compute.arrays import Array, namespace, pad_repeat, to_numpy, window
 from polsep.compute.filters import largest_around
-from polsep.compute.resizing import block_means
+from polsep.compute.resizing import block_means, repeat_pixels
 from polsep.compute.warm_up import make_ready
 from polsep.sensor.camera import Mosaic
 from polsep.separation import clipped_pattern_kernel
@@ -43,7 +43,7 @@ def smooth_separation(separation: Separation, mosaic: Mosaic) -> Separation:
     images = (separation.diffuse, separation.specular)
     xp, clipped = namespace(images[0]), mosaic.clipped()[..., None, rows, cols]
     weight = weigh_clipped(xp.astype(clipped, images[0].dtype), taps_of(PERIOD), shares_of(mosaic.layout.channels))
-    weight = xp.repeat(xp.repeat(weight, scale, axis=-1), scale, axis=-2)
+    weight = repeat_pixels(weight, scale)
     diffuse, specular = (smooth_planes(image, weight, taps_of(PERIOD * scale // 2)) for image in images)
     stokes = replace(separation.stokes, s0=diffuse + specular)
     return replace(separation, diffuse=diffuse, specular=specular, stokes=stokes)

@@ -395,8 +395,10 @@ def light_of(capture: Capture) -> Light:
 
 
 def is_calibrated(capture: Capture) -> bool:
-    """True if a calibration says the colour of the lamp."""
-    return isinstance(capture, Mosaic) and any(gain != 1 for gain in capture.light_color)
+    """True if a calibration says the colour of the lamp, which mono frames have none of."""
+    if not isinstance(capture, Mosaic) or capture.layout.channels == 1:
+        return False
+    return capture.lamp_measured or any(gain != 1 for gain in capture.light_color)
 
 
 def is_to_be_found(light_color: LightColor | str) -> bool:

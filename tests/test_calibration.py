@@ -22,13 +22,16 @@ from test_cli import polsep as run_polsep  # noqa: F401
 import polsep
 from polsep.calibrate.analysers import measure_analysers
 from polsep.calibrate.dark_flat import measure_dark, measure_flat
+from polsep.calibrate.exposures import merge_exposures
 from polsep.calibrate.files import describe
 from polsep.calibrate.lamp import measure_lamp
 from polsep.calibrate.statistics import robust_deviation, robust_mean
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.tiff import write_merged
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration, write_calibration
+from polsep.pipeline import is_calibrated
 from polsep.sensor.calibration import (
     Analyser,
     Calibration,
@@ -384,6 +387,18 @@ def test_ambient_light_is_subtracted() -> None:
 
     less = subtract_ambient(frame(lamp + room), mean_mosaic([frame(room * k) for k in (0.8, 0.9, 1.1, 1.2)]))
     np.testing.assert_allclose(less.data.numpy(), lamp + LEVEL, atol=1e-3)
+
+
+@pytest.mark.parametrize("color", [(1.0, 1.0, 1.0), (0.5, 1.0, 0.7)])
+def test_a_measured_lamp_is_not_sought_in_frames(color: tuple[float, float, float], tmp_path: Path) -> None:
+    """White lamps count as measured too, also in a frame that was merged; mono frames have no colour to measure."""
+    for layout, known in ((Layout(), True), (MONO, False)):
+        raw = Mosaic(np.full(SIZE, 500, np.float32), layout, 0.0, WHITE)
+        assert not is_calibrated(raw)
+        mosaic = correct_mosaic(raw, Calibration(layout, WHITE, lamp=LampFacts(color, None, None)))
+        assert is_calibrated(mosaic) == known
+        write_merged(tmp_path / "merged.tiff", merge_exposures([mosaic]).mosaic, {})
+        assert is_calibrated(next(read_frames(tmp_path / "merged.tiff", ReadOptions())).data) == known
 
 
 def test_histograms_are_of_raw_samples() -> None:

@@ -173,8 +173,9 @@ def correct_mosaic(mosaic: Mosaic, calibration: Calibration) -> Mosaic:
 
 def _with_facts(mosaic: Mosaic, black: float, calibration: Calibration) -> Mosaic:
     """The corrected frame with its black level, the calibrated lamp's colour and the falloff."""
-    light = mosaic.light_color if calibration.lamp is None else calibration.lamp.color
-    return replace(mosaic, black_level=black, light_color=light, falloff=calibration.falloff)
+    if calibration.lamp is not None:
+        mosaic = replace(mosaic, light_color=calibration.lamp.color, lamp_measured=True)
+    return replace(mosaic, black_level=black, falloff=calibration.falloff)
 
 
 def subtract_ambient(mosaic: Mosaic, ambient: Mosaic) -> Mosaic:

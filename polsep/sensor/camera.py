@@ -210,6 +210,7 @@ class Mosaic:
     count as clipped. ``light_color``: one gain per channel that `linear` divides out, so that what follows sees white
     light. ``falloff``: the smooth part of a calibrated sensor's flat frame (`calibration.falloff_image`), by which
     separated images are divided. ``less_ambient``: another frame was subtracted, and noise goes far below black.
+    ``lamp_measured``: ``light_color`` is that of a calibrated lamp, also where it is white.
     Raises ValueError when white is not above black or the frame is smaller than one period.
     """
 
@@ -220,6 +221,7 @@ class Mosaic:
     light_color: tuple[float, ...] = (1.0, 1.0, 1.0)
     falloff: tuple[tuple[float, ...], ...] | None = None
     less_ambient: bool = False
+    lamp_measured: bool = False
 
     __repr__ = short_repr
 

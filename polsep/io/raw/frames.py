@@ -248,7 +248,7 @@ def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, t
     if page.merged is not None and isinstance(data, Mosaic):
         if options.corrections is not None and options.corrections.calibration is not None:
             raise ValueError("expected --calibration with 'polsep merge', found it with a frame that is merged already")
-        data = replace(data, light_color=page.merged.light_color, falloff=page.merged.falloff)
+        data = replace(data, **page.merged._asdict())
     if options.corrections is None:
         return data, notes
     if isinstance(data, Measurements):

@@ -20,6 +20,7 @@ class MergedFacts(NamedTuple):
 
     light_color: tuple[float, ...]
     falloff: tuple[tuple[float, ...], ...] | None
+    lamp_measured: bool
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ def _as_merged(facts: dict[str, Any]) -> MergedFacts:
         raise InputError(f"expected a light of one or three colours, found {len(color)}")
     require_gains("light colour", color)
     require_falloff(falloff)
-    return MergedFacts(color, falloff)
+    return MergedFacts(color, falloff, facts.get("lamp_measured") is True)  # earlier files lack it
 
 
 def write_merged(path: Path, mosaic: Mosaic, facts: Mapping[str, Any]) -> None:
@@ -137,6 +137,7 @@ def write_merged(path: Path, mosaic: Mosaic, facts: Mapping[str, Any]) -> None:
         "white_level": 1,
         "light_color": mosaic.light_color,
         "falloff_legendre": mosaic.falloff,
+        "lamp_measured": mosaic.lamp_measured,
         **facts,
     }
     with atomic_path(path) as part:

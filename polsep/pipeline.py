@@ -11,7 +11,7 @@ import math
 import os
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -140,7 +140,7 @@ def separate(
 
     Images are ``[H/2, W/2, C]``, the mean over each 2x2 polarizer cell; ``full=True`` gives ``[H, W, C]``. ``layout``
     None is Sony's colour order; text is "color", "mono" or a `Layout.spec`. ``white_level`` None is the dtype's maximum
-    (1.0 for float): 12-bit codes in uint16 need 4095 said; moved to the left, to 65520, they need nothing.
+    (1.0 for float): 12-bit codes in uint16 need 4095; moved to the left, to 65520, they need nothing.
     ``calibration``: a file of `polsep calibrate`, applied first. ``ambient``: a raw frame with the lamp off, or
     several, subtracted. ``light_color``: "auto" finds it in the frame (`find_light`), or "white", or camera RGB of the
     light. ``raw`` may also be four angle images at 0, 45, 90, 135 degrees, ``[4, H, W]`` or ``[4, H, W, 3]``, which
@@ -349,8 +349,8 @@ def move_capture(capture: Capture, device: str) -> Capture:
 def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[SeparatedFrame, list[str]]:
     """A frame that was separated before, with the report beside its file, and notes for the user, a line each.
 
-    ``light_color`` of the report is the one that is told here, else the one beside the file; where nobody says it, it
-    is left out and a note says so. Raises InputError on what cannot be read.
+    ``light_color`` of the report is the one that is stated here, else the one beside the file; without either it is
+    left out and a note says so. Raises InputError on what cannot be read.
     """
     from polsep.io.results.separation_reader import read_separated
     from polsep.io.results.sidecars import read_report
@@ -358,14 +358,14 @@ def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[
     frame = replace(read_separated(path), report=read_report(path))
     notes = list(frame.report.get("warnings", ()))
     if not is_to_be_found(light_color):
-        frame.report["light_color"] = told_gains(light_color, frame.diffuse.shape[-1])
+        frame.report["light_color"] = stated_gains(light_color, frame.diffuse.shape[-1])
     elif "light_color" not in frame.report:
         notes.append(f"the lamp's colour is not told, nor known from {path.stem}.json beside the file: taken for white")
     return frame, notes
 
 
-def told_gains(light_color: LightColor | str, channels: int) -> list[float]:
-    """One gain per channel of a light whose colour is told: three numbers or "white"; mono has one channel.
+def stated_gains(light_color: LightColor | str, channels: int) -> list[float]:
+    """One gain per channel of a light whose colour is stated: three numbers or "white"; mono has one channel.
 
     Green is 1, as in lights that are found: of a colour only the ratios count, in whatever unit it was measured.
     """
@@ -379,14 +379,21 @@ def parse_light_color(text: str) -> LightColor | str:
     """The light's colour as people write it: ``R,G,B``, ``white``, ``auto`` or ``estimate``. Raises ValueError."""
     if text in LIGHT_WORDS:
         return text
-    expected = 'expected a light colour R,G,B like 1,0.9,0.7, "white" or "auto"'
+    color = _as_color(text.split(","))
+    if color is None:
+        raise ValueError(
+            f'expected a light colour R,G,B like 1,0.9,0.7, all positive, "white" or "auto", found {text!r:.40}'
+        )
+    return color
+
+
+def _as_color(parts: Iterable[Any]) -> tuple[float, ...] | None:
+    """Three positive numbers of a light's colour; None of anything else. Raises TypeError on what are no parts."""
     try:
-        r, g, b = (float(part) for part in text.split(","))
+        color = tuple(float(part) for part in parts)
     except ValueError:
-        raise ValueError(f"{expected}, found {text!r:.40}") from None
-    if not all(1e-6 < c < 1e6 for c in (r, g, b)):
-        raise ValueError(f"{expected}, all positive, found {text!r:.40}")
-    return (r, g, b)
+        return None
+    return color if len(color) == 3 and all(1e-6 < c < 1e6 for c in color) else None
 
 
 def light_of(capture: Capture) -> Light:
@@ -409,7 +416,7 @@ def is_to_be_found(light_color: LightColor | str) -> bool:
 def resolve_light(
     light_color: LightColor | str, capture: Capture
 ) -> tuple[tuple[float, ...], dict[str, Any], tuple[str, ...]]:
-    """One gain per channel, green 1, what the report says of the light, found in the frame or told, and remarks on it.
+    """One gain per channel, green 1, the report's entry on the light, found in the frame or stated, and remarks on it.
 
     "auto" takes what a calibration says, else what the frame shows. Raises ValueError on anything but three positive
     numbers or one of `LIGHT_WORDS`.
@@ -420,17 +427,16 @@ def resolve_light(
     if is_to_be_found(light_color) and not is_calibrated(capture):
         found = find_light(capture)
         return found.color if channels == 3 else (1.0,), {"source": "found", **found.describe()}, found.remarks
-    told = light_color
-    if isinstance(told, str):
-        told = capture.light_color if isinstance(capture, Mosaic) and told != "white" else (1.0, 1.0, 1.0)
+    stated, source = light_color, "told"
+    if isinstance(light_color, str):
+        stated = (1.0, 1.0, 1.0)
+        if isinstance(capture, Mosaic) and light_color != "white":
+            stated, source = capture.light_color, "calibrated"
     try:
-        color = tuple(float(c) for c in told)
+        color = _as_color(stated)
     except TypeError:
         raise WrongType(f"expected a light colour of three positive numbers, found {light_color!r:.40}") from None
-    except ValueError:
-        color = ()
-    if len(color) != 3 or not all(1e-6 < c < 1e6 for c in color):
+    if color is None:
         raise ValueError(f"expected a light colour of three positive numbers, found {light_color!r}")
-    color = tuple(told_gains(color, channels))
-    source = "calibrated" if isinstance(light_color, str) and light_color != "white" else "told"
-    return color, {"source": source, "color": list(color)}, ()
+    gains = stated_gains(color, channels)
+    return tuple(gains), {"source": source, "color": gains}, ()

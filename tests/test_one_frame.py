@@ -61,7 +61,7 @@ from polsep.networks.shape import ShapeNetwork
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.fresnel import diffuse_dolp
 from polsep.physics.stokes import Stokes
-from polsep.pipeline import told_gains
+from polsep.pipeline import stated_gains
 from polsep.render.blobs import random_blob
 from polsep.sensor.camera import IDEAL, Layout, Mosaic, expose
 from polsep.separation.report import SeparatedFrame
@@ -564,9 +564,11 @@ def test_a_lamp_that_is_told_goes_before_the_file_beside(tmp_path: Path, beside:
     ("light", "channels", "gains"),
     [("white", 3, [1, 1, 1]), ((2, 1, 0.5), 3, [2, 1, 0.5]), ((2, 1, 0.5), 1, [1]), ((512, 256, 128), 3, [2, 1, 0.5])],
 )
-def test_told_lamps_have_a_gain_per_channel(light: str | tuple[float, ...], channels: int, gains: list[float]) -> None:
+def test_stated_lamps_have_a_gain_per_channel(
+    light: str | tuple[float, ...], channels: int, gains: list[float]
+) -> None:
     """Mono has one, whatever the colour; green is 1, whatever the unit."""
-    assert told_gains(light, channels) == gains
+    assert stated_gains(light, channels) == gains
 
 
 def raw_sphere() -> NDArray[np.uint16]:

@@ -60,11 +60,11 @@ class Tiles(NamedTuple):
     @property
     def colors(self) -> int:
         """C: 3, or 1 for mono."""
-        return self.noise.shape[1]
+        return int(self.noise.shape[1])
 
     def select(self, chosen: NDArray[np.bool_ | np.int64]) -> Tiles:
         """Return the ``chosen`` tiles: a mask ``[T]``, or their numbers."""
-        return Tiles(*(values[chosen] for values in self))
+        return Tiles(self.moments[chosen], self.noise[chosen], self.counts[chosen], self.place[chosen])
 
 
 def taps(offset: int) -> tuple[float, float, float]:

@@ -32,7 +32,7 @@ STAGES = {
         "fill_under_highlights",
         "make_frame",
     ),
-    "sensor.checks": ("see_phases", "check_black_level", "encoding_warning", "check_layout", "remove_defects"),
+    "sensor.checks": ("phase_means", "check_black_level", "encoding_warning", "check_layout", "remove_defects"),
     "sensor.defects": ("make_rules",),
     "sensor.defects_kernel": ("find_candidates", "confirm"),
     "light.find": ("find_tiles", "_light_of_tiles"),

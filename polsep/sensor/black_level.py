@@ -1,4 +1,4 @@
-"""The black level that a frame shows by itself, compared with the one that was said.
+"""The black level that a frame shows by itself, compared with the one that was stated.
 
 Light brings noise: a sample of light x above black has the variance gain x + floor (photon transfer). Dark parts whose
 noise is far smaller than their level asks for are dark: their level is the black level. Two laws must agree:
@@ -6,7 +6,7 @@ noise is far smaller than their level asks for are dark: their level is the blac
 1. Nothing lies below black but noise: the darkest samples stop at it.
 2. The variance of smooth parts falls to the converter's and the reading's own at it, on a line through brighter parts.
 
-Frames with samples near the black level that was said are never in doubt. Unit: codes, as in `Mosaic.data`.
+Frames with samples near the black level that was stated are never in doubt. Unit: codes, as in `Mosaic.data`.
 Source: photon transfer, Janesick 2007 (doi:10.1117/3.725073); the test is this project's.
 """
 
@@ -36,7 +36,7 @@ QUIET = 0.35
 LEAST_NOISE, LARGEST_WELL = 0.6, 20_000.0
 #: Least noise of bright parts, over that of the same sensor.
 MIN_GAIN = 0.5
-#: Least black level that is told, and the least excess of one that was said, relative to white.
+#: Least black level that is reported, and the least excess of one that was stated, relative to white.
 LEAST, LEAST_EXCESS = 0.0015, 0.002
 #: Share of codes below black from which on too much is subtracted; corrected samples may be negative.
 BELOW = 0.002
@@ -52,27 +52,27 @@ class BlackLevel:
 
 def check_black_level(mosaic: Mosaic) -> BlackLevel:
     """Compare the first frame with its black level; silent where the frame does not show it."""
-    said, span = float(mosaic.black_level), float(mosaic.white_level - mosaic.black_level)
+    stated, span = float(mosaic.black_level), float(mosaic.white_level - mosaic.black_level)
     if min(mosaic.data.shape[-2:]) < 4 * BLOCK:
         return BlackLevel(None, None)
     rows = _some_rows(mosaic)
-    least, lowest = said - LEAST_EXCESS * span, float(rows.min())
+    least, lowest = stated - LEAST_EXCESS * span, float(rows.min())
     below = float(np.mean(rows < least)) if 0 <= lowest < least and not mosaic.less_ambient else 0.0
-    if below > BELOW and not _shows(mosaic, said, rows):
-        excess = f"{below:.1%} of the samples lie below the black level {said:g}, which only noise should"
+    if below > BELOW and not _shows(mosaic, stated, rows):
+        excess = f"{below:.1%} of the samples lie below the black level {stated:g}, which only noise should"
         return BlackLevel(None, f"{excess}: the darkest are at {np.quantile(rows, 0.001):g}, say a lower --black-level")
     level = _black_of(mosaic, rows)
-    if level is None or level - said < LEAST * span:
+    if level is None or level - stated < LEAST * span:
         return BlackLevel(None, None)
-    shown = f"black lies at {level:.4g}, not at {said:g}, as the noise of dark parts shows"
-    advice = "taken so, say" if said == 0 else "say"
+    shown = f"black lies at {level:.4g}, not at {stated:g}, as the noise of dark parts shows"
+    advice = "taken so, say" if stated == 0 else "say"
     return BlackLevel(level, f"{shown}: {advice} --black-level {level:.4g}")
 
 
-def _shows(mosaic: Mosaic, said: float, rows: Floats) -> bool:
-    """True if the dark parts of a frame show the black level that was said, or more: below are tails of their noise."""
+def _shows(mosaic: Mosaic, stated: float, rows: Floats) -> bool:
+    """True if the dark parts of a frame show the stated black level, or more: below are tails of their noise."""
     level = _black_of(replace(mosaic, black_level=0.0), rows)
-    return level is not None and level > said - LEAST * float(mosaic.white_level - said)
+    return level is not None and level > stated - LEAST * float(mosaic.white_level - stated)
 
 
 def _some_rows(mosaic: Mosaic) -> Floats:
@@ -86,12 +86,12 @@ def _some_rows(mosaic: Mosaic) -> Floats:
 
 def _black_of(mosaic: Mosaic, rows: Floats) -> float | None:
     """The level of the darkest parts if they are black, by their noise; None where that is not shown."""
-    said, span = float(mosaic.black_level), float(mosaic.white_level - mosaic.black_level)
+    stated, span = float(mosaic.black_level), float(mosaic.white_level - mosaic.black_level)
     level, variance = smooth_blocks(mosaic, rows)
     if level.size < 4 * MIN_BLOCKS or not _is_codes(mosaic, rows):
         return None
     count = max(MIN_BLOCKS, int(DARKEST * level.size))
-    if float(np.median(np.partition(level, count - 1)[:count])) - said < LEAST * span:
+    if float(np.median(np.partition(level, count - 1)[:count])) - stated < LEAST * span:
         return None
     order = np.argsort(level)
     level, variance = level[order], variance[order]
@@ -110,7 +110,7 @@ def _black_of(mosaic: Mosaic, rows: Floats) -> float | None:
     gain = float(np.quantile(gains, 0.25))
     if gain < MIN_GAIN * span / LARGEST_WELL:
         return None
-    if quiet > (dark - said) * min(QUIET * gain, LEAST_NOISE * span / LARGEST_WELL):
+    if quiet > (dark - stated) * min(QUIET * gain, LEAST_NOISE * span / LARGEST_WELL):
         return None
     return float(np.median(level[level <= dark + 4 * (quiet / BLOCK**2) ** 0.5]))
 

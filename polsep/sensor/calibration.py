@@ -38,7 +38,7 @@ Floats = NDArray[np.float32]
 LIT, LEAST_LEFT, MOST_GONE = 0.02, 0.05, 0.5
 #: Numbers per place of one period of filters, ``[period][period]``.
 Table = tuple[tuple[float, ...], ...]
-#: A black level that is said may differ from the measured one by rounding to whole codes.
+#: A black level that is stated may differ from the measured one by rounding to whole codes.
 ROUNDED_LEVEL = 0.51
 
 
@@ -115,26 +115,26 @@ class Calibration:
         known = [pixels for pixels in (self.hot, self.dead) if pixels is not None]
         return np.unique(np.concatenate(known)).astype(np.int32) if known else np.zeros(0, np.int32)
 
-    def require_black_level(self, said: float, name: str) -> None:
-        """Raise ValueError where a black level is said that is not the measured one; ``name``: of what says it."""
-        if not isinstance(said, Real):
-            raise WrongType(f"expected a black level that is a number, found {said!r:.40}")
-        if said and self.black_level is not None and abs(said - self.black_level) > ROUNDED_LEVEL:
+    def require_black_level(self, stated: float, name: str) -> None:
+        """Raise ValueError on a stated black level that is not the measured one; ``name``: of its option."""
+        if not isinstance(stated, Real):
+            raise WrongType(f"expected a black level that is a number, found {stated!r:.40}")
+        if stated and self.black_level is not None and abs(stated - self.black_level) > ROUNDED_LEVEL:
             measured = f"{self.black_level:.4g}, which a calibration of the dark measured"
-            raise ValueError(f"expected no {name} but {measured}, found {name} {said:g}")
+            raise ValueError(f"expected no {name} but {measured}, found {name} {stated:g}")
 
     def white_level_of(self, array: NDArray[Any]) -> float | None:
         """The calibrated white level for raw frames that do not say theirs; None where their type cannot hold it."""
         fits = self.white_level <= WHITE_LEVELS.get(getattr(array, "dtype", np.dtype(bool)).name, 0.0)
         return self.white_level if fits else None
 
-    def black_level_of(self, array: NDArray[Any], said: float, white_level: float | None) -> float:
-        """The measured black level in the unit of raw frames of a white level, None that of their type; else ``said``.
+    def black_level_of(self, array: NDArray[Any], stated: float, white_level: float | None) -> float:
+        """The measured black level in the unit of raw frames of a white level, None: of their type; else ``stated``.
 
         So that a frame's exposure is judged by the light above it.
         """
         white = WHITE_LEVELS.get(array.dtype.name) if white_level is None else white_level
-        return said if self.black_level is None or white is None else self.black_level * white / self.white_level
+        return stated if self.black_level is None or white is None else self.black_level * white / self.white_level
 
 
 def correct_mosaic(mosaic: Mosaic, calibration: Calibration) -> Mosaic:

@@ -1,6 +1,6 @@
-"""All checks of one raw frame, in order: black level, encoding, filter layout, defects; and what is put right.
+"""All checks of one raw frame, in order: black level, encoding, filter layout, defects; and the corrected frame.
 
-A frame that is encoded, or whose black level is too large, contradicts every layout: then nothing is said of layouts.
+A frame that is encoded, or whose black level is too large, contradicts every layout: then layouts are not judged.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from polsep.sensor.black_level import check_black_level
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import remove_defects
 from polsep.sensor.encoding import encoding_warning
-from polsep.sensor.layout_check import check_layout, see_phases
+from polsep.sensor.layout_check import check_layout, phase_means
 from polsep.sensor.levels import overexposure_notes
 
-#: Share of pixels that are defects from which on the owner is told.
+#: Share of pixels that are defects from which on the owner is warned.
 MANY_DEFECTS = 5e-4
 
 
 @dataclass(frozen=True)
 class CheckedMosaic:
-    """The frame, put right where it was sure; ``report``: number of defects, black level; ``warnings``, a line each."""
+    """The frame, corrected where sure; ``report``: number of defects, black level; ``warnings``: a line each."""
 
     mosaic: Mosaic
     report: dict[str, Any]
@@ -31,21 +31,18 @@ class CheckedMosaic:
 
 
 def check_mosaic(mosaic: Mosaic) -> CheckedMosaic:
-    """One frame ``[H, W]`` with its defects repaired and, where 0 was said, the black level that it shows.
+    """One frame ``[H, W]`` with its defects repaired and, where 0 was stated, the black level that it shows.
 
-    The same object where nothing was found. Of a batch only the layout of the first frame is checked.
+    The same object where nothing was found. Raises ValueError on a batch.
     """
-    if mosaic.data.ndim != 2:
-        warning = check_layout(mosaic).warning
-        return CheckedMosaic(mosaic, {}, (warning,) if warning else ())
-    phases = see_phases(mosaic)
+    phases = phase_means(mosaic)
     black, encoded, exposure = check_black_level(mosaic), encoding_warning(mosaic, phases), list[str]()
     if black.level is not None and mosaic.black_level == 0:
         samples, white = to_numpy(mosaic.data), float(mosaic.white_level)
-        if not overexposure_notes(samples, 0.0, white):  # else it was said where the levels were
+        if not overexposure_notes(samples, 0.0, white):  # else the reader has noted it
             exposure += overexposure_notes(samples, black.level, white)
         mosaic = replace(mosaic, black_level=black.level)
-        phases = see_phases(mosaic)
+        phases = phase_means(mosaic)
     understood = encoded is None and (black.warning is None or black.level is not None)
     layout = check_layout(mosaic, phases).warning if understood else None
     mosaic, count = remove_defects(mosaic)

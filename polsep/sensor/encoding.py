@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from polsep.compute.arrays import to_numpy
 from polsep.sensor.black_level import smooth_blocks
 from polsep.sensor.camera import Mosaic
-from polsep.sensor.layout_check import crossed_pairs, phase_cells, see_phases
+from polsep.sensor.layout_check import crossed_pairs, phase_cells, phase_means
 from polsep.sensor.noise import MIN_SPAN
 
 Floats = NDArray[np.float32]
@@ -43,9 +43,9 @@ JPEG_WHITE = 255.0
 SIDE, BLOCKS, MAX_RATIO = 8, 8192, 0.87
 
 
-def encoding_warning(mosaic: Mosaic, seen: Floats | None = None) -> str | None:
+def encoding_warning(mosaic: Mosaic, phases: Floats | None = None) -> str | None:
     """A line on samples that are gamma-encoded or were JPEG files, or None; the first frame of a batch."""
-    slope = gamma_slope(mosaic, seen)
+    slope = gamma_slope(mosaic, phases)
     bent = slope is not None and MIN_SLOPE < slope < MAX_SLOPE
     rise = noise_exponent(mosaic) if bent else None
     if rise is not None and rise < MAX_EXPONENT:
@@ -62,16 +62,16 @@ def encoding_warning(mosaic: Mosaic, seen: Floats | None = None) -> str | None:
     return None
 
 
-def gamma_slope(mosaic: Mosaic, seen: Floats | None = None) -> float | None:
+def gamma_slope(mosaic: Mosaic, phases: Floats | None = None) -> float | None:
     """Slope of the analysers' contradiction, (g - 1) / g for samples encoded by m^g; None where light shows none."""
     pairs = crossed_pairs(mosaic.layout)
     if pairs is None or min(mosaic.data.shape[-2:]) < MIN_SIDE:
         return None
-    cells = phase_cells(mosaic, see_phases(mosaic) if seen is None else seen)
+    cells = phase_cells(phase_means(mosaic) if phases is None else phases, mosaic.layout.origin)
     order = {"diagonals": (0, 3, 1, 2), "rows": (0, 1, 2, 3), "columns": (0, 2, 1, 3)}[pairs]
     a, b, c, d = (cells[:, k].ravel() for k in order)
     middle = (a + b + c + d) / 4
-    kept = middle > 0.02
+    kept = middle > MIN_LEVEL
     (p, r, s, t), mean = (np.array(values, np.float64)[..., kept] for values in ((a, b, c, d), middle))
     q, u = p - r, s - t
     polarized = np.hypot(q, u) / (2 * mean)

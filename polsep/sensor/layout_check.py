@@ -46,7 +46,7 @@ MIN_RATIO = 2.0
 MIN_COLOR, MAX_MONO, EVEN = 0.03, 0.02, 0.007
 #: Differences are those of filters where blocks agree: with their neighbours, or all of them. Rendered and real mono
 #: frames, where texture makes the differences: up to 0.36 with neighbours, and 0.09 of all; colour frames 0.45 or more
-#: of either, but for grey things and small objects, of which nothing is said.
+#: of either, but for grey things and small objects, which are not judged.
 MIN_AGREEMENT, MIN_COMMON, MAX_DISAGREEMENT, MAX_COMMON = 0.4, 0.25, 0.25, 0.1
 #: Fewest blocks whose disagreement says something, and how much more than at any other alignment cells must differ.
 MIN_BLOCKS, MIN_EXCESS = 60, 1.15
@@ -58,7 +58,7 @@ CHANCE = 1.6
 #: Ratio to all other alignments that shows colour without agreement. Mono frames: up to 2.1.
 FAR = 2.2
 
-#: Quantile of brightness that may be a black level nobody said, and the largest share of the mean that is taken for it.
+#: Quantile of brightness that may be a black level nobody stated, and the largest share of the mean taken for it.
 DARK, MAX_DARK = 0.01, 0.8
 
 #: Strips of a large frame, rows of one, a multiple of the blocks' 16, and how many times that a frame has to have.
@@ -112,7 +112,7 @@ def _strips(mosaic: Mosaic) -> list[Floats]:
     return [to_numpy(frame[top : top + size]).astype(np.float32, copy=False) for top in tops]
 
 
-def _phase_means(mosaic: Mosaic, data: Floats) -> Floats:
+def _strip_means(mosaic: Mosaic, data: Floats) -> Floats:
     """Means ``[4, 4, blocks]`` of each pixel of the 4x4 period over 16x16 blocks, gradients removed.
 
     ``data [H, W]``: samples of the mosaic. Blocks with clipped samples are left out. Codes are pooled and their means
@@ -144,7 +144,7 @@ def _gradient(x: Floats, axis: int) -> Floats:
     return np.zeros_like(x) if x.shape[axis] < 2 else np.gradient(x, axis=axis)
 
 
-def _cells(phases: Floats, origin: tuple[int, int]) -> Floats:
+def phase_cells(phases: Floats, origin: tuple[int, int]) -> Floats:
     """The four cells of a Bayer block and their four pixels, ``[4 cells, 4 pixels, blocks]``, for an alignment."""
     turned = np.roll(phases, (-origin[0], -origin[1]), (0, 1))
     blocks = phases.shape[-1]
@@ -179,7 +179,7 @@ class ColorPattern(NamedTuple):
 
 
 def _color_pattern(cells: Floats, dark: float) -> ColorPattern:
-    """Difference of the cells of one alignment; ``dark``: brightness of all samples, as of a black level not said."""
+    """Difference of the cells of one alignment; ``dark``: brightness of all samples, as of a black level not stated."""
     brightness = cells.mean(1)
     differences = np.stack(list(_PAIRINGS.values())) @ brightness / 4
     _, rows, columns = differences
@@ -194,26 +194,27 @@ def _color_pattern(cells: Floats, dark: float) -> ColorPattern:
     return ColorPattern(contrast, agreement, common, float((rows * columns).sum()) / max(power, 1e-12), size.size)
 
 
-def see_phases(mosaic: Mosaic) -> Floats:
-    """Means ``[4, 4, blocks]`` that all checks of filters look at: of the first frame, of a large one some strips."""
+def phase_means(mosaic: Mosaic) -> Floats:
+    """Means ``[4, 4, blocks]`` of each pixel of the 4x4 period, linear: of the first frame, of a large one some strips.
+
+    All checks of filters compare them. See `_strip_means`; frames of less than 16 pixels have no blocks.
+    """
     if min(mosaic.data.shape[-2:]) < 16:
         return np.zeros((4, 4, 0), np.float32)
     make_ready(periods_kernel.warm_up)
-    return np.concatenate([_phase_means(mosaic, strip) for strip in _strips(mosaic)], -1)
+    return np.concatenate([_strip_means(mosaic, strip) for strip in _strips(mosaic)], -1)
 
 
-def phase_cells(mosaic: Mosaic, phases: Floats) -> Floats:
-    """Mean samples ``[cells, 4, blocks]`` of the polarizer cells, linear."""
-    return _cells(phases, mosaic.layout.origin)
+def check_layout(mosaic: Mosaic, phases: Floats | None = None) -> LayoutCheck:
+    """Compare a frame (the first of a batch) with its own layout; never raises, and stays silent when in doubt.
 
-
-def check_layout(mosaic: Mosaic, seen: Floats | None = None) -> LayoutCheck:
-    """Compare a frame (the first of a batch) with its own layout; never raises, and stays silent when in doubt."""
-    phases = see_phases(mosaic) if seen is None else seen
+    ``phases``: its `phase_means`, where they are known.
+    """
+    phases = phase_means(mosaic) if phases is None else phases
     if phases.shape[-1] < 16 or float(phases.mean()) <= 1e-4:
         return LayoutCheck(None, None, None, (mosaic.layout,))
     color, origin, greens = _find_color(phases, mosaic.layout)
-    contradiction = _contradictions(_cells(phases, origin))
+    contradiction = _contradictions(phase_cells(phases, origin))
     pairs = _find_pairs(contradiction, mosaic.layout)
     fits = _fitting(mosaic.layout, color, origin, greens, pairs)
     layouts = tuple(fits)
@@ -226,8 +227,8 @@ def check_layout(mosaic: Mosaic, seen: Floats | None = None) -> LayoutCheck:
         likely, reason = next(((turn, why) for turn, why in _reversed(mosaic.layout) if turn in fits), (likely, reason))
     option = f"--layout {'mono' if likely == Layout(bayer=None) else likely.spec} ({reason})"
     if color is False and mosaic.layout.bayer is not None:
-        said = f"the frame shows no colour pattern: unless all it shows is grey, say {option}"
-        return LayoutCheck(said, pairs, color, layouts)
+        warning = f"the frame shows no colour pattern: unless all it shows is grey, say {option}"
+        return LayoutCheck(warning, pairs, color, layouts)
     return LayoutCheck(
         f"the frame contradicts layout {mosaic.layout.spec}: it fits {option}, the likeliest", pairs, color, layouts
     )
@@ -280,7 +281,7 @@ def _find_color(phases: Floats, layout: Layout) -> tuple[bool | None, tuple[int,
     dark = dark if dark < MAX_DARK * float(brightness.mean()) else 0.0
     phases = phases[..., brightness - dark > 0.1 * (brightness.mean() - dark)]
     origins = [(0, 0), (0, 1), (1, 0), (1, 1)]
-    found = {origin: _color_pattern(_cells(phases, origin), dark) for origin in origins}
+    found = {origin: _color_pattern(phase_cells(phases, origin), dark) for origin in origins}
     best = max(origins, key=lambda origin: found[origin].contrast)
     pattern = found[best]
     others = [found[origin].contrast for origin in origins if origin != best]

@@ -55,7 +55,7 @@ Notes = tuple[str, ...]
 
 
 class ForgottenLevel(str):
-    """A note on samples whose white level nobody said and is likely another: images would be far too dark or clipped.
+    """A note on samples whose white level nobody stated and is likely another: images would be far too dark or clipped.
 
     Python's callers are warned; commands that write files refuse such a frame (`io.raw.frames.refuse_forgotten`).
     """
@@ -170,8 +170,8 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
     elif high >= clip:
         notes += overexposure_notes(samples, black_level, white)
     if white_level is None and samples.dtype.kind == "f" and high > 2:
-        said = f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white"
-        return (*notes, ForgottenLevel(said))
+        note = f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white"
+        return (*notes, ForgottenLevel(note))
     if samples.dtype.kind == "f" and high <= 2 < white and high - black_level < MIN_USED * (white - black_level):
         notes += (f"float values reach {high:g} of white level {white:g}: is white 1? Then leave out --white-level",)
     if np.float32(high) > np.float32(white):

@@ -6,7 +6,7 @@ gradient of brightness therefore agree, whatever the lamp. A frame that was tran
 the layout it had before, shows them at right angles.
 
 In colour frames p_c = a s0_c + b (docs/conventions.md): how p = s1 + i s2 varies with s0 over the colours gives a, the
-polarization from inside, without the specular light. Mono frames have no such contrast, and nothing is said of them.
+polarization from inside, without the specular light. Mono frames have no such contrast, and are not judged.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MIN_AGREEMENT, CERTAIN = 0.1, 3.5
 def lies_across(mosaic: Mosaic) -> bool:
     """True if the polarization from inside lies across the slopes in the frame (the first of a batch), beyond doubt.
 
-    False where nothing can be said: mono frames, light without a polarizer, grey, flat, black and small things.
+    False where nothing can be judged: mono frames, light without a polarizer, grey, flat, black and small things.
     """
     top, left = mosaic.layout.origin
     frame = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0, top:, left:]

@@ -32,7 +32,7 @@ from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWri
 from polsep.io.store.atomic import refuse_inputs
 from polsep.io.store.errors import InputError
 from polsep.light.find import Light, combine
-from polsep.methods import Capture, find_method
+from polsep.methods import find_method
 from polsep.pipeline import (
     LightColor,
     find_device,
@@ -129,7 +129,7 @@ class FirstFrame:
 
 
 @dataclass(frozen=True)
-class Result:
+class SeparatedImages:
     """Diffuse and specular images of a separated frame, and its ``report``; Stokes images on request."""
 
     images: Images
@@ -138,17 +138,12 @@ class Result:
 
 
 class Job(NamedTuple):
-    """A frame to separate on a ``device``, how it was ``taken`` (`Frame.taken`), with Stokes images or without.
+    """A frame to separate on a ``device`` like the ``first`` one, with Stokes images or without."""
 
-    ``notes``: on its samples (`Frame.notes`).
-    """
-
-    data: Capture
+    frame: Frame
     first: FirstFrame
     device: str
-    taken: dict[str, Any]
     stokes: bool
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -156,7 +151,7 @@ class Separated:
     """The result of a frame, or its damage, and the state of the temporal filter after it, if there is one."""
 
     index: int
-    result: Result | DamagedFrame
+    result: SeparatedImages | DamagedFrame
     state: TemporalState | None
 
 
@@ -247,8 +242,8 @@ def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Fram
     refuse_forgotten(recording.stem, frame)
     shape = tuple(frame.data.data.shape)
     spread = islice(recording.begin(frame.index), 0, PART, LIGHT_STEP)
-    told, found = _light_of(_intact(spread, shape, options), options)
-    separated = separate_capture(frame.data, options.method, told, options.device)
+    light_color, found = _light_of(_intact(spread, shape, options), options)
+    separated = separate_capture(frame.data, options.method, light_color, options.device)
     gain = exposure_of(separated.diffuse + separated.specular)
     light = tuple(float(c) for c in separated.report["light_color"])
     size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
@@ -285,9 +280,9 @@ def _of_one_size(frame: Frame | DamagedFrame, shape: tuple[int, ...]) -> Frame |
 
 
 def _light_of(frames: Iterator[Frame], options: VideoOptions) -> tuple[LightColor | str, Light | None]:
-    """Colour of the light as told, or as ``frames`` of the first part show it; and what was found, for reports.
+    """Colour of the light as stated, or as ``frames`` of the first part show it; and the light found, for reports.
 
-    None where nothing is to be found: the colour was told, or a calibration says it, or frames are mono.
+    None where nothing is to be found: the colour is stated, or a calibration has it, or frames are mono.
     """
     if not is_to_be_found(options.light_color):
         return options.light_color, None
@@ -371,8 +366,7 @@ def separate_here(
         if isinstance(frame, DamagedFrame):
             return Separated(frame.index, frame, after)
         with own_threads(cores // workers):
-            job = Job(frame.data, first, device, frame.taken(), options.stokes, frame.notes)
-            return Separated(frame.index, separate_one(job), after)
+            return Separated(frame.index, separate_one(Job(frame, first, device, options.stokes)), after)
 
     with closing(ahead(_prepared(recording, options, first, begin, state), 1)) as frames:
         yield from map_ahead(separate, frames, workers)
@@ -389,7 +383,7 @@ def separate_on_ray(
         for frame, after in frames:
             submitted.append((frame if isinstance(frame, DamagedFrame) else frame.index, after))
             if not isinstance(frame, DamagedFrame):
-                yield Job(frame.data, first, device, frame.taken(), options.stokes, frame.notes)
+                yield Job(frame, first, device, options.stokes)
 
     def damaged_frames() -> Iterator[Separated]:
         while submitted and isinstance(submitted[0][0], DamagedFrame):
@@ -410,14 +404,14 @@ def separate_on_ray(
 ENGINES = {"local": separate_here, "ray": separate_on_ray}
 
 
-def separate_one(job: Job) -> Result:
+def separate_one(job: Job) -> SeparatedImages:
     """Separate one frame with the method and the light colour of the first one."""
-    light, data = job.first.light, move_capture(job.data, job.device)
+    frame, light, data = job.frame, job.first.light, move_capture(job.frame.data, job.device)
     method = find_method(job.first.method, data)
-    frame = make_frame(method.run(data, light, False), method, data, light)
-    stokes = replace(frame, capture=job.data).with_stokes().stokes if job.stokes else None
-    said = {"warnings": [*job.notes, *frame.report["warnings"]]}
-    return Result((frame.diffuse, frame.specular), frame.report | said | job.taken, stokes)
+    found = make_frame(method.run(data, light, False), method, data, light)
+    stokes = replace(found, capture=frame.data).with_stokes().stokes if job.stokes else None
+    report = found.report | {"warnings": [*frame.notes, *found.report["warnings"]]} | frame.taken()
+    return SeparatedImages((found.diffuse, found.specular), report, stokes)
 
 
 def _prepared(

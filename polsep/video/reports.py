@@ -45,9 +45,14 @@ def _without_numbers(text: str) -> str:
 
 def describe_run(settings: dict[str, Any], first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, Any]:
     """The report of a run: settings, number of frames, the damaged ones, and how often frames gave each warning."""
-    said = [text for line in lines for text in line.get("warnings", ())]
-    often = Counter(map(_without_numbers, said))
-    warnings = {text: often[_without_numbers(text)] for text in _each_once(said)}
+    texts = [text for line in lines for text in line.get("warnings", ())]
+    counts = Counter(map(_without_numbers, texts))
+    warnings = {text: counts[_without_numbers(text)] for text in _each_once(texts)}
     damaged = [line for line in lines if "damaged" in line]
-    counts = {"frames": len(lines), "damaged": damaged}
-    return {**counts, "settings": settings, "first_frame_warnings": list(first.warnings), "warnings": warnings}
+    return {
+        "frames": len(lines),
+        "damaged": damaged,
+        "settings": settings,
+        "first_frame_warnings": list(first.warnings),
+        "warnings": warnings,
+    }

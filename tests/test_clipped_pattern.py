@@ -14,9 +14,9 @@ from tolerances import assert_close
 from polsep.bench.period import measure_pattern
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import PERIOD, Layout, Mosaic
 from polsep.separation.analytic import Separation
-from polsep.separation.clipped_pattern import PERIOD, REACH, smooth_clipped, smooth_separation, taps_of
+from polsep.separation.clipped_pattern import REACH, smooth_clipped, smooth_separation, taps_of
 from polsep.separation.images import FrameImages, Tally
 
 CELLS, WHITE = 48, 4095

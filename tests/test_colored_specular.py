@@ -14,7 +14,7 @@ from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
 from polsep.render.disturbances import METALS
 from polsep.sensor.camera import IMX250, Layout, Mosaic, expose
-from polsep.separation.colored_specular import Colored, _see, color_specular, period_stokes
+from polsep.separation.colored_specular import Colored, _measure_periods, color_specular, period_stokes
 from polsep.separation.images import FrameImages, Tally
 
 SIZE = 96
@@ -162,6 +162,6 @@ def test_images_stay_over_their_periods_where_a_row_of_cells_is_left() -> None:
     size, kind = 514, torch.float32
     cells = torch.arange(size // 2, dtype=kind).expand(3, size // 2, size // 2)
     mosaic = Mosaic(torch.ones(size, size), Layout(), 0.0, 1.0)
-    seen = _see(mosaic, cells, 0 * cells, Tally(power=1.0, along=1.0))
+    seen = _measure_periods(mosaic, cells, 0 * cells, Tally(power=1.0, along=1.0))
     expected = 2 * torch.arange(size // 4, dtype=kind) + 0.5
     torch.testing.assert_close(seen.diffuse[0, 0], expected, rtol=0, atol=1e-3)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from polsep.demosaic.bilinear import aligned, demosaic_bilinear, demosaic_bilinear_half, mean_cells
 from polsep.physics.stokes import Stokes, fit_stokes
-from polsep.sensor.camera import IDEAL, Layout, Mosaic, expose
-from polsep.sensor.orient import PERIOD, Orientation, orient
+from polsep.sensor.camera import IDEAL, PERIOD, Layout, Mosaic, expose
+from polsep.sensor.orient import Orientation, orient
 
 SONY, MONO = Layout(), Layout(bayer=None)
 #: An order whose transposed one no mirror and no crop gives, as they give Sony's.

@@ -36,7 +36,7 @@ STAGES = {
     "sensor.defects": ("make_rules",),
     "sensor.defects_kernel": ("find_candidates", "confirm"),
     "light.find": ("find_tiles", "_light_of_tiles"),
-    "separation.colored_specular": ("_measure_places", "find_unpolarized", "_see", "find_retained"),
+    "separation.colored_specular": ("_measure_places", "find_unpolarized", "_measure_periods", "find_retained"),
     "separation.under_highlights": ("_clipped_cells", "_find_holes", "_fit_planes", "_contrast", "_solve_laplace"),
 }
 WHITE_LEVEL = 4095

@@ -218,11 +218,9 @@ def _as_light(fit: ColorFit, tiles: Tiles, aolp: float) -> Light:
 def likely_lamp(fitted: Doubles, good: float, astray: float, mean: Doubles) -> tuple[Doubles, float, float]:
     """The likely lamp ``[2]`` of a frame, its mean error [degrees], and the chance that the fit did not go astray.
 
-    The lamp is white, or the mean of what else is likely.
-
-    By Bayes' rule; lamps are as likely before as the shares above say. Log-ratios ``fitted``: of the fit, which is off
-    by ``good`` degrees on average unless it went ``astray``; ``mean``: of the frame, that of coloured bodies under the
-    lamp.
+    By Bayes' rule it is white, or the mean of what else is likely; lamps are as likely before as the shares above say.
+    Log-ratios ``fitted``: of the fit, off by ``good`` degrees on average, but for a chance ``astray`` that it is
+    anywhere; ``mean``: of the frame, that of coloured bodies under the lamp.
     """
     fitted, mean = (x.clip(-LARGEST_RATIO, LARGEST_RATIO) for x in (fitted, mean))
 

@@ -5,7 +5,7 @@ one row per photograph, is a product of rank 3: rows (1, cos 2t_k, sin 2t_k) / 2
 which the `gram` matrix holds, says what the pictures can say about the angles: the rows lie on an ellipse of a plane,
 and the one affine map that makes it the unit circle gives them. Open remain a common *roll* (where 0 lies) and a
 *mirror* (the sense of turning), which change AoLP but neither s0 nor DoLP. An ellipse needs five photographs, and
-light of several directions of polarization. Exposures must be equal or told: with unknown ones there is a family of
+light of several directions of polarization. Exposures must be equal or known: with unknown ones there is a family of
 solutions, since Lorentz boosts map the cone of Stokes vectors onto itself.
 
 Angles are refined by weighted subspace fitting, which reaches the least possible error for many pixels.

@@ -69,12 +69,12 @@ class LampFacts(NamedTuple):
 class Calibration:
     """Measured properties of a sensor and a lamp, each None where it was not measured.
 
-    Levels are in codes of ``white_level``. ``black_map``: code without light of each pixel ``[H, W]``, and
-    ``black_pattern`` its mean on each place of the period. ``gain_map [H, W]``: of each pixel, without the ``falloff``,
-    which is a polynomial (`falloff_image`); ``gains``: its mean on each place. ``hot``, ``dead``: indices of defective
-    pixels in reading order, of dark and of flat frames. ``details``: what each measurement found, for people,
-    JSON-able. Arrays are kept as copies that cannot be changed: files that were read, and what is prepared of maps, are
-    remembered.
+    Levels are in codes of ``white_level``. ``black_map``: code without light of each pixel ``[H, W]``;
+    ``black_pattern``: its mean on each place of the period, less ``black_level``. ``gain_map [H, W]``: of each pixel,
+    without the ``falloff``, which is a polynomial (`falloff_image`); ``gains``: its mean on each place. ``hot``,
+    ``dead``: indices of defective pixels in reading order, of dark and of flat frames. ``details``: what each
+    measurement found, for people, JSON-able. Arrays are kept as copies that cannot be changed: files that were read,
+    and what is prepared of maps, are remembered.
     """
 
     layout: Layout

@@ -34,6 +34,9 @@ BAYER_ORDERS = ("RGGB", "BGGR", "GRBG", "GBRG")
 #: at 65520 of 65535, and 10-bit data at 65472; 8-bit data are only clipped at 255.
 CLIP_MARGIN = 2.0**-10
 
+#: Pixels after which the filters of every sensor repeat, along both axes; those of mono ones after 2 already.
+PERIOD = 4
+
 #: Analysers that are closer than this [degrees] are one: no Stokes vector follows from their difference.
 MIN_APART_DEG = 0.1
 
@@ -128,7 +131,7 @@ class Layout:
     @property
     def period(self) -> int:
         """Pixels after which the filters repeat in both directions: 4 for colour, 2 for mono."""
-        return 2 if self.bayer is None else 4
+        return 2 if self.bayer is None else PERIOD
 
     @property
     def angles_deg(self) -> tuple[float, ...]:
@@ -150,7 +153,7 @@ class Layout:
 
     def table(self) -> list[list[Filter]]:
         """One 4x4 period of filters."""
-        return [[self.filter_at(row, col) for col in range(4)] for row in range(4)]
+        return [[self.filter_at(row, col) for col in range(PERIOD)] for row in range(PERIOD)]
 
     @classmethod
     def from_table(cls, table: list[list[Filter]]) -> Layout:

@@ -1,8 +1,9 @@
 """Frames of any orientation and crop as a network expects them: filters in one order, sides in whole periods.
 
 A mosaic whose filters are in another order, by a mirror, a transposition or an odd crop, is turned and continued until
-they are in the wanted one; its images are turned and cropped back. Mosaics are continued by whole periods, so that
-every added sample lies behind its own filter. Signs of Stokes images follow `Layout.flipped_horizontal`.
+they are in the wanted one; its images are turned and cropped back. Mosaics, mono ones too, are continued to multiples
+of `PERIOD` by whole periods, so that every added sample lies behind its own filter. Signs of Stokes images follow
+`Layout.flipped_horizontal`.
 """
 
 from __future__ import annotations
@@ -16,10 +17,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.arrays import Array, namespace, of_kind, window
 from polsep.physics.stokes import Stokes
-from polsep.sensor.camera import Layout, Mosaic
-
-#: Sides of frames are continued to multiples of the period of colour sensors, mono ones too.
-PERIOD = 4
+from polsep.sensor.camera import PERIOD, Layout, Mosaic
 
 
 @dataclass(frozen=True)

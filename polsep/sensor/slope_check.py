@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from polsep.compute.arrays import to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.sensor import periods_kernel
-from polsep.sensor.camera import CLIP_MARGIN, Filter, Layout, Mosaic
-from polsep.sensor.periods_kernel import PERIOD, sum_periods
+from polsep.sensor.camera import CLIP_MARGIN, PERIOD, Filter, Layout, Mosaic
+from polsep.sensor.periods_kernel import sum_periods
 
 Floats = NDArray[np.float32]
 

@@ -21,11 +21,10 @@ from polsep.compute.arrays import Array, namespace, pad_repeat, to_numpy, window
 from polsep.compute.filters import largest_around
 from polsep.compute.resizing import block_means, repeat_pixels
 from polsep.compute.warm_up import make_ready
-from polsep.sensor.camera import Mosaic
+from polsep.sensor.camera import PERIOD, Mosaic
 from polsep.separation import clipped_pattern_kernel
 from polsep.separation.analytic import Separation
 from polsep.separation.clipped_pattern_kernel import change_cells, weigh_cells
-from polsep.separation.colored_specular import PERIOD
 from polsep.separation.images import FrameImages
 
 #: Shares of clipped samples around a cell between which the filter's weight rises; the same where they go on, in mono.

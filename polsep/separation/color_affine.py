@@ -65,7 +65,7 @@ PRIOR_WEIGHT = 0.05
 #: Where light must be added for samples to clip: how much more freely than the diffuse light, relative to each one's
 #: brightness around, the specular varies; to the fourth power it decides who takes how much.
 SPECULAR_FREEDOM = 12.0
-#: Brightness squared below which freedom is not told apart.
+#: Squared brightness that is added to both sides of that comparison: in the dark it says nothing.
 FREEDOM_FLOOR = 1e-6
 
 #: Least weight of the specular light around as a prior, far below that of any sample and above rounding.

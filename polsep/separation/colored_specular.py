@@ -1,6 +1,6 @@
 """Specular light that does not have the lamp's colour: metals, tinted highlights, and what bodies keep polarized.
 
-Methods that assume white specular light leave its colour in the diffuse image. That part betrays itself: it is
+Methods that assume white specular light leave its colour in the diffuse image. That part shows: it is
 polarized as mirror images are. The polarization along the lamp's is regressed on the diffuse image, both as deviations
 from their mean over colours. Diffuse light of dielectrics has slopes of at most 0.3, and that only at
 grazing angles; diffuse images of gold have 1 and more. There the whole polarized light becomes specular.
@@ -34,14 +34,12 @@ from polsep.compute.resizing import block_means, resize_area, resize_bilinear
 from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import split_analysers
 from polsep.physics.stokes import Measurements, Stokes, fit_stokes
-from polsep.sensor.camera import Mosaic
+from polsep.sensor.camera import PERIOD, Mosaic
 from polsep.separation import places_kernel
 from polsep.separation.images import FrameImages, Tally
 from polsep.separation.lamp_polarization import Places, find_unpolarized, measure_places
 from polsep.separation.retained_polarization import find_retained
 
-#: Raw pixels along the side of a period.
-PERIOD = 4
 #: Slopes from which on, and up to which, diffuse light turns into specular light.
 SLOPES = (0.4, 0.7)
 #: Raw pixels along the side of the least frame, and from which on a ninth of it shows what bodies retain.
@@ -116,32 +114,32 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
         diffuse, specular = diffuse - left, before + left
     # What fills 3x3 periods fills one in every third row and column: a ninth of the frame shows that there is nothing.
     thin = replace(white, data=_thin(data, PERIOD))
-    some = _see(thin, _thin(diffuse, side) / gain, _thin(specular, side) / gain, tally)
+    some = _measure_periods(thin, _thin(diffuse, side) / gain, _thin(specular, side) / gain, tally)
     some = Periods(*to_numpy_together(*some))
     enough = some
     if min(data.shape) <= MANY:
-        enough = Periods(*to_numpy_together(*_see(white, diffuse / gain, specular / gain, tally)))
-    retained, share = find_retained(enough.polarized, enough.across, enough.diffuse), None
-    if float((_part(some) > 0.5).mean()) >= MIN_SHARE:
-        seen = _see(white, diffuse / gain, specular / gain, tally)
-        found = find_colored(seen)
-        share = found if _share(found) >= MIN_SHARE else None
-    if not retained and not unpolarized and share is None:
+        enough = Periods(*to_numpy_together(*_measure_periods(white, diffuse / gain, specular / gain, tally)))
+    retained, colored = find_retained(enough.polarized, enough.across, enough.diffuse), None
+    if _share(_part(some)) >= MIN_SHARE:
+        periods = _measure_periods(white, diffuse / gain, specular / gain, tally)
+        found = find_colored(periods)
+        colored = found if _share(found) >= MIN_SHARE else None
+    if not retained and not unpolarized and colored is None:
         return images, Colored()
     body, mirrored, valid = (1 - retained) * diffuse, specular + retained * diffuse, images.valid
-    if share is not None:
-        ratio = xp.minimum(seen.polarized.clip(0, None), seen.s0) / seen.total.clip(1e-4, None)
-        part, ratio = (resize_bilinear(x, diffuse.shape[-2:]) for x in (share, ratio.clip(0, MAX_GAIN)))
+    if colored is not None:
+        ratio = xp.minimum(periods.polarized.clip(0, None), periods.s0) / periods.total.clip(1e-4, None)
+        part, ratio = (resize_bilinear(x, diffuse.shape[-2:]) for x in (colored, ratio.clip(0, MAX_GAIN)))
         body, mirrored = (1 - part) * body, mirrored + part * (ratio * (diffuse + specular) - mirrored)
         valid = valid & (part[0] < 0.5)
     changed = [contiguous(xp.moveaxis(x, 0, -1)) for x in (body, mirrored)]
     more = float(xp.sum(xp.mean((mirrored - before) / gain, axis=0), dtype=xp.float64))
     tally = replace(tally, specular=tally.specular + more, valid=int(xp.sum(valid)))
-    if share is not None:  # all light of metals is what their polarization says, which changes the sum
+    if colored is not None:  # all light of metals is what their polarization says, which changes the sum
         gained = body + mirrored - diffuse - specular
         tally = replace(tally, s0=tally.s0 + float(xp.sum(xp.mean(gained / gain, axis=0), dtype=xp.float64)))
     images = replace(images, diffuse=changed[0], specular=changed[1], valid=valid, tally=tally)
-    return images, Colored(0.0 if share is None else float(xp.mean(share)), retained, unpolarized)
+    return images, Colored(0.0 if colored is None else float(xp.mean(colored)), retained, unpolarized)
 
 
 def _measure_places(images: FrameImages, light: tuple[float, ...], cell: int) -> Places:
@@ -169,7 +167,8 @@ def _thin(image: Array, side: int) -> Array:
     return blocks.reshape(*image.shape[:-2], *kept)
 
 
-def _see(mosaic: Mosaic, diffuse: Array, specular: Array, tally: Tally) -> Periods:
+def _measure_periods(mosaic: Mosaic, diffuse: Array, specular: Array, tally: Tally) -> Periods:
+    """`Periods` of a frame in white light and its images ``[3, h, w]``; ``tally`` has the lamp's polarization."""
     stokes = period_stokes(mosaic)
     length = max((tally.along**2 + tally.across**2) ** 0.5, 1e-30)
     polarized = (stokes.s1 * tally.along + stokes.s2 * tally.across) / length
@@ -180,19 +179,19 @@ def _see(mosaic: Mosaic, diffuse: Array, specular: Array, tally: Tally) -> Perio
     return Periods(stokes.s0, polarized, across, diffuse, diffuse + specular)
 
 
-def find_colored(seen: Periods) -> Array:
+def find_colored(periods: Periods) -> Array:
     """The part ``[1, h, w]``, 0 to 1, of the diffuse image that is specular."""
-    part = _part(seen)
+    part = _part(periods)
     solid = largest_around(-largest_around(-part, 1), 1)
     return namespace(part).minimum(part, solid)
 
 
-def _part(seen: Periods) -> Array:
+def _part(periods: Periods) -> Array:
     """0 to 1, as the slope of the colours' polarized on their diffuse light is in `SLOPES`, period by period."""
-    xp = namespace(seen.diffuse)
-    colors = seen.diffuse - xp.mean(seen.diffuse, axis=0, keepdims=True)
-    across = seen.polarized - xp.mean(seen.polarized, axis=0, keepdims=True)
-    product, brightness = xp.sum(across * colors, axis=0, keepdims=True), xp.mean(seen.total, axis=0, keepdims=True)
+    xp = namespace(periods.diffuse)
+    colors = periods.diffuse - xp.mean(periods.diffuse, axis=0, keepdims=True)
+    across = periods.polarized - xp.mean(periods.polarized, axis=0, keepdims=True)
+    product, brightness = xp.sum(across * colors, axis=0, keepdims=True), xp.mean(periods.total, axis=0, keepdims=True)
     contrast = xp.sum(colors * colors, axis=0, keepdims=True)
     slope = product / (contrast + MIN_CONTRAST + MIN_RELATIVE * brightness**2)
     return ((slope - SLOPES[0]) / (SLOPES[1] - SLOPES[0])).clip(0, 1)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames, refuse_forgotten
 from polsep.io.results.separation_writer import planned_outputs, write_separation
-from polsep.io.store.atomic import OutputError, refuse_existing
+from polsep.io.store.atomic import OutputError, refuse_existing, refuse_inputs
 from polsep.io.store.errors import one_line
 from polsep.methods import find_method, release_memory
 from polsep.pipeline import LightColor, Result, separate_capture
@@ -124,8 +124,7 @@ def separate_photographs(
     if photos.angles_deg == PAIR:
         find_method(options.method, ANY_PAIR)
     outputs = planned_outputs(write.directory, output_stem(paths[0]), write.format)
-    if clash := sorted({realpath(output) for output in outputs} & {realpath(path) for path in paths}):
-        raise OutputError(f"{paths[0]}: expected outputs of its own, found that {clash[0]} is an input")
+    refuse_inputs(outputs, [Path(path) for path in paths])
     refuse_existing(write.directory, outputs, write.overwrite)
     frame, facts = read_measurements(paths, photos, read)
     separated = _separate_frame(paths[0], frame, read, options, write.stokes)

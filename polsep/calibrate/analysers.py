@@ -31,6 +31,7 @@ from polsep.calibrate.dark_flat import MOST_CLIPPED, require_same_sensor
 from polsep.calibrate.statistics import Doubles, place_means
 from polsep.compute.arrays import to_numpy
 from polsep.compute.least_squares import least_squares
+from polsep.physics.stokes import diattenuation
 from polsep.sensor.calibration import Analyser, Calibration
 from polsep.sensor.camera import Layout, Mosaic
 
@@ -82,7 +83,7 @@ def measure_analysers(
         raise ValueError(
             f"expected frames of an evenly lit polarizer that turns, found samples that differ by {residual:.1%}"
         )
-    rho = 1.0 if math.isinf(polarizer_extinction) else (polarizer_extinction - 1) / (polarizer_extinction + 1)
+    rho = diattenuation(polarizer_extinction)
     period = layout.period
     found = [
         Analyser(math.degrees(t) % 180, _extinction(d / rho), float(g))

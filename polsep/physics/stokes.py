@@ -306,11 +306,16 @@ def _clipped_below_white(measurements: Measurements) -> Array | None:
     return below if bool(xp.any(below)) else None
 
 
+def diattenuation(extinction: float) -> float:
+    """D = (ER - 1) / (ER + 1) of an analyser of that extinction ratio ER; 1 of an ideal one, whose ER is infinite."""
+    return 1.0 if math.isinf(extinction) else (extinction - 1) / (extinction + 1)
+
+
 def correct_extinction(measurements: Measurements, extinction: float) -> Measurements:
     """Samples of ideal analysers, from those of ones that pass 1 / ``extinction`` of the light across them.
 
-    m = (s0 + D p_t) / 2 with D = (extinction - 1) / (extinction + 1), so m - s0 / 2 is divided by D. The extinction may
-    be that of a lamp's filter and an analyser together. Raises ValueError unless it is above 1.
+    m = (s0 + D p_t) / 2, so m - s0 / 2 is divided by the `diattenuation` D. The extinction may be that of a lamp's
+    filter and an analyser together. Raises ValueError unless it is above 1.
     """
     if not extinction > 1:
         raise ValueError(f"expected an extinction ratio above 1, found {extinction:g}")

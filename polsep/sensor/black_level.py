@@ -21,7 +21,7 @@ from polsep.compute.arrays import to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.sensor import periods_kernel
 from polsep.sensor.camera import Mosaic
-from polsep.sensor.noise import BLOCK, MIN_SPAN, code_step
+from polsep.sensor.noise import BLOCK, LARGEST_WELL, MIN_SPAN, code_step
 from polsep.sensor.periods_kernel import measure_blocks
 
 Floats = NDArray[np.float32]
@@ -32,8 +32,8 @@ BLOCKS, MIN_BLOCKS, LEVELS = 24_576, 32, 24
 DARKEST = 0.004
 #: A dark level is black if its variance is below this share of what its level asks for.
 QUIET = 0.35
-#: And below this share of what it asks for on a sensor of so many electrons at white, few of which have more.
-LEAST_NOISE, LARGEST_WELL = 0.6, 20_000.0
+#: And below this share of what it asks for on a sensor of `LARGEST_WELL`.
+LEAST_NOISE = 0.6
 #: Least noise of bright parts, over that of the same sensor.
 MIN_GAIN = 0.5
 #: Least black level that is reported, and the least excess of one that was stated, relative to white.

@@ -28,14 +28,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import as_floats, namespace, of_kind, to_numpy
+from polsep.physics.stokes import diattenuation
 from polsep.sensor.camera import Layout, Mosaic, WrongType, clip_level
 from polsep.sensor.defects import MIN_SIZE, repair
-from polsep.sensor.levels import WHITE_LEVELS
+from polsep.sensor.levels import LIT, WHITE_LEVELS
 
 Floats = NDArray[np.float32]
-#: A part of the white level from which on a sample is lit, and the part of its light that no ambient light leaves; in
-#: so many lit samples, such a frame is no ambient one: it was taken with the lamp on.
-LIT, LEAST_LEFT, MOST_GONE = 0.02, 0.05, 0.5
+#: Part of a lit sample's light that ambient light leaves at least, and the share of lit samples with less from which on
+#: the ambient frame was taken with the lamp on.
+LEAST_LEFT, MOST_GONE = 0.05, 0.5
 #: Numbers per place of one period of filters, ``[period][period]``.
 Table = tuple[tuple[float, ...], ...]
 #: A black level that is stated may differ from the measured one by rounding to whole codes.
@@ -52,8 +53,7 @@ class Analyser(NamedTuple):
     @property
     def vector(self) -> tuple[float, float, float]:
         """Factors of s0, s1, s2 in a sample."""
-        d = 1.0 if math.isinf(self.extinction) else (self.extinction - 1) / (self.extinction + 1)
-        t = 2 * math.radians(self.angle_deg)
+        d, t = diattenuation(self.extinction), 2 * math.radians(self.angle_deg)
         return 0.5 * self.gain, 0.5 * self.gain * d * math.cos(t), 0.5 * self.gain * d * math.sin(t)
 
 

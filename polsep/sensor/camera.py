@@ -23,7 +23,7 @@ from array_api_compat import device
 
 from polsep.compute.arrays import Array, as_floats, constant, namespace, short_repr
 from polsep.compute.resizing import repeat_pixels, resize_bilinear
-from polsep.physics.stokes import Measurements, Stokes
+from polsep.physics.stokes import Measurements, Stokes, diattenuation
 
 if TYPE_CHECKING:
     import torch
@@ -295,7 +295,7 @@ class Sensor:
 
 #: Sony IMX250MYR as published by third parties: full well 10.5 ke-, 2.4 e- read noise, 12 bits, extinction ratios of
 #: about 150 (R), 300 (G) and 425 (B). No data sheet was found; see docs/conventions.md.
-IMX250 = Sensor(10_500.0, 2.4, 12, (149 / 151, 299 / 301, 424 / 426))
+IMX250 = Sensor(10_500.0, 2.4, 12, tuple(map(diattenuation, (150, 300, 425))))
 
 #: A perfect sensor that still clips at 1.
 IDEAL = Sensor()

@@ -34,6 +34,7 @@ from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.noise import (
     BLOCK,
     BLOCKS,
+    LARGEST_WELL,
     MIN_BLOCKS,
     Levels,
     Noise,
@@ -60,8 +61,6 @@ SPREAD = 0.06
 #: Distance [pixels] over which textures stay alike, correlation of two colours' textures, their degree of
 #: polarization, and the noise that a prediction allows for, relative to the texture.
 LENGTH, CORRELATION, POLARIZATION, ALLOWANCE = 3.0, 0.95, 0.5, 0.02
-#: Electrons at white of sensors with little shot noise; a frame that shows less noise is taken for one of them.
-LARGEST_WELL = 20_000.0
 #: Rounds of finding: defects near others are found once these are repaired.
 ROUNDS = 3
 #: Samples along the sides of the least frame in which defects are looked for.

@@ -36,6 +36,8 @@ QUARTER, MEDIAN = 8.438 / 12, 11.34 / 12
 OUTLIER = 2.0
 #: Least full well that a gain may mean [electrons at white], and the largest deviation of black, relative to white.
 MIN_WELL, LARGEST_FLOOR = 200.0, 0.05
+#: Full well of sensors with little shot noise [electrons at white]; a frame with less noise is taken for one of these.
+LARGEST_WELL = 20_000.0
 #: Least deviation of floats, relative to white: noise-free renderings are not exact either.
 ROUNDING = 2.0**-20
 #: Whole numbers are codes if white is at least this far above black; share of samples that may be others.

@@ -15,7 +15,8 @@ import numpy as np
 
 from polsep.compute.arrays import Array, constant, namespace
 
-#: Largest possible |a|: DoLP of diffuse light at grazing exit for eta = 1.5 (`fresnel.diffuse_dolp` at 90 degrees).
+#: Largest possible |a|: the limit (eta^2 - 1) / (eta^2 + 1) = 0.3846 of `fresnel.diffuse_dolp` toward grazing exit for
+#: eta = 1.5, rounded up.
 MAX_DIFFUSE_DOLP = 0.3847
 
 #: Least eigenvalue of the normal equations of b, 6 without clipping, above which b counts as determined.

@@ -19,7 +19,7 @@ from polsep.compute import pages
 from polsep.compute.arrays import namespace, on_cpu, to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
-from polsep.demosaic.guided import MIN_CELLS, demosaic_guided, demosaic_guided_half
+from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half, is_large_enough
 from polsep.io.store.weights import is_shipped
 from polsep.networks.engines import ENGINES, combine_images, run_engine
 from polsep.physics.stokes import Measurements, behind_angles, bounded_below_white, fit_stokes, is_pair
@@ -140,7 +140,7 @@ def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
         not isinstance(capture, Mosaic)
         or not _is_plain(capture)
         or capture.layout.channels != 3
-        or min((n - start) // 2 for n, start in zip(capture.data.shape, capture.layout.origin, strict=True)) < MIN_CELLS
+        or not is_large_enough(capture)
     ):
         return run_reference(color_affine_reference, capture, light, full)
     kernel = color_affine_kernel

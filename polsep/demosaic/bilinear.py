@@ -27,9 +27,8 @@ from polsep.sensor.camera import Layout, Mosaic
 
 def aligned(values: Array, layout: Layout) -> Array:
     """``values [..., H, W]`` from the layout's origin on, cropped to whole 2x2 polarizer cells."""
-    row, col = layout.origin
-    height, width = ((n - o) // 2 * 2 for n, o in zip(values.shape[-2:], layout.origin, strict=True))
-    return values[..., row : row + height, col : col + width]
+    (row, col), (height, width) = layout.origin, layout.cells(values.shape)
+    return values[..., row : row + 2 * height, col : col + 2 * width]
 
 
 def repeat_tile(tile: Array, image: Array, block: int) -> Array:

@@ -86,7 +86,7 @@ def demosaic_guided(mosaic: Mosaic) -> Measurements:
 
     ``clipped`` and ``variance`` are those of `demosaic_bilinear`, whose samples are ``uniform``.
     """
-    if not _is_large_enough(mosaic):
+    if not is_large_enough(mosaic):
         return demosaic_bilinear(mosaic)
     values, layout = _padded(mosaic, FULL_MARGIN)
     intensity = _intensity_mosaic(values, _smooth_polarization(values, layout), layout)
@@ -103,7 +103,7 @@ def demosaic_guided_half(mosaic: Mosaic) -> Measurements:
 
     ``clipped`` and ``variance`` are those of `demosaic_bilinear_half`, whose samples are ``uniform``.
     """
-    if not _is_large_enough(mosaic):
+    if not is_large_enough(mosaic):
         return demosaic_bilinear_half(mosaic)
     found, _ = guide_once(mosaic)
     return _complete(found, demosaic_bilinear_half(mosaic))
@@ -123,8 +123,9 @@ def guide_once(mosaic: Mosaic, margin: int = MARGIN) -> tuple[Stokes, Array]:
     return Stokes(mean_cells(s0), polarization.s1, polarization.s2), s0
 
 
-def _is_large_enough(mosaic: Mosaic) -> bool:
-    return bool(min(aligned(mosaic.data, mosaic.layout).shape[-2:]) >= 2 * MIN_CELLS)
+def is_large_enough(mosaic: Mosaic) -> bool:
+    """True for frames that the guided filters take; smaller ones stay bilinear."""
+    return min(mosaic.layout.cells(mosaic.data.shape)) >= MIN_CELLS
 
 
 def _padded(mosaic: Mosaic, margin: int = MARGIN) -> tuple[Array, Layout]:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from polsep.compute.arrays import namespace, to_numpy
 from polsep.compute.threads import get_threads, run_over_rows
-from polsep.demosaic.bilinear import aligned, interpolate_analysers, interpolate_analysers_half
+from polsep.demosaic.bilinear import interpolate_analysers, interpolate_analysers_half
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
-from polsep.demosaic.guided import MIN_CELLS
+from polsep.demosaic.guided import is_large_enough
 from polsep.demosaic.guided_kernel import demosaic_rows, open_stream
 from polsep.physics.stokes import Measurements, complete_pair, fit_stokes, is_pair, stokes_inverse
 from polsep.sensor.camera import Mosaic
@@ -36,8 +36,7 @@ def measured_stokes(capture: Mosaic | Measurements, light: tuple[float, ...], fu
     """
     if isinstance(capture, Mosaic):
         white = replace(capture, data=to_numpy(capture.data), light_color=light)
-        cells = aligned(white.data, white.layout).shape
-        if white.layout.channels == 3 and not full and min(cells) >= 2 * MIN_CELLS:
+        if white.layout.channels == 3 and not full and is_large_enough(white):
             return _guided_half(white) * np.array(light, np.float32)
         interpolate = interpolate_analysers if full else interpolate_analysers_half
         gains = np.array(light, np.float32)[:, None, None]

@@ -151,6 +151,11 @@ class Layout:
             return Filter(angle, 0)
         return Filter(angle, "RGB".index(self.bayer[row // 2 % 2 * 2 + col // 2 % 2]))
 
+    def cells(self, shape: tuple[int, ...]) -> tuple[int, int]:
+        """Rows and columns of the whole 2x2 polarizer cells in frames ``[..., H, W]`` of that shape."""
+        height, width = ((n - start) // 2 for n, start in zip(shape[-2:], self.origin, strict=True))
+        return height, width
+
     def table(self) -> list[list[Filter]]:
         """One 4x4 period of filters."""
         return [[self.filter_at(row, col) for col in range(PERIOD)] for row in range(PERIOD)]

@@ -61,8 +61,7 @@ def exposure_flags(mosaic: Mosaic) -> NDArray[np.uint8]:
 
 def _cells(plane: NDArray[Any], mosaic: Mosaic) -> NDArray[Any]:
     """A plane ``[H, W]`` as ``[h, 2, w, 2]``."""
-    top, left = mosaic.layout.origin
-    height, width = (plane.shape[0] - top) // 2, (plane.shape[1] - left) // 2
+    (top, left), (height, width) = mosaic.layout.origin, mosaic.layout.cells(plane.shape)
     return plane[top : top + 2 * height, left : left + 2 * width].reshape(height, 2, width, 2)
 
 

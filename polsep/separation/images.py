@@ -77,7 +77,7 @@ class FrameImages:
         For a ``report`` also for DoLP and AoLP.
         """
         size = 2 if full else 1
-        h, w = ((n - start) // 2 * size for n, start in zip(shape, layout.origin, strict=True))
+        h, w = (size * n for n in layout.cells(shape))
         diffuse, specular = (pages.empty((h, w, layout.channels), np.float32) for _ in range(2))
         dolp, aolp = (pages.empty((h, w), np.float32) if report else None for _ in range(2))
         return cls(diffuse, specular, pages.empty((h, w), np.bool_), dolp, aolp)

@@ -137,8 +137,7 @@ def _clipped_cells(mosaic: Mosaic) -> Places:
     level, data = mosaic.clip_level, mosaic.data.reshape(-1)
     at = to_numpy(namespace(data).nonzero(data >= level)[0]).astype(np.int64)
     places = np.stack(np.divmod(at, width), axis=1) - np.array(mosaic.layout.origin)
-    count = (np.array(mosaic.data.shape) - mosaic.layout.origin) // 2
-    return _distinct(places // 2, (int(count[0]), int(count[1])))
+    return _distinct(places // 2, mosaic.layout.cells(mosaic.data.shape))
 
 
 def _find_holes(clipped: Places, shape: tuple[int, int], scale: int) -> _Holes:

@@ -141,3 +141,18 @@ def test_the_command_leaves_nothing_to_type(tmp_path: Path, run_polsep: Cli) -> 
         failed = run_polsep(*arguments)
         assert failed.status == 2 and failed.err.count("\n") == 1 and expected in failed.err, failed
     assert not (tmp_path / "a.tiff").exists()
+
+
+def test_a_folder_stands_for_its_frames(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
+    """A folder merges as its files do, whatever levels are said, and is not written into as one of its own frames."""
+    folder = tmp_path / "shots"
+    folder.mkdir()
+    for seed, time in enumerate((1, 4)):
+        codes = expose(light(), time, seed).data.numpy().astype(np.uint16)
+        tifffile.imwrite(folder / f"shot{time}.tiff", codes, photometric="minisblack", metadata=None)
+    levels = ("--white-level", WHITE, "--black-level", BLACK)
+    for out, frames in ((tmp_path / "a.tiff", [folder]), (tmp_path / "b.tiff", sorted(folder.iterdir()))):
+        assert run_polsep("merge", *frames, *levels, "-o", out).status == 0
+    assert (tmp_path / "a.tiff").read_bytes() == (tmp_path / "b.tiff").read_bytes()
+    failed = run_polsep("merge", folder, *levels, "-o", folder / "shot4.tiff", "--overwrite")
+    assert failed.status == 2 and "is an input" in failed.err

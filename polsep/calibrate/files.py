@@ -11,7 +11,8 @@ from polsep import __version__
 from polsep.calibrate.exposures import merge_exposures
 from polsep.compute.arrays import to_numpy
 from polsep.io.raw.corrections import read_mosaics
-from polsep.io.raw.frames import Frame, ReadOptions, forgets_level, read_frames, refuse_forgotten
+from polsep.io.raw.frames import Frame, ReadOptions, forgets_level, refuse_forgotten
+from polsep.io.raw.sequences import input_files
 from polsep.io.raw.tiff import write_merged
 from polsep.io.store.atomic import refuse_existing, refuse_inputs, require_writable
 from polsep.io.store.calibrations import maps_path, read_calibration, refuse_foreign_maps, write_calibration
@@ -86,19 +87,17 @@ def merge_files(
     """
     if output.suffix.lower() not in (".tif", ".tiff"):
         raise ValueError(f"expected an output that ends in .tiff, found {output.name!r}")
-    refuse_inputs([output], paths)
+    refuse_inputs([output], [file for path in paths for file in input_files(path)])
     refuse_existing(output.parent, [output], overwrite)
     require_black_level(paths, read)
-    frames, notes = list[Mosaic](), list[str]()
-    recorded, forgotten = list[float | None](), list[tuple[Path, Frame]]()
-    for path in paths:
-        for frame in read_frames(path, read):
-            if not isinstance(frame.data, Mosaic):
-                raise input_error(path, "expected a raw mosaic, found four angle images")
-            frames.append(frame.data)
-            recorded.append(frame.exposure)
-            forgotten += [(path, frame)] if forgets_level(frame) else []
-            notes += [f"{frame.stem}: {note}" for note in frame.notes if not isinstance(note, Overexposed)]
+    notes, recorded, forgotten = list[str](), list[float | None](), list[tuple[Path, Frame]]()
+
+    def note(path: Path, frame: Frame) -> None:
+        recorded.append(frame.exposure)
+        forgotten.extend([(path, frame)] if forgets_level(frame) else [])
+        notes.extend(f"{frame.stem}: {text}" for text in frame.notes if not isinstance(text, Overexposed))
+
+    frames = list(read_mosaics(paths, read, note))
     if len(forgotten) == len(frames) > 0:  # a short exposure alone may be dark
         refuse_forgotten(*forgotten[0])
     known = [time for time in recorded if time is not None]

@@ -151,8 +151,9 @@ def _measure(
 def merge(files: tuple[Path, ...], output: Path, times: str | None, overwrite: bool, **options: Any) -> None:
     """Merge frames of one still scene at different exposure times into one, without clipping and with less noise.
 
-    The camera, the lamp and its polarizer must not move between the frames. OUT is a float TIFF, which every command
-    reads without further options: black at 0, and white at 1, where the shortest exposure clips.
+    The camera, the lamp and its polarizer must not move between the frames, which are files, folders of them, or files
+    of several. OUT is a float TIFF, which every command reads without further options: black at 0, and white at 1,
+    where the shortest exposure clips.
 
     \b
     polsep merge short.png middle.png long.png --white-level 4095 --black-level 64 -o merged.tiff

@@ -28,8 +28,9 @@ Floats = NDArray[np.float32]
 
 #: Predicted samples above this share of white do not count; exposure times within this factor are equal.
 BRIGHTEST, EQUAL = 0.95, 1.02
-#: Samples that show the ratio of two exposures: of the longer one, in white. Fewest of them.
-RATIO_RANGE, MIN_SAMPLES = (0.1, 0.9), 64
+#: Samples that show the ratio of two exposures: of the longer one, in white. Fewest of them, and the largest ratio that
+#: they show: beyond, the shorter one has a few codes of 12 bits there, of which noise and the black level decide.
+RATIO_RANGE, MIN_SAMPLES, MOST_RATIO = (0.1, 0.9), 64, 300.0
 #: Largest disagreement of stated times with the frames, and share of the samples that may have moved.
 MAX_DISAGREEMENT, MAX_MOVED = 0.05, 0.01
 #: Deviations from the other exposures beyond which a sample has moved.
@@ -88,12 +89,12 @@ def _find_times(
     linear: Sequence[Floats], clipped: Sequence[NDArray[np.bool_]], times: Sequence[float] | None
 ) -> tuple[list[float], list[str]]:
     """Times of all frames, and notes where stated ones disagree with the frames' brightness."""
-    order = sorted(range(len(linear)), key=lambda i: float(np.median(linear[i])) if times is None else times[i])
+    order = sorted(range(len(linear)), key=lambda i: float(linear[i].mean()) if times is None else times[i])
     found, notes = {order[0]: 1.0 if times is None else float(times[order[0]])}, []
     for short, long in pairwise(order):
         ratio = _ratio(linear[short], linear[long], ~(clipped[short] | clipped[long]))
         if times is None:
-            if ratio is None:
+            if ratio is None or ratio > MOST_RATIO:
                 raise ValueError("expected exposures that share well exposed samples, found too few: say --times")
             found[long] = found[short] * ratio
             continue

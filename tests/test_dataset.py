@@ -32,6 +32,7 @@ from polsep.compute.threads import get_threads, set_threads
 from polsep.datasets import rendered as dataset
 from polsep.datasets.rendered import ENGINES, Job, RenderOptions, plan_jobs, render_dataset, render_job
 from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.sequences import expand_folders, input_files
 from polsep.io.results.dataset import (
     LAYERS,
     MANIFEST,
@@ -271,6 +272,8 @@ def test_files_hold_the_capture(format: str, tmp_path: Path) -> None:
     assert record["light"]["polarizer_deg"] == pytest.approx(math.degrees(shot.light.polarizer), abs=1e-6)
     (frame,) = read_frames(tmp_path / f"{view_stem(0, 1)}.png", ReadOptions(white_level=record["white_level"]))
     assert np.array_equal(frame.data.linear(), expected.mosaic.linear())
+    views = [str(tmp_path / f"{stem}.png") for stem in options.stems]  # no truth and no contact sheet
+    assert expand_folders([str(tmp_path)]) == views == [str(path) for path in input_files(tmp_path)]
 
 
 @pytest.mark.usefixtures("inline")

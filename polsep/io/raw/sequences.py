@@ -1,8 +1,9 @@
 """Recordings as sequences of frames that can be read from any frame on: folders of files, and files of many frames.
 
 A folder's frames are its files of one kind, in natural order (frame2 before frame10); a folder with a
-``recording.json`` is a recording of `polsep capture`. A frame that cannot be read becomes a `DamagedFrame` in its
-place, and reading continues after it where the file allows that.
+``recording.json`` is a recording of `polsep capture`; a set of `polsep render` has its raw mosaics alone as frames. A
+frame that cannot be read becomes a `DamagedFrame` in its place, and reading continues after it where the file allows
+that.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from polsep.io.raw.recording import RECORD, recording_files
 from polsep.io.store.errors import InputError, input_error, one_line
 
 _NUMBER = re.compile(r"(\d+)")
+#: Names of the raw frames of rendered sets, beside which lie their truth and a contact sheet.
+_VIEW = re.compile(r"shape\d+_view\d+\.png")
 #: Most frames of a film between two key frames; damage may spoil all of them.
 KEY_FRAMES = 300
 
@@ -60,7 +63,7 @@ def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
 
 def _frame_files(folder: Path) -> list[Path]:
     """The files of a folder's frames in natural order; InputError unless they are of one kind."""
-    files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.suffix.lower() in FRAME_FILES]
+    files = _named_as_frames(folder)
     kinds = Counter(p.suffix.lower() for p in files)
     if not files:
         raise input_error(folder, f"expected a folder of frames ({', '.join(FRAME_FILES)}), found none")
@@ -89,7 +92,7 @@ def expand_folders(paths: Sequence[str]) -> list[str]:
 def _folder_frames(folder: Path) -> list[str]:
     if (folder / RECORD).is_file():
         return [str(folder / RECORD)]
-    files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.suffix.lower() in FRAME_FILES]
+    files = _named_as_frames(folder)
     if not files:
         raise input_error(folder, f"expected a folder of frames ({', '.join(FRAME_FILES)}), found none")
     groups: dict[tuple[str, str], set[str]] = {}
@@ -101,6 +104,13 @@ def _folder_frames(folder: Path) -> list[str]:
         p if groups[_numbered(p)[0], p.suffix] != angles else p.with_stem(_numbered(p)[0] + "{angle}") for p in files
     ]
     return list(dict.fromkeys(str(path) for path in sorted(frames, key=natural_order)))
+
+
+def _named_as_frames(folder: Path) -> list[Path]:
+    """The files of a folder whose names are those of frames; of a set of `polsep render`, its views without truth."""
+    files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.suffix.lower() in FRAME_FILES]
+    views = [p for p in files if _VIEW.fullmatch(p.name)]
+    return views if views and (folder / "options.json").is_file() else files
 
 
 def _numbered(path: Path) -> tuple[str, str]:

@@ -113,6 +113,23 @@ def test_tiff_compressions_are_exact(tmp_path: Path, compression: str, tile: tup
     assert_samples(mosaic_of(only(path)), codes)
 
 
+@pytest.mark.parametrize(
+    ("compression", "arguments", "dtype", "found"),
+    [
+        ("jpeg2000", {"level": 60}, "uint16", "JPEG 2000 of the irreversible wavelet"),
+        ("lerc", {"level": 20}, "uint16", "LERC with errors up to 20"),
+        ("lerc", {"level": 0.01}, "float32", "LERC with errors up to 0.01"),
+    ],
+)
+def test_lossy_tiff_is_refused(
+    tmp_path: Path, compression: str, arguments: dict[str, float], dtype: str, found: str
+) -> None:
+    path = tmp_path / "shot.tif"
+    tifffile.imwrite(path, random_codes(dtype, (40, 34)), compression=compression, compressionargs=arguments)
+    with pytest.raises(InputError, match=f"expected lossless samples, found {found}"):
+        only(path)
+
+
 @pytest.mark.parametrize("bits", [10, 12, 14])
 def test_packed_tiff_says_its_white_level(tmp_path: Path, bits: int) -> None:
     path, codes = tmp_path / "shot.tiff", random_codes("uint16", top=2**bits - 1)

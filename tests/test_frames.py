@@ -160,6 +160,24 @@ def test_pages_come_lazily_and_are_numbered(tmp_path: Path) -> None:
             assert_samples(mosaic_of(frame), page)
 
 
+@pytest.mark.parametrize("order", "<>")
+def test_thumbnails_are_no_frames(tmp_path: Path, order: str) -> None:
+    """Wherever they stand, and what is left counts; a note says so. A file of nothing else is read."""
+    codes = random_codes("uint16", (2, 16, 16))
+    small = codes[0, ::2, ::2].astype(np.uint8)
+    with tifffile.TiffWriter(tmp_path / "run.tiff", byteorder=order, bigtiff=order == ">") as file:
+        for page, kind in ((small, 1), (codes[0], 0), (small, 1), (codes[1], 2), (small, 1)):
+            jpeg = {} if order == ">" else {"compression": "jpeg" if kind & 1 else None}
+            file.write(page, subfiletype=kind, photometric="minisblack", contiguous=False, **jpeg)
+    frames = list(read_frames(tmp_path / "run.tiff"))
+    assert [frame.stem for frame in frames] == ["run_0000", "run_0001"]
+    for frame, page in zip(frames, codes, strict=True):
+        assert_samples(mosaic_of(frame), page)
+        assert frame.notes == ("3 of 5 TIFF pictures left out: thumbnails or masks of others",)
+    tifffile.imwrite(tmp_path / "small.tiff", small, subfiletype=1)
+    assert_samples(mosaic_of(only(tmp_path / "small.tiff")), small)
+
+
 def test_damage_in_one_of_four_pages_comes_after_the_good_ones(tmp_path: Path) -> None:
     """Also where four pages might be four angles."""
     path = tmp_path / "run.tiff"

@@ -11,6 +11,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import tifffile
 from polsep.compute.arrays import to_numpy
 from polsep.io.raw.page import MergedFacts, Page
 from polsep.io.raw.tiff_chunks import PICTURES, STREAMS, check_chunks
-from polsep.io.raw.tiff_directories import check_entries, walk_directories
+from polsep.io.raw.tiff_directories import check_entries, find_pictures, walk_directories
 from polsep.io.store.atomic import atomic_path
 from polsep.io.store.errors import InputError, decoding
 from polsep.io.store.header_checks import require_signature, require_size
@@ -51,19 +52,22 @@ def read_tiff(path: Path, first: int = 0) -> Iterator[Page]:
         size = path.stat().st_size
         places = walk_directories(stream, size)
         check_entries(stream, places[0], size)
+        pictures = find_pictures(stream, places)
         stream.seek(0)
         with decoding("TIFF"):
             tif = tifffile.TiffFile(stream, **_UNWANTED)
         with tif:
-            for index in range(first, len(places)):
-                check_entries(stream, places[index], size)
+            for index, number in enumerate(pictures[first:], first):
+                check_entries(stream, places[number], size)
                 with decoding("TIFF"):
-                    directory = tif.pages[index]
+                    directory = tif.pages[number]
                     assert isinstance(directory, tifffile.TiffPage)  # frames only come from TiffPages.useframes
                     _require_readable(directory, size)
                     check_chunks(stream, directory)
-                    page = _read_page(directory, index, len(places))
-                yield page
+                    page = _read_page(directory, index, len(pictures))
+                left = len(places) - len(pictures)
+                note = f"{left} of {len(places)} TIFF pictures left out: thumbnails or masks of others"
+                yield replace(page, notes=(*page.notes, note)) if left else page
 
 
 def _read_page(page: tifffile.TiffPage, index: int, count: int) -> Page:

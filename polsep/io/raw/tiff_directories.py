@@ -8,7 +8,8 @@ Source: Adobe, TIFF Revision 6.0, section 2; Aware Systems, "The BigTIFF File Fo
 from __future__ import annotations
 
 import struct
-from typing import BinaryIO, NamedTuple
+from collections.abc import Sequence
+from typing import BinaryIO, Literal, NamedTuple
 
 from polsep.io.store.errors import InputError
 from polsep.io.store.header_checks import PAGES, require_at_most
@@ -22,6 +23,8 @@ _BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12
 _TEXT = (1, 2, 6, 7)
 #: Entries that lead to other directories: EXIF, GPS, interoperability. Entries of MetaMorph's stacks.
 _INNER, _STACKS = (34665, 34853, 40965), (33628, 33629, 33630, 33631)
+#: The entry NewSubfileType, and its bits of reduced pictures and masks.
+_SUBFILE, _PARTS = 254, 0b101
 
 
 class _Form(NamedTuple):
@@ -64,6 +67,24 @@ def walk_directories(stream: BinaryIO, size: int) -> list[int]:
     if not places:
         raise InputError("expected a TIFF with a picture, found no readable directory: it is truncated or damaged")
     return list(places)
+
+
+def find_pictures(stream: BinaryIO, places: Sequence[int]) -> list[int]:
+    """The numbers of the directories at ``places`` that are no thumbnail and no mask of another; all, if none is left.
+
+    NewSubfileType says so, the first entry of a directory that has it.
+    """
+    form, _ = _read_form(stream)
+    order: Literal["little", "big"] = "little" if form.entry.format.startswith("<") else "big"
+    kept = []
+    for number, place in enumerate(places):
+        stream.seek(place + form.number.size)
+        first = stream.read(form.step).ljust(form.step, b"\0")  # a directory may be empty
+        code, kind, _ = form.entry.unpack_from(first)
+        value = first[form.entry.size :][: _BYTES.get(kind, 0)]
+        if code != _SUBFILE or not int.from_bytes(value, order) & _PARTS:
+            kept.append(number)
+    return kept or list(range(len(places)))
 
 
 def check_entries(stream: BinaryIO, place: int, size: int) -> None:

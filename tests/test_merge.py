@@ -167,3 +167,14 @@ def test_a_folder_stands_for_its_frames(tmp_path: Path, run_polsep: Cli) -> None
     assert (tmp_path / "a.tiff").read_bytes() == (tmp_path / "b.tiff").read_bytes()
     failed = run_polsep("merge", folder, *levels, "-o", folder / "shot4.tiff", "--overwrite")
     assert failed.status == 2 and "is an input" in failed.err
+
+
+def test_four_pages_are_four_frames(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
+    """Two exposures taken twice obey m0 + m90 = m45 + m135, and are no four angles for that."""
+    codes = [expose(light(), time, seed).data.numpy().astype(np.uint16) for seed, time in enumerate((1, 1, 4, 4))]
+    tifffile.imwrite(tmp_path / "stack.tiff", np.stack(codes), photometric="minisblack", metadata=None)
+    levels = ("--white-level", WHITE, "--black-level", BLACK, "--layout", "color")
+    done = run_polsep("merge", tmp_path / "stack.tiff", *levels, "-o", tmp_path / "merged.tiff")
+    assert done.status == 0 and done.out.startswith("4 frames, exposure times 1, 1")
+    (frame,) = read_frames(tmp_path / "merged.tiff")
+    assert frame.data.data.shape == SIZE

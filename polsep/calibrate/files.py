@@ -22,6 +22,8 @@ from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.levels import Overexposed
 
+#: Several pages of a file are frames: four of a turned polarizer, or of two exposures, obey the law of four angles too.
+PAGES = "frames"
 #: Frames of a file in which black is looked for.
 LOOKS = 8
 #: Words of a measurement before which nobody measured or said a level.
@@ -42,7 +44,7 @@ def calibrate_files(paths: Sequence[Path], read: ReadOptions, output: Path, kind
     if before is not None and read.layout is None:
         read = replace(read, layout=before.layout)
     used = None if before is None else corrections_for(kind, before)
-    read = replace(read, corrections=used)
+    read = replace(read, corrections=used, pages=PAGES)
     if kind != "dark":
         require_black_level(paths, read)
     found = measure(read_mosaics(paths, read, _require_white_level), before)
@@ -89,6 +91,7 @@ def merge_files(
         raise ValueError(f"expected an output that ends in .tiff, found {output.name!r}")
     refuse_inputs([output], [file for path in paths for file in input_files(path)])
     refuse_existing(output.parent, [output], overwrite)
+    read = replace(read, pages=PAGES)
     require_black_level(paths, read)
     notes, recorded, forgotten = list[str](), list[float | None](), list[tuple[Path, Frame]]()
 

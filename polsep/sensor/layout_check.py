@@ -351,9 +351,19 @@ def _candidates(layout: Layout) -> tuple[tuple[Layout, str], ...]:
 
 
 def _cropped(layout: Layout) -> list[tuple[Layout, str]]:
-    """The layout of frames whose crop starts a few rows and columns inside the sensor's, the smallest crops first."""
+    """The layout of frames whose crop starts a few rows and columns inside the sensor's, the smallest crops first.
+
+    In colour the reason names the crop two rows and columns farther too, which differs in red and blue.
+    """
     starts = sorted(((row, col) for row in range(4) for col in range(4) if row or col), key=lambda start: sum(start))
-    return [(layout.rolled(-row, -col), f"cropped from row {row}, column {col} on") for row, col in starts]
+    return [(layout.rolled(-row, -col), _crop_reason(layout, row, col)) for row, col in starts]
+
+
+def _crop_reason(layout: Layout, row: int, col: int) -> str:
+    reason, (other_row, other_col) = f"cropped from row {row}, column {col} on", ((row + 2) % 4, (col + 2) % 4)
+    if layout.bayer is None:
+        return reason
+    return f"{reason}; if from row {other_row}, column {other_col}, {layout.rolled(-other_row, -other_col).spec}"
 
 
 def _mirrored(layout: Layout) -> list[tuple[Layout, str]]:

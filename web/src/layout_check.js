@@ -133,7 +133,7 @@ function candidates(layout) {
   const crops = [];
   for (let r = 0; r < 4; r++) for (let c = 0; c < 4; c++) if (r || c) crops.push([r, c]);
   crops.sort((a, b) => a[0] + a[1] - b[0] - b[1]);
-  const cropped = (own) => crops.map(([r, c]) => [rolled(own, -r, -c), `cropped from row ${r}, column ${c} on`]);
+  const cropped = (own) => crops.map(([r, c]) => [rolled(own, -r, -c), cropReason(own, r, c)]);
   const bayer = layout.bayer ? "RGGB" : null, found = [[layout, "as given"], [{ ...SONY, bayer }, "Sony's order"]];
   found.push(...cropped(layout).slice(0, 3), [mirroredAcross(layout, 4), "mirrored left-right"],
     [mirroredDown(layout, 4), "mirrored top-bottom"], [transposed(layout), "transposed"], ...cropped(layout).slice(3));
@@ -148,6 +148,12 @@ function candidates(layout) {
     found.push([other, swapped], ...cropped(other).map(([crop, why]) => [crop, `${swapped}, ${why}`]));
   }
   return [...found, ...turns(layout)];
+}
+
+/** In colour the reason names the crop two rows and columns farther too, which differs in red and blue. */
+function cropReason(layout, r, c) {
+  const reason = `cropped from row ${r}, column ${c} on`, row = (r + 2) % 4, col = (c + 2) % 4;
+  return layout.bayer ? `${reason}; if from row ${row}, column ${col}, ${specOf(rolled(layout, -row, -col))}` : reason;
 }
 
 /** The layout of frames turned by a right angle, which swap red and blue: the reason names the other one too. */

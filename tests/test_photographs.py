@@ -174,11 +174,17 @@ def test_photographs_that_stand_still_are_not_resampled(tmp_path: Path) -> None:
     assert any("of their light contradict" in note for note in told.notes)
 
 
-def test_swapped_pairs_are_doubted(tmp_path: Path) -> None:
-    """The parallel photograph has the highlights, so it is the brighter one."""
-    paths = [str(write_tiff(tmp_path / f"{angle:g}.tif", photograph(angle))) for angle in PAIR_DEG]
+@pytest.mark.parametrize("strength", [1.0, 0.15])
+def test_swapped_pairs_are_doubted(tmp_path: Path, strength: float) -> None:
+    """The parallel photograph has the highlights, so it is the brighter one there, if by 1 % of all light alone."""
+    parallel, crossed = (photograph(angle) for angle in PAIR_DEG)
+    pair = {"p": crossed + strength * (parallel - crossed), "c": crossed}
+    paths = [str(write_tiff(tmp_path / f"{name}.tif", image)) for name, image in pair.items()]
+    assert strength == 1 or 1.005 < pair["p"].mean() / pair["c"].mean() < 1.02
     for order, count in ((paths, 0), (paths[::-1], 1)):
-        frame, _ = read_measurements(order, PhotoOptions(PAIR, exposures=(1, 1), align="none"))
+        frame, _ = read_measurements(
+            order, PhotoOptions(PAIR, exposures=(1, 1), align="none"), ReadOptions(white_level=65535)
+        )
         assert sum("are they swapped?" in note for note in frame.notes) == count
 
 

@@ -241,6 +241,20 @@ def test_a_layout_given_wins_over_the_pixel_format(tmp_path: Path) -> None:
     assert any("is used although BayerRG12p says RGGB" in note for note in frame.notes)
 
 
+@pytest.mark.parametrize(("written", "read"), [("BayerRG12p", "BayerRG12Packed"), ("BayerRG12Packed", "BayerRG12p")])
+@pytest.mark.parametrize("layout", [None, Layout()])
+def test_the_other_packing_of_as_many_bytes_is_noted(
+    tmp_path: Path, written: str, read: str, layout: Layout | None
+) -> None:
+    """Half of the codes are right in either, so that neither layout nor levels show it."""
+    rows, cols = np.indices((64, 96))
+    light = 900 + 20 * rows + 15 * cols + np.random.default_rng(0).normal(0, 10, rows.shape)
+    (tmp_path / "shot.raw").write_bytes(pack_frame(light.astype(np.uint16), written))
+    assert only(tmp_path / "shot.raw", size=(96, 64), pixel_format=written, layout=layout).notes == ()
+    (note,) = only(tmp_path / "shot.raw", size=(96, 64), pixel_format=read, layout=layout).notes
+    assert f"every other column of {read} is noise" in note and note.endswith(written.removeprefix("BayerRG"))
+
+
 def test_size_given_for_a_container_is_noted(tmp_path: Path) -> None:
     write_png(tmp_path / "shot.png", random_codes("uint8"))
     assert "own header is used" in only(tmp_path / "shot.png", size=(8, 8)).notes[0]

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.io.raw.headerless import headerless_page, read_headerless
+from polsep.io.raw.headerless import headerless_page, read_headerless, with_layout
 from polsep.io.raw.npy import read_npy, read_npz, stack_angles
 from polsep.io.raw.page import Page
 from polsep.io.raw.pgm import read_pgm
@@ -303,10 +303,11 @@ def _noting_layout(page: Page, options: ReadOptions) -> Page:
     given, named = options.layout, page.layout
     if given is None or named is None:
         return page
+    page = with_layout(page, named)
     if given.bayer == named.bayer:
-        return replace(page, notes=())
+        return page
     note = f"layout {given.spec} is used although {options.pixel_format} says {named.bayer or 'mono'}"
-    return replace(page, notes=(note,))
+    return replace(page, notes=(note, *page.notes))
 
 
 def _group_angles(path: Path, options: ReadOptions, first: int) -> Iterator[Page]:

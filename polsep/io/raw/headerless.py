@@ -7,12 +7,30 @@ both.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from polsep.io.raw.genicam import PixelFormat, find_pixel_format, unpack_frame
+import numpy as np
+from numpy.typing import NDArray
+
+from polsep.io.raw.genicam import Codes, PixelFormat, find_pixel_format, unpack_frame
 from polsep.io.raw.page import Page
 from polsep.io.store.header_checks import require_size
 from polsep.sensor.camera import Layout
+
+#: Pixels after which filters repeat at the latest; rows of a frame in which its packing is checked, about, and how many
+#: times rougher codes of the wrong one are: 6 times and more.
+PERIOD, CHECKED_ROWS, ROUGHER = 4, 64, 3.0
+
+
+class AssumedLayout(str):
+    """A note on a layout that was assumed, which says nothing where somebody says the layout."""
+
+
+def with_layout(page: Page, layout: Layout | None) -> Page:
+    """The page with a layout that somebody says, without notes on an assumed one."""
+    return replace(page, layout=layout, notes=tuple(note for note in page.notes if not isinstance(note, AssumedLayout)))
 
 
 def read_headerless(path: Path, size: tuple[int, int], pixel_format: str, first: int = 0) -> Iterator[Page]:
@@ -40,15 +58,16 @@ def headerless_page(payload: bytes, size: tuple[int, int], pixel_format: str, in
     Raises ValueError as `genicam.unpack_frame` does.
     """
     fmt = find_pixel_format(pixel_format)
+    codes = unpack_frame(payload, *size, pixel_format)
     return Page(
-        unpack_frame(payload, *size, pixel_format),
+        codes,
         index,
         count,
         white_level=fmt.white_level if 8 < fmt.bits < 16 else None,  # 8 and 16 bits: that of the dtype
         layout=Layout(bayer=fmt.bayer),
         angles=fmt.planes > 1,
         sampled=fmt.planes > 1,
-        notes=_mirror_notes(fmt),
+        notes=(*_mirror_notes(fmt), *_packing_notes(fmt, codes)),
     )
 
 
@@ -56,4 +75,24 @@ def _mirror_notes(fmt: PixelFormat) -> tuple[str, ...]:
     """Sony sensors read out as RGGB; another order may come from a mirrored frame, whose angles are mirrored too."""
     if fmt.bayer in (None, "RGGB"):
         return ()
-    return (f"{fmt.name}: analysers taken as 90,45,135,0 under {fmt.bayer}; a mirrored frame needs its layout said",)
+    taken = f"{fmt.name}: analysers taken as 90,45,135,0 under {fmt.bayer}; a mirrored frame needs its layout said"
+    return (AssumedLayout(taken),)
+
+
+def _packing_notes(fmt: PixelFormat, codes: Codes) -> tuple[str, ...]:
+    """A note on 12-bit codes that are smooth in the other packing, which has as many bytes and the same odd columns."""
+    other = {"lsb": "12Packed", "gige": "12p"}.get(fmt.packing)
+    if fmt.bits != 12 or other is None or fmt.planes > 1 or codes.shape[1] % 2 or codes.shape[1] < 4 * PERIOD:
+        return ()
+    rows = codes[:: max(1, len(codes) // CHECKED_ROWS)]
+    even, odd = rows[:, ::2], rows[:, 1::2]
+    turned = (even << 4 & 0xFFF | even >> 8) if fmt.packing == "lsb" else (even >> 4 | (even & 15) << 8)
+    if _roughness(even) <= ROUGHER * max(_roughness(odd), _roughness(turned)):
+        return ()
+    return (f"every other column of {fmt.name} is noise that would be a picture in a format ending in {other}",)
+
+
+def _roughness(columns: NDArray[Any]) -> float:
+    """Mean difference of neighbours behind one filter, of every other column."""
+    step = PERIOD // 2
+    return float(np.abs(columns[:, step:].astype(np.int32) - columns[:, :-step]).mean())

@@ -25,7 +25,7 @@ from typing import Any, BinaryIO
 
 from polsep import __version__
 from polsep.io.raw.genicam import find_pixel_format
-from polsep.io.raw.headerless import headerless_page
+from polsep.io.raw.headerless import headerless_page, with_layout
 from polsep.io.raw.page import Page
 from polsep.io.store.atomic import refuse_existing, replace_text
 from polsep.io.store.header_checks import require_size
@@ -220,7 +220,7 @@ def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
     for index, image in enumerate(read_images(path, first), first):
         page = headerless_page(image.payload, size, header.pixel_format, index, count)
         if header.layout is not None:
-            page = replace(page, layout=Layout.parse(header.layout), notes=())
+            page = with_layout(page, Layout.parse(header.layout))
         yield replace(
             page, notes=page.notes + notes, exposure=exposure, captured=_captured(header, starts.get(index), image)
         )

@@ -241,7 +241,7 @@ def test_srgb_is_decoded_only_where_it_is_said(tmp_path: Path, suffix: str) -> N
             read_measurements(paths, PhotoOptions(PAIR, align="none"))
 
 
-def write_dng(path: Path, codes: NDArray[np.uint16], black: int, white: int) -> Path:
+def write_dng(path: Path, codes: NDArray[np.uint16], black: int, white: int, orientation: int = 1) -> Path:
     """The least DNG of an RGGB mosaic, exposed 1/60 s at f/8 in May 2026. Source: Adobe, Digital Negative 1.7."""
     matrix = [n for row in np.eye(3, dtype=int) for value in row for n in (int(value), 1)]
     tags: list[tuple[int, Any, int, Any, bool]] = [
@@ -255,6 +255,7 @@ def write_dng(path: Path, codes: NDArray[np.uint16], black: int, white: int) -> 
         (50728, "2I", 3, (1,) * 6, True),
         (33434, "2I", 1, (1, 60), True),
         (33437, "2I", 1, (8, 1), True),
+        (274, "H", 1, orientation, True),
     ]
     tifffile.imwrite(path, codes, photometric=32803, metadata=None, extratags=tags, datetime="2026:05:04 12:13:14")
     return path
@@ -272,6 +273,9 @@ def test_camera_raw_is_linear_light_in_the_cameras_colours(tmp_path: Path, full:
     codes = np.round(512 + np.take_along_axis(light, mosaic[..., None], 2)[..., 0] * (16000 - 512)).astype(np.uint16)
     codes[60:64, 60:64] = 16000
     photos = read_photographs([write_dng(tmp_path / "a.dng", codes, 512, 16000)], full=full)
+    turned = read_photographs([write_dng(tmp_path / "turned.dng", codes, 512, 16000, orientation=6)], full=full)
+    assert photos.notes == () and "orientation is not applied" in turned.notes[0]
+    np.testing.assert_array_equal(turned.array, photos.array)
     image, scale = photos.array[0], 1 if full else 2
     expected = light if full else light.reshape(64, 2, 64, 2, 3).mean((1, 3))
     clipped = image >= 1

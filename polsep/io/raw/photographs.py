@@ -113,6 +113,7 @@ def _read_camera_raw(path: Path, full: bool) -> Page:
     path.open("rb").close()  # a missing file is reported as such, not as damage
     with decoding("camera raw"), rawpy.imread(str(path)) as raw:
         require_size((raw.sizes.height, raw.sizes.width))
+        turned = raw.sizes.flip  # what comes next sets it to 0
         image = raw.postprocess(
             gamma=(1, 1),
             no_auto_bright=True,
@@ -134,7 +135,8 @@ def _read_camera_raw(path: Path, full: bool) -> Page:
         height, width = (n // 2 * 2 for n in planes.shape[1:])
         whole = planes[:, :height, :width]
         planes = np.where(halve((whole >= 1).astype(np.float32)) > 0, 1, halve(whole)).astype(np.float32)
-    return Page(np.ascontiguousarray(np.moveaxis(planes, 0, -1)), white_level=1.0, **facts)
+    notes = ("the camera was turned: its orientation is not applied, pixels stay as stored",) if turned else ()
+    return Page(np.ascontiguousarray(np.moveaxis(planes, 0, -1)), white_level=1.0, notes=notes, **facts)
 
 
 def _capture_facts(facts: Any) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import sys
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 from test_cli import Cli, assert_refused, contents, run_here
 
 from polsep.compute.registration import MOTIONS, find_motion, move_back, residual_shift
@@ -21,6 +23,7 @@ from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.raw.photographs import MOST_FRAMES, read_photographs
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
+from polsep.io.store.errors import InputError
 from polsep.methods import METHODS
 from polsep.photographs import PAIR, PAIR_DEG, PhotoOptions, read_measurements
 from polsep.physics.stokes import Measurements, fit_stokes
@@ -239,6 +242,21 @@ def test_srgb_is_decoded_only_where_it_is_said(tmp_path: Path, suffix: str) -> N
     else:
         with pytest.raises(ValueError, match="or --encoding srgb for JPEG"):
             read_measurements(paths, PhotoOptions(PAIR, align="none"))
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_truncated_jpeg_is_refused(tmp_path: Path, progressive: bool) -> None:
+    """Decoders fill what is missing with grey; what follows the end of a whole picture says nothing."""
+    codes = np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
+    stream = io.BytesIO()
+    Image.fromarray(codes).save(stream, "JPEG", progressive=progressive, exif=b"Exif\0\0\xff\xd9")
+    path, data = tmp_path / "a.jpg", stream.getvalue()
+    path.write_bytes(data + b"\0\xff trailer")
+    assert read_photographs([path], encoded=True).array.shape == (1, 64, 96, 3)
+    for cut in (40, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:cut])
+        with pytest.raises(InputError, match="it is truncated"):
+            read_photographs([path], encoded=True)
 
 
 def write_dng(path: Path, codes: NDArray[np.uint16], black: int, white: int, orientation: int = 1) -> Path:

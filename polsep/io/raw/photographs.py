@@ -101,10 +101,27 @@ def _read_jpeg(path: Path) -> Page:
     with path.open("rb") as stream:
         require_signature(stream, (b"\xff\xd8\xff",), "a JPEG")
         data = stream.read()
+    _require_end(data)
     with decoding("JPEG"):
         array = np.asarray(imagecodecs.jpeg_decode(data))
     require_size(array.shape)
     return Page(array, notes=("JPEG has the camera's own curve, which --encoding srgb only resembles: use camera raw",))
+
+
+def _require_end(data: bytes) -> None:
+    """Raise InputError on a JPEG without its end marker, whose missing part decoders fill with grey.
+
+    Source: ITU-T T.81, B.1.1: segments have lengths; behind those of scans, 0xFF comes with 0 or a restart marker.
+    """
+    place = data.find(b"\xff", 2)
+    while 0 <= place < len(data) - 1:
+        code = data[place + 1]
+        if code == 0xD9:
+            return
+        alone = code in (0, 1) or 0xD0 <= code <= 0xD7
+        step = 1 if code == 0xFF else 2 if alone else 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+        place = data.find(b"\xff", place + step)
+    raise InputError(f"expected a JPEG up to its end marker, found its end at byte {len(data)}: it is truncated")
 
 
 def _read_camera_raw(path: Path, full: bool) -> Page:

@@ -156,6 +156,35 @@ def test_results_are_opened_again(sessions: Sessions, tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.frame.specular, frame.specular)
 
 
+def test_results_keep_their_name_and_their_lamp(sessions: Sessions, tmp_path: Path) -> None:
+    """An upload is named as its owner names it; the owner's file has the report beside it; the page's word counts."""
+    frame = opened(sessions, light="0.5,1,0.25").frame
+    (path, *_) = write_separation(frame, tmp_path, "shot")
+    sent = upload(sessions, "my shot.exr", path.read_bytes())
+    sessions.open_upload("b", [(str(sent), sent.name)])
+    found = sessions.find("b").separate(Settings())
+    assert found.frame.report["source"] == "my_shot" and "light_color" not in found.frame.report
+    told = sessions.find("b").separate(parse_settings({"light": "1,2,0.5"}))
+    assert told.frame.report["light_color"] == [0.5, 1.0, 0.25] and "0.500, 1.000, 0.250 told" in light_panel(
+        told.frame, told.small
+    )
+    page = sessions.find("c")
+    page.begin_own(path)
+    own = page.separate(Settings())
+    assert own.frame.report["light_color"] == [0.5, 1.0, 0.25] and own.frame.report["method"] == "color-affine"
+    assert own.remarks == tuple(frame.report["warnings"]) and own.mends() == ()
+
+
+def test_results_of_light_alone_say_so(sessions: Sessions, tmp_path: Path) -> None:
+    """Frames of a film have no polarization and no mask, which the panels would show as 0 and valid."""
+    frame = opened(sessions).frame
+    assert opening.LIGHT_ALONE not in frame.report["warnings"]
+    np.savez(tmp_path / "frame.npz", diffuse=frame.diffuse, specular=frame.specular)
+    page = sessions.find("b")
+    page.begin_own(tmp_path / "frame.npz")
+    assert page.separate(Settings()).remarks == (opening.LIGHT_ALONE,)
+
+
 @pytest.mark.parametrize(
     ("name", "data", "said"),
     [

@@ -19,11 +19,11 @@ from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD
 from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
-from polsep.io.results.sidecars import result_names
+from polsep.io.results.sidecars import read_report, result_names
 from polsep.io.store.errors import InputError
 from polsep.io.store.header_checks import at_most
 from polsep.methods import check_method
-from polsep.pipeline import LightColor, parse_light_color, separate_capture
+from polsep.pipeline import LightColor, is_to_be_found, parse_light_color, separate_capture, told_gains
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.exposure import Histogram, exposure_flags, histogram
 from polsep.separation.report import SeparatedFrame
@@ -49,6 +49,8 @@ OPTIONS = {
     "light-color": ("Light colour", "light"),
 }
 _ADVICE = re.compile(rf"--({'|'.join(OPTIONS)}) (?!N\b)([\w][^\s;:)]*)")
+#: Remark on results of `polsep video` and `polsep edit`.
+LIGHT_ALONE = "the file holds diffuse and specular alone: DoLP and AoLP are shown as 0, and every pixel as valid"
 _PLACEHOLDER = "{angle}"
 _ANGLE = re.compile(r"(?<!\d)(?:0{1,3}|0?45|0?90|135)(?!\d)")
 _ANGLES = (0, 45, 90, 135)
@@ -234,7 +236,8 @@ def read_source(sources: tuple[Source, ...], read: ReadOptions, index: int) -> F
     source = sources[min(index, len(sources) - 1)]
     with at_most(MAX_SAMPLES), _renamed(source):
         if source.separated:
-            return read_separated(source.path)
+            separated = read_separated(source.path)
+            return replace(separated, report=separated.report | read_report(source.path))
         frame = next(read_frames(source.path, read, 0 if several else index), None)
         if frame is None:
             raise ValueError(f"{source.path}: expected a frame number {index}, found none")
@@ -247,7 +250,9 @@ def open_frame(sources: tuple[Source, ...], settings: Settings, read: Frame | Se
     """Display data of a frame that was read: separated with the settings, or as it is."""
     stem = sources[min(settings.index, len(sources) - 1)].stem
     if isinstance(read, SeparatedFrame):
-        return OpenedFrame(read, shrink_frame(read), None, None, (), stem, settings.index, len(sources))
+        frame = _as_opened(read, settings.light_color, stem)
+        remarks = tuple(frame.report["warnings"])
+        return OpenedFrame(frame, shrink_frame(frame), None, None, remarks, stem, settings.index, len(sources))
     frame = separate_capture(read.data, settings.method, settings.light_color, full=settings.full)
     frame.report["source"] = stem
     advice = (*read.notes, *frame.report["warnings"])
@@ -259,6 +264,17 @@ def open_frame(sources: tuple[Source, ...], settings: Settings, read: Frame | Se
     stem = stem if len(sources) > 1 or read.count == 1 else f"{stem}_{read.index:04d}"
     small, place = shrink_frame(frame, flags), (read.index, read.count)
     return OpenedFrame(frame, small, mosaic, counted, remarks, stem, *place, flags=flags, advice=advice)
+
+
+def _as_opened(read: SeparatedFrame, light_color: LightColor | str, stem: str) -> SeparatedFrame:
+    """A result under the user's name for it, of the lamp's colour that the page says, and remarks on what it lacks."""
+    report = read.report | {"source": stem, "warnings": list(read.report.get("warnings", ()))}
+    if not is_to_be_found(light_color):
+        color = told_gains(light_color, read.diffuse.shape[-1])
+        report |= {"light_color": color, "light": {"source": "told", "color": color}}
+    if not read.dolp.any():
+        report["warnings"].append(LIGHT_ALONE)
+    return replace(read, report=report)
 
 
 def _as_separated(read: object, capture: object) -> Mosaic | None:

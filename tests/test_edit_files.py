@@ -592,6 +592,7 @@ def test_masks_and_normals_are_read(tmp_path: Path) -> None:
     ("array", "kind", "said"),
     [
         (np.full((2, 2, 3), [1, 2, 3], np.uint8), "mask", "expected a grey image as mask, found colours"),
+        (np.array([[0, 1], [1, 0]], np.uint8), "mask", "expected a mask of codes from 0 to 255, found none above 1"),
         (np.full((2, 2), 1.5, np.float32), "mask", r"expected a mask in \[0, 1\], found 1.5 to 1.5"),
         (np.full((2, 2), np.nan, np.float32), "mask", r"expected a mask in \[0, 1\], found nan"),
         (np.full((2, 2), np.inf, np.float32), "texture", "expected finite values"),

@@ -162,6 +162,9 @@ def _as_mask(codes: NDArray[Any], white: float | None) -> NDArray[Any]:
         if (values != values[..., :1]).any():
             raise InputError("expected a grey image as mask, found colours")
         values = values[..., 0]
+    if codes.dtype.kind == "u" and codes.max() == 1:  # labels, which as grey would be next to black
+        largest = np.iinfo(codes.dtype).max if white is None else white
+        raise InputError(f"expected a mask of codes from 0 to {largest:g}, found none above 1")
     if not (values.min() >= 0 and values.max() <= 1):
         raise InputError(f"expected a mask in [0, 1], found {values.min():g} to {values.max():g}")
     return values

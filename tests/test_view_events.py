@@ -19,6 +19,7 @@ from test_view import mosaic_codes, opened, png, upload
 from test_view_sequences import sessions
 
 from polsep.edit import Metallic, Recipe, Rougher
+from polsep.io.results.separation_writer import write_separation
 from polsep.view.components import MENDS, OF_FILES, PAUSE, SAME, Components, Start, Updates
 from polsep.view.edits import list_controls
 from polsep.view.images import KINDS
@@ -223,6 +224,15 @@ def test_the_compared_method_is_not_edited(events: Events, sessions: Sessions) -
     assert names(told) == ("Edited · color-affine, half", "Input · analytic, half")
     plain = asyncio.run(events.draw({**edited, "right": "Input"}, REQUEST))
     assert told["stage"] == plain["stage"]
+
+
+def test_a_result_is_not_compared_with_itself(events: Events, sessions: Sessions, tmp_path: Path) -> None:
+    """No method makes another separation of one, so no picture has a method's name, and the page says so."""
+    path = write_separation(opened(sessions).frame, tmp_path, "shot", "exr")[0]
+    told = asyncio.run(collect(events.open_own(path, {**VALUES, "against": "analytic, half"}, REQUEST)))[-1]
+    assert names(told) == ("Input", "Diffuse")
+    assert told["against"] == SAME and "only raw frames are separated by other methods" in told["status"]
+    assert "against" not in asyncio.run(collect(events.separate(VALUES, REQUEST)))[-1]
 
 
 def test_a_later_picture_stays(events: Events, sessions: Sessions, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,8 @@ NO_SHAPE = '<p class="ps-hint">The surface of a thing before a dark ground, unde
 IMAGES = {"texture": "Texture", "normals": "Normals", "mask": "Mask for all edits"}
 #: Settings that describe a file, where nothing is said: another file begins with these.
 OF_FILES = {"layout": UNSAID, "white": UNSAID, "black": "0", "light": "auto", "size": "", "pixel_format": UNSAID}
+#: Remark where a result is to be compared.
+RESULT_AS_IS = "a result is shown as it is: only raw frames are separated by other methods"
 #: The right picture is of the same separation as the left one.
 SAME = "the same"
 #: Largest number of offered mends.

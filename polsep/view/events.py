@@ -22,6 +22,7 @@ from polsep.view.components import (
     NOTHING,
     OF_FILES,
     PAUSE,
+    RESULT_AS_IS,
     SAME,
     Components,
     Start,
@@ -176,11 +177,13 @@ class Events:
         parts, mends = self.components, found.mends()
         unfit = {type(edit) for edit in session.dropped}
         controls = zip(parts.controls, list_controls(), strict=True)
+        refused = session.against is None and session.view["against"] != SAME
         offered = [gr.update(visible=True, value=mend.words) for mend in mends[:MENDS]]
         offered += [gr.update(visible=False)] * (MENDS - len(offered))
         return {
             **self._idle(),
-            parts.status: status_line(found),
+            parts.status: status_line(found, (RESULT_AS_IS,) if refused else ()),
+            **({parts.view["against"]: SAME} if refused else {}),
             parts.stage: self._stage(session),
             parts.readout: self._readout(session),
             parts.exposure: exposure_panel(found.frame, found.histogram),

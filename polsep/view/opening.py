@@ -230,10 +230,19 @@ class OpenedFrame:
         )
 
 
+def is_result(sources: tuple[Source, ...], index: int) -> bool:
+    """True if frame number ``index`` of a sequence was separated before: no method makes another of it."""
+    return _source(sources, index).separated
+
+
+def _source(sources: tuple[Source, ...], index: int) -> Source:
+    return sources[min(index, len(sources) - 1)]
+
+
 def read_source(sources: tuple[Source, ...], read: ReadOptions, index: int) -> Frame | SeparatedFrame:
     """Read frame number ``index`` of a sequence. Raises InputError, in one line that names the file."""
     several = len(sources) > 1
-    source = sources[min(index, len(sources) - 1)]
+    source = _source(sources, index)
     with at_most(MAX_SAMPLES), _renamed(source):
         if source.separated:
             separated = read_separated(source.path)
@@ -248,7 +257,7 @@ def read_source(sources: tuple[Source, ...], read: ReadOptions, index: int) -> F
 
 def open_frame(sources: tuple[Source, ...], settings: Settings, read: Frame | SeparatedFrame) -> OpenedFrame:
     """Display data of a frame that was read: separated with the settings, or as it is."""
-    stem = sources[min(settings.index, len(sources) - 1)].stem
+    stem = _source(sources, settings.index).stem
     if isinstance(read, SeparatedFrame):
         frame = _as_opened(read, settings.light_color, stem)
         remarks = tuple(frame.report["warnings"])

@@ -22,7 +22,16 @@ from polsep.io.store.temporary import make_folder, random_name, remove_folder
 from polsep.separation.report import SeparatedFrame
 from polsep.view.edits import edit_small, keep_fitting
 from polsep.view.images import EditImage, read_image, require_fit
-from polsep.view.opening import OpenedFrame, Settings, Source, find_sources, open_frame, open_small, read_source
+from polsep.view.opening import (
+    OpenedFrame,
+    Settings,
+    Source,
+    find_sources,
+    is_result,
+    open_frame,
+    open_small,
+    read_source,
+)
 from polsep.view.pictures import Floats, Sharp, Small, Window, cut_window
 from polsep.view.playback import AHEAD, Prefetcher, Reel
 
@@ -101,7 +110,7 @@ class Session:
     def separate(
         self, settings: Settings, against: Settings | None = None, wanted: Callable[[], bool] = lambda: True
     ) -> OpenedFrame:
-        """Separate the opened file with these settings, and with those of ``against`` for comparison.
+        """Separate the opened file with these settings, and with those of ``against`` for comparison, if it is raw.
 
         Raises ValueError, in one line that names the file, and Superseded if the result is not ``wanted`` at the end.
         """
@@ -111,6 +120,7 @@ class Session:
             raise ValueError("expected an opened file, found none: choose one, or the demo capture")
         found = self._find(sources, settings)
         made, other = [(sources, settings, found)], None
+        against = None if is_result(sources, settings.index) else against
         if against is not None:
             other = found if against == settings else self._find(sources, against)
             made += [(sources, against, other)] if other is not found else []

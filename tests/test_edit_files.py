@@ -120,6 +120,21 @@ def test_edited_frames_can_be_edited(tmp_path: Path, polsep: Cli) -> None:
     assert (tmp_path / "b" / "shot.exr").read_bytes() == (tmp_path / "c" / "shot.exr").read_bytes()
 
 
+def test_recipes_find_their_images_from_linked_folders(
+    tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the recipe's folder, or the one of the call, is a link to a deeper one."""
+    source = separated(tmp_path)
+    for name in ("own", "its"):
+        (tmp_path / "far" / "away" / name).mkdir(parents=True)
+        (tmp_path / name).symlink_to(tmp_path / "far" / "away" / name)
+    png(tmp_path / "own" / "mask.png", np.full((21, 26), 255, np.uint8))
+    monkeypatch.chdir(tmp_path / "own")
+    saved = tmp_path / "its" / "look.json"
+    assert polsep(source, "-o", "a", "--rougher", "2", "--mask", "mask.png", "--save-recipe", saved).status == 0
+    assert polsep(source, "-o", "b", "--recipe", saved).status == 0
+
+
 def test_recipes_are_saved_and_replayed(tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     """--save-recipe keeps the call; file names are relative to the recipe, from wherever it is replayed."""
     monkeypatch.chdir(tmp_path)

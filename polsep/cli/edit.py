@@ -203,7 +203,8 @@ def _save_recipe(recipe: Recipe, folder: Path, path: Path, overwrite: bool) -> N
     from polsep.edit.recipe import recipe_as_text, rename_images
     from polsep.io.results.edited import write_recipe_text
 
-    moved = rename_images(recipe, lambda name: os.path.relpath(folder / name, path.parent))
+    own, real = os.path.realpath(path.parent), os.path.realpath(folder)  # ".." leads out of what a link points to
+    moved = rename_images(recipe, lambda name: os.path.relpath(os.path.join(real, name), own))
     write_recipe_text(path, recipe_as_text(moved), overwrite)
     print(path)
 

@@ -23,6 +23,7 @@ from viewer import running
 
 from polsep import cli
 from polsep.view.pictures import Exposure, Picture, Place, Small, stage
+from polsep.view.server import require_address
 
 GRADIO = importlib.util.find_spec("gradio") is not None
 needs_gradio = pytest.mark.skipif(not GRADIO, reason="needs the extra view")
@@ -102,6 +103,30 @@ def test_bad_options_are_one_line(
         cli.main()
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
+
+
+def test_addresses_that_cannot_be_had_are_one_line() -> None:
+    """A port that another program has, and names and addresses of no machine or another one."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(ValueError, match=rf"free port, found 127\.0\.0\.1, port {port}: Address already in use"):
+            require_address("127.0.0.1", port)
+    for host in ("nowhere.invalid", "192.0.2.1", "a" * 70):
+        with pytest.raises(ValueError, match=f"^expected an address of this machine and a free port, found {host}: "):
+            require_address(host, None)
+    require_address("127.0.0.1", port)
+
+
+@needs_gradio
+@pytest.mark.skipif(not socket.has_ipv6, reason="needs IPv6")
+def test_it_listens_to_addresses_with_colons(tmp_path: Path) -> None:
+    """As browsers write them, in brackets."""
+    try:
+        require_address("::1", None)
+    except ValueError:
+        pytest.skip("this machine has no address ::1")
+    with running(tmp_path, "--method", "analytic", "--host", "::1") as address:
+        assert address.startswith("http://[::1]:") and ask(address, "GET", "/")[0] == 200
 
 
 @needs_gradio

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import threading
 import warnings
 from collections.abc import Iterator
@@ -45,10 +46,11 @@ class ViewOptions:
 def serve(options: ViewOptions) -> Iterator[str]:
     """Serve the viewer inside the block and yield its address.
 
-    Raises ModuleNotFoundError without Gradio, and OSError if the port is in use.
+    Raises ModuleNotFoundError without Gradio, and ValueError where it cannot listen to the address.
     """
     if find_spec("gradio") is None:
         raise ModuleNotFoundError("No module named 'gradio'", name="gradio")
+    require_address(options.host, options.port)
     scratch = make_temporary_folders()
     kept = {name: os.environ.get(name) for name in _environment(scratch.root)}
     os.environ.update(_environment(scratch.root))
@@ -69,6 +71,25 @@ def serve(options: ViewOptions) -> Iterator[str]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+def require_address(host: str, port: int | None) -> None:
+    """Raise ValueError where this machine has no such address, or another program has the port."""
+    try:
+        family, kind, _, _, place = socket.getaddrinfo(plain_host(host), port or 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            if os.name == "posix":  # elsewhere it would share the port
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(place)
+    except (OSError, UnicodeError) as error:
+        at = host if port is None else f"{host}, port {port}"
+        reason = getattr(error, "strerror", None) or "no name of a machine"
+        raise ValueError(f"expected an address of this machine and a free port, found {at}: {reason}") from None
+
+
+def plain_host(host: str) -> str:
+    """The address without the brackets that addresses with colons have in a browser."""
+    return host[1:-1] if host.startswith("[") and host.endswith("]") else host
 
 
 def _environment(root: Path) -> dict[str, str]:
@@ -95,12 +116,13 @@ def _build(options: ViewOptions, sessions: Sessions):  # type: ignore[no-untyped
 def _launch(page, options: ViewOptions) -> str:  # type: ignore[no-untyped-def]
     import gradio as gr
 
-    hosts = None if options.host in ANY_HOST else (*LOOPBACK, options.host.lower())
+    host = plain_host(options.host)
+    hosts = None if host in ANY_HOST else (*LOOPBACK, host.lower())
     most_bytes = options.most_mb << 20
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         _, address, _ = page.launch(
-            server_name=options.host,
+            server_name=f"[{host}]" if ":" in host else host,
             server_port=options.port,
             prevent_thread_lock=True,
             inbrowser=False,

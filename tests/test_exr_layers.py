@@ -192,3 +192,28 @@ def test_frames_of_videos_have_all_of_it(tmp_path: Path, monkeypatch: pytest.Mon
         for n in range(3):
             npt.assert_allclose(layers[f"S{n}.{color}"], stokes[n, ..., k], rtol=HALF, atol=1e-3)
     assert layers["R"].shape == (HEIGHT // 2, WIDTH // 2)
+
+
+@pytest.mark.parametrize(
+    ("window", "shown"),
+    [
+        ((2, 1, 7, 4), (0, 0, 11, 7)),
+        ((-3, -2, 14, 9), (0, 0, 11, 7)),
+        ((2, 1, 7, 4), (4, 3, 9, 6)),
+        ((2, 1, 7, 4),) * 2,
+    ],
+)
+def test_pixels_of_a_data_window_are_at_their_places_of_the_display_window(
+    tmp_path: Path, window: tuple[int, ...], shown: tuple[int, ...]
+) -> None:
+    ys, xs = np.mgrid[window[1] : window[3] + 1, window[0] : window[2] + 1]
+    corners = {
+        name: (np.array(box[:2], np.int32), np.array(box[2:], np.int32))
+        for name, box in (("dataWindow", window), ("displayWindow", shown))
+    }
+    header = {**corners, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"Y": (100 + 10 * ys + xs).astype(np.float32)}).write(str(tmp_path / "cut.exr"))
+    ys, xs = np.mgrid[shown[1] : shown[3] + 1, shown[0] : shown[2] + 1]
+    inside = (ys >= window[1]) & (ys <= window[3]) & (xs >= window[0]) & (xs <= window[2])
+    expected = np.where(inside, 100 + 10 * ys + xs, 0)
+    np.testing.assert_array_equal(read_exr_layers(tmp_path / "cut.exr")["Y"], expected)

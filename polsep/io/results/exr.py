@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.compiling import read_only
 from polsep.compute.threads import get_threads, run_over_rows
-from polsep.io.results.exr_header import EXPECTED, Notes, check_exr_header, packed_note
+from polsep.io.results.exr_header import EXPECTED, Notes, Window, check_exr_header, packed_note
 from polsep.io.results.pixels_kernel import CHUNK, HEAD, LARGEST, ROWS, STORED, fill_rows, pack_chunks
 from polsep.io.store.errors import InputError, naming, refuse_pipe
 from polsep.io.store.header_checks import require_signature
@@ -54,6 +54,7 @@ if hasattr(os, "register_at_fork"):
 def read_exr_layers(path: Path) -> dict[str, NDArray[np.float32]]:
     """Every channel of a single-part EXR file by its full name, such as ``diffuse.R``, each ``[H, W]``.
 
+    They are of the display window, as compositing programs show it: 0 where the file has no pixels.
     Raises InputError on anything but a complete single-part EXR (OpenEXR itself returns no part and prints a warning
     when pixels are missing), and on too large sizes in the header, before any pixel is read.
     """
@@ -62,8 +63,22 @@ def read_exr_layers(path: Path) -> dict[str, NDArray[np.float32]]:
         with Path(path).open("rb") as stream:
             require_signature(stream, (_SIGNATURE,), "an OpenEXR")
             data = stream.read()
-        check_exr_header(data)
-        return {name: channel.pixels for name, channel in _open_exr(data).channels().items()}
+        window, shown = check_exr_header(data)
+        channels = _open_exr(data).channels().items()
+        return {name: _in_display(channel.pixels, window, shown) for name, channel in channels}
+
+
+def _in_display(pixels: NDArray[Number], window: Window, shown: Window) -> NDArray[Number]:
+    """The pixels of a data window at their places in the display window that is ``shown``."""
+    if window == shown:
+        return pixels
+    image = np.zeros(shown.size[::-1], pixels.dtype)
+    top, bottom = max(window.top, shown.top), min(window.bottom, shown.bottom) + 1
+    left, right = max(window.left, shown.left), min(window.right, shown.right) + 1
+    if top < bottom and left < right:
+        rows, cols = slice(top - window.top, bottom - window.top), slice(left - window.left, right - window.left)
+        image[top - shown.top : bottom - shown.top, left - shown.left : right - shown.left] = pixels[rows, cols]
+    return image
 
 
 def _open_exr(data: bytes) -> Any:

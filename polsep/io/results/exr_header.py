@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 from polsep.io.store.errors import InputError
 from polsep.io.store.header_checks import require_size
 
 #: Attributes of a file by name: texts, and numbers, which become float32.
 Notes = Mapping[str, str | float]
+
 #: How every message begins.
 EXPECTED = "expected a complete single-part EXR file"
 #: Flags of the version field: tiles, deep pixels, several parts.
@@ -27,8 +29,25 @@ _LONGEST, _MOST = 255, 1000
 _LEADER, _ENTRY = 8, 8
 
 
-def check_exr_header(data: bytes) -> None:
-    """Raise InputError unless a file's header is of one flat part that the file has room for, of a size allowed."""
+class Window(NamedTuple):
+    """The first and the last column and row of pixels."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.right - self.left + 1, self.bottom - self.top + 1
+
+
+def check_exr_header(data: bytes) -> tuple[Window, Window]:
+    """The data window and the display window of a file.
+
+    Raises InputError unless its header is of one flat part that the file has room for, of sizes allowed.
+    """
     (version,) = struct.unpack_from("<I", data, 4) if len(data) >= 8 else (0,)
     if version & 255 != 2 or version & (_DEEP | _PARTS):
         raise InputError(f"{EXPECTED}, found another version, deep pixels or more parts")
@@ -38,10 +57,11 @@ def check_exr_header(data: bytes) -> None:
     missing = [name for name in ("channels", "compression", "dataWindow") if not values.get(name)]
     if missing or len(values["dataWindow"]) != 16:
         raise InputError(f"{EXPECTED}, found a header without {', '.join(missing) or 'dataWindow'}")
-    left, top, right, bottom = struct.unpack("<4i", values["dataWindow"])
     channels = sum(1 for _ in _channels(values["channels"]))
-    width, height = right - left + 1, bottom - top + 1
-    require_size((height, width, max(channels, 1)))
+    window, shown = _window(values["dataWindow"]), _window(values.get("displayWindow", values["dataWindow"]))
+    width, height = window.size
+    for size in (window.size, shown.size):
+        require_size((size[1], size[0], max(channels, 1)))
     chunks = -(-height // _ROWS.get(values["compression"][0], 1))
     if version & _TILED:
         if len(values.get("tiles", b"")) != 9:
@@ -51,6 +71,14 @@ def check_exr_header(data: bytes) -> None:
         chunks = -(-width // across) * -(-height // down)
     if (needed := end + chunks * (_LEADER + _ENTRY)) > len(data):
         raise InputError(f"{EXPECTED} of {needed} bytes or more for {chunks} chunks, found {len(data)} bytes")
+    return window, shown
+
+
+def _window(value: bytes) -> Window:
+    """The window of an attribute. Raises InputError."""
+    if len(value) != 16:
+        raise InputError(f"{EXPECTED}, found a window of {len(value)} bytes")
+    return Window(*struct.unpack("<4i", value))
 
 
 def packed_note(note: str | float) -> tuple[str, bytes]:

@@ -437,6 +437,18 @@ def test_numbers_in_names_count_as_numbers() -> None:
     ]
 
 
+def test_numbers_without_a_file_are_said(tmp_path: Path) -> None:
+    """Results are counted from 0, so that their names do not show gaps."""
+    folder = write_folder(tmp_path / "run", frames(9))
+    assert open_sequence(folder, ReadOptions()).notes == ()
+    for number in (3, 5, 6):
+        (folder / f"shot{number}.png").unlink()
+    assert "the numbers 3, 5 to 6:" in open_sequence(folder, ReadOptions()).notes[0]
+    for number in (1, 7):  # 0, 2, 4, 8: most do not follow
+        (folder / f"shot{number}.png").unlink()
+    assert open_sequence(folder, ReadOptions()).notes == ()
+
+
 @pytest.mark.usefixtures("compiled")
 def test_a_killed_run_goes_on_to_the_same_files(recording: Path, steady: Path, tmp_path: Path) -> None:
     generator = random.Random(5)

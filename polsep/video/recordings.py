@@ -249,7 +249,7 @@ def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Fram
     size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
     facts = separated.report["light"] if found is None else {"source": "found", **found.describe()}
     remarks = () if found is None else found.remarks
-    notes = (*frame.notes, *remarks, *separated.report["warnings"])
+    notes = (*recording.notes, *frame.notes, *remarks, *separated.report["warnings"])
     defects = _defects_of(_intact(islice(recording.begin(0), DEFECT_FRAMES), shape, options))
     black = separated.report.get("black_level")
     return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black)

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
@@ -39,12 +39,13 @@ class DamagedFrame:
 class FrameSequence:
     """A recording: ``begin(first)`` yields its frames from number ``first`` on, about ``count`` in all.
 
-    ``stem`` names its outputs.
+    ``stem`` names its outputs; ``notes`` are one-line remarks for the user.
     """
 
     stem: str
     count: int
     begin: Callable[[int], Iterator[Frame | DamagedFrame]]
+    notes: tuple[str, ...] = ()
 
 
 def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
@@ -52,7 +53,8 @@ def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
     path = path / RECORD if (path / RECORD).is_file() else path
     if path.is_dir():
         files = _frame_files(path)
-        return FrameSequence(path.resolve().name, len(files), lambda first: _read_files(files, options, first))
+        stem, notes = path.resolve().name, _gap_notes(files)
+        return FrameSequence(stem, len(files), lambda first: _read_files(files, options, first), notes)
     unread: str | None = None
     for frame in _read_stack(path, options, 1, 0):
         if isinstance(frame, Frame):
@@ -71,6 +73,20 @@ def _frame_files(folder: Path) -> list[Path]:
         found = ", ".join(f"{count} {suffix}" for suffix, count in sorted(kinds.items()))
         raise input_error(folder, f"expected frames of one kind, found {found}")
     return sorted(files, key=natural_order)
+
+
+def _gap_notes(files: list[Path]) -> tuple[str, ...]:
+    """A note on numbers without a file, where names differ in the number at their end and most numbers follow."""
+    names, digits = zip(*map(_numbered, files), strict=True)
+    if len(set(names)) > 1 or not all(map(str.isdecimal, digits)):
+        return ()
+    numbers = sorted(map(int, digits))
+    gaps = [(a, b) for a, b in pairwise(numbers) if b > a + 1]
+    if not gaps or 2 * len(gaps) >= len(files):
+        return ()
+    some = ", ".join(f"{a + 1}" if b == a + 2 else f"{a + 1} to {b - 1}" for a, b in gaps[:8])
+    more = ", ..." if len(gaps) > 8 else ""
+    return (f"no files have the numbers {some}{more}: frames are counted from 0, without gaps",)
 
 
 def input_files(path: Path) -> list[Path]:

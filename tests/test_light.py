@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -295,6 +296,9 @@ def test_default_is_the_light_found() -> None:
     assert auto.report["light"] == {"source": "found", **found.describe()}
     assert auto.report["light_color"] == list(found.color) == again.report["light_color"]
     assert json.loads(json.dumps(auto.report["light"]))["sure"] is True
+    page = (Path(__file__).parents[1] / "docs" / "conventions.md").read_text("utf-8")
+    listed = page.partition("The entry `light`")[2].partition("##")[0]
+    assert all(f"`{name}`" in listed for name in auto.report["light"])
     assert np.array_equal(auto.specular, told.specular) and told.report["light"]["source"] == "told"
     assert separate_capture(mosaic, "analytic", "white").report["light_color"] == [1, 1, 1]
 

@@ -65,8 +65,10 @@ class Light:
 
     ``log_ratio``: (ln R/G, ln B/G) of the lamp in camera RGB, and its ``covariance`` (rr, rb, bb); None for mono.
     ``error_deg``: mean angle by which such colours are off. ``sure``: whether the colour is found rather than assumed.
-    ``aolp``: of specular light [rad, in [0, pi)], None where nothing shows it. ``metal``: share of the lit frame that
-    mirrors the lamp in the colour of gold or copper. ``remarks``: what the frame's owner should know of that.
+    ``aolp``: along which the frame is polarized most [rad, in [0, pi)], None where nothing shows it; that of specular
+    light, but where much diffuse light is polarized (statistics of reports are of separated light). ``metal``: share of
+    the lit frame that mirrors the lamp in the colour of gold or copper. ``remarks``: what the frame's owner should know
+    of that.
     """
 
     log_ratio: tuple[float, float] | None
@@ -92,7 +94,6 @@ class Light:
             "sure": self.sure,
             "log_ratio": None if self.log_ratio is None else [round(r, 5) for r in self.log_ratio],
             "covariance": None if self.covariance is None else [float(f"{c:.4g}") for c in self.covariance],
-            "specular_aolp_deg": None if self.aolp is None else round(math.degrees(self.aolp), 2),
             "metal_fraction": round(self.metal, 4),
         }
 

@@ -49,17 +49,19 @@ def psnr(found: Tensor, truth: Tensor, mask: Tensor) -> float:
 
 def psnr_unlimited(found: Tensor, truth: Tensor, mask: Tensor) -> float:
     """Return the PSNR of the values as they are; see `psnr`."""
-    error = float(((found - truth) ** 2).mean(dim=0)[mask].mean())
-    if math.isnan(error):
-        raise ValueError(f"expected numbers inside a mask, found NaN in {int(mask.sum())} pixels")
-    return min(120.0, -10 * math.log10(max(error, 1e-30)))
+    squared = ((found - truth) ** 2).mean(dim=0)[mask]
+    if not squared.numel():
+        raise ValueError("expected a mask with pixels, found an empty one")
+    _require_numbers(squared)
+    return min(120.0, -10 * math.log10(max(float(squared.mean()), 1e-30)))
 
 
 def ssim(found: Tensor, truth: Tensor, mask: Tensor) -> float:
     """Return the mean structural similarity of images limited to [0, 1], inside ``mask``.
 
     Every colour by itself; Gaussian windows, of which those that reach beyond the border are left out. Source: Wang,
-    Bovik, Sheikh, Simoncelli 2004, doi:10.1109/TIP.2003.819861. Raises ValueError when no window of the mask fits.
+    Bovik, Sheikh, Simoncelli 2004, doi:10.1109/TIP.2003.819861. Raises ValueError when no window of the mask fits,
+    and on values in such windows that are no numbers.
     """
     radius = SSIM_RADIUS
     kept = mask.clone()
@@ -73,7 +75,15 @@ def ssim(found: Tensor, truth: Tensor, mask: Tensor) -> float:
     covariance, variances = xy - mean_x * mean_y, xx + yy - mean_x**2 - mean_y**2
     likeness = (2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)
     likeness = likeness / ((mean_x**2 + mean_y**2 + SSIM_C1) * (variances + SSIM_C2))
-    return float(likeness.mean(dim=0)[kept].mean())
+    score = likeness.mean(dim=0)[kept]
+    _require_numbers(score)
+    return float(score.mean())
+
+
+def _require_numbers(image: Tensor) -> None:
+    """Raise ValueError on an image that holds NaN."""
+    if wrong := int(image.isnan().sum()):
+        raise ValueError(f"expected numbers inside a mask, found NaN in {wrong} pixels")
 
 
 def _around(mask: Tensor, margin: int) -> tuple[slice, slice]:
@@ -100,12 +110,14 @@ def flip(found: Tensor, truth: Tensor, mask: Tensor) -> float:
 
     Images ``[3, h, w]`` or ``[1, h, w]``, limited to [0, 1] and shown in sRGB at 67 pixels per degree: the difference
     that an observer sees who flips between both frames. Source: Andersson et al. 2020, doi:10.1145/3406183, by the
-    authors' own library. Raises ValueError without the extra bench, and where the mask is empty.
+    authors' own library. Raises ValueError without the extra bench, where the mask is empty, and on values that are no
+    numbers near it, which the library takes for light.
     """
     evaluator = require_flip()
     if not bool(mask.any()):
         raise ValueError("expected a mask with pixels, found an empty one")
     around = _around(mask, FLIP_REACH)
+    _require_numbers((found - truth)[..., *around].mean(dim=0))
     limited = (x[..., *around].clamp(0, 1).expand(3, -1, -1) for x in (truth, found))
     images = (x.permute(1, 2, 0).float().contiguous().numpy() for x in limited)
     # With inputsRGB=False the library accepts linear values.

@@ -65,10 +65,20 @@ def test_masks_without_windows_are_refused() -> None:
 def test_nothing_and_no_numbers_have_no_score(score: Callable[[Tensor, Tensor, Tensor], float]) -> None:
     """Neither an empty mask nor NaN may pass for a perfect image."""
     found, truth = pair()
-    with pytest.raises(ValueError, match="found NaN in 0 pixels"):
+    with pytest.raises(ValueError, match="found an empty one"):
         score(found, truth, torch.zeros_like(EVERYWHERE))
     found[0, 3, 3] = torch.nan
-    with pytest.raises(ValueError, match="found NaN in 2000 pixels"):
+    with pytest.raises(ValueError, match="found NaN in 1 pixels"):
+        score(found, truth, EVERYWHERE)
+
+
+@pytest.mark.parametrize("score", [ssim, flip])
+def test_scores_of_windows_refuse_what_is_no_number(score: Callable[[Tensor, Tensor, Tensor], float]) -> None:
+    if score is flip:
+        pytest.importorskip("flip_evaluator")
+    found, truth = pair()
+    found[0, 20, 20] = torch.nan
+    with pytest.raises(ValueError, match="expected numbers inside a mask, found NaN"):
         score(found, truth, EVERYWHERE)
 
 

@@ -399,6 +399,8 @@ def test_shapes_that_are_made_to_fit() -> None:
     codes = random_codes("uint8", (13, 17))
     mosaic, notes = as_mosaic(codes)
     assert notes == ("size 17x13 cuts polarizer cells of the layout: cropped to 16x12, whole cells",)
+    _, notes = as_mosaic(random_codes("uint8", (14, 17)), "90,45,135,0/GBRG@1,0")
+    assert notes == ("size 17x14 cuts polarizer cells of the layout: cropped to 16x12, whole cells",)
     assert_samples(mosaic, codes[:12, :16])
     codes = random_codes("uint8")
     assert_samples(as_mosaic(codes[..., None])[0], codes)

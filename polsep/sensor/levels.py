@@ -86,7 +86,7 @@ def as_mosaic(
     odd_rows, odd_cols = ((n - start) % 2 for n, start in zip((height, width), layout.origin, strict=True))
     if odd_rows or odd_cols:
         plane = plane[: height - odd_rows, : width - odd_cols]
-        size = f"{plane.shape[1]}x{plane.shape[0]}"
+        size = f"{plane.shape[1] - layout.origin[1]}x{plane.shape[0] - layout.origin[0]}"
         notes += (f"size {width}x{height} cuts polarizer cells of the layout: cropped to {size}, whole cells",)
     rows, cols = (layout.period + start for start in layout.origin)
     if plane.shape[0] < rows or plane.shape[1] < cols:

@@ -154,3 +154,13 @@ def test_frames_of_things_that_stand_stay_upright(tmp_path: Path, monkeypatch: p
     upright = {(0.5, 0.6, 0.6), (-0.5, 0.6, 0.6)}
     assert signs[1] == signs[2] == upright
     assert len(signs[0]) == 8 and len(KINDS) == 3
+
+
+@pytest.mark.parametrize("seed", [-3, 20261128104500])
+def test_a_seed_may_have_a_sign_and_be_a_date(tmp_path: Path, seed: int) -> None:
+    """Batches are read from its examples, whose files say which ones they are."""
+    planes = torch.zeros(COUNT, 24, 24)
+    planes[PLANES["mask"], 4:20, 4:20] = 1
+    write_example(path := Examples("train", seed).path(tmp_path, 7), planes)
+    assert find_example(path) == (Examples("train", seed), 7)
+    assert len(next(batches(ShapeOptions(seed=seed, batch=2, side=16), [path], 5, (0, 1))).planes) == 2

@@ -27,12 +27,10 @@ from polsep.train.material_losses import (
     rendering_loss,
     slopes_loss,
 )
-from polsep.train.tasks import find
+from polsep.train.tasks import batch_generator, find
 
 #: Seed and numbers of validation's configurations: random ones and mirror ones.
 VALIDATION_SEED, VALIDATION_PICTURES = 2026, (3, 6)
-#: A batch's seed is its step times this, plus the rank of the process.
-RANKS = 1024
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ def turn_example(example: MaterialBatch, across: bool, down: bool, transposed: b
 def batches(options: MaterialOptions, folder: Path, step: int, process: tuple[int, int]) -> Iterator[MaterialBatch]:
     """Yield batches from ``step`` on, for process (rank, count)."""
     while True:
-        generator = torch.Generator().manual_seed((options.seed << 24) ^ (step * RANKS + process[0]))
+        generator = batch_generator(options.seed, step, process[0])
         count = 1 + int(torch.randint(options.views, (1,), generator=generator))
         turned = []
         for number in torch.randint(options.examples, (options.batch,), generator=generator).tolist():

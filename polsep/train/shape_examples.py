@@ -227,7 +227,8 @@ def surface_planes(view: View, materials: Materials, shot: Shot) -> Tensor:
 
 def find_example(path: Path) -> tuple[Examples, int]:
     """The examples to which a file of `Examples.path` belongs, without their meshes, and its number."""
-    _, split, seed, number = path.stem.split("-")
+    _, split, rest = path.stem.split("-", 2)
+    seed, number = rest.rsplit("-", 1)  # a seed may have a sign
     return Examples(split, int(seed)), int(number)
 
 

@@ -28,7 +28,7 @@ from polsep.networks.sizes import ResidualSize
 from polsep.train.loop import Training
 from polsep.train.shape_examples import MESHES, PLANES, Examples, find_example, load_example
 from polsep.train.shape_losses import gained, pictures_loss, random_lamps, shape_loss
-from polsep.train.tasks import find
+from polsep.train.tasks import batch_generator, find
 
 #: Inputs of trainings: those of frames, and "perfect", the input "separated" of true images.
 TRAINED = (*INPUTS, "perfect")
@@ -42,8 +42,6 @@ CUTS, CUT = (1.04, 1.5), 1.1
 #: Share of frames of things that stand which are turned in eight ways, as frames of things held at any angle: with all
 #: of the solids, every second frame (a third and a quarter of two thirds).
 HELD_SHARE = 0.25
-#: A batch's seed is its step times this, plus the rank of the process.
-RANKS = 1024
 #: Seed and number of validation's lamps.
 LAMP_SEED, VALIDATION_LAMPS = 31, 20
 
@@ -179,7 +177,7 @@ def tell_light(planes: Tensor, generator: torch.Generator) -> Tensor:
 def batches(options: ShapeOptions, paths: Sequence[Path], step: int, process: tuple[int, int]) -> Iterator[ShapeBatch]:
     """Yield batches from ``step`` on, for process (rank, count)."""
     while True:
-        generator = torch.Generator().manual_seed((options.seed << 24) ^ (step * RANKS + process[0]))
+        generator = batch_generator(options.seed, step, process[0])
         found = []
         for number in torch.randint(len(paths), (options.batch,), generator=generator).tolist():
             draws = torch.rand(4, generator=generator).tolist()

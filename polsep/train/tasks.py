@@ -20,6 +20,8 @@ from polsep.train.stream import Examples, StreamOptions
 
 #: Share of a training for which `losses.first_specular_loss` replaces Eq. 21, on rungs without a specular closed form.
 FIRST_SHARE = 1 / 8
+#: A batch's seed is its step times this, plus the rank of the process.
+RANKS = 1024
 
 Item = TypeVar("Item")
 
@@ -81,3 +83,8 @@ def find(known: Mapping[str, Item], kind: str, name: str) -> Item:
     if name not in known:
         raise ValueError(f"expected {kind} of {', '.join(known)}, found {name!r}")
     return known[name]
+
+
+def batch_generator(seed: int, step: int, rank: int) -> torch.Generator:
+    """Return the generator of batch number ``step`` of a process ``rank``, in a training of any ``seed``."""
+    return torch.Generator().manual_seed(((seed << 24) ^ (step * RANKS + rank)) % 2**63)

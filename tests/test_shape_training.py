@@ -23,7 +23,7 @@ from polsep.io.store.weights import read_weights
 from polsep.networks.sizes import ResidualSize
 from polsep.train.loop import Run, Schedule
 from polsep.train.shape_command import train_shape
-from polsep.train.shape_examples import MESHES, PLANES, Examples, load_example
+from polsep.train.shape_examples import MESHES, PLANES, Examples, find_example, load_example
 from polsep.train.shape_task import ShapeOptions
 from tools import round_weights
 
@@ -52,7 +52,10 @@ def test_a_stopped_training_goes_on(tmp_path: Path) -> None:
 
 
 def test_meshes_of_files_are_shown_too(tmp_path: Path) -> None:
-    """As many examples again show them; the file says which meshes; a folder without meshes is refused."""
+    """As many examples again show them; the file says which meshes; a folder without meshes is refused.
+
+    Other meshes have other examples, in the same folder.
+    """
     folder, meshes = tmp_path / "examples", tmp_path / "meshes"
     meshes.mkdir()
     train = partial(train_shape, OPTIONS, folder=folder, report=lambda _: None)
@@ -61,15 +64,20 @@ def test_meshes_of_files_are_shown_too(tmp_path: Path) -> None:
     trimesh.creation.capsule(1, 0.4).export(meshes / "capsule.ply")
     trimesh.creation.box((1, 2, 3)).export(meshes / "box.obj")
     weights = train(Run(tmp_path / "run", schedule=SCHEDULE), meshes=meshes)
-    shown = Examples(MESHES, OPTIONS.seed)
+    found = hash_files([meshes / "box.obj", meshes / "capsule.ply"])
+    shown = Examples(MESHES, OPTIONS.seed, shown=found)
     names = {path.name for path in folder.glob("*.npy")}
     assert {shown.path(folder, number).name for number in range(2)} < names and len(names) == 5
     planes = load_example(shown.path(folder, 0)).float()
     length = planes[PLANES["normal"]].norm(dim=0)[planes[PLANES["mask"]][0] > 0]
     assert len(length) > 500 and float((length - 1).abs().max()) < 0.01
     facts = read_weights(weights)[1]
-    found = hash_files([meshes / "box.obj", meshes / "capsule.ply"])
     assert json.loads(facts["options"])["meshes"] == found and facts["command"].endswith("--meshes meshes")
+    (meshes / "box.obj").unlink()
+    train(Run(tmp_path / "other", schedule=SCHEDULE), meshes=meshes)
+    other = Examples(MESHES, OPTIONS.seed, shown=hash_files([meshes / "capsule.ply"])).path(folder, 0)
+    assert not load_example(other).equal(load_example(shown.path(folder, 0)))
+    assert find_example(other) == (Examples(MESHES, OPTIONS.seed), 0)
 
 
 def test_other_files_are_no_examples(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def train_shape(
 
     def make() -> Training:
         shown = [creased(read_mesh(path)) for path in found]
-        every = {split: Examples(split, options.seed, shown) for split in counts}
+        every = {split: Examples(split, options.seed, shown, options.meshes) for split in counts}
         makers.note(every[split].path(folder, k) for split in counts for k in range(counts[split]))
         for split, examples in every.items():
             for number in make_examples(examples, folder, range(counts[split])):

@@ -97,11 +97,15 @@ MAX_DRAWS = 20
 
 
 class Examples(NamedTuple):
-    """Examples of a ``split`` and a ``seed``; ``meshes``, with creases, are those that the split `MESHES` shows."""
+    """Examples of a ``split`` and a ``seed``; ``meshes``, with creases, are those that the split `MESHES` shows.
+
+    ``shown``: the sha256 of the files of these; its beginning is in the names of their examples.
+    """
 
     split: str
     seed: int
     meshes: Sequence[Mesh] = ()
+    shown: str = ""
 
     def generator(self, number: int, view: int | None = None) -> torch.Generator:
         """Return the generator of the thing of example ``number``, or of a view of it."""
@@ -121,7 +125,8 @@ class Examples(NamedTuple):
 
     def path(self, folder: Path, number: int) -> Path:
         """The file of example ``number``."""
-        return folder / f"shape-{self.split}-{self.seed}-{number:06d}.npy"
+        of = f".{self.shown[:12]}" if self.split == MESHES and self.shown else ""
+        return folder / f"shape-{self.split}{of}-{self.seed}-{number:06d}.npy"
 
 
 def random_upright_camera(vertices: Floats, generator: torch.Generator) -> PinholeCamera:
@@ -229,7 +234,7 @@ def find_example(path: Path) -> tuple[Examples, int]:
     """The examples to which a file of `Examples.path` belongs, without their meshes, and its number."""
     _, split, rest = path.stem.split("-", 2)
     seed, number = rest.rsplit("-", 1)  # a seed may have a sign
-    return Examples(split, int(seed)), int(number)
+    return Examples(split.partition(".")[0], int(seed)), int(number)
 
 
 def make_examples(examples: Examples, folder: Path, numbers: range) -> Iterator[int]:

@@ -231,7 +231,7 @@ def shape_training(options: ShapeOptions, folder: Path) -> Training:
     network, name = options.network(), encoding_of(options.input)
 
     def paths(split: str, count: int) -> list[Path]:
-        examples = Examples(split, options.seed)
+        examples = Examples(split, options.seed, shown=options.meshes)
         found = [path for number in range(count) if (path := examples.path(folder, number)).is_file()]
         if not found:
             raise ValueError(f"expected examples in {folder}, found none")

@@ -39,6 +39,8 @@ def test_a_stopped_training_goes_on(tmp_path: Path) -> None:
     part = Run(tmp_path / "part", schedule=SCHEDULE, until=2)
     train_shape(OPTIONS, part, folder, lambda _: None)
     resumed = train_shape(OPTIONS, replace(part, until=None), folder, lambda _: None)
+    with pytest.raises(ValueError, match="at step 4 of the checkpoint or later, found 2"):
+        train_shape(OPTIONS, part, folder, lambda _: None)  # its weights are of step 4 and say so
     first, second = read_weights(whole), read_weights(resumed)
     assert first[0].keys() == second[0].keys()
     for array in first[0]:

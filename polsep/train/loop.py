@@ -150,7 +150,8 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
     """Train to the end, from the last checkpoint if there is one, and return the averaged weights.
 
     ``report`` is called with every line of the log. Of several processes only the first one writes and reports; the
-    others return None. Raises ValueError on a checkpoint of another training, and on a loss that is not finite.
+    others return None. Raises ValueError on a checkpoint of another training or beyond the run's last step, and on a
+    loss that is not finite.
     """
     if run.schedule.precision == "bf16-mixed":
         device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -169,6 +170,7 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
     optimizer = Optimizers(network)
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
     step = _restore(state, described, network, optimizer, average)
+    _require_end(run, step)
     batches = training.batches(step, (fabric.global_rank, fabric.world_size)) if step < run.last else iter(())
     with ExitStack() as stack:
         log = (
@@ -266,6 +268,12 @@ def _restore(
     for name, value in average.items():
         value.copy_(state["average"][name])
     return int(state["step"])
+
+
+def _require_end(run: Run, step: int) -> None:
+    """Raise ValueError on a run that ends before the ``step`` of its checkpoint: its weights would be of another."""
+    if step > run.last:
+        raise ValueError(f"expected to end at step {step} of the checkpoint or later, found {run.last}")
 
 
 def _parts(network: nn.Module) -> list[nn.Module]:

@@ -31,6 +31,7 @@ from polsep.io.assets.shapes import encode_glb, encode_ply
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb
+from polsep.io.results.separation_reader import read_separated
 from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.image_codecs import encode_png
 from polsep.physics.stokes import Stokes
@@ -123,6 +124,18 @@ def test_notes_stay_with_views_that_shrink(separated: list[Path]) -> None:
     assert views.notes == ()
     small, _ = files.shrink(replace(views, notes=("a: b",)), np.ones((SIDE, SIDE), np.bool_), SIDE // 2)
     assert small.notes == ("a: b",) and small.images.shape[1:3] == (SIDE // 2, SIDE // 2)
+
+
+def test_the_lamps_colour_is_divided_out(separated: list[Path]) -> None:
+    """Separated files of a coloured lamp, which the report beside each names, are what a white lamp shows."""
+    source = files.Source("frames", ReadOptions(), "analytic")
+    white, color = files.read_views(separated, source).images, (0.5, 1.0, 0.6)
+    for path in separated:
+        frame = read_separated(path)
+        lit = [x * np.float32(color) for x in (frame.diffuse, frame.specular)]
+        frame = replace(frame, diffuse=lit[0], specular=lit[1], report={"light_color": list(color)})
+        write_separation(frame, path.parent, path.stem, overwrite=True)
+    np.testing.assert_allclose(files.read_views(separated, source).images, white * np.mean(color), rtol=2e-3)
 
 
 def test_a_turntable_is_a_film_of_the_mesh(

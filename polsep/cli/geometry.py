@@ -106,7 +106,8 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
         refuse_frame_options(f"{files[0]}, which is separated")
     read = read_options(options)
     targets = shape_targets(options["output"], options["name"], options["mesh"], options["turntable"])
-    refuse_inputs(targets, [*files, *filter(None, [options["mask"]]), *correcting_files(options)])
+    beside = [file.with_suffix(".json") for file in files if is_separated(file)]  # reports are read, too
+    refuse_inputs(targets, [*files, *beside, *filter(None, [options["mask"]]), *correcting_files(options)])
     refuse_existing(options["output"], targets, options["overwrite"])
     from polsep.geometry.files import (
         ShapeOptions,

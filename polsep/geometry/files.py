@@ -26,8 +26,9 @@ from polsep.io.raw.frames import ReadOptions
 from polsep.io.raw.videos import load_library
 from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
-from polsep.io.results.separation_reader import is_separated, read_separated
+from polsep.io.results.separation_reader import is_separated
 from polsep.io.store.errors import InputError, input_error
+from polsep.pipeline import open_separated
 from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float64]
@@ -98,20 +99,32 @@ def read_views(paths: Sequence[Path], source: Source) -> Views:
 
 
 def views_of(frames: Sequence[SeparatedFrame]) -> Views:
-    """Separated frames of one size with their polarization."""
-    names = ("diffuse", "specular", "dolp", "aolp", "valid")
-    stacks = (np.stack([getattr(frame, name) for frame in frames]).astype(np.float64) for name in names)
-    diffuse, specular, dolp, aolp, valid = stacks
+    """Separated frames of one size with their polarization.
+
+    In white light, as their DoLP is: the lamp's colour by each report, over its mean, is divided out.
+    """
+    lobes = [[lobe / _gains_of(frame) for lobe in (frame.diffuse, frame.specular)] for frame in frames]
+    diffuse, specular = (np.stack(images) for images in zip(*lobes, strict=True))
+    names = ("dolp", "aolp", "valid")
+    dolp, aolp, valid = (np.stack([getattr(frame, name) for frame in frames]).astype(np.float64) for name in names)
     grey, highlight = diffuse.mean(axis=-1), specular.mean(axis=-1)
     strength = dolp * (grey + highlight)
     return Views(diffuse, Polarized(grey, highlight, strength * np.cos(2 * aolp), strength * np.sin(2 * aolp), valid))
+
+
+def _gains_of(frame: SeparatedFrame) -> Floats:
+    """The lamp's colour by the report over its mean; 1 where it says none."""
+    channels = frame.diffuse.shape[-1]
+    light = np.array(frame.report.get("light_color", (1.0,) * channels), np.float64)[:channels]
+    gains: Floats = light / light.mean()
+    return gains
 
 
 def _read_frame(path: Path, source: Source) -> tuple[SeparatedFrame, list[str]]:
     """One frame, separated, and notes on a raw one."""
     if not is_separated(path):
         return separate_file(path, source.options, source.method)
-    frame = read_separated(path)
+    frame, _ = open_separated(path)
     if not frame.dolp.any():
         raise input_error(path, "expected a file of polsep separate with its polarization, found none in it")
     return frame, []

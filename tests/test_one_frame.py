@@ -438,6 +438,9 @@ def test_masks_of_odd_raw_frames_are_taken(tmp_path: Path) -> None:
     assert found.shape == (32, 33) and found[5:15, 10:20].all() and found.sum() == 100
     whole = read_object(tmp_path / "mask.npy", (64, 66))  # full resolution
     assert whole.shape == (64, 66) and whole.sum() == 400
+    np.save(tmp_path / "mask.npy", mask[1:, 1:])  # a crop to 64x66, whose first whole cells begin at 1, 1
+    cropped = read_object(tmp_path / "mask.npy", (31, 32))
+    assert cropped[4:14, 9:19].all() and cropped.sum() == 100
 
 
 def test_a_frame_that_is_full_is_said() -> None:

@@ -71,16 +71,18 @@ def read_map(path: Path, kind: str) -> Floats:
 
 
 def read_object(path: Path, size: tuple[int, ...]) -> NDArray[np.bool_]:
-    """The mask ``[H, W]`` of a thing, in a file of that size, or of the raw frame's, which is twice that or odd.
+    """The mask ``[H, W]`` of a thing, in a file of that size, or of the raw frame's, which is twice that or larger by
+    what cuts cells: an odd last row or column, and with it the first one of a frame whose cells begin at the second.
 
     Raises InputError.
     """
     found: NDArray[np.bool_] = np.asarray(read_map(path, "mask") > 0.5)
     if tuple(n // 2 * 2 for n in found.shape) == tuple(size):
         found = found[: size[0], : size[1]]
-    if found.shape != size and (found.shape[0] // 2, found.shape[1] // 2) == tuple(size):
-        found = found[: 2 * size[0], : 2 * size[1]]  # cells that are cut are not separated
-        found = found.reshape(size[0], 2, size[1], 2).min(axis=(1, 3))
+    cut = [n - 2 * half for n, half in zip(found.shape, size, strict=True)]
+    if found.shape != size and 0 <= min(cut) <= max(cut) <= 2:  # cells that are cut are not separated
+        rows, cols = (slice(n // 2, n // 2 + 2 * half) for n, half in zip(cut, size, strict=True))
+        found = found[rows, cols].reshape(size[0], 2, size[1], 2).min(axis=(1, 3))
     if found.shape != size:
         raise input_error(path, f"expected a mask of {list(size)}, found {list(found.shape)}")
     if not found.any():

@@ -359,7 +359,7 @@ def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[
     notes = list(frame.report.get("warnings", ()))
     if not is_to_be_found(light_color):
         frame.report["light_color"] = stated_gains(light_color, frame.diffuse.shape[-1])
-    elif "light_color" not in frame.report:
+    elif "light_color" not in frame.report and frame.diffuse.shape[-1] > 1:
         notes.append(f"the lamp's colour is not told, nor known from {path.stem}.json beside the file: taken for white")
     return frame, notes
 

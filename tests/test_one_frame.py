@@ -61,7 +61,7 @@ from polsep.networks.shape import ShapeNetwork
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.fresnel import diffuse_dolp
 from polsep.physics.stokes import Stokes
-from polsep.pipeline import stated_gains
+from polsep.pipeline import open_separated, stated_gains
 from polsep.render.blobs import random_blob
 from polsep.sensor.camera import IDEAL, Layout, Mosaic, expose
 from polsep.separation.report import SeparatedFrame
@@ -518,6 +518,8 @@ def test_a_file_becomes_maps_and_a_mesh(run: Cli, tmp_path: Path) -> None:
     assert (facts["light"], facts["light_is"]) == ([0, 0, 1], "told") and set(facts["units"]) == {
         name.split(".")[0] for name in planes
     }
+    assert (facts["index"], facts["mask_is"]) == (1.5, "found where light falls")
+    assert [f"polsep: {line}" for line in facts["warnings"]] == done.err.splitlines()
     assert_refused(run(path, "-o", out), "--overwrite")
 
 
@@ -542,6 +544,8 @@ def test_the_lamp_of_a_separated_file_is_read_beside_it(run: Cli, tmp_path: Path
     (tmp_path / "tinted.json").unlink()
     alone = run(tmp_path / "tinted.exr", "-o", tmp_path / "other", "--mesh", "none")
     assert alone.status == 0 and "colour is not told, nor known" in alone.err
+    gray = replace(frame, diffuse=frame.diffuse[..., :1], specular=frame.specular[..., :1])
+    assert not open_separated(write_separation(gray, tmp_path, "gray")[0])[1]  # mono has no lamp's colour
 
 
 @pytest.mark.parametrize("beside", ["nothing", "another colour"])

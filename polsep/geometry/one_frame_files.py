@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,8 @@ def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list
         files = shape_files(frame, found, settings, path.stem)
     except ValueError as error:
         raise input_error(path, error) from error
-    return files, notes + found.doubts()
+    notes = [*notes, *found.doubts()]
+    return replace(files, facts={**files.facts, "warnings": notes}), notes
 
 
 def _read_frame(path: Path, settings: ShapeSettings) -> tuple[SeparatedFrame, list[str]]:
@@ -93,6 +94,8 @@ def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, ti
     facts: dict[str, Any] = {
         "light": [round(x, 4) for x in found.light],
         "light_is": _light_source(found, settings),
+        "mask_is": "told" if found.mask_told else "found where light falls",
+        "index": settings.index,
         "method": frame.report.get("method", "separated before"),
         "median_normal_error_deg": round(float(np.degrees(np.median(found.normal_error[found.mask]))), 2),
         "unknown_roughness": round(float((found.roughness_error[found.mask] >= UNKNOWN).mean()), 4),

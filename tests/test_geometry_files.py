@@ -126,6 +126,15 @@ def test_notes_stay_with_views_that_shrink(separated: list[Path]) -> None:
     assert small.notes == ("a: b",) and small.images.shape[1:3] == (SIDE // 2, SIDE // 2)
 
 
+def test_a_small_object_is_found_in_noise() -> None:
+    """It may fill a hundredth of the frame or less; noise and hot pixels around it are none of it."""
+    images = np.abs(np.random.default_rng(0).normal(0, 0.002, (6, 256, 306, 3)))
+    images[:, 40, 50] = 1.0
+    images[:, 120:140, 160:180] += 0.5
+    mask = files.find_object(files.Views(images, None))
+    assert mask[120:140, 160:180].all() and mask.sum() == 400
+
+
 def test_the_lamps_colour_is_divided_out(separated: list[Path]) -> None:
     """Separated files of a coloured lamp, which the report beside each names, are what a white lamp shows."""
     source = files.Source("frames", ReadOptions(), "analytic")

@@ -20,6 +20,7 @@ from polsep.geometry.integration import integrate_bilateral, integrate_smooth
 from polsep.geometry.photometric import Appearance, fit_robust
 from polsep.geometry.polarization import Polarized, find_diffuse_polarization, normals_from_polarization
 from polsep.geometry.surface import Surface, draw_views, relight, span_surface
+from polsep.geometry.thing import find_lit
 from polsep.io.assets.maps import read_map
 from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
 from polsep.io.raw.frames import ReadOptions
@@ -35,8 +36,6 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Pixels = NDArray[np.uint8]
 
-#: Without a mask, the object is where the brightest frame exceeds this share of its 99th percentile.
-OBJECT_SHARE = 0.06
 #: Side of the pictures of the preview, and the views of its meshes: azimuth and elevation [degrees].
 CELL = 360
 VIEWS = ((-50.0, 5.0), (-20.0, 10.0), (20.0, 10.0), (50.0, 5.0))
@@ -163,11 +162,11 @@ def shrink(views: Views, mask: Mask, longest: int) -> tuple[Views, Mask]:
 
 def find_object(views: Views) -> Mask:
     """Estimate the mask of an object before a dark background, from where light falls. Raises InputError."""
-    brightest = views.images.mean(axis=-1).max(axis=0)
-    mask: Mask = brightest > OBJECT_SHARE * np.percentile(brightest, 99)
-    if not mask.any():
-        raise InputError("expected light on an object, found black images")
-    return mask
+    brightest = views.images.mean(axis=-1).max(axis=0).astype(np.float32)
+    try:
+        return find_lit(brightest, brightest)
+    except ValueError:
+        raise InputError("expected light on an object, found black images") from None
 
 
 def find_shape(views: Views, directions: Floats, mask: Mask, options: ShapeOptions) -> ShapeFiles:

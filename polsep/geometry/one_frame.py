@@ -32,13 +32,13 @@ from polsep.geometry.shape_maps import (
     mirror_seen,
     mirror_surface,
 )
+from polsep.geometry.thing import find_lit
 from polsep.io.store.weights import read_weights, shipped_weights
 from polsep.networks.graphs import core, require_own_threads, shape_model
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.fresnel import ETA, diffuse_dolp
 from polsep.pipeline import PolsepWarning
 from polsep.sensor.camera import WrongType
-from polsep.separation.highlights_kernel import find_parts
 from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float32]
@@ -47,15 +47,6 @@ Mask = NDArray[np.bool_]
 #: Side of the square around the thing [pixels]; over the longest side of the mask; sides of the blocks of pixels whose
 #: means the network sees (training shows it squares of ``SIDE / 2``).
 SIDE, WIDER, SCALES = 384, 1.1, (1, 2, 3)
-#: Without a mask, the thing is where s0 exceeds this share of a level, its 99th percentile.
-OBJECT_SHARE = 0.06
-#: A thing may be smaller than a hundredth of the frame: the level is at least this share of the diffuse light of this
-#: block, counted from the brightest one.
-SMALL_SHARE, SMALL_BLOCKS = 0.5, 4
-#: Side of blocks [pixels]: parts of the thing are near one that is mostly bright.
-BLOCK = 8
-#: Least share of the thing's blocks that a connected part has.
-SMALLEST_PART = 0.01
 #: Expected error of ln(roughness), and of ln(strength), from which on they count as unknown.
 UNKNOWN = 0.5
 #: Refractive indices of dielectrics, from water to diamond.
@@ -293,42 +284,9 @@ def _outside_zero(image: Floats, mask: Mask) -> Floats:
 
 
 def find_thing(frame: SeparatedFrame) -> Mask:
-    """The mask of a thing before a dark ground: where light falls, without specks and thin lines.
-
-    Raises ValueError on a black frame.
-    """
+    """The mask of a thing before a dark ground (`thing.find_lit`). Raises ValueError on a black frame."""
     diffuse = frame.diffuse.mean(axis=-1)
-    s0 = diffuse + frame.specular.mean(axis=-1)
-    blocks = _cell_means(diffuse)
-    level = max(np.percentile(s0, 99), SMALL_SHARE * np.sort(blocks, axis=None)[-SMALL_BLOCKS:][0])
-    bright: Mask = s0 > OBJECT_SHARE * level
-    if not bright.any() or not s0.any():
-        raise ValueError("expected light on a thing, found a black frame")
-    height, width = bright.shape
-    solid = _large_parts(_cell_means(bright) > 0.5)
-    around = np.pad(solid, 1)
-    rows = around[:-2] | around[1:-1] | around[2:]
-    near = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
-    found: Mask = bright & near.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[:height, :width]
-    return found if found.any() else bright
-
-
-def _cell_means(image: Floats | Mask) -> Floats:
-    """Means over blocks of `BLOCK` pixels, the last ones with the border's values."""
-    height, width = image.shape
-    padded = np.pad(image.astype(np.float32), ((0, -height % BLOCK), (0, -width % BLOCK)), "edge")
-    means: Floats = block_means(padded, BLOCK)
-    return means
-
-
-def _large_parts(solid: Mask) -> Mask:
-    """The connected parts with at least `SMALLEST_PART` of all cells."""
-    flat, number = np.flatnonzero(solid), np.zeros(solid.size, np.int32)
-    number[flat] = np.arange(1, flat.size + 1)
-    part, _ = find_parts(flat, number, solid.shape[1])
-    large = np.zeros(solid.size, np.bool_)
-    large[flat] = np.bincount(part)[part] >= SMALLEST_PART * flat.size if flat.size else False
-    return large.reshape(solid.shape)
+    return find_lit(diffuse + frame.specular.mean(axis=-1), diffuse)
 
 
 def images_of(frame: SeparatedFrame, mask: Mask) -> Floats:

@@ -23,7 +23,7 @@ from polsep.io.results.sidecars import read_report, result_names
 from polsep.io.store.errors import InputError
 from polsep.io.store.header_checks import at_most
 from polsep.methods import check_method
-from polsep.pipeline import LightColor, is_to_be_found, parse_light_color, separate_capture, told_gains
+from polsep.pipeline import LightColor, is_to_be_found, parse_light_color, separate_capture, stated_gains
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.exposure import Histogram, exposure_flags, histogram
 from polsep.separation.report import SeparatedFrame
@@ -279,7 +279,7 @@ def _as_opened(read: SeparatedFrame, light_color: LightColor | str, stem: str) -
     """A result under the user's name for it, of the lamp's colour that the page says, and remarks on what it lacks."""
     report = read.report | {"source": stem, "warnings": list(read.report.get("warnings", ()))}
     if not is_to_be_found(light_color):
-        color = told_gains(light_color, read.diffuse.shape[-1])
+        color = stated_gains(light_color, read.diffuse.shape[-1])
         report |= {"light_color": color, "light": {"source": "told", "color": color}}
     if not read.dolp.any():
         report["warnings"].append(LIGHT_ALONE)

@@ -97,10 +97,10 @@ def test_small_layers_learn_after_large_ones_were_rounded(tmp_path: Path) -> Non
     options = replace(OPTIONS, size=ResidualSize(24, (1, 1)))
     train = partial(train_shape, folder=tmp_path, report=lambda _: None)
     first = train(options, Run(tmp_path / "all", schedule=SCHEDULE))
-    round_weights.main([str(first)])
+    round_weights.main([str(first), "--examples", str(tmp_path)], standalone_mode=False)
     last = train(replace(options, part="small"), Run(tmp_path / "small", schedule=SCHEDULE, start=(first,)))
     (before, _), (after, facts) = read_weights(first), read_weights(last)
-    round_weights.main([str(last)])
+    round_weights.main([str(last)], standalone_mode=False)
     again = read_weights(last)[0]
     large = names_to_round(before, {})
     assert 2 < len(large) < len(before) and "--part small" in facts["command"]

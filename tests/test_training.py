@@ -223,7 +223,7 @@ def test_digests_cover_every_module_that_makes_examples() -> None:
     """Optics, Stokes algebra, sensor and all of the renderer; of the package, nothing that only trains."""
     drawn, separated = find_sources("polsep.train.stream"), find_sources("polsep.material.examples")
     render = {f"polsep.render.{path.stem}" for path in Path(polsep.__file__).parent.glob("render/*.py")}
-    drawn_only, for_shape = {"distances", "tracer"}, {"blobs", "vessels", "waves"}
+    drawn_only, for_shape = {"distances", "tracer"}, {"blobs", "models", "vessels", "waves"}
     unused = {f"polsep.render.{name}" for name in {"__init__"} | drawn_only | for_shape}
     common = {"polsep.physics.optics", "polsep.physics.stokes", "polsep.sensor.camera"}
     assert common | (render - unused) | {"polsep.train.variety", "polsep.train.reality"} <= set(drawn)

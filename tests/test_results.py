@@ -214,6 +214,16 @@ def commit(root: Path, files: dict[str, str | None]) -> str:
     return ask_git("rev-parse", "HEAD")
 
 
+def test_pages_are_no_changes(repository: Path) -> None:
+    """The card of weights changes with their scores; the weights count."""
+    first = commit(repository, {"weights/a.safetensors": "1", "weights/a.md": "1"})
+    commit(repository, {"weights/a.md": "2"})
+    assert find_changes({first}, ("weights",)) == ()
+    history._list_changes.cache_clear()
+    commit(repository, {"weights/a.safetensors": "2"})
+    assert find_changes({first}, ("weights",)) == ("weights",)
+
+
 def test_moves_that_change_no_output_are_no_changes(repository: Path) -> None:
     """Files that moved count under their old names before, the moving commits not at all, and later changes again."""
     text = "".join(f"line {k}\n" for k in range(20))

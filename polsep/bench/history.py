@@ -37,7 +37,7 @@ def find_changes(
     """The paths of ``measured`` that changed after any of ``commits``, up to ``until``.
 
     Commits in the ranges of `UNCHANGED` do not count, except for what is ``timed``; files that these renamed count
-    under their old names before.
+    under their old names before. Pages, such as the cards of weights, which hold results, do not count either.
     None where the history does not reach back so far, as in a shallow clone.
     """
     if ask_git("rev-parse", "--is-shallow-repository") != "false":
@@ -49,7 +49,7 @@ def find_changes(
     for commit in commits:
         for hash_, paths in _list_changes(commit, until):
             if timed or hash_ not in same:
-                changed.update(moved.get(path, path) for path in paths)
+                changed.update(moved.get(path, path) for path in paths if not path.endswith(".md"))
     return tuple(path for path in measured if any(x == path or x.startswith(f"{path}/") for x in changed))
 
 

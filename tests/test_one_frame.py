@@ -28,10 +28,10 @@ from test_geometry import cap
 
 import polsep
 from polsep.geometry import frames, one_frame, one_frame_files
+from polsep.geometry.lamp import seen_under
 from polsep.geometry.one_frame import (
     SIDE,
     ShapeEstimator,
-    find_lamp,
     gather,
     polarized_as_usual,
     shape,
@@ -208,16 +208,14 @@ def random_planes() -> Tensor:
 
 
 def test_a_lamp_that_is_not_told_is_looked_for(tmp_path: Path) -> None:
-    """The surface of an untold lamp is that of the lamp which the first looks imply."""
+    """The surface of an untold lamp is that of the lamp which is found."""
     estimator, _ = _untrained(tmp_path)
-    planes = cut_example(random_planes(), 1.1, SIDE)[None]
-    seen = _as_seen(planes)
+    seen = _as_seen(cut_example(random_planes(), 1.1, SIDE)[None])
     untold = seen._replace(light=0 * seen.light)
-    first = mean_surface(estimator.look(untold), mirror_surface(estimator.look(mirror_seen(untold))))
-    lamp = np.array(find_lamp(first, untold), np.float32)
-    assert lamp[2] > 0
-    wanted = estimator._find_at(untold._replace(light=lamp[:, None, None] + 0 * seen.light))
-    np.testing.assert_array_equal(estimator._find_at(untold).normal, wanted.normal)
+    lamp = estimator.find_lamp(untold)
+    assert math.hypot(*lamp) == pytest.approx(1, abs=1e-6)
+    wanted = estimator.find(seen_under(untold, lamp))
+    np.testing.assert_array_equal(estimator.find(untold).normal, wanted.normal)
 
 
 def _untrained(folder: Path) -> tuple[ShapeEstimator, ShapeNetwork]:
@@ -264,18 +262,6 @@ def test_losses_are_least_at_the_truth() -> None:
     assert least < 0.02
     assert loss(albedo=2 * exact.albedo) == pytest.approx(least, abs=5e-3)  # albedo is relative
     assert min(loss(normal=tilted), loss(albedo=ramp * exact.albedo), loss(roughness=0.8 * one)) > least + 0.05
-
-
-def test_the_lamp_is_found_in_the_shading() -> None:
-    """Of a matte sphere with its true normals, whatever its albedo is."""
-    normals, mask = cap(64, 80)
-    lamp = np.array([0.3, -0.2, 0.93])
-    albedo = np.where(np.arange(64) % 8 < 4, 0.8, 0.3)
-    image = np.broadcast_to(albedo * np.maximum(normals @ lamp, 0), (3, 64, 64))
-    none = np.full((1, 64, 64), 0.1)
-    planes = (np.moveaxis(normals, -1, 0), np.broadcast_to(albedo, (3, 64, 64)), none, none, none, none, none)
-    found = one_frame.find_lamp(Surface(*planes), Seen(image, None, None, None, mask[None], np.zeros((3, 1, 1))))
-    np.testing.assert_allclose(found, lamp / np.linalg.norm(lamp), atol=0.02)
 
 
 def test_squares_come_back() -> None:

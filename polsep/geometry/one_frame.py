@@ -1,7 +1,7 @@
 """The surface behind one frame under one polarized lamp: normals, albedo, roughness, strength of its mirror images.
 
 A network looks at the thing as a whole, in a square around its mask, and says how sure it is (`geometry.shape_maps`).
-It looks at the thing and at its mirror image, twice as fine and as it was trained, and again when it has found the lamp
+It looks at the thing and at its mirror image, twice as fine as it was trained and coarser, when it has found the lamp
 (`ShapeEstimator.find`).
 It was trained on rendered frames that were separated as users' frames are. `polarization.choose_outward` is the same
 task without training.
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.resizing import block_means, resize_area, resize_bilinear
+from polsep.geometry.lamp import search_lamp, seen_under
 from polsep.geometry.shape_maps import (
     INPUTS,
     Seen,
@@ -64,7 +65,7 @@ class Shape:
     along each of two axes [rad]. ``albedo [h, w, C]``: relative, 1 where a surface that faces the lamp is as bright as
     the thing in the mean. ``roughness``: GGX sqrt(alpha); ``specular``: strength of mirror images, 1 = a dielectric of
     index 1.5; ``roughness_error``, ``specular_error``: expected deviations of their logarithms, unknown from `UNKNOWN`
-    on. ``light [3]``: unit vector toward the lamp, told or found (`find_lamp`); zeros where none was found.
+    on. ``light [3]``: unit vector toward the lamp, told or found (`lamp.search_lamp`).
     ``mask_told``: the mask was given, not found.
     """
 
@@ -122,17 +123,19 @@ class ShapeEstimator:
         """The surface in images ``[C, SIDE, SIDE]``: the mean of what they and their means over `SCALES` say.
 
         Small blocks show the detail, large ones the whole. Each says the mean of looks at the thing and at its mirror
-        image. Where the lamp is not told, they look again with the lamp that the first surface implies.
+        image. Where the lamp is not told, it is found first (`find_lamp`).
         """
-        found = (self._find_at(_means(seen, block)) for block in SCALES)
+        seen = seen if np.any(seen.light) else seen_under(seen, self.find_lamp(seen))
+        found = (self._find_mirrored(_means(seen, block)) for block in SCALES)
         return mean_surface(*(Surface(*(resize_bilinear(x, (SIDE, SIDE)) for x in surface)) for surface in found))
 
-    def _find_at(self, seen: Seen) -> Surface:
-        found = self._find_mirrored(seen)
-        if np.any(seen.light):
-            return found
-        lamp = np.array(find_lamp(found, seen), np.float32)
-        return self._find_mirrored(seen._replace(light=lamp[:, None, None] + 0 * seen.light)) if lamp.any() else found
+    def find_lamp(self, seen: Seen) -> tuple[float, float, float]:
+        """The unit vector toward the lamp, which is not told (`lamp.search_lamp`).
+
+        By the coarsest of `SCALES` in which whole blocks are on the thing.
+        """
+        coarser = (_means(seen, block) for block in reversed(SCALES))
+        return search_lamp(self._find_mirrored, next((means for means in coarser if means.mask.any()), seen))
 
     def _find_mirrored(self, seen: Seen) -> Surface:
         return mean_surface(self.look(seen), mirror_surface(self.look(mirror_seen(seen))))
@@ -204,16 +207,17 @@ def find_shape(
         )
     if not frame.dolp[chosen].any():
         raise ValueError("expected a frame with its polarization, found DoLP 0 everywhere")
-    way = _unit(light)
+    told = None if light is None else _as_told(light)
     window = square_around(chosen)
     small = gather(images_of(frame, chosen), window, SIDE)
     small[4:6] = polarized_as_usual(small[4:6], small[:3].mean(axis=0), small[3:4] * on_thing(small[7:8]), index)
-    told = np.broadcast_to(np.array(way, np.float32)[:, None, None], (3, SIDE, SIDE))
-    seen = Seen(small[:3], small[3:4], small[4:6], small[6:7], on_thing(small[7:8]).astype(np.float32), told)
+    on = on_thing(small[7:8]).astype(np.float32)
+    untold = Seen(small[:3], small[3:4], small[4:6], small[6:7], on, np.zeros((3, SIDE, SIDE), np.float32))
     estimator = load_estimator(weights)
     if estimator.input != "separated":
         raise ValueError(f"expected weights of a network that sees separated images, found one for {estimator.input!r}")
-    found = estimator.find(seen)
+    lamp = told or estimator.find_lamp(untold)
+    found = estimator.find(seen_under(untold, lamp))
     planes = np.concatenate([np.asarray(x, np.float32) for x in found])
     wide = spread(planes, window, chosen.shape)
     normals = wide[:3] / np.maximum(np.linalg.norm(wide[:3], axis=0), 1e-6)
@@ -226,7 +230,6 @@ def find_shape(
         "roughness_error": wide[9],
         "specular_error": wide[10],
     }
-    lamp = way if light is not None else find_lamp(found, seen)
     inside = {name: _outside_zero(x, chosen) for name, x in maps.items()}
     return Shape(**inside, mask=chosen, light=lamp, mask_told=mask is not None)
 
@@ -248,26 +251,8 @@ def polarized_as_usual(polarized: Floats, diffuse: Floats, specular: Floats, ind
     return found
 
 
-def find_lamp(surface: Surface, seen: Seen) -> tuple[float, float, float]:
-    """The direction toward a far lamp that explains the shading: diffuse light over albedo is its product with normals.
-
-    Least squares over places that it reaches, the surer ones first; zeros where that points away from the camera.
-    """
-    shading = (seen.image.mean(axis=0) / np.maximum(surface.albedo.mean(axis=0), 1e-6)) * (seen.mask[0] > 0)
-    lit = shading > 0.2 * np.percentile(shading, 99)
-    weight = 1 / surface.normal_error[0][lit]
-    vector, *_ = np.linalg.lstsq((surface.normal[:, lit] * weight).T, shading[lit] * weight, rcond=None)
-    length = float(np.linalg.norm(vector))
-    if not length > 0 or vector[2] <= 0:
-        return (0.0, 0.0, 0.0)
-    x, y, z = (float(part) / length for part in vector)
-    return (x, y, z)
-
-
-def _unit(light: Sequence[float] | None) -> tuple[float, float, float]:
-    """A direction as a unit vector; zeros for None. Raises ValueError."""
-    if light is None:
-        return (0.0, 0.0, 0.0)
+def _as_told(light: Sequence[float]) -> tuple[float, float, float]:
+    """A direction that was given, as a unit vector. Raises ValueError."""
     try:
         numbers = [float(x) for x in light]
     except (TypeError, ValueError):

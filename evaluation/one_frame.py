@@ -223,6 +223,13 @@ def estimate(method: str, shot: Photograph) -> tuple[Surface, Surface, Floats]:
     return load_estimator(path).find(seen), truth, seen.mask
 
 
+def lamp_error(shot: Photograph) -> float:
+    """The angle [degrees] between the lamp's direction that is found in a photograph and the true one."""
+    found = load_estimator().find_lamp(seen_by("separated", shot, False)[0])
+    cosine = float(np.dot(found, shot.truth.light))
+    return math.degrees(math.acos(max(-1.0, min(cosine, 1.0))))
+
+
 def list_methods() -> list[str]:
     """Return what ships, with and without the lamp told, and the networks of equal training that are there."""
     equal = [
@@ -297,6 +304,8 @@ def measure(data: Path, names: Sequence[str] | None = None) -> Iterator[Row]:
             for method in (*methods, "classical"):
                 results = classical(shot) if method == "classical" else estimate(method, shot)
                 scores = score(*results)
+                if method == "separated":
+                    scores["lamp, angular error"] = lamp_error(shot)
                 found.setdefault((kind, method), []).append(scores)
                 case, metric = f"{subject.name}, {kind}", "mean angular error"
                 yield Row("shape/things", case, method, metric, scores[metric], "deg")

@@ -14,6 +14,7 @@ import torch
 
 from polsep.io.store.weights import read_weights, shipped_weights
 from polsep.networks.joint import Joint
+from polsep.networks.joint_weights import JointWeights
 from polsep.networks.paper import Refinement
 from polsep.networks.run import combine, run_joint
 from polsep.networks.rungs import RUNGS, Rung
@@ -22,7 +23,7 @@ from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import Separation
 from polsep.separation.clipped_pattern import smooth_separation
-from polsep.shipped import member_names, paper_name, read_joint, separate_colors, shipped_joint
+from polsep.shipped import paper_name, read_joint, separate_colors, shipped_joint
 
 _LOADING = threading.Lock()
 
@@ -33,8 +34,8 @@ def load_joint(path: Path, device: torch.device) -> Joint:
 
 
 @lru_cache(maxsize=8)
-def _shipped(name: str, device: torch.device) -> Joint:
-    network = Joint.of(shipped_joint(name), device)
+def _shipped(weights: JointWeights, device: torch.device) -> Joint:
+    network = Joint.of(weights, device)
     if device.type == "cuda":  # tensor cores read channels innermost; other processors gain nothing
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network
@@ -48,8 +49,9 @@ def separate_joint(method: str, capture: Mosaic | Measurements, full: bool = Fal
     if isinstance(capture, Measurements):
         raise ValueError(f"expected a mosaic for the method {method}, found four co-sited angle images")
     with _LOADING:
-        networks = [_shipped(name, capture.data.device) for name in member_names(method, capture.layout)]
-    return smooth_separation(combine([run_joint(network, capture, full) for network in networks]), capture)
+        networks = [_shipped(weights, capture.data.device) for weights in shipped_joint(method, capture.layout)]
+    shares = [network.share for network in networks]
+    return smooth_separation(combine([run_joint(network, capture, full) for network in networks], shares), capture)
 
 
 def load_refinement(path: Path, device: torch.device) -> tuple[Rung, Refinement]:

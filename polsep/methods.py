@@ -35,7 +35,6 @@ from polsep.separation.report import images_of, in_light, tally_again, under_whi
 from polsep.shipped import (
     NAMES,
     accepts_mosaic,
-    member_names,
     separate_paper,
     shipped_joint,
     weights_name,
@@ -156,9 +155,9 @@ def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameIma
     if isinstance(capture, Measurements):
         return run_joint_co_sited(name, capture, light)
     if capture.data.ndim == 2 and on_cpu(capture.data):
-        networks = [shipped_joint(member) for member in member_names(name, capture.layout)]
-        lit = replace(capture, light_color=light)
-        images = combine_images([run_engine(network, lit, full) for network in networks], light)
+        networks, lit = shipped_joint(name, capture.layout), replace(capture, light_color=light)
+        shares = [network.share for network in networks]
+        images = combine_images([run_engine(network, lit, full) for network in networks], light, shares)
         return smooth_clipped(images, capture, light)
     return run_reference(partial(joint_reference, name), capture, light, full)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import threading
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,34 +25,42 @@ from polsep.separation.analytic import Separation
 
 #: Methods of the joint network.
 NAMES = ("joint-large", "joint", "joint-fast")
-#: Networks of a method that weighs the images of several by their expected errors.
-MEMBERS = {"joint-large": ("joint-large", "joint")}
-#: Weights of mono networks whose images are averaged over shifts: for stills, at four times the time.
-AVERAGED = ("joint-mono",)
+#: Networks of a method that weighs the images of several by their expected errors, and the share of each besides:
+#: `joint` was not trained on all that `joint-large` was, and expects too small errors where frames differ from its own.
+MEMBERS = {"joint-large": {"joint-large": 1.0, "joint": 0.4}}
+#: Methods for stills, whose networks average frames seen in several ways, in colour; the same of mono frames.
+AVERAGED, AVERAGED_MONO = ("joint-large",), ("joint",)
 #: The paper's networks, trained on noisy mosaics of colour cameras, and of those without colour filters.
 PAPER, PAPER_MONO = "paper-mosaic", "paper-mono"
 
 _LOADING = threading.Lock()
 
 
-def read_joint(path: Path, averages_shifts: bool = False) -> JointWeights:
+def read_joint(path: Path, averages_ways: bool = False) -> JointWeights:
     """The network in a file of weights. Raises ValueError when the file is damaged or of another network."""
     arrays, metadata = read_weights(path)
     try:
-        return joint_weights(arrays, metadata, averages_shifts)
+        return joint_weights(arrays, metadata, averages_ways)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"expected weights of a joint network in {path}, found {type(error).__name__}") from None
 
 
-def shipped_joint(name: str) -> JointWeights:
-    """The joint network of a name of weights; the same object whoever asks, since engines are kept by network."""
+def shipped_joint(method: str, layout: Layout) -> list[JointWeights]:
+    """All networks of a method for frames of a layout; always the same objects, since engines are kept by them."""
+    averaged = AVERAGED_MONO if layout.bayer is None else AVERAGED
     with _LOADING:
-        return _read_shipped(name)
+        members = MEMBERS.get(method, {method: 1.0})
+        return [_read_shipped(weights_name(name, layout), method in averaged, members[name]) for name in members]
+
+
+@lru_cache(maxsize=16)
+def _read_shipped(name: str, averages_ways: bool, share: float) -> JointWeights:
+    return replace(_read_weights(name), averages_ways=averages_ways, share=share)
 
 
 @lru_cache(maxsize=8)
-def _read_shipped(name: str) -> JointWeights:
-    return read_joint(shipped_weights(name), name in AVERAGED)
+def _read_weights(name: str) -> JointWeights:
+    return read_joint(shipped_weights(name))
 
 
 def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[list[JointWeights], dict[str, str]]:
@@ -63,8 +72,7 @@ def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[list[Joi
     if method not in NAMES:
         raise ValueError(f"expected a method of {', '.join(NAMES)}, found {method!r}")
     if path is None:
-        names = member_names(method, layout)
-        return [shipped_joint(name) for name in names], read_weights(shipped_weights(names[0]))[1]
+        return shipped_joint(method, layout), read_weights(shipped_weights(weights_name(method, layout)))[1]
     network, metadata = read_joint(path), read_weights(path)[1]
     if network.colors != layout.channels:
         raise ValueError(f"expected weights for {layout.channels} colours in {path}, found {network.colors}")
@@ -74,11 +82,6 @@ def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[list[Joi
 def weights_name(method: str, layout: Layout) -> str:
     """The name of a method's weights for frames of a layout."""
     return f"{method}-{'mono' if layout.bayer is None else 'mosaic'}"
-
-
-def member_names(method: str, layout: Layout) -> tuple[str, ...]:
-    """The names of the weights of all networks of a method, for frames of a layout."""
-    return tuple(weights_name(member, layout) for member in MEMBERS.get(method, (method,)))
 
 
 def accepts_mosaic(method: str, mosaic: Mosaic) -> bool:

@@ -61,7 +61,8 @@ def ship(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
     for room in (weights, shipped, in_torch):
         monkeypatch.setattr(room, "shipped_weights", find)
-    caches = (shipped._shipped_refiner, shipped._read_shipped, in_torch._shipped, in_torch._shipped_refinement)
+    caches = [shipped._shipped_refiner, shipped._read_shipped, shipped._read_weights]
+    caches += [in_torch._shipped, in_torch._shipped_refinement]
     for cache in caches:
         cache.cache_clear()
     yield tmp_path

@@ -33,7 +33,7 @@ def turn(degrees: float) -> np.ndarray:
 
 
 def picture(lamp: np.ndarray, apart: bool = True) -> Seen:
-    """What is seen of the sphere under a lamp that is not told, at level 1; its highlights ``apart`` or in the image."""
+    """What is seen of the sphere under a lamp that is not told, at level 1; highlights ``apart`` or in it."""
     surface, mask = sphere()
     mirrored = relight(surface._replace(albedo=0 * surface.albedo), lamp)
     image = relight(surface, lamp) - mirrored * apart

@@ -23,7 +23,7 @@ from polsep.networks.run import combine, cut_rows, margin_of, run_joint
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.orient import orient, shifts_of
+from polsep.sensor.orient import orient, shifts_of, ways_of
 from polsep.separation.clipped_pattern import smooth_separation
 from polsep.shipped import accepts_mosaic, weights_name
 
@@ -85,11 +85,29 @@ def test_shifted_frames_are_combined(height: int, width: int, full: bool) -> Non
     assert len(ways) == 4 and len({frame.shape for frame in turned}) == 1
     single = [mosaic_network._run_turned(network, mosaic, way, full) for way in ways]
     assert not torch.allclose(single[0].diffuse, single[1].diffuse, atol=1e-3)
-    network.averages_shifts = True
+    network.averages_ways = True
     found = run_joint(network, mosaic, full)
     assert_close(found.diffuse, combine(single).diffuse)
     assert_close(found.stokes.s0, found.diffuse + found.specular)
     assert found.expected_error is not None and found.expected_error.shape[-2:] == found.diffuse.shape[-2:]
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (50, 63)])
+def test_colour_frames_are_seen_twice_by_networks_that_average(height: int, width: int) -> None:
+    """As they are, and a cell on with red and blue exchanged; so an exchange of these gives exchanged images."""
+    network, mosaic = random_network(COLOR), random_mosaic(COLOR, height, width)
+    single = [mosaic_network._run_turned(network, mosaic, way, False) for way in ways_of(mosaic, COLOR)]
+    assert len(single) == 2 and not torch.allclose(single[0].diffuse, single[1].diffuse, atol=1e-3)
+    whole = run_joint(network, mosaic, full=True)
+    network.averages_ways = True
+    found = run_joint(network, mosaic)
+    assert_close(found.diffuse, combine(single).diffuse)
+    assert_close(found.stokes.s0, found.diffuse + found.specular)
+    assert torch.equal(run_joint(network, mosaic, full=True).diffuse, whole.diffuse)
+    other = run_joint(network, Mosaic(mosaic.data, Layout(COLOR.polarizer, "BGGR"), 0.0, 1.0))
+    assert_close(other.diffuse.flip(0), found.diffuse)
+    assert_close(other.specular.flip(0), found.specular)
+    assert_close(other.stokes.s1.flip(0), found.stokes.s1)
 
 
 def test_separations_are_weighed_by_their_expected_variances() -> None:
@@ -106,6 +124,7 @@ def test_separations_are_weighed_by_their_expected_variances() -> None:
     assert found.expected_error is not None
     assert_close(found.expected_error, torch.cat([1.2 * ones, 1.2 * ones]))
     assert combine([one]) is one
+    assert_close(combine([one, two], (1.0, 4.0)).diffuse, one.diffuse + 0.5)
 
 
 def test_even_light_has_no_pattern_where_shifts_are_averaged() -> None:
@@ -119,7 +138,7 @@ def test_even_light_has_no_pattern_where_shifts_are_averaged() -> None:
         return float(inner.max() - inner.min())
 
     assert contrast() > 0.01
-    network.averages_shifts = True
+    network.averages_ways = True
     assert contrast() < 1e-5
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from polsep.demosaic.bilinear import aligned, demosaic_bilinear, demosaic_bilinear_half, mean_cells
 from polsep.physics.stokes import Stokes, fit_stokes
 from polsep.sensor.camera import IDEAL, PERIOD, Layout, Mosaic, expose
-from polsep.sensor.orient import Orientation, orient
+from polsep.sensor.orient import Orientation, orient, ways_of
 
 SONY, MONO = Layout(), Layout(bayer=None)
 #: An order whose transposed one no mirror and no crop gives, as they give Sony's.
@@ -62,6 +62,14 @@ def turn_light(stokes: Stokes, how: Orientation, height: int, width: int) -> Sto
     return Stokes(*parts).map(lambda s: s.expand(-1, height, width))
 
 
+def every_way(mosaic: Mosaic, wanted: Layout) -> tuple[Orientation, ...]:
+    """`orient` and `ways_of`, which are of one size; of colour frames, red and blue change places in the second."""
+    ways = ways_of(mosaic, wanted)
+    assert [way.swapped for way in ways] == ([False] * 4 if wanted is MONO else [False, True])
+    assert len({way.turn(mosaic.data).shape for way in ways}) == 1
+    return orient(mosaic, wanted), *ways
+
+
 def apart(a: Stokes, b: Stokes, edge: int) -> float:
     inside = (..., slice(edge, -edge), slice(edge, -edge))
     assert a.s0.shape == b.s0.shape
@@ -82,12 +90,14 @@ def test_the_turned_frame_has_the_wanted_filter_at_every_place(wanted: Layout, s
     """A uniform polarized field, of which each filter shows its own level, is the same field in the wanted order."""
     for layout in orders(wanted, *size):
         mosaic = expose(uniform(layout, *size), layout, IDEAL)
-        how = orient(mosaic, wanted)
-        turned = how.turn(mosaic.data)
-        assert turned.shape[-2] % PERIOD == turned.shape[-1] % PERIOD == 0
-        expected = expose(turn_light(uniform(layout, *size), how, *turned.shape[-2:]), wanted, IDEAL).data
-        assert len(expected.unique()) == 4 * wanted.channels
-        assert float((turned - expected).abs().max()) < EXACT
+        for how in every_way(mosaic, wanted):
+            turned = how.turn(mosaic.data)
+            assert turned.shape[-2] % PERIOD == turned.shape[-1] % PERIOD == 0
+            light = turn_light(uniform(layout, *size), how, *turned.shape[-2:])
+            light = light.map(lambda s: s.flip(-3)) if how.swapped else light
+            expected = expose(light, wanted, IDEAL).data
+            assert len(expected.unique()) == 4 * wanted.channels
+            assert float((turned - expected).abs().max()) < EXACT
 
 
 @pytest.mark.parametrize(("wanted", "size"), CASES, ids=case_name)
@@ -95,11 +105,11 @@ def test_whole_cells_come_back_where_they_were(wanted: Layout, size: tuple[int, 
     """`demosaic.aligned` of every pixel's number at full resolution, and the means of its cells at half."""
     numbers = torch.arange(size[0] * size[1], dtype=torch.float64).view(size)
     for layout in orders(wanted, *size):
-        how = orient(zeros(layout, *size), wanted)
-        turned = how.turn(torch.stack([numbers, -numbers]))
-        assert torch.equal(how.turn_back(turned, 2), aligned(torch.stack([numbers, -numbers]), layout))
-        if how.keeps_cells:
-            assert torch.equal(how.turn_back(mean_cells(turned), 1)[0], mean_cells(aligned(numbers, layout)))
+        for how in every_way(zeros(layout, *size), wanted):
+            turned = how.turn(torch.stack([numbers, -numbers]))
+            assert torch.equal(how.turn_back(turned, 2), aligned(torch.stack([numbers, -numbers]), layout))
+            if how.keeps_cells:
+                assert torch.equal(how.turn_back(mean_cells(turned), 1)[0], mean_cells(aligned(numbers, layout)))
 
 
 @pytest.mark.parametrize(("wanted", "size"), CASES, ids=case_name)

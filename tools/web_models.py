@@ -22,7 +22,7 @@ from polsep.networks.joint import Joint, limit
 from polsep.networks.taps import pool_outputs
 from polsep.sensor.camera import Layout
 from polsep.separation.clipped_pattern import shares_of, smooth_planes, taps_of, weigh_clipped
-from polsep.shipped import shipped_joint, weights_name
+from polsep.shipped import shipped_joint
 
 #: Files by the layout of the frames that their network reads.
 FILES = {"joint-fast.onnx": Layout(), "joint-fast-mono.onnx": Layout(bayer=None)}
@@ -65,7 +65,7 @@ def write_models(folder: Path) -> None:
     """Write `FILES`, each under its name once it is whole."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, layout in FILES.items():
-        network = Joint.of(shipped_joint(weights_name("joint-fast", layout)), torch.device("cpu"))
+        network = Joint.of(shipped_joint("joint-fast", layout)[0], torch.device("cpu"))
         graph, frame = PageNetwork(network).eval(), torch.zeros(1, 2, *SIDES)
         with atomic_path(folder / name) as part, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that the exporter is the older one, and remarks about its own parts

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import reduce
@@ -31,7 +31,7 @@ from polsep.networks.sizes import ResidualSize
 from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of
 from polsep.physics.stokes import wrap_aolp
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.orient import Orientation, orient, shifts_of
+from polsep.sensor.orient import Orientation, orient, ways_of
 from polsep.separation.images import FrameImages
 
 #: Engines that are kept at least, each with the memory that its frames need.
@@ -95,18 +95,21 @@ def _make_engine(job: _Job) -> OpenVinoEngine:
 def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages:
     """A network's images of one frame ``[H, W]`` on the CPU, in its light.
 
-    Frames in other orientations than the network's are turned before and after, as in `run.run_joint`. Huge frames are
+    Frames in other orientations than the network's are turned before and after, as in `run.run_joint`, which says in
+    which ways frames are seen by networks that average them. Huge frames are
     cut into strips, all of one height, since an engine is for one size. Raises ValueError on layouts that are not
     Sony's in any orientation, and RuntimeError as `require_own_threads`.
     """
     require_own_threads()
-    orientation = orient(mosaic, Layout.sony(mosaic.layout.channels))
+    wanted = Layout.sony(mosaic.layout.channels)
+    orientation = orient(mosaic, wanted)
     if not full and not orientation.keeps_cells:  # then the network's cells are not the frame's
         return _halve(run_engine(network, mosaic, full=True), mosaic.light_color)
     make_ready(images_kernel.warm_up)
     if full:
         make_ready(details_kernel.warm_up)
-    ways = shifts_of(orientation) if network.averages_shifts else (orientation,)
+    several = network.averages_ways and not (full and network.colors > 1)
+    ways = ways_of(mosaic, wanted) if several else (orientation,)
     return combine_images([_run_turned(network, mosaic, way, full) for way in ways], mosaic.light_color)
 
 
@@ -134,7 +137,7 @@ def _mean_cells(image: NDArray[Any]) -> NDArray[Any]:
     return np.moveaxis(mean_cells(np.moveaxis(image[:height, :width], (0, 1), (-2, -1))), (-2, -1), (0, 1))
 
 
-def combine_images(images: list[FrameImages], light: tuple[float, ...]) -> FrameImages:
+def combine_images(images: list[FrameImages], light: tuple[float, ...], shares: Sequence[float] = ()) -> FrameImages:
     """Images of one frame in a ``light``, weighed as `run.combine` does, in the arrays of the first.
 
     The tally is of what they became, but for the polarization of highlights, which is the mean of theirs.
@@ -143,10 +146,11 @@ def combine_images(images: list[FrameImages], light: tuple[float, ...]) -> Frame
     if len(images) == 1:
         return first
     together, sums = first.arrays(), np.zeros(4)
+    factors = np.array(shares or [1.0] * len(images), np.float32)[:, None, None, None]
     gain = np.array(light[: first.diffuse.shape[-1]], np.float32)
     for top in range(0, len(first.valid), COMBINED):
         rows = slice(top, top + COMBINED)
-        part = _combine({name: np.stack([one.arrays()[name][rows] for one in images]) for name in together})
+        part = _combine({name: np.stack([one.arrays()[name][rows] for one in images]) for name in together}, factors)
         for name, image in together.items():
             image[rows] = part[name]
         lobes = [(part[name] / gain).mean(axis=-1).sum(dtype=np.float64) for name in ("diffuse", "specular")]
@@ -158,9 +162,9 @@ def combine_images(images: list[FrameImages], light: tuple[float, ...]) -> Frame
     return replace(first, tally=replace(tally, diffuse_variance=variances[0], specular_variance=variances[1]))
 
 
-def _combine(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Images of several networks, stacked, as one."""
-    weights = np.maximum(arrays["error"], np.float32(LEAST_ERROR)) ** -2
+def _combine(arrays: dict[str, NDArray[Any]], factors: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
+    """Images of several networks, stacked, as one; ``factors [N, 1, 1, 1]`` on their weights."""
+    weights = factors * np.maximum(arrays["error"], np.float32(LEAST_ERROR)) ** -2
     weights /= weights.sum(axis=0)
     polarization = (arrays["dolp"] * np.exp(2j * arrays["aolp"])).mean(axis=0).astype(np.complex64)
     return {
@@ -181,10 +185,11 @@ def _run_turned(network: JointWeights, mosaic: Mosaic, orientation: Orientation,
     floats = data if as_it_is and readable else data.astype(np.float32)
     turned = floats if as_it_is else np.ascontiguousarray(orientation.turn(floats))
     cells, levels = 1 if full else 2, (mosaic.black_level, mosaic.white_level)
-    modulation = modulation_of(network, turned, levels, mosaic.light_color)
+    light = mosaic.light_color[::-1] if orientation.swapped else mosaic.light_color
+    modulation = modulation_of(network, turned, levels, light)
     targets = Targets.empty((turned.shape[0] // cells, turned.shape[1] // cells), network.colors)
     for (top, bottom), kept in _strips((turned.shape[0], turned.shape[1]), network.size, full):
-        seen = RawRows(turned[top:bottom], levels, mosaic.light_color, modulation)
+        seen = RawRows(turned[top:bottom], levels, light, modulation)
         own = Targets._make(image[top // cells : bottom // cells] for image in targets)
         job = _Job(network, full, seen.raw.shape, get_threads(), asked_precision())
         with ENGINES.borrow(job) as engine:
@@ -217,6 +222,7 @@ def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> Fra
 
     def turn(image: NDArray[Any]) -> NDArray[Any]:
         planes = np.moveaxis(image, -1, 0) if image.ndim == 3 else image
+        planes = planes[::-1] if orientation.swapped and len(planes) == 3 else planes
         planes = orientation.turn_back(planes, scale)
         return np.ascontiguousarray(np.moveaxis(planes, 0, -1) if planes.ndim == 3 else planes)
 

@@ -1,8 +1,8 @@
 """The joint networks of a method as one exportable module from raw samples to images, for engines other than torch.
 
 A graph is what the method makes of a frame: levels, clip mask and colour of the light, demosaicking and closed form,
-layers in float32, all networks of the method weighed by their expected errors, the four shifts of mono networks that
-average them: the twin of `run.run_joint` and, in float32, of `engines.run_engine`; then the mosaic's patterns are
+layers in float32, all networks of the method weighed by their expected errors, frames seen in several ways by networks
+that average these: the twin of `run.run_joint` and, in float32, of `engines.run_engine`; then the mosaic's patterns are
 smoothed out where samples clip, and diffuse light under clipped highlights is filled. Around it, `pipeline.separate`
 repairs defects, finds black level and light, and moves what metals, bodies and weak polarizers leave in the diffuse
 image; graphs do none of that. `io.store.onnx` writes them.
@@ -76,11 +76,12 @@ class ExportedNetwork(nn.Module):
         light = torch.ones(self.colors) if light_color is None else light_color
         gains = torch.cat([light[c : c + 1] for c in self.channels]).view(1, -1, 1, 1)
         samples = pixel_shuffle(pixel_unshuffle(samples, PERIOD) / gains, PERIOD)
-        found = []
+        found, shares = [], []
         for network in self.members:
             assert isinstance(network, Joint)
-            found += (self._run_shifted if network.averages_shifts else self._run)(network, samples, clipped)
-        whole = combine(found)
+            found.append(combine(self._run_ways(network, samples, clipped)))
+            shares.append(network.share)
+        whole = combine(found, shares)
         assert whole.expected_error is not None
         weight = repeat_pixels(weigh_clipped(clipped.float(), taps_of(PERIOD), shares_of(self.colors)), self._scale)
         along = taps_of(PERIOD * self._scale // 2)
@@ -104,6 +105,22 @@ class ExportedNetwork(nn.Module):
         near = cells_near_clipping(clipped)[:, 1:]
         error, near = (repeat_pixels(x, self._scale) for x in (error, near))
         return [_separation(diffuse, specular.expand_as(diffuse), ~near[:, 0], error)]
+
+    def _run_ways(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:
+        """The same in all ways in which the network sees frames, as `run.run_joint` does."""
+        if network.averages_ways and self.colors == 1:
+            return self._run_shifted(network, samples, clipped)
+        once = self._run(network, samples, clipped)
+        return once + self._run_swapped(network, samples, clipped) if network.averages_ways and not self.full else once
+
+    def _run_swapped(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:
+        """The same of frames a cell further down and right, where red and blue have changed places."""
+        moved = (_shifted(_shifted(x, 2, -2), 2, -1) for x in (samples, clipped))
+        (whole,) = self._run(network, *moved)
+        height, width = (n // 2 for n in samples.shape[-2:])
+        assert whole.expected_error is not None
+        images = (whole.diffuse.flip(1), whole.specular.flip(1), whole.valid, whole.expected_error)
+        return [_separation(*(image[..., 1 : 1 + height, 1 : 1 + width] for image in images))]
 
     def _run_shifted(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:
         """The same at all shifts, as one batch."""

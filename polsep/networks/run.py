@@ -15,7 +15,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
@@ -30,7 +30,7 @@ from polsep.networks.joint import Joint, limit
 from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of
 from polsep.physics.stokes import Stokes, stokes_inverse
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.orient import Orientation, orient, shifts_of
+from polsep.sensor.orient import Orientation, orient, ways_of
 from polsep.separation.analytic import Separation
 
 #: The type in which layers compute, by kind of device; elsewhere that of their weights.
@@ -48,17 +48,20 @@ def run_joint(network: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
 
     The polarization is that of the network's linear filter, at half resolution. ``valid`` is False near cells of
     which all samples clip. ``expected_error``: see `Separation`. Raises ValueError on layouts that are not
-    Sony's in any orientation.
+    Sony's in any orientation. Networks that average see mono frames in all of `ways_of` and colour frames at half
+    resolution, where the time is short.
     """
-    orientation = orient(mosaic, Layout.sony(mosaic.layout.channels))
+    wanted = Layout.sony(mosaic.layout.channels)
+    orientation = orient(mosaic, wanted)
     if not full and not orientation.keeps_cells:  # then the network's cells are not the frame's
         return _halve(run_joint(network, mosaic, full=True))
-    ways = shifts_of(orientation) if network.averages_shifts else (orientation,)
+    several = network.averages_ways and not (full and network.colors > 1)
+    ways = ways_of(mosaic, wanted) if several else (orientation,)
     return combine([_run_turned(network, mosaic, way, full) for way in ways])
 
 
-def combine(separations: list[Separation]) -> Separation:
-    """Several separations of one frame, each pixel weighed by the inverse of its expected variance.
+def combine(separations: list[Separation], shares: Sequence[float] = ()) -> Separation:
+    """Several separations of one frame, each pixel weighed by the inverse of its expected variance, times ``shares``.
 
     Diffuse and specular have weights of their own. A pixel is valid if it is in all of them; the expected error is the
     weighted mean, since their errors are alike. Polarization and what is not an image are the mean and the first one's.
@@ -67,7 +70,8 @@ def combine(separations: list[Separation]) -> Separation:
     if len(separations) == 1:
         return first
     errors = torch.stack([s.expected_error for s in separations if s.expected_error is not None])
-    weights = errors.clamp(min=LEAST_ERROR) ** -2
+    factors = torch.tensor(shares or [1.0] * len(separations), device=errors.device)
+    weights = factors.view(-1, *[1] * (errors.ndim - 1)) * errors.clamp(min=LEAST_ERROR) ** -2
     weights = weights / weights.sum(dim=0)
     diffuse, specular = weights[..., :1, :, :], weights[..., 1:, :, :]
     images = (torch.stack([getattr(s, name) for s in separations]) for name in ("diffuse", "specular"))
@@ -167,6 +171,8 @@ def _as_separation(images: list[Tensor], cells: Tensor, orientation: Orientation
     scale = 2 if diffuse.shape[-1] > cells.shape[-1] else 1
     s1, s2, error, residual, cells = (repeat_pixels(x, scale) for x in (*images[2:], cells))
     stokes = Stokes(diffuse + specular, s1, s2)
+    if orientation.swapped:
+        diffuse, specular, stokes = diffuse.flip(-3), specular.flip(-3), stokes.map(lambda s: s.flip(-3))
     turned = [orientation.turn_back(x, scale) for x in (diffuse, specular, cells, error, math.sqrt(2) * residual)]
     diffuse, specular, cells, error, residual = turned
     valid, clipped = ~cells[..., 1, :, :], cells[..., 0, :, :]

@@ -25,7 +25,8 @@ class Orientation:
     """Steps from a frame of ``height`` x ``width`` to a wanted one: transposed, mirrored, then continued.
 
     ``top``, ``left``: samples added there, of the turned frame; below and at the right it is continued to multiples of
-    `PERIOD`. ``origin``: first whole cell of the frame as it is, as in `Layout`.
+    `PERIOD`. ``origin``: first whole cell of the frame as it is, as in `Layout`. ``swapped``: where the wanted order
+    has red, the turned frame has blue, and the other way round.
     """
 
     height: int
@@ -36,6 +37,7 @@ class Orientation:
     top: int = 0
     left: int = 0
     origin: tuple[int, int] = (0, 0)
+    swapped: bool = False
 
     @property
     def spans(self) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -87,10 +89,29 @@ class Orientation:
         return Stokes(s0, -s1 if self.transposed else s1, -s2 if self.down != self.across else s2)
 
 
-def shifts_of(orientation: Orientation) -> tuple[Orientation, ...]:
-    """The four ways in which a turned mono frame lies on periods of 4 samples, all of one size.
+def ways_of(mosaic: Mosaic, wanted: Layout) -> tuple[Orientation, ...]:
+    """The ways in which a mosaic's filters come into the ``wanted`` order, all of one size.
 
-    Its filters repeat every 2 samples, so each is as good as the one that is given.
+    Of colour frames two: by a cell of rows and of columns apart, where the filters are the same but for red and blue.
+    Of mono frames four (`shifts_of`).
+    """
+    first = orient(mosaic, wanted)
+    shifts = shifts_of(first)
+    if wanted.bayer is None:
+        return shifts
+    steps = [((way.top - first.top) % PERIOD, (way.left - first.left) % PERIOD) for way in shifts]
+    return tuple(
+        replace(way, swapped=swapped)
+        for swapped, step in ((False, (0, 0)), (True, (PERIOD // 2, PERIOD // 2)))
+        for way, own in zip(shifts, steps, strict=True)
+        if own == step
+    )
+
+
+def shifts_of(orientation: Orientation) -> tuple[Orientation, ...]:
+    """The four ways in which a turned frame lies by whole cells on periods of 4 samples, all of one size.
+
+    Of mono frames, whose filters repeat every 2 samples, each is as good as the one that is given.
     """
     sides = (orientation.height, orientation.width)
     rows, cols = sides[::-1] if orientation.transposed else sides
@@ -100,7 +121,8 @@ def shifts_of(orientation: Orientation) -> tuple[Orientation, ...]:
 
 def _shifts(count: int, before: int) -> tuple[int, int]:
     """Samples before a side of ``count``, 2 apart, by which it becomes as many periods."""
-    first = before if (count + before) % PERIOD in (1, 2) else before + 2
+    least = before % 2
+    first = least if (count + least) % PERIOD in (1, 2) else least + 2
     return first, first + 2
 
 

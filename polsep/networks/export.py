@@ -28,8 +28,9 @@ from polsep.separation.clipped_pattern import shares_of, smooth_planes, taps_of,
 
 #: Names of the outputs, in order.
 OUTPUT_NAMES = ("diffuse", "specular", "error", "valid")
-#: Samples above and left of the frame in the four ways in which a mono one lies on periods (`orient.shifts_of`).
-_SHIFTS = tuple((top, left) for top in (2, 4) for left in (2, 4))
+#: Samples above and left of the frame in the ways in which it lies on periods (`orient.ways_of`), by its colours; by a
+#: cell, red and blue change places.
+SHIFTS = {1: tuple((top, left) for top in (2, 4) for left in (2, 4)), 3: ((4, 4), (2, 2))}
 
 
 def describe_graph(method: str, layout: Layout, full: bool, version: str) -> dict[str, str]:
@@ -107,33 +108,20 @@ class ExportedNetwork(nn.Module):
         return [_separation(diffuse, specular.expand_as(diffuse), ~near[:, 0], error)]
 
     def _run_ways(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:
-        """The same in all ways in which the network sees frames, as `run.run_joint` does."""
-        if network.averages_ways and self.colors == 1:
-            return self._run_shifted(network, samples, clipped)
-        once = self._run(network, samples, clipped)
-        return once + self._run_swapped(network, samples, clipped) if network.averages_ways and not self.full else once
-
-    def _run_swapped(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:
-        """The same of frames a cell further down and right, where red and blue have changed places."""
-        moved = (_shifted(_shifted(x, 2, -2), 2, -1) for x in (samples, clipped))
-        (whole,) = self._run(network, *moved)
-        height, width = (n // 2 for n in samples.shape[-2:])
-        assert whole.expected_error is not None
-        images = (whole.diffuse.flip(1), whole.specular.flip(1), whole.valid, whole.expected_error)
-        return [_separation(*(image[..., 1 : 1 + height, 1 : 1 + width] for image in images))]
-
-    def _run_shifted(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:
-        """The same at all shifts, as one batch."""
-        frames, count = (samples, clipped), samples.shape[0]
-        batch = [torch.cat([_shifted(_shifted(x, top, -2), left, -1) for top, left in _SHIFTS]) for x in frames]
+        """The same in all ways in which the network sees frames, as `run.run_joint` does: shifted, as one batch."""
+        if not network.averages_ways or (self.full and self.colors > 1):
+            return self._run(network, samples, clipped)
+        frames, count, shifts = (samples, clipped), samples.shape[0], SHIFTS[self.colors]
+        batch = [torch.cat([_shifted(_shifted(x, top, -2), left, -1) for top, left in shifts]) for x in frames]
         (whole,) = self._run(network, *batch)
         height, width = (n * self._scale // 2 for n in samples.shape[-2:])
         assert whole.expected_error is not None
         images, found = (whole.diffuse, whole.specular, whole.valid, whole.expected_error), []
-        for k, (top, left) in enumerate(_SHIFTS):
+        for k, (top, left) in enumerate(shifts):
             row, col = top * self._scale // 2, left * self._scale // 2
-            own = [image[k * count : (k + 1) * count] for image in images]
-            found.append(_separation(*(image[..., row : row + height, col : col + width] for image in own)))
+            own = [image[k * count : (k + 1) * count, ..., row : row + height, col : col + width] for image in images]
+            swapped = self.colors > 1 and top % PERIOD > 0
+            found.append(_separation(*(image.flip(1) if swapped else image for image in own[:2]), *own[2:]))
         return found
 
 

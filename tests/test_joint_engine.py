@@ -164,6 +164,12 @@ def test_bfloat16_rounds_corrections_only(layout: Layout, full: bool) -> None:
     assert_within(torch.from_numpy(found.aolp), torch.from_numpy(in_engine(net, mosaic, full=full).aolp), 0.0)
 
 
+def test_narrow_frames_are_not_made_of_memory_that_nobody_filled() -> None:
+    """Layers in bfloat16 of up to 16 raw columns read it, and made 1e34 of it."""
+    net, mosaic = random_net(COLOR), random_frame(400, 8, COLOR)
+    assert_same(in_engine(net, mosaic, "bf16"), in_torch(net, mosaic), run_joint(net, mosaic))
+
+
 @pytest.mark.parametrize("full", [False, True])
 def test_threads_and_frames_before_change_no_bit(full: bool) -> None:
     """Buffers are used again and again; strips of rows overlap."""

@@ -38,6 +38,9 @@ Floats = NDArray[np.float32]
 PRECISIONS = ("bf16", "f32", "i8")
 #: Packed rows that a thread processes at a time.
 _ROWS = 16
+#: Packed columns up to which layers run in float32: OpenVINO 2026.4's bfloat16 and 8-bit layers of matrix tiles (AMX)
+#: read memory that nobody filled there, and made values of 1e34 of it.
+_NARROW = 4
 
 
 class RawRows(NamedTuple):
@@ -56,8 +59,9 @@ class OpenVinoEngine:
     """A network for frames of one shape in its own order of filters, H and W multiples of 4.
 
     ``full``: images at full instead of half resolution. ``precision`` of layers: "bf16", "f32", "i8" (that of
-    `JointWeights.ranges`, others in float32), or None for what suits the processor. State: compiled layers and buffers
-    between raw samples and images, for one frame at a time. ``inputs [h, w, n]``: what `prepare` fills.
+    `JointWeights.ranges`, others in float32), or None for what suits the processor; narrow frames have float32. State:
+    compiled layers and buffers between raw samples and images, for one frame at a time. ``inputs [h, w, n]``:
+    what `prepare` fills.
     """
 
     def __init__(
@@ -67,7 +71,7 @@ class OpenVinoEngine:
         self._layout = network.layout
         h, w = shape[0] // PERIOD, shape[1] // PERIOD
         channels = input_channels(network.colors, network.inputs)
-        precision = precision or asked_precision() or usual_precision()
+        precision = "f32" if w <= _NARROW else precision or asked_precision() or usual_precision()
         halves = precision == "bf16"
         inputs = LayerInput.empty((h, w, channels.total), halves)
         closed = ClosedFormRows.empty(network.colors, h, w)

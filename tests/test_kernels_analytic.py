@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tolerances import assert_within
 
+from polsep import kernels
 from polsep.compute import library
 from polsep.compute.threads import get_threads, set_threads
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
@@ -313,6 +314,29 @@ def test_bad_packed_frames_are_refused(data: Any, height: int, packing: str, mes
 def test_bad_light_colors_are_refused(light: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match="light colour of 3 positive numbers"):
         separate_analytic_half(np.zeros((8, 8), np.uint8), Layout(), 0, 255, AnalyticOptions(light))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"layout": "color"}, "expected a polsep.Layout"),
+        ({"white_level": None}, "expected a number as white_level"),
+        ({"black_level": "0"}, "expected a number as black_level"),
+        ({"options": {"report": True}}, "Options, found dict"),
+        ({"options": AnalyticOptions("white")}, "light_color as one number per colour"),  # type: ignore[arg-type]
+        ({"options": AnalyticOptions(None)}, "light_color as one number per colour"),  # type: ignore[arg-type]
+        ({"options": AnalyticOptions(out=np.zeros((4, 4, 3)))}, "found ndarray"),  # type: ignore[arg-type]
+    ],
+)
+@pytest.mark.parametrize("name", ["analytic_half", "analytic_full", "color_affine_half", "color_affine_full"])
+def test_wrong_types_are_refused_in_one_line(name: str, given: dict[str, Any], words: str) -> None:
+    """An AttributeError of a str was what a layout's name gave."""
+    if name.startswith("color") and isinstance(given.get("options"), AnalyticOptions):
+        given = {"options": kernels.ColorAffineOptions(**vars(given["options"]) | {"guided": True})}
+    usual: dict[str, Any] = {"layout": Layout(), "black_level": 0, "white_level": 255}
+    with pytest.raises(TypeError, match=words) as error:
+        getattr(kernels, f"separate_{name}")(np.zeros((8, 8), np.uint8), **usual | given)
+    assert isinstance(error.value, ValueError) and "\n" not in str(error.value)
 
 
 def test_bad_images_are_refused() -> None:

@@ -843,6 +843,19 @@ def test_a_run_that_replaces_a_longer_one_leaves_none_of_its_frames(
     assert {name: (tmp_path / name).read_bytes() for name in others} == others
 
 
+def test_a_run_that_replaces_films_leaves_none_of_another_kind(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = command(recording, tmp_path, "--frames", "3", "--overwrite")
+    kinds = {"ffv1": ["_diffuse.mkv", "_specular.mkv"], "ffvhuff": ["_diffuse.avi", "_specular.avi"], "exr": []}
+    for kind, expected in kinds.items():
+        assert run(monkeypatch, *few, "--format", kind) == 0
+        found = {path.name.removeprefix(recording.stem) for path in tmp_path.glob("*.*") if path.suffix[1:2] in "am"}
+        assert found == {*expected, "_preview.mp4"}
+    assert run(monkeypatch, *few, "--no-preview") == 0
+    assert not list(tmp_path.glob("*.mp4"))
+
+
 def test_a_run_does_not_go_on_with_other_settings(recording: Path, tmp_path: Path) -> None:
     def steps(method: str) -> Iterator[video.Progress]:
         options = video.VideoOptions(method)

@@ -285,13 +285,17 @@ class SequenceWriter:
             units = {name: f"{units[name]}; code 65535 is {white:g}" for name, white in FILM_WHITE.items()}
         replace_text(self._report, json.dumps({**report, "units": units}, indent=2) + "\n")
         if self._overwrite:
-            self._remove_older_frames()
+            self._remove_older()
         shutil.rmtree(self._parts)
         self._unlock()
         return [*written, self._log_path, self._report]
 
-    def _remove_older_frames(self) -> None:
-        """Remove single frames of the run that this one replaces, where it has none of that number."""
+    def _remove_older(self) -> None:
+        """Remove films and single frames of the run that this one replaces, where it has none of that name."""
+        kinds = [("preview", WATCHABLE), *((image, kind) for image in FILM_WHITE for kind in LOSSLESS.values())]
+        films = {self.directory / f"{self.stem}_{image}{kind.suffix}" for image, kind in kinds}
+        for film in films - {self._film(image) for image in self._kinds}:
+            film.unlink(missing_ok=True)
         own = {self._exr_path(line["frame"]) for line in self.lines() if "damaged" not in line}
         for path in self._frames():
             if self.kind.format != "exr" or path not in own:

@@ -55,7 +55,7 @@ from polsep.io.raw.sequences import open_sequence
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.errors import InputError
 from polsep.pipeline import separate_capture
-from polsep.sensor.camera import Layout
+from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.levels import level_notes
 
 WIDTH, HEIGHT, PACKED = 36, 32, "BayerRG12p"
@@ -311,6 +311,20 @@ def test_a_recording_is_a_camera_byte_for_byte(tmp_path: Path) -> None:
         info, found = frames_of(FolderSource(path, fast()))
         assert info.pixel_format == PACKED
         assert [f.payload for f in found] == [i.payload for i in images]
+
+
+def test_a_recording_that_is_played_keeps_its_layout(tmp_path: Path) -> None:
+    """Its copy was read by the pixel format's name, and so was the live view."""
+    layout, other = Layout(((0, 45), (135, 90))), Layout(bayer=None)
+    run(Scripted([image(1), EndOfFrames()]), CapturePlan(tmp_path / "a", None, layout))
+    run(FolderSource(tmp_path / "a", fast()), CapturePlan(tmp_path / "b", None))
+    run(FolderSource(tmp_path / "a", fast()), CapturePlan(tmp_path / "c", None, other))
+    assert [record_of(tmp_path / name)["layout"] for name in "abc"] == [layout.spec, layout.spec, other.spec]
+    for said, expected in ((None, layout), (other, other)):
+        view = LiveView("analytic", said)
+        view.warm_up(frames_of(FolderSource(tmp_path / "b", fast()))[0])
+        data = view.separate(image(1).payload)[2]
+        assert isinstance(data, Mosaic) and data.layout == expected
 
 
 @pytest.mark.parametrize(

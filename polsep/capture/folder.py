@@ -82,7 +82,7 @@ class _Files:
             raise CameraError(f"{name}: expected at least one frame, found none")
         first = self._next[1]
         settings = {"frame_rate_hz": rate_hz}
-        self.info = CameraInfo(name, first.width, first.height, first.pixel_format, settings)
+        self.info = replace(first, name=name, settings=settings)
         self._count, self._due = 0, 0.0
 
     def start(self) -> None:
@@ -128,8 +128,9 @@ def _files_of(path: Path) -> list[Path]:
 def _recorded(path: Path) -> Iterator[tuple[bytes, CameraInfo]]:
     """Frames of a recording."""
     header = read_header(path)
+    info = CameraInfo(str(path), header.width, header.height, header.pixel_format, layout=header.layout)
     for image in read_images(path):
-        yield image.payload, CameraInfo(str(path), header.width, header.height, header.pixel_format)
+        yield image.payload, info
 
 
 def _pixel_format(page: Page) -> str:

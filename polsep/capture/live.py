@@ -67,7 +67,8 @@ class LiveView:
     def warm_up(self, info: CameraInfo) -> None:
         """Separate a black frame, to compile and load. Raises ValueError if the method does not fit the frames."""
         lower_priority()
-        read = ReadOptions(self._layout, size=(info.width, info.height), pixel_format=info.pixel_format)
+        layout = Layout.parse(info.layout) if self._layout is None and info.layout is not None else self._layout
+        read = ReadOptions(layout, size=(info.width, info.height), pixel_format=info.pixel_format)
         self._options = with_corrections(read, self._calibration, self._ambient)
         self.separate(bytes(find_pixel_format(info.pixel_format).frame_bytes(info.width, info.height)))
 

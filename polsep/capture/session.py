@@ -58,7 +58,8 @@ class Limits:
 class CapturePlan:
     """Plan of a capture: record into ``output``, separate with ``method``, serve a page on ``port``.
 
-    None leaves each of them out. ``layout``: of the mosaic; None derives it from the name of the pixel format.
+    None leaves each of them out. ``layout``: of the mosaic; None is that of a recording that is played, else derived
+    from the name of the pixel format.
     ``calibration`` and ``ambient``: files that correct the frames shown; recorded ones stay as the camera sent them.
     """
 
@@ -258,7 +259,7 @@ class Session:
             if info.describe() != self._info.describe():
                 raise CameraError(f"expected the camera back with {self._info.describe()}, found {info.describe()}")
             return
-        layout = self._plan.layout.spec if self._plan.layout is not None else None
+        layout = self._plan.layout.spec if self._plan.layout is not None else info.layout
         header = Header(info.width, info.height, info.pixel_format, info.name, info.settings, layout)
         self._info = info
         while self._live is not None and not self._view_ready.wait(TICK_S):  # only here the recorder waits for the view

@@ -75,7 +75,10 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """A connected camera: size and pixel format of its frames, and the settings that it reports."""
+    """A connected camera: size and pixel format of its frames, and the settings that it reports.
+
+    ``layout``: a `Layout.spec` that was said of its frames, None where the pixel format's name is all that is known.
+    """
 
     name: str
     width: int
@@ -83,6 +86,7 @@ class CameraInfo:
     pixel_format: str
     settings: dict[str, Any] = field(default_factory=dict)
     patience_s: float = PATIENCE_S
+    layout: str | None = None
 
     def take_payload(self, data: bytes, found: str, padded: bool) -> bytes:
         """The bytes of one frame. Raises CameraError on other frames (``found`` says which) and on padded rows."""

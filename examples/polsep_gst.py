@@ -98,24 +98,38 @@ class Polsep(GstBase.BaseTransform):
     def do_set_caps(self, sink, source):
         """Begin a stream of frames of one size."""
         if self.image not in ("diffuse", "specular"):
-            found = GLib.Error(f"expected image=diffuse or image=specular, found image={self.image}")
-            self.post_message(Gst.Message.new_error(self, found, ""))
-            return False
+            return self.refuse(f"expected image=diffuse or image=specular, found image={self.image}", False)
         frame = sink.get_structure(0)
         self.stride, self.out_stride = self.row_bytes(frame), self.row_bytes(source.get_structure(0))
         self.size = frame.get_int("height")[1], frame.get_int("width")[1]
         self.type = np.dtype("<u2" if frame.get_string("format") == "GRAY16_LE" else "u1")
-        self.filters = polsep.Layout.parse(self.layout)
-        self.run, self.options = stream_of(self.size, self.filters)
+        try:
+            self.filters = polsep.Layout.parse(self.layout)
+            self.run, self.options = stream_of(self.size, self.filters)
+            self.separate(np.zeros(self.size, self.type))  # levels and size are refused here
+        except ValueError as error:
+            return self.refuse(str(error), False)
         return True
+
+    def refuse(self, text, answer):
+        """End the pipeline with a line; return the answer."""
+        self.post_message(Gst.Message.new_error(self, GLib.Error(text), ""))
+        return answer
+
+    def separate(self, raw):
+        """The images of a frame, in the arrays of the stream."""
+        white = self.white_level or float(np.iinfo(self.type).max)
+        return self.run(raw, self.filters, self.black_level, white, self.options)
 
     def do_transform(self, before, after):
         """Separate one frame."""
         height, width = self.size
         rows = np.frombuffer(before.extract_dup(0, before.get_size()), np.uint8).reshape(height, self.stride)
         raw = np.ascontiguousarray(rows[:, : width * self.type.itemsize]).view(self.type)
-        white = self.white_level or float(np.iinfo(self.type).max)
-        images = self.run(raw, self.filters, self.black_level, white, self.options)
+        try:
+            images = self.separate(raw)
+        except ValueError as error:  # levels that were changed meanwhile
+            return self.refuse(str(error), Gst.FlowReturn.ERROR)
         light = images.specular if self.image == "specular" else images.diffuse
         tones = TONES[(np.clip(light * self.gain, 0, 1) * (len(TONES) - 1)).astype(np.intp)]
         shown = np.zeros((height // 2, self.out_stride), np.uint8)

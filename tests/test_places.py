@@ -216,6 +216,19 @@ def test_gstreamer_says_what_is_wrong(tmp_path: Path) -> None:
     assert "polsep_gst: error: expected a pipeline" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [("layout=foo", 'expected "color", "mono"'), ("white-level=-5", "white_level must be above black_level")],
+)
+def test_gstreamer_refuses_in_one_line(wrong: str, said: str, tmp_path: Path) -> None:
+    """A traceback for every frame, and the exit status of success."""
+    frames = "videotestsrc num-buffers=2 ! video/x-raw,format=GRAY8,width=64,height=48"
+    words = [sys.executable, str(EXAMPLES / "polsep_gst.py"), f"{frames} ! polsep {wrong} ! fakesink"]
+    done = subprocess.run(words, env=gstreamer(tmp_path), capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert f"polsep_gst: error: {said}" in done.stderr
+
+
 class Image(types.SimpleNamespace):
     """Stands in for the message of ROS."""
 

@@ -74,7 +74,7 @@ class Polsep(GstBase.BaseTransform):
                     known, value = size.get_int(name)
                     if known:
                         half = direction == Gst.PadDirection.SINK
-                        scaled.set_value(name, value // 2 if half else 2 * value)
+                        scaled.set_value(name, value // 2 if half else Gst.IntRange(range(2 * value, 2 * value + 1)))
                 rate = size.get_fraction("framerate")
                 if rate[0]:
                     scaled.set_value("framerate", Gst.Fraction(rate[1], rate[2]))

@@ -229,6 +229,14 @@ def test_gstreamer_refuses_in_one_line(wrong: str, said: str, tmp_path: Path) ->
     assert f"polsep_gst: error: {said}" in done.stderr
 
 
+def test_gstreamer_takes_frames_of_odd_sides(tmp_path: Path) -> None:
+    """Whole cells of them, as everything else."""
+    frames = "videotestsrc num-buffers=2 ! video/x-raw,format=GRAY8,width=65,height=49"
+    words = [sys.executable, str(EXAMPLES / "polsep_gst.py"), f"{frames} ! polsep ! filesink location={tmp_path}/out"]
+    subprocess.run(words, env=gstreamer(tmp_path), check=True, capture_output=True)
+    assert (tmp_path / "out").stat().st_size == 2 * 24 * 32 * 3
+
+
 class Image(types.SimpleNamespace):
     """Stands in for the message of ROS."""
 

@@ -894,6 +894,13 @@ def test_what_is_no_recording_is_said_in_a_line(
     assert not (tmp_path / "o").exists()
 
 
+def test_a_stream_that_is_cut_short_says_what_there_is(tmp_path: Path) -> None:
+    """Not read to its last whole frame: a wrong size has a rest, too."""
+    (tmp_path / "run.raw").write_bytes(bytes(2 * 64 + 7))
+    with pytest.raises(InputError, match=r"found 135 bytes, 2 frames and 7 bytes: .* head -c 128 takes the whole ones"):
+        open_sequence(tmp_path / "run.raw", ReadOptions(size=(8, 8), pixel_format="Mono8"))
+
+
 @pytest.mark.parametrize(("codec", "pixels"), [("libx264", "yuv420p"), ("mjpeg", "yuvj420p"), ("ffv1", "bgr0")])
 def test_films_that_hold_no_mosaic_are_refused(codec: str, pixels: str, tmp_path: Path) -> None:
     path = write_film(tmp_path / "run.mkv", frames(2), codec, pixels)

@@ -45,7 +45,11 @@ def read_headerless(path: Path, size: tuple[int, int], pixel_format: str, first:
     total = path.stat().st_size
     if total == 0 or total % frame:
         kind = f"{width}x{height} {fmt.name}" + ("; the size of ONE angle image" if fmt.planes > 1 else "")
-        raise ValueError(f"expected a whole number of frames of {frame} bytes ({kind}), found {total} bytes")
+        found, whole = f"{total} bytes", total // frame
+        if whole:
+            more = f"{whole} frames and {total % frame} bytes"
+            found += f", {more}: where the last one was cut short, head -c {whole * frame} takes the whole ones"
+        raise ValueError(f"expected a whole number of frames of {frame} bytes ({kind}), found {found}")
     with path.open("rb") as stream:
         stream.seek(first * frame)
         for index in range(first, total // frame):

@@ -386,6 +386,19 @@ def test_a_recording_cut_anywhere_is_read_to_its_last_whole_frame(
     assert any("ends within a frame" in note for note in frames[0].notes) == (cut % HEADER.frame_bytes > 0)
 
 
+def test_what_is_missing_between_frames_is_said(tmp_path: Path) -> None:
+    """Lost on the wire or dropped at the disk; ids that begin again, also behind an interruption, lack nothing."""
+    writer = RecordingWriter(tmp_path, HEADER)
+    steps = [(65533, 0, 0.0), (65534, 0, 0.0), (1, 1, 0.0), (2, 0, 0.0), (5, 1, 0.0), (900, 0, 3.5), (901, 0, 0.0)]
+    for done, (frame_id, lost, away_s) in enumerate(steps, 1):
+        writer.append(replace(image(frame_id % 9), frame_id=frame_id, lost_before=lost, away_s=away_s))
+        if done in (2, len(steps)):
+            said = open_sequence(tmp_path, ReadOptions()).notes
+            assert said == () if done == 2 else "3 frames are missing, first before frame 2 and the camera" in said[0]
+    writer.close()
+    assert "was away for 3.5 s: frames are counted from 0" in said[0]
+
+
 def test_frames_have_the_time_at_which_they_came(tmp_path: Path) -> None:
     """Behind a trigger that was waited for, and by a clock that begins again where the camera was without power."""
 

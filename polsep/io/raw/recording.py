@@ -20,6 +20,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -224,6 +225,26 @@ def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
         yield replace(
             page, notes=page.notes + notes, exposure=exposure, captured=_captured(header, starts.get(index), image)
         )
+
+
+def gap_notes(path: Path) -> tuple[str, ...]:
+    """A note on what is missing between the frames of a ``recording.json``, if anything is. Raises ValueError."""
+    _require_parts(path)
+    lines = sorted(_read_index(path.with_name(INDEX)).items())
+    away_s = sum(line.get("away_s", 0) for _, line in lines)
+    gaps = {after: count for before, (after, line) in pairwise(lines) if (count := _missing(before[1], line))}
+    found = [f"{sum(gaps.values())} frames are missing, first before frame {min(gaps)}"] if gaps else []
+    found += [f"the camera was away for {away_s:g} s"] if away_s > 0 else []
+    return (f"{' and '.join(found)}: frames are counted from 0, without gaps",) if found else ()
+
+
+def _missing(before: Mapping[str, Any], line: Mapping[str, Any]) -> int:
+    """Number of frames missing between those of two lines: lost on the wire or dropped; none while away.
+
+    Ids that go back begin again.
+    """
+    step = line.get("frame_id", 0) - before.get("frame_id", 0)
+    return 0 if line.get("away_s", 0) > 0 else max(step - 1, line.get("lost_before", 0), 0)
 
 
 def _starts(lines: Mapping[int, Mapping[str, Any]]) -> dict[int, int]:

@@ -17,7 +17,7 @@ from itertools import islice, pairwise
 from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
-from polsep.io.raw.recording import RECORD, recording_files
+from polsep.io.raw.recording import RECORD, gap_notes, recording_files
 from polsep.io.store.errors import InputError, input_error, one_line
 
 _NUMBER = re.compile(r"(\d+)")
@@ -58,7 +58,9 @@ def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
     unread: str | None = None
     for frame in _read_stack(path, options, 1, 0):
         if isinstance(frame, Frame):
-            return FrameSequence(output_stem(path), frame.count, partial(_read_stack, path, options, frame.count))
+            notes = gap_notes(path) if path.name == RECORD else ()
+            begin = partial(_read_stack, path, options, frame.count)
+            return FrameSequence(output_stem(path), frame.count, begin, notes)
         unread = unread or frame.reason
     raise input_error(path, "expected frames, found none") if unread is None else InputError(unread)
 

@@ -262,9 +262,10 @@ def _angles(images: Measurements, options: PhotoOptions) -> tuple[tuple[float, .
         return tuple(math.radians(angle) for angle in known), None
     found = find_angles(*gram(_samples(images)))
     if not found.error < MAX_ANGLE_ERROR:
+        uncertain = f"angles uncertain by {math.degrees(min(found.error, math.pi / 2)):.0f} deg"
         raise ValueError(
-            "expected light of several directions of polarization to find the angles in, found one direction "
-            f"(angles uncertain by {math.degrees(min(found.error, math.pi / 2)):.0f} deg): say --angles"
+            "expected light of several directions of polarization to find the angles in, found one direction, "
+            f"or a filter that was not turned ({uncertain}): say --angles"
         )
     return found.angles, found.error
 

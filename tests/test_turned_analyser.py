@@ -68,6 +68,13 @@ def test_one_direction_of_polarization_shows_no_angles() -> None:
         find_angles(*gram(flat[:4]))
 
 
+def test_a_filter_that_was_not_turned_shows_no_angles() -> None:
+    """Nor do equal photographs, of which rounding was taken for turns, known without error."""
+    rng = np.random.default_rng(3)
+    once = photographs([0.0], random_light(rng, 0.8), rng)
+    assert math.isinf(find_angles(*gram(np.repeat(once, 20, axis=0))).error)
+
+
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 1.6])
 def test_the_ratio_of_exposures_is_recovered(ratio: float) -> None:
     """Where a third of the samples has specular light, and diffuse light is polarized a little, within 2 %."""

@@ -28,6 +28,8 @@ Doubles = NDArray[np.float64]
 
 #: Fewest photographs whose angles can be found.
 LEAST_FOR_ANGLES = 5
+#: Share of the largest eigenvalue of a `gram` matrix below which others are rounding.
+ROUNDING = 1e-12
 #: Range of samples whose ratio says something, and the width over which ratios count as one, as a log.
 USABLE, RATIO_WIDTH = (0.02, 0.95), 0.02
 
@@ -92,6 +94,7 @@ def _signal(products: Doubles, count: int) -> tuple[Doubles, float]:
     values, vectors = np.linalg.eigh(products)
     level = float(values[:-3].mean())
     strength = np.clip(values[-3:] - level, 0, None) / np.sqrt(np.clip(values[-3:], 1e-300, None))
+    strength[values[-3:] < ROUNDING * values[-1]] = 0.0
     return vectors[:, -3:] * strength, max(level, 0.0) / count
 
 

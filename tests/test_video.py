@@ -764,6 +764,19 @@ def test_angles_of_a_film_are_averaged_around_the_circle() -> None:
             assert (report["statistics"][name] - expected + 90) % 180 == pytest.approx(90)
 
 
+def test_frames_without_light_say_nothing_of_its_angle() -> None:
+    """A film of which most frames are black had an angle near their 0 degrees."""
+    first = video.FirstFrame("joint", (1.0,), 1.0, (1, 1, 1), (2, 2), ())
+    seen = {"mean_s0": 0.4, "specular_fraction": 0.1, "specular_aolp_concentration": 0.9}
+    angles = {"specular_aolp_deg": 60.0, "light_polarizer_deg": 120.0}
+    black = {name: 0.0 for name in (*seen, *angles)}
+    lines = [{"frame": k, **(seen | angles if k == 0 else black)} for k in range(5)]
+    for some, expected in ((lines, angles), (lines[1:], {name: 0.0 for name in angles})):
+        report = shared_report(first, some)
+        assert report is not None
+        assert {name: report["statistics"][name] for name in angles} == pytest.approx(expected)
+
+
 def test_the_lamp_of_a_film_is_found_in_frames_put_right(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the black level that a frame shows, as separate finds it."""
     seen = list[float]()

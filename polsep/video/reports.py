@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polsep.physics.stokes import aolp_of
 
@@ -24,11 +25,18 @@ def shared_report(first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, A
     names = [name for name in good[0] if name not in ("frame", "warnings")]
     statistics = {name: float(np.mean([line[name] for line in good if name in line])) for name in names}
     for name in ("specular_aolp_deg", "light_polarizer_deg"):
-        turned = np.exp(2j * np.radians([line[name] for line in good])).sum()
+        turned = complex((np.exp(2j * np.radians([line[name] for line in good])) * _weights(good)).sum())
         statistics[name] = math.degrees(aolp_of(turned.real, turned.imag))
     warnings = _each_once([*first.warnings, *(text for line in good for text in line.get("warnings", ()))])
     light = {"light_color": list(first.light), "light": first.facts}
     return {"method": first.method, "statistics": statistics, **light, "warnings": warnings}
+
+
+def _weights(lines: list[dict[str, Any]]) -> NDArray[np.float64]:
+    """Specular light of each frame that has the frame's angle: a black frame's angle of 0 says nothing."""
+    names = ("mean_s0", "specular_fraction", "specular_aolp_concentration")
+    weights = np.array([math.prod(line.get(name, 1.0) for name in names) for line in lines], np.float64)
+    return weights if weights.any() else np.ones(len(lines))
 
 
 def _each_once(warnings: Sequence[str]) -> list[str]:

@@ -31,7 +31,7 @@ from torch.nn.functional import interpolate
 from polsep import cli, pipeline
 from polsep.compute.threads import own_threads
 from polsep.io.raw.frames import Frame, ReadOptions
-from polsep.io.raw.sequences import DamagedFrame, natural_order, open_sequence
+from polsep.io.raw.sequences import DamagedFrame, expand_folders, input_files, natural_order, open_sequence
 from polsep.io.results import films, sequences
 from polsep.io.results.exr import half_rows, read_exr_layers, zip_rows
 from polsep.io.results.films import LOSSLESS, WATCHABLE, Film, encode_film, join_films
@@ -50,6 +50,7 @@ from polsep.sensor.levels import as_mosaic
 from polsep.separation.report import SeparatedFrame
 from polsep.video import recordings as video
 from polsep.video.reports import shared_report
+from polsep.view.opening import find_sources
 
 av = pytest.importorskip("av", reason="needs the extra 'video'")
 
@@ -435,6 +436,16 @@ def test_numbers_in_names_count_as_numbers() -> None:
         "a10.png",
         "b1.png",
     ]
+
+
+def test_results_called_recording_are_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their report is a recording.json, too: their folder could not be viewed, nor raw frames beside it be read."""
+    np.save(tmp_path / "recording.npy", frames(3))
+    assert run(monkeypatch, *command(tmp_path / "recording.npy", tmp_path, "--no-preview")) == 0
+    assert (tmp_path / "recording.json").exists()
+    assert [source.path.name for source in find_sources(tmp_path)] == [f"recording_{k:06d}.exr" for k in range(3)]
+    assert input_files(tmp_path) == [tmp_path / "recording.npy"]
+    assert expand_folders([str(tmp_path)]) == [str(tmp_path / "recording.npy")]
 
 
 def test_numbers_without_a_file_are_said(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from polsep.capture.sources import CameraError, CameraInfo, CameraSettings, EndO
 from polsep.io.raw.frames import read_pages
 from polsep.io.raw.genicam import find_pixel_format, pack_frame
 from polsep.io.raw.page import Page
-from polsep.io.raw.recording import RECORD, RawImage, read_header, read_images
+from polsep.io.raw.recording import RECORD, RawImage, is_recording, read_header, read_images
 from polsep.io.raw.sequences import natural_order
 from polsep.io.store.errors import input_error, naming
 
@@ -112,7 +112,7 @@ class _Files:
 
 def _files_of(path: Path) -> list[Path]:
     """The recording, the files of a folder, or the file itself."""
-    if (path / RECORD).is_file():
+    if is_recording(path):
         return [path / RECORD]
     if not path.is_dir():
         if not path.exists():

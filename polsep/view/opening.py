@@ -17,7 +17,7 @@ import numpy as np
 
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
-from polsep.io.raw.recording import RECORD
+from polsep.io.raw.recording import RECORD, is_recording
 from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
 from polsep.io.results.sidecars import read_report, result_names
 from polsep.io.store.errors import InputError
@@ -148,7 +148,7 @@ def find_sources(path: Path) -> tuple[Source, ...]:
     """The owner's own file, four of a template with ``{angle}``, or a folder: frames as `polsep video` writes them, or
     raw ones. Raises InputError.
     """
-    path = path / RECORD if (path / RECORD).is_file() else path
+    path = path / RECORD if is_recording(path) else path
     if not path.is_dir():
         return (as_source(path, output_stem(path)),)
     try:

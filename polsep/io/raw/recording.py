@@ -164,6 +164,17 @@ def read_header(path: Path) -> Header:
     return Header(width, height, name, camera, settings if isinstance(settings, dict) else {}, layout, began)
 
 
+def is_recording(folder: Path) -> bool:
+    """True for a folder of `polsep capture`; the report on a frame or film called recording has a record's name."""
+    if not (folder / RECORD).is_file() or any((folder / name).is_file() for name in (RAW, INDEX)):
+        return (folder / RECORD).is_file()
+    try:
+        read_header(folder / RECORD)
+    except ValueError:
+        return False
+    return True
+
+
 def recording_files(path: Path) -> list[Path]:
     """The files of the recording that a file belongs to; none of other files."""
     names = (RECORD, RAW, INDEX)

@@ -17,7 +17,7 @@ from itertools import islice, pairwise
 from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
-from polsep.io.raw.recording import RECORD, gap_notes, recording_files
+from polsep.io.raw.recording import RECORD, gap_notes, is_recording, recording_files
 from polsep.io.store.errors import InputError, input_error, one_line
 
 _NUMBER = re.compile(r"(\d+)")
@@ -50,7 +50,7 @@ class FrameSequence:
 
 def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
     """The frames of a folder or of a file. Raises InputError where there are none, or none can be read."""
-    path = path / RECORD if (path / RECORD).is_file() else path
+    path = path / RECORD if is_recording(path) else path
     if path.is_dir():
         files = _frame_files(path)
         stem, notes = path.resolve().name, _gap_notes(files)
@@ -93,7 +93,7 @@ def _gap_notes(files: list[Path]) -> tuple[str, ...]:
 
 def input_files(path: Path) -> list[Path]:
     """The files that `open_sequence` reads, and their index: those that no output may replace."""
-    if path.is_dir() and not (path / RECORD).is_file():
+    if path.is_dir() and not is_recording(path):
         return _frame_files(path)
     return [path, *recording_files(path / RECORD if path.is_dir() else path)]
 
@@ -108,7 +108,7 @@ def expand_folders(paths: Sequence[str]) -> list[str]:
 
 
 def _folder_frames(folder: Path) -> list[str]:
-    if (folder / RECORD).is_file():
+    if is_recording(folder):
         return [str(folder / RECORD)]
     files = _named_as_frames(folder)
     if not files:

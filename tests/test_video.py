@@ -881,8 +881,8 @@ def test_a_run_that_replaces_films_leaves_none_of_another_kind(
 
 
 def test_a_run_does_not_go_on_with_other_settings(recording: Path, tmp_path: Path) -> None:
-    def steps(method: str) -> Iterator[video.Progress]:
-        options = video.VideoOptions(method)
+    def steps(method: str, count: int | None = None) -> Iterator[video.Progress]:
+        options = video.VideoOptions(method, frames=count)
         return video.separate_video(recording, ReadOptions(white_level=WHITE), options, video.Target(tmp_path))
 
     begun = steps("analytic")
@@ -892,6 +892,8 @@ def test_a_run_does_not_go_on_with_other_settings(recording: Path, tmp_path: Pat
     words = r"expected .*method analytic, with which .* was begun, found .*method color-affine; --overwrite begins anew"
     with pytest.raises(OutputError, match=words):
         next(steps("color-affine"))
+    with pytest.raises(OutputError, match=r"expected frames not said, with which .* was begun, found frames 40; "):
+        next(steps("analytic", 40))
     *_, end = steps("analytic")
     assert end.done == FRAMES and end.written
 

@@ -117,8 +117,13 @@ def require_same_settings(path: Path, settings: Mapping[str, Any], owner: str, a
         raise OutputError(f"expected the settings of {owner} in {path}, found {error}") from error
     different = [name for name in before | now if before.get(name) != now.get(name)]
     if different:
-        expected, found = (", ".join(f"{name} {all.get(name)}" for name in different) for all in (before, now))
+        expected, found = (", ".join(_said(name, all.get(name)) for name in different) for all in (before, now))
         raise OutputError(f"expected {expected}, with which {owner} was begun, found {found}{advice}")
+
+
+def _said(name: str, value: Any) -> str:
+    """A setting and its value in words."""
+    return f"{name} not said" if value is None else f"{name} {value}"
 
 
 def _flat_names(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

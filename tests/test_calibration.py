@@ -256,6 +256,21 @@ def test_pictures_are_no_dark_frames() -> None:
             measure_dark([Mosaic(data, Layout(), 0.0, WHITE)] * 2)
 
 
+def test_one_wrong_frame_among_many_is_refused() -> None:
+    """A frame of paper or of a small thing among dark ones, and a dark one among flat ones, hide in the mean."""
+    sensor = BadSensor(Layout(), dead=0)
+    dark = [sensor.expose(np.zeros(SIZE)) for _ in range(7)]
+    thing = np.zeros(SIZE)
+    thing[40:80, 40:90] = 0.1
+    paper = sensor.expose(sensor.sees(np.full(SIZE, 0.8)))
+    for lit in (paper, sensor.expose(sensor.sees(thing))):
+        with pytest.raises(ValueError, match=r"without light \(lens cap on\), found parts of frame 8 that differ"):
+            measure_dark([*dark, lit])
+    flat = [replace(frame, black_level=LEVEL) for frame in (paper, paper, paper, dark[0])]
+    with pytest.raises(ValueError, match=r"near half of the white level, found one of 0\.\d%"):
+        measure_flat(flat)
+
+
 def test_a_lamp_that_objects_do_not_show_is_refused() -> None:
     """Polarized light of a body's own colour is not the lamp's: the frame is refused, with what to do."""
     sensor, body = BadSensor(Layout(), dead=0), np.array([0.2, 0.3, 0.9])

@@ -29,6 +29,8 @@ from polsep.sensor.camera import Layout, Mosaic
 HOT, HOT_DEVIATIONS = 0.01, 12.0
 #: Share of hot pixels above which they are a picture. Sensors have less than 1 %.
 MOST_HOT = 0.05
+#: Side of blocks whose means show light in one of several dark frames, and the least change that does, white = 1.
+BLOCK, LIGHT = 32, 0.01
 #: Least deviation of a defective pixel's gain, and in robust deviations of all pixels.
 DEAD, DEAD_DEVIATIONS = 0.25, 8.0
 #: Share of dead pixels above which something lies over the paper, and the least falloff of a lens; what is expected.
@@ -48,7 +50,7 @@ def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) ->
 
     Raises ValueError on frames that hold light.
     """
-    dark = average_frames(frames)
+    dark = average_frames(_unlit(frames))
     require_same_sensor(before, dark.first)
     mosaic, period = dark.first, dark.first.layout.period
     level = float(np.median(dark.mean))
@@ -92,6 +94,31 @@ def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) ->
     )
 
 
+def _unlit(frames: Iterable[Mosaic]) -> Iterator[Mosaic]:
+    """The frames, all as dark as the first: light in one would hide in their mean. Raises ValueError."""
+    first: Floats | None = None
+    for number, mosaic in enumerate(frames, start=1):
+        means = _block_means(to_numpy(mosaic.data))
+        first = means if first is None else first
+        if means.shape == first.shape:  # else they are refused as of different sizes
+            largest = float(np.abs(means - first).max()) / mosaic.white_level
+            if largest > LIGHT:
+                raise ValueError(
+                    f"expected frames without light (lens cap on), found parts of frame {number} that differ from "
+                    f"frame 1 by {largest:.1%} of white"
+                )
+        yield mosaic
+
+
+def _block_means(image: NDArray[np.generic]) -> Floats:
+    """Means of blocks of `BLOCK` pixels along a side, or of fewer where the image is smaller."""
+    rows, cols = (max(1, n // BLOCK) for n in image.shape)
+    height, width = (n // k for n, k in zip(image.shape, (rows, cols), strict=True))
+    blocks = image[: rows * height, : cols * width].reshape(rows, height, cols, width)
+    means: Floats = blocks.mean(axis=(1, 3), dtype=np.float32)
+    return means
+
+
 def _line_offsets(residual: Floats, pixel_variance: float) -> Floats:
     """Offsets of rows and columns ``[H, W]``, each shrunk by its noise."""
     lines = np.zeros_like(residual)
@@ -108,14 +135,12 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
     ``frames`` are as the camera wrote them less ``before``'s black level. Raises ValueError on dark, clipped or
     polarized ones.
     """
-    flat = average_frames(_unpolarized(frames))
+    flat = average_frames(_lit_evenly(frames))
     require_same_sensor(before, flat.first)
     mosaic, layout = flat.first, flat.first.layout
     span = mosaic.white_level - mosaic.black_level
     signal = flat.mean - np.float32(mosaic.black_level)
     brightness = float(np.median(signal)) / span
-    if brightness < DARKEST_FLAT:
-        raise ValueError(f"expected flat frames near half of the white level, found {brightness:.1%} of it")
     if flat.clipped > MOST_CLIPPED:
         raise ValueError(f"expected flat frames without clipping, found {flat.clipped:.1%} of the samples clipped")
     means = place_means(signal, layout.period)
@@ -163,10 +188,15 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
     )
 
 
-def _unpolarized(frames: Iterable[Mosaic]) -> Iterator[Mosaic]:
-    """The frames, none of them behind a polarizer, whose turns might cancel in their mean. Raises ValueError."""
+def _lit_evenly(frames: Iterable[Mosaic]) -> Iterator[Mosaic]:
+    """The frames, none dark nor behind a polarizer, which their mean might not show. Raises ValueError."""
     for mosaic in frames:
-        means = place_means(to_numpy(mosaic.linear()), mosaic.layout.period)
+        light = to_numpy(mosaic.linear())
+        if (brightness := float(np.median(light))) < DARKEST_FLAT:
+            raise ValueError(
+                f"expected flat frames near half of the white level, found one of {max(brightness, 0):.1%}"
+            )
+        means = place_means(light, mosaic.layout.period)
         if means.min() > 0:
             dolp = _apparent_dolp(means / _color_means(means, mosaic.layout), mosaic.layout)
             _refuse_polarized(dolp, POLARIZER)

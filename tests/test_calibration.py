@@ -562,6 +562,19 @@ def test_commands_measure_and_apply(tmp_path: Path, run_polsep: Cli) -> None:  #
         assert failed.status == 2 and failed.err.count("\n") == 1 and expected in failed.err, failed
 
 
+def test_a_wrong_layout_is_noted(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
+    """Frames of a mono sensor measured as colour are a note: all later frames would be read so."""
+    sensor = BadSensor(MONO, dead=0)
+    paper = [save(tmp_path / f"paper{i}.tiff", sensor.expose(sensor.sees(np.full(SIZE, 1.0)))) for i in range(3)]
+    said = ("--white-level", WHITE, "--black-level", LEVEL, "-o", tmp_path / "rig.json", "--layout")
+    right = run_polsep("calibrate", "flat", *paper, *said, "mono")
+    (tmp_path / "rig.json").unlink()
+    wrong = run_polsep("calibrate", "flat", *paper, *said, "color")
+    assert (right.status, right.err) == (0, "")
+    assert wrong.status == 0 and wrong.err.startswith("polsep: paper0: the frame shows no colour pattern")
+    assert wrong.err.count("\n") == 1
+
+
 def test_an_ambient_frame_with_the_lamp_on_is_said() -> None:
     """Such a frame leaves hardly any light; one of a dimmer room, or of none, says nothing."""
     scene = np.random.default_rng(3).integers(500, 3000, SIZE).astype(np.uint16)

@@ -20,7 +20,8 @@ from polsep.io.store.errors import input_error
 from polsep.sensor.black_level import check_black_level
 from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Mosaic
-from polsep.sensor.levels import Overexposed
+from polsep.sensor.layout_check import check_layout
+from polsep.sensor.levels import BlackFrame, Overexposed
 
 #: Several pages of a file are frames: four of a turned polarizer, or of two exposures, obey the law of four angles too.
 PAGES = "frames"
@@ -32,10 +33,13 @@ ASSUMED_BLACK = "; black was taken to be at 0: if it is not, measure it first ('
 Measure = Callable[[Iterator[Mosaic], Calibration | None], Calibration]
 
 
-def calibrate_files(paths: Sequence[Path], read: ReadOptions, output: Path, kind: str, measure: Measure) -> str:
-    """Measure a ``kind`` from files of frames, write it into ``output``, and return a line about it.
+def calibrate_files(
+    paths: Sequence[Path], read: ReadOptions, output: Path, kind: str, measure: Measure
+) -> tuple[str, tuple[str, ...]]:
+    """Measure a ``kind`` from files of frames, write it into ``output``; a line about it, and notes.
 
-    Other sections of ``output`` stay, and those that come before in `ORDER` correct the frames. Raises ValueError.
+    Other sections of ``output`` stay, and those that come before it (`corrections_for`) correct the frames. Raises
+    ValueError.
     """
     refuse_foreign_maps(output)
     refuse_inputs([output, maps_path(output)], paths)
@@ -47,10 +51,22 @@ def calibrate_files(paths: Sequence[Path], read: ReadOptions, output: Path, kind
     read = replace(read, corrections=used, pages=PAGES)
     if kind != "dark":
         require_black_level(paths, read)
-    found = measure(read_mosaics(paths, read, _require_white_level), before)
+    notes, looks = dict[str, str](), iter([] if kind == "dark" else [check_layout])
+
+    def check(path: Path, frame: Frame) -> None:
+        _require_white_level(path, frame)
+        found = [note for note in frame.notes if not isinstance(note, Overexposed | BlackFrame)]
+        for look in islice(looks, 1):  # the first frame shows the layout of all
+            assert isinstance(frame.data, Mosaic)  # as `read_mosaics` makes sure
+            found += [warning] if (warning := look(frame.data).warning) else []
+        for note in found:
+            notes.setdefault(note, f"{frame.stem}: {note}")
+
+    found = measure(read_mosaics(paths, read, check), before)
     written = write_calibration(output, found, __version__)
     black = "" if kind == "dark" or read.black_level or found.black_level is not None else ASSUMED_BLACK
-    return f"{kind}: {describe(found, kind)}{black} -> {', '.join(str(path) for path in written)}"
+    line = f"{kind}: {describe(found, kind)}{black} -> {', '.join(str(path) for path in written)}"
+    return line, tuple(notes.values())
 
 
 def _require_white_level(path: Path, frame: Frame) -> None:

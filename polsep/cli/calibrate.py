@@ -131,7 +131,9 @@ def _measure(
     from polsep.calibrate.files import calibrate_files
 
     with show_progress(f"measuring {kind}"):
-        line = calibrate_files(files, read_options(options), output, kind, measure)
+        line, notes = calibrate_files(files, read_options(options), output, kind, measure)
+    for note in notes:
+        print_note(note)
     print(line)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -61,10 +61,13 @@ class Log:
 
 
 @contextmanager
-def open_log(folder: Path, step: int, report: Report, first: Callable[[], dict[str, float]]) -> Iterator[Log]:
+def open_log(
+    folder: Path, step: int, report: Report, first: Callable[[], dict[str, float]], losses: Sequence[float] = ()
+) -> Iterator[Log]:
     """Open the log in ``folder`` of a training that resumes after ``step``, 0 for a new one.
 
-    Lines of later steps are removed. If there is no line of step 0, ``first`` returns its scores.
+    Lines of later steps are removed. If there is no line of step 0, ``first`` returns its scores. ``losses``: of the
+    steps since the last line that is left.
     """
     path = folder / "log.jsonl"
     # Without a checkpoint, lines that are there are of another run, which was stopped.
@@ -76,7 +79,9 @@ def open_log(folder: Path, step: int, report: Report, first: Callable[[], dict[s
             add_events(events, 0, scores)
             report(lines[0])
         write_lines(path, [json.dumps(line) for line in lines])
-        yield Log(path, events, report)
+        log = Log(path, events, report)
+        log.losses += losses
+        yield log
 
 
 def read_log(folder: Path) -> list[Line]:

@@ -173,9 +173,8 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
     _require_end(run, step)
     batches = training.batches(step, (fabric.global_rank, fabric.world_size)) if step < run.last else iter(())
     with ExitStack() as stack:
-        log = (
-            stack.enter_context(open_log(run.out, step, report, training.references)) if fabric.is_global_zero else None
-        )
+        opened = open_log(run.out, step, report, training.references, _losses(state))
+        log = stack.enter_context(opened) if fabric.is_global_zero else None
         while step < run.last:
             rate = run.schedule.rate_at(step)
             loss = training.loss(wrapped, _to(fabric.device, next(batches)), step / run.schedule.steps)
@@ -195,7 +194,7 @@ def run_training(training: Training, run: Run, report: Report) -> dict[str, Tens
                 log.add_scores(step, run.schedule.rate_at(step), scores)
             if run.schedule.is_due(step, run.schedule.checkpoint_every):
                 state = {"step": step, "run": described, "network": network.state_dict()}
-                state |= {"optimizer": optimizer.state_dict(), "average": average}
+                state |= {"optimizer": optimizer.state_dict(), "average": average, "losses": log.losses}
                 write_checkpoint(run.out / "checkpoint.pt", state)
     return average if fabric.is_global_zero else None
 
@@ -268,6 +267,11 @@ def _restore(
     for name, value in average.items():
         value.copy_(state["average"][name])
     return int(state["step"])
+
+
+def _losses(state: dict[str, Any] | None) -> list[float]:
+    """The losses since the log's last line of a checkpoint; none of older ones, which do not hold them."""
+    return [] if state is None else state.get("losses", [])
 
 
 def _require_end(run: Run, step: int) -> None:

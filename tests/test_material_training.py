@@ -98,9 +98,14 @@ def test_examples_are_made_once(folder: Path) -> None:
     assert path.read_bytes() == before
     example = load_example(path)
     assert example.views.shape == (2, 15, 128, 128) and example.maps.shape == (9, 128, 128)
-    bad = folder / "bad.npy"
-    bad.write_bytes(b"nothing")
-    with pytest.raises(ValueError, match="expected an example of a material"):
+    bad, planes = folder / "bad.npy", np.load(path)
+    for damaged in (b"nothing", b"", before[:-100], b"PK\3\4nothing"):
+        bad.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"expected an example of a training in .*; once deleted, it is made"):
+            load_example(bad)
+    planes[0, 0, 0] = np.nan
+    np.save(bad, planes)
+    with pytest.raises(ValueError, match="expected finite planes in"):
         load_example(bad)
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from polsep.io.store.atomic import atomic_path, replace_text
+from polsep.io.store.errors import one_line
 
 
 def write_example(path: Path, planes: Tensor) -> None:
@@ -20,13 +21,20 @@ def write_example(path: Path, planes: Tensor) -> None:
 
 
 def read_example(path: Path) -> Tensor:
-    """Planes ``[K, h, w]`` in half precision. Raises ValueError on a file of anything else."""
+    """Planes ``[K, h, w]`` in half precision. Raises ValueError on a damaged file, and on one of anything else."""
     try:
-        planes = np.load(path, allow_pickle=False)
+        with path.open("rb") as file:
+            planes = np.lib.format.read_array(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise ValueError(f"expected an example of a material in {path}, found {type(error).__name__}") from None
-    if planes.dtype != np.float16 or planes.ndim != 3:
+        raise ValueError(
+            f"expected an example of a training in {path}, found {one_line(error, 80)}; once deleted, it is made again"
+        ) from None
+    if planes.dtype != np.float16 or planes.ndim != 3 or not planes.size:
         raise ValueError(f"expected planes [K, h, w] of float16 in {path}, found {planes.dtype} {planes.shape}")
+    if not np.isfinite(planes).all():
+        raise ValueError(
+            f"expected finite planes in {path}, found NaN or infinite ones; once deleted, it is made again"
+        )
     return torch.from_numpy(planes)
 
 

@@ -28,6 +28,7 @@ from polsep.calibrate.lamp import measure_lamp
 from polsep.calibrate.statistics import robust_deviation, robust_mean
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.sequences import expand_folders
 from polsep.io.raw.tiff import write_merged
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration, write_calibration
@@ -560,6 +561,18 @@ def test_commands_measure_and_apply(tmp_path: Path, run_polsep: Cli) -> None:  #
             run_polsep(*arguments, "-o", tmp_path / "none") if arguments[0] == "separate" else run_polsep(*arguments)
         )
         assert failed.status == 2 and failed.err.count("\n") == 1 and expected in failed.err, failed
+
+
+def test_a_calibration_lies_beside_its_frames(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
+    """Its maps are no frame of the folder: dark frames are measured twice there, and shots separated."""
+    sensor = BadSensor(Layout())
+    for i in range(3):
+        save(tmp_path / f"cap{i}.tiff", sensor.expose(np.zeros(SIZE)))
+    measure = ("calibrate", "dark", tmp_path, "--white-level", 4095, "-o", tmp_path / "rig.json")
+    for _ in range(2):
+        done = run_polsep(*measure)
+        assert (done.status, done.err) == (0, "") and (tmp_path / "rig.npz").exists() and "3 frames" in done.out
+    assert [Path(path).suffix for path in expand_folders([str(tmp_path)])] == [".tiff"] * 3
 
 
 def test_a_wrong_layout_is_noted(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811

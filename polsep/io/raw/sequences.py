@@ -1,9 +1,9 @@
 """Recordings as sequences of frames that can be read from any frame on: folders of files, and files of many frames.
 
-A folder's frames are its files of one kind, in natural order (frame2 before frame10); a folder with a
-``recording.json`` is a recording of `polsep capture`; a set of `polsep render` has its raw mosaics alone as frames. A
-frame that cannot be read becomes a `DamagedFrame` in its place, and reading continues after it where the file allows
-that.
+A folder's frames are its files of one kind, in natural order (frame2 before frame10); maps of a calibration are none.
+A folder with a ``recording.json`` is a recording of `polsep capture`; a set of `polsep render` has its raw mosaics
+alone as frames. A frame that cannot be read becomes a `DamagedFrame` in its place, and reading continues after it where
+the file allows that.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD, gap_notes, is_recording, recording_files
+from polsep.io.store.calibrations import holds_maps
 from polsep.io.store.errors import InputError, input_error, one_line
 
 _NUMBER = re.compile(r"(\d+)")
@@ -125,8 +126,12 @@ def _folder_frames(folder: Path) -> list[str]:
 
 
 def _named_as_frames(folder: Path) -> list[Path]:
-    """The files of a folder whose names are those of frames; of a set of `polsep render`, its views without truth."""
+    """The files of a folder whose names are those of frames; of a set of `polsep render`, its views without truth.
+
+    Maps of a calibration that lies beside its frames are none.
+    """
     files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.suffix.lower() in FRAME_FILES]
+    files = [p for p in files if p.suffix.lower() != ".npz" or not holds_maps(p)]
     views = [p for p in files if _VIEW.fullmatch(p.name)]
     return views if views and (folder / "options.json").is_file() else files
 

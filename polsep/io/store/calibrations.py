@@ -80,12 +80,12 @@ def refuse_foreign_maps(path: Path) -> None:
     if path.suffix.lower() != ".json":
         raise ValueError(f"expected a calibration file that ends in .json, found {path.name!r}")
     maps = maps_path(path)
-    if maps.exists() and not _holds_maps(maps):
+    if maps.exists() and not holds_maps(maps):
         raise OutputError(f"expected no {maps}, where maps of {path.name} belong, found a file of something else")
 
 
-def _holds_maps(path: Path) -> bool:
-    """True for an NPZ file of arrays that calibrations have."""
+def holds_maps(path: Path) -> bool:
+    """Return True for an NPZ file of arrays that calibrations have."""
     try:
         with zipfile.ZipFile(path) as archive:
             return {Path(name).stem for name in archive.namelist()} <= set(ARRAYS)

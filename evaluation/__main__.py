@@ -43,7 +43,10 @@ def measure(data: Path | None, output: Path, quick: bool, images: Path | None) -
 
 def fill_tables(output: Path) -> None:
     """Make the tables of README.md and docs anew, and say below them which are older than the code."""
-    fill_tables_of_docs(output, MEASURES)
+    try:
+        fill_tables_of_docs(output, MEASURES)
+    except ValueError as error:
+        raise InputFailure(str(error)) from None
 
 
 def accept(name: str, output: Path) -> None:

@@ -730,6 +730,7 @@ def test_commands_without_their_files(tmp_path: Path, polsep: Cli, monkeypatch: 
         table := "<!-- table: speed -->\n| 1 |\n<!-- end -->\n", encoding="utf-8"
     )
     assert_refused(polsep("bench", "readme", "-o", "result"), "found no result")
+    assert_refused(polsep("bench", "readme", "-o", "."), "found no NAME.jsonl in .")
     assert page.read_text(encoding="utf-8") == table and list(tmp_path.iterdir()) == [page]
     page.unlink()
     assert_refused(polsep("bench", "readme", "-o", str(tmp_path)), "expected the checkout of polsep")

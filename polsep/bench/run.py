@@ -49,12 +49,15 @@ def fill_tables_of_docs(output: Path, measures: Mapping[str, tuple[str, ...]]) -
     """Make the tables of README.md and docs/ from the rows in ``output``.
 
     Tables of what ``measures`` names, paths by benchmark, say whether they are older than the code. Raises ValueError
-    where there is no such folder, before tables are replaced by none, and where README.md is not here.
+    where there is no such folder or none of its files, before tables are replaced by none, and where README.md is not
+    here.
     """
     if not output.is_dir():
         raise ValueError(f"expected a folder of measured rows, found no {output}")
     if not Path("README.md").is_file():
         raise ValueError("expected the checkout of polsep as the working directory, found no README.md in it")
+    if not any(output.glob("*.jsonl")):
+        raise ValueError(f"expected a folder of measured rows, found no NAME.jsonl in {output}")
     for page in (Path("README.md"), *sorted(Path("docs").rglob("*.md"))):
         fill_page(
             page,

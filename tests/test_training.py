@@ -302,9 +302,20 @@ def test_mono_sees_the_green_light_behind_every_pixel() -> None:
 
 
 def test_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
-    train(small_task(), run_in(tmp_path), lambda _: None)
-    with pytest.raises(ValueError, match="expected the checkpoint of"):
-        train(small_task(), run_in(tmp_path, replace(SCHEDULE, rate=1.0)), lambda _: None)
+    """In one line that names what differs, and nothing else."""
+    run = replace(run_in(tmp_path), what=json.dumps({"seed": 0, "size": {"width": 4}}))
+    train(small_task(), run, lambda _: None)
+    for other, asked, found in (
+        (replace(run, schedule=replace(SCHEDULE, rate=1.0)), "schedule rate 1.0", "schedule rate 0.001"),
+        (replace(run, what=json.dumps({"seed": 1, "size": {"width": 4}})), "seed 1", "seed 0"),
+        (
+            replace(run, what=json.dumps({"seed": 0, "size": {"width": 8}}), workers=0),
+            "width 8, workers 0",
+            "workers 1",
+        ),
+    ):
+        with pytest.raises(ValueError, match=f"a training with .*{asked}, found one with .*{found}$"):
+            train(small_task(), other, lambda _: None)
 
 
 def test_foreign_checkpoint_is_refused(tmp_path: Path) -> None:

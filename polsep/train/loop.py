@@ -260,13 +260,32 @@ def _restore(
     """Load network, optimizer and average from a checkpoint, and return its step; 0 without a checkpoint."""
     if state is None:
         return 0
-    if state["run"] != described:
-        raise ValueError(f"expected the checkpoint of {described}, found one of {state['run']}")
+    _require_same(_flat(described), _flat(state["run"]))
     network.load_state_dict(state["network"])
     optimizer.load_state_dict(state["optimizer"])
     for name, value in average.items():
         value.copy_(state["average"][name])
     return int(state["step"])
+
+
+def _require_same(wanted: dict[str, Any], found: dict[str, Any]) -> None:
+    """Raise ValueError on a training with other options than those of its checkpoint, which names them."""
+    differ = [name for name in wanted | found if wanted.get(name) != found.get(name)]
+    if differ:
+        asked, said = (
+            ", ".join(f"{name} {entries[name]}" if name in entries else f"no {name}" for name in differ)
+            for entries in (wanted, found)
+        )
+        raise ValueError(f"expected the checkpoint of a training with {asked}, found one with {said}")
+
+
+def _flat(entry: Any, name: str = "") -> dict[str, Any]:
+    """The entries of `_describe`, by names such as "schedule rate"; those of ``what`` by theirs alone."""
+    entry = json.loads(entry) if isinstance(entry, str) and entry.startswith("{") else entry
+    if not isinstance(entry, dict):
+        return {name: entry}
+    parts = ((f"{name} {key}".strip() if key != "what" else "", value) for key, value in entry.items())
+    return {part: value for key, below in parts for part, value in _flat(below, key).items()}
 
 
 def _losses(state: dict[str, Any] | None) -> list[float]:

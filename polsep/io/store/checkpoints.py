@@ -27,7 +27,7 @@ def read_checkpoint(path: Path) -> dict[str, Any] | None:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
         raise ValueError(f"expected a checkpoint of a training in {path}, found {type(error).__name__}") from None
-    if not isinstance(state, dict) or "step" not in state:
+    if not isinstance(state, dict) or not {"step", "run", "network", "optimizer", "average"} <= state.keys():
         raise ValueError(f"expected a checkpoint of a training in {path}, found something else")
     return state
 

@@ -13,6 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from polsep.compute.arrays import namespace
+from polsep.io.store.errors import one_line
 from polsep.io.store.weights import is_shipped, read_weights, shipped_weights
 from polsep.networks.joint_weights import JointWeights, joint_weights
 from polsep.networks.paper_engine import Refiner
@@ -42,15 +43,20 @@ def read_joint(path: Path, averages_ways: bool = False) -> JointWeights:
     try:
         return joint_weights(arrays, metadata, averages_ways)
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"expected weights of a joint network in {path}, found {type(error).__name__}") from None
+        found = type(error).__name__ if metadata["method"] in NAMES else f"those of {one_line(metadata['method'], 40)}"
+        raise ValueError(f"expected weights of a joint network in {path}, found {found}") from None
 
 
 def shipped_joint(method: str, layout: Layout) -> list[JointWeights]:
     """All networks of a method for frames of a layout; always the same objects, since engines are kept by them."""
-    averaged = AVERAGED_MONO if layout.bayer is None else AVERAGED
     with _LOADING:
-        members = MEMBERS.get(method, {method: 1.0})
-        return [_read_shipped(weights_name(name, layout), method in averaged, members[name]) for name in members]
+        members, averages = MEMBERS.get(method, {method: 1.0}), _averages(method, layout)
+        return [_read_shipped(weights_name(name, layout), averages, members[name]) for name in members]
+
+
+def _averages(method: str, layout: Layout) -> bool:
+    """True where a method's networks average frames of a layout seen in several ways."""
+    return method in (AVERAGED_MONO if layout.bayer is None else AVERAGED)
 
 
 @lru_cache(maxsize=16)
@@ -67,13 +73,15 @@ def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[list[Joi
     """A method's networks for frames of a layout, and the metadata of the first one's weights.
 
     They are those that are shipped, all that the method weighs together; or the one in a file of weights. Raises
-    ValueError on methods without such a network, and on weights for other frames.
+    ValueError on methods without such a network, and on weights of another method or for other frames.
     """
     if method not in NAMES:
         raise ValueError(f"expected a method of {', '.join(NAMES)}, found {method!r}")
     if path is None:
         return shipped_joint(method, layout), read_weights(shipped_weights(weights_name(method, layout)))[1]
-    network, metadata = read_joint(path), read_weights(path)[1]
+    network, metadata = read_joint(path, _averages(method, layout)), read_weights(path)[1]
+    if metadata["method"] != method:
+        raise ValueError(f"expected weights of {method} in {path}, found those of {metadata['method']}")
     if network.colors != layout.channels:
         raise ValueError(f"expected weights for {layout.channels} colours in {path}, found {network.colors}")
     return [network], metadata

@@ -26,7 +26,7 @@ import onnxruntime
 import polsep
 from polsep import cli
 from polsep.in_torch import load_joint
-from polsep.io.store.weights import write_weights
+from polsep.io.store.weights import shipped_weights, write_weights
 from polsep.methods import METHODS
 from polsep.networks.channels import INPUTS
 from polsep.networks.export import OUTPUT_NAMES, ExportedNetwork
@@ -170,6 +170,21 @@ def test_graphs_are_the_whole_method(
         found = graph(torch.from_numpy(raw)[None], torch.tensor([0.0]), torch.tensor([white]), *light)
     asked = {"method": method, "layout": layout, "light_color": LIGHT, "full": full}
     assert_separated([image[0].numpy() for image in found], raw, white, asked, crop is highlight_crop)
+
+
+def test_weights_of_users_are_those_of_the_method() -> None:
+    """Others are refused by name; mono networks average shifts whether their file is named or not."""
+    for method, name, said in (
+        ("joint", "joint-fast-mosaic", "expected weights of joint in .*, found those of joint-fast"),
+        ("joint-fast", "paper-mosaic", "expected weights of a joint network in .*, found those of paper"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            find_joint(method, Layout(), shipped_weights(name))
+    for method in ("joint", "joint-fast"):
+        layout = Layout.parse("mono")
+        (own,), _ = find_joint(method, layout, shipped_weights(f"{method}-mono"))
+        (shipped,), _ = find_joint(method, layout, None)
+        assert own.averages_shifts == shipped.averages_shifts == (method == "joint")
 
 
 def test_full_graphs_take_batches_of_any_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,6 +48,8 @@ FIXED = 1e-6
 MIN_FRAMES, MIN_SPREAD = 5, 0.1
 #: Largest rms residual of frames that fit the model, relative to their light.
 MAX_RESIDUAL = 0.02
+#: Standard errors beyond which analysers are better than perfect ones, so that the polarizer is better than stated.
+SURE = 3.0
 #: Least signal, and least degree of polarization by the layout's analysers, of a frame behind a polarizer.
 DARKEST, MIN_DOLP = 0.02, 0.5
 
@@ -84,6 +86,12 @@ def measure_analysers(
             f"expected frames of an evenly lit polarizer that turns, found samples that differ by {residual:.1%}"
         )
     rho = diattenuation(polarizer_extinction)
+    both = float(fit.diattenuation.mean())
+    if math.isfinite(polarizer_extinction) and both > rho + SURE * errors.diattenuation:
+        raise ValueError(
+            f"expected a polarizer's extinction ratio of at least {_extinction(both):.0f}, which the frames show of it "
+            f"and the analysers together, found {polarizer_extinction:g}"
+        )
     period = layout.period
     found = [
         Analyser(math.degrees(t) % 180, _extinction(d / rho), float(g))
@@ -96,7 +104,7 @@ def measure_analysers(
         "angle_off_rms_deg": round(float(np.sqrt((angles**2).mean())), 4),
         "angle_off_largest_deg": round(float(np.abs(angles).max()), 4),
         "angle_error_deg": round(math.degrees(errors.angle), 4),
-        "diattenuation": round(float(fit.diattenuation.mean() / rho), 5),
+        "diattenuation": round(both / rho, 5),
         "diattenuation_error": round(errors.diattenuation, 5),
         "gain_error": round(errors.gain, 5),
         "residual_rms": round(residual, 6),

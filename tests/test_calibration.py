@@ -198,6 +198,8 @@ def test_a_turned_polarizer_shows_the_analysers(layout: Layout, flat: bool) -> N
     np.testing.assert_allclose(np.array(again.analysers), np.array(found.analysers), rtol=1e-4)
     imperfect = measure_analysers(frames, replace(known, analysers=None), polarizer_extinction=50.0)
     assert imperfect.details["analysers"]["diattenuation"] > found.details["analysers"]["diattenuation"]
+    with pytest.raises(ValueError, match="extinction ratio of at least 30, which the frames show of it and the"):
+        measure_analysers(frames, replace(known, analysers=None), polarizer_extinction=20.0)
 
 
 @pytest.mark.parametrize("card", [True, False])
@@ -455,6 +457,16 @@ def test_coarse_codes_have_their_mean() -> None:
     rng = np.random.default_rng(0)
     codes = np.round(rng.normal(64.3, 0.3, 20_000)).astype(np.float32)
     assert robust_mean(codes) == pytest.approx(float(codes.mean()), abs=0.01) and robust_deviation(codes) > 0.3
+
+
+def test_what_is_said_of_float_frames_is_not_rounded_away() -> None:
+    """Frames whose white level is 1: black level, its error and the noise have digits."""
+    rng = np.random.default_rng(3)
+    frames = [rng.normal(64 / 4095, 2 / 4095, SIZE).astype(np.float32) for _ in range(4)]
+    found = measure_dark(Mosaic(frame, Layout(), 0.0, 1.0) for frame in frames)
+    assert found.details["dark"]["black_level_error_codes"] == pytest.approx(1 / 4095 / 143, rel=0.1)
+    line = describe(found, "dark")
+    assert "black level 0.0156" in line and "read noise 0.0004" in line
 
 
 def test_black_of_float_frames_is_kept(tmp_path: Path) -> None:

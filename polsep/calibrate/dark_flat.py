@@ -76,10 +76,10 @@ def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) ->
     varies = bool(share or lines.any())
     details = {
         "frames": dark.count,
-        "black_level_error_codes": round(spread / dark.mean.size**0.5, 5),
-        "pattern_rms_codes": round(float(np.std(table)), 4),
-        "lines_rms_codes": round(float(lines.std()), 4),
-        "pixels_rms_codes": round(share**0.5 * robust_deviation(kept), 4),
+        "black_level_error_codes": _rounded(spread / dark.mean.size**0.5),
+        "pattern_rms_codes": _rounded(float(np.std(table))),
+        "lines_rms_codes": _rounded(float(lines.std())),
+        "pixels_rms_codes": _rounded(share**0.5 * robust_deviation(kept)),
         "hot_pixels": int(hot.sum()),
     }
     base = _base(before, mosaic)
@@ -92,6 +92,11 @@ def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) ->
         read_noise=noise**0.5,
         details={**base.details, "dark": details},
     )
+
+
+def _rounded(codes: float) -> float:
+    """A number to three digits, whatever the unit: frames of floats have a white level of 1."""
+    return float(f"{codes:.3g}")
 
 
 def _unlit(frames: Iterable[Mosaic]) -> Iterator[Mosaic]:

@@ -156,9 +156,9 @@ def describe(found: Calibration, kind: str) -> str:
     facts = found.details[kind]
     if kind == "dark":
         return (
-            f"black level {found.black_level:.2f} +- {facts['black_level_error_codes']:.2g} of {found.white_level:g}, "
+            f"black level {found.black_level:.5g} +- {facts['black_level_error_codes']:.2g} of {found.white_level:g}, "
             f"pattern {facts['pattern_rms_codes']:.2g} codes rms over filters, {facts['lines_rms_codes']:.2g} over "
-            f"lines, {facts['pixels_rms_codes']:.2g} over pixels, read noise {found.read_noise:.2f} codes, "
+            f"lines, {facts['pixels_rms_codes']:.2g} over pixels, read noise {found.read_noise:.3g} codes, "
             f"{facts['hot_pixels']} hot pixels, {facts['frames']} frames"
         )
     if kind == "flat":

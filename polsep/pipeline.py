@@ -75,7 +75,7 @@ class PolsepWarning(UserWarning):
     """Something about a frame that its owner should know: the layout, the bit depth, the exposure, the light."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result(SeparatedFrame):
     """A separated frame that can be saved and shown; its images are those of `SeparatedFrame`.
 

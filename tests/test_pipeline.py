@@ -488,6 +488,14 @@ def test_results_are_short_texts() -> None:
         assert len(repr(thing)) < 300 and "float32 [" in repr(thing)
 
 
+def test_results_can_be_compared_and_collected() -> None:
+    """Things that hold arrays are equal to themselves alone: lists, sets and ``==`` take them."""
+    frame = raw_frame()
+    results = [quietly(frame, method="analytic") for _ in range(2)]
+    for one, other in (results, [as_mosaic(frame)[0] for _ in range(2)], [lit_scene() for _ in range(2)]):
+        assert one == one and one != other and other in [one, other] and len({one, other}) == 2
+
+
 @pytest.mark.parametrize("name", ["shot.exr", "shot.npz", "shot.tif", "shot.png", "shot"])
 def test_results_are_saved(tmp_path: Path, name: str) -> None:
     """`save` writes what the command line writes; files from before stay unless they are to be replaced."""

@@ -31,7 +31,7 @@ class Separated(Protocol):
         """``[h, w, C]``."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SeparatedImages:
     """Diffuse and specular images of one size, non-negative. Raises EditError on other shapes and types."""
 

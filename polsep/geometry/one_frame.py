@@ -57,7 +57,7 @@ INDICES = (1.3, 2.5)
 FILLED, UNCERTAIN_DEG = 0.2, 15.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shape:
     """The surface of a frame, ``[h, w]`` as its images; 0 outside the ``mask``.
 

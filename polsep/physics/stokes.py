@@ -34,7 +34,7 @@ MAX_DOLP = 2.0
 BELOW_WHITE, MOST_BOUNDED = 2.0**-8, 1e-3
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Stokes:
     """Linear Stokes images ``s0, s1, s2``, each ``[..., C, H, W]``, floating point, same linear scale."""
 
@@ -64,7 +64,7 @@ class Stokes:
         return Stokes(function(self.s0), function(self.s1), function(self.s2))
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Measurements:
     """Samples behind K analysers at the same points: ``data`` and ``clipped`` are ``[..., K, C, H, W]``.
 

@@ -210,7 +210,7 @@ def clip_level(black_level: float, white_level: float) -> float:
     return black_level + (1 - CLIP_MARGIN) * (white_level - black_level)
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Mosaic:
     """One raw frame (or a batch): linear sensor values ``data [..., H, W]`` with what is needed to read them.
 

@@ -25,7 +25,7 @@ from polsep.physics.stokes import (
 )
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Separation:
     """A diffuse and a specular image ``[..., C, h, w]`` with ``valid [..., h, w]`` and the `stokes` they came from.
 

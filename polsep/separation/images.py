@@ -52,7 +52,7 @@ class Tally:
         return Tally(pixels, *counts, *(None if total is None else share * total for total in sums))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FrameImages:
     """The images of a frame, channels last; streams pass one to be filled again and again.
 

@@ -34,7 +34,7 @@ MAX_RESIDUAL = 0.07
 QUANTILE_SAMPLES = 50_000
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SeparatedFrame:
     """A separated frame as NumPy arrays, channels last.
 

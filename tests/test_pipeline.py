@@ -27,7 +27,7 @@ from polsep.networks.channels import MIN_BRIGHTNESS
 from polsep.networks.joint import Joint
 from polsep.networks.run import run_joint
 from polsep.networks.sizes import ResidualSize
-from polsep.physics.stokes import Stokes, measure
+from polsep.physics.stokes import Measurements, Stokes, measure
 from polsep.pipeline import PolsepWarning, find_device, separate, separate_capture
 from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
 from polsep.sensor.levels import as_mosaic
@@ -644,6 +644,22 @@ def test_mosaic_refuses_what_it_cannot_hold() -> None:
         Mosaic(torch.zeros(3, 8), Layout(), 0.0, 1.0)
     with pytest.raises(ValueError, match="must be above"):
         Mosaic(torch.zeros(8, 8), Layout(), 1.0, 1.0)
+    with pytest.raises(ValueError, match=r"expected a Layout \(Layout.parse reads text\), found 'color'"):
+        Mosaic(torch.zeros(8, 8), "color", 0.0, 1.0)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"expected levels that are numbers, found black 0\.0, white None"):
+        Mosaic(torch.zeros(8, 8), Layout(), 0.0, None)  # type: ignore[arg-type]
+
+
+def test_angles_of_measurements_are_radians() -> None:
+    """Degrees would give images of any other angles without a word."""
+    with pytest.raises(ValueError, match=r"expected analyser angles in radians, found \[0.0, 45.0, 90.0, 135.0\]"):
+        Measurements(np.zeros((4, 1, 8, 8), np.float32), (0, 45, 90, 135))
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 1, 8, 8), (4, 2, 8, 8)])
+def test_angle_images_that_are_no_frame_are_one_line(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"expected angle images \[K, C, H, W\] of 1 or 3 colours, found \("):
+        polsep.separate(Measurements(np.ones(shape, np.float32), Layout().angles), "analytic")
 
 
 @pytest.mark.parametrize("method", ["joint-fast", "analytic"])

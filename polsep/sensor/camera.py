@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from numbers import Real
 from typing import TYPE_CHECKING, NamedTuple
 
 from array_api_compat import device
@@ -197,7 +198,14 @@ class Layout:
 
 
 def check_frame(shape: tuple[int, ...], layout: Layout, black_level: float, white_level: float) -> None:
-    """Raise ValueError when white is not above black or a frame ``[..., H, W]`` is smaller than one period."""
+    """Raise ValueError when white is not above black or a frame ``[..., H, W]`` is smaller than one period.
+
+    Of text as layout and of levels that are no numbers, it is a `WrongType`.
+    """
+    if not isinstance(layout, Layout):
+        raise WrongType(f"expected a Layout (Layout.parse reads text), found {layout!r:.40}")
+    if not (isinstance(black_level, Real) and isinstance(white_level, Real)):
+        raise WrongType(f"expected levels that are numbers, found black {black_level!r:.40}, white {white_level!r:.40}")
     rows, cols = (layout.period + start for start in layout.origin)
     if len(shape) < 2 or shape[-2] < rows or shape[-1] < cols:
         raise ValueError(f"expected a mosaic [..., H, W] of at least {rows}x{cols}, found {shape}")

@@ -242,6 +242,8 @@ def separate_capture(
     """`separate` for a frame that is already a `Mosaic`, or co-sited `Measurements` (which keep their resolution)."""
     if isinstance(capture, Mosaic) and capture.data.ndim != 2:
         raise ValueError(f"expected one mosaic [H, W], found a batch of shape {tuple(capture.data.shape)}")
+    if isinstance(capture, Measurements) and (capture.data.ndim != 4 or capture.data.shape[1] not in (1, 3)):
+        raise ValueError(f"expected angle images [K, C, H, W] of 1 or 3 colours, found {tuple(capture.data.shape)}")
     chosen = find_method(method, capture)
     checked = check_mosaic(capture) if isinstance(capture, Mosaic) else None
     capture, device = checked.mosaic if checked else capture, find_device(device)

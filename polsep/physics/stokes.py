@@ -32,6 +32,8 @@ MAX_DOLP = 2.0
 #: An analyser clips below white if its brightest clipped sample is this much below it: more than rounding and the
 #: margin of the sensor's codes. Share of pixels of which that leaves light unknown from which on it matters.
 BELOW_WHITE, MOST_BOUNDED = 2.0**-8, 1e-3
+#: Largest analyser angle [rad], two turns: numbers beyond are degrees.
+MOST_ANGLE = 4 * math.pi
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -85,6 +87,8 @@ class Measurements:
     def __post_init__(self) -> None:
         if self.data.ndim < 4 or self.data.shape[-4] != len(self.angles):
             raise ValueError(f"expected data [..., {len(self.angles)}, C, H, W], found shape {tuple(self.data.shape)}")
+        if any(abs(angle) > MOST_ANGLE for angle in self.angles):
+            raise ValueError(f"expected analyser angles in radians, found {list(map(float, self.angles))}: degrees?")
         if self.clipped is not None and self.clipped.shape != self.data.shape:
             raise ValueError(
                 f"clipped must have the shape of data {tuple(self.data.shape)}, found {tuple(self.clipped.shape)}"

@@ -45,7 +45,7 @@ def tile(grid: list[list[Image.Image]]) -> Image.Image:
 def mistakes(raw: np.ndarray) -> Image.Image:
     """Return diffuse (above) and specular images of a correct capture and of captures with one mistake each.
 
-    The lamp's colour is divided out of the panels, so that only the mistake differs.
+    The lamp is stated to be white. Its colour is divided out of the panels, so that only the mistake differs.
     """
     layout, white = polsep.Layout(), 4095.0
     colors = np.array([[layout.filter_at(row, col).channel for col in range(4)] for row in range(4)])
@@ -54,14 +54,14 @@ def mistakes(raw: np.ndarray) -> Image.Image:
     tinted = np.where(raw >= 4090, white, tinted)  # what clips goes on clipping
     captures = {
         "correct": (raw, 1.0),
-        "lamp's colour not stated": (tinted, 1 / lamp),
+        "lamp's colour wrong": (tinted, 1 / lamp),
         "room light": (np.minimum(raw + 0.05 * white, white), 1.0),
         "overexposed 4 times": (np.minimum(raw * 4.0, white), 0.25),
         "gamma on": (white * (raw / white) ** (1 / 2.2), 0.25),
     }
     rows: list[list[Image.Image]] = [[], []]
     for name, (frame, scale) in captures.items():
-        found = polsep.separate(frame.astype(np.float32), white_level=white)
+        found = polsep.separate(frame.astype(np.float32), white_level=white, light_color="white")
         rows[0].append(panel((found.diffuse * scale).astype(np.float32), 2, name, 380))
         rows[1].append(panel((found.specular * scale).astype(np.float32), 4, "", 380))
     return tile(rows)
@@ -72,7 +72,7 @@ def main(directory: str) -> None:
     warnings.simplefilter("ignore")
     raw = imagecodecs.imread(Path(polsep.__file__).parent / "data" / "still_life.png")
     rows = []
-    for method, name in (("analytic", "paper's analytic split"), ("joint", "polsep")):
+    for method, name in (("analytic", "paper's analytic split"), ("auto", "polsep")):
         found = polsep.separate(raw, method=method, white_level=4095)
         if not rows:
             gain = exposure_of(found.diffuse + found.specular)

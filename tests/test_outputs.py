@@ -377,6 +377,15 @@ def test_a_directory_that_is_a_file_is_refused_by_name(tmp_path: Path, below: st
     assert contents(tmp_path) == {"file": b"x"}
 
 
+def test_no_preview_replaces_a_raw_frame(tmp_path: Path) -> None:
+    """Results beside their frame have a preview of its name: what was recorded is kept, also with overwrite."""
+    raw = imagecodecs.png_encode(np.arange(64, dtype=np.uint16).reshape(8, 8))
+    (tmp_path / "shot.png").write_bytes(raw)
+    with pytest.raises(OutputError, match=r"expected a preview of before to replace, found a grey PNG, .*shot\.png"):
+        write_separation(random_frame(), tmp_path, "shot", overwrite=True)
+    assert contents(tmp_path) == {"shot.png": raw}
+
+
 def test_a_directory_in_the_place_of_an_output_is_refused_even_with_overwrite(tmp_path: Path) -> None:
     (tmp_path / "shot.exr").mkdir()
     (tmp_path / "shot.exr" / "precious").write_text("x")

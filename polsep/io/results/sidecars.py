@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -50,9 +51,10 @@ def write_with_sidecar(
     """Write ``files`` and then their sidecar STEM.json, the last of ``targets``; atomically, as `write_set` does.
 
     ``files`` may be lazy: each is in memory alone. The sidecar holds ``facts`` before the list of files and ``report``
-    after it. Raises OutputError, also on a sidecar that is not JSON.
+    after it. Raises OutputError, also on a sidecar that is not JSON, and where the preview would replace a raw frame.
     """
     stem = targets[-1].stem
+    _refuse_gray(targets[-1].with_suffix(".png"))
 
     def write(folder: Path) -> None:
         listed = []
@@ -71,6 +73,16 @@ def write_with_sidecar(
         write_checked(folder / f"{stem}.json", (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
 
     write_set(targets, stem, write)
+
+
+def _refuse_gray(preview: Path) -> None:
+    """Raise OutputError on a PNG of one channel in a preview's place, as raw frames are and no preview of polsep is."""
+    if not (os.path.isfile(preview) and os.access(preview, os.R_OK)):
+        return
+    with preview.open("rb") as stream:
+        head = stream.read(26)
+    if head.startswith(b"\x89PNG") and head[25:] in (b"\0", b"\4"):
+        raise OutputError(f"expected a preview of before to replace, found a grey PNG, as raw frames are: {preview}")
 
 
 def read_report(path: Path) -> dict[str, Any]:

@@ -599,6 +599,16 @@ def test_images_that_do_not_fit_are_refused() -> None:
         SeparatedImages(images.diffuse.astype(np.float64), images.specular)  # type: ignore[arg-type]
 
 
+def test_what_is_no_recipe_or_frame_is_refused_in_one_line() -> None:
+    """An edit alone is no recipe, and an array no frame."""
+    with pytest.raises(EditError, match=r"expected a Recipe of edits, found Rougher"):
+        apply(random_images(), Rougher())  # type: ignore[arg-type]
+    with pytest.raises(EditError, match=r"expected a recipe of edits, .*, found Rougher\("):
+        Recipe(Rougher())  # type: ignore[arg-type]
+    with pytest.raises(EditError, match=r"expected a frame with diffuse and specular images, found ndarray"):
+        apply(np.ones((4, 4, 3), np.float32), Recipe())  # type: ignore[arg-type]
+
+
 def test_names_of_images() -> None:
     """A recipe knows its images by kind, and can rename them."""
     recipe = Recipe((Texture(image="wood.png", mask="m.png"), Rougher(mask="m.png"), Metallic()))

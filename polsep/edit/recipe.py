@@ -26,11 +26,16 @@ _KEY = "polsep_recipe"
 
 @dataclass(frozen=True)
 class Recipe:
-    """Edits in the order in which they are applied. Raises EditError where one image name stands for two kinds."""
+    """Edits in the order in which they are applied.
+
+    Raises EditError where one image name stands for two kinds, and on what are no edits.
+    """
 
     edits: tuple[Edit, ...] = ()
 
     def __post_init__(self) -> None:
+        if not isinstance(self.edits, tuple | list) or not all(isinstance(edit, Edit) for edit in self.edits):
+            raise EditError(f"expected a recipe of edits, Recipe((Rougher(), Metallic())), found {_brief(self.edits)}")
         kinds: dict[str, str] = {}
         for edit in self.edits:
             for kind, name in edit.images():
@@ -63,6 +68,10 @@ def apply(images: Separated, recipe: Recipe, maps: Maps | None = None) -> Separa
     0 or more. The frame itself is never changed; images that no edit changes are the same arrays.
     Raises EditError, naming the edit, if one does not fit the images.
     """
+    if not isinstance(recipe, Recipe):
+        raise EditError(f"expected a Recipe of edits, found {type(recipe).__name__}")
+    if not (hasattr(images, "diffuse") and hasattr(images, "specular")):
+        raise EditError(f"expected a frame with diffuse and specular images, found {type(images).__name__}")
     edited = SeparatedImages(images.diffuse, images.specular)
     for place, edit in enumerate(recipe.edits, 1):
         try:

@@ -103,11 +103,13 @@ class Result(SeparatedFrame):
 
         ``path``: DIR/STEM.exr, .npz, .tiff or .png (sets of one file per image); EXR without an ending. All or nothing.
         ``stokes``: EXR files also get the layers S0, S1, S2 of `with_stokes`. Raises ValueError where files exist and
-        ``overwrite`` is False, on another ending, or where writing fails.
+        ``overwrite`` is False, on another ending, on a folder, or where writing fails.
         """
         from polsep.io.results.separation_writer import write_separation
 
         target = Path(path)
+        if os.fspath(path).endswith(("/", os.sep)) or target.is_dir():
+            raise OutputError(f"expected a file name like {target / 'shot.exr'}, found a folder")
         stem = target.stem if target.suffix.lower() in _ENDINGS else target.name
         if target.suffix and stem == target.name:
             raise ValueError(f"expected a file name that ends in {', '.join(_ENDINGS)}, found {target.name!r:.80}")

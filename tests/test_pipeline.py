@@ -514,6 +514,14 @@ def test_results_of_unknown_endings_are_refused(tmp_path: Path) -> None:
     """An ending that no format has is refused before anything is written."""
     with pytest.raises(ValueError, match=r"ends in \.exr"):
         quietly(raw_frame(), method="analytic").save(tmp_path / "shot.jpg")
+
+
+def test_results_are_not_saved_as_a_folder(tmp_path: Path) -> None:
+    """A folder is no name of a frame: the files would lie beside it, with its name."""
+    for folder in (f"{tmp_path}/new/", tmp_path):
+        with pytest.raises(ValueError, match=r"expected a file name like .*shot\.exr, found a folder"):
+            quietly(raw_frame(), method="analytic").save(folder)
+    assert not list(tmp_path.iterdir()) and not tmp_path.with_suffix(".exr").exists()
     assert list(tmp_path.iterdir()) == []
 
 

@@ -360,6 +360,9 @@ ARRAYS: list[tuple[str, Callable[[], object], str]] = [
     ("four channels", lambda: as_measurements(np.ones((4, 4, 4, 4))), "expected four gray or RGB images"),
     ("five planes", lambda: interleave_planes(np.ones((5, 4, 4)), Layout()), "expected four planes"),
     ("pages", lambda: ReadOptions(pages="both"), 'expected pages "auto", "frames" or "angles", found'),
+    ("options", lambda: next(read_frames("shot.png", 4095)), "expected ReadOptions, found int"),  # type: ignore[arg-type]
+    ("no results", lambda: read_separated("missing"), "missing: expected a file, found nothing at this path"),
+    ("folder", lambda: read_separated("."), "expected a separated frame (.exr, .npz), found a directory"),
     ("size", lambda: ReadOptions(size=(0, 4)), "expected a size of positive width and height, found (0, 4)"),
 ]
 

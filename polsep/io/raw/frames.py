@@ -34,7 +34,7 @@ from polsep.io.store.errors import InputError, input_error, naming, refuse_pipe
 from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
 from polsep.sensor.calibration import Corrections
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Layout, Mosaic, WrongType
 from polsep.sensor.levels import (
     WHITE_LEVELS,
     ForgottenLevel,
@@ -164,6 +164,8 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
     before the first frame is asked for. Raises InputError, in one line that names the file, on whatever can't be
     read; frames before a damaged one have been yielded by then.
     """
+    if not isinstance(options, ReadOptions | None):
+        raise WrongType(f"expected ReadOptions, found {type(options).__name__}")
     options = ReadOptions() if options is None else options
     if _PLACEHOLDER in str(path):
         pages: Iterator[Page] = iter([_read_template(str(path), options)])

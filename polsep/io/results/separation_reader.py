@@ -56,10 +56,11 @@ def read_separated(path: str | Path) -> SeparatedFrame:
     """
     path = Path(path)
     suffix = path.suffix.lower()
+    with naming(path):
+        path.stat()  # raises where nothing is
     if suffix not in SUFFIXES:
-        raise input_error(
-            path, f"expected a separated frame ({', '.join(SUFFIXES)}), found {suffix or 'no extension'!r}"
-        )
+        found = "a directory" if path.is_dir() else repr(suffix) if suffix else "no extension"
+        raise input_error(path, f"expected a separated frame ({', '.join(SUFFIXES)}), found {found}")
     planes = read_exr_layers(path) if suffix == ".exr" else None
     with naming(path):
         refuse_pipe(path)

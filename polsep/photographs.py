@@ -94,7 +94,14 @@ class PhotoOptions:
             if self.angles_deg != PAIR:
                 raise ValueError(f"expected angles in degrees, None or {PAIR!r}, found {self.angles_deg!r:.40}")
         elif self.angles_deg is not None:
-            stokes_inverse([math.radians(angle) for angle in self.angles_deg])  # raises on too few
+            try:
+                stokes_inverse([math.radians(angle) for angle in self.angles_deg])
+            except ValueError:
+                found = ", ".join(f"{angle:g}" for angle in self.angles_deg)
+                raise ValueError(
+                    f"expected three or more angles that differ modulo 180 degrees, found {found}: of two photographs "
+                    "say --parallel and --crossed"
+                ) from None
 
     def known_deg(self) -> tuple[float, ...] | None:
         """The angle of each photograph [degrees]; None where they are to be found."""
@@ -114,7 +121,7 @@ def read_measurements(
     number = len(photos.array)
     for name, given in (("angles", options.known_deg()), ("exposures", options.exposures)):
         if given is not None and len(given) != number:
-            raise ValueError(f"expected {number} {name} for {number} photographs, found {len(given)}")
+            raise ValueError(f"expected as many {name} as photographs ({number}), found {len(given)}")
     with naming(paths[0]):
         images, notes = _to_light(photos, options, read)
     refuse_forgotten(paths[0], Frame("", images, notes))

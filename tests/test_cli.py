@@ -283,6 +283,19 @@ def test_folders_are_separated(tmp_path: Path, polsep: Cli) -> None:
     assert run.status == 2 and "expected a folder of frames" in run.err and (tmp_path / "beside" / "good.exr").exists()
 
 
+def test_results_beside_their_frames_are_no_frames(tmp_path: Path, polsep: Cli) -> None:
+    """Previews of frames that are no PNG files lie beside them; a raw frame beside the results of its name is one."""
+    (tmp_path / "shot.tiff").write_bytes(imagecodecs.tiff_encode(frame()))
+    words = ("-o", tmp_path, "--method", "analytic", "--overwrite")
+    for _ in range(2):
+        run = polsep("separate", tmp_path, *words)
+        assert run.status == 0 and run.out.count(" -> ") == 1, run
+    (tmp_path / "shot.tiff").unlink()
+    png(tmp_path / "shot.png", frame())
+    run = polsep("separate", tmp_path, "-o", tmp_path / "o", "--method", "analytic")
+    assert run.status == 0 and run.out.count(" -> ") == 1, run
+
+
 def test_memory_of_networks_is_given_back_before_the_last_frame_is_written(
     tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:

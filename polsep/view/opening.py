@@ -19,9 +19,10 @@ from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD, is_recording
 from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
-from polsep.io.results.sidecars import read_report, result_names
+from polsep.io.results.sidecars import read_report
 from polsep.io.store.errors import InputError
 from polsep.io.store.header_checks import at_most
+from polsep.io.store.result_names import result_names
 from polsep.methods import check_method
 from polsep.pipeline import LightColor, is_to_be_found, parse_light_color, separate_capture, stated_gains
 from polsep.sensor.camera import Layout, Mosaic

@@ -20,6 +20,7 @@ from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, r
 from polsep.io.raw.recording import RECORD, gap_notes, is_recording, recording_files
 from polsep.io.store.calibrations import holds_maps
 from polsep.io.store.errors import InputError, input_error, one_line
+from polsep.io.store.result_names import result_names
 
 _NUMBER = re.compile(r"(\d+)")
 #: Names of the raw frames of rendered sets, beside which lie their truth and a contact sheet.
@@ -128,9 +129,11 @@ def _folder_frames(folder: Path) -> list[str]:
 def _named_as_frames(folder: Path) -> list[Path]:
     """The files of a folder whose names are those of frames; of a set of `polsep render`, its views without truth.
 
-    Maps of a calibration that lies beside its frames are none.
+    Results that lie beside its frames, by their sidecars, and maps of a calibration are none.
     """
-    files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.suffix.lower() in FRAME_FILES]
+    seen = [p for p in folder.iterdir() if not p.name.startswith(".")]
+    results = {name for p in seen if p.suffix.lower() == ".json" for name in result_names(p)}
+    files = [p for p in seen if p.suffix.lower() in FRAME_FILES and p.name not in results]
     files = [p for p in files if p.suffix.lower() != ".npz" or not holds_maps(p)]
     views = [p for p in files if _VIEW.fullmatch(p.name)]
     return views if views and (folder / "options.json").is_file() else files

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from polsep import __version__
 from polsep.io.store.atomic import Contents, OutputError, write_checked, write_set
 from polsep.io.store.json_text import parse_json, read_text
+from polsep.io.store.result_names import is_gray, listed_names
 
 #: Attributes of EXR files by the keys of a report.
 _REPORTED = {
@@ -54,7 +54,8 @@ def write_with_sidecar(
     after it. Raises OutputError, also on a sidecar that is not JSON, and where the preview would replace a raw frame.
     """
     stem = targets[-1].stem
-    _refuse_gray(targets[-1].with_suffix(".png"))
+    if is_gray(preview := targets[-1].with_suffix(".png")):
+        raise OutputError(f"expected a preview of before to replace, found a grey PNG, as raw frames are: {preview}")
 
     def write(folder: Path) -> None:
         listed = []
@@ -75,16 +76,6 @@ def write_with_sidecar(
     write_set(targets, stem, write)
 
 
-def _refuse_gray(preview: Path) -> None:
-    """Raise OutputError on a PNG of one channel in a preview's place, as raw frames are and no preview of polsep is."""
-    if not (os.path.isfile(preview) and os.access(preview, os.R_OK)):
-        return
-    with preview.open("rb") as stream:
-        head = stream.read(26)
-    if head.startswith(b"\x89PNG") and head[25:] in (b"\0", b"\4"):
-        raise OutputError(f"expected a preview of before to replace, found a grey PNG, as raw frames are: {preview}")
-
-
 def read_report(path: Path) -> dict[str, Any]:
     """The report on a file of `polsep separate`, in the sidecar beside it; empty where there is none.
 
@@ -100,25 +91,9 @@ def read_report(path: Path) -> dict[str, Any]:
     return report if isinstance(report, dict) else {}
 
 
-def result_names(path: Path) -> list[str]:
-    """Names of the results that a sidecar lists, its preview among them; none of another JSON file."""
-    try:
-        sidecar = parse_json(read_text(path))
-    except (OSError, ValueError):
-        return []
-    files = _names(sidecar.get("files")) if isinstance(sidecar, dict) and "polsep" in sidecar else []
-    return [*files, f"{path.stem}.png"] if files else []
-
-
 def _formats(files: object, unless: str) -> list[str]:
     """The endings of names in a sidecar's list of files; ``unless`` where it has no such list."""
-    return [Path(name).suffix.lower() for name in _names(files)] or [unless]
-
-
-def _names(files: object) -> list[str]:
-    """The names in a sidecar's list of files."""
-    entries = files if isinstance(files, list) else []
-    return [str(entry.get("name") if isinstance(entry, dict) else entry) for entry in entries]
+    return [Path(name).suffix.lower() for name in listed_names(files)] or [unless]
 
 
 def require_same_settings(path: Path, settings: Mapping[str, Any], owner: str, advice: str = "") -> None:

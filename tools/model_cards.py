@@ -64,8 +64,8 @@ _KINDS = {
         "Normals, albedo, roughness and strength of mirror images of a thing, and their expected errors, from one "
         "separated frame.",
         "Unions of solids, smooth bodies and vessels with random textures, rendered as a model of Sony's IMX250 "
-        "records them, and separated by this package (docs/shape.md), and 162 meshes from packages under free licences "
-        "(evaluation/weights/shape/meshes.tsv). No photographs, no scans of measured objects.",
+        "records them, and separated by this package (docs/shape.md), and 367 meshes from packages under free licences "
+        "(evaluation/weights/shape/meshes.tsv). No photographs, no scans of objects but asteroids.",
         "One dielectric thing under one polarized lamp within some 45 degrees of the camera; detail below a "
         "hundredth of the thing is lost or faint (docs/shape.md).",
         "shape",

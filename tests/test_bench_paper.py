@@ -367,6 +367,7 @@ def test_readme_fills_all_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "docs").mkdir()
     (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "speed.jsonl").touch()
     for page in ("README.md", "docs/joint.md", "docs/paper.md"):
         (tmp_path / page).write_text("<!-- table: paper/costs -->\n<!-- end -->\n", encoding="utf-8")
     app(["bench", "readme"], standalone_mode=False)

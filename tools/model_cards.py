@@ -65,7 +65,7 @@ _KINDS = {
         "separated frame.",
         "Unions of solids, smooth bodies and vessels with random textures, rendered as a model of Sony's IMX250 "
         "records them, and separated by this package (docs/shape.md), and 367 meshes from packages under free licences "
-        "(evaluation/weights/shape/meshes.tsv). No photographs, no scans of objects but asteroids.",
+        "(evaluation/weights/shape/meshes.tsv). No photographs; some bones and asteroids are scans.",
         "One dielectric thing under one polarized lamp within some 45 degrees of the camera; detail below a "
         "hundredth of the thing is lost or faint (docs/shape.md).",
         "shape",

@@ -25,7 +25,7 @@ from polsep.networks import details_kernel, images_kernel
 from polsep.networks.channels import PERIOD
 from polsep.networks.graphs import require_own_threads
 from polsep.networks.images_kernel import Targets
-from polsep.networks.joint_weights import JointWeights
+from polsep.networks.joint_weights import JointWeights, sees_ways
 from polsep.networks.openvino_engine import OpenVinoEngine, RawRows, as_images, asked_precision, modulation_of
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of
@@ -95,10 +95,10 @@ def _make_engine(job: _Job) -> OpenVinoEngine:
 def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages:
     """A network's images of one frame ``[H, W]`` on the CPU, in its light.
 
-    Frames in other orientations than the network's are turned before and after, as in `run.run_joint`, which says in
-    which ways frames are seen by networks that average them. Huge frames are
-    cut into strips, all of one height, since an engine is for one size. Raises ValueError on layouts that are not
-    Sony's in any orientation, and RuntimeError as `require_own_threads`.
+    Frames in other orientations than the network's are turned before and after, as in `run.run_joint`, and seen in
+    several ways where `sees_ways` says so. Huge frames are cut into strips, all of one height, since an engine is for
+    one size. Raises ValueError on layouts that are not Sony's in any orientation, and RuntimeError as
+    `require_own_threads`.
     """
     require_own_threads()
     wanted = Layout.sony(mosaic.layout.channels)
@@ -108,8 +108,7 @@ def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages
     make_ready(images_kernel.warm_up)
     if full:
         make_ready(details_kernel.warm_up)
-    several = network.averages_ways and not (full and network.colors > 1)
-    ways = ways_of(mosaic, wanted) if several else (orientation,)
+    ways = ways_of(mosaic, wanted) if sees_ways(network, full) else (orientation,)
     return combine_images([_run_turned(network, mosaic, way, full) for way in ways], mosaic.light_color)
 
 

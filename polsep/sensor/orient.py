@@ -96,16 +96,10 @@ def ways_of(mosaic: Mosaic, wanted: Layout) -> tuple[Orientation, ...]:
     Of mono frames four (`shifts_of`).
     """
     first = orient(mosaic, wanted)
-    shifts = shifts_of(first)
     if wanted.bayer is None:
-        return shifts
-    steps = [((way.top - first.top) % PERIOD, (way.left - first.left) % PERIOD) for way in shifts]
-    return tuple(
-        replace(way, swapped=swapped)
-        for swapped, step in ((False, (0, 0)), (True, (PERIOD // 2, PERIOD // 2)))
-        for way, own in zip(shifts, steps, strict=True)
-        if own == step
-    )
+        return shifts_of(first)
+    shifts = {((way.top - first.top) % PERIOD, (way.left - first.left) % PERIOD): way for way in shifts_of(first)}
+    return shifts[0, 0], replace(shifts[2, 2], swapped=True)
 
 
 def shifts_of(orientation: Orientation) -> tuple[Orientation, ...]:

@@ -10,7 +10,7 @@ from numbers import Real
 
 from polsep.compute.threads import get_threads, set_threads
 from polsep.light import color_kernel, tiles_kernel
-from polsep.networks import details_kernel, images_kernel
+from polsep.networks import combine_kernel, details_kernel, images_kernel
 from polsep.sensor import defects_kernel, periods_kernel
 from polsep.sensor.camera import Layout, WrongType
 from polsep.sensor.unpack_kernel import PackedFrame, RawFrame
@@ -122,6 +122,7 @@ def warm_up() -> None:
         color_affine_kernel,
         images_kernel,
         details_kernel,
+        combine_kernel,
         temporal_kernel,
         periods_kernel,
         defects_kernel,

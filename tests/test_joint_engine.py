@@ -24,9 +24,9 @@ from polsep.networks.channels import INPUTS, PERIOD
 from polsep.networks.engines import run_engine
 from polsep.networks.joint import Demosaicker, Joint
 from polsep.networks.openvino_engine import OpenVinoEngine
-from polsep.networks.run import run_joint
+from polsep.networks.run import combine, run_joint
 from polsep.networks.sizes import ResidualSize
-from polsep.physics.stokes import MAX_DOLP, aolp, dolp
+from polsep.physics.stokes import MAX_DOLP, Stokes, aolp, dolp
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation
 from polsep.sensor.unpack_kernel import as_samples
@@ -363,3 +363,48 @@ def test_an_interrupt_comes_through_after_engines_have_gone() -> None:
     program = [sys.executable, "-c", INTERRUPTED, str(Path(__file__).parent)]
     run = subprocess.run(program, capture_output=True, text=True, timeout=100)
     assert run.stdout.split() == ["interrupted"], f"{run.returncode} {run.stderr}"
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_images_of_several_networks_are_weighed_as_in_torch(layout: Layout) -> None:
+    """Images, polarization, expected errors and sums of three networks, of which one counts less."""
+    rng, shape, colors, shares = np.random.default_rng(3), (13, 18), layout.channels, (1.0, 0.4, 1.0)
+    light = LIGHT if colors == 3 else LIGHT[1:2]
+    several = []
+    for _ in shares:
+        diffuse, specular = rng.random((2, *shape, colors), np.float32)
+        error = 10 ** rng.uniform(-6, 0, (*shape, 2)).astype(np.float32)
+        dolp, aolp = rng.uniform(0, 1.2, shape), rng.uniform(0, math.pi, shape)
+        valid = rng.random(shape) < 0.9
+        images = (diffuse, specular, valid, dolp.astype(np.float32), aolp.astype(np.float32))
+        several.append(FrameImages(*images, Tally(dolp.size, power=2.0, along=1.0), error))
+    expected = combine([_as_separation(images) for images in several], shares)
+    found = engines.combine_images(several, light, shares)
+    assert_close(torch.from_numpy(np.moveaxis(found.diffuse, -1, 0)), expected.diffuse)
+    assert_close(torch.from_numpy(np.moveaxis(found.specular, -1, 0)), expected.specular)
+    assert np.array_equal(found.valid, expected.valid.numpy())
+    assert found.error is not None and found.dolp is not None and found.aolp is not None and found.tally is not None
+    assert expected.expected_error is not None
+    assert_close(torch.from_numpy(np.moveaxis(found.error, -1, 0)), expected.expected_error)
+    polarized = torch.complex(expected.stokes.s1[0], expected.stokes.s2[0])
+    assert_within(torch.from_numpy(found.dolp), polarized.abs(), 1e-6)
+    assert_same_angle(torch.from_numpy(found.aolp), torch.angle(polarized) / 2, 1e-5)
+    gain = np.array(light, np.float32)
+    tally = found.tally
+    assert (tally.valid, tally.above_one) == (found.valid.sum(), (found.dolp > 1).sum())
+    sums = [(x / gain).mean(axis=-1).sum() for x in (found.diffuse + found.specular, found.specular)]
+    squares = ((found.error / gain.mean()) ** 2).sum(axis=(0, 1))
+    sums_found = (tally.s0, tally.specular, tally.diffuse_variance, tally.specular_variance)
+    assert sums_found == pytest.approx((*sums, *squares), rel=1e-5)
+    assert tally.power == pytest.approx(2 * tally.along)
+
+
+def _as_separation(images: FrameImages) -> Separation:
+    """Polarization as Stokes images of light of s0 = 1; all else as it is."""
+    assert images.dolp is not None and images.aolp is not None and images.error is not None
+    polarized = torch.from_numpy(images.dolp * np.exp(2j * images.aolp)).expand(images.diffuse.shape[-1], -1, -1)
+    diffuse, specular, error = (
+        torch.from_numpy(np.moveaxis(x, -1, 0).copy()) for x in (images.diffuse, images.specular, images.error)
+    )
+    stokes = Stokes(torch.ones_like(polarized.real), polarized.real, polarized.imag)
+    return Separation(diffuse, specular, torch.from_numpy(images.valid.copy()), stokes, expected_error=error)

@@ -6,29 +6,30 @@ An engine (`openvino_engine`) is for frames of one size. Twin: `run`, in torch, 
 from __future__ import annotations
 
 import logging
+import operator
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import reduce
-from operator import add
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
-from polsep.compute.threads import get_threads
+from polsep.compute.threads import get_threads, run_over_rows
 from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import mean_cells
-from polsep.networks import details_kernel, images_kernel
+from polsep.networks import combine_kernel, details_kernel, images_kernel
 from polsep.networks.channels import PERIOD
+from polsep.networks.combine_kernel import Rows, add_images
 from polsep.networks.graphs import require_own_threads
 from polsep.networks.images_kernel import Targets
 from polsep.networks.joint_weights import JointWeights, sees_ways
 from polsep.networks.openvino_engine import OpenVinoEngine, RawRows, as_images, asked_precision, modulation_of
 from polsep.networks.sizes import ResidualSize
-from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of
+from polsep.networks.strips import cut_rows, margin_of
 from polsep.physics.stokes import wrap_aolp
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation, orient, ways_of
@@ -36,8 +37,6 @@ from polsep.separation.images import FrameImages
 
 #: Engines that are kept at least, each with the memory that its frames need.
 KEPT = 2
-#: Rows of several networks' images that become one at a time.
-COMBINED = 64
 
 
 class _Job(NamedTuple):
@@ -144,36 +143,23 @@ def combine_images(images: list[FrameImages], light: tuple[float, ...], shares: 
     first = images[0]
     if len(images) == 1:
         return first
-    together, sums = first.arrays(), np.zeros(4)
-    factors = np.array(shares or [1.0] * len(images), np.float32)[:, None, None, None]
-    gain = np.array(light[: first.diffuse.shape[-1]], np.float32)
-    for top in range(0, len(first.valid), COMBINED):
-        rows = slice(top, top + COMBINED)
-        part = _combine({name: np.stack([one.arrays()[name][rows] for one in images]) for name in together}, factors)
-        for name, image in together.items():
-            image[rows] = part[name]
-        lobes = [(part[name] / gain).mean(axis=-1).sum(dtype=np.float64) for name in ("diffuse", "specular")]
-        sums += [*lobes, *np.square(part["error"] / gain.mean(), dtype=np.float64).sum(axis=(0, 1))]
-    tally = reduce(add, (one.tally for one in images if one.tally is not None)).of_pixels(first.valid.size)
-    valid, above_one = (int(np.count_nonzero(mask)) for mask in (first.valid, together["dolp"] > 1))
-    diffuse, specular, *variances = sums.tolist()
-    tally = replace(tally, valid=valid, above_one=above_one, s0=diffuse + specular, specular=specular)
+    factors, (together, *others) = np.array(shares or [1.0] * len(images), np.float32), map(_as_rows, images)
+    rows, gains = len(first.valid), np.array(light[: first.diffuse.shape[-1]], np.float32)
+    weights, sums = np.empty_like(together.error), np.zeros((rows, combine_kernel.SUMS))
+    make_ready(combine_kernel.warm_up)
+    for k, other in enumerate(others, 1):
+        run_over_rows(partial(add_images, together, other, factors[[0, k]], k, weights, gains, sums), rows, 1)
+    tally = reduce(operator.add, (one.tally for one in images if one.tally is not None)).of_pixels(first.valid.size)
+    diffuse, specular, *variances, above_one, valid = sums.sum(axis=0).tolist()
+    tally = replace(tally, valid=int(valid), above_one=int(above_one), s0=diffuse + specular, specular=specular)
     return replace(first, tally=replace(tally, diffuse_variance=variances[0], specular_variance=variances[1]))
 
 
-def _combine(arrays: dict[str, NDArray[Any]], factors: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
-    """Images of several networks, stacked, as one; ``factors [N, 1, 1, 1]`` on their weights."""
-    weights = factors * np.maximum(arrays["error"], np.float32(LEAST_ERROR)) ** -2
-    weights /= weights.sum(axis=0)
-    polarization = (arrays["dolp"] * np.exp(2j * arrays["aolp"])).mean(axis=0).astype(np.complex64)
-    return {
-        "diffuse": (weights[..., :1] * arrays["diffuse"]).sum(axis=0),
-        "specular": (weights[..., 1:] * arrays["specular"]).sum(axis=0),
-        "valid": arrays["valid"].all(axis=0),
-        "dolp": np.abs(polarization),
-        "aolp": wrap_aolp(np.angle(polarization) / 2),
-        "error": (weights * arrays["error"]).sum(axis=0),
-    }
+def _as_rows(images: FrameImages) -> Rows:
+    assert images.dolp is not None and images.aolp is not None and images.error is not None
+    rows = len(images.valid)
+    diffuse, specular = images.diffuse.reshape(rows, -1, copy=False), images.specular.reshape(rows, -1, copy=False)
+    return Rows(diffuse, specular, images.error.reshape(rows, -1, copy=False), images.valid, images.dolp, images.aolp)
 
 
 def _run_turned(network: JointWeights, mosaic: Mosaic, orientation: Orientation, full: bool) -> FrameImages:

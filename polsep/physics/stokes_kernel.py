@@ -18,6 +18,10 @@ _A0, _A1, _A2, _A3, _A4, _A5, _A6 = (
     for c in (0.999996112, -0.333173682, 0.198078157, -0.132333405, 0.079623623, -0.0336041677, 0.00681177381)
 )
 
+# sin(x) / x and cos(x) on [-pi / 2, pi / 2] as Taylor's polynomials in x^2, 6e-8.
+_S1, _S2, _S3, _S4, _S5 = (np.float32((-1) ** k / math.factorial(2 * k + 1)) for k in range(1, 6))
+_C1, _C2, _C3, _C4, _C5, _C6 = (np.float32((-1) ** k / math.factorial(2 * k)) for k in range(1, 7))
+
 
 @compiled
 def fit_stokes_row(m: Any, c: int, inverse: Any, s0: Any, s1: Any, s2: Any) -> None:
@@ -72,3 +76,13 @@ def polarize(s0: Any, s1: Any, s2: Any, dolp: Any, angle: Any) -> None:
         degree = np.sqrt(s1[j] * s1[j] + s2[j] * s2[j]) / (s0[j] if s0[j] > ZERO else ONE)
         dolp[j] = min(degree, _MAX_DOLP) if s0[j] > ZERO else ZERO
         angle[j] = aolp(s1[j], s2[j])
+
+
+@compiled
+def polarized_components(dolp: Any, angle: Any) -> Any:
+    """The inverse of `polarize` for light of s0 = 1: s1 and s2 of an AoLP in [0, pi], without branches."""
+    x = angle - _HALF_PI
+    z = x * x
+    sine = x * (ONE + z * (_S1 + z * (_S2 + z * (_S3 + z * (_S4 + z * _S5)))))
+    cosine = ONE + z * (_C1 + z * (_C2 + z * (_C3 + z * (_C4 + z * (_C5 + z * _C6)))))
+    return dolp * (sine * sine - cosine * cosine), -(dolp + dolp) * sine * cosine

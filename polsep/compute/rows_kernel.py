@@ -16,6 +16,7 @@ _SUMS = 64
 
 _ROUND, _ODD, _SIXTEEN = np.uint32(0x7FFF), np.uint32(1), np.uint32(16)
 _SHIFTS = (np.uint64(16), np.uint64(32), np.uint64(48))
+_UPPER = np.uint32(0xFFFF0000)
 
 
 @compiled
@@ -156,6 +157,29 @@ def weave(planes: Any, row: Any) -> None:
         for j in range(w):
             low = np.uint64(a[j]) | np.uint64(b[j]) << _SHIFTS[0]
             out[j] = low | np.uint64(c[j]) << _SHIFTS[1] | np.uint64(d[j]) << _SHIFTS[2]
+
+
+@compiled
+def unweave(floats: Any, halves: Any, t: int, planes: Any) -> None:
+    """Write row ``t`` of ``floats [h, w, n]`` to ``planes [n, w]``; where these are empty, of ``halves``, bfloat16.
+
+    n is a multiple of 4.
+    """
+    n, w = planes.shape
+    if floats.size:
+        for k in range(n):
+            plane, x = planes[k], floats[t, :, k]
+            for j in range(w):
+                plane[j] = x[j]
+        return
+    fours, bits = halves[t].reshape(-1).view(np.uint64), planes.view(np.uint32)
+    for k in range(0, n, 4):
+        a, b, c, d, x = bits[k], bits[k + 1], bits[k + 2], bits[k + 3], fours[k // 4 :: n // 4]
+        for j in range(w):
+            a[j] = np.uint32(x[j] << _SHIFTS[0])
+            b[j] = np.uint32(x[j]) & _UPPER
+            c[j] = np.uint32(x[j] >> _SHIFTS[0]) & _UPPER
+            d[j] = np.uint32(x[j] >> _SHIFTS[1]) & _UPPER
 
 
 @compiled

@@ -66,14 +66,14 @@ class Maps(NamedTuple):
     details: Floats
 
 
-class LayerInput(NamedTuple):
-    """An input of the layers, channels last ``[h, w, n]``, as float32 or as bits of bfloat16; the other is empty."""
+class ChannelsLast(NamedTuple):
+    """An input or output of the layers ``[h, w, n]``, as float32 or as bits of bfloat16; the other is empty."""
 
     floats: Floats
     halves: NDArray[np.uint16]
 
     @classmethod
-    def empty(cls, shape: tuple[int, int, int], halves: bool) -> LayerInput:
+    def empty(cls, shape: tuple[int, int, int], halves: bool) -> ChannelsLast:
         """A buffer in one of the two precisions."""
         nothing = (0, 0, 0)
         return cls(

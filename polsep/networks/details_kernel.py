@@ -24,10 +24,11 @@ from polsep.compute.rows_kernel import (
     fill,
     filter_rows,
     sum_three,
+    unweave,
     weave,
 )
 from polsep.compute.threads import RowRange
-from polsep.networks.buffers import ClosedFormRows, LayerInput
+from polsep.networks.buffers import ChannelsLast, ClosedFormRows
 from polsep.networks.channels import DETAIL_MAPS, MIN_DETAIL, PERIOD
 from polsep.networks.images_kernel import LayerOutputs, Targets, mark_clipped, spread
 from polsep.physics.stokes_kernel import polarize
@@ -54,23 +55,22 @@ class Smooth(NamedTuple):
 class DetailOutputs(NamedTuple):
     """The layers' outputs on three details of four cells.
 
-    ``diffuse``, ``specular [12, h, w]``: the share of s0's further details in each image; ``change [12 (C + 1), h,
-    w]``: corrections of every image relative to the local brightness. ``beyond [2 h, 3 C, 2 w]``: by `find_beyond`;
-    ``smooth``: the interpolation.
+    ``shares [h, w, 24]``: the share of s0's further details in the diffuse image, then in the specular one; ``change
+    [h, w, 12 (C + 1)]``: corrections of every image relative to the local brightness. ``beyond [2 h, 3 C, 2 w]``: by
+    `find_beyond`; ``smooth``: the interpolation.
     """
 
-    diffuse: Floats
-    specular: Floats
-    change: Floats
+    shares: ChannelsLast
+    change: ChannelsLast
     beyond: Floats
     smooth: Smooth
 
     @classmethod
-    def of(cls, output: Floats, beyond: Floats, smooth: Smooth) -> DetailOutputs:
-        """Split the layers' output ``[24 + 12 (C + 1), h, w]``, the first three parts one after the other."""
-        return cls(
-            output[:DETAIL_MAPS], output[DETAIL_MAPS : 2 * DETAIL_MAPS], output[2 * DETAIL_MAPS :], beyond, smooth
-        )
+    def empty(cls, colors: int, beyond: Floats, smooth: Smooth, halves: bool) -> DetailOutputs:
+        """Buffers for what the layers fill."""
+        h, w = beyond.shape[0] // 2, beyond.shape[2] // 2
+        shares, change = (ChannelsLast.empty((h, w, n * DETAIL_MAPS), halves) for n in (2, colors + 1))
+        return cls(shares, change, beyond, smooth)
 
 
 def read_smooth(weight: Floats) -> Smooth:
@@ -158,7 +158,7 @@ def _enter_power(details: Any, y: int, ring: Any) -> None:
 
 
 @entry
-def emit_details(details: Floats, closed: ClosedFormRows, inputs: LayerInput, row_range: RowRange) -> None:
+def emit_details(details: Floats, closed: ClosedFormRows, inputs: ChannelsLast, row_range: RowRange) -> None:
     """Size of the details around the cells of a range of the packed rows, relative to the local brightness."""
     h, n = details.shape[0], details.shape[2]
     ring, total, around = (
@@ -212,23 +212,26 @@ def _enter_images(outputs: LayerOutputs, y: int, rings: Any, spare: Any) -> None
 
 
 @compiled
-def _add_details(outputs: DetailOutputs, y: int, image: int, light: Any, details: Any, spare: Any) -> None:
-    """Add to the interpolated ``details [3, n]`` of an image in cell row ``y`` its share of s0's, and corrections."""
-    colors, t = outputs.beyond.shape[1] // 3, y // 2
-    shares, part = outputs.diffuse if image < colors else outputs.specular, np.float32(1 / colors)
+def _add_details(beyond: Any, planes: Any, y: int, image: int, light: Any, details: Any, spare: Any) -> None:
+    """Add to the interpolated ``details [3, n]`` of an image in cell row ``y`` its share of s0's, and corrections.
+
+    ``planes [24 + 12 (C + 1), n / 2]``: the layers' outputs in that row.
+    """
+    colors = beyond.shape[1] // 3
+    shares, change, part = planes[: 2 * DETAIL_MAPS], planes[2 * DETAIL_MAPS :], np.float32(1 / colors)
     for k in range(3):
         if image < colors:
-            copy(outputs.beyond[y, 3 * image + k], spare)
+            copy(beyond[y, 3 * image + k], spare)
         else:
             fill(ZERO, spare)
             for c in range(colors):
-                add_product(outputs.beyond[y, 3 * c + k], part, spare)
+                add_product(beyond[y, 3 * c + k], part, spare)
         for side in range(2):
             cell = 4 * k + 2 * (y % 2) + side
-            share, more = shares[cell, t], outputs.change[12 * image + cell, t]
-            beyond, out = spare[side:], details[k, side:]
+            share = shares[cell if image < colors else DETAIL_MAPS + cell]
+            more, other, out = change[DETAIL_MAPS * image + cell], spare[side:], details[k, side:]
             for j in range(share.size):
-                out[2 * j] += share[j] * beyond[2 * j] + more[j] * light[j]
+                out[2 * j] += share[j] * other[2 * j] + more[j] * light[j]
 
 
 @compiled
@@ -323,7 +326,7 @@ def write_pixels(
     starts, spare, wide = np.empty(_SIDE, np.int64), np.empty(n // 2, np.float32), np.empty((4, 2 * n), np.float32)
     pixels, s0, row = np.empty((2, 2 * n), np.float32), np.empty((2, 2 * n), np.float32), np.empty(n, np.float32)
     valid, near = np.empty(n, np.bool_), np.zeros(n + 2, np.uint8)
-    mean_gain = ZERO
+    planes, mean_gain = np.empty((DETAIL_MAPS * (colors + 3), n // 2), np.float32), ZERO
     for c in range(colors):
         mean_gain += gains[c] / np.float32(colors)
     for y in range(max(2 * row_range[0] - 2, 0), min(2 * row_range[0] + 2, h)):
@@ -331,11 +334,14 @@ def write_pixels(
     for y in range(2 * row_range[0], 2 * row_range[1]):
         if y + 2 < h:
             _enter_images(outputs, y + 2, rings, spare)
+        if y % 2 == 0:
+            unweave(details.shares.floats, details.shares.halves, y // 2, planes[: 2 * DETAIL_MAPS])
+            unweave(details.change.floats, details.change.halves, y // 2, planes[2 * DETAIL_MAPS :])
         _starts(y, h, n + 4, starts)
         fill(ZERO, s0.reshape(-1))
         for k in range(colors + 1):
             _interpolate(details.smooth, rings[k], starts, own)
-            _add_details(details, y, k, closed.brightness[y // 2], own, row)
+            _add_details(details.beyond, planes, y, k, closed.brightness[y // 2], own, row)
             _join(rings[k, y % _SIDE, 2:], own, pixels)
             _write_image(k, pixels, gains, targets, y, s0)
         _write_polarization(closed, y, s0, pixels, targets, wide)
@@ -349,8 +355,10 @@ def warm_up() -> None:
     closed, beyond = ClosedFormRows.empty(3, size, size), np.zeros((2 * size, 9, 2 * size), np.float32)
     smooth = read_smooth(np.zeros((3, 1, _SIDE, _SIDE), np.float32))
     find_beyond(closed, smooth, beyond, (0, size))
-    emit_details(beyond, closed, LayerInput.empty((size, size, DETAIL_MAPS), halves=False), (0, size))
+    emit_details(beyond, closed, ChannelsLast.empty((size, size, DETAIL_MAPS), halves=False), (0, size))
     outputs = LayerOutputs.of(closed, *(np.zeros((n, size, size), np.float32) for n in (20, 8)))
-    details = DetailOutputs.of(np.zeros((72, size, size), np.float32), beyond, smooth)
+    details = DetailOutputs.empty(3, beyond, smooth, halves=True)
+    for layer in (details.shares, details.change):
+        layer.halves.fill(0)
     targets = Targets.empty((PERIOD * size, PERIOD * size), 3)
     write_pixels(outputs, details, np.ones(3, np.float32), targets, (0, size))

@@ -203,8 +203,8 @@ def joint_model(weights: JointWeights, packed: tuple[int, int], full: bool, quan
     From inputs ``[1, n, h, w]``, where ``full`` also `DETAIL_MAPS` of the size of details, and for networks that see a
     whole frame what modulates their features, see `whole_frame_model`. To corrections ``[1, 4 C + 8, h, w]`` of
     diffuse, specular and the closed form's gain (`images_kernel.LayerOutputs`), relative to the local brightness and to
-    the closed form; to deviations ``[1, 8, h, w]``; and where ``full`` to ``[1, 24 + 12 (C + 1), h, w]``, see
-    `details_kernel.DetailOutputs`. ``quantized``: layers with known ranges in 8 bits.
+    the closed form; to deviations ``[1, 8, h, w]``; and where ``full`` to ``[1, 24, h, w]`` and ``[1, 12 (C + 1),
+    h, w]``, see `details_kernel.DetailOutputs`. ``quantized``: layers with known ranges in 8 bits.
     """
     graph, arrays = _Graph(weights.arrays, weights.ranges, quantized), weights.arrays
     ops, widths = graph.ops, weights.size.widths
@@ -228,7 +228,7 @@ def joint_model(weights: JointWeights, packed: tuple[int, int], full: bool, quan
     if full:
         seen = ops.concat([features, parameters[1]], 1)
         belief = graph.convolve(graph.relu(graph.convolve(seen, "details.belief.0")), "details.belief.2")
-        outputs.append(ops.concat([belief, graph.convolve(features, "details.change")], 1))
+        outputs += [belief, graph.convolve(features, "details.change")]
     return import_openvino().Model([ops.result(output) for output in outputs], parameters)
 
 

@@ -17,7 +17,7 @@ from polsep.compute.rows_kernel import AT_ONCE, add_product, add_up, copy
 from polsep.compute.threads import RowRange
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
-from polsep.networks.buffers import ClosedFormRows, LayerInput, Maps, Taps
+from polsep.networks.buffers import ChannelsLast, ClosedFormRows, Maps, Taps
 from polsep.networks.channels import PERIOD, input_channels
 from polsep.networks.maps_kernel import map_guided_rows, map_rows
 from polsep.physics.stokes import stokes_inverse
@@ -187,7 +187,7 @@ def warm_up() -> None:
     samples = as_samples(np.eye(PERIOD * size, dtype=np.uint8))
     pattern = read_pattern((PERIOD * size, PERIOD * size), layout, 0, 1, (1.0, 1.0, 1.0))
     closed, channels = ClosedFormRows.empty(3, size, size), input_channels(3, ())
-    inputs = LayerInput.empty((size, size, channels.total), halves=False)
+    inputs = ChannelsLast.empty((size, size, channels.total), halves=False)
     maps = Maps(*inputs, channels, closed, np.zeros((0, 0, 0), np.float32))
     nothing = np.zeros((4, AT_ONCE), np.int64)
     map_rows(samples, pattern, Taps(np.zeros((4, 9, AT_ONCE), np.float32), nothing, nothing, 3), maps, (0, size))

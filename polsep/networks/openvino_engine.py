@@ -19,7 +19,7 @@ from polsep.compute.processor import cpu_flags
 from polsep.compute.threads import RowRange, get_threads, run_over_rows
 from polsep.demosaic.bilinear_kernel import Pattern, read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
-from polsep.networks.buffers import ClosedFormRows, LayerInput, Maps
+from polsep.networks.buffers import ChannelsLast, ClosedFormRows, Maps
 from polsep.networks.channels import DETAIL_MAPS, PERIOD, input_channels
 from polsep.networks.details_kernel import DetailOutputs, emit_details, find_beyond, read_smooth, write_pixels
 from polsep.networks.graphs import core, import_openvino, joint_model, whole_frame_model
@@ -73,25 +73,26 @@ class OpenVinoEngine:
         channels = input_channels(network.colors, network.inputs)
         precision = "f32" if w <= _NARROW else precision or asked_precision() or usual_precision()
         halves = precision == "bf16"
-        inputs = LayerInput.empty((h, w, channels.total), halves)
+        inputs = ChannelsLast.empty((h, w, channels.total), halves)
         closed = ClosedFormRows.empty(network.colors, h, w)
         beyond = np.empty((2 * h, 3 * network.colors, 2 * w) if full else (0, 0, 0), np.float32)
         self._maps = Maps(inputs.floats, inputs.halves, channels, closed, beyond)
         self._taps = None if network.demosaic is None else make_taps(network.demosaic, network.colors, w, full)
         change, deviation = (np.empty((n, h, w), np.float32) for n in (4 * network.colors + 8, 8))
         self._outputs = LayerOutputs.of(closed, change, deviation)
-        self.inputs, outputs = [inputs.filled], [change, deviation]
+        self.inputs, layers = [inputs.filled], list[NDArray[Any]]()
         if full:
-            shares = np.empty((2 * DETAIL_MAPS + DETAIL_MAPS * (network.colors + 1), h, w), np.float32)
             smooth = read_smooth(network.arrays["details.smooth"])
-            self._details = DetailOutputs.of(shares, beyond, smooth)
-            self._detail_input = LayerInput.empty((h, w, DETAIL_MAPS), halves)
-            self.inputs, outputs = [*self.inputs, self._detail_input.filled], [*outputs, shares]
+            self._details = DetailOutputs.empty(network.colors, beyond, smooth, halves)
+            self._detail_input = ChannelsLast.empty((h, w, DETAIL_MAPS), halves)
+            self.inputs.append(self._detail_input.filled)
+            layers = [self._details.shares.filled, self._details.change.filled]
         self._network, self._modulation = network, np.zeros((1, 1, 2 * sum(network.size.widths)), np.float32)
         if network.sees_frame:
             self.inputs = [*self.inputs, self._modulation]
         model = joint_model(network, (h, w), full, quantized=precision == "i8")
-        self._request = _compile(model, self.inputs, outputs, "f32" if precision == "i8" else precision)
+        images = ([change, deviation], layers)
+        self._request = _compile(model, self.inputs, images, "f32" if precision == "i8" else precision)
 
     def run(
         self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...], modulation: Floats | None = None
@@ -162,23 +163,37 @@ def _whole_frame_of(network: JointWeights) -> Any:
     return core().compile_model(whole_frame_model(network), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
 
 
-def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[Floats], precision: str) -> Any:
-    """A request that reads ``inputs [h, w, n]``, float32 or bits of bfloat16, and fills ``outputs [n, h, w]``."""
+def _compile(
+    model: Any, inputs: list[NDArray[Any]], outputs: tuple[list[Floats], list[NDArray[Any]]], precision: str
+) -> Any:
+    """A request that reads ``inputs [h, w, n]``, float32 or bits of bfloat16, and fills ``outputs``.
+
+    The first ones are planar ``[n, h, w]``, the others, which are larger, like inputs: OpenVINO would move twice what
+    it has channels last.
+    """
     openvino = import_openvino()
     # Pinned threads of two engines would share a core, and wait there for whoever else works on it.
     options: dict[str, Any] = {"INFERENCE_NUM_THREADS": get_threads(), "PERFORMANCE_HINT": "LATENCY"}
     options |= {"ENABLE_CPU_PINNING": False, "INFERENCE_PRECISION_HINT": precision}
-    steps = openvino.preprocess.PrePostProcessor(model)
-    kinds = [openvino.Type.bf16 if seen.dtype == np.uint16 else openvino.Type.f32 for seen in inputs]
-    for k, kind in enumerate(kinds):
-        steps.input(k).tensor().set_element_type(kind).set_layout(openvino.Layout("NHWC"))
-        steps.input(k).model().set_layout(openvino.Layout("NCHW"))
+    steps, (planar, layers) = openvino.preprocess.PrePostProcessor(model), outputs
+    places = [(steps.input(k), seen) for k, seen in enumerate(inputs)]
+    for place, array in [*places, *((steps.output(k), image) for k, image in enumerate(layers, len(planar)))]:
+        place.tensor().set_element_type(_type_of(array)).set_layout(openvino.Layout("NHWC"))
+        place.model().set_layout(openvino.Layout("NCHW"))
     request = core().compile_model(steps.build(), "CPU", options).create_infer_request()
-    for k, (seen, kind) in enumerate(zip(inputs, kinds, strict=True)):
-        request.set_input_tensor(k, openvino.Tensor(seen, [1, *seen.shape], kind))
-    for k, image in enumerate(outputs):
+    for k, seen in enumerate(inputs):
+        request.set_input_tensor(k, openvino.Tensor(seen, [1, *seen.shape], _type_of(seen)))
+    for k, image in enumerate(planar):
         request.set_output_tensor(k, openvino.Tensor(image[None], shared_memory=True))
+    for k, image in enumerate(layers, len(planar)):
+        request.set_output_tensor(k, openvino.Tensor(image, [1, *image.shape], _type_of(image)))
     return request
+
+
+def _type_of(array: NDArray[Any]) -> Any:
+    """OpenVINO's type of an input or output: uint16 are bits of bfloat16."""
+    types = import_openvino().Type
+    return types.bf16 if array.dtype == np.uint16 else types.f32
 
 
 def asked_precision() -> str | None:

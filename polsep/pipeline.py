@@ -188,8 +188,9 @@ def _as_capture(
     if isinstance(raw, Mosaic | Measurements):
         if layout is not None or black_level != 0 or white_level is not None:
             raise ValueError(f"expected layout and levels with an array, found them with a {type(raw).__name__}")
-        if bad := int((~namespace(raw.data).isfinite(raw.data)).sum()):
-            raise ValueError(f"expected finite samples, found {bad} that are not")
+        finite = namespace(raw.data).isfinite(raw.data)
+        if not finite.all():
+            raise ValueError(f"expected finite samples, found {int((~finite).sum())} that are not")
         return raw, ()
     four = isinstance(raw, np.ndarray) and raw.ndim in (3, 4) and raw.shape[0] == 4
     if not four or (raw.ndim == 3 and raw.shape[2] in (1, 3)):

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute import pages
 from polsep.compute.arrays import of_kind, to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.sensor.camera import Layout, Mosaic
@@ -134,7 +135,9 @@ def _find(mosaic: Mosaic) -> tuple[Places, Floats]:
         if not len(new):
             break
         places = np.unique(np.concatenate([places, new]), axis=0)
-        repaired = x.copy() if repaired is x else repaired
+        if repaired is x:
+            repaired = pages.empty(x.shape, x.dtype.type)
+            repaired[:] = x
         repaired[places[:, 0], places[:, 1]] = x[places[:, 0], places[:, 1]]
         kernel.fill(repaired, predictor, float(rules.clip), places)
         candidates = _near(candidates, new, places, x.shape)

@@ -58,7 +58,8 @@ def smooth_clipped(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     colors, tally, along = images.diffuse.shape[2], images.tally, taps_of(PERIOD * scale // 2)
     gain = np.array(light[:colors], np.float32)
     weight = weigh_cells(clipped, taps_of(PERIOD), shares_of(colors), REACH)
-    changes = [change_cells(image, weight, along) for image in (images.diffuse, images.specular)]
+    cells = np.flatnonzero(weight)
+    changes = [change_cells(image, weight, cells, along) for image in (images.diffuse, images.specular)]
     if tally is not None:
         diffuse, specular = (float((change / gain).sum()) / colors for change in changes)
         tally = replace(tally, s0=tally.s0 + diffuse + specular, specular=tally.specular + specular)

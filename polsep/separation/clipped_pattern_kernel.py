@@ -30,12 +30,13 @@ def weigh_cells(clipped: NDArray[np.bool_], taps: tuple[float, ...], shares: tup
     return weight
 
 
-def change_cells(image: Floats, weight: Floats, taps: tuple[float, ...]) -> Floats:
-    """Filter an image ``[h, w, C]`` where cells have a ``weight``, in place; return the changes ``[N, scale^2, C]``.
+def change_cells(image: Floats, weight: Floats, cells: NDArray[np.int64], taps: tuple[float, ...]) -> Floats:
+    """Filter an image ``[h, w, C]`` in ``cells``, in place; return the changes ``[N, scale^2, C]``.
 
-    Twin of `clipped_pattern.smooth_planes`.
+    ``weight [h, w]``: of every cell; ``cells [N]``: the places, row by row, where it is not 0. Twin of
+    `clipped_pattern.smooth_planes`.
     """
-    cells, scale = np.flatnonzero(weight), image.shape[0] // weight.shape[0]
+    scale = image.shape[0] // weight.shape[0]
     changes, factors = np.empty((cells.size, scale**2, image.shape[2]), np.float32), np.array(taps, np.float32)
     run_over_rows(lambda some: find_changes(image, cells, weight, factors, changes, some), cells.size, _CELLS)
     run_over_rows(lambda some: add_changes(image, cells, weight.shape[1], changes, some), cells.size, _CELLS)
@@ -46,7 +47,7 @@ def warm_up() -> None:
     """Load the kernels, or compile them."""
     taps = (0.25, 0.5, 0.25)
     weight = weigh_cells(np.ones((2, 2), np.bool_), taps, (0.4, 0.5, 0.2, 0.25), 2)
-    change_cells(np.zeros((1, 1, 3), np.float32), weight, taps)
+    change_cells(np.zeros((1, 1, 3), np.float32), weight, np.flatnonzero(weight), taps)
 
 
 @entry

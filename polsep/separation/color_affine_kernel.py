@@ -197,8 +197,11 @@ def _complete(
     if not pixels.valid.all():
         h, w = out.valid.shape
         holes = np.flatnonzero(~pixels.valid)
-        level = halve_separation(out.diffuse, out.specular, targets.lines, out.valid)
-        fill_pixels(pixels, cosines, sines, holes, interpolate_holes(level, (h, w), places[holes]))
+        # No name holds the pyramid, a third of the frame, when the next one is made.
+        around = interpolate_holes(
+            halve_separation(out.diffuse, out.specular, targets.lines, out.valid), (h, w), places[holes]
+        )
+        fill_pixels(pixels, cosines, sines, holes, around)
         _write(pixels, places, out)
         core = pixels.clipped == ALL_CLIPPED
         if core.any():

@@ -190,21 +190,26 @@ def emit_details(details: Floats, closed: ClosedFormRows, inputs: ChannelsLast, 
 
 
 @compiled
-def _enter_images(outputs: LayerOutputs, y: int, rings: Any, spare: Any) -> None:
-    """The images at half resolution in cell row ``y``, not limited, to their rings ``[C + 1, 5, n + 4]``."""
+def _enter_images(outputs: LayerOutputs, y: int, planes: Any, rings: Any, spare: Any) -> None:
+    """The images at half resolution in cell row ``y``, not limited, to their rings ``[C + 1, 5, n + 4]``.
+
+    ``planes [4 C + 8, n / 2]``: the layers' changes in that packed row, filled at an even ``y``.
+    """
     t, colors, closed = y // 2, rings.shape[0] - 1, outputs.closed
+    if y % 2 == 0:
+        unweave(outputs.change.floats, outputs.change.halves, t, planes)
     light = closed.brightness[t]
     for side in range(2):
         cell = 2 * (y % 2) + side
-        specular, gain = closed.specular[t, cell], outputs.gain[cell, t]
+        specular, gain = closed.specular[t, cell], planes[4 * colors + 4 + cell]
         for j in range(spare.size):
             spare[j] = specular[j] * gain[j]
         for c in range(colors):
-            own, change = closed.diffuse[t, 4 * c + cell], outputs.diffuse[4 * c + cell, t]
+            own, change = closed.diffuse[t, 4 * c + cell], planes[4 * c + cell]
             out = rings[c, y % _SIDE, 2 + side :]
             for j in range(spare.size):
                 out[2 * j] = own[j] - spare[j] + change[j] * light[j]
-        change, out = outputs.specular[cell, t], rings[colors, y % _SIDE, 2 + side :]
+        change, out = planes[4 * colors + cell], rings[colors, y % _SIDE, 2 + side :]
         for j in range(spare.size):
             out[2 * j] = specular[j] + spare[j] + change[j] * light[j]
     for k in range(colors + 1):
@@ -249,12 +254,11 @@ def _join(means: Any, found: Any, pixels: Any) -> None:
 
 
 @compiled
-def _write_errors(outputs: LayerOutputs, y: int, gain: Any, targets: Targets, spare: Any) -> None:
+def _write_errors(deviations: Any, light: Any, y: int, gain: Any, targets: Targets, spare: Any) -> None:
     """Expected errors of the two rows of pixels of cell row ``y``, and the sums of their squares."""
-    t, light = y // 2, outputs.closed.brightness[y // 2]
     for kind in range(2):
         for side in range(2):
-            deviation = outputs.deviation[4 * kind + 2 * (y % 2) + side, t]
+            deviation = deviations[4 * kind + 2 * (y % 2) + side]
             for j in range(spare.size):
                 spare[j] = deviation[j] * light[j]
             for row in range(2):
@@ -327,16 +331,18 @@ def write_pixels(
     pixels, s0, row = np.empty((2, 2 * n), np.float32), np.empty((2, 2 * n), np.float32), np.empty(n, np.float32)
     valid, near = np.empty(n, np.bool_), np.zeros(n + 2, np.uint8)
     planes, mean_gain = np.empty((DETAIL_MAPS * (colors + 3), n // 2), np.float32), ZERO
+    changes, deviations = np.empty((4 * colors + 8, n // 2), np.float32), np.empty((8, n // 2), np.float32)
     for c in range(colors):
         mean_gain += gains[c] / np.float32(colors)
     for y in range(max(2 * row_range[0] - 2, 0), min(2 * row_range[0] + 2, h)):
-        _enter_images(outputs, y, rings, spare)
+        _enter_images(outputs, y, changes, rings, spare)
     for y in range(2 * row_range[0], 2 * row_range[1]):
         if y + 2 < h:
-            _enter_images(outputs, y + 2, rings, spare)
+            _enter_images(outputs, y + 2, changes, rings, spare)
         if y % 2 == 0:
             unweave(details.shares.floats, details.shares.halves, y // 2, planes[: 2 * DETAIL_MAPS])
             unweave(details.change.floats, details.change.halves, y // 2, planes[2 * DETAIL_MAPS :])
+            unweave(outputs.deviation.floats, outputs.deviation.halves, y // 2, deviations)
         _starts(y, h, n + 4, starts)
         fill(ZERO, s0.reshape(-1))
         for k in range(colors + 1):
@@ -345,7 +351,7 @@ def write_pixels(
             _join(rings[k, y % _SIDE, 2:], own, pixels)
             _write_image(k, pixels, gains, targets, y, s0)
         _write_polarization(closed, y, s0, pixels, targets, wide)
-        _write_errors(outputs, y, mean_gain, targets, spare)
+        _write_errors(deviations, closed.brightness[y // 2], y, mean_gain, targets, spare)
         _write_masks(closed, y, targets, valid, near)
 
 
@@ -356,9 +362,8 @@ def warm_up() -> None:
     smooth = read_smooth(np.zeros((3, 1, _SIDE, _SIDE), np.float32))
     find_beyond(closed, smooth, beyond, (0, size))
     emit_details(beyond, closed, ChannelsLast.empty((size, size, DETAIL_MAPS), halves=False), (0, size))
-    outputs = LayerOutputs.of(closed, *(np.zeros((n, size, size), np.float32) for n in (20, 8)))
-    details = DetailOutputs.empty(3, beyond, smooth, halves=True)
-    for layer in (details.shares, details.change):
+    outputs, details = LayerOutputs.empty(closed, halves=True), DetailOutputs.empty(3, beyond, smooth, halves=True)
+    for layer in (outputs.change, details.shares, details.change):
         layer.halves.fill(0)
     targets = Targets.empty((PERIOD * size, PERIOD * size), 3)
     write_pixels(outputs, details, np.ones(3, np.float32), targets, (0, size))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polsep.compute import pages
 from polsep.compute.compiling import ONE, ZERO, compiled, entry
-from polsep.compute.rows_kernel import AT_ONCE, add_product, add_up, copy
+from polsep.compute.rows_kernel import AT_ONCE, add_product, add_up, copy, unweave
 from polsep.compute.threads import RowRange
 from polsep.demosaic.bilinear_kernel import read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
@@ -38,24 +38,22 @@ _CELLS = 2 * math.sqrt(2)
 
 
 class LayerOutputs(NamedTuple):
-    """The closed form, and what the layers add to it, of every packed pixel, planar.
+    """The closed form, and what the layers add to it, of every packed pixel.
 
-    ``diffuse [4 C, h, w]``, ``specular [4, h, w]``: corrections relative to the local brightness; ``gain [4, h, w]``:
-    more of the closed form's specular light, relative to that; ``deviation [8, h, w]``: expected standard deviations
-    of the diffuse errors of four cells, then of the specular ones, relative to the local brightness.
+    ``change [h, w, 4 C + 8]``: corrections of 4 C diffuse and 4 specular values relative to the local brightness, then
+    4 of the closed form's specular light relative to that; ``deviation [h, w, 8]``: expected standard deviations of
+    the diffuse errors of four cells, then of the specular ones, relative to the local brightness.
     """
 
     closed: ClosedFormRows
-    diffuse: Floats
-    specular: Floats
-    gain: Floats
-    deviation: Floats
+    change: ChannelsLast
+    deviation: ChannelsLast
 
     @classmethod
-    def of(cls, closed: ClosedFormRows, change: Floats, deviation: Floats) -> LayerOutputs:
-        """Split the layers' two outputs, ``change [4 C + 8, h, w]`` being the first three parts one after the other."""
-        first = closed.diffuse.shape[1]
-        return cls(closed, change[:first], change[first : first + 4], change[first + 4 :], deviation)
+    def empty(cls, closed: ClosedFormRows, halves: bool) -> LayerOutputs:
+        """Buffers for what the layers fill; deviations are of a kind of float that ``halves`` do not change."""
+        h, changes, w = closed.diffuse.shape
+        return cls(closed, ChannelsLast.empty((h, w, changes + 8), halves), ChannelsLast.empty((h, w, 8), False))
 
 
 class Targets(NamedTuple):
@@ -95,20 +93,23 @@ def spread(row: Any, gain: Any, place: int, image: Any) -> None:
 
 
 @compiled
-def _write_cells(outputs: LayerOutputs, t: int, cell: int, gains: Any, targets: Targets, spare: Any) -> None:
-    """One of the four cells of every packed pixel of row ``t``."""
-    y, side, colors, closed = 2 * t + cell // 2, cell % 2, gains.size, outputs.closed
+def _write_cells(
+    closed: ClosedFormRows, planes: Any, t: int, cell: int, gains: Any, targets: Targets, spare: Any
+) -> None:
+    """One of the four cells of every packed pixel of row ``t``; ``planes [4 C + 16, w]``: change and deviation."""
+    y, side, colors = 2 * t + cell // 2, cell % 2, gains.size
+    corrections, gain, deviations = planes[: 4 * colors + 4], planes[4 * colors + 4 + cell], planes[4 * colors + 8 :]
     light = closed.brightness[t]
     image, tau, s0, dolp, aolp, moved = spare[0], spare[1], spare[2], spare[3], spare[4], spare[5]
-    specular, gain = closed.specular[t, cell], outputs.gain[cell, t]
+    specular = closed.specular[t, cell]
     for j in range(moved.size):
         moved[j] = specular[j] * gain[j]
-    _correct(specular, outputs.specular[cell, t], light, moved, tau)
+    _correct(specular, corrections[4 * colors + cell], light, moved, tau)
     copy(tau, s0)
     for j in range(moved.size):
         moved[j] = -moved[j]
     for c in range(colors):
-        _correct(closed.diffuse[t, 4 * c + cell], outputs.diffuse[4 * c + cell, t], light, moved, image)
+        _correct(closed.diffuse[t, 4 * c + cell], corrections[4 * c + cell], light, moved, image)
         add_product(image, np.float32(1 / colors), s0)
         spread(image, gains[c], colors * side + c, targets.diffuse[y])
         spread(tau, gains[c], colors * side + c, targets.specular[y])
@@ -121,7 +122,7 @@ def _write_cells(outputs: LayerOutputs, t: int, cell: int, gains: Any, targets: 
         mean_gain += gains[c] / np.float32(colors)
     sums = targets.sums[y]
     for kind in range(2):
-        deviation = outputs.deviation[4 * kind + cell, t]
+        deviation = deviations[4 * kind + cell]
         for j in range(image.size):
             image[j] = deviation[j] * light[j]
         spread(image, mean_gain, 2 * side + kind, targets.error[y])
@@ -173,9 +174,13 @@ def write_rows(outputs: LayerOutputs, gains: Floats, targets: Targets, row_range
     closed = outputs.closed
     w = closed.brightness.shape[1]
     spare, near = np.zeros((6, w), np.float32), np.zeros(2 * w + 2, np.uint8)
+    changes = 4 * gains.size + 8
+    planes = np.empty((changes + 8, w), np.float32)
     for t in range(row_range[0], row_range[1]):
+        unweave(outputs.change.floats, outputs.change.halves, t, planes[:changes])
+        unweave(outputs.deviation.floats, outputs.deviation.halves, t, planes[changes:])
         for cell in range(4):
-            _write_cells(outputs, t, cell, gains, targets, spare)
+            _write_cells(closed, planes, t, cell, gains, targets, spare)
         for y in range(2 * t, 2 * t + 2):
             targets.sums[y, 8] = mark_clipped(closed.clipped, y, targets.valid[y], near)
             targets.sums[y, 9] = _CELLS * add_up(closed.fit_residual[t])
@@ -193,5 +198,6 @@ def warm_up() -> None:
     map_rows(samples, pattern, Taps(np.zeros((4, 9, AT_ONCE), np.float32), nothing, nothing, 3), maps, (0, size))
     grid = read_grid(pattern, layout.angles, stokes_inverse(layout.angles).astype(np.float32))
     map_guided_rows(Source(samples, pattern, grid), maps, (0, size))
-    outputs = LayerOutputs.of(closed, *(np.zeros((n, size, size), np.float32) for n in (20, 8)))
+    outputs = LayerOutputs.empty(closed, halves=True)
+    outputs.change.halves.fill(0)
     write_rows(outputs, np.ones(3, np.float32), Targets.empty((2 * size, 2 * size), 3), (0, size))

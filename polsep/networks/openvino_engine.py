@@ -78,21 +78,19 @@ class OpenVinoEngine:
         beyond = np.empty((2 * h, 3 * network.colors, 2 * w) if full else (0, 0, 0), np.float32)
         self._maps = Maps(inputs.floats, inputs.halves, channels, closed, beyond)
         self._taps = None if network.demosaic is None else make_taps(network.demosaic, network.colors, w, full)
-        change, deviation = (np.empty((n, h, w), np.float32) for n in (4 * network.colors + 8, 8))
-        self._outputs = LayerOutputs.of(closed, change, deviation)
-        self.inputs, layers = [inputs.filled], list[NDArray[Any]]()
+        self._outputs = LayerOutputs.empty(closed, halves)
+        self.inputs, outputs = [inputs.filled], [self._outputs.change.filled, self._outputs.deviation.filled]
         if full:
             smooth = read_smooth(network.arrays["details.smooth"])
             self._details = DetailOutputs.empty(network.colors, beyond, smooth, halves)
             self._detail_input = ChannelsLast.empty((h, w, DETAIL_MAPS), halves)
             self.inputs.append(self._detail_input.filled)
-            layers = [self._details.shares.filled, self._details.change.filled]
+            outputs += [self._details.shares.filled, self._details.change.filled]
         self._network, self._modulation = network, np.zeros((1, 1, 2 * sum(network.size.widths)), np.float32)
         if network.sees_frame:
             self.inputs = [*self.inputs, self._modulation]
         model = joint_model(network, (h, w), full, quantized=precision == "i8")
-        images = ([change, deviation], layers)
-        self._request = _compile(model, self.inputs, images, "f32" if precision == "i8" else precision)
+        self._request = _compile(model, self.inputs, outputs, "f32" if precision == "i8" else precision)
 
     def run(
         self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...], modulation: Floats | None = None
@@ -163,30 +161,24 @@ def _whole_frame_of(network: JointWeights) -> Any:
     return core().compile_model(whole_frame_model(network), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
 
 
-def _compile(
-    model: Any, inputs: list[NDArray[Any]], outputs: tuple[list[Floats], list[NDArray[Any]]], precision: str
-) -> Any:
-    """A request that reads ``inputs [h, w, n]``, float32 or bits of bfloat16, and fills ``outputs``.
+def _compile(model: Any, inputs: list[NDArray[Any]], outputs: list[NDArray[Any]], precision: str) -> Any:
+    """A request that reads ``inputs`` and fills ``outputs [h, w, n]``, float32 or bits of bfloat16.
 
-    The first ones are planar ``[n, h, w]``, the others, which are larger, like inputs: OpenVINO would move twice what
-    it has channels last.
+    All have channels last, as layers have them: OpenVINO takes long to move them.
     """
     openvino = import_openvino()
     # Pinned threads of two engines would share a core, and wait there for whoever else works on it.
     options: dict[str, Any] = {"INFERENCE_NUM_THREADS": get_threads(), "PERFORMANCE_HINT": "LATENCY"}
     options |= {"ENABLE_CPU_PINNING": False, "INFERENCE_PRECISION_HINT": precision}
-    steps, (planar, layers) = openvino.preprocess.PrePostProcessor(model), outputs
+    steps = openvino.preprocess.PrePostProcessor(model)
     places = [(steps.input(k), seen) for k, seen in enumerate(inputs)]
-    for place, array in [*places, *((steps.output(k), image) for k, image in enumerate(layers, len(planar)))]:
+    for place, array in [*places, *((steps.output(k), image) for k, image in enumerate(outputs))]:
         place.tensor().set_element_type(_type_of(array)).set_layout(openvino.Layout("NHWC"))
         place.model().set_layout(openvino.Layout("NCHW"))
     request = core().compile_model(steps.build(), "CPU", options).create_infer_request()
-    for k, seen in enumerate(inputs):
-        request.set_input_tensor(k, openvino.Tensor(seen, [1, *seen.shape], _type_of(seen)))
-    for k, image in enumerate(planar):
-        request.set_output_tensor(k, openvino.Tensor(image[None], shared_memory=True))
-    for k, image in enumerate(layers, len(planar)):
-        request.set_output_tensor(k, openvino.Tensor(image, [1, *image.shape], _type_of(image)))
+    for arrays, set_tensor in ((inputs, request.set_input_tensor), (outputs, request.set_output_tensor)):
+        for k, array in enumerate(arrays):
+            set_tensor(k, openvino.Tensor(array, [1, *array.shape], _type_of(array)))
     return request
 
 

@@ -32,6 +32,7 @@ from polsep.sensor.calibration import Calibration, Corrections, Table, falloff_i
 from polsep.sensor.camera import Layout, Mosaic, WrongType
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.levels import (
+    as_layout,
     as_measurements,
     as_mosaic,
     has_levels_of,
@@ -195,7 +196,7 @@ def _as_capture(
     four = isinstance(raw, np.ndarray) and raw.ndim in (3, 4) and raw.shape[0] == 4
     if not four or (raw.ndim == 3 and raw.shape[2] in (1, 3)):
         return as_mosaic(raw, layout, black_level, white_level)
-    layout = Layout.parse(layout) if isinstance(layout, str) else layout
+    layout = as_layout(layout)
     if raw.ndim == 3 and layout is not None and layout.bayer is not None:
         return as_mosaic(interleave_planes(raw, layout), layout, black_level, white_level)
     if layout is not None:

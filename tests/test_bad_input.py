@@ -17,11 +17,13 @@ import numpy as np
 import pytest
 import tifffile
 
+import polsep
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.results.separation_reader import read_separated
 from polsep.io.store.errors import InputError
-from polsep.sensor.camera import Layout
+from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
+from polsep.separation.images import FrameImages
 
 CODES = np.random.default_rng(0).integers(0, 65536, (48, 64)).astype(np.uint16)
 
@@ -365,6 +367,46 @@ ARRAYS: list[tuple[str, Callable[[], object], str]] = [
     ("folder", lambda: read_separated("."), "expected a separated frame (.exr, .npz), found a directory"),
     ("size", lambda: ReadOptions(size=(0, 4)), "expected a size of positive width and height, found (0, 4)"),
 ]
+
+SOME = np.ones((8, 8), np.float32)
+TYPES: list[tuple[str, Callable[[], object], str]] = [
+    ("a size of one", lambda: ReadOptions(size=64), "a size of width and height in whole pixels, found 64"),  # type: ignore[arg-type]
+    ("a size as text", lambda: ReadOptions(size="64x48"), "whole pixels, found '64x48'"),  # type: ignore[arg-type]
+    ("a layout", lambda: ReadOptions(layout=3), "expected layout as a Layout, text or None, found 3"),  # type: ignore[arg-type]
+    ("a level", lambda: ReadOptions(white_level="4095"), "expected white_level as a number or None, found '4095'"),  # type: ignore[arg-type]
+    ("a file", lambda: ReadOptions(corrections="rig.json"), "expected corrections as Corrections or None"),  # type: ignore[arg-type]
+    (
+        "images",
+        lambda: FrameImages.empty((8, 8), "color"),
+        "expected a Layout (Layout.parse reads text), found 'color'",
+    ),  # type: ignore[arg-type]
+    ("a shape", lambda: FrameImages.empty(8, Layout()), "expected the shape (H, W) of mosaics, found 8"),  # type: ignore[arg-type]
+    ("bool", lambda: Mosaic(SOME > 0, Layout(), 0, 1), "expected samples of whole numbers or floats, found bool"),
+    ("complex", lambda: Mosaic(SOME + 1j, Layout(), 0, 1), "found complex"),
+    ("list", lambda: Mosaic([[1.0]], Layout(), 0, 1), "a NumPy array or a torch tensor, found list"),
+    ("a light", lambda: Mosaic(SOME, Layout(), 0, 1, light_color="red"), "expected a light_color of positive numbers"),  # type: ignore[arg-type]
+    ("planes", lambda: polsep.separate(np.ones((4, 8, 8)), layout=3), 'expected a Layout, "color", "mono", a'),  # type: ignore[arg-type]
+]
+
+
+@pytest.mark.parametrize(("name", "call", "message"), TYPES, ids=[case[0] for case in TYPES])
+def test_wrong_types(name: str, call: Callable[[], object], message: str) -> None:
+    with pytest.raises(TypeError, match="expected") as caught:
+        call()
+    text = str(caught.value)
+    assert isinstance(caught.value, ValueError) and "\n" not in text and "found" in text and message in text, text
+
+
+def test_gains_and_levels_of_a_mosaic() -> None:
+    for gains in ((1.0, 1.0), (0.0, 1.0, 1.0), (1.0, np.nan, 1.0)):
+        with pytest.raises(ValueError, match="expected a light_color of three positive numbers"):
+            Mosaic(SOME, Layout(), 0, 1, light_color=gains)
+    with pytest.raises(ValueError, match="white_level must be above black_level, found inf and 0"):
+        Mosaic(SOME, Layout(), 0, np.inf)
+
+
+def test_layout_of_read_options_as_text() -> None:
+    assert ReadOptions(layout="mono").settings()["layout"] == "90,45,135,0/mono"  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("name", "call", "message"), ARRAYS, ids=[case[0] for case in ARRAYS])

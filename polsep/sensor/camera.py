@@ -20,7 +20,8 @@ from itertools import pairwise
 from numbers import Real
 from typing import TYPE_CHECKING, NamedTuple
 
-from array_api_compat import device
+import numpy as np
+from array_api_compat import device, is_array_api_obj
 
 from polsep.compute.arrays import Array, as_floats, constant, namespace, short_repr
 from polsep.compute.resizing import repeat_pixels, resize_bilinear
@@ -197,20 +198,43 @@ class Layout:
         return Layout.from_table([[turned[col][row] for col in range(4)] for row in range(4)])
 
 
+def require_layout(layout: object) -> None:
+    """Raise WrongType unless ``layout`` is a `Layout`."""
+    if not isinstance(layout, Layout):
+        raise WrongType(f"expected a Layout (Layout.parse reads text), found {layout!r:.40}")
+
+
 def check_frame(shape: tuple[int, ...], layout: Layout, black_level: float, white_level: float) -> None:
     """Raise ValueError when white is not above black or a frame ``[..., H, W]`` is smaller than one period.
 
     Of text as layout and of levels that are no numbers, it is a `WrongType`.
     """
-    if not isinstance(layout, Layout):
-        raise WrongType(f"expected a Layout (Layout.parse reads text), found {layout!r:.40}")
+    require_layout(layout)
     if not (isinstance(black_level, Real) and isinstance(white_level, Real)):
         raise WrongType(f"expected levels that are numbers, found black {black_level!r:.40}, white {white_level!r:.40}")
     rows, cols = (layout.period + start for start in layout.origin)
     if len(shape) < 2 or shape[-2] < rows or shape[-1] < cols:
         raise ValueError(f"expected a mosaic [..., H, W] of at least {rows}x{cols}, found {shape}")
-    if not white_level > black_level:
+    if not (white_level > black_level and math.isfinite(white_level - black_level)):
         raise ValueError(f"white_level must be above black_level, found {white_level} and {black_level}")
+
+
+def _require_samples(data: Array) -> None:
+    """Raise WrongType unless ``data`` is an array of whole numbers or floats: others have no place on a sensor."""
+    if not is_array_api_obj(data) or isinstance(data, np.ma.MaskedArray):  # masked samples have no value
+        raise WrongType(f"expected samples as a NumPy array or a torch tensor, found {type(data).__name__}")
+    if not namespace(data).isdtype(data.dtype, ("integral", "real floating")):
+        raise WrongType(f"expected samples of whole numbers or floats, found {data.dtype}")
+
+
+def _require_gains(gains: object, channels: int) -> None:
+    """Raise ValueError unless ``gains`` are positive numbers, three or one per channel; of others it is a WrongType."""
+    try:
+        numbers = [float(gain) for gain in gains]  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        raise WrongType(f"expected a light_color of positive numbers, found {gains!r:.40}") from None
+    if len(numbers) not in (3, channels) or not all(0 < gain < math.inf for gain in numbers):
+        raise ValueError(f"expected a light_color of three positive numbers, found {gains!r:.80}")
 
 
 def clip_level(black_level: float, white_level: float) -> float:
@@ -227,7 +251,8 @@ class Mosaic:
     light. ``falloff``: the smooth part of a calibrated sensor's flat frame (`calibration.falloff_image`), by which
     separated images are divided. ``less_ambient``: another frame was subtracted, and noise goes far below black.
     ``lamp_measured``: ``light_color`` is that of a calibrated lamp, also where it is white.
-    Raises ValueError when white is not above black or the frame is smaller than one period.
+    Raises ValueError when white is not above black or the frame is smaller than one period; of samples that are no
+    whole numbers or floats, it is a `WrongType`.
     """
 
     data: Array
@@ -242,7 +267,9 @@ class Mosaic:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
+        _require_samples(self.data)
         check_frame(tuple(self.data.shape), self.layout, self.black_level, self.white_level)
+        _require_gains(self.light_color, self.layout.channels)
 
     @property
     def clip_level(self) -> float:

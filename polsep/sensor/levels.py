@@ -69,6 +69,14 @@ class BlackFrame(str):
     """A note on samples that all are black, which say nothing of their levels."""
 
 
+def as_layout(layout: Layout | str | None) -> Layout | None:
+    """A layout, of text by `Layout.parse`, or None. Raises `WrongType` on anything else."""
+    layout = Layout.parse(layout) if isinstance(layout, str) else layout
+    if not isinstance(layout, Layout | None):
+        raise WrongType(f'expected a Layout, "color", "mono", a specification or None, found {type(layout).__name__}')
+    return layout
+
+
 def as_mosaic(
     array: NDArray[Any], layout: Layout | str | None = None, black_level: float = 0.0, white_level: float | None = None
 ) -> tuple[Mosaic, Notes]:
@@ -78,9 +86,7 @@ def as_mosaic(
     last row or column is cropped and gray stored as three equal channels is reduced to one, both with a note. Bit depth
     is not guessed. Raises ValueError on another dtype or shape, values that are not finite, or white not above black.
     """
-    layout = Layout() if layout is None else Layout.parse(layout) if isinstance(layout, str) else layout
-    if not isinstance(layout, Layout):
-        raise WrongType(f'expected a Layout, "color", "mono", a specification or None, found {type(layout).__name__}')
+    layout = as_layout(layout) or Layout()
     plane, notes = _one_channel(_checked(array))
     height, width = plane.shape
     odd_rows, odd_cols = ((n - start) % 2 for n, start in zip((height, width), layout.origin, strict=True))

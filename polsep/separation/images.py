@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute import pages
-from polsep.sensor.camera import Layout
+from polsep.sensor.camera import Layout, WrongType, require_layout
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,13 @@ class FrameImages:
     def empty(cls, shape: tuple[int, int], layout: Layout, report: bool = False, full: bool = False) -> FrameImages:
         """Buffers for mosaics of that ``shape`` (H, W) at half or ``full`` resolution, of all whole cells.
 
-        For a ``report`` also for DoLP and AoLP.
+        For a ``report`` also for DoLP and AoLP. Raises ValueError on another shape; of wrong types it is a `WrongType`.
         """
+        require_layout(layout)
+        if not isinstance(shape, Sequence) or not all(isinstance(n, Integral) for n in shape):
+            raise WrongType(f"expected the shape (H, W) of mosaics, found {shape!r:.40}")
+        if len(shape) != 2 or min(layout.cells(shape)) < 1:
+            raise ValueError(f"expected the shape (H, W) of mosaics, found {shape!r:.40}")
         size = 2 if full else 1
         h, w = (size * n for n in layout.cells(shape))
         diffuse, specular = (pages.empty((h, w, layout.channels), np.float32) for _ in range(2))

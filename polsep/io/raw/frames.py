@@ -13,9 +13,10 @@ layouts: what the caller says, else what the pixel format's name says, else Sony
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,14 +101,25 @@ SUPPORTED = (
 )
 
 
+#: Types of `ReadOptions`, and how messages name them.
+_KINDS: dict[str, tuple[Any, str]] = {
+    "layout": (Layout | None, "a Layout, text or None"),
+    "black_level": (Real, "a number"),
+    "white_level": (Real | None, "a number or None"),
+    "pixel_format": (str | None, "a name or None"),
+    "corrections": (Corrections | None, "Corrections or None"),
+}
+
+
 @dataclass(frozen=True)
 class ReadOptions:
     """Facts that files may not contain. Levels are in the units of the samples; None: see the module.
 
-    ``size`` (width, height) and ``pixel_format`` (a GenICam name) describe headerless raw. ``pages``: several pages of
-    a file are separate "frames", or every four are the "angles" 0, 45, 90, 135; "auto": angles if they are four RGB
-    pages, or four grey ones that obey m0 + m90 = m45 + m135 as no four frames do. ``corrections``: made to every
-    mosaic, by a calibration that also says the white level where nothing else does. Raises ValueError on anything else.
+    ``layout`` as text is read by `Layout.parse`. ``size`` (width, height) and ``pixel_format`` (a GenICam name)
+    describe headerless raw. ``pages``: several pages of a file are separate "frames", or every four are the "angles" 0,
+    45, 90, 135; "auto": angles if they are four RGB pages, or four grey ones that obey m0 + m90 = m45 + m135 as no four
+    frames do. ``corrections``: made to every mosaic, by a calibration that also says the white level where nothing else
+    does. Raises ValueError on anything else; of wrong types it is a `WrongType`.
     """
 
     layout: Layout | None = None
@@ -121,10 +133,24 @@ class ReadOptions:
     def __post_init__(self) -> None:
         if self.pages not in ("auto", "frames", "angles"):
             raise ValueError(f'expected pages "auto", "frames" or "angles", found {self.pages!r}')
+        if isinstance(self.layout, str):
+            object.__setattr__(self, "layout", Layout.parse(self.layout))
+        self._require_types()
         if self.corrections is not None and self.corrections.calibration is not None:
             self.corrections.calibration.require_black_level(self.black_level, "--black-level")
-        if self.size is not None and (len(self.size) != 2 or min(self.size) < 1):
-            raise ValueError(f"expected a size of positive width and height, found {self.size}")
+        if self.size is not None:
+            if len(self.size) != 2 or min(self.size) < 1:
+                raise ValueError(f"expected a size of positive width and height, found {self.size}")
+            object.__setattr__(self, "size", (int(self.size[0]), int(self.size[1])))
+
+    def _require_types(self) -> None:
+        """Raise WrongType on a value of another type than that of its field."""
+        for name, (kind, wanted) in _KINDS.items():
+            if not isinstance(value := getattr(self, name), kind):
+                raise WrongType(f"expected {name} as {wanted}, found {value!r:.40}")
+        size = self.size
+        if size is not None and not (isinstance(size, Sequence) and all(isinstance(n, Integral) for n in size)):
+            raise WrongType(f"expected a size of width and height in whole pixels, found {size!r:.40}")
 
     def settings(self) -> dict[str, Any]:
         """The options as a report lists them."""

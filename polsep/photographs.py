@@ -271,8 +271,8 @@ def _angles(images: Measurements, options: PhotoOptions) -> tuple[tuple[float, .
     if not found.error < MAX_ANGLE_ERROR:
         uncertain = f"angles uncertain by {math.degrees(min(found.error, math.pi / 2)):.0f} deg"
         raise ValueError(
-            "expected light of several directions of polarization to find the angles in, found one direction, "
-            f"or a filter that was not turned ({uncertain}): say --angles"
+            "expected light of several directions of polarization and five different angles of the filter to find them "
+            f"in, found one direction or fewer angles ({uncertain}): say --angles"
         )
     return found.angles, found.error
 

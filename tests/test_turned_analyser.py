@@ -75,6 +75,15 @@ def test_a_filter_that_was_not_turned_shows_no_angles() -> None:
     assert math.isinf(find_angles(*gram(np.repeat(once, 20, axis=0))).error)
 
 
+@pytest.mark.parametrize(
+    "degrees", [[0, 60, 0, 60, 0], [0, 90, 0, 90, 0], [0, 60, 120, 0, 60, 120], [0, 45, 90, 135, 0, 45, 90, 135]]
+)
+def test_fewer_than_five_different_angles_are_not_found(degrees: list[float]) -> None:
+    """In however many photographs: of two angles others were found, known to a degree as it seemed."""
+    rng = np.random.default_rng(8)
+    assert math.isinf(find_angles(*gram(photographs(degrees, random_light(rng, 0.8), rng))).error)
+
+
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 1.6])
 def test_the_ratio_of_exposures_is_recovered(ratio: float) -> None:
     """Where a third of the samples has specular light, and diffuse light is polarized a little, within 2 %."""

@@ -51,7 +51,8 @@ def find_angles(products: Doubles, count: int) -> Turned:
     """Angles in [0, pi) of K photographs from their `gram` matrix over ``count`` samples, up to a roll and a mirror.
 
     By convention the first is 0 and the second lies below pi / 2. The error is large or infinite where the polarization
-    of all pixels lies along one direction. Raises ValueError on fewer than `LEAST_FOR_ANGLES`.
+    of all pixels lies along one direction, and infinite where fewer than `LEAST_FOR_ANGLES` photographs differ by more
+    than noise: rows of fewer angles, however many they are, lie on many ellipses. Raises ValueError on fewer of them.
     """
     number = len(products)
     if number < LEAST_FOR_ANGLES:
@@ -60,6 +61,8 @@ def find_angles(products: Doubles, count: int) -> Turned:
     turns = np.arange(1, number, dtype=np.float64) * np.float64(math.pi / number)
     starts = [start for start in (_angles_on_ellipse(signal), turns, 2 * turns) if start is not None]
     found, error = min((_fit(signal, noise, start) for start in starts), key=lambda fit: fit[2])[:2]
+    if _count_different(products, noise * count) < LEAST_FOR_ANGLES:
+        error = math.inf
     angles = np.concatenate([[0.0], found])
     if math.sin(2 * angles[1]) < 0:
         angles = -angles
@@ -87,6 +90,17 @@ def find_pair_exposure(parallel: NDArray[np.floating], crossed: NDArray[np.float
     below, middle, above = smooth[top - 1], smooth[top], smooth[top + 1]
     offset = 0.5 * (below - above) / (below - 2 * middle + above)  # the parabola through the three
     return math.exp(edges[top] + step * (0.5 + offset))
+
+
+def _count_different(products: Doubles, noise: float) -> int:
+    """Number of photographs that differ from each other: by more than twice what ``noise``, of each, makes differ."""
+    power = np.diag(products)
+    apart = power[:, None] + power - 2 * products  # sums of (m_k - m_l)^2
+    least, different = max(4 * noise, ROUNDING * float(power.max())), list[int]()
+    for k, row in enumerate(apart):
+        if all(row[other] > least for other in different):
+            different.append(k)
+    return len(different)
 
 
 def _signal(products: Doubles, count: int) -> tuple[Doubles, float]:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from test_bad_input import FILES
 
 from polsep import batch, cli
-from polsep.cli.app import has_extra, print_note
+from polsep.cli.app import RATE, has_extra, print_note
 from polsep.cli.progress import Progress
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
@@ -554,12 +554,18 @@ def test_bad_commands(polsep: Cli, args: list[str]) -> None:
     assert_refused(polsep(*args))
 
 
+def test_rates_may_be_ratios() -> None:
+    """Film shot for NTSC runs at 24000/1001 frames per second."""
+    assert [RATE.convert(text, None, None) for text in ("24", "24000/1001", 25.0)] == [24, 24000 / 1001, 25]
+
+
 @pytest.mark.parametrize(
     ("words", "option"),
     [
         ("separate a.png --white-level nan", "--white-level"),
         ("separate a.png --black-level 4 --white-level 3", "--white-level"),
         ("video in -o o --rate -2", "--rate"),
+        ("video in -o o --rate 24/0", "--rate"),
         ("video in -o o --frames 0", "--frames"),
         ("video in -o o --compression rar", "--compression"),
         ("video in -o o --format gif", "--format"),

@@ -12,7 +12,7 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
@@ -49,7 +49,9 @@ class Number(_ParamType):
 
     name = "number"
 
-    def __init__(self, kind: type, low: float = -math.inf, high: float = math.inf, above: bool = False) -> None:
+    def __init__(
+        self, kind: Callable[[Any], float], low: float = -math.inf, high: float = math.inf, above: bool = False
+    ) -> None:
         self.kind, self.low, self.high, self.above = kind, low, high, above
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -57,7 +59,7 @@ class Number(_ParamType):
         try:
             number = self.kind(value)
             fits = math.isfinite(number) and self.low <= number <= self.high and not (self.above and number == self.low)
-        except (ValueError, OverflowError):
+        except (ValueError, ArithmeticError):
             fits = False
         if not fits:
             self.fail(f"expected {self._range()}, found {str(value)!r:.40}", param, ctx)
@@ -70,6 +72,12 @@ class Number(_ParamType):
         if self.low > -math.inf:
             return f"{noun} above {self.low:g}" if self.above else f"{noun} of {self.low:g} or more"
         return noun
+
+
+def _ratio(text: Any) -> float:
+    """A number, or the ratio of two, like NTSC's 24000/1001. Raises ValueError, ZeroDivisionError."""
+    over, slash, under = str(text).partition("/")
+    return float(over) / float(under) if slash else float(over)
 
 
 class Word(_ParamType):
@@ -90,7 +98,7 @@ class Word(_ParamType):
 
 
 COUNT, POSITIVE, FINITE = Number(int, 1), Number(float, 0, above=True), Number(float)
-RATE = Number(float, 0.001, 100_000)
+RATE = Number(_ratio, 0.001, 100_000)
 COMPRESSION, DAMAGED = Word("none", "zip", "piz"), Word("stop", "skip")
 
 LAYOUT = click.option(

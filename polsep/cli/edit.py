@@ -55,7 +55,9 @@ if TYPE_CHECKING:
     default=None,
     help="Write a video of a sequence to watch.  [default: where the extra video is installed]",
 )
-@click.option("--rate", type=RATE, default=25.0, metavar="N", help="Frames per second of that video.")
+@click.option(
+    "--rate", type=RATE, default=25.0, metavar="N", help="Frames per second of that video, like 24 or 24000/1001."
+)
 @click.option(
     "--damaged",
     type=DAMAGED,

@@ -66,7 +66,13 @@ from polsep.cli.progress import report_step, show_progress
     default=None,
     help="Write a video of input, diffuse and specular to watch.  [default: where the extra video is installed]",
 )
-@click.option("--rate", type=RATE, default=25.0, metavar="N", help="Frames per second of the videos written.")
+@click.option(
+    "--rate",
+    type=RATE,
+    default=25.0,
+    metavar="N",
+    help="Frames per second of the videos written, like 24 or 24000/1001.",
+)
 @click.option(
     "--filter",
     type=Word("temporal", "none"),

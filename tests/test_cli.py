@@ -201,12 +201,15 @@ def test_four_angle_images(tmp_path: Path, polsep: Cli) -> None:
         png(tmp_path / f"nir_{angle}.png", plane)
     tifffile.imwrite(tmp_path / "stack.tiff", np.stack(planes), photometric="minisblack")
     common = ("-o", tmp_path / "o", "--layout", "mono", "--format", "npz")
-    assert polsep("separate", tmp_path / "nir_{angle}.png", *common).status == 0
+    run = polsep("separate", tmp_path / "nir_{angle}.png", *common)
+    assert run.status == 0 and "{angle}" not in run.err
     assert polsep("separate", tmp_path / "stack.tiff", "--pages", "angles", *common).status == 0
     one, other = np.load(tmp_path / "o" / "nir.npz"), np.load(tmp_path / "o" / "stack.npz")
     assert one["diffuse"].shape == (24, 20, 1)
     for layer in LAYERS:
         assert np.abs(one[layer].astype(float) - other[layer]).max() == 0
+    run = polsep("separate", *sorted(tmp_path.glob("nir_*.png")), *common)
+    assert run.status == 0 and "nir_{angle}.png' makes one frame of four angles" in run.err
 
 
 def test_headerless_raw_is_the_png(tmp_path: Path, polsep: Cli) -> None:

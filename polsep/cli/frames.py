@@ -104,7 +104,6 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
         require_paths(*files)
     check_read_options(options)
     from polsep.batch import SeparateOptions, WriteOptions, separate_files, separate_photographs
-    from polsep.io.raw.sequences import expand_folders
     from polsep.methods import check_method
     from polsep.pipeline import find_device
 
@@ -121,15 +120,8 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
             outcome = separate_photographs(photographs, read_photo_options(options), read, run, write)
         _report(outcome)
         return
-    paths, seen, failures = list[str](), list[str](), 0
-    for file in files:
-        try:
-            paths += expand_folders([file])
-        except (ValueError, OSError) as error:
-            if len(files) == 1:  # of several the others are separated all the same
-                raise
-            print_note(f"error: {error}")
-            failures += 1
+    paths, failures = _expand_files(files)
+    seen = list[str]()
     with show_progress(f"separating {files[0]}" if len(files) == 1 else "separating", len(paths)) as progress:
         for outcome in separate_files(paths, read, run, write):
             if outcome.source not in seen:
@@ -138,6 +130,24 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
             failures += _report(outcome)
     if failures:
         sys.exit(2)
+
+
+def _expand_files(files: tuple[str, ...]) -> tuple[list[str], int]:
+    """The files with folders replaced by their frames, and the number of folders without; that of one file raises."""
+    from polsep.io.raw.sequences import angles_together, expand_folders
+
+    for name in sorted(set(angles_together(map(Path, files))) - set(map(Path, files))):
+        print_note(f"the four files of {name} are separated one by one: '{name}' makes one frame of four angles")
+    paths, failures = list[str](), 0
+    for file in files:
+        try:
+            paths += expand_folders([file])
+        except (ValueError, OSError) as error:
+            if len(files) == 1:  # of several the others are separated all the same
+                raise
+            print_note(f"error: {error}")
+            failures += 1
+    return paths, failures
 
 
 def _report(outcome: Outcome) -> int:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, pairwise
@@ -115,15 +115,22 @@ def _folder_frames(folder: Path) -> list[str]:
     files = _named_as_frames(folder)
     if not files:
         raise input_error(folder, f"expected a folder of frames ({', '.join(FRAME_FILES)}), found none")
-    groups: dict[tuple[str, str], set[str]] = {}
+    return [str(path) for path in sorted(angles_together(files), key=natural_order)]
+
+
+def angles_together(files: Iterable[Path]) -> list[Path]:
+    """The files with ``shot_{angle}.png`` in place of four like ``shot_0.png``, ``shot_45.png`` and so on.
+
+    Four angle images are named so, where no other of these files has their name with another number.
+    """
+    groups: dict[tuple[Path, str, str], list[Path]] = {}
     for path in files:
-        name, number = _numbered(path)
-        groups.setdefault((name, path.suffix), set()).add(number)
-    angles = {"0", "45", "90", "135"}
-    frames = [
-        p if groups[_numbered(p)[0], p.suffix] != angles else p.with_stem(_numbered(p)[0] + "{angle}") for p in files
-    ]
-    return list(dict.fromkeys(str(path) for path in sorted(frames, key=natural_order)))
+        groups.setdefault((path.parent, _numbered(path)[0], path.suffix), []).append(path)
+    together = list[Path]()
+    for (folder, name, suffix), group in groups.items():
+        angles = {_numbered(path)[1] for path in group} == {"0", "45", "90", "135"}
+        together += [folder / f"{name}{{angle}}{suffix}"] if angles else group
+    return together
 
 
 def _named_as_frames(folder: Path) -> list[Path]:

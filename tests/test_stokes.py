@@ -14,12 +14,14 @@ from hypothesis import strategies as st
 from tolerances import ROUNDING, SIGMAS, assert_close, assert_finite, assert_same_angle
 from torch import Tensor
 
+from polsep.cli.summary import summary
 from polsep.physics.stokes import (
     Measurements,
     Stokes,
     analyser_matrix,
     analyser_residual,
     aolp,
+    axis_deg,
     dolp,
     fit_stokes,
     fit_stokes_unclipped,
@@ -407,6 +409,15 @@ def test_exposure_scales_everything(generator: torch.Generator) -> None:
     assert_close(polarized_intensity(bright), 3.5 * polarized_intensity(stokes))
     assert_close(dolp(bright), dolp(stokes))
     assert_close(aolp(bright), aolp(stokes))
+
+
+def test_shown_angles_stay_below_180() -> None:
+    """Also rounded: a polarizer at 179.6 degrees was printed as at 180, which is no AoLP in [0, 180)."""
+    assert [axis_deg(angle) for angle in (0.0, 89.5, 179.4, 179.6)] == [0, 90, 179, 0]
+    assert [axis_deg(angle, 1) for angle in (179.94, 179.96)] == [179.9, 0]
+    report = {"method": "joint", "light_color": [1.0], "warnings": []}
+    statistics = {"clipped_fraction": 0.0, "light_polarizer_deg": 179.6}
+    assert "polarizer at 0 deg" in summary({**report, "statistics": statistics})
 
 
 def test_inconsistent_images_are_refused() -> None:

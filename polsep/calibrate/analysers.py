@@ -31,7 +31,7 @@ from polsep.calibrate.dark_flat import MOST_CLIPPED, require_same_sensor
 from polsep.calibrate.statistics import Doubles, place_means
 from polsep.compute.arrays import to_numpy
 from polsep.compute.least_squares import least_squares
-from polsep.physics.stokes import diattenuation
+from polsep.physics.stokes import axis_deg, diattenuation
 from polsep.sensor.calibration import Analyser, Calibration
 from polsep.sensor.camera import Layout, Mosaic
 
@@ -100,7 +100,7 @@ def measure_analysers(
     angles = np.rad2deg(fit.angle) - np.rad2deg(nominal)
     details = {
         "frames": len(means),
-        "polarizer_angles_deg": [round(float(math.degrees(phi)) % 180, 2) for phi in fit.phi],
+        "polarizer_angles_deg": [axis_deg(math.degrees(phi), 2) for phi in fit.phi],
         "angle_off_rms_deg": round(float(np.sqrt((angles**2).mean())), 4),
         "angle_off_largest_deg": round(float(np.abs(angles).max()), 4),
         "angle_error_deg": round(math.degrees(errors.angle), 4),
@@ -176,7 +176,7 @@ def _start(means: Doubles, colors: Ints, nominal: Doubles) -> Fit:
     if spread < MIN_SPREAD:
         raise ValueError(
             "expected polarizer angles spread over 180 degrees, found "
-            + ", ".join(f"{math.degrees(angle) % 180:.0f}" for angle in phi)
+            + ", ".join(f"{axis_deg(math.degrees(angle)):.0f}" for angle in phi)
         )
     ones = np.ones_like(nominal)
     return Fit(ones, 0.98 * ones, nominal.copy(), phi, strength)

@@ -17,6 +17,7 @@ from polsep.io.raw.tiff import write_merged
 from polsep.io.store.atomic import refuse_existing, refuse_inputs, require_writable
 from polsep.io.store.calibrations import maps_path, read_calibration, refuse_foreign_maps, write_calibration
 from polsep.io.store.errors import input_error
+from polsep.physics.stokes import axis_deg
 from polsep.sensor.black_level import check_black_level
 from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Mosaic
@@ -182,6 +183,5 @@ def describe(found: Calibration, kind: str) -> str:
     line = f"colour {color} +- {facts['color_error_deg']:.2f} deg, from {facts['from']}"
     if "polarizer_deg" not in facts or found.lamp.dolp is None:
         return line
-    return (
-        f"{line}, polarizer at {facts['polarizer_deg']:.1f} deg, degree of polarization at least {found.lamp.dolp:.3f}"
-    )
+    polarizer = axis_deg(facts["polarizer_deg"], 1)
+    return f"{line}, polarizer at {polarizer:.1f} deg, degree of polarization at least {found.lamp.dolp:.3f}"

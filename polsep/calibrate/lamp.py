@@ -18,7 +18,7 @@ from polsep.calibrate.statistics import Doubles
 from polsep.compute.arrays import to_numpy
 from polsep.demosaic.bilinear import demosaic_bilinear_half
 from polsep.light.find import SURE_DEG, Light, combine, find_light
-from polsep.physics.stokes import fit_stokes_unclipped
+from polsep.physics.stokes import aolp_of, axis_deg, fit_stokes_unclipped
 from polsep.sensor.calibration import Calibration, LampFacts
 from polsep.sensor.camera import Mosaic
 from polsep.separation.analytic import light_polarizer_angle
@@ -56,10 +56,10 @@ def measure_lamp(frames: Iterable[Mosaic], before: Calibration | None = None, ca
     if polarizations:
         pairs = np.array(polarizations)
         vector = np.exp(2j * pairs[:, 0]).mean()
-        aolp = 0.5 * float(np.angle(vector)) % math.pi
+        aolp = aolp_of(float(vector.real), float(vector.imag))
         lamp = lamp._replace(dolp=float(pairs[:, 1].max()), aolp_deg=math.degrees(aolp))
         details |= {
-            "polarizer_deg": round(math.degrees(light_polarizer_angle(aolp)), 2),
+            "polarizer_deg": axis_deg(math.degrees(light_polarizer_angle(aolp)), 2),
             "aolp_spread_deg": round(math.degrees(math.sqrt(max(-2 * math.log(max(abs(vector), 1e-9)), 0)) / 2), 3),
             "dolp_is": "at least",
         }

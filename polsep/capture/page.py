@@ -60,7 +60,7 @@ function tell(shot) {
     `<p><b>Focus</b> ${shot.focus.toFixed(3)}, best so far ${best.toFixed(3)}</p>` +
     `<p><b class="found">Highlights</b> of one angle: ${shot.concentration.toFixed(2)} of 1, ` +
     `${percent(shot.specular)} of the light</p>` +
-    `<p><b class="lamp">Polarizer of the light</b> ${shot.light_deg.toFixed(0)}&deg;</p>`;
+    `<p><b class="lamp">Polarizer of the light</b> ${shot.light_deg.toFixed(0) % 180}&deg;</p>`;
   at("histogram").innerHTML = shot.histogram;
   at("rose").innerHTML = shot.rose;
 }

@@ -29,6 +29,7 @@ from polsep.capture.ring import Ring
 from polsep.capture.sources import Camera, CameraError, CameraInfo, CameraLost, CameraSource, EndOfFrames, Loss
 from polsep.io.raw.recording import INDEX, PICTURE, RAW, RECORD, Header, RawImage, RecordingWriter, refuse_recording
 from polsep.io.store.atomic import OutputError, refuse_inputs
+from polsep.physics.stokes import axis_deg
 from polsep.sensor.camera import Layout
 
 #: Seconds between attempts to connect to a lost camera.
@@ -100,7 +101,7 @@ class Status:
     def line(self) -> str:
         """The status as one line for the terminal."""
         count = self.counters
-        light = "" if self.light_deg is None else f", light {self.light_deg:.0f} deg"
+        light = "" if self.light_deg is None else f", light {axis_deg(self.light_deg):.0f} deg"
         away = f", {count.interruptions} interruptions ({count.away_s:.1f} s)" if count.interruptions else ""
         return (
             f"{self.seconds:.1f} s, {self.rate_hz:.1f} frames/s: {count.received} received, {count.lost} lost, "

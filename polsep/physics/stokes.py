@@ -367,6 +367,11 @@ def aolp_of(s1: float, s2: float) -> float:
     return 0.5 * math.atan2(s2, s1) % math.pi % math.pi  # twice: rounding takes tiny negative angles to pi
 
 
+def axis_deg(degrees: float, digits: int = 0) -> float:
+    """An AoLP in [0, 180) [degrees] as it is shown with so many digits: rounding takes 179.6 to 0, not to 180."""
+    return round(degrees, digits) % 180
+
+
 def rotate_frame(stokes: Stokes, angle: float | Array) -> Stokes:
     """The same light in a frame turned counter-clockwise by ``angle`` [rad]: AoLP falls by ``angle``."""
     c, s = _direction(angle, stokes.s0)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from polsep.io.store import errors
+from polsep.physics.stokes import axis_deg
 from polsep.view.edits import list_controls
 from polsep.view.opening import UNSAID, OpenedFrame
 
@@ -113,7 +114,7 @@ def status_line(found: OpenedFrame, more: Sequence[str] = ()) -> str:
     statistics = frame.report["statistics"]
     if "clipped_fraction" in statistics:
         texts.append(f"{statistics['clipped_fraction']:.2%} of the pixels clip")
-        texts.append(f"light polarizer about {statistics['light_polarizer_deg']:.0f}°")
+        texts.append(f"light polarizer about {axis_deg(statistics['light_polarizer_deg']):.0f}°")
     texts.append(f"{found.seconds:.2f} s")
     name = html.escape(found.stem)
     line = "".join(f"<span>{html.escape(text)}</span>" for text in texts)

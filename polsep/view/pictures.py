@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from polsep.io.results.charts import CHANNELS, histogram_svg, rose_shares, rose_svg
 from polsep.io.results.previews import aolp_legend, aolp_wheel, dolp_map, exposure_of, srgb
 from polsep.io.store.image_codecs import encode_jpeg_quickly, encode_png
+from polsep.physics.stokes import wrap_aolp
 from polsep.sensor.exposure import BLACK, CLIPPED, Histogram
 from polsep.separation.report import SeparatedFrame
 
@@ -85,7 +86,7 @@ def shrink_frame(frame: SeparatedFrame, flags: Pixels | None = None, step: int |
     s1, s2 = (shrink(polarized * wave, step) for wave in (np.cos(2 * frame.aolp), np.sin(2 * frame.aolp)))
     light = shrink(s0, step)
     dolp = (np.hypot(s1, s2) / np.where(light > 0, light, 1)).astype(np.float32)
-    aolp = np.mod(np.arctan2(s2, s1) / 2, np.float32(np.pi))
+    aolp = wrap_aolp(np.arctan2(s2, s1) / 2)
     error = None if frame.error is None else np.sqrt(shrink(frame.error**2, step))
     marked = None if flags is None else _any_flag(flags, step)
     return Small(step, diffuse, specular, dolp, aolp, error, exposure_of(diffuse + specular), None, marked)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from polsep.physics.stokes import Measurements, fit_stokes
+from polsep.physics.stokes import Measurements, axis_deg, fit_stokes
 from polsep.sensor.camera import Mosaic
 from polsep.separation.report import SeparatedFrame
 
@@ -113,7 +113,7 @@ def readout_panel(found: Readout, maker: str = "") -> str:
     rows.append(("Specular", _colors(found.specular)))
     if found.error is not None:
         rows.append(("Expected error", f"diffuse {found.error[0]:.4f}, specular {found.error[1]:.4f}"))
-    rows.append(("Polarization", f"DoLP {found.dolp:.3f}, AoLP {found.aolp_deg:.1f}°"))
+    rows.append(("Polarization", f"DoLP {found.dolp:.3f}, AoLP {axis_deg(found.aolp_deg, 1):.1f}°"))
     body = "".join(f"<tr><th>{name}</th><td>{value}</td></tr>" for name, value in rows)
     return f'<table class="ps-readout">{body}</table>'
 

@@ -175,7 +175,7 @@ function showFacts({ light, light_color: color, statistics: s, defects, colored_
     facts.push([`Lamp, ${source}`, [swatch, color.map((gain) => gain.toFixed(2)).join(", ")]]);
   }
   facts.push(["Specular share", [percent(s.specular_fraction)]], ["Clipped", [percent(s.clipped_fraction)]],
-    ["Highlights' AoLP", [`${s.specular_aolp_deg.toFixed(0)}°`]], ["Concentration", [s.specular_aolp_concentration.toFixed(2)]]);
+    ["Highlights' AoLP", [`${s.specular_aolp_deg.toFixed(0) % 180}°`]], ["Concentration", [s.specular_aolp_concentration.toFixed(2)]]);
   if (defects) facts.push(["Pixels repaired", [String(defects)]]);
   if (metal) facts.push(["Coloured metal", [percent(metal)]]);
   part("facts").replaceChildren(...facts.flatMap(([name, values]) => {
@@ -313,7 +313,7 @@ function showReadout(event) {
   const { width, colors, diffuse, specular, dolp, aolp, valid } = state.images, k = place[0] * width + place[1];
   const values = (image) => Array.from({ length: colors }, (_, c) => image[k * colors + c].toFixed(3)).join("  ");
   part("readout").textContent = `row ${place[0]}, column ${place[1]}${valid[k] ? "" : ", clipped: estimated"}\n` +
-    `diffuse ${values(diffuse)}\nspecular ${values(specular)}\nDoLP ${dolp[k].toFixed(3)}, AoLP ${((aolp[k] * 180) / Math.PI).toFixed(1)}°`;
+    `diffuse ${values(diffuse)}\nspecular ${values(specular)}\nDoLP ${dolp[k].toFixed(3)}, AoLP ${(((aolp[k] * 180) / Math.PI).toFixed(1) % 180).toFixed(1)}°`;
 }
 
 for (const id of ["open", "choose"]) part(id).onclick = () => part("file").click();

@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from polsep.physics.stokes import wrap_aolp
+
 if TYPE_CHECKING:
     from polsep.separation.report import SeparatedFrame
 
@@ -181,7 +183,7 @@ def _panels(frame: SeparatedFrame, flags: list[Flag]) -> list[Panel]:
     light = (parts[0] + parts[1]).mean(axis=-1)
     s1, s2 = np.moveaxis(_shrunk(partial(_polarized, frame), size), -1, 0)
     dolp = np.hypot(s1, s2) / np.where(light > 0, light, 1)
-    aolp = np.mod(np.arctan2(s2, s1) / 2, np.pi)
+    aolp = wrap_aolp(np.arctan2(s2, s1) / 2)
     shown = _clearness(frame, light)[..., None]
     combined, diffuse, specular = (toned(image, gain) for image in (parts[0] + parts[1], *parts))
     exposure = f"exposure x {gain:.3g}"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from polsep.io.raw.frames import Frame
 from polsep.io.store.errors import one_line
 from polsep.methods import METHODS
+from polsep.physics.stokes import axis_deg
 from polsep.sensor.camera import Layout
 from polsep.sensor.levels import as_mosaic
 from polsep.view.napari.layers import FACTS, frame_layers
@@ -117,7 +118,8 @@ class Panel:
             show_warning(remark)
         report = found.frame.report
         clipped, angle = (report["statistics"][name] for name in ("clipped_fraction", "light_polarizer_deg"))
-        said = f"Separated by {report['method']}. {clipped:.2%} of the pixels clip; light polarizer at {angle:.0f}°."
+        polarizer = f"light polarizer at {axis_deg(angle):.0f}°"
+        said = f"Separated by {report['method']}. {clipped:.2%} of the pixels clip; {polarizer}."
         self._end("\n\n".join([said, *found.remarks]))
 
     def _fail(self, error: BaseException) -> None:

@@ -67,7 +67,7 @@ def separated(tmp_path: Path) -> list[Path]:
             np.ones((SIDE, SIDE), np.bool_),
             np.abs(slope).astype(np.float32),
             np.mod(np.angle(slope) / 2, np.pi).astype(np.float32),
-            {},
+            {"light_color": [1.0, 1.0, 1.0]},
         )
         paths.append(write_separation(frame, tmp_path / "in", f"light{number}")[0])
     (tmp_path / "mask.png").write_bytes(encode_png(255 * mask.astype(np.uint8)))
@@ -124,6 +124,13 @@ def test_notes_stay_with_views_that_shrink(separated: list[Path]) -> None:
     assert views.notes == ()
     small, _ = files.shrink(replace(views, notes=("a: b",)), np.ones((SIDE, SIDE), np.bool_), SIDE // 2)
     assert small.notes == ("a: b",) and small.images.shape[1:3] == (SIDE // 2, SIDE // 2)
+
+
+def test_a_lamp_that_no_file_tells_is_said_to_be_taken_for_white(separated: list[Path]) -> None:
+    """Of separated files without the report beside them."""
+    separated[2].with_suffix(".json").unlink()
+    views = files.read_views(separated, files.Source("frames", ReadOptions(), "analytic"))
+    assert len(views.notes) == 1 and views.notes[0].startswith(f"{separated[2]}: the lamp's colour is not told")
 
 
 def test_a_small_object_is_found_in_noise() -> None:

@@ -120,13 +120,13 @@ def _gains_of(frame: SeparatedFrame) -> Floats:
 
 
 def _read_frame(path: Path, source: Source) -> tuple[SeparatedFrame, list[str]]:
-    """One frame, separated, and notes on a raw one."""
+    """One frame, separated, and notes; its report's warnings were given when it was separated."""
     if not is_separated(path):
         return separate_file(path, source.options, source.method)
-    frame, _ = open_separated(path)
+    frame, notes = open_separated(path)
     if not frame.dolp.any():
         raise input_error(path, "expected a file of polsep separate with its polarization, found none in it")
-    return frame, []
+    return frame, [note for note in notes if note not in frame.report.get("warnings", ())]
 
 
 def _require_one_shape(paths: Sequence[Path], images: Sequence[NDArray[Any]]) -> None:

@@ -567,6 +567,9 @@ def test_rates_may_be_ratios() -> None:
     [
         ("separate a.png --white-level nan", "--white-level"),
         ("separate a.png --black-level 4 --white-level 3", "--white-level"),
+        ("separate a.png --frame-size 64", "--size"),
+        ("shape a.png --size 64 --mesh none", "--size"),
+        ("material a.png --frame-size 64", "--frame-size"),
         ("video in -o o --rate -2", "--rate"),
         ("video in -o o --rate 24/0", "--rate"),
         ("video in -o o --frames 0", "--frames"),

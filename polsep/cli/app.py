@@ -118,7 +118,9 @@ LIGHT_COLOR = click.option(
     metavar="auto|white|R,G,B",
     help="Colour of the light: auto finds it in the frame; or camera RGB.",
 )
-SIZE = click.option("--size", metavar="WxH", help="Size of headerless raw frames, like 2448x2048.")
+SIZE = click.option(
+    "--size", "--frame-size", "size", metavar="WxH", help="Size of headerless raw frames, like 2448x2048."
+)
 PIXEL_FORMAT = click.option(
     "--pixel-format", metavar="NAME", help="GenICam pixel format of headerless raw frames, like BayerRG12p."
 )
@@ -171,10 +173,11 @@ def said_command(program: str) -> str:
     return " ".join(words)
 
 
-def parse_size(text: str | None, option: str = "--size") -> tuple[int, int] | None:
-    """Width and height from ``WIDTHxHEIGHT``, the value of an ``option``."""
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """Width and height from ``WIDTHxHEIGHT``. Raises ValueError, which names the option of the command."""
     if text is None:
         return None
+    option = next(param.opts[0] for param in click.get_current_context().command.params if param.name == "size")
     width, x, height = text.lower().partition("x")
     if not (x and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise ValueError(f"expected {option} WIDTHxHEIGHT like 2448x2048, found {text!r}")

@@ -17,6 +17,7 @@ from polsep.cli.app import (
     LIGHT_COLOR,
     OVERWRITE,
     PIXEL_FORMAT,
+    SIZE,
     WHITE_LEVEL,
     Word,
     app,
@@ -65,7 +66,7 @@ from polsep.cli.progress import show_progress
 @CALIBRATION
 @AMBIENT
 @LIGHT_COLOR
-@click.option("--frame-size", "size", metavar="WxH", help="Size of a headerless raw frame, like 2448x2048.")
+@SIZE
 @PIXEL_FORMAT
 @click.option(
     "--mesh",

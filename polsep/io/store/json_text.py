@@ -17,13 +17,13 @@ MOST_BYTES = 2**26
 
 
 def read_text(path: Path) -> str:
-    """The UTF-8 text of a file of at most `MOST_BYTES`. Raises ValueError, and OSError."""
+    """The UTF-8 text of a file of at most `MOST_BYTES`, without a byte order mark. Raises ValueError, and OSError."""
     with path.open("rb") as stream:
         data = stream.read(MOST_BYTES + 1)
     if len(data) > MOST_BYTES:
         raise ValueError(f"expected a text of at most {MOST_BYTES} bytes, found more")
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")  # as editors on Windows save it
     except UnicodeDecodeError as error:
         raise ValueError(f"expected text in UTF-8, found byte {data[error.start]:#04x} at {error.start}") from None
 

@@ -757,6 +757,17 @@ def test_an_ambient_folder_is_read_again_when_its_files_change(tmp_path: Path) -
         assert float(read.corrections.ambient.data.mean()) == value
 
 
+def test_settings_know_the_content_of_corrections(tmp_path: Path) -> None:
+    """By which a film that is resumed knows a calibration or an ambient frame of the same name for another one."""
+    settings = []
+    for level in (8.0, 9.0):
+        write_calibration(tmp_path / "rig.json", Calibration(Layout(), 255.0, (16, 16), level, read_noise=1.0), "0")
+        np.save(tmp_path / "room.npy", np.full((16, 16), int(level), np.uint8))
+        settings.append(with_corrections(ReadOptions(), tmp_path / "rig.json", [tmp_path / "room.npy"]).settings())
+    assert settings[0]["calibration"] == settings[1]["calibration"] == "rig.json"
+    assert all(settings[0][name] != settings[1][name] for name in ("calibration_sha256", "ambient_sha256"))
+
+
 def test_recordings_are_corrected(tmp_path: Path) -> None:
     """Every frame of a file is corrected as it is read, ambient frames too."""
     sensor = BadSensor(Layout())

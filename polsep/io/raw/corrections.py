@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+
+import numpy as np
 
 from polsep.io.raw.frames import Frame, ReadOptions, read_frames
 from polsep.io.raw.sequences import DamagedFrame, input_files, open_sequence
@@ -14,6 +17,8 @@ from polsep.io.store.errors import InputError, input_error
 from polsep.sensor.calibration import Corrections, mean_mosaic
 from polsep.sensor.camera import Mosaic
 
+#: Digits of hashes in reports, by which a run that is resumed knows its files again.
+DIGITS = 16
 #: Looks at a frame of a file before it is used.
 Check = Callable[[Path, Frame], None]
 
@@ -41,11 +46,14 @@ def _read_corrected(
     sources: dict[str, object] = {}
     measured = None if calibration is None else read_calibration(calibration)
     if calibration is not None:
-        sources["calibration"] = calibration.name
+        digest = hashlib.sha256(calibration.read_bytes()).hexdigest()[:DIGITS]  # its text knows the hash of its maps
+        sources |= {"calibration": calibration.name, "calibration_sha256": digest}
     corrections = Corrections(measured, None, sources)
     if ambient:
         room = mean_mosaic(read_mosaics(ambient, replace(read, corrections=corrections)))
-        corrections = Corrections(measured, room, {**sources, "ambient": [path.name for path in ambient]})
+        digest = hashlib.sha256(np.ascontiguousarray(room.data).tobytes()).hexdigest()[:DIGITS]
+        sources |= {"ambient": [path.name for path in ambient], "ambient_sha256": digest}
+        corrections = Corrections(measured, room, sources)
     return replace(read, corrections=corrections)
 
 

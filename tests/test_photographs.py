@@ -244,6 +244,18 @@ def test_srgb_is_decoded_only_where_it_is_said(tmp_path: Path, suffix: str) -> N
             read_measurements(paths, PhotoOptions(PAIR, align="none"))
 
 
+def test_turned_jpeg_stays_as_stored(tmp_path: Path) -> None:
+    """With a note, as camera raw: angles count in the sensor's pixels."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    picture = Image.fromarray(np.random.default_rng(2).integers(0, 256, (24, 32, 3)).astype(np.uint8))
+    for name, more in (("upright.jpg", {}), ("turned.jpg", {"exif": exif})):
+        picture.save(tmp_path / name, **more)  # type: ignore[arg-type]
+    upright, turned = (read_photographs([tmp_path / f"{name}.jpg"], True) for name in ("upright", "turned"))
+    assert len(upright.notes) == 1 and "orientation is not applied" in turned.notes[1]
+    np.testing.assert_array_equal(turned.array, upright.array)
+
+
 @pytest.mark.parametrize("progressive", [False, True])
 def test_truncated_jpeg_is_refused(tmp_path: Path, progressive: bool) -> None:
     """Decoders fill what is missing with grey; what follows the end of a whole picture says nothing."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from polsep.io.raw.frames import read_pages
+from polsep.io.raw.photographs import orientation_of
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import linear_from_srgb
 from polsep.io.store.errors import InputError, decoding, input_error, naming
@@ -36,8 +36,7 @@ _SHORTEST = 0.5
 _LONGEST = 1e6
 
 
-#: The EXIF tag of a picture's orientation, and how pictures of each are made upright.
-ORIENTATION = 0x0112
+#: How pictures of each EXIF orientation are made upright.
 UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -96,13 +95,6 @@ def hash_map(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _orientation_of(picture: Image.Image) -> int:
-    """The EXIF orientation of a picture; upright, 1, where its EXIF data are damaged."""
-    with suppress(Exception):  # no reader of EXIF says all that it raises
-        return int(picture.getexif().get(ORIENTATION, 1))
-    return 1
-
-
 def _read(path: Path, suffix: str) -> tuple[NDArray[Any] | Mapping[str, NDArray[Any]], float | None]:
     """The one image of a file, or its channels by name, and its white level where it names one.
 
@@ -116,7 +108,7 @@ def _read(path: Path, suffix: str) -> tuple[NDArray[Any] | Mapping[str, NDArray[
             unwarned = warnings.catch_warnings(action="ignore")  # of large pictures, which have a limit of their own
             with decoding("JPEG"), unwarned, Image.open(stream, formats=["JPEG"]) as picture:
                 require_size((picture.height, picture.width, 3))
-                turn = UPRIGHT.get(_orientation_of(picture))
+                turn = UPRIGHT.get(orientation_of(picture))
                 upright = picture if turn is None else picture.transpose(turn)
                 return np.asarray(upright.convert("L" if upright.mode == "L" else "RGB")), None
     page = next(read_pages(path))

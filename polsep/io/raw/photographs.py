@@ -8,8 +8,11 @@ JPEG, and films that are not lossless RGB or grey, have a curve, so they are rea
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -17,6 +20,7 @@ from typing import Any
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from polsep.compute.filters import box_mean
 from polsep.compute.resizing import halve
@@ -28,6 +32,9 @@ from polsep.io.raw.videos import load_library
 from polsep.io.store.errors import InputError, decoding, input_error, naming
 from polsep.io.store.header_checks import SAMPLES, limit, require_signature, require_size
 
+#: The EXIF tag of a picture's orientation, and the note on one that is not upright: angles count in the stored pixels.
+ORIENTATION = 0x0112
+TURNED = "the camera was turned: its orientation is not applied, pixels stay as stored"
 #: Most frames of a film that are used, evenly spaced: more of them add little and fill the memory.
 MOST_FRAMES = 24
 #: Reach of LibRaw's interpolation in pixels, within which a clipped sample counts.
@@ -105,7 +112,18 @@ def _read_jpeg(path: Path) -> Page:
     with decoding("JPEG"):
         array = np.asarray(imagecodecs.jpeg_decode(data))
     require_size(array.shape)
-    return Page(array, notes=("JPEG has the camera's own curve, which --encoding srgb only resembles: use camera raw",))
+    unwarned = warnings.catch_warnings(action="ignore")  # of large pictures, which have a limit of their own
+    with decoding("JPEG"), unwarned, Image.open(BytesIO(data), formats=["JPEG"]) as picture:
+        turned = orientation_of(picture) != 1
+    curve = "JPEG has the camera's own curve, which --encoding srgb only resembles: use camera raw"
+    return Page(array, notes=(curve, TURNED) if turned else (curve,))
+
+
+def orientation_of(picture: Image.Image) -> int:
+    """The EXIF orientation of a picture; upright, 1, where its EXIF data are damaged."""
+    with suppress(Exception):  # no reader of EXIF says all that it raises
+        return int(picture.getexif().get(ORIENTATION, 1))
+    return 1
 
 
 def _require_end(data: bytes) -> None:
@@ -152,7 +170,7 @@ def _read_camera_raw(path: Path, full: bool) -> Page:
         height, width = (n // 2 * 2 for n in planes.shape[1:])
         whole = planes[:, :height, :width]
         planes = np.where(halve((whole >= 1).astype(np.float32)) > 0, 1, halve(whole)).astype(np.float32)
-    notes = ("the camera was turned: its orientation is not applied, pixels stay as stored",) if turned else ()
+    notes = (TURNED,) if turned else ()
     return Page(np.ascontiguousarray(np.moveaxis(planes, 0, -1)), white_level=1.0, notes=notes, **facts)
 
 

@@ -607,6 +607,12 @@ def test_what_is_no_recipe_or_frame_is_refused_in_one_line() -> None:
         Recipe(Rougher())  # type: ignore[arg-type]
     with pytest.raises(EditError, match=r"expected a frame with diffuse and specular images, found ndarray"):
         apply(np.ones((4, 4, 3), np.float32), Recipe())  # type: ignore[arg-type]
+    with pytest.raises(EditError, match=r"expected a kind of edit, .*, found 'rougher'"):
+        make_edit("rougher", {})  # type: ignore[arg-type]
+    with pytest.raises(EditError, match=r"expected texture 'wood' as a NumPy array, found 'wood.png'"):
+        apply(random_images(), Recipe((Texture(image="wood"),)), {"wood": "wood.png"})  # type: ignore[dict-item]
+    with pytest.raises(EditError, match=r"expected a recipe as text, found NoneType"):
+        recipe_from_text(None)  # type: ignore[arg-type]
 
 
 def test_names_of_images() -> None:

@@ -40,6 +40,8 @@ class SeparatedImages:
 
     def __post_init__(self) -> None:
         for name, image in (("diffuse", self.diffuse), ("specular", self.specular)):
+            if not isinstance(image, np.ndarray):
+                raise EditError(f"expected {name} as a NumPy array, found {image!r:.40}")
             if image.dtype != np.float32 or image.ndim != 3 or image.shape[2] not in (1, 3) or 0 in image.shape:
                 raise EditError(f"expected {name} as float32 [h, w, 3 or 1], found {image.dtype} {list(image.shape)}")
         if self.diffuse.shape != self.specular.shape:
@@ -66,6 +68,8 @@ def find_map(maps: Maps, kind: str, name: str, images: SeparatedImages) -> Float
     if name not in maps:
         raise EditError(f"expected an image {name!r} as {kind}, found {', '.join(map(repr, maps)) or 'none'}")
     found = maps[name]
+    if not isinstance(found, np.ndarray):
+        raise EditError(f"expected {kind} {name!r} as a NumPy array, found {found!r:.40}")
     size = images.diffuse.shape[:2]
     if kind == "texture":
         fits = found.ndim == 3 and found.shape[2] in (1, images.colors) and 0 not in found.shape

@@ -99,9 +99,13 @@ def _edit_as_data(edit: Edit) -> dict[str, Any]:
 
 
 def recipe_from_text(text: str) -> Recipe:
-    """The recipe that a JSON text holds. Raises EditError."""
+    """The recipe that a JSON text holds, also behind a byte order mark. Raises EditError."""
+    if not isinstance(text, str):
+        raise EditError(f"expected a recipe as text, found {type(text).__name__}")
     try:
-        data = json.loads(text, object_pairs_hook=_without_repeats)  # edits check their numbers, and name themselves
+        data = json.loads(
+            text.removeprefix("\ufeff"), object_pairs_hook=_without_repeats
+        )  # edits check their numbers, and name themselves
     except EditError:
         raise
     except RecursionError:
@@ -150,6 +154,8 @@ def _edit_from_data(data: object, place: int) -> Edit:
 
 def make_edit(kind: type[Edit], values: Mapping[str, Any]) -> Edit:
     """An edit of a kind from values by name; those that are left out are defaults. Raises EditError."""
+    if not (isinstance(kind, type) and issubclass(kind, Edit)):
+        raise EditError(f"expected a kind of edit, such as Rougher or EDITS['rougher'], found {kind!r:.40}")
     parameters = kind.parameters()
     _refuse_unknown(values, tuple(p.name for p in parameters), kind.name)
     for parameter in parameters:

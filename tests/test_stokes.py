@@ -431,5 +431,7 @@ def test_inconsistent_images_are_refused() -> None:
         Measurements(torch.ones(3, 1, 2, 2), SONY)
     with pytest.raises(ValueError, match="clipped must have the shape of data"):
         Measurements(torch.ones(4, 1, 2, 2), SONY, torch.ones(4, 3, 2, 2, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"expected analyser angles in radians, found \[nan"):
+        Measurements(torch.ones(4, 1, 2, 2), (math.nan, 0.0, 1.0, 2.0))
     with pytest.raises(TypeError, match=r"floating point, white at 1, found torch\.uint8"):
         Measurements(torch.ones(4, 1, 2, 2, dtype=torch.uint8), SONY)

@@ -87,7 +87,7 @@ class Measurements:
     def __post_init__(self) -> None:
         if self.data.ndim < 4 or self.data.shape[-4] != len(self.angles):
             raise ValueError(f"expected data [..., {len(self.angles)}, C, H, W], found shape {tuple(self.data.shape)}")
-        if any(abs(angle) > MOST_ANGLE for angle in self.angles):
+        if not all(abs(angle) <= MOST_ANGLE for angle in self.angles):  # nor NaN
             raise ValueError(f"expected analyser angles in radians, found {list(map(float, self.angles))}: degrees?")
         if self.clipped is not None and self.clipped.shape != self.data.shape:
             raise ValueError(

@@ -109,7 +109,7 @@ class Result(SeparatedFrame):
         from polsep.io.results.separation_writer import write_separation
 
         target = Path(path)
-        if os.fspath(path).endswith(("/", os.sep)) or target.is_dir():
+        if os.fspath(path).endswith(("/", os.sep)) or os.path.isdir(target):
             raise OutputError(f"expected a file name like {target / 'shot.exr'}, found a folder")
         stem = target.stem if target.suffix.lower() in _ENDINGS else target.name
         if target.suffix and stem == target.name:

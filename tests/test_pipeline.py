@@ -516,6 +516,12 @@ def test_results_of_unknown_endings_are_refused(tmp_path: Path) -> None:
         quietly(raw_frame(), method="analytic").save(tmp_path / "shot.jpg")
 
 
+def test_results_are_not_saved_under_a_name_too_long(tmp_path: Path) -> None:
+    """Which is refused as every file that cannot be written is."""
+    with pytest.raises(ValueError, match="expected to write 'xxx"):
+        quietly(raw_frame(), method="analytic").save(tmp_path / f"{'x' * 300}.exr")
+
+
 def test_results_are_not_saved_as_a_folder(tmp_path: Path) -> None:
     """A folder is no name of a frame: the files would lie beside it, with its name."""
     for folder in (f"{tmp_path}/new/", tmp_path):

@@ -237,6 +237,26 @@ def test_the_lamp_of_several_frames_is_their_mean() -> None:
     assert found.details["light"]["aolp_spread_deg"] == pytest.approx(math.degrees(0.06), rel=0.1)
 
 
+@pytest.mark.parametrize("layout", [Layout(), MONO])
+def test_rims_of_objects_show_no_lamp(layout: Layout) -> None:
+    """Light that is polarized around the middle, as that of a matte ball's rim, has no angle: none is named for the
+    lamp, and a mono frame, of which nothing is left, is refused. A highlight in the middle has the lamp's."""
+    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in SIZE), indexing="ij")
+    turns = np.deg2rad([[2 * layout.filter_at(r % 4, c % 4).angle_deg for c in range(SIZE[1])] for r in range(SIZE[0])])
+    rim = 0.3 * (1 + 0.3 * (x**2 + y**2) * np.cos(turns - 2 * np.arctan2(y, x)))
+    shine = 1.2 * np.exp(-20 * (x**2 + y**2)) * (1 + np.cos(turns - 1))
+    ball, shiny = (Mosaic((light / 2).astype(np.float32), layout, 0.0, 1.5) for light in (rim, rim + shine))
+    lamp = measure_lamp([shiny]).lamp
+    assert lamp is not None and lamp.aolp_deg == pytest.approx(math.degrees(0.5), abs=1)
+    if layout is MONO:
+        with pytest.raises(ValueError, match=r"expected polarized light of one angle, found many \(concentration 0\.0"):
+            measure_lamp([ball])
+        return
+    found = measure_lamp([ball])
+    assert found.lamp is not None and found.lamp.aolp_deg is None and found.lamp.dolp is None
+    assert "polarizer not found: its light shows many angles (concentration 0.0" in describe(found, "light")
+
+
 def test_a_frame_without_the_lamp_is_refused() -> None:
     """Unpolarized light shows no mirrored lamp, and a dark frame no card."""
     sensor = BadSensor(Layout(), dead=0)

@@ -181,7 +181,13 @@ def describe(found: Calibration, kind: str) -> str:
     assert kind == "light" and found.lamp is not None
     color = ", ".join(f"{c:.3f}" for c in found.lamp.color)
     line = f"colour {color} +- {facts['color_error_deg']:.2f} deg, from {facts['from']}"
-    if "polarizer_deg" not in facts or found.lamp.dolp is None:
+    if "aolp_concentration" not in facts:
         return line
+    concentration = f"(concentration {facts['aolp_concentration']:.2f})"
+    if found.lamp.dolp is None:
+        return f"{line}, polarizer not found: its light shows many angles {concentration}, a shiny ball shows one"
     polarizer = axis_deg(facts["polarizer_deg"], 1)
-    return f"{line}, polarizer at {polarizer:.1f} deg, degree of polarization at least {found.lamp.dolp:.3f}"
+    return (
+        f"{line}, polarizer at {polarizer:.1f} deg {concentration}, degree of polarization at least "
+        f"{found.lamp.dolp:.3f}"
+    )

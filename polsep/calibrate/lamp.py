@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +28,9 @@ from polsep.separation.analytic import light_polarizer_angle
 STRONG, LEAST, MIN_PIXELS = 0.3, 0.02, 64
 #: Share of those pixels, the most polarized ones, that show the lamp's degree of polarization.
 PURE = 0.1
+#: Concentration of AoLP in those pixels and in the most polarized ones of them, below which they show no lamp: balls
+#: have 1.0, still lifes that show its angle 0.75 and more, rims of objects and wrong white levels 0.5 and less.
+ONE_ANGLE = 0.6
 #: Parts of a card whose colours are compared for the error.
 PARTS = 8
 #: Least brightness of a card, white = 1.
@@ -36,7 +40,8 @@ DARKEST_CARD = 0.02
 def measure_lamp(frames: Iterable[Mosaic], before: Calibration | None = None, card: bool = False) -> Calibration:
     """``before`` with the lamp of frames that show an object, or, with ``card``, a grey card in their middle.
 
-    ``frames`` are corrected by ``before``. Raises ValueError where too little polarized, unclipped light shows.
+    ``frames`` are corrected by ``before``. The lamp has no angle and no degree of polarization where their polarized
+    light is of many angles, which is refused in mono. Raises ValueError where too little polarized light shows.
     """
     colors, lights, polarizations, first = [], [], [], None
     for mosaic in frames:
@@ -54,15 +59,16 @@ def measure_lamp(frames: Iterable[Mosaic], before: Calibration | None = None, ca
     lamp = LampFacts(color, None, None) if base.lamp is None else base.lamp._replace(color=color)
     details: dict[str, object] = {"from": "card" if card else "mirrored light", "color_error_deg": round(error, 3)}
     if polarizations:
-        pairs = np.array(polarizations)
-        vector = np.exp(2j * pairs[:, 0]).mean()
-        aolp = aolp_of(float(vector.real), float(vector.imag))
-        lamp = lamp._replace(dolp=float(pairs[:, 1].max()), aolp_deg=math.degrees(aolp))
-        details |= {
-            "polarizer_deg": axis_deg(math.degrees(light_polarizer_angle(aolp)), 2),
-            "aolp_spread_deg": round(math.degrees(math.sqrt(max(-2 * math.log(max(abs(vector), 1e-9)), 0)) / 2), 3),
-            "dolp_is": "at least",
-        }
+        polarized = _mean_polarization(polarizations)
+        sure = polarized.concentration >= ONE_ANGLE
+        if not sure and first.layout.channels == 1:
+            raise ValueError(
+                f"expected polarized light of one angle, found many (concentration {polarized.concentration:.2f}): "
+                "show a shiny ball, and see that the white level and the layout are right"
+            )
+        dolp, aolp_deg = (polarized.degree, math.degrees(polarized.aolp)) if sure else (None, None)
+        lamp = lamp._replace(dolp=dolp, aolp_deg=aolp_deg)
+        details |= {"aolp_concentration": round(polarized.concentration, 3)} | (polarized.facts() if sure else {})
     return replace(base, lamp=lamp, details={**base.details, "light": details})
 
 
@@ -80,24 +86,55 @@ def _found_color(lights: Sequence[Light]) -> tuple[tuple[float, float, float], f
     return (r, g, b), light.error_deg
 
 
-def _mirrored_polarization(mosaic: Mosaic) -> tuple[float, float]:
-    """AoLP [radians] and degree of the polarized light of a frame where it is purest."""
+class _Polarized(NamedTuple):
+    """AoLP [radians], degree and concentration of the polarized light of frames, and how far their AoLPs spread."""
+
+    aolp: float
+    degree: float
+    concentration: float
+    spread: float = 0.0
+
+    def facts(self) -> dict[str, object]:
+        """The angles for people [degrees]."""
+        return {
+            "polarizer_deg": axis_deg(math.degrees(light_polarizer_angle(self.aolp)), 2),
+            "aolp_spread_deg": round(math.degrees(self.spread), 3),
+            "dolp_is": "at least",
+        }
+
+
+def _mean_polarization(found: Sequence[_Polarized]) -> _Polarized:
+    """The polarized light of several frames of one lamp, as concentrated as that of the least of them."""
+    vector = np.mean([np.exp(2j * one.aolp) for one in found])
+    length = float(abs(vector))
+    return _Polarized(
+        aolp_of(float(vector.real), float(vector.imag)),
+        max(one.degree for one in found),
+        length * min(one.concentration for one in found),
+        math.sqrt(max(-2 * math.log(max(length, 1e-9)), 0)) / 2,
+    )
+
+
+def _mirrored_polarization(mosaic: Mosaic) -> _Polarized:
+    """The polarized light of a frame where it is purest."""
     stokes, determined = fit_stokes_unclipped(demosaic_bilinear_half(mosaic))
     s0, s1, s2 = (
         to_numpy(image).astype(np.float64).reshape(image.shape[-3], -1) for image in (stokes.s0, stokes.s1, stokes.s2)
     )
     known = to_numpy(determined).all(axis=-3).reshape(-1)
-    p = np.hypot(s1.mean(axis=0), s2.mean(axis=0)) * known
+    s0, s1, s2 = (image.mean(axis=0) for image in (s0, s1, s2))
+    p = np.hypot(s1, s2) * known
     strong = np.flatnonzero(p > max(STRONG * float(np.quantile(p, 0.999)), LEAST))
     if strong.size < MIN_PIXELS:
         raise ValueError(
             f"expected {MIN_PIXELS} unclipped pixels of polarized light, found {strong.size}: expose so that "
             "highlights stay below white, or show a grey card and say --card"
         )
-    degree = p[strong] / np.maximum(s0[:, strong].mean(axis=0), 1e-6)
+    degree = p[strong] / np.maximum(s0[strong], 1e-6)
     pure = strong[degree >= np.quantile(degree, 1 - PURE)]
-    aolp = 0.5 * math.atan2(float(s2[:, pure].sum()), float(s1[:, pure].sum()))
-    return aolp, min(float(np.quantile(degree, 1 - PURE / 2)), 1.0)
+    aolp = 0.5 * math.atan2(float(s2[pure].sum()), float(s1[pure].sum()))
+    concentration = min(math.hypot(s1[some].sum(), s2[some].sum()) / float(p[some].sum()) for some in (strong, pure))
+    return _Polarized(aolp, min(float(np.quantile(degree, 1 - PURE / 2)), 1.0), concentration)
 
 
 def _card_colors(mosaic: Mosaic) -> list[Doubles]:

@@ -633,6 +633,31 @@ def test_an_ambient_frame_with_the_lamp_on_is_said() -> None:
     assert not said(scene // 2) and not said(scene // 10) and not said(np.zeros_like(scene))
 
 
+@pytest.mark.parametrize("layout", [Layout(), MONO, Layout(((0, 45), (90, 135)), "BGGR", (1, 0))])
+def test_a_dim_lamp_in_an_ambient_frame_is_said(layout: Layout) -> None:
+    """A lamp at a twentieth of its light, or at most of it, is told by its highlights; no room is that is mirrored
+    elsewhere, or in the same places at another angle."""
+    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in SIZE), indexing="ij")
+    turns = np.deg2rad([[2 * layout.filter_at(r, c).angle_deg for c in range(SIZE[1])] for r in range(SIZE[0])])
+    body = 0.1 + 0.05 * np.sin(40 * x) * np.sin(30 * y)
+
+    def lit(place: float, angle: float) -> NDArray[np.float64]:
+        return 0.5 * (body + 0.6 * np.exp(-9 * ((x - place) ** 2 + y**2)) * (1 + np.cos(turns - 2 * angle)))
+
+    def said(room: NDArray[np.float64], lamp: float = 1.0) -> tuple[str, ...]:
+        noise = np.random.default_rng(1).normal(0, 0.003, (2, *SIZE))
+        frame, dark = (
+            Mosaic((k + n).astype(np.float32), layout, 0.0, 2.0)
+            for k, n in zip((lit(0, 1) * lamp + room, room), noise, strict=True)
+        )
+        return Corrections(None, dark).apply_noting(frame)[1]
+
+    for part in (0.05, 0.5, 0.8):
+        (note,) = said(part * lit(0, 1), 1 - part)
+        assert "has the highlights of this one in" in note and "was the lamp off in it?" in note, (part, note)
+    assert said(lit(0.6, 1)) == said(lit(0, 1.8)) == said(0 * x) == ()
+
+
 def test_paper_that_does_not_fill_the_frame_is_refused() -> None:
     """A border in half the light, and a corner in none: neither is a lens, nor are so many pixels dead."""
     sensor = BadSensor(MONO, dead=0)

@@ -29,14 +29,12 @@ from numpy.typing import NDArray
 
 from polsep.compute.arrays import as_floats, namespace, of_kind, to_numpy
 from polsep.physics.stokes import diattenuation
+from polsep.sensor.ambient import ambient_notes
 from polsep.sensor.camera import Layout, Mosaic, WrongType, clip_level
 from polsep.sensor.defects import MIN_SIZE, repair
-from polsep.sensor.levels import LIT, WHITE_LEVELS
+from polsep.sensor.levels import WHITE_LEVELS
 
 Floats = NDArray[np.float32]
-#: Part of a lit sample's light that ambient light leaves at least, and the share of lit samples with less from which on
-#: the ambient frame was taken with the lamp on.
-LEAST_LEFT, MOST_GONE = 0.05, 0.5
 #: Numbers per place of one period of filters, ``[period][period]``.
 Table = tuple[tuple[float, ...], ...]
 #: A black level that is stated may differ from the measured one by rounding to whole codes.
@@ -197,20 +195,6 @@ def subtract_ambient(mosaic: Mosaic, ambient: Mosaic) -> Mosaic:
     data = data - namespace(data).astype(as_floats(other.data) - black, data.dtype, copy=False)
     hidden = (mosaic.clipped() | other.clipped()) & (data < clip_level(black, white))
     return replace(mosaic, data=namespace(data).where(hidden, white, data), less_ambient=True)
-
-
-def ambient_notes(frame: Mosaic, less: Mosaic) -> tuple[str, ...]:
-    """A note where most of a frame's light is gone in the frame ``less`` its ambient light: the lamp was on in both.
-
-    In every fifth sample of every fifth row, which are samples of all filters.
-    """
-    black, white = float(frame.black_level), float(frame.white_level)
-    was, left = (to_numpy(mosaic.data[..., ::5, ::5]) - black for mosaic in (frame, less))
-    lit = was > LIT * (white - black)
-    gone = float(np.mean(left[lit] < LEAST_LEFT * was[lit])) if lit.any() else 0.0
-    if gone < MOST_GONE:
-        return ()
-    return (f"the ambient frame is as bright as this one in {gone:.0%} of what is lit: was the lamp off in it?",)
 
 
 def mean_mosaic(mosaics: Iterable[Mosaic]) -> Mosaic:

@@ -25,7 +25,7 @@ from polsep.calibrate.dark_flat import measure_dark, measure_flat
 from polsep.calibrate.exposures import merge_exposures
 from polsep.calibrate.files import describe
 from polsep.calibrate.lamp import measure_lamp
-from polsep.calibrate.statistics import robust_deviation, robust_mean
+from polsep.calibrate.statistics import median, robust_deviation, robust_mean
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.raw.sequences import expand_folders
@@ -470,6 +470,15 @@ def test_a_mean_takes_frames_one_at_a_time() -> None:
     assert float(mean_mosaic(frames()).data.mean()) == pytest.approx(102.5)
     with pytest.raises(ValueError, match="expected at least one frame"):
         mean_mosaic([])
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (5, 7), (64, 48)])
+def test_medians_are_those_of_numpy(shape: tuple[int, int], kind: type[np.floating]) -> None:
+    """To the last bit, of floats and of codes."""
+    noise = np.random.default_rng(1).normal(240, 3, shape).astype(kind)
+    for values in (noise, noise.round(), noise[::2, ::2]):
+        assert median(values) == np.median(values) and median(values).dtype == kind
 
 
 def test_coarse_codes_have_their_mean() -> None:

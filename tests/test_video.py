@@ -13,9 +13,10 @@ import sys
 import threading
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ from polsep.sensor.levels import as_mosaic
 from polsep.separation.report import SeparatedFrame
 from polsep.video import recordings as video
 from polsep.video.reports import shared_report
-from polsep.view.opening import find_sources
+from polsep.view.opening import as_source, find_sources, read_source
 
 av = pytest.importorskip("av", reason="needs the extra 'video'")
 
@@ -78,16 +79,26 @@ def frames(count: int = FRAMES) -> NDArray[np.uint16]:
     return images
 
 
-def write_film(path: Path, images: NDArray[np.uint16], codec: str = "ffv1", pixels: str = "gray12le") -> Path:
-    """The images as a film."""
+def write_film(
+    path: Path,
+    images: NDArray[np.uint16],
+    codec: str = "ffv1",
+    pixels: str = "gray12le",
+    times_ms: Sequence[int] | None = None,
+) -> Path:
+    """The images as a film, of 50 frames per second where no times are said."""
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(codec, rate=50)
         stream.height, stream.width, stream.pix_fmt = images.shape[1], images.shape[2], pixels
         stream.options = {"level": "3", "slicecrc": "1", "g": "1"} if codec == "ffv1" else {}
-        for image in images:
+        for number, image in enumerate(images):
             given = image if pixels.startswith("gray1") else np.repeat((image >> 4).astype(np.uint8)[..., None], 3, 2)
             shown = av.VideoFrame.from_ndarray(given, format=pixels if given is image else "rgb24")
-            container.mux(stream.encode(shown.reformat(format=pixels)))
+            shown = shown.reformat(format=pixels)
+            if times_ms is not None:
+                stream.codec_context.time_base = shown.time_base = Fraction(1, 1000)
+                shown.pts = times_ms[number]
+            container.mux(stream.encode(shown))
         container.mux(stream.encode())
     return path
 
@@ -281,6 +292,20 @@ def test_every_kind_of_recording_gives_the_same_images(
         before, after = (read_exr_layers(path) for path in (one, other))  # headers of raw have another white level
         for name in before | after:
             np.testing.assert_array_equal(before[name], after[name])
+
+
+@pytest.mark.parametrize("suffix", ["mkv", "nut"])
+def test_films_of_uneven_times_say_so_and_have_all_frames(suffix: str, tmp_path: Path) -> None:
+    """A note, where times differ by more than the milliseconds they are rounded to; and the viewer reaches the last
+    frame and none behind it, though the length of a film by its duration is a guess."""
+    images = frames(6)[:, :64, :64].repeat(4, axis=0)
+    even = [round(1000 / 29.97 * k) for k in range(len(images))]
+    for times, uneven in ((even, False), ([t * (1 + t // 300) for t in even], True), ([*even[:-1], 2000], True)):
+        film = write_film(tmp_path / f"run.{suffix}", images, times_ms=times)
+        notes = open_sequence(film, ReadOptions()).notes
+        assert (len(notes) == 1 and "found them 33 to" in notes[0]) if uneven else not notes
+        first = read_source((as_source(film, "run"),), ReadOptions(), 0)
+        assert isinstance(first, Frame) and first.count == len(images)
 
 
 @pytest.mark.parametrize(("codec", "suffix"), [("ffv1", "mkv"), ("ffvhuff", "avi")])

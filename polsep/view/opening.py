@@ -18,6 +18,7 @@ import numpy as np
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD, is_recording
+from polsep.io.raw.videos import count_frames, is_film
 from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
 from polsep.io.results.sidecars import read_report
 from polsep.io.store.errors import InputError
@@ -253,6 +254,8 @@ def read_source(sources: tuple[Source, ...], read: ReadOptions, index: int) -> F
             raise ValueError(f"{source.path}: expected a frame number {index}, found none")
         if several and frame.count > 1:
             raise ValueError(f"{source.path}: expected one frame in each of several files, found {frame.count}")
+        if frame.count > 1 and not several and is_film(source.path):
+            frame = replace(frame, count=count_frames(source.path, frame.count, index))
     return replace(frame, index=index, count=len(sources)) if several else frame
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD, gap_notes, is_recording, recording_files
+from polsep.io.raw.videos import is_film, timing_notes
 from polsep.io.store.calibrations import holds_maps
 from polsep.io.store.errors import InputError, input_error, one_line
 from polsep.io.store.result_names import result_names
@@ -60,7 +61,7 @@ def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
     unread: str | None = None
     for frame in _read_stack(path, options, 1, 0):
         if isinstance(frame, Frame):
-            notes = gap_notes(path) if path.name == RECORD else ()
+            notes = gap_notes(path) if path.name == RECORD else timing_notes(path) if is_film(path) else ()
             begin = partial(_read_stack, path, options, frame.count)
             return FrameSequence(output_stem(path), frame.count, begin, notes)
         unread = unread or frame.reason

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
 from itertools import count as count_from
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +28,16 @@ _GREY = re.compile(r"gray(\d*)(?:le|be)?")
 #: FFmpeg's name of each container. It would look for any, also for lists that name other files or addresses.
 CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mov": "mov", ".nut": "nut"}
 
+#: Bytes of films whose frames are counted as they are opened. First frames whose times are looked at, and the range of
+#: the times between them, relative to the median, from which on they are uneven.
+SMALL, FIRST, UNEVEN = 2**30, 64, 0.2
+
 mute("libav")
+
+
+def is_film(path: Path) -> bool:
+    """True for the names of films."""
+    return path.suffix.lower() in CONTAINERS
 
 
 def load_library() -> Any:
@@ -37,8 +49,9 @@ def load_library() -> Any:
     return av
 
 
-def read_video(path: Path, first: int = 0) -> Iterator[Page]:
-    """The frames of a lossless grey video from ``first`` on: uint8 or uint16 ``[H, W]``. Raises ValueError."""
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, _Grey]]:
+    """The container of a film, and its stream. Raises ValueError."""
     path.open("rb").close()  # a missing file is reported as such, not as damage
     av = load_library()
     options = {"max_pixels": str(limit(SAMPLES))}
@@ -47,6 +60,13 @@ def read_video(path: Path, first: int = 0) -> Iterator[Page]:
     with container:
         with decoding("video"):
             kind = _grey_stream(container, path.stat().st_size)
+        yield container, kind
+
+
+def read_video(path: Path, first: int = 0) -> Iterator[Page]:
+    """The frames of a lossless grey video from ``first`` on: uint8 or uint16 ``[H, W]``. Raises ValueError."""
+    av = load_library()
+    with _opened(path) as (container, kind):
         kind.stream.thread_type = "SLICE"  # each packet then yields its own frame
         index, intact = None, False
         for number, packet in _packets_from_key_frame(container.demux(kind.stream), first):
@@ -60,6 +80,46 @@ def read_video(path: Path, first: int = 0) -> Iterator[Page]:
                     array = _as_array(frames[0], kind, index)
                     yield Page(array, index, max(kind.about, index + 1), white_level=kind.white)
                 index += 1
+
+
+def count_frames(path: Path, about: int, index: int) -> int:
+    """The number of frames of a film, where it says ``about`` how many.
+
+    They are counted if the file is small, or if ``index`` is that of its last ones, for which it is read to its end
+    anyway.
+    """
+    found = path.stat()
+    if found.st_size > SMALL and index + 1 < about:
+        return about
+    try:
+        return max(_count_packets(path.absolute(), (found.st_mtime_ns, found.st_size)), index + 1)
+    except ValueError:  # the frame that is damaged says so
+        return about
+
+
+@lru_cache(maxsize=64)
+def _count_packets(path: Path, stamp: tuple[int, int]) -> int:
+    with _opened(path) as (container, kind), decoding("video"):
+        return sum(packet.size > 0 for packet in container.demux(kind.stream))
+
+
+def timing_notes(path: Path) -> tuple[str, ...]:
+    """A note on a film whose first frames come at uneven times, which are not kept."""
+    try:
+        with _opened(path) as (container, kind), decoding("video"):
+            packets = islice(container.demux(kind.stream), FIRST)
+            times = sorted(packet.pts for packet in packets if packet.size and packet.pts is not None)
+            unit = float(kind.stream.time_base or 0)
+    except ValueError:  # the frame that is damaged says so
+        return ()
+    steps = sorted(after - before for before, after in pairwise(times))
+    if not steps or steps[-1] - steps[0] <= max(UNEVEN * steps[len(steps) // 2], 2):
+        return ()
+    least, most = (1000 * unit * step for step in (steps[0], steps[-1]))
+    return (
+        f"frames were expected at even times, found them {least:.3g} to {most:.3g} ms apart: the times are not kept, "
+        "every frame counts alike",
+    )
 
 
 class _Grey(NamedTuple):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from test_cli import Cli
 from test_cli import polsep as run_polsep  # noqa: F401
 
+import polsep
 from polsep.calibrate.exposures import merge_exposures
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.sensor.camera import Layout, Mosaic
@@ -102,6 +103,7 @@ def test_what_does_not_fit_is_said() -> None:
     for frames, times, expected in (
         ([], None, "at least one frame to merge, found none"),
         ([short, long], [1.0], "expected 2 positive exposure times"),
+        ([short, long], [4.0, 1.0], "found 1 for frame 2 and 4 for frame 1, which is darker"),
         ([short, replace(long, data=long.data[:64])], None, "expected frames of one size and layout"),
         ([short, replace(long, data=torch.full(SIZE, WHITE))], None, "say --times"),
         ([expose(scene, 1e-3, 3), long], None, "say --times"),  # hardly an electron: no ratio to find
@@ -152,6 +154,21 @@ def test_the_command_leaves_nothing_to_type(tmp_path: Path, run_polsep: Cli) -> 
         failed = run_polsep(*arguments)
         assert failed.status == 2 and failed.err.count("\n") == 1 and expected in failed.err, failed
     assert not (tmp_path / "a.tiff").exists()
+
+
+def test_frames_that_do_not_belong_together_are_noted(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
+    """A frame of a mono sensor among colour ones, which no PNG file says, and times that only some TIFF files say."""
+    samples = Path(polsep.__file__).parent / "data" / "samples"
+    levels = ("--white-level", 4095, "--black-level", 0)
+    mixed = run_polsep("merge", samples / "color.png", samples / "mono.png", *levels, "-o", tmp_path / "a.tiff")
+    assert mixed.status == 0 and "polsep: mono: the frame shows no colour pattern" in mixed.err
+    codes = [expose(light(), time, time).data.numpy().astype(np.uint16) for time in (1, 4)]
+    tags = [(33434, "2I", 1, (1, 100), True)]
+    files = [tmp_path / "shot1.tiff", tmp_path / "shot4.tiff"]
+    tifffile.imwrite(files[0], codes[0], photometric="minisblack", metadata=None, extratags=tags)
+    tifffile.imwrite(files[1], codes[1], photometric="minisblack", metadata=None)
+    some = run_polsep("merge", *files, "--white-level", WHITE, "--black-level", BLACK, "-o", tmp_path / "b.tiff")
+    assert some.status == 0 and "1 of 2 frames say their exposure time: all are found in the frames" in some.err
 
 
 def test_a_folder_stands_for_its_frames(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811

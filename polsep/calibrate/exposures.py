@@ -56,7 +56,7 @@ def merge_exposures(frames: Sequence[Mosaic], times: Sequence[float] | None = No
     """Frames ``[H, W]`` of one still scene merged into one; ``times`` in any unit, None to find them in the frames.
 
     One frame is returned as it is, in the new unit. Raises ValueError on frames of other sizes or layouts, on times
-    that are not positive, and where the frames do not show their ratio.
+    that are not positive or in another order than the frames' brightness, and where frames do not show their ratio.
     """
     _require_same(frames)
     if times is not None and (len(times) != len(frames) or not all(0 < t < float("inf") for t in times)):
@@ -100,6 +100,11 @@ def _find_times(
             continue
         found[long] = float(times[long])
         stated = found[long] / found[short]
+        if ratio is not None and stated > EQUAL and ratio < 1 - MAX_DISAGREEMENT:
+            raise ValueError(
+                f"expected exposure times in the order of the frames, found {found[short]:g} for frame {short + 1} and "
+                f"{found[long]:g} for frame {long + 1}, which is darker ({ratio:.3g} of it)"
+            )
         if ratio is not None and abs(ratio / stated - 1) > MAX_DISAGREEMENT:
             notes.append(f"exposure times of 1:{stated:.3g} were stated, the frames' brightness says 1:{ratio:.3g}")
     return [found[i] for i in range(len(linear))], notes

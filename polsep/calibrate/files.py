@@ -115,13 +115,18 @@ def merge_files(
     def note(path: Path, frame: Frame) -> None:
         recorded.append(frame.exposure)
         forgotten.extend([(path, frame)] if forgets_level(frame) else [])
-        notes.extend(f"{frame.stem}: {text}" for text in frame.notes if not isinstance(text, Overexposed))
+        assert isinstance(frame.data, Mosaic)  # as `read_mosaics` makes sure
+        found = [text for text in frame.notes if not isinstance(text, Overexposed)]
+        found += [warning] if (warning := check_layout(frame.data).warning) else []
+        notes.extend(f"{frame.stem}: {text}" for text in found)
 
     frames = list(read_mosaics(paths, read, note))
     if len(forgotten) == len(frames) > 0:  # a short exposure alone may be dark
         refuse_forgotten(*forgotten[0])
     known = [time for time in recorded if time is not None]
     said = "as stated" if times is not None else "of the files" if len(known) == len(frames) else "found in the frames"
+    if times is None and 0 < len(known) < len(frames):
+        notes.append(f"{len(known)} of {len(frames)} frames say their exposure time: all are {said}, or say --times")
     merged = merge_exposures(frames, known if times is None and len(known) == len(frames) else times)
     facts = {
         "exposure_times": [float(f"{time:.6g}") for time in merged.times],

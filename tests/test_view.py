@@ -577,9 +577,10 @@ def test_folders_are_read_as_other_commands_read_them(tmp_path: Path) -> None:
     (tmp_path / "hidden" / "probe.exr").write_bytes(b"of something else")
     assert [source.stem for source in opening.find_sources(tmp_path / "hidden")] == ["a1", "a2"]
     frame = separate_capture(Mosaic(mosaic_codes(), Layout(), 0.0, float(WHITE)), "analytic")
-    for kind in ("exr", "tiff", "png"):
+    sequences, either = "name single files themselves", "expected raw frames or results of polsep in the folder"
+    for kind, said in (("exr", sequences), ("tiff", either), ("png", either)):
         write_separation(frame, tmp_path / kind, "shot", kind)
-        with pytest.raises(InputError, match="name single files themselves"):
+        with pytest.raises(InputError, match=said):
             opening.find_sources(tmp_path / kind)
     write_separation(frame, tmp_path / "npz", "shot", "npz")
     (source,) = opening.find_sources(tmp_path / "npz")

@@ -21,7 +21,7 @@ from polsep.io.raw.recording import RECORD, is_recording
 from polsep.io.raw.videos import count_frames, is_film
 from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
 from polsep.io.results.sidecars import read_report
-from polsep.io.store.errors import InputError
+from polsep.io.store.errors import InputError, input_error
 from polsep.io.store.header_checks import at_most
 from polsep.io.store.result_names import result_names
 from polsep.methods import check_method
@@ -161,6 +161,8 @@ def find_sources(path: Path) -> tuple[Source, ...]:
         frames = (f for f in seen if f.suffix.lower() in FRAME_FILES)
         plain = (f for f in frames if f.name not in results or as_source(f, f.stem).separated)
         files = sorted(plain, key=lambda f: in_numbers(f.name))
+        if not files and not any(file.suffix.lower() == ".exr" for file in seen):
+            raise input_error(path, "expected raw frames or results of polsep in the folder, found none") from None
         if not files:
             raise
         groups = group_angles([file.name for file in files])

@@ -224,6 +224,9 @@ def test_a_file_whose_format_nobody_says_leaves_settings(page: Any) -> None:
     assert page.input_value("#white") == "4095" and page.is_hidden("#raw")
     change(page, lambda: page.select_option("#light", "white"))
     assert page.evaluate("polsep.report.white_level") == 4095
+    page.fill("#white", "0")
+    change(page, lambda: page.press("#white", "Enter"))
+    assert "expected a white level above the black level, found white 0, black 0" in page.inner_text("#notes")
 
 
 @needs_packages

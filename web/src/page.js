@@ -54,7 +54,7 @@ function showProgress({ share, text }) {
 
 const settings = () => ({
   method: part("method").value,
-  white: part("white").valueAsNumber || null,
+  white: part("white").value === "" ? null : part("white").valueAsNumber,  // 0 is said, and refused
   black: part("black").valueAsNumber || 0,
   layout: part("sensor").value === "other" ? part("layout").value || part("layout").placeholder : part("sensor").value || null,
   light: part("light").value === "stated" ? part("color").value.split(",").map(Number) : part("light").value,

@@ -15,6 +15,7 @@ import pytest
 from view_page import (
     DEMO,
     WAIT_MS,
+    await_text,
     browser,
     choose,
     fetch,
@@ -40,7 +41,8 @@ pytestmark = needs_browser
 def test_one_click_shows_what_polsep_does(page: Any, tmp_path: Path) -> None:
     """The demo capture is separated by the first click; its EXR is the Python result, bit for bit."""
     open_demo(page)
-    assert "still_life" in page.inner_text("#ps-status") and "color-affine" in page.inner_text("#ps-status")
+    await_text(page, "#ps-status", "still_life")
+    await_text(page, "#ps-status", "color-affine")
     layers = read_exr_layers(fetch(page, "exr", tmp_path))
     truth = separated(imagecodecs.png_decode(DEMO.read_bytes()))
     for k, color in enumerate("RGB"):
@@ -53,12 +55,12 @@ def test_an_upload_is_separated_compared_edited_and_fetched(page: Any, tmp_path:
     codes = imagecodecs.png_decode(DEMO.read_bytes())[512:1280, 600:1624]
     send(page, "shot.png", bytes(imagecodecs.png_encode(np.ascontiguousarray(codes))))
     page.wait_for_selector("#ps-mend-0:visible")
-    assert "White level 4095" in page.inner_text("#ps-status")
-    assert page.inner_text("#ps-mend-0") == "Use white level 4095"
+    await_text(page, "#ps-status", "White level 4095")
+    await_text(page, "#ps-mend-0", "Use white level 4095")
     page.click("#ps-mend-0")
     page.wait_for_selector("#ps-mend-0", state="hidden")
     assert page.input_value("#ps-white input") == "4095"
-    assert "White level" not in page.inner_text("#ps-status")
+    page.wait_for_function("!document.querySelector('#ps-status').innerText.includes('White level')")
     choose(page, "ps-right", "Specular")
     page.wait_for_selector(".ps-right[alt=Specular]")
     box = page.locator(".ps-stage").bounding_box()
@@ -163,7 +165,7 @@ def test_a_sequence_plays_under_edits(page: Any, tmp_path: Path) -> None:
     choose(page, "ps-white", "4095")
     page.set_input_files("#ps-top input[type=file]", files)
     page.wait_for_selector("#ps-play:visible")
-    assert "s0" in page.inner_text("#ps-status")
+    await_text(page, "#ps-status", "s0")
     page.click("#ps-play")
     index = "document.querySelector('#ps-index input[type=number]').value"
     for place in ("1", "2", "3", "0"):
@@ -179,11 +181,11 @@ def test_a_sequence_plays_under_edits(page: Any, tmp_path: Path) -> None:
     for _ in range(100):
         path = fetch(page, "edited", tmp_path)
         place = int(path.name[1])
-        if page.evaluate(index) == str(place):  # the numbers of the shown frame are there
+        shown = page.evaluate(index), page.inner_text("#ps-status")[:2]
+        if shown == (str(place), f"s{place}"):  # the numbers of the shown frame are there
             break
         page.wait_for_timeout(100)
-    assert page.evaluate(index) == str(place)
-    assert page.inner_text("#ps-status").startswith(f"s{place}")
+    assert shown == (str(place), f"s{place}")
     edited = read_exr_layers(path)
     truth = separated(imagecodecs.png_decode(small_frame(4 * place)))
     np.testing.assert_array_equal(edited["combined.G"], truth.diffuse[..., 1])

@@ -12,6 +12,7 @@ import pytest
 from view_page import (
     DEMO,
     WAIT_MS,
+    await_text,
     browser,
     choose,
     folder,
@@ -176,7 +177,8 @@ def test_specular_has_its_own_exposure_and_clipping_is_marked(page: Any, frame: 
     red = (marked.astype(int) - (255, 40, 40)).__abs__().sum(axis=2) < 120
     assert clipped.sum() > 20 and red[clipped].mean() > 0.95 and (red & ~clipped).sum() < clipped.sum()
     tab(page, "Light")
-    assert "Polarizer of the light" in page.inner_text("#ps-side") and page.locator(".ps-rose path").count() == 1
+    await_text(page, "#ps-side", "Polarizer of the light")
+    assert page.locator(".ps-rose path").count() == 1
 
 
 def test_settings_are_the_new_files(page: Any) -> None:
@@ -209,7 +211,8 @@ def test_four_angle_files_are_one_frame(page: Any) -> None:
     choose(page, "ps-white", "4095")
     page.set_input_files("#ps-top input[type=file]", files)
     page.wait_for_selector(".ps-sharp")
-    assert "80 × 64 pixels" in page.inner_text("#ps-status") and not page.is_visible("#ps-strip")
+    await_text(page, "#ps-status", "80 × 64 pixels")
+    assert not page.is_visible("#ps-strip")
 
 
 def test_waiting_is_said_and_ended(page: Any) -> None:
@@ -225,7 +228,7 @@ def test_waiting_is_said_and_ended(page: Any) -> None:
     assert page.inner_text("#ps-status") == before
     choose(page, "ps-method", "color-affine")
     page.wait_for_function("document.querySelector('#ps-progress').innerText === ''")
-    assert "color-affine" in page.inner_text("#ps-status")
+    await_text(page, "#ps-status", "color-affine")
 
 
 def test_sliders_agree_with_their_boxes(page: Any, frame: Any) -> None:
@@ -381,4 +384,5 @@ def test_the_demo_is_opened_again_after_an_error(page: Any) -> None:
     send(page, "a.png", b"nothing")
     page.wait_for_selector(".ps-error")
     open_demo(page)
-    assert DEMO.stem in page.inner_text("#ps-status") and page.evaluate(VIEW) == [1, 0, 0]
+    await_text(page, "#ps-status", DEMO.stem)
+    assert page.evaluate(VIEW) == [1, 0, 0]

@@ -68,6 +68,13 @@ def tab(page: Any, name: str) -> None:
     page.get_by_role("tab", name=name, exact=True).click()
 
 
+def await_text(page: Any, part: str, text: str) -> None:
+    """Wait until a part of the page has this text: what belongs together comes in several messages."""
+    from playwright.sync_api import expect
+
+    expect(page.locator(part)).to_contain_text(text, timeout=WAIT_MS)
+
+
 def open_demo(page: Any) -> None:
     """Open the demo capture, and wait for its sharp picture."""
     page.click("#ps-demo")

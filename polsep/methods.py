@@ -157,7 +157,7 @@ def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameIma
     if capture.data.ndim == 2 and on_cpu(capture.data):
         networks, lit = shipped_joint(name, capture.layout), replace(capture, light_color=light)
         shares = [network.share for network in networks]
-        images = combine_images([run_engine(network, lit, full) for network in networks], light, shares)
+        images = combine_images((run_engine(network, lit, full) for network in networks), light, shares)
         return smooth_clipped(images, capture, light)
     return run_reference(partial(joint_reference, name), capture, light, full)
 

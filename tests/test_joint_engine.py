@@ -312,12 +312,13 @@ def test_huge_frames_are_separated_in_strips(
     layout: Layout, full: bool, exact: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same as whole ones, by an engine for one height; also where the height is no multiple of strips."""
-    mosaic = random_frame(1452, 36, layout)
+    mosaic = random_frame(1932, 36, layout)
     whole = run_engine(WEIGHTS[mosaic.layout.channels], mosaic, full)
-    monkeypatch.setattr(strips, "MAX_PIXELS", 36 * 720 * (1 + full))
+    monkeypatch.setattr(strips, "MAX_PIXELS", 36 * 984 * (1 + full))
     network = NETS[mosaic.layout.channels]
-    heights = {bottom - top for (top, bottom), _ in engines._strips((1452, 36), network.size, full)}
-    assert len(heights) == 1 and max(heights) <= 720 + PERIOD * network.size.grid
+    pieces = list(engines._strips((1932, 36), network.size, full))
+    heights = {bottom - top for (top, bottom), _ in pieces}
+    assert len(pieces) == 4 and len(heights) == 1 and max(heights) <= 984 + PERIOD * network.size.grid
     parts = run_engine(WEIGHTS[mosaic.layout.channels], mosaic, full)
     assert whole is not None and parts is not None
     assert np.array_equal(parts.valid, whole.valid)

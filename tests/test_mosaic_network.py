@@ -93,18 +93,17 @@ def test_shifted_frames_are_combined(height: int, width: int, full: bool) -> Non
 
 
 @pytest.mark.parametrize(("height", "width"), [(48, 64), (50, 63)])
-def test_colour_frames_are_seen_twice_by_networks_that_average(height: int, width: int) -> None:
+@pytest.mark.parametrize("full", [False, True])
+def test_colour_frames_are_seen_twice_by_networks_that_average(height: int, width: int, full: bool) -> None:
     """As they are, and a cell on with red and blue exchanged; so an exchange of these gives exchanged images."""
     network, mosaic = random_network(COLOR), random_mosaic(COLOR, height, width)
-    single = [mosaic_network._run_turned(network, mosaic, way, False) for way in ways_of(mosaic, COLOR)]
+    single = [mosaic_network._run_turned(network, mosaic, way, full) for way in ways_of(mosaic, COLOR)]
     assert len(single) == 2 and not torch.allclose(single[0].diffuse, single[1].diffuse, atol=1e-3)
-    whole = run_joint(network, mosaic, full=True)
     network.averages_ways = True
-    found = run_joint(network, mosaic)
+    found = run_joint(network, mosaic, full)
     assert_close(found.diffuse, combine(single).diffuse)
     assert_close(found.stokes.s0, found.diffuse + found.specular)
-    assert torch.equal(run_joint(network, mosaic, full=True).diffuse, whole.diffuse)
-    other = run_joint(network, Mosaic(mosaic.data, Layout(COLOR.polarizer, "BGGR"), 0.0, 1.0))
+    other = run_joint(network, Mosaic(mosaic.data, Layout(COLOR.polarizer, "BGGR"), 0.0, 1.0), full)
     assert_close(other.diffuse.flip(0), found.diffuse)
     assert_close(other.specular.flip(0), found.specular)
     assert_close(other.stokes.s1.flip(0), found.stokes.s1)
@@ -156,14 +155,22 @@ def test_mono_cells_of_other_frames_are_their_own() -> None:
 @pytest.mark.parametrize("full", [False, True])
 @pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
 def test_strips_are_the_whole_frame(layout: Layout, full: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    network, mosaic = random_network(layout), random_mosaic(layout, 720, 36)
+    network, mosaic = random_network(layout), random_mosaic(layout, 1504, 36)
     whole = run_joint(network, mosaic, full)
     monkeypatch.setattr(strips, "MAX_PIXELS", 36 * 600 * (1 + full))
-    assert len(list(cut_rows((720, 36), network.size, full))) > 5
+    assert len(list(cut_rows((1504, 36), network.size, full))) == 3
     parts = run_joint(network, mosaic, full)
     assert torch.equal(parts.valid, whole.valid)
     for name in ("diffuse", "specular", "expected_error"):
         assert_close(getattr(parts, name), getattr(whole, name), 4.0)
+
+
+def test_strips_are_no_smaller_than_their_margins() -> None:
+    """However large the frame: where more rows would be computed than are kept twice over, strips are larger."""
+    for width in (2448, 20_000):
+        pieces = list(cut_rows((2048, width), ResidualSize(64, (3, 3, 2)), True))
+        assert pieces == [(0, 1024), (1024, 2048)]
+    assert len(list(cut_rows((4096, 8192), SIZE, True))) == 4096 // (2 * margin_of(SIZE))
 
 
 def test_frames_of_a_batch_are_separated_alike() -> None:

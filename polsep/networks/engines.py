@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import operator
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial, reduce
@@ -26,7 +26,7 @@ from polsep.networks.channels import PERIOD
 from polsep.networks.combine_kernel import Rows, add_images
 from polsep.networks.graphs import require_own_threads
 from polsep.networks.images_kernel import Targets
-from polsep.networks.joint_weights import JointWeights, sees_ways
+from polsep.networks.joint_weights import JointWeights
 from polsep.networks.openvino_engine import OpenVinoEngine, RawRows, as_images, asked_precision, modulation_of
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.strips import cut_rows, margin_of
@@ -95,7 +95,7 @@ def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages
     """A network's images of one frame ``[H, W]`` on the CPU, in its light.
 
     Frames in other orientations than the network's are turned before and after, as in `run.run_joint`, and seen in
-    several ways where `sees_ways` says so. Huge frames are cut into strips, all of one height, since an engine is for
+    several ways where it averages them. Huge frames are cut into strips, all of one height, since an engine is for
     one size. Raises ValueError on layouts that are not Sony's in any orientation, and RuntimeError as
     `require_own_threads`.
     """
@@ -107,8 +107,8 @@ def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages
     make_ready(images_kernel.warm_up)
     if full:
         make_ready(details_kernel.warm_up)
-    ways = ways_of(mosaic, wanted) if sees_ways(network, full) else (orientation,)
-    return combine_images([_run_turned(network, mosaic, way, full) for way in ways], mosaic.light_color)
+    ways = ways_of(mosaic, wanted) if network.averages_ways else (orientation,)
+    return combine_images((_run_turned(network, mosaic, way, full) for way in ways), mosaic.light_color)
 
 
 def _halve(images: FrameImages, light: tuple[float, ...]) -> FrameImages:
@@ -135,21 +135,28 @@ def _mean_cells(image: NDArray[Any]) -> NDArray[Any]:
     return np.moveaxis(mean_cells(np.moveaxis(image[:height, :width], (0, 1), (-2, -1))), (-2, -1), (0, 1))
 
 
-def combine_images(images: list[FrameImages], light: tuple[float, ...], shares: Sequence[float] = ()) -> FrameImages:
+def combine_images(
+    images: Iterable[FrameImages], light: tuple[float, ...], shares: Sequence[float] = ()
+) -> FrameImages:
     """Images of one frame in a ``light``, weighed as `run.combine` does, in the arrays of the first.
 
-    The tally is of what they became, but for the polarization of highlights, which is the mean of theirs.
+    They are asked for one after the other, so that no more than two are in memory. The tally is of what they became,
+    but for the polarization of highlights, which is the mean of theirs.
     """
-    first = images[0]
-    if len(images) == 1:
+    remaining = iter(images)
+    first = next(remaining)
+    tallies, (rows, columns) = [first.tally], first.valid.shape
+    gains = np.array(light[: first.diffuse.shape[-1]], np.float32)
+    weights, sums = np.empty((rows, 2 * columns), np.float32), np.zeros((rows, combine_kernel.SUMS))
+    for k, other in enumerate(remaining, 1):
+        make_ready(combine_kernel.warm_up)
+        factors = np.array((shares[0], shares[k]) if shares else (1, 1), np.float32)
+        add = partial(add_images, _as_rows(first), _as_rows(other), factors, k, weights, gains, sums)
+        run_over_rows(add, rows, 1)
+        tallies.append(other.tally)
+    if len(tallies) == 1:
         return first
-    factors, (together, *others) = np.array(shares or [1.0] * len(images), np.float32), map(_as_rows, images)
-    rows, gains = len(first.valid), np.array(light[: first.diffuse.shape[-1]], np.float32)
-    weights, sums = np.empty_like(together.error), np.zeros((rows, combine_kernel.SUMS))
-    make_ready(combine_kernel.warm_up)
-    for k, other in enumerate(others, 1):
-        run_over_rows(partial(add_images, together, other, factors[[0, k]], k, weights, gains, sums), rows, 1)
-    tally = reduce(operator.add, (one.tally for one in images if one.tally is not None)).of_pixels(first.valid.size)
+    tally = reduce(operator.add, filter(None, tallies)).of_pixels(first.valid.size)
     diffuse, specular, *variances, above_one, valid = sums.sum(axis=0).tolist()
     tally = replace(tally, valid=int(valid), above_one=int(above_one), s0=diffuse + specular, specular=specular)
     return replace(first, tally=replace(tally, diffuse_variance=variances[0], specular_variance=variances[1]))

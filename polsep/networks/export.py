@@ -20,7 +20,6 @@ from polsep.compute.resizing import repeat_pixels
 from polsep.networks.channels import PERIOD
 from polsep.networks.fill import fill_holes
 from polsep.networks.joint import Joint
-from polsep.networks.joint_weights import sees_ways
 from polsep.networks.run import cells_near_clipping, combine, run_images
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import CLIP_MARGIN, Layout
@@ -110,7 +109,7 @@ class ExportedNetwork(nn.Module):
 
     def _run_ways(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:
         """The same in all ways in which the network sees frames, as `run.run_joint` does: shifted, as one batch."""
-        if not sees_ways(network, self.full):
+        if not network.averages_ways:
             return self._run(network, samples, clipped)
         frames, count, shifts = (samples, clipped), samples.shape[0], SHIFTS[self.colors]
         batch = [torch.cat([_shifted(_shifted(x, top, -2), left, -1) for top, left in shifts]) for x in frames]

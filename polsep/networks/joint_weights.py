@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +14,6 @@ from polsep.networks.channels import DETAIL_MAPS, INPUTS, PERIOD, input_channels
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.thumbnails import COMMON, LIGHT, WIDTHS, thumbnail_channels
 from polsep.sensor.camera import Layout
-
-if TYPE_CHECKING:
-    from polsep.networks.joint import Joint
 
 Arrays = Mapping[str, NDArray[np.float32]]
 #: Parts of `joint.Joint` whose parameters have other names in files of weights.
@@ -72,14 +68,6 @@ class JointWeights:
     def sees_frame(self) -> bool:
         """True for a network that sees a thumbnail of the whole frame."""
         return "whole_frame.light.bias" in self.arrays
-
-
-def sees_ways(network: JointWeights | Joint, full: bool) -> bool:
-    """True where a network averages frames seen in all of `orient.ways_of`.
-
-    At full resolution, where that takes seconds, only mono ones are.
-    """
-    return network.averages_ways and not (full and network.colors > 1)
 
 
 def joint_weights(arrays: Arrays, metadata: Mapping[str, str], averages_ways: bool = False) -> JointWeights:

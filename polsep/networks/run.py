@@ -27,7 +27,6 @@ from torch.nn.functional import max_pool2d
 from polsep.compute.resizing import repeat_pixels
 from polsep.demosaic.bilinear import mean_cells
 from polsep.networks.joint import Joint, limit
-from polsep.networks.joint_weights import sees_ways
 from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of
 from polsep.physics.stokes import Stokes, stokes_inverse
 from polsep.sensor.camera import Layout, Mosaic
@@ -49,13 +48,13 @@ def run_joint(network: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
 
     The polarization is that of the network's linear filter, at half resolution. ``valid`` is False near cells of
     which all samples clip. ``expected_error``: see `Separation`. Raises ValueError on layouts that are not
-    Sony's in any orientation. In all of `ways_of`, where `sees_ways` says so.
+    Sony's in any orientation. In all of `ways_of`, where the network averages them.
     """
     wanted = Layout.sony(mosaic.layout.channels)
     orientation = orient(mosaic, wanted)
     if not full and not orientation.keeps_cells:  # then the network's cells are not the frame's
         return _halve(run_joint(network, mosaic, full=True))
-    ways = ways_of(mosaic, wanted) if sees_ways(network, full) else (orientation,)
+    ways = ways_of(mosaic, wanted) if network.averages_ways else (orientation,)
     return combine([_run_turned(network, mosaic, way, full) for way in ways])
 
 

@@ -12,7 +12,8 @@ from polsep.networks.channels import PERIOD
 from polsep.networks.sizes import ResidualSize
 
 #: Raw pixels of a frame, or of a strip with its margins, that are processed at once; half as many at full resolution.
-MAX_PIXELS = 6_200_000
+#: More where a strip's own rows would be fewer than those of its margins: then most of the work would be theirs.
+MAX_PIXELS = 6_400_000
 #: Raw rows beyond the reach of the U-Net that demosaicking and the closed form see (a test measures that).
 OTHER_REACH = 128
 #: Least expected error that counts when separations are weighed.
@@ -29,7 +30,7 @@ def cut_rows(shape: tuple[int, int], size: ResidualSize, full: bool) -> Iterator
     """First and last row of the strips of a frame of ``shape``: one, or several that begin at multiples of the grid."""
     (height, width), grid, margin = shape, PERIOD * size.grid, margin_of(size)
     most, rows, count = MAX_PIXELS // (2 if full else 1) // width, height, 1
-    while rows > grid and rows + margin * min(count - 1, 2) > most:
+    while count < height // (2 * margin) and rows + margin * min(count - 1, 2) > most:
         count += 1
         rows = -(-height // (count * grid)) * grid
     for first in range(0, height, rows):

@@ -25,6 +25,7 @@ from polsep.io.store.weights import read_weights, write_weights
 from polsep.metrics import psnr
 from polsep.networks.channels import INPUTS
 from polsep.networks.joint import Joint, JointOutput, Polarization, bilinear_filter
+from polsep.networks.ranges import silenced
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.unet import count_parameters
 from polsep.physics.stokes import Stokes
@@ -526,6 +527,32 @@ def test_a_network_grows_without_a_change_of_its_images(sees_frame: bool) -> Non
         assert_close(getattr(after, name), getattr(before, name), scale=10)
     if sees_frame:
         assert_close(b.specular, a.specular, scale=10)
+
+
+@pytest.mark.parametrize("layer", ["net.ups.1", "net.encoders.1.0.second"])
+def test_what_was_silent_becomes_zero_and_wakes(layer: str) -> None:
+    """Silent parts change no image, before and after; a training that starts from them can move them again."""
+    torch.manual_seed(2)
+    network = Joint(1, ResidualSize(8, (0, 1, 1)))
+    for weight in network.parameters():
+        torch.nn.init.normal_(weight, std=0.1)
+    state = network.state_dict()
+    before = "net.encoders.2.0.second" if layer == "net.ups.1" else "net.encoders.1.0.first"
+    state[f"{before}.bias"] -= 1000  # below zero everywhere
+    raw, none = torch.rand(1, 1, 32, 32), torch.zeros(1, 1, 32, 32, dtype=torch.bool)
+    expected = network(raw, none)[0].diffuse
+    arrays = silenced({name: value.numpy() for name, value in state.items()}, {layer: (0.0, 0.0), "net.ups.0": (0, 1)})
+    zeros = {name for name, array in arrays.items() if not array.any()}
+    rest = "net.downs.1." if layer == "net.ups.1" else "net.encoders.1.0.first."
+    assert rest + "weight" in zeros and len(zeros) == (7 if layer == "net.ups.1" else 3)
+    network.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})
+    assert_close(network(raw, none)[0].diffuse, expected, scale=10)
+    network.load_state_dict(grow(network.state_dict(), Joint(1, network.size)))
+    found = network(raw, none)[0].diffuse
+    assert_close(found, expected, scale=10)
+    found.sum().backward()
+    last = network.get_parameter("net.ups.1.weight" if layer == "net.ups.1" else f"{layer}.weight")
+    assert last.grad is not None and bool(last.grad.any()) and not bool(last.any())
 
 
 def test_a_network_grows_from_a_part_of_itself_alone() -> None:

@@ -1,7 +1,8 @@
 """``python -m tools.round_weights FILE...``: write large layers of weights in 8 bits (`polsep.io.store.rounding`).
 
-That halves the file. A file that is rounded already stays as it is. ``--examples DIR`` rounds networks for shape so
-that what they say of the examples of `polsep train shape` there stays (`polsep.train.rounding`).
+That halves the file. What is silent in a joint network becomes 0, also in a file that is rounded already.
+``--examples DIR`` rounds networks for shape so that what they say of the examples of `polsep train shape` there stays
+(`polsep.train.rounding`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from polsep.io.store.rounding import coarsened, names_to_round, steps_of
 from polsep.io.store.weights import read_weights, write_weights
+from polsep.networks.ranges import silenced
 
 #: Batches of 8 examples that are looked at.
 BATCHES = 8
@@ -29,16 +31,17 @@ def main(paths: tuple[Path, ...], examples: Path | None) -> None:
     """Round and write."""
     for path in paths:
         arrays, metadata = read_weights(path)
+        names, before, own = names_to_round(arrays, metadata), path.stat().st_size, metadata.pop("sha256")
+        arrays = silenced(arrays, json.loads(metadata.get("ranges", "{}")))
         if "rounded_from" in metadata:
+            write_weights(path, arrays, metadata, names)
             continue
-        names, before = names_to_round(arrays, metadata), path.stat().st_size
-        exact = metadata.pop("sha256")
         counts = {name: steps_of(arrays[name], metadata["method"]) for name in names}
         if examples is not None:
             arrays = _rounded_by_examples(arrays, metadata, counts, examples)
         else:
             arrays |= {name: coarsened(arrays[name], n) for name, n in counts.items() if n < 127}
-        write_weights(path, arrays, metadata | {"rounded_from": exact}, names)
+        write_weights(path, arrays, metadata | {"rounded_from": own}, names)
         share = sum(arrays[name].size for name in names) / sum(array.size for array in arrays.values())
         print(f"{path}: {len(names)} arrays, {share:.0%} of the numbers, {before} to {path.stat().st_size} bytes")
 

@@ -8,9 +8,12 @@ costs many times what rounding all others does (docs/experiments.md).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polsep.networks.channels import PERIOD
 from polsep.networks.graphs import core, joint_model
@@ -46,6 +49,29 @@ def measure_ranges(network: JointWeights, frames: Iterable[Mosaic]) -> dict[str,
     if not bounds:
         raise ValueError("expected at least one frame to measure ranges on, found none")
     return {name: _widest(found) for name, found in bounds.items()}
+
+
+def silenced(arrays: Mapping[str, NDArray[Any]], ranges: Mapping[str, tuple[float, float]]) -> dict[str, NDArray[Any]]:
+    """A joint network's arrays with zeros for the weights of what its ``ranges`` say is silent; its images stay.
+
+    That is a block whose second layer has the range (0, 0), or a level, and all deeper ones, if the layer that leads
+    up from it has. Wheels compress zeros, and a training that starts from them draws new weights (`train.growth`).
+    """
+    found = dict(arrays)
+    for layer, bounds in ranges.items():
+        if bounds[0] == bounds[1] == 0:
+            silent = _silent_with(layer)
+            found |= {name: np.zeros_like(array) for name, array in arrays.items() if silent.match(name)}
+    return found
+
+
+def _silent_with(layer: str) -> re.Pattern[str]:
+    """Names of arrays that change nothing where a layer's input is 0; the layer's own bias is not among them."""
+    part, level, *_ = layer.removeprefix("net.").split(".")
+    if part != "ups":
+        return re.compile(rf"{re.escape(layer.removesuffix('.second'))}\.(first\.|second\.weight)")
+    below, beyond = rf"[{level}-9]", rf"[{int(level) + 1}-9]"
+    return re.compile(rf"net\.(downs\.{below}|encoders\.{beyond}|(ups|decoders)\.{beyond}|ups\.{level}\.weight)(\.|$)")
 
 
 def _widest(bounds: list[tuple[float, float]]) -> tuple[float, float]:

@@ -45,7 +45,7 @@ from polsep.networks.joint_weights import DOUBT_HIDDEN, NAMES_IN_FILES, JointWei
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.taps import pool_outputs
 from polsep.networks.thumbnails import LIGHT
-from polsep.networks.unet import ResidualUNet
+from polsep.networks.unet import Block, ResidualUNet
 from polsep.networks.whole_frame import WholeFrame, make_thumbnail, split_modulation
 from polsep.physics.stokes import fit_stokes
 from polsep.sensor.camera import Layout, Mosaic
@@ -154,6 +154,8 @@ class Joint(nn.Module):
         network = cls(weights.colors, weights.size, weights.inputs, demosaicker, weights.sees_frame)
         network.load_state_dict({name: torch.tensor(array) for name, array in weights.arrays.items()})
         network.averages_ways, network.share = weights.averages_ways, weights.share
+        for block in (part for part in network.modules() if isinstance(part, Block)):
+            block.silent = not bool(block.second.weight.any())
         return network.to(device, torch.float32).eval()
 
     def weights(self) -> JointWeights:

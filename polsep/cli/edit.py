@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from polsep.cli.app import COMPRESSION, DAMAGED, DIR, FILE, OVERWRITE, RATE, app, print_note, require_paths
+from polsep.cli.app import COMPRESSION, DAMAGED, DIR, FILE, FINITE, OVERWRITE, RATE, app, print_note, require_paths
 from polsep.cli.progress import report_step, show_progress
 from polsep.cli.video import with_preview
 from polsep.io.store.errors import MOST, one_line
@@ -27,21 +27,21 @@ if TYPE_CHECKING:
 @click.option("--save-recipe", type=FILE, metavar="FILE", help="Save the edits of this call to a file.")
 @click.option("--mask", metavar="FILE", help="Edit only where this grey image is white.")
 @click.option("--recolor", metavar="R,G,B", help="Give the material this linear colour and keep its shading.")
-@click.option("--recolor-amount", type=float, metavar="X", help="0 to 1.  [default: 1]")
+@click.option("--recolor-amount", type=FINITE, metavar="X", help="0 to 1.  [default: 1]")
 @click.option("--texture", metavar="FILE", help="Put a texture on the material, under its highlights.")
-@click.option("--texture-amount", type=float, metavar="X", help="0 to 1.  [default: 1]")
-@click.option("--texture-repeats", type=float, metavar="X", help="Repeats across the image.  [default: 1]")
+@click.option("--texture-amount", type=FINITE, metavar="X", help="0 to 1.  [default: 1]")
+@click.option("--texture-repeats", type=FINITE, metavar="X", help="Repeats across the image.  [default: 1]")
 @click.option("--texture-normals", metavar="FILE", help="Normal map along which the texture follows the shape.")
-@click.option("--diffuse-gain", type=float, metavar="X", help="Multiply the diffuse light.")
+@click.option("--diffuse-gain", type=FINITE, metavar="X", help="Multiply the diffuse light.")
 @click.option(
-    "--rougher", type=float, metavar="PX", help="Blur highlights by this sigma; 10 is the paper's matte appearance."
+    "--rougher", type=FINITE, metavar="PX", help="Blur highlights by this sigma; 10 is the paper's matte appearance."
 )
-@click.option("--sharper", type=float, metavar="PX", help="Undo such a blur of highlights, as far as possible.")
-@click.option("--metallic", type=float, metavar="X", help="Metal of the object's colour, 0 to 1.")
-@click.option("--metallic-gain", type=float, metavar="X", help="Multiply the specular light of metal.  [default: 45]")
-@click.option("--specular-gain", type=float, metavar="X", help="Multiply the specular light.")
-@click.option("--remove-highlights", type=float, metavar="X", help="Remove specular light; 0 none, 1 all of it.")
-@click.option("--isolate-highlights", type=float, metavar="X", help="Remove diffuse light; 0 none, 1 all of it.")
+@click.option("--sharper", type=FINITE, metavar="PX", help="Undo such a blur of highlights, as far as possible.")
+@click.option("--metallic", type=FINITE, metavar="X", help="Metal of the object's colour, 0 to 1.")
+@click.option("--metallic-gain", type=FINITE, metavar="X", help="Multiply the specular light of metal.  [default: 45]")
+@click.option("--specular-gain", type=FINITE, metavar="X", help="Multiply the specular light.")
+@click.option("--remove-highlights", type=FINITE, metavar="X", help="Remove specular light; 0 none, 1 all of it.")
+@click.option("--isolate-highlights", type=FINITE, metavar="X", help="Remove diffuse light; 0 none, 1 all of it.")
 @click.option("--tint", metavar="R,G,B", help="Multiply the colour of the light.")
 @click.option(
     "--compression",

@@ -22,6 +22,7 @@ from polsep.cli.app import (
     SIZE,
     STOKES,
     WHITE_LEVEL,
+    Word,
     app,
     check_read_options,
     correcting_files,
@@ -53,8 +54,9 @@ if TYPE_CHECKING:
 @LIGHT_COLOR
 @click.option(
     "--format",
-    type=click.Choice(["exr", "npz", "tiff", "png"]),
+    type=Word("exr", "npz", "tiff", "png"),
     default="exr",
+    metavar="exr|npz|tiff|png",
     help="Format of the images; a PNG preview is always written.",
 )
 @click.option("--full", is_flag=True, help="Full resolution instead of one pixel per 2x2 cell.")
@@ -63,8 +65,9 @@ if TYPE_CHECKING:
 @PIXEL_FORMAT
 @click.option(
     "--pages",
-    type=click.Choice(["auto", "frames", "angles"]),
+    type=Word("auto", "frames", "angles"),
     default="auto",
+    metavar="auto|frames|angles",
     help="Pages of one file: frames, or every four are the angles 0, 45, 90, 135; auto looks at them.",
 )
 @photo_options

@@ -25,7 +25,7 @@ from polsep.cli.progress import show_progress
     help="train, validation or test; they share no random draws.",
 )
 @click.option("--samples", type=Number(int, 1, 16), default=2, metavar="N", help="Trace N x N rays per pixel.")
-@click.option("--format", type=click.Choice(["exr", "npz"]), default="exr", help="Format of the ground truth.")
+@click.option("--format", type=Word("exr", "npz"), default="exr", metavar="exr|npz", help="Format of the ground truth.")
 @click.option("--workers", type=COUNT, metavar="N", help="Number of processes.  [default: one per core]")
 @ENGINE
 def render(output: Path, workers: int | None, engine: str, **options: Any) -> None:

@@ -43,7 +43,10 @@ OWN |= {"part": (*_JOINT, "shape"), "side": ("shape",), "meshes": ("shape",), "c
 @click.option("--fold", type=COUNT, default=2, metavar="N", help="Fold N x N pixels into channels; 1 folds none.")
 @click.option("--blocks", metavar="N,N,...", help="Residual blocks per level of a joint network.")
 @click.option(
-    "--entry", type=int, metavar="N", help="Channels after a joint network's first layer; 0 keeps all inputs."
+    "--entry",
+    type=Number(int, 0),
+    metavar="N",
+    help="Channels after a joint network's first layer; 0 keeps all inputs.",
 )
 @click.option("--ablation", default="none", metavar="NAME", help="Ablation of a joint network.")
 @click.option(
@@ -68,7 +71,7 @@ OWN |= {"part": (*_JOINT, "shape"), "side": ("shape",), "meshes": ("shape",), "c
 @click.option("--side", type=COUNT, default=96, metavar="PX", help="shape: side of the images that the network sees.")
 @click.option(
     "--meshes",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    type=DIR,
     metavar="DIR",
     help="shape: folder of GLB, OBJ, OFF, PLY or STL files, +y up, which as many examples again show.",
 )
@@ -85,7 +88,7 @@ OWN |= {"part": (*_JOINT, "shape"), "side": ("shape",), "meshes": ("shape",), "c
 )
 @click.option("--until", type=COUNT, metavar="N", help="material, shape: end at this step of the schedule.")
 @click.option("--rate", type=POSITIVE, default=1e-3, metavar="X", help="Peak learning rate.")
-@click.option("--seed", type=int, default=0, metavar="N", help="Random seed of the weights and of the data.")
+@click.option("--seed", type=Number(int), default=0, metavar="N", help="Random seed of the weights and of the data.")
 @click.option("--workers", type=COUNT, default=1, metavar="N", help="Rendering processes per device.")
 @click.option("--devices", type=COUNT, default=1, metavar="N", help="Number of GPUs, where there are any.")
 @click.option(
@@ -120,7 +123,7 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
     """
     refuse_foreign(rung)
     require_extra("train")
-    require_paths(*options["start"])
+    require_paths(*options["start"], *filter(None, [options["meshes"]]))
     from polsep.io.store.atomic import require_writable
 
     require_writable(output)

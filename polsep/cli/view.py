@@ -11,6 +11,7 @@ import click
 from polsep.cli.app import (
     AMBIENT,
     CALIBRATION,
+    COUNT,
     LAYOUT,
     PIXEL_FORMAT,
     SIZE,
@@ -45,7 +46,7 @@ from polsep.cli.app import (
 @PIXEL_FORMAT
 @click.option(
     "--upload-limit",
-    type=click.IntRange(1),
+    type=COUNT,
     default=240,
     metavar="MB",
     help="Largest size of files that are uploaded together.",

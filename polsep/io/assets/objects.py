@@ -66,7 +66,8 @@ def read_mesh(path: Path) -> Mesh:
 
 def list_meshes(folder: Path) -> list[Path]:
     """The files of `MESHES` in a folder, in the order of their names. Raises ValueError where there are none."""
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in MESHES)
+    found = folder.iterdir() if folder.is_dir() else ()
+    paths = sorted(path for path in found if path.suffix.lower() in MESHES)
     if not paths:
         raise ValueError(f"expected meshes ({', '.join(MESHES)}) in {folder}, found none")
     return paths

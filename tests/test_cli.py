@@ -571,6 +571,7 @@ def test_rates_may_be_ratios() -> None:
         ("separate a.png --format gif", "--format"),
         ("separate a.png --pages some", "--pages"),
         ("shape a.png --size 64 --mesh none", "--size"),
+        ("shape a.png --index 9 --mesh none", "--index"),
         ("material a.png --frame-size 64", "--frame-size"),
         ("video in -o o --rate -2", "--rate"),
         ("video in -o o --rate 24/0", "--rate"),
@@ -645,6 +646,7 @@ def test_missing_paths_are_named_before_any_import(tmp_path: Path, words: str) -
 def test_words_of_options_are_those_of_the_library() -> None:
     """The words that the command line knows, without loading anything, are those that the library knows."""
     from polsep.geometry.files import INTEGRATIONS
+    from polsep.geometry.one_frame import INDICES
     from polsep.io.results.exr import COMPRESSIONS
     from polsep.io.results.sequences import FORMATS as kinds
     from polsep.networks.rungs import RUNGS
@@ -660,6 +662,8 @@ def test_words_of_options_are_those_of_the_library() -> None:
     assert words("edit", "--damaged") == words("video", "--damaged") == set(ON_DAMAGE)
     assert words("geometry", "--integration") == set(INTEGRATIONS)
     assert words("shape", "--integration") == set(INTEGRATIONS)
+    index = next(p.type for p in cli.app.commands["shape"].params if "--index" in p.opts)
+    assert (index.low, index.high) == INDICES  # type: ignore[attr-defined]
     assert words("render", "--split") == set(splits)
     assert words("train", "rung") == {*RUNGS, *NAMES, "material", "shape"}
 

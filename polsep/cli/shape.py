@@ -19,6 +19,7 @@ from polsep.cli.app import (
     PIXEL_FORMAT,
     SIZE,
     WHITE_LEVEL,
+    Number,
     Word,
     app,
     correcting_files,
@@ -48,9 +49,8 @@ from polsep.cli.progress import show_progress
 )
 @click.option(
     "--index",
-    type=float,
+    type=Number(float, 1.3, 2.5),
     default=1.5,
-    show_default=True,
     metavar="N",
     help="Refractive index of the thing: 1.33 water, 1.4 skin, 1.5 glass and most paints, 1.6 polycarbonate.",
 )

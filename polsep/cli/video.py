@@ -106,9 +106,11 @@ def video(recording: Path, output: Path, **options: Any) -> None:
     polsep video run.mkv -o out --format ffv1 --method joint
     """
     require_paths(recording)
+    from polsep.io.raw.extensions import LOSSLESS
+
     if options["engine"] == "ray":
         require_extra("ray")
-    if options["format"] in ("ffv1", "ffvhuff") or recording.suffix.lower() in (".mkv", ".avi", ".mov", ".nut"):
+    if options["format"] in ("ffv1", "ffvhuff") or recording.suffix.lower() in LOSSLESS:
         require_extra("video")
     read = read_options(options)
     from polsep.compute.workers import keep_memory

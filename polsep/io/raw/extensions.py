@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-#: Camera raw files that LibRaw reads, JPEG, and films.
+#: Camera raw files that LibRaw reads, JPEG, films that may be lossless, and all films.
 CAMERA_RAW = (".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".iiq")
 JPEG = (".jpg", ".jpeg")
-FILMS = (".mkv", ".avi", ".mov", ".nut", ".mp4", ".m4v", ".webm")
+LOSSLESS = (".mkv", ".avi", ".mov", ".nut")
+FILMS = (*LOSSLESS, ".mp4", ".m4v", ".webm")
 
 
 def needs_rawpy(paths: Sequence[str]) -> bool:

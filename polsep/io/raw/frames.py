@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.io.raw.extensions import LOSSLESS
 from polsep.io.raw.headerless import headerless_page, read_headerless, with_layout
 from polsep.io.raw.npy import read_npy, read_npz, stack_angles
 from polsep.io.raw.page import Page
@@ -79,10 +80,7 @@ READERS: dict[str, Reader] = {
     ".npy": Reader("NPY", read_npy),
     ".npz": Reader("NPZ", read_npz),
     ".pgm": Reader("PGM", read_pgm),
-    ".mkv": Reader("a lossless video", read_video, single=False),
-    ".avi": Reader("a lossless video", read_video, single=False),
-    ".mov": Reader("a lossless video", read_video, single=False),
-    ".nut": Reader("a lossless video", read_video, single=False),
+    **dict.fromkeys(LOSSLESS, Reader("a lossless video", read_video, single=False)),
     ".json": Reader("a recording.json", read_recording, single=False),
 }
 _HEADERLESS = (".raw", ".bin")

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.io.raw.extensions import LOSSLESS
 from polsep.io.raw.page import Page
 from polsep.io.store.errors import InputError, decoding
 from polsep.io.store.header_checks import SAMPLES, limit, require_size
@@ -26,7 +27,7 @@ from polsep.io.store.quiet import mute
 #: FFmpeg's pixel formats that hold a mosaic: gray, gray10le, ...; the number of bits is 8 unless named.
 _GREY = re.compile(r"gray(\d*)(?:le|be)?")
 #: FFmpeg's name of each container. It would look for any, also for lists that name other files or addresses.
-CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mov": "mov", ".nut": "nut"}
+CONTAINERS = dict(zip(LOSSLESS, ("matroska", "avi", "mov", "nut"), strict=True))
 
 #: Bytes of films whose frames are counted as they are opened. First frames whose times are looked at, and the range of
 #: the times between them, relative to the median, from which on they are uneven.

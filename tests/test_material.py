@@ -21,7 +21,6 @@ from torch import Tensor
 from evaluation.material import novel_lights, score_failure, score_maps, score_relit
 from polsep.cli.app import main
 from polsep.io.assets.materials import (
-    DIELECTRIC,
     encode_glb,
     encode_materialx,
     metallic_maps,
@@ -39,6 +38,7 @@ from polsep.material.network import MaterialNetwork, MaterialSize, detail_cues, 
 from polsep.material.procedural import halve, random_svbrdf
 from polsep.material.shots import CAMERA, CAMERA_HEIGHT, INPUTS, photograph, random_example, random_flash
 from polsep.material.svbrdf import Svbrdf, plane_points, relight, unstack
+from polsep.physics.gltf import GLASS
 from polsep.render.sphere_tracing import PointLight
 from polsep.separation.report import SeparatedFrame
 from polsep.train.material_losses import material_loss
@@ -224,7 +224,7 @@ def test_a_glb_is_one_textured_square() -> None:
     size = struct.unpack_from("<I", data, 12)[0]
     document = json.loads(data[20 : 20 + size])
     specular = document["materials"][0]["extensions"]["KHR_materials_specular"]
-    assert specular["specularColorFactor"][0] == pytest.approx(specular_scale(maps["specular"]) / DIELECTRIC)
+    assert specular["specularColorFactor"][0] == pytest.approx(specular_scale(maps["specular"]) / GLASS)
     (shading,), (primitive,) = document["materials"], document["meshes"][0]["primitives"]
     assert sorted(primitive["attributes"]) == ["NORMAL", "POSITION", "TANGENT", "TEXCOORD_0"]
     assert set(shading) & {"occlusionTexture", "emissiveTexture"} == set()

@@ -22,7 +22,7 @@ import numpy as np
 
 from polsep.compute.arrays import Array, namespace
 from polsep.physics.fresnel import diffuse_dolp
-from polsep.physics.gltf import Coat, reflect
+from polsep.physics.gltf import GLASS, Coat, reflect
 
 #: Inputs, and their numbers of maps.
 INPUTS = {"separated": 18, "stokes": 18, "rgb": 8}
@@ -39,8 +39,6 @@ STEPS = 512
 USUAL = (0.0, 0.0, 0.5, -2.5, 0.3, 0.3, 0.3, -0.9, -1.5, -0.5, -0.5)
 #: The output that is the logarithm of the variance of the normal's error.
 NORMAL_VARIANCE = 3
-#: Reflectance at normal incidence of strength 1: a dielectric of index 1.5.
-GLASS = 0.04
 #: Range of logarithms of variances, and of other logarithms.
 LOG_VARIANCES, LOGARITHMS = (-9.0, 2.0), (-6.0, 6.0)
 

@@ -18,14 +18,13 @@ from torch.nn.functional import avg_pool2d
 from polsep.material.heights import Relief, random_relief
 from polsep.material.svbrdf import Svbrdf, plane_points
 from polsep.physics.fresnel import fresnel
+from polsep.physics.gltf import GLASS
 from polsep.physics.optics import normalize
 from polsep.render.materials import random_materials
 from polsep.render.textures import pattern_weight
 
 #: Largest number of layers, and probabilities of 1, 2, 3; each layer has its own texture and mask.
 LAYERS, LAYER_SHARES = 3, (0.3, 0.4, 0.3)
-#: Reflectance at normal incidence of strength 1: glass of index 1.5, as `optics` has it.
-GLASS = 0.04
 #: Factor of the specular strength of a layer, 0.5 to 1; log-uniform: indices of refraction of 1.3 to 1.9.
 GAINS = (0.5, 2.5)
 #: Least roughness: below it, the reflection of a small flash is a point.
@@ -41,9 +40,9 @@ MAP_SIZE = 128
 #: Share of flat materials; rms slope along an axis of the others, at `MAP_SIZE`, log-uniform. No slope is steeper than
 #: the third number; the raw pixels of reliefs that are finer than the maps have no larger rms than the last.
 FLAT_SHARE, SLOPES, STEEPEST, FINEST = 0.05, (0.04, 0.8), 3.0, 1.2
-#: Number of reliefs and probability of the second; probabilities that patterns of colour also have height, and that a
+#: Probability of a second relief; probabilities that patterns of colour also have height, and that a
 #: layer lies where the relief says.
-RELIEFS, SECOND_SHARE, RAISED_SHARE, FOLLOWS_SHARE = 2, 0.5, 0.5, 0.5
+SECOND_SHARE, RAISED_SHARE, FOLLOWS_SHARE = 0.5, 0.5, 0.5
 #: Rounds in which heights are scaled to a slope.
 ROUNDS = 4
 

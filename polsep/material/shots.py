@@ -18,10 +18,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from polsep.demosaic.measured_stokes import measured_stokes
-from polsep.material.procedural import GLASS, MAP_SIZE, halve, random_svbrdf
+from polsep.material.procedural import MAP_SIZE, halve, random_svbrdf
 from polsep.material.svbrdf import Svbrdf, plane_points
 from polsep.physics.fresnel import fresnel
-from polsep.physics.gltf import metalness
+from polsep.physics.gltf import GLASS, metalness
 from polsep.physics.optics import Geometry, dot, metal_stokes, normalize
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture

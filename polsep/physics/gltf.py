@@ -18,6 +18,8 @@ SCHLICK = (-5.55473, -6.98316)
 MIN_ROUGHNESS, MIN_COSINE = 0.03, 1e-3
 #: Largest mean reflectance at normal incidence of dielectrics, and least of metals: gems reach 0.17, iron has 0.56.
 DIELECTRICS, METALS = 0.2, 0.32
+#: Reflectance at normal incidence of a dielectric of index 1.5: ((1.5 - 1) / (1.5 + 1))^2.
+GLASS = 0.04
 
 
 class Coat(NamedTuple):

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
+from polsep.physics.gltf import GLASS
 from polsep.physics.stokes import Stokes, rotate_frame
 from polsep.render.sphere_tracing import Scene
 
@@ -45,8 +46,6 @@ METALS = {
     "silver": (0.972, 0.960, 0.915),
     "iron": (0.562, 0.565, 0.578),
 }
-#: Reflectance of a dielectric of index 1.5 at normal incidence, that of the specular lobe that a metal replaces.
-DIELECTRIC = 0.04
 
 
 def as_color(rgb: Sequence[float] | Tensor) -> Tensor:
@@ -160,7 +159,7 @@ def add_indirect_light(scene: Scene, light: IndirectLight) -> Scene:
     return replace(scene, diffuse=diffuse, specular=scene.specular + turned)
 
 
-def make_metal(scene: Scene, metal: Tensor, reflectance: Number, strength: float = 1 / DIELECTRIC) -> Scene:
+def make_metal(scene: Scene, metal: Tensor, reflectance: Number, strength: float = 1 / GLASS) -> Scene:
     """Return the scene with surfaces of metal: no diffuse light, and coloured specular light.
 
     ``metal [..., 1, H, W]``: 1 where there is metal, 0 elsewhere. ``reflectance``: its colour (`METALS`).

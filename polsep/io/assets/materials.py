@@ -37,7 +37,7 @@ from polsep.io.results.sidecars import EncodedFile, exr_notes, require_finite, r
 from polsep.io.store.atomic import refuse_existing
 from polsep.io.store.errors import naming
 from polsep.io.store.image_codecs import encode_png
-from polsep.physics.gltf import metalness
+from polsep.physics.gltf import GLASS, metalness
 
 Floats = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
@@ -52,8 +52,6 @@ UNITS = {
     "roughness": "GGX alpha = roughness^2; PNG: linear",
     "specular": "linear reflectance at normal incidence, 0.04 for glass; PNG: sRGB, over specular_scale",
 }
-#: Reflectance of glTF's dielectrics at normal incidence.
-DIELECTRIC = 0.04
 #: Panels of a picture of Deschaintre et al. 2018: the photograph, normals, diffuse, roughness, specular.
 PANELS = 5
 
@@ -99,8 +97,8 @@ def _encoded_files(material: MaterialFiles, name: str, scale: float) -> Iterator
 
 
 def specular_scale(specular: Floats) -> float:
-    """The reflectance at normal incidence of white in the specular texture: the largest one, at least `DIELECTRIC`."""
-    return max(float(specular.max()), DIELECTRIC)
+    """The reflectance at normal incidence of white in the specular texture: the largest one, at least `GLASS`."""
+    return max(float(specular.max()), GLASS)
 
 
 def texture_pixels(maps: Mapping[str, Floats]) -> dict[str, Pixels]:
@@ -119,7 +117,7 @@ def metallic_maps(maps: Mapping[str, Floats]) -> dict[str, Floats]:
     specular = np.ascontiguousarray(np.moveaxis(maps["specular"], -1, 0))
     metallic = np.moveaxis(metalness(specular), 0, -1).astype(np.float32)
     base = maps["diffuse"] + metallic * (maps["specular"] - maps["diffuse"])
-    dielectric = maps["specular"] + metallic * (DIELECTRIC - maps["specular"])
+    dielectric = maps["specular"] + metallic * (GLASS - maps["specular"])
     return {**maps, "diffuse": base, "specular": dielectric, "metallic": metallic}
 
 
@@ -155,7 +153,7 @@ def encode_glb(maps: Mapping[str, Floats], name: str) -> bytes:
         (primitive,), (shading,) = tree["meshes"][0]["primitives"], tree["materials"]
         primitive["attributes"]["TANGENT"] = primitive["attributes"].pop("_TANGENT")
         specular = {
-            "specularColorFactor": [scale / DIELECTRIC] * 3,
+            "specularColorFactor": [scale / GLASS] * 3,
             "specularColorTexture": shading.pop("occlusionTexture"),
         }
         shading["extensions"] = {"KHR_materials_specular": specular}
@@ -191,7 +189,7 @@ def encode_materialx(files: Mapping[str, str], scale: float, name: str) -> str:
         file = {"name": "file", "type": "filename", "value": files[texture], **encoding}
         node("image", f"{texture}_image", type, file)
     node("normalmap", "normal_map", "vector3", link("in", "vector3", "normal_image"))
-    factor = {"name": "in2", "type": "float", "value": f"{scale / DIELECTRIC:.6g}"}
+    factor = {"name": "in2", "type": "float", "value": f"{scale / GLASS:.6g}"}
     node("multiply", "specular_color", "color3", link("in1", "color3", "specular_image"), factor)
     node(
         "gltf_pbr",

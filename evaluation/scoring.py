@@ -67,7 +67,7 @@ class Score(NamedTuple):
 
 
 def own_entries(mosaics: bool) -> tuple[Entry, ...]:
-    """`pipeline.METHODS` as entries: all for ``mosaics``, those that take them for co-sited samples."""
+    """`methods.METHODS` as entries: all for ``mosaics``, those that take them for co-sited samples."""
     return tuple(Entry(m.name, m.reference) for m in METHODS.values() if mosaics or not m.reads_mosaic)
 
 

@@ -1,7 +1,7 @@
 """Colour, polarization angle and degree of a lamp, from frames of an object or of a grey card under it.
 
 Mirrored light has the lamp's colour and polarization. On a shiny dark ball it is nearly all the light there is; on
-other objects the colour is that of `light.find_light`, while the degree of polarization is a lower bound. A grey card
+other objects the colour is that of `find_light`, while the degree of polarization is a lower bound. A grey card
 shows the colour without any mirrored light.
 """
 

@@ -42,7 +42,7 @@ PRECISIONS = ("bf16-mixed", "32-true")
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """Options of a ``rung`` of `paper.RUNGS` on a ``variant`` of the data. Raises ValueError on unknown names."""
+    """Options of a ``rung`` of `rungs.RUNGS` on a ``variant`` of the data. Raises ValueError on unknown names."""
 
     rung: str
     variant: str = "mosaic"

@@ -30,7 +30,7 @@ from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
 from polsep.io.results.separation_reader import is_separated
 from polsep.io.store.errors import InputError, input_error
 from polsep.pipeline import open_separated
-from polsep.separation.report import SeparatedFrame
+from polsep.separation.report import SeparatedFrame, reported_light
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -113,8 +113,7 @@ def views_of(frames: Sequence[SeparatedFrame]) -> Views:
 
 def _gains_of(frame: SeparatedFrame) -> Floats:
     """The lamp's colour by the report over its mean; 1 where it says none."""
-    channels = frame.diffuse.shape[-1]
-    light = np.array(frame.report.get("light_color", (1.0,) * channels), np.float64)[:channels]
+    light = np.array(reported_light(frame), np.float64)
     gains: Floats = light / light.mean()
     return gains
 
@@ -183,8 +182,7 @@ def find_shape(views: Views, directions: Floats, mask: Mask, options: ShapeOptio
     gain = 1 / max(float(np.percentile(found.albedo[mask], 99.5)), 1e-30)
     shown = Appearance(found.normals, np.minimum(found.albedo * gain, 1), mask)
     surface = span_surface(shown, depth, intrinsics)
-    encode = encode_glb if options.mesh == "glb" else encode_ply
-    mesh = encode(surface.vertices, surface.normals, surface.colors, surface.faces)
+    mesh = encode_mesh(surface, options.mesh)
     sidecar = {
         "lights": directions.round(6).tolist(),
         "polarization": cue is not None,
@@ -196,11 +194,17 @@ def find_shape(views: Views, directions: Floats, mask: Mask, options: ShapeOptio
     }
     sheet, film = draw_sheet(views, shown, surface), None
     if options.turntable:
-        film = encode_film(draw_turntable(surface), WATCHABLE, TURN_RATE)
+        film = film_turntable(surface)
         sidecar |= {
             "turntable": f"seen from {SWING[0]:g} degrees left to {SWING[0]:g} right, the light beside the camera"
         }
     return ShapeFiles(found.normals, found.albedo, depth, mask, mesh, sheet, film, sidecar)
+
+
+def encode_mesh(surface: Surface, name: str, roughness: float = 1.0) -> bytes:
+    """The mesh as a file, "glb" or "ply", which has no ``roughness``."""
+    arrays = (surface.vertices, surface.normals, surface.colors, surface.faces)
+    return encode_ply(*arrays) if name == "ply" else encode_glb(*arrays, roughness)
 
 
 def intrinsics_of(fov_deg: float, size: tuple[int, ...]) -> Floats:
@@ -222,11 +226,22 @@ def draw_sheet(views: Views, shown: Appearance, surface: Surface) -> Pixels:
         Panel("Albedo", "brightest = white", toned(shown.albedo, 0.9)),
         Panel("Another light", "from above left", toned(relit, exposure_of(relit[mask]))),
     ]
-    meshes = np.stack(list(draw_views(surface, CELL, VIEWS)))
+    return titled_sheet(
+        [[panel._replace(pixels=_cell(panel.pixels, mask)) for panel in flat], draw_mesh(surface, CELL)]
+    )
+
+
+def draw_mesh(surface: Surface, size: int) -> list[Panel]:
+    """Pictures of a mesh from `VIEWS`, each ``size`` x ``size`` on grey, of one exposure."""
+    meshes = np.stack(list(draw_views(surface, size, VIEWS)))
     gain = exposure_of(meshes[meshes.sum(axis=-1) > 0])
     sides = [f"{abs(azimuth):g} deg {'left' if azimuth < 0 else 'right'}" for azimuth, _ in VIEWS]
-    solid = [Panel("Mesh", side, _on_grey(picture, gain)) for side, picture in zip(sides, meshes, strict=True)]
-    return titled_sheet([[panel._replace(pixels=_cell(panel.pixels, mask)) for panel in flat], solid])
+    return [Panel("Mesh", side, _on_grey(picture, gain)) for side, picture in zip(sides, meshes, strict=True)]
+
+
+def film_turntable(surface: Surface) -> bytes:
+    """The film of `draw_turntable`, to watch. Raises ValueError without the extra ``video``."""
+    return encode_film(draw_turntable(surface), WATCHABLE, TURN_RATE)
 
 
 def draw_turntable(surface: Surface) -> Iterator[Pixels]:

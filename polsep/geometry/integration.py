@@ -61,12 +61,16 @@ def find_slopes(normals: Floats, mask: Mask, intrinsics: Floats | None = None) -
     if intrinsics is None:
         cosine, ratio, scale = z, 1.0, 1.0
     else:
-        rows, cols = np.mgrid[: mask.shape[0], : mask.shape[1]]
         scale, ratio = float(intrinsics[0, 0]), float(intrinsics[0, 0] / intrinsics[1, 1])
-        across = (cols - intrinsics[0, 2]) / intrinsics[0, 0]
-        upward = (intrinsics[1, 2] - rows) / intrinsics[1, 1]
+        across, upward = pixel_rays(mask.shape, intrinsics)
         cosine = -scale * (x * across + y * upward - z)
     return Slopes(np.maximum(cosine, MIN_COSINE * scale), x, -y * ratio, mask)
+
+
+def pixel_rays(size: tuple[int, ...], intrinsics: Floats) -> tuple[Floats, Floats]:
+    """The rays (x, y, -1) of pixels: x and y ``[H, W]``, to the right and up; ``intrinsics [3, 3]`` in pixels."""
+    rows, cols = np.mgrid[: size[0], : size[1]]
+    return (cols - intrinsics[0, 2]) / intrinsics[0, 0], (intrinsics[1, 2] - rows) / intrinsics[1, 1]
 
 
 def integrate_bilateral(normals: Floats, mask: Mask, intrinsics: Floats | None = None) -> Floats:

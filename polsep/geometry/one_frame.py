@@ -40,7 +40,7 @@ from polsep.networks.sizes import ResidualSize
 from polsep.physics.fresnel import ETA, diffuse_dolp
 from polsep.pipeline import PolsepWarning
 from polsep.sensor.camera import WrongType
-from polsep.separation.report import SeparatedFrame
+from polsep.separation.report import SeparatedFrame, reported_light
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -279,8 +279,7 @@ def images_of(frame: SeparatedFrame, mask: Mask) -> Floats:
 
     In white light: the lamp's colour that the report names is divided out.
     """
-    channels = frame.diffuse.shape[-1]
-    gain = np.array(frame.report.get("light_color", (1.0,) * channels), np.float32)[:channels]
+    gain = np.array(reported_light(frame), np.float32)
     diffuse, specular = frame.diffuse / gain, (frame.specular / gain).mean(axis=-1)
     strength = frame.dolp * (diffuse.mean(axis=-1) + specular)
     error = np.zeros_like(strength) if frame.error is None else frame.error[..., 0] / gain.mean()

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,15 +16,17 @@ from polsep.geometry.one_frame import SIDE, UNKNOWN, Shape, find_shape, gather, 
 from polsep.geometry.shape_maps import Surface, relight
 from polsep.io.assets.maps import read_object
 from polsep.io.assets.relight_page import RelightMaps, encode_relight_page
-from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
+from polsep.io.assets.shapes import ShapeFiles
 from polsep.io.raw.frames import ReadOptions
-from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
 from polsep.io.results.separation_reader import is_separated
 from polsep.io.store.errors import input_error
 from polsep.physics.fresnel import ETA
 from polsep.pipeline import LightColor, open_separated
 from polsep.separation.report import SeparatedFrame
+
+if TYPE_CHECKING:
+    from polsep.geometry.surface import Surface as Mesh
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -109,12 +111,14 @@ def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, ti
     }
     panels, depth, mesh, film = draw_panels(frame, found), None, None, None
     if settings.mesh != "none":
-        solid = _Solid(found, settings.integration)
-        depth, mesh = solid.depth, solid.encode(settings.mesh)
-        panels.append(solid.draw())
-        facts |= {"integration": settings.integration, "triangles": solid.triangles}
+        from polsep.geometry.files import draw_mesh, encode_mesh, film_turntable
+
+        surface, depth = _solid(found, settings.integration)
+        mesh = encode_mesh(surface, settings.mesh, float(np.median(found.roughness[found.mask])))
+        panels.append(draw_mesh(surface, CELL))
+        facts |= {"integration": settings.integration, "triangles": len(surface.faces)}
         if settings.turntable:
-            film = encode_film(solid.turn(), WATCHABLE, 24.0)
+            film = film_turntable(surface)
     normals, albedo = (x.astype(np.float64) for x in (found.normals, found.albedo))
     page = page_of(found, title)
     return ShapeFiles(normals, albedo, depth, found.mask, mesh, titled_sheet(panels), film, facts, more, page)
@@ -139,57 +143,25 @@ def _page_maps(found: Shape) -> RelightMaps:
     return RelightMaps(normals, colors, surface.roughness[0], surface.specular[0], on_thing(share))
 
 
-class _Solid:
-    """Depth and mesh of a shape. Needs the extra ``mesh``. State: the mesh. Raises ValueError on too thin things."""
+def _solid(found: Shape, integration: str) -> tuple[Mesh, NDArray[np.float64]]:
+    """Mesh and depth ``[h, w]`` of a shape. Needs the extra ``mesh``. Raises ValueError on too thin things."""
+    from polsep.geometry.files import INTEGRATIONS
+    from polsep.geometry.photometric import Appearance
+    from polsep.geometry.surface import span_surface
 
-    def __init__(self, found: Shape, integration: str) -> None:
-        from polsep.geometry.files import INTEGRATIONS
-        from polsep.geometry.photometric import Appearance
-        from polsep.geometry.surface import span_surface
-
-        window = square_around(found.mask)
-        surface, share = in_square(found, MESH_SIDE)
-        mask, side = share > 0.99, len(share)
-        corners = np.lib.stride_tricks.sliding_window_view(mask, (2, 2))
-        if corners.sum(axis=(2, 3)).max() < 3:  # of four neighbours a triangle needs three
-            least = math.ceil(3 * window[2] / side)
-            raise ValueError(
-                f"expected a thing of {least} pixels across or more for a mesh, found less; say --mesh none"
-            )
-        normals, albedo = (np.moveaxis(x, 0, -1).astype(np.float64) * mask[..., None] for x in surface[:2])
-        depth = INTEGRATIONS[integration](normals, mask)
-        gain = 1 / max(float(np.percentile(albedo[mask], 99.5)), 1e-9)
-        shown = np.minimum(albedo * gain, 1) * mask[..., None]
-        self.surface = span_surface(Appearance(normals, np.broadcast_to(shown, (side, side, 3)), mask), depth)
-        self.triangles = len(self.surface.faces)
-        self.roughness = float(np.median(found.roughness[found.mask]))
-        self.depth = _enlarged(np.where(mask, depth, np.nan) * (window[2] / side), window, found.mask)
-
-    def encode(self, name: str) -> bytes:
-        """The mesh as a file."""
-        s = self.surface
-        if name == "ply":
-            return encode_ply(s.vertices, s.normals, s.colors, s.faces)
-        return encode_glb(s.vertices, s.normals, s.colors, s.faces, self.roughness)
-
-    def draw(self) -> Sequence[Panel]:
-        """A row of pictures of the mesh."""
-        from polsep.geometry.files import VIEWS
-        from polsep.geometry.surface import draw_views
-
-        pictures = np.stack(list(draw_views(self.surface, CELL, VIEWS)))
-        gain = exposure_of(pictures[pictures.sum(axis=-1) > 0])
-        sides = [f"{abs(a):g} deg {'left' if a < 0 else 'right'}" for a, _ in VIEWS]
-        return [
-            Panel("Mesh", side, _on_grey(toned(x, gain), x.sum(axis=-1) > 0))
-            for side, x in zip(sides, pictures, strict=True)
-        ]
-
-    def turn(self) -> Any:
-        """Pictures of a turntable."""
-        from polsep.geometry.files import draw_turntable
-
-        return draw_turntable(self.surface)
+    window = square_around(found.mask)
+    surface, share = in_square(found, MESH_SIDE)
+    mask, side = share > 0.99, len(share)
+    corners = np.lib.stride_tricks.sliding_window_view(mask, (2, 2))
+    if corners.sum(axis=(2, 3)).max() < 3:  # of four neighbours a triangle needs three
+        least = math.ceil(3 * window[2] / side)
+        raise ValueError(f"expected a thing of {least} pixels across or more for a mesh, found less; say --mesh none")
+    normals, albedo = (np.moveaxis(x, 0, -1).astype(np.float64) * mask[..., None] for x in surface[:2])
+    depth = INTEGRATIONS[integration](normals, mask)
+    gain = 1 / max(float(np.percentile(albedo[mask], 99.5)), 1e-9)
+    shown = np.minimum(albedo * gain, 1) * mask[..., None]
+    mesh = span_surface(Appearance(normals, np.broadcast_to(shown, (side, side, 3)), mask), depth)
+    return mesh, _enlarged(np.where(mask, depth, np.nan) * (window[2] / side), window, found.mask)
 
 
 def _enlarged(depth: NDArray[np.float64], window: tuple[int, int, int], mask: Mask) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from polsep.geometry.integration import Slopes, find_slopes
+from polsep.geometry.integration import Slopes, find_slopes, pixel_rays
 from polsep.geometry.photometric import Appearance
 from polsep.render.tracer import Tracer
 
@@ -47,12 +47,11 @@ class Surface:
 def span_surface(appearance: Appearance, depth: Floats, intrinsics: Floats | None = None) -> Surface:
     """The surface of a depth map of `integration`, with the normals and albedo of its pixels. Raises ValueError."""
     mask = appearance.mask & np.isfinite(depth)
-    rows, cols = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float64)
     if intrinsics is None:
+        rows, cols = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float64)
         points, focal, flat = np.stack([cols, -rows, -depth], axis=-1), 1.0, depth
     else:
-        across = (cols - intrinsics[0, 2]) / intrinsics[0, 0]
-        upward = (intrinsics[1, 2] - rows) / intrinsics[1, 1]
+        across, upward = pixel_rays(mask.shape, intrinsics)
         points = np.stack([across, upward, -np.ones_like(depth)], axis=-1) * depth[..., None]
         focal = float(intrinsics[0, 0])
         flat = focal * np.log(np.where(mask, depth, 1.0))  # rises in pixels, whatever the distance

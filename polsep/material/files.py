@@ -23,7 +23,7 @@ from polsep.material.procedural import MAP_SIZE
 from polsep.material.shots import CAMERA_HEIGHT
 from polsep.material.svbrdf import Svbrdf, plane_points, relight
 from polsep.pipeline import LightColor, open_separated, separate_capture
-from polsep.separation.report import SeparatedFrame
+from polsep.separation.report import SeparatedFrame, reported_light
 
 Floats = NDArray[np.float32]
 
@@ -126,7 +126,7 @@ def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photogra
                 raise input_error(path, "expected light in the middle of a photograph, found a black one")
             views.append(view)
             sources.append(Path(path).name)
-            lights.append(_light_of(frame))
+            lights.append(reported_light(frame))
             notes += [f"{path}: {note}" for note in said]
     if not views:
         raise InputError("expected photographs of a material, found none")
@@ -150,15 +150,9 @@ def _separated(path: str, options: MaterialOptions) -> Iterator[tuple[SeparatedF
 def white_lobes(frame: SeparatedFrame) -> tuple[Floats, Floats]:
     """Diffuse and specular image under white light of the same mean, as training's are: the lamp's colour over its mean
     is divided out, so that grey paper is grey and its mean s0 stays."""
-    light = np.array(_light_of(frame), np.float32)
+    light = np.array(reported_light(frame), np.float32)
     gains = light / light.mean()
     return frame.diffuse / gains, frame.specular / gains
-
-
-def _light_of(frame: SeparatedFrame) -> tuple[float, ...]:
-    """The lamp's colour by the report, a gain per channel; white where it says none."""
-    channels = frame.diffuse.shape[-1]
-    return tuple(frame.report.get("light_color", (1.0,) * channels))[:channels]
 
 
 def flatness_notes(photographs: Photographs) -> list[str]:

@@ -63,6 +63,12 @@ class SeparatedFrame:
         return f"{type(self).__name__}({method}: diffuse and specular {list(self.diffuse.shape)}, {warned})"
 
 
+def reported_light(frame: SeparatedFrame) -> tuple[float, ...]:
+    """The lamp's colour by the report of a frame, a gain for each of its C channels; white where it says none."""
+    channels = frame.diffuse.shape[-1]
+    return tuple(frame.report.get("light_color", (1.0,) * channels))[:channels]
+
+
 def grey(stokes: Stokes) -> Stokes:
     """Stokes images ``[..., 1, h, w]`` of all colours together."""
     return stokes.map(lambda image: namespace(image).mean(image, axis=-3, keepdims=True))

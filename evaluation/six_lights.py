@@ -19,18 +19,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from evaluation.testsets.casting import LENS_BLUR, SAMPLES, look_at
+from evaluation.testsets.casting import LENS_BLUR, SAMPLES
 from evaluation.testsets.statues import (
     DILIGENT,
     DILIGENT_FILES,
     ROUGHNESSES,
     SCANS,
     random_albedo,
-    span_surface,
-    unproject,
+    read_scan,
+    read_statue,
 )
 from polsep.geometry.lights import NAMED
-from polsep.io.assets.objects import read_depth, read_intrinsics, read_mask, read_mesh, read_normal_map
 from polsep.physics.stokes import Stokes
 from polsep.render.distances import Field
 from polsep.render.raycast import Hits, MeshScene, find_hits, is_lit
@@ -91,33 +90,20 @@ def load_subjects(data: Path, names: Sequence[str] | None = None) -> list[Subjec
         albedo = random_albedo(number, generator)
         low, high = ROUGHNESSES
         roughness = low + (high - low) * torch.rand(1, generator=generator).item()
-        mesh, camera = _statue(data / "diligent_normals" / name) if name in DILIGENT else _scan(data, name)
+        mesh, camera = (
+            _statue(data / "diligent_normals" / name)
+            if name in DILIGENT
+            else read_scan(data / "meshes" / name, SCANS[name])
+        )
         found.append(Subject(stem, MeshScene(mesh), camera, albedo, roughness))
     return found
 
 
 def _statue(folder: Path) -> tuple[Mesh, PinholeCamera]:
     """A DiLiGenT object from where its camera was."""
-    paths = [folder / file for file in DILIGENT_FILES]
-    normals, mask, depth = read_normal_map(paths[0]), read_mask(paths[1]), read_depth(paths[2])
-    matrix = read_intrinsics(paths[3])
-    surface = span_surface(unproject(depth, matrix), normals, mask & np.isfinite(depth))
-    middle = (surface.vertices.min(axis=0) + surface.vertices.max(axis=0)) / 2
-    radius = float(np.linalg.norm(surface.vertices - middle, axis=1).max())
-    vertices = (surface.vertices - middle) / radius
-    mesh = Mesh(vertices, surface.normals, surface.uv, surface.faces, surface.slots)
-    x, y, z = (float(c) for c in -middle / radius)
-    fov = math.degrees(2 * math.atan(1.02 * float(np.abs(vertices[:, :2]).max()) / z))
-    return mesh, PinholeCamera((x, y, z), (0.0, 0.0, 0.0), fov)
-
-
-def _scan(data: Path, name: str) -> tuple[Mesh, PinholeCamera]:
-    """A scanned mesh in the pose of the selection set."""
-    mesh, pose = read_mesh(data / "meshes" / name), SCANS[name]
-    if pose.up == "z":
-        turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-        mesh = Mesh(mesh.vertices @ turn.T, mesh.normals @ turn.T, mesh.uv, mesh.faces, mesh.slots)
-    return mesh, look_at(mesh, pose.azimuth_deg, pose.elevation_deg)
+    mesh, viewpoint = read_statue([folder / file for file in DILIGENT_FILES])
+    fov = math.degrees(2 * math.atan(1.02 * float(np.abs(mesh.vertices[:, :2]).max()) / viewpoint[2]))
+    return mesh, PinholeCamera(viewpoint, (0.0, 0.0, 0.0), fov)
 
 
 def photograph(subject: Subject, seed: int, side: int = SIDE) -> Shoot:

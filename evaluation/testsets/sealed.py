@@ -120,6 +120,11 @@ def bowl(size: tuple[int, int], share: Floats) -> Floats:
     return turned(profile, size)
 
 
+def sphere_angles(size: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Longitudes ``[n, 1]`` around, and latitudes ``[m]`` from pole to pole [rad]."""
+    return 2 * math.pi * np.arange(size[0])[:, None] / size[0], np.linspace(-math.pi / 2, math.pi / 2, size[1])
+
+
 def superquadric(size: tuple[int, int], share: Floats) -> Floats:
     """A rounded box or a spindle, by exponents from 0.35 to 1.8. Source: Barr 1981, doi:10.1109/MCG.1981.1673799."""
 
@@ -128,7 +133,7 @@ def superquadric(size: tuple[int, int], share: Floats) -> Floats:
         return found
 
     around, up = (0.35 + 1.45 * share[k] for k in (0, 1))
-    u, v = 2 * math.pi * np.arange(size[0])[:, None] / size[0], np.linspace(-math.pi / 2, math.pi / 2, size[1])
+    u, v = sphere_angles(size)
     flat = power(np.cos(v), up)
     parts = (
         power(np.cos(u), around) * flat,
@@ -140,7 +145,7 @@ def superquadric(size: tuple[int, int], share: Floats) -> Floats:
 
 def shell(size: tuple[int, int], share: Floats) -> Floats:
     """A lobed gourd: radius over the sphere by two waves."""
-    u, v = 2 * math.pi * np.arange(size[0])[:, None] / size[0], np.linspace(-math.pi / 2, math.pi / 2, size[1])
+    u, v = sphere_angles(size)
     radius = (
         1 + (0.1 + 0.12 * share[0]) * np.cos(int(3 + 5 * share[1]) * u) * np.cos(v) + 0.15 * np.sin(3 * v + share[2])
     )

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from evaluation.testsets.cases import Recipe
 from evaluation.testsets.casting import FILLED, look_at, random_light_near, render_covered
+from polsep.geometry.integration import pixel_rays
 from polsep.io.assets.objects import read_depth, read_intrinsics, read_mask, read_mesh, read_normal_map
 from polsep.render.distances import Field, cells, marble, plain
 from polsep.render.materials import rgb_from_hsv
@@ -80,9 +81,7 @@ SCANS = {
 
 def make_statue(scene: int, paths: list[Path], generator: torch.Generator) -> Scene:
     """A DiLiGenT object under a random light with a random skin."""
-    normals, mask, depth = read_normal_map(paths[0]), read_mask(paths[1]), read_depth(paths[2])
-    points = unproject(depth, read_intrinsics(paths[3]))
-    mesh, viewpoint = _centred(span_surface(points, normals, mask & np.isfinite(depth)))
+    mesh, viewpoint = read_statue(paths)
     camera = _look_from(mesh, viewpoint)
     back = tuple(STATUE_LIGHT_DISTANCE * x / math.hypot(*viewpoint) for x in viewpoint)
     light = random_light_near(PinholeCamera((back[0], back[1], back[2]), camera.target), generator)
@@ -91,13 +90,25 @@ def make_statue(scene: int, paths: list[Path], generator: torch.Generator) -> Sc
 
 def make_scan(scene: int, pose: Pose, paths: list[Path], generator: torch.Generator) -> Scene:
     """A scanned mesh in a fixed pose under a random light with a random skin."""
-    mesh = read_mesh(paths[0])
+    mesh, camera = read_scan(paths[0], pose)
+    light = random_light_near(camera, generator)
+    return _render(mesh, (camera, light), random_albedo(scene, generator), generator, SCAN_SIDE)
+
+
+def read_statue(paths: list[Path]) -> tuple[Mesh, Vector]:
+    """The visible surface of a DiLiGenT object, of radius 1 around the origin, and where its camera was."""
+    normals, mask, depth = read_normal_map(paths[0]), read_mask(paths[1]), read_depth(paths[2])
+    points = unproject(depth, read_intrinsics(paths[3]))
+    return _centred(span_surface(points, normals, mask & np.isfinite(depth)))
+
+
+def read_scan(path: Path, pose: Pose) -> tuple[Mesh, PinholeCamera]:
+    """A scanned mesh, +y up, and the camera of its pose."""
+    mesh = read_mesh(path)
     if pose.up == "z":
         turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
         mesh = Mesh(mesh.vertices @ turn.T, mesh.normals @ turn.T, mesh.uv, mesh.faces, mesh.slots)
-    camera = look_at(mesh, pose.azimuth_deg, pose.elevation_deg)
-    light = random_light_near(camera, generator)
-    return _render(mesh, (camera, light), random_albedo(scene, generator), generator, SCAN_SIDE)
+    return mesh, look_at(mesh, pose.azimuth_deg, pose.elevation_deg)
 
 
 def _render(
@@ -133,10 +144,8 @@ def _within(interval: tuple[float, float], share: Tensor) -> Tensor:
 
 def unproject(depth: Floats, intrinsics: Floats) -> Floats:
     """Points ``[H, W, 3]`` in the camera's frame (x right, y up, z toward it) of depths along its axis."""
-    rows, cols = np.mgrid[: depth.shape[0], : depth.shape[1]]
-    x = (cols - intrinsics[0, 2]) / intrinsics[0, 0] * depth
-    y = (intrinsics[1, 2] - rows) / intrinsics[1, 1] * depth
-    return np.stack([x, y, -depth], axis=-1)
+    x, y = pixel_rays(depth.shape, intrinsics)
+    return np.stack([x * depth, y * depth, -depth], axis=-1)
 
 
 def span_surface(points: Floats, normals: Floats, mask: NDArray[np.bool_]) -> Mesh:

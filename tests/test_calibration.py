@@ -10,6 +10,7 @@ import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from polsep.io.raw.sequences import expand_folders
 from polsep.io.raw.tiff import write_merged
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration, write_calibration
+from polsep.io.store.errors import InputError
 from polsep.pipeline import is_calibrated
 from polsep.sensor.calibration import (
     Analyser,
@@ -689,6 +691,53 @@ def test_what_cannot_be_read_again_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="expected a falloff"):
         write_calibration(tmp_path / "rig.json", replace(good, falloff=((0.4, 0.6),)), "0")
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+DAMAGES: list[tuple[str, Any, str]] = [
+    ("layout", 3, "expected layout as text, found 3"),
+    ("white_level_codes", "4095", 'expected white_level_codes as a number, found "4095"'),
+    ("height", 1.5, "expected height in whole pixels, found 1.5"),
+    ("dark", True, "expected dark as a section of entries, found true"),
+    ("dark", None, "expected black_level with its black_map, found none: is a section missing?"),
+    ("dark.black_level_codes", True, "expected black_level_codes as a number, found true"),
+    ("dark.read_noise_codes", -2, "expected read noise from 0 to 4095, found -2"),
+    ("dark.black_pattern_codes", [1, 2], "expected black_pattern_codes as a list of numbers, found 1"),
+    ("flat", {}, "expected an entry gains, found none"),
+    ("flat.gains", None, "expected gains as rows of numbers, found null"),
+    ("analysers.gain", [[1.0]], "expected angle_deg, extinction and gain of the same places, found rows of [[4, 4, 4"),
+    ("analysers.extinction", [[0.5] * 4] * 4, "expected extinction ratios above 1, found 0.5"),
+    ("light", [1, 2], "expected light as a section of entries, found [1, 2]"),
+    ("light.color_rgb", [1, 2], "expected color_rgb as 3 numbers, found [1, 2]"),
+    ("light.dolp", "x", 'expected dolp as a number, found "x"'),
+    ("light.dolp", -5, "expected a lamp's dolp from 0 to 2, found -5"),
+    ("maps", "rig.npz", 'expected maps as a section of entries, found "rig.npz"'),
+    ("maps", {}, "expected an entry sha256, found none"),
+]
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"), DAMAGES, ids=[f"{place}-{value}" for place, value, _ in DAMAGES]
+)
+def test_damaged_files_name_the_entry(tmp_path: Path, place: str, value: Any, message: str) -> None:
+    layout, table, zeros = Layout(), ((1.0,) * 4,) * 4, np.zeros((8, 8), np.float32)
+    analysers = tuple(tuple(Analyser(layout.filter_at(r, c).angle_deg, 99.0, 1.0) for c in range(4)) for r in range(4))
+    rig = Calibration(layout, 4095.0, (8, 8), 64.0, table, zeros + 64, 2.0, table, zeros + 1, ((1.0,),))
+    path = tmp_path / "rig.json"
+    write_calibration(path, replace(rig, analysers=analysers, lamp=LampFacts((0.5, 1.0, 0.7), 0.9, 30.0)), "test")
+    read_calibration(path)
+    record = json.loads(path.read_text())
+    section, _, entry = place.rpartition(".")
+    (record[section] if section else record)[entry] = value
+    path.write_text(json.dumps(record))
+    with pytest.raises(InputError) as caught:
+        read_calibration(path)
+    assert message in str(caught.value), caught.value
+
+
+def test_an_unknown_read_noise_is_read_again(tmp_path: Path) -> None:
+    write_calibration(tmp_path / "rig.json", Calibration(Layout(), 4095.0, black_level=2.0), "test")
+    found = read_calibration(tmp_path / "rig.json")
+    assert found.black_level == 2 and found.read_noise is None and found.black_pattern is None
 
 
 def test_measuring_again_replaces_defects_of_its_own_kind() -> None:

@@ -14,7 +14,7 @@ import math
 import os
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.store.atomic import OutputError, replace_bytes, replace_text
-from polsep.io.store.errors import InputError, decoding, naming, one_line
+from polsep.io.store.errors import InputError, decoding, naming
 from polsep.io.store.header_checks import SAMPLES, limit
-from polsep.io.store.json_text import parse_json, read_text
+from polsep.io.store.json_text import (
+    entry_of,
+    number_of,
+    numbers_of,
+    parse_json,
+    read_text,
+    section_of,
+    table_of,
+)
 from polsep.io.store.plausible import require_falloff, require_gains, require_level, require_within
-from polsep.sensor.calibration import Analyser, Calibration, LampFacts, Table
-from polsep.sensor.camera import Layout
+from polsep.physics.stokes import MAX_DOLP
+from polsep.sensor.calibration import Analyser, Calibration, LampFacts
+from polsep.sensor.camera import Layout, WrongType
 
 FORMAT = "polsep calibration 1"
 #: Least steps of the maps: of black as a part of the white level, at most in codes, and of gains.
@@ -111,10 +120,7 @@ def read_calibration(path: str | Path) -> Calibration:
 @lru_cache(maxsize=4)  # viewers read it with every frame
 def _read(path: Path, stamp: int, maps_stamp: int) -> Calibration:
     record = _read_record(path)
-    try:
-        return _from_record(record, _read_maps(path, record.get("maps")))
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"expected a complete calibration, found a wrong or missing {one_line(error, 80)}") from None
+    return _from_record(record, _read_maps(path, section_of(record, "maps")))
 
 
 def _read_record(path: Path) -> dict[str, Any]:
@@ -135,7 +141,8 @@ def _read_maps(path: Path, entry: Mapping[str, Any] | None) -> dict[str, NDArray
     found = [file.read_bytes() for file in (maps, _waiting(maps)) if file.exists()]
     if not found:
         raise ValueError(f"expected its maps in {maps.name} beside it, found none")
-    data = next((data for data in found if hashlib.sha256(data).hexdigest() == entry["sha256"]), None)
+    wanted = entry_of(entry, "sha256")
+    data = next((data for data in found if hashlib.sha256(data).hexdigest() == wanted), None)
     if data is None:
         raise ValueError(f"expected the maps that it was written with in {maps.name}, found others")
     most = 4 * limit(SAMPLES)
@@ -196,28 +203,23 @@ def _record(c: Calibration) -> dict[str, Any]:
 
 
 def _from_record(record: dict[str, Any], maps: dict[str, NDArray[Any]]) -> Calibration:
-    dark, flat, analysers, light = (record.get(name) for name in ("dark", "flat", "analysers", "light"))
-    size = (int(record["height"]), int(record["width"])) if "height" in record else None
-    black_map, gain_map = maps.get("black_offset_codes"), maps.get("gain_minus_1")
-    level = None if dark is None else float(dark["black_level_codes"])
-    lamp, older = None, maps.get("defective_pixels")
-    if light is not None:
-        r, g, b = (float(x) for x in light["color_rgb"])
-        lamp = LampFacts((r, g, b), *(None if light[k] is None else float(light[k]) for k in ("dolp", "aolp_deg")))
+    dark, flat, analysers, light = (section_of(record, name) for name in ("dark", "flat", "analysers", "light"))
+    black_map, gain_map, older = (maps.get(name) for name in ("black_offset_codes", "gain_minus_1", "defective_pixels"))
+    level = None if dark is None else number_of("black_level_codes", entry_of(dark, "black_level_codes"))
     found = Calibration(
-        Layout.parse(record["layout"]),
-        float(record["white_level_codes"]),
-        size,
+        _layout(entry_of(record, "layout")),
+        number_of("white_level_codes", entry_of(record, "white_level_codes")),
+        (_side(record, "height"), _side(record, "width")) if "height" in record or "width" in record else None,
         level,
-        _table(dark and dark["black_pattern_codes"]),
+        _unless_null(table_of, dark, "black_pattern_codes"),
         None if black_map is None else black_map.astype(np.float32) + np.float32(level or 0),
-        None if dark is None else float(dark["read_noise_codes"]),
-        _table(flat and flat["gains"]),
+        _unless_null(number_of, dark, "read_noise_codes"),
+        None if flat is None else table_of("gains", entry_of(flat, "gains")),
         None if gain_map is None else gain_map.astype(np.float32) + np.float32(1),
-        _table(flat and flat["falloff_legendre"]),
+        _unless_null(table_of, flat, "falloff_legendre"),
         maps.get("dead_pixels", older),
         None if analysers is None else _analysers(analysers),
-        lamp,
+        None if light is None else _lamp(light),
         {name: _details(section) for name, section in record.items() if isinstance(section, dict) and name != "maps"},
         maps.get("hot_pixels", older),
     )
@@ -225,11 +227,18 @@ def _from_record(record: dict[str, Any], maps: dict[str, NDArray[Any]]) -> Calib
     return found
 
 
+#: What is nothing without another field.
+_PARTS = (("black_map", "black_level"), ("black_pattern", "black_level"), ("gain_map", "gains"), ("falloff", "gains"))
+
+
 def _require_plausible(c: Calibration) -> None:
     """Raise ValueError where a frame that is corrected by these numbers would hold NaN or infinite samples."""
     require_level("white level", c.white_level)
-    for name, level in (("black level", c.black_level), ("read noise", c.read_noise)):
-        require_within(name, level, c.white_level)
+    for part, whole in _PARTS:
+        if getattr(c, part) is not None and getattr(c, whole) is None:
+            raise ValueError(f"expected {whole} with its {part}, found none: is a section missing?")
+    require_within("black level", c.black_level, c.white_level)
+    require_within("read noise", c.read_noise, c.white_level, 0.0)
     for name, codes in (("black pattern", c.black_pattern), ("black map", c.black_map)):
         require_within(name, None if codes is None else np.asarray(codes), c.white_level)
     require_gains("gains", None if c.gains is None else np.asarray(c.gains))
@@ -238,9 +247,12 @@ def _require_plausible(c: Calibration) -> None:
     for analyser in (analyser for row in c.analysers or () for analyser in row):
         require_within("angles of analysers", analyser.angle_deg, MOST_DEGREES)
         require_gains("gains of analysers", [analyser.gain])
-        require_level("extinction ratio", analyser.extinction if math.isfinite(analyser.extinction) else 1.0)
+        if not analyser.extinction > 1:
+            raise ValueError(f"expected extinction ratios above 1, found {analyser.extinction:g}")
     if c.lamp is not None:
         require_gains("a lamp's colour", c.lamp.color)
+        require_within("a lamp's dolp", c.lamp.dolp, MAX_DOLP, 0.0)
+        require_within("a lamp's aolp_deg", c.lamp.aolp_deg, MOST_DEGREES)
     count = math.prod(c.size or (0,))
     for pixels in (pixels for pixels in (c.hot, c.dead) if pixels is not None):
         listed = pixels.ndim == 1 and pixels.dtype.kind == "i"
@@ -257,16 +269,51 @@ def _details(section: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in section.items() if name not in _FIELDS}
 
 
-def _analysers(section: dict[str, Any]) -> tuple[tuple[Analyser, ...], ...]:
-    columns = [section[name] for name in ("angle_deg", "extinction", "gain")]
+def _layout(spec: Any) -> Layout:
+    """The layout of its text. Raises ValueError."""
+    try:
+        return Layout.parse(spec)
+    except WrongType:
+        raise ValueError(f"expected layout as text, found {json.dumps(spec):.40}") from None
+
+
+def _side(record: Mapping[str, Any], name: str) -> int:
+    """Rows or columns of a frame. Raises ValueError."""
+    side = number_of(name, entry_of(record, name))
+    if not (1 <= side <= limit(SAMPLES) and side.is_integer()):
+        raise ValueError(f"expected {name} in whole pixels, found {side:g}")
+    return int(side)
+
+
+def _unless_null(parse: Callable[[str, Any], Any], section: Mapping[str, Any] | None, name: str) -> Any:
+    """An entry that must be there, but may be null: unknown, as in a section that was not measured."""
+    value = None if section is None else entry_of(section, name)
+    return None if value is None else parse(name, value)
+
+
+def _lamp(section: Mapping[str, Any]) -> LampFacts:
+    r, g, b = numbers_of("color_rgb", entry_of(section, "color_rgb"), 3)
+    return LampFacts((r, g, b), *(_unless_null(number_of, section, name) for name in ("dolp", "aolp_deg")))
+
+
+def _analysers(section: Mapping[str, Any]) -> tuple[tuple[Analyser, ...], ...]:
+    """One analyser per place; an extinction of null is infinite. Raises ValueError on tables of different places."""
+    angles, gains = (table_of(name, entry_of(section, name)) for name in ("angle_deg", "gain"))
+    ratios = table_of("extinction", _null_as_infinite(entry_of(section, "extinction")))
+    sizes = [[len(row) for row in table] for table in (angles, ratios, gains)]
+    if sizes != [sizes[0]] * 3:
+        raise ValueError(f"expected angle_deg, extinction and gain of the same places, found rows of {sizes}")
     return tuple(
-        tuple(Analyser(float(t), math.inf if e is None else float(e), float(g)) for t, e, g in zip(*rows, strict=True))
-        for rows in zip(*columns, strict=True)
+        tuple(Analyser(*places) for places in zip(*rows, strict=True))
+        for rows in zip(angles, ratios, gains, strict=True)
     )
 
 
-def _table(rows: Any) -> Table | None:
-    return None if rows is None else tuple(tuple(float(x) for x in row) for row in rows)
+def _null_as_infinite(table: Any) -> Any:
+    """A table with the nulls of its rows replaced; anything else as it is."""
+    if not isinstance(table, list):
+        return table
+    return [[math.inf if x is None else x for x in row] if isinstance(row, list) else row for row in table]
 
 
 def _to_json(record: dict[str, Any]) -> str:

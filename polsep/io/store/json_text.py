@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from typing import Any
 MOST_DIGITS = 20
 #: Largest file that is read as one JSON text [bytes].
 MOST_BYTES = 2**26
+#: Characters of a wrong value that messages quote.
+MOST_QUOTED = 40
 
 
 def read_text(path: Path) -> str:
@@ -34,6 +37,48 @@ def parse_json(text: str) -> Any:
         return json.loads(text, parse_constant=_refuse, parse_float=_as_float, parse_int=_as_int)
     except RecursionError:
         raise ValueError("expected JSON of a few levels, found hundreds") from None
+
+
+def entry_of(section: Mapping[str, Any], name: str) -> Any:
+    """An entry that must be there. Raises ValueError."""
+    if name not in section:
+        raise ValueError(f"expected an entry {name}, found none")
+    return section[name]
+
+
+def section_of(record: Mapping[str, Any], name: str) -> dict[str, Any] | None:
+    """A section of a record, None where it is missing or null. Raises ValueError on anything else."""
+    found = record.get(name)
+    if not isinstance(found, dict | None):
+        raise ValueError(f"expected {name} as a section of entries, found {_quote(found)}")
+    return found
+
+
+def number_of(name: str, value: Any) -> float:
+    """A number, neither true nor digits as text. Raises ValueError."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"expected {name} as a number, found {_quote(value)}")
+    return float(value)
+
+
+def numbers_of(name: str, value: Any, count: int | None = None) -> tuple[float, ...]:
+    """A list of numbers, of ``count`` where that is stated. Raises ValueError."""
+    if not isinstance(value, list) or (count is not None and len(value) != count):
+        raise ValueError(f"expected {name} as {'a list of' if count is None else count} numbers, found {_quote(value)}")
+    return tuple(number_of(name, number) for number in value)
+
+
+def table_of(name: str, value: Any) -> tuple[tuple[float, ...], ...]:
+    """Rows of numbers. Raises ValueError."""
+    if not isinstance(value, list):
+        raise ValueError(f"expected {name} as rows of numbers, found {_quote(value)}")
+    return tuple(numbers_of(name, row) for row in value)
+
+
+def _quote(value: Any) -> str:
+    """The beginning of a value as the file has it."""
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= MOST_QUOTED else f"{text[:MOST_QUOTED]} ..."
 
 
 def _refuse(name: str) -> None:

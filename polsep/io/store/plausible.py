@@ -31,14 +31,15 @@ def require_gains(name: str, values: Iterable[float] | NDArray[Any] | None) -> N
         raise ValueError(f"expected {name} from {1 / FACTOR:g} to {FACTOR:g}, found {wrong.flat[0]:g}")
 
 
-def require_within(name: str, values: NDArray[Any] | float | None, limit: float) -> None:
-    """Raise ValueError unless values are finite numbers, none larger than ``limit`` either way."""
+def require_within(name: str, values: NDArray[Any] | float | None, limit: float, least: float | None = None) -> None:
+    """Raise ValueError unless values are finite numbers from ``least`` to ``limit``; None: from ``-limit`` on."""
     if values is None:
         return
     found = np.asarray(values, np.float64)
-    wrong = found[~(np.abs(found) <= limit)]
+    wrong = found[~((found >= (-limit if least is None else least)) & (found <= limit))]
     if wrong.size:
-        raise ValueError(f"expected {name} within {limit:g}, found {wrong.flat[0]:g}")
+        wanted = f"within {limit:g}" if least is None else f"from {least:g} to {limit:g}"
+        raise ValueError(f"expected {name} {wanted}, found {wrong.flat[0]:g}")
 
 
 def require_falloff(coefficients: Table | None) -> None:

@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from numbers import Real
 
+from polsep.compute.arrays import WrongType
 from polsep.compute.threads import get_threads, set_threads
 from polsep.light import color_kernel, tiles_kernel
 from polsep.networks import combine_kernel, details_kernel, images_kernel
 from polsep.sensor import defects_kernel, periods_kernel
-from polsep.sensor.camera import Layout, WrongType
+from polsep.sensor.camera import Layout
 from polsep.sensor.unpack_kernel import PackedFrame, RawFrame
 from polsep.separation import (
     analytic_kernel,

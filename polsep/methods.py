@@ -16,14 +16,14 @@ from typing import Protocol
 import numpy as np
 
 from polsep.compute import pages
-from polsep.compute.arrays import namespace, on_cpu, to_numpy
+from polsep.compute.arrays import WrongType, namespace, on_cpu, to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half, is_large_enough
 from polsep.io.store.weights import is_shipped
 from polsep.networks.engines import ENGINES, combine_images, run_engine
 from polsep.physics.stokes import Measurements, behind_angles, bounded_below_white, fit_stokes, is_pair
-from polsep.sensor.camera import Layout, Mosaic, WrongType, sample_fine_mosaic
+from polsep.sensor.camera import Layout, Mosaic, sample_fine_mosaic
 from polsep.separation import analytic_kernel, color_affine_kernel
 from polsep.separation.analytic import Separation, clipped_pixels, separate_analytic
 from polsep.separation.analytic_kernel import AnalyticOptions

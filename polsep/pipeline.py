@@ -21,7 +21,7 @@ import numpy as np
 from array_api_compat import is_array_api_obj
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import namespace, to_device
+from polsep.compute.arrays import WrongType, namespace, to_device
 from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration
@@ -29,7 +29,7 @@ from polsep.light.find import Light, find_light
 from polsep.methods import Capture, Method, find_method
 from polsep.physics.stokes import Measurements
 from polsep.sensor.calibration import Calibration, Corrections, Table, falloff_image, mean_mosaic
-from polsep.sensor.camera import Layout, Mosaic, WrongType
+from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.levels import (
     as_layout,

@@ -21,6 +21,7 @@ import polsep
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.results.separation_reader import read_separated
 from polsep.io.store.errors import InputError
+from polsep.physics.stokes import Measurements, Stokes
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
 from polsep.separation.images import FrameImages
@@ -385,6 +386,15 @@ TYPES: list[tuple[str, Callable[[], object], str]] = [
     ("complex", lambda: Mosaic(SOME + 1j, Layout(), 0, 1), "found complex"),
     ("list", lambda: Mosaic([[1.0]], Layout(), 0, 1), "a NumPy array or a torch tensor, found list"),
     ("a light", lambda: Mosaic(SOME, Layout(), 0, 1, light_color="red"), "expected a light_color of positive numbers"),  # type: ignore[arg-type]
+    ("lists", lambda: Measurements([[1.0]], (0.0,)), "expected measurements as a NumPy array or a torch tensor"),
+    (
+        "codes",
+        lambda: Measurements(np.ones((4, 1, 8, 8), int), Layout().angles),
+        "measurements in floating point, white at 1, found int",
+    ),
+    ("angles", lambda: Measurements(SOME[None, None], "0"), "expected analyser angles in radians, found '0'"),  # type: ignore[arg-type]
+    ("stokes", lambda: Stokes(SOME, SOME, [[1.0]]), "expected Stokes images as a NumPy array or a torch tensor"),
+    ("bits", lambda: Stokes(SOME > 0, SOME, SOME), "expected Stokes images in floating point, found bool"),
     ("planes", lambda: polsep.separate(np.ones((4, 8, 8)), layout=3), 'expected a Layout, "color", "mono", a'),  # type: ignore[arg-type]
 ]
 

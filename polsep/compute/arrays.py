@@ -18,9 +18,21 @@ from numpy.typing import NDArray
 Array: TypeAlias = Any
 
 
+class WrongType(TypeError, ValueError):
+    """An argument of a wrong type; also a ValueError, as every wrong input is."""
+
+
 def namespace(x: Array) -> Any:
     """The standard's functions for arrays of x's kind: NumPy's are NumPy itself, of which no copy is made."""
     return np if isinstance(x, np.ndarray | np.generic) else array_namespace(x)
+
+
+def require_floats(name: str, x: Array, wanted: str = "floating point") -> None:
+    """Raise WrongType unless ``x`` is an array of floats; ``name`` and ``wanted``: words of the message."""
+    if not is_array_api_obj(x) or isinstance(x, np.ma.MaskedArray):  # masked samples have no value
+        raise WrongType(f"expected {name} as a NumPy array or a torch tensor, found {type(x).__name__}")
+    if not namespace(x).isdtype(x.dtype, "real floating"):
+        raise WrongType(f"expected {name} in {wanted}, found {x.dtype}")
 
 
 def to_numpy(x: Array) -> NDArray[Any]:

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import WrongType
 from polsep.compute.resizing import block_means, resize_area, resize_bilinear
 from polsep.geometry.lamp import search_lamp, seen_under
 from polsep.geometry.shape_maps import (
@@ -39,7 +40,6 @@ from polsep.networks.graphs import core, require_own_threads, shape_model
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.fresnel import ETA, diffuse_dolp
 from polsep.pipeline import PolsepWarning
-from polsep.sensor.camera import WrongType
 from polsep.separation.report import SeparatedFrame, reported_light
 
 Floats = NDArray[np.float32]

@@ -22,7 +22,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import Array, constant, namespace, short_repr
+from polsep.compute.arrays import Array, WrongType, constant, namespace, require_floats, short_repr
 
 Doubles = NDArray[np.float64]
 
@@ -47,11 +47,11 @@ class Stokes:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
+        for image in (self.s0, self.s1, self.s2):
+            require_floats("Stokes images", image)
         if self.s1.shape != self.s0.shape or self.s2.shape != self.s0.shape:
             shapes = sorted({tuple(s.shape) for s in (self.s0, self.s1, self.s2)})
             raise ValueError(f"s0, s1, s2 must have one shape, found {shapes}")
-        if not namespace(self.s0).isdtype(self.s0.dtype, "real floating"):
-            raise TypeError(f"Stokes images must be floating point, found {self.s0.dtype}")
 
     def __add__(self, other: Stokes) -> Stokes:
         """Incoherent superposition: Stokes vectors of independent light add."""
@@ -85,16 +85,17 @@ class Measurements:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
+        require_floats("measurements", self.data, "floating point, white at 1")
         if self.data.ndim < 4 or self.data.shape[-4] != len(self.angles):
             raise ValueError(f"expected data [..., {len(self.angles)}, C, H, W], found shape {tuple(self.data.shape)}")
+        if not all(isinstance(angle, Real) for angle in self.angles):
+            raise WrongType(f"expected analyser angles in radians, found {self.angles!r:.60}")
         if not all(abs(angle) <= MOST_ANGLE for angle in self.angles):  # nor NaN
             raise ValueError(f"expected analyser angles in radians, found {list(map(float, self.angles))}: degrees?")
         if self.clipped is not None and self.clipped.shape != self.data.shape:
             raise ValueError(
                 f"clipped must have the shape of data {tuple(self.data.shape)}, found {tuple(self.clipped.shape)}"
             )
-        if not namespace(self.data).isdtype(self.data.dtype, "real floating"):
-            raise TypeError(f"measurements must be floating point, white at 1, found {self.data.dtype}")
 
 
 def analyser_matrix(angles: Sequence[float]) -> Doubles:

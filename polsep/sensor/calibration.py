@@ -27,10 +27,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import as_floats, namespace, of_kind, to_numpy
+from polsep.compute.arrays import WrongType, as_floats, namespace, of_kind, to_numpy
 from polsep.physics.stokes import diattenuation
 from polsep.sensor.ambient import ambient_notes
-from polsep.sensor.camera import Layout, Mosaic, WrongType, clip_level
+from polsep.sensor.camera import Layout, Mosaic, clip_level
 from polsep.sensor.defects import MIN_SIZE, repair
 from polsep.sensor.levels import WHITE_LEVELS
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from array_api_compat import device, is_array_api_obj
 
-from polsep.compute.arrays import Array, as_floats, constant, namespace, short_repr
+from polsep.compute.arrays import Array, WrongType, as_floats, constant, namespace, short_repr
 from polsep.compute.resizing import repeat_pixels, resize_bilinear
 from polsep.physics.stokes import Measurements, Stokes, diattenuation
 
@@ -50,10 +50,6 @@ class Filter(NamedTuple):
 
     angle_deg: float
     channel: int
-
-
-class WrongType(TypeError, ValueError):
-    """An argument of a wrong type; also a ValueError, as every wrong input is."""
 
 
 @dataclass(frozen=True)

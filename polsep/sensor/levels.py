@@ -23,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute import pages
+from polsep.compute.arrays import WrongType
 from polsep.physics.stokes import Measurements
-from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, WrongType, clip_level
+from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, clip_level
 
 #: Accepted samples and the white level that their type implies.
 WHITE_LEVELS = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0, "float64": 1.0}

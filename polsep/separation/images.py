@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute import pages
-from polsep.sensor.camera import Layout, WrongType, require_layout
+from polsep.compute.arrays import WrongType
+from polsep.sensor.camera import Layout, require_layout
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import WrongType
 from polsep.io.raw.extensions import LOSSLESS
 from polsep.io.raw.headerless import headerless_page, read_headerless, with_layout
 from polsep.io.raw.npy import read_npy, read_npz, stack_angles
@@ -36,7 +37,7 @@ from polsep.io.store.errors import InputError, input_error, naming, refuse_pipe
 from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
 from polsep.sensor.calibration import Corrections
-from polsep.sensor.camera import Layout, Mosaic, WrongType
+from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.levels import (
     WHITE_LEVELS,
     ForgottenLevel,

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute.arrays import WrongType
 from polsep.io.store.atomic import OutputError, replace_bytes, replace_text
 from polsep.io.store.errors import InputError, decoding, naming
 from polsep.io.store.header_checks import SAMPLES, limit
@@ -37,7 +38,7 @@ from polsep.io.store.json_text import (
 from polsep.io.store.plausible import require_falloff, require_gains, require_level, require_within
 from polsep.physics.stokes import MAX_DOLP
 from polsep.sensor.calibration import Analyser, Calibration, LampFacts
-from polsep.sensor.camera import Layout, WrongType
+from polsep.sensor.camera import Layout
 
 FORMAT = "polsep calibration 1"
 #: Least steps of the maps: of black as a part of the white level, at most in codes, and of gains.

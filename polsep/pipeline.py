@@ -25,6 +25,7 @@ from polsep.compute.arrays import WrongType, namespace, to_device
 from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration
+from polsep.io.store.errors import as_path
 from polsep.light.find import Light, find_light
 from polsep.methods import Capture, Method, find_method
 from polsep.physics.stokes import Measurements
@@ -108,7 +109,7 @@ class Result(SeparatedFrame):
         """
         from polsep.io.results.separation_writer import write_separation
 
-        target = Path(path)
+        target = as_path(path)
         if os.fspath(path).endswith(("/", os.sep)) or os.path.isdir(target):
             raise OutputError(f"expected a file name like {target / 'shot.exr'}, found a folder")
         stem = target.stem if target.suffix.lower() in _ENDINGS else target.name

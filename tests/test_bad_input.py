@@ -386,6 +386,10 @@ TYPES: list[tuple[str, Callable[[], object], str]] = [
     ("complex", lambda: Mosaic(SOME + 1j, Layout(), 0, 1), "found complex"),
     ("list", lambda: Mosaic([[1.0]], Layout(), 0, 1), "a NumPy array or a torch tensor, found list"),
     ("a light", lambda: Mosaic(SOME, Layout(), 0, 1, light_color="red"), "expected a light_color of positive numbers"),  # type: ignore[arg-type]
+    ("frames", lambda: next(polsep.read_frames(3)), "expected the path of a file, found 3"),  # type: ignore[arg-type]
+    ("results", lambda: polsep.read_separated(None), "expected the path of a file, found None"),  # type: ignore[arg-type]
+    ("rig", lambda: polsep.read_calibration(3), "expected the path of a file, found 3"),  # type: ignore[arg-type]
+    ("output", lambda: polsep.Result.save(None, None), "expected the path of a file, found None"),  # type: ignore[arg-type]
     ("lists", lambda: Measurements([[1.0]], (0.0,)), "expected measurements as a NumPy array or a torch tensor"),
     (
         "codes",

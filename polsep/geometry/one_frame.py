@@ -35,6 +35,7 @@ from polsep.geometry.shape_maps import (
     mirror_surface,
 )
 from polsep.geometry.thing import find_lit
+from polsep.io.store.errors import as_path
 from polsep.io.store.weights import read_weights, shipped_weights
 from polsep.networks.graphs import core, require_own_threads, shape_model
 from polsep.networks.sizes import ResidualSize
@@ -183,7 +184,7 @@ def shape(
         raise WrongType(f"expected a frame that polsep.separate separated, found {type(frame).__name__}")
     if not isinstance(index, Real):
         raise WrongType(f"expected a refractive index that is a number, found {index!r:.40}")
-    found = find_shape(frame, mask, light, None if weights is None else Path(weights), float(index))
+    found = find_shape(frame, mask, light, None if weights is None else as_path(weights), float(index))
     for note in found.doubts():
         warnings.warn(note, PolsepWarning, stacklevel=2)
     return found

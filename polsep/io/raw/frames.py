@@ -33,7 +33,7 @@ from polsep.io.raw.png import read_png
 from polsep.io.raw.recording import RECORD, read_recording
 from polsep.io.raw.tiff import read_tiff
 from polsep.io.raw.videos import read_video
-from polsep.io.store.errors import InputError, input_error, naming, refuse_pipe
+from polsep.io.store.errors import InputError, as_path, input_error, naming, refuse_pipe
 from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
 from polsep.sensor.calibration import Corrections
@@ -191,15 +191,16 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
     """
     if not isinstance(options, ReadOptions | None):
         raise WrongType(f"expected ReadOptions, found {type(options).__name__}")
+    path = as_path(path)
     options = ReadOptions() if options is None else options
     if _PLACEHOLDER in str(path):
         pages: Iterator[Page] = iter([_read_template(str(path), options)])
     elif options.pages == "frames":
-        pages = read_pages(Path(path), options, first)
+        pages = read_pages(path, options, first)
     elif options.pages == "angles":
-        pages = _group_angles(Path(path), options, first)
+        pages = _group_angles(path, options, first)
     else:
-        pages = _look_for_angles(Path(path), options, first)
+        pages = _look_for_angles(path, options, first)
     for page in pages:
         if page.index < first:
             continue

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polsep.io.raw.npy import read_arrays
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.store.errors import InputError, input_error, naming, refuse_pipe
+from polsep.io.store.errors import InputError, as_path, input_error, naming, refuse_pipe
 from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float32]
@@ -54,7 +54,7 @@ def read_separated(path: str | Path) -> SeparatedFrame:
     AoLP 0. Raises InputError, also on values that no separation has (below 0, infinite, not a number) and on too large
     sizes in the header.
     """
-    path = Path(path)
+    path = as_path(path)
     suffix = path.suffix.lower()
     with naming(path):
         path.stat()  # raises where nothing is

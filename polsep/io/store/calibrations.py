@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.arrays import WrongType
 from polsep.io.store.atomic import OutputError, replace_bytes, replace_text
-from polsep.io.store.errors import InputError, decoding, naming
+from polsep.io.store.errors import InputError, as_path, decoding, naming
 from polsep.io.store.header_checks import SAMPLES, limit
 from polsep.io.store.json_text import (
     entry_of,
@@ -110,7 +110,7 @@ def _waiting(maps: Path) -> Path:
 
 def read_calibration(path: str | Path) -> Calibration:
     """The calibration of a JSON file and of the maps beside it. Raises InputError, in one line that names the file."""
-    path = Path(path)
+    path = as_path(path)
     with naming(path):
         record = _read_record(path)
         maps = maps_path(path)

@@ -11,6 +11,9 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+from polsep.compute.arrays import WrongType
 
 #: Most characters of a message with the name of its file, and of that name.
 MOST, MOST_OF_NAME = 300, 200
@@ -19,6 +22,14 @@ _CUT = " ... "
 
 class InputError(ValueError):
     """A file that can't be read as asked; its message is one line, "expected ..., found ..."."""
+
+
+def as_path(path: Any) -> Path:
+    """The path of text or of a path-like thing. Raises WrongType on anything else."""
+    try:
+        return Path(path)
+    except TypeError:
+        raise WrongType(f"expected the path of a file, found {path!r:.40}") from None
 
 
 def one_line(text: object, most: int = MOST) -> str:

@@ -356,6 +356,7 @@ ARRAYS: list[tuple[str, Callable[[], object], str]] = [
     ("small mono", lambda: as_mosaic(np.ones((1, 8)), Layout(bayer=None)), "at least 2x2 pixels"),
     ("levels", lambda: as_mosaic(np.ones((4, 4)), None, 1.0), "expected a white level above"),
     ("levels reversed", lambda: as_mosaic(np.ones((4, 4)), None, 9.0, 3.0), "found white 3, black 9"),
+    ("below codes", lambda: as_mosaic(CODES, None, -5), "a black level from 0 on in samples of uint16, found -5"),
     ("text", lambda: as_mosaic(np.ones((4, 4)), None, 0.0, "4095"), "expected a white level that is a number"),  # type: ignore[arg-type]
     ("nothing", lambda: as_mosaic(np.ones((4, 4)), None, None), "expected a black level that is a number"),  # type: ignore[arg-type]
     ("infinite", lambda: as_mosaic(np.ones((4, 4)), None, 0.0, np.inf), "expected finite black and white levels"),

@@ -290,6 +290,8 @@ def _white_level(samples: NDArray[Any], black_level: float, white_level: float |
             raise WrongType(f"expected a {name} level that is a number, found {level!r:.40}")
     if not (math.isfinite(white) and math.isfinite(black_level)):
         raise ValueError(f"expected finite black and white levels, found {black_level:g} and {white:g}")
+    if samples.dtype.kind == "u" and black_level < 0:
+        raise ValueError(f"expected a black level from 0 on in samples of {samples.dtype}, found {black_level:g}")
     if not white > black_level:
         raise ValueError(f"expected a white level above the black level, found white {white:g}, black {black_level:g}")
     _require_span(samples, float(black_level), float(white))

@@ -324,3 +324,10 @@ def test_errors_and_variances_are_of_one_spread() -> None:
     for error in (0.5, 3.0):
         spread = _spread_deg(np.zeros(2), _variance_of(error) * np.eye(2) * np.array([[1, 0.5], [0.5, 1]]))
         assert spread == pytest.approx(error * 2 / math.sqrt(math.pi), rel=0.15)
+
+
+def test_forgotten_levels_are_remarked() -> None:
+    """12-bit codes in 16-bit words were taken for a dark frame without a word."""
+    codes = np.random.default_rng(0).integers(64, 4000, (64, 64)).astype(np.uint16)
+    assert any("looks like 12-bit right-justified data" in note for note in find_light(codes).remarks)
+    assert not any("12-bit" in note for note in find_light(codes, white_level=4095).remarks)

@@ -68,7 +68,7 @@ class Light:
     ``aolp``: along which the frame is polarized most [rad, in [0, pi)], None where nothing shows it; that of specular
     light, but where much diffuse light is polarized (statistics of reports are of separated light). ``metal``: share of
     the lit frame that mirrors the lamp in the colour of gold or copper. ``remarks``: what the frame's owner should know
-    of that.
+    of that, and of the levels of an array.
     """
 
     log_ratio: tuple[float, float] | None
@@ -111,7 +111,15 @@ def find_light(
     frame shows little, ``sure`` is False and the colour is the likeliest of usual lamps. Deterministic. Raises
     ValueError on input that is not a mosaic.
     """
-    capture = raw if isinstance(raw, Mosaic | Measurements) else as_mosaic(raw, layout, black_level, white_level)[0]
+    if isinstance(raw, Mosaic | Measurements):
+        return _light_of(raw)
+    mosaic, notes = as_mosaic(raw, layout, black_level, white_level)
+    found = _light_of(mosaic)
+    return replace(found, remarks=(*notes, *found.remarks))
+
+
+def _light_of(capture: Mosaic | Measurements) -> Light:
+    """The light of a capture; see `find_light`."""
     tiles = find_tiles(capture)
     if len(tiles.counts) < MIN_TILES:
         return unknown_light(tiles.colors)

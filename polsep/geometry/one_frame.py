@@ -56,6 +56,8 @@ INDICES = (1.3, 2.5)
 #: Share of the frame's border on the thing from which on the mask is probably wrong; expected error of normals
 #: [degrees], in the median, from which on they are called uncertain.
 FILLED, UNCERTAIN_DEG = 0.2, 15.0
+#: A note on a colour frame without the lamp's colour, as `read_separated` gives.
+UNTOLD = 'the lamp\'s colour is not told: taken for white, or set frame.report["light_color"] = [r, g, b] before'
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +187,8 @@ def shape(
     if not isinstance(index, Real):
         raise WrongType(f"expected a refractive index that is a number, found {index!r:.40}")
     found = find_shape(frame, mask, light, None if weights is None else as_path(weights), float(index))
-    for note in found.doubts():
+    untold = () if "light_color" in frame.report or frame.diffuse.shape[-1] == 1 else (UNTOLD,)
+    for note in (*untold, *found.doubts()):
         warnings.warn(note, PolsepWarning, stacklevel=2)
     return found
 

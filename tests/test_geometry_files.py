@@ -237,6 +237,7 @@ def test_files_that_do_not_fit_are_named(polsep: Cli, separated: list[Path], tmp
     damaged.write_bytes(separated[0].read_bytes()[:200])
     out = ["-o", tmp_path / "out"]
     assert_refused(polsep(*separated[:5], damaged, *out), "damaged.exr")
+    assert_refused(polsep(damaged, *separated[:4], damaged, *out), "expected pictures under different lights")
     again = tmp_path / "again.exr"
     again.write_bytes(separated[1].read_bytes())
     assert_refused(polsep(*separated[:5], again, *out), "again.exr", "under different lights", separated[1].name)

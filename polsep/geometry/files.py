@@ -84,6 +84,12 @@ class ShapeOptions:
 
 def read_views(paths: Sequence[Path], source: Source) -> Views:
     """Read files, and separate raw frames. Raises InputError, also on images of different shapes."""
+    whole = [path.resolve() for path in paths]
+    for k, path in enumerate(paths):
+        if whole[k] in whole[:k]:  # before minutes are spent on the others
+            raise input_error(
+                path, f"expected pictures under different lights, found {paths[whole.index(whole[k])]} again"
+            )
     if source.kind == "photographs":
         images = [read_map(path, "texture") for path in paths]
         _require_one_shape(paths, images)

@@ -473,6 +473,19 @@ def test_results_called_recording_are_no_recording(tmp_path: Path, monkeypatch: 
     assert expand_folders([str(tmp_path)]) == [str(tmp_path / "recording.npy")]
 
 
+def test_four_angle_images_of_a_folder_are_one_frame(tmp_path: Path) -> None:
+    """As `polsep separate` reads the folder: each alone would be taken for a mosaic."""
+    for k, mosaic in enumerate(frames(3)):
+        places = {0: mosaic[1::2, 1::2], 45: mosaic[::2, 1::2], 90: mosaic[::2, ::2], 135: mosaic[1::2, ::2]}
+        for angle, image in places.items():
+            (tmp_path / f"shot{k}_{angle}.png").write_bytes(imagecodecs.png_encode(image.copy()))
+    sequence = open_sequence(tmp_path, ReadOptions(white_level=WHITE))
+    read = list(sequence.begin(1))
+    assert sequence.count == 3 and [frame.index for frame in read] == [1, 2]
+    assert all(isinstance(frame, Frame) and frame.data.data.shape[0] == 4 for frame in read)
+    assert sequence.notes == ("12 of 12 files are read as frames of four angle images, like shot0_{angle}.png",)
+
+
 def test_numbers_without_a_file_are_said(tmp_path: Path) -> None:
     """Results are counted from 0, so that their names do not show gaps."""
     folder = write_folder(tmp_path / "run", frames(9))

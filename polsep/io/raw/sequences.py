@@ -1,6 +1,7 @@
 """Recordings as sequences of frames that can be read from any frame on: folders of files, and files of many frames.
 
-A folder's frames are its files of one kind, in natural order (frame2 before frame10); maps of a calibration are none.
+A folder's frames are its files of one kind, in natural order (frame2 before frame10), four angle images together as one
+frame; maps of a calibration are none.
 A folder with a ``recording.json`` is a recording of `polsep capture`; a set of `polsep render` has its raw mosaics
 alone as frames. A frame that cannot be read becomes a `DamagedFrame` in its place, and reading continues after it where
 the file allows that.
@@ -55,8 +56,9 @@ def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
     """The frames of a folder or of a file. Raises InputError where there are none, or none can be read."""
     path = path / RECORD if is_recording(path) else path
     if path.is_dir():
-        files = _frame_files(path)
-        stem, notes = path.resolve().name, _gap_notes(files)
+        found = _frame_files(path)
+        files = sorted(angles_together(found), key=natural_order)
+        stem, notes = path.resolve().name, _gap_notes(files) + _angle_notes(found, files)
         return FrameSequence(stem, len(files), lambda first: _read_files(files, options, first), notes)
     unread: str | None = None
     for frame in _read_stack(path, options, 1, 0):
@@ -92,6 +94,14 @@ def _gap_notes(files: list[Path]) -> tuple[str, ...]:
     some = ", ".join(f"{a + 1}" if b == a + 2 else f"{a + 1} to {b - 1}" for a, b in gaps[:8])
     more = ", ..." if len(gaps) > 8 else ""
     return (f"no files have the numbers {some}{more}: frames are counted from 0, without gaps",)
+
+
+def _angle_notes(found: list[Path], files: list[Path]) -> tuple[str, ...]:
+    """A note on the files of a folder that are read as four angle images of one frame, if there are any."""
+    frames = [path for path in files if path not in found]
+    if not frames:
+        return ()
+    return (f"{4 * len(frames)} of {len(found)} files are read as frames of four angle images, like {frames[0].name}",)
 
 
 def input_files(path: Path) -> list[Path]:

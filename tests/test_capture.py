@@ -399,6 +399,21 @@ def test_what_is_missing_between_frames_is_said(tmp_path: Path) -> None:
     assert "was away for 3.5 s: frames are counted from 0" in said[0]
 
 
+def test_a_recording_has_the_rate_at_which_its_frames_came(tmp_path: Path) -> None:
+    """Or that of its settings where times say nothing; what is lost and where the camera was away says nothing."""
+    steps_ns = [(1, 0, 0.0), (2, 40_000_000, 0.0), (5, 160_000_000, 0.0), (6, 200_000_000, 0.0), (7, 5_000, 9.0)]
+    for settings, scale, rate in (
+        ({"frame_rate_hz": 10.0}, 1, 25.0),
+        ({"frame_rate_hz": 25.02}, 1, 25.02),
+        ({}, 0, None),
+    ):
+        writer = RecordingWriter(tmp_path, replace(HEADER, settings=settings), overwrite=True)
+        for frame_id, stamp, away_s in steps_ns:
+            writer.append(replace(image(1), frame_id=frame_id, timestamp_ns=scale * stamp, away_s=away_s))
+        writer.close()
+        assert open_sequence(tmp_path, ReadOptions()).rate == rate
+
+
 def test_frames_have_the_time_at_which_they_came(tmp_path: Path) -> None:
     """Behind a trigger that was waited for, and by a clock that begins again where the camera was without power."""
 

@@ -31,7 +31,8 @@ from torch.nn.functional import interpolate
 
 from polsep import cli, pipeline
 from polsep.compute.threads import own_threads
-from polsep.io.raw.frames import Frame, ReadOptions
+from polsep.io.raw.frames import Frame, ReadOptions, read_frames
+from polsep.io.raw.rates import frame_rate
 from polsep.io.raw.sequences import DamagedFrame, expand_folders, input_files, natural_order, open_sequence
 from polsep.io.results import films, sequences
 from polsep.io.results.exr import half_rows, read_exr_layers, zip_rows
@@ -486,6 +487,33 @@ def test_four_angle_images_of_a_folder_are_one_frame(tmp_path: Path) -> None:
     assert sequence.notes == ("12 of 12 files are read as frames of four angle images, like shot0_{angle}.png",)
 
 
+def test_rate_and_length_of_a_film_are_its_own(tmp_path: Path) -> None:
+    """The rate of its first frames where the file states another; a pause is none, nor are whole milliseconds."""
+    images = frames(20)[:, :16, :16]
+    paused = [20 * k + 900 * (k > 9) for k in range(20)]
+    for times, rate in ((None, 50.0), ([40 * k for k in range(20)], 25.0), (paused, 50.0)):
+        sequence = open_sequence(write_film(tmp_path / "run.mkv", images, times_ms=times), ReadOptions())
+        assert sequence.count == 20 and sequence.rate == rate
+    assert frame_rate(300.0, [0.003, 0.003, 0.004] * 21) == 300.0 and frame_rate(None, []) is None
+
+
+def test_films_have_the_rate_of_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another one only where that is said; what has no rate has 25, and edited films have that of the film."""
+    film = write_film(tmp_path / "run.mkv", frames(3))
+    assert run(monkeypatch, *command(film, tmp_path / "out")) == 0
+    assert run(monkeypatch, *command(film, tmp_path / "said", "--rate", "24000/1001")) == 0
+    assert run(monkeypatch, *command(write_folder(tmp_path / "none", frames(3)), tmp_path / "none-out")) == 0
+    edit = ["edit", str(tmp_path / "out"), "-o", str(tmp_path / "edited"), "--metallic", "1"]
+    assert run(monkeypatch, *edit) == 0
+    previews = ("out/run", "said/run", "none-out/none", "edited/run")
+    assert [rate_of(tmp_path / f"{name}_preview.mp4") for name in previews] == [50, Fraction(24000, 1001), 25, 50]
+
+
+def rate_of(film: Path) -> Fraction:
+    with av.open(str(film)) as container:
+        return Fraction(container.streams.video[0].average_rate)
+
+
 def test_numbers_without_a_file_are_said(tmp_path: Path) -> None:
     """Results are counted from 0, so that their names do not show gaps."""
     folder = write_folder(tmp_path / "run", frames(9))
@@ -717,11 +745,11 @@ def piped_film(images: NDArray[np.uint16], between: int) -> bytearray:
 
 @pytest.mark.parametrize("between", [1, 12])
 def test_films_of_unknown_length_are_read_to_their_end(between: int, tmp_path: Path) -> None:
-    """From any frame on, behind a damaged one, and where the file is cut off."""
+    """From any frame on, behind a damaged one, and where the file is cut off; its frames are counted at once."""
     path, data = tmp_path / "run.mkv", piped_film(frames(), between)
     path.write_bytes(data)
     film = open_sequence(path, ReadOptions())
-    assert film.count < FRAMES
+    assert film.count == FRAMES > next(read_frames(path)).count
     for first in (0, PART, FRAMES):
         assert [frame.index for frame in film.begin(first)] == list(range(first, FRAMES))
     place = len(data) // 50
@@ -978,8 +1006,11 @@ def test_films_that_hold_no_mosaic_are_refused(codec: str, pixels: str, tmp_path
         ({"format": "gif"}, "expected a format of exr, ffv1, ffvhuff, none, found 'gif'"),
         ({"compression": "rar"}, "expected a compression of none, zip, piz, found 'rar'"),
         ({"rate": 0.0}, "expected a rate of 0.001 to 100000 frames per second, found 0"),
-        ({"format": "ffv1", "rate": 1001.0}, "expected at most 1000 frames per second in ffv1, found 1001"),
-        ({"format": "ffvhuff", "rate": 1001.0}, "expected at most 1000 frames per second in ffvhuff, found 1001"),
+        ({"format": "ffv1", "rate": 1001.0}, "expected a rate of at most 1000 frames per second in ffv1, found 1001"),
+        (
+            {"format": "ffvhuff", "rate": 1001.0},
+            "expected a rate of at most 1000 frames per second in ffvhuff, found 1001",
+        ),
         ({"format": "none", "preview": False}, "expected something to write"),
     ],
 )

@@ -56,7 +56,10 @@ if TYPE_CHECKING:
     help="Write a video of a sequence to watch.  [default: where the extra video is installed]",
 )
 @click.option(
-    "--rate", type=RATE, default=25.0, metavar="N", help="Frames per second of that video, like 24 or 24000/1001."
+    "--rate",
+    type=RATE,
+    metavar="N",
+    help="Frames per second of that video, like 24 or 24000/1001.  [default: those of the sequence, else 25]",
 )
 @click.option(
     "--damaged",

@@ -69,9 +69,8 @@ from polsep.cli.progress import report_step, show_progress
 @click.option(
     "--rate",
     type=RATE,
-    default=25.0,
     metavar="N",
-    help="Frames per second of the videos written, like 24 or 24000/1001.",
+    help="Frames per second of the videos written, like 24 or 24000/1001.  [default: those of the recording, else 25]",
 )
 @click.option(
     "--filter",

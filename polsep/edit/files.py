@@ -25,7 +25,7 @@ from polsep.io.results.edited import EditedFrame, read_recipe_text, write_edited
 from polsep.io.results.previews import exposure_of, toned
 from polsep.io.results.separation_reader import NumberedFiles, find_numbered, read_separated
 from polsep.io.results.separation_writer import planned_outputs
-from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter
+from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter, read_rate
 from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import InputError, input_error, one_line
 from polsep.video.recordings import ON_DAMAGE, Progress, black_picture, draw_panels, write_pictures
@@ -180,6 +180,7 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
         raise input_error(
             folder, f"expected frames without gaps, found none of number {some}; --damaged skip continues"
         )
+    kind = target.kind.at(read_rate(folder / f"{found.stem}.json"))
     before, after = _first_frame(found, work, target.damaged)
     gain, size = _exposure(before, after), before.diffuse.shape
     settings = {
@@ -189,18 +190,18 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
         "first": found.first,
         "count": len(found.files),
         "missing": missing,
-        "kind": asdict(target.kind),
+        "kind": asdict(kind),
         "gain": gain,
         "shape": list(size),
         "colors": size[2],
     }
     _refuse_frames(folder, found, target)
-    writer = SequenceWriter(target.directory, found.stem, target.kind, settings, target.overwrite)
+    writer = SequenceWriter(target.directory, found.stem, kind, settings, target.overwrite)
     count = len(found.files)
     for caution in work.recipe.cautions():
         yield Progress(writer.first, count, caution)
     yield Progress(writer.first, count)
-    pictures = _SequenceEdit(found, work, gain, size, target.kind.preview).picture
+    pictures = _SequenceEdit(found, work, gain, size, kind.preview).picture
     with closing(map_ahead(pictures, range(writer.first, count), AT_ONCE)) as edited:
         yield from write_pictures(writer, ((picture, {}) for picture in edited), target.damaged, count)
     preview = target.directory / f"{found.stem}.png"

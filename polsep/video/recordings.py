@@ -180,6 +180,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     if options.stokes and target.kind.format != "exr":
         raise ValueError(f"expected the format exr for Stokes images, found {target.kind.format}")
     recording = open_sequence(path, read)
+    kind = target.kind.at(recording.rate)
     inputs = [*input_files(path), *target.kept]
     refuse_inputs([target.directory / f"{recording.stem}{end}" for end in (".json", ".jsonl")], inputs)
     count = recording.count if options.frames is None else min(recording.count, options.frames)
@@ -190,7 +191,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
         "read": read.settings(),
         "filter": options.filter,
         "stokes": options.stokes,
-        "kind": asdict(target.kind),
+        "kind": asdict(kind),
         "method": first.method,
         "light_color": list(first.light),
         "light": first.facts,
@@ -201,7 +202,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
         "colors": first.size[2],
         "device": find_device(options.device),
     }
-    sequence = SequenceWriter(target.directory, recording.stem, target.kind, settings, target.overwrite)
+    sequence = SequenceWriter(target.directory, recording.stem, kind, settings, target.overwrite)
     for warning in first.warnings:
         yield Progress(sequence.first, count, warning)
     yield Progress(sequence.first, count)

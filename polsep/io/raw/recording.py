@@ -28,6 +28,7 @@ from polsep import __version__
 from polsep.io.raw.genicam import find_pixel_format
 from polsep.io.raw.headerless import headerless_page, with_layout
 from polsep.io.raw.page import Page
+from polsep.io.raw.rates import frame_rate
 from polsep.io.store.atomic import refuse_existing, replace_text
 from polsep.io.store.header_checks import require_size
 from polsep.io.store.json_text import parse_json, read_text
@@ -247,6 +248,18 @@ def gap_notes(path: Path) -> tuple[str, ...]:
     found = [f"{sum(gaps.values())} frames are missing, first before frame {min(gaps)}"] if gaps else []
     found += [f"the camera was away for {away_s:g} s"] if away_s > 0 else []
     return (f"{' and '.join(found)}: frames are counted from 0, without gaps",) if found else ()
+
+
+def recorded_rate(path: Path) -> float | None:
+    """Frames per second of a ``recording.json``, or None where nothing says them. Raises ValueError.
+
+    They are those of the camera's settings unless frames came at another rate, as they may with a trigger.
+    """
+    stated = read_header(path).settings.get("frame_rate_hz")
+    lines = [line for _, line in sorted(_read_index(path.with_name(INDEX)).items())]
+    whole = [(a, b) for a, b in pairwise(lines) if not _missing(a, b) and not b.get("away_s")]
+    steps_s = [1e-9 * (b.get("timestamp_ns", 0) - a.get("timestamp_ns", 0)) for a, b in whole]
+    return frame_rate(stated if isinstance(stated, int | float) and stated > 0 else None, steps_s)
 
 
 def _missing(before: Mapping[str, Any], line: Mapping[str, Any]) -> int:

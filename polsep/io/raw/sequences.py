@@ -18,8 +18,8 @@ from itertools import islice, pairwise
 from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
-from polsep.io.raw.recording import RECORD, gap_notes, is_recording, recording_files
-from polsep.io.raw.videos import is_film, timing_notes
+from polsep.io.raw.recording import RECORD, gap_notes, is_recording, recorded_rate, recording_files
+from polsep.io.raw.videos import count_frames, find_timing, is_film
 from polsep.io.store.calibrations import holds_maps
 from polsep.io.store.errors import InputError, input_error, one_line
 from polsep.io.store.result_names import result_names
@@ -43,13 +43,14 @@ class DamagedFrame:
 class FrameSequence:
     """A recording: ``begin(first)`` yields its frames from number ``first`` on, about ``count`` in all.
 
-    ``stem`` names its outputs; ``notes`` are one-line remarks for the user.
+    ``stem`` names its outputs; ``notes`` are one-line remarks for the user; ``rate``: frames per second, if known.
     """
 
     stem: str
     count: int
     begin: Callable[[int], Iterator[Frame | DamagedFrame]]
     notes: tuple[str, ...] = ()
+    rate: float | None = None
 
 
 def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
@@ -63,11 +64,19 @@ def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
     unread: str | None = None
     for frame in _read_stack(path, options, 1, 0):
         if isinstance(frame, Frame):
-            notes = gap_notes(path) if path.name == RECORD else timing_notes(path) if is_film(path) else ()
             begin = partial(_read_stack, path, options, frame.count)
-            return FrameSequence(output_stem(path), frame.count, begin, notes)
+            rate, notes = _times_of(path)
+            count = count_frames(path, frame.count, 0) if is_film(path) else frame.count
+            return FrameSequence(output_stem(path), count, begin, notes, rate)
         unread = unread or frame.reason
     raise input_error(path, "expected frames, found none") if unread is None else InputError(unread)
+
+
+def _times_of(path: Path) -> tuple[float | None, tuple[str, ...]]:
+    """Frames per second of a file of many frames, if it says them, and notes on their times."""
+    if path.name == RECORD:
+        return recorded_rate(path), gap_notes(path)
+    return find_timing(path) if is_film(path) else (None, ())
 
 
 def _frame_files(folder: Path) -> list[Path]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from polsep.io.raw.extensions import LOSSLESS
 from polsep.io.raw.page import Page
+from polsep.io.raw.rates import frame_rate
 from polsep.io.store.errors import InputError, decoding
 from polsep.io.store.header_checks import SAMPLES, limit, require_size
 from polsep.io.store.quiet import mute
@@ -104,20 +105,24 @@ def _count_packets(path: Path, stamp: tuple[int, int]) -> int:
         return sum(packet.size > 0 for packet in container.demux(kind.stream))
 
 
-def timing_notes(path: Path) -> tuple[str, ...]:
-    """A note on a film whose first frames come at uneven times, which are not kept."""
+def find_timing(path: Path) -> tuple[float | None, tuple[str, ...]]:
+    """Frames per second of a film, or None; and a note where its first frames come at uneven times, which are not kept.
+
+    Of the first frames; the rate is that of `frame_rate`.
+    """
     try:
         with _opened(path) as (container, kind), decoding("video"):
             packets = islice(container.demux(kind.stream), FIRST)
             times = sorted(packet.pts for packet in packets if packet.size and packet.pts is not None)
-            unit = float(kind.stream.time_base or 0)
+            unit, stated = float(kind.stream.time_base or 0), float(kind.stream.average_rate or 0) or None
     except ValueError:  # the frame that is damaged says so
-        return ()
+        return None, ()
     steps = sorted(after - before for before, after in pairwise(times))
+    rate = frame_rate(stated, [unit * step for step in steps])
     if not steps or steps[-1] - steps[0] <= max(UNEVEN * steps[len(steps) // 2], 2):
-        return ()
+        return rate, ()
     least, most = (1000 * unit * step for step in (steps[0], steps[-1]))
-    return (
+    return rate, (
         f"frames were expected at even times, found them {least:.3g} to {most:.3g} ms apart: the times are not kept, "
         "every frame counts alike",
     )

@@ -16,7 +16,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +39,7 @@ from polsep.io.store.atomic import (
     replace_text,
     require_writable,
 )
+from polsep.io.store.json_text import parse_json, read_text
 
 #: Frames per part, about a second; films have a key frame at least as often.
 PART = 25
@@ -46,6 +47,8 @@ PART = 25
 FORMATS = ("exr", "ffv1", "ffvhuff", "none")
 #: Formats that are films.
 LOSSLESS_CODECS = FORMATS[1:3]
+#: Frames per second where neither the user nor the input says them.
+RATE = 25.0
 #: Largest rate of lossless films: Matroska counts milliseconds, and FFmpeg's AVI takes no more.
 _LOSSLESS_RATE = 1000
 #: Threads that write at once: an EXR file or two lossless films, and the film to watch.
@@ -78,26 +81,34 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True)
 class SequenceKind:
-    """Format of a sequence: one of `FORMATS`, EXR's compression, a film to watch or none, frames per second."""
+    """Format of a sequence: one of `FORMATS`, EXR's compression, a film to watch or none, frames per second.
+
+    ``rate`` None: that of the input where it has one, else `RATE`.
+    """
 
     format: str = "exr"
     compression: str = "none"
     preview: bool = True
-    rate: float = 25.0
+    rate: float | None = None
 
     def __post_init__(self) -> None:
         if self.format not in FORMATS:
             raise OutputError(f"expected a format of {', '.join(FORMATS)}, found {self.format!r}")
         if self.compression not in COMPRESSIONS:
             raise OutputError(f"expected a compression of {', '.join(COMPRESSIONS)}, found {self.compression!r}")
-        if not 0.001 <= self.rate <= 100_000:
-            raise OutputError(f"expected a rate of 0.001 to 100000 frames per second, found {self.rate:g}")
-        if self.format in LOSSLESS_CODECS and self.rate > _LOSSLESS_RATE:
+        rate = RATE if self.rate is None else self.rate
+        if not 0.001 <= rate <= 100_000:
+            raise OutputError(f"expected a rate of 0.001 to 100000 frames per second, found {rate:g}")
+        if self.format in LOSSLESS_CODECS and rate > _LOSSLESS_RATE:
             raise OutputError(
-                f"expected at most {_LOSSLESS_RATE} frames per second in {self.format}, found {self.rate:g}"
+                f"expected a rate of at most {_LOSSLESS_RATE} frames per second in {self.format}, found {rate:g}"
             )
         if self.format == "none" and not self.preview:
             raise OutputError("expected something to write, found format none and no preview")
+
+    def at(self, rate: float | None) -> SequenceKind:
+        """The kind with the rate of an input, if any, or with `RATE`, where it has none of its own."""
+        return replace(self, rate=self.rate or rate or RATE)
 
 
 class SequenceWriter:
@@ -208,7 +219,7 @@ class SequenceWriter:
             pixels = getattr(picture, "panels" if image == "preview" else image)
             if image not in self._films:
                 size = (pixels.shape[0], pixels.shape[1])
-                self._films[image] = Film(self._film_path(self._done, image), kind, size, self.kind.rate)
+                self._films[image] = Film(self._film_path(self._done, image), kind, size, self.kind.rate or RATE)
             self._start(_write_pixels, self._films[image], pixels, FILM_WHITE.get(image))
         self._log.append(picture.line)
         if len(self._log) == PART:
@@ -277,7 +288,7 @@ class SequenceWriter:
             target = self._film(image)
             parts = [path for k in range(self._done) if (path := self._film_path(k, image)).exists()]
             with atomic_path(target) as joined:
-                join_films(parts, joined, kind, self.kind.rate)
+                join_films(parts, joined, kind, self.kind.rate or RATE)
             written.append(target)
         replace_bytes(self._log_path, b"".join(self._record(k).read_bytes() for k in range(self._done)))
         units = {name: UNITS[name] for name in ("diffuse", "specular")}
@@ -300,6 +311,17 @@ class SequenceWriter:
         for path in self._frames():
             if self.kind.format != "exr" or path not in own:
                 path.unlink()
+
+
+def read_rate(report: Path) -> float | None:
+    """Frames per second in the report of a sequence; None where there is none, or it has none."""
+    try:
+        rate: Any = parse_json(read_text(report))
+        for name in ("settings", "kind", "rate"):
+            rate = rate[name]
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+    return float(rate) if isinstance(rate, int | float) and rate > 0 else None
 
 
 def write_exr(path: Path, picture: Picture, compression: str) -> None:

@@ -964,6 +964,28 @@ def test_a_run_does_not_go_on_with_other_settings(recording: Path, tmp_path: Pat
     assert end.done == FRAMES and end.written
 
 
+def test_a_run_does_not_go_on_with_another_recording_of_its_name(tmp_path: Path) -> None:
+    """Also where everything that its first frame fixes is the same; a frame behind may be repaired."""
+    images, path = frames(PART + 3), tmp_path / "run.npy"
+    others = [images.copy(), images.copy()]
+    others[0][0, SIDE - 3, SIDE - 3] ^= 1
+    others[1][-1] ^= 1
+
+    def steps(samples: NDArray[np.uint16]) -> Iterator[video.Progress]:
+        np.save(path, samples)
+        target = video.Target(tmp_path / "out", SequenceKind(preview=False))
+        return video.separate_video(path, ReadOptions(white_level=WHITE), video.VideoOptions("analytic"), target)
+
+    begun = steps(images)
+    while next(begun).done < PART + 1:
+        pass
+    begun.close()  # type: ignore[attr-defined]  # a generator
+    with pytest.raises(OutputError, match=r"expected first_frame_sha256 \w+, .*found first_frame_sha256 \w+"):
+        next(steps(others[0]))
+    *_, end = steps(others[1])
+    assert end.done == PART + 3 and end.written
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from polsep.compute.cluster import map_ordered
 from polsep.compute.threads import get_threads, own_threads
 from polsep.compute.workers import DEPTH, ahead, map_ahead
+from polsep.io.raw.corrections import hash_samples
 from polsep.io.raw.frames import Frame, ReadOptions, refuse_forgotten
 from polsep.io.raw.sequences import DamagedFrame, FrameSequence, input_files, open_sequence
 from polsep.io.results.previews import exposure_of, srgb
@@ -114,7 +115,7 @@ class FirstFrame:
 
     ``size`` includes colours. ``shape``: of raw frames. ``warnings``: for the user. ``defects``: mask ``[H, W]`` of the
     pixels that are repaired in every frame, None where there are none. ``facts``: of the light, for the report.
-    ``black_level``: of raw frames.
+    ``black_level``: of raw frames. ``sha256``: of its samples, by which a run that is resumed knows its recording.
     """
 
     method: str
@@ -126,6 +127,7 @@ class FirstFrame:
     defects: NDArray[np.bool_] | None = None
     facts: dict[str, Any] = field(default_factory=dict)
     black_level: float | None = None
+    sha256: str = ""
 
 
 @dataclass(frozen=True)
@@ -187,6 +189,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     first = separate_first(recording, options)
     settings = {
         "source": path.name,
+        "first_frame_sha256": first.sha256,
         "frames": options.frames,
         "read": read.settings(),
         "filter": options.filter,
@@ -253,7 +256,8 @@ def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Fram
     notes = (*recording.notes, *frame.notes, *remarks, *separated.report["warnings"])
     defects = _defects_of(_intact(islice(recording.begin(0), DEFECT_FRAMES), shape, options))
     black = separated.report.get("black_level")
-    return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black)
+    digest = hash_samples(frame.data.data)
+    return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black, digest)
 
 
 def _ends_run(damaged: DamagedFrame, options: VideoOptions) -> bool:

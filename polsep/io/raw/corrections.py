@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -51,10 +52,14 @@ def _read_corrected(
     corrections = Corrections(measured, None, sources)
     if ambient:
         room = mean_mosaic(read_mosaics(ambient, replace(read, corrections=corrections)))
-        digest = hashlib.sha256(np.ascontiguousarray(room.data).tobytes()).hexdigest()[:DIGITS]
-        sources |= {"ambient": [path.name for path in ambient], "ambient_sha256": digest}
+        sources |= {"ambient": [path.name for path in ambient], "ambient_sha256": hash_samples(room.data)}
         corrections = Corrections(measured, room, sources)
     return replace(read, corrections=corrections)
+
+
+def hash_samples(samples: Any) -> str:
+    """The first `DIGITS` of the sha256 of an array's samples, by which reports know it again."""
+    return hashlib.sha256(np.ascontiguousarray(samples)).hexdigest()[:DIGITS]
 
 
 def read_mosaics(paths: Sequence[Path], read: ReadOptions, check: Check | None = None) -> Iterator[Mosaic]:

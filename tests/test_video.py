@@ -757,9 +757,24 @@ def test_films_of_unknown_length_are_read_to_their_end(between: int, tmp_path: P
     seen = list(open_sequence(path, ReadOptions()).begin(0))
     assert [frame.index for frame in seen] == list(range(FRAMES))
     assert [frame.index for frame in seen if isinstance(frame, DamagedFrame)] == list(range(between))
+    assert not film.notes
     path.write_bytes(data[: len(data) // 2])
     cut = list(open_sequence(path, ReadOptions()).begin(0))
     assert 1 < len(cut) < FRAMES and all(isinstance(frame, Frame) for frame in cut[:-1])
+
+
+@pytest.mark.parametrize("suffix", ["mkv", "avi", "nut"])
+def test_a_film_that_is_cut_short_says_so(suffix: str, tmp_path: Path) -> None:
+    """By a note or by a damaged frame, wherever it is cut."""
+    path = write_film(tmp_path / f"run.{suffix}", frames(20))
+    data = path.read_bytes()
+    assert not open_sequence(path, ReadOptions()).notes
+    for share in (0.5, 0.66, 0.99):
+        path.write_bytes(data[: int(len(data) * share)])
+        film = open_sequence(path, ReadOptions())
+        seen = list(film.begin(0))
+        cut = film.notes and f"expected {len(data)} bytes, found {int(len(data) * share)}" in film.notes[0]
+        assert 1 < len(seen) <= 20 and (cut or isinstance(seen[-1], DamagedFrame))
 
 
 def test_a_damaged_first_frame_is_one_of_many(tmp_path: Path) -> None:

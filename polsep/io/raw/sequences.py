@@ -19,7 +19,7 @@ from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD, gap_notes, is_recording, recorded_rate, recording_files
-from polsep.io.raw.videos import count_frames, find_timing, is_film
+from polsep.io.raw.videos import count_frames, cut_notes, find_timing, is_film
 from polsep.io.store.calibrations import holds_maps
 from polsep.io.store.errors import InputError, input_error, one_line
 from polsep.io.store.result_names import result_names
@@ -73,10 +73,13 @@ def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
 
 
 def _times_of(path: Path) -> tuple[float | None, tuple[str, ...]]:
-    """Frames per second of a file of many frames, if it says them, and notes on their times."""
+    """Frames per second of a file of many frames, if it says them, and notes on what is missing and on their times."""
     if path.name == RECORD:
         return recorded_rate(path), gap_notes(path)
-    return find_timing(path) if is_film(path) else (None, ())
+    if not is_film(path):
+        return None, ()
+    rate, notes = find_timing(path)
+    return rate, cut_notes(path) + notes
 
 
 def _frame_files(folder: Path) -> list[Path]:

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from functools import lru_cache
 from itertools import count as count_from
 from itertools import islice, pairwise
+from os import SEEK_CUR
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +31,8 @@ _GREY = re.compile(r"gray(\d*)(?:le|be)?")
 #: FFmpeg's name of each container. It would look for any, also for lists that name other files or addresses.
 CONTAINERS = dict(zip(LOSSLESS, ("matroska", "avi", "mov", "nut"), strict=True))
 
+#: Marks of the two parts of a Matroska file.
+_EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
 #: Bytes of films whose frames are counted as they are opened. First frames whose times are looked at, and the range of
 #: the times between them, relative to the median, from which on they are uneven.
 SMALL, FIRST, UNEVEN = 2**30, 64, 0.2
@@ -125,6 +128,28 @@ def find_timing(path: Path) -> tuple[float | None, tuple[str, ...]]:
     return rate, (
         f"frames were expected at even times, found them {least:.3g} to {most:.3g} ms apart: the times are not kept, "
         "every frame counts alike",
+    )
+
+
+def cut_notes(path: Path) -> tuple[str, ...]:
+    """A note on a Matroska film of fewer bytes than it says, whose frames behind its end FFmpeg leaves out silently.
+
+    Films of other kinds end with a damaged frame.
+    """
+    with path.open("rb") as stream:
+        ends = 0
+        for element in (_EBML, _SEGMENT):  # a header, and all else
+            if stream.read(4) != element:
+                return ()
+            first = stream.read(1)
+            length = 9 - first[0].bit_length() if first else 9
+            size = int.from_bytes(first + stream.read(length - 1)) & ~(1 << 7 * length)
+            if length > 8 or size == (1 << 7 * length) - 1:  # unknown while it is recorded
+                return ()
+            ends = stream.seek(size, SEEK_CUR)
+    found = path.stat().st_size
+    return (f"the film is cut short: expected {ends} bytes, found {found}, the last frames are missing",) * (
+        ends > found
     )
 
 

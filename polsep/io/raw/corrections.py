@@ -59,7 +59,7 @@ def _read_corrected(
 
 def hash_samples(samples: Any) -> str:
     """The first `DIGITS` of the sha256 of an array's samples, by which reports know it again."""
-    return hashlib.sha256(np.ascontiguousarray(samples)).hexdigest()[:DIGITS]
+    return hashlib.sha256(np.ascontiguousarray(samples).tobytes()).hexdigest()[:DIGITS]
 
 
 def read_mosaics(paths: Sequence[Path], read: ReadOptions, check: Check | None = None) -> Iterator[Mosaic]:

@@ -948,6 +948,31 @@ def test_a_run_that_replaces_a_longer_one_leaves_none_of_its_frames(
     assert {name: (tmp_path / name).read_bytes() for name in others} == others
 
 
+def test_a_run_that_replaces_another_is_resumed_like_any(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without --overwrite, which begins anew; the report of before is gone with the first of its frames."""
+    recording, out = tmp_path / "run.npy", tmp_path / "out"
+    np.save(recording, frames())
+    more = ("--no-preview", "--method", "color-affine", "--frames", str(PART + 5))
+    assert run(monkeypatch, *command(recording, out, "--no-preview")) == 0
+    before = {path.name for path in out.iterdir()}
+    with monkeypatch.context() as patch:
+        patch.setattr(video, "write_pictures", partial(stopped_behind, video.write_pictures, PART + 2))
+        assert run(patch, *command(recording, out, *more, "--overwrite")) == 130
+    assert {path.name for path in out.glob("run*")} == before - {"run.json"}
+    first = (out / "run_000000.exr").stat().st_mtime_ns
+    assert run(monkeypatch, *command(recording, out, *more)) == 0
+    assert (out / "run_000000.exr").stat().st_mtime_ns == first
+    assert len(list(out.glob("*.exr"))) == json.loads((out / "run.json").read_text())["frames"] == PART + 5
+
+
+def stopped_behind(write: Any, count: int, *given: Any) -> Iterator[video.Progress]:
+    """`write_pictures`, until Ctrl-C."""
+    for step in write(*given):
+        yield step
+        if step.done == count:
+            raise KeyboardInterrupt
+
+
 def test_a_run_that_replaces_films_leaves_none_of_another_kind(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -57,6 +57,8 @@ _WRITERS = 3
 _CACHED = 8
 #: The file by which a run holds its parts.
 LOCK = "lock"
+#: The file by which a run that is resumed knows that it replaces what is there.
+REPLACING = "replacing"
 #: The value of code 65535 in lossless films.
 FILM_WHITE = {"diffuse": 2.0, "specular": 8.0}
 
@@ -122,11 +124,11 @@ class SequenceWriter:
         self, directory: Path, stem: str, kind: SequenceKind, settings: dict[str, Any], overwrite: bool = False
     ) -> None:
         self.directory, self.stem, self.kind, self._settings = directory, stem, kind, settings
-        self._overwrite = overwrite
         self._parts = directory / f".polsep-{stem}"
         self._report, self._log_path = directory / f"{stem}.json", directory / f"{stem}.jsonl"
         require_writable(directory)
-        if not overwrite and self._report.exists():
+        replacing = self._parts / REPLACING
+        if not overwrite and self._report.exists() and not replacing.exists():
             raise OutputError(f"expected no {self._report}, found one from before; --overwrite replaces it")
         self._kinds = self._film_kinds()
         begun = self._parts / "run.json"
@@ -139,6 +141,8 @@ class SequenceWriter:
         if overwrite:
             for path in self._parts.iterdir():
                 path.unlink() if path.name != LOCK else None
+            replacing.touch()
+        self._overwrite = replacing.exists()
         if begun.exists():
             require_same_settings(begun, settings, f"{directory / stem}", "; --overwrite begins anew")
         else:
@@ -213,6 +217,8 @@ class SequenceWriter:
         call. ``state``: what the next part depends on; it is written at the end of a part.
         """
         self._wait()
+        if self._overwrite and not self._done and not self._log:
+            self._report.unlink(missing_ok=True)  # its frames are replaced from now on
         if self.kind.format == "exr" and "damaged" not in picture.line:
             self._start(self._write_exr, index, picture)
         for image, kind in self._kinds.items():

@@ -446,6 +446,17 @@ def test_a_gap_of_an_earlier_run_still_counts(tmp_path: Path) -> None:
     assert not list(edit_sequence(tmp_path / "whole", work, EditTarget(tmp_path / "fine", kind=SILENT)))[-1].damaged
 
 
+def test_a_film_that_is_not_finished_is_said(tmp_path: Path, polsep: Cli) -> None:
+    """As `polsep video` leaves it where it was stopped; its frames so far are edited."""
+    folder = film(tmp_path / "in", 3)
+    (folder / ".polsep-take").mkdir()
+    run = polsep(folder, "-o", tmp_path / "out", "--rougher", "1", "--no-preview")
+    assert run.status == 0 and "in: the run that writes it is not finished, " in run.err
+    assert json.loads((tmp_path / "out" / "take.json").read_text())["warnings"] == [run.err.strip()[len("polsep: ") :]]
+    (folder / "take.json").write_text("{}")
+    assert not polsep(folder, "-o", tmp_path / "finished", "--rougher", "1", "--no-preview").err
+
+
 def test_good_folders_go_on_beside_bad_ones(tmp_path: Path, polsep: Cli) -> None:
     """A folder with a gap costs a line and exit status 2, not the next folder; nor does a folder without a sequence."""
     gap, good, empty = film(tmp_path / "gap", 4), tmp_path / "good", tmp_path / "empty"

@@ -25,7 +25,7 @@ from polsep.io.results.edited import EditedFrame, read_recipe_text, write_edited
 from polsep.io.results.previews import exposure_of, toned
 from polsep.io.results.separation_reader import NumberedFiles, find_numbered, read_separated
 from polsep.io.results.separation_writer import planned_outputs
-from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter, read_rate
+from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter, is_unfinished, read_rate
 from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import InputError, input_error, one_line
 from polsep.video.recordings import ON_DAMAGE, Progress, black_picture, draw_panels, write_pictures
@@ -198,7 +198,9 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
     _refuse_frames(folder, found, target)
     writer = SequenceWriter(target.directory, found.stem, kind, settings, target.overwrite)
     count = len(found.files)
-    for caution in work.recipe.cautions():
+    unfinished = f"{folder}: the run that writes it is not finished, the frames that are there are edited"
+    cautions = [unfinished] * is_unfinished(folder, found.stem) + work.recipe.cautions()
+    for caution in cautions:
         yield Progress(writer.first, count, caution)
     yield Progress(writer.first, count)
     pictures = _SequenceEdit(found, work, gain, size, kind.preview).picture
@@ -209,7 +211,7 @@ def edit_sequence(folder: Path, work: Work, target: EditTarget) -> Generator[Pro
     lines = writer.lines()
     damaged = [line for line in lines if "damaged" in line]
     said = {**settings, "damaged": target.damaged}
-    report = {"frames": len(lines), "damaged": damaged, "settings": said, "warnings": work.recipe.cautions()}
+    report = {"frames": len(lines), "damaged": damaged, "settings": said, "warnings": cautions}
     yield Progress(count, count, damaged=bool(damaged), written=(preview, *writer.finish(report)))
 
 

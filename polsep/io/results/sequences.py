@@ -124,7 +124,7 @@ class SequenceWriter:
         self, directory: Path, stem: str, kind: SequenceKind, settings: dict[str, Any], overwrite: bool = False
     ) -> None:
         self.directory, self.stem, self.kind, self._settings = directory, stem, kind, settings
-        self._parts = directory / f".polsep-{stem}"
+        self._parts = _parts_of(directory, stem)
         self._report, self._log_path = directory / f"{stem}.json", directory / f"{stem}.jsonl"
         require_writable(directory)
         replacing = self._parts / REPLACING
@@ -317,6 +317,15 @@ class SequenceWriter:
         for path in self._frames():
             if self.kind.format != "exr" or path not in own:
                 path.unlink()
+
+
+def is_unfinished(directory: Path, stem: str) -> bool:
+    """True for a sequence whose run was stopped, or is under way."""
+    return _parts_of(directory, stem).is_dir() and not (directory / f"{stem}.json").exists()
+
+
+def _parts_of(directory: Path, stem: str) -> Path:
+    return directory / f".polsep-{stem}"
 
 
 def read_rate(report: Path) -> float | None:

@@ -31,6 +31,7 @@ from torch.nn.functional import interpolate
 
 from polsep import cli, pipeline
 from polsep.compute.threads import own_threads
+from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import Frame, ReadOptions, read_frames
 from polsep.io.raw.rates import frame_rate
 from polsep.io.raw.sequences import DamagedFrame, expand_folders, input_files, natural_order, open_sequence
@@ -894,6 +895,21 @@ def test_panels_of_low_and_narrow_frames_hold_nothing_else(size: tuple[int, int]
     width = panels.shape[1] // 3
     assert (panels[:, 2 * width :] == 0).all()
     assert (panels[:, : 2 * width] == panels[0, 0]).all() and panels[0, 0].min() > 0
+
+
+def test_a_lamp_off_frame_is_no_frame_of_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would come first, so the lamp's colour and the exposure would be those of its noise."""
+    folder = write_folder(tmp_path / "run", frames(3))
+    (folder / "off.png").write_bytes(imagecodecs.png_encode(frames(1)[0] // 16))
+    given = command(folder, tmp_path / "out", "--no-preview", "--ambient")
+    (tmp_path / "link").symlink_to(folder)
+    read = with_corrections(ReadOptions(white_level=WHITE), None, [folder / "off.png"])
+    target = video.Target(tmp_path / "out", kept=(tmp_path / "link" / "off.png",))
+    with pytest.raises(InputError, match=r"off.png: expected a lamp-off frame apart from .* one of its frames"):
+        next(video.separate_video(folder, read, video.VideoOptions("analytic"), target))
+    assert run(monkeypatch, *given, str(folder / "off.png")) == 2
+    (folder / "off.png").rename(tmp_path / "off.png")
+    assert run(monkeypatch, *given, str(tmp_path / "off.png")) == 0
 
 
 def test_a_calibration_is_not_replaced_by_results(

@@ -27,7 +27,7 @@ from polsep.compute.threads import get_threads, own_threads
 from polsep.compute.workers import DEPTH, ahead, map_ahead
 from polsep.io.raw.corrections import hash_samples
 from polsep.io.raw.frames import Frame, ReadOptions, refuse_forgotten
-from polsep.io.raw.sequences import DamagedFrame, FrameSequence, input_files, open_sequence
+from polsep.io.raw.sequences import DamagedFrame, FrameSequence, input_files, open_sequence, refuse_frames
 from polsep.io.results.previews import exposure_of, srgb
 from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWriter, State
 from polsep.io.store.atomic import refuse_inputs
@@ -184,6 +184,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     recording = open_sequence(path, read)
     kind = target.kind.at(recording.rate)
     inputs = [*input_files(path), *target.kept]
+    refuse_frames(path, target.kept)
     refuse_inputs([target.directory / f"{recording.stem}{end}" for end in (".json", ".jsonl")], inputs)
     count = recording.count if options.frames is None else min(recording.count, options.frames)
     first = separate_first(recording, options)

@@ -123,6 +123,13 @@ def input_files(path: Path) -> list[Path]:
     return [path, *recording_files(path / RECORD if path.is_dir() else path)]
 
 
+def refuse_frames(path: Path, others: Sequence[Path]) -> None:
+    """Raise InputError where one of the ``others`` is a frame of a recording: the lamp would be looked for in it."""
+    frames = {file.resolve() for file in input_files(path)}
+    if shared := [file for file in others if file.resolve() in frames]:
+        raise input_error(shared[0], "expected a lamp-off frame apart from the recording, found one of its frames")
+
+
 def expand_folders(paths: Sequence[str]) -> list[str]:
     """The paths with each folder replaced by its frames: a recording, or its files of all kinds in natural order.
 

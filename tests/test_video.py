@@ -510,6 +510,13 @@ def test_films_have_the_rate_of_the_recording(tmp_path: Path, monkeypatch: pytes
     assert [rate_of(tmp_path / f"{name}_preview.mp4") for name in previews] == [50, Fraction(24000, 1001), 25, 50]
 
 
+def test_rates_that_no_film_has_are_not_those_of_recordings() -> None:
+    """Clocks of cameras count in any unit, and lossless films in milliseconds: only a rate that is said is refused."""
+    for kind, found, rate in (("exr", 1e6, 25), ("exr", 2500, 2500), ("ffv1", 2500, 25), ("exr", 1e-4, 25)):
+        assert SequenceKind(kind).at(found).rate == rate
+    assert SequenceKind(rate=24.0).at(50.0).rate == 24
+
+
 def rate_of(film: Path) -> Fraction:
     with av.open(str(film)) as container:
         return Fraction(container.streams.video[0].average_rate)

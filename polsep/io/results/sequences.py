@@ -49,6 +49,8 @@ FORMATS = ("exr", "ffv1", "ffvhuff", "none")
 LOSSLESS_CODECS = FORMATS[1:3]
 #: Frames per second where neither the user nor the input says them.
 RATE = 25.0
+#: Rates that films to watch may have.
+_LEAST_RATE, _MOST_RATE = 0.001, 100_000
 #: Largest rate of lossless films: Matroska counts milliseconds, and FFmpeg's AVI takes no more.
 _LOSSLESS_RATE = 1000
 #: Threads that write at once: an EXR file or two lossless films, and the film to watch.
@@ -99,8 +101,9 @@ class SequenceKind:
         if self.compression not in COMPRESSIONS:
             raise OutputError(f"expected a compression of {', '.join(COMPRESSIONS)}, found {self.compression!r}")
         rate = RATE if self.rate is None else self.rate
-        if not 0.001 <= rate <= 100_000:
-            raise OutputError(f"expected a rate of 0.001 to 100000 frames per second, found {rate:g}")
+        if not _LEAST_RATE <= rate <= _MOST_RATE:
+            expected = f"a rate of {_LEAST_RATE} to {_MOST_RATE} frames per second"
+            raise OutputError(f"expected {expected}, found {rate:g}")
         if self.format in LOSSLESS_CODECS and rate > _LOSSLESS_RATE:
             raise OutputError(
                 f"expected a rate of at most {_LOSSLESS_RATE} frames per second in {self.format}, found {rate:g}"
@@ -109,8 +112,10 @@ class SequenceKind:
             raise OutputError("expected something to write, found format none and no preview")
 
     def at(self, rate: float | None) -> SequenceKind:
-        """The kind with the rate of an input, if any, or with `RATE`, where it has none of its own."""
-        return replace(self, rate=self.rate or rate or RATE)
+        """The kind with the rate of an input, or with `RATE` where films cannot have that; its own one stays."""
+        most = _LOSSLESS_RATE if self.format in LOSSLESS_CODECS else _MOST_RATE
+        found = rate if rate is not None and _LEAST_RATE <= rate <= most else RATE
+        return replace(self, rate=found if self.rate is None else self.rate)
 
 
 class SequenceWriter:

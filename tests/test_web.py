@@ -197,6 +197,7 @@ def test_a_file_that_fails_leaves_the_one_before(page: Any, tmp_path: Path) -> N
     send(page, "broken.png", BROKEN)
     said = page.inner_text("#notes")
     assert said.startswith("broken.png: expected a complete PNG file") and page.input_value("#white") == "4095"
+    assert page.inner_text("#status").startswith("good.png · 160×32 · ")  # of the picture that stays
     assert fetch(page, "exr", tmp_path).name == "good.exr"
     change(page, lambda: page.select_option("#light", "white"))
     assert page.inner_text("#status").startswith("good.png · ") and page.inner_text("#notes") == said

@@ -12,9 +12,10 @@ const viewer = new Viewer(part("stage"), part("canvas"), part("handle"), showSca
 /** Settings that describe a file. */
 const OF_FILES = ["black", "white", "sensor", "layout", "light"];
 // name: of the images shown; frame: name of the frame that the worker holds, once there is one; pending: the file that is
-// being read, or whose format is asked for; subject: name of the file at work; kept: settings of the frame meanwhile.
+// being read, or whose format is asked for; subject: name of the file at work; kept: settings of the frame meanwhile;
+// shown: what the status says of the images.
 const state = {
-  images: null, report: null, gain: 1, name: "", frame: "", pending: null, kept: null,
+  images: null, report: null, gain: 1, name: "", shown: "", frame: "", pending: null, kept: null,
   subject: "", busy: false, again: false, next: null,
 };
 
@@ -159,7 +160,8 @@ function showResult({ images, report, notes, name }) {
   if (first) viewer.fit();
   const seconds = Object.entries(report.seconds).reduce((total, [name, own]) => (name === "load" ? total : total + own), 0);
   const where = report.device ? ` on the ${report.device}` : "";
-  part("status").textContent = `${state.name} · ${images.width}×${images.height} · ${report.method}${where} · ${seconds.toFixed(1)} s`;
+  state.shown = `${name} · ${images.width}×${images.height} · ${report.method}${where} · ${seconds.toFixed(1)} s`;
+  part("status").textContent = state.shown;
   showFacts(report);
   document.body.dataset.state = "done";
   window.polsep = { images, report, notes };  // for tests and the curious
@@ -225,7 +227,7 @@ function fail(error, file = state.subject) {
   item.dataset.file = file;
   item.textContent = `${file}: ${error.message}`;
   part("notes").replaceChildren(item);
-  part("status").textContent = "";
+  part("status").textContent = state.shown;
   part("progress").hidden = true;
   document.body.dataset.state = "failed";
 }

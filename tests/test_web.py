@@ -214,6 +214,31 @@ def test_a_file_that_fails_leaves_the_one_before(page: Any, tmp_path: Path) -> N
 
 @needs_packages
 @needs_browser
+def test_tiny_frames_are_separated_as_the_library_does(page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From one period of the filters on, 4x4 samples in colour and 2x2 in mono; less is refused in the same words."""
+    monkeypatch.setenv("POLSEP_LAYERS", "f32")
+    for sensor, method, (height, width) in (
+        ("color", "joint-fast", (4, 4)),
+        ("color", "analytic", (7, 9)),
+        ("mono", "joint-fast", (3, 2)),
+        ("mono", "analytic", (40, 4)),
+    ):
+        codes = np.ascontiguousarray(crop()[:height, :width])
+        page.select_option("#method", method)
+        send(page, "tiny.png", bytes(imagecodecs.png_encode(codes)))
+        page.evaluate("document.getElementById('white').value = '4095'")
+        change(page, lambda sensor=sensor: page.select_option("#sensor", sensor))
+        truth = separated(codes, method, layout=sensor)
+        found = page.evaluate("Array.from(window.polsep.images.diffuse)")
+        np.testing.assert_allclose(np.reshape(found, truth.diffuse.shape), truth.diffuse, rtol=0, atol=AGREES)
+    send(page, "less.png", bytes(imagecodecs.png_encode(np.ascontiguousarray(crop()[:3, :8]))))
+    with pytest.raises(ValueError, match="at least 4x4 pixels") as said:
+        separated(crop()[:3, :8], "analytic")
+    assert page.inner_text("#notes") == f"less.png: {said.value}"
+
+
+@needs_packages
+@needs_browser
 def test_a_file_whose_format_nobody_says_leaves_settings(page: Any) -> None:
     """Those of the frame that is shown come back when another file takes the place of the one that was asked about."""
     page.select_option("#method", "analytic")

@@ -9,7 +9,7 @@ import { encodingWarning } from "./encoding.js";
 import { fillUnderHighlights } from "./highlights.js";
 import { separateJoint } from "./joint.js";
 import { checkLayout, seePhases } from "./layout_check.js";
-import { channelsOf, parseLayout, specOf } from "./layout.js";
+import { channelsOf, parseLayout, periodOf, specOf } from "./layout.js";
 import { levelNotes, overexposureNotes, whiteOf } from "./levels.js";
 import { findLight } from "./light.js";
 import { checkBlackLevel } from "./noise.js";
@@ -107,10 +107,12 @@ function prepare(settings) {
   const layout = parseLayout(settings.layout || frame.layout || "color"), notes = frame.notes.map((text) => ({ text }));
   const said = settings.white ?? frame.white, white = said ?? whiteOf(frame.data), black = settings.black || 0;
   if (!(white > black)) throw new Error(`expected a white level above the black level, found white ${white}, black ${black}`);
-  const [top, left] = layout.origin, height = frame.height - ((frame.height - top) % 2), width = frame.width - ((frame.width - left) % 2);
+  const [top, left] = layout.origin, [rows, cols] = [top, left].map((start) => start + periodOf(layout));
+  if (frame.height < rows || frame.width < cols)
+    throw new Error(`expected a mosaic of at least ${cols}x${rows} pixels, found ${frame.width}x${frame.height}`);
+  const height = frame.height - ((frame.height - top) % 2), width = frame.width - ((frame.width - left) % 2);
   if (height !== frame.height || width !== frame.width)
-    notes.push({ text: `size ${frame.width}x${frame.height} cuts polarizer cells of the layout: cropped to ${width}x${height}, whole cells` });
-  if (Math.min(height, width) < 16) throw new Error(`expected a mosaic of at least 16x16 pixels, found ${frame.width}x${frame.height}`);
+    notes.push({ text: `size ${frame.width}x${frame.height} cuts polarizer cells of the layout: cropped to ${width - left}x${height - top}, whole cells` });
   const data = new Float32Array(height * width);
   for (let r = 0; r < height; r++) data.set(frame.data.subarray(r * frame.width, r * frame.width + width), r * width);
   notes.push(...levelNotes(frame.data, frame.width, black, said));

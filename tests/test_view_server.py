@@ -90,14 +90,20 @@ def test_the_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: 
     ("options", "said"),
     [
         (["nowhere.png"], "nowhere.png: expected a file, found nothing"),
+        (["report.json"], "report.json: expected a polsep recording"),
+        (["notes.png"], "notes.png: expected a PNG file, found text"),
         (["--method", "magic"], "expected a method of"),
         (["--white-level", "much"], "expected a number as white level"),
     ],
 )
 def test_bad_options_are_one_line(
-    options: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    options: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Before anything starts."""
+    (tmp_path / "report.json").write_text("{}")
+    (tmp_path / "notes.png").write_text("no picture at all")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("polsep.view.server.serve", lambda _: pytest.fail("expected a refusal, found a page"))
     monkeypatch.setattr(sys, "argv", ["polsep", "view", *options])
     with pytest.raises(SystemExit, match="2"):
         cli.main()

@@ -14,6 +14,7 @@ from typing import Any
 
 import gradio as gr
 
+from polsep.io.raw.frames import HEADERLESS
 from polsep.view.components import (
     HINT,
     IMAGES,
@@ -102,7 +103,7 @@ class Events:
         self.sessions.line.leave(_key(request))  # the job of the files before, whatever its settings
         if said is None:
             names = [] if first or values[self.components.keep] else list(OF_FILES)
-            if any(source.path.suffix.lower() in (".raw", ".bin") for source in session.sources):
+            if any(source.path.suffix.lower() in HEADERLESS for source in session.sources):
                 names = [name for name in names if name not in ("size", "pixel_format")]
             said = {settings[name]: value for name, value in self.start.of_files().items() if name in names}
         async for update in self.separate({**values, **said, settings["index"]: 0}, request):

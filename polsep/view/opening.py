@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from polsep.io.raw.corrections import with_corrections
-from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
+from polsep.io.raw.frames import FRAME_FILES, HEADERLESS, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD, is_recording
 from polsep.io.raw.videos import count_frames, is_film
 from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
@@ -169,6 +169,14 @@ def find_sources(path: Path) -> tuple[Source, ...]:
         if groups is None or not all(file.is_file() for name in groups for file in four_angles(path / name)):
             return tuple(as_source(file, file.stem) for file in files)
         return tuple(as_source(path / template, output_stem(template)) for template in groups)
+
+
+def require_first(sources: tuple[Source, ...], read: ReadOptions) -> None:
+    """Raise InputError, in one line, where the first frame cannot be read, and no setting of the page would change
+    that: of headerless raw, size and pixel format may be said there.
+    """
+    if sources[0].path.suffix.lower() not in HEADERLESS or None not in (read.size, read.pixel_format):
+        read_source(sources, read, 0)
 
 
 def four_angles(path: Path) -> tuple[Path, ...]:
@@ -327,8 +335,9 @@ def _renamed(source: Source) -> Iterator[None]:
         yield
     except ValueError as error:
         said = str(error).replace(str(source.path), source.stem + source.path.suffix)
-        for path, angle in zip(four_angles(source.path), _ANGLES, strict=False):
-            said = said.replace(str(path), f"{source.stem} {angle}°{path.suffix}")
+        if _PLACEHOLDER in source.path.name:
+            for path, angle in zip(four_angles(source.path), _ANGLES, strict=True):
+                said = said.replace(str(path), f"{source.stem} {angle}°{path.suffix}")
         raise InputError(said) from error
 
 

@@ -84,9 +84,10 @@ READERS: dict[str, Reader] = {
     **dict.fromkeys(LOSSLESS, Reader("a lossless video", read_video, single=False)),
     ".json": Reader("a recording.json", read_recording, single=False),
 }
-_HEADERLESS = (".raw", ".bin")
+#: Extensions of files without a header.
+HEADERLESS = (".raw", ".bin")
 #: Extensions of files that a folder of frames may hold.
-FRAME_FILES = (*(suffix for suffix, reader in READERS.items() if reader.single), *_HEADERLESS)
+FRAME_FILES = (*(suffix for suffix, reader in READERS.items() if reader.single), *HEADERLESS)
 _LOSSY = {".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".heic": "HEIC", ".mp4": "video"}
 _ANGLES = (0, 45, 90, 135)
 _PLACEHOLDER = "{angle}"
@@ -228,7 +229,7 @@ def read_pages(path: Path, options: ReadOptions | None = None, first: int = 0) -
             notes = ("the size and pixel format given are for headerless raw: the file's own header is used",)
             for page in READERS[suffix].read(path, first):
                 yield replace(page, notes=page.notes + notes) if described else page
-        elif suffix in _HEADERLESS or (options.pixel_format is not None and suffix not in _LOSSY):
+        elif suffix in HEADERLESS or (options.pixel_format is not None and suffix not in _LOSSY):
             for page in read_headerless(path, *_headerless_format(options), first):
                 yield _noting_layout(page, options)
         elif suffix in _LOSSY:

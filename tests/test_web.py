@@ -468,11 +468,25 @@ def test_files_that_the_library_refuses_are_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "pages.tif", np.stack([codes] * 4), photometric="minisblack")
     tifffile.imwrite(tmp_path / "turned.tif", codes, photometric="minisblack", extratags=[(274, 3, 1, 6, True)])
     (tmp_path / "II.raw").write_bytes(b"II" + bytes(62))
+    large = imagecodecs.png_encode(np.zeros((8, 8), np.uint8)).replace(bytes([0, 0, 0, 8] * 2), b"\0\0\x40\0" * 2)
+    (tmp_path / "large.png").write_bytes(large)
+    tifffile.imwrite(tmp_path / "large.tif", np.zeros((6000, 6000), np.uint8), compression="zlib")
     damaged = write_damaged_tiff(tmp_path, codes)
     others = {"photo.png": b"\xff\xd8\xff\xe0", "shot.tiff": b"raw samples", "shot.npy": b"\x93NUMPY", "empty.raw": b""}
     for name, data in others.items():
         (tmp_path / name).write_bytes(data)
-    names = [*others, "whole.png", "damaged.png", "negative.tif", "pages.tif", "turned.tif", "II.raw", *damaged]
+    names = [
+        *others,
+        "large.png",
+        "large.tif",
+        "whole.png",
+        "damaged.png",
+        "negative.tif",
+        "pages.tif",
+        "turned.tif",
+        "II.raw",
+        *damaged,
+    ]
     script = f"""
       import {{ readFileSync }} from "node:fs";
       import {{ readFrame }} from {json.dumps((WEB / "src" / "read.js").as_uri())};
@@ -492,6 +506,8 @@ def test_files_that_the_library_refuses_are_refused(tmp_path: Path) -> None:
     assert said["pages.tif"] == "expected a TIFF file of one picture, found several"
     assert said["turned.tif"] == next(read_frames(tmp_path / "turned.tif")).notes[0]
     assert said["whole.png"] == said["II.raw"] == ""
+    for name, side in (("large.png", 16384), ("large.tif", 6000)):  # before anything of that size is made
+        assert said[name] == f"expected a frame of at most 30 million samples, found {side}x{side}"
     assert said["empty.raw"] == "expected a raw frame, found an empty file" and said["shot.npy"].endswith("found .npy")
     assert "as the name says" in said["photo.png"] and "as the name says" in said["shot.tiff"]
     for name in damaged:

@@ -2,6 +2,7 @@
 // polsep/io/raw. A frame is {data: Uint8Array or Uint16Array, height, width, white, layout, notes}.
 
 import { decode } from "fast-png";
+import { requireSize } from "./header_checks.js";
 import { readTiff } from "./tiff.js";
 
 const PACKINGS = {
@@ -54,6 +55,8 @@ function readIntactTiff(bytes) {
 
 function readPng(bytes) {
   let png;
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  if (bytes.length > 24 && view.getUint32(12) === 0x49484452) requireSize(view.getUint32(16), view.getUint32(20));  // IHDR
   try {
     png = decode(bytes, { checkCrc: true });
   } catch (error) {
@@ -85,7 +88,8 @@ function guessFormats(size) {
 function readHeaderless(bytes, { format, width, height }) {
   const kind = PIXEL_FORMATS[format];
   if (!kind) throw new Error(`expected a GenICam pixel format, found ${format}`);
-  if (!(width > 0 && height > 0 && width * height <= 2 ** 28)) throw new Error(`expected a width and height, found ${width}x${height}`);
+  if (!(width > 0 && height > 0)) throw new Error(`expected a width and height, found ${width}x${height}`);
+  requireSize(width, height);
   const expected = frameBytes(kind, width, height);
   if (bytes.length !== expected) throw new Error(`expected ${expected} bytes for ${width}x${height} ${format}, found ${bytes.length}`);
   const data = kind.packing === "byte" ? bytes.slice() : new Uint16Array(width * height);

@@ -2,6 +2,7 @@
 // or PackBits. Twin of what polsep/io/raw/tiff.py reads. Source: TIFF 6.0 (Adobe 1992).
 
 import { unzlibSync } from "fflate";
+import { requireSize } from "./header_checks.js";
 
 const SIZES = { 1: 1, 2: 1, 3: 2, 4: 4, 6: 1, 7: 1, 13: 4 };
 const COMPRESSIONS = { 1: (x) => x, 5: unpackLzw, 8: unpackDeflate, 32946: unpackDeflate, 32773: unpackBits };
@@ -17,6 +18,7 @@ export function readTiff(bytes) {
   const width = one(256), height = one(257), bits = one(258, 1), channels = one(277, 1);
   const unpack = COMPRESSIONS[one(259, 1)], predictor = one(317, 1);
   if (!width || !height) throw new Error("expected a TIFF file with a size, found none");
+  requireSize(width, height);
   if (channels !== 1) throw new Error(`expected one channel, found ${channels}: a demosaicked picture is not a raw mosaic`);
   if (next) throw new Error("expected a TIFF file of one picture, found several");
   if (!PHOTOMETRIC.includes(one(262, 0))) throw new Error(`expected gray samples with black at zero, found TIFF photometric ${one(262, 0)}`);

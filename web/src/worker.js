@@ -18,7 +18,6 @@ import { addPolarization, describe, intoLight, tallyOf } from "./report.js";
 import { networkOf } from "./runtime.js";
 import { encodeExr, encodeLinearPng, layersOf } from "./write.js";
 
-const MAX_SAMPLES = 3e7;
 let frame = null, separated = null;
 
 const tell = (share, text) => postMessage({ progress: { share, text } });
@@ -38,8 +37,6 @@ const JOBS = {
     });
     const found = readFrame(name, new Uint8Array(bytes), stated);
     if (found.needsFormat) return found;
-    if (found.width * found.height > MAX_SAMPLES)
-      throw new Error(`expected a frame of at most ${MAX_SAMPLES / 1e6} million samples, found ${found.width}x${found.height}`);
     frame = { ...found, name };
     return { name, width: found.width, height: found.height, white: found.white, layout: found.layout };
   },

@@ -332,6 +332,50 @@ def test_another_file_has_settings_of_its_own(page: Any) -> None:
     assert found == ["", "", "", "auto", "analytic"] and page.is_hidden("#rgb")
 
 
+@needs_packages
+@needs_browser
+def test_going_back_to_the_page_begins_anew(page: Any) -> None:
+    """The browser does not fill in the level and the filters of the file before, which another file may not have."""
+    page.select_option("#sensor", "other")
+    page.select_option("#light", "stated")
+    for part, value in (("white", "4095"), ("black", "20"), ("layout", "0,45,90,135/RGGB")):
+        page.fill(f"#{part}", value)
+    page.goto("about:blank")
+    page.go_back()
+    page.wait_for_selector("body[data-state=ready]")
+    found = [page.input_value(f"#{part}") for part in ("white", "black", "layout", "sensor", "light")]
+    assert found == ["", "", "", "", "auto"]
+
+
+@needs_packages
+@needs_browser
+def test_what_is_no_number_is_refused(page: Any) -> None:
+    """Chromium lets 4e stand in a field of numbers, and says that nothing is there."""
+    page.select_option("#method", "analytic")
+    send(page, "shot.png", shot())
+    change(page, lambda: page.click("text=Use white level 4095"))
+    page.focus("#white")
+    page.keyboard.press("Control+A")
+    page.keyboard.type("4e")
+    change(page, lambda: page.keyboard.press("Enter"))
+    assert page.inner_text("#notes") == "shot.png: expected a number as white level, found text that is none"
+
+
+@needs_packages
+@needs_browser
+def test_the_menu_of_downloads_closes(page: Any) -> None:
+    """With a click elsewhere, and with Escape, which gives the keyboard back to its button."""
+    page.select_option("#method", "analytic")
+    send(page, "shot.png", shot())
+    page.click("#download summary")
+    page.mouse.click(300, 500)
+    assert page.is_hidden("[data-format=exr]")
+    page.click("#download summary")
+    page.focus("[data-format=exr]")
+    page.keyboard.press("Escape")
+    assert page.is_hidden("[data-format=exr]") and page.evaluate("document.activeElement.tagName") == "SUMMARY"
+
+
 @needs_browser
 def test_a_new_build_is_kept_whole(browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The service worker does not keep what the browser's own cache still has of the build before."""

@@ -53,10 +53,16 @@ function showProgress({ share, text }) {
   part("status").textContent = `${state.subject} · ${text} …`;
 }
 
+/** The number in a field, null where there is none. Throws on what is no number, like 4e. */
+function numberIn(id, name) {
+  if (part(id).validity.badInput) throw new Error(`expected a number as ${name}, found text that is none`);
+  return part(id).value === "" ? null : part(id).valueAsNumber;
+}
+
 const settings = () => ({
   method: part("method").value,
-  white: part("white").value === "" ? null : part("white").valueAsNumber,  // 0 is said, and refused
-  black: part("black").valueAsNumber || 0,
+  white: numberIn("white", "white level"),  // 0 is said, and refused
+  black: numberIn("black", "black level") ?? 0,
   layout: part("sensor").value === "other" ? part("layout").value || part("layout").placeholder : part("sensor").value || null,
   light: part("light").value === "stated" ? part("color").value.split(",").map(Number) : part("light").value,
   threads: Number(options.get("threads")) || 0,
@@ -345,6 +351,12 @@ part("stops").ondblclick = () => {
 };
 part("fit").onclick = () => viewer.fit();
 part("actual").onclick = () => viewer.actual();
+addEventListener("pointerdown", ({ target }) => part("download").contains(target) || (part("download").open = false));
+part("download").onkeydown = ({ key }) => {
+  if (key !== "Escape") return;
+  part("download").open = false;
+  part("download").querySelector("summary").focus();
+};
 part("download").onclick = ({ target }) => target.dataset.format && download(target.dataset.format);
 part("stage").addEventListener("pointermove", showReadout);
 addEventListener("dragover", (event) => {

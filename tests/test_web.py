@@ -621,6 +621,25 @@ def test_the_page_finds_the_lamp_that_the_library_finds(tmp_path: Path) -> None:
 
 
 @needs_packages
+def test_even_light_has_no_angle(tmp_path: Path) -> None:
+    """A frame of one value, as all that clips: rounding does not polarize it, and the report warns as the library's."""
+    script = f"""
+      import {{ separateAnalytic }} from {json.dumps((WEB / "src" / "analytic.js").as_uri())};
+      import {{ parseLayout }} from {json.dumps((WEB / "src" / "layout.js").as_uri())};
+      import {{ addPolarization, describe, tallyOf }} from {json.dumps((WEB / "src" / "report.js").as_uri())};
+      const layout = parseLayout("color"), data = new Float32Array(32 * 32).fill(4095);
+      const images = separateAnalytic({{ data, height: 32, width: 32, layout, black: 0, white: 4095 }}, [1, 1, 1]);
+      addPolarization(images);
+      console.log(JSON.stringify(describe(tallyOf(images), false, 3)));"""
+    done = subprocess.run(
+        [str(NODE), "--input-type=module", "-e", script], cwd=tmp_path, capture_output=True, check=True, timeout=60
+    )
+    found, truth = json.loads(done.stdout), separated(np.full((32, 32), 4095, np.uint16), "analytic").report
+    assert found["statistics"]["specular_aolp_concentration"] == 0 == truth["statistics"]["specular_aolp_concentration"]
+    assert found["warnings"][0] in truth["warnings"]
+
+
+@needs_packages
 def test_the_page_is_small(site: Path) -> None:
     """All that a host serves, the example and both runtimes included."""
     assert sum(path.stat().st_size for path in site.iterdir()) < LARGEST

@@ -13,7 +13,8 @@ export function stokesInverse(degrees) {
   const adjoint = [[d * f - e * e, c * e - b * f, b * e - c * d], [c * e - b * f, a * f - c * c, b * c - a * e],
     [b * e - c * d, b * c - a * e, a * d - b * b]];
   const det = a * adjoint[0][0] + b * adjoint[0][1] + c * adjoint[0][2];
-  return adjoint.map((own) => rows.map((row) => (own[0] * row[0] + own[1] * row[1] + own[2] * row[2]) / det));
+  const exact = (x) => Math.round(x * 1e12) / 1e12;  // rounding would polarize
+  return adjoint.map((own) => rows.map((row) => exact((own[0] * row[0] + own[1] * row[1] + own[2] * row[2]) / det)));
 }
 
 /** Correlate an image with (side, middle, side) along rows, or `down` columns; borders mirror. */

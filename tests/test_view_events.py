@@ -157,6 +157,25 @@ def test_the_file_that_was_sent_last_is_shown(events: Events, held: Held, tmp_pa
     assert all("status" not in update for update in before)
 
 
+def test_settings_changed_meanwhile_stay(events: Events, held: Held, tmp_path: Path) -> None:
+    """A file says its settings once, not with every word on progress; a wrong setting ends the work by others."""
+
+    async def act() -> tuple[list[Updates], list[Updates]]:
+        first = asyncio.create_task(collect(events.open_demo({**VALUES, "keep": True}, REQUEST)))
+        await asyncio.wait_for(first, 60)
+        second = asyncio.create_task(collect(events.open_own(file(tmp_path, "slow"), VALUES, REQUEST)))
+        await reached(held.begun)
+        await asyncio.sleep(0.2)
+        wrong = await collect(events.separate({**VALUES, "white": "40x"}, REQUEST))
+        return await asyncio.wait_for(second, 60), wrong
+
+    told, (wrong,) = asyncio.run(act())
+    assert "white" in told[0] and all("white" not in update for update in told[1:]) and len(told) > 2
+    assert "expected a number as white level" in wrong["status"]
+    assert all("status" not in update for update in told)  # which would replace the message
+    held.go_on.set()
+
+
 def test_a_file_that_fails_ends_the_wait_for_the_one_before(
     events: Events, sessions: Sessions, held: Held, tmp_path: Path
 ) -> None:

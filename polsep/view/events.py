@@ -83,6 +83,7 @@ class Events:
             said = {self.components.settings[m.setting]: m.value for m in mends[place : place + 1]}
             async for update in self.separate({**values, **said}, request):
                 yield said | update
+                said = {}  # as in `_open`
 
         return answer
 
@@ -106,8 +107,10 @@ class Events:
             if any(source.path.suffix.lower() in HEADERLESS for source in session.sources):
                 names = [name for name in names if name not in ("size", "pixel_format")]
             said = {settings[name]: value for name, value in self.start.of_files().items() if name in names}
+        first_words = emptied | said
         async for update in self.separate({**values, **said, settings["index"]: 0}, request):
-            yield emptied | said | update
+            yield first_words | update
+            first_words = {}  # once: whoever changes a setting while the file is separated keeps it
 
     async def separate(self, values: Values, request: gr.Request) -> AsyncIterator[Updates]:
         """Separate the session's file with the settings of the page; tell the progress meanwhile."""
@@ -118,6 +121,7 @@ class Events:
             settings = parse_settings(said if demo else self.start.corrections() | said)
             against = parse_against(values[parts.view["against"]], settings)
         except FAILURES as error:
+            self.sessions.line.leave(_key(request))  # what is made by other settings than the page's is not shown
             yield self._failed(error, session)
             return
         self._see(session, values)

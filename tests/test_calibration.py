@@ -591,12 +591,17 @@ def test_commands_measure_and_apply(tmp_path: Path, run_polsep: Cli) -> None:  #
     out = polsep.separate(raws[0], "analytic", calibration=rig, ambient=raws[1])
     np.testing.assert_array_equal(diffuse, out.diffuse)
     assert abs(float((out.diffuse + out.specular).mean()) - 0.6) < 0.01
+    both = ("separate", shot, room, "--ambient", room, "--calibration", rig, "-o", tmp_path / "both")
+    done = run_polsep(*both, "--method", "analytic")
+    assert done.status == 0 and "room.tiff is the lamp-off frame: it is not separated" in done.err
+    assert {path.stem for path in (tmp_path / "both").iterdir()} == {"shot"}
     save(tmp_path / "small.tiff", replace(sensor.expose(np.zeros(SIZE)), data=torch.zeros(64, 64)))
     for arguments, expected in (
         (("separate", tmp_path / "small.tiff", "--calibration", rig), "expected frames of 160x128, as calibrated"),
         (("separate", shot, "--calibration", tmp_path / "none.json"), "expected a file, found nothing"),
         (("separate", shot, "--calibration", shot), "expected a calibration of 'polsep calibrate'"),
         (("separate", shot, "--ambient", tmp_path / "small.tiff"), "expected an ambient frame of 160x128"),
+        (("separate", room, "--ambient", room), "expected frames with the lamp on, found the lamp-off frame alone"),
         (("calibrate", "dark", *paper, "--white-level", 800, "-o", rig), "expected frames of white level 4095.0"),
         (("calibrate", "flat", *caps, "-o", rig), "expected flat frames near half of the white level"),
     ):

@@ -124,6 +124,7 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
         _report(outcome)
         return
     paths, failures = _expand_files(files)
+    paths = _without_ambient(paths, options["ambient"])
     seen = list[str]()
     with show_progress(f"separating {files[0]}" if len(files) == 1 else "separating", len(paths)) as progress:
         for outcome in separate_files(paths, read, run, write):
@@ -151,6 +152,21 @@ def _expand_files(files: tuple[str, ...]) -> tuple[list[str], int]:
             print_note(f"error: {error}")
             failures += 1
     return paths, failures
+
+
+def _without_ambient(paths: list[str], ambient: tuple[Path, ...]) -> list[str]:
+    """The paths of frames without those of lamp-off frames, each with a note. Raises InputError if none is left."""
+    from polsep.io.raw.sequences import input_files
+    from polsep.io.store.errors import input_error
+
+    dark = {file.resolve() for path in ambient for file in input_files(path)}
+    kept = [path for path in paths if Path(path).resolve() not in dark]
+    if paths and not kept:
+        raise input_error(paths[0], "expected frames with the lamp on, found the lamp-off frame alone")
+    for path in paths:
+        if path not in kept:
+            print_note(f"{path} is the lamp-off frame: it is not separated")
+    return kept
 
 
 def _report(outcome: Outcome) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from numbers import Real
 
-from polsep.compute.arrays import WrongType
+from polsep.compute.arguments import WrongType
 from polsep.compute.threads import get_threads, set_threads
 from polsep.light import color_kernel, tiles_kernel
 from polsep.networks import combine_kernel, details_kernel, images_kernel

@@ -16,7 +16,8 @@ from typing import Protocol
 import numpy as np
 
 from polsep.compute import pages
-from polsep.compute.arrays import WrongType, namespace, on_cpu, to_numpy
+from polsep.compute.arguments import WrongType
+from polsep.compute.arrays import namespace, on_cpu, to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half, is_large_enough

@@ -21,7 +21,8 @@ import numpy as np
 from array_api_compat import is_array_api_obj
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import WrongType, namespace, to_device
+from polsep.compute.arguments import WrongType
+from polsep.compute.arrays import namespace, to_device
 from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration

@@ -636,7 +636,7 @@ def test_a_mesh_is_left_out_on_request(run: Cli, tmp_path: Path) -> None:
         (("--light", "left"), "x,y,z"),
         (("--mesh", "none", "--turntable"), "--turntable"),
         (("--mesh", "obj"), "glb"),
-        (("--index", "1"), "refractive index"),
+        (("--index", "1"), "'--index': expected a finite number from 1.3 to 2.5"),
     ],
 )
 def test_wrong_options_are_refused(run: Cli, tmp_path: Path, words: tuple[str, ...], said: str) -> None:

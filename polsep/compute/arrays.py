@@ -14,12 +14,10 @@ import numpy as np
 from array_api_compat import array_namespace, device, is_array_api_obj, is_torch_array
 from numpy.typing import NDArray
 
+from polsep.compute.arguments import WrongType
+
 #: A NumPy array or a torch tensor; docstrings give its shape. (Type checkers know no type for both.)
 Array: TypeAlias = Any
-
-
-class WrongType(TypeError, ValueError):
-    """An argument of a wrong type; also a ValueError, as every wrong input is."""
 
 
 def namespace(x: Array) -> Any:

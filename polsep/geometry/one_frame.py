@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import WrongType
+from polsep.compute.arguments import WrongType
 from polsep.compute.resizing import block_means, resize_area, resize_bilinear
 from polsep.geometry.lamp import search_lamp, seen_under
 from polsep.geometry.shape_maps import (

@@ -22,7 +22,8 @@ from numbers import Real
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import Array, WrongType, constant, namespace, require_floats, short_repr
+from polsep.compute.arguments import WrongType
+from polsep.compute.arrays import Array, constant, namespace, require_floats, short_repr
 
 Doubles = NDArray[np.float64]
 

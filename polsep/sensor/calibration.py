@@ -27,7 +27,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import WrongType, as_floats, namespace, of_kind, to_numpy
+from polsep.compute.arguments import WrongType
+from polsep.compute.arrays import as_floats, namespace, of_kind, to_numpy
 from polsep.physics.stokes import diattenuation
 from polsep.sensor.ambient import ambient_notes
 from polsep.sensor.camera import Layout, Mosaic, clip_level

@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from array_api_compat import device, is_array_api_obj
 
-from polsep.compute.arrays import Array, WrongType, as_floats, constant, namespace, short_repr
+from polsep.compute.arguments import WrongType
+from polsep.compute.arrays import Array, as_floats, constant, namespace, short_repr
 from polsep.compute.resizing import repeat_pixels, resize_bilinear
 from polsep.physics.stokes import Measurements, Stokes, diattenuation
 

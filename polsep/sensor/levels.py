@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute import pages
-from polsep.compute.arrays import WrongType
+from polsep.compute.arguments import WrongType
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, clip_level
 

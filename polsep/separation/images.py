@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute import pages
-from polsep.compute.arrays import WrongType
+from polsep.compute.arguments import WrongType
 from polsep.sensor.camera import Layout, require_layout
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import WrongType
+from polsep.compute.arguments import WrongType
 from polsep.io.store.atomic import OutputError, replace_bytes, replace_text
 from polsep.io.store.errors import InputError, as_path, decoding, naming
 from polsep.io.store.header_checks import SAMPLES, limit

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from polsep.compute.arrays import WrongType
+from polsep.compute.arguments import WrongType
 
 #: Most characters of a message with the name of its file, and of that name.
 MOST, MOST_OF_NAME = 300, 200

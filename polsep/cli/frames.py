@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -159,8 +160,8 @@ def _without_ambient(paths: list[str], ambient: tuple[Path, ...]) -> list[str]:
     from polsep.io.raw.sequences import input_files
     from polsep.io.store.errors import input_error
 
-    dark = {file.resolve() for path in ambient for file in input_files(path)}
-    kept = [path for path in paths if Path(path).resolve() not in dark]
+    dark = {os.path.realpath(file) for path in ambient for file in input_files(path)}
+    kept = [path for path in paths if os.path.realpath(path) not in dark]  # also of links that lead in a circle
     if paths and not kept:
         raise input_error(paths[0], "expected frames with the lamp on, found the lamp-off frame alone")
     for path in paths:

@@ -7,6 +7,7 @@ ordinary camera, which have no polarization.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -84,7 +85,7 @@ class ShapeOptions:
 
 def read_views(paths: Sequence[Path], source: Source) -> Views:
     """Read files, and separate raw frames. Raises InputError, also on images of different shapes."""
-    whole = [path.resolve() for path in paths]
+    whole = [os.path.realpath(path) for path in paths]
     for k, path in enumerate(paths):
         if whole[k] in whole[:k]:  # before minutes are spent on the others
             raise input_error(

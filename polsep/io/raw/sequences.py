@@ -9,6 +9,7 @@ the file allows that.
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -125,8 +126,8 @@ def input_files(path: Path) -> list[Path]:
 
 def refuse_frames(path: Path, others: Sequence[Path]) -> None:
     """Raise InputError where one of the ``others`` is a frame of a recording: the lamp would be looked for in it."""
-    frames = {file.resolve() for file in input_files(path)}
-    if shared := [file for file in others if file.resolve() in frames]:
+    frames = {os.path.realpath(file) for file in input_files(path)}
+    if shared := [file for file in others if os.path.realpath(file) in frames]:
         raise input_error(shared[0], "expected a lamp-off frame apart from the recording, found one of its frames")
 
 

@@ -59,7 +59,7 @@ def test_an_upload_is_separated_compared_edited_and_fetched(page: Any, tmp_path:
     await_text(page, "#ps-mend-0", "Use white level 4095")
     page.click("#ps-mend-0")
     page.wait_for_selector("#ps-mend-0", state="hidden")
-    assert page.input_value("#ps-white input") == "4095"
+    page.wait_for_function("document.querySelector('#ps-white input').value === '4095'")
     page.wait_for_function("!document.querySelector('#ps-status').innerText.includes('White level')")
     choose(page, "ps-right", "Specular")
     page.wait_for_selector(".ps-right[alt=Specular]")

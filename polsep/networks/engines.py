@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polsep.compute import pages
 from polsep.compute.arrays import to_numpy
 from polsep.compute.threads import get_threads, run_over_rows
 from polsep.compute.warm_up import make_ready
@@ -37,6 +38,8 @@ from polsep.separation.images import FrameImages
 
 #: Engines that are kept at least, each with the memory that its frames need.
 KEPT = 2
+#: Rows of an image that a thread copies at a time.
+ROWS = 64
 
 
 class _Job(NamedTuple):
@@ -174,8 +177,8 @@ def _run_turned(network: JointWeights, mosaic: Mosaic, orientation: Orientation,
     data = to_numpy(mosaic.data)
     as_it_is = orientation == Orientation(*data.shape) and not any(n % PERIOD for n in data.shape)
     readable = data.dtype in (np.uint8, np.uint16, np.float32)
-    floats = data if as_it_is and readable else data.astype(np.float32)
-    turned = floats if as_it_is else np.ascontiguousarray(orientation.turn(floats))
+    samples = data if readable else data.astype(np.float32)
+    turned = samples if as_it_is else np.ascontiguousarray(orientation.turn(samples))
     cells, levels = 1 if full else 2, (mosaic.black_level, mosaic.white_level)
     light = mosaic.light_color[::-1] if orientation.swapped else mosaic.light_color
     modulation = modulation_of(network, turned, levels, light)
@@ -206,6 +209,15 @@ def _strips(
         yield (top, top + rows), (first, last)
 
 
+def _as_contiguous(image: NDArray[Any]) -> NDArray[Any]:
+    """NumPy's function of that name by all threads, in memory that is used again."""
+    if image.flags.c_contiguous:
+        return image
+    copy = pages.empty(image.shape, image.dtype)
+    run_over_rows(lambda rows: np.copyto(copy[slice(*rows)], image[slice(*rows)]), len(image), ROWS)
+    return copy
+
+
 def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> FrameImages:
     """Images of a turned frame, ``scale`` pixels along a cell's side, as those of the frame itself.
 
@@ -216,7 +228,7 @@ def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> Fra
         planes = np.moveaxis(image, -1, 0) if image.ndim == 3 else image
         planes = planes[::-1] if orientation.swapped and len(planes) == 3 else planes
         planes = orientation.turn_back(planes, scale)
-        return np.ascontiguousarray(np.moveaxis(planes, 0, -1) if planes.ndim == 3 else planes)
+        return _as_contiguous(np.moveaxis(planes, 0, -1) if planes.ndim == 3 else planes)
 
     turned, tally = {name: turn(image) for name, image in images.arrays().items()}, images.tally
     assert tally is not None

@@ -21,7 +21,7 @@ import numpy as np
 from array_api_compat import is_array_api_obj
 from numpy.typing import NDArray
 
-from polsep.compute.arguments import WrongType
+from polsep.compute.arguments import WrongType, require_flags
 from polsep.compute.arrays import namespace, to_device
 from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.io.store.atomic import OutputError
@@ -30,9 +30,10 @@ from polsep.io.store.errors import as_path
 from polsep.light.find import Light, find_light
 from polsep.methods import Capture, Method, find_method
 from polsep.physics.stokes import Measurements
-from polsep.sensor.calibration import Calibration, Corrections, Table, falloff_image, mean_mosaic
+from polsep.sensor.calibration import Calibration, Corrections, mean_mosaic
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.checks import check_mosaic
+from polsep.sensor.falloff import Table, falloff_image
 from polsep.sensor.levels import (
     as_layout,
     as_measurements,
@@ -111,10 +112,11 @@ class Result(SeparatedFrame):
         from polsep.io.results.separation_writer import write_separation
 
         target = as_path(path)
+        require_flags(overwrite=overwrite, stokes=stokes)
         if os.fspath(path).endswith(("/", os.sep)) or os.path.isdir(target):
             raise OutputError(f"expected a file name like {target / 'shot.exr'}, found a folder")
         stem = target.stem if target.suffix.lower() in _ENDINGS else target.name
-        if target.suffix and stem == target.name:
+        if (target.suffix and stem == target.name) or target.name.lower() in _ENDINGS:
             raise ValueError(f"expected a file name that ends in {', '.join(_ENDINGS)}, found {target.name!r:.80}")
         frame, kind = self.with_stokes() if stokes else self, _ENDINGS.get(target.suffix.lower(), "exr")
         try:
@@ -153,8 +155,7 @@ def separate(
     issued as `PolsepWarning`. Raises ValueError, with one line of what was expected and what was found, on other input;
     of wrong types it is also a TypeError.
     """
-    if not isinstance(full, bool | np.bool_):
-        raise WrongType(f"expected full as True or False, found {full!r:.40}")
+    require_flags(full=full)
     if not isinstance(calibration, Calibration | str | PathLike | None):
         raise WrongType(f"expected a calibration or its file, found {type(calibration).__name__}")
     measured = calibration if isinstance(calibration, Calibration | None) else read_calibration(Path(calibration))
@@ -164,8 +165,7 @@ def separate(
         measured.require_black_level(black_level, "black_level")
         if isinstance(raw, np.ndarray):
             black_level = measured.black_level_of(raw, black_level, white_level)
-    levels = (layout, black_level, white_level)
-    capture, notes = _as_capture(raw, *levels)
+    capture, notes = _as_capture(raw, layout, black_level, white_level)
     if isinstance(capture, Mosaic):
         corrections = Corrections(measured)
         if ambient is not None:
@@ -231,7 +231,7 @@ def _ambient_frames(
         return [ambient]
     if isinstance(ambient, np.ndarray):
         gray = not four and ambient.ndim == 3 and ambient.shape[-1] in (1, 3)  # as `as_mosaic` takes them
-        return [ambient] if gray or ambient.ndim == 2 + four else list(ambient)
+        return [ambient] if gray or ambient.ndim == 2 + four else list(np.atleast_1d(ambient))
     if isinstance(ambient, str) or not isinstance(ambient, Sequence):
         raise WrongType(f"expected a raw frame with the lamp off, or several, found {type(ambient).__name__}")
     return list(ambient)

@@ -368,7 +368,29 @@ ARRAYS: list[tuple[str, Callable[[], object], str]] = [
     ("no results", lambda: read_separated("missing"), "missing: expected a file, found nothing at this path"),
     ("folder", lambda: read_separated("."), "expected a separated frame (.exr, .npz), found a directory"),
     ("size", lambda: ReadOptions(size=(0, 4)), "expected a size of positive width and height, found (0, 4)"),
+    ("white", lambda: calibration(white_level=np.nan), "a white level well above the black level, found white nan"),
+    ("white 0", lambda: calibration(white_level=0), "a white level well above the black level, found white 0"),
+    ("black", lambda: calibration(black_level=4095), "well above the black level, found white 4095, black 4095"),
+    ("below", lambda: calibration(black_level=-5000), "expected black level within 4095, found -5000"),
+    ("noise", lambda: calibration(read_noise=-1), "expected read noise from 0 to 4095, found -1"),
+    ("no size", lambda: calibration(size=(0, 8)), "expected a size of positive height and width, found (0, 8)"),
+    ("map", lambda: calibration(size=(8, 9), black_map=SOME), "a black_map of the size (8, 9), found (8, 8)"),
+    ("dark map", lambda: calibration(size=(8, 8), gain_map=0 * SOME), "gains of pixels from 0.001 to 1000, found 0"),
+    ("nan map", lambda: calibration(size=(8, 8), black_map=np.nan * SOME), "black map within 4095, found nan"),
+    ("gains", lambda: calibration(gains=-np.ones((4, 4))), "expected gains from 0.001 to 1000, found -1"),
+    ("places", lambda: calibration(gains=((1.0,) * 2,) * 2), "expected gains of 4x4 places, found [2, 2]"),
+    ("falloff", lambda: calibration(falloff=((0.4, 0.6),)), "expected a falloff from 0.001 to 1000, found"),
+    ("pixels", lambda: calibration(size=(8, 8), dead=np.array([64])), "pixels as indices below 64"),
+    ("one angle", lambda: calibration(analysers=[[(45, 99, 1)] * 4] * 4), "20 degrees of the layout's 90, found 45"),
+    ("no angle", lambda: calibration(analysers=[[(np.nan, 99, 1)] * 4] * 4), "of the layout's 90, found nan"),
+    ("extinction", lambda: calibration(analysers=[[(90, 0.5, 1)] * 4] * 4), "ratios above 1, found 0.5"),
+    ("lamp", lambda: calibration(lamp=((0, 1, 1), None, None)), "a lamp's colour from 0.001 to 1000, found 0"),
 ]
+
+
+def calibration(**fields: Any) -> polsep.Calibration:
+    return polsep.Calibration(**{"layout": Layout(), "white_level": 4095, **fields})
+
 
 SOME = np.ones((8, 8), np.float32)
 TYPES: list[tuple[str, Callable[[], object], str]] = [
@@ -401,6 +423,24 @@ TYPES: list[tuple[str, Callable[[], object], str]] = [
     ("stokes", lambda: Stokes(SOME, SOME, [[1.0]]), "expected Stokes images as a NumPy array or a torch tensor"),
     ("bits", lambda: Stokes(SOME > 0, SOME, SOME), "expected Stokes images in floating point, found bool"),
     ("planes", lambda: polsep.separate(np.ones((4, 8, 8)), layout=3), 'expected a Layout, "color", "mono", a'),  # type: ignore[arg-type]
+    ("angle", lambda: Measurements(SOME[None, None], 0.5), "expected analyser angles in radians, found 0.5"),  # type: ignore[arg-type]
+    ("a 2D colour", lambda: polsep.separate(SOME, light_color=np.ones((3, 3))), "colour of three positive numbers"),
+    ("one sample", lambda: polsep.separate(SOME, ambient=np.array(3)), "expected a NumPy array, found int64"),
+    ("a format", lambda: polsep.Result.save(None, "a.exr", "npz"), "expected overwrite as True or False, found 'npz'"),  # type: ignore[arg-type]
+    ("half a row", lambda: Layout().rolled(1.5, 0), "expected rows or columns as a whole number, found 1.5"),  # type: ignore[arg-type]
+    ("a width", lambda: Layout().flipped_horizontal("9"), "expected a width as a whole number, found '9'"),  # type: ignore[arg-type]
+    ("a height", lambda: Layout().flipped_vertical(None), "expected a height as a whole number, found None"),  # type: ignore[arg-type]
+    ("a pixel", lambda: Layout().filter_at(0, 0.5), "expected a row or column as a whole number, found 0.5"),  # type: ignore[arg-type]
+    ("a rig", lambda: calibration(layout="color"), "expected a Layout (Layout.parse reads text), found 'color'"),
+    ("no white", lambda: calibration(white_level=None), "expected white_level as a number, found None"),
+    ("a text", lambda: calibration(black_level="64"), "expected black_level as a number, found '64'"),
+    ("a side", lambda: calibration(size=8), "expected size as rows and columns, found 8"),
+    ("a gain", lambda: calibration(gains=1.0), "expected gains as rows of numbers, found 1.0"),
+    ("a map", lambda: calibration(gain_map=[[1.0]]), "expected gain_map as an array of numbers, found [[1.0]]"),
+    ("complex map", lambda: calibration(black_map=1j * SOME), "expected black_map as an array of numbers, found"),
+    ("a pixel", lambda: calibration(dead=np.array([1.5])), "expected dead as an array of indices, found"),
+    ("analysers", lambda: calibration(analysers=SOME[:4, :4]), "rows of an angle, an extinction ratio and a gain"),
+    ("a lamp", lambda: calibration(lamp=(1, 1, 1)), "a colour of three numbers, a degree and an angle of polariz"),
 ]
 
 

@@ -43,12 +43,12 @@ from polsep.sensor.calibration import (
     correct_analysers,
     correct_analysers_reference,
     correct_mosaic,
-    falloff_image,
     mean_mosaic,
     subtract_ambient,
 )
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.exposure import histogram
+from polsep.sensor.falloff import falloff_image
 
 SIZE = (128, 160)
 WHITE = 4095.0
@@ -693,8 +693,8 @@ def test_what_cannot_be_read_again_is_not_written(tmp_path: Path) -> None:
     good = BadSensor(Layout()).calibration()
     write_calibration(tmp_path / "rig.json", good, "0")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(ValueError, match="expected a falloff"):
-        write_calibration(tmp_path / "rig.json", replace(good, falloff=((0.4, 0.6),)), "0")
+    with pytest.raises(ValueError, match="expected black_level with its black_map"):
+        write_calibration(tmp_path / "rig.json", replace(good, black_level=None), "0")
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -177,7 +178,10 @@ def test_angles_that_are_no_numbers_are_refused(spec: str) -> None:
         (((90, 45), (135, 0, 30)), "RGGB", (0, 0), "polarizer must be 2x2"),
         (((90, 45), (135, 225)), "RGGB", (0, 0), "four different angles"),
         (((90, 45), (135, 0)), "RGBG", (0, 0), "bayer must be one of RGGB, BGGR, GRBG, GBRG or None"),
+        (((90, 45), (135, 0)), ["RGGB"], (0, 0), "bayer must be one of"),
         (((90, 45), (135, 0)), "RGGB", (0, 2), "origin must be"),
+        (((90, 45), (135, 0)), "RGGB", np.array([0, 2]), "origin must be"),
+        (((90, 45), (135, 0)), "RGGB", 1, "origin must be"),
         (((90, 45), (135, 0)), None, (1, 0), "mono layout needs no origin"),
     ],
 )

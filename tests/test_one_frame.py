@@ -379,6 +379,10 @@ def test_bad_arguments_are_refused() -> None:
         shape(frame, np.ones((3, 3), np.bool_))
     with pytest.raises(ValueError, match="holds pixels"):
         shape(frame, np.zeros((64, 64), np.bool_))
+    with pytest.raises(ValueError, match="expected a mask of bools, found NaN"):
+        shape(frame, np.full((64, 64), np.nan))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="expected a mask as an array of bools, found"):
+        shape(frame, [[1], [1, 2]])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="lamp's direction"):
         shape(frame, light=(0.0, 0.0, -1.0))
     dark = replace(frame, diffuse=0 * frame.diffuse, specular=0 * frame.specular)

@@ -441,15 +441,6 @@ def test_calibrations_that_would_divide_by_zero_are_refused(
     assert_refused(path, read_calibration)
 
 
-def test_maps_of_calibrations_are_checked(tmp_path: Path) -> None:
-    path, size = tmp_path / "cal.json", (8, 8)
-    good = Calibration(Layout(), 4095.0, size, gains=ONES, gain_map=np.ones(size, np.float32), falloff=((1.0,),))
-    for index, changes in enumerate(({"gain_map": np.zeros(size, np.float32)}, {"dead": np.array([64], np.int32)})):
-        path = tmp_path / f"cal{index}.json"
-        with pytest.raises(ValueError, match=r"expected (gains of pixels|defective pixels)"):
-            write_calibration(path, Calibration(**{**vars(good), **changes}), "0.1")
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
 def test_normals_that_are_no_vectors_are_refused(tmp_path: Path, value: float) -> None:
     path = tmp_path / "normals.npy"

@@ -23,8 +23,9 @@ from polsep.calibrate.statistics import (
     tile,
 )
 from polsep.compute.arrays import to_numpy
-from polsep.sensor.calibration import Calibration, Table, falloff_image
+from polsep.sensor.calibration import Calibration
 from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.falloff import Table, falloff_image
 
 #: Least deviation from black of a hot pixel, relative to white, and in robust deviations of all pixels.
 HOT, HOT_DEVIATIONS = 0.01, 12.0
@@ -218,7 +219,7 @@ def _refuse_polarized(dolp: float, most: float) -> None:
 
 
 def fit_falloff(image: Floats, period: int) -> Table:
-    """Coefficients of `calibration.falloff_image`, largest value 1, nearest to an image of mean 1 on every place."""
+    """Coefficients of `falloff.falloff_image`, largest value 1, nearest to an image of mean 1 on every place."""
     rows, cols = (n // period for n in image.shape)
     blocks = image[: rows * period, : cols * period].reshape(rows, period, cols, period)
     values = np.median(blocks.swapaxes(1, 2).reshape(rows * cols, -1), axis=1).astype(np.float64)

@@ -203,7 +203,7 @@ def find_shape(
     """`shape` without warnings."""
     if not INDICES[0] <= index <= INDICES[1]:
         raise ValueError(f"expected a refractive index from {INDICES[0]} to {INDICES[1]}, found {index:g}")
-    chosen = find_thing(frame) if mask is None else np.asarray(mask, bool)
+    chosen = find_thing(frame) if mask is None else _as_mask(mask)
     if chosen.shape != frame.dolp.shape or not chosen.any():
         raise ValueError(
             f"expected a mask of {list(frame.dolp.shape)} that holds pixels, found {list(chosen.shape)}, "
@@ -253,6 +253,17 @@ def polarized_as_usual(polarized: Floats, diffuse: Floats, specular: Floats, ind
     usual = np.interp(strength, diffuse_dolp(cosines, index), diffuse_dolp(cosines))
     found: Floats = polarized + left * (usual / np.maximum(strength, 1e-6) - 1)
     return found
+
+
+def _as_mask(mask: object) -> Mask:
+    """A mask that was given, of bools or of numbers. Raises ValueError."""
+    try:
+        numbers = np.asarray(mask, np.float32)
+    except (TypeError, ValueError):
+        raise WrongType(f"expected a mask as an array of bools, found {mask!r:.40}") from None
+    if np.isnan(numbers).any():
+        raise ValueError("expected a mask of bools, found NaN")
+    return np.asarray(numbers != 0)
 
 
 def _as_told(light: Sequence[float]) -> tuple[float, float, float]:

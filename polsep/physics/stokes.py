@@ -87,16 +87,16 @@ class Measurements:
 
     def __post_init__(self) -> None:
         require_floats("measurements", self.data, "floating point, white at 1")
+        listed = isinstance(self.angles, Sequence | np.ndarray)
+        if not listed or not all(isinstance(angle, Real) for angle in self.angles):
+            raise WrongType(f"expected analyser angles in radians, found {self.angles!r:.60}")
         if self.data.ndim < 4 or self.data.shape[-4] != len(self.angles):
             raise ValueError(f"expected data [..., {len(self.angles)}, C, H, W], found shape {tuple(self.data.shape)}")
-        if not all(isinstance(angle, Real) for angle in self.angles):
-            raise WrongType(f"expected analyser angles in radians, found {self.angles!r:.60}")
         if not all(abs(angle) <= MOST_ANGLE for angle in self.angles):  # nor NaN
             raise ValueError(f"expected analyser angles in radians, found {list(map(float, self.angles))}: degrees?")
-        if self.clipped is not None and self.clipped.shape != self.data.shape:
-            raise ValueError(
-                f"clipped must have the shape of data {tuple(self.data.shape)}, found {tuple(self.clipped.shape)}"
-            )
+        shape = getattr(self.clipped, "shape", type(self.clipped).__name__)
+        if self.clipped is not None and shape != self.data.shape:
+            raise ValueError(f"clipped must have the shape of data {tuple(self.data.shape)}, found {shape}")
 
 
 def analyser_matrix(angles: Sequence[float]) -> Doubles:

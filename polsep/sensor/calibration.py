@@ -20,8 +20,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from numbers import Real
+from operator import index
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,13 +32,13 @@ from polsep.compute.arguments import WrongType
 from polsep.compute.arrays import as_floats, namespace, of_kind, to_numpy
 from polsep.physics.stokes import diattenuation
 from polsep.sensor.ambient import ambient_notes
-from polsep.sensor.camera import Layout, Mosaic, clip_level
+from polsep.sensor.camera import Layout, Mosaic, clip_level, require_layout
 from polsep.sensor.defects import MIN_SIZE, repair
+from polsep.sensor.falloff import Table
 from polsep.sensor.levels import WHITE_LEVELS
+from polsep.sensor.plausible import require_plausible
 
 Floats = NDArray[np.float32]
-#: Numbers per place of one period of filters, ``[period][period]``.
-Table = tuple[tuple[float, ...], ...]
 #: A black level that is stated may differ from the measured one by rounding to whole codes.
 ROUNDED_LEVEL = 0.51
 
@@ -73,7 +74,8 @@ class Calibration:
     without the ``falloff``, which is a polynomial (`falloff_image`); ``gains``: its mean on each place. ``hot``,
     ``dead``: indices of defective pixels in reading order, of dark and of flat frames. ``details``: what each
     measurement found, for people, JSON-able. Arrays are kept as copies that cannot be changed: files that were read,
-    and what is prepared of maps, are remembered.
+    and what is prepared of maps, are remembered. Raises ValueError on what no sensor has, by which corrected frames
+    would hold NaN; of wrong types it is a `WrongType`.
     """
 
     layout: Layout
@@ -93,20 +95,15 @@ class Calibration:
     hot: NDArray[np.int32] | None = None
 
     def __post_init__(self) -> None:
-        period = self.layout.period
-        for name in ("black_pattern", "gains", "analysers"):
-            table = getattr(self, name)
-            if table is not None and [len(row) for row in table] != [period] * period:
-                raise ValueError(f"expected {name} of {period}x{period} places, found {[len(row) for row in table]}")
-        for name in ("black_map", "gain_map"):
-            values = getattr(self, name)
-            if values is not None and values.shape != self.size:
-                raise ValueError(f"expected a {name} of the size {self.size}, found {values.shape}")
-        for name in ("black_map", "gain_map", "hot", "dead"):
-            values = getattr(self, name)
-            if values is not None and values.flags.writeable:
-                object.__setattr__(self, name, values := values.copy())
-                values.flags.writeable = False
+        require_layout(self.layout)
+        for name, (convert, wanted) in _KINDS.items():
+            value = getattr(self, name)
+            if value is not None or name == "white_level":
+                try:
+                    object.__setattr__(self, name, convert(value))
+                except (TypeError, ValueError):
+                    raise WrongType(f"expected {name} as {wanted}, found {value!r:.40}") from None
+        require_plausible(self)
 
     @property
     def defects(self) -> NDArray[np.int32]:
@@ -134,6 +131,57 @@ class Calibration:
         """
         white = WHITE_LEVELS.get(array.dtype.name) if white_level is None else white_level
         return stated if self.black_level is None or white is None else self.black_level * white / self.white_level
+
+
+def _number(value: Any) -> float:
+    if not isinstance(value, Real):  # float() reads text
+        raise TypeError
+    return float(value)
+
+
+def _numbers(values: Any) -> tuple[float, ...]:
+    return tuple(map(_number, values))
+
+
+def _rows(values: Any) -> Table:
+    return tuple(map(_numbers, values))
+
+
+def _analysers(values: Any) -> tuple[tuple[Analyser, ...], ...]:
+    return tuple(tuple(Analyser(*_numbers(analyser)) for analyser in row) for row in values)
+
+
+def _lamp(values: Any) -> LampFacts:
+    (r, g, b), *facts = values
+    return LampFacts((_number(r), _number(g), _number(b)), *(None if fact is None else _number(fact) for fact in facts))
+
+
+def _size_of(values: Any) -> tuple[int, int]:
+    rows, cols = map(index, values)
+    return rows, cols
+
+
+def _frozen(kinds: str, kept: type[np.generic], values: Any) -> NDArray[Any]:
+    """An array of one of some ``kinds`` as a copy that cannot be changed, or itself where it cannot already."""
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in kinds:
+        raise TypeError
+    frozen: NDArray[Any] = values.astype(kept, copy=values.flags.writeable)
+    frozen.flags.writeable = False
+    return frozen
+
+
+_MAP, _PIXELS = partial(_frozen, "fiu", np.float32), partial(_frozen, "iu", np.int32)
+#: Conversion of the fields of `Calibration`, and how messages name what they hold.
+_KINDS: dict[str, tuple[Any, str]] = {
+    **dict.fromkeys(("white_level", "black_level", "read_noise"), (_number, "a number")),
+    **dict.fromkeys(("black_pattern", "gains", "falloff"), (_rows, "rows of numbers")),
+    **dict.fromkeys(("black_map", "gain_map"), (_MAP, "an array of numbers")),
+    **dict.fromkeys(("hot", "dead"), (_PIXELS, "an array of indices")),
+    "size": (_size_of, "rows and columns"),
+    "analysers": (_analysers, "rows of an angle, an extinction ratio and a gain"),
+    "lamp": (_lamp, "a colour of three numbers, a degree and an angle of polarization"),
+    "details": (dict, "a mapping"),
+}
 
 
 def correct_mosaic(mosaic: Mosaic, calibration: Calibration) -> Mosaic:
@@ -219,23 +267,6 @@ def mean_mosaic(mosaics: Iterable[Mosaic]) -> Mosaic:
         return first
     mean = xp.astype(total / count, xp.float32)
     return replace(first, data=xp.where(clipped, mean.clip(float(first.white_level), None), mean))
-
-
-def falloff_image(coefficients: Table, height: int, width: int) -> Floats:
-    """The smooth part of a flat frame ``[height, width]``, 1 at the brightest place of the sensor.
-
-    Sum of ``coefficients[i][j]`` P_i(y) P_j(x) over Legendre polynomials of the pixel's place, -1 to 1 over the frame.
-    """
-    c = np.asarray(coefficients, np.float64)
-    rows, cols = (_legendre(n, k) for n, k in zip((height, width), c.shape, strict=True))
-    image: Floats = (rows @ c @ cols.T).astype(np.float32)
-    return image
-
-
-def _legendre(count: int, terms: int) -> NDArray[np.float64]:
-    """Values ``[count, terms]`` of Legendre polynomials at the centres of ``count`` pixels."""
-    values = np.polynomial.legendre.legvander((2 * np.arange(count) + 1) / count - 1, terms - 1)
-    return np.asarray(values, np.float64)
 
 
 class Neighbours(NamedTuple):

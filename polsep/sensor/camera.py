@@ -15,6 +15,7 @@ they are data that people type; everything computed from them is in radians. Son
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from numbers import Real
@@ -23,7 +24,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from array_api_compat import device, is_array_api_obj
 
-from polsep.compute.arguments import WrongType
+from polsep.compute.arguments import WrongType, require_whole
 from polsep.compute.arrays import Array, as_floats, constant, namespace, short_repr
 from polsep.compute.resizing import repeat_pixels, resize_bilinear
 from polsep.physics.stokes import Measurements, Stokes, diattenuation
@@ -81,11 +82,12 @@ class Layout:
                 f"polarizer must hold four different angles (modulo 180 degrees), found {self.polarizer!r}"
             )
         object.__setattr__(self, "polarizer", ((kept[0], kept[1]), (kept[2], kept[3])))
-        if self.bayer is not None and self.bayer not in BAYER_ORDERS:
+        if self.bayer is not None and not (isinstance(self.bayer, str) and self.bayer in BAYER_ORDERS):
             raise ValueError(f"bayer must be one of {', '.join(BAYER_ORDERS)} or None, found {self.bayer!r}")
-        if self.origin not in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        origin = tuple(self.origin) if isinstance(self.origin, Sequence | np.ndarray) else ()
+        if origin not in ((0, 0), (0, 1), (1, 0), (1, 1)):
             raise ValueError(f"origin must be two of 0 or 1, found {self.origin!r}")
-        object.__setattr__(self, "origin", (int(self.origin[0]), int(self.origin[1])))
+        object.__setattr__(self, "origin", (int(origin[0]), int(origin[1])))
         if self.bayer is None and self.origin != (0, 0):
             raise ValueError("a mono layout needs no origin: permute its polarizer cell instead")
 
@@ -144,6 +146,7 @@ class Layout:
 
     def filter_at(self, row: int, col: int) -> Filter:
         """The filter on pixel (row, col) of the mosaic."""
+        require_whole("a row or column", row, col)
         row, col = row - self.origin[0], col - self.origin[1]
         angle = float(self.polarizer[row % 2][col % 2])
         if self.bayer is None:
@@ -175,16 +178,19 @@ class Layout:
 
     def rolled(self, rows: int, cols: int) -> Layout:
         """The layout of a mosaic rolled by (rows, cols) pixels, or cropped by (-rows, -cols)."""
+        require_whole("rows or columns", rows, cols)
         t = self.table()
         return Layout.from_table([[t[(row - rows) % 4][(col - cols) % 4] for col in range(4)] for row in range(4)])
 
     def flipped_horizontal(self, width: int) -> Layout:
         """The layout of the left-right mirrored frame of that width: columns reverse and angles change sign."""
+        require_whole("a width", width)
         t = [[Filter(-f.angle_deg % 180, f.channel) for f in row] for row in self.table()]
         return Layout.from_table([[t[row][(width - 1 - col) % 4] for col in range(4)] for row in range(4)])
 
     def flipped_vertical(self, height: int) -> Layout:
         """The layout of the top-bottom mirrored frame of that height: rows reverse and angles change sign."""
+        require_whole("a height", height)
         t = [[Filter(-f.angle_deg % 180, f.channel) for f in row] for row in self.table()]
         return Layout.from_table([t[(height - 1 - row) % 4] for row in range(4)])
 
@@ -245,7 +251,7 @@ class Mosaic:
 
     ``black_level`` and ``white_level`` are in the units of ``data``. Samples within `CLIP_MARGIN` of the white level
     count as clipped. ``light_color``: one gain per channel that `linear` divides out, so that what follows sees white
-    light. ``falloff``: the smooth part of a calibrated sensor's flat frame (`calibration.falloff_image`), by which
+    light. ``falloff``: the smooth part of a calibrated sensor's flat frame (`falloff.falloff_image`), by which
     separated images are divided. ``less_ambient``: another frame was subtracted, and noise goes far below black.
     ``lamp_measured``: ``light_color`` is that of a calibrated lamp, also where it is white.
     Raises ValueError when white is not above black or the frame is smaller than one period; of samples that are no

@@ -300,9 +300,8 @@ def _white_level(samples: NDArray[Any], black_level: float, white_level: float |
 
 def _require_span(samples: NDArray[Any], black: float, white: float) -> None:
     """Raise ValueError for levels and samples with which float32 would overflow, or lose every digit."""
+    require_levels(black, white)
     span = white - black
-    if not (SPANS[0] <= span <= SPANS[1] and max(abs(black), abs(white)) <= MAX_RATIO * span):
-        raise ValueError(f"expected a white level well above the black level, found white {white:g}, black {black:g}")
     least, most = (samples.min(), samples.max()) if samples.dtype.kind == "f" else (0, WHITE_LEVELS[samples.dtype.name])
     farthest = max(black - float(least), float(most) - black)
     if farthest > MAX_RATIO * span:
@@ -310,6 +309,13 @@ def _require_span(samples: NDArray[Any], black: float, white: float) -> None:
             f"expected samples within {MAX_RATIO:g} times the white level, found them {farthest:g} from black, "
             f"white {white:g}: say --white-level N"
         )
+
+
+def require_levels(black: float, white: float) -> None:
+    """Raise ValueError unless float32 tells white from black, and the squares of samples between them from infinity."""
+    span = white - black
+    if not (SPANS[0] <= span <= SPANS[1] and max(abs(black), abs(white)) <= MAX_RATIO * span):
+        raise ValueError(f"expected a white level well above the black level, found white {white:g}, black {black:g}")
 
 
 def _as_float32(samples: NDArray[Any]) -> NDArray[np.float32]:

@@ -26,9 +26,9 @@ from polsep.io.store.atomic import atomic_path
 from polsep.io.store.errors import InputError, decoding
 from polsep.io.store.header_checks import require_signature, require_size
 from polsep.io.store.json_text import parse_json
-from polsep.io.store.plausible import require_falloff, require_gains
 from polsep.io.store.quiet import mute
 from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.plausible import require_falloff, require_gains
 
 #: Format of the description of merged frames.
 MERGED = "polsep merged mosaic 1"

@@ -35,16 +35,12 @@ from polsep.io.store.json_text import (
     section_of,
     table_of,
 )
-from polsep.io.store.plausible import require_falloff, require_gains, require_level, require_within
-from polsep.physics.stokes import MAX_DOLP
 from polsep.sensor.calibration import Analyser, Calibration, LampFacts
 from polsep.sensor.camera import Layout
 
 FORMAT = "polsep calibration 1"
 #: Least steps of the maps: of black as a part of the white level, at most in codes, and of gains.
 BLACK_PART, BLACK_STEP, GAIN_STEP = 2.0**-22, 2.0**-10, 2.0**-17
-#: Angles of analysers lie within two turns.
-MOST_DEGREES = 720.0
 #: Arrays of the NPZ file. "defective_pixels" are hot and dead ones of older files, which do not tell them apart.
 ARRAYS = ("black_offset_codes", "gain_minus_1", "hot_pixels", "dead_pixels", "defective_pixels")
 
@@ -62,7 +58,7 @@ def write_calibration(path: Path, calibration: Calibration, version: str) -> lis
     could not be read again, and leaves the one before.
     """
     refuse_foreign_maps(path)
-    _require_plausible(calibration)
+    _require_parts(calibration)
     arrays, maps = _arrays(calibration), maps_path(path)
     record = _record(calibration) | {"polsep": version}
     try:
@@ -224,7 +220,7 @@ def _from_record(record: dict[str, Any], maps: dict[str, NDArray[Any]]) -> Calib
         {name: _details(section) for name, section in record.items() if isinstance(section, dict) and name != "maps"},
         maps.get("hot_pixels", older),
     )
-    _require_plausible(found)
+    _require_parts(found)
     return found
 
 
@@ -232,33 +228,11 @@ def _from_record(record: dict[str, Any], maps: dict[str, NDArray[Any]]) -> Calib
 _PARTS = (("black_map", "black_level"), ("black_pattern", "black_level"), ("gain_map", "gains"), ("falloff", "gains"))
 
 
-def _require_plausible(c: Calibration) -> None:
-    """Raise ValueError where a frame that is corrected by these numbers would hold NaN or infinite samples."""
-    require_level("white level", c.white_level)
+def _require_parts(c: Calibration) -> None:
+    """Raise ValueError on what cannot be written without another field, as its section is missing."""
     for part, whole in _PARTS:
         if getattr(c, part) is not None and getattr(c, whole) is None:
             raise ValueError(f"expected {whole} with its {part}, found none: is a section missing?")
-    require_within("black level", c.black_level, c.white_level)
-    require_within("read noise", c.read_noise, c.white_level, 0.0)
-    for name, codes in (("black pattern", c.black_pattern), ("black map", c.black_map)):
-        require_within(name, None if codes is None else np.asarray(codes), c.white_level)
-    require_gains("gains", None if c.gains is None else np.asarray(c.gains))
-    require_gains("gains of pixels", c.gain_map)
-    require_falloff(c.falloff)
-    for analyser in (analyser for row in c.analysers or () for analyser in row):
-        require_within("angles of analysers", analyser.angle_deg, MOST_DEGREES)
-        require_gains("gains of analysers", [analyser.gain])
-        if not analyser.extinction > 1:
-            raise ValueError(f"expected extinction ratios above 1, found {analyser.extinction:g}")
-    if c.lamp is not None:
-        require_gains("a lamp's colour", c.lamp.color)
-        require_within("a lamp's dolp", c.lamp.dolp, MAX_DOLP, 0.0)
-        require_within("a lamp's aolp_deg", c.lamp.aolp_deg, MOST_DEGREES)
-    count = math.prod(c.size or (0,))
-    for pixels in (pixels for pixels in (c.hot, c.dead) if pixels is not None):
-        listed = pixels.ndim == 1 and pixels.dtype.kind == "i"
-        if not listed or (pixels.size and not 0 <= pixels.min() <= pixels.max() < count):
-            raise ValueError(f"expected defective pixels as indices below {count}, found others")
 
 
 #: Entries of sections that are fields of `Calibration`; the others are its details.

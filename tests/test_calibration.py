@@ -265,17 +265,27 @@ def test_a_frame_without_the_lamp_is_refused() -> None:
     frame = correct_mosaic(sensor.expose(sensor.sees(np.full(SIZE, 0.5))), sensor.calibration())
     with pytest.raises(ValueError, match="expected 64 unclipped pixels of polarized light"):
         measure_lamp([frame])
+    red = torch.tensor(
+        [[Layout().filter_at(r % 4, c % 4).channel == 0 for c in range(SIZE[1])] for r in range(SIZE[0])]
+    )
+    edge = torch.where(red & (torch.arange(SIZE[1]) < SIZE[1] // 2), 0.2, 1.0)
+    with pytest.raises(ValueError, match=r"expected one colour over the card, found parts that differ by \d+"):
+        measure_lamp([replace(frame, data=frame.data * edge)], card=True)
     with pytest.raises(ValueError, match="expected a lit card in the middle"):
         measure_lamp([replace(frame, data=torch.full(SIZE, LEVEL))], card=True)
 
 
 def test_pictures_are_no_dark_frames() -> None:
-    """A dark picture of a bright thing: most of it is black, a tenth is not. Nor is an evenly lit frame."""
+    """A dark picture of a bright thing: most of it is black, a tenth is not. Nor is an evenly lit frame, nor one with a
+    glowing corner, whose pixels would all count as hot ones."""
     picture = np.full(SIZE, LEVEL, np.float32)
     picture[: SIZE[0] // 10] += 0.3 * WHITE
+    corner = np.full(SIZE, LEVEL, np.float32)
+    corner[:28, :28] += 0.02 * WHITE
     for data, found in (
         (picture, r"found .*% of the pixels far from black"),
         (picture * 0 + WHITE / 2, "found a median of"),
+        (corner, r"found 7\d\.\d% of the pixels in one place far from black"),
     ):
         with pytest.raises(ValueError, match=rf"expected frames without light \(lens cap on\), {found}"):
             measure_dark([Mosaic(data, Layout(), 0.0, WHITE)] * 2)
@@ -321,6 +331,19 @@ def test_frames_that_show_no_turned_polarizer_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match=expected):
             measure_analysers(some)
+
+
+def test_doubtful_light_is_said() -> None:
+    """Paper lit from one side, whose shading would be divided out of every image, and light beside the polarizer."""
+    sensor = BadSensor(MONO, dead=0)
+    across = np.broadcast_to(np.linspace(0.8, 1.2, SIZE[1]), SIZE)
+    for light, said in ((np.ones(SIZE), False), (across, True)):
+        flat = measure_flat([replace(sensor.expose(sensor.sees(light)), black_level=LEVEL)])
+        assert ("one side is 3" in describe(flat, "flat")) == said
+    for dolp, said in ((1.0, False), (0.8, True)):
+        turned = (sensor.expose(sensor.sees(np.full(SIZE, 0.8), dolp, turn)) for turn in np.arange(10) * 0.3)
+        found = measure_analysers(replace(frame, black_level=LEVEL) for frame in turned)
+        assert ("was the polarizer poor" in describe(found, "analysers")) == said
 
 
 def test_polarized_flat_frames_are_refused() -> None:
@@ -809,6 +832,11 @@ def test_levels_of_the_dark_are_said_once(tmp_path: Path, run_polsep: Cli) -> No
     words = ("--calibration", tmp_path / "rig.json", "--black-level", 100, "-o", tmp_path / "out")
     done = run_polsep("separate", shot, *words)
     assert done.status == 2 and "expected no --black-level but 64, which a calibration" in done.err
+    words = ("--white-level", 4095, "--black-level", 100, "-o", tmp_path / "new.json")
+    done = run_polsep(
+        "calibrate", "dark", save(tmp_path / "cap.tiff", BadSensor(Layout()).expose(np.zeros(SIZE))), *words
+    )
+    assert done.status == 2 and "expected no --black-level but 6" in done.err and not (tmp_path / "new.json").exists()
     with pytest.raises(ValueError, match="expected no black_level but 64"):
         polsep.separate(tifffile.imread(shot), calibration=tmp_path / "rig.json", black_level=100)
     with warnings.catch_warnings(action="ignore"):  # of an even frame

@@ -31,6 +31,8 @@ from polsep.sensor.falloff import Table, falloff_image
 HOT, HOT_DEVIATIONS = 0.01, 12.0
 #: Share of hot pixels above which they are a picture. Sensors have less than 1 %.
 MOST_HOT = 0.05
+#: Share of them in a block from which on they are a thing in the picture: those of sensors lie apart.
+DENSE = 0.25
 #: Side of blocks whose means show light in one of several dark frames, and the least change that does, white = 1.
 BLOCK, LIGHT = 32, 0.01
 #: Least deviation of a defective pixel's gain, and in robust deviations of all pixels.
@@ -65,10 +67,7 @@ def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) ->
     residual = dark.mean - tile(table, dark.mean.shape)
     spread = robust_deviation(residual)
     hot = np.abs(residual) > max(HOT * mosaic.white_level, HOT_DEVIATIONS * spread)
-    if hot.mean() > MOST_HOT:
-        raise ValueError(
-            f"expected frames without light (lens cap on), found {hot.mean():.1%} of the pixels far from black"
-        )
+    _require_scattered(hot, MOST_HOT, "expected frames without light (lens cap on)", "far from black")
     noise = spread**2 if (found := dark.noise) is None else found
     kept = np.where(hot, 0, residual)
     lines = _line_offsets(kept, spread**2)
@@ -94,6 +93,15 @@ def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) ->
         read_noise=noise**0.5,
         details={**base.details, "dark": details},
     )
+
+
+def _require_scattered(defects: NDArray[np.bool_], most: float, wanted: str, found: str) -> None:
+    """Raise ValueError on too many defective pixels, in the frame or in one place of it."""
+    share, densest = float(defects.mean()), float(_block_means(defects).max())
+    if share > most:
+        raise ValueError(f"{wanted}, found {share:.1%} of the pixels {found}")
+    if densest > DENSE:
+        raise ValueError(f"{wanted}, found {densest:.1%} of the pixels in one place {found}")
 
 
 def _rounded(codes: float) -> float:
@@ -163,8 +171,7 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
     residual = even / tile(means, signal.shape)
     spread = robust_deviation(residual)
     dead = np.abs(residual - 1) > max(DEAD, DEAD_DEVIATIONS * spread)
-    if dead.mean() > MOST_DEAD:
-        raise ValueError(f"{WHOLE_FRAME}, found {dead.mean():.1%} of the pixels far brighter or darker than others")
+    _require_scattered(dead, MOST_DEAD, WHOLE_FRAME, "far brighter or darker than others")
     share = 0.0
     if flat.variance is not None:
         relative = flat.variance / np.maximum(signal, 1e-6 * span) ** 2
@@ -179,6 +186,7 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
         "pixel_gains_rms": round(share**0.5 * spread, 5),
         "place_gains_error": round(float(spread / (signal.size / layout.period**2) ** 0.5), 6),
         "falloff_least": round(least, 4),
+        "falloff_lopsided": round(float((1 - fall / fall[::-1, ::-1]).max()), 4),  # as no lens is
         "apparent_dolp": round(polarized, 4),
         "dead_pixels": int(dead.sum()),
     }

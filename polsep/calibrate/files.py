@@ -30,6 +30,8 @@ PAGES = "frames"
 LOOKS = 8
 #: Words of a measurement before which nobody measured or said a level.
 ASSUMED_BLACK = "; black was taken to be at 0: if it is not, measure it first ('polsep calibrate dark') and this again"
+#: Difference of two sides of a flat frame from which on it is no lens's, and a degree that analysers hardly fall below.
+LOPSIDED, LEAST_DIATTENUATION = 0.15, 0.9
 #: A measurement: frames and the calibration so far to a calibration with one more section.
 Measure = Callable[[Iterator[Mosaic], Calibration | None], Calibration]
 
@@ -64,6 +66,8 @@ def calibrate_files(
             notes.setdefault(note, f"{frame.stem}: {note}")
 
     found = measure(read_mosaics(paths, read, check), before)
+    if kind == "dark":
+        found.require_black_level(read.black_level, "--black-level")
     written = write_calibration(output, found, __version__)
     black = "" if kind == "dark" or read.black_level or found.black_level is not None else ASSUMED_BLACK
     line = f"{kind}: {describe(found, kind)}{black} -> {', '.join(str(path) for path in written)}"
@@ -173,7 +177,7 @@ def describe(found: Calibration, kind: str) -> str:
             f"gains of filters {min(gains):.3f} to {max(gains):.3f} +- {facts['place_gains_error']:.2g}, of pixels "
             f"{facts['pixel_gains_rms']:.2%} rms, falloff to {facts['falloff_least']:.2f}, {facts['dead_pixels']} dead "
             f"pixels, apparent DoLP {facts['apparent_dolp']:.1%}, {facts['frames']} frames at "
-            f"{facts['brightness']:.0%} of white"
+            f"{facts['brightness']:.0%} of white{_uneven(facts['falloff_lopsided'])}"
         )
     if kind == "analysers":
         ratios = sorted(a.extinction for row in found.analysers or () for a in row)
@@ -182,6 +186,7 @@ def describe(found: Calibration, kind: str) -> str:
             f"(+- {facts['angle_error_deg']:.2f}), extinction {ratios[0]:.0f} to {ratios[-1]:.0f} (diattenuation "
             f"{facts['diattenuation']:.4f} +- {facts['diattenuation_error']:.2g}), gains +- {facts['gain_error']:.2g}, "
             f"{facts['frames']} frames that differ by {facts['residual_rms']:.2%} from the model"
+            f"{_poor(facts['diattenuation'])}"
         )
     assert kind == "light" and found.lamp is not None
     color = ", ".join(f"{c:.3f}" for c in found.lamp.color)
@@ -196,3 +201,15 @@ def describe(found: Calibration, kind: str) -> str:
         f"{line}, polarizer at {polarizer:.1f} deg {concentration}, degree of polarization at least "
         f"{found.lamp.dolp:.3f}"
     )
+
+
+def _uneven(lopsided: float) -> str:
+    """Words on light that was uneven, which would be divided out of every image."""
+    side = f"; one side is {lopsided:.0%} darker than the other: was it lit evenly? Else turn the camera between frames"
+    return side if lopsided > LOPSIDED else ""
+
+
+def _poor(diattenuation: float) -> str:
+    """Words on analysers that are worse than those of sensors."""
+    low = "; is the extinction the sensor's, or was the polarizer poor, light beside it, or the black level wrong?"
+    return low if diattenuation < LEAST_DIATTENUATION else ""

@@ -31,8 +31,9 @@ PURE = 0.1
 #: Concentration of AoLP in those pixels and in the most polarized ones of them, below which they show no lamp: balls
 #: have 1.0, still lifes that show its angle 0.75 and more, rims of objects and wrong white levels 0.5 and less.
 ONE_ANGLE = 0.6
-#: Parts of a card whose colours are compared for the error.
-PARTS = 8
+#: Parts of a card along each side whose colours are compared for the error, and the largest root mean square of their
+#: differences from the mean [degrees]: noise averages out in parts, and lamps are uneven by less.
+PARTS, UNEVEN_DEG = 3, 5.0
 #: Least brightness of a card, white = 1.
 DARKEST_CARD = 0.02
 
@@ -147,7 +148,8 @@ def _card_colors(mosaic: Mosaic) -> list[Doubles]:
     light = to_numpy(measurements.data)[middle].mean(axis=-4, dtype=np.float64)
     if float(light.mean()) < DARKEST_CARD:
         raise ValueError(f"expected a lit card in the middle of the frame, found {float(light.mean()):.1%} of white")
-    parts = np.array_split(light, min(PARTS, light.shape[1]), axis=1)
+    bands = np.array_split(light, min(PARTS, light.shape[1]), axis=1)
+    parts = [part for band in bands for part in np.array_split(band, min(PARTS, light.shape[2]), axis=2)]
     return [part.reshape(part.shape[0], -1).mean(axis=1) for part in parts]
 
 
@@ -162,6 +164,8 @@ def _mean_color(colors: Doubles) -> tuple[tuple[float, float, float], float]:
         raise ValueError(
             f"expected light of all three colours, found {', '.join(f'{c:.3f}' for c in mean / mean.max())}"
         )
-    off = np.rad2deg(np.arccos(np.clip(units @ mean, -1, 1)))
+    off = float(np.sqrt((np.rad2deg(np.arccos(np.clip(units @ mean, -1, 1))) ** 2).mean()))
+    if off > UNEVEN_DEG:
+        raise ValueError(f"expected one colour over the card, found parts that differ by {off:.1f} degrees")
     r, g, b = (float(c / mean[1]) for c in mean)
-    return (r, g, b), float(np.sqrt((off**2).mean() / len(units)))
+    return (r, g, b), off / len(units) ** 0.5

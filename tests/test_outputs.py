@@ -374,6 +374,8 @@ def test_a_directory_that_is_a_file_is_refused_by_name(tmp_path: Path, below: st
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match=r"expected a directory.*found a file.*file"):
         write_separation(random_frame(), tmp_path / "file" / below, "shot")
+    with pytest.raises(OutputError, match=r"expected a directory to write into, found the name of a file: .*new\.exr"):
+        write_separation(random_frame(), tmp_path / "new.exr", "shot")
     assert contents(tmp_path) == {"file": b"x"}
 
 

@@ -28,6 +28,8 @@ except ImportError:  # Windows
 Contents = bytes | memoryview | Callable[[BinaryIO], object]
 #: Seconds after which a hidden folder of a set is nobody's any more: a set of files is written in far less.
 FORGOTTEN = 3600.0
+#: Endings of files that commands write: a folder to be made with one is a file name in the wrong place.
+FILES = (".exr", ".npz", ".tiff", ".tif", ".png", ".json", ".onnx", ".glb", ".mkv", ".mp4")
 
 
 class OutputError(ValueError):
@@ -119,6 +121,8 @@ def hold_lock(owner: object, path: Path) -> Callable[[], object]:
 
 def require_writable(directory: Path) -> None:
     """Raise OutputError where nothing may be written into a directory, or into the one to make it in. Call it first."""
+    if directory.suffix.lower() in FILES and not os.path.lexists(directory):
+        raise OutputError(f"expected a directory to write into, found the name of a file: {directory}")
     nearest = next((d for d in (directory, *directory.parents) if os.path.lexists(d)), None)
     if nearest is not None and not os.path.isdir(nearest):
         raise OutputError(f"expected a directory to write into, found a file: {nearest}")

@@ -23,7 +23,9 @@ from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
 from polsep.light.find import find_light
 from polsep.pipeline import PolsepWarning
-from polsep.sensor.camera import Layout
+from polsep.sensor.black_level import check_black_level
+from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.defects import measure_noise
 from polsep.sensor.encoding import encoding_warning
 from polsep.sensor.levels import as_mosaic
 from tools import web_page
@@ -618,6 +620,49 @@ def test_the_page_finds_the_lamp_that_the_library_finds(tmp_path: Path) -> None:
         np.testing.assert_allclose(found["color"], light.color, rtol=1e-3, err_msg=str(own))
         assert found["error_deg"] == pytest.approx(light.error_deg, rel=0.01), own
         assert (found["sure"], len(found["remarks"])) == (light.sure, len(light.remarks)), own
+
+
+@needs_packages
+def test_the_page_finds_the_noise_that_the_library_finds(tmp_path: Path) -> None:
+    """Of codes at the left of a word, below a black level that is too high, and below one whose noise has tails."""
+    light = np.maximum(np.arange(320) - 80, 0) * 12.0
+    noisy = np.random.default_rng(0).normal(240 + light, np.sqrt(0.4 * light + 16), (288, 320)).round()
+    above, cases = crop() * 15 // 16 + 240, list[tuple[Any, float, float]]()
+    cases += [(16 * above, 0, 65520), (above, 300, 4095), (noisy, 240, 4095), (16 * noisy, 0, 65520)]
+    (tmp_path / "frames").write_bytes(b"".join(np.float32(codes).tobytes() for codes, *_ in cases))
+    script = f"""
+      import {{ readFileSync }} from "node:fs";
+      import {{ parseLayout }} from {json.dumps((WEB / "src" / "layout.js").as_uri())};
+      import {{ checkBlackLevel, measureNoise }} from {json.dumps((WEB / "src" / "noise.js").as_uri())};
+      const bytes = readFileSync("frames"), all = new Float32Array(bytes.buffer, bytes.byteOffset, bytes.length / 4);
+      console.log(JSON.stringify({json.dumps([levels for _, *levels in cases])}.map(([black, white], k) => {{
+        const data = all.subarray(k * 288 * 320, (k + 1) * 288 * 320), layout = parseLayout("color");
+        const mosaic = {{ data, height: 288, width: 320, layout, black, white }};
+        const {{ gain, floor }} = measureNoise(mosaic);
+        return [gain, floor, checkBlackLevel(mosaic)?.text ?? null];
+      }})));"""
+    done = subprocess.run(
+        [str(NODE), "--input-type=module", "-e", script], cwd=tmp_path, capture_output=True, check=True, timeout=60
+    )
+    warned = []
+    for (codes, black, white), (gain, floor, text) in zip(cases, json.loads(done.stdout), strict=True):
+        mosaic = Mosaic(np.float32(codes), Layout(), black, white)
+        noise, warning = measure_noise(mosaic, np.float32(codes)), check_black_level(mosaic).warning
+        assert (gain, floor) == pytest.approx((noise.gain, noise.floor), rel=1e-3), (black, white)
+        assert text == (warning and warning.replace("--black-level", "black level"))
+        warned.append(warning is not None)
+    assert warned == [False, True, False, True]
+
+
+@needs_packages
+@pytest.mark.parametrize("spec", ["90,45,-45,180/RGGB", "270,45.5,135,0/GRBG@0,1"])
+def test_layouts_are_read_as_the_library_reads_them(spec: str) -> None:
+    """Angles are kept from 0 to 180 degrees: -45 is Sony's 135, which the network knows."""
+    script = f"""
+      import {{ parseLayout, specOf }} from {json.dumps((WEB / "src" / "layout.js").as_uri())};
+      console.log(specOf(parseLayout({json.dumps(spec)})));"""
+    done = subprocess.run([str(NODE), "--input-type=module", "-e", script], capture_output=True, check=True, timeout=60)
+    assert done.stdout.decode().strip() == Layout.parse(spec).spec
 
 
 @needs_packages

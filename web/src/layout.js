@@ -17,8 +17,8 @@ export function parseLayout(spec) {
   if (spec === "color" || spec === "colour") return SONY;
   if (spec === "mono") return SONY_MONO;
   const found = /^([^/]+)\/(RGGB|BGGR|GRBG|GBRG|mono)(?:@([01]),([01]))?$/.exec(spec.trim());
-  const polarizer = found ? found[1].split(",").map((text) => (text.trim() === "" ? NaN : Number(text))) : [];
-  const around = polarizer.map((angle) => mod(angle, 180)).sort((a, b) => a - b);
+  const polarizer = found ? found[1].split(",").map((text) => (text.trim() === "" ? NaN : mod(Number(text), 180))) : [];
+  const around = [...polarizer].sort((a, b) => a - b);
   const apart = around.every((angle, k) => (k < 3 ? around[k + 1] : around[0] + 180) - angle >= 0.1);
   const bayer = found && found[2] !== "mono" ? found[2] : null;
   const origin = found && found[3] ? [Number(found[3]), Number(found[4])] : [0, 0];

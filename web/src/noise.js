@@ -1,13 +1,14 @@
 // Noise of samples and the black level that one frame shows: twins of polsep/sensor/noise.py and black_level.py.
 
 import { clipLevel } from "./levels.js";
-import { median, quantile, quantileOfSorted, sorted } from "./numbers.js";
+import { mean, median, quantile, quantileOfSorted, sorted, sum } from "./numbers.js";
 
 /** Samples along the side of a block. */
 export const BLOCK = 4;
 const BLOCKS = 6144, MAX_BINS = 64, FEWEST_BINS = 6, BLOCKS_PER_BIN = 48, MIN_BLOCKS = 24;
 const QUARTER = 8.438 / 12, MEDIAN = 11.34 / 12, OUTLIER = 2, MIN_WELL = 200, LARGEST_FLOOR = 0.05;
 const ROUNDING = 2 ** -20, ROUNDS = 16, DEVIATION = 0.44, LARGEST_WELL = 20000;
+const CODE_ROWS = 8, MIN_CODES = 32, MIN_SPAN = 100, LEAST = 0.0015;
 
 /**
  * Rows of blocks, every `step`-th, with what all estimates need of them: `kept` tells blocks that do not clip, nor
@@ -41,12 +42,25 @@ function* blockRows({ data, height, width }, step, full, least) {
 
 const leastNoise = (span, step) => ({ gain: 0, floor: step ** 2 / 4 + (ROUNDING * span) ** 2 });
 
-const isCodes = (values) => values.every((value) => value === Math.floor(value));
+/** Step between the codes that samples of some rows are, scaled ones too; 0 for others, as of renderings. */
+function codeStep({ data, width }, rows, span) {
+  const kept = rows.filter((_, k) => k % Math.max(1, Math.floor(rows.length / CODE_ROWS)) === 0);
+  const ordered = Float32Array.from(kept.flatMap((row) => Array.from(data.subarray(row * width, (row + 1) * width)))).sort();
+  const codes = ordered.filter((value, k) => value === ordered[k + 1] && value !== ordered[k - 1]);  // that occur twice
+  const gaps = codes.subarray(1).map((code, k) => code - codes[k]), least = gaps.reduce((a, b) => Math.min(a, b), Infinity);
+  if (codes.length >= MIN_CODES && 2 ** -15 * span <= least && least <= 2 ** -7 * span) {
+    const near = mean(gaps.filter((gap) => gap < 1.5 * least));
+    const step = sum(gaps) / sum(gaps.map((gap) => Math.round(gap / near)));
+    if (codes.every((code) => Math.abs((code - codes[0]) / step - Math.round((code - codes[0]) / step)) < 0.05)) return step;
+  }
+  const lit = ordered.filter((value) => value !== 0), others = lit.filter((value) => value !== Math.floor(value));
+  return span >= MIN_SPAN && others.length <= 0.01 * lit.length ? 1 : 0;
+}
 
 /** Variance of a sample, {gain, floor}: gain times its light above black, plus floor; for the search of defects. */
 export function measureNoise(mosaic) {
-  const { data, width, height, black, white } = mosaic, span = white - black, middle = (height >> 1) * width;
-  const step = span >= 100 && isCodes(data.subarray(middle, middle + width)) ? 1 : 0;
+  const { width, height, black, white } = mosaic, span = white - black;
+  const step = codeStep(mosaic, Array.from({ length: height }, (_, row) => row), span);
   const blocks = Math.floor(height / BLOCK) * Math.floor(width / BLOCK), least = leastNoise(span, step);
   const signal = [], spread = [], dark = [];
   for (const row of blockRows(mosaic, Math.max(1, Math.floor(blocks / BLOCKS)), clipLevel(mosaic), 0))
@@ -123,48 +137,38 @@ function fitLine(x, y, weight, least) {
  * what was said. `level` null: only a warning.
  */
 export function checkBlackLevel(mosaic) {
-  const { height, width, black, white } = mosaic, span = white - black;
+  const { data, height, width, black, white } = mosaic, span = white - black;
   if (Math.min(height, width) < 4 * BLOCK) return null;
-  const count = Math.floor(height / BLOCK) * Math.floor(width / BLOCK), values = [], level = [], variance = [];
-  let codes = true;
-  for (const row of blockRows(mosaic, Math.max(1, Math.floor(count / 24576)), clipLevel(mosaic), -Infinity)) {
-    codes &&= isCodes(row.x);
-    values.push(row.x);
-    for (let b = 1; b < row.cols - 1; b++)
-      if (row.usable[b] && row.usable[b - 1] && row.usable[b + 1]) {
-        level.push(row.level[b]);
-        variance.push(row.variance[b]);
-      }
-  }
-  let below = 0, total = 0, lowest = Infinity;
-  for (const x of values)
-    for (const value of x) {
-      below += value < black - 0.002 * span;
-      lowest = Math.min(lowest, value);
-      total++;
-    }
-  if (lowest >= 0 && below / total > 0.002) {
-    const darkest = quantile(values.flatMap((x) => Array.from(x.filter((_, k) => k % 7 === 0))), 0.001);
+  const samples = someRows(mosaic).flatMap((row) => Array.from(data.subarray(row * width, row * width + width - (width % BLOCK))));
+  const below = samples.filter((value) => value < black - 0.002 * span).length / samples.length;
+  if (below > 0.002 && !((blackOf({ ...mosaic, black: 0 }) ?? 0) > black - LEAST * span))  // else these are tails of its noise
     return {
       level: null,
-      text: `${((100 * below) / total).toFixed(1)}% of the samples lie below the black level ${black}, which only noise ` +
-        `should: the darkest are at ${Math.round(darkest)}, say a lower black level`,
+      text: `${(100 * below).toFixed(1)}% of the samples lie below the black level ${black}, which only noise should: ` +
+        `the darkest are at ${Number(quantile(samples, 0.001).toPrecision(6))}, say a lower black level`,
     };
-  }
-  const found = codes && span >= 100 ? blackOf(level, variance, black, span) : null;
-  if (found === null || found - black < 0.0015 * span) return null;
+  const found = blackOf(mosaic);
+  if (found === null || found - black < LEAST * span) return null;
   const shown = Number(found.toPrecision(4)), text = `black lies at ${shown}, not at ${black}, as the noise of dark parts shows`;
   return { level: found, shown, text: `${text}: ${black === 0 ? "taken so, say" : "say"} black level ${shown}` };
 }
 
-function blackOf(levels, variances, black, span) {
-  const least = 32;
-  if (levels.length < 4 * least) return null;
-  const order = Array.from(levels, (_, k) => k).sort((a, b) => levels[a] - levels[b]);
-  const level = order.map((k) => levels[k]), variance = order.map((k) => variances[k]);
+const stepOf = ({ height, width }) => Math.max(1, Math.floor(Math.floor(height / BLOCK) * Math.floor(width / BLOCK) / 24576));
+
+/** Rows of samples in some rows of blocks. */
+function someRows(mosaic) {
+  const count = Math.floor(Math.floor(mosaic.height / BLOCK - 1) / stepOf(mosaic)) + 1;
+  return Array.from({ length: BLOCK * count }, (_, k) => (k >> 2) * stepOf(mosaic) * BLOCK + (k & 3));
+}
+
+/** The level of the darkest parts if they are black, by their noise; null where that is not shown. */
+function blackOf(mosaic) {
+  const { black, white } = mosaic, span = white - black, least = 32, step = codeStep(mosaic, someRows(mosaic), span);
+  const blocks = smoothBlocks(mosaic).sort(([a], [b]) => a - b), [level, variance] = [0, 1].map((k) => blocks.map((own) => own[k]));
+  if (level.length < 4 * least || !(0 < step && step <= span / MIN_SPAN)) return null;
   const count = Math.max(least, Math.floor(0.004 * level.length));
   const dark = median(level.slice(0, count)), quiet = median(variance.slice(0, count)), last = level[level.length - 1];
-  if (dark - black < 0.0015 * span || !(last > dark)) return null;
+  if (dark - black < LEAST * span || !(last > dark)) return null;
   const edge = (k) => dark + (last - dark) * (k / 24) ** 2, gains = [];
   for (let k = 1, at = level.findIndex((own) => own >= edge(1)); k <= 24 && at >= 0; k++) {
     let end = at;
@@ -182,8 +186,8 @@ function blackOf(levels, variances, black, span) {
 
 /** Mean level and variance [level, variance] of unclipped blocks, without what is common to a block: texture. */
 export function smoothBlocks(mosaic) {
-  const count = Math.floor(mosaic.height / BLOCK) * Math.floor(mosaic.width / BLOCK), found = [];
-  for (const row of blockRows(mosaic, Math.max(1, Math.floor(count / 24576)), clipLevel(mosaic), -Infinity))
+  const found = [];
+  for (const row of blockRows(mosaic, stepOf(mosaic), clipLevel(mosaic), -Infinity))
     for (let b = 1; b < row.cols - 1; b++)
       if (row.usable[b] && row.usable[b - 1] && row.usable[b + 1]) found.push([row.level[b], row.variance[b]]);
   return found;

@@ -336,6 +336,22 @@ def test_another_file_has_settings_of_its_own(page: Any) -> None:
 
 @needs_packages
 @needs_browser
+def test_the_numbers_of_a_pixel_are_of_the_picture(page: Any) -> None:
+    """Also after the frame was separated anew, while the pointer was elsewhere."""
+    page.select_option("#method", "analytic")
+    send(page, "shot.png", shot())
+    page.hover("#canvas", position={"x": 300, "y": 425})  # beside the line
+    before = page.inner_text("#readout")
+    change(page, lambda: page.click("text=Use white level 4095"))
+    after = page.inner_text("#readout")
+    assert before.startswith("row ") and after.split()[:4] == before.split()[:4] and after != before
+    values = "Array.from(polsep.images.diffuse.subarray(3 * k, 3 * k + 3), (own) => own.toFixed(3)).join(' ')"
+    row, column = (int(after.split()[place].strip(",")) for place in (1, 3))
+    assert f"diffuse {page.evaluate(f'((k) => {values})({row * 160 + column})')}" in after.splitlines()
+
+
+@needs_packages
+@needs_browser
 def test_going_back_to_the_page_begins_anew(page: Any) -> None:
     """The browser does not fill in the level and the filters of the file before, which another file may not have."""
     page.select_option("#sensor", "other")

@@ -169,6 +169,7 @@ function showResult({ images, report, notes, name }) {
   state.shown = `${name} · ${images.width}×${images.height} · ${report.method}${where} · ${seconds.toFixed(1)} s`;
   part("status").textContent = state.shown;
   showFacts(report);
+  showReadout();
   document.body.dataset.state = "done";
   window.polsep = { images, report, notes };  // for tests and the curious
 }
@@ -314,13 +315,14 @@ async function download(format) {
   }, state.name);
 }
 
-/** Values under the pointer. */
-function showReadout(event) {
-  const box = part("stage").getBoundingClientRect(), place = viewer.pixelAt(event.clientX - box.left, event.clientY - box.top);
-  if (!place || !state.images) return void (part("readout").textContent = "");
-  const { width, colors, diffuse, specular, dolp, aolp, valid } = state.images, k = place[0] * width + place[1];
+let pointed = null;  // row and column of the pixel under the pointer, or the last one that was
+/** The numbers of that pixel. */
+function showReadout() {
+  const { height, width, colors, diffuse, specular, dolp, aolp, valid } = state.images ?? { height: 0 };
+  if (!pointed || pointed[0] >= height || pointed[1] >= width) return void (part("readout").textContent = "");
+  const [row, column] = pointed, k = row * width + column;
   const values = (image) => Array.from({ length: colors }, (_, c) => image[k * colors + c].toFixed(3)).join("  ");
-  part("readout").textContent = `row ${place[0]}, column ${place[1]}${valid[k] ? "" : ", clipped: estimated"}\n` +
+  part("readout").textContent = `row ${row}, column ${column}${valid[k] ? "" : ", clipped: estimated"}\n` +
     `diffuse ${values(diffuse)}\nspecular ${values(specular)}\nDoLP ${dolp[k].toFixed(3)}, AoLP ${(((aolp[k] * 180) / Math.PI).toFixed(1) % 180).toFixed(1)}°`;
 }
 
@@ -358,7 +360,11 @@ part("download").onkeydown = ({ key }) => {
   part("download").querySelector("summary").focus();
 };
 part("download").onclick = ({ target }) => target.dataset.format && download(target.dataset.format);
-part("stage").addEventListener("pointermove", showReadout);
+part("stage").addEventListener("pointermove", (event) => {
+  const box = part("stage").getBoundingClientRect();
+  pointed = viewer.pixelAt(event.clientX - box.left, event.clientY - box.top);
+  showReadout();
+});
 addEventListener("dragover", (event) => {
   event.preventDefault();
   part("over").hidden = false;

@@ -36,7 +36,7 @@ export class Viewer {
   /** Zoom to `scale` CSS pixels per picture's pixel around a point of the stage; its middle if none is given. */
   zoom(scale, x = this.stage.clientWidth / 2, y = this.stage.clientHeight / 2) {
     if (!this.pictures.length) return;
-    scale = Math.min(Math.max(scale, 0.05), 32);
+    scale = Math.min(Math.max(scale, 0.05), Math.max(this.scale, 32));  // tiny pictures fit at more
     this.x = x - ((x - this.x) * scale) / this.scale;
     this.y = y - ((y - this.y) * scale) / this.scale;
     this.scale = scale;
@@ -107,7 +107,9 @@ export class Viewer {
     });
     handle.addEventListener("keydown", (event) => {
       const step = { ArrowLeft: -0.02, ArrowRight: 0.02, Home: -1, End: 1 }[event.key];
-      if (step) this.setSplit(this.split + step);
+      if (!step) return;
+      event.preventDefault();  // the page does not scroll
+      this.setSplit(this.split + step);
     });
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);

@@ -93,6 +93,24 @@ def test_a_wrong_file_gives_a_readable_message(page: Any) -> None:
     assert page.locator(".ps-error").count() == 0
 
 
+def test_a_dropped_folder_is_the_files_in_it(page: Any, tmp_path: Path) -> None:
+    """Its frames are one sequence, whatever else lies there; one without frames is refused in words."""
+    film = tmp_path / "film"
+    film.mkdir()
+    (tmp_path / "empty").mkdir()
+    for k in range(3):
+        (film / f"s{k}.png").write_bytes(small_frame(4 * k))
+    (film / ".DS_Store").write_bytes(b"of another program")
+    (film / "notes.txt").write_text("of the owner")
+    driver = page.context.new_cdp_session(page)
+    for dropped, part, said in (("empty", ".ps-error", "empty: expected"), ("film", "#ps-status", "s0")):
+        for kind in ("dragEnter", "dragOver", "drop"):
+            data = {"items": [], "files": [str(tmp_path / dropped)], "dragOperationsMask": 1}
+            driver.send("Input.dispatchDragEvent", {"type": kind, "x": 300, "y": 300, "data": data})
+        await_text(page, part, said)
+    assert page.locator("#ps-index input[type=number]").get_attribute("max") == "2"
+
+
 def test_the_picture_follows_the_exposure_slider(page: Any) -> None:
     """Another picture comes for another exposure; `polsep bench view` says how soon."""
     open_demo(page)

@@ -16,11 +16,25 @@ ON_LOAD = """() => {
   new MutationObserver(keep).observe(document.body, {attributes: true, attributeFilter: ['class']});
   keep();
   window.addEventListener('dragover', (event) => event.preventDefault());
-  window.addEventListener('drop', (event) => {
+  const inside = async (folder) => {  // results, else raw frames; else a file of its name, refused in words
+    const reader = folder.createReader(), all = [];
+    const more = () => new Promise((done, fail) => reader.readEntries(done, fail));  // a hundred at a time
+    for (let some = await more(); some.length; some = await more()) all.push(...some);
+    const files = all.filter((entry) => entry.isFile && !entry.name.startsWith('.'));
+    const [results, frames] = [/[.]exr$/i, /[.](png|tiff?|npy|npz|pgm|raw|bin)$/i]
+      .map((kinds) => files.filter((entry) => kinds.test(entry.name)));
+    const kept = await Promise.all((results.length ? results : frames)
+      .map((entry) => new Promise((done, fail) => entry.file(done, fail))));
+    return kept.length ? kept : [new File([], folder.name)];
+  };
+  window.addEventListener('drop', async (event) => {
     event.preventDefault();
-    const field = document.querySelector('#ps-top input[type=file]');
-    if (!field || !event.dataTransfer?.files.length) return;
-    field.files = event.dataTransfer.files;
+    const items = [...event.dataTransfer?.items ?? []].map((item) => [item.webkitGetAsEntry(), item.getAsFile()]);
+    const field = document.querySelector('#ps-top input[type=file]'), dropped = new DataTransfer();
+    for (const [entry, file] of items)
+      for (const own of entry?.isDirectory ? await inside(entry) : file ? [file] : []) dropped.items.add(own);
+    if (!field || !dropped.files.length) return;
+    field.files = dropped.files;
     field.dispatchEvent(new Event('change', {bubbles: true}));
   });
   document.addEventListener('focusout', (event) => {

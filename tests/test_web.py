@@ -247,6 +247,10 @@ def test_a_file_whose_format_nobody_says_leaves_settings(page: Any) -> None:
     send(page, "good.png", shot())
     change(page, lambda: page.click("text=Use white level 4095"))
     ask_format(page, "other.raw", pack_frame(crop()[:96], "BayerRG12p"))
+    change(page, lambda: page.click("#leave"))
+    assert page.input_value("#white") == "4095" and page.is_hidden("#raw")
+    assert page.inner_text("#status").startswith("good.png · 160×32 · ")
+    ask_format(page, "other.raw", pack_frame(crop()[:96], "BayerRG12p"))
     assert page.input_value("#white") == ""
     send(page, "broken.png", BROKEN)
     assert page.input_value("#white") == "4095" and page.is_hidden("#raw")

@@ -340,6 +340,16 @@ part("raw").onsubmit = (event) => {
   event.preventDefault();
   open(state.pending, { format: part("format").value, width: part("width").valueAsNumber, height: part("height").valueAsNumber });
 };
+part("leave").onclick = () => {
+  if (state.busy) return;  // it is being read
+  if (state.kept) restoreSettings();
+  state.pending = null;
+  part("raw").hidden = true;
+  clearNotes();
+  part("status").textContent = state.shown;
+  document.body.dataset.state = "ready";
+  separate();  // the frame before, and what was said of it
+};
 part("settings").onsubmit = (event) => event.preventDefault();
 part("settings").onchange = () => {
   showFields();

@@ -386,7 +386,7 @@ def test_what_is_no_number_is_refused(page: Any) -> None:
 @needs_packages
 @needs_browser
 def test_the_menu_of_downloads_closes(page: Any) -> None:
-    """With a click elsewhere, and with Escape, which gives the keyboard back to its button."""
+    """With a click or the keyboard elsewhere; Escape and a download give the keyboard back to its button."""
     page.select_option("#method", "analytic")
     send(page, "shot.png", shot())
     page.click("#download summary")
@@ -396,6 +396,15 @@ def test_the_menu_of_downloads_closes(page: Any) -> None:
     page.focus("[data-format=exr]")
     page.keyboard.press("Escape")
     assert page.is_hidden("[data-format=exr]") and page.evaluate("document.activeElement.tagName") == "SUMMARY"
+    page.keyboard.press("Enter")
+    page.focus("[data-format=right]")
+    with page.expect_download():
+        page.keyboard.press("Enter")
+    assert page.is_hidden("[data-format=exr]") and page.evaluate("document.activeElement.tagName") == "SUMMARY"
+    page.keyboard.press("Enter")
+    page.focus("[data-format=right]")
+    page.keyboard.press("Tab")
+    assert page.is_hidden("[data-format=exr]")
 
 
 @needs_browser

@@ -298,8 +298,13 @@ function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 60000);
 }
 
-async function download(format) {
+function closeMenu() {
   part("download").open = false;
+  part("download").querySelector("summary").focus();
+}
+
+async function download(format) {
+  closeMenu();
   while (state.busy) await new Promise((resolve) => setTimeout(resolve, 50)); // a setting that has just been left
   if (!state.images) return;
   const stem = state.name.replace(/\.[^.]*$/, "");
@@ -363,11 +368,10 @@ part("stops").ondblclick = () => {
 };
 part("fit").onclick = () => viewer.fit();
 part("actual").onclick = () => viewer.actual();
-addEventListener("pointerdown", ({ target }) => part("download").contains(target) || (part("download").open = false));
+for (const left of ["pointerdown", "focusin"])
+  addEventListener(left, ({ target }) => part("download").contains(target) || (part("download").open = false));
 part("download").onkeydown = ({ key }) => {
-  if (key !== "Escape") return;
-  part("download").open = false;
-  part("download").querySelector("summary").focus();
+  if (key === "Escape") closeMenu();
 };
 part("download").onclick = ({ target }) => target.dataset.format && download(target.dataset.format);
 part("stage").addEventListener("pointermove", (event) => {

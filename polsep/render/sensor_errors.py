@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from polsep.physics.stokes import Stokes
+from polsep.render.simulate import filter_light
 from polsep.sensor.camera import Layout, Mosaic, Sensor, add_noise
 
 #: Kinds of defective pixels in equal parts: dead ones (0), stuck ones (white), hot ones (a random offset in `HOT`), and
@@ -51,7 +52,7 @@ def record(light: Stokes, layout: Layout, sensor: Sensor, errors: SensorErrors, 
     """
     noise = torch.Generator().manual_seed(seed)
     angles, gains, defects = (torch.Generator().manual_seed(3 * errors.specimen + k) for k in range(3))
-    samples = filter_with_errors(light, layout, sensor, random_analyser_angles(layout, errors.angles_deg, angles))
+    samples = filter_light(light, layout, sensor, random_analyser_angles(layout, errors.angles_deg, angles))
     samples = cross_talk(samples, errors.cross_talk)
     samples = vary_gains(samples, layout, (errors.gains, errors.period_gains), gains)
     samples = (errors.black + (1 - errors.black) * add_noise(samples, sensor, noise)).clamp(0, 1)
@@ -64,21 +65,6 @@ def record(light: Stokes, layout: Layout, sensor: Sensor, errors: SensorErrors, 
 def random_analyser_angles(layout: Layout, deviation_deg: float, generator: torch.Generator) -> Tensor:
     """Return the errors [rad] ``[P, P]`` of the analysers' angles in one period of the layout."""
     return math.radians(deviation_deg) * torch.randn(layout.period, layout.period, generator=generator)
-
-
-def filter_with_errors(light: Stokes, layout: Layout, sensor: Sensor, turned: Tensor) -> Tensor:
-    """Return `render.simulate.filter_light` with every analyser of a period turned by ``turned [P, P]`` [rad]."""
-    out, period, losses = torch.empty_like(light.s0[..., 0, :, :]), layout.period, sensor.diattenuation
-    if light.s0.shape[-3] == 1:
-        losses = losses[len(losses) // 2 :][:1]
-    for row in range(period):
-        for col in range(period):
-            covered = layout.filter_at(row, col)
-            at = (..., covered.channel, slice(row, None, period), slice(col, None, period))
-            angle = 2 * (math.radians(covered.angle_deg) + float(turned[row, col]))
-            polarized = light.s1[at] * math.cos(angle) + light.s2[at] * math.sin(angle)
-            out[(..., *at[2:])] = 0.5 * (light.s0[at] + losses[covered.channel % len(losses)] * polarized)
-    return out
 
 
 def cross_talk(samples: Tensor, share: float) -> Tensor:

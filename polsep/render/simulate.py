@@ -115,10 +115,11 @@ def capture(scene: Scene, layout: Layout, sensor: Sensor, generator: torch.Gener
     return Capture(Mosaic(codes, layout, 0.0, sensor.white_level), scene)
 
 
-def filter_light(light: Stokes, layout: Layout, sensor: Sensor) -> Tensor:
+def filter_light(light: Stokes, layout: Layout, sensor: Sensor, turned: Tensor | None = None) -> Tensor:
     """Return ``light [..., C, H, W]`` behind the filters of a layout: noise-free samples ``[..., H, W]``, white = 1.
 
-    Equal to `camera.sample_mosaic` of `camera.measure_with_analysers`, without computing unused samples.
+    Equal to `camera.sample_mosaic` of `camera.measure_with_analysers`, without computing unused samples. ``turned
+    [P, P]``: errors [rad] of the analysers' angles in one period of the layout.
     """
     out, period = torch.empty_like(light.s0[..., 0, :, :]), layout.period
     losses = sensor.diattenuation
@@ -130,6 +131,7 @@ def filter_light(light: Stokes, layout: Layout, sensor: Sensor) -> Tensor:
             at = (..., slice(covered.channel, covered.channel + 1), slice(row, None, period), slice(col, None, period))
             part = light.map(lambda s, at=at: s[at])  # type: ignore[misc]
             loss = losses[covered.channel % len(losses)]
-            behind = measure_with_analysers(part, (math.radians(covered.angle_deg),), (loss,))
+            angle = math.radians(covered.angle_deg) + (0.0 if turned is None else float(turned[row, col]))
+            behind = measure_with_analysers(part, (angle,), (loss,))
             out[(..., *at[2:])] = behind.data[..., 0, 0, :, :]
     return out

@@ -29,7 +29,7 @@ from polsep.physics.stokes import Stokes
 from polsep.render.materials import Materials, random_materials
 from polsep.render.raycast import MeshScene, find_lit, find_view, shade_view
 from polsep.render.room import Around, light_from_around, roughen
-from polsep.render.sensor_errors import SensorErrors, cross_talk, filter_with_errors, random_analyser_angles, vary_gains
+from polsep.render.sensor_errors import SensorErrors, cross_talk, random_analyser_angles, vary_gains
 from polsep.render.simulate import HEADROOM, blur, filter_light
 from polsep.render.sphere_tracing import PointLight, Scene
 from polsep.render.views import MIN_LEVEL, random_shot, scene_seed, seeded_shape
@@ -331,7 +331,7 @@ def record(light: Stokes, errors: bool, generator: torch.Generator) -> Tensor:
     """Return codes ``[H, W]`` from 0 to 1 of ``light [3, H, W]`` by a random sensor, with or without its errors."""
     layout, wrong = Layout(), random_errors(generator) if errors else SensorErrors()
     turned = random_analyser_angles(layout, wrong.angles_deg, generator)
-    signal = cross_talk(filter_with_errors(light, layout, IMX250, turned), wrong.cross_talk)
+    signal = cross_talk(filter_light(light, layout, IMX250, turned), wrong.cross_talk)
     signal = vary_gains(signal, layout, (wrong.gains, wrong.period_gains), generator)
     return add_gaussian_noise(signal, random_sensor(generator), generator, wrong.black)
 

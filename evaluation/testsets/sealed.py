@@ -21,11 +21,11 @@ from evaluation.testsets.cases import Recipe
 from evaluation.testsets.casting import look_at, random_light_near, render_covered
 from evaluation.testsets.statues import random_albedo
 from polsep.io.assets.maps import read_map
-from polsep.io.assets.objects import smooth_normals
 from polsep.render.distances import Field
 from polsep.render.raycast import Hits, MeshScene
 from polsep.render.shapes import Floats, Mesh, join
 from polsep.render.sphere_tracing import GBuffer, Scene
+from polsep.render.triangles import area_vectors, smooth_normals
 
 #: Raw pixels per side, rows and columns of a shape's grid.
 SIDE, GRID = 512, (240, 120)
@@ -168,9 +168,8 @@ def span_grid(points: Floats, closed: bool) -> Mesh:
     faces = np.concatenate([np.stack(c, -1).reshape(-1, 3) for c in ((corner, below, right), (right, below, across))])
     vertices = points.reshape(-1, 3) - (points.max((0, 1)) + points.min((0, 1))) / 2
     vertices = vertices / np.linalg.norm(vertices, axis=1).max()
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normals = np.cross(b - a, c - a)
-    if float((a * normals).sum()) < 0:  # the volume six times
+    normals = area_vectors(vertices, faces)
+    if float((vertices[faces[:, 0]] * normals).sum()) < 0:  # the volume six times
         faces = faces[:, ::-1]
     faces = np.ascontiguousarray(faces[np.linalg.norm(normals, axis=1) > 1e-10])
     return Mesh(vertices, smooth_normals(vertices, faces), np.zeros((n * m, 2)), faces, np.zeros(len(faces), np.int64))

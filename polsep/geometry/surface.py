@@ -12,20 +12,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from polsep.geometry.integration import Slopes, find_slopes, pixel_rays
 from polsep.geometry.photometric import Appearance
 from polsep.render.tracer import Tracer
+from polsep.render.triangles import without_fragments
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 #: A rise between neighbours is a jump if it differs from that of their normals by this many pixels and this share.
 JUMP, JUMP_SHARE = 1.5, 1.5
-#: Larger rises [pixels] count as jumps; connected parts with a smaller share of the triangles are removed.
-MAX_RISE, SMALLEST_PART = 8.0, 0.01
+#: Larger rises [pixels] count as jumps.
+MAX_RISE = 8.0
 #: Field of view [degrees] of pictures of a mesh, and the distance of their camera in extents.
 FOV_DEG, DISTANCE = 24.0, 2.9
 #: Direction toward the light of pictures, in the camera's frame.
@@ -56,8 +55,7 @@ def span_surface(appearance: Appearance, depth: Floats, intrinsics: Floats | Non
         focal = float(intrinsics[0, 0])
         flat = focal * np.log(np.where(mask, depth, 1.0))  # rises in pixels, whatever the distance
     slopes = find_slopes(appearance.normals, mask, intrinsics)
-    faces = _triangles(mask, _steady_links(slopes, focal, flat))
-    faces = _without_fragments(faces)
+    faces = without_fragments(_triangles(mask, _steady_links(slopes, focal, flat)))
     if not len(faces):
         raise ValueError("expected a surface of three pixels or more, found none")
     kept, faces = np.unique(faces, return_inverse=True)
@@ -100,18 +98,6 @@ def _triangles(mask: NDArray[np.bool_], links: tuple[NDArray[np.bool_], ...]) ->
             np.stack([beside, below, across], axis=-1)[second],
         ]
     )
-
-
-def _without_fragments(faces: Integers) -> Integers:
-    """The triangles of connected parts that are large enough."""
-    if not len(faces):
-        return faces
-    links = (np.ones(2 * len(faces)), (np.repeat(faces[:, 0], 2), faces[:, 1:].reshape(-1)))
-    count = int(faces.max()) + 1
-    _, part = connected_components(coo_array(links, (count, count)), directed=False)
-    owner = part[faces[:, 0]]
-    kept: Integers = faces[np.bincount(owner)[owner] >= SMALLEST_PART * len(faces)]
-    return kept
 
 
 def relight(appearance: Appearance, direction: tuple[float, float, float] = PICTURE_LIGHT) -> Floats:

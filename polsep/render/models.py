@@ -18,6 +18,7 @@ import torch
 from polsep.render.blobs import patched
 from polsep.render.materials import USUAL_SIZE
 from polsep.render.shapes import Floats, Integers, Mesh
+from polsep.render.triangles import area_vectors
 from polsep.render.waves import draw_one, drawn_from
 
 #: Triangles that meet at a larger angle meet in a crease.
@@ -46,8 +47,7 @@ def creased(mesh: Mesh) -> Mesh:
     Triangles that are wound against each other count as if they were not; corners share no
     vertices, and triangles without area are left out.
     """
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    weighted = np.cross(b - a, c - a)
+    weighted = area_vectors(mesh.vertices, mesh.faces)
     area = np.linalg.norm(weighted, axis=1)
     kept = area > 0
     weighted, corners = weighted[kept], mesh.faces[kept].reshape(-1)

@@ -18,6 +18,8 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import grid_sample, interpolate, pad
 
+from polsep.render.triangles import area_vectors, smooth_normals
+
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
@@ -205,26 +207,7 @@ def smooth_patch(points: Floats, uv: Floats) -> Mesh:
     corner = (np.arange(rows)[:, None] * (cols + 1) + np.arange(cols)).reshape(-1)
     right, below = corner + 1, corner + cols + 1
     faces = np.concatenate([np.stack([corner, below, right], 1), np.stack([right, below, below + 1], 1)])
-    faces = faces[_areas(vertices, faces) > 1e-12]
-    smooth = _smooth_normals(vertices, faces)
+    faces = faces[np.linalg.norm(area_vectors(vertices, faces), axis=1) > 2e-12]  # but at the poles of a grid
+    _, point = np.unique(np.round(vertices, 9), axis=0, return_inverse=True)  # one on both sides of a seam
+    smooth = smooth_normals(vertices, faces, point.reshape(-1))
     return Mesh(vertices, smooth, uv.reshape(-1, 2), faces, np.zeros(len(faces), np.int64))
-
-
-def _areas(vertices: Floats, faces: Integers) -> Floats:
-    """Area of every triangle, which is 0 at the poles of a grid."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    areas: Floats = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    return areas
-
-
-def _smooth_normals(vertices: Floats, faces: Integers) -> Floats:
-    """Unit normals of vertices: means over their triangles by area, over seams and poles of the grid too."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    weighted = np.cross(b - a, c - a)
-    _, same = np.unique(np.round(vertices, 9), axis=0, return_inverse=True)
-    same = same.reshape(-1)
-    total = np.zeros((same.max() + 1, 3))
-    for k in range(3):
-        np.add.at(total, same[faces[:, k]], weighted)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return (total / np.where(length > 0, length, 1))[same]

@@ -15,17 +15,14 @@ import numpy as np
 import scipy.io
 import trimesh
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from polsep.io.raw.png import read_png
 from polsep.io.store.errors import decoding
 from polsep.render.shapes import Floats, Mesh
+from polsep.render.triangles import smooth_normals, without_fragments
 
 #: Endings of files of meshes.
 MESHES = (".glb", ".obj", ".off", ".ply", ".stl")
-#: Connected parts of a scan with less than this share of its triangles are loose fragments, which are dropped.
-SMALLEST_PART = 0.01
 #: Vertices closer than this share of the mesh's radius are one vertex.
 SAME_VERTEX = 1e-6
 
@@ -45,7 +42,7 @@ def read_mesh(path: Path) -> Mesh:
     """A mesh file as one material slot, centred on its bounding box and scaled into the unit sphere; no (u, v).
 
     Vertices at one place are one vertex, so that normals are smooth over the seams of a texture; normals are means over
-    triangles by area. Loose fragments (`SMALLEST_PART`) are dropped. The file's axes are kept.
+    triangles by area. Loose fragments (`triangles.SMALLEST_PART`) are dropped. The file's axes are kept.
     """
     with decoding(path.suffix.lstrip(".").upper()):
         loaded: Any = trimesh.load(path, force="mesh", process=False)
@@ -57,7 +54,7 @@ def read_mesh(path: Path) -> Mesh:
     _, first, same = np.unique(np.round(vertices / SAME_VERTEX), axis=0, return_index=True, return_inverse=True)
     vertices, faces = vertices[first], same.reshape(-1)[faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    faces = _without_fragments(faces)
+    faces = without_fragments(faces)
     if not len(faces):
         raise ValueError(f"expected connected triangles in {path}, found loose fragments only")
     normals = smooth_normals(vertices, faces)
@@ -71,27 +68,6 @@ def list_meshes(folder: Path) -> list[Path]:
     if not paths:
         raise ValueError(f"expected meshes ({', '.join(MESHES)}) in {folder}, found none")
     return paths
-
-
-def _without_fragments(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The triangles of connected parts that are large enough."""
-    start, end = np.concatenate([faces[:, :2], faces[:, 1:]]).T  # two edges connect the corners of a triangle
-    size = int(faces.max()) + 1
-    edges = coo_array((np.ones(len(start), np.bool_), (start, end)), shape=(size, size))
-    part: NDArray[np.int32] = connected_components(edges, directed=False)[1][faces[:, 0]]
-    share = np.bincount(part) / len(faces)
-    return faces[share[part] >= SMALLEST_PART]
-
-
-def smooth_normals(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
-    """Unit normals of vertices ``[V, 3]``: means over their triangles by area; +z where a vertex has no triangle."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    weighted = np.cross(b - a, c - a)
-    total = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(total, faces[:, k], weighted)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0, total / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
 
 
 def read_photograph(path: Path) -> NDArray[np.float32]:

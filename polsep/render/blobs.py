@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from polsep.render.materials import USUAL_SIZE
-from polsep.render.shapes import Floats, Mesh
+from polsep.render.materials import USUAL_SIZE, rotation_rows
+from polsep.render.shapes import Floats, Mesh, fitted
 from polsep.render.waves import Draw, bumps, draw_one, draw_way, drawn_from, folds
 
 #: Number of ellipsoids, and semi-axes of the first and, relative to the one that they grow out of, of the others.
@@ -57,9 +57,7 @@ def random_blob(generator: torch.Generator) -> Mesh:
     field = np.pad(field, 1, constant_values=step)  # what reaches beyond the grid ends there, closed
     meshed = marching_cubes(field, 0.0, spacing=(step,) * 3, gradient_direction="ascent")  # type: ignore[no-untyped-call]
     vertices, faces, normals, _ = meshed
-    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    scale = USUAL_SIZE / float((vertices.max(axis=0) - vertices.min(axis=0)).max())
-    placed = ((vertices - middle) * scale).astype(np.float64)
+    placed = fitted(vertices, USUAL_SIZE).astype(np.float64)
     outward, faces = -normals.astype(np.float64), np.ascontiguousarray(faces[:, ::-1], np.int64)
     return patched(Mesh(placed, outward, np.zeros((len(placed), 2)), faces, np.zeros(len(faces), np.int64)), draw)
 
@@ -95,11 +93,4 @@ def patched(mesh: Mesh, draw: Draw) -> Mesh:
 
 def _turn(quaternion: Floats) -> Floats:
     """The rotation matrix of a quaternion of any length."""
-    x, y, z, w = quaternion / max(float(np.linalg.norm(quaternion)), 1e-6)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.array(rotation_rows(*(quaternion / max(float(np.linalg.norm(quaternion)), 1e-6))))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -145,12 +146,16 @@ def _random_rotations(count: int, generator: torch.Generator) -> Tensor:
     a, b = 2 * math.pi * a, 2 * math.pi * b
     low, high = torch.sqrt(1 - radius), torch.sqrt(radius)
     x, y, z, w = low * a.sin(), low * a.cos(), high * b.sin(), high * b.cos()
-    rows = [
+    return torch.stack([torch.stack(row, dim=1) for row in rotation_rows(x, y, z, w)], dim=1).float()
+
+
+def rotation_rows(x: Any, y: Any, z: Any, w: Any) -> list[list[Any]]:
+    """Return the rotation matrix of a unit quaternion x i + y j + z k + w by rows, of numbers or tensors."""
+    return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1).float()
 
 
 def rgb_from_hsv(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:

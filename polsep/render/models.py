@@ -17,7 +17,7 @@ import torch
 
 from polsep.render.blobs import patched
 from polsep.render.materials import USUAL_SIZE
-from polsep.render.shapes import Floats, Integers, Mesh
+from polsep.render.shapes import Floats, Integers, Mesh, fitted, rotation_about
 from polsep.render.triangles import area_vectors
 from polsep.render.waves import draw_one, drawn_from
 
@@ -33,11 +33,8 @@ def random_model(meshes: Sequence[Mesh], generator: torch.Generator) -> Mesh:
     mesh = meshes[int(draw_one(draw, (0, len(meshes))))]
     stretch = np.exp(draw(-math.log(STRETCH), math.log(STRETCH), 3))
     turn, tilt = math.radians(draw_one(draw, (0, 360))), math.radians(draw_one(draw, (-TILT_DEG, TILT_DEG)))
-    (a, b), (c, d) = (math.cos(turn), math.sin(turn)), (math.cos(tilt), math.sin(tilt))
-    turned = np.array([[1, 0, 0], [0, c, -d], [0, d, c]]) @ np.array([[a, 0, b], [0, 1, 0], [-b, 0, a]])
-    vertices = (mesh.vertices * stretch) @ turned.T
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    placed = (vertices - (low + high) / 2) * (USUAL_SIZE / float((high - low).max()))
+    turned = rotation_about(0, tilt) @ rotation_about(1, turn)
+    placed = fitted((mesh.vertices * stretch) @ turned.T, USUAL_SIZE)
     return patched(replace(mesh, vertices=placed, normals=(mesh.normals / stretch) @ turned.T), draw)
 
 

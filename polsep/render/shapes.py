@@ -11,7 +11,7 @@ from outside; (u, v) in [0, 1]^2 per slot. Random draws take a generator and are
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -67,7 +67,7 @@ def random_mesh(generator: torch.Generator) -> Mesh:
         shape = added if shape is None else join(_random_pose(shape, reach, generator), added)
     assert shape is not None
     center = (shape.vertices.min(axis=0) + shape.vertices.max(axis=0)) / 2
-    return Mesh(shape.vertices - center, shape.normals, shape.uv, shape.faces, shape.slots)
+    return replace(shape, vertices=shape.vertices - center)
 
 
 def random_axes(generator: torch.Generator) -> Floats:
@@ -157,8 +157,24 @@ def join(*meshes: Mesh) -> Mesh:
 
 def moved(mesh: Mesh, rotation: Floats, translation: Floats) -> Mesh:
     """Return the mesh rotated by a matrix ``[3, 3]`` about the origin, then moved."""
-    vertices = mesh.vertices @ rotation.T + translation
-    return Mesh(vertices, mesh.normals @ rotation.T, mesh.uv, mesh.faces, mesh.slots)
+    return replace(mesh, vertices=mesh.vertices @ rotation.T + translation, normals=mesh.normals @ rotation.T)
+
+
+def rotation_about(axis: int, angle: float) -> Floats:
+    """Return the matrix ``[3, 3]`` that rotates about x, y or z (0, 1, 2), counter-clockwise seen from its end."""
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    turn = np.eye(3)
+    turn[first, first] = turn[second, second] = math.cos(angle)
+    turn[second, first] = math.sin(angle)
+    turn[first, second] = -turn[second, first]
+    return turn
+
+
+def fitted(vertices: Floats, size: float) -> Floats:
+    """Return vertices ``[V, 3]`` centred on their bounding box, whose longest side becomes ``size``."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    found: Floats = (vertices - (low + high) / 2) * (size / float((high - low).max()))
+    return found
 
 
 def _uniform(count: int, low: float, high: float, generator: torch.Generator) -> Floats:
@@ -170,12 +186,7 @@ def _random_pose(mesh: Mesh, reach: float, generator: torch.Generator) -> Mesh:
     """Rotated by 0 to 180 degrees about x, y and z, then moved by up to ``reach`` along each."""
     rotation = np.eye(3)
     for axis, angle in enumerate(_uniform(3, 0.0, math.pi, generator)):
-        first, second = (axis + 1) % 3, (axis + 2) % 3
-        turn = np.eye(3)
-        turn[first, first] = turn[second, second] = math.cos(angle)
-        turn[second, first] = math.sin(angle)
-        turn[first, second] = -turn[second, first]
-        rotation = turn @ rotation
+        rotation = rotation_about(axis, angle) @ rotation
     return moved(mesh, rotation, _uniform(3, 0.0, reach, generator))
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,18 @@ import torch
 from scipy.interpolate import PchipInterpolator
 
 from polsep.render.materials import USUAL_SIZE
-from polsep.render.shapes import Floats, Mesh, ellipsoid, join, moved, random_heights, smooth_patch, uv_grid
+from polsep.render.shapes import (
+    Floats,
+    Mesh,
+    ellipsoid,
+    fitted,
+    join,
+    moved,
+    random_heights,
+    rotation_about,
+    smooth_patch,
+    uv_grid,
+)
 from polsep.render.waves import Draw, bumps, draw_log, draw_one, drawn_from, folds
 
 #: Height over diameter, log-uniform, from plates to bottles; below `LOW` a wall only widens upward.
@@ -70,12 +82,10 @@ def random_vessel(generator: torch.Generator) -> Mesh:
     moved_parts = _displaced(turned, draw)
     vessel = join(*(smooth_patch(points, uv_grid(len(points) - 1, AROUND)) for points in moved_parts))
     if draw_one(draw) < PLAIN_SHARE:
-        vessel = Mesh(vessel.vertices, vessel.normals, vessel.uv, vessel.faces, np.zeros_like(vessel.slots))
+        vessel = replace(vessel, slots=np.zeros_like(vessel.slots))
     if draw_one(draw) < LADEN_SHARE:
         vessel = join(vessel, *_loads(profile.place, draw, generator))
-    low, high = vessel.vertices.min(axis=0), vessel.vertices.max(axis=0)
-    scaled = (vessel.vertices - (low + high) / 2) * (USUAL_SIZE / float((high - low).max()))
-    return Mesh(scaled, vessel.normals, vessel.uv, vessel.faces, vessel.slots)
+    return replace(vessel, vertices=fitted(vessel.vertices, USUAL_SIZE))
 
 
 def random_profile(draw: Draw) -> Profile:
@@ -157,7 +167,6 @@ def _loads(place: tuple[float, float], draw: Draw, generator: torch.Generator) -
         heights = random_heights(float(0.3 * axes.min()), generator)
         far = 0.7 * radius * draw_one(draw)
         turn, spin = (2 * math.pi * draw(0, 1, 2)).tolist()
-        rotation = np.array([[math.cos(spin), 0, math.sin(spin)], [0, 1, 0], [-math.sin(spin), 0, math.cos(spin)]])
         at = np.array([far * math.cos(turn), height + axes[1] * draw_one(draw), far * math.sin(turn)])
-        found.append(moved(ellipsoid(axes, [heights]), rotation, at))
+        found.append(moved(ellipsoid(axes, [heights]), rotation_about(1, spin), at))
     return found

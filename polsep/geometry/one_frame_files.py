@@ -95,7 +95,7 @@ def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, ti
     """
     facts: dict[str, Any] = {
         "light": [round(x, 4) for x in found.light],
-        "light_is": _light_source(found, settings),
+        "light_is": "found from the shading" if settings.lamp is None else "told",
         "mask_is": "told" if found.mask_told else "found where light falls",
         "index": settings.index,
         "method": frame.report.get("method", "separated before"),
@@ -124,15 +124,9 @@ def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, ti
     return ShapeFiles(normals, albedo, depth, found.mask, mesh, titled_sheet(panels), film, facts, more, page)
 
 
-def _light_source(found: Shape, settings: ShapeSettings) -> str:
-    if settings.lamp is not None:
-        return "told"
-    return "found from the shading" if any(found.light) else "not found"
-
-
 def page_of(found: Shape, title: str) -> bytes:
-    """The page that relights a shape; its lamp begins where the frame's was, or beside the camera."""
-    return encode_relight_page(_page_maps(found), title, found.light if any(found.light) else (0.0, 0.0, 1.0))
+    """The page that relights a shape; its lamp begins where the frame's was."""
+    return encode_relight_page(_page_maps(found), title, found.light)
 
 
 def _page_maps(found: Shape) -> RelightMaps:

@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def _direction(right_deg: float, up_deg: float) -> tuple[float, float, float]:
-    """A unit vector at these angles to the right of the camera and above it."""
+def direction_at(right_deg: float, up_deg: float) -> tuple[float, float, float]:
+    """The unit vector at these angles [degrees] to the right of the camera and above it."""
     right, up = math.radians(right_deg), math.radians(up_deg)
     return (math.sin(right) * math.cos(up), math.sin(up), math.cos(right) * math.cos(up))
 
 
 #: The six lights, in the order of the photographs.
 NAMED = {
-    "right": _direction(70, 0),
-    "front-right": _direction(35, 0),
-    "front": _direction(0, 0),
-    "front-left": _direction(-35, 0),
-    "left": _direction(-70, 0),
-    "above": _direction(0, 60),
+    "right": direction_at(70, 0),
+    "front-right": direction_at(35, 0),
+    "front": direction_at(0, 0),
+    "front-left": direction_at(-35, 0),
+    "left": direction_at(-70, 0),
+    "above": direction_at(0, 60),
 }
 
 

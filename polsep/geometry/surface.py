@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.geometry.integration import Slopes, find_slopes, pixel_rays
+from polsep.geometry.lights import direction_at
 from polsep.geometry.photometric import Appearance
 from polsep.render.tracer import Tracer
 from polsep.render.triangles import without_fragments
@@ -120,10 +121,7 @@ def draw_views(surface: Surface, size: int, views: Sequence[tuple[float, float]]
     down, across = (grid.reshape(-1, 1) for grid in np.meshgrid(ticks, ticks, indexing="ij"))
     light = np.array(PICTURE_LIGHT) / math.hypot(*PICTURE_LIGHT)
     for azimuth_deg, elevation_deg in views:
-        azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
-        back = np.array(
-            [math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)]
-        )
+        azimuth, back = math.radians(azimuth_deg), np.array(direction_at(azimuth_deg, elevation_deg))
         right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
         up = np.cross(back, right)
         directions = across * right - down * up - back

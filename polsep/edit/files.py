@@ -8,7 +8,6 @@ Previews have the exposure of the input, or less where edits add light; in seque
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
@@ -115,15 +114,7 @@ def _planned_edit(path: Path, target: EditTarget) -> list[Path]:
 
 
 def edit_files(paths: Sequence[Path], work: Work, target: EditTarget) -> Iterator[Edited]:
-    """Edit single frames; a bad file gives an outcome with an error, and the rest are edited.
-
-    Raises OutputError before any work if two inputs have one name.
-    """
-    stems = Counter(path.stem for path in paths)
-    repeated = [path for path in paths if stems[path.stem] > 1]
-    if repeated:
-        same = ", ".join(str(path) for path in repeated if path.stem == repeated[0].stem)
-        raise OutputError(f"expected inputs of different names, found {same}: their outputs would be one file")
+    """Edit single frames; a bad file gives an outcome with an error, and the rest are edited."""
     inputs = {realpath(path) for path in paths}
     for path in paths:
         try:

@@ -144,10 +144,13 @@ class MaterialNetwork(nn.Module):
 def encode_images(images: Tensor) -> Tensor:
     """Images ``[N, C, H, W]`` on a logarithmic scale, -1 for black and 1 for white, and x and y of every pixel."""
     scaled = (torch.log(images.clamp(min=0) + FLOOR) - math.log(FLOOR)) / (math.log(1 + FLOOR) - math.log(FLOOR))
-    height, width = images.shape[-2:]
-    y, x = (torch.linspace(-1, 1, n).to(images) for n in (height, width))
-    places = torch.stack(torch.meshgrid(-y, x, indexing="ij")[::-1])
-    return torch.cat([2 * scaled - 1, places.expand(len(images), -1, -1, -1)], dim=1)
+    return torch.cat([2 * scaled - 1, _places(images).expand(len(images), -1, -1, -1)], dim=1)
+
+
+def _places(images: Tensor) -> Tensor:
+    """x to the right and y up, -1 to 1, of every pixel of images, ``[2, H, W]``."""
+    y, x = (torch.linspace(-1, 1, n).to(images) for n in images.shape[-2:])
+    return torch.stack([x.expand(len(y), -1), -y[:, None].expand(-1, len(x))])
 
 
 def detail_cues(images: Tensor) -> Tensor:
@@ -157,9 +160,7 @@ def detail_cues(images: Tensor) -> Tensor:
     it: so details times the direction from there are slopes to first order. The middle is where the last three channels
     are bright.
     """
-    height, width = images.shape[-2:]
-    y, x = (torch.linspace(-1, 1, n).to(images) for n in (height, width))
-    places = torch.stack(torch.meshgrid(-y, x, indexing="ij")[::-1])
+    places = _places(images)
     weight = images[:, -3:].mean(dim=1, keepdim=True).clamp(0, 1) ** 2
     middle = (weight * places).mean(dim=(-2, -1)) / weight.mean(dim=(-2, -1)).clamp(min=1e-6)
     away = places - middle[..., None, None]

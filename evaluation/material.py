@@ -23,9 +23,9 @@ from evaluation import WEIGHTS
 from polsep.bench.rows import Row
 from polsep.io.assets.materials import find_panels, read_panels
 from polsep.material.estimate import Estimator, load_estimator
-from polsep.material.procedural import MAP_SIZE, halve, random_svbrdf
-from polsep.material.shots import CAMERA_HEIGHT, INPUTS, RAW_SIZE, Example, make_example, random_example
-from polsep.material.svbrdf import Svbrdf, plane_points, relight, unstack
+from polsep.material.procedural import halve, random_svbrdf
+from polsep.material.shots import RAW_SIZE, Example, make_example, random_example
+from polsep.material.svbrdf import CAMERA_HEIGHT, INPUTS, MAP_SIZE, Svbrdf, plane_points, relight, unstack
 from polsep.metrics import flip, psnr, require_flip
 from polsep.physics.gltf import metalness
 from polsep.physics.optics import dot

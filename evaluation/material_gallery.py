@@ -13,8 +13,8 @@ from evaluation.figures import Panel, Pixels, draw_grid, tone
 from evaluation.material import load_estimators, metal_examples, novel_lights, photograph_under
 from polsep.bench.rows import Row
 from polsep.io.store.image_codecs import write_jpeg
-from polsep.material.shots import INPUTS, Example, random_example
-from polsep.material.svbrdf import Svbrdf, unstack
+from polsep.material.shots import Example, random_example
+from polsep.material.svbrdf import INPUTS, Svbrdf, unstack
 
 #: Held-out procedural materials that are shown, and with how many photographs.
 SHOWN, VIEWS = (1, 8), 1

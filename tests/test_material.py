@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import struct
+import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
@@ -36,8 +37,8 @@ from polsep.material.estimate import load_estimator
 from polsep.material.files import MaterialOptions, Photographs, find_white, flatness_notes, read_photographs
 from polsep.material.network import MaterialNetwork, MaterialSize, detail_cues, encode_images
 from polsep.material.procedural import halve, random_svbrdf
-from polsep.material.shots import CAMERA, CAMERA_HEIGHT, INPUTS, photograph, random_example, random_flash
-from polsep.material.svbrdf import Svbrdf, plane_points, relight, unstack
+from polsep.material.shots import CAMERA, photograph, random_example, random_flash
+from polsep.material.svbrdf import CAMERA_HEIGHT, INPUTS, Svbrdf, plane_points, relight, unstack
 from polsep.physics.gltf import GLASS
 from polsep.render.sphere_tracing import PointLight
 from polsep.separation.report import SeparatedFrame
@@ -425,6 +426,15 @@ def test_details_are_slopes_of_a_glossy_bump() -> None:
         MaterialSize(cues=("magic",))
     network = MaterialNetwork(6, replace(SMALL, cues=("details",)))
     assert network(torch.rand(1, 2, 6, 40, 32, generator=seeded(1))).shape == (1, 9, 40, 32)
+
+
+def test_estimates_need_the_extra_torch_alone() -> None:
+    """Nothing of the renderer is loaded, whose libraries are in other extras."""
+    names = "[name for name in sys.modules if name.startswith('polsep.render')]"
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys, polsep.material.files; print({names})"], capture_output=True, check=True
+    )
+    assert done.stdout.split() == [b"[]"]
 
 
 def test_samples_that_are_not_flat_are_warned_of() -> None:

@@ -20,7 +20,6 @@ from polsep.material.procedural import (
 )
 from polsep.material.shots import (
     AROUND,
-    CAMERA_HEIGHT,
     FLASH,
     HEIGHTS,
     photograph,
@@ -30,7 +29,7 @@ from polsep.material.shots import (
     shade_metal,
     shade_plane,
 )
-from polsep.material.svbrdf import Svbrdf
+from polsep.material.svbrdf import CAMERA_HEIGHT, Svbrdf
 from polsep.physics.fresnel import conductor
 from polsep.physics.gltf import DIELECTRICS, METALS, metalness
 from polsep.physics.optics import Geometry, metal_stokes, normalize, specular_stokes

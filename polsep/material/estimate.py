@@ -11,13 +11,12 @@ from torch import Tensor
 
 from polsep.io.store.weights import read_weights, shipped_weights
 from polsep.material.network import MaterialNetwork, MaterialSize
-from polsep.material.shots import INPUTS
-from polsep.material.svbrdf import Svbrdf, unstack
+from polsep.material.svbrdf import INPUTS, Svbrdf, unstack
 
 
 @dataclass(frozen=True)
 class Estimator:
-    """A trained ``network`` and its ``input``, of `shots.INPUTS`."""
+    """A trained ``network`` and its ``input``, of `svbrdf.INPUTS`."""
 
     network: MaterialNetwork
     input: str

@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 
 from polsep.io.store.examples import read_example, write_example
-from polsep.material.shots import INPUTS, RAW_SIZE, SMALL_SIZE, Example, random_example
-from polsep.material.svbrdf import STACKED
+from polsep.material.shots import RAW_SIZE, SMALL_SIZE, Example, random_example
+from polsep.material.svbrdf import INPUTS, STACKED
 
 #: Planes of one view.
 PLANES = max(part.stop for part in INPUTS.values())

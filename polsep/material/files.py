@@ -19,9 +19,7 @@ from polsep.io.results.separation_reader import is_separated
 from polsep.io.store.atomic import refuse_existing, refuse_inputs
 from polsep.io.store.errors import InputError, input_error
 from polsep.material.estimate import load_estimator
-from polsep.material.procedural import MAP_SIZE
-from polsep.material.shots import CAMERA_HEIGHT
-from polsep.material.svbrdf import Svbrdf, plane_points, relight
+from polsep.material.svbrdf import CAMERA_HEIGHT, MAP_SIZE, Svbrdf, plane_points, relight
 from polsep.pipeline import LightColor, open_separated, separate_capture
 from polsep.separation.report import SeparatedFrame, reported_light
 

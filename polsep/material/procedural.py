@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from polsep.material.heights import Relief, random_relief
-from polsep.material.svbrdf import Svbrdf, plane_points
+from polsep.material.svbrdf import MAP_SIZE, Svbrdf, plane_points
 from polsep.physics.fresnel import fresnel
 from polsep.physics.gltf import GLASS
 from polsep.physics.optics import normalize
@@ -35,8 +35,6 @@ METAL_SHARE, ALL_METAL_SHARE = 0.2, 0.5
 #: green to red and blue to green of the others, as from copper to gold; the factor of the second material of a texture.
 REFLECTANCES, GREY_METALS, GREY_SPREAD = (0.4, 0.95), 0.5, 0.04
 GREENS, BLUES, TARNISH = (0.65, 0.95), (0.42, 0.9), (0.8, 1.0)
-#: Pixels along the side of maps.
-MAP_SIZE = 128
 #: Share of flat materials; rms slope along an axis of the others, at `MAP_SIZE`, log-uniform. No slope is steeper than
 #: the third number; the raw pixels of reliefs that are finer than the maps have no larger rms than the last.
 FLAT_SHARE, SLOPES, STEEPEST, FINEST = 0.05, (0.04, 0.8), 3.0, 1.2

@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from polsep.demosaic.measured_stokes import measured_stokes
-from polsep.material.procedural import MAP_SIZE, halve, random_svbrdf
-from polsep.material.svbrdf import Svbrdf, plane_points
+from polsep.material.procedural import halve, random_svbrdf
+from polsep.material.svbrdf import CAMERA_HEIGHT, MAP_SIZE, Svbrdf, plane_points
 from polsep.physics.fresnel import fresnel
 from polsep.physics.gltf import GLASS, metalness
 from polsep.physics.optics import Geometry, dot, metal_stokes, normalize
@@ -30,8 +30,7 @@ from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Sce
 from polsep.render.views import BLURS, scene_seed
 from polsep.sensor.camera import IMX250, Layout, Mosaic
 
-#: Height of the camera above a plane of sides 2.
-CAMERA_HEIGHT = 2.75
+#: The camera, whose frame the plane fills.
 CAMERA = PinholeCamera((0.0, 0.0, CAMERA_HEIGHT), (0.0, 0.0, 0.0), 2 * math.degrees(math.atan(1 / CAMERA_HEIGHT)))
 #: Largest distance of a flash from the lens along each axis, and the range of other lights: sides, heights.
 FLASH, AROUND, HEIGHTS = 0.15, 1.4, (1.8, 3.2)
@@ -41,8 +40,6 @@ LARGEST_CLIPPED, MIN_LEVEL = 0.03, 0.06
 METHOD = "joint"
 #: Standard deviation of the logarithm of the error of the level of white paper.
 WHITE_ERROR = 0.05
-#: Channels of each input, by name, among the 15 of an example's views.
-INPUTS: dict[str, slice] = {"unseparated": slice(0, 3), "separated": slice(3, 9), "perfect": slice(9, 15)}
 #: Raw pixels along the side of a frame; images are averaged to `MAP_SIZE` pixels, as frames of real cameras are.
 RAW_SIZE = 512
 #: Raw pixels of every other example of training: large maps and parts of frames have as few for a pixel.
@@ -53,7 +50,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class Example:
-    """Views ``[V, 15, h, w]`` of one material (see `INPUTS`) and its ``maps [9, h, w]`` (see `Svbrdf.stack`)."""
+    """Views ``[V, 15, h, w]`` of one material (see `svbrdf.INPUTS`) and its ``maps [9, h, w]`` (see `Svbrdf.stack`)."""
 
     views: Tensor
     maps: Tensor
@@ -134,7 +131,7 @@ def separated_images(mosaic: Mosaic) -> Tensor:
 
 
 def random_view(maps: Svbrdf, light: PointLight, generator: torch.Generator) -> Tensor:
-    """All inputs of networks from one photograph, ``[15, h, w]``; see `INPUTS`."""
+    """All inputs of networks from one photograph, ``[15, h, w]``; see `svbrdf.INPUTS`."""
     mosaic, scene, white = photograph(maps, light, generator)
     diffuse, specular, _ = half_resolution(scene)
     off = math.exp(WHITE_ERROR * float(torch.randn(1, generator=generator, dtype=torch.float64)))

@@ -21,6 +21,12 @@ from polsep.physics.optics import dot, normalize
 
 #: Channels of stacked maps: normal x and y, diffuse, roughness, specular.
 STACKED = 9
+#: Pixels along the side of maps.
+MAP_SIZE = 128
+#: Height of the camera, which looks straight down, above the plane.
+CAMERA_HEIGHT = 2.75
+#: Channels of each network's input, by name, among the 15 of a view in `shots`.
+INPUTS: dict[str, slice] = {"unseparated": slice(0, 3), "separated": slice(3, 9), "perfect": slice(9, 15)}
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from polsep.material.examples import example_path, load_example
 from polsep.material.network import MaterialNetwork, MaterialSize
-from polsep.material.shots import INPUTS, Example
-from polsep.material.svbrdf import unstack
+from polsep.material.shots import Example
+from polsep.material.svbrdf import INPUTS, unstack
 from polsep.train.loop import Training
 from polsep.train.material_losses import (
     maps_loss,
@@ -35,7 +35,7 @@ VALIDATION_SEED, VALIDATION_PICTURES = 2026, (3, 6)
 
 @dataclass(frozen=True)
 class MaterialOptions:
-    """Options of a training for materials: ``input`` of `shots.INPUTS`, from the first ``examples`` of ``seed``.
+    """Options of a training for materials: ``input`` of `svbrdf.INPUTS`, from the first ``examples`` of ``seed``.
 
     ``views``: of every example; a batch has 1 to all of them. Raises ValueError on unknown inputs and counts below 1.
     """

@@ -22,11 +22,11 @@ from polsep.material.procedural import halve, random_svbrdf
 from polsep.material.svbrdf import CAMERA_HEIGHT, MAP_SIZE, Svbrdf, plane_points
 from polsep.physics.fresnel import fresnel
 from polsep.physics.gltf import GLASS, metalness
-from polsep.physics.optics import Geometry, dot, metal_stokes, normalize
+from polsep.physics.optics import metal_stokes
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
 from polsep.render.simulate import blur, capture, expose_to_clip, expose_to_level, half_resolution
-from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Scene, Vector, shade
+from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Scene, Vector, beams_at, shade
 from polsep.render.views import BLURS, scene_seed
 from polsep.sensor.camera import IMX250, Layout, Mosaic
 
@@ -76,12 +76,7 @@ def _light(position: Vector, generator: torch.Generator) -> PointLight:
 
 def shade_metal(maps: Svbrdf, light: PointLight) -> Stokes:
     """The light ``[3, H, W]`` that a plane of metal mirrors to the camera, as `sphere_tracing.shade` of dielectrics."""
-    points, up = plane_points(*maps.roughness.shape[-2:]), torch.tensor([0.0, 1.0, 0.0]).view(3, 1, 1)
-    to_light = torch.tensor(light.position).view(3, 1, 1) - points
-    distance = torch.sqrt(dot(to_light, to_light))
-    to_camera = normalize(torch.tensor(CAMERA.position).view(3, 1, 1) - points)
-    geometry = Geometry(maps.normal, to_camera, to_light / distance, up, up)
-    irradiance = light.intensity / distance**2
+    geometry, irradiance = beams_at(plane_points(*maps.roughness.shape[-2:]), maps.normal, CAMERA, light)
     return metal_stokes(geometry, torch.tensor(light.polarizer), irradiance, maps.roughness, maps.specular)
 
 

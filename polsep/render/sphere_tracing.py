@@ -184,16 +184,23 @@ def is_lit(parts: tuple[Part, ...], buffer: GBuffer, light: PointLight) -> Tenso
     return buffer.mask & ~shadowed
 
 
+def beams_at(position: Tensor, normal: Tensor, camera: PinholeCamera, light: PointLight) -> tuple[Geometry, Tensor]:
+    """Return the beams at points ``[3, *]`` from a light and to a camera, and the irradiance without the cosine."""
+    eye, lamp, up = (
+        torch.tensor(v, dtype=torch.float32).to(position).view(3, 1, 1)
+        for v in (camera.position, light.position, (0.0, 1.0, 0.0))
+    )
+    to_light = lamp - position
+    distance = torch.sqrt(dot(to_light, to_light))
+    geometry = Geometry(normal, normalize(eye - position), to_light / distance, up, up)
+    return geometry, light.intensity / distance**2
+
+
 def shade(buffer: GBuffer, camera: PinholeCamera, light: PointLight, lit: Tensor) -> tuple[Stokes, Stokes]:
     """Return diffuse and specular Stokes images ``[3, N, 1]`` of a G-buffer, black where not ``lit``."""
-    position, normal = buffer.position, buffer.normal
-    up = torch.tensor([0.0, 1.0, 0.0]).to(position).view(3, 1, 1)
-    to_light = torch.tensor(light.position, dtype=torch.float32).to(position).view(3, 1, 1) - position
-    distance = torch.sqrt(dot(to_light, to_light))
-    to_camera = normalize(torch.tensor(camera.position, dtype=torch.float32).to(position).view(3, 1, 1) - position)
-    irradiance = light.intensity / distance**2 * lit
-    polarizer = torch.tensor(light.polarizer, dtype=torch.float32).to(position)
-    geometry = Geometry(normal, to_camera, to_light / distance, up, up)
+    geometry, irradiance = beams_at(buffer.position, buffer.normal, camera, light)
+    irradiance = irradiance * lit
+    polarizer = torch.tensor(light.polarizer, dtype=torch.float32).to(buffer.position)
     diffuse = diffuse_stokes(geometry, polarizer, irradiance, buffer.albedo)
     specular = specular_stokes(geometry, polarizer, irradiance, buffer.roughness) * buffer.specular
     return diffuse, specular.map(lambda s: s.expand_as(diffuse.s0))

@@ -19,7 +19,6 @@ from polsep.render.disturbances import (
     depolarize_lamp,
     make_metal,
     random_field,
-    random_lamp_color,
     retain_polarization,
     scale_light,
     shift_colors,
@@ -179,9 +178,9 @@ def test_metal_has_no_diffuse_light_and_its_colour() -> None:
     """The ratio of its colours is that of the reflectance; elsewhere nothing changes."""
     scene, metal = lit_scene(), torch.zeros(1, *SIZE)
     metal[:, :, 16:] = 1
-    found = make_metal(scene, metal, as_color(METALS["gold"]), 20.0)
+    found = make_metal(scene, metal, as_color(METALS["gold"]))
     assert float(found.diffuse.s0[..., 16:].abs().max()) == 0
-    expected = 20 * torch.tensor(METALS["gold"])[:, None, None] * scene.specular.s0[..., 16:]
+    expected = 25 * torch.tensor(METALS["gold"])[:, None, None] * scene.specular.s0[..., 16:]
     torch.testing.assert_close(found.specular.s0[..., 16:], expected)
     assert torch.equal(found.diffuse.s0[..., :16], scene.diffuse.s0[..., :16])
 
@@ -206,13 +205,8 @@ def test_chromatic_aberration_magnifies_red_and_leaves_green() -> None:
     assert torch.equal(found[1:], dot[1:])
 
 
-def test_random_draws_are_repeatable_and_in_range() -> None:
-    """Colours have green 1, fields the mean 1 and their contrast."""
-    colors = random_lamp_color(torch.Generator().manual_seed(3), 50)
-    assert torch.equal(colors, random_lamp_color(torch.Generator().manual_seed(3), 50))
-    assert colors.shape == (50, 3, 1, 1)
-    assert bool((colors[:, 1] == 1).all())
-    assert float(colors.min()) > 0.25
+def test_random_fields_are_in_range() -> None:
+    """Fields have the mean 1 and their contrast."""
     field = random_field((2, 1, *SIZE), 4, 0.5, torch.Generator().manual_seed(1))
     torch.testing.assert_close(field.mean(dim=(-2, -1)), torch.ones(2, 1))
     torch.testing.assert_close((field - 1).abs().amax(dim=(-2, -1)), torch.full((2, 1), 0.5))

@@ -35,7 +35,7 @@ UNKNOWN_DEG = 20.0
 #: Logistic model of the chance that a fit is led astray: of the logarithms of polarization across over along and of the
 #: disagreement of clear and dull tiles [degrees], each with an offset; and of the lean of the diffuse polarization.
 ASTRAY, ASTRAY_LEAN, ASTRAY_BIAS = ((0.938, 0.02), (0.323, 0.1)), -0.674, 0.017
-#: Log-ratios of lamps before usual sensors, least and most: of bluish LEDs to bulbs (`render.disturbances.RED, BLUE`).
+#: Log-ratios of lamps before usual sensors, least and most: of bluish LEDs to bulbs.
 RAW_LAMPS = np.array([[-1.05, 0.13], [-1.35, 0.03]])
 #: Direction from cold to warm lamps after a white balance.
 WARM = np.array([0.524, -0.852])

@@ -36,8 +36,6 @@ LAMPS = {
     "cool LED": (0.50, 1.0, 0.80),
     "warm LED": (0.75, 1.0, 0.42),
 }
-#: Ranges of the raw red and blue of lamps before usual sensors, green = 1: of bluish LEDs to incandescent bulbs.
-RED, BLUE = (0.38, 1.05), (0.28, 0.95)
 #: Reflectance of metals at normal incidence in linear RGB: Hoffman, in Akenine-Moeller et al. 2018, table 9.2.
 METALS = {
     "gold": (1.000, 0.782, 0.344),
@@ -51,13 +49,6 @@ METALS = {
 def as_color(rgb: Sequence[float] | Tensor) -> Tensor:
     """Return three numbers, or ``[..., 3]``, as a colour ``[..., 3, 1, 1]``."""
     return torch.as_tensor(rgb, dtype=torch.float32)[..., None, None]
-
-
-def random_lamp_color(generator: torch.Generator, count: int = 1) -> Tensor:
-    """Return raw colours ``[count, 3, 1, 1]`` of lamps before sensors, green = 1: log-uniform in `RED` and `BLUE`."""
-    red, blue = torch.rand(2, count, generator=generator)
-    red, blue = (low * (high / low) ** x for x, (low, high) in ((red, RED), (blue, BLUE)))
-    return as_color(torch.stack([red, torch.ones(count), blue], dim=1))
 
 
 def scale_light(scene: Scene, gain: Number) -> Scene:
@@ -159,14 +150,14 @@ def add_indirect_light(scene: Scene, light: IndirectLight) -> Scene:
     return replace(scene, diffuse=diffuse, specular=scene.specular + turned)
 
 
-def make_metal(scene: Scene, metal: Tensor, reflectance: Number, strength: float = 1 / GLASS) -> Scene:
+def make_metal(scene: Scene, metal: Tensor, reflectance: Number) -> Scene:
     """Return the scene with surfaces of metal: no diffuse light, and coloured specular light.
 
-    ``metal [..., 1, H, W]``: 1 where there is metal, 0 elsewhere. ``reflectance``: its colour (`METALS`).
-    ``strength``: factor on the dielectric's specular lobe; the default gives the metal its reflectance at normal
-    incidence. The lobe keeps the dielectric's polarization: metals turn it a little and make some of it circular.
+    ``metal [..., 1, H, W]``: 1 where there is metal, 0 elsewhere. ``reflectance``: its colour (`METALS`) at normal
+    incidence, in place of the dielectric's. The lobe keeps the dielectric's polarization: metals turn it a little and
+    make some of it circular.
     """
-    specular = scene.specular * (1 + metal * (strength * reflectance - 1))
+    specular = scene.specular * (1 + metal * (1 / GLASS * reflectance - 1))
     return replace(scene, diffuse=scene.diffuse * (1 - metal), specular=specular)
 
 

@@ -159,24 +159,17 @@ def _solid(found: Shape, integration: str) -> tuple[Mesh, NDArray[np.float64]]:
 
 
 def _enlarged(depth: NDArray[np.float64], window: tuple[int, int, int], mask: Mask) -> NDArray[np.float64]:
-    """Depth of the small square at every pixel of the mask, of its nearest known pixel."""
-    from scipy.ndimage import distance_transform_edt
+    """Depth of the small square at every pixel of the mask, bilinear; unknown pixels have that of the nearest known."""
+    from scipy.ndimage import distance_transform_edt, map_coordinates
 
     top, left, width = window
     side = len(depth)
     nearest = distance_transform_edt(np.isnan(depth), return_distances=False, return_indices=True)
     whole = depth[tuple(nearest)]
     rows, cols = np.nonzero(mask)
-    at = [np.clip(((x - first + 0.5) * side / width - 0.5), 0, side - 1) for x, first in ((rows, top), (cols, left))]
-    low = [np.minimum(x.astype(int), side - 2) for x in at]
-    share = [x - n for x, n in zip(at, low, strict=True)]
+    at = [(x - first + 0.5) * side / width - 0.5 for x, first in ((rows, top), (cols, left))]
     found = np.full(mask.shape, np.nan)
-    total = np.zeros(len(rows))
-    for i in (0, 1):
-        for j in (0, 1):
-            weight = (share[0] if i else 1 - share[0]) * (share[1] if j else 1 - share[1])
-            total += weight * whole[low[0] + i, low[1] + j]
-    found[mask] = total
+    found[mask] = map_coordinates(whole, at, order=1, mode="nearest")
     return found
 
 

@@ -27,7 +27,7 @@ import trimesh
 from test_geometry import cap
 
 import polsep
-from polsep.geometry import frames, one_frame, one_frame_files
+from polsep.geometry import frames, one_frame
 from polsep.geometry.lamp import seen_under
 from polsep.geometry.one_frame import (
     SIDE,
@@ -551,8 +551,7 @@ def test_a_lamp_that_is_told_goes_before_the_file_beside(tmp_path: Path, beside:
         path = write_separation(one, tmp_path, name)[0]
         if beside == "nothing":
             (tmp_path / f"{name}.json").unlink()
-        settings = one_frame_files.ShapeSettings(light_color=told)
-        found, notes = one_frame_files._read_frame(path, settings)
+        found, notes = frames.open_frame(path, ReadOptions(), "joint", told)
         assert notes == []
         seen.append(one_frame.images_of(found, frame.valid))
     np.testing.assert_allclose(seen[1], seen[0], rtol=1e-5, atol=1e-6)
@@ -599,10 +598,10 @@ def test_of_many_frames_two_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(frames, "read_frames", film)
     with pytest.raises(InputError, match=r"film.npy: expected one frame, found 9000"):
-        frames.separate_file(tmp_path / "film.npy", ReadOptions(), "analytic")
+        frames.open_frame(tmp_path / "film.npy", ReadOptions(), "analytic")
     monkeypatch.setattr(frames, "read_frames", lambda path, options: iter(()))
     with pytest.raises(InputError, match=r"film.npy: expected one frame, found 0"):
-        frames.separate_file(tmp_path / "film.npy", ReadOptions(), "analytic")
+        frames.open_frame(tmp_path / "film.npy", ReadOptions(), "analytic")
 
 
 @pytest.mark.parametrize(("wide", "meshed"), [(1, False), (4, False), (14, True)])

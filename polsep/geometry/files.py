@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.geometry.frames import separate_file
+from polsep.geometry.frames import open_frame
 from polsep.geometry.integration import integrate_bilateral, integrate_smooth
 from polsep.geometry.photometric import Appearance, fit_robust
 from polsep.geometry.polarization import Polarized, find_diffuse_polarization, normals_from_polarization
@@ -30,7 +30,6 @@ from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
 from polsep.io.results.separation_reader import is_separated
 from polsep.io.store.errors import InputError, input_error
-from polsep.pipeline import open_separated
 from polsep.separation.report import SeparatedFrame, reported_light
 
 Floats = NDArray[np.float64]
@@ -127,9 +126,9 @@ def _gains_of(frame: SeparatedFrame) -> Floats:
 
 def _read_frame(path: Path, source: Source) -> tuple[SeparatedFrame, list[str]]:
     """One frame, separated, and notes; its report's warnings were given when it was separated."""
+    frame, notes = open_frame(path, source.options, source.method)
     if not is_separated(path):
-        return separate_file(path, source.options, source.method)
-    frame, notes = open_separated(path)
+        return frame, notes
     if not frame.dolp.any():
         raise input_error(path, "expected a file of polsep separate with its polarization, found none in it")
     return frame, [note for note in notes if note not in frame.report.get("warnings", ())]

@@ -1,4 +1,4 @@
-"""One raw frame of a file, separated: the input of `polsep shape` and `polsep geometry` besides separated files."""
+"""The frame of a file, separated here or before: the input of `polsep shape` and `polsep geometry`."""
 
 from __future__ import annotations
 
@@ -6,18 +6,22 @@ from itertools import islice
 from pathlib import Path
 
 from polsep.io.raw.frames import ReadOptions, read_frames, refuse_forgotten
+from polsep.io.results.separation_reader import is_separated
 from polsep.io.store.errors import input_error
-from polsep.pipeline import LightColor, separate_capture
+from polsep.pipeline import LightColor, open_separated, separate_capture
 from polsep.separation.report import SeparatedFrame
 
 
-def separate_file(
+def open_frame(
     path: Path, read: ReadOptions, method: str, light_color: LightColor | str = "auto"
 ) -> tuple[SeparatedFrame, list[str]]:
-    """The only frame of a raw file, separated, and notes for the user, a line each: on the file and on the frame.
+    """The only frame of a file, separated, and notes for the user, a line each: on the file and on the frame.
 
-    Of a file of several frames two are read. Raises InputError on it, and on what cannot be read or separated.
+    ``read`` and ``method`` are for raw frames. Of a raw file of several frames two are read. Raises InputError on it,
+    and on what cannot be read or separated.
     """
+    if is_separated(path):
+        return open_separated(path, light_color)
     frames = list(islice(read_frames(path, read), 2))
     if len(frames) != 1:
         number = max((frame.count for frame in frames), default=0)

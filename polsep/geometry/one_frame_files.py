@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.geometry.frames import separate_file
+from polsep.geometry.frames import open_frame
 from polsep.geometry.one_frame import SIDE, UNKNOWN, Shape, find_shape, gather, on_thing, square_around
 from polsep.geometry.shape_maps import Surface, relight
 from polsep.io.assets.maps import read_object
@@ -19,10 +19,9 @@ from polsep.io.assets.relight_page import RelightMaps, encode_relight_page
 from polsep.io.assets.shapes import ShapeFiles
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
-from polsep.io.results.separation_reader import is_separated
 from polsep.io.store.errors import input_error
 from polsep.physics.fresnel import ETA
-from polsep.pipeline import LightColor, open_separated
+from polsep.pipeline import LightColor
 from polsep.separation.report import SeparatedFrame
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ class ShapeSettings:
 
 def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list[str]]:
     """The files of the shape in a frame, and notes for the user. Raises ValueError."""
-    frame, notes = _read_frame(path, settings)
+    frame, notes = open_frame(path, settings.read, settings.method, settings.light_color)
     mask = None if settings.mask is None else read_object(settings.mask, frame.dolp.shape)
     try:
         found = find_shape(frame, mask, settings.lamp, settings.weights, settings.index)
@@ -79,13 +78,6 @@ def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list
         raise input_error(path, error) from error
     notes = [*notes, *found.doubts()]
     return replace(files, facts={**files.facts, "warnings": notes}), notes
-
-
-def _read_frame(path: Path, settings: ShapeSettings) -> tuple[SeparatedFrame, list[str]]:
-    """A separated frame, and what was said about it."""
-    if not is_separated(path):
-        return separate_file(path, settings.read, settings.method, settings.light_color)
-    return open_separated(path, settings.light_color)
 
 
 def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, title: str) -> ShapeFiles:

@@ -19,7 +19,8 @@ from polsep.sensor.camera import Layout, expose
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.lamp_polarization import MIN_PART, SIDE, find_unpolarized, measure_places
 from polsep.separation.places_kernel import measure_places_fast
-from polsep.video.recordings import VideoOptions, separate_first
+from polsep.video.first_frame import separate_first
+from polsep.video.recordings import VideoOptions
 
 SIZE = 96
 #: Errors of a slope, since the mean colour of a place holds a little of what is left.

@@ -51,6 +51,7 @@ from polsep.sensor.camera import IDEAL, Layout, expose
 from polsep.sensor.checks import CheckedMosaic
 from polsep.sensor.levels import as_mosaic
 from polsep.separation.report import SeparatedFrame
+from polsep.video import first_frame, panels
 from polsep.video import recordings as video
 from polsep.video.reports import shared_report
 from polsep.view.opening import as_source, find_sources, read_source
@@ -568,7 +569,25 @@ def test_a_damaged_frame_stops_the_run_until_it_is_repaired(
     broken.write_bytes(whole)
     assert run(monkeypatch, *command(folder, tmp_path / "out")) == 0
     found, expected = contents(tmp_path / "out"), contents(undisturbed)
-    assert {k: v for k, v in found.items() if k != "run.json"} == {k: v for k, v in expected.items() if k != "run.json"}
+    assert found.keys() == expected.keys()
+    assert all(found[name] == expected[name] for name in found if not name.startswith("run.json"))
+    lines = [json.loads(line) for line in found["run.jsonl"].splitlines()]
+    assert [line.pop("file") for line in lines] == [f"shot{number}.png" for number in range(FRAMES)]
+    assert lines == [json.loads(line) for line in expected["run.jsonl"].splitlines()]
+
+
+def test_frames_of_two_cameras_make_no_film(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where their bits tell them apart; where only their names do, a note says so."""
+    folder = write_folder(tmp_path / "run", frames(4) << 4)
+    for number in range(2):
+        (folder / f"other{number}.png").write_bytes((folder / f"shot{number}.png").read_bytes())
+    assert "2 kinds of names (other#, shot#)" in open_sequence(folder, ReadOptions()).notes[0]
+    (folder / "shot2.png").write_bytes(imagecodecs.png_encode((frames(1)[0] >> 4).astype(np.uint8)))
+    given = ["--method", "analytic", "--filter", "none", "--no-preview"]
+    assert run(monkeypatch, "video", str(folder), "-o", str(tmp_path / "out"), *given) == 2
+    assert "shot2: expected white level 65535 as in the first frame, found 255" in capsys.readouterr().err
 
 
 def test_a_damaged_frame_that_others_depend_on_is_repaired(
@@ -595,13 +614,26 @@ def test_a_damaged_frame_that_others_depend_on_is_repaired(
 )
 def test_the_lamp_is_not_found_without_a_frame_that_ends_the_run(wrong: bytes, tmp_path: Path) -> None:
     """It would be another one once the frame is repaired."""
-    folder = write_folder(tmp_path / "run", frames(video.LIGHT_STEP + 1))
-    (folder / f"shot{video.LIGHT_STEP}.png").write_bytes(wrong)
+    folder = write_folder(tmp_path / "run", frames(first_frame.LIGHT_STEP + 1))
+    (folder / f"shot{first_frame.LIGHT_STEP}.png").write_bytes(wrong)
     found, options = open_sequence(folder, ReadOptions(white_level=WHITE)), video.VideoOptions("analytic")
-    with pytest.raises(InputError, match=f"shot{video.LIGHT_STEP}.png|frame {video.LIGHT_STEP}: expected 32x32"):
-        video.separate_first(found, options)
-    for other in ({"damaged": "skip"}, {"frames": video.LIGHT_STEP}):
-        assert video.separate_first(found, replace(options, **other)).shape == (SIDE, SIDE)
+    with pytest.raises(InputError, match=rf"shot{first_frame.LIGHT_STEP}(\.png|: expected size 32x32)"):
+        first_frame.separate_first(found, options)
+    for other in ({"damaged": "skip"}, {"frames": first_frame.LIGHT_STEP}):
+        assert first_frame.separate_first(found, replace(options, **other)).shape == (SIDE, SIDE)
+
+
+def test_a_run_does_not_go_on_where_files_have_other_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that was separated is gone: the next file to separate would be left out."""
+    folder = write_folder(tmp_path / "run", frames(PART + 3))
+    (folder / f"shot{PART + 1}.png").write_bytes(b"no picture")
+    assert run(monkeypatch, *command(folder, tmp_path / "out")) == 2
+    (folder / "shot20.png").unlink()
+    capsys.readouterr()
+    assert run(monkeypatch, *command(folder, tmp_path / "out")) == 2
+    assert "expected frame 20 in shot20.png, as the run was begun, found shot21.png" in capsys.readouterr().err
 
 
 def test_a_run_that_a_damaged_frame_stopped_goes_on_without_it(
@@ -697,7 +729,7 @@ def test_damaged_frames_are_left_out_when_that_is_asked(
     assert run(monkeypatch, *command(folder, tmp_path / "out", "--damaged", "skip")) == 2
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 2 and "shot4.png" in errors[0]
-    assert f"frame {PART}: expected {SIDE}x{SIDE} samples as in the first one, found {SIDE + 4}x{SIDE}" in errors[1]
+    assert f"shot{PART}: expected size {SIDE}x{SIDE} as in the first frame, found {SIDE + 4}x{SIDE}" in errors[1]
     report = json.loads((tmp_path / "out" / "run.json").read_text())
     assert [line["frame"] for line in report["damaged"]] == [4, PART]
     found, expected = contents(tmp_path / "out"), contents(undisturbed)
@@ -855,7 +887,7 @@ def test_remarks_that_differ_in_numbers_count_as_one(tmp_path: Path, monkeypatch
 
 def test_angles_of_a_film_are_averaged_around_the_circle() -> None:
     """The mean of 179 and 1 degree is 0, not 90; of 44 and 46 it is 45."""
-    first = video.FirstFrame("joint", (1.0,), 1.0, (1, 1, 1), (2, 2), ())
+    first = first_frame.FirstFrame("joint", (1.0,), 1.0, (1, 1, 1), (2, 2), ())
     for angles, mean in (((179.0, 1.0), 0.0), ((44.0, 46.0), 45.0)):
         lines = [{"frame": k, "specular_aolp_deg": t, "light_polarizer_deg": 180 - t} for k, t in enumerate(angles)]
         report = shared_report(first, lines)
@@ -866,7 +898,7 @@ def test_angles_of_a_film_are_averaged_around_the_circle() -> None:
 
 def test_frames_without_light_say_nothing_of_its_angle() -> None:
     """A film of which most frames are black had an angle near their 0 degrees."""
-    first = video.FirstFrame("joint", (1.0,), 1.0, (1, 1, 1), (2, 2), ())
+    first = first_frame.FirstFrame("joint", (1.0,), 1.0, (1, 1, 1), (2, 2), ())
     seen = {"mean_s0": 0.4, "specular_fraction": 0.1, "specular_aolp_concentration": 0.9}
     angles = {"specular_aolp_deg": 60.0, "light_polarizer_deg": 120.0}
     black = {name: 0.0 for name in (*seen, *angles)}
@@ -890,7 +922,7 @@ def test_the_lamp_of_a_film_is_found_in_frames_put_right(recording: Path, monkey
 
     monkeypatch.setattr(pipeline, "check_mosaic", checked)
     monkeypatch.setattr(pipeline, "find_light", found)
-    video.separate_first(open_sequence(recording, ReadOptions(white_level=WHITE)), video.VideoOptions("analytic"))
+    first_frame.separate_first(open_sequence(recording, ReadOptions(white_level=WHITE)), video.VideoOptions("analytic"))
     assert seen and set(seen) == {7.0}
 
 
@@ -898,10 +930,10 @@ def test_the_lamp_of_a_film_is_found_in_frames_put_right(recording: Path, monkey
 def test_panels_of_low_and_narrow_frames_hold_nothing_else(size: tuple[int, int]) -> None:
     """The panel of a black image is black, and an even one is even: nothing from beyond the images is read."""
     even, black = np.full((*size, 3), 0.25, np.float32), np.zeros((*size, 3), np.float32)
-    panels = video.draw_panels(even, black, 1.0)
-    width = panels.shape[1] // 3
-    assert (panels[:, 2 * width :] == 0).all()
-    assert (panels[:, : 2 * width] == panels[0, 0]).all() and panels[0, 0].min() > 0
+    drawn = panels.draw_panels(even, black, 1.0)
+    width = drawn.shape[1] // 3
+    assert (drawn[:, 2 * width :] == 0).all()
+    assert (drawn[:, : 2 * width] == drawn[0, 0]).all() and drawn[0, 0].min() > 0
 
 
 def test_a_lamp_off_frame_is_no_frame_of_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,8 @@ from polsep.io.results.separation_writer import planned_outputs
 from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter, is_unfinished, read_rate
 from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.errors import InputError, input_error, one_line
-from polsep.video.recordings import ON_DAMAGE, Progress, black_picture, draw_panels, write_pictures
+from polsep.video.panels import black_picture, draw_panels
+from polsep.video.recordings import ON_DAMAGE, Progress, write_pictures
 
 #: Number of frames that are read and edited at once.
 AT_ONCE = 2

@@ -25,29 +25,22 @@ from numpy.typing import NDArray
 from polsep.compute.cluster import map_ordered
 from polsep.compute.threads import get_threads, own_threads
 from polsep.compute.workers import DEPTH, ahead, map_ahead
-from polsep.io.raw.corrections import hash_samples
-from polsep.io.raw.frames import Frame, ReadOptions, refuse_forgotten
+from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.raw.sequences import DamagedFrame, FrameSequence, input_files, open_sequence, refuse_frames
-from polsep.io.results.previews import exposure_of, srgb
-from polsep.io.results.sequences import PART, Picture, SequenceKind, SequenceWriter, State
-from polsep.io.store.atomic import refuse_inputs
+from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter, State
+from polsep.io.store.atomic import OutputError, refuse_inputs
 from polsep.io.store.errors import InputError
-from polsep.light.find import Light, combine
 from polsep.methods import find_method
 from polsep.pipeline import (
     LightColor,
     find_device,
-    is_calibrated,
-    is_to_be_found,
-    light_of,
     make_frame,
     move_capture,
-    separate_capture,
 )
 from polsep.sensor.camera import Mosaic
-from polsep.sensor.defects import find_lasting_defects, repair
-from polsep.sensor.levels import BlackFrame
-from polsep.video.panels_kernel import STEPS, make_panels
+from polsep.sensor.defects import repair
+from polsep.video.first_frame import FirstFrame, of_one_camera, separate_first
+from polsep.video.panels import black_picture, draw_panels
 from polsep.video.reports import describe_run, shared_report
 from polsep.video.temporal import Images, TemporalState, filter_frame, steady_images
 
@@ -55,16 +48,8 @@ Floats = NDArray[np.float32]
 
 #: Largest number of frames that this process separates at once: each needs the memory of its method.
 AT_ONCE = 4
-#: First frames in which dead and hot pixels are looked for.
-DEFECT_FRAMES = 8
-#: Distance of the frames of the first part that show the light's colour.
-LIGHT_STEP = 8
 #: Names of the averaged images in the saved state.
 IMAGES = ("diffuse", "specular")
-#: Largest side of a panel of the preview.
-PANEL = 640
-#: The tone curve at equal steps of the square root of linear light.
-_TONES = np.rint(255 * srgb((np.arange(STEPS + 1) / STEPS) ** 2)).astype(np.uint8)
 #: Filters against flicker.
 FILTERS = ("temporal", "none")
 #: Ways to treat a damaged frame.
@@ -107,27 +92,6 @@ class Target:
     kind: SequenceKind = field(default_factory=SequenceKind)
     overwrite: bool = False
     kept: tuple[Path, ...] = ()
-
-
-@dataclass(frozen=True)
-class FirstFrame:
-    """Values that the first frame fixes for all: colour of the ``light``, ``gain`` of the preview, ``size`` of images.
-
-    ``size`` includes colours. ``shape``: of raw frames. ``warnings``: for the user. ``defects``: mask ``[H, W]`` of the
-    pixels that are repaired in every frame, None where there are none. ``facts``: of the light, for the report.
-    ``black_level``: of raw frames. ``sha256``: of its samples, by which a run that is resumed knows its recording.
-    """
-
-    method: str
-    light: tuple[float, ...]
-    gain: float
-    size: tuple[int, int, int]
-    shape: tuple[int, ...]
-    warnings: tuple[str, ...]
-    defects: NDArray[np.bool_] | None = None
-    facts: dict[str, Any] = field(default_factory=dict)
-    black_level: float | None = None
-    sha256: str = ""
 
 
 @dataclass(frozen=True)
@@ -207,6 +171,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
         "device": find_device(options.device),
     }
     sequence = SequenceWriter(target.directory, recording.stem, kind, settings, target.overwrite)
+    _refuse_other_files(sequence, recording)
     for warning in first.warnings:
         yield Progress(sequence.first, count, warning)
     yield Progress(sequence.first, count)
@@ -221,90 +186,12 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     yield Progress(last, last, damaged=bool(report["damaged"]), written=written, report=shared_report(first, lines))
 
 
-def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFrame:
-    """Separate the first undamaged frame that shows light. Raises ValueError if there is none among those of one part.
-
-    Where all of them are black, it is the first one. With ``damaged`` "stop", a frame that is looked at and cannot be
-    read is an error here already: what is found without it would not be what is found once it is repaired.
-    """
-    reason, black_frame = "none at all", None
-    for _, frame in zip(range(PART), recording.begin(0), strict=False):
-        if isinstance(frame, DamagedFrame):
-            reason = frame.reason
-            if _ends_run(frame, options):
-                black_frame = None
-                break
-        elif any(isinstance(note, BlackFrame) for note in frame.notes):
-            black_frame = black_frame or frame  # which says nothing of levels, nor of the light
-        else:
-            return _separate_first(recording, options, frame)
-    if black_frame is None:
-        raise ValueError(f"expected a frame that can be read, found {reason}")
-    return _separate_first(recording, options, black_frame)
-
-
-def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Frame) -> FirstFrame:
-    refuse_forgotten(recording.stem, frame)
-    shape = tuple(frame.data.data.shape)
-    spread = islice(recording.begin(frame.index), 0, PART, LIGHT_STEP)
-    light_color, found = _light_of(_intact(spread, shape, options), options)
-    separated = separate_capture(frame.data, options.method, light_color, options.device)
-    gain = exposure_of(separated.diffuse + separated.specular)
-    light = tuple(float(c) for c in separated.report["light_color"])
-    size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
-    facts = separated.report["light"] if found is None else {"source": "found", **found.describe()}
-    remarks = () if found is None else found.remarks
-    notes = (*recording.notes, *frame.notes, *remarks, *separated.report["warnings"])
-    defects = _defects_of(_intact(islice(recording.begin(0), DEFECT_FRAMES), shape, options))
-    black = separated.report.get("black_level")
-    digest = hash_samples(frame.data.data)
-    return FirstFrame(separated.report["method"], light, gain, size, shape, notes, defects, facts, black, digest)
-
-
-def _ends_run(damaged: DamagedFrame, options: VideoOptions) -> bool:
-    """True for a frame at which the run will stop."""
-    return options.damaged == "stop" and (options.frames is None or damaged.index < options.frames)
-
-
-def _intact(frames: Iterator[Frame | DamagedFrame], shape: tuple[int, ...], options: VideoOptions) -> Iterator[Frame]:
-    """The frames of ``shape`` that are not damaged. Raises InputError at one that ends the run."""
-    for frame in frames:
-        checked = _of_one_size(frame, shape)
-        if isinstance(checked, Frame):
-            yield checked
-        elif _ends_run(checked, options):
-            raise InputError(checked.reason)
-
-
-def _of_one_size(frame: Frame | DamagedFrame, shape: tuple[int, ...]) -> Frame | DamagedFrame:
-    """A frame, which counts as damaged where its samples are not of the ``shape`` of the first one."""
-    if isinstance(frame, DamagedFrame) or tuple(frame.data.data.shape) == shape:
-        return frame
-    wanted, found = ("x".join(map(str, reversed(sides))) for sides in (shape, frame.data.data.shape))
-    reason = f"frame {frame.index}: expected {wanted} samples as in the first one, found {found}"
-    return DamagedFrame(frame.index, reason)
-
-
-def _light_of(frames: Iterator[Frame], options: VideoOptions) -> tuple[LightColor | str, Light | None]:
-    """Colour of the light as stated, or as ``frames`` of the first part show it; and the light found, for reports.
-
-    None where nothing is to be found: the colour is stated, or a calibration has it, or frames are mono.
-    """
-    if not is_to_be_found(options.light_color):
-        return options.light_color, None
-    captures = [frame.data for frame in frames]
-    if not captures or any(is_calibrated(capture) for capture in captures):
-        return options.light_color, None
-    found = combine([light_of(capture) for capture in captures])
-    if found.log_ratio is None:
-        return options.light_color, None
-    return found.color, found
-
-
-def _defects_of(frames: Iterator[Frame]) -> NDArray[np.bool_] | None:
-    """Mask of the defects that ``frames`` share; None where there are none."""
-    mask = find_lasting_defects(frame.data for frame in frames if isinstance(frame.data, Mosaic))
-    return mask if mask is not None and mask.any() else None
+def _refuse_other_files(sequence: SequenceWriter, recording: FrameSequence) -> None:
+    """Raise OutputError where a folder's files no longer have the numbers of those that an earlier run separated."""
+    for line, name in zip(sequence.lines(), recording.names, strict=False):
+        if line.get("file", name) != name:
+            found = f"found {name} in its place; --overwrite begins anew"
+            raise OutputError(f"expected frame {line['frame']} in {line['file']}, as the run was begun, {found}")
 
 
 def write_pictures(
@@ -337,13 +224,14 @@ def _pictures(
     with closing(ENGINES[options.engine](recording, options, first, sequence.first, state)) as frames:
         for frame in frames:
             if isinstance(frame.result, DamagedFrame):
-                picture = black_picture(first.size, preview, {"frame": frame.index, "damaged": frame.result.reason})
+                line = _line_of(recording, frame.index) | {"damaged": frame.result.reason}
+                picture = black_picture(first.size, preview, line)
             else:
                 images, report = frame.result.images, frame.result.report
                 if frame.state is not None:
                     images = steady_images(images, before, frame.state)
                 before = images
-                line = {"frame": frame.index, **report["statistics"]}
+                line = _line_of(recording, frame.index) | report["statistics"]
                 if report["warnings"]:
                     line["warnings"] = report["warnings"]
                 diffuse, specular = images
@@ -354,6 +242,11 @@ def _pictures(
             if frame.state is not None:
                 kept = frame.state.to_arrays() | (dict(zip(IMAGES, before, strict=True)) if before else {})
             yield picture, kept
+
+
+def _line_of(recording: FrameSequence, index: int) -> dict[str, Any]:
+    """The number of a frame for the log, and its file in a folder."""
+    return {"frame": index} | ({"file": recording.names[index]} if recording.names else {})
 
 
 def separate_here(
@@ -426,7 +319,7 @@ def _prepared(
     """Frames from number ``begin`` on, temporally filtered where asked, each with the state after it."""
     count = None if options.frames is None else max(options.frames - begin, 0)
     for frame in islice(recording.begin(begin), count):
-        frame = _of_one_size(frame, first.shape)
+        frame = of_one_camera(frame, first.camera)
         if first.black_level is not None and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
             frame = replace(frame, data=replace(frame.data, black_level=first.black_level))
         if first.defects is not None and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
@@ -435,14 +328,3 @@ def _prepared(
             data, state = filter_frame(frame.data, state)
             frame = replace(frame, data=data)
         yield frame, state
-
-
-def draw_panels(diffuse: Floats, specular: Floats, gain: float) -> NDArray[np.uint8]:
-    """Panels of input, diffuse and specular ``[h, w, C]`` as sRGB ``uint8 [h', 3 w', 3]``, at a ``gain``."""
-    return make_panels((diffuse, specular), gain, _TONES, PANEL)
-
-
-def black_picture(size: tuple[int, ...], preview: bool, line: dict[str, Any]) -> Picture:
-    """A black picture in place of a missing frame; ``line``: for the log."""
-    black = np.zeros(size, np.float32)
-    return Picture(black, black, draw_panels(black, black, 1.0) if preview else None, line)

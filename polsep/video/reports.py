@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from polsep.physics.stokes import aolp_of
 
 if TYPE_CHECKING:
-    from polsep.video.recordings import FirstFrame
+    from polsep.video.first_frame import FirstFrame
 
 
 def shared_report(first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, Any] | None:
@@ -22,7 +22,7 @@ def shared_report(first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, A
     good = [line for line in lines if "damaged" not in line]
     if not good:
         return None
-    names = [name for name in good[0] if name not in ("frame", "warnings")]
+    names = [name for name in good[0] if name not in ("frame", "file", "warnings")]
     statistics = {name: float(np.mean([line[name] for line in good if name in line])) for name in names}
     for name in ("specular_aolp_deg", "light_polarizer_deg"):
         turned = complex((np.exp(2j * np.radians([line[name] for line in good])) * _weights(good)).sum())

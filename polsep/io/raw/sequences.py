@@ -44,7 +44,8 @@ class DamagedFrame:
 class FrameSequence:
     """A recording: ``begin(first)`` yields its frames from number ``first`` on, about ``count`` in all.
 
-    ``stem`` names its outputs; ``notes`` are one-line remarks for the user; ``rate``: frames per second, if known.
+    ``stem`` names its outputs; ``notes`` are one-line remarks for the user; ``rate``: frames per second, if known;
+    ``names``: of the files of a folder, in the order of frames.
     """
 
     stem: str
@@ -52,6 +53,7 @@ class FrameSequence:
     begin: Callable[[int], Iterator[Frame | DamagedFrame]]
     notes: tuple[str, ...] = ()
     rate: float | None = None
+    names: tuple[str, ...] = ()
 
 
 def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
@@ -60,8 +62,10 @@ def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
     if path.is_dir():
         found = _frame_files(path)
         files = sorted(angles_together(found), key=natural_order)
-        stem, notes = path.resolve().name, _gap_notes(files) + _angle_notes(found, files)
-        return FrameSequence(stem, len(files), lambda first: _read_files(files, options, first), notes)
+        notes = _gap_notes(files) + _name_notes(files) + _angle_notes(found, files)
+        names = tuple(file.name for file in files)
+        begin = partial(_read_files, files, options)
+        return FrameSequence(path.resolve().name, len(files), begin, notes, names=names)
     unread: str | None = None
     for frame in _read_stack(path, options, 1, 0):
         if isinstance(frame, Frame):
@@ -107,6 +111,15 @@ def _gap_notes(files: list[Path]) -> tuple[str, ...]:
     some = ", ".join(f"{a + 1}" if b == a + 2 else f"{a + 1} to {b - 1}" for a, b in gaps[:8])
     more = ", ..." if len(gaps) > 8 else ""
     return (f"no files have the numbers {some}{more}: frames are counted from 0, without gaps",)
+
+
+def _name_notes(files: list[Path]) -> tuple[str, ...]:
+    """A note on names that differ in more than numbers, as those of two cameras do, where several files have each."""
+    names = Counter(_NUMBER.sub("#", path.stem) for path in files)
+    if len(names) == 1 or min(names.values()) == 1:
+        return ()
+    some = ", ".join(list(names)[:4]) + ", ..." * (len(names) > 4)
+    return (f"files have {len(names)} kinds of names ({some}): all of them are read as one recording",)
 
 
 def _angle_notes(found: list[Path], files: list[Path]) -> tuple[str, ...]:

@@ -65,6 +65,7 @@ def polsep(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -
 def run_here(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], *args: str | Path) -> Run:
     """Run `polsep ARGS` inside this process."""
     monkeypatch.setattr(sys, "argv", ["polsep", *map(str, args)])
+    monkeypatch.setattr("polsep.cli.progress.EVERY_S", 1e6)  # no lines on progress, however busy the machine is
     capfd.readouterr()
     status: Any = 0
     try:

@@ -115,7 +115,7 @@ def _camera_of(frame: Frame) -> dict[str, str]:
     """The properties that all frames of a recording share, in words."""
     size = "x".join(map(str, reversed(frame.data.data.shape)))
     layout = frame.data.layout.spec if isinstance(frame.data, Mosaic) else "of angle images"
-    return {"size": size, "layout": layout, "white level": f"{frame.white_level or math.nan:g}"}
+    return {"layout": layout, "size": size, "white level": f"{frame.white_level or math.nan:g}"}
 
 
 def of_one_camera(frame: Frame | DamagedFrame, camera: dict[str, str]) -> Frame | DamagedFrame:

@@ -36,6 +36,8 @@ _EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
 #: Bytes of films whose frames are counted as they are opened. First frames whose times are looked at, and the range of
 #: the times between them, relative to the median, from which on they are uneven.
 SMALL, FIRST, UNEVEN = 2**30, 64, 0.2
+#: Frames that a film is taken to have where it does not say how many.
+FEWEST = 2
 
 mute("libav")
 
@@ -91,15 +93,21 @@ def count_frames(path: Path, about: int, index: int) -> int:
     """The number of frames of a film, where it says ``about`` how many.
 
     They are counted if the file is small, or if ``index`` is that of its last ones, for which it is read to its end
-    anyway.
+    anyway. Of a large file that does not say its length, the number is estimated from the bytes of the first ones.
     """
     found = path.stat()
-    if found.st_size > SMALL and index + 1 < about:
-        return about
     try:
+        if found.st_size > SMALL and index + 1 < about:
+            return about if about > FEWEST else _estimate_frames(path)
         return max(_count_packets(path.absolute(), (found.st_mtime_ns, found.st_size)), index + 1)
     except ValueError:  # the frame that is damaged says so
         return about
+
+
+def _estimate_frames(path: Path) -> int:
+    with _opened(path) as (container, kind), decoding("video"):
+        sizes: list[int] = [packet.size for packet in islice(container.demux(kind.stream), FIRST) if packet.size]
+    return max(path.stat().st_size * len(sizes) // max(sum(sizes), 1), FEWEST)
 
 
 @lru_cache(maxsize=64)
@@ -226,5 +234,5 @@ def _grey_stream(container: Any, size: int) -> _Grey:
     # 10 and 12 bits have their own white level, 8 and 16 that of the dtype.
     white = None if bits in (8, 16) else float(2**bits - 1)
     duration = (container.duration or 0) / 1_000_000
-    count = max(int(stream.frames), round(duration * float(stream.average_rate or 0)), 2)  # approximate
+    count = max(int(stream.frames), round(duration * float(stream.average_rate or 0)), FEWEST)  # approximate
     return _Grey(stream, shape, np.uint8 if bits == 8 else np.uint16, white, min(count, max(size, 2)))

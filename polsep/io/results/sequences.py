@@ -100,6 +100,8 @@ class SequenceKind:
             raise OutputError(f"expected a format of {', '.join(FORMATS)}, found {self.format!r}")
         if self.compression not in COMPRESSIONS:
             raise OutputError(f"expected a compression of {', '.join(COMPRESSIONS)}, found {self.compression!r}")
+        if self.format != "exr" and self.compression != "none":
+            raise OutputError(f"expected the format exr for compression {self.compression}, found {self.format}")
         rate = RATE if self.rate is None else self.rate
         if not _LEAST_RATE <= rate <= _MOST_RATE:
             expected = f"a rate of {_LEAST_RATE} to {_MOST_RATE} frames per second"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames, refuse_forgotten
 from polsep.io.results.separation_writer import planned_outputs, write_separation
-from polsep.io.store.atomic import OutputError, refuse_existing, refuse_inputs
+from polsep.io.store.atomic import OutputError, is_disk_full, refuse_existing, refuse_inputs, require_writable
 from polsep.io.store.errors import one_line
 from polsep.methods import find_method, release_memory
 from polsep.pipeline import LightColor, Result, separate_capture
@@ -76,8 +76,9 @@ def separate_files(
 
     Raises OutputError before any work when two inputs have one name. A frame whose outputs would replace an input, or
     one of another frame, is refused, also with ``overwrite``. So is one whose white level was likely forgotten, unless
-    a frame before it used the range of that level. A failure ends its file.
+    a frame before it used the range of that level. A failure ends its file, and a full disk raises OutputError.
     """
+    require_writable(write.directory)
     _refuse_equal_names(paths)
     angles = ("0", "45", "90", "135")
     claimed = {realpath(path.replace("{angle}", angle)): "is an input" for path in paths for angle in angles}
@@ -108,6 +109,8 @@ def separate_files(
             if left is None:
                 raise ValueError(f"{path}: expected frames, found none")
         except (ValueError, OSError, MemoryError, RuntimeError) as error:
+            if is_disk_full(error):
+                raise
             more = f"; {left - 1} frames behind it are left out" if left and left > 1 else ""
             yield Outcome(path, error=(one_line(error) or type(error).__name__) + more)
 

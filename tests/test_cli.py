@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -31,6 +32,7 @@ from polsep.cli.progress import Progress
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.separation_writer import FORMATS, LAYERS
+from polsep.io.store.atomic import OutputError
 from polsep.methods import BEST, METHODS
 from polsep.networks.engines import ENGINES
 from polsep.physics.stokes import Stokes
@@ -121,6 +123,8 @@ def test_help_of_every_command(polsep: Cli) -> None:
             assert run.status == 0 and run.err == ""
             assert all(option in run.out for p in command.params for option in p.opts if option.startswith("--"))
         assert name in polsep("--help").out
+    lists = [polsep(*group, "--help").out.partition("Commands:")[2] for group in ([], ["calibrate"])]
+    assert all(lists) and "..." not in "".join(lists)  # no sentence is cut
     bare = polsep()
     assert bare.status == 2 and "Usage: " in bare.out
 
@@ -597,6 +601,8 @@ def test_rates_may_be_ratios() -> None:
         ("edit a.png --metallic 7", "--metallic"),
         ("edit a.png --rougher much", "--rougher"),
         ("edit a.png --damaged hide", "--damaged"),
+        ("edit a.png --rougher 1 --rate 24", "--rate"),
+        ("video in -o o --rate 24 --no-preview", "--rate"),
         ("calibrate analysers a.png --polarizer-extinction 1", "--polarizer-extinction"),
         ("merge a.png -o m.tiff --times soon", "--times"),
     ],
@@ -712,7 +718,7 @@ def test_bad_output_directories(tmp_path: Path, polsep: Cli, place: str) -> None
 @pytest.mark.parametrize(
     "words",
     [
-        "separate a.png -o out/deep",
+        "separate a.png b.png -o out/deep",
         "video frames -o out",
         "demo -o out",
         "samples -o out",
@@ -734,8 +740,8 @@ def test_folders_without_permission_are_refused_before_work(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
     (tmp_path / "frames").mkdir()
-    png(tmp_path / "a.png", frame())
-    png(tmp_path / "frames" / "a.png", frame())
+    for name in ("a.png", "b.png", "frames/a.png"):
+        png(tmp_path / name, frame())
     allowed = os.access
 
     def refuse_writing(path: Any, mode: int, **more: Any) -> bool:
@@ -771,6 +777,17 @@ def test_commands_without_their_files(tmp_path: Path, polsep: Cli, monkeypatch: 
     assert page.read_text(encoding="utf-8") == table and list(tmp_path.iterdir()) == [page]
     page.unlink()
     assert_refused(polsep("bench", "readme", "-o", str(tmp_path)), "expected the checkout of polsep")
+
+
+def test_full_disk_ends_the_run(tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other frames would only be separated in vain."""
+
+    def write_nothing(*given: Any) -> None:
+        raise OutputError("expected to write 'a', found none") from OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(batch, "write_separation", write_nothing)
+    sources = [png(tmp_path / f"{name}.png", frame()) for name in "ab"]
+    assert_refused(polsep("separate", *sources, "-o", tmp_path / "o"), "expected to write 'a'")
 
 
 def test_full_disk_leaves_nothing(tmp_path: Path) -> None:

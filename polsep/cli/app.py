@@ -146,7 +146,18 @@ ENGINE = click.option(
 )
 
 
-@click.group(context_settings=SETTINGS, no_args_is_help=True)
+class Group(click.Group):
+    """Commands, which the help lists by their whole first sentence."""
+
+    group_class = type
+
+    def add_command(self, cmd: click.Command, name: str | None = None) -> None:
+        """Add a command."""
+        cmd.short_help = (cmd.help or "").partition("\n\n")[0]
+        super().add_command(cmd, name)
+
+
+@click.group(cls=Group, context_settings=SETTINGS, no_args_is_help=True)
 @click.version_option(__version__, message="polsep %(version)s")
 def app() -> None:
     """One raw frame of a polarization camera in, a diffuse and a specular image out."""
@@ -165,7 +176,7 @@ def said_command(program: str) -> str:
         name, given = parameter.name or "", context.params.get(parameter.name or "")
         if isinstance(parameter, click.Argument):
             words.append(str(given))
-        elif context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE:
+        elif is_given(name):
             if getattr(parameter, "is_flag", False):
                 words.append(max(parameter.opts, key=len))
             elif not isinstance(parameter.type, click.Path):
@@ -230,16 +241,19 @@ def read_options(options: Mapping[str, Any]) -> ReadOptions:
     return with_corrections(read, options.get("calibration"), options.get("ambient", ()))
 
 
+def is_given(name: str) -> bool:
+    """True for an option of the command that runs, by its name in Python, that the user typed."""
+    return click.get_current_context().get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE
+
+
 #: Options that say something of raw frames alone.
 OF_FRAMES = ("white_level", "black_level", "layout", "calibration", "ambient", "size", "pixel_format", "method")
 
 
 def refuse_frame_options(other: str) -> None:
     """Raise ValueError on an option of raw frames that was given beside something else: it would change nothing."""
-    context = click.get_current_context()
-    for option in context.command.params:
-        given = context.get_parameter_source(option.name or "") == click.core.ParameterSource.COMMANDLINE
-        if given and option.name in OF_FRAMES:
+    for option in click.get_current_context().command.params:
+        if option.name in OF_FRAMES and is_given(option.name):
             raise ValueError(f"expected {option.opts[0]} with raw frames, found it with {other}")
 
 

@@ -10,7 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from polsep.cli.app import COMPRESSION, DAMAGED, DIR, FILE, FINITE, OVERWRITE, RATE, app, print_note, require_paths
+from polsep.cli.app import (
+    COMPRESSION,
+    DAMAGED,
+    DIR,
+    FILE,
+    FINITE,
+    OVERWRITE,
+    RATE,
+    app,
+    is_given,
+    print_note,
+    require_paths,
+)
 from polsep.cli.progress import report_step, show_progress
 from polsep.cli.video import with_preview
 from polsep.io.store.errors import MOST, one_line
@@ -91,6 +103,7 @@ def edit(inputs: tuple[Path, ...], **options: Any) -> None:
         return
     if not inputs:
         raise ValueError("expected a separated frame or a folder of them, found nothing to edit")
+    _refuse_film_options(inputs)
     if len(inputs) == 1:  # of several the others are edited all the same
         require_paths(*inputs)
     from polsep.compute.workers import keep_memory
@@ -117,6 +130,13 @@ def edit(inputs: tuple[Path, ...], **options: Any) -> None:
     failures = _edit_all(inputs, work, target)
     if failures:
         sys.exit(2)
+
+
+def _refuse_film_options(inputs: tuple[Path, ...]) -> None:
+    """Raise ValueError on an option of sequences that was given where there is none: it would change nothing."""
+    given = [name for name in ("compression", "rate", "damaged") if is_given(name)]
+    if given and not any(path.is_dir() for path in inputs):
+        raise ValueError(f"expected a folder of frames for --{given[0]}, found single files")
 
 
 def _refuse_result(saved: Path, planned: list[Path]) -> None:

@@ -27,6 +27,7 @@ from polsep.cli.app import (
     app,
     check_read_options,
     correcting_files,
+    is_given,
     print_note,
     read_light,
     read_options,
@@ -101,7 +102,7 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     --layout mono    the same without colours
     --layout SPEC    2x2 angles in reading order and the Bayer order, like 90,45,135,0/RGGB or 0,45,90,135/mono
     """
-    if click.get_current_context().get_parameter_source("layout") != click.core.ParameterSource.COMMANDLINE:
+    if not is_given("layout"):
         options["layout"] = None  # files that say their own layout are read by it
     photographs = find_photographs(files, options)
     if len(files) == 1 and not photographs:  # of several the others are separated all the same

@@ -107,6 +107,8 @@ def video(recording: Path, output: Path, **options: Any) -> None:
     require_paths(recording)
     from polsep.io.raw.extensions import LOSSLESS
 
+    if options["rate"] is not None and options["format"] == "exr" and options["preview"] is False:
+        raise ValueError("expected a film for --rate, found EXR files and --no-preview")
     if options["engine"] == "ray":
         require_extra("ray")
     if options["format"] in ("ffv1", "ffvhuff") or recording.suffix.lower() in LOSSLESS:

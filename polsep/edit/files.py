@@ -25,7 +25,7 @@ from polsep.io.results.previews import exposure_of, toned
 from polsep.io.results.separation_reader import NumberedFiles, find_numbered, read_separated
 from polsep.io.results.separation_writer import planned_outputs
 from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter, is_unfinished, read_rate
-from polsep.io.store.atomic import OutputError, refuse_existing
+from polsep.io.store.atomic import OutputError, is_disk_full, refuse_existing, require_writable
 from polsep.io.store.errors import InputError, input_error, one_line
 from polsep.video.panels import black_picture, draw_panels
 from polsep.video.recordings import ON_DAMAGE, Progress, write_pictures
@@ -115,7 +115,12 @@ def _planned_edit(path: Path, target: EditTarget) -> list[Path]:
 
 
 def edit_files(paths: Sequence[Path], work: Work, target: EditTarget) -> Iterator[Edited]:
-    """Edit single frames; a bad file gives an outcome with an error, and the rest are edited."""
+    """Edit single frames; a bad file gives an outcome with an error, and the rest are edited.
+
+    Raises OutputError before any work if nothing may be written; and on a full disk.
+    """
+    if paths:
+        require_writable(target.directory)
     inputs = {realpath(path) for path in paths}
     for path in paths:
         try:
@@ -126,6 +131,8 @@ def edit_files(paths: Sequence[Path], work: Work, target: EditTarget) -> Iterato
             frame = _edited_frame(path, work)
             yield Edited(path, tuple(write_edited(frame, target.directory, path.stem, target.overwrite)))
         except (ValueError, OSError, MemoryError) as error:
+            if is_disk_full(error):
+                raise
             yield Edited(path, error=one_line(error) or type(error).__name__)
 
 

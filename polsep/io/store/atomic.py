@@ -97,6 +97,12 @@ def release_cache(file: int | Path) -> None:
             os.posix_fadvise(file, 0, 0, os.POSIX_FADV_DONTNEED)
 
 
+def is_disk_full(error: BaseException) -> bool:
+    """True for an error by which nothing more can be written, such as an `OutputError` of `write_set`."""
+    cause = error if isinstance(error, OSError) else error.__cause__
+    return isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
 def hold_lock(owner: object, path: Path) -> Callable[[], object]:
     """Hold a file, made if missing, until the function returned is called or ``owner`` or its process is gone.
 

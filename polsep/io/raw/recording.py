@@ -240,14 +240,17 @@ def read_recording(path: Path, first: int = 0) -> Iterator[Page]:
 
 
 def gap_notes(path: Path) -> tuple[str, ...]:
-    """A note on what is missing between the frames of a ``recording.json``, if anything is. Raises ValueError."""
+    """Notes on what is missing of a ``recording.json``: its end, and frames between others. Raises ValueError."""
     _require_parts(path)
     lines = sorted(_read_index(path.with_name(INDEX)).items())
     away_s = sum(line.get("away_s", 0) for _, line in lines)
     gaps = {after: count for before, (after, line) in pairwise(lines) if (count := _missing(before[1], line))}
     found = [f"{sum(gaps.values())} frames are missing, first before frame {min(gaps)}"] if gaps else []
     found += [f"the camera was away for {away_s:g} s"] if away_s > 0 else []
-    return (f"{' and '.join(found)}: frames are counted from 0, without gaps",) if found else ()
+    notes: tuple[str, ...] = (f"{' and '.join(found)}: frames are counted from 0, without gaps",) if found else ()
+    if parse_json(read_text(path)).get("finished") is False:
+        notes += ("the recording is under way, or was stopped before its end: the frames that are there are read",)
+    return notes
 
 
 def recorded_rate(path: Path) -> float | None:

@@ -1106,6 +1106,14 @@ def test_what_is_no_recording_is_said_in_a_line(
     assert not (tmp_path / "o").exists()
 
 
+def test_damage_is_said_in_words_alone(tmp_path: Path) -> None:
+    """Neither by FFmpeg's numbers, nor with the name of the file twice."""
+    (tmp_path / "run.mkv").touch()
+    with pytest.raises(InputError, match="found damage: Invalid data found") as error:
+        open_sequence(tmp_path / "run.mkv", ReadOptions())
+    assert str(error.value).count("run.mkv") == 1
+
+
 def test_a_stream_that_is_cut_short_says_what_there_is(tmp_path: Path) -> None:
     """Not read to its last whole frame: a wrong size has a rest, too."""
     (tmp_path / "run.raw").write_bytes(bytes(2 * 64 + 7))

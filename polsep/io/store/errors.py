@@ -98,5 +98,5 @@ def decoding(kind: str) -> Iterator[None]:
     except InputError:  # has its message already
         raise
     except Exception as error:
-        found = one_line(error) or type(error).__name__
+        found = one_line(getattr(error, "strerror", None) or error) or type(error).__name__
         raise ValueError(f"expected an intact {kind} file, found damage: {found}") from error

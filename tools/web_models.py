@@ -20,6 +20,7 @@ from polsep.io.store.atomic import atomic_path
 from polsep.networks.channels import PERIOD
 from polsep.networks.joint import Joint, limit
 from polsep.networks.taps import pool_outputs
+from polsep.networks.thumbnails import SIDE, thumbnail_channels
 from polsep.sensor.camera import Layout
 from polsep.separation.clipped_pattern import shares_of, smooth_planes, taps_of, weigh_clipped
 from polsep.shipped import shipped_joint
@@ -33,6 +34,8 @@ OPERATORS, SIDES = 17, (64, 96)
 
 class PageNetwork(nn.Module):
     """``frame [1, 2, H, W]``, linear samples and 1 where they clip, in Sony's order, to images, channels first.
+
+    ``thumbnail``: of the whole frame, for a network that sees it (`whole_frame.make_thumbnail`).
 
     ``diffuse``, ``s1``, ``s2 [1, C, H/2, W/2]``, ``specular [1, 1, H/2, W/2]``, ``error [1, 2, H/2, W/2]``,
     ``residual [1, 1, H/4, W/4]``; H and W are multiples of 4.
@@ -52,9 +55,9 @@ class PageNetwork(nn.Module):
 
         self.network.demosaicked = demosaicked  # type: ignore[method-assign]
 
-    def forward(self, frame: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, frame: Tensor, thumbnail: Tensor | None = None) -> tuple[Tensor, ...]:
         """See the class."""
-        images = self.network.half_resolution(frame[:, :1], frame[:, 1:] > 0.5)
+        images = self.network.half_resolution(frame[:, :1], frame[:, 1:] > 0.5, thumbnail)
         diffuse, specular, error = limit(images)
         weight = weigh_clipped(frame[:, 1:], taps_of(PERIOD), shares_of(self.network.colors))
         diffuse, specular = (smooth_planes(image, weight, taps_of(PERIOD // 2)) for image in (diffuse, specular))
@@ -66,15 +69,17 @@ def write_models(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, layout in FILES.items():
         network = Joint.of(shipped_joint("joint-fast", layout)[0], torch.device("cpu"))
-        graph, frame = PageNetwork(network).eval(), torch.zeros(1, 2, *SIDES)
+        graph, inputs = PageNetwork(network).eval(), [torch.zeros(1, 2, *SIDES)]
+        if network.whole_frame is not None:
+            inputs.append(torch.zeros(1, thumbnail_channels(network.colors), SIDE, SIDE))
         with atomic_path(folder / name) as part, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that the exporter is the older one, and remarks about its own parts
             torch.onnx.export(
                 graph,
-                (frame,),
+                tuple(inputs),
                 str(part),
                 dynamo=False,
-                input_names=["frame"],
+                input_names=["frame", "thumbnail"][: len(inputs)],
                 output_names=list(OUTPUTS),
                 dynamic_axes={"frame": {2: "H", 3: "W"}},
                 opset_version=OPERATORS,

@@ -6,6 +6,7 @@
 import { linearSamples } from "./analytic.js";
 import { channelsOf, orient, spansOf, turnedPlaces } from "./layout.js";
 import { clipLevel } from "./levels.js";
+import { thumbnailOf } from "./thumbnail.js";
 
 /** Raw rows around a strip that its images depend on. Raw samples of all strips that run at once, and of one. */
 const MARGIN = 112, AT_ONCE = 5.2e6, SAMPLES = 1.9e6;
@@ -30,7 +31,7 @@ class Planes {
 
 /**
  * Images as `separateAnalytic` gives them, with `error` and `sums`, of a mosaic in a light.
- * `network`: {run(samples, rows, width), count of strips at once}; `progress(share)` is told after every strip.
+ * `network`: {run(samples, rows, width, thumbnail), count of strips at once}; `progress(share)` is told after every strip.
  */
 export async function separateJoint(mosaic, light, network, progress) {
   const way = orient(mosaic.height, mosaic.width, mosaic.layout), { rows, cols } = turnedPlaces(way);
@@ -38,7 +39,8 @@ export async function separateJoint(mosaic, light, network, progress) {
   const samples = linearSamples(mosaic, light);
   const planes = new Planes({ diffuse: colors, specular: 1, error: 2, s1: colors, s2: colors }, H / 2, W / 2);
   const residual = new Float32Array((H * W) / 16);
-  const strips = cutRows(H, W, network.count);
+  const strips = cutRows(H, W, network.count), clips = (place) => (mosaic.data[place] >= full ? 1 : 0);
+  const thumbnail = thumbnailOf(mosaic.layout, { rows, cols }, samples, clips);
   let next = 0, done = 0;
 
   async function takeStrip([first, last]) {
@@ -48,9 +50,9 @@ export async function separateJoint(mosaic, light, network, progress) {
       for (let c = 0; c < W; c++, at++) {
         const place = rows[r] + cols[c];
         frame[at] = samples[place];
-        frame[size + at] = mosaic.data[place] >= full ? 1 : 0;
+        frame[size + at] = clips(place);
       }
-    const images = await network.run(frame, bottom - top, W);
+    const images = await network.run(frame, bottom - top, W, thumbnail);
     for (const name of ["diffuse", "specular", "error", "s1", "s2"])
       planes[name].forEach((plane, c) => {
         const begin = (c * size) / 4 + ((first - top) / 2) * (W / 2);

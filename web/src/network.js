@@ -1,6 +1,7 @@
 // A worker that runs the network on one strip after the other: ONNX Runtime Web, by WebAssembly (SIMD) or WebGPU.
 //
-// Messages in: {id, kind: "cpu" or "gpu", colors, samples, rows, width}; out: {id, images} or {id, failed}.
+// Messages in: {id, kind: "cpu" or "gpu", colors, samples, rows, width, thumbnail}; out: {id, images} or {id, failed}.
+// Without a thumbnail a dark frame's is taken; networks that see none do not ask for it.
 
 const KINDS = {
   cpu: { module: "ort.wasm.bundle.min.mjs", binary: "ort-cpu.bin", provider: "wasm" },
@@ -28,14 +29,17 @@ async function start(kind, colors) {
     { executionProviders: [KINDS[kind].provider], graphOptimizationLevel: "all", enableMemPattern: false });
 }
 
-async function run({ kind, colors, samples, rows, width }) {
+async function run({ kind, colors, samples, rows, width, thumbnail }) {
   if (!sessions.has(colors))
     sessions.set(colors, start(kind, colors).catch((error) => {
       sessions.delete(colors);
       throw error;
     }));
   const session = await sessions.get(colors), { Tensor } = await runtime, images = {};
-  const found = await session.run({ frame: new Tensor("float32", samples, [1, 2, rows, width]) });
+  const inputs = { frame: new Tensor("float32", samples, [1, 2, rows, width]) }, shape = [1, 5 * colors + 2, 64, 64];
+  if (session.inputNames.includes("thumbnail"))
+    inputs.thumbnail = new Tensor("float32", thumbnail ?? new Float32Array(shape.reduce((a, b) => a * b)), shape);
+  const found = await session.run(inputs);
   for (const [name, tensor] of Object.entries(found)) {
     images[name] = (await tensor.getData()).slice();
     tensor.dispose();

@@ -20,9 +20,9 @@ class Pool {
   }
 
   /** The network's images of a strip. */
-  run(colors, samples, rows, width) {
+  run(colors, samples, rows, width, thumbnail) {
     return new Promise((resolve, reject) => {
-      this.waiting.push({ resolve, reject, message: { id: this.next++, kind: this.kind, colors, samples, rows, width } });
+      this.waiting.push({ resolve, reject, message: { id: this.next++, kind: this.kind, colors, samples, rows, width, thumbnail } });
       this.give();
     });
   }
@@ -61,7 +61,7 @@ function poolOf(kind, count) {
 /** Workers that are asked for, else one for each core. */
 export const countOf = ({ threads }) => Math.min(threads || navigator.hardwareConcurrency || 1, MOST);
 
-/** {run(samples, rows, width), count, name} of the network for so many colours. `settings`: {threads, device}. */
+/** {run(samples, rows, width, thumbnail), count, name} of the network for so many colours. `settings`: {threads, device}. */
 export async function networkOf(colors, settings) {
   const count = countOf(settings), cpu = poolOf("cpu", count);
   const made = (pool, name) => ({ run: (...strip) => pool.run(colors, ...strip), count: pool.count, name });

@@ -29,7 +29,7 @@ RECIPES = {
     "paper": ("--width", "16", "--rate", "1e-3"),
     "stokes": ("--width", "16", "--rate", "1e-3"),
     "no-angle": ("--width", "16", "--rate", "1e-3"),
-    "joint-fast": ("--rate", "2e-3"),
+    "joint-fast": ("--width", "16", "--entry", "16", "--rate", "2e-3"),
 }
 SEEDS = (1, 2, 3)
 STEPS = 1000

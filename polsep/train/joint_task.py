@@ -27,12 +27,12 @@ from polsep.train.tasks import Task
 SIZES = {
     "joint-large": ResidualSize(64, (3, 3, 2)),
     "joint": ResidualSize(48, (0, 1, 1)),
-    "joint-fast": ResidualSize(16, (0, 1, 1), 16),
+    "joint-fast": ResidualSize(32, (0, 1, 1), 32),
 }
 #: Source of their Stokes images for colour frames; mono frames use a linear filter.
 DEMOSAICKERS: dict[str, Demosaicker] = {"joint-large": "guided", "joint": "guided", "joint-fast": "linear"}
 #: Networks that see a thumbnail of the whole frame, by name and variant.
-SEES_FRAME = {("joint-large", "mosaic"), ("joint", "mosaic")}
+SEES_FRAME = {("joint-large", "mosaic"), ("joint", "mosaic"), ("joint-fast", "mosaic")}
 #: Cells by which the guided demosaicker extends crops.
 MARGIN = 8
 #: Batches for the fit of the filter, size of their scene pool, and their lane, which no worker uses.

@@ -213,7 +213,7 @@ def _as_contiguous(image: NDArray[Any]) -> NDArray[Any]:
     """NumPy's function of that name by all threads, in memory that is used again."""
     if image.flags.c_contiguous:
         return image
-    copy = pages.empty(image.shape, image.dtype)
+    copy: NDArray[Any] = pages.empty(image.shape, image.dtype.type)
     run_over_rows(lambda rows: np.copyto(copy[slice(*rows)], image[slice(*rows)]), len(image), ROWS)
     return copy
 

@@ -146,7 +146,7 @@ def test_layers_are_of_the_precision_that_is_asked_for(monkeypatch: pytest.Monke
         npt.assert_array_equal(image, found.setdefault(asked, image))
     assert not np.array_equal(found["f32"], found["i8"])
     monkeypatch.setenv("POLSEP_LAYERS", "f16")
-    with pytest.raises(ValueError, match="expected POLSEP_LAYERS as bf16, f32, i8, found 'f16'"):
+    with pytest.raises(ValueError, match="expected POLSEP_LAYERS as bf16, f32, i8, i8-bf16, found 'f16'"):
         polsep.separate(raw, "joint-fast", white_level=white)
 
 

@@ -54,6 +54,7 @@ from polsep.train.joint_task import (
     FIT_LANE,
     FIT_REACH,
     JOINT_VARIANTS,
+    SEES_FRAME,
     SIZES,
     fit_filter,
     joint_task,
@@ -488,7 +489,10 @@ def test_training_ends_in_weights_that_say_all(variant: str, tmp_path: Path, sho
     assert [halves[f"{image} PSNR"] for image in ("diffuse", "specular")] == pytest.approx(last, abs=0.1)
     assert set(json.loads(metadata["reference"])) == {"analytic", "color-affine"}
     assert metadata["command"].startswith("polsep train joint-fast ")
-    network = Joint(colors, ResidualSize(**json.loads(metadata["size"])), tuple(json.loads(metadata["inputs"])))
+    size, inputs = ResidualSize(**json.loads(metadata["size"])), tuple(json.loads(metadata["inputs"]))
+    sees_frame = json.loads(metadata["sees_frame"])
+    assert sees_frame == (("joint-fast", variant) in SEES_FRAME)
+    network = Joint(colors, size, inputs, sees_frame=sees_frame)
     network.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
     assert metadata["parameters"] == str(count_parameters(network))
     examples = itertools.islice(stream_lane(STREAM, FIT_LANE, 0), 4)

@@ -59,10 +59,11 @@ def test_several_frames_have_the_widest_range() -> None:
 
 @pytest.mark.parametrize("layout", [COLOR, MONO], ids=["color", "mono"])
 @pytest.mark.parametrize("full", [False, True])
-def test_rounding_to_bytes_changes_corrections_little(layout: Layout, full: bool) -> None:
+@pytest.mark.parametrize("precision", ["i8", "i8-bf16"])
+def test_rounding_to_bytes_changes_corrections_little(layout: Layout, full: bool, precision: str) -> None:
     plain = random_net(layout).weights()
     network = replace(plain, ranges=measure_ranges(plain, [frame(layout)]))
-    assert 0 < rms(plain, network, ("f32", "i8"), layout, full) < ROUNDED
+    assert 0 < rms(plain, network, ("f32", precision), layout, full) < ROUNDED
 
 
 @pytest.mark.parametrize("harm", [lambda low, high: (low / 20, high / 20), lambda low, high: (50 * low, 50 * high)])
@@ -100,17 +101,18 @@ def test_shipped_networks_have_ranges(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("hint", "flags", "precision"),
+    ("hint", "flags", "amd", "precision"),
     [
-        ("bf16", {"amx_bf16", "avx512_vnni"}, "bf16"),
-        ("bf16", {"avx512_bf16", "avx512_vnni"}, "i8"),
-        ("f32", {"avx_vnni"}, "i8"),
-        ("f32", {"avx2"}, "f32"),
-        ("f16", set(), "f16"),
+        ("bf16", {"amx_bf16", "avx512_vnni"}, False, "bf16"),
+        ("bf16", {"avx512_bf16", "avx512_vnni"}, False, "i8"),
+        ("bf16", {"avx512_bf16", "avx512_vnni"}, True, "i8-bf16"),
+        ("f32", {"avx_vnni"}, True, "i8"),
+        ("f32", {"avx2"}, True, "f32"),
+        ("f16", set(), False, "f16"),
     ],
 )
 def test_precision_that_suits_the_processor(
-    hint: str, flags: set[str], precision: str, monkeypatch: pytest.MonkeyPatch
+    hint: str, flags: set[str], amd: bool, precision: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Core:
         def get_property(self, *_: str) -> Core:
@@ -121,4 +123,5 @@ def test_precision_that_suits_the_processor(
 
     monkeypatch.setattr("polsep.networks.openvino_engine.core", Core)
     monkeypatch.setattr("polsep.networks.openvino_engine.cpu_flags", lambda: frozenset(flags))
+    monkeypatch.setattr("polsep.networks.openvino_engine.is_amd", lambda: amd)
     assert usual_precision() == precision

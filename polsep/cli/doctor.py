@@ -11,7 +11,12 @@ import click
 from polsep.cli.app import EXTRAS, app, print_note
 
 #: Words for the precision of layers.
-_PRECISIONS = {"bf16": "bfloat16 (AMX)", "i8": "8-bit integers (VNNI)", "f32": "float32"}
+_PRECISIONS = {
+    "bf16": "bfloat16 (AMX)",
+    "i8": "8-bit integers (VNNI)",
+    "i8-bf16": "8-bit integers (VNNI) and bfloat16",
+    "f32": "float32",
+}
 
 
 @app.command()

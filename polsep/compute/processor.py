@@ -16,8 +16,19 @@ def cpu_flags() -> frozenset[str]:
 
     Known on Linux for x86 only.
     """
+    return frozenset(_said("flags").split())
+
+
+@lru_cache(maxsize=1)
+def is_amd() -> bool:
+    """True for a processor of AMD; known on Linux for x86 only."""
+    return _said("vendor_id") == "AuthenticAMD"
+
+
+def _said(name: str) -> str:
+    """What Linux says of the first processor; nothing where it says nothing."""
     if sys.platform != "linux" or not Path("/proc/cpuinfo").exists():
-        return frozenset()
+        return ""
     with Path("/proc/cpuinfo").open(encoding="ascii", errors="replace") as lines:
-        found = next((line for line in lines if line.startswith("flags")), "")
-    return frozenset(found.partition(":")[2].split())
+        found = next((line for line in lines if line.startswith(name)), "")
+    return found.partition(":")[2].strip()

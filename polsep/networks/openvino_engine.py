@@ -1,7 +1,8 @@
 """The joint network on CPUs for frames of one size: kernels make its inputs, OpenVINO runs its layers, kernels images.
 
 The same as `run.run_joint`, in less time. Layers run in what is fastest on the processor: bfloat16 where it has matrix
-tiles for it, else most of them in 8-bit integers where it multiplies those, else in float32. The closed form and the
+tiles for it, else most of them in 8-bit integers where it multiplies those, and others in bfloat16 where its vector
+units are faster with it; else in float32. The closed form and the
 images are float32 always.
 """
 
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.processor import cpu_flags
+from polsep.compute.processor import cpu_flags, is_amd
 from polsep.compute.threads import RowRange, get_threads, run_over_rows
 from polsep.demosaic.bilinear_kernel import Pattern, read_pattern
 from polsep.demosaic.cells_kernel import Source, read_grid
@@ -34,8 +35,8 @@ from polsep.separation.images import FrameImages, Tally
 
 Floats = NDArray[np.float32]
 
-#: Precisions of layers.
-PRECISIONS = ("bf16", "f32", "i8")
+#: Precisions of layers, and those of layers that are not in 8 bits.
+PRECISIONS = {"bf16": "bf16", "f32": "f32", "i8": "f32", "i8-bf16": "bf16"}
 #: Packed rows that a thread processes at a time.
 _ROWS = 16
 #: Packed columns up to which layers run in float32: OpenVINO 2026.4's bfloat16 and 8-bit layers of matrix tiles (AMX)
@@ -58,8 +59,9 @@ class RawRows(NamedTuple):
 class OpenVinoEngine:
     """A network for frames of one shape in its own order of filters, H and W multiples of 4.
 
-    ``full``: images at full instead of half resolution. ``precision`` of layers: "bf16", "f32", "i8" (that of
-    `JointWeights.ranges`, others in float32), or None for what suits the processor; narrow frames have float32. State:
+    ``full``: images at full instead of half resolution. ``precision`` of layers: "bf16", "f32", "i8" (those of
+    `JointWeights.ranges`, others in float32), "i8-bf16" (others in bfloat16), or None for what suits the processor;
+    narrow frames have float32. State:
     compiled layers and buffers between raw samples and images, for one frame at a time. ``inputs [h, w, n]``:
     what `prepare` fills.
     """
@@ -72,7 +74,8 @@ class OpenVinoEngine:
         h, w = shape[0] // PERIOD, shape[1] // PERIOD
         channels = input_channels(network.colors, network.inputs)
         precision = "f32" if w <= _NARROW else precision or asked_precision() or usual_precision()
-        halves = precision == "bf16"
+        others = PRECISIONS.get(precision, precision)
+        halves = others == "bf16"
         inputs = ChannelsLast.empty((h, w, channels.total), halves)
         closed = ClosedFormRows.empty(network.colors, h, w)
         beyond = np.empty((2 * h, 3 * network.colors, 2 * w) if full else (0, 0, 0), np.float32)
@@ -89,8 +92,8 @@ class OpenVinoEngine:
         self._network, self._modulation = network, np.zeros((1, 1, 2 * sum(network.size.widths)), np.float32)
         if network.sees_frame:
             self.inputs = [*self.inputs, self._modulation]
-        model = joint_model(network, (h, w), full, quantized=precision == "i8")
-        self._request = _compile(model, self.inputs, outputs, "f32" if precision == "i8" else precision)
+        model = joint_model(network, (h, w), full, quantized=precision.startswith("i8"))
+        self._request = _compile(model, self.inputs, outputs, others)
 
     def run(
         self, raw: RawFrame, levels: tuple[float, float], light: tuple[float, ...], modulation: Floats | None = None
@@ -199,13 +202,16 @@ def asked_precision() -> str | None:
 def usual_precision() -> str:
     """The fastest precision on this processor: "bf16" where OpenVINO takes it and matrix tiles (AMX) multiply it.
 
-    Vector units that know bfloat16 alone (AVX512-BF16) take 1.6 times as long with it as with float32, and those that
-    multiply 8-bit integers (VNNI) a third as long with these (docs/experiments.md).
+    Vector units that know bfloat16 (AVX512-BF16) take 1.6 times as long with it as with float32 on processors of Intel,
+    half as long on those of AMD; those that multiply 8-bit integers (VNNI) a third to a quarter as long with these
+    (docs/experiments.md).
     """
     name: str = core().get_property("CPU", "INFERENCE_PRECISION_HINT").get_type_name()
-    if name == "bf16" and "amx_bf16" not in cpu_flags():
+    if name == "bf16" and "amx_bf16" not in cpu_flags() and not is_amd():
         name = "f32"
-    return "i8" if name == "f32" and cpu_flags() & {"avx512_vnni", "avx_vnni"} else name
+    if "amx_bf16" in cpu_flags() or not cpu_flags() & {"avx512_vnni", "avx_vnni"}:
+        return name
+    return {"f32": "i8", "bf16": "i8-bf16"}.get(name, name)
 
 
 def as_images(targets: Targets) -> FrameImages:

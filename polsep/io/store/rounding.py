@@ -44,7 +44,14 @@ def steps_of(array: NDArray[Any], method: str) -> int:
 
 
 def coarsened(array: NDArray[Any], count: int) -> NDArray[Any]:
-    """The array with ``count`` values on each side of 0 for each output, its first axis, up to the largest one."""
+    """The array with ``count`` values on each side of 0 for each output, its first axis, up to the largest one.
+
+    Outputs that have no more values already stay: `train.rounding` may leave the largest one out, and steps up to the
+    next one would be others.
+    """
     step = np.maximum(np.abs(array).max(axis=tuple(range(1, array.ndim)), keepdims=True), 1e-12) / count
     found: NDArray[Any] = (np.round(array / step) * step).astype(np.float32)
+    for output, before in zip(found, array, strict=True):
+        if len(np.unique(np.abs(before))) <= count + 1:
+            output[...] = before
     return found

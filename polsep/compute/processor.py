@@ -26,7 +26,7 @@ def is_amd() -> bool:
 
 
 def _said(name: str) -> str:
-    """What Linux says of the first processor; nothing where it says nothing."""
+    """The value under a name in what Linux says of the first processor; empty where there is none."""
     if sys.platform != "linux" or not Path("/proc/cpuinfo").exists():
         return ""
     with Path("/proc/cpuinfo").open(encoding="ascii", errors="replace") as lines:

@@ -418,7 +418,7 @@ def test_sizes_and_ablations_are_told_apart() -> None:
     assert set(SIZES) == {"joint-large", "joint", "joint-fast"}
     assert {name for name, ablation in ABLATIONS.items() if ablation == ABLATIONS["none"]} == {"none"}
     parameters = {name: count_parameters(Joint(3, size)) for name, size in SIZES.items()}
-    assert parameters["joint-large"] > 3 * parameters["joint"] > 4 * parameters["joint-fast"]
+    assert parameters["joint-large"] > 3 * parameters["joint"] > 6 * parameters["joint-fast"]
 
 
 @pytest.mark.parametrize("variant", JOINT_VARIANTS)

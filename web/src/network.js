@@ -3,6 +3,8 @@
 // Messages in: {id, kind: "cpu" or "gpu", colors, samples, rows, width, thumbnail}; out: {id, images} or {id, failed}.
 // Without a thumbnail a dark frame's is taken; networks that see none do not ask for it.
 
+import { SIDE } from "./thumbnail.js";
+
 const KINDS = {
   cpu: { module: "ort.wasm.bundle.min.mjs", binary: "ort-cpu.bin", provider: "wasm" },
   gpu: { module: "ort.webgpu.bundle.min.mjs", binary: "ort-gpu.bin", provider: "webgpu" },
@@ -36,7 +38,7 @@ async function run({ kind, colors, samples, rows, width, thumbnail }) {
       throw error;
     }));
   const session = await sessions.get(colors), { Tensor } = await runtime, images = {};
-  const inputs = { frame: new Tensor("float32", samples, [1, 2, rows, width]) }, shape = [1, 5 * colors + 2, 64, 64];
+  const inputs = { frame: new Tensor("float32", samples, [1, 2, rows, width]) }, shape = [1, 5 * colors + 2, SIDE, SIDE];
   if (session.inputNames.includes("thumbnail"))
     inputs.thumbnail = new Tensor("float32", thumbnail ?? new Float32Array(shape.reduce((a, b) => a * b)), shape);
   const found = await session.run(inputs);

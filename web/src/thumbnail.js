@@ -4,7 +4,8 @@
 import { channelsOf, SONY, SONY_MONO, tableOf } from "./layout.js";
 
 /** Cells of a thumbnail along each side; brightness that is added before it is divided by. */
-const SIDE = 64, MIN_BRIGHTNESS = 0.01;
+export const SIDE = 64;
+const MIN_BRIGHTNESS = 0.01;
 /** Stokes component that an analyser counts to, and its sign, by its angle in degrees. */
 const PARTS = { 0: [1, 1], 90: [1, -1], 45: [2, 1], 135: [2, -1] };
 

@@ -83,7 +83,7 @@ for layout in ("color", "mono"):
         measurements = demosaic(mosaic)
         assert type(measurements.data) is np.ndarray and measurements.data.dtype == np.float32
         fit_stokes(measurements), fit_stokes_unclipped(measurements), find_light(measurements)
-    dark = measure_dark([as_mosaic(codes // 8, layout, 64, 1023)[0]] * 2)
+    dark = measure_dark(as_mosaic(codes[::turn] // 8, layout, 64, 1023)[0] for turn in (1, -1))
     correct_mosaic(mosaic, dark), subtract_ambient(mosaic, mean_mosaic([mosaic, mosaic]))
     merge_exposures([mosaic], [1.0])
 find_light(as_measurements(np.stack([codes] * 4), 64, 1023)[0])

@@ -456,7 +456,7 @@ def test_gains_and_levels_of_a_mosaic() -> None:
     for gains in ((1.0, 1.0), (0.0, 1.0, 1.0), (1.0, np.nan, 1.0)):
         with pytest.raises(ValueError, match="expected a light_color of three positive numbers"):
             Mosaic(SOME, Layout(), 0, 1, light_color=gains)
-    with pytest.raises(ValueError, match="white_level must be above black_level, found inf and 0"):
+    with pytest.raises(ValueError, match="expected a white level above the black level, found inf and 0"):
         Mosaic(SOME, Layout(), 0, np.inf)
 
 

@@ -7,7 +7,7 @@ import math
 import os
 import warnings
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -289,6 +289,16 @@ def test_pictures_are_no_dark_frames() -> None:
     ):
         with pytest.raises(ValueError, match=rf"expected frames without light \(lens cap on\), {found}"):
             measure_dark([Mosaic(data, Layout(), 0.0, WHITE)] * 2)
+
+
+@pytest.mark.parametrize("measure", [measure_dark, measure_flat])
+def test_copies_of_one_frame_are_refused(measure: Callable[..., Calibration]) -> None:
+    """They would measure no noise, and take that of the frame for its pattern."""
+    sensor = BadSensor(Layout(), dead=0)
+    light = 0.0 if measure is measure_dark else 0.8
+    frame = replace(sensor.expose(sensor.sees(np.full(SIZE, light))), black_level=LEVEL)
+    with pytest.raises(ValueError, match="taken one after another, found the same samples 3 times"):
+        measure([frame] * 3)
 
 
 def test_one_wrong_frame_among_many_is_refused() -> None:

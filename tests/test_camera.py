@@ -159,7 +159,7 @@ sony 90,45,135/RGGB 90,45,135,0 90,45,135,0/ 90,45,135,0,3/RGGB a,b,c,d/RGGB 90,
 @pytest.mark.parametrize("spec", ["", *WRONG_SPECS.split()])
 def test_wrong_specs_are_refused_in_one_line(spec: str) -> None:
     """Text that is no layout raises one line of what was expected or found."""
-    with pytest.raises(ValueError, match=r"expected|must|needs no origin") as refusal:
+    with pytest.raises(ValueError, match="expected") as refusal:
         Layout.parse(spec)
     assert "\n" not in str(refusal.value)
 
@@ -174,15 +174,15 @@ def test_angles_that_are_no_numbers_are_refused(spec: str) -> None:
 @pytest.mark.parametrize(
     ("polarizer", "bayer", "origin", "message"),
     [
-        (((90, 45),), "RGGB", (0, 0), "polarizer must be 2x2"),
-        (((90, 45), (135, 0, 30)), "RGGB", (0, 0), "polarizer must be 2x2"),
-        (((90, 45), (135, 225)), "RGGB", (0, 0), "four different angles"),
-        (((90, 45), (135, 0)), "RGBG", (0, 0), "bayer must be one of RGGB, BGGR, GRBG, GBRG or None"),
-        (((90, 45), (135, 0)), ["RGGB"], (0, 0), "bayer must be one of"),
-        (((90, 45), (135, 0)), "RGGB", (0, 2), "origin must be"),
-        (((90, 45), (135, 0)), "RGGB", np.array([0, 2]), "origin must be"),
-        (((90, 45), (135, 0)), "RGGB", 1, "origin must be"),
-        (((90, 45), (135, 0)), None, (1, 0), "mono layout needs no origin"),
+        (((90, 45),), "RGGB", (0, 0), "expected a polarizer of 2x2 angles"),
+        (((90, 45), (135, 0, 30)), "RGGB", (0, 0), "expected a polarizer of 2x2 angles"),
+        (((90, 45), (135, 225)), "RGGB", (0, 0), "four different analyser angles"),
+        (((90, 45), (135, 0)), "RGBG", (0, 0), "expected bayer RGGB, BGGR, GRBG, GBRG or None"),
+        (((90, 45), (135, 0)), ["RGGB"], (0, 0), "expected bayer"),
+        (((90, 45), (135, 0)), "RGGB", (0, 2), "expected an origin"),
+        (((90, 45), (135, 0)), "RGGB", np.array([0, 2]), "expected an origin"),
+        (((90, 45), (135, 0)), "RGGB", 1, "expected an origin"),
+        (((90, 45), (135, 0)), None, (1, 0), "origin of a mono layout"),
     ],
 )
 def test_wrong_layouts_are_refused(
@@ -296,7 +296,7 @@ def test_too_small_mosaics_are_refused(shape: tuple[int, ...], layout: Layout) -
 @pytest.mark.parametrize(("black", "white"), [(0, 0), (64, 63), (0, math.nan), (math.nan, 1)])
 def test_white_has_to_be_above_black(black: float, white: float) -> None:
     """A white level that is not above the black level is refused."""
-    with pytest.raises(ValueError, match="white_level must be above black_level"):
+    with pytest.raises(ValueError, match="expected a white level above the black level"):
         Mosaic(torch.zeros(4, 4), Layout(), black, white)
 
 
@@ -478,11 +478,11 @@ def test_sampling_is_undone_by_looking_up_each_filter(layout: Layout) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"full_well": 0.0}, "full_well must be positive"),
-        ({"full_well": math.nan}, "full_well must be positive"),
-        ({"read_noise": -1.0}, "read_noise not negative"),
-        ({"diattenuation": (1.1,)}, "diattenuation must be one or three"),
-        ({"diattenuation": (0.9, -0.1, 0.9)}, "diattenuation must be one or three"),
+        ({"full_well": 0.0}, "expected a positive full_well"),
+        ({"full_well": math.nan}, "expected a positive full_well"),
+        ({"read_noise": -1.0}, "read_noise of at least 0"),
+        ({"diattenuation": (1.1,)}, "expected one or three"),
+        ({"diattenuation": (0.9, -0.1, 0.9)}, "expected one or three"),
     ],
 )
 def test_impossible_sensors_are_refused(options: dict[str, float], message: str) -> None:

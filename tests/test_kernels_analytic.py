@@ -282,7 +282,7 @@ def test_diffuse_and_specular_add_up_to_s0() -> None:
         (np.zeros((8, 8, 3), np.uint8), Layout(), (0, 255), r"\[H, W\], found shape \(8, 8, 3\)"),
         (np.zeros((3, 8), np.uint8), Layout(), (0, 255), "at least 4x4"),
         (np.zeros((4, 8), np.uint8), Layout(origin=(1, 0)), (0, 255), "at least 5x4"),
-        (np.zeros((8, 8), np.uint8), Layout(), (255, 255), "white_level must be above black_level"),
+        (np.zeros((8, 8), np.uint8), Layout(), (255, 255), "expected a white level above the black level"),
         ([[0, 1], [2, 3]], Layout(), (0, 255), "NumPy mosaic or a PackedFrame, found list"),
     ],
 )

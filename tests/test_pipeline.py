@@ -659,7 +659,7 @@ def test_mosaic_refuses_what_it_cannot_hold() -> None:
     """A `Mosaic` smaller than its period, or with white not above black, is refused."""
     with pytest.raises(ValueError, match="at least 4x4"):
         Mosaic(torch.zeros(3, 8), Layout(), 0.0, 1.0)
-    with pytest.raises(ValueError, match="must be above"):
+    with pytest.raises(ValueError, match="a white level above"):
         Mosaic(torch.zeros(8, 8), Layout(), 1.0, 1.0)
     with pytest.raises(ValueError, match=r"expected a Layout \(Layout.parse reads text\), found 'color'"):
         Mosaic(torch.zeros(8, 8), "color", 0.0, 1.0)  # type: ignore[arg-type]

@@ -218,7 +218,7 @@ def test_gstreamer_says_what_is_wrong(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("wrong", "said"),
-    [("layout=foo", 'expected "color", "mono"'), ("white-level=-5", "white_level must be above black_level")],
+    [("layout=foo", 'expected "color", "mono"'), ("white-level=-5", "expected a white level above the black level")],
 )
 def test_gstreamer_refuses_in_one_line(wrong: str, said: str, tmp_path: Path) -> None:
     """A traceback for every frame, and the exit status of success."""

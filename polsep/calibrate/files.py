@@ -140,8 +140,9 @@ def merge_files(
     write_merged(output, merged.mosaic, facts)
     shortest, longest = min(merged.times), max(merged.times)
     clipped = float(to_numpy(merged.mosaic.clipped()).mean())
+    count, times_said = len(merged.times), ", ".join(f"{time:.4g}" for time in merged.times)
     line = (
-        f"{len(frames)} frames, exposure times {', '.join(f'{time:.4g}' for time in merged.times)} ({said}), range "
+        f"{count} frame{'s' * (count != 1)}, exposure time{'s' * (count != 1)} {times_said} ({said}), range "
         f"{longest / shortest:.3g}, {clipped:.2%} of the samples clipped in the shortest -> {output}"
     )
     return line, (*notes, *merged.notes)

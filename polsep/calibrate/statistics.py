@@ -24,6 +24,8 @@ PER_MEAN = 1.2533
 OUTLIER = 5.0
 #: Share of the pixels that count for the noise: the most variable ones are left out.
 KEPT = 0.99
+#: Share of the samples above which those that differ from their neighbours are noise: others may be hot pixels.
+NOISY = 0.1
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class FrameMean:
 def average_frames(frames: Iterable[Mosaic]) -> FrameMean:
     """Mean and variance over frames, by Welford's recurrence: one frame in memory at a time.
 
-    Raises ValueError on none, or on frames of different sizes, layouts or levels.
+    Raises ValueError on none, on frames of different sizes, layouts or levels, and on copies of one noisy frame.
     """
     first, count, clipped = None, 0, 0.0
     mean: Floats = np.zeros((0, 0), np.float32)
@@ -77,6 +79,8 @@ def average_frames(frames: Iterable[Mosaic]) -> FrameMean:
         squares += _less_neighbour(change, period) * _less_neighbour(samples - mean, period)
     if first is None:
         raise ValueError("expected at least one frame, found none")
+    if count > 1 and not squares.any() and np.mean(_less_neighbour(mean, first.layout.period) != 0) > NOISY:
+        raise ValueError(f"expected frames taken one after another, found the same samples {count} times")
     variance = squares / np.float32(count - 1) if count > 1 else None
     return FrameMean(first, mean, variance, clipped / count, count)
 

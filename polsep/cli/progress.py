@@ -89,7 +89,8 @@ def report_step(step: Step, progress: Progress) -> bool:
     for path in step.written:
         print(path)
     if step.report is not None:
-        print(f"  {step.count} frame{'s' * (step.count != 1)}: {summary(step.report)}")
+        good = step.report["frames"]
+        print(f"  {good} frame{'s' * (good != 1)}: {summary(step.report)}")
     return step.damaged
 
 

@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 
 from polsep.physics.stokes import Stokes
 from polsep.render.simulate import filter_light
-from polsep.sensor.camera import Layout, Mosaic, Sensor, add_noise
+from polsep.sensor.camera import Layout, Mosaic, Sensor, add_noise, digitize
 
 #: Kinds of defective pixels in equal parts: dead ones (0), stuck ones (white), hot ones (a random offset in `HOT`), and
 #: weak ones (a random factor in `WEAK`). Sensors in use have 1e-5 to 1e-3 of them (EMVA 1288, section 8.6).
@@ -56,10 +56,7 @@ def record(light: Stokes, layout: Layout, sensor: Sensor, errors: SensorErrors, 
     samples = cross_talk(samples, errors.cross_talk)
     samples = vary_gains(samples, layout, (errors.gains, errors.period_gains), gains)
     samples = (errors.black + (1 - errors.black) * add_noise(samples, sensor, noise)).clamp(0, 1)
-    samples = add_defects(samples, errors.defects, defects)
-    if sensor.bits is not None:
-        samples = torch.round(samples * sensor.white_level)
-    return Mosaic(samples, layout, 0.0, sensor.white_level)
+    return digitize(add_defects(samples, errors.defects, defects), layout, sensor)
 
 
 def random_analyser_angles(layout: Layout, deviation_deg: float, generator: torch.Generator) -> Tensor:

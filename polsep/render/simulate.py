@@ -15,7 +15,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from polsep.physics.stokes import Stokes
 from polsep.render.sphere_tracing import Scene
-from polsep.sensor.camera import Layout, Mosaic, Sensor, add_noise, measure_with_analysers
+from polsep.sensor.camera import Layout, Mosaic, Sensor, add_noise, digitize, measure_with_analysers
 
 #: Brightest object sample, as a share of the white level, in exposures without clipping.
 HEADROOM = 0.95
@@ -109,10 +109,7 @@ def expose_to_level(scene: Scene, level: float, layout: Layout, sensor: Sensor) 
 def capture(scene: Scene, layout: Layout, sensor: Sensor, generator: torch.Generator | None = None) -> Capture:
     """Return a raw frame of an exposed scene: `camera.expose`, with one measurement per pixel instead of twelve."""
     signal = filter_light(scene.diffuse + scene.specular, layout, sensor)
-    codes = add_noise(signal, sensor, generator).clamp(0, 1)
-    if sensor.bits is not None:
-        codes = torch.round(codes * sensor.white_level)
-    return Capture(Mosaic(codes, layout, 0.0, sensor.white_level), scene)
+    return Capture(digitize(add_noise(signal, sensor, generator), layout, sensor), scene)
 
 
 def filter_light(light: Stokes, layout: Layout, sensor: Sensor, turned: Tensor | None = None) -> Tensor:

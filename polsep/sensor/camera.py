@@ -70,26 +70,23 @@ class Layout:
     def __post_init__(self) -> None:
         try:
             (a, b), (c, d) = self.polarizer
-            flat = [float(angle) for angle in (a, b, c, d)]
+            kept = [float(angle) % 180 for angle in (a, b, c, d)]
+            if math.isnan(sum(kept)):  # of infinite ones, too
+                raise ValueError
         except (TypeError, ValueError):
-            raise ValueError(f"a layout's polarizer must be 2x2 angles in degrees, found {self.polarizer!r}") from None
-        if not all(math.isfinite(angle) for angle in flat):
-            raise ValueError(f"a layout's polarizer must be 2x2 angles in degrees, found {self.polarizer!r}")
-        kept = [angle % 180 for angle in flat]
+            raise ValueError(f"expected a polarizer of 2x2 angles in degrees, found {self.polarizer!r}") from None
         around = sorted(kept)
         if min(b - a for a, b in pairwise([*around, around[0] + 180])) < MIN_APART_DEG:
-            raise ValueError(
-                f"polarizer must hold four different angles (modulo 180 degrees), found {self.polarizer!r}"
-            )
+            raise ValueError(f"expected four different analyser angles (modulo 180 degrees), found {self.polarizer!r}")
         object.__setattr__(self, "polarizer", ((kept[0], kept[1]), (kept[2], kept[3])))
         if self.bayer is not None and not (isinstance(self.bayer, str) and self.bayer in BAYER_ORDERS):
-            raise ValueError(f"bayer must be one of {', '.join(BAYER_ORDERS)} or None, found {self.bayer!r}")
+            raise ValueError(f"expected bayer {', '.join(BAYER_ORDERS)} or None, found {self.bayer!r}")
         origin = tuple(self.origin) if isinstance(self.origin, Sequence | np.ndarray) else ()
         if origin not in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            raise ValueError(f"origin must be two of 0 or 1, found {self.origin!r}")
+            raise ValueError(f"expected an origin of two numbers, each 0 or 1, found {self.origin!r}")
         object.__setattr__(self, "origin", (int(origin[0]), int(origin[1])))
         if self.bayer is None and self.origin != (0, 0):
-            raise ValueError("a mono layout needs no origin: permute its polarizer cell instead")
+            raise ValueError(f"expected (0, 0) as the origin of a mono layout: permute its cell, found {self.origin}")
 
     @classmethod
     def sony(cls, channels: int) -> Layout:
@@ -219,7 +216,7 @@ def check_frame(shape: tuple[int, ...], layout: Layout, black_level: float, whit
     if len(shape) < 2 or shape[-2] < rows or shape[-1] < cols:
         raise ValueError(f"expected a mosaic [..., H, W] of at least {rows}x{cols}, found {shape}")
     if not (white_level > black_level and math.isfinite(white_level - black_level)):
-        raise ValueError(f"white_level must be above black_level, found {white_level} and {black_level}")
+        raise ValueError(f"expected a white level above the black level, found {white_level} and {black_level}")
 
 
 def _require_samples(data: Array) -> None:
@@ -317,11 +314,11 @@ class Sensor:
 
     def __post_init__(self) -> None:
         if not (self.full_well > 0 and self.read_noise >= 0):
-            raise ValueError(f"full_well must be positive and read_noise not negative, found {self}")
+            raise ValueError(f"expected a positive full_well and a read_noise of at least 0, found {self}")
         if self.bits is not None and self.bits < 1:
-            raise ValueError(f"bits must be at least 1, found {self.bits}")
+            raise ValueError(f"expected at least 1 bit, found {self.bits}")
         if len(self.diattenuation) not in (1, 3) or not all(0 <= d <= 1 for d in self.diattenuation):
-            raise ValueError(f"diattenuation must be one or three numbers in [0, 1], found {self.diattenuation}")
+            raise ValueError(f"expected one or three diattenuations in [0, 1], found {self.diattenuation}")
 
     @property
     def white_level(self) -> float:
@@ -412,7 +409,11 @@ def expose(stokes: Stokes, layout: Layout, sensor: Sensor, generator: torch.Gene
     Deterministic for a given ``generator``; none is needed for a noise-free sensor.
     """
     signal = sample_mosaic(measure_with_analysers(stokes, layout.angles, sensor.diattenuation), layout)
-    signal = add_noise(signal, sensor, generator)
+    return digitize(add_noise(signal, sensor, generator), layout, sensor)
+
+
+def digitize(signal: Array, layout: Layout, sensor: Sensor) -> Mosaic:
+    """Noisy signals ``[..., H, W]``, of which 1 fills the well, as the converter says them: clipped, in whole codes."""
     codes = signal.clip(0.0, 1.0)
     if sensor.bits is not None:
         codes = namespace(codes).round(codes * sensor.white_level)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def shared_report(first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Statistics of all frames as one, and each warning once; None where all frames are damaged."""
+    """Number and statistics of all good frames as one, and each warning once; None where all are damaged."""
     good = [line for line in lines if "damaged" not in line]
     if not good:
         return None
@@ -29,7 +29,7 @@ def shared_report(first: FirstFrame, lines: list[dict[str, Any]]) -> dict[str, A
         statistics[name] = math.degrees(aolp_of(turned.real, turned.imag))
     warnings = _each_once([*first.warnings, *(text for line in good for text in line.get("warnings", ()))])
     light = {"light_color": list(first.light), "light": first.facts}
-    return {"method": first.method, "statistics": statistics, **light, "warnings": warnings}
+    return {"frames": len(good), "method": first.method, "statistics": statistics, **light, "warnings": warnings}
 
 
 def _weights(lines: list[dict[str, Any]]) -> NDArray[np.float64]:

@@ -61,6 +61,8 @@ _CACHED = 8
 LOCK = "lock"
 #: The file by which a run that is resumed knows that it replaces what is there.
 REPLACING = "replacing"
+#: Settings that follow from others and the first frame.
+FOUND = ("first_frame_sha256", "light_color", "light", "gain", "black_level", "defects")
 #: The value of code 65535 in lossless films.
 FILM_WHITE = {"diffuse": 2.0, "specular": 8.0}
 
@@ -151,7 +153,7 @@ class SequenceWriter:
             replacing.touch()
         self._overwrite = replacing.exists()
         if begun.exists():
-            require_same_settings(begun, settings, f"{directory / stem}", "; --overwrite begins anew")
+            require_same_settings(begun, settings, f"{directory / stem}", "; --overwrite begins anew", FOUND)
         else:
             replace_text(begun, json.dumps(settings, sort_keys=True))
         self._done = 0

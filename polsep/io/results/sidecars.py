@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -96,16 +96,22 @@ def _formats(files: object, unless: str) -> list[str]:
     return [Path(name).suffix.lower() for name in listed_names(files)] or [unless]
 
 
-def require_same_settings(path: Path, settings: Mapping[str, Any], owner: str, advice: str = "") -> None:
-    """Raise OutputError, naming what differs, unless ``path`` holds these settings; ``owner``: what they belong to."""
+def require_same_settings(
+    path: Path, settings: Mapping[str, Any], owner: str, advice: str = "", found: Container[str] = ()
+) -> None:
+    """Raise OutputError, naming what differs, unless ``path`` holds these settings; ``owner``: what they belong to.
+
+    Those ``found`` in frames are named only where nothing else differs, which they follow from.
+    """
     try:
         before, now = (_flat_names(json.loads(text)) for text in (path.read_text("utf-8"), json.dumps(settings)))
     except (ValueError, AttributeError) as error:
         raise OutputError(f"expected the settings of {owner} in {path}, found {error}") from error
     different = [name for name in before | now if before.get(name) != now.get(name)]
+    different = [name for name in different if name.split()[0] not in found] or different
     if different:
-        expected, found = (", ".join(_said(name, all.get(name)) for name in different) for all in (before, now))
-        raise OutputError(f"expected {expected}, with which {owner} was begun, found {found}{advice}")
+        expected, other = (", ".join(_said(name, all.get(name)) for name in different) for all in (before, now))
+        raise OutputError(f"expected {expected}, with which {owner} was begun, found {other}{advice}")
 
 
 def _said(name: str, value: Any) -> str:

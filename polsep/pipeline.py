@@ -116,7 +116,7 @@ class Result(SeparatedFrame):
         if os.fspath(path).endswith(("/", os.sep)) or os.path.isdir(target):
             raise OutputError(f"expected a file name like {target / 'shot.exr'}, found a folder")
         stem = target.stem if target.suffix.lower() in _ENDINGS else target.name
-        if (target.suffix and stem == target.name) or target.name.lower() in _ENDINGS:
+        if (target.suffix and stem == target.name) or target.name.lower() in _ENDINGS or target.name.endswith("."):
             raise ValueError(f"expected a file name that ends in {', '.join(_ENDINGS)}, found {target.name!r:.80}")
         frame, kind = self.with_stokes() if stokes else self, _ENDINGS.get(target.suffix.lower(), "exr")
         try:

@@ -199,6 +199,7 @@ def test_photographs_do_too(polsep: Cli, tmp_path: Path) -> None:
         (["--integration", "rough"], ["bilateral or smooth"]),
         (["--size", "0"], ["--size"]),
         (["--name", "a/b"], ["stem"]),
+        (["--name", "ball.exr"], ["--name", "expected a name without an ending, as ball, found 'ball.exr'"]),
         (["--method", "magic"], ["magic"]),
         (["--mask", "absent.png"], ["absent.png"]),
     ],

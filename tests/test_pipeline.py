@@ -514,6 +514,8 @@ def test_results_of_unknown_endings_are_refused(tmp_path: Path) -> None:
     """An ending that no format has, or one without a name, is refused before anything is written."""
     with pytest.raises(ValueError, match=r"ends in \.exr"):
         quietly(raw_frame(), method="analytic").save(tmp_path / "shot.jpg")
+    with pytest.raises(ValueError, match=r"ends in \.exr.*, found 'shot\.'"):
+        quietly(raw_frame(), method="analytic").save(tmp_path / "shot.")
     with pytest.raises(ValueError, match=r"expected a file name that ends in .*, found '\.exr'"):
         quietly(raw_frame(), method="analytic").save(tmp_path / "new" / ".exr")
     assert not list(tmp_path.iterdir())

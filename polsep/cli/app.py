@@ -97,6 +97,19 @@ class Word(_ParamType):
         return value
 
 
+class Stem(_ParamType):
+    """The name of output files, which get their endings; one with an ending is an error that names its option."""
+
+    name = "stem"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the name. Raises BadParameter."""
+        if Path(value).suffix.lower() in (".exr", ".npz", ".tif", ".tiff", ".png", ".json", ".glb", ".mp4"):
+            self.fail(f"expected a name without an ending, as {Path(value).stem}, found {str(value)!r:.80}", param, ctx)
+        return value
+
+
+STEM = Stem()
 COUNT, POSITIVE, FINITE = Number(int, 1), Number(float, 0, above=True), Number(float)
 RATE = Number(_ratio, 0.001, 100_000)
 COMPRESSION, DAMAGED = Word("none", "zip", "piz"), Word("stop", "skip")

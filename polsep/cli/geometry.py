@@ -16,6 +16,7 @@ from polsep.cli.app import (
     FILE,
     LAYOUT,
     OVERWRITE,
+    STEM,
     WHITE_LEVEL,
     Number,
     Word,
@@ -36,7 +37,7 @@ ORDER = "right front-right front front-left left above"
 @app.command()
 @click.argument("files", nargs=-1, type=FILE, metavar="FILE...")
 @click.option("-o", "--output", type=DIR, default=Path("polsep-geometry"), metavar="DIR", help="Folder of the results.")
-@click.option("--name", default="shape", metavar="STEM", help="Name of the output files.")
+@click.option("--name", type=STEM, default="shape", metavar="STEM", help="Name of the output files.")
 @click.option("--lights", default=ORDER, metavar="LIGHTS", help="A name or x,y,z per FILE; see above.")
 @click.option(
     "--mask", type=FILE, metavar="FILE", help="Image that is white on the object.  [default: where light falls]"

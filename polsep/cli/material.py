@@ -16,6 +16,7 @@ from polsep.cli.app import (
     LIGHT_COLOR,
     OVERWRITE,
     PIXEL_FORMAT,
+    STEM,
     WHITE_LEVEL,
     Number,
     app,
@@ -33,7 +34,7 @@ from polsep.cli.progress import show_progress
 @app.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @click.option("-o", "--output", type=DIR, default=Path("polsep-material"), metavar="DIR", help="Folder of the results.")
-@click.option("--name", metavar="NAME", help="Name of the results.  [default: that of the first file]")
+@click.option("--name", type=STEM, metavar="NAME", help="Name of the results.  [default: that of the first file]")
 @click.option(
     "--white", metavar="N,...", help="s0 of white paper in the middle: one number, or one for each photograph."
 )

@@ -18,6 +18,7 @@ from polsep.cli.app import (
     OVERWRITE,
     PIXEL_FORMAT,
     SIZE,
+    STEM,
     WHITE_LEVEL,
     Number,
     Word,
@@ -36,7 +37,7 @@ from polsep.cli.progress import show_progress
 @app.command()
 @click.argument("file", type=FILE, metavar="FILE")
 @click.option("-o", "--output", type=DIR, default=Path("polsep-shape"), metavar="DIR", help="Folder of the results.")
-@click.option("--name", metavar="STEM", help="Name of the output files.  [default: that of FILE]")
+@click.option("--name", type=STEM, metavar="STEM", help="Name of the output files.  [default: that of FILE]")
 @click.option(
     "--light",
     "lamp",

@@ -253,7 +253,7 @@ def _write_film(path: Path, codec: str, pixels: str) -> None:
 
 
 def recording_seeds() -> Seeds:
-    """A recording of three frames, whose three files are damaged by turns."""
+    """A recording of three frames that ended, and one that was stopped, whose three files are damaged by turns."""
 
     def write(path: Path) -> None:
         settings = {"exposure_us": 1000.0, "gain_db": 0.0}
@@ -265,10 +265,8 @@ def recording_seeds() -> Seeds:
         writer.close()
 
     files = _written("recording.json", write)
-    return [
-        files,
-        {"recording.json": files["recording.json"].replace(b'"finished": true', b'"finished": false'), **files},
-    ]
+    stopped = files["recording.json"].replace(b'"finished": true', b'"finished": false')
+    return [files, {**files, "recording.json": stopped}]
 
 
 def exr_seeds() -> Seeds:

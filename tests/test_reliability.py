@@ -80,8 +80,9 @@ def test_damaged_files_are_read_or_refused(tmp_path: Path, name: str) -> None:
     """The short form of `make fuzz`: the same damage in every run."""
     from evaluation.reliability import damaged_files, judge, write_files
 
-    reader, outcomes = damage_seeds.READERS[name], set()
-    for seed in damage_seeds.seeds_of(name):
+    reader, outcomes, seeds = damage_seeds.READERS[name], set(), damage_seeds.seeds_of(name)
+    assert all(seeds.count(seed) == 1 for seed in seeds)
+    for seed in seeds:
         assert judge(write_files(tmp_path / "whole", seed), reader)[:2] == ("accepted", ())
     for index in range(INPUTS):
         found = judge(write_files(tmp_path / str(index), damaged_files(name, index)), reader)

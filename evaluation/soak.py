@@ -19,14 +19,12 @@ from typing import NamedTuple
 import click
 import numpy as np
 
-import polsep
 from evaluation.faults import Contents, read_contents
 from polsep.bench.rows import Row, read_commit, replace_rows
-from polsep.compute.arrays import to_numpy
+from polsep.bench.truth import read_demo_codes
 from polsep.compute.workers import keep_memory
-from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.frames import ReadOptions
 from polsep.io.store.rows import read_memory, write_array
-from polsep.sensor.camera import Mosaic
 from polsep.video.recordings import Target, VideoOptions, separate_video
 
 #: Frames of the recording, two parts of a sequence and a half, and their size.
@@ -48,10 +46,7 @@ class Pass(NamedTuple):
 
 def make_recording(path: Path) -> None:
     """A pan over the example frame."""
-    example = Path(polsep.__file__).parent / "data" / "still_life.png"
-    (frame,) = read_frames(str(example), ReadOptions(white_level=4095.0))
-    assert isinstance(frame.data, Mosaic)
-    raw = to_numpy(frame.data.data).astype(np.uint16)
+    raw = read_demo_codes()
     views = [raw[600 + 8 * k : 600 + 8 * k + SIZE[0], 700 + 4 * k :][:, : SIZE[1]] for k in range(FRAMES)]
     write_array(path, np.stack(views))
 

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.bench.rows import Row
-from polsep.bench.truth import read_demo_capture
-from polsep.compute.arrays import to_numpy
+from polsep.bench.truth import read_demo_codes
 from polsep.compute.workers import keep_memory
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.raw.genicam import pack_frame
@@ -143,5 +142,5 @@ def _measure_alone(method: str, frames: list[NDArray[np.uint16]]) -> tuple[float
 
 def _frames() -> list[NDArray[np.uint16]]:
     """The demo capture, shifted by whole periods of its filters."""
-    raw = to_numpy(read_demo_capture().data).astype(np.uint16)
+    raw = read_demo_codes()
     return [np.roll(raw, (8 * k, 16 * k), (0, 1)) for k in range(DISTINCT)]

@@ -1,8 +1,8 @@
 """Response times of `polsep view` through the page's own server, without a browser, and the time of every edit.
 
 Waiting is from a request to its whole answer, as a browser on this machine makes it: what the browser adds to draw the
-picture, some 10 ms at screen size, is not in it. Every number is the median of `TIMES` after a first one, but for the
-first frame, for what plays, and for plain NumPy, which takes seconds.
+picture, some 10 ms at screen size, is not in it. Every number is the median of `TIMES` after a first one, or of
+`PLAIN_TIMES` of plain NumPy, which takes seconds; but for the first frame and for what plays.
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ from numpy.typing import NDArray
 
 from evaluation.naive import NAIVE, naive_texture
 from polsep.bench.rows import Row
-from polsep.compute.arrays import to_numpy
+from polsep.bench.truth import read_demo_capture, read_demo_codes
 from polsep.edit import EDITS, SeparatedImages, Texture, make_edit
 from polsep.edit.edits import Edit
-from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.store.rows import read_bytes, write_array
+from polsep.methods import find_method
 from polsep.pipeline import separate_capture
+from polsep.sensor.levels import as_mosaic
 from polsep.view.edits import list_controls
 from polsep.view.opening import DEMO, DEMO_WHITE
 from polsep.view.server import ViewOptions, serve
 
-#: How often something is measured.
-TIMES = 15
+#: How often something is measured, and plain NumPy.
+TIMES, PLAIN_TIMES = 15, 3
 CASE = "2448x2048 colour frame"
 SMALL, LARGE = "screen size, 612x512", "1224x1024 in colour"
 #: Values of edits that are measured, where the defaults are the identity or too mild.
@@ -125,13 +126,14 @@ def bench_view() -> Iterator[Row]:
 def _bench_page(address: str) -> Iterator[Row]:
     """Rows of the times that a user waits."""
     page = Page(address, "bench")
-    data = read_bytes(DEMO)
+    data, codes = read_bytes(DEMO), read_demo_codes()
+    method = find_method("auto", as_mosaic(codes, white_level=DEMO_WHITE)[0]).name
 
     def open_frame() -> None:
         page.do(Event("ps-file", "upload", [page.send("shot.png", data)]))
 
-    yield Row("view/page", CASE, "joint", "opened just after the start", _seconds(open_frame), "s")
-    yield Row("view/page", CASE, "joint", "opened, separated and shown", _median(open_frame, 5), "s")
+    yield Row("view/page", CASE, method, "opened just after the start", _seconds(open_frame), "s")
+    yield Row("view/page", CASE, method, "opened, separated and shown", _median(open_frame, 5), "s")
     steps = iter(np.linspace(-2, 2, 1000).tolist())
     moved = _median(lambda: page.do(Event("ps-stops", "input", next(steps))))
     yield Row("view/page", SMALL, "slider of exposure", "answer", 1000 * moved, "ms")
@@ -146,15 +148,13 @@ def _bench_page(address: str) -> Iterator[Row]:
         page.do(Event(part, "input", control.start))
     with TemporaryDirectory() as folder:
         path = Path(folder) / "stack.npy"
-        demo = next(read_frames(DEMO, ReadOptions(white_level=DEMO_WHITE))).data
-        codes = to_numpy(demo.data).astype(np.uint16)
         write_array(path, np.stack([np.roll(codes, 16 * k, axis=1) for k in range(4)]))
         page.do(Event("ps-file", "upload", [page.send("stack.npy", read_bytes(path))]))
     page.do(Event("ps-play", "click", "Play"))
     made = _seconds(lambda: _show(page, 4))
-    yield Row("view/page", f"sequence of {CASE}s", "joint", "played at first", 4 / made, "frames/s")
+    yield Row("view/page", f"sequence of {CASE}s", method, "played at first", 4 / made, "frames/s")
     shown = _seconds(lambda: _show(page, TIMES))
-    yield Row("view/page", f"sequence of {CASE}s", "joint", "played again", TIMES / shown, "frames/s")
+    yield Row("view/page", f"sequence of {CASE}s", method, "played again", TIMES / shown, "frames/s")
 
 
 def _show(page: Page, count: int) -> None:
@@ -165,8 +165,7 @@ def _show(page: Page, count: int) -> None:
 
 def bench_edits() -> Iterator[Row]:
     """Every edit on the demo's frame, and the same in plain NumPy: time, ratio, and the largest difference."""
-    frame = next(read_frames(DEMO, ReadOptions(white_level=DEMO_WHITE)))
-    found = separate_capture(frame.data, "color-affine", "white")
+    found = separate_capture(read_demo_capture(), "color-affine", "white")
     images = SeparatedImages(found.diffuse, found.specular)
     texture = np.random.default_rng(0).random((512, 512, 3), dtype=np.float32)
     for name, kind in EDITS.items():
@@ -179,10 +178,8 @@ def _compare(
     edit: Edit, plain: Callable[[Edit, Floats, Floats], tuple[Floats, Floats]], images: SeparatedImages, maps: Any
 ) -> Iterator[Row]:
     mine = _median(lambda: edit.change(images, maps))
-    begin = time.perf_counter()
-    expected = plain(edit, images.diffuse, images.specular)
-    theirs = time.perf_counter() - begin
-    after = edit.change(images, maps)
+    theirs = _median(lambda: plain(edit, images.diffuse, images.specular), PLAIN_TIMES)
+    expected, after = plain(edit, images.diffuse, images.specular), edit.change(images, maps)
     pairs = zip((after.diffuse, after.specular), expected, strict=True)
     largest = max(float(np.abs(a - b).max() / max(float(np.abs(b).max()), 1e-9)) for a, b in pairs)
     rows = (("polsep", 1000 * mine, "ms"), ("plain NumPy", 1000 * theirs, "ms"), ("times as fast", theirs / mine, "x"))

@@ -138,7 +138,7 @@ def test_chains_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
         "wait_until_idle": lambda: 3.0,
         "measure_copy_bandwidth": lambda: 1e10,
         "warm_up": lambda: None,
-        "read_demo_capture": lambda: polsep.Mosaic(np.ones((8, 8), np.uint16), polsep.Layout(), 0.0, 4095.0),
+        "read_demo_codes": lambda: np.ones((8, 8), np.uint16),
     }.items():
         monkeypatch.setattr(speed, name, value)
     programs = dict.fromkeys(("half: a, one frame", "half: b, one frame", "full: c, one frame"), speed._own())

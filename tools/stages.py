@@ -15,12 +15,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 import polsep
 from polsep import methods
-from polsep.bench.truth import read_demo_capture
-from polsep.compute.arrays import to_numpy
+from polsep.bench.truth import read_demo_codes
 
 #: Functions that are timed, by the module whose name they are called by: a deeper stage is part of the one above it.
 STAGES = {
@@ -70,7 +67,7 @@ def main() -> None:
         place = importlib.import_module(f"polsep.{module}")
         for name in names:
             setattr(place, name, timed(getattr(place, name), f"{module}.{name}", spent))
-    raw = to_numpy(read_demo_capture().data).astype(np.uint16)
+    raw = read_demo_codes()
     for title in asked.method:
         method = methods.METHODS[title]
         methods.METHODS[title] = replace(method, run=timed(method.run, "the method itself", spent))

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.bench.truth import read_demo_codes
 from polsep.io.store.image_codecs import encode_png
-from polsep.view.opening import DEMO
 from polsep.view.server import ViewOptions, serve
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
@@ -47,8 +46,7 @@ def show_demo(page: Any) -> None:
 
 def show_sequence(page: Any, folder: Path) -> None:
     """A sequence that plays under edits."""
-    codes = np.asarray(next(read_frames(DEMO, ReadOptions(white_level=4095))).data.data).astype(np.uint16)
-    files = []
+    codes, files = read_demo_codes(), []
     for k in range(4):
         files.append(folder / f"shot{k}.png")
         files[-1].write_bytes(encode_png(np.roll(codes, 16 * k, axis=1)))

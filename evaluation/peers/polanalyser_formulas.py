@@ -16,7 +16,7 @@ from recorded import record
 
 import polsep
 from polsep.bench.rows import Row
-from polsep.bench.truth import read_demo_capture
+from polsep.bench.truth import read_demo_capture, read_demo_codes
 from polsep.compute.arrays import to_numpy
 from polsep.demosaic.bilinear import demosaic_bilinear
 from polsep.physics.stokes import Measurements, fit_stokes
@@ -27,8 +27,7 @@ from polsep.separation.analytic import separate_analytic
 def main() -> None:
     """Measure parity and record the rows."""
     mosaic = read_demo_capture()
-    raw = to_numpy(mosaic.data).astype(np.uint16)
-    images = pa.demosaicing(raw, pa.COLOR_PolarRGB)
+    images = pa.demosaicing(read_demo_codes(), pa.COLOR_PolarRGB)
     data = torch.from_numpy(np.stack(images).astype(np.float64) / 4095).permute(0, 3, 1, 2)
     ours = Measurements(data, Layout().angles)
     theirs = pa.calcStokes([image / 4095 for image in images], np.deg2rad([0, 45, 90, 135]))

@@ -34,8 +34,7 @@ from polsep.bench import chains, stopwatch
 from polsep.bench.history import ROOT
 from polsep.bench.peers import SCRIPT, TWO_THREADS, find_peers, run_json
 from polsep.bench.rows import Row
-from polsep.bench.truth import read_demo_capture
-from polsep.compute.arrays import to_numpy
+from polsep.bench.truth import read_demo_codes
 from polsep.io.store.rows import read_cpu_times, read_peak_memory, write_array
 from polsep.kernels import warm_up
 
@@ -92,7 +91,7 @@ def _own() -> Program:
 def measure(programs: dict[str, Program], rounds: int, seconds: float) -> Iterator[Row]:
     """Rows of chains by name, "RESOLUTION: TITLE"."""
     warm_up()  # compiled kernels are kept on disk, so that no process has to make them
-    raw, found = to_numpy(read_demo_capture().data).astype(np.uint16), {name: Times() for name in programs}
+    raw, found = read_demo_codes(), {name: Times() for name in programs}
     busy, bandwidths = [], []
     with TemporaryDirectory() as folder:
         path = Path(folder) / "raw.npy"

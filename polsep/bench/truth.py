@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 import polsep
+from polsep.compute.arrays import to_numpy
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.physics.stokes import Measurements, measure
 from polsep.render.distances import random_light, random_parts
@@ -29,6 +32,11 @@ def read_demo_capture() -> Mosaic:
     frame = next(read_frames(path, ReadOptions(white_level=DEMO_WHITE))).data
     assert isinstance(frame, Mosaic)
     return frame
+
+
+def read_demo_codes() -> NDArray[np.uint16]:
+    """Codes of the demo capture, as a camera gives them."""
+    return to_numpy(read_demo_capture().data).astype(np.uint16)
 
 
 def render_scene(seed: int, saturation: float, size: tuple[int, int] = SCENE_SIZE) -> Scene:

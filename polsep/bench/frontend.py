@@ -31,7 +31,7 @@ from polsep.bench.truth import SCENE_SEEDS, captures, render_scene
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half, mean_cells
 from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half
 from polsep.io.raw.frames import read_frames
-from polsep.metrics import psnr
+from polsep.metrics import psnr, psnr_unlimited
 from polsep.physics.stokes import Measurements, Stokes, aolp, dolp, fit_stokes, measure
 from polsep.sensor.camera import Layout, Mosaic, sample_mosaic
 from polsep.separation.analytic import separate_analytic
@@ -142,21 +142,16 @@ def score_images(found: Tensor, truth: Tensor, mask: Tensor) -> dict[str, float]
     ours, true = (Measurements(images, Layout().angles) for images in (found, truth))
     stokes, true_stokes = fit_stokes(ours), fit_stokes(true)
     split, true_split = separate_analytic(ours), separate_analytic(true)
-    errors = {s: getattr(stokes, s) - getattr(true_stokes, s) for s in ("s0", "s1", "s2")}
+    pairs = {s: (getattr(stokes, s), getattr(true_stokes, s)) for s in ("s0", "s1", "s2")}
     degree, angle = score_stokes(stokes, true_stokes, mask)
     return {
         "analysers PSNR": statistics.fmean(psnr(found[k], truth[k], mask) for k in range(4)),
-        **{f"{name} PSNR": _unlimited_psnr(error, mask) for name, error in errors.items()},
+        **{f"{name} PSNR": psnr_unlimited(*pair, mask) for name, pair in pairs.items()},
         "DoLP error": degree,
         "AoLP error": angle,
         "diffuse PSNR": psnr(split.diffuse, true_split.diffuse, mask),
         "specular PSNR": psnr(split.specular, true_split.specular, mask),
     }
-
-
-def _unlimited_psnr(error: Tensor, mask: Tensor) -> float:
-    """`psnr` of an error ``[C, h, w]`` between images that are not limited."""
-    return min(120.0, -10 * math.log10(max(float((error**2).mean(dim=0)[mask].mean()), 1e-30)))
 
 
 def score_stokes(found: Stokes, truth: Stokes, mask: Tensor) -> tuple[float, float]:

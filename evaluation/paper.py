@@ -42,7 +42,7 @@ QUICK = Extent({"objects": 2, "statues": 1, "photographs": 1}, Sweep(2, (0, 20))
 
 
 def bench_paper(data: Path) -> Iterator[Row]:
-    """The paper's Tables 2 and 3 and Fig. 5, on all selection sets, with all rungs that have weights.
+    """The paper's Tables 2 and 3 and its sweep (Fig. 5), on all selection sets, with all rungs that have weights.
 
     Raises ValueError without the extra bench, and without the sets' files in ``data``.
     """

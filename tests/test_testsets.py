@@ -11,8 +11,7 @@ import pytest
 import torch
 
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
-pytest.importorskip("scipy", reason="meshes need the extra 'render'")
-pytest.importorskip("scipy", reason="depth maps need the extra 'render'")
+pytest.importorskip("scipy", reason="meshes and depth maps need the extra 'render'")
 
 from tolerances import SIGMAS, assert_close, assert_same_angle, assert_within
 

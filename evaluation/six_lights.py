@@ -64,19 +64,13 @@ class Shoot:
     """Six frames of a subject and their truth at half resolution.
 
     ``mosaics``; exposed exact ``scenes`` at raw resolution; ``normals [h, w, 3]`` with x right, y up, z to the camera;
-    the object's ``mask [h, w]``; ``directions [6, 3]``: toward the true lights from the object's middle.
+    the object's ``mask [h, w]``.
     """
 
-    name: str
     mosaics: tuple[Mosaic, ...]
     scenes: tuple[Scene, ...]
     normals: NDArray[np.float64]
     mask: NDArray[np.bool_]
-    directions: NDArray[np.float64]
-
-    def perfect(self) -> list[Tensor]:
-        """The true diffuse images ``[3, h, w]``."""
-        return [half_resolution(scene)[0] for scene in self.scenes]
 
 
 def load_subjects(data: Path, names: Sequence[str] | None = None) -> list[Subject]:
@@ -106,29 +100,21 @@ def _statue(folder: Path) -> tuple[Mesh, PinholeCamera]:
     return mesh, PinholeCamera(viewpoint, (0.0, 0.0, 0.0), fov)
 
 
-def photograph(subject: Subject, seed: int, side: int = SIDE) -> Shoot:
-    """Six noisy frames ``side`` x ``side`` of a subject. Raises ValueError where a light reaches nothing."""
+def photograph(subject: Subject, seed: int) -> Shoot:
+    """Six noisy frames of a subject. Raises ValueError where a light reaches nothing."""
     generator = torch.Generator().manual_seed(seed)
     axes = camera_axes(subject.camera).double()
     to_world = torch.stack([axes[0], axes[1], -axes[2]]).T
     ways = [_turned(torch.tensor(direction, dtype=torch.float64), generator) for direction in NAMED.values()]
-    lights = [_light(to_world @ way, generator) for way in ways]
-    scenes, normals, mask = _render(subject, lights, side)
+    scenes, normals, mask = _render(subject, [_light(to_world @ way, generator) for way in ways])
     brightest = max(_level(scene) for scene in scenes)
     scenes = [Scene(s.diffuse * (1 / brightest), s.specular * (1 / brightest), mask) for s in scenes]
     mosaics = tuple(capture(scene, Layout(), IMX250, generator).mosaic for scene in scenes)
-    seen = (to_world.T.float() @ normals.reshape(3, -1)).reshape(3, side, side)
+    seen = (to_world.T.float() @ normals.reshape(3, -1)).reshape(3, SIDE, SIDE)
     mean = avg_pool2d(seen, 2).permute(1, 2, 0).double().numpy()
     whole = half_resolution(scenes[0])[2].numpy()
     length = np.linalg.norm(mean, axis=-1, keepdims=True)
-    return Shoot(
-        subject.name,
-        mosaics,
-        tuple(scenes),
-        mean / np.where(length > 0, length, 1),
-        whole,
-        np.stack([way.numpy() for way in ways]),
-    )
+    return Shoot(mosaics, tuple(scenes), mean / np.where(length > 0, length, 1), whole)
 
 
 def _turned(direction: Tensor, generator: torch.Generator) -> Tensor:
@@ -147,16 +133,15 @@ def _light(way: Tensor, generator: torch.Generator) -> PointLight:
     return PointLight((x, y, z), LIGHT_DISTANCE**2 * (1 + LARGEST_GAIN * (2 * gain - 1)), math.pi * turn)
 
 
-def _render(subject: Subject, lights: list[PointLight], side: int) -> tuple[list[Scene], Tensor, Tensor]:
-    """Exact scenes behind the lens, and the normals ``[3, side, side]`` in the world's frame."""
+def _render(subject: Subject, lights: list[PointLight]) -> tuple[list[Scene], Tensor, Tensor]:
+    """Exact scenes behind the lens, and the normals ``[3, SIDE, SIDE]`` in the world's frame."""
     bands: list[list[Tensor]] = []
-    for first in range(0, side, ROWS_AT_ONCE):
-        count = min(ROWS_AT_ONCE, side - first)
-        rows = first + (torch.arange(count * SAMPLES) + 0.5) / SAMPLES
-        cols = (torch.arange(side * SAMPLES) + 0.5) / SAMPLES
+    size = (ROWS_AT_ONCE * SAMPLES, SIDE * SAMPLES)
+    for first in range(0, SIDE, ROWS_AT_ONCE):
+        rows = first + (torch.arange(size[0]) + 0.5) / SAMPLES
+        cols = (torch.arange(size[1]) + 0.5) / SAMPLES
         points = tuple(g.flatten() for g in torch.meshgrid(rows, cols, indexing="ij"))
-        hits = find_hits(subject.mesh, subject.camera, (points[0], points[1]), (side, side))
-        size = (count * SAMPLES, side * SAMPLES)
+        hits = find_hits(subject.mesh, subject.camera, (points[0], points[1]), (SIDE, SIDE))
         planes = [_pooled(torch.ones_like(hits.position[:1]), hits, size), _pooled(hits.normal, hits, size)]
         for light in lights:
             lobes = shade(_cover(subject, hits), subject.camera, light, is_lit(subject.mesh, hits, light))

@@ -103,11 +103,12 @@ def make_two_tones(_paths: list[Path], _generator: torch.Generator) -> Scene:
 
 @pytest.fixture
 def tiny_sets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One scene of two tones in place of the selection sets, and small views for the sweep."""
+    """One scene of two tones in place of the selection sets, and small views under two lights for the sweep."""
     recipe = Recipe("two-tones", 1, (), make_two_tones)
     monkeypatch.setattr(testsets, "SETS", {"objects": (recipe, recipe)})
     monkeypatch.setattr(testsets, "check_case", lambda _: None)
     monkeypatch.setattr("evaluation.calibration.SIZE", (48, 48))
+    monkeypatch.setattr("evaluation.calibration.NOMINAL_DEG", (0.0, 45.0))
     monkeypatch.setattr(gallery, "VIEW_SIZE", (48, 48))
     monkeypatch.setattr(gallery, "SCENES", ("two-tones", "two-tones"))
     frame = Mosaic(0.5 * torch.ones(32, 32), Layout(), 0.0, 1.0)

@@ -247,6 +247,13 @@ def test_frames_of_any_orientation_and_side(layout: Layout, turn: str, full: boo
     grey = white.stokes.map(lambda s: s.mean(dim=-3))
     polarized = dolp(grey) > 0.05
     assert_same_angle(torch.from_numpy(found.aolp)[polarized], aolp(grey)[polarized], NOISE)
+    assert_same_sums(found, white)
+
+
+def assert_same_sums(found: FrameImages, white: Separation) -> None:
+    """Sums over the frame's own pixels, not over those by which it was continued."""
+    for name in ("pixels", "valid", "s0", "specular", "diffuse_variance", "specular_variance"):
+        assert getattr(found.tally, name) == pytest.approx(getattr(tally(white), name), rel=SUMMED), name
 
 
 @pytest.mark.parametrize("turned", [{"across": True}, {"down": True}, {"transposed": True}])
@@ -296,6 +303,7 @@ def test_cells_half_a_cell_off_are_means_of_full_resolution(layout: Layout, exac
     assert torch.equal(torch.from_numpy(found.valid), white.valid)
     lit = grey.s0 > 0.05
     assert_within(torch.from_numpy(found.dolp)[lit], dolp(grey)[lit], 0.02)  # of images, not of demosaicked light
+    assert_same_sums(found, white)
 
 
 def test_samples_of_double_precision_are_read_in_single(exact: None) -> None:

@@ -35,6 +35,7 @@ from polsep.physics.stokes import wrap_aolp
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.orient import Orientation, orient, ways_of
 from polsep.separation.images import FrameImages
+from polsep.separation.report import tally_again
 
 #: Engines that are kept at least, each with the memory that its frames need.
 KEPT = 2
@@ -117,7 +118,7 @@ def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages
 def _halve(images: FrameImages, light: tuple[float, ...]) -> FrameImages:
     """Means over 2x2 cells of images at full resolution, in a ``light``; a cell is valid if all of its pixels are.
 
-    The tally has the means over the pixels at full resolution.
+    In the tally, polarization and clipping are the means over the pixels at full resolution.
     """
     assert images.dolp is not None and images.aolp is not None and images.error is not None
     colors = images.diffuse.shape[-1]
@@ -129,13 +130,13 @@ def _halve(images: FrameImages, light: tuple[float, ...]) -> FrameImages:
     valid = _mean_cells(images.valid.astype(np.float32)) == 1
     aolp = wrap_aolp((np.angle(polarized) / 2).astype(np.float32))
     assert images.tally is not None
-    return FrameImages(diffuse, specular, valid, dolp, aolp, images.tally.of_pixels(valid.size), error)
+    halved = FrameImages(diffuse, specular, valid, dolp, aolp, images.tally.of_pixels(valid.size), error)
+    return tally_again(halved, light)
 
 
 def _mean_cells(image: NDArray[Any]) -> NDArray[Any]:
-    """`mean_cells` of an image ``[H, W, ...]``, whose last row and column do not count where it has an odd size."""
-    height, width = (n // 2 * 2 for n in image.shape[:2])
-    return np.moveaxis(mean_cells(np.moveaxis(image[:height, :width], (0, 1), (-2, -1))), (-2, -1), (0, 1))
+    """`mean_cells` of an image ``[H, W, ...]``."""
+    return np.moveaxis(mean_cells(np.moveaxis(image, (0, 1), (-2, -1))), (-2, -1), (0, 1))
 
 
 def combine_images(
@@ -190,7 +191,10 @@ def _run_turned(network: JointWeights, mosaic: Mosaic, orientation: Orientation,
         with ENGINES.borrow(job) as engine:
             engine.fill(seen, own, ((kept[0] - top) // PERIOD, (kept[1] - top) // PERIOD))
     images = as_images(targets)
-    return images if as_it_is else _turn_back(images, orientation, 2 if full else 1)
+    if as_it_is:
+        return images
+    found = _turn_back(images, orientation, 2 if full else 1)
+    return found if found.valid.size == images.valid.size else tally_again(found, mosaic.light_color)
 
 
 def _strips(
@@ -221,7 +225,7 @@ def _as_contiguous(image: NDArray[Any]) -> NDArray[Any]:
 def _turn_back(images: FrameImages, orientation: Orientation, scale: int) -> FrameImages:
     """Images of a turned frame, ``scale`` pixels along a cell's side, as those of the frame itself.
 
-    The tally has the means over all pixels that the network saw.
+    The tally has the means over all pixels that the network saw, those of continued frames too.
     """
 
     def turn(image: NDArray[Any]) -> NDArray[Any]:

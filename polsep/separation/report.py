@@ -110,15 +110,19 @@ def tally(separation: Separation) -> Tally:
 
 
 def tally_again(images: FrameImages, light: tuple[float, ...]) -> FrameImages:
-    """Images in a ``light`` that were changed, with sums of their light and of their expected errors taken anew."""
+    """Images in a ``light`` that were changed, with their valid pixels and sums of light and expected errors anew."""
     assert images.tally is not None
-    gain, xp = constant([*light], images.diffuse), namespace(images.diffuse)
-    diffuse, specular = (_total(xp.mean(image / gain, axis=-1)) for image in (images.diffuse, images.specular))
-    sums: dict[str, Any] = {"s0": float(diffuse + specular), "specular": float(specular)}
+    xp, gains = namespace(images.diffuse), np.array(light[: images.diffuse.shape[-1]])
+
+    def total(image: Array) -> NDArray[Any]:
+        """Sums by channel; NumPy takes ten times as long over both axes at once."""
+        return to_numpy(xp.sum(xp.sum(image, axis=0, dtype=xp.float64), axis=0))
+
+    diffuse, specular = (float((total(image) / gains).mean()) for image in (images.diffuse, images.specular))
+    sums: dict[str, Any] = {"valid": int(xp.sum(images.valid)), "s0": diffuse + specular, "specular": specular}
     if images.error is not None:
-        for k, name in enumerate(("diffuse_variance", "specular_variance")):
-            deviation = _doubles(images.error[..., k]) * (len(light) / math.fsum(light))
-            sums[name] = float(_total(deviation**2))
+        variances = total(images.error * images.error) / gains.mean() ** 2
+        sums |= {"diffuse_variance": float(variances[0]), "specular_variance": float(variances[1])}
     return replace(images, tally=replace(images.tally, **sums))
 
 

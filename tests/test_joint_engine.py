@@ -395,7 +395,7 @@ def test_images_of_several_networks_are_weighed_as_in_torch(layout: Layout) -> N
     assert found.error is not None and found.dolp is not None and found.aolp is not None and found.tally is not None
     assert expected.expected_error is not None
     assert_close(torch.from_numpy(np.moveaxis(found.error, -1, 0)), expected.expected_error)
-    polarized = torch.complex(expected.stokes.s1[0], expected.stokes.s2[0])
+    polarized = torch.complex(expected.stokes.s1[0], expected.stokes.s2[0]) / expected.stokes.s0[0]
     assert_within(torch.from_numpy(found.dolp), polarized.abs(), 1e-6)
     assert_same_angle(torch.from_numpy(found.aolp), torch.angle(polarized) / 2, 1e-5)
     gain = np.array(light, np.float32)

@@ -61,8 +61,9 @@ def run_joint(network: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
 def combine(separations: list[Separation], shares: Sequence[float] = ()) -> Separation:
     """Several separations of one frame, each pixel weighed by the inverse of its expected variance, times ``shares``.
 
-    Diffuse and specular have weights of their own. A pixel is valid if it is in all of them; the expected error is the
-    weighted mean, since their errors are alike. Polarization and what is not an image are the mean and the first one's.
+    Diffuse and specular have weights of their own, so their sum may differ from s0. A pixel is valid if it is in all of
+    them; the expected error is the weighted mean, since their errors are alike. Stokes images are the plain mean, what
+    is not an image is the first one's.
     """
     first = separations[0]
     if len(separations) == 1:
@@ -74,11 +75,10 @@ def combine(separations: list[Separation], shares: Sequence[float] = ()) -> Sepa
     diffuse, specular = weights[..., :1, :, :], weights[..., 1:, :, :]
     images = (torch.stack([getattr(s, name) for s in separations]) for name in ("diffuse", "specular"))
     body, mirrored = ((w * x).sum(dim=0) for w, x in zip((diffuse, specular), images, strict=True))
-    s1, s2 = (torch.stack([getattr(s.stokes, name) for s in separations]).mean(dim=0) for name in ("s1", "s2"))
+    stokes = (torch.stack([getattr(s.stokes, name) for s in separations]).mean(dim=0) for name in ("s0", "s1", "s2"))
     valid = torch.stack([s.valid for s in separations]).all(dim=0)
     error = (weights * errors).sum(dim=0)
-    stokes = Stokes(body + mirrored, s1, s2)
-    return replace(first, diffuse=body, specular=mirrored, valid=valid, stokes=stokes, expected_error=error)
+    return replace(first, diffuse=body, specular=mirrored, valid=valid, stokes=Stokes(*stokes), expected_error=error)
 
 
 def _run_turned(network: Joint, mosaic: Mosaic, orientation: Orientation, full: bool) -> Separation:

@@ -36,7 +36,7 @@ REACH = 2
 def smooth_separation(separation: Separation, mosaic: Mosaic) -> Separation:
     """A separation of a mosaic ``[..., H, W]`` at half or full resolution, without patterns where samples clip.
 
-    Expected errors stay.
+    Expected errors and Stokes images stay.
     """
     scale, rows, cols = _cells(mosaic, separation.diffuse.shape[-2:])
     images = (separation.diffuse, separation.specular)
@@ -44,8 +44,7 @@ def smooth_separation(separation: Separation, mosaic: Mosaic) -> Separation:
     weight = weigh_clipped(xp.astype(clipped, images[0].dtype), taps_of(PERIOD), shares_of(mosaic.layout.channels))
     weight = repeat_pixels(weight, scale)
     diffuse, specular = (smooth_planes(image, weight, taps_of(PERIOD * scale // 2)) for image in images)
-    stokes = replace(separation.stokes, s0=diffuse + specular)
-    return replace(separation, diffuse=diffuse, specular=specular, stokes=stokes)
+    return replace(separation, diffuse=diffuse, specular=specular)
 
 
 def smooth_clipped(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> FrameImages:

@@ -41,17 +41,15 @@ def _shipped(weights: JointWeights, device: torch.device) -> Joint:
     return network
 
 
-def separate_joint(method: str, capture: Mosaic | Measurements, full: bool = False) -> Separation:
-    """Separate a mosaic by a method of `shipped.NAMES`, with shipped weights.
+def separate_joint(method: str, mosaic: Mosaic, full: bool = False) -> Separation:
+    """Separate mosaics ``[..., H, W]`` by a method of `shipped.NAMES`, with shipped weights.
 
-    Raises ValueError on co-sited measurements, and on layouts that are not Sony's in any orientation.
+    Raises ValueError on layouts that are not Sony's in any orientation.
     """
-    if isinstance(capture, Measurements):
-        raise ValueError(f"expected a mosaic for the method {method}, found four co-sited angle images")
     with _LOADING:
-        networks = [_shipped(weights, capture.data.device) for weights in shipped_joint(method, capture.layout)]
+        networks = [_shipped(weights, mosaic.data.device) for weights in shipped_joint(method, mosaic.layout)]
     shares = [network.share for network in networks]
-    return smooth_separation(combine([run_joint(network, capture, full) for network in networks], shares), capture)
+    return smooth_separation(combine([run_joint(network, mosaic, full) for network in networks], shares), mosaic)
 
 
 def load_refinement(path: Path, device: torch.device) -> tuple[Rung, Refinement]:

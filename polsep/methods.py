@@ -110,8 +110,9 @@ def paper_reference(capture: Capture, full: bool = False) -> Separation:
 
 def joint_reference(name: str, capture: Capture, full: bool = False) -> Separation:
     """`in_torch.separate_joint`; takes mosaics as torch tensors alone. Raises ValueError on others."""
-    if isinstance(capture.data, np.ndarray) or isinstance(capture, Measurements):
-        raise ValueError(f"expected one mosaic [H, W] for the method {name}, found shape {capture.data.shape}")
+    if isinstance(capture, Measurements) or isinstance(capture.data, np.ndarray):
+        found = f"{type(capture).__name__} of {type(capture.data).__name__} {tuple(capture.data.shape)}"
+        raise ValueError(f"expected a Mosaic of torch's Tensor for the reference of {name}, found {found}")
     from polsep.in_torch import separate_joint
 
     return separate_joint(name, capture, full)

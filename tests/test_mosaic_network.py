@@ -212,9 +212,15 @@ def test_methods_take_what_they_have_weights_for(ship: Path) -> None:
     found = separate_joint("joint", mosaic)
     expected = smooth_separation(run_joint(network, mosaic), mosaic)
     assert_within(found.diffuse, expected.diffuse, 0.01)  # weights in half precision
-    co_sited = Measurements(torch.rand(4, 3, 8, 8), COLOR.angles)
-    with pytest.raises(ValueError, match="expected a mosaic for the method joint, found four co-sited angle images"):
-        separate_joint("joint", co_sited)
+    data = torch.rand(4, 3, 8, 8)
+    for capture, said in (
+        (Measurements(data, COLOR.angles), r"Measurements of Tensor \(4, 3, 8, 8\)"),
+        (Mosaic(data[0, 0].numpy(), COLOR, 0.0, 1.0), r"Mosaic of ndarray \(8, 8\)"),
+    ):
+        with pytest.raises(
+            ValueError, match=f"expected a Mosaic of torch's Tensor for the reference of joint, found {said}"
+        ):
+            METHODS["joint"].reference(capture)
 
 
 def test_auto_takes_the_closed_form_where_no_network_does() -> None:

@@ -53,6 +53,9 @@ EDGE_REACH = 0.1
 #: Light below which polarization says nothing about edges.
 EDGE_FLOOR = 1e-3
 
+#: Radius of the window over which the noise of samples is averaged.
+NOISE_RADIUS = 3
+
 #: Colour contrast counts only where it exceeds this many times its expected noise.
 CONTRAST_MARGIN = 2.0
 
@@ -75,7 +78,7 @@ MIN_PRIOR = 1e-6
 def separate_color_affine(measurements: Measurements) -> Separation:
     """Diffuse and white specular of colour samples ``[..., 4, 3, h, w]`` by the closed form above.
 
-    Falls back to `separation.separate_analytic_unclipped` on mono data and, smoothly, on grey surfaces. Recovers
+    Falls back to `separate_analytic_unclipped` on mono data and, smoothly, on grey surfaces. Recovers
     clipped samples from the unclipped analysers and colours of the same pixel; where too few are left, ``valid`` is
     False, the diffuse is interpolated from around and the specular the least that explains the clipping.
     """
@@ -115,7 +118,7 @@ def _unclipped(measurements: Measurements, clipped: Array) -> Array:
     return namespace(clipped).astype(~clipped[..., None, :, :], measurements.data.dtype)
 
 
-def sample_variance(measurements: Measurements, radius: int = 3) -> Array:
+def sample_variance(measurements: Measurements) -> Array:
     """Local noise variance of one sample ``[..., 1, h, w]`` from the analysers' contradiction of m0 + m90 = m45 + m135.
 
     It covers sensor noise and misregistration alike, needs no noise model of the sensor, and is zero on exact data.
@@ -129,9 +132,9 @@ def sample_variance(measurements: Measurements, radius: int = 3) -> Array:
         squared = _fine_details(measurements.data)
     clipped = clipped_pixels(measurements)
     if clipped is None:
-        return box_mean(squared, radius)
+        return box_mean(squared, NOISE_RADIUS)
     weight = _unclipped(measurements, clipped)
-    return box_mean(squared * weight, radius) / box_mean(weight, radius).clip(1e-6, None)
+    return box_mean(squared * weight, NOISE_RADIUS) / box_mean(weight, NOISE_RADIUS).clip(1e-6, None)
 
 
 def _fine_details(data: Array) -> Array:

@@ -670,15 +670,15 @@ def test_a_wrong_layout_is_noted(tmp_path: Path, run_polsep: Cli) -> None:  # no
 
 
 def test_an_ambient_frame_with_the_lamp_on_is_said() -> None:
-    """Such a frame leaves hardly any light; one of a dimmer room, or of none, says nothing."""
+    """Such a frame leaves hardly any light; one of a dimmer room, or of none, says nothing. Strips are told, too."""
     scene = np.random.default_rng(3).integers(500, 3000, SIZE).astype(np.uint16)
 
     def said(room: NDArray[np.uint16]) -> bool:
         with warnings.catch_warnings(action="ignore"):
-            out = polsep.separate(scene, "analytic", white_level=4095, ambient=room)
+            out = polsep.separate(scene[: len(room)], "analytic", white_level=4095, ambient=room)
         return any("was the lamp off in it?" in warning for warning in out.report["warnings"])
 
-    assert said(scene) and said(scene + np.uint16(9))
+    assert said(scene) and said(scene + np.uint16(9)) and said(scene[:6]) and not said(scene[:6] // 8)
     assert not said(scene // 2) and not said(scene // 10) and not said(np.zeros_like(scene))
 
 

@@ -31,7 +31,7 @@ from polsep.calibrate.dark_flat import MOST_CLIPPED, require_same_sensor
 from polsep.calibrate.statistics import Doubles, place_means
 from polsep.compute.arrays import to_numpy
 from polsep.compute.least_squares import least_squares
-from polsep.physics.stokes import axis_deg, diattenuation
+from polsep.physics.stokes import analyser_matrix, axis_deg, diattenuation, stokes_inverse
 from polsep.sensor.calibration import Analyser, Calibration
 from polsep.sensor.camera import Layout, Mosaic
 
@@ -157,11 +157,10 @@ def _places(layout: Layout) -> tuple[Ints, Doubles]:
 
 def _start(means: Doubles, colors: Ints, nominal: Doubles) -> Fit:
     """Sources by least squares behind ideal analysers, in the mean over colours. ValueError on unpolarized ones."""
-    design = 0.5 * np.stack([np.ones_like(nominal), np.cos(2 * nominal), np.sin(2 * nominal)], axis=1)
     light = []
     vector = np.zeros((len(means), 2))
     for color in np.unique(colors):
-        stokes = means[:, colors == color] @ np.linalg.pinv(design[colors == color]).T
+        stokes = means[:, colors == color] @ stokes_inverse(nominal[colors == color]).T
         light.append(stokes[:, 0])
         vector += stokes[:, 1:]
     strength = np.stack(light, axis=1)
@@ -171,7 +170,7 @@ def _start(means: Doubles, colors: Ints, nominal: Doubles) -> Fit:
             f"expected frames behind a linear polarizer, found one of a degree of polarization of {dolp.min():.2f}"
         )
     phi = 0.5 * np.arctan2(vector[:, 1], vector[:, 0])
-    sources = np.stack([np.ones_like(phi), np.cos(2 * phi), np.sin(2 * phi)], axis=1)
+    sources = 2 * analyser_matrix(phi.tolist())
     spread = float(np.linalg.eigvalsh(sources.T @ sources / len(phi))[0])
     if spread < MIN_SPREAD:
         raise ValueError(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
+from polsep.physics.stokes import stokes_inverse
 from polsep.sensor.camera import Layout, Mosaic, clip_level
 from polsep.sensor.levels import LIT
 
@@ -42,7 +43,7 @@ def ambient_notes(frame: Mosaic, less: Mosaic) -> tuple[str, ...]:
     gone = float(np.mean(left[lit] < LEAST_LEFT * was[lit])) if lit.any() else 0.0
     if gone >= MOST_GONE:
         return (f"the ambient frame is as bright as this one in {gone:.0%} of what is lit: was the lamp off in it?",)
-    part = shared_highlights(frame, less)
+    part = shared_highlights(frame, less) if min(frame.data.shape) >= SIDE else None
     if part is None:
         return ()
     return (f"the ambient frame has the highlights of this one in {part:.0%} of their light: was the lamp off in it?",)
@@ -80,12 +81,10 @@ def _bands(samples: NDArray[Any]) -> NDArray[Any]:
 @lru_cache(maxsize=4)
 def _polarization(layout: Layout) -> Floats:
     """Weights ``[2, 4, 4]`` of 4x4 samples, whatever their colours, that make s1 and s2 of a block, mean of colours."""
-    filters = [layout.filter_at(row, col) for row in range(4) for col in range(4)]
-    angle, channel = 2 * np.deg2rad([f.angle_deg for f in filters]), np.array([f.channel for f in filters])
+    filters = [filt for row in layout.table() for filt in row]
+    angle, channel = np.deg2rad([f.angle_deg for f in filters]), np.array([f.channel for f in filters])
     weights = np.zeros((2, 16))
     for color in np.unique(channel):
-        own = channel == color
-        design = 0.5 * np.stack([np.ones(own.sum()), np.cos(angle[own]), np.sin(angle[own])], axis=1)
-        weights[:, own] = np.linalg.pinv(design)[1:]
+        weights[:, channel == color] = stokes_inverse(angle[channel == color])[1:]
     scale = len(np.unique(channel)) * (SIDE // 4) ** 2
     return (weights / scale).astype(np.float32).reshape(2, 4, 4)

@@ -356,6 +356,18 @@ def test_doubtful_light_is_said() -> None:
         assert ("was the polarizer poor" in describe(found, "analysers")) == said
 
 
+@LAYOUTS
+@pytest.mark.parametrize("bits", [8, 12])
+def test_gamma_of_flat_frames_is_said(layout: Layout, bits: int) -> None:
+    """Shot noise grows with light along the falloff of a lens; behind a gamma curve it does not."""
+    sensor, white = BadSensor(layout, dead=0), 2.0**bits - 1
+    for gamma, said in ((1.0, False), (1 / 1.8, True), (1 / 2.2, True)):
+        linear = [(sensor.expose(sensor.sees(np.full(SIZE, 1.0))).data.numpy() - LEVEL) / WHITE for _ in range(30)]
+        codes = [np.round(white * light.clip(0) ** gamma).astype(np.float32) for light in linear]
+        flat = measure_flat(Mosaic(samples, layout, 0.0, white) for samples in codes)
+        assert ("is gamma off in the camera?" in describe(flat, "flat")) == said, (gamma, flat.details)
+
+
 def test_polarized_flat_frames_are_refused() -> None:
     """Gains that hide a lamp's polarization would take it out of every frame; a tenth of that is told, not refused."""
     sensor = BadSensor(Layout(), dead=0)

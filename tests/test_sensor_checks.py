@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import imagecodecs
 import numpy as np
@@ -11,6 +13,9 @@ import torch
 from torch import Tensor
 
 import polsep
+from polsep.calibrate.files import calibrate_files, merge_files
+from polsep.calibrate.lamp import measure_lamp
+from polsep.io.raw.frames import ReadOptions
 from polsep.physics.stokes import Stokes
 from polsep.render.simulate import filter_light
 from polsep.sensor.black_level import BELOW, LEAST_EXCESS, check_black_level
@@ -185,6 +190,18 @@ def test_jpeg_is_seen(layout: Layout) -> None:
     rounded = replace(plain, data=torch.from_numpy(imagecodecs.jpeg_decode(codes).astype(np.float32)))
     assert block_ratio(plain) == pytest.approx(1, abs=0.1)
     assert "JPEG" in (encoding_warning(rounded) or "")
+
+
+def test_encoded_frames_are_said_where_they_are_measured_or_merged(tmp_path: Path) -> None:
+    """Linear light is what calibrations and merged exposures are of."""
+    for power, said in ((1.0, False), (1 / 2.2, True)):
+        shot, read = tmp_path / f"{power:.1f}.png", ReadOptions(white_level=255.0)
+        shot.write_bytes(imagecodecs.png_encode(encoded(frame(COLOR), power).data.numpy().astype(np.uint8)))
+        for _, notes in (
+            calibrate_files([shot], read, tmp_path / f"{power:.1f}.json", "light", partial(measure_lamp, card=True)),
+            merge_files([shot], read, tmp_path / f"{power:.1f}.tiff", None, False),
+        ):
+            assert any("the samples are gamma-encoded" in note for note in notes) == said
 
 
 @pytest.mark.parametrize("size", [2, 4, 6, 16, 30])

@@ -47,6 +47,9 @@ DEGREE, BLOCKS_PER_DEGREE = 6, 4
 #: Apparent degree of polarization of the mean of flat frames, and of one of them, from which gains are not believed:
 #: the sky's light averages out where the camera is turned, a polarizer does not belong there.
 POLARIZED_FLAT, POLARIZER = 0.1, 0.85
+#: Least deviation of the logarithm of a falloff along which noise shows gamma, largest error of its exponent, and the
+#: largest variance of one sample that counts for it, in means of all.
+LEAST_SPREAD, MOST_ERROR, MOST_NOISE = 0.01, 0.1, 10.0
 
 
 def measure_dark(frames: Iterable[Mosaic], before: Calibration | None = None) -> Calibration:
@@ -187,6 +190,7 @@ def measure_flat(frames: Iterable[Mosaic], before: Calibration | None = None) ->
         "place_gains_error": round(float(spread / (signal.size / layout.period**2) ** 0.5), 6),
         "falloff_least": round(least, 4),
         "falloff_lopsided": round(float((1 - fall / fall[::-1, ::-1]).max()), 4),  # as no lens is
+        "noise_exponent": _noise_exponent(flat.variance, fall, layout.period),
         "apparent_dolp": round(polarized, 4),
         "dead_pixels": int(dead.sum()),
     }
@@ -245,6 +249,23 @@ def fit_falloff(image: Floats, period: int) -> Table:
     for (i, j), value in zip(terms, solution, strict=True):
         found[i, j] = value
     return _as_table(found / (design @ solution).max())
+
+
+def _noise_exponent(variance: Floats | None, fall: Floats, period: int) -> float | None:
+    """Exponent of the power of the light that the variance over frames follows along the falloff; None where unsure.
+
+    It is 1 for shot noise in linear samples and 2 - 1 / g in samples encoded by m^g: -0.2 for the usual g of 1 / 2.2.
+    """
+    if variance is None:
+        return None
+    level = np.log(fall, dtype=np.float64)
+    level -= level.mean()
+    spread = float(level.std())
+    noise = np.minimum(variance / np.maximum(tile(place_means(variance, period), fall.shape), 1e-30), MOST_NOISE)
+    noise /= max(float(noise.mean()), 1e-30)
+    error = float(noise.std()) * (2 / noise.size) ** 0.5 / max(spread, LEAST_SPREAD)  # neighbours share half of it
+    sure = spread >= LEAST_SPREAD and error <= MOST_ERROR
+    return round(float((level * noise).mean()) / spread**2, 3) if sure else None
 
 
 def _color_means(table: Doubles, layout: Layout) -> Doubles:

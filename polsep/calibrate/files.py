@@ -21,6 +21,7 @@ from polsep.physics.stokes import axis_deg
 from polsep.sensor.black_level import check_black_level
 from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Mosaic
+from polsep.sensor.encoding import MAX_EXPONENT, encoding_warning
 from polsep.sensor.layout_check import check_layout
 from polsep.sensor.levels import BlackFrame, Overexposed
 
@@ -54,14 +55,13 @@ def calibrate_files(
     read = replace(read, corrections=used, pages=PAGES)
     if kind != "dark":
         require_black_level(paths, read)
-    notes, looks = dict[str, str](), iter([] if kind == "dark" else [check_layout])
+    notes, first = dict[str, str](), iter([] if kind == "dark" else [None])
 
     def check(path: Path, frame: Frame) -> None:
         _require_white_level(path, frame)
         found = [note for note in frame.notes if not isinstance(note, Overexposed | BlackFrame)]
-        for look in islice(looks, 1):  # the first frame shows the layout of all
-            assert isinstance(frame.data, Mosaic)  # as `read_mosaics` makes sure
-            found += [warning] if (warning := look(frame.data).warning) else []
+        for _ in first:  # the first frame shows the layout of all
+            found += _doubts(frame)
         for note in found:
             notes.setdefault(note, f"{frame.stem}: {note}")
 
@@ -72,6 +72,14 @@ def calibrate_files(
     black = "" if kind == "dark" or read.black_level or found.black_level is not None else ASSUMED_BLACK
     line = f"{kind}: {describe(found, kind)}{black} -> {', '.join(str(path) for path in written)}"
     return line, tuple(notes.values())
+
+
+def _doubts(frame: Frame) -> list[str]:
+    """Warnings of a frame whose samples are encoded, or else of another layout."""
+    assert isinstance(frame.data, Mosaic)  # as `read_mosaics` makes sure
+    encoded = encoding_warning(frame.data)
+    warning = check_layout(frame.data).warning if encoded is None else encoded
+    return [] if warning is None else [warning]
 
 
 def _require_white_level(path: Path, frame: Frame) -> None:
@@ -119,10 +127,8 @@ def merge_files(
     def note(path: Path, frame: Frame) -> None:
         recorded.append(frame.exposure)
         forgotten.extend([(path, frame)] if forgets_level(frame) else [])
-        assert isinstance(frame.data, Mosaic)  # as `read_mosaics` makes sure
         found = [text for text in frame.notes if not isinstance(text, Overexposed)]
-        found += [warning] if (warning := check_layout(frame.data).warning) else []
-        notes.extend(f"{frame.stem}: {text}" for text in found)
+        notes.extend(f"{frame.stem}: {text}" for text in (*found, *_doubts(frame)))
 
     frames = list(read_mosaics(paths, read, note))
     if len(forgotten) == len(frames) > 0:  # a short exposure alone may be dark
@@ -178,7 +184,7 @@ def describe(found: Calibration, kind: str) -> str:
             f"gains of filters {min(gains):.3f} to {max(gains):.3f} +- {facts['place_gains_error']:.2g}, of pixels "
             f"{facts['pixel_gains_rms']:.2%} rms, falloff to {facts['falloff_least']:.2f}, {facts['dead_pixels']} dead "
             f"pixels, apparent DoLP {facts['apparent_dolp']:.1%}, {facts['frames']} frames at "
-            f"{facts['brightness']:.0%} of white{_uneven(facts['falloff_lopsided'])}"
+            f"{facts['brightness']:.0%} of white{_uneven(facts['falloff_lopsided'])}{_encoded(facts['noise_exponent'])}"
         )
     if kind == "analysers":
         ratios = sorted(a.extinction for row in found.analysers or () for a in row)
@@ -208,6 +214,12 @@ def _uneven(lopsided: float) -> str:
     """Words on light that was uneven, which would be divided out of every image."""
     side = f"; one side is {lopsided:.0%} darker than the other: was it lit evenly? Else turn the camera between frames"
     return side if lopsided > LOPSIDED else ""
+
+
+def _encoded(exponent: float | None) -> str:
+    """Words on noise that does not grow with light: gains of encoded samples are wrong for linear ones."""
+    seen = f"; noise follows light to the power of {exponent}, of linear samples 1: is gamma off in the camera?"
+    return "" if exponent is None or exponent >= MAX_EXPONENT else seen
 
 
 def _poor(diattenuation: float) -> str:

@@ -176,6 +176,18 @@ def test_a_frame_less_another_has_noise_below_black() -> None:
     assert check_black_level(replace(mosaic, less_ambient=True)).warning is None
 
 
+@pytest.mark.parametrize(("white", "kind"), [(4095, np.uint16), (255, np.uint8), (1, np.float32)])
+def test_a_sensor_that_clips_below_the_white_level_is_said(white: float, kind: type[np.generic]) -> None:
+    """Samples pile up where it clips; the brightest of others do not, however dark, and their contradiction is no gamma."""
+    light = frame(COLOR).data.numpy() / 4095
+    light *= 0.95 / light.max()
+    codes = (light * white).astype(kind)
+    top = np.quantile(codes, 0.99).astype(kind)
+    said = [level_notes(samples, 0.0, white) for samples in (codes, np.minimum(codes, top), (codes / 8).astype(kind))]
+    assert said[0] == said[2] == () and f"say --white-level {top:.6g}" in said[1][0] and len(said[1]) == 1
+    assert check_mosaic(Mosaic(np.minimum(codes, top).astype(np.float32), COLOR, 0.0, white)).warnings == ()
+
+
 def test_overexposure_is_seen_in_codes_moved_to_the_left() -> None:
     """12 bits in 16-bit words end at 65520 of 65535, and clip there."""
     codes = np.where(np.arange(64)[:, None] < 32, 4095, 1000) * np.ones((1, 64), int) << 4

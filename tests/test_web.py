@@ -27,7 +27,7 @@ from polsep.sensor.black_level import check_black_level
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.defects import measure_noise
 from polsep.sensor.encoding import encoding_warning
-from polsep.sensor.levels import as_mosaic
+from polsep.sensor.levels import as_mosaic, level_notes
 from tools import web_page
 from tools.web_page import CHROMIUM, DEMO, HAS_PACKAGES, NODE, WEB, build_page, change, fetch, send, served
 
@@ -692,6 +692,25 @@ def test_layouts_are_read_as_the_library_reads_them(spec: str) -> None:
       console.log(specOf(parseLayout({json.dumps(spec)})));"""
     done = subprocess.run([str(NODE), "--input-type=module", "-e", script], capture_output=True, check=True, timeout=60)
     assert done.stdout.decode().strip() == Layout.parse(spec).spec
+
+
+@needs_packages
+def test_a_white_level_above_where_the_sensor_clips_is_said_as_in_the_library(tmp_path: Path) -> None:
+    """The note offers the level that samples share; frames whose brightest are few have none."""
+    codes = np.random.default_rng(3).integers(64, 3900, (96, 96)).astype(np.uint16)
+    frames = [codes, np.minimum(codes, 3700)]
+    (tmp_path / "frames").write_bytes(b"".join(frame.tobytes() for frame in frames))
+    script = f"""
+      import {{ readFileSync }} from "node:fs";
+      import {{ levelNotes }} from {json.dumps((WEB / "src" / "levels.js").as_uri())};
+      const bytes = readFileSync("frames"), all = new Uint16Array(bytes.buffer, bytes.byteOffset, bytes.length / 2);
+      console.log(JSON.stringify([0, 1].map((k) => levelNotes(all.subarray(k * 9216, (k + 1) * 9216), 96, 0, 4095))));"""
+    done = subprocess.run(
+        [str(NODE), "--input-type=module", "-e", script], cwd=tmp_path, capture_output=True, check=True, timeout=60
+    )
+    even, cut = json.loads(done.stdout)
+    (said,) = level_notes(frames[1], 0.0, 4095.0)
+    assert even == [] and cut == [{"text": said.replace("--white-level", "white level"), "white": 3700}]
 
 
 @needs_packages

@@ -43,6 +43,10 @@ MAX_CLIPPED, LIT = 0.03, 0.02
 #: Of frames of so many rows one group of rows in some is counted.
 LARGE, ROWS, SKIPPED = 1024, 4, 4
 
+#: Where a sensor clips below the white level: samples that share the largest value, at least; how many times those of
+#: one of the codes below they are; and these codes' range, relative to white.
+PILE, PILE_RATIO, PILE_RANGE = 64, 5.0, 1 / 64
+
 #: Order of four angle planes, as LUCID names them, in degrees.
 PLANE_ANGLES_DEG = (0.0, 45.0, 90.0, 135.0)
 
@@ -176,6 +180,8 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
         notes += (f"every sample is clipped: the smallest is {low:g} of white level {white:g}",)
     elif high >= clip:
         notes += overexposure_notes(samples, black_level, white)
+    elif samples.dtype.kind == "f" or white_level is not None or samples.dtype == np.uint8:
+        notes += _saturation_notes(samples, black_level, white)
     if white_level is None and samples.dtype.kind == "f" and high > 2:
         note = f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white"
         return (*notes, ForgottenLevel(note))
@@ -189,6 +195,26 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
     if white_level is None and samples.dtype == np.uint16:
         notes += _depth_notes(samples, int(high))
     return notes
+
+
+def _saturation_notes(samples: NDArray[Any], black_level: float, white: float) -> Notes:
+    if not saturates_early(samples, black_level, white):
+        return ()
+    high = f"{float(samples.max()):.6g}"
+    found = f"many samples share the largest value {high}, below the white level {white:g}"
+    return (f"{found}: if the sensor clips there, say --white-level {high}",)
+
+
+def saturates_early(samples: NDArray[Any], black_level: float, white: float) -> bool:
+    """Whether samples pile up at their largest value, and that is one between black and what counts as clipped."""
+    high = samples.max()
+    if not black_level < high < clip_level(black_level, white):
+        return False
+    count = int(np.count_nonzero(samples == high))
+    if count < PILE:
+        return False
+    below = samples[(samples > high - PILE_RANGE * (white - black_level)) & (samples < high)]
+    return count * np.unique(below).size > PILE_RATIO * below.size > 0
 
 
 def overexposure_notes(samples: NDArray[Any], black_level: float, white: float) -> Notes:

@@ -3,6 +3,7 @@
 /** A sample within this share of white counts as clipped. */
 export const CLIP_MARGIN = 2 ** -10;
 const MAX_CLIPPED = 0.03, LIT = 0.02, NARROW_BITS = [8, 10, 12, 14];
+const PILE = { count: 64, ratio: 5, range: 1 / 64 };
 
 /** The white level that a type of samples implies. */
 export const whiteOf = (samples) =>
@@ -28,12 +29,28 @@ export function levelNotes(samples, width, black, said) {
   if (low - black >= (1 - CLIP_MARGIN) * (white - black))
     notes.push({ text: `every sample is clipped: the smallest is ${low} of white level ${shown}` });
   else if (high >= black + (1 - CLIP_MARGIN) * (white - black)) notes.push(...overexposureNotes(samples, width, black, white));
+  else if ((said != null || !(samples instanceof Uint16Array)) && saturatesEarly(samples, black, white))
+    notes.push({ text: `many samples share the largest value ${Number(high.toPrecision(6))}, below the white level ${shown}: if the ` +
+      `sensor clips there, say white level ${Number(high.toPrecision(6))}`, white: Number(high.toPrecision(6)) });
   if (high > white)
     notes.push({ text: `${above} samples exceed the white level ${shown} (largest ${high}): they count as clipped` });
   if (white > whiteOf(samples))
     notes.push({ text: `white level ${shown} is beyond the file's samples: no sample can count as clipped` });
   if (said == null && samples instanceof Uint16Array) notes.push(...depthNotes(used, high));
   return notes;
+}
+
+/** Whether samples pile up at their largest value, and that is one between black and what counts as clipped. */
+export function saturatesEarly(samples, black, white) {
+  const high = samples.reduce((most, value) => Math.max(most, value), -Infinity);
+  if (!(black < high && high < clipLevel({ black, white }))) return false;
+  const codes = new Set(), least = high - PILE.range * (white - black);
+  let count = 0, below = 0;
+  for (const value of samples) {
+    if (value === high) count++;
+    else if (value > least) below++, codes.add(value);
+  }
+  return count >= PILE.count && below > 0 && count * codes.size > PILE.ratio * below;
 }
 
 /** A note on a frame of which too many lit samples clip, or none. */

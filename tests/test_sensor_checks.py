@@ -178,7 +178,7 @@ def test_a_frame_less_another_has_noise_below_black() -> None:
 
 @pytest.mark.parametrize(("white", "kind"), [(4095, np.uint16), (255, np.uint8), (1, np.float32)])
 def test_a_sensor_that_clips_below_the_white_level_is_said(white: float, kind: type[np.generic]) -> None:
-    """Samples pile up where it clips; the brightest of others do not, however dark, and their contradiction is no gamma."""
+    """Samples pile up where it clips, the brightest of others do not; the contradiction of such samples is no gamma."""
     light = frame(COLOR).data.numpy() / 4095
     light *= 0.95 / light.max()
     codes = (light * white).astype(kind)

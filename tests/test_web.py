@@ -704,7 +704,8 @@ def test_a_white_level_above_where_the_sensor_clips_is_said_as_in_the_library(tm
       import {{ readFileSync }} from "node:fs";
       import {{ levelNotes }} from {json.dumps((WEB / "src" / "levels.js").as_uri())};
       const bytes = readFileSync("frames"), all = new Uint16Array(bytes.buffer, bytes.byteOffset, bytes.length / 2);
-      console.log(JSON.stringify([0, 1].map((k) => levelNotes(all.subarray(k * 9216, (k + 1) * 9216), 96, 0, 4095))));"""
+      const parts = [all.subarray(0, 9216), all.subarray(9216)];
+      console.log(JSON.stringify(parts.map((samples) => levelNotes(samples, 96, 0, 4095))));"""
     done = subprocess.run(
         [str(NODE), "--input-type=module", "-e", script], cwd=tmp_path, capture_output=True, check=True, timeout=60
     )

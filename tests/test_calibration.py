@@ -824,6 +824,17 @@ def test_a_small_part_of_a_card_is_enough() -> None:
     assert lamp is not None and lamp.color == (1.0, 1.0, 1.0)
 
 
+def test_a_hot_pixel_on_a_card_is_no_clipping() -> None:
+    """Of many pixels one counts for nothing; a clipped part of the card is refused."""
+    data = np.full((192, 192), 0.5, np.float32)
+    data[96, 96] = 1
+    lamp = measure_lamp([Mosaic(data, Layout(), 0.0, 1.0)], None, True).lamp
+    assert lamp is not None and lamp.color == pytest.approx((1, 1, 1), abs=0.01)
+    data[90:100, 90:100] = 1
+    with pytest.raises(ValueError, match="found clipped samples"):
+        measure_lamp([Mosaic(data, Layout(), 0.0, 1.0)], None, True)
+
+
 def test_a_black_level_that_nobody_says_is_asked_for(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
     """Where frames show that black is not at 0: the lamp's colour and exposure times would be wrong without a word."""
     rng = np.random.default_rng(0)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polsep.calibrate.dark_flat import require_same_sensor
+from polsep.calibrate.dark_flat import MOST_CLIPPED, require_same_sensor
 from polsep.calibrate.statistics import Doubles
 from polsep.compute.arrays import to_numpy
 from polsep.demosaic.bilinear import demosaic_bilinear_half
@@ -143,7 +143,7 @@ def _card_colors(mosaic: Mosaic) -> list[Doubles]:
     measurements = demosaic_bilinear_half(mosaic)
     height, width = measurements.data.shape[-2:]
     middle = (..., slice(height // 3, height - height // 3), slice(width // 3, width - width // 3))
-    if measurements.clipped is not None and bool(to_numpy(measurements.clipped)[middle].any()):
+    if measurements.clipped is not None and to_numpy(measurements.clipped)[middle].mean() > MOST_CLIPPED:
         raise ValueError("expected a card without clipping in the middle of the frame, found clipped samples")
     light = to_numpy(measurements.data)[middle].mean(axis=-4, dtype=np.float64)
     if float(light.mean()) < DARKEST_CARD:

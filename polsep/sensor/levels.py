@@ -207,14 +207,14 @@ def _saturation_notes(samples: NDArray[Any], black_level: float, white: float) -
 
 def saturates_early(samples: NDArray[Any], black_level: float, white: float) -> bool:
     """Whether samples pile up at their largest value, and that is one between black and what counts as clipped."""
-    high = samples.max()
+    high = float(samples.max())
     if not black_level < high < clip_level(black_level, white):
         return False
     count = int(np.count_nonzero(samples == high))
     if count < PILE:
         return False
     below = samples[(samples > high - PILE_RANGE * (white - black_level)) & (samples < high)]
-    return count * np.unique(below).size > PILE_RATIO * below.size > 0
+    return 0 < PILE_RATIO * below.size < count * np.unique(below).size
 
 
 def overexposure_notes(samples: NDArray[Any], black_level: float, white: float) -> Notes:

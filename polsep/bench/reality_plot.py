@@ -14,6 +14,7 @@ STYLES = {
     "analytic": ("#999999", "o"),
     "color-affine": ("#e69f00", "s"),
     "paper": ("#56b4e9", "v"),
+    "joint-large": ("#cc79a7", "P"),
     "joint": ("#d55e00", "D"),
     "joint-fast": ("#009e73", "^"),
 }

@@ -31,7 +31,7 @@ CROP = (slice(400, 912), slice(300, 812))
 #: 8 bits, bfloat16 and float32 do by less.
 MEANS = {
     "joint-large": (0.2237, 0.00959),
-    "joint": (0.2244, 0.00925),
+    "joint": (0.2242, 0.0093),
     "joint-fast": (0.2225, 0.01074),
     "color-affine": (0.2240, 0.00977),
     "analytic": (0.2170, 0.01614),

@@ -206,7 +206,7 @@ def _saturation_notes(samples: NDArray[Any], black_level: float, white: float) -
 
 
 def saturates_early(samples: NDArray[Any], black_level: float, white: float) -> bool:
-    """Whether samples pile up at their largest value, and that is one between black and what counts as clipped."""
+    """True where samples pile up at their largest value, and that is one between black and what counts as clipped."""
     high = float(samples.max())
     if not black_level < high < clip_level(black_level, white):
         return False

@@ -37,7 +37,7 @@ from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.report import in_light
 from polsep.shipped import find_joint
 
-LIGHT = (0.8, 1.0, 1.3)
+LIGHT = (0.85, 1.0, 1.2)
 SIZE = ResidualSize(4, (0, 1))
 #: Rounding through two dozen layers, in white levels.
 ROUNDED = 1e-4

@@ -37,7 +37,7 @@ from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.report import in_light
 from polsep.shipped import find_joint
 
-LIGHT = (0.85, 1.0, 1.2)
+LIGHT = (0.8, 1.0, 1.3)
 SIZE = ResidualSize(4, (0, 1))
 #: Rounding through two dozen layers, in white levels.
 ROUNDED = 1e-4
@@ -165,10 +165,11 @@ def test_graphs_are_the_whole_method(
         raw = raw.reshape(height // 2, width // 2)
     networks, _ = find_joint(method, Layout.parse(layout), None)
     graph = ExportedNetwork([Joint.of(network, torch.device("cpu")) for network in networks], full)
-    light = [torch.tensor(LIGHT)] if layout == "color" else []
+    lamp = (0.85, 1.0, 1.2)  # near enough to the frames' own that no specular colour is found
+    light = [torch.tensor(lamp)] if layout == "color" else []
     with torch.no_grad():
         found = graph(torch.from_numpy(raw)[None], torch.tensor([0.0]), torch.tensor([white]), *light)
-    asked = {"method": method, "layout": layout, "light_color": LIGHT, "full": full}
+    asked = {"method": method, "layout": layout, "light_color": lamp, "full": full}
     assert_separated([image[0].numpy() for image in found], raw, white, asked, crop is highlight_crop)
 
 

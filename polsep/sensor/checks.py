@@ -15,7 +15,7 @@ from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import remove_defects
 from polsep.sensor.encoding import encoding_warning
 from polsep.sensor.layout_check import check_layout, phase_means
-from polsep.sensor.levels import overexposure_notes, saturates_early
+from polsep.sensor.levels import overexposure_notes
 
 #: Share of pixels that are defects from which on the owner is warned.
 MANY_DEFECTS = 5e-4
@@ -43,8 +43,6 @@ def check_mosaic(mosaic: Mosaic) -> CheckedMosaic:
             exposure += overexposure_notes(samples, black.level, white)
         mosaic = replace(mosaic, black_level=black.level)
         phases = phase_means(mosaic)
-    if encoded is not None and saturates_early(to_numpy(mosaic.data), mosaic.black_level, mosaic.white_level):
-        encoded = None  # samples that clip unknown contradict the analysers, too
     understood = encoded is None and (black.warning is None or black.level is not None)
     layout = check_layout(mosaic, phases).warning if understood else None
     mosaic, count = remove_defects(mosaic)

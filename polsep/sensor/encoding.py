@@ -20,6 +20,7 @@ from polsep.compute.arrays import to_numpy
 from polsep.sensor.black_level import smooth_blocks
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.layout_check import crossed_pairs, phase_cells, phase_means
+from polsep.sensor.levels import saturates_early
 from polsep.sensor.noise import MIN_SPAN
 
 Floats = NDArray[np.float32]
@@ -47,6 +48,8 @@ def encoding_warning(mosaic: Mosaic, phases: Floats | None = None) -> str | None
     """A line on samples that are gamma-encoded or were JPEG files, or None; the first frame of a batch."""
     slope = gamma_slope(mosaic, phases)
     bent = slope is not None and MIN_SLOPE < slope < MAX_SLOPE
+    # Samples that clip below the white level contradict the analysers, too.
+    bent = bent and not saturates_early(to_numpy(mosaic.data), mosaic.black_level, mosaic.white_level)
     rise = noise_exponent(mosaic) if bent else None
     if rise is not None and rise < MAX_EXPONENT:
         return (

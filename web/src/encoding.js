@@ -1,5 +1,6 @@
 // Samples that are no longer linear light: gamma curves and JPEG. Twin of polsep/sensor/encoding.py, which explains it.
 
+import { saturatesEarly } from "./levels.js";
 import { crossedPairs, seePhases } from "./layout_check.js";
 import { median, quantile } from "./numbers.js";
 import { smoothBlocks } from "./noise.js";
@@ -11,7 +12,8 @@ const MIN_RANGE = 0.25, MAX_DOLP = 0.9, MIN_DOLP = 0.05, MIN_CELLS = 64, MIN_SID
 /** A line on samples that are gamma-encoded or were JPEG files, or null. */
 export function encodingWarning(mosaic, phases = seePhases(mosaic)) {
   const slope = gammaSlope(mosaic, phases), bent = slope !== null && MIN_SLOPE < slope && slope < MAX_SLOPE;
-  const rise = bent ? noiseExponent(mosaic) : null;
+  const early = bent && saturatesEarly(mosaic.data, mosaic.black, mosaic.white);  // contradicts the analysers, too
+  const rise = bent && !early ? noiseExponent(mosaic) : null;
   if (rise !== null && rise < MAX_EXPONENT)
     return "the samples are gamma-encoded, as analysers and noise show: linear ones were expected; record with gamma off (1), " +
       "or decode the frame first";

@@ -10,7 +10,7 @@ import { fillUnderHighlights } from "./highlights.js";
 import { separateJoint } from "./joint.js";
 import { checkLayout, seePhases } from "./layout_check.js";
 import { channelsOf, parseLayout, periodOf, specOf } from "./layout.js";
-import { levelNotes, overexposureNotes, saturatesEarly, whiteOf } from "./levels.js";
+import { levelNotes, overexposureNotes, whiteOf } from "./levels.js";
 import { findLight } from "./light.js";
 import { checkBlackLevel } from "./noise.js";
 import { readFrame } from "./read.js";
@@ -117,7 +117,7 @@ function prepare(settings) {
   tell(0.05, "Checking the frame");
   let phases = seePhases(mosaic);
   const level = checkBlackLevel(mosaic);
-  const encoded = saturatesEarly(frame.data, black, white) ? null : encodingWarning(mosaic, phases);
+  const encoded = encodingWarning(mosaic, phases);
   if (encoded) notes.push({ text: encoded });
   const taken = level?.level != null && black === 0;
   if (level) notes.push({ text: level.text, black: taken ? null : level.shown });

@@ -10,7 +10,7 @@ from torch.nn.functional import pixel_unshuffle
 from polsep.networks.channels import MIN_BRIGHTNESS, PERIOD
 from polsep.networks.joint import Joint
 from polsep.networks.sizes import ResidualSize
-from polsep.networks.thumbnails import SIDE, thumbnail_channels
+from polsep.networks.thumbnails import SIDE, keep_color, thumbnail_channels
 from polsep.networks.whole_frame import make_thumbnail
 from polsep.networks.whole_frame_kernel import thumbnail_of
 from polsep.physics.stokes import Stokes
@@ -53,6 +53,21 @@ def test_even_light_is_found_exactly(layout: Layout) -> None:
     assert_close(found[:-2], torch.asinh(means / brightness).expand(-1, SIDE, SIDE))
     assert_close(found[-2], torch.zeros(SIDE, SIDE))
     assert_close(found[-1], torch.full((SIDE, SIDE), brightness).log())
+
+
+@pytest.mark.parametrize("color", [0, 1, 2])
+def test_one_color_of_a_thumbnail_is_that_of_a_sensor_without_filters(color: int) -> None:
+    """Where light is even over a packed pixel: there both sensors see the same."""
+    light = (
+        torch.rand(3, 3, 16, 16, generator=torch.Generator().manual_seed(5))
+        + torch.tensor([1.0, 0, 0])[:, None, None, None]
+    )
+    s0, s1, s2 = (0.3 * x.repeat_interleave(PERIOD, -2).repeat_interleave(PERIOD, -1) for x in light.unbind(1))
+    colored = thumbnail(expose(Stokes(s0, s1, s2), COLOR, IDEAL))
+    own = slice(color, color + 1)
+    assert_close(
+        keep_color(colored, color), thumbnail(expose(Stokes(s0[own], s1[own], s2[own]), MONO, IDEAL)), scale=10
+    )
 
 
 def test_a_crop_with_its_frames_thumbnail_is_the_frames_crop() -> None:

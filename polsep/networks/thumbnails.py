@@ -29,3 +29,15 @@ def scale_thumbnail(means: Array, largest: Array, clipped: Array) -> Array:
     brightness = xp.clip(xp.mean(s0, axis=(1, 2, 3), keepdims=True), min=0) + MIN_BRIGHTNESS
     light = xp.asinh(xp.concat([means, largest], axis=1) / brightness)
     return xp.concat([light, clipped, xp.broadcast_to(xp.log(brightness), clipped.shape)], axis=1)
+
+
+def keep_color(thumbnail: Array, color: int) -> Array:
+    """A thumbnail ``[N, 17, SIDE, SIDE]`` of a colour frame to that of a frame of one of its colours ``[N, 7, ...]``.
+
+    Nearly what a sensor without colour filters sees of that light: maxima are over half of its samples, and the clipped
+    share is that of all colours.
+    """
+    xp = namespace(thumbnail)
+    light = xp.sinh(thumbnail[:, :15]) * xp.exp(thumbnail[:, 16:])
+    means, largest = light[:, color:9:3], light[:, 9 + color :: 3]
+    return scale_thumbnail(means, largest, thumbnail[:, 15:16])

@@ -32,7 +32,7 @@ SIZES = {
 #: Source of their Stokes images for colour frames; mono frames use a linear filter.
 DEMOSAICKERS: dict[str, Demosaicker] = {"joint-large": "guided", "joint": "guided", "joint-fast": "linear"}
 #: Networks that see a thumbnail of the whole frame, by name and variant.
-SEES_FRAME = {("joint-large", "mosaic"), ("joint", "mosaic"), ("joint-fast", "mosaic")}
+SEES_FRAME = {("joint-large", "mosaic"), ("joint", "mosaic"), ("joint", "mono"), ("joint-fast", "mosaic")}
 #: Cells by which the guided demosaicker extends crops.
 MARGIN = 8
 #: Batches for the fit of the filter, size of their scene pool, and their lane, which no worker uses.

@@ -24,6 +24,7 @@ from torch.nn.functional import pixel_unshuffle
 from torch.utils.data import IterableDataset, get_worker_info
 
 from polsep.networks.channels import PERIOD
+from polsep.networks.thumbnails import keep_color
 from polsep.networks.whole_frame import make_thumbnail
 from polsep.physics.stokes import Stokes
 from polsep.render.materials import Materials, random_materials
@@ -409,7 +410,6 @@ def expose_mono(examples: Examples) -> Examples:
     generator = torch.Generator().manual_seed(zlib.crc32(examples.raw.cpu().numpy().tobytes()))
     raw = torch.stack([add_gaussian_noise(x, random_sensor(generator), generator) for x in signal])
     clipped = raw >= 1 - CLIP_MARGIN
-    planes, masks = (pixel_unshuffle(x[:, None].float(), PERIOD) for x in (raw, clipped))
     mono = examples._replace(raw=raw, clipped=clipped, diffuse=diffuse, specular=specular, polarized=polarized)
-    mono = mono._replace(thumbnail=make_thumbnail(planes, masks, MONO))
+    mono = mono._replace(thumbnail=keep_color(examples.thumbnail.cpu(), 1))
     return Examples(*(x.to(examples.raw.device) for x in mono))

@@ -359,6 +359,8 @@ def test_stacks_of_four_angles_are_read_as_such(tmp_path: Path, pages: str) -> N
         (["--angles", "unknown", "p.tif", "c.tif"], "expected at least 5 photographs"),
         (["--angles", "unknown", "{angle}.tif"], "expected angles for a name with {angle}"),
         (["--angles", "0,60,120"], "Missing argument 'FILE...'"),
+        (["--parallel", "p.tif", "--crossed", "./p.tif"], "p.tif: expected a photograph of each angle"),
+        (["--angles", "0,60,120", "p.tif", "link.tif", "c.tif"], "link.tif: expected a photograph of each angle"),
         (["--exposures", "1,2", "p.tif"], "expected --exposures with --parallel and --crossed"),
         (["--parallel", "p.tif", "--crossed", "c.tif", "--exposures", "1,0"], "expected positive exposures"),
         ([], "Missing argument 'FILE...'"),
@@ -372,6 +374,7 @@ def test_wrong_photographs_get_one_line(
         write_tiff(Path(f"{name}.tif"), image)
     write_tiff(Path("small.tif"), photograph(90)[:, 1:])
     Path("cut.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    Path("link.tif").symlink_to("p.tif")
     av = pytest.importorskip("av")
     with av.open("film.mp4", "w") as container:
         stream = container.add_stream("mpeg4", rate=25)

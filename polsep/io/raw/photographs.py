@@ -8,6 +8,7 @@ JPEG, and films that are not lossless RGB or grey, have a curve, so they are rea
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
@@ -66,9 +67,11 @@ class Photographs:
 def read_photographs(paths: Sequence[Path], encoded: bool = False, full: bool = False) -> Photographs:
     """The photographs of K files, or of one film or file of several pages; see the module.
 
-    Raises InputError on whatever can't be read, and on photographs of different sizes, types or white levels.
+    Raises InputError on whatever can't be read, on a file that is named twice, and on photographs of different sizes,
+    types or white levels.
     """
     pages: list[tuple[str, Page]] = []
+    _require_different(paths)
     for path in paths:
         with naming(path):
             found = _read_pages(path, encoded, full)
@@ -84,6 +87,16 @@ def read_photographs(paths: Sequence[Path], encoded: bool = False, full: bool = 
     notes = tuple(dict.fromkeys(note for _, page in pages for note in page.notes))
     exposures = said if len(said) == len(pages) else None
     return Photographs(array, names, levels.pop(), exposures, notes, first.exposure, first.captured)
+
+
+def _require_different(paths: Sequence[Path]) -> None:
+    """Raise InputError where two paths lead to one file, of which only one angle of the filter can be right."""
+    seen: dict[str, Path] = {}
+    for path in paths:
+        file = os.path.realpath(path)
+        if file in seen:
+            raise input_error(path, f"expected a photograph of each angle of the filter, found {seen[file]} again")
+        seen[file] = path
 
 
 def _read_pages(path: Path, encoded: bool, full: bool) -> list[Page]:

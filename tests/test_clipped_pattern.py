@@ -126,6 +126,14 @@ def test_kernels_and_tensors_agree(layout: Layout, scale: int, analysers: int) -
         assert two.stokes is apart.stokes
 
 
+@pytest.mark.parametrize("layout", [COLOR, MONO])
+def test_the_order_of_samples_in_memory_changes_nothing(layout: Layout) -> None:
+    mosaic = frame(layout)
+    turned = replace(mosaic, data=np.asfortranarray(mosaic.data))
+    plain, other = (smooth_clipped(images_of(dots(layout, 1)), each, LIGHT) for each in (mosaic, turned))
+    assert (plain.diffuse == other.diffuse).all() and plain.tally == other.tally
+
+
 @pytest.mark.parametrize(("layout", "scale"), CASES)
 def test_sums_are_those_of_the_images(layout: Layout, scale: int) -> None:
     """Of white light, means over colours, as the report has them."""

@@ -50,7 +50,7 @@ def smooth_separation(separation: Separation, mosaic: Mosaic) -> Separation:
 def smooth_clipped(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]) -> FrameImages:
     """`smooth_separation` of one frame by kernels, in a ``light`` (camera RGB); arrays of images are written to."""
     scale, rows, cols = _cells(mosaic, images.diffuse.shape[:2])
-    clipped = to_numpy(mosaic.data)[rows, cols] >= mosaic.clip_level
+    clipped = np.ascontiguousarray(to_numpy(mosaic.data)[rows, cols] >= mosaic.clip_level)
     if not clipped.any():
         return images
     make_ready(clipped_pattern_kernel.warm_up)

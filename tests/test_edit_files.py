@@ -638,6 +638,22 @@ def test_bad_images_are_refused(tmp_path: Path, array: NDArray[Any], kind: str, 
         read_map(tmp_path / "x.npy", kind)
 
 
+@pytest.mark.parametrize("kind", ["texture", "mask"])
+def test_a_matte_in_the_alpha_channel_is_not_left_out(tmp_path: Path, kind: str) -> None:
+    """Programs write one with colours, or beside white: refused, unless it is even or what the colours are."""
+    matte = np.eye(8, dtype=np.float32)
+
+    def written(light: NDArray[Any], alpha: NDArray[Any]) -> Path:
+        (tmp_path / "m.exr").write_bytes(encode_exr({**dict.fromkeys("RGB", light), "A": alpha}, {}))
+        return tmp_path / "m.exr"
+
+    with pytest.raises(InputError, match=r"m\.exr: expected an image without alpha, found a channel A from 0 to 1"):
+        read_map(written(np.ones_like(matte), matte), kind)
+    for alpha in (matte, np.ones_like(matte), np.zeros_like(matte)):
+        found = read_map(written(matte, alpha), kind)
+        assert (found.reshape(8, 8, -1) == matte[..., None]).all()
+
+
 @pytest.mark.parametrize("suffix", ["png", "jpg", "exr", "npy", "tiff"])
 def test_files_of_another_kind_are_refused(tmp_path: Path, suffix: str) -> None:
     """Once by name, in one line."""

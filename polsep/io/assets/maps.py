@@ -127,8 +127,21 @@ def _checked(codes: NDArray[Any]) -> NDArray[Any]:
 def _from_planes(planes: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
     for names in ("RGB", "XYZ", "Y"):
         if set(names) <= set(planes):
+            _require_no_alpha(planes, names[0])
             return np.stack([planes[name] for name in names], axis=-1)
     raise InputError(f"expected channels R, G and B, or X, Y and Z, or Y, found {', '.join(sorted(planes)[:8])}")
+
+
+def _require_no_alpha(planes: Mapping[str, NDArray[Any]], name: str) -> None:
+    """Raise InputError on an alpha channel that says something: more than one number, and not what channel ``name`` is.
+
+    A matte may lie in it, and colours may be multiplied by it. PNG files with alpha are refused, too.
+    """
+    alpha = planes.get("A")
+    if alpha is None or (alpha == alpha[:1, :1]).all() or np.array_equal(alpha, planes[name]):
+        return
+    low, high = float(alpha.min()), float(alpha.max())
+    raise InputError(f"expected an image without alpha, found a channel A from {low:g} to {high:g}")
 
 
 def _in_unit(codes: NDArray[Any], white: float | None) -> NDArray[Any]:

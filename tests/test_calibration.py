@@ -896,6 +896,18 @@ def test_exposure_is_judged_above_the_measured_black(tmp_path: Path, scale: int,
     assert found.report["warnings"][0] == one.notes[0]
 
 
+def test_the_white_of_floats_is_not_that_of_codes(tmp_path: Path) -> None:
+    """A lamp that was measured in a merged frame, whose white is 1, says nothing of the white level of raw frames."""
+    lamp = Calibration(Layout(), 1.0, lamp=LampFacts((0.5, 1.0, 0.7), None, None))
+    codes = np.random.default_rng(2).integers(100, 65_000, (32, 32)).astype(np.uint16)
+    np.save(tmp_path / "shot.npy", codes)
+    (read,) = read_frames(tmp_path / "shot.npy", ReadOptions(corrections=Corrections(lamp)))
+    with warnings.catch_warnings(action="ignore"):  # of noise
+        found = polsep.separate(codes, "analytic", calibration=lamp)
+    assert read.white_level == found.report["white_level"] == 65535
+    assert lamp.white_level_of(codes.astype(np.float32)) == 1
+
+
 def test_maps_replace_no_file_of_something_else(tmp_path: Path) -> None:
     """Raw frames in rig.npz stay when rig.json is written, with maps and without; maps of before do not."""
     sensor, rig, maps = BadSensor(Layout()), tmp_path / "rig.json", tmp_path / "rig.npz"

@@ -35,7 +35,7 @@ from polsep.sensor.ambient import ambient_notes
 from polsep.sensor.camera import Layout, Mosaic, clip_level, require_layout
 from polsep.sensor.defects import MIN_SIZE, repair
 from polsep.sensor.falloff import Table
-from polsep.sensor.levels import WHITE_LEVELS
+from polsep.sensor.levels import MOST_FLOAT, WHITE_LEVELS
 from polsep.sensor.plausible import require_plausible
 
 Floats = NDArray[np.float32]
@@ -120,9 +120,13 @@ class Calibration:
             raise ValueError(f"expected no {name} but {measured}, found {name} {stated:g}")
 
     def white_level_of(self, array: NDArray[Any]) -> float | None:
-        """The calibrated white level for raw frames that do not say theirs; None where their type cannot hold it."""
-        fits = self.white_level <= WHITE_LEVELS.get(getattr(array, "dtype", np.dtype(bool)).name, 0.0)
-        return self.white_level if fits else None
+        """The calibrated white level for raw frames that do not say theirs; None where their type cannot hold it.
+
+        Nor is the white of floats that of integers.
+        """
+        kind = getattr(array, "dtype", np.dtype(bool))
+        fits = self.white_level <= WHITE_LEVELS.get(kind.name, 0.0)
+        return self.white_level if fits and (kind.kind != "u" or self.white_level > MOST_FLOAT) else None
 
     def black_level_of(self, array: NDArray[Any], stated: float, white_level: float | None) -> float:
         """The measured black level in the unit of raw frames of a white level, None: of their type; else ``stated``.

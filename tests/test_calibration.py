@@ -719,6 +719,30 @@ def test_a_dim_lamp_in_an_ambient_frame_is_said(layout: Layout) -> None:
     assert said(lit(0.6, 1)) == said(lit(0, 1.8)) == said(0 * x) == ()
 
 
+def test_ambient_frames_of_another_exposure_time_are_named(tmp_path: Path) -> None:
+    """Where the files of both say it: nothing is scaled. Lamp-off frames of several times are refused."""
+
+    def shot(name: str, time: int | None) -> Path:
+        tags = [] if time is None else [(33434, "2I", 1, (time, 1000), True)]
+        tifffile.imwrite(tmp_path / name, np.full((16, 16), 900, np.uint16), extratags=tags)
+        return tmp_path / name
+
+    def said(time: int | None, *rooms: int | None) -> list[str]:
+        paths = [shot(f"room{k}.tiff", room) for k, room in enumerate(rooms)]
+        read = with_corrections(ReadOptions(white_level=1000), None, paths)
+        (frame,) = read_frames(shot("shot.tiff", time), read)
+        return [note for note in frame.notes if "exposed for" in note]
+
+    assert said(10, 100) == [
+        "the ambient frame was exposed for 0.1 s, this one for 0.01 s: too much is subtracted, "
+        "take one of the same exposure"
+    ]
+    assert "too little" in said(10, 5)[0]
+    assert said(10, 10, 10) == said(10, 10, None) == said(10, None) == said(None, 10) == []
+    with pytest.raises(InputError, match=r"room0\.tiff: expected .* one exposure time, found 0\.01 s and 0\.02 s"):
+        said(10, 10, 20)
+
+
 def test_paper_that_does_not_fill_the_frame_is_refused() -> None:
     """A border in half the light, and a corner in none: neither is a lens, nor are so many pixels dead."""
     sensor = BadSensor(MONO, dead=0)

@@ -6,6 +6,7 @@ ambient frame are: of one lamp. Those of a room lie elsewhere, or are polarized 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -29,6 +30,8 @@ SIDE, STRONG, LEAST, MIN_BLOCKS, MANY = 8, 0.3, 0.01, 12, 2**20
 #: room, ambient frames with the lamp off have 0.40 at most where highlights are so concentrated, with a lamp of a fifth
 #: of its light 0.63 to 0.996.
 ONE_LAMP, ALIKE, LEAST_PART = 0.5, 0.8, 0.02
+#: Exposure times within this factor are equal.
+EQUAL = 1.02
 
 
 def ambient_notes(frame: Mosaic, less: Mosaic) -> tuple[str, ...]:
@@ -47,6 +50,20 @@ def ambient_notes(frame: Mosaic, less: Mosaic) -> tuple[str, ...]:
     if part is None:
         return ()
     return (f"the ambient frame has the highlights of this one in {part:.0%} of their light: was the lamp off in it?",)
+
+
+def exposure_notes(frame_s: float | None, ambient_s: float | None) -> tuple[str, ...]:
+    """A note where a frame and the ambient light that is subtracted from it say different exposure times [s]."""
+    if frame_s is None or ambient_s is None or equally_exposed([frame_s, ambient_s]):
+        return ()
+    much = "much" if ambient_s > frame_s else "little"
+    times = f"the ambient frame was exposed for {ambient_s:.4g} s, this one for {frame_s:.4g} s"
+    return (f"{times}: too {much} is subtracted, take one of the same exposure",)
+
+
+def equally_exposed(times_s: Sequence[float]) -> bool:
+    """True for exposure times that differ by no more than rounding."""
+    return max(times_s) <= EQUAL * min(times_s)
 
 
 def shared_highlights(frame: Mosaic, less: Mosaic) -> float | None:

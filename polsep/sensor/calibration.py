@@ -413,11 +413,15 @@ def _keep_clipped(samples: Floats, clipped: NDArray[np.bool_], levels: tuple[flo
 
 @dataclass(frozen=True, eq=False)
 class Corrections:
-    """Changes to every raw frame before anything else reads it; ``sources`` names their files in reports."""
+    """Changes to every raw frame before anything else reads it; ``sources`` names their files in reports.
+
+    ``ambient_exposure_s``: exposure time of the ambient light in seconds, where its files say it.
+    """
 
     calibration: Calibration | None = None
     ambient: Mosaic | None = None
     sources: Mapping[str, Any] = field(default_factory=dict)
+    ambient_exposure_s: float | None = None
 
     def apply(self, mosaic: Mosaic) -> Mosaic:
         """The frame calibrated and less the ambient light, which is of calibrated frames. Raises ValueError."""

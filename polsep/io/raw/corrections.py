@@ -15,6 +15,7 @@ from polsep.io.raw.frames import Frame, ReadOptions, read_frames
 from polsep.io.raw.sequences import DamagedFrame, input_files, open_sequence
 from polsep.io.store.calibrations import read_calibration
 from polsep.io.store.errors import InputError, input_error
+from polsep.sensor.ambient import equally_exposed
 from polsep.sensor.calibration import Corrections, mean_mosaic
 from polsep.sensor.camera import Mosaic
 
@@ -51,10 +52,21 @@ def _read_corrected(
         sources |= {"calibration": calibration.name, "calibration_sha256": digest}
     corrections = Corrections(measured, None, sources)
     if ambient:
-        room = mean_mosaic(read_mosaics(ambient, replace(read, corrections=corrections)))
+        times: list[float | None] = []
+        frames = read_mosaics(ambient, replace(read, corrections=corrections), lambda _, f: times.append(f.exposure))
+        room = mean_mosaic(frames)
         sources |= {"ambient": [path.name for path in ambient], "ambient_sha256": hash_samples(room.data)}
-        corrections = Corrections(measured, room, sources)
+        corrections = Corrections(measured, room, sources, _one_time(ambient[0], times))
     return replace(read, corrections=corrections)
+
+
+def _one_time(path: Path, times: Sequence[float | None]) -> float | None:
+    """The exposure time of lamp-off frames [s], None where not all say it. Raises InputError on different ones."""
+    known = [time for time in times if time is not None]
+    if known and not equally_exposed(known):
+        found = f"{min(known):.4g} s and {max(known):.4g} s"
+        raise input_error(path, f"expected lamp-off frames of one exposure time, found {found}")
+    return known[0] if len(known) == len(times) else None
 
 
 def hash_samples(samples: Any) -> str:

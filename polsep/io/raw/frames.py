@@ -36,6 +36,7 @@ from polsep.io.raw.videos import read_video
 from polsep.io.store.errors import InputError, as_path, input_error, naming, refuse_pipe
 from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
+from polsep.sensor.ambient import exposure_notes
 from polsep.sensor.calibration import Corrections
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.levels import (
@@ -283,7 +284,7 @@ def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, t
     if isinstance(data, Measurements):
         raise ValueError("expected a raw mosaic to calibrate or to subtract room light from, found four angle images")
     data, more = options.corrections.apply_noting(data)
-    return data, notes + more
+    return data, notes + more + exposure_notes(page.exposure, options.corrections.ambient_exposure_s)
 
 
 def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:

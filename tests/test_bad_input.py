@@ -178,6 +178,12 @@ FILES: list[tuple[str, bytes, dict[str, Any], str]] = [
     ("half16.tiff", tiff(CODES[:4].astype(np.float16) / 2), {}, "found float16"),
     ("nan.tiff", tiff(NAN), {}, "found 1 that are not, the first (nan) at (1, 2)"),
     ("rgb.tiff", tiff(np.arange(192, dtype=np.uint8).reshape(8, 8, 3), photometric="rgb"), {}, "demosaicked"),
+    (
+        "planes.tiff",
+        tiff(STACK5[:4], photometric="rgb", planarconfig="separate"),
+        {},
+        "found one of 4: frames and angles",
+    ),
     # NPY and NPZ
     ("half.npy", npy(CODES)[:3000], {}, "bytes of samples"),
     ("longer.npy", npy(CODES) + b"more", {}, "bytes of samples"),

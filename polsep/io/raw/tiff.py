@@ -76,6 +76,9 @@ def _read_page(page: tifffile.TiffPage, index: int, count: int) -> Page:
         raise InputError(f"expected one TIFF directory per picture, found one for {pictures} pictures")
     array = np.asarray(page.asarray())
     if page.planarconfig == 2 and array.ndim == 3:  # separate planes [C, H, W]
+        if len(array) not in (1, 3):  # as tifffile writes four frames or angles, unless it is told otherwise
+            pages = "frames and angles are pages of their own (tifffile: photometric='minisblack')"
+            raise InputError(f"expected a picture of one plane, or of three, found one of {len(array)}: {pages}")
         array = np.moveaxis(array, 0, -1)
     bits = page.bitspersample
     white = 2.0**bits - 1 if array.dtype == np.uint16 and bits < 16 else None

@@ -364,6 +364,7 @@ ARRAYS: list[tuple[str, Callable[[], object], str]] = [
     ("levels reversed", lambda: as_mosaic(np.ones((4, 4)), None, 9.0, 3.0), "found white 3, black 9"),
     ("below codes", lambda: as_mosaic(CODES, None, -5), "a black level from 0 on in samples of uint16, found -5"),
     ("text", lambda: as_mosaic(np.ones((4, 4)), None, 0.0, "4095"), "expected a white level that is a number"),  # type: ignore[arg-type]
+    ("truth", lambda: as_mosaic(CODES, None, 0.0, True), "expected a white level that is a number, found True"),
     ("nothing", lambda: as_mosaic(np.ones((4, 4)), None, None), "expected a black level that is a number"),  # type: ignore[arg-type]
     ("infinite", lambda: as_mosaic(np.ones((4, 4)), None, 0.0, np.inf), "expected finite black and white levels"),
     ("three angles", lambda: as_measurements(np.ones((3, 4, 4))), "expected four gray or RGB images"),

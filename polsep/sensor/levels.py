@@ -312,7 +312,7 @@ def _white_level(samples: NDArray[Any], black_level: float, white_level: float |
     """The given white level, or that of the dtype. Raises ValueError unless it is finite and above black."""
     white = WHITE_LEVELS[samples.dtype.name] if white_level is None else white_level
     for name, level in (("black", black_level), ("white", white)):
-        if not isinstance(level, Real):
+        if not isinstance(level, Real) or isinstance(level, bool):  # True would be a white of 1
             raise WrongType(f"expected a {name} level that is a number, found {level!r:.40}")
     if not (math.isfinite(white) and math.isfinite(black_level)):
         raise ValueError(f"expected finite black and white levels, found {black_level:g} and {white:g}")

@@ -1,4 +1,4 @@
-"""The fused analytic kernel against its twin: every layout, size, dtype, packing and border, clipped samples too."""
+"""The fused analytic kernels against their twin: every layout, size, dtype, packing and border, clipped samples too."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ from polsep.separation.report import images_of, in_light, tally
 SONY = ((90, 45), (135, 0))
 PERMUTED = ((0, 135), (45, 90))
 UNUSUAL = ((10, 75), (200, -30))
+LIGHT = (0.8, 1.0, 1.3)
 WHITES = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0}
 ROUNDING = 2e-6  # of white: float32, summed in another order
 ANGLE = 1e-5  # [rad], the polynomial's arctangent
@@ -50,6 +51,9 @@ LAYOUTS = [
     Layout(SONY, None),
     Layout(UNUSUAL, None),
 ]
+#: Kernels by their resolution.
+KERNELS = {"half": separate_analytic_half, "full": separate_analytic_full}
+RESOLUTIONS = pytest.mark.parametrize("full", [False, True], ids=KERNELS)
 
 
 @pytest.fixture(autouse=True)
@@ -87,16 +91,21 @@ def assert_same(images: AnalyticImages, expected: Separation, tolerance: float =
     np.testing.assert_array_equal(images.valid, expected.valid.numpy())
 
 
+def separate(full: bool, *given: Any) -> AnalyticImages:
+    """What the kernel of a resolution makes of a frame."""
+    return KERNELS["full" if full else "half"](*given)
+
+
 def assert_agrees(
     raw: NDArray[Any], layout: Layout, black: float = 0.0, white: float | None = None, full: bool = False
 ) -> AnalyticImages:
     levels = black, WHITES[str(raw.dtype)] if white is None else white
-    images = (separate_analytic_full if full else separate_analytic_half)(raw, layout, *levels)
+    images = separate(full, raw, layout, *levels)
     assert_same(images, twin(raw, layout, levels, (1.0, 1.0, 1.0), full))
     return images
 
 
-@pytest.mark.parametrize("full", [False, True], ids=["half", "full"])
+@RESOLUTIONS
 @pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
 def test_every_layout_and_size_agrees(layout: Layout, full: bool) -> None:
     """From one period on, odd sizes too, with and without clipped samples, within a strip and across strips."""
@@ -109,7 +118,7 @@ def test_every_layout_and_size_agrees(layout: Layout, full: bool) -> None:
         assert_agrees(random_codes(shape, clipped=0.03, seed=seed), layout, full=full)
 
 
-@pytest.mark.parametrize("full", [False, True], ids=["half", "full"])
+@RESOLUTIONS
 @given(
     st.sampled_from(LAYOUTS),
     st.tuples(st.integers(5, 24), st.integers(5, 40)),
@@ -125,48 +134,63 @@ def test_any_frame_agrees(
     assert_agrees(raw, layout, black=WHITES[dtype] / 20, full=full)
 
 
+@RESOLUTIONS
 @pytest.mark.parametrize("layout", [LAYOUTS[0], LAYOUTS[5], Layout(SONY, None)], ids=spec)
-def test_one_clipped_sample_marks_what_it_touches(layout: Layout) -> None:
+def test_one_clipped_sample_marks_what_it_touches(layout: Layout, full: bool) -> None:
     """Wherever the one clipped sample lies, border included, the same pixels lose validity as in the twin."""
     for row in range(10):
         for col in range(10):
             raw = np.full((10, 10), 0.5, np.float32)
             raw[row, col] = 1
-            assert_agrees(raw, layout)
+            assert_agrees(raw, layout, full=full)
 
 
-def test_uniform_polarized_field_is_exact_to_the_border() -> None:
-    """Every layout of a uniform field gives one diffuse and one specular value: nothing is invented at borders."""
-    for layout in LAYOUTS:
-        angles = np.array([[layout.filter_at(row, col).angle_deg for col in range(9)] for row in range(9)])
-        raw = 0.5 * (0.8 + 0.3 * np.cos(2 * np.radians(angles - 25)))
-        images = separate_analytic_half(raw.astype(np.float32), layout, 0.0, 1.0)
-        assert_within(torch.from_numpy(images.specular), 0.3, ROUNDING)
-        assert_within(torch.from_numpy(images.diffuse), 0.5, ROUNDING)
+@RESOLUTIONS
+@pytest.mark.parametrize("layout", LAYOUTS, ids=spec)
+def test_uniform_polarized_field_is_exact_to_the_border(layout: Layout, full: bool) -> None:
+    """A uniform field gives one diffuse and one specular value, of every whole cell: nothing is invented at borders."""
+    angles = np.array([[layout.filter_at(row, col).angle_deg for col in range(11)] for row in range(9)])
+    raw = 0.5 * (0.8 + 0.3 * np.cos(2 * np.radians(angles - 25)))
+    images = separate(full, raw.astype(np.float32), layout, 0.0, 1.0)
+    cells = tuple((n - start) // 2 for n, start in zip((9, 11), layout.origin, strict=True))
+    assert images.diffuse.shape[:2] == tuple(2 * n if full else n for n in cells)
+    assert_within(torch.from_numpy(images.specular), 0.3, ROUNDING)
+    assert_within(torch.from_numpy(images.diffuse), 0.5, ROUNDING)
 
 
-@pytest.mark.parametrize("light", [(0.8, 1.0, 1.3), (2.0, 1.0, 0.25)])
+def test_samples_stay_where_they_are() -> None:
+    """Of one bright sample, its own pixel has what its own filter alone says, whatever is around."""
+    layout = Layout(UNUSUAL, None)
+    for row, col in ((4, 4), (4, 5), (5, 4), (5, 5)):
+        raw = np.zeros((10, 10), np.float32)
+        raw[row, col] = 0.8
+        images = separate_analytic_full(raw, layout, 0.0, 1.0)
+        alone = twin(raw, layout, (0.0, 1.0), (1.0, 1.0, 1.0), full=True).stokes.s0[0, row, col]
+        total = images.diffuse + images.specular
+        assert_within(torch.tensor(total[row, col, 0]), max(float(alone), 0.0), ROUNDING)
+        assert float(total.max()) == pytest.approx(float(total[row, col, 0]))
+
+
+@RESOLUTIONS
+@pytest.mark.parametrize("light", [LIGHT, (2.0, 1.0, 0.25)])
 @pytest.mark.parametrize("layout", [LAYOUTS[1], LAYOUTS[6], Layout(SONY, None)], ids=spec)
-def test_light_color_is_divided_out_and_multiplied_back(layout: Layout, light: tuple[float, ...]) -> None:
+def test_light_color_is_divided_out_and_multiplied_back(layout: Layout, light: tuple[float, ...], full: bool) -> None:
     """As `Mosaic.light_color` and, on demand, as the pipeline's `in_light`."""
     raw = random_codes((17, 23), clipped=0.01)
-    expected = twin(raw, layout, (1000.0, 65535.0), light)
-    options = AnalyticOptions(light)
-    assert_same(separate_analytic_half(raw, layout, 1000, 65535, options), expected, ROUNDING / min(light))
-    options = AnalyticOptions(light, in_light=True)
-    assert_same(
-        separate_analytic_half(raw, layout, 1000, 65535, options),
-        in_light(expected, light[: layout.channels]),
-        ROUNDING * max(light),
-    )
+    expected = twin(raw, layout, (1000.0, 65535.0), light, full)
+    found = separate(full, raw, layout, 1000, 65535, AnalyticOptions(light))
+    assert_same(found, expected, ROUNDING / min(light))
+    found = separate(full, raw, layout, 1000, 65535, AnalyticOptions(light, in_light=True))
+    assert_same(found, in_light(expected, light[: layout.channels]), ROUNDING * max(light))
 
 
-@pytest.mark.parametrize("layout", [LAYOUTS[0], LAYOUTS[8], Layout(SONY, None)], ids=spec)
-def test_dolp_and_aolp_agree_with_the_pipeline(layout: Layout) -> None:
+@RESOLUTIONS
+@pytest.mark.parametrize("layout", [LAYOUTS[0], LAYOUTS[6], LAYOUTS[8], Layout(SONY, None)], ids=spec)
+def test_dolp_and_aolp_agree_with_the_pipeline(layout: Layout, full: bool) -> None:
     """DoLP and AoLP of the mean over colours in white light; AoLP where it is defined to more than rounding."""
-    light, raw = (0.8, 1.0, 1.3), random_codes((40, 60))
-    images = separate_analytic_half(raw, layout, 0, 65535, AnalyticOptions(light, in_light=True, report=True))
-    white = twin(raw, layout, (0.0, 65535.0), light)
+    raw = random_codes((40, 60))
+    images = separate(full, raw, layout, 0, 65535, AnalyticOptions(LIGHT, in_light=True, report=True))
+    white = twin(raw, layout, (0.0, 65535.0), LIGHT, full)
     expected = images_of(white, white)
     assert expected.dolp is not None and expected.aolp is not None
     assert images.dolp is not None and images.aolp is not None
@@ -176,15 +200,15 @@ def test_dolp_and_aolp_agree_with_the_pipeline(layout: Layout) -> None:
     assert float((away * np.minimum(expected.dolp, 1)).max()) < ANGLE
 
 
-@pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), (0.8, 1.0, 1.3)])
+@RESOLUTIONS
+@pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), LIGHT])
 @pytest.mark.parametrize("layout", [LAYOUTS[0], LAYOUTS[6], LAYOUTS[8], Layout(SONY, None)], ids=spec)
-def test_tally_is_the_twins(layout: Layout, light: tuple[float, ...]) -> None:
+def test_tally_is_the_twins(layout: Layout, light: tuple[float, ...], full: bool) -> None:
     """Every sum over the frame, of white light whatever the images are in; the counts exactly."""
-    raw = random_codes((71, 60), clipped=0.01)
-    mosaic = Mosaic(torch.from_numpy(raw.astype(np.float32)), layout, 25_000.0, 65535.0, light)
-    expected = tally(compose(demosaic_bilinear_half, separate_analytic)(mosaic))
+    raw = random_codes((71, 61), clipped=0.01)
+    expected = tally(twin(raw, layout, (25_000.0, 65535.0), light, full))
     options = AnalyticOptions(light, in_light=True, report=True)
-    found = separate_analytic_half(raw, layout, 25_000, 65535, options).tally
+    found = separate(full, raw, layout, 25_000, 65535, options).tally
     assert found is not None and found.clipped > 0 and found.above_one > 0
     for name in ("pixels", "clipped", "valid", "above_one", "residual", "noise"):
         assert getattr(found, name) == getattr(expected, name)
@@ -211,8 +235,9 @@ def test_aolp_is_exact_around_the_circle() -> None:
         assert max(images.dolp.max(), images.aolp.max(), images.specular.max()) <= ROUNDING * level
 
 
+@RESOLUTIONS
 @pytest.mark.parametrize("name", ["Mono12Packed", "BayerRG12Packed", "Mono12p", "BayerRG12p"])
-def test_packed_frames_agree_with_unpacked_ones(name: str) -> None:
+def test_packed_frames_agree_with_unpacked_ones(name: str, full: bool) -> None:
     """GenICam's two 12-bit packings, bit for bit, for odd widths and origins, as a stream and in padded rows."""
     packing = "gige" if name.endswith("Packed") else "lsb"
     mono = name.startswith("Mono")
@@ -220,11 +245,11 @@ def test_packed_frames_agree_with_unpacked_ones(name: str) -> None:
     for layout in layouts:
         for height, width in ((5, 5), (6, 7), (8, 8), (9, 13), (7, 50)):
             codes = random_codes((height, width), clipped=0.02) >> 4
-            expected = separate_analytic_half(codes, layout, 64, 4095)
+            expected = separate(full, codes, layout, 64, 4095)
             stream = np.frombuffer(pack_frame(codes, name), np.uint8)
             rows = [np.frombuffer(pack_frame(row[None], name) + b"\xff" * 5, np.uint8) for row in codes]
             for data in (stream, np.stack(rows)):
-                found = separate_analytic_half(PackedFrame(data, height, width, packing), layout, 64, 4095)
+                found = separate(full, PackedFrame(data, height, width, packing), layout, 64, 4095)
                 np.testing.assert_array_equal(found.diffuse, expected.diffuse)
                 np.testing.assert_array_equal(found.specular, expected.specular)
                 np.testing.assert_array_equal(found.valid, expected.valid)
@@ -241,14 +266,15 @@ def test_clip_threshold_is_the_twins(black: int, span: int) -> None:
     assert code == pytest.approx(black + span * (1 - CLIP_MARGIN), rel=1e-4, abs=1e-2)
 
 
-def test_threads_do_not_change_a_bit() -> None:
+@RESOLUTIONS
+def test_threads_do_not_change_a_bit(full: bool) -> None:
     """With one thread and with more than there are strips, into fresh and into given images."""
     raw = random_codes((150, 90), clipped=0.002)
-    expected = separate_analytic_half(raw, Layout(), 0, 65535, AnalyticOptions(report=True))
-    out = AnalyticImages.empty((150, 90), Layout(), report=True)
+    expected = separate(full, raw, Layout(), 0, 65535, AnalyticOptions(report=True))
+    out = AnalyticImages.empty((150, 90), Layout(), report=True, full=full)
     for count in (1, 2, 3, 7):
         set_threads(count)
-        found = separate_analytic_half(raw, Layout(), 0, 65535, AnalyticOptions(report=True, out=out))
+        found = separate(full, raw, Layout(), 0, 65535, AnalyticOptions(report=True, out=out))
         assert found.diffuse is out.diffuse and found.dolp is out.dolp
         assert found.tally == expected.tally
         for name in ("diffuse", "specular", "valid", "dolp", "aolp"):
@@ -286,10 +312,13 @@ def test_diffuse_and_specular_add_up_to_s0() -> None:
         ([[0, 1], [2, 3]], Layout(), (0, 255), "NumPy mosaic or a PackedFrame, found list"),
     ],
 )
-def test_bad_frames_are_refused(raw: Any, layout: Layout, levels: tuple[float, float], message: str) -> None:
+@RESOLUTIONS
+def test_bad_frames_are_refused(
+    raw: Any, layout: Layout, levels: tuple[float, float], message: str, full: bool
+) -> None:
     """One line of what was expected and what was found."""
     with pytest.raises(ValueError, match=message) as error:
-        separate_analytic_half(raw, layout, *levels)
+        separate(full, raw, layout, *levels)
     assert "\n" not in str(error.value)
 
 
@@ -357,6 +386,8 @@ def test_bad_images_are_refused() -> None:
                 255,
                 AnalyticOptions(report=True, out=AnalyticImages(**vars(good) | change)),
             )
+    with pytest.raises(ValueError, match="expected diffuse to be"):
+        separate_analytic_full(np.zeros((8, 8), np.uint8), Layout(), 0, 255, AnalyticOptions(out=good))
 
 
 def test_one_compilation_serves_all_frames() -> None:

@@ -1,6 +1,6 @@
 """The command line: parse, call one function, print. Heavy imports stay inside the commands."""
 
-from polsep.cli import (
+from polsep.cli import (  # noqa: F401  # each adds its commands to the app
     bench,
     calibrate,
     capture,
@@ -18,21 +18,4 @@ from polsep.cli import (
 )
 from polsep.cli.app import app, main
 
-__all__ = [
-    "app",
-    "bench",
-    "calibrate",
-    "capture",
-    "doctor",
-    "edit",
-    "frames",
-    "geometry",
-    "main",
-    "material",
-    "render",
-    "samples",
-    "shape",
-    "train",
-    "video",
-    "view",
-]
+__all__ = ["app", "main"]

@@ -12,7 +12,8 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import reduce
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
     _ParamType = click.ParamType[Any]
 else:
     _ParamType = click.ParamType  # generic from click 8.4 on
+
+Command = Callable[..., Any]
+Decorator = Callable[[Command], Command]
 
 SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True, "max_content_width": 100}
 
@@ -148,6 +152,22 @@ AMBIENT = click.option(
     help="Frame with the lamp off, subtracted; of several (the option repeated, or in a file) their mean.",
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace existing results.")
+SEPARATED_BY = click.option(
+    "--method", default="auto", metavar="NAME", help="Method that separates raw frames; see 'polsep methods'."
+)
+INTEGRATION = click.option(
+    "--integration",
+    type=Word("bilateral", "smooth"),
+    default="bilateral",
+    metavar="bilateral|smooth",
+    help="Depth with jumps, or one smooth surface.",
+)
+TURNTABLE = click.option(
+    "--turntable", is_flag=True, help="Also write DIR/STEM.mp4, the turning mesh; needs the extra video."
+)
+WEIGHTS = click.option(
+    "--weights", type=click.Path(path_type=Path), metavar="FILE", help="Weights of 'polsep train'.  [default: shipped]"
+)
 STOKES = click.option("--stokes", is_flag=True, help="EXR files also get the measured Stokes images S0, S1, S2.")
 DEVICE = click.option("--device", default="auto", metavar="NAME", help="Device: auto, cpu or cuda (extra torch).")
 ENGINE = click.option(
@@ -157,6 +177,20 @@ ENGINE = click.option(
     metavar="NAME",
     help="local: this machine; ray: the cluster of RAY_ADDRESS (extra ray).",
 )
+
+
+def add_options(*options: Decorator) -> Decorator:
+    """The decorator that gives a command these options, in the order of its help."""
+
+    def decorate(command: Command) -> Command:
+        return reduce(lambda decorated, option: option(decorated), reversed(options), command)
+
+    return decorate
+
+
+#: How raw frames are read and corrected; whole frames of the light's colour too.
+READING = add_options(LAYOUT, BLACK_LEVEL, WHITE_LEVEL, CALIBRATION, AMBIENT)
+LIT_READING = add_options(READING, LIGHT_COLOR)
 
 
 class Group(click.Group):
@@ -179,6 +213,14 @@ def app() -> None:
 def print_note(line: str) -> None:
     """Print one line for the user on stderr; stdout is for results."""
     print(f"polsep: {printable(line)}", file=sys.stderr)
+
+
+def print_results(notes: Iterable[str], written: Iterable[Path]) -> None:
+    """Print notes for the user, then the files that were written."""
+    for note in notes:
+        print_note(note)
+    for path in written:
+        print(path)
 
 
 def said_command(program: str) -> str:

@@ -20,6 +20,7 @@ from polsep.cli.app import (
     SIZE,
     WHITE_LEVEL,
     Number,
+    add_options,
     app,
     print_note,
     read_options,
@@ -33,11 +34,8 @@ OUTPUT = click.option(
 )
 
 
-def frame_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The arguments that all kinds share."""
-    for option in (PIXEL_FORMAT, SIZE, WHITE_LEVEL, BLACK_LEVEL, LAYOUT, OUTPUT, FRAMES):
-        command = option(command)
-    return command
+#: The arguments that all kinds share.
+frame_options = add_options(FRAMES, OUTPUT, LAYOUT, BLACK_LEVEL, WHITE_LEVEL, SIZE, PIXEL_FORMAT)
 
 
 @app.group()

@@ -8,21 +8,20 @@ from typing import Any
 import click
 
 from polsep.cli.app import (
-    AMBIENT,
-    BLACK_LEVEL,
-    CALIBRATION,
     COUNT,
     DIR,
     FILE,
-    LAYOUT,
+    INTEGRATION,
     OVERWRITE,
+    READING,
+    SEPARATED_BY,
     STEM,
-    WHITE_LEVEL,
+    TURNTABLE,
     Number,
     Word,
     app,
     correcting_files,
-    print_note,
+    print_results,
     read_options,
     refuse_frame_options,
     require_extra,
@@ -43,14 +42,8 @@ ORDER = "right front-right front front-left left above"
     "--mask", type=FILE, metavar="FILE", help="Image that is white on the object.  [default: where light falls]"
 )
 @click.option("--srgb", is_flag=True, help="Files are photographs: 8-bit sRGB, or linear TIFF, EXR, 16-bit PNG.")
-@click.option(
-    "--method", default="auto", metavar="NAME", help="Method that separates raw frames; see 'polsep methods'."
-)
-@LAYOUT
-@BLACK_LEVEL
-@WHITE_LEVEL
-@CALIBRATION
-@AMBIENT
+@SEPARATED_BY
+@READING
 @click.option(
     "--fov",
     type=Number(float, 0, 120, above=True),
@@ -58,15 +51,9 @@ ORDER = "right front-right front front-left left above"
     help="The camera's vertical field of view.  [default: orthographic]",
 )
 @click.option("--size", "longest", type=COUNT, default=640, metavar="PX", help="Longer side of the maps at most.")
-@click.option(
-    "--integration",
-    type=Word("bilateral", "smooth"),
-    default="bilateral",
-    metavar="bilateral|smooth",
-    help="Depth with jumps, or one smooth surface.",
-)
+@INTEGRATION
 @click.option("--mesh", type=Word("glb", "ply"), default="glb", metavar="glb|ply", help="Format of the mesh.")
-@click.option("--turntable", is_flag=True, help="Also write DIR/STEM.mp4, the turning mesh; needs the extra video.")
+@TURNTABLE
 @OVERWRITE
 def geometry(files: tuple[Path, ...], **options: Any) -> None:
     """Estimate normals, albedo, depth and a mesh of an object from frames under different lights.
@@ -126,7 +113,4 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
         mask = find_object(views) if options["mask"] is None else read_object(options["mask"], size)
         views, mask = shrink(views, mask, options["longest"])
         write_shape(find_shape(views, directions, mask, shape_options), targets)
-    for note in views.notes:
-        print_note(note)
-    for path in targets:
-        print(path)
+    print_results(views.notes, targets)

@@ -8,20 +8,17 @@ from typing import Any
 import click
 
 from polsep.cli.app import (
-    AMBIENT,
-    BLACK_LEVEL,
-    CALIBRATION,
     DIR,
-    LAYOUT,
-    LIGHT_COLOR,
+    LIT_READING,
     OVERWRITE,
     PIXEL_FORMAT,
+    SEPARATED_BY,
     STEM,
-    WHITE_LEVEL,
+    WEIGHTS,
     Number,
     app,
     correcting_files,
-    print_note,
+    print_results,
     read_light,
     read_options,
     refuse_frame_options,
@@ -44,18 +41,9 @@ from polsep.cli.progress import show_progress
 @click.option(
     "--input", "network_input", default="separated", metavar="NAME", help="separated, or unseparated to compare."
 )
-@click.option(
-    "--weights", type=click.Path(path_type=Path), metavar="FILE", help="Weights of 'polsep train'.  [default: shipped]"
-)
-@click.option(
-    "--method", default="auto", metavar="NAME", help="Method that separates raw frames; see 'polsep methods'."
-)
-@LAYOUT
-@BLACK_LEVEL
-@WHITE_LEVEL
-@CALIBRATION
-@AMBIENT
-@LIGHT_COLOR
+@WEIGHTS
+@SEPARATED_BY
+@LIT_READING
 @click.option("--frame-size", "size", metavar="WxH", help="Size of headerless raw frames, like 2448x2048.")
 @PIXEL_FORMAT
 @OVERWRITE
@@ -101,10 +89,7 @@ def material(files: tuple[str, ...], **options: Any) -> None:
     )
     with show_progress("estimating the material"):
         written, notes = estimate_files(files, settings, options["output"], options["name"], options["overwrite"])
-    for note in notes:
-        print_note(note)
-    for path in written:
-        print(path)
+    print_results(notes, written)
 
 
 def _parse_white(text: str | None) -> tuple[float, ...]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from polsep.cli.app import Number, Word, require_extra, require_paths
+from polsep.cli.app import Number, Word, add_options, require_extra, require_paths
 
 if TYPE_CHECKING:
     from polsep.photographs import PhotoOptions
@@ -19,47 +19,40 @@ _OF_FRAMES = {"layout": None, "calibration": None, "ambient": (), "size": None, 
 _OF_PHOTOGRAPHS = {"exposures": None, "extinction": None, "align": None, "encoding": None}
 _FILE = click.Path(path_type=str)
 
-Command = Callable[..., None]
-
-
-def photo_options(command: Command) -> Command:
-    """Add the options of photographs to a command."""
-    options = (
-        click.option("--parallel", type=_FILE, metavar="P", help="Photograph through a filter parallel to the lamp's."),
-        click.option("--crossed", type=_FILE, metavar="C", help="The same through a filter crossed with the lamp's."),
-        click.option(
-            "--angles",
-            metavar="A,B,C,...|unknown",
-            help="FILEs are photographs of one scene with the filter at these angles in degrees; unknown finds them in "
-            "five or more, or in a film.",
-        ),
-        click.option(
-            "--exposures",
-            metavar="A,B,...",
-            help="Relative exposures of the photographs.  [default: found where they show, else equal]",
-        ),
-        click.option(
-            "--extinction",
-            type=Number(float, 1, above=True),
-            metavar="N",
-            help="Extinction ratio of lamp filter and lens filter together.  [default: perfect]",
-        ),
-        click.option(
-            "--align",
-            type=Word("none", "shift", "rigid", "affine", "homography"),
-            metavar="MOTION",
-            help="Motion undone between photographs: none, shift, rigid, affine or homography.  [default: rigid]",
-        ),
-        click.option(
-            "--encoding",
-            type=Word("linear", "srgb"),
-            metavar="NAME",
-            help="Encoding of photographs: linear or srgb.  [default: linear]",
-        ),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
+#: The options of photographs.
+photo_options = add_options(
+    click.option("--parallel", type=_FILE, metavar="P", help="Photograph through a filter parallel to the lamp's."),
+    click.option("--crossed", type=_FILE, metavar="C", help="The same through a filter crossed with the lamp's."),
+    click.option(
+        "--angles",
+        metavar="A,B,C,...|unknown",
+        help="FILEs are photographs of one scene with the filter at these angles in degrees; unknown finds them in "
+        "five or more, or in a film.",
+    ),
+    click.option(
+        "--exposures",
+        metavar="A,B,...",
+        help="Relative exposures of the photographs.  [default: found where they show, else equal]",
+    ),
+    click.option(
+        "--extinction",
+        type=Number(float, 1, above=True),
+        metavar="N",
+        help="Extinction ratio of lamp filter and lens filter together.  [default: perfect]",
+    ),
+    click.option(
+        "--align",
+        type=Word("none", "shift", "rigid", "affine", "homography"),
+        metavar="MOTION",
+        help="Motion undone between photographs: none, shift, rigid, affine or homography.  [default: rigid]",
+    ),
+    click.option(
+        "--encoding",
+        type=Word("linear", "srgb"),
+        metavar="NAME",
+        help="Encoding of photographs: linear or srgb.  [default: linear]",
+    ),
+)
 
 
 def find_photographs(files: tuple[str, ...], options: Mapping[str, Any]) -> list[str]:

@@ -8,23 +8,21 @@ from typing import Any
 import click
 
 from polsep.cli.app import (
-    AMBIENT,
-    BLACK_LEVEL,
-    CALIBRATION,
     DIR,
     FILE,
-    LAYOUT,
-    LIGHT_COLOR,
+    INTEGRATION,
+    LIT_READING,
     OVERWRITE,
     PIXEL_FORMAT,
     SIZE,
     STEM,
-    WHITE_LEVEL,
+    TURNTABLE,
+    WEIGHTS,
     Number,
     Word,
     app,
     correcting_files,
-    print_note,
+    print_results,
     read_light,
     read_options,
     refuse_frame_options,
@@ -61,12 +59,7 @@ from polsep.cli.progress import show_progress
     metavar="NAME",
     help="Method that separates a raw frame; the network for shape was mostly trained on images by joint.",
 )
-@LAYOUT
-@BLACK_LEVEL
-@WHITE_LEVEL
-@CALIBRATION
-@AMBIENT
-@LIGHT_COLOR
+@LIT_READING
 @SIZE
 @PIXEL_FORMAT
 @click.option(
@@ -76,17 +69,9 @@ from polsep.cli.progress import show_progress
     metavar="glb|ply|none",
     help="Format of the mesh; none: no depth and no mesh, which need the extra mesh.",
 )
-@click.option(
-    "--integration",
-    type=Word("bilateral", "smooth"),
-    default="bilateral",
-    metavar="bilateral|smooth",
-    help="Depth with jumps, or one smooth surface.",
-)
-@click.option("--turntable", is_flag=True, help="Also write DIR/STEM.mp4, the turning mesh; needs the extra video.")
-@click.option(
-    "--weights", type=click.Path(path_type=Path), metavar="FILE", help="Weights of 'polsep train'.  [default: shipped]"
-)
+@INTEGRATION
+@TURNTABLE
+@WEIGHTS
 @OVERWRITE
 def shape(file: Path, **options: Any) -> None:
     """Estimate normals, albedo, roughness, depth and a mesh of a thing from one frame under one polarized lamp.
@@ -136,10 +121,7 @@ def shape(file: Path, **options: Any) -> None:
     with show_progress("finding the shape"):
         files, notes = find_shape_of(file, settings)
         write_shape(files, targets)
-    for note in notes:
-        print_note(note)
-    for path in targets:
-        print(path)
+    print_results(notes, targets)
 
 
 def _parse_lamp(text: str) -> tuple[float, ...] | None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from polsep.cli.app import COUNT, DIR, POSITIVE, Number, Word, app, require_extra, require_paths
+from polsep.cli.app import COUNT, DIR, POSITIVE, Number, Word, app, is_given, require_extra, require_paths
 
 #: What can be trained.
 RUNGS = (
@@ -157,11 +157,9 @@ def train(rung: str, output: Path, data: str, **options: Any) -> None:
 
 def refuse_foreign(rung: str) -> None:
     """Raise ValueError on an option that was given and is none of a rung: it would change nothing."""
-    context = click.get_current_context()
-    for parameter in context.command.params:
+    for parameter in click.get_current_context().command.params:
         rungs = OWN.get(parameter.name or "", RUNGS)
-        given = context.get_parameter_source(parameter.name or "") == click.core.ParameterSource.COMMANDLINE
-        if given and rung not in rungs:
+        if rung not in rungs and is_given(parameter.name or ""):
             raise ValueError(f"expected {parameter.opts[0]} with {', '.join(rungs)}, found it with {rung}")
 
 

@@ -9,23 +9,18 @@ from typing import Any
 import click
 
 from polsep.cli.app import (
-    AMBIENT,
-    BLACK_LEVEL,
-    CALIBRATION,
     COMPRESSION,
     COUNT,
     DAMAGED,
     DEVICE,
     DIR,
     ENGINE,
-    LAYOUT,
-    LIGHT_COLOR,
+    LIT_READING,
     OVERWRITE,
     PIXEL_FORMAT,
     RATE,
     SIZE,
     STOKES,
-    WHITE_LEVEL,
     Word,
     app,
     correcting_files,
@@ -45,12 +40,7 @@ from polsep.cli.progress import report_step, show_progress
 @click.option(
     "--method", default="auto-fast", metavar="NAME", help="Method; auto-fast is joint-fast where it fits the frames."
 )
-@LAYOUT
-@BLACK_LEVEL
-@WHITE_LEVEL
-@CALIBRATION
-@AMBIENT
-@LIGHT_COLOR
+@LIT_READING
 @click.option(
     "--format",
     type=Word("exr", "ffv1", "ffvhuff", "none"),

@@ -321,14 +321,7 @@ DARK = polsep.Calibration(Layout(), 255, black_level=2.0)
 
 REFUSED: list[tuple[Any, dict[str, Any], str]] = [
     (np.full((8, 8), np.nan, np.float32), {}, "expected finite values"),
-    (np.full((8, 8), np.inf), {}, "expected finite values"),
     (np.zeros((8, 8), np.int32), {}, "expected samples of uint8, uint16"),
-    (np.zeros((8, 8), bool), {}, "found bool"),
-    (np.zeros((8, 8), complex), {}, "found complex"),
-    (np.zeros((8, 8), object), {}, "found object"),
-    (np.zeros(8, np.uint8), {}, "expected an image"),
-    (np.zeros((0, 8), np.uint8), {}, "expected an image"),
-    (np.zeros((1, 1), np.uint8), {}, "at least 4x4"),
     (np.zeros((3, 64), np.uint8), {}, "at least 4x4"),
     (np.zeros((2, 8, 8, 2), np.uint8), {}, "expected a mosaic"),
     (np.random.default_rng(0).random((8, 8, 3)), {}, "demosaicked picture"),
@@ -342,7 +335,6 @@ REFUSED: list[tuple[Any, dict[str, Any], str]] = [
     (np.zeros((8, 8), np.uint8), {"light_color": (1, 0, 1)}, "expected a light colour"),
     (np.zeros((8, 8), np.uint8), {"light_color": (1, -1, 1)}, "expected a light colour"),
     (np.zeros((8, 8), np.uint8), {"light_color": (1, float("nan"), 1)}, "expected a light colour"),
-    (np.zeros((8, 8), np.uint8), {"white_level": 0}, "above the black level"),
     (np.zeros((8, 8), np.uint8), {"black_level": 300}, "above the black level"),
     (np.zeros((8, 8), np.uint8), {"white_level": float("inf")}, "expected finite black and white"),
 ]

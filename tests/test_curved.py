@@ -6,21 +6,20 @@ pixel is evaluated once, so there is no sampling noise.
 
 from __future__ import annotations
 
-import importlib.util
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from test_optics import reference as reference  # the fixture
+from test_optics import stacked
 from tolerances import MITSUBA, assert_within
 from torch import Tensor
 
 from polsep.physics.fresnel import ETA
 from polsep.physics.optics import normalize
-from polsep.physics.stokes import Stokes
 from polsep.render.materials import Materials, random_materials
 from polsep.render.shapes import FINE, Mesh, ellipsoid, random_mesh
 from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, shade
@@ -50,10 +49,6 @@ def random_setting(seed: int) -> tuple[Mesh, PinholeCamera, PointLight]:
     reach, angle = (torch.rand(2, generator=generator) * torch.tensor([2.0, math.pi])).tolist()
     camera = PinholeCamera(tuple((2.4 * size * eye).tolist()), (0.1, -0.1, 0.0), 24.0)
     return mesh, camera, PointLight(tuple(((0.9 + reach) * size * side).tolist()), 5 * size**2, angle)
-
-
-def stacked(stokes: Stokes) -> Tensor:
-    return torch.stack([stokes.s0, stokes.s1, stokes.s2])
 
 
 # ------------------------------------------------------------------------------------------------------------- Mitsuba
@@ -174,19 +169,6 @@ def test_rendered_shapes_agree_with_mitsuba(mi: Any, seed: int) -> None:
 
 
 # ----------------------------------------------------------------------------------------------------- NumPy reference
-
-
-@pytest.fixture(scope="module")
-def reference(shared: Path) -> Any:
-    """The independent float64 reference implementation, loaded by its path."""
-    path = shared / "reference" / "pbrdf.py"
-    if not path.is_file():
-        pytest.skip(f"no reference implementation at {path}")
-    specification = importlib.util.spec_from_file_location("reference_pbrdf", path)
-    assert specification is not None and specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
 
 
 def reference_lobes(reference: Any, buffer: GBuffer, camera: PinholeCamera, light: PointLight) -> Tensor:

@@ -381,15 +381,6 @@ def test_gradients_are_finite_and_right(function: Callable[[Stokes], Tensor], ge
     torch.autograd.gradcheck(lambda s0, s1, s2: function(Stokes(s0, s1, s2)), inputs)
 
 
-@pytest.mark.parametrize("function", [aolp, dolp, polarized_intensity])
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_no_nan_in_the_dark(function: Callable[[Stokes], Tensor], dtype: torch.dtype) -> None:
-    """Light of zero intensity has zero DoLP, AoLP and polarized intensity."""
-    zeros = torch.zeros(3, 2, 2, dtype=dtype)
-    result = function(Stokes(zeros, zeros, zeros))
-    assert torch.equal(result, zeros)
-
-
 def test_superposition_of_two_polarized_lights() -> None:
     """Eq. 10 with its factor 4: |z|^2 = (a + b)^2 - 4 a b sin^2 of the angle between them, .48458 for the example."""
     a, b, phi_d, phi_s = 0.3, 0.7, 0.4, 1.3

@@ -27,6 +27,7 @@ import pytest
 import tifffile
 import torch
 from numpy.typing import NDArray
+from test_cli import contents
 from torch.nn.functional import interpolate
 
 from polsep import cli, pipeline
@@ -131,13 +132,14 @@ def command(recording: Path, output: Path, *more: str) -> list[str]:
 STEADY = ("--filter", "temporal")
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *args: str) -> int:
+def run(*args: str) -> int:
     """What `polsep ARGS` exits with, in this process."""
-    monkeypatch.setattr(sys, "argv", ["polsep", *args])
-    try:
-        cli.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["polsep", *args])
+        try:
+            cli.main()
+        except SystemExit as stop:
+            return int(stop.code or 0)
     return 0
 
 
@@ -146,17 +148,11 @@ def separated_alone(image: NDArray[np.uint16]) -> SeparatedFrame:
     return separate_capture(as_mosaic(image, white_level=WHITE)[0], "analytic")
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder, hidden ones too."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
 @pytest.fixture(scope="module")
 def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What one run makes of it."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    with pytest.MonkeyPatch.context() as patch:
-        assert run(patch, *command(recording, folder)) == 0
+    assert run(*command(recording, folder)) == 0
     return folder
 
 
@@ -164,8 +160,7 @@ def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def steady(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What one run with the temporal filter makes of it."""
     folder = tmp_path_factory.mktemp("steady")
-    with pytest.MonkeyPatch.context() as patch:
-        assert run(patch, *command(recording, folder, *STEADY)) == 0
+    assert run(*command(recording, folder, *STEADY)) == 0
     return folder
 
 
@@ -272,9 +267,7 @@ def test_the_film_to_watch_has_every_frame_at_its_time(undisturbed: Path) -> Non
 
 
 @pytest.mark.parametrize("kind", ["folder", "tiff", "mkv", "raw"])
-def test_every_kind_of_recording_gives_the_same_images(
-    kind: str, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_kind_of_recording_gives_the_same_images(kind: str, undisturbed: Path, tmp_path: Path) -> None:
     images, more = frames(), []
     path = tmp_path / f"run.{kind}"
     if kind == "folder":
@@ -286,7 +279,7 @@ def test_every_kind_of_recording_gives_the_same_images(
     else:
         path.write_bytes((images << 4).astype("<u2").tobytes())  # 12 bits, left-justified
         more = ["--size", f"{SIDE}x{SIDE}", "--pixel-format", "BayerRG16", "--white-level", str(WHITE * 16)]
-    assert run(monkeypatch, *command(path, tmp_path / "out", "--no-preview", *more)) == 0
+    assert run(*command(path, tmp_path / "out", "--no-preview", *more)) == 0
     made = {folder: sorted(folder.glob("*.exr")) for folder in (tmp_path / "out", undisturbed)}
     assert [path.name for path in made[undisturbed]] == [path.name for path in made[tmp_path / "out"]]
     for one, other in zip(*made.values(), strict=True):
@@ -313,10 +306,10 @@ def test_films_of_uneven_times_say_so_and_have_all_frames(suffix: str, tmp_path:
 
 @pytest.mark.parametrize(("codec", "suffix"), [("ffv1", "mkv"), ("ffvhuff", "avi")])
 def test_lossless_films_hold_the_images_in_sixteen_bits(
-    codec: str, suffix: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    codec: str, suffix: str, recording: Path, tmp_path: Path
 ) -> None:
     more = ("--format", codec, "--frames", str(PART + 2), "--no-preview", "--rate", "30")
-    assert run(monkeypatch, *command(recording, tmp_path, *more)) == 0
+    assert run(*command(recording, tmp_path, *more)) == 0
     assert set(contents(tmp_path)) == {f"run_diffuse.{suffix}", f"run_specular.{suffix}", "run.json", "run.jsonl"}
     for name, white in FILM_WHITE.items():
         with av.open(str(tmp_path / f"run_{name}.{suffix}")) as container:
@@ -357,13 +350,13 @@ def test_an_error_of_a_thread_that_writes_ends_the_run(
         write_exr(path, *more)
 
     monkeypatch.setattr(sequences, "write_exr", fail)
-    assert run(monkeypatch, *command(recording, tmp_path)) == 2
+    assert run(*command(recording, tmp_path)) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and f"{PART + 3:06d}.exr" in error
     assert not (tmp_path / "run.json").exists() and not list(tmp_path.rglob("*.part"))
     assert [path.name for path in (tmp_path / ".polsep-run").glob("0*.json")] == ["000000.json"]
     monkeypatch.setattr(sequences, "write_exr", write_exr)
-    assert run(monkeypatch, *command(recording, tmp_path)) == 0
+    assert run(*command(recording, tmp_path)) == 0
 
 
 def test_films_end_behind_the_frame_that_is_being_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -466,10 +459,10 @@ def test_numbers_in_names_count_as_numbers() -> None:
     ]
 
 
-def test_results_called_recording_are_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_called_recording_are_no_recording(tmp_path: Path) -> None:
     """Their report is a recording.json, too: their folder could not be viewed, nor raw frames beside it be read."""
     np.save(tmp_path / "recording.npy", frames(3))
-    assert run(monkeypatch, *command(tmp_path / "recording.npy", tmp_path, "--no-preview")) == 0
+    assert run(*command(tmp_path / "recording.npy", tmp_path, "--no-preview")) == 0
     assert (tmp_path / "recording.json").exists()
     assert [source.path.name for source in find_sources(tmp_path)] == [f"recording_{k:06d}.exr" for k in range(3)]
     assert input_files(tmp_path) == [tmp_path / "recording.npy"]
@@ -499,14 +492,14 @@ def test_rate_and_length_of_a_film_are_its_own(tmp_path: Path) -> None:
     assert frame_rate(300.0, [0.003, 0.003, 0.004] * 21) == 300.0 and frame_rate(None, []) is None
 
 
-def test_films_have_the_rate_of_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_films_have_the_rate_of_the_recording(tmp_path: Path) -> None:
     """Another one only where that is said; what has no rate has 25, and edited films have that of the film."""
     film = write_film(tmp_path / "run.mkv", frames(3))
-    assert run(monkeypatch, *command(film, tmp_path / "out")) == 0
-    assert run(monkeypatch, *command(film, tmp_path / "said", "--rate", "24000/1001")) == 0
-    assert run(monkeypatch, *command(write_folder(tmp_path / "none", frames(3)), tmp_path / "none-out")) == 0
+    assert run(*command(film, tmp_path / "out")) == 0
+    assert run(*command(film, tmp_path / "said", "--rate", "24000/1001")) == 0
+    assert run(*command(write_folder(tmp_path / "none", frames(3)), tmp_path / "none-out")) == 0
     edit = ["edit", str(tmp_path / "out"), "-o", str(tmp_path / "edited"), "--metallic", "1"]
-    assert run(monkeypatch, *edit) == 0
+    assert run(*edit) == 0
     previews = ("out/run", "said/run", "none-out/none", "edited/run")
     assert [rate_of(tmp_path / f"{name}_preview.mp4") for name in previews] == [50, Fraction(24000, 1001), 25, 50]
 
@@ -556,18 +549,18 @@ def test_a_killed_run_goes_on_to_the_same_files(recording: Path, steady: Path, t
 
 
 def test_a_damaged_frame_stops_the_run_until_it_is_repaired(
-    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, undisturbed: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = write_folder(tmp_path / "run", frames())
     broken = folder / f"shot{PART + 3}.png"
     whole = broken.read_bytes()
     broken.write_bytes(whole[:100])
-    assert run(monkeypatch, *command(folder, tmp_path / "out")) == 2
+    assert run(*command(folder, tmp_path / "out")) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and broken.name in error
     assert not (tmp_path / "out" / "run.json").exists()
     broken.write_bytes(whole)
-    assert run(monkeypatch, *command(folder, tmp_path / "out")) == 0
+    assert run(*command(folder, tmp_path / "out")) == 0
     found, expected = contents(tmp_path / "out"), contents(undisturbed)
     assert found.keys() == expected.keys()
     assert all(found[name] == expected[name] for name in found if not name.startswith("run.json"))
@@ -576,9 +569,7 @@ def test_a_damaged_frame_stops_the_run_until_it_is_repaired(
     assert lines == [json.loads(line) for line in expected["run.jsonl"].splitlines()]
 
 
-def test_frames_of_two_cameras_make_no_film(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_of_two_cameras_make_no_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Where their bits tell them apart; where only their names do, a note says so."""
     folder = write_folder(tmp_path / "run", frames(4) << 4)
     for number in range(2):
@@ -586,24 +577,22 @@ def test_frames_of_two_cameras_make_no_film(
     assert "2 kinds of names (other#, shot#)" in open_sequence(folder, ReadOptions()).notes[0]
     (folder / "shot2.png").write_bytes(imagecodecs.png_encode((frames(1)[0] >> 4).astype(np.uint8)))
     given = ["--method", "analytic", "--filter", "none", "--no-preview"]
-    assert run(monkeypatch, "video", str(folder), "-o", str(tmp_path / "out"), *given) == 2
+    assert run("video", str(folder), "-o", str(tmp_path / "out"), *given) == 2
     assert "shot2: expected white level 65535 as in the first frame, found 255" in capsys.readouterr().err
 
 
-def test_a_damaged_frame_that_others_depend_on_is_repaired(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_frame_that_others_depend_on_is_repaired(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The first one, which shows the exposure; nothing of a run without it is left."""
     images = frames(3)
     images[0] //= 2
     folder, out = write_folder(tmp_path / "run", images), tmp_path / "out"
-    assert run(monkeypatch, *command(folder, tmp_path / "whole")) == 0
+    assert run(*command(folder, tmp_path / "whole")) == 0
     whole = (folder / "shot0.png").read_bytes()
     (folder / "shot0.png").write_bytes(b"no picture")
-    assert run(monkeypatch, *command(folder, out)) == 2
+    assert run(*command(folder, out)) == 2
     assert "shot0.png" in capsys.readouterr().err and not out.exists()
     (folder / "shot0.png").write_bytes(whole)
-    assert run(monkeypatch, *command(folder, out)) == 0
+    assert run(*command(folder, out)) == 0
     assert contents(out) == contents(tmp_path / "whole")
 
 
@@ -624,15 +613,15 @@ def test_the_lamp_is_not_found_without_a_frame_that_ends_the_run(wrong: bytes, t
 
 
 def test_a_run_does_not_go_on_where_files_have_other_numbers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One that was separated is gone: the next file to separate would be left out."""
     folder = write_folder(tmp_path / "run", frames(PART + 3))
     (folder / f"shot{PART + 1}.png").write_bytes(b"no picture")
-    assert run(monkeypatch, *command(folder, tmp_path / "out")) == 2
+    assert run(*command(folder, tmp_path / "out")) == 2
     (folder / "shot20.png").unlink()
     capsys.readouterr()
-    assert run(monkeypatch, *command(folder, tmp_path / "out")) == 2
+    assert run(*command(folder, tmp_path / "out")) == 2
     assert "expected frame 20 in shot20.png, as the run was begun, found shot21.png" in capsys.readouterr().err
 
 
@@ -642,13 +631,13 @@ def test_a_run_that_a_damaged_frame_stopped_goes_on_without_it(
     """Nothing that is done depends on what becomes of damage; a run that goes on says that a frame is missing."""
     folder, out = write_folder(tmp_path / "run", frames()), tmp_path / "out"
     (folder / f"shot{PART + 3}.png").write_bytes(b"no picture")
-    assert run(monkeypatch, *command(folder, out)) == 2
+    assert run(*command(folder, out)) == 2
     first = (out / "run_000000.exr").stat().st_ino
     finish = SequenceWriter.finish
     monkeypatch.setattr(SequenceWriter, "finish", interrupt)
-    assert run(monkeypatch, *command(folder, out, "--damaged", "skip")) == 130
+    assert run(*command(folder, out, "--damaged", "skip")) == 130
     monkeypatch.setattr(SequenceWriter, "finish", finish)
-    assert run(monkeypatch, *command(folder, out, "--damaged", "skip")) == 2
+    assert run(*command(folder, out, "--damaged", "skip")) == 2
     assert (out / "run_000000.exr").stat().st_ino == first
     report = json.loads((out / "run.json").read_text())
     assert [line["frame"] for line in report["damaged"]] == [PART + 3] and report["settings"]["damaged"] == "skip"
@@ -666,9 +655,9 @@ def test_a_run_that_was_stopped_behind_its_last_frame_goes_on_there(
     """The last part is a short one."""
     with monkeypatch.context() as patch:
         patch.setattr(SequenceWriter, "finish", interrupt)
-        assert run(patch, *command(recording, tmp_path)) == 130
+        assert run(*command(recording, tmp_path)) == 130
     capsys.readouterr()
-    assert run(monkeypatch, *command(recording, tmp_path)) == 0
+    assert run(*command(recording, tmp_path)) == 0
     said = capsys.readouterr()
     assert said.err == f"polsep: resuming at frame {FRAMES} of {FRAMES}\n" and f"  {FRAMES} frames: " in said.out
     assert contents(tmp_path) == contents(undisturbed)
@@ -678,7 +667,7 @@ def test_films_go_into_folders_with_a_colon(recording: Path, tmp_path: Path, mon
     """FFmpeg takes the word before a colon for a protocol."""
     monkeypatch.chdir(tmp_path)
     out = Path("take1:left")
-    assert run(monkeypatch, *command(recording, out, "--frames", "2")) == 0
+    assert run(*command(recording, out, "--frames", "2")) == 0
     assert (out / "run_preview.mp4").stat().st_size > 0
 
 
@@ -720,13 +709,13 @@ def interrupt(*arguments: object) -> None:
 
 
 def test_damaged_frames_are_left_out_when_that_is_asked(
-    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, undisturbed: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = write_folder(tmp_path / "run", frames())
     (folder / "shot4.png").write_bytes(b"no picture")
     other = imagecodecs.png_encode(np.zeros((SIDE, SIDE + 4), np.uint16))
     (folder / f"shot{PART}.png").write_bytes(other)
-    assert run(monkeypatch, *command(folder, tmp_path / "out", "--damaged", "skip")) == 2
+    assert run(*command(folder, tmp_path / "out", "--damaged", "skip")) == 2
     said = capsys.readouterr()
     errors = said.err.splitlines()
     assert len(errors) == 2 and "shot4.png" in errors[0]
@@ -849,42 +838,32 @@ def test_a_black_first_frame_says_nothing_of_levels(
     """A lamp that is not on yet: 12-bit codes behind it still need their white level."""
     images = np.concatenate([np.zeros_like(frames(3)[:1]), frames(3)])
     folder = write_folder(tmp_path / "run", images)
-    plain = (
-        "video",
-        str(folder),
-        "-o",
-        str(tmp_path / "out"),
-        "--method",
-        "analytic",
-        "--format",
-        "exr",
-        "--no-preview",
-    )
-    assert run(monkeypatch, *plain) == 2
+    plain = ("video", str(folder), "-o", str(tmp_path / "out"), "--method", "analytic", "--no-preview")
+    assert run(*plain) == 2
     assert "expected a white level" in capsys.readouterr().err and not list((tmp_path / "out").glob("*.exr"))
     lit = list[bool]()
     monkeypatch.setattr(pipeline, "find_light", lambda capture: lit.append(capture.data.any()) or find_light(capture))
-    assert run(monkeypatch, *plain, "--white-level", str(WHITE)) == 0
+    assert run(*plain, "--white-level", str(WHITE)) == 0
     assert lit and all(lit)  # nor of the lamp
     write_folder(tmp_path / "dark", images[:1].repeat(2, axis=0))
-    assert run(monkeypatch, "video", str(tmp_path / "dark"), "-o", str(tmp_path / "dark-out"), "--no-preview") == 0
+    assert run("video", str(tmp_path / "dark"), "-o", str(tmp_path / "dark-out"), "--no-preview") == 0
 
 
-def test_remarks_on_later_frames_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_remarks_on_later_frames_are_kept(tmp_path: Path) -> None:
     images = frames(3)
     images[1, : SIDE // 2] = WHITE
     folder = write_folder(tmp_path / "run", images)
-    assert run(monkeypatch, *command(folder, tmp_path / "out", "--format", "none")) == 0
+    assert run(*command(folder, tmp_path / "out", "--format", "none")) == 0
     lines = [json.loads(line) for line in (tmp_path / "out" / "run.jsonl").read_text().splitlines()]
     said = [any("overexposed" in text for text in line.get("warnings", [])) for line in lines]
     assert said == [False, True, False]
 
 
-def test_remarks_that_differ_in_numbers_count_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_remarks_that_differ_in_numbers_count_as_one(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "run", frames(4))
     level = str(int(frames(4).max()) - 40)
     words = ("video", str(folder), "-o", str(tmp_path / "out"), "--method", "analytic", "--filter", "none")
-    assert run(monkeypatch, *words, "--white-level", level, "--format", "none") == 0
+    assert run(*words, "--white-level", level, "--format", "none") == 0
     found = json.loads((tmp_path / "out" / "run.json").read_text())["warnings"]
     (count,) = [often for text, often in found.items() if "samples exceed the white level" in text]
     assert count > 1
@@ -941,7 +920,7 @@ def test_panels_of_low_and_narrow_frames_hold_nothing_else(size: tuple[int, int]
     assert (drawn[:, : 2 * width] == drawn[0, 0]).all() and drawn[0, 0].min() > 0
 
 
-def test_a_lamp_off_frame_is_no_frame_of_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lamp_off_frame_is_no_frame_of_the_recording(tmp_path: Path) -> None:
     """It would come first, so the lamp's colour and the exposure would be those of its noise."""
     folder = write_folder(tmp_path / "run", frames(3))
     (folder / "off.png").write_bytes(imagecodecs.png_encode(frames(1)[0] // 16))
@@ -951,58 +930,54 @@ def test_a_lamp_off_frame_is_no_frame_of_the_recording(tmp_path: Path, monkeypat
     target = video.Target(tmp_path / "out", kept=(tmp_path / "link" / "off.png",))
     with pytest.raises(InputError, match=r"off.png: expected a lamp-off frame apart from .* one of its frames"):
         next(video.separate_video(folder, read, video.VideoOptions("analytic"), target))
-    assert run(monkeypatch, *given, str(folder / "off.png")) == 2
+    assert run(*given, str(folder / "off.png")) == 2
     (folder / "off.png").rename(tmp_path / "off.png")
-    assert run(monkeypatch, *given, str(tmp_path / "off.png")) == 0
+    assert run(*given, str(tmp_path / "off.png")) == 0
 
 
-def test_a_calibration_is_not_replaced_by_results(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_calibration_is_not_replaced_by_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, rig = write_folder(tmp_path / "rig", frames(2)), tmp_path / "rig.json"
     write_calibration(rig, Calibration(Layout(), float(WHITE), (SIDE, SIDE), black_level=0.0, read_noise=1.0), "0")
     before = rig.read_bytes()
     words = ("--calibration", str(rig), "--overwrite", "--method", "analytic", "--no-preview")
-    assert run(monkeypatch, "video", str(folder), "-o", str(tmp_path), *words) == 2
+    assert run("video", str(folder), "-o", str(tmp_path), *words) == 2
     assert "is an input" in capsys.readouterr().err and rig.read_bytes() == before
 
 
 def test_results_of_other_commands_are_not_replaced_unasked(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Single frames and logs without a report of a recording beside them; a run that was stopped goes on."""
     for name in (f"{recording.stem}_000002.exr", f"{recording.stem}.jsonl"):
         folder = tmp_path / Path(name).suffix[1:]
         folder.mkdir()
         (folder / name).write_bytes(b"mine")
-        assert run(monkeypatch, *command(recording, folder, "--frames", "3")) == 2
+        assert run(*command(recording, folder, "--frames", "3")) == 2
         assert f"expected no {folder / name}" in capsys.readouterr().err
         assert contents(folder) == {name: b"mine"}
-        assert run(monkeypatch, *command(recording, folder, "--frames", "3", "--overwrite")) == 0
+        assert run(*command(recording, folder, "--frames", "3", "--overwrite")) == 0
 
 
 def test_what_is_there_is_not_replaced_unasked(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     short = ("--frames", "3", "--format", "none")
-    assert run(monkeypatch, *command(recording, tmp_path, *short)) == 0
+    assert run(*command(recording, tmp_path, *short)) == 0
     before = contents(tmp_path)
-    assert run(monkeypatch, *command(recording, tmp_path, *short)) == 2
+    assert run(*command(recording, tmp_path, *short)) == 2
     assert "--overwrite replaces it" in capsys.readouterr().err
     assert contents(tmp_path) == before
-    assert run(monkeypatch, *command(recording, tmp_path, *short, "--overwrite")) == 0
+    assert run(*command(recording, tmp_path, *short, "--overwrite")) == 0
     assert contents(tmp_path) == before
 
 
-def test_a_run_that_replaces_a_longer_one_leaves_none_of_its_frames(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_replaces_a_longer_one_leaves_none_of_its_frames(recording: Path, tmp_path: Path) -> None:
     """And touches nothing else."""
     others = {name: b"mine" for name in ("other_000004.exr", f"{recording.stem}_4.exr", f"{recording.stem}_000004.txt")}
     for name, data in others.items():
         (tmp_path / name).write_bytes(data)
-    assert run(monkeypatch, *command(recording, tmp_path, "--frames", "5")) == 0
-    assert run(monkeypatch, *command(recording, tmp_path, "--frames", "3", "--overwrite")) == 0
+    assert run(*command(recording, tmp_path, "--frames", "5")) == 0
+    assert run(*command(recording, tmp_path, "--frames", "3", "--overwrite")) == 0
     left = sorted(path.name for path in tmp_path.glob("*_00*.exr"))
     assert left == sorted([*(f"{recording.stem}_{k:06d}.exr" for k in range(3)), "other_000004.exr"])
     assert {name: (tmp_path / name).read_bytes() for name in others} == others
@@ -1013,14 +988,14 @@ def test_a_run_that_replaces_another_is_resumed_like_any(tmp_path: Path, monkeyp
     recording, out = tmp_path / "run.npy", tmp_path / "out"
     np.save(recording, frames())
     more = ("--no-preview", "--method", "color-affine", "--frames", str(PART + 5))
-    assert run(monkeypatch, *command(recording, out, "--no-preview")) == 0
+    assert run(*command(recording, out, "--no-preview")) == 0
     before = {path.name for path in out.iterdir()}
     with monkeypatch.context() as patch:
         patch.setattr(video, "write_pictures", partial(stopped_behind, video.write_pictures, PART + 2))
-        assert run(patch, *command(recording, out, *more, "--overwrite")) == 130
+        assert run(*command(recording, out, *more, "--overwrite")) == 130
     assert {path.name for path in out.glob("run*")} == before - {"run.json"}
     first = (out / "run_000000.exr").stat().st_mtime_ns
-    assert run(monkeypatch, *command(recording, out, *more)) == 0
+    assert run(*command(recording, out, *more)) == 0
     assert (out / "run_000000.exr").stat().st_mtime_ns == first
     assert len(list(out.glob("*.exr"))) == json.loads((out / "run.json").read_text())["frames"] == PART + 5
 
@@ -1033,16 +1008,14 @@ def stopped_behind(write: Any, count: int, *given: Any) -> Iterator[video.Progre
             raise KeyboardInterrupt
 
 
-def test_a_run_that_replaces_films_leaves_none_of_another_kind(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_replaces_films_leaves_none_of_another_kind(recording: Path, tmp_path: Path) -> None:
     few = command(recording, tmp_path, "--frames", "3", "--overwrite")
     kinds = {"ffv1": ["_diffuse.mkv", "_specular.mkv"], "ffvhuff": ["_diffuse.avi", "_specular.avi"], "exr": []}
     for kind, expected in kinds.items():
-        assert run(monkeypatch, *few, "--format", kind) == 0
+        assert run(*few, "--format", kind) == 0
         found = {path.name.removeprefix(recording.stem) for path in tmp_path.glob("*.*") if path.suffix[1:2] in "am"}
         assert found == {*expected, "_preview.mp4"}
-    assert run(monkeypatch, *few, "--no-preview") == 0
+    assert run(*few, "--no-preview") == 0
     assert not list(tmp_path.glob("*.mp4"))
 
 
@@ -1097,12 +1070,10 @@ def test_a_run_does_not_go_on_with_another_recording_of_its_name(tmp_path: Path)
     ids=["empty", "mixed", "missing", "unreadable"],
 )
 def test_what_is_no_recording_is_said_in_a_line(
-    make: Any, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    make: Any, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     make(tmp_path)
-    assert (
-        run(monkeypatch, *command(tmp_path / "run" if words[0] != "f" else tmp_path / "run.npy", tmp_path / "o")) == 2
-    )
+    assert run(*command(tmp_path / "run" if words[0] != "f" else tmp_path / "run.npy", tmp_path / "o")) == 2
     said = capsys.readouterr()
     assert said.err.count("\n") == 1 and words in said.err
     assert not (tmp_path / "o").exists()
@@ -1155,11 +1126,11 @@ def test_without_the_library_films_are_refused_before_any_work(
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     for asked in ("--preview", "--format=ffv1", "--format=ffvhuff"):
-        assert run(monkeypatch, *command(recording, tmp_path / "o", asked)) == 2
+        assert run(*command(recording, tmp_path / "o", asked)) == 2
         said = capsys.readouterr().err
         assert "expected the extra 'video'" in said and said.count("\n") == 1
         assert not (tmp_path / "o").exists()
-    assert run(monkeypatch, *command(recording, tmp_path / "o", "--frames", "1")) == 0
+    assert run(*command(recording, tmp_path / "o", "--frames", "1")) == 0
     assert "no video to watch is written: it needs the extra 'video'" in capsys.readouterr().err
     assert not list((tmp_path / "o").glob("*.mp4"))
 
@@ -1193,7 +1164,7 @@ def test_ray_makes_the_same_bytes_with_a_worker_killed(recording: Path, steady: 
     assert contents(tmp_path) == contents(steady)
 
 
-def test_what_stands_still_is_steady(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_stands_still_is_steady(tmp_path: Path) -> None:
     """Noise of a still scene falls as frames are averaged, by both filters; across parts too."""
     still = frames(1)[0].astype(np.float64)
     noise = np.random.default_rng(2).normal(0, 20, (FRAMES, SIDE, SIDE))
@@ -1201,7 +1172,7 @@ def test_what_stands_still_is_steady(tmp_path: Path, monkeypatch: pytest.MonkeyP
     spread = {}
     for name in ("none", "temporal"):
         more = ("--filter", name, "--no-preview")
-        assert run(monkeypatch, *command(tmp_path / "run.npy", tmp_path / name, *more)) == 0
+        assert run(*command(tmp_path / "run.npy", tmp_path / name, *more)) == 0
         late = [read_exr_layers(tmp_path / name / f"run_{k:06d}.exr")["diffuse.G"] for k in range(PART - 3, PART + 9)]
         spread[name] = float(np.std(np.stack(late).astype(np.float64), axis=0).mean())
     assert spread["temporal"] < 0.2 * spread["none"]

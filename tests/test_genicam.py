@@ -13,36 +13,24 @@ from polsep.io.store.errors import InputError
 LUCID = "PolarizedAngles_0d_45d_90d_135d_"
 
 
-def test_12p_bytes_by_hand() -> None:
-    # p0 = 0xABC, p1 = 0x123: b0 = 0xBC, b1 = 0x3 << 4 | 0xA, b2 = 0x12
-    codes = unpack_frame(bytes([0xBC, 0x3A, 0x12]), 2, 1, "Mono12p")
-    np.testing.assert_array_equal(codes, [[0xABC, 0x123]])
-    assert pack_frame(codes, "BayerRGPolarized12p") == bytes([0xBC, 0x3A, 0x12])
-
-
-def test_12packed_bytes_by_hand() -> None:
-    # p0 = 0xABC, p1 = 0x123: the high bytes 0xAB and 0x12 outside, the low nibbles 0x3 and 0xC between
-    codes = unpack_frame(bytes([0xAB, 0x3C, 0x12]), 2, 1, "Mono12Packed")
-    np.testing.assert_array_equal(codes, [[0xABC, 0x123]])
-    assert pack_frame(codes, "BayerRG12Packed") == bytes([0xAB, 0x3C, 0x12])
-
-
-def test_10packed_bytes_by_hand() -> None:
-    # p0 = 0b10_0000_0111, p1 = 0b01_1111_1010: high bytes 0x81 and 0x7E, low pairs 0b11 and 0b10
-    codes = unpack_frame(bytes([0x81, 0x23, 0x7E]), 2, 1, "Mono10Packed")
-    np.testing.assert_array_equal(codes, [[0b10_0000_0111, 0b01_1111_1010]])
-
-
-def test_10p_bytes_by_hand() -> None:
-    # p = 0x001, 0x202, 0x103, 0x3FF as one little-endian number: sum of p_k << 10 k, in five bytes
-    number = 0x001 | 0x202 << 10 | 0x103 << 20 | 0x3FF << 30
-    assert number.to_bytes(5, "little") == bytes([0x01, 0x08, 0x38, 0xD0, 0xFF])
-    codes = unpack_frame(bytes([0x01, 0x08, 0x38, 0xD0, 0xFF]), 2, 2, "BayerGB10p")
-    np.testing.assert_array_equal(codes, [[0x001, 0x202], [0x103, 0x3FF]])
-
-
-def test_words_are_little_endian() -> None:
-    np.testing.assert_array_equal(unpack_frame(b"\x34\x02", 1, 1, "Mono10"), [[0x234]])
+@pytest.mark.parametrize(
+    ("name", "data", "codes"),
+    [
+        # p0 = 0xABC, p1 = 0x123: b0 = 0xBC, b1 = 0x3 << 4 | 0xA, b2 = 0x12
+        ("BayerRGPolarized12p", [0xBC, 0x3A, 0x12], [[0xABC, 0x123]]),
+        # the same codes: the high bytes 0xAB and 0x12 outside, the low nibbles 0x3 and 0xC between
+        ("BayerRG12Packed", [0xAB, 0x3C, 0x12], [[0xABC, 0x123]]),
+        # high bytes 0x81 and 0x7E, low pairs 0b11 and 0b10
+        ("Mono10Packed", [0x81, 0x23, 0x7E], [[0b10_0000_0111, 0b01_1111_1010]]),
+        # one little-endian number: the sum of p_k << 10 k, in five bytes
+        ("BayerGB10p", [0x01, 0x08, 0x38, 0xD0, 0xFF], [[0x001, 0x202], [0x103, 0x3FF]]),
+        ("Mono10", [0x34, 0x02], [[0x234]]),  # words are little-endian
+    ],
+)
+def test_bytes_by_hand(name: str, data: list[int], codes: list[list[int]]) -> None:
+    height, width = len(codes), len(codes[0])
+    np.testing.assert_array_equal(unpack_frame(bytes(data), width, height, name), codes)
+    assert pack_frame(np.array(codes), name) == bytes(data)
 
 
 def test_lucid_angles_lie_side_by_side_in_each_pixel() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
@@ -11,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from test_without_torch import run
 from torch.nn import functional
 
 from polsep.compute.arrays import Array, of_kind, pad_mirror, pad_repeat, to_numpy
@@ -47,17 +46,8 @@ SHAPES = ((48, 56), (2, 34, 30), (14, 12))
 DEMOSAICKERS = (demosaic_bilinear, demosaic_bilinear_half, demosaic_dave2022, demosaic_guided, demosaic_guided_half)
 MOVES = (flip_horizontal, flip_vertical, rotate_quarter, transpose, lambda stokes: rotate_frame(stokes, 0.3))
 
-#: Rooms up to the light in an interpreter that finds no torch.
+#: Rooms up to the light, in an interpreter that finds no torch.
 WITHOUT_TORCH = """
-import sys
-
-class Without:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] == "torch":
-            raise ModuleNotFoundError(name)
-
-sys.meta_path.insert(0, Without())
-
 import numpy as np
 import polsep.io.store.calibrations
 from polsep.calibrate.dark_flat import measure_dark
@@ -244,5 +234,5 @@ def test_gradients_reach_the_samples() -> None:
 
 def test_nothing_of_it_needs_torch() -> None:
     """Reading, checking, calibrating, demosaicking and finding the light, where torch cannot be imported."""
-    done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH], capture_output=True, text=True)
+    done = run(WITHOUT_TORCH, "blocked")
     assert done.returncode == 0, done.stderr

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from test_kernels_color_affine import random_frame
+from test_without_torch import run
 from torch.nn import functional
 
 from polsep.compute.arrays import to_numpy
@@ -33,15 +32,7 @@ MONO = Layout(bayer=None)
 
 #: A frame of noise, some of it clipped, separated by every closed form in an interpreter without torch.
 WITHOUT_TORCH = """
-import sys
-
-class Without:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] == "torch":
-            raise ModuleNotFoundError(name)
-
-sys.meta_path.insert(0, Without())
-
+warnings.simplefilter("error")
 import numpy as np
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
@@ -156,5 +147,5 @@ def test_resizing_is_torchs(shape: tuple[int, int], generator: torch.Generator) 
 
 
 def test_closed_forms_run_without_torch() -> None:
-    done = subprocess.run([sys.executable, "-W", "error", "-c", WITHOUT_TORCH], capture_output=True, text=True)
+    done = run(WITHOUT_TORCH, "blocked")
     assert done.returncode == 0, done.stderr

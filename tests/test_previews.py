@@ -8,6 +8,7 @@ import numpy as np
 import numpy.testing as npt
 import pytest
 from skimage.color import rgb2lab
+from test_outputs import random_frame
 
 from polsep.io.results.previews import (
     BACKGROUND,
@@ -22,19 +23,6 @@ from polsep.io.results.previews import (
     srgb,
 )
 from polsep.separation.report import SeparatedFrame
-
-
-def random_frame(height: int, width: int, channels: int = 3) -> SeparatedFrame:
-    rng = np.random.default_rng(7)
-    size = (height, width)
-    return SeparatedFrame(
-        rng.random((*size, channels), np.float32),
-        rng.random((*size, channels), np.float32),
-        rng.random(size) > 0.1,
-        rng.random(size, np.float32),
-        np.pi * rng.random(size, np.float32),
-        {},
-    )
 
 
 def uniform_frame(height: int, width: int, dolp: float, aolp: float) -> SeparatedFrame:
@@ -117,7 +105,7 @@ def test_dolp_map_grows_lighter_all_the_way_and_limits_outside() -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (7, 13, 1), (5, 300, 3), (641, 333, 3), (700, 1301, 1)])
 def test_sheet_is_rgb_bytes_of_bounded_size_for_any_frame(shape: tuple[int, int, int]) -> None:
-    sheet = contact_sheet(random_frame(*shape))
+    sheet = contact_sheet(random_frame(shape[2], shape[:2]))
     assert sheet.dtype == np.uint8
     assert sheet.shape[2] == 3
     assert sheet.shape[0] <= 2 * PANEL + 300
@@ -211,7 +199,7 @@ def test_mask_shows_a_single_pixel_that_is_not_valid() -> None:
 
 
 def test_small_frames_show_each_pixel_twice_as_large() -> None:
-    frame = random_frame(100, 310)
+    frame = random_frame(size=(100, 310))
     panel = panel_of(contact_sheet(frame), 0, 0, 200, 620)
     npt.assert_array_equal(panel[::2, ::2], panel[1::2, 1::2])
     total = frame.diffuse + frame.specular

@@ -26,11 +26,11 @@ from polsep.bench.truth import read_demo_capture, read_demo_codes
 from polsep.edit import EDITS, SeparatedImages, Texture, make_edit
 from polsep.edit.edits import Edit
 from polsep.io.store.rows import read_bytes, write_array
+from polsep.io.store.samples import DEMO, DEMO_WHITE
 from polsep.methods import find_method
 from polsep.pipeline import separate_capture
 from polsep.sensor.levels import as_mosaic
 from polsep.view.edits import list_controls
-from polsep.view.opening import DEMO, DEMO_WHITE
 from polsep.view.server import ViewOptions, serve
 
 #: How often something is measured, and plain NumPy.

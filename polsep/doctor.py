@@ -122,11 +122,12 @@ def check_files() -> None:
 def separate_crop(method: str) -> Any:
     """The self-test's crop of the embedded capture, separated by a method."""
     from polsep.io.raw.frames import ReadOptions, read_frames
+    from polsep.io.store.samples import DEMO, DEMO_WHITE
 
-    frame = next(read_frames(Path(polsep.__file__).parent / "data" / "still_life.png", ReadOptions(white_level=4095.0)))
+    frame = next(read_frames(DEMO, ReadOptions(white_level=DEMO_WHITE)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", polsep.PolsepWarning)
-        return polsep.separate(frame.data.data[CROP], method, white_level=4095.0, device="cpu")
+        return polsep.separate(frame.data.data[CROP], method, white_level=DEMO_WHITE, device="cpu")
 
 
 def _attempt(tests: dict[str, dict[str, Any]], name: str, act: Callable[[], Any]) -> Any:

@@ -13,16 +13,15 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-import polsep
 from polsep import cli
+from polsep.io.store import samples
+from polsep.io.store.samples import DEMO
 from polsep.methods import BEST, METHODS
 from polsep.render.distances import still_life
 from polsep.render.sphere_tracing import cast, is_lit, render, shade
 from polsep.sensor.camera import IMX250, Layout, Sensor, expose
 from polsep.sensor.layout_check import check_layout
 from polsep.sensor.levels import as_mosaic
-
-CAPTURE = Path(polsep.__file__).parent / "data" / "still_life.png"
 
 
 @pytest.mark.usefixtures("compiled")
@@ -40,10 +39,9 @@ def test_demo_works_offline(
 
     monkeypatch.setattr(socket, "socket", refuse)
     if every:
-        middle = imagecodecs.png_decode(CAPTURE.read_bytes())[768:1280, 768:1536]
-        (tmp_path / "data").mkdir()
-        (tmp_path / "data" / CAPTURE.name).write_bytes(imagecodecs.png_encode(np.ascontiguousarray(middle)))
-        monkeypatch.setattr(polsep, "__file__", str(tmp_path / "__init__.py"))
+        middle = imagecodecs.png_decode(DEMO.read_bytes())[768:1280, 768:1536]
+        (tmp_path / DEMO.name).write_bytes(imagecodecs.png_encode(np.ascontiguousarray(middle)))
+        monkeypatch.setattr(samples, "DEMO", tmp_path / DEMO.name)
     monkeypatch.setattr(sys, "argv", ["polsep", "demo", "-o", str(tmp_path / "o"), *["--all"] * every])
     cli.main()
     said = capsys.readouterr()
@@ -64,7 +62,7 @@ def test_demo_works_offline(
 def test_embedded_capture_is_a_12_bit_frame() -> None:
     """The capture has the size of an IMX250, codes up to 4095 in 16-bit words, a few of them clipped, and a layout
     that its own samples confirm."""
-    codes = imagecodecs.png_decode(CAPTURE.read_bytes())
+    codes = imagecodecs.png_decode(DEMO.read_bytes())
     assert codes.shape == (2048, 2448) and codes.dtype == np.uint16
     assert int(codes.max()) == 4095
     assert 0 < float((codes == 4095).mean()) < 0.05
@@ -85,7 +83,7 @@ def test_rendering_the_still_life_is_deterministic() -> None:
 @pytest.mark.parametrize("first", [300, 480, 1000, 1500])
 def test_the_still_life_is_the_capture(first: int) -> None:
     """Four rows of the embedded capture, rendered anew by today's code, agree with it within the sensor's noise."""
-    codes = torch.from_numpy(imagecodecs.png_decode(CAPTURE.read_bytes())[first : first + 4].astype(np.float32))
+    codes = torch.from_numpy(imagecodecs.png_decode(DEMO.read_bytes())[first : first + 4].astype(np.float32))
     parts, camera, light = still_life()
     rows, cols = first + (torch.arange(8) + 0.5) / 2, (torch.arange(2 * 2448) + 0.5) / 2
     points = [g.flatten() for g in torch.meshgrid(rows, cols, indexing="ij")]

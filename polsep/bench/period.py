@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from polsep.bench.rows import Row
-from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.bench.truth import read_real_frames
 from polsep.methods import METHODS
 from polsep.pipeline import PolsepWarning, separate_capture
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Mosaic
 
 #: Side of a tile at half resolution; bins around a frequency that its window spreads over, and those compared with it.
 TILE, NEAR, AROUND = 32, 2, 5
@@ -71,15 +71,12 @@ def measure_pattern(image: Tensor, period: int) -> Pattern:
 
 def bench_period(data: Path, methods: Sequence[str]) -> Iterator[Row]:
     """Patterns of the mosaic's period in diffuse and specular images of the real frames of ``data``/raw."""
-    for path in sorted((data / "raw").glob("*.png")):
-        layout = Layout() if "quadbayer" in path.stem else Layout(bayer=None)
-        mosaic = next(read_frames(path, ReadOptions(layout))).data
-        assert isinstance(mosaic, Mosaic)
+    for stem, mosaic in read_real_frames(data):
         for method in (name for name in methods if METHODS[name].accepts(mosaic)):
             for full in (False, True):
                 if full and method == "paper":
                     continue
-                yield from _rows_of(path.stem, method, mosaic, full)
+                yield from _rows_of(stem, method, mosaic, full)
 
 
 def _rows_of(stem: str, method: str, mosaic: Mosaic, full: bool) -> Iterator[Row]:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from polsep.bench.rows import Row
+from polsep.bench.truth import read_real_frames
 from polsep.demosaic.bilinear import demosaic_bilinear_half
-from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.physics.stokes import aolp, fit_stokes
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.layout_check import SENSOR_SIZES, check_layout, crossed_pairs
@@ -22,20 +22,13 @@ REFERENCE_POLARIZERS = ((0, 544, 189, 88), (45, 544, 502, 88), (90, 544, 778, 88
 
 def bench_real(data: Path) -> Iterator[Row]:
     """Reference polarizers and the layout check on the real frames of ``data``/raw."""
-    mosaics = {path.stem: _read_mosaic(path) for path in sorted((data / "raw").glob("*.png"))}
+    mosaics = dict(read_real_frames(data))
     yield from _reference_angles(mosaics["polarizer_IMX250MZR"])
     right = total = 0
     for mosaic in mosaics.values():
         for verdict in _layout_verdicts(mosaic):
             right, total = right + verdict, total + 1
     yield Row("real", "layout check on real frames", "layout check", "right verdicts", right, f"of {total}")
-
-
-def _read_mosaic(path: Path) -> Mosaic:
-    layout = Layout() if "quadbayer" in path.stem else Layout(bayer=None)
-    frame = next(read_frames(path, ReadOptions(layout)))
-    assert isinstance(frame.data, Mosaic)
-    return frame.data
 
 
 def _reference_angles(mosaic: Mosaic) -> Iterator[Row]:

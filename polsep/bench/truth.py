@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-import polsep
 from polsep.compute.arrays import to_numpy
 from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.store.samples import DEMO, DEMO_WHITE
 from polsep.physics.stokes import Measurements, measure
 from polsep.render.distances import random_light, random_parts
 from polsep.render.sphere_tracing import PinholeCamera, Scene, render
@@ -22,16 +22,22 @@ from polsep.sensor.camera import IMX250, Layout, Mosaic, add_noise, expose
 #: Seeds of the benchmark's scenes; nothing is ever tuned or trained on seeds from 2000 to 2999.
 SCENE_SEEDS = tuple(range(2000, 2008))
 SCENE_SIZE = (384, 384)
-#: White level of the demo capture.
-DEMO_WHITE = 4095.0
 
 
 def read_demo_capture() -> Mosaic:
     """The 2448x2048 colour frame of 12 bits that comes with polsep."""
-    path = Path(polsep.__file__).parent / "data" / "still_life.png"
-    frame = next(read_frames(path, ReadOptions(white_level=DEMO_WHITE))).data
+    frame = next(read_frames(DEMO, ReadOptions(white_level=DEMO_WHITE))).data
     assert isinstance(frame, Mosaic)
     return frame
+
+
+def read_real_frames(data: Path) -> Iterator[tuple[str, Mosaic]]:
+    """The frames of ``data``/raw by their stems; colour sensors have a quad-Bayer pattern."""
+    for path in sorted((data / "raw").glob("*.png")):
+        layout = Layout() if "quadbayer" in path.stem else Layout(bayer=None)
+        mosaic = next(read_frames(path, ReadOptions(layout))).data
+        assert isinstance(mosaic, Mosaic)
+        yield path.stem, mosaic
 
 
 def read_demo_codes() -> NDArray[np.uint16]:

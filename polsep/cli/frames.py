@@ -22,6 +22,7 @@ from polsep.cli.app import (
     PIXEL_FORMAT,
     SIZE,
     STOKES,
+    WEIGHTS,
     WHITE_LEVEL,
     Word,
     app,
@@ -189,9 +190,7 @@ def _report(outcome: Outcome) -> int:
 @click.option("--mono", is_flag=True, help="For cameras without colour filters.")
 @click.option("--full", is_flag=True, help="Images of the mosaic's own resolution.")
 @click.option("--no-fill", is_flag=True, help="No loops: nothing fills diffuse light under clipped highlights.")
-@click.option(
-    "--weights", type=click.Path(path_type=Path), metavar="FILE", help="Weights of 'polsep train'.  [default: shipped]"
-)
+@WEIGHTS
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def export(method: str, output: Path, weights: Path | None, **options: bool) -> None:
     """Write a joint method as one ONNX file: raw uint16 frames in, diffuse, specular, expected error and valid out.
@@ -251,13 +250,13 @@ def demo(output: Path, every: bool) -> None:
     """
     from polsep.batch import SeparateOptions, WriteOptions, separate_files
     from polsep.io.raw.frames import ReadOptions
+    from polsep.io.store.samples import DEMO, DEMO_WHITE
     from polsep.methods import BEST, METHODS
 
     best = BEST[0].name
-    capture = Path(polsep.__file__).parent / "data" / "still_life.png"
     for name in METHODS if every else ("analytic", best):
         write = WriteOptions(output / name, overwrite=True)
-        for outcome in separate_files([str(capture)], ReadOptions(white_level=4095.0), SeparateOptions(name), write):
+        for outcome in separate_files([str(DEMO)], ReadOptions(white_level=DEMO_WHITE), SeparateOptions(name), write):
             if _report(outcome):
                 sys.exit(2)
     print("The lamp's polarizer is at 25 deg; highlights show a few degrees more, as the lamp is not at the camera.")

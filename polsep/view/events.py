@@ -15,6 +15,7 @@ from typing import Any
 import gradio as gr
 
 from polsep.io.raw.frames import HEADERLESS
+from polsep.io.store.samples import DEMO, DEMO_WHITE
 from polsep.view.components import (
     HINT,
     IMAGES,
@@ -35,7 +36,7 @@ from polsep.view.components import (
 )
 from polsep.view.edits import list_controls, recipe_of
 from polsep.view.images import KINDS
-from polsep.view.opening import DEMO, DEMO_WHITE, OpenedFrame, parse_against, parse_settings
+from polsep.view.opening import OpenedFrame, parse_against, parse_settings
 from polsep.view.pictures import Exposure, Picture, Place, Window, exposure_panel, light_panel, shape_panel, stage
 from polsep.view.readout import read_pixel, readout_panel
 from polsep.view.session import Session, Superseded

@@ -18,8 +18,9 @@ import numpy as np
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import FRAME_FILES, HEADERLESS, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD, is_recording
+from polsep.io.raw.sequences import natural_order
 from polsep.io.raw.videos import count_frames, is_film
-from polsep.io.results.separation_reader import find_numbered, holds_separated, read_separated
+from polsep.io.results.separation_reader import find_numbered, is_separated, read_separated
 from polsep.io.results.sidecars import read_report
 from polsep.io.store.errors import InputError, input_error
 from polsep.io.store.header_checks import at_most
@@ -34,9 +35,6 @@ from polsep.view.pictures import Pixels, Small, shrink_frame
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-#: The capture that comes with polsep, and its white level.
-DEMO = Path(__file__).resolve().parents[1] / "data" / "still_life.png"
-DEMO_WHITE = 4095.0
 #: Largest number of samples of a frame: four times a 16-megapixel sensor.
 MAX_SAMPLES = 2**26
 #: The value of unset fields: the file, or the type of its samples, decides.
@@ -141,9 +139,7 @@ class Source:
 
 def as_source(path: Path, stem: str) -> Source:
     """A file, or a template of four angle images, as a source with a display name."""
-    plain = _PLACEHOLDER not in path.name
-    separated = plain and (path.suffix.lower() == ".exr" or (path.suffix.lower() == ".npz" and holds_separated(path)))
-    return Source(path, stem, separated)
+    return Source(path, stem, _PLACEHOLDER not in path.name and is_separated(path))
 
 
 def find_sources(path: Path) -> tuple[Source, ...]:
@@ -160,7 +156,7 @@ def find_sources(path: Path) -> tuple[Source, ...]:
         results = {name for file in seen if file.suffix.lower() == ".json" for name in result_names(file)}
         frames = (f for f in seen if f.suffix.lower() in FRAME_FILES)
         plain = (f for f in frames if f.name not in results or as_source(f, f.stem).separated)
-        files = sorted(plain, key=lambda f: in_numbers(f.name))
+        files = sorted(plain, key=natural_order)
         if not files and not any(file.suffix.lower() == ".exr" for file in seen):
             raise input_error(path, "expected raw frames or results of polsep in the folder, found none") from None
         if not files:
@@ -199,11 +195,6 @@ def group_angles(names: Sequence[str]) -> dict[str, tuple[int, ...]] | None:
     whole = {t: tuple(places[a] for a in _ANGLES) for t, places in found.items() if set(places) == set(_ANGLES)}
     used = sorted(place for places in whole.values() for place in places)
     return whole if used == list(range(len(names))) else None
-
-
-def in_numbers(name: str) -> list[tuple[int, str]]:
-    """A key that sorts numbered names by number: shot2 before shot10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 class Mend(NamedTuple):

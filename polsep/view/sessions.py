@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from polsep.io.raw.frames import output_stem
+from polsep.io.raw.sequences import natural_order
 from polsep.io.store.errors import InputError
 from polsep.io.store.temporary import (
     TemporaryFolders,
@@ -20,7 +21,7 @@ from polsep.io.store.temporary import (
     remove_folder,
 )
 from polsep.view.images import image_name
-from polsep.view.opening import Source, as_source, group_angles, in_numbers, plain_name
+from polsep.view.opening import Source, as_source, group_angles, plain_name
 from polsep.view.playback import Prefetcher
 from polsep.view.session import Session
 from polsep.view.waiting import Line
@@ -86,7 +87,7 @@ class Sessions:
         else:
             pairs = zip(names, paths, strict=True)
             kept = [as_source(self._keep(key, path, folder, suffix), stem) for (stem, suffix), path in pairs]
-        session.begin(tuple(sorted(kept, key=lambda source: in_numbers(source.stem))))
+        session.begin(tuple(sorted(kept, key=lambda source: natural_order(Path(source.stem)))))
 
     def _keep_angles(self, key: str, paths: Sequence[Path], folder: Path, template: str) -> Source:
         """Link the uploads of four angles, 0, 45, 90 and 135, as one source."""

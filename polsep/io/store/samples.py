@@ -8,6 +8,9 @@ from pathlib import Path
 
 from polsep.io.store.atomic import refuse_existing, write_set
 
+#: The frame of the demo, 2448x2048 in colour, and its white level: 12 bits.
+DEMO, DEMO_WHITE = Path(str(files("polsep") / "data" / "still_life.png")), 4095.0
+
 
 def sample_folder() -> Path:
     """The folder of the sample frames in the package; README.md there says what each shows."""

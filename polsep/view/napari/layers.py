@@ -18,9 +18,9 @@ from polsep.io.raw.frames import Frame, ReadOptions, read_frames
 from polsep.io.results.previews import aolp_wheel, exposure_of
 from polsep.io.results.separation_reader import holds_separated, read_separated
 from polsep.io.results.sidecars import read_report
+from polsep.io.store.samples import DEMO, DEMO_WHITE
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation.report import SeparatedFrame
-from polsep.view.opening import DEMO, DEMO_WHITE
 
 #: Data, arguments of the layer, and its kind, as napari takes them.
 LayerData = tuple[NDArray[Any], dict[str, Any], str]

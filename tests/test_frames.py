@@ -20,7 +20,7 @@ from polsep.io.raw.genicam import PIXEL_FORMATS, pack_frame
 from polsep.io.store.errors import InputError
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic, sample_mosaic
-from polsep.sensor.levels import as_measurements, as_mosaic, interleave_planes
+from polsep.sensor.levels import ForgottenLevel, as_measurements, as_mosaic, interleave_planes
 
 Array = NDArray[Any]
 LUCID = "PolarizedAngles_0d_45d_90d_135d_"
@@ -351,6 +351,23 @@ def test_right_justified_data_are_noted_not_rescaled(bits: int) -> None:
     seen = f"values never exceed {top} of 65535: looks like {bits}-bit right-justified data"
     assert notes == (f"{seen}; say --white-level {top} if so",)
     assert notes_of(codes, white_level=float(top)) == ""
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("bits", [8, 10, 12, 14])
+def test_right_justified_data_as_floats_are_noted(bits: int, dtype: str) -> None:
+    """Codes over 65535, as some readers give them; other floats are not taken for such codes."""
+    top = 2**bits - 1
+    codes = random_codes("uint16", top=top).astype(dtype)
+    codes[0, 0] = 1
+    floats = codes / np.asarray(65535, dtype)
+    (note,) = as_mosaic(floats)[1]
+    assert isinstance(note, ForgottenLevel) and f"{bits}-bit right-justified data; say --white-level" in note
+    said = float(note.split("--white-level ")[1].split()[0])
+    assert bool(as_mosaic(floats, white_level=said)[0].clipped()[0, 1]) and notes_of(floats, white_level=said) == ""
+    even = np.full_like(floats, 0.2)  # which is 13107/65535
+    for other in (floats + np.asarray(3e-6, dtype), codes / top, np.rint(codes % 60) / 255, even.astype(dtype)):
+        assert notes_of(other.astype(dtype)) == ""
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14])

@@ -53,6 +53,9 @@ PLANE_ANGLES_DEG = (0.0, 45.0, 90.0, 135.0)
 #: Bit depths of converters that are stored in 16-bit words.
 _NARROW_BITS = (8, 10, 12, 14)
 
+#: Largest distance of float32 samples over 65535 from codes of 14 bits, in codes.
+CODE_ERROR = 2e-3
+
 #: Largest sample of light in floats of white 1, and how many times white is no light any more.
 MOST_FLOAT, MANY_WHITES = 2.0, 100.0
 
@@ -192,8 +195,8 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
         notes += (f"{above} samples exceed the white level {white:g} (largest {high:g}): they count as clipped",)
     if samples.dtype.kind == "u" and white > WHITE_LEVELS[samples.dtype.name]:
         notes += (f"white level {white:g} is beyond {samples.dtype.name}: no sample can count as clipped",)
-    if white_level is None and samples.dtype == np.uint16:
-        notes += _depth_notes(samples, int(high))
+    if white_level is None and samples.dtype != np.uint8:
+        notes += _float_depth_notes(samples, high) if samples.dtype.kind == "f" else _depth_notes(samples, int(high))
     return notes
 
 
@@ -254,6 +257,25 @@ def _depth_notes(samples: NDArray[Any], high: int) -> Notes:
     top = 2**right - 1
     seen = f"values never exceed {top} of 65535: looks like {right}-bit right-justified data"
     return (ForgottenLevel(f"{seen}; say --white-level {top} if so"),)
+
+
+def _float_depth_notes(samples: NDArray[Any], high: float) -> Notes:
+    """The likely bit depth of floats that are right-justified codes of uint16 over 65535, of unknown white level."""
+    right = next((bits for bits in _NARROW_BITS if round(65535 * high) < 2**bits), None)
+    if right is None or not (_are_codes(samples[0]) and _are_codes(samples)):
+        return ()
+    # Codes of 8 bits over 255 are multiples of 257 / 65535; left-justified ones, of 4 and more.
+    if np.gcd.reduce(np.rint(65535 * samples.astype(np.float64)).astype(np.int64), axis=None) != 1:
+        return ()
+    top = 2**right - 1
+    seen = f"float values are multiples of 1/65535 up to {top}/65535: looks like {right}-bit right-justified data"
+    return (ForgottenLevel(f"{seen}; say --white-level {np.float32(top / 65535)} if so"),)
+
+
+def _are_codes(samples: NDArray[Any]) -> bool:
+    """True for floats that are whole numbers over 65535."""
+    codes = 65535 * samples.astype(np.float64)
+    return bool((np.abs(codes - np.rint(codes)) < CODE_ERROR).all())
 
 
 def _shape(array: NDArray[Any]) -> str:

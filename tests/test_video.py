@@ -581,6 +581,25 @@ def test_frames_of_two_cameras_make_no_film(tmp_path: Path, capsys: pytest.Captu
     assert "shot2: expected white level 65535 as in the first frame, found 255" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("names", "kinds"),
+    [
+        (["cam1_0001", "cam1_0002", "cam1_0003", "cam2_0002", "cam2_0003"], "2 kinds of names (cam1_#, cam2_#)"),
+        ([f"{frame}-cam{camera}" for frame in range(8, 12) for camera in (0, 1)], "2 kinds of names (#-cam0, #-cam1)"),
+        (["20260101_115959_970", "20260101_115959_990", "20260101_120000_010", "20260101_120000_030"], None),
+        (["cam1_0001", "cam1_0002", "cam1_0003"], None),
+        (["1_1", "2_2", "3_3"], None),
+        (["shape000_view00", "shape000_view01", "shape001_view00", "shape001_view01"], None),
+    ],
+)
+def test_numbers_of_cameras_in_names_are_noted(tmp_path: Path, names: list[str], kinds: str | None) -> None:
+    """Cameras that differ by a number alone were mixed without a word; times, counters and views are no cameras."""
+    for name in names:
+        (tmp_path / f"{name}.png").touch()
+    notes = open_sequence(tmp_path, ReadOptions()).notes
+    assert kinds in notes[0] if kinds else notes == ()
+
+
 def test_a_damaged_frame_that_others_depend_on_is_repaired(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The first one, which shows the exposure; nothing of a run without it is left."""
     images = frames(3)

@@ -114,12 +114,34 @@ def _gap_notes(files: list[Path]) -> tuple[str, ...]:
 
 
 def _name_notes(files: list[Path]) -> tuple[str, ...]:
-    """A note on names that differ in more than numbers, as those of two cameras do, where several files have each."""
+    """A note on names that differ as those of two cameras do, where several files have each."""
     names = Counter(_NUMBER.sub("#", path.stem) for path in files)
-    if len(names) == 1 or min(names.values()) == 1:
+    if len(names) == 1:
+        names = _names_of_cameras(files)
+    if len(names) < 2 or min(names.values()) == 1:
         return ()
     some = ", ".join(list(names)[:4]) + ", ..." * (len(names) > 4)
     return (f"files have {len(names)} kinds of names ({some}): all of them are read as one recording",)
+
+
+def _names_of_cameras(files: list[Path]) -> Counter[str]:
+    """Kinds of names of one pattern in which a number seems to be a camera's, as ``cam1_#``; empty if none does.
+
+    With every value of it at least half of the other numbers come again, unlike those of a time. Views of a rendered
+    set are of one camera.
+    """
+    names = [_NUMBER.split(path.stem) for path in files if not _VIEW.fullmatch(path.name)]
+    found: Counter[str] = Counter()
+    for at in range(1, len(names[0]) if names else 0, 2):
+        others: dict[str, set[tuple[str, ...]]] = {}
+        for name in names:
+            others.setdefault(name[at], set()).add((*name[:at], *name[at + 1 :]))
+        least, shared = min(map(len, others.values())), len(set.intersection(*others.values()))
+        if least > 1 and len(others) > 1 and 2 * shared >= least and (not found or len(others) < len(found)):
+            pattern = ["#" if k % 2 else part for k, part in enumerate(names[0])]
+            kinds = {number: "".join((*pattern[:at], number, *pattern[at + 1 :])) for number in others}
+            found = Counter({kinds[number]: len(group) for number, group in others.items()})
+    return found
 
 
 def _angle_notes(found: list[Path], files: list[Path]) -> tuple[str, ...]:

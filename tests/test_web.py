@@ -28,6 +28,7 @@ from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.defects import measure_noise
 from polsep.sensor.encoding import encoding_warning
 from polsep.sensor.levels import as_mosaic, level_notes
+from polsep.sensor.orient import orient
 from tools import web_page
 from tools.web_page import CHROMIUM, DEMO, HAS_PACKAGES, NODE, WEB, build_page, change, fetch, send, served
 
@@ -692,6 +693,31 @@ def test_layouts_are_read_as_the_library_reads_them(spec: str) -> None:
       console.log(specOf(parseLayout({json.dumps(spec)})));"""
     done = subprocess.run([str(NODE), "--input-type=module", "-e", script], capture_output=True, check=True, timeout=60)
     assert done.stdout.decode().strip() == Layout.parse(spec).spec
+
+
+@needs_packages
+def test_layouts_are_refused_in_the_words_of_the_library() -> None:
+    """Text that is no layout, and filters that the network does not know."""
+    said = ["90,45,135/RGGB", "90,45,135,0", "90,45,135,0/", "90,,135,0/RGGB", "90,45,135,x/mono", "90,45,135,0/RGGB@1"]
+    said += ["90,45.5,135,225.5/RGGB", "0,45,90,180/mono", "90,45,135,0/RGBG", "90,45,135,0/RGGB@2,0", "color "]
+    said += ["90,45,135,0/mono@0,1", "", "90,45,135,0/rggb", "90,45,135,0/RGGB@0.5,0"]
+    orders = ["90,45.5,135,0/RGGB", "90,135,0,45/mono", "0,45,90,135/GRBG@0,1"]
+    script = f"""
+      import {{ orient, parseLayout }} from {json.dumps((WEB / "src" / "layout.js").as_uri())};
+      const wordsOf = (run) => {{ try {{ run(); return null; }} catch (error) {{ return error.message; }} }};
+      console.log(JSON.stringify([...{json.dumps(said)}.map((spec) => wordsOf(() => parseLayout(spec))),
+        ...{json.dumps(orders)}.map((spec) => wordsOf(() => orient(8, 8, parseLayout(spec))))]));"""
+    done = subprocess.run([str(NODE), "--input-type=module", "-e", script], capture_output=True, check=True, timeout=60)
+    found = dict(zip([*said, *orders], json.loads(done.stdout), strict=True))
+    for spec in said:
+        with pytest.raises(ValueError, match="expected") as refused:
+            Layout.parse(spec)
+        assert found[spec] == str(refused.value)
+    for spec in orders:
+        layout = Layout.parse(spec)
+        with pytest.raises(ValueError, match="mirrored, turned or cropped") as refused:
+            orient(Mosaic(np.zeros((8, 8), np.float32), layout, 0.0, 1.0), Layout.sony(layout.channels))
+        assert found[spec] == str(refused.value)
 
 
 @needs_packages

@@ -7,23 +7,34 @@ const BAYER = ["RGGB", "BGGR", "GRBG", "GBRG"];
 /** Sides of frames are continued to multiples of it before they go through a network. */
 export const PERIOD = 4;
 
+/** Analysers that are closer than this are one. */
+const MIN_APART_DEG = 0.1;
+
 export const SONY = { polarizer: [90, 45, 135, 0], bayer: "RGGB", origin: [0, 0] };
 export const SONY_MONO = { ...SONY, bayer: null };
 
 const mod = (a, n) => ((a % n) + n) % n;
 
-/** A layout of "color", "mono" or "90,45,135,0/RGGB@row,col". Throws on other text. */
+/** A layout of "color", "mono" or "90,45,135,0/RGGB@row,col". Throws on other text, in the words of `Layout`. */
 export function parseLayout(spec) {
   if (spec === "color" || spec === "colour") return SONY;
   if (spec === "mono") return SONY_MONO;
-  const found = /^([^/]+)\/(RGGB|BGGR|GRBG|GBRG|mono)(?:@([01]),([01]))?$/.exec(spec.trim());
-  const polarizer = found ? found[1].split(",").map((text) => (text.trim() === "" ? NaN : mod(Number(text), 180))) : [];
-  const around = [...polarizer].sort((a, b) => a - b);
-  const apart = around.every((angle, k) => (k < 3 ? around[k + 1] : around[0] + 180) - angle >= 0.1);
-  const bayer = found && found[2] !== "mono" ? found[2] : null;
-  const origin = found && found[3] ? [Number(found[3]), Number(found[4])] : [0, 0];
-  if (polarizer.length !== 4 || !polarizer.every(Number.isFinite) || !apart || (!bayer && (origin[0] || origin[1])))
-    throw new Error(`expected a layout like 90,45,135,0/RGGB of four different angles, found ${spec}`);
+  const [, angles, colors, row, col] = /^([^/]*)\/([^@]+)(?:@([^,]*),([^,]*))?$/.exec(spec) ?? [];
+  const number = (text) => (text?.trim() ? Number(text) : NaN), given = (angles ?? "").split(",").map(number);
+  const origin = row === undefined ? [0, 0] : [number(row), number(col)];
+  if (given.length !== 4 || !given.every(Number.isFinite) || !origin.every(Number.isInteger))
+    throw new Error(`expected "color", "mono" or angles and colours like "90,45,135,0/RGGB", found '${spec}'`);
+  const polarizer = given.map((angle) => mod(angle, 180)), around = [...polarizer].sort((a, b) => a - b);
+  if (!around.every((angle, k) => (k < 3 ? around[k + 1] : around[0] + 180) - angle >= MIN_APART_DEG)) {
+    const [a, b, c, d] = given.map((angle) => (Number.isInteger(angle) ? angle.toFixed(1) : angle));
+    throw new Error(`expected four different analyser angles (modulo 180 degrees), found ((${a}, ${b}), (${c}, ${d}))`);
+  }
+  const bayer = colors === "mono" ? null : colors;
+  if (bayer && !BAYER.includes(bayer)) throw new Error(`expected bayer ${BAYER.join(", ")} or None, found '${bayer}'`);
+  if (!origin.every((start) => start === 0 || start === 1))
+    throw new Error(`expected an origin of two numbers, each 0 or 1, found (${origin.join(", ")})`);
+  if (!bayer && (origin[0] || origin[1]))
+    throw new Error(`expected (0, 0) as the origin of a mono layout: permute its cell, found (${origin.join(", ")})`);
   return { polarizer, bayer, origin };
 }
 
@@ -98,7 +109,8 @@ export function orient(height, width, layout) {
         }
     }
   }
-  throw new Error(`joint-fast knows Sony's filters in any orientation; ${specOf(layout)} is none, take analytic`);
+  const known = specOf(layout.bayer ? SONY : SONY_MONO);
+  throw new Error(`expected filters ${known}, mirrored, turned or cropped, found ${specOf(layout)}`);
 }
 
 /** First row and column of the turned frame that the frame's whole cells take, and how many samples. */

@@ -63,7 +63,7 @@ const settings = () => ({
   method: part("method").value,
   white: numberIn("white", "white level"),  // 0 is said, and refused
   black: numberIn("black", "black level") ?? 0,
-  layout: part("sensor").value === "other" ? part("layout").value || part("layout").placeholder : part("sensor").value || null,
+  layout: part("sensor").value === "other" ? part("layout").value.trim() || part("layout").placeholder : part("sensor").value || null,
   light: part("light").value === "stated" ? part("color").value.split(",").map(Number) : part("light").value,
   threads: Number(options.get("threads")) || 0,
   device: options.get("device") || part("device").value,

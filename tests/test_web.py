@@ -741,6 +741,28 @@ def test_a_white_level_above_where_the_sensor_clips_is_said_as_in_the_library(tm
 
 
 @needs_packages
+@pytest.mark.parametrize("sees", [True, False])
+def test_networks_that_do_not_see_the_frame_are_given_no_thumbnail(sees: bool) -> None:
+    """Those for mono frames: a thumbnail was made of every frame in vain."""
+    script = f"""
+      import {{ parseLayout }} from {json.dumps((WEB / "src" / "layout.js").as_uri())};
+      import {{ separateJoint }} from {json.dumps((WEB / "src" / "joint.js").as_uri())};
+      const layout = parseLayout("mono"), data = new Float32Array(32 * 32).fill(0.5), given = [];
+      const run = async (samples, rows, width, thumbnail) => {{
+        given.push(thumbnail?.length ?? 0);
+        const plane = (count) => new Float32Array((count * rows * width) / 4);
+        const [diffuse, specular, error, s1, s2, residual] = [1, 1, 2, 1, 1, 1].map(plane);
+        return {{ diffuse, specular, error, s1, s2, residual }};
+      }};
+      await separateJoint({{ data, height: 32, width: 32, layout, black: 0, white: 1 }}, [1],
+        {{ run, seesFrame: {json.dumps(sees)}, count: 1 }}, () => {{}});
+      console.log(JSON.stringify(given));"""
+    done = subprocess.run([str(NODE), "--input-type=module", "-e", script], capture_output=True, check=True, timeout=60)
+    given = json.loads(done.stdout)
+    assert given and all((size > 0) == sees for size in given)
+
+
+@needs_packages
 def test_even_light_has_no_angle(tmp_path: Path) -> None:
     """A frame of one value, as all that clips: rounding does not polarize it, and the report warns as the library's."""
     script = f"""

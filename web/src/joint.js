@@ -31,7 +31,8 @@ class Planes {
 
 /**
  * Images as `separateAnalytic` gives them, with `error` and `sums`, of a mosaic in a light.
- * `network`: {run(samples, rows, width, thumbnail), count of strips at once}; `progress(share)` is told after every strip.
+ * `network`: {run(samples, rows, width, thumbnail), seesFrame, count of strips at once}; only one that sees the frame is
+ * given a thumbnail. `progress(share)` is told after every strip.
  */
 export async function separateJoint(mosaic, light, network, progress) {
   const way = orient(mosaic.height, mosaic.width, mosaic.layout), { rows, cols } = turnedPlaces(way);
@@ -40,7 +41,7 @@ export async function separateJoint(mosaic, light, network, progress) {
   const planes = new Planes({ diffuse: colors, specular: 1, error: 2, s1: colors, s2: colors }, H / 2, W / 2);
   const residual = new Float32Array((H * W) / 16);
   const strips = cutRows(H, W, network.count), clips = (place) => (mosaic.data[place] >= full ? 1 : 0);
-  const thumbnail = thumbnailOf(mosaic.layout, { rows, cols }, samples, clips);
+  const thumbnail = network.seesFrame ? thumbnailOf(mosaic.layout, { rows, cols }, samples, clips) : null;
   let next = 0, done = 0;
 
   async function takeStrip([first, last]) {

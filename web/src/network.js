@@ -1,7 +1,7 @@
 // A worker that runs the network on one strip after the other: ONNX Runtime Web, by WebAssembly (SIMD) or WebGPU.
 //
-// Messages in: {id, kind: "cpu" or "gpu", colors, samples, rows, width, thumbnail}; out: {id, images} or {id, failed}.
-// Without a thumbnail a dark frame's is taken; networks that see none do not ask for it.
+// Messages in: {id, kind: "cpu" or "gpu", colors, samples, rows, width, thumbnail}; out: {id, images,
+// seesFrame} or {id, failed}. Without a thumbnail a dark frame's is taken; networks that do not see the frame need none.
 
 import { SIDE } from "./thumbnail.js";
 
@@ -38,21 +38,22 @@ async function run({ kind, colors, samples, rows, width, thumbnail }) {
       throw error;
     }));
   const session = await sessions.get(colors), { Tensor } = await runtime, images = {};
+  const seesFrame = session.inputNames.includes("thumbnail");
   const inputs = { frame: new Tensor("float32", samples, [1, 2, rows, width]) }, shape = [1, 5 * colors + 2, SIDE, SIDE];
-  if (session.inputNames.includes("thumbnail"))
+  if (seesFrame)
     inputs.thumbnail = new Tensor("float32", thumbnail ?? new Float32Array(shape.reduce((a, b) => a * b)), shape);
   const found = await session.run(inputs);
   for (const [name, tensor] of Object.entries(found)) {
     images[name] = (await tensor.getData()).slice();
     tensor.dispose();
   }
-  return images;
+  return { images, seesFrame };
 }
 
 onmessage = async ({ data }) => {
   try {
-    const images = await run(data);
-    postMessage({ id: data.id, images }, Object.values(images).map(({ buffer }) => buffer));
+    const { images, seesFrame } = await run(data);
+    postMessage({ id: data.id, images, seesFrame }, Object.values(images).map(({ buffer }) => buffer));
   } catch (error) {
     postMessage({ id: data.id, failed: error.message });
   }

@@ -6,13 +6,18 @@ const AGREEMENT = 1e-3, TEST_SIDE = 96;
 /** Most workers of WebAssembly: each takes some 200 MB. */
 const MOST = 4;
 
-/** Workers of one kind, each with one strip at a time. State: idle ones and what waits for one. */
+/** Workers of one kind, each with one strip at a time. State: idle ones, what waits for one, and which networks (by
+ * their colours) see the whole frame. */
 class Pool {
   constructor(kind, count) {
-    Object.assign(this, { kind, waiting: [], jobs: new Map(), next: 0 });
+    Object.assign(this, { kind, waiting: [], jobs: new Map(), seesFrame: new Map(), next: 0 });
     this.idle = Array.from({ length: count }, () => {
       const worker = new Worker(new URL("network.js", self.location.href), { type: "module" });
-      worker.onmessage = ({ data: { id, images, failed } }) => this.finish(worker, id, (job) => failed ? job.reject(new Error(failed)) : job.resolve(images));
+      worker.onmessage = ({ data: { id, images, seesFrame, failed } }) => this.finish(worker, id, (job) => {
+        if (failed) return job.reject(new Error(failed));
+        this.seesFrame.set(job.message.colors, seesFrame);
+        job.resolve(images);
+      });
       worker.onerror = (event) => this.drop(new Error(event.message || "expected network.js beside the page, found none that runs"));
       return worker;
     });
@@ -61,10 +66,14 @@ function poolOf(kind, count) {
 /** Workers that are asked for, else one for each core. */
 export const countOf = ({ threads }) => Math.min(threads || navigator.hardwareConcurrency || 1, MOST);
 
-/** {run(samples, rows, width, thumbnail), count, name} of the network for so many colours. `settings`: {threads, device}. */
+/**
+ * {run(samples, rows, width, thumbnail), seesFrame, count, name} of the network for so many colours. `settings`:
+ * {threads, device}. `seesFrame`: false where it is known that the network needs no thumbnail.
+ */
 export async function networkOf(colors, settings) {
   const count = countOf(settings), cpu = poolOf("cpu", count);
-  const made = (pool, name) => ({ run: (...strip) => pool.run(colors, ...strip), count: pool.count, name });
+  const made = (pool, name) =>
+    ({ run: (...strip) => pool.run(colors, ...strip), seesFrame: pool.seesFrame.get(colors) ?? true, count: pool.count, name });
   if (settings.device !== "cpu" && (await hasGpu(settings))) {
     const gpu = poolOf("gpu", 1);
     gpu.agrees ??= await agree(made(gpu), made(cpu)).catch((error) => {

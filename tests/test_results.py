@@ -11,10 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
-from polsep.bench import history
+from polsep.bench import BENCHES, history
 from polsep.bench.history import TIMED, ask_git, find_changes
 from polsep.bench.rows import Row, accept_partial, provenance, to_jsonl, with_spread, write_rows
+from polsep.cli.bench import EVALUATED, bench
 from polsep.io.store.rows import fill_tables, markdown_table, read_rows
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,6 +52,15 @@ def test_every_result_has_a_table() -> None:
     shown = set(re.findall(r"<!-- table: (\w+)", text))
     assert shown >= {path.stem for path in (ROOT / "results").glob("*.jsonl")} - {"blender", "materialx"}
     assert text.count("<!-- table: ") == text.count("<!-- end -->") >= 30
+
+
+def test_bench_names_the_benchmarks_of_evaluation() -> None:
+    """`polsep bench NAME` says of each of them, and of no other, how a checkout measures it."""
+    laboratory = pytest.importorskip("evaluation.benches", reason="needs the extras render and bench").BENCHES
+    assert sorted(EVALUATED.split()) == sorted(laboratory) and laboratory.keys().isdisjoint(BENCHES)
+    for name in laboratory:
+        refused = CliRunner().invoke(bench, [name])
+        assert refused.exit_code and f"; in a checkout of polsep: python -m evaluation {name}\n" in refused.output
 
 
 @pytest.mark.parametrize("page", PAGES, ids=label)

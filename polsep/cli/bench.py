@@ -8,6 +8,12 @@ import click
 
 from polsep.cli.app import DIR, app, said_command
 
+#: Benchmarks of ``evaluation``, which the package does not hold.
+EVALUATED = (
+    "rendering sets joint ablations repeats dynamic calibration sensors material video geometry shape install web "
+    "agreement warned view gallery gallery_real paper"
+)
+
 
 @app.command()
 @click.argument("name", metavar="NAME", default="list")
@@ -76,6 +82,4 @@ def _words(text: str | None, separator: str) -> tuple[str, ...]:
 
 def _evaluation_hint(name: str) -> str:
     """The command of a benchmark that is in ``evaluation``, outside the package."""
-    known = "rendering sets joint ablations dynamic calibration material video geometry view gallery gallery_real paper"
-    known += " repeats sensors shape install web agreement warned"
-    return f"; in a checkout of polsep: python -m evaluation {name}" if name in known.split() else ""
+    return f"; in a checkout of polsep: python -m evaluation {name}" if name in EVALUATED.split() else ""

@@ -45,6 +45,7 @@ from polsep.sensor.calibration import (
     correct_mosaic,
     mean_mosaic,
     subtract_ambient,
+    tile,
 )
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.exposure import histogram
@@ -56,6 +57,15 @@ LEVEL = 64.0
 WELL, READ = 10_500.0, 2.4
 MONO = Layout(bayer=None)
 LAYOUTS = pytest.mark.parametrize("layout", [Layout(), MONO, Layout(origin=(1, 0))], ids=lambda x: x.spec)
+
+
+def test_tables_of_a_period_are_repeated() -> None:
+    """From the first sample on, whole or not, of any numbers per place; nothing of nothing."""
+    table = np.arange(32.0).reshape(4, 4, 2)
+    tiled = tile(table, (6, 11))
+    assert tiled.dtype == np.float32 and tile(None, (6, 11)) is None
+    np.testing.assert_array_equal(tiled, np.tile(table, (2, 3, 1))[:6, :11])
+    np.testing.assert_array_equal(tile(table[..., 0], (8, 4)), np.tile(table[..., 0], (2, 1)))
 
 
 class BadSensor:

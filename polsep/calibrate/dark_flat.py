@@ -20,10 +20,9 @@ from polsep.calibrate.statistics import (
     place_means,
     robust_deviation,
     signal_share,
-    tile,
 )
 from polsep.compute.arrays import to_numpy
-from polsep.sensor.calibration import Calibration
+from polsep.sensor.calibration import Calibration, tile
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.falloff import Table, falloff_image
 

@@ -134,13 +134,6 @@ def place_means(image: Floats, period: int) -> Doubles:
     return np.array([[robust_mean(image[row::period, col::period]) for col in rows] for row in rows])
 
 
-def tile(table: NDArray[np.floating], shape: tuple[int, ...]) -> Floats:
-    """A table ``[period, period]`` repeated over a frame."""
-    rows, cols = (np.arange(n) % table.shape[0] for n in shape)
-    tiled: Floats = np.asarray(table, np.float32)[rows][:, cols]
-    return tiled
-
-
 def signal_share(values: NDArray[np.floating], noise_variance: float) -> float:
     """Weight in [0, 1] of noisy estimates that makes their squared error least: signal / (signal + noise).
 

@@ -319,7 +319,7 @@ def mix_neighbours(samples: Floats, black: Any, rows: Neighbours, cols: Neighbou
         return cols.weight * image[:, cols.near] + (1 - cols.weight) * image[:, cols.far]
 
     vertical = rows.weight[:, None] * x[rows.near] + (1 - rows.weight[:, None]) * x[rows.far]
-    w = _tiled(weights, samples.shape)
+    w = tile(weights, samples.shape)
     mixed: Floats = w[..., 0] * x + w[..., 1] * across(x) + w[..., 2] * vertical + w[..., 3] * across(vertical) + black
     return mixed
 
@@ -386,9 +386,9 @@ def _prepared(
     if calibration.black_map is not None:
         offset = calibration.black_map * np.float32(white / calibration.white_level)
     elif calibration.black_pattern is not None:
-        offset = _tiled(calibration.black_pattern, shape) * np.float32(white / calibration.white_level)
+        offset = tile(calibration.black_pattern, shape) * np.float32(white / calibration.white_level)
         offset += np.float32(black)
-    gain = calibration.gain_map if calibration.gain_map is not None else _tiled(calibration.gains, shape)
+    gain = calibration.gain_map if calibration.gain_map is not None else tile(calibration.gains, shape)
     if gain is not None:
         factor = np.float32(1) / gain
         if offset is None:
@@ -396,7 +396,7 @@ def _prepared(
     return offset, factor
 
 
-def _tiled(table: Any, shape: tuple[int, ...]) -> Any:
+def tile(table: Any, shape: tuple[int, ...]) -> Any:
     """A table ``[period, period, ...]`` repeated over a frame, as float32; None for None."""
     if table is None:
         return None

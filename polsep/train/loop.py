@@ -246,7 +246,6 @@ def _starts(run: Run, state: dict[str, Any] | None) -> list[Any]:
 def _describe(run: Run, starts: list[Any]) -> str:
     """JSON of all that must be equal for a training to resume from a checkpoint."""
     described: dict[str, Any] = {"what": run.what, "stream": asdict(run.stream), "schedule": asdict(run.schedule)}
-    described["stream"] |= {"constants": list(run.stream.constants)}
     if not run.stream.constants:
         del described["stream"]["constants"]
     described |= {"start": starts} if run.start else {}

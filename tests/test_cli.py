@@ -41,6 +41,8 @@ from polsep.shipped import NAMES
 
 COLOR_LAYERS = {f"{image}.{color}" for image in ("diffuse", "specular") for color in "RGB"}
 MAPS = {"dolp.Y", "aolp.Y", "valid.Y"}
+#: The lamp, which small frames do not show.
+WHITE = ("--light-color", "white")
 LINE = re.compile(r"polsep: error: [^\n]+\n")
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -140,7 +142,7 @@ def test_version_and_methods(polsep: Cli) -> None:
 
 def test_separate_writes_the_contract(tmp_path: Path) -> None:
     """A shell's `polsep separate` writes the layers of the contract, a preview and a sidecar, and says where."""
-    source = png(tmp_path / "shot.png", frame())
+    source = png(tmp_path / "shot.png", frame(size=80))
     run = subprocess_run("separate", source, "-o", tmp_path / "out")
     assert run.status == 0, run
     assert run.err == ""
@@ -150,7 +152,7 @@ def test_separate_writes_the_contract(tmp_path: Path) -> None:
     layers = read_exr_layers(tmp_path / "out" / "shot.exr")
     errors = {"error.diffuse", "error.specular"} if BEST[0].name in NAMES else set()
     assert set(layers) == COLOR_LAYERS | MAPS | errors | set("RGB")
-    assert {image.shape for image in layers.values()} == {(16, 16)}
+    assert {image.shape for image in layers.values()} == {(40, 40)}
     preview = imagecodecs.png_decode((tmp_path / "out" / "shot.png").read_bytes())
     assert preview.ndim == 3 and preview.dtype == np.uint8
     sidecar = json.loads((tmp_path / "out" / "shot.json").read_text())
@@ -242,7 +244,7 @@ def test_same_command_same_bytes(tmp_path: Path, polsep: Cli) -> None:
 def test_warnings_are_lines_on_stderr(tmp_path: Path, polsep: Cli) -> None:
     """What the owner should know is said once, on stderr, with the file's name; stdout stays for results."""
     odd = frame()[:, :-1]
-    run = polsep("separate", png(tmp_path / "odd.png", odd), "-o", tmp_path / "o")
+    run = polsep("separate", png(tmp_path / "odd.png", odd), "-o", tmp_path / "o", *WHITE)
     assert run.status == 0
     assert run.err.startswith(f"polsep: {tmp_path / 'odd.png'}: size 31x32 cuts polarizer cells")
     assert run.err.count("\n") == 1 and run.out.splitlines()[1].endswith("; 1 warning")
@@ -325,7 +327,7 @@ def test_a_frame_that_fails_ends_its_file(tmp_path: Path, polsep: Cli) -> None:
     np.save(tmp_path / "run.npy", np.stack([frame(k) for k in range(4)]))
     (tmp_path / "o").mkdir()
     (tmp_path / "o" / "run_0001.exr").write_bytes(b"precious")
-    run = polsep("separate", tmp_path / "run.npy", "-o", tmp_path / "o", "--method", "analytic")
+    run = polsep("separate", tmp_path / "run.npy", "-o", tmp_path / "o", "--method", "analytic", *WHITE)
     assert run.status == 2 and LINE.fullmatch(run.err) and run.err.endswith("; 2 frames behind it are left out\n")
     assert set(contents(tmp_path / "o")) == {"run_0001.exr", *(f"run_0000.{s}" for s in ("exr", "png", "json"))}
 
@@ -375,7 +377,7 @@ def test_good_files_are_written_beside_bad_ones(tmp_path: Path, polsep: Cli) -> 
     """One bad file of three: the others are written, one line says what was wrong, and the status is 2."""
     first, last = png(tmp_path / "a.png", frame()), png(tmp_path / "c.png", frame(1))
     (tmp_path / "b.png").write_bytes(first.read_bytes()[:99])
-    run = polsep("separate", first, tmp_path / "b.png", last, "-o", tmp_path / "o")
+    run = polsep("separate", first, tmp_path / "b.png", last, "-o", tmp_path / "o", *WHITE)
     assert run.status == 2
     assert LINE.fullmatch(run.err) and "b.png" in run.err
     assert len(run.out.splitlines()) == 4
@@ -387,7 +389,7 @@ def test_pages_before_a_damaged_one_are_written(tmp_path: Path, polsep: Cli) -> 
     array = np.stack([frame(0), frame(1)]).astype(np.float32) / 65535
     array[1, 3, 5] = np.nan
     np.save(tmp_path / "run.npy", array)
-    run = polsep("separate", tmp_path / "run.npy", "-o", tmp_path / "o")
+    run = polsep("separate", tmp_path / "run.npy", "-o", tmp_path / "o", *WHITE)
     assert run.status == 2 and LINE.fullmatch(run.err) and "(3, 5)" in run.err
     assert set(contents(tmp_path / "o")) == {f"run_0000.{s}" for s in ("exr", "png", "json")}
 
@@ -800,7 +802,7 @@ def test_interrupt_leaves_whole_frames_only(tmp_path: Path, sent: signal.Signals
     np.save(tmp_path / "run.npy", np.stack([frame(size=64)] * 400))
     out = tmp_path / "o"
     command = [sys.executable, "-c", "from polsep.cli import main; main()", "separate", tmp_path / "run.npy", "-o", out]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([*command, *WHITE], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 60
         while not (out / "run_0001.json").exists() and time.monotonic() < deadline and process.poll() is None:
             time.sleep(0.01)

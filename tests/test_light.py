@@ -214,6 +214,7 @@ def test_frames_that_show_nothing_are_not_sure() -> None:
     for raw in (np.zeros((64, 64), np.uint16), np.full((64, 64), 65535, np.uint16), np.zeros((4, 4), np.uint8)):
         found = find_light(raw)
         assert not found.sure and found.color == (1, 1, 1) and found.error_deg == UNKNOWN_DEG and found.aolp is None
+        assert sum("white is assumed" in remark for remark in found.remarks) == 1
 
 
 def test_mono_has_no_color() -> None:

@@ -123,8 +123,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def command(recording: Path, output: Path, *more: str) -> list[str]:
-    """Each frame for itself, so that it can be compared with itself alone."""
-    given = ["--method", "analytic", "--white-level", str(WHITE), "--filter", "none"]
+    """Each frame for itself, to be compared with itself alone; too small to show the lamp, which is white."""
+    given = ["--method", "analytic", "--white-level", str(WHITE), "--filter", "none", "--light-color", "white"]
     return ["video", str(recording), "-o", str(output), *given, *more]
 
 

@@ -57,6 +57,11 @@ GOOD = (1.25 * math.exp(0.28), 0.126, 0.563)
 #: What calls for a remark: least expected error of a colour [degrees], least share of coloured metal, and, where white
 #: is assumed, largest sum of the log-ratios of the frame's mean: raw frames without white balance are that green.
 UNCERTAIN_DEG, LEAST_METAL, GREENISH = 5.5, 0.02, -1.2
+#: Remark on a frame in which no colour can be looked for.
+TOO_LITTLE = (
+    "a frame that shows the lamp's colour was expected, found one too small, dark or overexposed; white is assumed: "
+    "if the lamp is not white, say --light-color"
+)
 
 
 @dataclass(frozen=True)
@@ -191,7 +196,7 @@ def unknown_light(colors: int) -> Light:
     if colors != 3:
         return Light(None, None, 0.0, True)
     variance = _variance_of(UNKNOWN_DEG)
-    return Light((0.0, 0.0), (variance, 0.0, variance), UNKNOWN_DEG, False)
+    return Light((0.0, 0.0), (variance, 0.0, variance), UNKNOWN_DEG, False, remarks=(TOO_LITTLE,))
 
 
 def combine(lights: Sequence[Light]) -> Light:

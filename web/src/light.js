@@ -31,12 +31,15 @@ function eigen2(a, b, d) {
   return [[value(c, s), [c, s]], [value(-s, c), [-s, c]]];
 }
 
+const TOO_LITTLE = "a frame that shows the lamp's colour was expected, found one too small, dark or overexposed; white is " +
+  "assumed: if the lamp is not white, state the lamp's colour";
+
 /** {color: [r, g, b], source, sure, error_deg, metal_fraction, remarks} of a colour mosaic; green = 1. */
 export function findLight(mosaic) {
   const tiles = tilesOf(mosaic);
   if (tiles.length < MIN_TILES) {
     const unknown = { x: [0, 0], error: UNKNOWN_DEG, sure: false, metal: 0 };
-    return { ...asReport(unknown), remarks: [] };
+    return { ...asReport(unknown), remarks: [TOO_LITTLE] };
   }
   const axis = axisOf(strongest(tiles)), light = lightOfTiles(tiles, axis);
   return { ...asReport(light), remarks: remarksOn(light, tiles) };

@@ -354,6 +354,23 @@ def test_photographs_of_any_unit_give_one_shape() -> None:
     np.testing.assert_allclose(found[1].albedo, 1e-3 * found[0].albedo, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.parametrize("gloss", [0.0, 0.3, 3.0])
+def test_photographs_whose_light_no_normal_explains_are_remarked_on(gloss: float) -> None:
+    """Highlights that clip tore the mesh of flash photographs without a word; one smooth surface is whole."""
+    normals, mask = cap(48, 70)
+    half = SIX + np.array([0.0, 0.0, 1.0])
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    lit, mirrored = (np.maximum(np.einsum("ijk,lk->lij", normals, x), 0) for x in (SIX, half))
+    images = np.minimum(0.3 * lit + gloss * (lit > 0) * mirrored**20, 1)[..., None].repeat(3, axis=-1)
+    views = files.Views(images, None, ("other",))
+    torn, whole = (
+        files.find_shape(views, SIX, mask, files.ShapeOptions(integration=how)).facts["warnings"]
+        for how in ("bilateral", "smooth")
+    )
+    assert torn[0] == "other" and whole == ["other"]
+    assert len(torn) == (2 if gloss > 1 else 1) and all("--integration smooth" in note for note in torn[1:])
+
+
 def test_pictures_show_the_side_that_is_lit() -> None:
     """Relit images and pictures of the mesh are brighter toward the light, and black where nothing is."""
     appearance, surface = ball()

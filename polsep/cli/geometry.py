@@ -112,5 +112,6 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
         size = views.images.shape[1:3]
         mask = find_object(views) if options["mask"] is None else read_object(options["mask"], size)
         views, mask = shrink(views, mask, options["longest"])
-        write_shape(find_shape(views, directions, mask, shape_options), targets)
-    print_results(views.notes, targets)
+        shape = find_shape(views, directions, mask, shape_options)
+        write_shape(shape, targets)
+    print_results(shape.facts["warnings"], targets)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from polsep.geometry.frames import open_frame
 from polsep.geometry.integration import integrate_bilateral, integrate_smooth
-from polsep.geometry.photometric import Appearance, fit_robust
+from polsep.geometry.photometric import Appearance, fit_robust, unexplained_share
 from polsep.geometry.polarization import Polarized, find_diffuse_polarization, normals_from_polarization
 from polsep.geometry.surface import Surface, draw_views, relight, span_surface
 from polsep.geometry.thing import find_lit
@@ -43,6 +43,9 @@ VIEWS = ((-50.0, 5.0), (-20.0, 10.0), (20.0, 10.0), (50.0, 5.0))
 SWING, TURN_PICTURES, TURN_RATE = (60.0, 12.0), 96, 24.0
 #: Integration of normals to depth: with jumps, or as one smooth surface.
 INTEGRATIONS = {"bilateral": integrate_bilateral, "smooth": integrate_smooth}
+#: Largest `unexplained_share` of photographs without a remark: of statues rendered with weak highlights it is at most
+#: 0.17, with strong ones 0.23 to 0.32, of two objects under a flash 0.31 and 0.51.
+MOST_UNEXPLAINED = 0.2
 #: Colour around the object in previews.
 GREY = 40
 
@@ -182,6 +185,9 @@ def find_shape(views: Views, directions: Floats, mask: Mask, options: ShapeOptio
     else:  # photographs of a unit of their own: the brightest light on the object stands for white
         level = max(float(np.percentile(views.images[:, mask], 99.5)), 1e-30)
     found = fit_robust(views.images / level, directions, mask, cue)
+    notes = views.notes
+    if cue is None and options.integration == "bilateral":
+        notes += _notes_on_photographs(unexplained_share(views.images / level, directions, found))
     found = replace(found, albedo=found.albedo * level)
     intrinsics = None if options.fov_deg is None else intrinsics_of(options.fov_deg, mask.shape)
     depth = INTEGRATIONS[options.integration](found.normals, mask, intrinsics)
@@ -196,7 +202,7 @@ def find_shape(views: Views, directions: Floats, mask: Mask, options: ShapeOptio
         "integration": options.integration,
         "triangles": len(surface.faces),
         "albedo_of_mesh": f"albedo x {gain:.6g}, limited to 1",
-        "warnings": list(views.notes),
+        "warnings": list(notes),
     }
     sheet, film = draw_sheet(views, shown, surface), None
     if options.turntable:
@@ -205,6 +211,14 @@ def find_shape(views: Views, directions: Floats, mask: Mask, options: ShapeOptio
             "turntable": f"seen from {SWING[0]:g} degrees left to {SWING[0]:g} right, the light beside the camera"
         }
     return ShapeFiles(found.normals, found.albedo, depth, mask, mesh, sheet, film, sidecar)
+
+
+def _notes_on_photographs(unexplained: float) -> tuple[str, ...]:
+    """A note on photographs whose normals are too poor for a depth with jumps, or none."""
+    if unexplained <= MOST_UNEXPLAINED:
+        return ()
+    seen = f"light of matte surfaces was expected, found {unexplained:.0%} of it that no normal explains"
+    return (f"{seen} (highlights, clipped or uneven light): the mesh may be torn; --integration smooth keeps it whole",)
 
 
 def encode_mesh(surface: Surface, name: str, roughness: float = 1.0) -> bytes:

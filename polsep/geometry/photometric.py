@@ -70,7 +70,7 @@ def fit_robust(images: Floats, directions: Floats, mask: Mask, cue: Cue | None =
     """
     _check(images, directions, mask)
     light = images.mean(axis=-1)[:, mask]
-    lit = light > np.maximum(SHADOW * light.max(axis=0), DARK)
+    lit = _lit(light)
     frames = _Frames(light, lit, directions, mask)
     choices = None if cue is None else (cue.first[mask], cue.second[mask], cue.deviation[mask])
     weight = lit.astype(np.float64)
@@ -211,3 +211,22 @@ def _check(images: Floats, directions: Floats, mask: Mask) -> None:
         raise ValueError("expected three lights or more, in directions that are not in one plane, found fewer")
     if not mask.any():
         raise ValueError("expected a mask that holds pixels, found none")
+
+
+def unexplained_share(images: Floats, directions: Floats, found: Appearance) -> float:
+    """Share of the lit samples that lie farther from what the normals explain than lights off by degrees make them.
+
+    It grows with highlights, clipped samples and lights of unequal brightness.
+    """
+    light, normals = images.mean(axis=-1)[:, found.mask], found.normals[found.mask]
+    lit = _lit(light)
+    even, cosines = light / _transmission(normals, directions), directions @ normals.T
+    relative = even / _albedo(even, lit.astype(np.float64), cosines)
+    off = np.abs(relative - cosines) > OUTLYING * np.hypot(RELATIVE * relative, ABSOLUTE)
+    return float((off & lit).sum() / max(int(lit.sum()), 1))
+
+
+def _lit(light: Floats) -> Mask:
+    """A mask of the samples ``[L, P]`` that are in no shadow."""
+    lit: Mask = light > np.maximum(SHADOW * light.max(axis=0), DARK)
+    return lit

@@ -745,6 +745,39 @@ def test_a_white_level_above_where_the_sensor_clips_is_said_as_in_the_library(tm
 
 
 @needs_packages
+def test_levels_are_refused_as_the_library_refuses_them() -> None:
+    """A negative black level brightened all of a frame without a word; others leave float32 no digits."""
+    levels = [
+        (0, 4095),
+        (240, 65535),
+        (-5, 4095),
+        (4095, 4095),
+        (500, 240),
+        (0, 0),
+        (0, 0.01),
+        (0, 1e13),
+        (4e3, 4000.001),
+    ]
+    script = f"""
+      import {{ requireLevels }} from {json.dumps((WEB / "src" / "levels.js").as_uri())};
+      const wordsOf = (run) => {{ try {{ run(); return null; }} catch (error) {{ return error.message; }} }};
+      console.log(JSON.stringify([new Uint8Array(16), new Uint16Array(16)].map((samples) =>
+        {json.dumps(levels)}.map(([black, white]) => wordsOf(() => requireLevels(samples, black, white))))));"""
+    done = subprocess.run([str(NODE), "--input-type=module", "-e", script], capture_output=True, check=True, timeout=60)
+    for dtype, found in zip((np.uint8, np.uint16), json.loads(done.stdout), strict=True):
+        assert found == [refusal_of(np.zeros((4, 4), dtype), black, white) for black, white in levels]
+
+
+def refusal_of(codes: np.ndarray[Any, Any], black: float, white: float) -> str | None:
+    """The page's words for what the library says of levels, or None where it takes them."""
+    try:
+        as_mosaic(codes, None, black, white)
+    except ValueError as refused:
+        return str(refused).replace("--white-level", "white level").replace("1e+13", "10000000000000")
+    return None
+
+
+@needs_packages
 @pytest.mark.parametrize("sees", [True, False])
 def test_networks_that_do_not_see_the_frame_are_given_no_thumbnail(sees: bool) -> None:
     """Those for mono frames: a thumbnail was made of every frame in vain."""

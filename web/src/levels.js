@@ -3,11 +3,32 @@
 /** A sample within this share of white counts as clipped. */
 export const CLIP_MARGIN = 2 ** -10;
 const MAX_CLIPPED = 0.03, LIT = 0.02, NARROW_BITS = [8, 10, 12, 14];
+const SPANS = [1e-12, 1e12], MAX_RATIO = 1e6;
 const PILE = { count: 64, ratio: 5, range: 1 / 64 };
 
 /** The white level that a type of samples implies. */
 export const whiteOf = (samples) =>
   samples instanceof Uint8Array ? 255 : samples instanceof Uint16Array ? 65535 : 1;
+
+/** Throws on levels that the library refuses, in its words: between them samples must keep their digits as float32. */
+export function requireLevels(samples, black, white) {
+  const [shownBlack, shownWhite] = [black, white].map(shortOf), span = white - black, most = whiteOf(samples);
+  if (!Number.isFinite(black) || !Number.isFinite(white))
+    throw new Error(`expected finite black and white levels, found ${shownBlack} and ${shownWhite}`);
+  if (black < 0)
+    throw new Error(`expected a black level from 0 on in samples of uint${most === 255 ? 8 : 16}, found ${shownBlack}`);
+  const found = `found white ${shownWhite}, black ${shownBlack}`;
+  if (!(white > black)) throw new Error(`expected a white level above the black level, ${found}`);
+  if (!(span >= SPANS[0] && span <= SPANS[1] && white <= MAX_RATIO * span))
+    throw new Error(`expected a white level well above the black level, ${found}`);
+  const farthest = Math.max(black, most - black);
+  if (farthest > MAX_RATIO * span)
+    throw new Error(`expected samples within 1e+06 times the white level, found them ${shortOf(farthest)} from black, ` +
+      `white ${shownWhite}: say white level N`);
+}
+
+/** A number in six digits, as the library's messages show it. */
+const shortOf = (value) => String(Number(value.toPrecision(6)));
 
 /** The least clipped sample. */
 export const clipLevel = ({ black, white }) => black + (1 - CLIP_MARGIN) * (white - black);

@@ -10,7 +10,7 @@ import { fillUnderHighlights } from "./highlights.js";
 import { separateJoint } from "./joint.js";
 import { checkLayout, seePhases } from "./layout_check.js";
 import { channelsOf, parseLayout, periodOf, specOf } from "./layout.js";
-import { levelNotes, overexposureNotes, whiteOf } from "./levels.js";
+import { levelNotes, overexposureNotes, requireLevels, whiteOf } from "./levels.js";
 import { findLight } from "./light.js";
 import { checkBlackLevel } from "./noise.js";
 import { readFrame } from "./read.js";
@@ -103,7 +103,7 @@ function stopwatch(steps) {
 function prepare(settings) {
   const layout = parseLayout(settings.layout || frame.layout || "color"), notes = frame.notes.map((text) => ({ text }));
   const said = settings.white ?? frame.white, white = said ?? whiteOf(frame.data), black = settings.black || 0;
-  if (!(white > black)) throw new Error(`expected a white level above the black level, found white ${white}, black ${black}`);
+  requireLevels(frame.data, black, white);
   const [top, left] = layout.origin, [rows, cols] = [top, left].map((start) => start + periodOf(layout));
   if (frame.height < rows || frame.width < cols)
     throw new Error(`expected a mosaic of at least ${cols}x${rows} pixels, found ${frame.width}x${frame.height}`);

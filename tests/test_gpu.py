@@ -234,7 +234,7 @@ def test_benchmark_is_whole(monkeypatch: pytest.MonkeyPatch, generator: torch.Ge
     monkeypatch.setattr(gpu, "SECONDS", 0.0)
     monkeypatch.setattr(gpu, "FIRST", 1)
     monkeypatch.setattr(gpu, "COMPILED", ())
-    rows = list(gpu.measure("cpu", textured(generator, 64), ("joint-fast", "analytic")))
+    rows = list(gpu.measure("cpu", textured(generator, 96), ("joint-fast", "analytic")))
     assert all(row.value > 0 for row in rows)
     rates = ["raw frame in, images out", "on the device", "polsep.separate"]
     for case in ("half resolution", "full resolution"):

@@ -44,7 +44,7 @@ SWING, TURN_PICTURES, TURN_RATE = (60.0, 12.0), 96, 24.0
 #: Integration of normals to depth: with jumps, or as one smooth surface.
 INTEGRATIONS = {"bilateral": integrate_bilateral, "smooth": integrate_smooth}
 #: Largest `unexplained_share` of photographs without a remark: of statues rendered with weak highlights it is at most
-#: 0.17, with strong ones 0.23 to 0.32, of two objects under a flash 0.31 and 0.51.
+#: 0.17, with strong ones 0.23 to 0.32, of two objects under a flash 0.31 and 0.51 (docs/experiments.md).
 MOST_UNEXPLAINED = 0.2
 #: Colour around the object in previews.
 GREY = 40

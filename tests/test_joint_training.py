@@ -54,7 +54,6 @@ from polsep.train.joint_task import (
     FIT_LANE,
     FIT_REACH,
     JOINT_VARIANTS,
-    SEES_FRAME,
     SIZES,
     fit_filter,
     joint_task,
@@ -89,7 +88,7 @@ def batches() -> list[Examples]:
 
 def small_task(ablation: str = "none", variant: str = "mosaic") -> Task[JointInputs]:
     torch.manual_seed(1)
-    return joint_task(variant, TINY, ABLATIONS[ablation], sees_frame=True)
+    return joint_task(variant, TINY, ABLATIONS[ablation])
 
 
 def truth_of(seen: JointInputs) -> JointOutput:
@@ -491,7 +490,7 @@ def test_training_ends_in_weights_that_say_all(variant: str, tmp_path: Path, sho
     assert metadata["command"].startswith("polsep train joint-fast ")
     size, inputs = ResidualSize(**json.loads(metadata["size"])), tuple(json.loads(metadata["inputs"]))
     sees_frame = json.loads(metadata["sees_frame"])
-    assert sees_frame == (("joint-fast", variant) in SEES_FRAME)
+    assert sees_frame
     network = Joint(colors, size, inputs, sees_frame=sees_frame)
     network.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
     assert metadata["parameters"] == str(count_parameters(network))

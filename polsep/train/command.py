@@ -24,7 +24,6 @@ from polsep.train.joint_task import (
     DEMOSAICKERS,
     JOINT_VARIANTS,
     PARTS,
-    SEES_FRAME,
     SIZES,
     freeze_others,
     joint_task,
@@ -98,7 +97,7 @@ class JointOptions:
     def task(self) -> Task[JointInputs]:
         """Return the task of the network and its ablation."""
         size, ablation = self.size or SIZES[self.name], ABLATIONS[self.ablation]
-        task = joint_task(self.variant, size, ablation, self.demosaicker, self.sees_frame)
+        task = joint_task(self.variant, size, ablation, self.demosaicker)
         freeze_others(task.network, self.part)
         return task
 
@@ -107,16 +106,11 @@ class JointOptions:
         """Source of the network's Stokes images."""
         return DEMOSAICKERS[self.name] if self.variant == "mosaic" else "linear"
 
-    @property
-    def sees_frame(self) -> bool:
-        """True for a network that sees a thumbnail of the whole frame."""
-        return (self.name, self.variant) in SEES_FRAME
-
     def metadata(self) -> dict[str, str]:
         """Return what is needed to load the weights."""
         inputs, colors = json.dumps(ABLATIONS[self.ablation].inputs), str(JOINT_VARIANTS[self.variant][1])
         named = {"method": self.name, "ablation": self.ablation, "demosaicker": self.demosaicker}
-        return named | {"inputs": inputs, "colors": colors, "sees_frame": json.dumps(self.sees_frame)}
+        return named | {"inputs": inputs, "colors": colors, "sees_frame": "true"}
 
     @property
     def crop(self) -> int:

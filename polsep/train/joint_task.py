@@ -31,8 +31,6 @@ SIZES = {
 }
 #: Source of their Stokes images for colour frames; mono frames use a linear filter.
 DEMOSAICKERS: dict[str, Demosaicker] = {"joint-large": "guided", "joint": "guided", "joint-fast": "linear"}
-#: Networks that see a thumbnail of the whole frame, by name and variant.
-SEES_FRAME = {("joint-large", "mosaic"), ("joint", "mosaic"), ("joint", "mono"), ("joint-fast", "mosaic")}
 #: Cells by which the guided demosaicker extends crops.
 MARGIN = 8
 #: Batches for the fit of the filter, size of their scene pool, and their lane, which no worker uses.
@@ -78,11 +76,10 @@ def joint_task(
     size: ResidualSize,
     ablation: Ablation,
     demosaicker: Demosaicker = "linear",
-    sees_frame: bool = False,
 ) -> Task[JointInputs]:
     """Return the task of the joint network for colour (``mosaic``) or ``mono`` frames."""
     prepare, colors = JOINT_VARIANTS[variant]
-    network = Joint(colors, size, ablation.inputs, demosaicker, sees_frame)
+    network = Joint(colors, size, ablation.inputs, demosaicker, sees_frame=True)
     network.margin = MARGIN
     if not torch.cuda.is_available():
         network.guide = guide_batch

@@ -532,6 +532,30 @@ def test_a_network_grows_without_a_change_of_its_images(sees_frame: bool) -> Non
         assert_close(b.specular, a.specular, scale=10)
 
 
+@pytest.mark.parametrize("entry", [0, 6])
+def test_a_mono_network_begins_as_the_colour_network_on_grey_frames(entry: int) -> None:
+    """The specular image, errors and light are the same; the diffuse image is the mean over the colours."""
+    torch.manual_seed(3)
+    color, mono = (Joint(colors, ResidualSize(8, (0, 1, 1), entry), sees_frame=True) for colors in (3, 1))
+    for weight in color.parameters():
+        torch.nn.init.normal_(weight, std=0.1)
+    own = mono.demosaic
+    assert own is not None and color.demosaic is not None
+    grey = torch.cat([part.repeat(3, 1, 1, 1) for part in own.split((16, 4, 4))])  # s0, s1, s2 of three equal colours
+    color.demosaic.copy_(grey)
+    mono.load_state_dict(grow(color.state_dict(), mono))
+    assert mono.demosaic is not None and torch.equal(mono.demosaic, own)
+    raw, seen = torch.rand(2, 1, 32, 32), torch.rand(2, 7, 64, 64)
+    none = torch.zeros_like(raw, dtype=torch.bool)
+    equal = torch.cat([seen[:, :5].repeat_interleave(3, dim=1), seen[:, 5:]], dim=1)
+    with torch.no_grad():
+        (expected, a), (found, b) = color(raw, none, equal), mono(raw, none, seen)
+    assert_close(found.diffuse, expected.diffuse.mean(dim=1, keepdim=True), scale=10)
+    for name in ("specular", "log_variance", "light"):
+        assert_close(getattr(found, name), getattr(expected, name), scale=10)
+    assert_close(b.specular, a.specular, scale=10)
+
+
 @pytest.mark.parametrize("layer", ["net.ups.1", "net.encoders.1.0.second"])
 def test_what_was_silent_becomes_zero_and_wakes(layer: str) -> None:
     """Silent parts change no image, before and after; a training that starts from them can move them again."""

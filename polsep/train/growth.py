@@ -3,7 +3,7 @@
 A larger network has more residual blocks per level, whose last convolutions start at zero, or more channels, on which
 nothing that was there depends at first. It need not learn again what the small one knows (Chen et al. 2016, Net2Net,
 arXiv 1511.05641). Blocks and levels that an earlier training left silent, all 0 in the file (`networks.ranges`), begin
-again in the same way.
+again in the same way. A network for mono frames can begin as one for colour frames, of which every frame is grey.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import re
 import torch
 from torch import Tensor
 
+from polsep.networks.channels import input_channels
 from polsep.networks.joint import Joint
 
 #: Parts that a smaller network may lack: they change nothing until they are trained.
@@ -25,9 +26,13 @@ def grow(tensors: dict[str, Tensor], network: Joint) -> dict[str, Tensor]:
     """Return the state of a network with the weights of a smaller one in it.
 
     What the smaller one lacks, and what is 0 in it, keeps its initial values, but old outputs do not depend on new
-    inputs, nor on a level that was silent. Raises ValueError on weights of a network that is not a part of this one.
+    inputs, nor on a level that was silent. A network of one colour takes weights of three, see `for_one_color`, and
+    keeps its own linear filter. Raises ValueError on weights of a network that is not a part of this one.
     """
     state = {name: value.clone() for name, value in network.state_dict().items()}
+    if network.colors == 1 and "last.bias" in tensors and len(tensors["last.bias"]) == 16:
+        tensors = for_one_color(tensors, network.inputs)
+        tensors |= {name: value for name, value in state.items() if name == "demosaic"}
     lacking = [name for name in state if name not in tensors and not NEW_PARTS.match(name)]
     if lacking or not tensors.keys() <= state.keys():
         raise ValueError(
@@ -39,6 +44,30 @@ def grow(tensors: dict[str, Tensor], network: Joint) -> dict[str, Tensor]:
         if old.any() or not WAKING.match(name):
             state[name] = _embed(old, state[name], places.get(name))
     return state
+
+
+def for_one_color(tensors: dict[str, Tensor], inputs: tuple[str, ...]) -> dict[str, Tensor]:
+    """Return the weights of a network of three colours, without its linear filter, for frames of one colour.
+
+    The images are those of a frame that is grey everywhere, the diffuse one the mean over colours: weights of equal
+    inputs are added up, those of the colours' outputs averaged. ``inputs``: as of `Joint`.
+    """
+    changed = {name: value for name, value in tensors.items() if name != "demosaic"}
+    for name, cells in (("last", 4), ("details.change", 12)):
+        for part in ("weight", "bias"):
+            value = changed[f"{name}.{part}"]
+            grey = torch.stack(value[: 3 * cells].chunk(3)).mean(dim=0)
+            changed[f"{name}.{part}"] = torch.cat([grey, value[3 * cells :]])
+    first = input_channels(3, inputs).diffuse
+    name = "net.enter.weight" if "net.enter.weight" in changed else "net.enter.0.weight"
+    if first >= 0:
+        before, own, after = changed[name].tensor_split((first, first + 12), dim=1)
+        changed[name] = torch.cat([before, torch.stack(own.chunk(3, dim=1)).sum(dim=0), after], dim=1)
+    name = "whole_frame.look.0.weight"
+    if name in changed:
+        light, after = changed[name].tensor_split((15,), dim=1)
+        changed[name] = torch.cat([light[:, 0::3] + light[:, 1::3] + light[:, 2::3], after], dim=1)
+    return changed
 
 
 def _moved(old: tuple[int, ...], new: tuple[int, ...]) -> dict[str, tuple[int, Tensor]]:

@@ -196,7 +196,7 @@ def _precision() -> str:
 
 
 def _device() -> str:
-    from polsep.pipeline import find_device
+    from polsep.compute.devices import find_device
 
     return find_device("auto")
 

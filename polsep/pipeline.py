@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.arguments import WrongType, require_flags
 from polsep.compute.arrays import namespace, to_device
+from polsep.compute.devices import find_device
 from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration
@@ -30,7 +31,7 @@ from polsep.io.store.errors import as_path
 from polsep.light.find import Light, find_light
 from polsep.methods import Capture, Method, find_method
 from polsep.physics.stokes import Measurements
-from polsep.sensor.calibration import Calibration, Corrections, mean_mosaic
+from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.falloff import Table, falloff_image
@@ -171,8 +172,8 @@ def separate(
         if ambient is not None:
             four = isinstance(raw, np.ndarray) and raw.ndim == 3 and raw.shape[0] == 4
             kind = None if white_level is not None else getattr(raw, "dtype", None)
-            rooms = [corrections.apply(_as_room(room, capture, kind)) for room in _ambient_frames(ambient, four)]
-            corrections = Corrections(measured, mean_mosaic(rooms))
+            rooms = [_as_room(room, capture, kind) for room in _ambient_frames(ambient, four)]
+            corrections = corrections.with_ambient(rooms)
         capture, more = corrections.apply_noting(capture)
         notes += more
     elif measured is not None or ambient is not None:
@@ -317,37 +318,6 @@ def _is_finite(facts: Any) -> bool:
     return all(map(_is_finite, facts))
 
 
-def find_device(name: str) -> str:
-    """Name of a device: ``auto`` is CUDA where torch and a GPU are, else the CPU, which needs no torch.
-
-    Raises ValueError on a device that is not there.
-    """
-    if not isinstance(name, str):
-        raise WrongType(f"expected a device like auto, cpu or cuda, found {name!r}")
-    if name == "cpu" or (name == "auto" and not _may_have_gpu()):
-        return "cpu"
-    try:
-        import torch
-
-        if name == "auto":
-            return "cuda" if torch.cuda.is_available() else "cpu"
-        torch.zeros(1, device=name).cpu()
-    except (ImportError, RuntimeError, TypeError, AssertionError, NotImplementedError) as error:
-        if name == "auto":
-            return "cpu"
-        if isinstance(error, ImportError):
-            raise ValueError(f"device {name!r} needs torch: install polsep[torch]") from None
-        known = name.partition(":")[0] in ("cuda", "mps", "xpu")  # of other words torch lists all that it knows
-        reason = f": {str(error).splitlines()[0].partition('. ')[0]}" if known else ""
-        raise ValueError(f"expected a device like auto, cpu or cuda, found {name!r:.40}{reason}") from None
-    return name
-
-
-def _may_have_gpu() -> bool:
-    """True if torch is loaded anyway, or may find a GPU: asking it takes a second and 200 MB of memory."""
-    return "torch" in sys.modules or Path("/dev/nvidiactl").exists() or sys.platform == "win32"
-
-
 def move_capture(capture: Capture, device: str) -> Capture:
     """The capture with its arrays on a device: on the CPU as they are, on others as torch tensors."""
     moved = {name: to_device(value, device) for name, value in vars(capture).items() if is_array_api_obj(value)}
@@ -367,6 +337,7 @@ def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[
     notes = list(frame.report.get("warnings", ()))
     if not is_to_be_found(light_color):
         frame.report["light_color"] = stated_gains(light_color, frame.diffuse.shape[-1])
+        notes += color_notes(light_color, frame.diffuse.shape[-1])
     elif "light_color" not in frame.report and frame.diffuse.shape[-1] > 1:
         notes.append(f"the lamp's colour is not told, nor known from {path.stem}.json beside the file: taken for white")
     return frame, notes
@@ -381,6 +352,12 @@ def stated_gains(light_color: LightColor | str, channels: int) -> list[float]:
         return [1.0] * channels
     color = [float(gain) for gain in light_color]
     return [gain / color[1] for gain in color]
+
+
+def color_notes(light_color: LightColor | str, channels: int) -> tuple[str, ...]:
+    """A note where the colour that is stated of a light changes nothing: mono frames show none."""
+    ignored = channels == 1 and not isinstance(light_color, str) and len(set(light_color)) > 1
+    return ("the colour stated of the light changes nothing: mono frames show no colours",) * ignored
 
 
 def parse_light_color(text: str) -> LightColor | str:
@@ -447,4 +424,4 @@ def resolve_light(
     if color is None:
         raise ValueError(f"expected a light colour of three positive numbers, found {light_color!r}")
     gains = stated_gains(color, channels)
-    return tuple(gains), {"source": source, "color": gains}, ()
+    return tuple(gains), {"source": source, "color": gains}, color_notes(color, channels)

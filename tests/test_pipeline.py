@@ -21,6 +21,7 @@ from tolerances import assert_close
 from torch.nn.functional import interpolate
 
 import polsep
+from polsep.compute.devices import find_device
 from polsep.io.results.previews import contact_sheet
 from polsep.methods import BEST, FASTEST, METHODS, Capture, Method, find_method, run_reference
 from polsep.networks.channels import MIN_BRIGHTNESS
@@ -28,7 +29,8 @@ from polsep.networks.joint import Joint
 from polsep.networks.run import run_joint
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.stokes import Measurements, Stokes, measure
-from polsep.pipeline import PolsepWarning, find_device, separate, separate_capture
+from polsep.pipeline import PolsepWarning, open_separated, separate, separate_capture
+from polsep.sensor.calibration import Calibration
 from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
 from polsep.sensor.levels import as_mosaic
 from polsep.separation.analytic import Separation
@@ -433,6 +435,22 @@ def test_lamp_off_frames_of_other_levels_are_refused(dtype: str) -> None:
             polsep.separate(as_mosaic(raw)[0], "analytic", ambient=room)
 
 
+def test_a_lamp_off_frame_of_codes_at_the_other_end_of_words_is_noted() -> None:
+    """A sixteenth of the room is subtracted, or sixteen times it; frames alike, and means of several, say nothing."""
+    codes, room = (raw_frame(exposure=light) // 16 for light in (1.0, 0.1))
+    gains = Calibration(Layout(), 4095.0, gains=((1.0, 1.1, 0.9, 1.0),) * 4)
+
+    def said(frame: NDArray[Any], ambient: Any, **options: Any) -> str:
+        notes = quietly(frame, "analytic", ambient=ambient, **options).report["warnings"]
+        return " ".join(note for note in notes if "left-justified in 16 bits?" in note)
+
+    assert "16 times too little is subtracted" in said(16 * codes, room)
+    assert "16 times too little is subtracted" in said(16 * codes, [16 * room, room], calibration=gains)
+    assert "16 times too much is subtracted" in said(codes, 16 * room, white_level=4095)
+    assert not said(16 * codes, 16 * room) and not said(codes, room, white_level=4095)
+    assert not said(16 * codes, (16 * codes) // 3) and not said(16 * codes, 0 * room)
+
+
 def test_lamp_off_frames_with_an_axis_of_colours_are_one_frame() -> None:
     """``[H, W, 1]`` and three equal channels are one frame, as beside the lamp; an axis before them holds several."""
     raw, room = raw_frame()[..., None], raw_frame(exposure=0.1)[..., None]
@@ -593,12 +611,15 @@ def test_a_device_that_is_none_is_refused_in_few_words() -> None:
         find_device("gpu")
 
 
-def test_mono_ignores_the_light_color() -> None:
-    """One channel has no colour: the light's colour changes nothing."""
+def test_mono_ignores_the_light_color(tmp_path: Path) -> None:
+    """One channel has no colour: the light's colour changes nothing, which is said."""
     mono = Layout(bayer=None)
     raw = raw_frame(layout=mono)
     one, other = quietly(raw, layout=mono), quietly(raw, layout=mono, light_color=ODD_LIGHT)
     assert float(np.abs(one.specular - other.specular).max()) == 0
+    notes = ["the colour stated of the light changes nothing: mono frames show no colours"]
+    assert other.report["warnings"] == notes + one.report["warnings"]
+    assert open_separated(one.save(tmp_path / "shot")[0], ODD_LIGHT)[1] == one.report["warnings"] + notes
 
 
 def test_light_of_a_report_is_that_of_the_images() -> None:

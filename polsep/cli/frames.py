@@ -110,8 +110,8 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
         require_paths(*files)
     check_read_options(options)
     from polsep.batch import SeparateOptions, WriteOptions, separate_files, separate_photographs
+    from polsep.compute.devices import find_device
     from polsep.methods import check_method
-    from polsep.pipeline import find_device
 
     read = read_options(options)
     check_method(options["method"])

@@ -1,4 +1,4 @@
-"""Signs that the lamp was on in a frame that is subtracted as the room's light.
+"""Signs that a frame that is subtracted as the room's light is not that: the lamp was on, or its unit is another.
 
 A lamp as bright as in the frame leaves nothing. A dimmer one leaves highlights that are polarized as those of the
 ambient frame are: of one lamp. Those of a room lie elsewhere, or are polarized at other angles.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,40 @@ SIDE, STRONG, LEAST, MIN_BLOCKS, MANY = 8, 0.3, 0.01, 12, 2**20
 ONE_LAMP, ALIKE, LEAST_PART = 0.5, 0.8, 0.02
 #: Exposure times within this factor are equal.
 EQUAL = 1.02
+#: Codes of 16-bit words.
+WORDS = 65536
+
+
+class CodeScale(NamedTuple):
+    """The power of two of which all codes of a raw frame are multiples, 0 where unknown, and the largest code."""
+
+    step: int
+    largest: float
+
+
+UNKNOWN_SCALE = CodeScale(0, 0.0)
+
+
+def code_scale(mosaic: Mosaic) -> CodeScale:
+    """The scale of a raw frame, by every fifth sample of every fifth row; it is unknown of frames of one code."""
+    samples = to_numpy(mosaic.data)[..., ::5, ::5]
+    codes = samples.astype(np.int64)
+    used, varies = (int(np.bitwise_or.reduce(c, axis=None)) for c in (codes, codes ^ codes.flat[0]))
+    known = varies and (codes == samples).all()
+    return CodeScale(used & -used if known else 0, float(samples.max()))
+
+
+def scale_notes(frame: Mosaic, ambient: CodeScale) -> tuple[str, ...]:
+    """A note where codes of one of a frame and its ambient frame are left-justified, and those of the other are not."""
+    scales = {"this frame": code_scale(frame), "the ambient frame": ambient}
+    (right, low), (left, high) = sorted(scales.items(), key=lambda item: item[1].step)
+    if low.step != 1 or high.step < 4 or low.largest * high.step >= WORDS:
+        return ()
+    much = "little" if right == "the ambient frame" else "much"
+    return (
+        f"codes of {left} are multiples of {high.step}, those of {right} are not and reach {low.largest:g}: is only "
+        f"one left-justified in 16 bits? Then {high.step} times too {much} is subtracted",
+    )
 
 
 def ambient_notes(frame: Mosaic, less: Mosaic) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ Model of a sample without noise, t its analyser's angle and D = (ER - 1) / (ER +
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from numbers import Real
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from polsep.compute.arguments import WrongType
 from polsep.compute.arrays import as_floats, namespace, of_kind, to_numpy
 from polsep.physics.stokes import diattenuation
-from polsep.sensor.ambient import ambient_notes
+from polsep.sensor.ambient import UNKNOWN_SCALE, CodeScale, ambient_notes, code_scale, scale_notes
 from polsep.sensor.camera import Layout, Mosaic, clip_level, require_layout
 from polsep.sensor.defects import MIN_SIZE, repair
 from polsep.sensor.falloff import Table
@@ -415,13 +415,25 @@ def _keep_clipped(samples: Floats, clipped: NDArray[np.bool_], levels: tuple[flo
 class Corrections:
     """Changes to every raw frame before anything else reads it; ``sources`` names their files in reports.
 
-    ``ambient_exposure_s``: exposure time of the ambient light in seconds, where its files say it.
+    ``ambient_exposure_s`` (where files say it) and ``ambient_scale`` are of the ambient light's raw frames.
     """
 
     calibration: Calibration | None = None
     ambient: Mosaic | None = None
     sources: Mapping[str, Any] = field(default_factory=dict)
     ambient_exposure_s: float | None = None
+    ambient_scale: CodeScale = UNKNOWN_SCALE
+
+    def with_ambient(self, frames: Iterable[Mosaic]) -> Corrections:
+        """The same with the ambient light of raw frames, the mean of which, calibrated, is subtracted."""
+        scales = list[CodeScale]()
+
+        def calibrated() -> Iterator[Mosaic]:
+            for frame in frames:
+                scales.append(code_scale(frame))
+                yield replace(self, ambient=None).apply(frame)
+
+        return replace(self, ambient=mean_mosaic(calibrated()), ambient_scale=min(scales))
 
     def apply(self, mosaic: Mosaic) -> Mosaic:
         """The frame calibrated and less the ambient light, which is of calibrated frames. Raises ValueError."""
@@ -435,4 +447,4 @@ class Corrections:
         if self.ambient is None:
             return calibrated, ()
         less = subtract_ambient(calibrated, self.ambient)
-        return less, ambient_notes(calibrated, less)
+        return less, scale_notes(mosaic, self.ambient_scale) + ambient_notes(calibrated, less)

@@ -26,7 +26,7 @@ from polsep.io.store.errors import InputError, input_error
 from polsep.io.store.header_checks import at_most
 from polsep.io.store.result_names import result_names
 from polsep.methods import check_method
-from polsep.pipeline import LightColor, is_to_be_found, parse_light_color, separate_capture, stated_gains
+from polsep.pipeline import LightColor, color_notes, is_to_be_found, parse_light_color, separate_capture, stated_gains
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.exposure import Histogram, exposure_flags, histogram
 from polsep.separation.report import SeparatedFrame
@@ -286,6 +286,7 @@ def _as_opened(read: SeparatedFrame, light_color: LightColor | str, stem: str) -
     if not is_to_be_found(light_color):
         color = stated_gains(light_color, read.diffuse.shape[-1])
         report |= {"light_color": color, "light": {"source": "told", "color": color}}
+        report["warnings"] += color_notes(light_color, len(color))
     if not read.dolp.any():
         report["warnings"].append(LIGHT_ALONE)
     return replace(read, report=report)

@@ -16,7 +16,7 @@ from polsep.io.raw.sequences import DamagedFrame, input_files, open_sequence
 from polsep.io.store.calibrations import read_calibration
 from polsep.io.store.errors import InputError, input_error
 from polsep.sensor.ambient import equally_exposed
-from polsep.sensor.calibration import Corrections, mean_mosaic
+from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Mosaic
 
 #: Digits of hashes in reports, by which a run that is resumed knows its files again.
@@ -53,10 +53,13 @@ def _read_corrected(
     corrections = Corrections(measured, None, sources)
     if ambient:
         times: list[float | None] = []
-        frames = read_mosaics(ambient, replace(read, corrections=corrections), lambda _, f: times.append(f.exposure))
-        room = mean_mosaic(frames)
-        sources |= {"ambient": [path.name for path in ambient], "ambient_sha256": hash_samples(room.data)}
-        corrections = Corrections(measured, room, sources, _one_time(ambient[0], times))
+        levels = measured and Calibration(measured.layout, measured.white_level, measured.size, measured.black_level)
+        raw = replace(read, corrections=Corrections(levels))
+        corrections = corrections.with_ambient(read_mosaics(ambient, raw, lambda _, f: times.append(f.exposure)))
+        assert corrections.ambient is not None
+        digest = hash_samples(corrections.ambient.data)
+        sources |= {"ambient": [path.name for path in ambient], "ambient_sha256": digest}
+        corrections = replace(corrections, ambient_exposure_s=_one_time(ambient[0], times))
     return replace(read, corrections=corrections)
 
 

@@ -678,6 +678,22 @@ def test_a_calibration_lies_beside_its_frames(tmp_path: Path, run_polsep: Cli) -
     assert [Path(path).suffix for path in expand_folders([str(tmp_path)])] == [".tiff"] * 3
 
 
+def test_dark_frames_of_different_exposure_times_are_noted(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
+    """Dark current grows with time: the calibration is for none of them. Frames that say no time are like all."""
+    caps, codes = [tmp_path / f"cap{k}.tiff" for k in range(3)], np.random.default_rng(1).integers(60, 70, (3, 32, 32))
+
+    def said(*times: int | None) -> str:
+        for path, frame, time in zip(caps, codes, times, strict=True):
+            tags = [] if time is None else [(33434, "2I", 1, (time, 100), True)]
+            tifffile.imwrite(path, frame.astype(np.uint16), photometric="minisblack", extratags=tags)
+        done = run_polsep("calibrate", "dark", *caps, "--white-level", WHITE, "-o", tmp_path / "rig.json")
+        assert done.status == 0
+        return done.err
+
+    assert "dark frames were exposed for 0.01 s to 0.04 s: use the exposure time of" in said(1, 4, None)
+    assert said(4, 4, None) == said(None, None, None) == ""
+
+
 def test_a_wrong_layout_is_noted(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
     """Frames of a mono sensor measured as colour are a note: all later frames would be read so."""
     sensor = BadSensor(MONO, dead=0)

@@ -150,6 +150,7 @@ def test_the_command_leaves_nothing_to_type(tmp_path: Path, run_polsep: Cli) -> 
             "expected 2 positive exposure times",
         ),
         (("merge", tmp_path / "none.tiff", "-o", tmp_path / "a.tiff"), "expected a file, found nothing"),
+        (("merge", *files, files[0], "-o", tmp_path / "a.tiff"), f"of different exposures, found {files[0]} again"),
     ):
         failed = run_polsep(*arguments)
         assert failed.status == 2 and failed.err.count("\n") == 1 and expected in failed.err, failed

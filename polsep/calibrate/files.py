@@ -16,8 +16,9 @@ from polsep.io.raw.sequences import input_files
 from polsep.io.raw.tiff import write_merged
 from polsep.io.store.atomic import refuse_existing, refuse_inputs, require_writable
 from polsep.io.store.calibrations import maps_path, read_calibration, refuse_foreign_maps, write_calibration
-from polsep.io.store.errors import input_error
+from polsep.io.store.errors import input_error, refuse_repeated
 from polsep.physics.stokes import axis_deg
+from polsep.sensor.ambient import equally_exposed
 from polsep.sensor.black_level import check_black_level
 from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Mosaic
@@ -56,9 +57,12 @@ def calibrate_files(
     if kind != "dark":
         require_black_level(paths, read)
     notes, first = dict[str, str](), iter([] if kind == "dark" else [None])
+    times, merged = list[float](), list[bool]()
 
     def check(path: Path, frame: Frame) -> None:
         _require_white_level(path, frame)
+        times.extend([] if frame.exposure is None else [frame.exposure])
+        merged.append(frame.merged)
         found = [note for note in frame.notes if not isinstance(note, Overexposed | BlackFrame)]
         for _ in first:  # the first frame shows the layout of all
             found += _doubts(frame)
@@ -69,9 +73,18 @@ def calibrate_files(
     if kind == "dark":
         found.require_black_level(read.black_level, "--black-level")
     written = write_calibration(output, found, __version__)
-    black = "" if kind == "dark" or read.black_level or found.black_level is not None else ASSUMED_BLACK
+    known = kind == "dark" or read.black_level or found.black_level is not None or all(merged)
+    black = "" if known else ASSUMED_BLACK
     line = f"{kind}: {describe(found, kind)}{black} -> {', '.join(str(path) for path in written)}"
-    return line, tuple(notes.values())
+    return line, (*notes.values(), *(_time_notes(times) if kind == "dark" else ()))
+
+
+def _time_notes(times_s: Sequence[float]) -> tuple[str, ...]:
+    """A note where dark frames were exposed for different times: what their pixels collect without light grows."""
+    if not times_s or equally_exposed(times_s):
+        return ()
+    found = f"{min(times_s):.4g} s to {max(times_s):.4g} s"
+    return (f"the dark frames were exposed for {found}: use the exposure time of the frames to come",)
 
 
 def _doubts(frame: Frame) -> list[str]:
@@ -118,7 +131,9 @@ def merge_files(
     """
     if output.suffix.lower() not in (".tif", ".tiff"):
         raise ValueError(f"expected an output that ends in .tiff, found {output.name!r}")
-    refuse_inputs([output], [file for path in paths for file in input_files(path)])
+    inputs = [file for path in paths for file in input_files(path)]
+    refuse_repeated(inputs, "frames of different exposures")
+    refuse_inputs([output], inputs)
     refuse_existing(output.parent, [output], overwrite)
     read = replace(read, pages=PAGES)
     require_black_level(paths, read)

@@ -7,7 +7,6 @@ ordinary camera, which have no polarization.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +28,7 @@ from polsep.io.raw.videos import load_library
 from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
 from polsep.io.results.separation_reader import is_separated
-from polsep.io.store.errors import InputError, input_error
+from polsep.io.store.errors import InputError, input_error, refuse_repeated
 from polsep.separation.report import SeparatedFrame, reported_light
 
 Floats = NDArray[np.float64]
@@ -87,12 +86,7 @@ class ShapeOptions:
 
 def read_views(paths: Sequence[Path], source: Source) -> Views:
     """Read files, and separate raw frames. Raises InputError, also on images of different shapes."""
-    whole = [os.path.realpath(path) for path in paths]
-    for k, path in enumerate(paths):
-        if whole[k] in whole[:k]:  # before minutes are spent on the others
-            raise input_error(
-                path, f"expected pictures under different lights, found {paths[whole.index(whole[k])]} again"
-            )
+    refuse_repeated(paths, "pictures under different lights")
     if source.kind == "photographs":
         images = [read_map(path, "texture") for path in paths]
         _require_one_shape(paths, images)

@@ -166,7 +166,7 @@ class Frame:
 
     It is number ``index`` of ``count`` (approximate where a video does not say). Where the file says them,
     ``exposure``: its time in seconds, and ``captured``: when it was taken, in ISO 8601. ``white_level``: in the units
-    of the file, said or of its type.
+    of the file, said or of its type. ``merged``: by `polsep merge`, so black is at 0.
     """
 
     stem: str
@@ -177,6 +177,7 @@ class Frame:
     exposure: float | None = None
     captured: str | None = None
     white_level: float | None = None
+    merged: bool = False
 
     def taken(self) -> dict[str, Any]:
         """Facts of the capture, for reports: those that the file says."""
@@ -210,7 +211,7 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
             data, notes = _convert(page, options)
         stem = output_stem(path)
         name = stem if page.count == 1 else f"{stem}_{page.index:04d}"
-        taken = (page.exposure, page.captured, _white_level(page, options))
+        taken = (page.exposure, page.captured, _white_level(page, options), page.merged is not None)
         yield Frame(name, data, page.notes + notes, page.index, page.count, *taken)
 
 

@@ -8,7 +8,6 @@ JPEG, and films that are not lossless RGB or grey, have a curve, so they are rea
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
@@ -30,7 +29,7 @@ from polsep.io.raw.frames import read_pages
 from polsep.io.raw.npy import stack_angles
 from polsep.io.raw.page import Page
 from polsep.io.raw.videos import load_library
-from polsep.io.store.errors import InputError, decoding, input_error, naming
+from polsep.io.store.errors import InputError, decoding, input_error, naming, refuse_repeated
 from polsep.io.store.header_checks import SAMPLES, limit, require_signature, require_size
 
 #: The EXIF tag of a picture's orientation, and the note on one that is not upright: angles count in the stored pixels.
@@ -71,7 +70,7 @@ def read_photographs(paths: Sequence[Path], encoded: bool = False, full: bool = 
     types or white levels.
     """
     pages: list[tuple[str, Page]] = []
-    _require_different(paths)
+    refuse_repeated(paths, "a photograph of each angle of the filter")
     for path in paths:
         with naming(path):
             found = _read_pages(path, encoded, full)
@@ -87,16 +86,6 @@ def read_photographs(paths: Sequence[Path], encoded: bool = False, full: bool = 
     notes = tuple(dict.fromkeys(note for _, page in pages for note in page.notes))
     exposures = said if len(said) == len(pages) else None
     return Photographs(array, names, levels.pop(), exposures, notes, first.exposure, first.captured)
-
-
-def _require_different(paths: Sequence[Path]) -> None:
-    """Raise InputError where two paths lead to one file, of which only one angle of the filter can be right."""
-    seen: dict[str, Path] = {}
-    for path in paths:
-        file = os.path.realpath(path)
-        if file in seen:
-            raise input_error(path, f"expected a photograph of each angle of the filter, found {seen[file]} again")
-        seen[file] = path
 
 
 def _read_pages(path: Path, encoded: bool, full: bool) -> list[Page]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -73,6 +73,16 @@ def refuse_pipe(path: str | Path) -> None:
         return
     if stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode):
         raise ValueError("expected a file, found a pipe: save what comes through it first")
+
+
+def refuse_repeated(paths: Iterable[Path], wanted: str) -> None:
+    """Raise InputError where two paths lead to one file; ``wanted``: what all of them should be."""
+    seen: dict[str, Path] = {}
+    for path in paths:
+        file = os.path.realpath(path)
+        if file in seen:
+            raise input_error(path, f"expected {wanted}, found {seen[file]} again")
+        seen[file] = path
 
 
 @contextmanager

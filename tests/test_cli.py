@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import click
 import imagecodecs
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from test_bad_input import FILES
 
 from polsep import batch, cli
-from polsep.cli.app import RATE, has_extra, print_note
+from polsep.cli.app import RATE, app, has_extra, print_note
 from polsep.cli.progress import Progress
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
@@ -332,6 +333,19 @@ def test_a_frame_that_fails_ends_its_file(tmp_path: Path, polsep: Cli) -> None:
     assert set(contents(tmp_path / "o")) == {"run_0001.exr", *(f"run_0000.{s}" for s in ("exr", "png", "json"))}
 
 
+def test_an_output_without_a_name_is_refused() -> None:
+    """An empty variable in a script would be the current folder: no command that writes takes it."""
+    groups, asked = [app], 0
+    for group in groups:
+        for name, command in group.commands.items():
+            groups += [command] if isinstance(command, click.Group) else []
+            for output in (param for param in command.params if "--output" in param.opts):
+                asked += 1
+                with pytest.raises(click.BadParameter, match="expected a path, found an empty one"):
+                    output.type_cast_value(click.Context(command, info_name=name), "")
+    assert asked > 15
+
+
 def test_a_calibration_is_not_replaced(tmp_path: Path, polsep: Cli) -> None:
     """No output takes the place of a file that corrects the frames, not even with --overwrite."""
     for name in ("rig", "dark"):
@@ -355,6 +369,10 @@ def test_a_calibration_says_that_black_was_taken_to_be_at_0(tmp_path: Path, pols
     dark = ("calibrate", "dark", tmp_path / "dark.png", "--white-level", "65535", "-o", tmp_path / "c.json")
     assert polsep(*dark).status == 0
     assert "black was" not in polsep(*measure, tmp_path / "c.json").out
+    merged = tmp_path / "merged.tiff"
+    assert polsep("merge", tmp_path / "flat.png", "--white-level", "65535", "-o", merged).status == 0
+    found = polsep("calibrate", "flat", merged, "-o", tmp_path / "d.json")
+    assert found.status == 0 and "black was" not in found.out  # black is subtracted in it
 
 
 def test_names_of_any_bytes_are_printed(tmp_path: Path) -> None:

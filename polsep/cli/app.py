@@ -41,8 +41,19 @@ SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True, "max_co
 #: Signals that ask the program to end, Ctrl-C apart: by the system, and where the terminal is closed (not on Windows).
 ENDINGS = ("SIGTERM", "SIGHUP")
 
-DIR = click.Path(path_type=Path)
-FILE = click.Path(path_type=Path, dir_okay=False)
+
+class Place(click.Path):
+    """A path; an empty one, which would be the current folder, is an error that names its option."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path. Raises BadParameter."""
+        if value == "":
+            self.fail("expected a path, found an empty one", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+DIR = Place(path_type=Path)
+FILE = Place(path_type=Path, dir_okay=False)
 
 
 class Number(_ParamType):

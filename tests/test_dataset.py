@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import math
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from dying_worker import with_dying_worker
 
 pytest.importorskip("embreex", reason="rendering needs the extra 'render'")
 
@@ -71,6 +71,7 @@ from polsep.sensor.camera import IMX250, Layout
 KILLS = int(os.environ.get("POLSEP_KILLS", "2"))
 SHAPES, VIEWS = 6, 2 * max(1, KILLS)
 SMALL = RenderOptions(2, 2, 32, samples=1)
+PROGRAM = (sys.executable, "-c", "from polsep.cli import main; main()")
 
 
 @pytest.fixture(scope="module")
@@ -101,10 +102,10 @@ def contents(directory: Path) -> dict[str, bytes]:
     return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 
 
-def begin(directory: Path, *more: str) -> subprocess.Popen[str]:
+def begin(directory: Path, *more: str, program: Sequence[str] = PROGRAM) -> subprocess.Popen[str]:
     """`polsep render` of a small set, in a process group of its own."""
     options = {"shapes": SHAPES, "views": VIEWS, "size": 64, "seed": 4, "samples": 1, "output": directory}
-    command = [sys.executable, "-c", "from polsep.cli import main; main()", "render"]
+    command = [*program, "render"]
     command += [text for name, value in options.items() for text in (f"--{name}", str(value))]
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen([*command, *more], start_new_session=True, **pipes)
@@ -440,16 +441,8 @@ def test_stopping_is_clean(undisturbed: Path, tmp_path: Path) -> None:
 def test_ray_makes_the_same_bytes_with_a_worker_killed(undisturbed: Path, tmp_path: Path) -> None:
     """The cluster of one machine loses a worker in the middle of its work."""
     pytest.importorskip("ray", reason="needs the extra 'ray'")
-    psutil = pytest.importorskip("psutil")
-    directory = tmp_path / "set"
-    run = begin(directory, "--workers", "2", "--engine", "ray")
-    wait_for_records(directory, 1, run)
-    killed = 0
-    with contextlib.suppress(psutil.NoSuchProcess):
-        for process in psutil.Process(run.pid).children(recursive=True):
-            if not killed and "render_job" in " ".join(process.cmdline()):
-                process.kill()
-                killed += 1
+    directory, died = tmp_path / "set", tmp_path / "died"
+    run = begin(directory, "--workers", "2", "--engine", "ray", program=with_dying_worker(render_job, died))
     _, err = run.communicate(timeout=300)
-    assert (run.returncode, killed) == (0, 1), err
+    assert run.returncode == 0 and died.exists(), err
     assert contents(directory) == contents(undisturbed)

@@ -16,12 +16,12 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib import metadata
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import polsep
+from polsep.compute.installed import is_installed
 
 #: Instruction sets that change what runs: the library of kernels needs AVX2 and FMA, layers use VNNI and AMX.
 INSTRUCTIONS = ("avx2", "fma", "avx512f", "avx_vnni", "avx512_vnni", "amx_int8", "amx_bf16")
@@ -58,7 +58,7 @@ def examine(extras: Mapping[str, Sequence[str]]) -> dict[str, Any]:
     for name, find in _FACTS.items():
         facts[name] = _attempt(tests, name, find)
     facts["extras"] = {
-        name: [module for module in modules if not _is_there(module)] for name, modules in extras.items()
+        name: [module for module in modules if not is_installed(module)] for name, modules in extras.items()
     }
     facts["extra_packages"] = find_extra_packages(extras)
     names = _attempt(tests, "methods", _methods) or ()
@@ -87,7 +87,7 @@ def find_packages() -> dict[str, str | None]:
 def find_extra_packages(extras: Mapping[str, Sequence[str]]) -> dict[str, str]:
     """Versions of the installed packages that extras are known by, by name."""
     owners = metadata.packages_distributions()
-    modules = {module for modules in extras.values() for module in modules if _is_there(module)}
+    modules = {module for modules in extras.values() for module in modules if is_installed(module)}
     names = sorted({owners[module][0] for module in modules if module in owners})
     return {name: metadata.version(name) for name in names}
 
@@ -176,7 +176,7 @@ def _kernels() -> str:
 def _cache() -> dict[str, Any]:
     """The folder of kernels that numba has compiled, where it is needed, and whether it can be written."""
     folder = Path(polsep.__file__).parent / "compute"
-    if not _is_there("numba"):
+    if not is_installed("numba"):
         return {"needed": _kernels() != "library", "folder": None, "writable": False}
     from numba.core.caching import FunctionCache
 
@@ -225,10 +225,3 @@ def _version(name: str) -> str | None:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return None
-
-
-def _is_there(module: str) -> bool:
-    try:
-        return find_spec(module) is not None
-    except ModuleNotFoundError:
-        return False

@@ -32,7 +32,7 @@ class doctor_cameras:
 @pytest.mark.usefixtures("compiled")
 def test_an_installation_that_works(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Every method is tried, every extra named, and the exit status is 0."""
-    monkeypatch.setattr(doctor, "_is_there", lambda module: module != "gradio")
+    monkeypatch.setattr(doctor, "is_installed", lambda module: module != "gradio")
     run(monkeypatch, "--json")
     facts = json.loads(capsys.readouterr().out)
     assert facts["problems"] == []
@@ -50,7 +50,7 @@ def test_problems_are_said_and_counted(monkeypatch: pytest.MonkeyPatch, capsys: 
     monkeypatch.setattr(doctor, "MEANS", {"analytic": (0.5, 0.1)})
     monkeypatch.setattr("polsep.methods.METHODS", {"analytic": METHODS["analytic"], "absent": None})
     monkeypatch.setattr(doctor, "find_packages", lambda: {"numpy": "2", "OpenEXR": None})
-    monkeypatch.setattr(doctor, "_is_there", lambda module: module != "av")
+    monkeypatch.setattr(doctor, "is_installed", lambda module: module != "av")
     with pytest.raises(SystemExit) as stop:
         run(monkeypatch)
     said = capsys.readouterr()

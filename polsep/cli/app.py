@@ -14,7 +14,6 @@ import signal
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import reduce
-from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -22,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from polsep import __version__
+from polsep.compute.installed import is_installed
 from polsep.io.store.errors import MOST, one_line, printable
 
 if TYPE_CHECKING:
@@ -356,14 +356,7 @@ def has_extra(extra: str) -> bool:
 
 def missing_module(extra: str) -> str | None:
     """A module of an extra that is not installed, None if all are."""
-    return next((name for name in EXTRAS[extra] if not _is_installed(name)), None)
-
-
-def _is_installed(module: str) -> bool:
-    try:
-        return find_spec(module) is not None
-    except ModuleNotFoundError:
-        return False
+    return next((name for name in EXTRAS[extra] if not is_installed(name)), None)
 
 
 def require_extra(extra: str, otherwise: str = "") -> None:

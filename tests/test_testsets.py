@@ -29,7 +29,7 @@ from evaluation.testsets import (
     fingerprint,
     version_of,
 )
-from evaluation.testsets.cases import LARGEST_CLIPPED, TOLERANCE, record_of
+from evaluation.testsets.cases import LARGEST_CLIPPED, TOLERANCE
 from evaluation.testsets.casting import FILLED, LARGEST_ANGLE_DEG, look_at, random_light_near
 from evaluation.testsets.expected import EXPECTED
 from evaluation.testsets.photographs import normals_from_depth, polarize_diffuse
@@ -400,4 +400,3 @@ def test_unreadable_objects_are_refused(tmp_path: Path) -> None:
 def test_sets_are_as_large_as_documented() -> None:
     """16 objects, 5 statues and 17 scans, 8 photographs."""
     assert [len(recipes) for recipes in (OBJECTS, STATUES, PHOTOGRAPHS)] == [16, 22, 8]
-    assert record_of(Recipe("ball", 5, (), make_ball)).inputs == ""

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from evaluation.testsets.expected import EXPECTED, Expected
+from evaluation.testsets.expected import EXPECTED
 from polsep.io.assets.objects import hash_files
 from polsep.physics.stokes import Measurements, Stokes, measure
 from polsep.render.simulate import expose_to_clip, half_resolution
@@ -114,11 +114,6 @@ def weigh_scene(scene: Scene, mosaics: tuple[Mosaic, ...]) -> tuple[float, ...]:
     """The weighted means behind `fingerprint`: s0, s1, s2 of the diffuse and of the specular, then the samples."""
     lobes = [image for lobe in (scene.diffuse, scene.specular) for image in _components(lobe)]
     return tuple(_weighted_mean(image) for image in (*lobes, *(mosaic.linear()[None] for mosaic in mosaics)))
-
-
-def record_of(recipe: Recipe, data: Path | None = None) -> Expected:
-    """The record of a recipe as it comes out here and now: what `expected` is to hold after a change on purpose."""
-    return Expected(digest_of(recipe, data), fingerprint(build_case(recipe, data)))
 
 
 def check_case(case: Case) -> None:

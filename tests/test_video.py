@@ -14,7 +14,6 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
@@ -26,6 +25,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from dying_worker import with_dying_worker
 from numpy.typing import NDArray
 from test_cli import contents
 from torch.nn.functional import interpolate
@@ -89,10 +89,11 @@ def write_film(
     codec: str = "ffv1",
     pixels: str = "gray12le",
     times_ms: Sequence[int] | None = None,
+    rate: int = 50,
 ) -> Path:
-    """The images as a film, of 50 frames per second where no times are said."""
+    """The images as a film, of ``rate`` frames per second where no times are said."""
     with av.open(str(path), "w") as container:
-        stream: Any = container.add_stream(codec, rate=50)
+        stream: Any = container.add_stream(codec, rate=rate)
         stream.height, stream.width, stream.pix_fmt = images.shape[1], images.shape[2], pixels
         stream.options = {"level": "3", "slicecrc": "1", "g": "1"} if codec == "ffv1" else {}
         for number, image in enumerate(images):
@@ -489,6 +490,10 @@ def test_rate_and_length_of_a_film_are_its_own(tmp_path: Path) -> None:
     for times, rate in ((None, 50.0), ([40 * k for k in range(20)], 25.0), (paused, 50.0)):
         sequence = open_sequence(write_film(tmp_path / "run.mkv", images, times_ms=times), ReadOptions())
         assert sequence.count == 20 and sequence.rate == rate
+    for rate in (1500, 3000):  # Matroska counts milliseconds, in which several frames fall
+        sequence = open_sequence(write_film(tmp_path / "fast.mkv", images, rate=rate), ReadOptions())
+        assert (sequence.count, sequence.rate, sequence.notes) == (20, rate, ())
+        assert [frame.index for frame in sequence.begin(0)] == list(range(20))
     assert frame_rate(300.0, [0.003, 0.003, 0.004] * 21) == 300.0 and frame_rate(None, []) is None
 
 
@@ -504,8 +509,11 @@ def test_films_have_the_rate_of_the_recording(tmp_path: Path) -> None:
     assert [rate_of(tmp_path / f"{name}_preview.mp4") for name in previews] == [50, Fraction(24000, 1001), 25, 50]
 
 
-def test_rates_that_no_film_has_are_not_those_of_recordings() -> None:
+def test_rates_that_no_film_has_are_not_those_of_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Clocks of cameras count in any unit, and lossless films in milliseconds: only a rate that is said is refused."""
+    film = write_film(tmp_path / "run.mkv", frames(2), rate=2500)
+    assert run(*command(film, tmp_path / "out", "--format", "ffv1", "--no-preview")) == 0
+    assert "no film of ffv1 has the recording's 2500 frames/s: 25, or say --rate" in capsys.readouterr().err
     for kind, found, rate in (("exr", 1e6, 25), ("exr", 2500, 2500), ("ffv1", 2500, 25), ("exr", 1e-4, 25)):
         assert SequenceKind(kind).at(found).rate == rate
     assert SequenceKind(rate=24.0).at(50.0).rate == 24
@@ -1154,33 +1162,15 @@ def test_without_the_library_films_are_refused_before_any_work(
     assert not list((tmp_path / "o").glob("*.mp4"))
 
 
-def _title(psutil: Any, process: Any) -> str:
-    """What a process says it does; nothing when it has ended."""
-    try:
-        return " ".join(process.cmdline())
-    except psutil.Error:
-        return ""
-
-
 @pytest.mark.usefixtures("compiled")
 def test_ray_makes_the_same_bytes_with_a_worker_killed(recording: Path, steady: Path, tmp_path: Path) -> None:
     """The cluster of one machine loses a worker in the middle of its work."""
     pytest.importorskip("ray", reason="needs the extra 'ray'")
-    psutil = pytest.importorskip("psutil")
-    program = [sys.executable, "-c", "from polsep.cli import main; main()"]
-    run = subprocess.Popen(
-        [*program, *command(recording, tmp_path, *STEADY, "--engine", "ray")], stdout=subprocess.DEVNULL
-    )
-    workers: list[Any] = []
-    while run.poll() is None and not workers:
-        time.sleep(0.005)
-        children = psutil.Process(run.pid).children(recursive=True)
-        workers = [child for child in children if "separate_one" in _title(psutil, child)]
-    assert workers, "no worker was seen at work"
-    with suppress(psutil.NoSuchProcess):
-        workers[0].kill()
-    assert run.wait(300) == 0
-    assert contents(tmp_path) == contents(steady)
+    program = with_dying_worker(video.separate_one, tmp_path / "died")
+    arguments = command(recording, tmp_path / "out", *STEADY, "--engine", "ray")
+    subprocess.run([*program, *arguments], stdout=subprocess.DEVNULL, timeout=300, check=True)
+    assert (tmp_path / "died").exists()
+    assert contents(tmp_path / "out") == contents(steady)
 
 
 def test_what_stands_still_is_steady(tmp_path: Path) -> None:

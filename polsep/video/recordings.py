@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.cluster import map_ordered
+from polsep.compute.devices import find_device
 from polsep.compute.threads import get_threads, own_threads
 from polsep.compute.workers import DEPTH, ahead, map_ahead
 from polsep.io.raw.frames import Frame, ReadOptions
@@ -31,12 +32,7 @@ from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter, S
 from polsep.io.store.atomic import OutputError, refuse_inputs
 from polsep.io.store.errors import InputError
 from polsep.methods import find_method
-from polsep.pipeline import (
-    LightColor,
-    find_device,
-    make_frame,
-    move_capture,
-)
+from polsep.pipeline import LightColor, make_frame, move_capture
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import repair
 from polsep.video.first_frame import FirstFrame, of_one_camera, separate_first
@@ -172,7 +168,7 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     }
     sequence = SequenceWriter(target.directory, recording.stem, kind, settings, target.overwrite)
     _refuse_other_files(sequence, recording)
-    for warning in first.warnings:
+    for warning in (*_rate_notes(recording, target.kind, kind), *first.warnings):
         yield Progress(sequence.first, count, warning)
     yield Progress(sequence.first, count)
     last = sequence.first
@@ -184,6 +180,13 @@ def separate_video(path: Path, read: ReadOptions, options: VideoOptions, target:
     report = describe_run({**settings, "damaged": options.damaged}, first, lines)
     written = tuple(sequence.finish(report))
     yield Progress(last, last, damaged=bool(report["damaged"]), written=written, report=shared_report(first, lines))
+
+
+def _rate_notes(recording: FrameSequence, asked: SequenceKind, kind: SequenceKind) -> tuple[str, ...]:
+    """A note where films cannot have the rate of a recording, and nobody said another."""
+    if asked.rate is not None or recording.rate in (None, kind.rate):
+        return ()
+    return (f"no film of {kind.format} has the recording's {recording.rate:g} frames/s: {kind.rate:g}, or say --rate",)
 
 
 def _refuse_other_files(sequence: SequenceWriter, recording: FrameSequence) -> None:

@@ -119,7 +119,7 @@ def _count_packets(path: Path, stamp: tuple[int, int]) -> int:
 def find_timing(path: Path) -> tuple[float | None, tuple[str, ...]]:
     """Frames per second of a film, or None; and a note where its first frames come at uneven times, which are not kept.
 
-    Of the first frames; the rate is that of `frame_rate`.
+    Of the first frames; the rate is that of `frame_rate`, or the stated one of a film whose clock ticks less often.
     """
     try:
         with _opened(path) as (container, kind), decoding("video"):
@@ -129,6 +129,8 @@ def find_timing(path: Path) -> tuple[float | None, tuple[str, ...]]:
     except ValueError:  # the frame that is damaged says so
         return None, ()
     steps = sorted(after - before for before, after in pairwise(times))
+    if unit and stated and stated * unit > 1:  # Matroska's milliseconds are too long to contradict it
+        return stated, ()
     rate = frame_rate(stated, [unit * step for step in steps])
     if not steps or steps[-1] - steps[0] <= max(UNEVEN * steps[len(steps) // 2], 2):
         return rate, ()

@@ -22,7 +22,7 @@ from polsep.io.raw.frames import InputError, read_frames
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
 from polsep.light.find import find_light
-from polsep.pipeline import PolsepWarning
+from polsep.pipeline import PolsepWarning, resolve_light
 from polsep.sensor.black_level import check_black_level
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.defects import measure_noise
@@ -650,10 +650,34 @@ def test_the_page_finds_the_lamp_that_the_library_finds(tmp_path: Path) -> None:
         light = find_light(one, white_level=4095)
         np.testing.assert_allclose(found["color"], light.color, rtol=1e-3, err_msg=str(own))
         assert found["error_deg"] == pytest.approx(light.error_deg, rel=0.01), own
-        assert (found["sure"], len(found["remarks"])) == (light.sure, len(light.remarks)), own
-        assert [text.partition(":")[0] for text in found["remarks"]] == [
-            text.partition(":")[0] for text in light.remarks
-        ]
+        assert found["sure"] == light.sure, own
+        remarks = [text.replace("--light-color", "the lamp's colour").replace("--m", "m") for text in light.remarks]
+        assert found["remarks"] == remarks
+
+
+@needs_packages
+def test_a_lamp_that_is_stated_is_taken_as_the_library_takes_it() -> None:
+    """In any unit, and of a mono frame with a remark; what is no colour is refused."""
+    said: list[Any] = ["auto", "white", [2, 1.8, 1.4], [3, 3, 3], [1, 2], [1, 0, 1]]
+    script = f"""
+      import {{ lightOf }} from {json.dumps((WEB / "src" / "light.js").as_uri())};
+      import {{ parseLayout }} from {json.dumps((WEB / "src" / "layout.js").as_uri())};
+      const data = new Float32Array(256).fill(9), sides = {{ data, height: 16, width: 16, black: 0, white: 4095 }};
+      const of = (run) => {{ try {{ return run(); }} catch (error) {{ return error.message; }} }};
+      console.log(JSON.stringify(["color", "mono"].map((layout) => {json.dumps(said)}.map((light) =>
+        of(() => lightOf(light, {{ ...sides, layout: parseLayout(layout) }}))))));"""
+    done = subprocess.run([str(NODE), "--input-type=module", "-e", script], capture_output=True, check=True, timeout=60)
+    for layout, lights in zip(("color", "mono"), json.loads(done.stdout), strict=True):
+        mosaic = Mosaic(np.full((16, 16), 9, np.float32), Layout.parse(layout), 0.0, 4095.0)
+        for light, found in zip(said, lights, strict=True):
+            if isinstance(found, str):
+                with pytest.raises(ValueError, match=found.partition(", found")[0]):
+                    resolve_light(light, mosaic)
+                continue
+            color, facts, remarks = resolve_light(light, mosaic)
+            assert found["color"] == pytest.approx(color) and found["source"] == facts["source"]
+            assert found["remarks"] == [text.replace("--light-color", "the lamp's colour") for text in remarks]
+        assert sum(isinstance(found, str) for found in lights) == 2
 
 
 @needs_packages
@@ -728,18 +752,23 @@ def test_layouts_are_refused_in_the_words_of_the_library() -> None:
 def test_a_white_level_above_where_the_sensor_clips_is_said_as_in_the_library(tmp_path: Path) -> None:
     """The note offers the level that samples share; frames whose brightest are few have none."""
     codes = np.random.default_rng(3).integers(64, 3900, (96, 96)).astype(np.uint16)
-    frames = [codes, np.minimum(codes, 3700)]
+    bright = np.full((96, 96), 4095, np.uint16)  # as two rows, which are fewer than a group of rows
+    bright[0, :90] = 300
+    frames = [codes, np.minimum(codes, 3700), bright]
     (tmp_path / "frames").write_bytes(b"".join(frame.tobytes() for frame in frames))
     script = f"""
       import {{ readFileSync }} from "node:fs";
       import {{ levelNotes }} from {json.dumps((WEB / "src" / "levels.js").as_uri())};
       const bytes = readFileSync("frames"), all = new Uint16Array(bytes.buffer, bytes.byteOffset, bytes.length / 2);
-      const parts = [all.subarray(0, 9216), all.subarray(9216)];
-      console.log(JSON.stringify(parts.map((samples) => levelNotes(samples, 96, 0, 4095))));"""
+      const parts = [all.subarray(0, 9216), all.subarray(9216, 18432), all.subarray(18432, 18624)];
+      console.log(JSON.stringify([...parts.map((samples) => levelNotes(samples, 96, 0, 4095)),
+        levelNotes(parts[0], 96, 0, 70000)]));"""
     done = subprocess.run(
         [str(NODE), "--input-type=module", "-e", script], cwd=tmp_path, capture_output=True, check=True, timeout=60
     )
-    even, cut = json.loads(done.stdout)
+    even, cut, *others = json.loads(done.stdout)
+    for (note,), samples, white in zip(others, (bright[:2], codes), (4095.0, 70000.0), strict=True):
+        assert level_notes(samples, 0.0, white) == (note["text"],)
     (said,) = level_notes(frames[1], 0.0, 4095.0)
     assert even == [] and cut == [{"text": said.replace("--white-level", "white level"), "white": 3700}]
 

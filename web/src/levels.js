@@ -10,13 +10,16 @@ const PILE = { count: 64, ratio: 5, range: 1 / 64 };
 export const whiteOf = (samples) =>
   samples instanceof Uint8Array ? 255 : samples instanceof Uint16Array ? 65535 : 1;
 
+/** The library's name of a type of samples. */
+const typeOf = (samples) => `uint${8 * samples.BYTES_PER_ELEMENT}`;
+
 /** Throws on levels that the library refuses, in its words: between them samples must keep their digits as float32. */
 export function requireLevels(samples, black, white) {
   const [shownBlack, shownWhite] = [black, white].map(shortOf), span = white - black, most = whiteOf(samples);
   if (!Number.isFinite(black) || !Number.isFinite(white))
     throw new Error(`expected finite black and white levels, found ${shownBlack} and ${shownWhite}`);
   if (black < 0)
-    throw new Error(`expected a black level from 0 on in samples of uint${most === 255 ? 8 : 16}, found ${shownBlack}`);
+    throw new Error(`expected a black level from 0 on in samples of ${typeOf(samples)}, found ${shownBlack}`);
   const found = `found white ${shownWhite}, black ${shownBlack}`;
   if (!(white > black)) throw new Error(`expected a white level above the black level, ${found}`);
   if (!(span >= SPANS[0] && span <= SPANS[1] && white <= MAX_RATIO * span))
@@ -56,7 +59,7 @@ export function levelNotes(samples, width, black, said) {
   if (high > white)
     notes.push({ text: `${above} samples exceed the white level ${shown} (largest ${high}): they count as clipped` });
   if (white > whiteOf(samples))
-    notes.push({ text: `white level ${shown} is beyond the file's samples: no sample can count as clipped` });
+    notes.push({ text: `white level ${shown} is beyond ${typeOf(samples)}: no sample can count as clipped` });
   if (said == null && samples instanceof Uint16Array) notes.push(...depthNotes(used, high));
   return notes;
 }
@@ -84,12 +87,13 @@ export function overexposureNotes(samples, width, black, white) {
   }];
 }
 
+/** Share of clipped samples among those that light reaches, of a large frame among some of its rows. */
 function clippedShare(samples, width, black, white) {
-  const height = samples.length / width, span = white - black, every = height >= 1024 ? 16 : 4;
+  const height = samples.length / width, span = white - black, rows = Math.min(4, height), every = height >= 1024 ? 16 : rows;
   const lit = black + LIT * span, full = black + (1 - CLIP_MARGIN) * span;
   let bright = 0, clipped = 0;
-  for (let first = 0; first + 4 <= height; first += every)
-    for (let k = first * width; k < (first + 4) * width; k++) {
+  for (let first = 0; first + rows <= height; first += every)
+    for (let k = first * width; k < (first + rows) * width; k++) {
       bright += samples[k] > lit;
       clipped += samples[k] >= full;
     }

@@ -1,6 +1,7 @@
 // The lamp's colour, found in one frame: twin of polsep/light/color.py, find.py and metals.py, where the method, its
 // sources and every constant are explained. Matrices [3][3] are arrays of 9, in reading order.
 
+import { channelsOf } from "./layout.js";
 import { mean, median, quantile, sum } from "./numbers.js";
 import { tilesOf } from "./tiles.js";
 
@@ -31,11 +32,24 @@ function eigen2(a, b, d) {
   return [[value(c, s), [c, s]], [value(-s, c), [-s, c]]];
 }
 
+const IGNORED = "the colour stated of the light changes nothing: mono frames show no colours";
 const TOO_LITTLE = "a frame that shows the lamp's colour was expected, found one too small, dark or overexposed; white is " +
-  "assumed: if the lamp is not white, state the lamp's colour";
+  "assumed: if the lamp is not white, say the lamp's colour";
 
-/** {color: [r, g, b], source, sure, error_deg, metal_fraction, remarks} of a colour mosaic; green = 1. */
+/** The light's colour, {color: [gain per channel], source, remarks}, green = 1: found in the frame unless it was said. */
+export function lightOf(said, mosaic) {
+  const mono = channelsOf(mosaic.layout) === 1, told = (color, remarks = []) => ({ color, source: "told", remarks });
+  if (said === "white") return told(mono ? [1] : [1, 1, 1]);
+  if (!Array.isArray(said)) return findLight(mosaic);
+  if (said.length !== 3 || !said.every((gain) => gain > 1e-6 && gain < 1e6))
+    throw new Error(`expected a light colour of three positive numbers, found ${said}`);
+  if (!mono) return told(said.map((gain) => gain / said[1]));
+  return told([1], new Set(said).size > 1 ? [IGNORED] : []);
+}
+
+/** {color: [r, g, b], source, sure, error_deg, metal_fraction, remarks}, green = 1; of a mono mosaic the colour is [1]. */
 export function findLight(mosaic) {
+  if (channelsOf(mosaic.layout) === 1) return { color: [1], source: "found", sure: true, error_deg: 0, metal_fraction: 0, remarks: [] };
   const tiles = tilesOf(mosaic);
   if (tiles.length < MIN_TILES) {
     const unknown = { x: [0, 0], error: UNKNOWN_DEG, sure: false, metal: 0 };
@@ -66,13 +80,13 @@ function remarksOn(light, tiles) {
   const remarks = [], color = colorOf(light);
   if (light.metal >= LEAST_METAL)
     remarks.push("highlights of the lamp's colour were expected, found those of gold or copper on " +
-      `${Math.round(100 * light.metal)}% of the lit frame: diffuse and specular may be wrong there; compare with analytic`);
+      `${Math.round(100 * light.metal)}% of the lit frame: diffuse and specular may be wrong there; compare with method analytic`);
   if (light.sure) return remarks;
   const [r, g, b] = [1, 2, 3].map((k) => mean(tiles.map(({ moments }) => moments[k] / moments[0])));
   const white = light.x[0] === 0 && light.x[1] === 0;
   if (light.error > UNCERTAIN_DEG && (!white || r * b < Math.exp(GREENISH) * g ** 2))
     remarks.push(`highlights that show the lamp's colour were expected, found too few; ${color.map((v) => v.toFixed(2))} is ` +
-      "assumed: show a shiny thing, or measure a grey card and state the lamp's colour");
+      "assumed: show a shiny thing, or measure a grey card and say the lamp's colour");
   return remarks;
 }
 

@@ -11,7 +11,7 @@ import { separateJoint } from "./joint.js";
 import { checkLayout, seePhases } from "./layout_check.js";
 import { channelsOf, parseLayout, periodOf, specOf } from "./layout.js";
 import { levelNotes, overexposureNotes, requireLevels, whiteOf } from "./levels.js";
-import { findLight } from "./light.js";
+import { lightOf } from "./light.js";
 import { checkBlackLevel } from "./noise.js";
 import { readFrame } from "./read.js";
 import { addPolarization, describe, intoLight, tallyOf } from "./report.js";
@@ -134,19 +134,6 @@ function prepare(settings) {
     notes.push({ text: `${defects} dead or hot pixels were repaired (${(100 * share).toFixed(2)}%): a calibration of the dark ` +
       "finds them more surely, see 'polsep calibrate dark'" });
   return { mosaic, notes, defects };
-}
-
-/** The light's colour, {color: [gain per channel], source, remarks}: found in the frame unless it was said. */
-function lightOf(said, mosaic) {
-  const white = channelsOf(mosaic.layout) === 3 ? [1, 1, 1] : [1];
-  if (white.length === 1) return { color: white, source: "mono", remarks: [] };
-  if (said === "white") return { color: white, source: "told", remarks: [] };
-  if (Array.isArray(said)) {
-    if (said.length !== 3 || !said.every((gain) => gain > 1e-6 && gain < 1e6))
-      throw new Error("expected a light colour of three positive numbers like 1,0.9,0.7");
-    return { color: said.map((gain) => gain / said[1]), source: "told", remarks: [] }; // a ratio, as a found one is
-  }
-  return findLight(mosaic);
 }
 
 let before = Promise.resolve();

@@ -31,7 +31,7 @@ from polsep.io.raw.page import Page
 from polsep.io.raw.rates import frame_rate
 from polsep.io.store.atomic import refuse_existing, replace_text
 from polsep.io.store.header_checks import require_size
-from polsep.io.store.json_text import parse_json, read_text
+from polsep.io.store.json_text import parse_json, read_record, read_text
 from polsep.sensor.camera import Layout
 
 FORMAT = "polsep recording 1"
@@ -146,12 +146,7 @@ def refuse_recording(directory: Path, overwrite: bool) -> None:
 
 def read_header(path: Path) -> Header:
     """The header of a ``recording.json``. Raises ValueError when it is another file or incomplete."""
-    try:
-        record = parse_json(read_text(path))
-    except ValueError as error:
-        raise ValueError(f"expected a polsep recording ({RECORD}), found a file that is not JSON: {error}") from None
-    if not isinstance(record, dict) or record.get("format") != FORMAT:
-        raise ValueError(f"expected a polsep recording ({RECORD} with format {FORMAT!r}), found another JSON file")
+    record = read_record(path, f"a polsep recording ({RECORD})", FORMAT)
     width, height = record.get("width"), record.get("height")
     name, layout = record.get("pixel_format"), record.get("layout")
     if not (isinstance(width, int) and isinstance(height, int) and isinstance(name, str)):

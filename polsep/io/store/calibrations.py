@@ -30,15 +30,14 @@ from polsep.io.store.json_text import (
     entry_of,
     number_of,
     numbers_of,
-    parse_json,
-    read_text,
+    read_record,
     section_of,
     table_of,
 )
 from polsep.sensor.calibration import Analyser, Calibration, LampFacts
 from polsep.sensor.camera import Layout
 
-FORMAT = "polsep calibration 1"
+FORMAT, KIND = "polsep calibration 1", "a calibration of 'polsep calibrate'"
 #: Least steps of the maps: of black as a part of the white level, at most in codes, and of gains.
 BLACK_PART, BLACK_STEP, GAIN_STEP = 2.0**-22, 2.0**-10, 2.0**-17
 #: Arrays of the NPZ file. "defective_pixels" are hot and dead ones of older files, which do not tell them apart.
@@ -108,7 +107,7 @@ def read_calibration(path: str | Path) -> Calibration:
     """The calibration of a JSON file and of the maps beside it. Raises InputError, in one line that names the file."""
     path = as_path(path)
     with naming(path):
-        record = _read_record(path)
+        record = read_record(path, KIND, FORMAT)
         maps = maps_path(path)
         stamp = os.stat(maps).st_mtime_ns if record.get("maps") and maps.exists() else 0
         return _read(path.absolute(), path.stat().st_mtime_ns, stamp)  # another folder may be the current one
@@ -116,18 +115,8 @@ def read_calibration(path: str | Path) -> Calibration:
 
 @lru_cache(maxsize=4)  # viewers read it with every frame
 def _read(path: Path, stamp: int, maps_stamp: int) -> Calibration:
-    record = _read_record(path)
+    record = read_record(path, KIND, FORMAT)
     return _from_record(record, _read_maps(path, section_of(record, "maps")))
-
-
-def _read_record(path: Path) -> dict[str, Any]:
-    try:
-        record = parse_json(read_text(path))
-    except ValueError as error:
-        raise ValueError(f"expected a calibration of 'polsep calibrate', found no JSON: {error}") from None
-    if not isinstance(record, dict) or record.get("format") != FORMAT:
-        raise ValueError(f"expected a calibration with format {FORMAT!r}, found another JSON file")
-    return record
 
 
 def _read_maps(path: Path, entry: Mapping[str, Any] | None) -> dict[str, NDArray[Any]]:

@@ -39,6 +39,17 @@ def parse_json(text: str) -> Any:
         raise ValueError("expected JSON of a few levels, found hundreds") from None
 
 
+def read_record(path: Path, kind: str, form: str) -> dict[str, Any]:
+    """The record in a JSON file of a ``kind``, whose entry "format" is ``form``. Raises ValueError, and OSError."""
+    try:
+        record = parse_json(read_text(path))
+    except ValueError as error:
+        raise ValueError(f"expected {kind}, found a file that is not JSON: {error}") from None
+    if not isinstance(record, dict) or record.get("format") != form:
+        raise ValueError(f"expected {kind} with format {form!r}, found another JSON file")
+    return record
+
+
 def entry_of(section: Mapping[str, Any], name: str) -> Any:
     """An entry that must be there. Raises ValueError."""
     if name not in section:

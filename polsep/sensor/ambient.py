@@ -49,6 +49,8 @@ UNKNOWN_SCALE = CodeScale(0, 0.0)
 def code_scale(mosaic: Mosaic) -> CodeScale:
     """The scale of a raw frame, by every fifth sample of every fifth row; it is unknown of frames of one code."""
     samples = to_numpy(mosaic.data)[..., ::5, ::5]
+    if not 0 <= samples.min() <= samples.max() < WORDS:
+        return UNKNOWN_SCALE
     codes = samples.astype(np.int64)
     used, varies = (int(np.bitwise_or.reduce(c, axis=None)) for c in (codes, codes ^ codes.flat[0]))
     known = varies and (codes == samples).all()

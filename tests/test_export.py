@@ -185,7 +185,7 @@ def test_weights_of_users_are_those_of_the_method() -> None:
         layout = Layout.parse("mono")
         (own,), _ = find_joint(method, layout, shipped_weights(f"{method}-mono"))
         (shipped,), _ = find_joint(method, layout, None)
-        assert own.averages_ways == shipped.averages_ways == (method == "joint")
+        assert own.averages_shifts == shipped.averages_shifts == (method == "joint")
 
 
 def test_full_graphs_take_batches_of_any_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,7 +47,7 @@ from polsep.train.shape_losses import gained, random_lamps
 
 Floats = NDArray[np.float32]
 
-#: Strength of mirror images of matte things; share of samples that clip; raw pixels per side.
+#: Strength of specular reflections of matte things; share of samples that clip; raw pixels per side.
 MATTE, CLIPPED, RAW_SIDE = 0.05, 0.005, 512
 #: Of a usual rig: room light over the lamp's; its lights' number, distance in radii, and colour over the lamp's; the
 #: lamp's degree of polarization and raw colour.
@@ -66,7 +66,7 @@ COUNT, LAMP_SEED, STEEP_DEG = 20, 77, 30.0
 
 
 class Kind(NamedTuple):
-    """A way to photograph things: the ``strength`` of their mirror images, and whether in a usual ``rig``."""
+    """A way to photograph things: the ``strength`` of their specular reflections, and whether in a usual ``rig``."""
 
     strength: float
     rig: bool = False

@@ -85,7 +85,7 @@ def test_rooms_are_diffuse_and_have_their_share() -> None:
     lamp, room = light_stage(stage()), light_room(stage(), 0.3)
     assert float(room.specular.s0.abs().max()) == 0
     share = room.diffuse.s0[:, room.mask].mean() / lamp.diffuse.s0[:, lamp.mask].mean()
-    assert 0.3 < float(share) < 0.6  # its mirror image comes on top
+    assert 0.3 < float(share) < 0.6  # its specular reflection comes on top
     turned = light_room(replace(stage(), light=replace(stage().light, polarizer=1.0)), 0.3).diffuse
     scale = room.diffuse.s0.sum() / turned.s0.sum()
     torch.testing.assert_close(turned.s1 * scale, room.diffuse.s1, rtol=1e-4, atol=1e-6)
@@ -108,7 +108,7 @@ def test_mannequins_have_unpolarized_bodies() -> None:
 
 
 def test_traced_light_is_counted_as_behind_crossed_polarizers() -> None:
-    """Light along the lamp's mirror images is specular, unpolarized light and that across them is diffuse."""
+    """Light along the lamp's highlights is specular, unpolarized light and that across them is diffuse."""
     one, angle = torch.ones(1, 4, 4), math.radians(40)
     lit = Stokes(one, one * math.cos(2 * angle), one * math.sin(2 * angle))
     direct = Scene(Stokes(one, 0 * one, 0 * one), lit, one[0] > 0)

@@ -1,7 +1,7 @@
 """Corners of coloured walls with objects in them, whose inter-reflections are traced by Mitsuba (extra ``mitsuba``).
 
 The truth is that behind crossed polarizers: of light that came over another surface first, what still oscillates along
-the lamp's mirror images counts as specular, and all the rest as diffuse, mirrored or not.
+the lamp's highlights counts as specular, and all the rest as diffuse, mirrored or not.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ SAMPLES = 2
 CLIPPED, LEVEL = 0.001, 0.05
 #: Least specular over diffuse light of a stage, and most draws of one: without highlights methods hardly differ.
 LEAST_SPECULAR, MAX_DRAWS = 0.02, 20
-#: Directions of a room's light, least roughness of its mirror images, which blurs single directions, and how much
+#: Directions of a room's light, least roughness of its reflections, which blurs single directions, and how much
 #: brighter its bright side is than its mean.
 ROOM_LIGHTS, ROOM_ROUGHNESS, ROOM_CONTRAST = 16, 0.5, 0.8
 #: Range of a room light's red and blue over the lamp's, green = 1.

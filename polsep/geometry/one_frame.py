@@ -1,4 +1,4 @@
-"""The surface behind one frame under one polarized lamp: normals, albedo, roughness, strength of its mirror images.
+"""The surface behind one frame under one polarized lamp: normals, albedo, roughness, specular strength.
 
 A network looks at the thing as a whole, in a square around its mask, and says how sure it is (`geometry.shape_maps`).
 It looks at the thing and at its mirror image, twice as fine as it was trained and coarser, when it has found the lamp
@@ -66,7 +66,7 @@ class Shape:
 
     ``normals [h, w, 3]``: unit vectors, x right, y up, z to the camera. ``normal_error``: their expected deviation
     along each of two axes [rad]. ``albedo [h, w, C]``: relative, 1 where a surface that faces the lamp is as bright as
-    the thing in the mean. ``roughness``: GGX sqrt(alpha); ``specular``: strength of mirror images, 1 = a dielectric of
+    the thing in the mean. ``roughness``: GGX sqrt(alpha); ``specular``: strength of reflections, 1 = a dielectric of
     index 1.5; ``roughness_error``, ``specular_error``: expected deviations of their logarithms, unknown from `UNKNOWN`
     on. ``light [3]``: unit vector toward the lamp, told or found (`lamp.search_lamp`).
     ``mask_told``: the mask was given, not found.
@@ -241,7 +241,7 @@ def find_shape(
 def polarized_as_usual(polarized: Floats, diffuse: Floats, specular: Floats, index: float) -> Floats:
     """The polarized light ``[2, h, w]`` that the same surface of index 1.5, for which the network is made, would have.
 
-    ``diffuse [h, w]`` and ``specular [1, h, w]`` light. What mirror images leave of the polarization (`encode`) is
+    ``diffuse [h, w]`` and ``specular [1, h, w]`` light. What specular light leaves of the polarization (`encode`) is
     diffuse light of one zenith angle: its DoLP there is exchanged (`fresnel.diffuse_dolp`), its AoLP stays.
     """
     if index == ETA:

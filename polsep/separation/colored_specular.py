@@ -1,7 +1,7 @@
 """Specular light that does not have the lamp's colour: metals, tinted highlights, and what bodies keep polarized.
 
 Methods that assume white specular light leave its colour in the diffuse image. That part shows: it is
-polarized as mirror images are. The polarization along the lamp's is regressed on the diffuse image, both as deviations
+polarized as highlights are. The polarization along the lamp's is regressed on the diffuse image, both as deviations
 from their mean over colours. Diffuse light of dielectrics has slopes of at most 0.3, and that only at
 grazing angles; diffuse images of gold have 1 and more. There the whole polarized light becomes specular.
 

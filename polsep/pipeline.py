@@ -368,7 +368,7 @@ def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[
     if not is_to_be_found(light_color):
         frame.report["light_color"] = stated_gains(light_color, frame.diffuse.shape[-1])
     elif "light_color" not in frame.report and frame.diffuse.shape[-1] > 1:
-        notes.append(f"the lamp's colour is not told, nor known from {path.stem}.json beside the file: taken for white")
+        notes.append(f"the lamp's colour is neither stated nor in {path.stem}.json beside the file: taken for white")
     return frame, notes
 
 
@@ -435,7 +435,7 @@ def resolve_light(
     if is_to_be_found(light_color) and not is_calibrated(capture):
         found = find_light(capture)
         return found.color if channels == 3 else (1.0,), {"source": "found", **found.describe()}, found.remarks
-    stated, source = light_color, "told"
+    stated, source = light_color, "stated"
     if isinstance(light_color, str):
         stated = (1.0, 1.0, 1.0)
         if isinstance(capture, Mosaic) and light_color != "white":

@@ -379,7 +379,7 @@ def test_gamma_of_flat_frames_is_said(layout: Layout, bits: int) -> None:
 
 
 def test_polarized_flat_frames_are_refused() -> None:
-    """Gains that hide a lamp's polarization would take it out of every frame; a tenth of that is told, not refused."""
+    """Gains that hide a lamp's polarization would take it out of every frame; of a tenth of that polsep warns."""
     sensor = BadSensor(Layout(), dead=0)
 
     def flat(dolp: float) -> Calibration:
@@ -692,7 +692,7 @@ def test_a_wrong_layout_is_noted(tmp_path: Path, run_polsep: Cli) -> None:  # no
 
 
 def test_an_ambient_frame_with_the_lamp_on_is_said() -> None:
-    """Such a frame leaves hardly any light; one of a dimmer room, or of none, says nothing. Strips are told, too."""
+    """Such a frame leaves hardly any light; one of a dimmer room, or of none, says nothing. Strips are seen, too."""
     scene = np.random.default_rng(3).integers(500, 3000, SIZE).astype(np.uint16)
 
     def said(room: NDArray[np.uint16]) -> bool:
@@ -706,7 +706,7 @@ def test_an_ambient_frame_with_the_lamp_on_is_said() -> None:
 
 @pytest.mark.parametrize("layout", [Layout(), MONO, Layout(((0, 45), (90, 135)), "BGGR", (1, 0))])
 def test_a_dim_lamp_in_an_ambient_frame_is_said(layout: Layout) -> None:
-    """A lamp at a twentieth of its light, or at most of it, is told by its highlights; no room is that is mirrored
+    """A lamp at a twentieth of its light, or at most of it, is seen by its highlights; no room is that is mirrored
     elsewhere, or in the same places at another angle."""
     y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in SIZE), indexing="ij")
     turns = np.deg2rad([[2 * layout.filter_at(r, c).angle_deg for c in range(SIZE[1])] for r in range(SIZE[0])])

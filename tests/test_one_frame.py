@@ -31,7 +31,7 @@ from polsep.geometry import frames, one_frame
 from polsep.geometry.lamp import seen_under
 from polsep.geometry.one_frame import (
     SIDE,
-    UNTOLD,
+    UNKNOWN_LIGHT,
     ShapeEstimator,
     gather,
     polarized_as_usual,
@@ -117,7 +117,7 @@ def _brighter(planes: Tensor, gain: float) -> Tensor:
 
 
 @pytest.mark.parametrize("name", INPUTS)
-def test_lamps_that_are_not_told_are_zeros(name: str) -> None:
+def test_lamps_that_are_not_given_are_zeros(name: str) -> None:
     """One map says whether a lamp is known, three where it is; the last one is the mask."""
     seen = seen_of(sphere_planes()[None], name)
     for lamp, known in (((0.0, 0.0, 0.0), 0.0), ((0.6, 0.0, 0.8), 1.0)):
@@ -179,12 +179,12 @@ def test_the_engine_is_the_network(tmp_path: Path) -> None:
     assert (found.normal[2] > 0).all()
 
 
-@pytest.mark.parametrize("told", [False, True])
-def test_mirrored_frames_give_mirrored_surfaces(tmp_path: Path, told: bool) -> None:
+@pytest.mark.parametrize("given", [False, True])
+def test_mirrored_frames_give_mirrored_surfaces(tmp_path: Path, given: bool) -> None:
     """Of a random frame: mirror images are seen alike, as s2 and the lamp's x change their signs."""
     estimator, _ = _untrained(tmp_path)
     planes = cut_example(random_planes(), 1.1, SIDE)
-    planes[PLANES["light"]] *= told
+    planes[PLANES["light"]] *= given
     mirrored = turn_example(planes, True, False, False)
     seen, other = (_as_seen(p[None]) for p in (planes, mirrored))
     for first, second in zip(other, mirror_seen(seen), strict=True):
@@ -208,15 +208,15 @@ def random_planes() -> Tensor:
     return planes
 
 
-def test_a_lamp_that_is_not_told_is_looked_for(tmp_path: Path) -> None:
-    """The surface of an untold lamp is that of the lamp which is found."""
+def test_a_lamp_that_is_not_given_is_looked_for(tmp_path: Path) -> None:
+    """The surface of a lamp that is not given is that of the lamp which is found."""
     estimator, _ = _untrained(tmp_path)
     seen = _as_seen(cut_example(random_planes(), 1.1, SIDE)[None])
-    untold = seen._replace(light=0 * seen.light)
-    lamp = estimator.find_lamp(untold)
+    unknown = seen._replace(light=0 * seen.light)
+    lamp = estimator.find_lamp(unknown)
     assert math.hypot(*lamp) == pytest.approx(1, abs=1e-6)
-    wanted = estimator.find(seen_under(untold, lamp))
-    np.testing.assert_array_equal(estimator.find(untold).normal, wanted.normal)
+    wanted = estimator.find(seen_under(unknown, lamp))
+    np.testing.assert_array_equal(estimator.find(unknown).normal, wanted.normal)
 
 
 def _untrained(folder: Path) -> tuple[ShapeEstimator, ShapeNetwork]:
@@ -336,7 +336,7 @@ def test_the_shipped_network_finds_a_sphere() -> None:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         found = polsep.shape(frame, mask, (0.0, 0.0, 1.0))
-    assert [str(note.message) for note in said] == [UNTOLD, *found.doubts()]  # its report names no lamp's colour
+    assert [str(note.message) for note in said] == [UNKNOWN_LIGHT, *found.doubts()]  # its report names no lamp's colour
     angle = angles_deg(
         torch.from_numpy(found.normals).movedim(-1, 0)[None], torch.from_numpy(normals).movedim(-1, 0)[None]
     )
@@ -449,7 +449,7 @@ def test_a_frame_that_is_full_is_said() -> None:
         (0, 0, 1),
     )
     assert any("(mask)" in line for line in found.doubts())
-    assert replace(found, mask_told=True).doubts() == []
+    assert replace(found, mask_given=True).doubts() == []
     assert replace(found, mask=cap(64, 80)[1]).doubts() == []
 
 
@@ -506,7 +506,7 @@ def test_a_file_becomes_maps_and_a_mesh(run: Cli, tmp_path: Path) -> None:
     np.testing.assert_allclose(planes["normal_error.Y"], np.degrees(found.normal_error), rtol=1e-5)
     assert np.isfinite(planes["depth.Z"]).all() and np.ptp(planes["depth.Z"][found.mask]) > 10
     facts = json.loads((out / "ball.json").read_text())
-    assert (facts["light"], facts["light_is"]) == ([0, 0, 1], "told") and set(facts["units"]) == {
+    assert (facts["light"], facts["light_is"]) == ([0, 0, 1], "given") and set(facts["units"]) == {
         name.split(".")[0] for name in planes
     }
     assert (facts["index"], facts["mask_is"]) == (1.5, "found where light falls")
@@ -528,30 +528,30 @@ def test_the_lamp_of_a_separated_file_is_read_beside_it(run: Cli, tmp_path: Path
     for end in ("exr", "json"):  # also where both were given another name
         (tmp_path / f"cup.{end}").write_bytes((tmp_path / f"tinted.{end}").read_bytes())
     renamed = run(tmp_path / "cup.exr", "-o", tmp_path / "out", "--mesh", "none")
-    assert renamed.status == 0 and "colour is not told" not in renamed.err
+    assert renamed.status == 0 and "colour is neither stated" not in renamed.err
     write_separation(frame, tmp_path, "cup", "npz", overwrite=True)  # of another run, in another format
     other = run(tmp_path / "cup.exr", "-o", tmp_path / "out", "--mesh", "none", "--overwrite")
-    assert other.status == 0 and "colour is not told" in other.err
+    assert other.status == 0 and "colour is neither stated" in other.err
     (tmp_path / "tinted.json").unlink()
     alone = run(tmp_path / "tinted.exr", "-o", tmp_path / "other", "--mesh", "none")
-    assert alone.status == 0 and "colour is not told, nor known" in alone.err
+    assert alone.status == 0 and "colour is neither stated nor in" in alone.err
     gray = replace(frame, diffuse=frame.diffuse[..., :1], specular=frame.specular[..., :1])
     assert not open_separated(write_separation(gray, tmp_path, "gray")[0])[1]  # mono has no lamp's colour
 
 
 @pytest.mark.parametrize("beside", ["nothing", "another colour"])
-def test_a_lamp_that_is_told_goes_before_the_file_beside(tmp_path: Path, beside: str) -> None:
-    """The colour told of a separated file is divided out, and nobody says that it is not known; white is told too."""
+def test_a_lamp_that_is_stated_goes_before_the_file_beside(tmp_path: Path, beside: str) -> None:
+    """The colour stated of a separated file is divided out, and no note says that it is unknown; so is white."""
     frame, tint = sphere_frame(), np.array([0.5, 1.0, 0.7], np.float32)
     report = {"warnings": [], "light_color": [1.0, 0.3, 0.3]}
     specular, error = frame.specular * tint, frame.error * tint.mean()
     tinted = replace(frame, diffuse=frame.diffuse * tint, specular=specular, error=error, report=report)
     seen = []
-    for name, one, told in (("white", replace(frame, report=report), "white"), ("tinted", tinted, (0.5, 1.0, 0.7))):
+    for name, one, stated in (("white", replace(frame, report=report), "white"), ("tinted", tinted, (0.5, 1.0, 0.7))):
         path = write_separation(one, tmp_path, name)[0]
         if beside == "nothing":
             (tmp_path / f"{name}.json").unlink()
-        found, notes = frames.open_frame(path, ReadOptions(), "joint", told)
+        found, notes = frames.open_frame(path, ReadOptions(), "joint", stated)
         assert notes == []
         seen.append(one_frame.images_of(found, frame.valid))
     np.testing.assert_allclose(seen[1], seen[0], rtol=1e-5, atol=1e-6)

@@ -240,16 +240,16 @@ def test_sidecar_states_version_source_report_units_and_a_sha256_of_every_other_
 ) -> None:
     frame = random_frame()
     written = write_separation(frame, tmp_path, "shot", format)
-    told = sidecar(tmp_path)
-    assert told["source"] == "shot.raw"
-    assert told["report"] == frame.report
-    assert told["format"] == format
-    assert told["shape"] == [37, 53, 3]
-    assert set(told["units"]) == set(LAYERS)
-    assert ("65535 = 2.0" in told["units"]["specular"]) == (format == "png")
-    assert isinstance(told["polsep"], str)
-    assert [f["name"] for f in told["files"]] == [p.name for p in written[:-1]]
-    for entry, path in zip(told["files"], written[:-1], strict=True):
+    said = sidecar(tmp_path)
+    assert said["source"] == "shot.raw"
+    assert said["report"] == frame.report
+    assert said["format"] == format
+    assert said["shape"] == [37, 53, 3]
+    assert set(said["units"]) == set(LAYERS)
+    assert ("65535 = 2.0" in said["units"]["specular"]) == (format == "png")
+    assert isinstance(said["polsep"], str)
+    assert [f["name"] for f in said["files"]] == [p.name for p in written[:-1]]
+    for entry, path in zip(said["files"], written[:-1], strict=True):
         data = path.read_bytes()
         assert entry == {"name": path.name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
@@ -302,9 +302,9 @@ def test_expected_errors_survive_every_format(tmp_path: Path, channels: int) -> 
     frame.error[0, 0] = (3, 2)
     for format in FORMATS:
         write_separation(frame, tmp_path, "shot", format, overwrite=True)
-        told = sidecar(tmp_path)
-        assert set(told["units"]) == {*LAYERS, "error"}
-        limited = told.get("limited_samples", {"error": None})
+        said = sidecar(tmp_path)
+        assert set(said["units"]) == {*LAYERS, "error"}
+        limited = said.get("limited_samples", {"error": None})
         assert limited["error"] == ({"below": 0, "above": 1} if format == "png" else None)
     layers = read_exr_layers(tmp_path / "shot.exr")
     assert OpenEXR.File(str(tmp_path / "shot.exr"), header_only=True).header()["errorUnits"] == UNITS["error"]

@@ -58,7 +58,7 @@ def raw_frame(dtype: str = "uint16", layout: Layout | None = None, **scene: Any)
 
 
 def quietly(*args: Any, **kwargs: Any) -> polsep.Result:
-    """`polsep.separate` under white light unless told, without its warnings, which stay in the report."""
+    """`polsep.separate` under white light unless stated, without its warnings, which stay in the report."""
     kwargs.setdefault("light_color", "white")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", polsep.PolsepWarning)
@@ -581,8 +581,8 @@ def test_only_the_ratios_of_a_light_color_count(method: str) -> None:
 def test_the_light_color_may_be_an_array() -> None:
     """A NumPy array of three numbers is a light colour as a tuple is."""
     raw = raw_frame()
-    told = quietly(raw, method="analytic", light_color=ODD_LIGHT)
-    assert (told.specular == quietly(raw, method="analytic", light_color=np.array(ODD_LIGHT)).specular).all()
+    stated = quietly(raw, method="analytic", light_color=ODD_LIGHT)
+    assert (stated.specular == quietly(raw, method="analytic", light_color=np.array(ODD_LIGHT)).specular).all()
     with pytest.raises(ValueError, match="light colour of three positive numbers"):
         polsep.separate(raw, light_color=np.ones(4))  # type: ignore[arg-type]
 

@@ -70,14 +70,14 @@ def test_units_bring_twins_together() -> None:
         torch.testing.assert_close(found.specular / found.unit, ideal.specular, rtol=1e-4, atol=1e-5)
 
 
-def test_what_is_told_is_true() -> None:
-    """The formula, told the light's colour, the black level or the room, loses nothing but noise."""
+def test_what_is_stated_is_true() -> None:
+    """The formula, given the light's colour, the black level or the room, loses nothing but noise."""
     ideal = score(ideal_frame(stage()), "analytic", True)
     for name in ("daylight balance", "black level 240", "room light 30 %, lamp-off frame"):
-        told = score(frame(name), "analytic", True)
-        assert ideal.diffuse - told.diffuse < 0.5
-        assert ideal.specular - told.specular < 0.5
-    assert frame("daylight balance").told == {"light_color": LAMPS["daylight"]}
+        stated = score(frame(name), "analytic", True)
+        assert ideal.diffuse - stated.diffuse < 0.5
+        assert ideal.specular - stated.specular < 0.5
+    assert frame("daylight balance").options == {"light_color": LAMPS["daylight"]}
 
 
 def test_rooms_are_diffuse_and_have_their_share() -> None:

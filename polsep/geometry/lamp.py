@@ -1,6 +1,6 @@
 """The direction toward the lamp of one frame: by the shading of a surface, and among many by which explains most.
 
-A surface says which lamp would shade it so (`lamp_by_shading`), but a network that is not told the lamp draws surfaces
+A surface says which lamp would shade it so (`lamp_by_shading`), but a network that is not given the lamp draws surfaces
 for the lamp it guesses. So it looks once more for each of `LAMPS` (`search_lamp`). Under the true one it is surest,
 its surface shows the picture that was seen, and its highlights are where they were seen (`misfit`).
 """
@@ -57,7 +57,7 @@ def lamp_by_shading(surface: Surface, seen: Seen) -> Vector:
 def search_lamp(look: Callable[[Seen], Surface], seen: Seen) -> Vector:
     """The mean of `LAMPS` by how well the surface that ``look`` finds under each explains what is seen.
 
-    They count less the farther they are from the lamp that shades the surface of an untold lamp.
+    They count less the farther they are from the lamp that shades the surface found without a lamp.
     """
     shading = np.array(lamp_by_shading(look(seen), seen), np.float32)
     away = np.degrees(np.arccos(np.clip(LAMPS @ shading, -1, 1))) / SHADING_DEG if shading.any() else 0 * LAMPS[:, 0]
@@ -68,7 +68,7 @@ def search_lamp(look: Callable[[Seen], Surface], seen: Seen) -> Vector:
 
 
 def seen_under(seen: Seen, lamp: Vector | Floats) -> Seen:
-    """The same images, with the direction toward the lamp told."""
+    """The same images, with the direction toward the lamp given."""
     return seen._replace(light=np.array(lamp, np.float32)[:, None, None] + 0 * seen.light)
 
 

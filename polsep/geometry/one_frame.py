@@ -57,7 +57,9 @@ INDICES = (1.3, 2.5)
 #: [degrees], in the median, from which on they are called uncertain.
 FILLED, UNCERTAIN_DEG = 0.2, 15.0
 #: A note on a colour frame without the lamp's colour, as `read_separated` gives.
-UNTOLD = 'the lamp\'s colour is not told: taken for white, or set frame.report["light_color"] = [r, g, b] before'
+UNKNOWN_LIGHT = (
+    'the lamp\'s colour is not known: taken for white, or set frame.report["light_color"] = [r, g, b] before'
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +70,8 @@ class Shape:
     along each of two axes [rad]. ``albedo [h, w, C]``: relative, 1 where a surface that faces the lamp is as bright as
     the thing in the mean. ``roughness``: GGX sqrt(alpha); ``specular``: strength of reflections, 1 = a dielectric of
     index 1.5; ``roughness_error``, ``specular_error``: expected deviations of their logarithms, unknown from `UNKNOWN`
-    on. ``light [3]``: unit vector toward the lamp, told or found (`lamp.search_lamp`).
-    ``mask_told``: the mask was given, not found.
+    on. ``light [3]``: unit vector toward the lamp, given or found (`lamp.search_lamp`).
+    ``mask_given``: the mask was given, not found.
     """
 
     normals: Floats
@@ -81,7 +83,7 @@ class Shape:
     specular_error: Floats
     mask: Mask
     light: tuple[float, float, float]
-    mask_told: bool = False
+    mask_given: bool = False
 
     def __repr__(self) -> str:
         share, error = float(self.mask.mean()), float(np.degrees(np.median(self.normal_error[self.mask])))
@@ -95,7 +97,7 @@ class Shape:
         error = float(np.degrees(np.median(self.normal_error[inside])))
         border = float(np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]]).mean())
         notes = []
-        if border > FILLED and not self.mask_told:
+        if border > FILLED and not self.mask_given:
             notes.append(
                 f"one thing before a dark ground was expected, found light on {border:.0%} of the frame's border: say "
                 "where the thing is (mask)"
@@ -126,14 +128,14 @@ class ShapeEstimator:
         """The surface in images ``[C, SIDE, SIDE]``: the mean of what they and their means over `SCALES` say.
 
         Small blocks show the detail, large ones the whole. Each says the mean of looks at the thing and at its mirror
-        image. Where the lamp is not told, it is found first (`find_lamp`).
+        image. Where the lamp is not given, it is found first (`find_lamp`).
         """
         seen = seen if np.any(seen.light) else seen_under(seen, self.find_lamp(seen))
         found = (self._find_mirrored(_means(seen, block)) for block in SCALES)
         return mean_surface(*(Surface(*(resize_bilinear(x, (SIDE, SIDE)) for x in surface)) for surface in found))
 
     def find_lamp(self, seen: Seen) -> tuple[float, float, float]:
-        """The unit vector toward the lamp, which is not told (`lamp.search_lamp`).
+        """The unit vector toward the lamp, which is not given (`lamp.search_lamp`).
 
         By the coarsest of `SCALES` in which whole blocks are on the thing.
         """
@@ -187,8 +189,8 @@ def shape(
     if not isinstance(index, Real):
         raise WrongType(f"expected a refractive index that is a number, found {index!r:.40}")
     found = find_shape(frame, mask, light, None if weights is None else as_path(weights), float(index))
-    untold = () if "light_color" in frame.report or frame.diffuse.shape[-1] == 1 else (UNTOLD,)
-    for note in (*untold, *found.doubts()):
+    remarks = () if "light_color" in frame.report or frame.diffuse.shape[-1] == 1 else (UNKNOWN_LIGHT,)
+    for note in (*remarks, *found.doubts()):
         warnings.warn(note, PolsepWarning, stacklevel=2)
     return found
 
@@ -211,17 +213,17 @@ def find_shape(
         )
     if not frame.dolp[chosen].any():
         raise ValueError("expected a frame with its polarization, found DoLP 0 everywhere")
-    told = None if light is None else _as_told(light)
+    given = None if light is None else _as_direction(light)
     window = square_around(chosen)
     small = gather(images_of(frame, chosen), window, SIDE)
     small[4:6] = polarized_as_usual(small[4:6], small[:3].mean(axis=0), small[3:4] * on_thing(small[7:8]), index)
     on = on_thing(small[7:8]).astype(np.float32)
-    untold = Seen(small[:3], small[3:4], small[4:6], small[6:7], on, np.zeros((3, SIDE, SIDE), np.float32))
+    seen = Seen(small[:3], small[3:4], small[4:6], small[6:7], on, np.zeros((3, SIDE, SIDE), np.float32))
     estimator = load_estimator(weights)
     if estimator.input != "separated":
         raise ValueError(f"expected weights of a network that sees separated images, found one for {estimator.input!r}")
-    lamp = told or estimator.find_lamp(untold)
-    found = estimator.find(seen_under(untold, lamp))
+    lamp = given or estimator.find_lamp(seen)
+    found = estimator.find(seen_under(seen, lamp))
     planes = np.concatenate([np.asarray(x, np.float32) for x in found])
     wide = spread(planes, window, chosen.shape)
     normals = wide[:3] / np.maximum(np.linalg.norm(wide[:3], axis=0), 1e-6)
@@ -235,7 +237,7 @@ def find_shape(
         "specular_error": wide[10],
     }
     inside = {name: _outside_zero(x, chosen) for name, x in maps.items()}
-    return Shape(**inside, mask=chosen, light=lamp, mask_told=mask is not None)
+    return Shape(**inside, mask=chosen, light=lamp, mask_given=mask is not None)
 
 
 def polarized_as_usual(polarized: Floats, diffuse: Floats, specular: Floats, index: float) -> Floats:
@@ -266,7 +268,7 @@ def _as_mask(mask: object) -> Mask:
     return np.asarray(numbers != 0)
 
 
-def _as_told(light: Sequence[float]) -> tuple[float, float, float]:
+def _as_direction(light: Sequence[float]) -> tuple[float, float, float]:
     """A direction that was given, as a unit vector. Raises ValueError."""
     try:
         numbers = [float(x) for x in light]

@@ -51,7 +51,7 @@ GREY = 40
 @dataclass(frozen=True)
 class ShapeSettings:
     """Options of `polsep shape`: ``read`` and ``method`` of a raw frame; ``light_color``, of a separated one too, where
-    it goes before that of its report; ``lamp``, toward which a direction is told; a file of the ``mask``; format of the
+    it goes before that of its report; ``lamp``, the direction toward it; a file of the ``mask``; format of the
     ``mesh`` ("none": no depth and mesh), its ``integration``, a ``turntable``; ``weights`` instead of the shipped ones;
     and the refractive ``index`` of the thing."""
 
@@ -87,8 +87,8 @@ def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, ti
     """
     facts: dict[str, Any] = {
         "light": [round(x, 4) for x in found.light],
-        "light_is": "found from the shading" if settings.lamp is None else "told",
-        "mask_is": "told" if found.mask_told else "found where light falls",
+        "light_is": "found from the shading" if settings.lamp is None else "given",
+        "mask_is": "given" if found.mask_given else "found where light falls",
         "index": settings.index,
         "method": frame.report.get("method", "separated before"),
         "median_normal_error_deg": round(float(np.degrees(np.median(found.normal_error[found.mask]))), 2),

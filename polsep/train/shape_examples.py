@@ -187,8 +187,8 @@ def _photograph(real: RealScene, clip: float, generator: torch.Generator) -> Ten
     exposed = expose_to_level(expose_to_clip(real.scene, clip, layout, sensor), MIN_LEVEL, layout, sensor)
     mosaic = capture(exposed, layout, sensor, generator).mosaic
     mosaic = replace(mosaic, data=mosaic.data.numpy().astype(np.float32))
-    told = real.told / real.told[1]
-    light = tuple(float(c) for c in told)
+    color = real.told / real.told[1]
+    light = tuple(float(c) for c in color)
     method = METHODS[int(torch.multinomial(torch.tensor(METHOD_SHARES), 1, generator=generator))]
     frame = separate_capture(mosaic, method, light)
     gain = np.array(light, np.float32)
@@ -198,9 +198,9 @@ def _photograph(real: RealScene, clip: float, generator: torch.Generator) -> Ten
     error = np.zeros((*strength.shape, 2), np.float32) if frame.error is None else frame.error / gain.mean()
     images = [stokes[0], stokes[1], stokes[2], diffuse, specular]
     images += [(strength * f(2 * frame.aolp))[..., None] for f in (np.cos, np.sin)] + [error]
-    true = [light.s0 / told[:, None, None] for light in (exposed.diffuse, exposed.specular)]
+    true = [light.s0 / color[:, None, None] for light in (exposed.diffuse, exposed.specular)]
     total = exposed.diffuse + exposed.specular
-    polarized = [(s / told[:, None, None]).mean(dim=0, keepdim=True) for s in (total.s1, total.s2)]
+    polarized = [(s / color[:, None, None]).mean(dim=0, keepdim=True) for s in (total.s1, total.s2)]
     truth = torch.cat([true[0], true[1].mean(dim=0, keepdim=True), *polarized])
     seen = torch.from_numpy(np.concatenate(images, axis=-1)).movedim(-1, 0)
     return torch.cat([seen, avg_pool2d(truth, 2)])

@@ -35,8 +35,8 @@ TRAINED = (*INPUTS, "perfect")
 #: Parts that are trained: all layers, or small ones alone, which make up for it that large ones were rounded before
 #: (`io.store.rounding`).
 PARTS = ("all", "small")
-#: Share of frames whose lamp's direction is not told, and deviation of the others' [rad].
-UNTOLD, TOLD_ERROR = 0.3, 0.05
+#: Share of frames whose lamp's direction is not given, and deviation of the others' [rad].
+NOT_GIVEN, GIVEN_ERROR = 0.3, 0.05
 #: Side of a cut over the longest side of the thing, in training; and in validation.
 CUTS, CUT = (1.04, 1.5), 1.1
 #: Share of frames of things that stand which are turned in eight ways, as frames of things held at any angle: with all
@@ -165,13 +165,13 @@ def turn_example(planes: Tensor, across: bool, down: bool, transposed: bool) -> 
     return turned
 
 
-def tell_light(planes: Tensor, generator: torch.Generator) -> Tensor:
-    """An example whose lamp's direction is told with an error, or not at all."""
-    untold = float(torch.rand(1, generator=generator)) < UNTOLD
-    error = TOLD_ERROR * torch.randn(3, 1, 1, generator=generator)
-    told = planes.clone()
-    told[PLANES["light"]] = 0.0 if untold else normalize(planes[PLANES["light"]] + error, dim=0)
-    return told
+def give_light(planes: Tensor, generator: torch.Generator) -> Tensor:
+    """An example whose lamp's direction is given with an error, or not at all."""
+    unknown = float(torch.rand(1, generator=generator)) < NOT_GIVEN
+    error = GIVEN_ERROR * torch.randn(3, 1, 1, generator=generator)
+    given = planes.clone()
+    given[PLANES["light"]] = 0.0 if unknown else normalize(planes[PLANES["light"]] + error, dim=0)
+    return given
 
 
 def batches(options: ShapeOptions, paths: Sequence[Path], step: int, process: tuple[int, int]) -> Iterator[ShapeBatch]:
@@ -187,7 +187,7 @@ def batches(options: ShapeOptions, paths: Sequence[Path], step: int, process: tu
             examples, shown = find_example(paths[number])
             any_way = not examples.stands(shown) or draws[3] < HELD_SHARE
             down, transposed = (way and any_way for way in others)
-            found.append(tell_light(turn_example(planes, across, down, transposed), generator))
+            found.append(give_light(turn_example(planes, across, down, transposed), generator))
         yield ShapeBatch(torch.stack(found))
         step += 1
 

@@ -285,7 +285,7 @@ def _as_opened(read: SeparatedFrame, light_color: LightColor | str, stem: str) -
     report = read.report | {"source": stem, "warnings": list(read.report.get("warnings", ()))}
     if not is_to_be_found(light_color):
         color = stated_gains(light_color, read.diffuse.shape[-1])
-        report |= {"light_color": color, "light": {"source": "told", "color": color}}
+        report |= {"light_color": color, "light": {"source": "stated", "color": color}}
     if not read.dolp.any():
         report["warnings"].append(LIGHT_ALONE)
     return replace(read, report=report)

@@ -140,11 +140,11 @@ function prepare(settings) {
 function lightOf(said, mosaic) {
   const white = channelsOf(mosaic.layout) === 3 ? [1, 1, 1] : [1];
   if (white.length === 1) return { color: white, source: "mono", remarks: [] };
-  if (said === "white") return { color: white, source: "told", remarks: [] };
+  if (said === "white") return { color: white, source: "stated", remarks: [] };
   if (Array.isArray(said)) {
     if (said.length !== 3 || !said.every((gain) => gain > 1e-6 && gain < 1e6))
       throw new Error("expected a light colour of three positive numbers like 1,0.9,0.7");
-    return { color: said.map((gain) => gain / said[1]), source: "told", remarks: [] }; // a ratio, as a found one is
+    return { color: said.map((gain) => gain / said[1]), source: "stated", remarks: [] }; // a ratio, as a found one is
   }
   return findLight(mosaic);
 }

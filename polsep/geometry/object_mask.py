@@ -1,4 +1,4 @@
-"""The mask of a thing before a dark ground, where nobody told it: where light falls."""
+"""The mask of a thing before a dark ground, where none was given: where light falls."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Scores of shape from one frame on the things of selection set (b): by what a network sees, and without a network.
+"""Scores of shape from one frame on the objects of selection set (b): by what a network sees, and without a network.
 
-Every thing of `six_lights.load_subjects` is photographed as `KINDS` say, each time by one lamp within `LARGEST_DEG` of
+Every object of `six_lights.load_subjects` is photographed as `KINDS` say, each time by one lamp within `LARGEST_DEG` of
 the camera, behind a polarizer at any angle, in 512 x 512 raw pixels with noise; the mask is given, the lamp's direction
-where a row says so. Frames of a usual rig are those of glossy things, in light of the room, by a lamp that is not white
-to the sensor, behind an imperfect polarizer, with a sensor's errors, and nothing stated. "separated" is what ships.
+where a row says so. Frames of a usual rig are those of glossy objects, in room light, by a lamp that is not white to
+the sensor, behind an imperfect polarizer, with a sensor's errors, and nothing stated. "separated" is what ships.
 Networks of equal size and training, less than that of what ships, see the separated images and their polarization
 (`EQUAL`), the measured Stokes images, or s0 alone; "perfect" sees true images. Needs the extra ``bench``.
 """
@@ -47,7 +47,7 @@ from polsep.train.shape_losses import gained, random_lamps
 
 Floats = NDArray[np.float32]
 
-#: Strength of specular reflections of matte things; share of samples that clip; raw pixels per side.
+#: Strength of specular reflections of matte objects; share of samples that clip; raw pixels per side.
 MATTE, CLIPPED, RAW_SIDE = 0.05, 0.005, 512
 #: Of a usual rig: room light over the lamp's; its lights' number, distance in radii, and colour over the lamp's; the
 #: lamp's degree of polarization and raw colour.
@@ -55,7 +55,7 @@ ROOM, ROOM_LIGHTS, ROOM_DISTANCE, ROOM_COLOR = 0.1, 6, 30.0, (1.15, 1.0, 0.85)
 DEGREE, RIG_COLOR = 0.98, LAMPS["daylight"]
 #: Largest angle of the lamp from the camera, and its distance relative to the camera's.
 LARGEST_DEG, DISTANCES = 45.0, (0.7, 1.4)
-#: A distant lamp for things whose camera is many radii away, in radii.
+#: A distant lamp for objects whose camera is many radii away, in radii.
 LAMP_DISTANCE = 8.0
 #: Networks of all inputs, of equal training; the method of the one that sees separated images; and what a method's name
 #: ends with where the lamp's direction is given.
@@ -66,13 +66,13 @@ COUNT, LAMP_SEED, STEEP_DEG = 20, 77, 30.0
 
 
 class Kind(NamedTuple):
-    """A way to photograph things: the ``strength`` of their specular reflections, and whether in a usual ``rig``."""
+    """A way to photograph objects: the ``strength`` of their specular reflections, and whether in a usual ``rig``."""
 
     strength: float
     rig: bool = False
 
 
-#: Kinds of photographs; those of a thing in the dark and in a rig have the same lamp.
+#: Kinds of photographs; those of an object in the dark and in a rig have the same lamp.
 KINDS = {"glossy": Kind(1.0), "matte": Kind(MATTE), "glossy, in a usual rig": Kind(1.0, rig=True)}
 
 
@@ -302,7 +302,7 @@ UNITS |= dict.fromkeys(("azimuth flips", "roughness known", "roughness, median e
 
 
 def measure(data: Path, names: Sequence[str] | None = None) -> Iterator[Row]:
-    """Rows of scores per method, over glossy and matte things and per kind, and of expected errors."""
+    """Rows of scores per method, over glossy and matte objects and per kind, and of expected errors."""
     found: dict[tuple[str, str], list[dict[str, float]]] = {}
     tenths: list[tuple[Floats, Floats]] = []
     methods = list_methods()

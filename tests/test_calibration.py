@@ -286,8 +286,8 @@ def test_a_frame_without_the_lamp_is_refused() -> None:
 
 
 def test_pictures_are_no_dark_frames() -> None:
-    """A dark picture of a bright thing: most of it is black, a tenth is not. Nor is an evenly lit frame, nor one with a
-    glowing corner, whose pixels would all count as hot ones."""
+    """A dark picture of a bright object: most of it is black, a tenth is not. Nor is an evenly lit frame, nor one with
+    a glowing corner, whose pixels would all count as hot ones."""
     picture = np.full(SIZE, LEVEL, np.float32)
     picture[: SIZE[0] // 10] += 0.3 * WHITE
     corner = np.full(SIZE, LEVEL, np.float32)
@@ -312,13 +312,13 @@ def test_copies_of_one_frame_are_refused(measure: Callable[..., Calibration]) ->
 
 
 def test_one_wrong_frame_among_many_is_refused() -> None:
-    """A frame of paper or of a small thing among dark ones, and a dark one among flat ones, hide in the mean."""
+    """A frame of paper or of a small object among dark ones, and a dark one among flat ones, hide in the mean."""
     sensor = BadSensor(Layout(), dead=0)
     dark = [sensor.expose(np.zeros(SIZE)) for _ in range(7)]
-    thing = np.zeros(SIZE)
-    thing[40:80, 40:90] = 0.1
+    bright = np.zeros(SIZE)
+    bright[40:80, 40:90] = 0.1
     paper = sensor.expose(sensor.sees(np.full(SIZE, 0.8)))
-    for lit in (paper, sensor.expose(sensor.sees(thing))):
+    for lit in (paper, sensor.expose(sensor.sees(bright))):
         with pytest.raises(ValueError, match=r"without light \(lens cap on\), found parts of frame 8 that differ"):
             measure_dark([*dark, lit])
     flat = [replace(frame, black_level=LEVEL) for frame in (paper, paper, paper, dark[0])]

@@ -266,7 +266,7 @@ def test_losses_are_least_at_the_truth() -> None:
 
 
 def test_squares_come_back() -> None:
-    """A smooth image survives the way into the network's square and back, also where the thing touches the border."""
+    """A smooth image survives the way into the network's square and back, also where the object touches the border."""
     rows, cols = np.mgrid[:90, :120] / 100.0
     image = np.stack([rows, np.sin(3 * cols)]).astype(np.float32)
     mask = np.zeros((90, 120), np.bool_)
@@ -353,7 +353,7 @@ def test_the_shipped_network_finds_a_sphere() -> None:
 
 
 def test_floor_of_the_shipped_weights() -> None:
-    """On things that no training saw, made here, the shipped network is no worse than when it was shipped."""
+    """On objects that no training saw, made here, the shipped network is no worse than when it was shipped."""
     examples = [cut_example(random_shape_example(Examples("test", 11), n, 256), 1.1, SIDE // 2) for n in range(6)]
     network = ShapeNetwork(INPUTS["separated"], USUAL, one_frame.load_estimator().size)
     arrays = polsep_weights()
@@ -362,7 +362,7 @@ def test_floor_of_the_shipped_weights() -> None:
     assert scores["normals, mean deg"] < FLOOR_DEG, scores
 
 
-#: Mean angular error of the shipped weights on six things, two of each kind (30.7), and a tenth more.
+#: Mean angular error of the shipped weights on six objects, two of each kind (30.7), and a tenth more.
 FLOOR_DEG = 33.8
 
 
@@ -373,7 +373,7 @@ def polsep_weights() -> dict[str, NDArray[np.float32]]:
 
 
 def test_bad_arguments_are_refused() -> None:
-    """Masks of another size or empty ones, lamps behind the thing, frames without polarization or light."""
+    """Masks of another size or empty ones, lamps behind the object, frames without polarization or light."""
     frame = sphere_frame()
     with pytest.raises(ValueError, match="expected a mask of"):
         shape(frame, np.ones((3, 3), np.bool_))
@@ -435,7 +435,7 @@ def test_masks_of_odd_raw_frames_are_taken(tmp_path: Path) -> None:
 
 
 def test_a_frame_that_is_full_is_said() -> None:
-    """A mask that reaches around the border has a line that says what to do; a thing inside has none."""
+    """A mask that reaches around the border has a line that says what to do; an object inside has none."""
     one = np.ones((64, 64), np.float32)
     found = one_frame.Shape(
         np.dstack([0 * one, 0 * one, one]),
@@ -453,20 +453,20 @@ def test_a_frame_that_is_full_is_said() -> None:
     assert replace(found, mask=cap(64, 80)[1]).doubts() == []
 
 
-def test_specks_and_lines_are_not_the_thing() -> None:
+def test_specks_and_lines_are_not_the_object() -> None:
     """The mask is the sphere alone, whole, though a bright line and a speck are beside it."""
     frame = sphere_frame()
     diffuse = np.pad(frame.diffuse, ((16, 16), (0, 64), (0, 0)))
     diffuse[4:6, :] = diffuse[60:63, 100:104] = 1
     grown = replace(frame, diffuse=diffuse, specular=0 * diffuse)
-    found = one_frame.find_thing(grown)
+    found = one_frame.mask_of(grown)
     sphere = np.pad(frame.diffuse.mean(axis=-1), ((16, 16), (0, 64))) > 0.1
     np.testing.assert_array_equal(found[sphere], True)
     assert not found[:8].any() and not found[:, 80:].any()
 
 
-def test_a_small_thing_is_found_in_a_noisy_frame() -> None:
-    """A thousandth of the frame is enough: noise around it is not the thing, and its highlight is no other level."""
+def test_a_small_object_is_found_in_a_noisy_frame() -> None:
+    """A thousandth of the frame is enough: noise around it is not the object, and its highlight is no other level."""
     rows, cols = np.mgrid[:640, :768] - np.array([[[300]], [[200]]])
     radius = np.hypot(rows, cols) / 14
     light = np.where(radius < 1, 0.3 * np.sqrt(np.maximum(1 - radius**2, 0.05)), 0.0)
@@ -474,7 +474,7 @@ def test_a_small_thing_is_found_in_a_noisy_frame() -> None:
     highlight = np.where(radius < 0.2, 2.0, 0.0)
     color = [np.repeat(image[..., None], 3, axis=-1).astype(np.float32) for image in (noisy, highlight)]
     frame = replace(sphere_frame(), diffuse=color[0], specular=color[1])
-    found = one_frame.find_thing(frame)
+    found = one_frame.mask_of(frame)
     assert float((found & (radius < 1)).sum() / (found | (radius < 1)).sum()) > 0.97
     assert 0.0012 < (radius < 1).mean() < 0.0013
 
@@ -606,7 +606,7 @@ def test_of_many_frames_two_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize(("wide", "meshed"), [(1, False), (4, False), (14, True)])
 def test_thin_things_have_maps_but_no_mesh(run: Cli, tmp_path: Path, wide: int, meshed: bool) -> None:
-    """A line of a few pixels has its maps; of a mesh a line says, with the file, how wide things have to be."""
+    """A line of a few pixels has its maps; of a mesh a line says, with the file, how wide objects have to be."""
     ones = np.ones((48, 600), np.float32)
     light = 0.3 * ones[..., None].repeat(3, axis=2)
     frame = SeparatedFrame(light, 0.2 * light, ones > 0, 0.2 * ones, 0.5 * ones, {"warnings": []})
@@ -619,7 +619,7 @@ def test_thin_things_have_maps_but_no_mesh(run: Cli, tmp_path: Path, wide: int, 
     if meshed:
         assert done.status == 0, done
         return
-    assert_refused(done, f"{path}: expected a thing of 11 pixels across or more for a mesh", "say --mesh none")
+    assert_refused(done, f"{path}: expected an object of 11 pixels across or more for a mesh", "say --mesh none")
     assert run(*words, "--mesh", "none").status == 0
     assert (read_exr_layers(tmp_path / "out" / "wire.exr")["normal.Z"][mask > 0] > 0).all()
 

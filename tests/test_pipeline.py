@@ -209,12 +209,12 @@ def test_unpolarized_light_is_reported() -> None:
 
 @pytest.mark.parametrize("method", ["joint", "color-affine"])
 def test_metals_are_reported(method: str) -> None:
-    """Highlights in the metal's own colour, and nothing else, are no white light on a coloured thing."""
+    """Highlights in the metal's own colour, and nothing else, are no white light on a coloured object."""
     generator = torch.Generator().manual_seed(2)
     light = interpolate(torch.rand(1, 1, 12, 12, generator=generator), size=(SIZE, SIZE))[0]
     gold = 0.1 + 0.9 * light * torch.tensor([1.0, 0.78, 0.34]).view(3, 1, 1)
     frame = expose(Stokes(gold, 0.6 * gold, 0.7 * gold), Layout(), IDEAL).data.numpy()
-    with pytest.warns(polsep.PolsepWarning, match="white highlights on coloured things were expected"):
+    with pytest.warns(polsep.PolsepWarning, match="white highlights on coloured objects were expected"):
         polsep.separate(frame, method=method, light_color="white")
 
 

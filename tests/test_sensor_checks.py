@@ -31,7 +31,7 @@ SIZE = 256
 
 
 def scene(channels: int) -> Stokes:
-    """Smooth polarized things of several colours on black."""
+    """Smooth polarized objects of several colours on black."""
     y, x = torch.meshgrid(torch.linspace(0, 1, SIZE), torch.linspace(0, 1, SIZE), indexing="ij")
     inside = ((y - 0.5) ** 2 + (x - 0.5) ** 2 < 0.18).float()
     s0 = torch.stack([inside * (0.25 + 0.5 * x + 0.4 * c * y) for c in range(channels)])

@@ -1,4 +1,4 @@
-"""Set (b): photographed statues and scanned things with random albedo and roughness.
+"""Set (b): photographed statues and scanned objects with random albedo and roughness.
 
 Five DiLiGenT objects, each a surface spanned by its depth map that carries the map's normals, seen from where its own
 camera was; and the meshes of the data folder. Surfaces cast shadows, of the DiLiGenT objects the visible side only.

@@ -90,7 +90,7 @@ def misfit(surface: Surface, seen: Seen, lamp: Floats) -> float:
 
 
 def _logarithm(image: Floats, seen: Seen) -> Floats:
-    """The logarithm of an image's mean over colours, relative to the thing's level."""
+    """The logarithm of an image's mean over colours, relative to the object's level."""
     level = object_level(seen.image, seen.mask)[0]
     found: Floats = np.log(image.mean(axis=0).clip(0, None) / level + FLOOR)
     return found

@@ -170,7 +170,7 @@ def _remarks_on(light: Light, tiles: Tiles) -> Iterator[str]:
         color = ",".join(f"{c:.2f}" for c in light.color)
         yield (
             f"highlights that show the lamp's colour were expected, found too few; {color} is assumed: show a shiny "
-            "thing, or measure a grey card and say --light-color"
+            "object, or measure a grey card and say --light-color"
         )
 
 

@@ -1,4 +1,4 @@
-"""Check that light from inside a body is polarized along the slope of its shading, as it is on convex things.
+"""Check that light from inside a body is polarized along the slope of its shading, as it is on convex objects.
 
 Light that leaves a surface from inside is polarized in the plane that holds the normal and the view: its AoLP points
 where the surface tilts. There brightness falls or rises too, above all at outlines. Across all of a frame AoLP and the
@@ -41,7 +41,7 @@ MIN_AGREEMENT, CERTAIN = 0.1, 3.5
 def lies_across(mosaic: Mosaic) -> bool:
     """True if the polarization from inside lies across the slopes in the frame (the first of a batch), beyond doubt.
 
-    False where nothing can be judged: mono frames, light without a polarizer, grey, flat, black and small things.
+    False where nothing can be judged: mono frames, light without a polarizer, grey, flat, black and small objects.
     """
     top, left = mosaic.layout.origin
     frame = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0, top:, left:]

@@ -1,8 +1,8 @@
-"""Training of the network for shape, on examples from a folder: turned, mirrored, cut to the thing.
+"""Training of the network for shape, on examples from a folder: turned, mirrored, cut to the object.
 
-Frames of things that stand are mostly mirrored across alone, so that the network learns where down is: users' things
-stand, and a flat thing's normals are known but for the side to which it tips. `HELD_SHARE` of these frames and all of
-solids are turned in eight ways, so that a thing held at any angle still works.
+Frames of objects that stand are mostly mirrored across alone, so that the network learns where down is: users' objects
+stand, and a flat object's normals are known but for the side to which it tips. `HELD_SHARE` of these frames and all of
+solids are turned in eight ways, so that an object held at any angle still works.
 
 Batch number n depends on the options and n alone, so that a resumed training uses the same batches.
 """
@@ -37,10 +37,10 @@ TRAINED = (*INPUTS, "perfect")
 PARTS = ("all", "small")
 #: Share of frames whose lamp's direction is not given, and deviation of the others' [rad].
 NOT_GIVEN, GIVEN_ERROR = 0.3, 0.05
-#: Side of a cut over the longest side of the thing, in training; and in validation.
+#: Side of a cut over the longest side of the object, in training; and in validation.
 CUTS, CUT = (1.04, 1.5), 1.1
-#: Share of frames of things that stand which are turned in eight ways, as frames of things held at any angle: with all
-#: of the solids, every second frame (a third and a quarter of two thirds).
+#: Share of frames of objects that stand which are turned in eight ways, as if held at any angle: with all of the
+#: solids, every second frame (a third and a quarter of two thirds).
 HELD_SHARE = 0.25
 #: Seed and number of validation's lamps.
 LAMP_SEED, VALIDATION_LAMPS = 31, 20
@@ -119,9 +119,9 @@ def truth_of(planes: Tensor) -> Surface:
 
 
 def cut_example(planes: Tensor, wider: float, side: int, place: tuple[float, float] = (0.5, 0.5)) -> Tensor:
-    """A square of ``wider`` times the longest side of the thing, resized to ``side``: ``[COUNT, side, side]``.
+    """A square of ``wider`` times the longest side of the object, resized to ``side``: ``[COUNT, side, side]``.
 
-    ``place``: of the thing in it, from 0 to 1 along rows and columns. Images that shrink are means over areas.
+    ``place``: of the object in it, from 0 to 1 along rows and columns. Images that shrink are means over areas.
     """
     mask = planes[PLANES["mask"]][0] > 0.5
     rows, cols = (torch.nonzero(mask.any(dim=axis))[:, 0] for axis in (1, 0))

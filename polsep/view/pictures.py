@@ -352,7 +352,7 @@ def exposure_panel(frame: SeparatedFrame, found: Histogram | None) -> str:
 
 
 def shape_panel(frame: SeparatedFrame, stem: str) -> str:
-    """The surface of a frame's thing on a page of its own, and how sure it is. Raises ValueError."""
+    """The surface of a frame's object on a page of its own, and how sure it is. Raises ValueError."""
     from polsep.geometry.one_frame import find_shape
     from polsep.geometry.one_frame_files import page_of
 

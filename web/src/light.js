@@ -72,7 +72,7 @@ function remarksOn(light, tiles) {
   const white = light.x[0] === 0 && light.x[1] === 0;
   if (light.error > UNCERTAIN_DEG && (!white || r * b < Math.exp(GREENISH) * g ** 2))
     remarks.push(`highlights that show the lamp's colour were expected, found too few; ${color.map((v) => v.toFixed(2))} is ` +
-      "assumed: show a shiny thing, or measure a grey card and state the lamp's colour");
+      "assumed: show a shiny object, or measure a grey card and state the lamp's colour");
   return remarks;
 }
 

@@ -48,7 +48,7 @@ export function describe(sums, network, colors) {
     warnings.push("polarized light of one angle was expected, found many (concentration " +
       `${concentration.toFixed(2)}): is the light polarized, and the only one?`);
   if (network && colors === 3 && brightness > 1e-3 && misfit > MAX_RESIDUAL)
-    warnings.push("white highlights on coloured things were expected, found polarization of other colours (misfit " +
+    warnings.push("white highlights on coloured objects were expected, found polarization of other colours (misfit " +
       `${misfit.toFixed(2)} of the light): are there metals, or several lights?`);
   const statistics = {
     clipped_fraction: sums.clipped / sums.frame,

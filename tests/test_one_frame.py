@@ -336,7 +336,10 @@ def test_the_shipped_network_finds_a_sphere() -> None:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         found = polsep.shape(frame, mask, (0.0, 0.0, 1.0))
-    assert [str(note.message) for note in said] == [UNKNOWN_LIGHT, *found.doubts()]  # its report names no lamp's colour
+    assert [str(note.message) for note in said] == [
+        UNKNOWN_LIGHT,
+        *found.warnings(),
+    ]  # its report names no lamp's colour
     angle = angles_deg(
         torch.from_numpy(found.normals).movedim(-1, 0)[None], torch.from_numpy(normals).movedim(-1, 0)[None]
     )
@@ -448,9 +451,9 @@ def test_a_frame_that_is_full_is_said() -> None:
         one > 0,
         (0, 0, 1),
     )
-    assert any("(mask)" in line for line in found.doubts())
-    assert replace(found, mask_given=True).doubts() == []
-    assert replace(found, mask=cap(64, 80)[1]).doubts() == []
+    assert any("(mask)" in line for line in found.warnings())
+    assert replace(found, mask_given=True).warnings() == []
+    assert replace(found, mask=cap(64, 80)[1]).warnings() == []
 
 
 def test_specks_and_lines_are_not_the_object() -> None:

@@ -226,7 +226,7 @@ def test_statistics_are_what_a_method_measures() -> None:
 
 
 @pytest.fixture
-def doubting(monkeypatch: pytest.MonkeyPatch) -> Joint:
+def expecting(monkeypatch: pytest.MonkeyPatch) -> Joint:
     """A random network that expects errors, installed as the method ``joint``."""
     torch.manual_seed(3)
     network = Joint(3, ResidualSize(4, (0, 1, 1))).eval()
@@ -244,11 +244,11 @@ def doubting(monkeypatch: pytest.MonkeyPatch) -> Joint:
 
 
 @pytest.mark.parametrize("full", [False, True])
-def test_expected_errors_reach_their_owner(doubting: Joint, full: bool) -> None:
+def test_expected_errors_reach_their_owner(expecting: Joint, full: bool) -> None:
     """The frame holds what the method expects, and the report their rms; other methods have neither."""
     raw = raw_frame("float32", exposure=0.5)
     out = quietly(raw, method="joint", full=full)
-    expected = run_joint(doubting, Mosaic(torch.from_numpy(raw), Layout(), 0.0, 1.0), full).expected_error
+    expected = run_joint(expecting, Mosaic(torch.from_numpy(raw), Layout(), 0.0, 1.0), full).expected_error
     assert expected is not None and out.error is not None
     assert out.error.shape == (*out.valid.shape, 2) and out.error.dtype == np.float32
     assert out.error.flags.c_contiguous and float(out.error.min()) > 0 and float(np.ptp(out.error)) > 0
@@ -262,9 +262,9 @@ def test_expected_errors_reach_their_owner(doubting: Joint, full: bool) -> None:
 
 
 @pytest.mark.parametrize("full", [False, True])
-def test_expected_errors_are_in_the_light(doubting: Joint, full: bool) -> None:
+def test_expected_errors_are_in_the_light(expecting: Joint, full: bool) -> None:
     """Under a said light, errors grow by the mean over its colours as images do; statistics stay of white light."""
-    del doubting
+    del expecting
     white = quietly(raw_frame("float32", exposure=0.5), method="joint", full=full)
     light = {"light": ODD_LIGHT, "exposure": 0.5}
     colored = quietly(raw_frame("float32", **light), method="joint", light_color=ODD_LIGHT, full=full)

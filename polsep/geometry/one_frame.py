@@ -90,7 +90,7 @@ class Shape:
         size = list(self.mask.shape)
         return f"Shape(normals {size}, {share:.0%} on the object, expected error {error:.1f} degrees in the median)"
 
-    def doubts(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """Lines on what the network does not know, or what it was not made for."""
         inside = self.mask
         unknown = float((self.roughness_error[inside] >= UNKNOWN).mean())
@@ -177,7 +177,7 @@ def shape(
     weights: str | Path | None = None,
     index: float = ETA,
 ) -> Shape:
-    """Find the surface of the object in a frame that `polsep.separate` separated; its `doubts` are issued as warnings.
+    """Find the surface of the object in a frame that `polsep.separate` separated; issue its `warnings`.
 
     ``mask [h, w]``: where the object is; None: where light falls (`mask_of`). ``light``: x, y, z toward the lamp,
     x right, y up, z to the camera; None: not known, as beside the camera it need not be. ``index``: refractive index of
@@ -190,7 +190,7 @@ def shape(
         raise WrongType(f"expected a refractive index that is a number, found {index!r:.40}")
     found = find_shape(frame, mask, light, None if weights is None else as_path(weights), float(index))
     remarks = () if "light_color" in frame.report or frame.diffuse.shape[-1] == 1 else (UNKNOWN_LIGHT,)
-    for note in (*remarks, *found.doubts()):
+    for note in (*remarks, *found.warnings()):
         warnings.warn(note, PolsepWarning, stacklevel=2)
     return found
 

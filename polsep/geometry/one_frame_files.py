@@ -76,7 +76,7 @@ def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list
         files = shape_files(frame, found, settings, path.stem)
     except ValueError as error:
         raise input_error(path, error) from error
-    notes = [*notes, *found.doubts()]
+    notes = [*notes, *found.warnings()]
     return replace(files, facts={**files.facts, "warnings": notes}), notes
 
 

@@ -139,9 +139,9 @@ def encode(seen: Seen, name: str) -> Array:
         specular, polarized = seen.specular.clip(0, None) / level, seen.polarized / level
         lamp, sure = lamp_direction(polarized, specular * mask)
         left = (polarized - specular * lamp) / (grey + LEAST)
-        doubt = xp.log((seen.error / level) / (grey + LEAST) + 1e-3)
+        uncertainty = xp.log((seen.error / level) / (grey + LEAST) + 1e-3)
         parts += [xp.log(specular + FLOOR), _limited(polarized / (grey + specular + LEAST)), _limited(left)]
-        parts += [projected_normal(left), lamp * sure + 0 * grey, doubt]
+        parts += [projected_normal(left), lamp * sure + 0 * grey, uncertainty]
     elif name == "stokes":
         assert seen.polarized is not None
         polarized = seen.polarized / level

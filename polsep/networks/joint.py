@@ -41,7 +41,7 @@ from polsep.networks.channels import (
     seen_maps,
 )
 from polsep.networks.details import Details
-from polsep.networks.joint_weights import DOUBT_HIDDEN, NAMES_IN_FILES, JointWeights
+from polsep.networks.joint_weights import NAMES_IN_FILES, VARIANCE_HIDDEN, JointWeights
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.taps import pool_outputs
 from polsep.networks.thumbnails import LIGHT
@@ -140,7 +140,7 @@ class Joint(nn.Module):
         largest = torch.tensor(MAX_LOG_VARIANCE).repeat_interleave(4)
         self.register_buffer("max_log_variance", largest, persistent=False)
         self.log_variance = nn.Sequential(
-            nn.Conv2d(width, DOUBT_HIDDEN, 3, padding=1), nn.ReLU(), nn.Conv2d(DOUBT_HIDDEN, 8, 1)
+            nn.Conv2d(width, VARIANCE_HIDDEN, 3, padding=1), nn.ReLU(), nn.Conv2d(VARIANCE_HIDDEN, 8, 1)
         )
         self.details = Details(colors, width)
         self.whole_frame = WholeFrame(colors, size.widths) if sees_frame else None

@@ -24,7 +24,7 @@ NAMES_IN_FILES = {
     "log_variance": "doubt",
 }
 #: Channels between features and beliefs in details, and between features and variances.
-HIDDEN, DOUBT_HIDDEN = 32, 16
+HIDDEN, VARIANCE_HIDDEN = 32, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ def expected_shapes(weights: JointWeights) -> dict[str, tuple[int, ...]]:
     width = size.widths[0]
     outputs = {"last": 4 * (colors + 1), "pose": 4} | ({"trust": 4} if "split" in weights.inputs else {})
     layers = {name: (count, width, 1) for name, count in outputs.items()}
-    layers |= {"doubt.0": (DOUBT_HIDDEN, width, 3), "doubt.2": (8, DOUBT_HIDDEN, 1)}
+    layers |= {"doubt.0": (VARIANCE_HIDDEN, width, 3), "doubt.2": (8, VARIANCE_HIDDEN, 1)}
     layers |= {"details.belief.0": (HIDDEN, width + DETAIL_MAPS, 3), "details.belief.2": (2 * DETAIL_MAPS, HIDDEN, 1)}
     layers |= {"details.change": (DETAIL_MAPS * (colors + 1), width, 1)}
     layers |= _unet_layers(input_channels(colors, weights.inputs).total, size)

@@ -25,7 +25,7 @@ from polsep.io.store.weights import read_weights, write_weights
 from polsep.metrics import psnr
 from polsep.networks.channels import INPUTS
 from polsep.networks.joint import Joint, JointOutput, Polarization, bilinear_filter
-from polsep.networks.ranges import silenced
+from polsep.networks.ranges import pruned
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.unet import count_parameters
 from polsep.physics.stokes import Stokes
@@ -537,8 +537,8 @@ def test_a_network_grows_without_a_change_of_its_images(sees_frame: bool) -> Non
 
 
 @pytest.mark.parametrize("layer", ["net.ups.1", "net.encoders.1.0.second"])
-def test_what_was_silent_becomes_zero_and_wakes(layer: str) -> None:
-    """Silent parts change no image, before and after; a training that starts from them can move them again."""
+def test_what_was_inactive_becomes_zero_and_trains_again(layer: str) -> None:
+    """Inactive parts change no image, before and after; a training that starts from them can move them again."""
     torch.manual_seed(2)
     network = Joint(1, ResidualSize(8, (0, 1, 1)))
     for weight in network.parameters():
@@ -548,7 +548,7 @@ def test_what_was_silent_becomes_zero_and_wakes(layer: str) -> None:
     state[f"{before}.bias"] -= 1000  # below zero everywhere
     raw, none = torch.rand(1, 1, 32, 32), torch.zeros(1, 1, 32, 32, dtype=torch.bool)
     expected = network(raw, none)[0].diffuse
-    arrays = silenced({name: value.numpy() for name, value in state.items()}, {layer: (0.0, 0.0), "net.ups.0": (0, 1)})
+    arrays = pruned({name: value.numpy() for name, value in state.items()}, {layer: (0.0, 0.0), "net.ups.0": (0, 1)})
     zeros = {name for name, array in arrays.items() if not array.any()}
     rest = "net.downs.1." if layer == "net.ups.1" else "net.encoders.1.0.first."
     assert rest + "weight" in zeros and len(zeros) == (7 if layer == "net.ups.1" else 3)
@@ -556,7 +556,7 @@ def test_what_was_silent_becomes_zero_and_wakes(layer: str) -> None:
     assert_close(network(raw, none)[0].diffuse, expected, scale=10)
     fast = Joint.of(network.weights(), torch.device("cpu"))  # leaves such a block out
     assert_close(fast(raw, none)[0].diffuse, expected, scale=10)
-    assert [name for name, part in fast.named_modules() if getattr(part, "silent", False)] == [
+    assert [name for name, part in fast.named_modules() if getattr(part, "inactive", False)] == [
         before.rpartition(".")[0]
     ]
     network.load_state_dict(grow(network.state_dict(), Joint(1, network.size)))

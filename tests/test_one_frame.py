@@ -336,10 +336,8 @@ def test_the_shipped_network_finds_a_sphere() -> None:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         found = polsep.shape(frame, mask, (0.0, 0.0, 1.0))
-    assert [str(note.message) for note in said] == [
-        UNKNOWN_LIGHT,
-        *found.warnings(),
-    ]  # its report names no lamp's colour
+    # Its report names no lamp's colour.
+    assert [str(note.message) for note in said] == [UNKNOWN_LIGHT, *found.warnings()]
     angle = angles_deg(
         torch.from_numpy(found.normals).movedim(-1, 0)[None], torch.from_numpy(normals).movedim(-1, 0)[None]
     )

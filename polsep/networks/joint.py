@@ -155,7 +155,7 @@ class Joint(nn.Module):
         network.load_state_dict({name: torch.tensor(array) for name, array in weights.arrays.items()})
         network.averages_shifts, network.share = weights.averages_shifts, weights.share
         for block in (part for part in network.modules() if isinstance(part, Block)):
-            block.silent = not bool(block.second.weight.any())
+            block.inactive = not bool(block.second.weight.any())
         return network.to(device, torch.float32).eval()
 
     def weights(self) -> JointWeights:

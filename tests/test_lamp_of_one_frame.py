@@ -1,4 +1,4 @@
-"""The lamp of one frame: found by shading, and by looks under many lamps."""
+"""The lamp of one frame: found by shading, and by predictions under many lamps."""
 
 from __future__ import annotations
 
@@ -78,16 +78,16 @@ def test_the_true_lamp_and_surface_explain_most(apart: bool) -> None:
 
 
 @pytest.mark.parametrize("lamp", [LAMPS[0], LAMPS[2], LAMPS[10], LAMP])
-def test_looks_under_many_lamps_find_it(lamp: np.ndarray) -> None:
+def test_predictions_under_many_lamps_find_it(lamp: np.ndarray) -> None:
     """Where the surface is drawn for the lamp that is given: turned with it, as a network that believes it would."""
     seen = picture(lamp)
 
-    def look(under: Seen) -> Surface:
+    def predict(under: Seen) -> Surface:
         believed = under.light[:, 0, 0] if under.light.any() else LAMPS[0]
         about = math.degrees(math.atan2(believed[0], believed[2]) - math.atan2(lamp[0], lamp[2]))
         return relative(sphere(turn(about / 2))[0], lamp)
 
-    assert math.degrees(math.acos(min(1, float(np.dot(search_lamp(look, seen), lamp))))) < 8
+    assert math.degrees(math.acos(min(1, float(np.dot(search_lamp(predict, seen), lamp))))) < 8
 
 
 def test_tried_lamps_are_mirror_images_of_each_other() -> None:

@@ -129,11 +129,11 @@ def test_lamps_that_are_not_given_are_zeros(name: str) -> None:
 def test_means_weigh_normals_by_their_variances() -> None:
     """Of all else the geometric mean is taken, also of expected errors."""
     errors, ways = (0.1, 0.2), ((0.0, 0.6, 0.8), (0.6, 0.0, 0.8))
-    looks = [
+    predictions = [
         Surface(np.array(way).reshape(3, 1, 1), *[np.full((3, 1, 1), 1 / error)] * 3, *[np.full((1, 1, 1), error)] * 3)
         for error, way in zip(errors, ways, strict=True)
     ]
-    mean = mean_surface(*looks)
+    mean = mean_surface(*predictions)
     expected = np.array(ways[0]) / 0.1**2 + np.array(ways[1]) / 0.2**2
     np.testing.assert_allclose(mean.normal[:, 0, 0], expected / np.linalg.norm(expected))
     np.testing.assert_allclose(mean.albedo, 50**0.5)
@@ -172,7 +172,7 @@ def test_the_engine_is_the_network(tmp_path: Path) -> None:
     seen = seen_of(planes, "separated")
     with torch.no_grad():
         wanted = decode(network(encode(seen, "separated")), seen.image, seen.mask)
-    found = estimator.look(_as_seen(planes))
+    found = estimator.predict(_as_seen(planes))
     for name in found._fields:
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name)[0].numpy(), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=0), 1, atol=1e-6)
@@ -208,7 +208,7 @@ def random_planes() -> Tensor:
     return planes
 
 
-def test_a_lamp_that_is_not_given_is_looked_for(tmp_path: Path) -> None:
+def test_a_lamp_that_is_not_given_is_found(tmp_path: Path) -> None:
     """The surface of a lamp that is not given is that of the lamp which is found."""
     estimator, _ = _untrained(tmp_path)
     seen = _as_seen(cut_example(random_planes(), 1.1, SIDE)[None])

@@ -1,9 +1,9 @@
 """The surface behind one frame under one polarized lamp: normals, albedo, roughness, specular strength.
 
-A network looks at the object as a whole, in a square around its mask, and says how sure it is (`geometry.shape_maps`).
-It looks at the object and at its mirror image, twice as fine as it was trained and coarser, when it has found the lamp
-(`ShapeEstimator.find`).
-It was trained on rendered frames that were separated as users' frames are. `polarization.choose_outward` is the same
+A network sees the object as a whole, in a square around its mask, and predicts its own errors
+(`geometry.shape_maps`). Its predictions for the object and its mirror image at three scales, twice as fine as it was
+trained and coarser, are averaged (test-time augmentation), once the lamp is found (`ShapeEstimator.find`). It was
+trained on rendered frames that were separated as users' frames are. `polarization.choose_outward` is the same
 task without training.
 """
 
@@ -127,8 +127,8 @@ class ShapeEstimator:
     def find(self, seen: Seen) -> Surface:
         """The surface in images ``[C, SIDE, SIDE]``: the mean of what they and their means over `SCALES` say.
 
-        Small blocks show the detail, large ones the whole. Each says the mean of looks at the object and at its mirror
-        image. Where the lamp is not given, it is found first (`find_lamp`).
+        Small blocks show the detail, large ones the whole; for each, predictions for the object and its mirror image
+        are averaged. Where the lamp is not given, it is found first (`find_lamp`).
         """
         seen = seen if np.any(seen.light) else seen_under(seen, self.find_lamp(seen))
         found = (self._find_mirrored(_means(seen, block)) for block in SCALES)
@@ -143,10 +143,10 @@ class ShapeEstimator:
         return search_lamp(self._find_mirrored, next((means for means in coarser if means.mask.any()), seen))
 
     def _find_mirrored(self, seen: Seen) -> Surface:
-        return mean_surface(self.look(seen), mirror_surface(self.look(mirror_seen(seen))))
+        return mean_surface(self.predict(seen), mirror_surface(self.predict(mirror_seen(seen))))
 
-    def look(self, seen: Seen) -> Surface:
-        """The surface by one look of the network at images of ``SIDE`` over one of `SCALES`."""
+    def predict(self, seen: Seen) -> Surface:
+        """The surface by one run of the network on images of ``SIDE`` over one of `SCALES`."""
         require_own_threads()
         maps = np.ascontiguousarray(encode(seen, self.input), np.float32)[None]
         outputs = self._layers[maps.shape[-1]].create_infer_request().infer([maps])[0][0]

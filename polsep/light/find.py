@@ -72,7 +72,7 @@ class Light:
     ``error_deg``: mean angle by which such colours are off. ``sure``: whether the colour is found rather than assumed.
     ``aolp``: along which the frame is polarized most [rad, in [0, pi)], None where nothing shows it; that of specular
     light, but where much diffuse light is polarized (statistics of reports are of separated light). ``metal``: share of
-    the lit frame that mirrors the lamp in the colour of gold or copper. ``remarks``: what the frame's owner should know
+    the lit frame that mirrors the lamp in the colour of gold or copper. ``remarks``: what the user should know
     of that, and of the levels of an array.
     """
 
@@ -154,7 +154,7 @@ def _light_of_tiles(tiles: Tiles, axis: NDArray[np.float64]) -> Light:
 
 
 def _remarks_on(light: Light, tiles: Tiles) -> Iterator[str]:
-    """Remarks for the owner of a frame: metals, and a colour that may be wrong."""
+    """Remarks for the user: metals, and a colour that may be wrong."""
     if light.metal >= LEAST_METAL:
         yield (
             f"highlights of the lamp's colour were expected, found those of gold or copper on {light.metal:.0%} of the "

@@ -82,7 +82,7 @@ class Colored(NamedTuple):
 
     @property
     def remark(self) -> str | None:
-        """A line for the owner of the frame, or None."""
+        """A line for the user, or None."""
         if not self.unpolarized:
             return None
         return (

@@ -33,7 +33,7 @@ Updates = dict[Any, Any]
 
 @dataclass(frozen=True)
 class Start:
-    """The first state of the page: values of its settings, and a ``file`` of the owner to open."""
+    """The first state of the page: values of its settings, and a ``file`` of the user to open."""
 
     settings: dict[str, Any]
     file: Any = None

@@ -143,7 +143,7 @@ def as_source(path: Path, stem: str) -> Source:
 
 
 def find_sources(path: Path) -> tuple[Source, ...]:
-    """The owner's own file, four of a template with ``{angle}``, or a folder: frames as `polsep video` writes them, or
+    """The user's own file, four of a template with ``{angle}``, or a folder: frames as `polsep video` writes them, or
     raw ones. Raises InputError.
     """
     path = path / RECORD if is_recording(path) else path

@@ -1,4 +1,4 @@
-// Polarization of separated images and what their owner should know: twin of polsep/separation/report.py.
+// Polarization of separated images and what the user should know: twin of polsep/separation/report.py.
 
 const MIN_CONCENTRATION = 0.34, MIN_CONCENTRATION_CLOSED = 0.29, MAX_RESIDUAL = 0.07, MAX_DOLP = 2;
 
@@ -39,7 +39,7 @@ export function tallyOf(images) {
   return { ...counts, ...sums };
 }
 
-/** Statistics of a frame and lines for its owner; `network`: of the method joint-fast. */
+/** Statistics of a frame and lines for the user; `network`: of the method joint-fast. */
 export function describe(sums, network, colors) {
   const angle = (0.5 * Math.atan2(sums.across, sums.along) + Math.PI) % Math.PI, warnings = [];
   const concentration = sums.power > 0 ? Math.hypot(sums.along, sums.across) / sums.power : 0;

@@ -54,9 +54,9 @@ def _read_corrected(
     if ambient:
         times: list[float | None] = []
         frames = read_mosaics(ambient, replace(read, corrections=corrections), lambda _, f: times.append(f.exposure))
-        room = mean_mosaic(frames)
-        sources |= {"ambient": [path.name for path in ambient], "ambient_sha256": hash_samples(room.data)}
-        corrections = Corrections(measured, room, sources, _one_time(ambient[0], times))
+        mean = mean_mosaic(frames)
+        sources |= {"ambient": [path.name for path in ambient], "ambient_sha256": hash_samples(mean.data)}
+        corrections = Corrections(measured, mean, sources, _one_time(ambient[0], times))
     return replace(read, corrections=corrections)
 
 

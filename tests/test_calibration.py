@@ -227,7 +227,7 @@ def test_the_lamp_is_found(card: bool) -> None:
     frame = correct_mosaic(sensor.expose(sensor.sees(s0, 0.0 if card else 0.96, 0.5)), truth)
     found = measure_lamp([frame], replace(truth, lamp=None), card)
     lamp, line = found.lamp, describe(found, "light")
-    assert lamp is not None and ("from card" in line if card else "from mirrored light, polarizer at 151" in line)
+    assert lamp is not None and ("from card" in line if card else "from specular light, polarizer at 151" in line)
     cosine = np.array(lamp.color) @ color / np.linalg.norm(lamp.color) / np.linalg.norm(color)
     assert math.degrees(math.acos(min(cosine, 1))) < 0.3
     if not card:
@@ -270,7 +270,7 @@ def test_rims_of_objects_show_no_lamp(layout: Layout) -> None:
 
 
 def test_a_frame_without_the_lamp_is_refused() -> None:
-    """Unpolarized light shows no mirrored lamp, and a dark frame no card."""
+    """Unpolarized light shows no reflection of the lamp, and a dark frame no card."""
     sensor = BadSensor(Layout(), dead=0)
     frame = correct_mosaic(sensor.expose(sensor.sees(np.full(SIZE, 0.5))), sensor.calibration())
     with pytest.raises(ValueError, match="expected 64 unclipped pixels of polarized light"):

@@ -74,11 +74,11 @@ def combine(separations: list[Separation], shares: Sequence[float] = ()) -> Sepa
     weights = weights / weights.sum(dim=0)
     diffuse, specular = weights[..., :1, :, :], weights[..., 1:, :, :]
     images = (torch.stack([getattr(s, name) for s in separations]) for name in ("diffuse", "specular"))
-    body, mirrored = ((w * x).sum(dim=0) for w, x in zip((diffuse, specular), images, strict=True))
+    body, reflected = ((w * x).sum(dim=0) for w, x in zip((diffuse, specular), images, strict=True))
     stokes = (torch.stack([getattr(s.stokes, name) for s in separations]).mean(dim=0) for name in ("s0", "s1", "s2"))
     valid = torch.stack([s.valid for s in separations]).all(dim=0)
     error = (weights * errors).sum(dim=0)
-    return replace(first, diffuse=body, specular=mirrored, valid=valid, stokes=Stokes(*stokes), expected_error=error)
+    return replace(first, diffuse=body, specular=reflected, valid=valid, stokes=Stokes(*stokes), expected_error=error)
 
 
 def _run_turned(network: Joint, mosaic: Mosaic, orientation: Orientation, full: bool) -> Separation:

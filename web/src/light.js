@@ -13,7 +13,7 @@ const GOOD = [1.25 * Math.exp(0.28), 0.126, 0.563], UNCERTAIN_DEG = 5.5, LEAST_M
 const WHITE_SHARE = 0.6, RAW_SHARE = 0.27, WARM_SHARE = 0.08, ANY_SHARE = 0.05, ANY_SPREAD = 0.5;
 const BODIES_SPREAD = 1, ASTRAY_SPREAD = 0.5, GOOD_SPREAD = 2.03, LIKELY_WHITE = 0.5, LIKELY_RIGHT = 0.5, GRID = [-1.5, 0.8, 47];
 const LARGEST_RATIO = 5;
-const GREENISH = -1.2, MIRROR = 1, MIN_MIRRORS = 3, METAL_DISTANCE = 0.28;
+const GREENISH = -1.2, PURE_SPECULAR = 1, MIN_SPECULAR_TILES = 3, METAL_DISTANCE = 0.28;
 const COPPER = [0.403, -0.17], GOLD = [0.246, -0.821];
 /** Two directions beside grey. */
 const BESIDE = [[1, -1, 0].map((v) => v / Math.SQRT2), [1, 1, -2].map((v) => v / Math.sqrt(6))];
@@ -51,14 +51,14 @@ const asReport = (light) =>
 
 /** The light of the bodies alone where they show that the frame holds coloured metal. */
 function lightOfTiles(tiles, axis) {
-  const fit = fitColor(strongest(tiles), axis), mirrors = onlyMirrors(tiles, axis);
-  const marked = new Set(tiles.filter((_, k) => mirrors[k]).map(({ row, col }) => `${row},${col}`));
+  const fit = fitColor(strongest(tiles), axis), specular = onlySpecular(tiles, axis);
+  const marked = new Set(tiles.filter((_, k) => specular[k]).map(({ row, col }) => `${row},${col}`));
   const touches = ({ row, col }) => [-1, 0, 1].some((i) => [-1, 0, 1].some((j) => marked.has(`${row + i},${col + j}`)));
   const bodies = tiles.filter((tile) => !touches(tile));
-  if (marked.size < MIN_MIRRORS || bodies.length < MIN_TILES) return asLight(fit, tiles);
-  const mirrored = iterate(planesAlong(strongest(tiles.filter((_, k) => mirrors[k])), axis)).x;
+  if (marked.size < MIN_SPECULAR_TILES || bodies.length < MIN_TILES) return asLight(fit, tiles);
+  const reflected = iterate(planesAlong(strongest(tiles.filter((_, k) => specular[k])), axis)).x;
   const ownAxis = axisOf(strongest(bodies)), own = fitColor(strongest(bodies), ownAxis);
-  if (!isMetal([mirrored[0] - own.x[0], mirrored[1] - own.x[1]])) return asLight(fit, tiles);
+  if (!isMetal([reflected[0] - own.x[0], reflected[1] - own.x[1]])) return asLight(fit, tiles);
   return { ...asLight(own, bodies), metal: metalShare(tiles, ownAxis, own.x) };
 }
 
@@ -288,8 +288,8 @@ function spreadDeg(x, covariance) {
 }
 
 /** Which tiles hold hardly any diffuse light. */
-const onlyMirrors = (tiles, axis) =>
-  planesAlong(tiles, axis).map(({ qq, dd }) => trace(qq) > MIRROR ** 2 * Math.max(trace(dd), 1e-9));
+const onlySpecular = (tiles, axis) =>
+  planesAlong(tiles, axis).map(({ qq, dd }) => trace(qq) > PURE_SPECULAR ** 2 * Math.max(trace(dd), 1e-9));
 
 /** True for colours, relative to the lamp's, of gold, copper and what lies between. */
 function isMetal([r, b]) {
@@ -300,10 +300,10 @@ function isMetal([r, b]) {
 
 /** Share of the lit points that are in tiles of coloured metal. */
 function metalShare(tiles, axis, lamp) {
-  const mirrors = onlyMirrors(tiles, axis), planes = planesAlong(tiles, axis);
+  const specular = onlySpecular(tiles, axis), planes = planesAlong(tiles, axis);
   const metal = planes.map(({ qq }, t) => {
     const [r, g, b] = [qq[0], qq[4], qq[8]].map((v) => Math.max(v, 1e-12));
-    return mirrors[t] && isMetal([0.5 * Math.log(r / g) - lamp[0], 0.5 * Math.log(b / g) - lamp[1]]);
+    return specular[t] && isMetal([0.5 * Math.log(r / g) - lamp[0], 0.5 * Math.log(b / g) - lamp[1]]);
   });
   return sum(tiles.map(({ count }, t) => (metal[t] ? count : 0))) / Math.max(sum(tiles.map(({ count }) => count)), 1);
 }

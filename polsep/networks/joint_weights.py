@@ -23,7 +23,7 @@ NAMES_IN_FILES = {
     "polarization": "pose",
     "log_variance": "doubt",
 }
-#: Channels between features and beliefs in details, and between features and variances.
+#: Channels between features and shares of details, and between features and variances.
 HIDDEN, VARIANCE_HIDDEN = 32, 16
 
 

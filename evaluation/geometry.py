@@ -61,15 +61,15 @@ def bench_shape_quick(data: Path) -> Iterator[Row]:
 def draw_shape(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
     """Write pictures and pages of docs/shape.md, of meshes in the public domain, and give their paths."""
     del rows
-    from evaluation.one_frame_pictures import draw_thing, relight_thing
+    from evaluation.one_frame_pictures import draw_object, relight_object
     from evaluation.six_lights import load_subjects
 
     for number, subject in enumerate(load_subjects(data, SHOWN)):
         path = folder / f"{subject.name}.jpg"
-        write_jpeg(path, draw_thing(subject, number))
+        write_jpeg(path, draw_object(subject, number))
         yield path
         if subject.name == SHOWN[0]:
-            replace_bytes(page := folder / f"{subject.name}.html", relight_thing(subject, number))
+            replace_bytes(page := folder / f"{subject.name}.html", relight_object(subject, number))
             yield page
 
 

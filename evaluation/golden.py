@@ -328,8 +328,8 @@ def measure_commands(golden: Golden) -> None:
             words = shlex.split(line) + ([] if target in ("methods", "edits") else ["-o", target])
             done = subprocess.run([*PROGRAM, *words], cwd=folder, capture_output=True, text=True)
             out = re.sub(r"\b[0-9a-f]{64}\b", "SHA256", done.stdout).splitlines()  # some cover polsep's version
-            told = [text for text in done.stderr.splitlines() if text.startswith("polsep: ")]  # no notes on compiling
-            golden.text(f"commands/{target}", {"status": done.returncode, "out": out, "err": told})
+            said = [text for text in done.stderr.splitlines() if text.startswith("polsep: ")]  # no notes on compiling
+            golden.text(f"commands/{target}", {"status": done.returncode, "out": out, "err": said})
             for path in sorted(path for path in (folder / target).rglob("*") if path.is_file()):
                 golden.file(f"commands/{target}/{path.relative_to(folder / target)}", path)
         golden.file("commands/edit-texture/recipe", folder / "recipe.json")

@@ -1,8 +1,8 @@
 """The structure of the code as rows: its size, its rooms and their imports, the way from a call to the mathematics.
 
-A room is a folder or module at the top of the package; an arrow is an import from one room to another, anywhere in a
-file. Ranks are those of the checkout's tests/test_architecture.py; an arrow is against them unless it goes to a lower
-rank. Any checkout can be measured, so numbers before and after a change come from one script.
+A room is a subpackage: a folder or module at the top of the package; an arrow is an import from one to another,
+anywhere in a file. Ranks are those of the checkout's tests/test_architecture.py; an arrow is against them unless it
+goes to a lower rank. Any checkout can be measured, so numbers before and after a change come from one script.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Scores of shape from one frame on the things of selection set (b): by what a network sees, and without a network.
+"""Scores of shape from one frame on the objects of selection set (b): by what a network sees, and without a network.
 
-Every thing of `six_lights.load_subjects` is photographed as `KINDS` say, each time by one lamp within `LARGEST_DEG` of
+Every object of `six_lights.load_subjects` is photographed as `KINDS` say, each time by one lamp within `LARGEST_DEG` of
 the camera, behind a polarizer at any angle, in 512 x 512 raw pixels with noise; the mask is given, the lamp's direction
-is not told unless a row says so. Frames of a usual rig are those of glossy things, in light of the room, by a lamp that
-is not white to the sensor, behind an imperfect polarizer, with a sensor's errors, and nothing told. "separated" is what
-ships. Networks of equal size and training, less than that of what ships, see the separated images and their
-polarization (`EQUAL`), the measured Stokes images, or s0 alone; "perfect" sees true images. Needs the extra ``bench``.
+where a row says so. Frames of a usual rig are those of glossy objects, in room light, by a lamp that is not white to
+the sensor, behind an imperfect polarizer, with a sensor's errors, and nothing stated. "separated" is what ships.
+Networks of equal size and training, less than that of what ships, see the separated images and their polarization
+(`EQUAL`), the measured Stokes images, or s0 alone; "perfect" sees true images. Needs the extra ``bench``.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from polsep.train.shape_losses import gained, random_lamps
 
 Floats = NDArray[np.float32]
 
-#: Strength of mirror images of matte things; share of samples that clip; raw pixels per side.
+#: Strength of specular reflections of matte objects; share of samples that clip; raw pixels per side.
 MATTE, CLIPPED, RAW_SIDE = 0.05, 0.005, 512
 #: Of a usual rig: room light over the lamp's; its lights' number, distance in radii, and colour over the lamp's; the
 #: lamp's degree of polarization and raw colour.
@@ -55,24 +55,24 @@ ROOM, ROOM_LIGHTS, ROOM_DISTANCE, ROOM_COLOR = 0.1, 6, 30.0, (1.15, 1.0, 0.85)
 DEGREE, RIG_COLOR = 0.98, LAMPS["daylight"]
 #: Largest angle of the lamp from the camera, and its distance relative to the camera's.
 LARGEST_DEG, DISTANCES = 45.0, (0.7, 1.4)
-#: A distant lamp for things whose camera is many radii away, in radii.
+#: A distant lamp for objects whose camera is many radii away, in radii.
 LAMP_DISTANCE = 8.0
 #: Networks of all inputs, of equal training; the method of the one that sees separated images; and what a method's name
-#: ends with where the lamp is told.
-EQUAL, TOLD = "separated, equal training", ", lamp told"
+#: ends with where the lamp's direction is given.
+EQUAL, GIVEN = "separated, equal training", ", lamp told"
 WEIGHTS = Path(__file__).parent / "weights" / "shape"
 #: Lamps of relit pictures, and their seed; zenith [degrees] from which on an azimuth turned by more than 90 is a flip.
 COUNT, LAMP_SEED, STEEP_DEG = 20, 77, 30.0
 
 
 class Kind(NamedTuple):
-    """A way to photograph things: the ``strength`` of their mirror images, and whether in a usual ``rig``."""
+    """A way to photograph objects: the ``strength`` of their specular reflections, and whether in a usual ``rig``."""
 
     strength: float
     rig: bool = False
 
 
-#: Kinds of photographs; those of a thing in the dark and in a rig have the same lamp.
+#: Kinds of photographs; those of an object in the dark and in a rig have the same lamp.
 KINDS = {"glossy": Kind(1.0), "matte": Kind(MATTE), "glossy, in a usual rig": Kind(1.0, rig=True)}
 
 
@@ -191,7 +191,7 @@ def _perfect(scene: Scene) -> SeparatedFrame:
     return SeparatedFrame(images[0], images[1], s0 > 0, dolp, aolp, {"warnings": []})
 
 
-def seen_by(name: str, shot: Photograph, told: bool) -> tuple[Seen, Surface]:
+def seen_by(name: str, shot: Photograph, given: bool) -> tuple[Seen, Surface]:
     """Images that an input sees of a photograph in the network's square, and the truth there."""
     mask = shot.truth.mask
     window = square_around(mask)
@@ -199,7 +199,7 @@ def seen_by(name: str, shot: Photograph, told: bool) -> tuple[Seen, Surface]:
     small = gather(truth * mask, window, SIDE)
     inside = (small[-1:] > 0.99).astype(np.float32)
     surface = _as_surface(small)
-    light = np.array(shot.truth.light if told else np.zeros(3), np.float32)
+    light = np.array(shot.truth.light if given else np.zeros(3), np.float32)
     lamp = np.broadcast_to(light[:, None, None], (3, SIDE, SIDE))
     if name in ("separated", "perfect"):
         images = gather(images_of(shot.frame if name == "separated" else shot.perfect, mask), window, SIDE)
@@ -220,8 +220,8 @@ def estimate(method: str, shot: Photograph, lamp: Vector | None = None) -> tuple
 
     ``lamp``: what `find_lamp` found for the method before, which takes longer than the rest.
     """
-    name, told = method.split(",")[0], method.endswith(TOLD)
-    seen, truth = seen_by(name, shot, told)
+    name, given = method.split(",")[0], method.endswith(GIVEN)
+    seen, truth = seen_by(name, shot, given)
     seen = seen if lamp is None else seen_under(seen, lamp)
     ships = name == "separated" and method != EQUAL
     path = shipped_weights("shape/separated") if ships else WEIGHTS / f"{name}.safetensors"
@@ -239,13 +239,13 @@ def lamp_error(lamp: Vector, shot: Photograph) -> float:
 
 
 def list_methods() -> list[str]:
-    """Return what ships, with and without the lamp told, and the networks of equal training that are there."""
+    """Return what ships, with and without the lamp's direction, and the networks of equal training that are there."""
     equal = [
         name
         for name in (EQUAL, "stokes", "rgb", "perfect")
         if (WEIGHTS / f"{name.split(',')[0]}.safetensors").is_file()
     ]
-    return ["separated", f"separated{TOLD}", *equal]
+    return ["separated", f"separated{GIVEN}", *equal]
 
 
 def classical(shot: Photograph) -> tuple[Surface, Surface, Floats]:
@@ -302,7 +302,7 @@ UNITS |= dict.fromkeys(("azimuth flips", "roughness known", "roughness, median e
 
 
 def measure(data: Path, names: Sequence[str] | None = None) -> Iterator[Row]:
-    """Rows of scores per method, over glossy and matte things and per kind, and of expected errors."""
+    """Rows of scores per method, over glossy and matte objects and per kind, and of expected errors."""
     found: dict[tuple[str, str], list[dict[str, float]]] = {}
     tenths: list[tuple[Floats, Floats]] = []
     methods = list_methods()

@@ -1,4 +1,4 @@
-"""The pictures of docs/shape.md: one frame of a thing, and its surface by what a network sees."""
+"""The pictures of docs/shape.md: one frame of an object, and its surface by what a network sees."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ OTHER_LAMPS = 450
 LARGEST_DEG, LAMP = 30.0, (-0.6, 0.35, 0.72)
 
 
-def draw_thing(subject: Subject, number: int) -> Pixels:
-    """Normals, their errors, albedo and another lamp for a glossy thing and a matte one, by input, and the truth."""
+def draw_object(subject: Subject, number: int) -> Pixels:
+    """Normals, their errors, albedo and another lamp for a glossy object and a matte one, by input, and the truth."""
     rows = []
     for kind in ("glossy", "matte"):
         shot = photograph(subject, OTHER_LAMPS + number, KINDS[kind])
@@ -37,8 +37,8 @@ def draw_thing(subject: Subject, number: int) -> Pixels:
     return draw_grid(rows, f"{subject.name}: shape from one frame")
 
 
-def relight_thing(subject: Subject, number: int) -> bytes:
-    """The page that relights a glossy thing, from one frame of it."""
+def relight_object(subject: Subject, number: int) -> bytes:
+    """The page that relights a glossy object, from one frame of it."""
     found, _, mask = estimate("separated", photograph(subject, OTHER_LAMPS + number, KINDS["glossy"]))
     inside = mask[0] > 0
     albedo = np.moveaxis(found.albedo * (0.9 / np.percentile(found.albedo[:, inside], 99)), 0, -1)

@@ -81,7 +81,7 @@ def summarize(scores: Scores) -> dict[str, Any]:
 @click.command()
 @click.option(
     "--data", type=click.Path(file_okay=False, path_type=Path), envvar="POLSEP_DATA", metavar="DIR",
-    help="Folder of the skins' images; or POLSEP_DATA.",
+    help="Folder of the textures' images; or POLSEP_DATA.",
 )  # fmt: skip
 @click.option(
     "--quick", is_flag=True, help="Two small scenes of the same make, not the sealed ones, to sealed-quick.log."

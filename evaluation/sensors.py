@@ -3,7 +3,7 @@
 Scenes of `datasets.reality`, split test, as `polsep bench reality` has them, each before a `BAD` sensor of its own with
 vignetting, a black level and a black pattern. Ten frames of each kind are recorded, too, and measured as the command
 measures its files: the cap on, an even unpolarized field, a polarizer turned before it, a grey card under the lamp.
-Loss: PSNR of the ideal twin, whose white lamp is told, less that of the frame.
+Loss: PSNR of the ideal twin, whose white lamp is stated, less that of the frame.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def _bench(scenes: int) -> Iterator[Row]:
 
 
 def _before_bad_sensor(stage: Stage) -> dict[str, Frame]:
-    """The scene before its bad sensor, by what of that is told."""
+    """The scene before its bad sensor, by what of that is stated."""
     sensor = _BadSensor(stage)
     scene = light_stage(stage)
     diffuse, specular, mask = half_resolution(scene)
@@ -86,18 +86,19 @@ def _before_bad_sensor(stage: Stage) -> dict[str, Frame]:
     known: list[dict[str, Any]] = [{"black_level": BAD.black * WORN.white_level}]
     known += [{"calibration": one} for one in (dark, flat, measure_analysers(turned, flat))]
     white = {"light_color": (1.0, 1.0, 1.0)}
-    return {f"worn sensor: {name}": replace(frame, told=white | told) for name, told in zip(KNOWN, known, strict=True)}
+    return {f"worn sensor: {name}": replace(frame, options=white | one) for name, one in zip(KNOWN, known, strict=True)}
 
 
 def _under_lamp(stage: Stage) -> dict[str, Frame]:
-    """The scene under a lamp that is not white to the sensor, not told and measured by a grey card."""
+    """The scene under a lamp that is not white to the sensor, not stated, and measured by a grey card."""
     lamp = Capture(LAMP)
     card = Stokes(LEVEL * as_color(LAMP).expand(3, SIDE, SIDE), *_no_polarization())
     cards = (record(card, Layout(), lamp.sensor, lamp.errors, stage.seed + 1 + k) for k in range(FRAMES))
     measured = {"calibration": measure_lamp(cards, card=True)}
     found = {"not told": {}, "light": measured}
     return {
-        f"daylight lamp: {name}": expose_frame(stage, light_stage(stage), lamp, told) for name, told in found.items()
+        f"daylight lamp: {name}": expose_frame(stage, light_stage(stage), lamp, options)
+        for name, options in found.items()
     }
 
 

@@ -1,6 +1,6 @@
 """Scores of shapes: normals from six lights by input, and depth from true normals. Needs the extra ``bench``.
 
-Rows of "geometry/normals": mean angular error of statues and scans under the lights of `six_lights`, which are told
+Rows of "geometry/normals": mean angular error of statues and scans under the lights of `six_lights`, which are known
 roughly; "least squares" and "robust" see light alone, the others the polarization of their diffuse image too.
 Rows of "geometry/depth": rms error against the depth of the DiLiGenT objects after scaling, a jump, and CPU time.
 """

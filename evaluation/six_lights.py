@@ -2,7 +2,7 @@
 
 The six lights stand where `geometry.lights.NAMED` says, but for the errors that a hand makes: each is a point at
 `LIGHT_DISTANCE` radii of the object, turned by up to `LARGEST_TURN_DEG`, brighter or darker by up to `LARGEST_GAIN`,
-behind a polarizer at any angle. Methods are told the named directions alone. Shapes, poses, skins and roughness are
+behind a polarizer at any angle. Methods know the named directions alone. Shapes, poses, textures and roughness are
 those of the selection set `statues`; shadows are cast. One exposure serves all six frames.
 """
 
@@ -50,7 +50,7 @@ SEED = 9000
 
 @dataclass(frozen=True)
 class Subject:
-    """A subject of photographs: a mesh around the origin, its camera, the colours and the roughness of its skin."""
+    """A subject of photographs: a mesh around the origin, its camera, the colours and the roughness of its surface."""
 
     name: str
     mesh: MeshScene

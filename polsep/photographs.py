@@ -45,7 +45,7 @@ PAIR: Final = "pair"
 #: Their angles in degrees from there.
 PAIR_DEG = (0.0, 90.0)
 Angles = tuple[float, ...] | Literal["pair"] | None
-#: Where angles count from, by the angles that were told: in all other cases from the picture's right.
+#: Where angles count from, by the angles that were stated: in all other cases from the picture's right.
 _FRAMES: dict[Angles, str] = {None: "the first photograph", PAIR: "the specular light's direction"}
 
 #: Largest logarithm of the ratio of a pair's exposures that counts as none: finding it may err by as much.
@@ -69,7 +69,7 @@ class PhotoOptions:
     """Facts of photographs that files do not contain.
 
     ``angles_deg``: of the filter in each photograph [degrees], in their order; None: unknown. `PAIR` is a parallel and
-    a crossed photograph. ``exposures``: relative ones, told; None: what camera raw says, else equal, of pairs found.
+    a crossed photograph. ``exposures``: relative ones, stated; None: what camera raw says, else equal, of pairs found.
     ``extinction``: of filters, parallel over crossed light of a mirror. ``align``: one of `ALIGNMENTS`. ``encoding``:
     one of `ENCODINGS`. ``full``: camera raw at full resolution. Raises ValueError on anything else.
     """
@@ -135,7 +135,7 @@ def read_measurements(
         "files": list(photos.names),
         "brightness": [round(float(mean), 5) for mean in means],
         "angles_deg": [round(math.degrees(t), 3) for t in angles],
-        "angles": "found, up to a common roll and mirror" if options.angles_deg is None else "told",
+        "angles": "found, up to a common roll and mirror" if options.angles_deg is None else "stated",
         "frame": _FRAMES.get(options.angles_deg, "picture"),
         "exposures": [round(e, 5) for e in exposures],
         "exposures_source": source,
@@ -242,7 +242,7 @@ def _samples(images: Measurements) -> NDArray[np.float32]:
 def _exposures(images: Measurements, photos: Photographs, options: PhotoOptions) -> tuple[tuple[float, ...], str]:
     """Exposure of each photograph relative to the least, and where that is from: only a pair's ratio can be found."""
     if options.exposures is not None:
-        return _over_least(options.exposures), "told"
+        return _over_least(options.exposures), "stated"
     said = (1.0,) * len(images.data) if photos.exposures is None else _over_least(photos.exposures)
     if options.angles_deg == PAIR:
         ratio = find_pair_exposure(images.data[0], images.data[1])
@@ -263,7 +263,7 @@ def _divide(images: Measurements, exposures: Sequence[float]) -> Measurements:
 
 
 def _angles(images: Measurements, options: PhotoOptions) -> tuple[tuple[float, ...], float | None]:
-    """Angles [rad], told or found; found ones with their error."""
+    """Angles [rad], stated or found; found ones with their error."""
     known = options.known_deg()
     if known is not None:
         return tuple(math.radians(angle) for angle in known), None

@@ -77,7 +77,7 @@ if hasattr(os, "register_at_fork"):
 
 
 class PolsepWarning(UserWarning):
-    """Something about a frame that its owner should know: the layout, the bit depth, the exposure, the light."""
+    """Something about a frame that the user should know: the layout, the bit depth, the exposure, the light."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -152,7 +152,7 @@ def separate(
     ``calibration``: a file of `polsep calibrate`, applied first. ``ambient``: a raw frame with the lamp off, or
     several, subtracted. ``light_color``: "auto" finds it in the frame (`find_light`), or "white", or camera RGB of the
     light. ``raw`` may also be four angle images at 0, 45, 90, 135 degrees, ``[4, H, W]`` or ``[4, H, W, 3]``, which
-    keep their resolution, or what `read_frames` read. What the owner should know is in ``report["warnings"]`` and
+    keep their resolution, or what `read_frames` read. What the user should know is in ``report["warnings"]`` and
     issued as `PolsepWarning`. Raises ValueError, with one line of what was expected and what was found, on other input;
     of wrong types it is also a TypeError.
     """
@@ -172,8 +172,8 @@ def separate(
         if ambient is not None:
             four = isinstance(raw, np.ndarray) and raw.ndim == 3 and raw.shape[0] == 4
             kind = None if white_level is not None else getattr(raw, "dtype", None)
-            rooms = [_as_room(room, capture, kind) for room in _ambient_frames(ambient, four)]
-            corrections = corrections.with_ambient(rooms)
+            frames = [_as_ambient(dark, capture, kind) for dark in _ambient_frames(ambient, four)]
+            corrections = corrections.with_ambient(frames)
         capture, more = corrections.apply_noting(capture)
         notes += more
     elif measured is not None or ambient is not None:
@@ -207,20 +207,20 @@ def _as_capture(
     return as_measurements(raw, black_level, white_level)
 
 
-def _as_room(room: NDArray[Any] | Mosaic, capture: Mosaic, kind: np.dtype[Any] | None) -> Mosaic:
+def _as_ambient(dark: NDArray[Any] | Mosaic, capture: Mosaic, kind: np.dtype[Any] | None) -> Mosaic:
     """A frame with the lamp off, of the layout and the levels of the frame with it, before both are corrected.
 
     ``kind``: the type of its samples, where that says the white level. Raises ValueError on samples of other levels.
     """
-    if isinstance(room, Mosaic):
-        return room
-    if isinstance(room, np.ndarray) and not has_levels_of(room, capture.white_level, kind):
+    if isinstance(dark, Mosaic):
+        return dark
+    if isinstance(dark, np.ndarray) and not has_levels_of(dark, capture.white_level, kind):
         levels = f"white {capture.white_level:g}" if kind is None else f"{kind}, white {capture.white_level:g}"
-        samples = f"{room.dtype} up to {float(room.max()):g}"
+        samples = f"{dark.dtype} up to {float(dark.max()):g}"
         raise ValueError(f"expected a lamp-off frame like the frame ({levels}), found {samples}")
-    found, _ = _as_capture(room, capture.layout, capture.black_level, capture.white_level)
+    found, _ = _as_capture(dark, capture.layout, capture.black_level, capture.white_level)
     if not isinstance(found, Mosaic):
-        raise ValueError(f"expected a raw frame with the lamp off, found shape {'x'.join(map(str, room.shape))}")
+        raise ValueError(f"expected a raw frame with the lamp off, found shape {'x'.join(map(str, dark.shape))}")
     return found
 
 
@@ -339,7 +339,7 @@ def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[
         frame.report["light_color"] = stated_gains(light_color, frame.diffuse.shape[-1])
         notes += color_notes(light_color, frame.diffuse.shape[-1])
     elif "light_color" not in frame.report and frame.diffuse.shape[-1] > 1:
-        notes.append(f"the lamp's colour is not told, nor known from {path.stem}.json beside the file: taken for white")
+        notes.append(f"the lamp's colour is neither stated nor in {path.stem}.json beside the file: taken for white")
     return frame, notes
 
 
@@ -412,7 +412,7 @@ def resolve_light(
     if is_to_be_found(light_color) and not is_calibrated(capture):
         found = find_light(capture)
         return found.color if channels == 3 else (1.0,), {"source": "found", **found.describe()}, found.remarks
-    stated, source = light_color, "told"
+    stated, source = light_color, "stated"
     if isinstance(light_color, str):
         stated = (1.0, 1.0, 1.0)
         if isinstance(capture, Mosaic) and light_color != "white":

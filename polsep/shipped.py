@@ -29,7 +29,7 @@ NAMES = ("joint-large", "joint", "joint-fast")
 #: Networks of a method that weighs the images of several by their expected errors, and the share of each besides:
 #: `joint` was not trained on all that `joint-large` was, and expects too small errors where frames differ from its own.
 MEMBERS = {"joint-large": {"joint-large": 1.0, "joint": 0.4}}
-#: Methods for stills, whose networks average frames seen in several ways, in colour; the same of mono frames.
+#: Methods for stills, whose networks average frames seen at several shifts, in colour; the same of mono frames.
 AVERAGED, AVERAGED_MONO = ("joint-large",), ("joint",)
 #: The paper's networks, trained on noisy mosaics of colour cameras, and of those without colour filters.
 PAPER, PAPER_MONO = "paper-mosaic", "paper-mono"
@@ -37,11 +37,11 @@ PAPER, PAPER_MONO = "paper-mosaic", "paper-mono"
 _LOADING = threading.Lock()
 
 
-def read_joint(path: Path, averages_ways: bool = False) -> JointWeights:
+def read_joint(path: Path, averages_shifts: bool = False) -> JointWeights:
     """The network in a file of weights. Raises ValueError when the file is damaged or of another network."""
     arrays, metadata = read_weights(path)
     try:
-        return joint_weights(arrays, metadata, averages_ways)
+        return joint_weights(arrays, metadata, averages_shifts)
     except (KeyError, TypeError, ValueError) as error:
         found = type(error).__name__ if metadata["method"] in NAMES else f"those of {one_line(metadata['method'], 40)}"
         raise ValueError(f"expected weights of a joint network in {path}, found {found}") from None
@@ -55,13 +55,13 @@ def shipped_joint(method: str, layout: Layout) -> list[JointWeights]:
 
 
 def _averages(method: str, layout: Layout) -> bool:
-    """True where a method's networks average frames of a layout seen in several ways."""
+    """True where a method's networks average frames of a layout seen at several shifts."""
     return method in (AVERAGED_MONO if layout.bayer is None else AVERAGED)
 
 
 @lru_cache(maxsize=16)
-def _read_shipped(name: str, averages_ways: bool, share: float) -> JointWeights:
-    return replace(_read_weights(name), averages_ways=averages_ways, share=share)
+def _read_shipped(name: str, averages_shifts: bool, share: float) -> JointWeights:
+    return replace(_read_weights(name), averages_shifts=averages_shifts, share=share)
 
 
 @lru_cache(maxsize=8)

@@ -1,4 +1,4 @@
-"""The floor plan, held over the syntax trees: who imports whom, where files and codecs live, what is documented."""
+"""The architecture, checked on the syntax trees: who imports whom, where files and codecs live, what is documented."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "polsep"
 
-#: Rank of every room: a folder or a module of the package. Modules import from rooms of lower rank, or from their own.
+#: Rank of every subpackage: a folder or a module of the package. Modules import from lower ranks, or from their own.
 RANKS = {
     "compute": 0,
     "physics": 1,
@@ -45,7 +45,7 @@ RANKS = {
 }
 #: Rooms inside of io, which has the same rule.
 IO_RANKS = {"store": 0, "raw": 1, "results": 2, "assets": 3}
-#: Libraries that only one room may use.
+#: Libraries that only one subpackage may use.
 HOMES = {
     "imagecodecs": "io",
     "tifffile": "io",
@@ -99,8 +99,8 @@ def suites() -> list[Path]:
     return sorted((ROOT / "tests").glob("*.py"))
 
 
-def room(path: Path) -> str:
-    """``polsep/io/raw/png.py`` is in the room ``io``, ``polsep/physics/stokes.py`` in ``stokes``."""
+def subpackage(path: Path) -> str:
+    """``polsep/io/raw/png.py`` is in the subpackage ``io``, ``polsep/physics/stokes.py`` in ``stokes``."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return parts[0]
 
@@ -134,19 +134,19 @@ def called_name(node: ast.AST) -> str | None:
 
 
 def test_imports_go_down() -> None:
-    """A module imports from rooms of lower rank only, or from its own room."""
+    """A module imports from subpackages of lower rank only, or from its own."""
     wrong = []
     for path in modules():
-        here = room(path)
+        here = subpackage(path)
         if here == "__init__":
             continue
-        assert here in RANKS, f"{label(path)}: give this room a rank in {label(Path(__file__))}"
+        assert here in RANKS, f"{label(path)}: give this subpackage a rank in {label(Path(__file__))}"
         for line, name in imports(path):
             there = name.split(".")[1] if name.startswith("polsep.") else ""
             if there in RANKS and there != here and RANKS[there] >= RANKS[here]:
                 wrong.append(f"{label(path)}:{line}: {here} (rank {RANKS[here]}) imports {name} (rank {RANKS[there]})")
     assert wrong == []
-    assert {room(path) for path in modules()} - {"__init__"} == set(RANKS)
+    assert {subpackage(path) for path in modules()} - {"__init__"} == set(RANKS)
 
 
 def test_imports_inside_io_go_down() -> None:
@@ -166,8 +166,8 @@ def test_libraries_stay_in_their_room() -> None:
     for path in modules():
         for line, name in imports(path):
             homes = [home for library, home in HOMES.items() if (name + ".").startswith(library + ".")]
-            wrong += [f"{label(path)}:{line}: {name}" for home in homes if room(path) != home]
-        if room(path) != "train":
+            wrong += [f"{label(path)}:{line}: {name}" for home in homes if subpackage(path) != home]
+        if subpackage(path) != "train":
             optimizers = (n for n in ast.walk(tree(path)) if isinstance(n, ast.Attribute) and n.attr == "optim")
             wrong += [f"{label(path)}:{node.lineno}: optim" for node in optimizers]
     assert wrong == []
@@ -178,7 +178,7 @@ def test_files_are_touched_in_io_only() -> None:
     wrong = [
         f"{label(path)}:{node.lineno}: {called_name(node)}(...)"
         for path in modules()
-        if room(path) != "io"
+        if subpackage(path) != "io"
         for node in ast.walk(tree(path))
         if called_name(node) in FILE_CALLS and not is_io_function(node, path) and not reads_facts(node)
     ]
@@ -236,7 +236,7 @@ def test_public_functions_have_few_parameters() -> None:
     """More than five are a frozen dataclass; kernels may have eight, which the linter checks."""
     wrong = []
     for path in modules():
-        if path.name.endswith("_kernel.py") or room(path) in CONTRACTS:
+        if path.name.endswith("_kernel.py") or subpackage(path) in CONTRACTS:
             continue
         for name, node in public_definitions(path):
             if isinstance(node, ast.FunctionDef):

@@ -227,7 +227,7 @@ def test_the_lamp_is_found(card: bool) -> None:
     frame = correct_mosaic(sensor.expose(sensor.sees(s0, 0.0 if card else 0.96, 0.5)), truth)
     found = measure_lamp([frame], replace(truth, lamp=None), card)
     lamp, line = found.lamp, describe(found, "light")
-    assert lamp is not None and ("from card" in line if card else "from mirrored light, polarizer at 151" in line)
+    assert lamp is not None and ("from card" in line if card else "from specular light, polarizer at 151" in line)
     cosine = np.array(lamp.color) @ color / np.linalg.norm(lamp.color) / np.linalg.norm(color)
     assert math.degrees(math.acos(min(cosine, 1))) < 0.3
     if not card:
@@ -270,7 +270,7 @@ def test_rims_of_objects_show_no_lamp(layout: Layout) -> None:
 
 
 def test_a_frame_without_the_lamp_is_refused() -> None:
-    """Unpolarized light shows no mirrored lamp, and a dark frame no card."""
+    """Unpolarized light shows no reflection of the lamp, and a dark frame no card."""
     sensor = BadSensor(Layout(), dead=0)
     frame = correct_mosaic(sensor.expose(sensor.sees(np.full(SIZE, 0.5))), sensor.calibration())
     with pytest.raises(ValueError, match="expected 64 unclipped pixels of polarized light"):
@@ -286,8 +286,8 @@ def test_a_frame_without_the_lamp_is_refused() -> None:
 
 
 def test_pictures_are_no_dark_frames() -> None:
-    """A dark picture of a bright thing: most of it is black, a tenth is not. Nor is an evenly lit frame, nor one with a
-    glowing corner, whose pixels would all count as hot ones."""
+    """A dark picture of a bright object: most of it is black, a tenth is not. Nor is an evenly lit frame, nor one with
+    a glowing corner, whose pixels would all count as hot ones."""
     picture = np.full(SIZE, LEVEL, np.float32)
     picture[: SIZE[0] // 10] += 0.3 * WHITE
     corner = np.full(SIZE, LEVEL, np.float32)
@@ -312,13 +312,13 @@ def test_copies_of_one_frame_are_refused(measure: Callable[..., Calibration]) ->
 
 
 def test_one_wrong_frame_among_many_is_refused() -> None:
-    """A frame of paper or of a small thing among dark ones, and a dark one among flat ones, hide in the mean."""
+    """A frame of paper or of a small object among dark ones, and a dark one among flat ones, hide in the mean."""
     sensor = BadSensor(Layout(), dead=0)
     dark = [sensor.expose(np.zeros(SIZE)) for _ in range(7)]
-    thing = np.zeros(SIZE)
-    thing[40:80, 40:90] = 0.1
+    bright = np.zeros(SIZE)
+    bright[40:80, 40:90] = 0.1
     paper = sensor.expose(sensor.sees(np.full(SIZE, 0.8)))
-    for lit in (paper, sensor.expose(sensor.sees(thing))):
+    for lit in (paper, sensor.expose(sensor.sees(bright))):
         with pytest.raises(ValueError, match=r"without light \(lens cap on\), found parts of frame 8 that differ"):
             measure_dark([*dark, lit])
     flat = [replace(frame, black_level=LEVEL) for frame in (paper, paper, paper, dark[0])]
@@ -379,7 +379,7 @@ def test_gamma_of_flat_frames_is_said(layout: Layout, bits: int) -> None:
 
 
 def test_polarized_flat_frames_are_refused() -> None:
-    """Gains that hide a lamp's polarization would take it out of every frame; a tenth of that is told, not refused."""
+    """Gains that hide a lamp's polarization would take it out of every frame; of a tenth of that polsep warns."""
     sensor = BadSensor(Layout(), dead=0)
 
     def flat(dolp: float) -> Calibration:
@@ -708,7 +708,7 @@ def test_a_wrong_layout_is_noted(tmp_path: Path, run_polsep: Cli) -> None:  # no
 
 
 def test_an_ambient_frame_with_the_lamp_on_is_said() -> None:
-    """Such a frame leaves hardly any light; one of a dimmer room, or of none, says nothing. Strips are told, too."""
+    """Such a frame leaves hardly any light; one of a dimmer room, or of none, says nothing. Strips are seen, too."""
     scene = np.random.default_rng(3).integers(500, 3000, SIZE).astype(np.uint16)
 
     def said(room: NDArray[np.uint16]) -> bool:
@@ -722,7 +722,7 @@ def test_an_ambient_frame_with_the_lamp_on_is_said() -> None:
 
 @pytest.mark.parametrize("layout", [Layout(), MONO, Layout(((0, 45), (90, 135)), "BGGR", (1, 0))])
 def test_a_dim_lamp_in_an_ambient_frame_is_said(layout: Layout) -> None:
-    """A lamp at a twentieth of its light, or at most of it, is told by its highlights; no room is that is mirrored
+    """A lamp at a twentieth of its light, or at most of it, is seen by its highlights; no room is that is mirrored
     elsewhere, or in the same places at another angle."""
     y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in SIZE), indexing="ij")
     turns = np.deg2rad([[2 * layout.filter_at(r, c).angle_deg for c in range(SIZE[1])] for r in range(SIZE[0])])

@@ -1,4 +1,4 @@
-"""Specular light in another colour than the lamp's: found where the diffuse image is polarized like mirror images."""
+"""Specular light in another colour than the lamp's: found where the diffuse image is polarized like highlights."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ def test_retention_moves_light() -> None:
 
 
 def test_room_light_has_its_share_and_is_all_diffuse() -> None:
-    """The diffusely reflected part has its share of the lamp's on the mask; mirror images keep their polarization."""
+    """The diffusely reflected part has its share of the lamp's on the mask; the specular part stays polarized."""
     lamp, around = lit_scene(), lit_scene(seed=3)
     room = as_room(around, lamp, 0.3, 1.0)
     gain = 0.3 * lamp.diffuse.s0[:, lamp.mask].mean() / around.diffuse.s0[:, lamp.mask].mean()

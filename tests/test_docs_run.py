@@ -40,8 +40,8 @@ LEFT_OUT = {
     "polsep doctor": "tries every method; tests/test_doctor.py",
     "polsep capture -o": "needs a camera; tests/test_capture_cameras.py",
     "polsep calibrate (flat|analysers|light)": "needs pictures of a rig; tests/test_calibration.py",
-    "polsep geometry": "needs six lights on one thing; tests/test_geometry_files.py",
-    "polsep shape": "needs the extra mesh and one thing in a frame; tests/test_one_frame.py",
+    "polsep geometry": "needs six lights on one object; tests/test_geometry_files.py",
+    "polsep shape": "needs the extra mesh and one object in a frame; tests/test_one_frame.py",
     "polsep material": "needs the extra torch and flash frames of one sample; tests/test_material.py",
     "polsep separate --(parallel|crossed|angles)": "needs photographs through a filter; tests/test_photographs.py",
     "polsep video run.mkv": "needs the extra video; tests/test_video.py",
@@ -53,8 +53,8 @@ NO_PYTHON = {
     "export": "needs an exported graph; tests/test_export.py",
     "extending": "tests/test_docs.py",
     "python": "tests/test_docs.py",
-    "geometry": "needs six lights on one thing; tests/test_geometry.py",
-    "shape": "needs one thing in a frame; tests/test_one_frame.py",
+    "geometry": "needs six lights on one object; tests/test_geometry.py",
+    "shape": "needs one object in a frame; tests/test_one_frame.py",
     "testsets": "needs data that cannot ship; tests/test_testsets.py",
 }
 

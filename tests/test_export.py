@@ -116,10 +116,14 @@ def test_the_shipped_graph_is_what_the_command_line_says(
     lines = capfd.readouterr().err.splitlines()  # on a slow machine others tell the progress
     assert lines[0] == "polsep: exporting joint-fast, which may take minutes"
     assert all("step" in line for line in lines[1:])
-    told = onnxruntime.InferenceSession(tmp_path / "fast.onnx").get_modelmeta().custom_metadata_map
-    assert told["name"] == "polsep joint-fast, colour frames, half resolution"
-    assert told["version"] == polsep.__version__ and told["layout"] == Layout().spec and told["precision"] == "float32"
-    assert "1.0 = one measurement at the white level" in told["units"] and told["license"].startswith("MIT")
+    metadata = onnxruntime.InferenceSession(tmp_path / "fast.onnx").get_modelmeta().custom_metadata_map
+    assert metadata["name"] == "polsep joint-fast, colour frames, half resolution"
+    assert (
+        metadata["version"] == polsep.__version__
+        and metadata["layout"] == Layout().spec
+        and metadata["precision"] == "float32"
+    )
+    assert "1.0 = one measurement at the white level" in metadata["units"] and metadata["license"].startswith("MIT")
     asked = {"method": "joint-fast", "light_color": LIGHT}
     raw, white = clipped_crop()
     assert_separated([x[0] for x in images_of(tmp_path / "fast.onnx", raw[None], (0, white), LIGHT)], raw, white, asked)
@@ -185,7 +189,7 @@ def test_weights_of_users_are_those_of_the_method() -> None:
         layout = Layout.parse("mono")
         (own,), _ = find_joint(method, layout, shipped_weights(f"{method}-mono"))
         (shipped,), _ = find_joint(method, layout, None)
-        assert own.averages_ways == shipped.averages_ways == (method == "joint")
+        assert own.averages_shifts == shipped.averages_shifts == (method == "joint")
 
 
 def test_full_graphs_take_batches_of_any_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -135,15 +135,15 @@ def test_headers_tell_how_a_frame_was_made(tmp_path: Path) -> None:
     result = separate_capture(random_mosaic(COLOR), "analytic", (0.5, 1, 0.75))
     result.report.update(exposure_s=0.02, captured="2026-03-01T12:30:05.250+02:00")
     result.save(tmp_path / "shot.exr")
-    told = header(tmp_path / "shot.exr")
-    assert (told["polsepMethod"], told["polsepLayout"], told["polsepLightColor"]) == (
+    attributes = header(tmp_path / "shot.exr")
+    assert (attributes["polsepMethod"], attributes["polsepLayout"], attributes["polsepLightColor"]) == (
         "analytic",
         "90,45,135,0/RGGB",
         "0.5,1,0.75",
     )
-    assert (told["polsepBlackLevel"], told["polsepWhiteLevel"]) == (64, 4095)
-    assert told["expTime"] == pytest.approx(0.02)
-    assert (told["capDate"], told["utcOffset"]) == ("2026:03:01 10:30:05", 0)
+    assert (attributes["polsepBlackLevel"], attributes["polsepWhiteLevel"]) == (64, 4095)
+    assert attributes["expTime"] == pytest.approx(0.02)
+    assert (attributes["capDate"], attributes["utcOffset"]) == ("2026:03:01 10:30:05", 0)
     four = separate_capture(Measurements(np.full((4, 3, 8, 8), 0.2, np.float32), COLOR.angles), "analytic")
     four.save(tmp_path / "four.exr")
     assert not {"polsepWhiteLevel", "expTime", "capDate"} & set(header(tmp_path / "four.exr"))
@@ -181,9 +181,12 @@ def test_frames_of_videos_have_all_of_it(tmp_path: Path, monkeypatch: pytest.Mon
         next(
             separate_video(folder, ReadOptions(), VideoOptions(stokes=True), Target(tmp_path, SequenceKind("ffvhuff")))
         )
-    told, layers = header(tmp_path / "out" / "take_000001.exr"), read_exr_layers(tmp_path / "out" / "take_000001.exr")
-    assert told["polsepMethod"] == "analytic" and told["capDate"] == "2026:03:02 00:00:00"
-    assert told["expTime"] == pytest.approx(0.002)
+    attributes, layers = (
+        header(tmp_path / "out" / "take_000001.exr"),
+        read_exr_layers(tmp_path / "out" / "take_000001.exr"),
+    )
+    assert attributes["polsepMethod"] == "analytic" and attributes["capDate"] == "2026:03:02 00:00:00"
+    assert attributes["expTime"] == pytest.approx(0.002)
     (second,) = read_frames(folder / RECORD, ReadOptions(), 1)
     light = tuple(json.loads((tmp_path / "out" / "take.json").read_text())["settings"]["light_color"])
     stokes = measured_stokes(second.data, light)

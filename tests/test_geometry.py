@@ -282,20 +282,20 @@ def test_multigrid_solves_what_sparse_elimination_solves() -> None:
 
 
 @pytest.mark.parametrize("integrate", [integrate_bilateral, integrate_smooth])
-def test_specks_beside_a_thing_leave_its_depth(integrate: Callable[..., Floats]) -> None:
-    """Thousands of unlinked specks, as of a noisy ground, lie around the same depth as the thing and change nothing."""
+def test_specks_beside_an_object_leave_its_depth(integrate: Callable[..., Floats]) -> None:
+    """Thousands of unlinked specks, as of a noisy ground, lie around the object's depth and change nothing."""
     generator, side, radius = np.random.default_rng(0), 128, 40
     v, u = (np.mgrid[:side, :side] - 63.5) / radius
     height = np.sqrt(np.maximum(1 - u**2 - v**2, 0))
-    thing = u**2 + v**2 < 0.9
+    inside = u**2 + v**2 < 0.9
     random = np.array([0, 0, 1]) + generator.normal(0, 0.3, (side, side, 3))
-    normals = np.where(thing[..., None], np.stack([u, -v, height], axis=-1), random)
+    normals = np.where(inside[..., None], np.stack([u, -v, height], axis=-1), random)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    alone = integrate(normals, thing)
-    assert np.std((alone + radius * height)[thing]) < 0.1
-    mask = thing | ((u**2 + v**2 > 1) & (generator.random(thing.shape) < 0.25))
+    alone = integrate(normals, inside)
+    assert np.std((alone + radius * height)[inside]) < 0.1
+    mask = inside | ((u**2 + v**2 > 1) & (generator.random(inside.shape) < 0.25))
     depth = integrate(normals, mask)
-    assert np.std((depth - alone)[thing]) < 0.1
+    assert np.std((depth - alone)[inside]) < 0.1
     assert np.abs(depth[mask]).max() < radius
 
 

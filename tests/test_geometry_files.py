@@ -130,7 +130,7 @@ def test_a_lamp_that_no_file_tells_is_said_to_be_taken_for_white(separated: list
     """Of separated files without the report beside them."""
     separated[2].with_suffix(".json").unlink()
     views = files.read_views(separated, files.Source("frames", ReadOptions(), "analytic"))
-    assert len(views.notes) == 1 and views.notes[0].startswith(f"{separated[2]}: the lamp's colour is not told")
+    assert len(views.notes) == 1 and views.notes[0].startswith(f"{separated[2]}: the lamp's colour is neither stated")
 
 
 def test_a_small_object_is_found_in_noise() -> None:

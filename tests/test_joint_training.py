@@ -25,7 +25,7 @@ from polsep.io.store.weights import read_weights, write_weights
 from polsep.metrics import psnr
 from polsep.networks.channels import INPUTS
 from polsep.networks.joint import Joint, JointOutput, Polarization, bilinear_filter
-from polsep.networks.ranges import silenced
+from polsep.networks.ranges import pruned
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.unet import count_parameters
 from polsep.physics.stokes import Stokes
@@ -92,12 +92,13 @@ def small_task(ablation: str = "none", variant: str = "mosaic") -> Task[JointInp
 
 
 def truth_of(seen: JointInputs) -> JointOutput:
-    """True light as the network would give it, with doubts about nothing."""
+    """True light as the network would give it, with an expected variance of 1."""
     s1, s2 = avg_pool2d(seen.polarized, 2).chunk(2, dim=1)
     count, _, height, width = seen.raw.shape
-    doubt, light = torch.zeros(count, 2, height // 2, width // 2), torch.ones(count, 1, height // 4, width // 4)
+    log_variance, light = torch.zeros(count, 2, height // 2, width // 2), torch.ones(count, 1, height // 4, width // 4)
     nothing = torch.zeros(count, 0)
-    return JointOutput(seen.full_diffuse, seen.full_specular, s1, s2, doubt, light, torch.zeros_like(light), nothing)
+    images = (seen.full_diffuse, seen.full_specular, s1, s2)
+    return JointOutput(*images, log_variance, light, torch.zeros_like(light), nothing)
 
 
 def explained(layout: Layout) -> tuple[JointOutput, Polarization, JointInputs]:
@@ -176,44 +177,44 @@ def test_light_beyond_white_counts() -> None:
 
 
 @pytest.mark.parametrize("share", [1e-4, 0.01, 0.3])
-def test_doubt_is_least_where_it_is_the_squared_error(share: float) -> None:
+def test_the_variance_is_best_where_it_is_the_squared_error(share: float) -> None:
     """Relative to the light around: the log variance that the likelihood wants, for each of both images."""
     light = torch.full((1, 1, 2, 2), 0.4)
     errors = (torch.full((1, 3, 4, 4), 0.4 * share), torch.full((1, 1, 4, 4), -0.8 * share))
     best = torch.log(torch.tensor([share**2, 4 * share**2]) + 1e-7).view(1, 2, 1, 1).expand(1, 2, 4, 4)
 
-    def loss(doubt: Tensor) -> Tensor:
+    def loss(log_variance: Tensor) -> Tensor:
         nothing = torch.zeros(1)
         return variance_loss(
-            JointOutput(*[nothing] * 4, doubt, light, nothing, nothing), errors, torch.ones(1, 1, 4, 4)
+            JointOutput(*[nothing] * 4, log_variance, light, nothing, nothing), errors, torch.ones(1, 1, 4, 4)
         )
 
-    doubt = best.clone().requires_grad_()
-    loss(doubt).backward()
-    assert_close(doubt.grad, torch.zeros_like(best))
+    log_variance = best.clone().requires_grad_()
+    loss(log_variance).backward()
+    assert_close(log_variance.grad, torch.zeros_like(best))
     for step in (-0.5, 0.5):
         assert float(loss(best + step)) > float(loss(best))
 
 
 def test_a_pixel_that_is_far_off_does_not_outweigh_the_others() -> None:
-    """Its pull on the doubt ends at that of an error of `SURPRISE` variances, however sure the network was."""
+    """Its pull on the variance ends at that of an error of `SURPRISE` variances, however sure the network was."""
     light, nothing = torch.ones(1, 1, 2, 2), torch.zeros(1)
     errors = torch.ones(1, 3, 4, 4), torch.ones(1, 1, 4, 4)
     pulls = []
     for sure in (0.0, -math.log(2 * SURPRISE), -200.0):
-        doubt = torch.full((1, 2, 4, 4), sure, requires_grad=True)
+        log_variance = torch.full((1, 2, 4, 4), sure, requires_grad=True)
         loss = variance_loss(
-            JointOutput(*[nothing] * 4, doubt, light, nothing, nothing), errors, torch.ones(1, 1, 4, 4)
+            JointOutput(*[nothing] * 4, log_variance, light, nothing, nothing), errors, torch.ones(1, 1, 4, 4)
         )
         loss.backward()
-        assert doubt.grad is not None
-        assert_finite(loss, doubt.grad)
-        pulls.append(float(doubt.grad.sum()))
+        assert log_variance.grad is not None
+        assert_finite(loss, log_variance.grad)
+        pulls.append(float(log_variance.grad.sum()))
     assert abs(pulls[0]) < 1e-6
     assert pulls[1:] == pytest.approx([0.5 * (1 - SURPRISE)] * 2, rel=1e-5)
 
 
-def test_doubt_moves_nothing_but_itself() -> None:
+def test_the_variance_moves_nothing_but_itself() -> None:
     images = as_variable(explained(COLOR)[0])
     diffuse, specular = avg_pool2d(images.diffuse, 2), avg_pool2d(images.specular, 2)
     variance_loss(images, (diffuse - 0.3, specular - 0.1), torch.ones(2, 1, 8, 8)).backward()
@@ -262,7 +263,7 @@ def test_misfit_is_quadratic_for_noise_and_linear_beyond() -> None:
 
 @pytest.mark.parametrize("layout", [COLOR, MONO], ids=lambda layout: layout.spec)
 def test_nothing_is_better_than_the_truth(layout: Layout) -> None:
-    """The whole loss, with the doubts that go with each."""
+    """The whole loss, with the variances that go with each."""
     images, polarization, seen = explained(layout)
     floor = math.log(1e-7)
     known = images._replace(log_variance=torch.full_like(images.log_variance, floor))
@@ -272,8 +273,8 @@ def test_nothing_is_better_than_the_truth(layout: Layout) -> None:
             images._replace(diffuse=images.diffuse + change),
             images._replace(specular=images.specular + change),
         ):
-            doubt = torch.full_like(images.log_variance, 2 * math.log(abs(change)))
-            assert float(joint_loss((other._replace(log_variance=doubt), polarization), seen, Goal())) > float(best) + 1
+            certain = other._replace(log_variance=torch.full_like(images.log_variance, 2 * math.log(abs(change))))
+            assert float(joint_loss((certain, polarization), seen, Goal())) > float(best) + 1
 
 
 def known_views(layout: Layout, weight: Tensor) -> list[JointInputs]:
@@ -499,8 +500,10 @@ def test_training_ends_in_weights_that_say_all(variant: str, tmp_path: Path, sho
     assert torch.equal(network.demosaic, fitted.half().float())
 
 
-@pytest.mark.parametrize("part", ["details", "doubt"])
-def test_of_a_network_a_part_can_be_trained_alone(part: str, tmp_path: Path, shortened: None) -> None:
+@pytest.mark.parametrize(("part", "name_in_files"), [("details", "details."), ("errors", "doubt.")])
+def test_of_a_network_a_part_can_be_trained_alone(
+    part: str, name_in_files: str, tmp_path: Path, shortened: None
+) -> None:
     """Everything else stays bit by bit as it began, and with it all images at half resolution."""
     run = Run(tmp_path / "all", "a test", STREAM, SCHEDULE, workers=0)
     start = train_weights(JointOptions("joint-fast", size=TINY), run, lambda _: None)
@@ -508,7 +511,7 @@ def test_of_a_network_a_part_can_be_trained_alone(part: str, tmp_path: Path, sho
     held = train_weights(JointOptions("joint-fast", size=TINY, part=part), run, lambda _: None)
     (before, _), (after, metadata) = read_weights(start), read_weights(held)
     moved = {name for name in before if not np.array_equal(before[name], after[name])}
-    assert moved and all(name.startswith(f"{part}.") for name in moved)
+    assert moved and all(name.startswith(name_in_files) for name in moved)
     assert f"--part {part}" in metadata["command"]
     assert int(metadata["parameters"]) == sum(x.size for name, x in after.items() if name != "demosaic")
 
@@ -557,8 +560,8 @@ def test_a_mono_network_begins_as_the_colour_network_on_grey_frames(entry: int) 
 
 
 @pytest.mark.parametrize("layer", ["net.ups.1", "net.encoders.1.0.second"])
-def test_what_was_silent_becomes_zero_and_wakes(layer: str) -> None:
-    """Silent parts change no image, before and after; a training that starts from them can move them again."""
+def test_what_was_inactive_becomes_zero_and_trains_again(layer: str) -> None:
+    """Inactive parts change no image, before and after; a training that starts from them can move them again."""
     torch.manual_seed(2)
     network = Joint(1, ResidualSize(8, (0, 1, 1)))
     for weight in network.parameters():
@@ -568,7 +571,7 @@ def test_what_was_silent_becomes_zero_and_wakes(layer: str) -> None:
     state[f"{before}.bias"] -= 1000  # below zero everywhere
     raw, none = torch.rand(1, 1, 32, 32), torch.zeros(1, 1, 32, 32, dtype=torch.bool)
     expected = network(raw, none)[0].diffuse
-    arrays = silenced({name: value.numpy() for name, value in state.items()}, {layer: (0.0, 0.0), "net.ups.0": (0, 1)})
+    arrays = pruned({name: value.numpy() for name, value in state.items()}, {layer: (0.0, 0.0), "net.ups.0": (0, 1)})
     zeros = {name for name, array in arrays.items() if not array.any()}
     rest = "net.downs.1." if layer == "net.ups.1" else "net.encoders.1.0.first."
     assert rest + "weight" in zeros and len(zeros) == (7 if layer == "net.ups.1" else 3)
@@ -576,7 +579,7 @@ def test_what_was_silent_becomes_zero_and_wakes(layer: str) -> None:
     assert_close(network(raw, none)[0].diffuse, expected, scale=10)
     fast = Joint.of(network.weights(), torch.device("cpu"))  # leaves such a block out
     assert_close(fast(raw, none)[0].diffuse, expected, scale=10)
-    assert [name for name, part in fast.named_modules() if getattr(part, "silent", False)] == [
+    assert [name for name, part in fast.named_modules() if getattr(part, "inactive", False)] == [
         before.rpartition(".")[0]
     ]
     network.load_state_dict(grow(network.state_dict(), Joint(1, network.size)))

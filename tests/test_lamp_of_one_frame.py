@@ -1,4 +1,4 @@
-"""The lamp of one frame: found by shading, and by looks under many lamps."""
+"""The lamp of one frame: found by shading, and by predictions under many lamps."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def turn(degrees: float) -> np.ndarray:
 
 
 def picture(lamp: np.ndarray, apart: bool = True) -> Seen:
-    """What is seen of the sphere under a lamp that is not told, at level 1; highlights ``apart`` or in it."""
+    """What is seen of the sphere under a lamp that is not given, at level 1; highlights ``apart`` or in it."""
     surface, mask = sphere()
     mirrored = relight(surface._replace(albedo=0 * surface.albedo), lamp)
     image = relight(surface, lamp) - mirrored * apart
@@ -78,16 +78,16 @@ def test_the_true_lamp_and_surface_explain_most(apart: bool) -> None:
 
 
 @pytest.mark.parametrize("lamp", [LAMPS[0], LAMPS[2], LAMPS[10], LAMP])
-def test_looks_under_many_lamps_find_it(lamp: np.ndarray) -> None:
-    """Where the surface is drawn for the lamp that is told: turned with it, as a network that believes it would."""
+def test_predictions_under_many_lamps_find_it(lamp: np.ndarray) -> None:
+    """Where the surface is drawn for the lamp that is given: turned with it, as a network that believes it would."""
     seen = picture(lamp)
 
-    def look(told: Seen) -> Surface:
-        believed = told.light[:, 0, 0] if told.light.any() else LAMPS[0]
+    def predict(under: Seen) -> Surface:
+        believed = under.light[:, 0, 0] if under.light.any() else LAMPS[0]
         about = math.degrees(math.atan2(believed[0], believed[2]) - math.atan2(lamp[0], lamp[2]))
         return relative(sphere(turn(about / 2))[0], lamp)
 
-    assert math.degrees(math.acos(min(1, float(np.dot(search_lamp(look, seen), lamp))))) < 8
+    assert math.degrees(math.acos(min(1, float(np.dot(search_lamp(predict, seen), lamp))))) < 8
 
 
 def test_tried_lamps_are_mirror_images_of_each_other() -> None:
@@ -98,7 +98,7 @@ def test_tried_lamps_are_mirror_images_of_each_other() -> None:
     assert np.abs(LAMPS[:, None] - mirrored[None]).max(axis=-1).min(axis=0).max() < 1e-6
 
 
-def test_a_lamp_is_told_everywhere() -> None:
+def test_a_lamp_is_given_everywhere() -> None:
     """The planes of the direction are filled with it."""
     seen = seen_under(picture(LAMP), LAMPS[3])
     np.testing.assert_array_equal(seen.light, np.broadcast_to(LAMPS[3][:, None, None], seen.light.shape))

@@ -1,4 +1,4 @@
-"""The lamp's degree of polarization: found from the white light that its mirror images leave in the diffuse image."""
+"""The lamp's degree of polarization: found from the white light that its highlights leave in the diffuse image."""
 
 from __future__ import annotations
 

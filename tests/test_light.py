@@ -293,14 +293,16 @@ def test_default_is_the_light_found() -> None:
     """`separate` takes the colour that `find_light` finds, and reports it; "estimate" is another word for it."""
     mosaic = frame(light=DAYLIGHT)
     found = find_light(mosaic)
-    auto, again, told = (separate_capture(mosaic, "analytic", *light) for light in ((), ("estimate",), (found.color,)))
+    auto, again, stated = (
+        separate_capture(mosaic, "analytic", *light) for light in ((), ("estimate",), (found.color,))
+    )
     assert auto.report["light"] == {"source": "found", **found.describe()}
     assert auto.report["light_color"] == list(found.color) == again.report["light_color"]
     assert json.loads(json.dumps(auto.report["light"]))["sure"] is True
     page = (Path(__file__).parents[1] / "docs" / "conventions.md").read_text("utf-8")
     listed = page.partition("The entry `light`")[2].partition("##")[0]
     assert all(f"`{name}`" in listed for name in auto.report["light"])
-    assert np.array_equal(auto.specular, told.specular) and told.report["light"]["source"] == "told"
+    assert np.array_equal(auto.specular, stated.specular) and stated.report["light"]["source"] == "stated"
     assert separate_capture(mosaic, "analytic", "white").report["light_color"] == [1, 1, 1]
 
 

@@ -469,10 +469,10 @@ def grey_paper(folder: Path, format: str, report: dict[str, object]) -> str:
 
 @pytest.mark.parametrize("format", ["exr", "npz"])
 def test_grey_paper_is_grey_under_any_lamp(tmp_path: Path, format: str) -> None:
-    """The colour told or in the report is divided out of both lobes, told before reported, and the mean s0 stays."""
-    for report, told in (({"light_color": TINT.tolist()}, "auto"), ({"light_color": [1, 1, 1]}, (0.55, 1, 0.7))):
-        path = grey_paper(tmp_path / str(told), format, report)
-        found = read_photographs([path], MaterialOptions(light_color=told, size=32))
+    """The colour stated or in the report is divided out of both lobes, stated before reported; the mean s0 stays."""
+    for report, stated in (({"light_color": TINT.tolist()}, "auto"), ({"light_color": [1, 1, 1]}, (0.55, 1, 0.7))):
+        path = grey_paper(tmp_path / str(stated), format, report)
+        found = read_photographs([path], MaterialOptions(light_color=stated, size=32))
         assert found.notes == () and found.lights == (pytest.approx((0.55, 1, 0.7)),)
         torch.testing.assert_close(found.views[0, :3], torch.full((3, 32, 32), 0.3))
         torch.testing.assert_close(found.views[0, 3:], torch.full((3, 32, 32), 0.1))
@@ -484,17 +484,17 @@ def test_a_lamp_of_no_known_colour_is_said(tmp_path: Path) -> None:
     Path(path).with_suffix(".json").unlink()
     found = read_photographs([path], MaterialOptions(size=32))
     (note,) = found.notes
-    assert note.startswith(f"{path}: the lamp's colour is not told, nor known from paper.json")
+    assert note.startswith(f"{path}: the lamp's colour is neither stated nor in paper.json")
     assert found.lights == ((1, 1, 1),) and float(found.views[0, 1].mean() / found.views[0, 0].mean()) > 1.5
 
 
-def test_raw_frames_lose_the_colour_that_is_told(frame: Path) -> None:
-    """A raw frame of a white lamp, told to be tinted, is what is separated over that colour."""
+def test_raw_frames_lose_the_colour_that_is_stated(frame: Path) -> None:
+    """A raw frame of a white lamp, stated to be tinted, is what is separated over that colour."""
     read = ReadOptions(white_level=4095)
-    told, white = (
+    stated, white = (
         read_photographs([str(frame)], MaterialOptions(read, "analytic", light, size=32))
         for light in (tuple(TINT.tolist()), "white")
     )
-    sums = [x.views[0, :3] + x.views[0, 3:] for x in (told, white)]
+    sums = [x.views[0, :3] + x.views[0, 3:] for x in (stated, white)]
     gains = torch.from_numpy(TINT / TINT.mean()).view(3, 1, 1)
     torch.testing.assert_close(sums[0] * gains, sums[1], rtol=0.02, atol=0.002)

@@ -145,7 +145,7 @@ def test_metals_mirror_as_glass_does_but_more() -> None:
 
 
 def test_metals_keep_the_lamps_polarization() -> None:
-    """Up to 25 degrees 99 % of a mirror image stays linear, and never more than all."""
+    """Up to 25 degrees 99 % of a reflection stays linear, and never more than all."""
     generator = seeded(2)
     light, camera = (torch.randn(3, 400, 1, generator=generator) for _ in range(2))
     light, camera = (normalize(torch.cat([0.35 * x[:2], x[2:].abs() + 0.5])) for x in (light, camera))
@@ -160,7 +160,7 @@ def test_metals_keep_the_lamps_polarization() -> None:
     assert float(dolp[:, cosine > math.cos(math.radians(25))].min()) > 0.99
 
 
-def test_photographs_of_metal_are_mirror_images() -> None:
+def test_photographs_of_metal_are_specular_alone() -> None:
     """The scene of a plate of metal is specular alone, polarized and coloured; separated, most of it is specular."""
     maps = plate((0.9, 0.7, 0.45), 0.5)
     diffuse, specular = shade_plane(maps, PointLight((0.1, 0.0, 2.75), 1.0, 0.4))

@@ -1,4 +1,4 @@
-"""Things from meshes: smooth but for creases, whatever the winding, and with the normals of the stretched surface."""
+"""Objects from meshes: smooth but for creases, whatever the winding, and with the normals of the stretched surface."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_winding_does_not_matter() -> None:
 
 
 def test_a_stretched_box_has_the_normals_of_its_faces() -> None:
-    """So have all stretched and tilted things; they are centred, of the usual size, and the same for the same seed."""
+    """So have all stretched and tilted objects; they are centred, of the usual size, and the same for the same seed."""
     meshes = [creased(mesh_of(trimesh.creation.box((1, 2, 3)))), creased(mesh_of(trimesh.creation.icosphere(3)))]
     found = [random_model(meshes, torch.Generator().manual_seed(seed)) for seed in range(8)]
     assert {len(mesh.faces) for mesh in found} == {len(mesh.faces) for mesh in meshes}

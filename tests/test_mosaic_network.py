@@ -23,7 +23,7 @@ from polsep.networks.run import combine, cut_rows, margin_of, run_joint
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.orient import orient, shifts_of, ways_of
+from polsep.sensor.orient import cell_shifts, orient, shifts_of
 from polsep.separation.clipped_pattern import smooth_separation
 from polsep.shipped import accepts_mosaic, weights_name
 
@@ -80,12 +80,12 @@ def test_mirrored_frames_give_mirrored_images(layout: Layout) -> None:
 def test_shifted_frames_are_combined(height: int, width: int, full: bool) -> None:
     """A mono frame less its first two rows or columns lies differently on the network's periods of four samples."""
     network, mosaic = random_network(MONO), random_mosaic(MONO, height, width)
-    ways = shifts_of(orient(mosaic, MONO))
-    turned = [way.turn(mosaic.data) for way in ways]
-    assert len(ways) == 4 and len({frame.shape for frame in turned}) == 1
-    single = [mosaic_network._run_turned(network, mosaic, way, full) for way in ways]
+    shifts = cell_shifts(orient(mosaic, MONO))
+    turned = [shift.turn(mosaic.data) for shift in shifts]
+    assert len(shifts) == 4 and len({frame.shape for frame in turned}) == 1
+    single = [mosaic_network._run_turned(network, mosaic, shift, full) for shift in shifts]
     assert not torch.allclose(single[0].diffuse, single[1].diffuse, atol=1e-3)
-    network.averages_ways = True
+    network.averages_shifts = True
     found = run_joint(network, mosaic, full)
     assert_close(found.diffuse, combine(single).diffuse)
     assert_close(found.stokes.s0, torch.stack([one.stokes.s0 for one in single]).mean(dim=0))
@@ -97,9 +97,9 @@ def test_shifted_frames_are_combined(height: int, width: int, full: bool) -> Non
 def test_colour_frames_are_seen_twice_by_networks_that_average(height: int, width: int, full: bool) -> None:
     """As they are, and a cell on with red and blue exchanged; so an exchange of these gives exchanged images."""
     network, mosaic = random_network(COLOR), random_mosaic(COLOR, height, width)
-    single = [mosaic_network._run_turned(network, mosaic, way, full) for way in ways_of(mosaic, COLOR)]
+    single = [mosaic_network._run_turned(network, mosaic, shift, full) for shift in shifts_of(mosaic, COLOR)]
     assert len(single) == 2 and not torch.allclose(single[0].diffuse, single[1].diffuse, atol=1e-3)
-    network.averages_ways = True
+    network.averages_shifts = True
     found = run_joint(network, mosaic, full)
     assert_close(found.diffuse, combine(single).diffuse)
     assert_close(found.stokes.s0, torch.stack([one.stokes.s0 for one in single]).mean(dim=0))
@@ -137,7 +137,7 @@ def test_even_light_has_no_pattern_where_shifts_are_averaged() -> None:
         return float(inner.max() - inner.min())
 
     assert contrast() > 0.01
-    network.averages_ways = True
+    network.averages_shifts = True
     assert contrast() < 1e-5
 
 

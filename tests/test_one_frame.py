@@ -31,7 +31,7 @@ from polsep.geometry import frames, one_frame
 from polsep.geometry.lamp import seen_under
 from polsep.geometry.one_frame import (
     SIDE,
-    UNTOLD,
+    UNKNOWN_LIGHT,
     ShapeEstimator,
     gather,
     polarized_as_usual,
@@ -117,7 +117,7 @@ def _brighter(planes: Tensor, gain: float) -> Tensor:
 
 
 @pytest.mark.parametrize("name", INPUTS)
-def test_lamps_that_are_not_told_are_zeros(name: str) -> None:
+def test_lamps_that_are_not_given_are_zeros(name: str) -> None:
     """One map says whether a lamp is known, three where it is; the last one is the mask."""
     seen = seen_of(sphere_planes()[None], name)
     for lamp, known in (((0.0, 0.0, 0.0), 0.0), ((0.6, 0.0, 0.8), 1.0)):
@@ -129,11 +129,11 @@ def test_lamps_that_are_not_told_are_zeros(name: str) -> None:
 def test_means_weigh_normals_by_their_variances() -> None:
     """Of all else the geometric mean is taken, also of expected errors."""
     errors, ways = (0.1, 0.2), ((0.0, 0.6, 0.8), (0.6, 0.0, 0.8))
-    looks = [
+    predictions = [
         Surface(np.array(way).reshape(3, 1, 1), *[np.full((3, 1, 1), 1 / error)] * 3, *[np.full((1, 1, 1), error)] * 3)
         for error, way in zip(errors, ways, strict=True)
     ]
-    mean = mean_surface(*looks)
+    mean = mean_surface(*predictions)
     expected = np.array(ways[0]) / 0.1**2 + np.array(ways[1]) / 0.2**2
     np.testing.assert_allclose(mean.normal[:, 0, 0], expected / np.linalg.norm(expected))
     np.testing.assert_allclose(mean.albedo, 50**0.5)
@@ -172,19 +172,19 @@ def test_the_engine_is_the_network(tmp_path: Path) -> None:
     seen = seen_of(planes, "separated")
     with torch.no_grad():
         wanted = decode(network(encode(seen, "separated")), seen.image, seen.mask)
-    found = estimator.look(_as_seen(planes))
+    found = estimator.predict(_as_seen(planes))
     for name in found._fields:
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name)[0].numpy(), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=0), 1, atol=1e-6)
     assert (found.normal[2] > 0).all()
 
 
-@pytest.mark.parametrize("told", [False, True])
-def test_mirrored_frames_give_mirrored_surfaces(tmp_path: Path, told: bool) -> None:
+@pytest.mark.parametrize("given", [False, True])
+def test_mirrored_frames_give_mirrored_surfaces(tmp_path: Path, given: bool) -> None:
     """Of a random frame: mirror images are seen alike, as s2 and the lamp's x change their signs."""
     estimator, _ = _untrained(tmp_path)
     planes = cut_example(random_planes(), 1.1, SIDE)
-    planes[PLANES["light"]] *= told
+    planes[PLANES["light"]] *= given
     mirrored = turn_example(planes, True, False, False)
     seen, other = (_as_seen(p[None]) for p in (planes, mirrored))
     for first, second in zip(other, mirror_seen(seen), strict=True):
@@ -208,15 +208,15 @@ def random_planes() -> Tensor:
     return planes
 
 
-def test_a_lamp_that_is_not_told_is_looked_for(tmp_path: Path) -> None:
-    """The surface of an untold lamp is that of the lamp which is found."""
+def test_a_lamp_that_is_not_given_is_found(tmp_path: Path) -> None:
+    """The surface of a lamp that is not given is that of the lamp which is found."""
     estimator, _ = _untrained(tmp_path)
     seen = _as_seen(cut_example(random_planes(), 1.1, SIDE)[None])
-    untold = seen._replace(light=0 * seen.light)
-    lamp = estimator.find_lamp(untold)
+    unknown = seen._replace(light=0 * seen.light)
+    lamp = estimator.find_lamp(unknown)
     assert math.hypot(*lamp) == pytest.approx(1, abs=1e-6)
-    wanted = estimator.find(seen_under(untold, lamp))
-    np.testing.assert_array_equal(estimator.find(untold).normal, wanted.normal)
+    wanted = estimator.find(seen_under(unknown, lamp))
+    np.testing.assert_array_equal(estimator.find(unknown).normal, wanted.normal)
 
 
 def _untrained(folder: Path) -> tuple[ShapeEstimator, ShapeNetwork]:
@@ -266,7 +266,7 @@ def test_losses_are_least_at_the_truth() -> None:
 
 
 def test_squares_come_back() -> None:
-    """A smooth image survives the way into the network's square and back, also where the thing touches the border."""
+    """A smooth image survives the way into the network's square and back, also where the object touches the border."""
     rows, cols = np.mgrid[:90, :120] / 100.0
     image = np.stack([rows, np.sin(3 * cols)]).astype(np.float32)
     mask = np.zeros((90, 120), np.bool_)
@@ -336,7 +336,8 @@ def test_the_shipped_network_finds_a_sphere() -> None:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         found = polsep.shape(frame, mask, (0.0, 0.0, 1.0))
-    assert [str(note.message) for note in said] == [UNTOLD, *found.doubts()]  # its report names no lamp's colour
+    # Its report names no lamp's colour.
+    assert [str(note.message) for note in said] == [UNKNOWN_LIGHT, *found.warnings()]
     angle = angles_deg(
         torch.from_numpy(found.normals).movedim(-1, 0)[None], torch.from_numpy(normals).movedim(-1, 0)[None]
     )
@@ -353,7 +354,7 @@ def test_the_shipped_network_finds_a_sphere() -> None:
 
 
 def test_floor_of_the_shipped_weights() -> None:
-    """On things that no training saw, made here, the shipped network is no worse than when it was shipped."""
+    """On objects that no training saw, made here, the shipped network is no worse than when it was shipped."""
     examples = [cut_example(random_shape_example(Examples("test", 11), n, 256), 1.1, SIDE // 2) for n in range(6)]
     network = ShapeNetwork(INPUTS["separated"], USUAL, one_frame.load_estimator().size)
     arrays = polsep_weights()
@@ -362,7 +363,7 @@ def test_floor_of_the_shipped_weights() -> None:
     assert scores["normals, mean deg"] < FLOOR_DEG, scores
 
 
-#: Mean angular error of the shipped weights on six things, two of each kind (30.7), and a tenth more.
+#: Mean angular error of the shipped weights on six objects, two of each kind (30.7), and a tenth more.
 FLOOR_DEG = 33.8
 
 
@@ -373,7 +374,7 @@ def polsep_weights() -> dict[str, NDArray[np.float32]]:
 
 
 def test_bad_arguments_are_refused() -> None:
-    """Masks of another size or empty ones, lamps behind the thing, frames without polarization or light."""
+    """Masks of another size or empty ones, lamps behind the object, frames without polarization or light."""
     frame = sphere_frame()
     with pytest.raises(ValueError, match="expected a mask of"):
         shape(frame, np.ones((3, 3), np.bool_))
@@ -435,7 +436,7 @@ def test_masks_of_odd_raw_frames_are_taken(tmp_path: Path) -> None:
 
 
 def test_a_frame_that_is_full_is_said() -> None:
-    """A mask that reaches around the border has a line that says what to do; a thing inside has none."""
+    """A mask that reaches around the border has a line that says what to do; an object inside has none."""
     one = np.ones((64, 64), np.float32)
     found = one_frame.Shape(
         np.dstack([0 * one, 0 * one, one]),
@@ -448,25 +449,25 @@ def test_a_frame_that_is_full_is_said() -> None:
         one > 0,
         (0, 0, 1),
     )
-    assert any("(mask)" in line for line in found.doubts())
-    assert replace(found, mask_told=True).doubts() == []
-    assert replace(found, mask=cap(64, 80)[1]).doubts() == []
+    assert any("(mask)" in line for line in found.warnings())
+    assert replace(found, mask_given=True).warnings() == []
+    assert replace(found, mask=cap(64, 80)[1]).warnings() == []
 
 
-def test_specks_and_lines_are_not_the_thing() -> None:
+def test_specks_and_lines_are_not_the_object() -> None:
     """The mask is the sphere alone, whole, though a bright line and a speck are beside it."""
     frame = sphere_frame()
     diffuse = np.pad(frame.diffuse, ((16, 16), (0, 64), (0, 0)))
     diffuse[4:6, :] = diffuse[60:63, 100:104] = 1
     grown = replace(frame, diffuse=diffuse, specular=0 * diffuse)
-    found = one_frame.find_thing(grown)
+    found = one_frame.mask_of(grown)
     sphere = np.pad(frame.diffuse.mean(axis=-1), ((16, 16), (0, 64))) > 0.1
     np.testing.assert_array_equal(found[sphere], True)
     assert not found[:8].any() and not found[:, 80:].any()
 
 
-def test_a_small_thing_is_found_in_a_noisy_frame() -> None:
-    """A thousandth of the frame is enough: noise around it is not the thing, and its highlight is no other level."""
+def test_a_small_object_is_found_in_a_noisy_frame() -> None:
+    """A thousandth of the frame is enough: noise around it is not the object, and its highlight is no other level."""
     rows, cols = np.mgrid[:640, :768] - np.array([[[300]], [[200]]])
     radius = np.hypot(rows, cols) / 14
     light = np.where(radius < 1, 0.3 * np.sqrt(np.maximum(1 - radius**2, 0.05)), 0.0)
@@ -474,7 +475,7 @@ def test_a_small_thing_is_found_in_a_noisy_frame() -> None:
     highlight = np.where(radius < 0.2, 2.0, 0.0)
     color = [np.repeat(image[..., None], 3, axis=-1).astype(np.float32) for image in (noisy, highlight)]
     frame = replace(sphere_frame(), diffuse=color[0], specular=color[1])
-    found = one_frame.find_thing(frame)
+    found = one_frame.mask_of(frame)
     assert float((found & (radius < 1)).sum() / (found | (radius < 1)).sum()) > 0.97
     assert 0.0012 < (radius < 1).mean() < 0.0013
 
@@ -506,7 +507,7 @@ def test_a_file_becomes_maps_and_a_mesh(run: Cli, tmp_path: Path) -> None:
     np.testing.assert_allclose(planes["normal_error.Y"], np.degrees(found.normal_error), rtol=1e-5)
     assert np.isfinite(planes["depth.Z"]).all() and np.ptp(planes["depth.Z"][found.mask]) > 10
     facts = json.loads((out / "ball.json").read_text())
-    assert (facts["light"], facts["light_is"]) == ([0, 0, 1], "told") and set(facts["units"]) == {
+    assert (facts["light"], facts["light_is"]) == ([0, 0, 1], "given") and set(facts["units"]) == {
         name.split(".")[0] for name in planes
     }
     assert (facts["index"], facts["mask_is"]) == (1.5, "found where light falls")
@@ -528,30 +529,30 @@ def test_the_lamp_of_a_separated_file_is_read_beside_it(run: Cli, tmp_path: Path
     for end in ("exr", "json"):  # also where both were given another name
         (tmp_path / f"cup.{end}").write_bytes((tmp_path / f"tinted.{end}").read_bytes())
     renamed = run(tmp_path / "cup.exr", "-o", tmp_path / "out", "--mesh", "none")
-    assert renamed.status == 0 and "colour is not told" not in renamed.err
+    assert renamed.status == 0 and "colour is neither stated" not in renamed.err
     write_separation(frame, tmp_path, "cup", "npz", overwrite=True)  # of another run, in another format
     other = run(tmp_path / "cup.exr", "-o", tmp_path / "out", "--mesh", "none", "--overwrite")
-    assert other.status == 0 and "colour is not told" in other.err
+    assert other.status == 0 and "colour is neither stated" in other.err
     (tmp_path / "tinted.json").unlink()
     alone = run(tmp_path / "tinted.exr", "-o", tmp_path / "other", "--mesh", "none")
-    assert alone.status == 0 and "colour is not told, nor known" in alone.err
+    assert alone.status == 0 and "colour is neither stated nor in" in alone.err
     gray = replace(frame, diffuse=frame.diffuse[..., :1], specular=frame.specular[..., :1])
     assert not open_separated(write_separation(gray, tmp_path, "gray")[0])[1]  # mono has no lamp's colour
 
 
 @pytest.mark.parametrize("beside", ["nothing", "another colour"])
-def test_a_lamp_that_is_told_goes_before_the_file_beside(tmp_path: Path, beside: str) -> None:
-    """The colour told of a separated file is divided out, and nobody says that it is not known; white is told too."""
+def test_a_lamp_that_is_stated_goes_before_the_file_beside(tmp_path: Path, beside: str) -> None:
+    """The colour stated of a separated file is divided out, and no note says that it is unknown; so is white."""
     frame, tint = sphere_frame(), np.array([0.5, 1.0, 0.7], np.float32)
     report = {"warnings": [], "light_color": [1.0, 0.3, 0.3]}
     specular, error = frame.specular * tint, frame.error * tint.mean()
     tinted = replace(frame, diffuse=frame.diffuse * tint, specular=specular, error=error, report=report)
     seen = []
-    for name, one, told in (("white", replace(frame, report=report), "white"), ("tinted", tinted, (0.5, 1.0, 0.7))):
+    for name, one, stated in (("white", replace(frame, report=report), "white"), ("tinted", tinted, (0.5, 1.0, 0.7))):
         path = write_separation(one, tmp_path, name)[0]
         if beside == "nothing":
             (tmp_path / f"{name}.json").unlink()
-        found, notes = frames.open_frame(path, ReadOptions(), "joint", told)
+        found, notes = frames.open_frame(path, ReadOptions(), "joint", stated)
         assert notes == []
         seen.append(one_frame.images_of(found, frame.valid))
     np.testing.assert_allclose(seen[1], seen[0], rtol=1e-5, atol=1e-6)
@@ -606,7 +607,7 @@ def test_of_many_frames_two_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize(("wide", "meshed"), [(1, False), (4, False), (14, True)])
 def test_thin_things_have_maps_but_no_mesh(run: Cli, tmp_path: Path, wide: int, meshed: bool) -> None:
-    """A line of a few pixels has its maps; of a mesh a line says, with the file, how wide things have to be."""
+    """A line of a few pixels has its maps; of a mesh a line says, with the file, how wide objects have to be."""
     ones = np.ones((48, 600), np.float32)
     light = 0.3 * ones[..., None].repeat(3, axis=2)
     frame = SeparatedFrame(light, 0.2 * light, ones > 0, 0.2 * ones, 0.5 * ones, {"warnings": []})
@@ -619,7 +620,7 @@ def test_thin_things_have_maps_but_no_mesh(run: Cli, tmp_path: Path, wide: int, 
     if meshed:
         assert done.status == 0, done
         return
-    assert_refused(done, f"{path}: expected a thing of 11 pixels across or more for a mesh", "say --mesh none")
+    assert_refused(done, f"{path}: expected an object of 11 pixels across or more for a mesh", "say --mesh none")
     assert run(*words, "--mesh", "none").status == 0
     assert (read_exr_layers(tmp_path / "out" / "wire.exr")["normal.Z"][mask > 0] > 0).all()
 

@@ -529,7 +529,7 @@ def test_lobes_do_not_depend_on_the_choice_of_world_axes(generator: torch.Genera
 
 
 def test_turning_polarizer_and_light_up_together_changes_nothing(generator: torch.Generator) -> None:
-    """Only the direction of the light's field in space counts, not the frame that its angle is told in."""
+    """Only the direction of the light's field in space counts, not the frame that its angle is measured in."""
     g = random_geometry(100, generator)
     nu, delta = uniform(100, 0, 3, generator), 0.6
     beam = beam_frame(-g.to_light, g.light_up)

@@ -11,7 +11,7 @@ from torch import Tensor
 from polsep.demosaic.bilinear import aligned, demosaic_bilinear, demosaic_bilinear_half, mean_cells
 from polsep.physics.stokes import Stokes, fit_stokes
 from polsep.sensor.camera import IDEAL, PERIOD, Layout, Mosaic, expose
-from polsep.sensor.orient import Orientation, orient, ways_of
+from polsep.sensor.orient import Orientation, orient, shifts_of
 
 SONY, MONO = Layout(), Layout(bayer=None)
 #: An order whose transposed one no mirror and no crop gives, as they give Sony's.
@@ -63,11 +63,11 @@ def turn_light(stokes: Stokes, how: Orientation, height: int, width: int) -> Sto
 
 
 def every_way(mosaic: Mosaic, wanted: Layout) -> tuple[Orientation, ...]:
-    """`orient` and `ways_of`, which are of one size; of colour frames, red and blue change places in the second."""
-    ways = ways_of(mosaic, wanted)
-    assert [way.swapped for way in ways] == ([False] * 4 if wanted is MONO else [False, True])
-    assert len({way.turn(mosaic.data).shape for way in ways}) == 1
-    return orient(mosaic, wanted), *ways
+    """`orient` and `shifts_of`, which are of one size; of colour frames, red and blue change places in the second."""
+    shifts = shifts_of(mosaic, wanted)
+    assert [shift.swapped for shift in shifts] == ([False] * 4 if wanted is MONO else [False, True])
+    assert len({shift.turn(mosaic.data).shape for shift in shifts}) == 1
+    return orient(mosaic, wanted), *shifts
 
 
 def apart(a: Stokes, b: Stokes, edge: int) -> float:

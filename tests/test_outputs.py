@@ -46,7 +46,7 @@ def random_frame(channels: int = 3, size: tuple[int, int] = (37, 53)) -> Separat
     )
 
 
-def doubtful_frame(channels: int = 3) -> SeparatedFrame:
+def frame_with_errors(channels: int = 3) -> SeparatedFrame:
     """`random_frame` with an expected error of two channels."""
     error = np.random.default_rng(4).random((37, 53, 2), np.float32)
     return replace(random_frame(channels), error=0.1 * error)
@@ -240,16 +240,16 @@ def test_sidecar_states_version_source_report_units_and_a_sha256_of_every_other_
 ) -> None:
     frame = random_frame()
     written = write_separation(frame, tmp_path, "shot", format)
-    told = sidecar(tmp_path)
-    assert told["source"] == "shot.raw"
-    assert told["report"] == frame.report
-    assert told["format"] == format
-    assert told["shape"] == [37, 53, 3]
-    assert set(told["units"]) == set(LAYERS)
-    assert ("65535 = 2.0" in told["units"]["specular"]) == (format == "png")
-    assert isinstance(told["polsep"], str)
-    assert [f["name"] for f in told["files"]] == [p.name for p in written[:-1]]
-    for entry, path in zip(told["files"], written[:-1], strict=True):
+    said = sidecar(tmp_path)
+    assert said["source"] == "shot.raw"
+    assert said["report"] == frame.report
+    assert said["format"] == format
+    assert said["shape"] == [37, 53, 3]
+    assert set(said["units"]) == set(LAYERS)
+    assert ("65535 = 2.0" in said["units"]["specular"]) == (format == "png")
+    assert isinstance(said["polsep"], str)
+    assert [f["name"] for f in said["files"]] == [p.name for p in written[:-1]]
+    for entry, path in zip(said["files"], written[:-1], strict=True):
         data = path.read_bytes()
         assert entry == {"name": path.name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
@@ -258,7 +258,7 @@ def test_sidecar_states_version_source_report_units_and_a_sha256_of_every_other_
 def test_exactly_the_planned_files_appear_in_new_directories(tmp_path: Path, format: str) -> None:
     directory = tmp_path / "a" / "b"
     planned = planned_outputs(directory, "shot", format)
-    assert write_separation(doubtful_frame(), directory, "shot", format) == planned
+    assert write_separation(frame_with_errors(), directory, "shot", format) == planned
     assert sorted(p for p in tmp_path.rglob("*") if not p.is_dir()) == sorted(planned)
     assert sorted(p.name for p in directory.iterdir()) == sorted(p.name for p in planned)
     without = [path for path in planned if path.name != f"shot_error.{format}"]
@@ -268,13 +268,13 @@ def test_exactly_the_planned_files_appear_in_new_directories(tmp_path: Path, for
 
 
 @pytest.mark.parametrize("format", ["tiff", "png"])
-@pytest.mark.parametrize("frame", [random_frame(), doubtful_frame()], ids=["without", "with"])
+@pytest.mark.parametrize("frame", [random_frame(), frame_with_errors()], ids=["without", "with"])
 def test_an_error_image_from_before_is_refused_and_never_stays_beside_other_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str, frame: SeparatedFrame
 ) -> None:
     """Also where the frame has no error; and it is back when anything fails, at whichever step."""
     directory = tmp_path / "out"
-    write_separation(doubtful_frame(1), directory, "shot", format)
+    write_separation(frame_with_errors(1), directory, "shot", format)
     before = contents(directory)
     alone = tmp_path / "alone" / f"shot_error.{format}"
     alone.parent.mkdir()
@@ -297,14 +297,14 @@ def test_an_error_image_from_before_is_refused_and_never_stays_beside_other_imag
 @pytest.mark.parametrize("channels", [3, 1])
 def test_expected_errors_survive_every_format(tmp_path: Path, channels: int) -> None:
     """Exactly, two channels, diffuse first, and in PNG within half a code; the sidecar says so."""
-    frame = doubtful_frame(channels)
+    frame = frame_with_errors(channels)
     assert frame.error is not None
     frame.error[0, 0] = (3, 2)
     for format in FORMATS:
         write_separation(frame, tmp_path, "shot", format, overwrite=True)
-        told = sidecar(tmp_path)
-        assert set(told["units"]) == {*LAYERS, "error"}
-        limited = told.get("limited_samples", {"error": None})
+        said = sidecar(tmp_path)
+        assert set(said["units"]) == {*LAYERS, "error"}
+        limited = said.get("limited_samples", {"error": None})
         assert limited["error"] == ({"below": 0, "above": 1} if format == "png" else None)
     layers = read_exr_layers(tmp_path / "shot.exr")
     assert OpenEXR.File(str(tmp_path / "shot.exr"), header_only=True).header()["errorUnits"] == UNITS["error"]

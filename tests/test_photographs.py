@@ -128,7 +128,7 @@ def test_photographs_too_small_to_align_are_refused(shape: tuple[int, int]) -> N
 
 
 def test_two_angles_are_no_pair() -> None:
-    """Degrees are told from the picture's right, those of a pair from a direction that nobody measures."""
+    """Degrees count from the picture's right, those of a pair from a direction that nobody measures."""
     for angles in (PAIR_DEG, (90.0, 0.0)):
         with pytest.raises(ValueError, match="expected three or more angles that differ"):
             PhotoOptions(angles)
@@ -162,7 +162,7 @@ def test_a_pair_comes_back_as_diffuse_and_specular(tmp_path: Path, polsep: Cli) 
 
 
 def test_photographs_that_stand_still_are_not_resampled(tmp_path: Path) -> None:
-    """Their samples are those of the files, to the bit, whether aligned or not; told exposures divide them."""
+    """Their samples are those of the files, to the bit, whether aligned or not; stated exposures divide them."""
     pytest.importorskip("cv2")
     paths = [str(write_tiff(tmp_path / f"{angle:g}.tif", photograph(angle, seed=k))) for k, angle in enumerate(SIX)]
     aligned, facts = read_measurements(paths, PhotoOptions(SIX))
@@ -171,10 +171,10 @@ def test_photographs_that_stand_still_are_not_resampled(tmp_path: Path) -> None:
     assert (aligned.data.data == plain.data.data).all() and facts["contradiction"] < 0.01 and not aligned.notes
     codes = np.moveaxis(tifffile.imread(paths[3]), -1, 0)
     assert (plain.data.data[3] == codes.astype(np.float32) / np.float32(65535)).all()
-    told, facts = read_measurements(paths, PhotoOptions(SIX, exposures=(2, 1, 1, 1, 1, 4), align="none"))
-    assert isinstance(told.data, Measurements) and facts["exposures"] == [2, 1, 1, 1, 1, 4]
-    assert (told.data.data[5] == plain.data.data[5] / 4).all()
-    assert any("of their light contradict" in note for note in told.notes)
+    stated, facts = read_measurements(paths, PhotoOptions(SIX, exposures=(2, 1, 1, 1, 1, 4), align="none"))
+    assert isinstance(stated.data, Measurements) and facts["exposures"] == [2, 1, 1, 1, 1, 4]
+    assert (stated.data.data[5] == plain.data.data[5] / 4).all()
+    assert any("of their light contradict" in note for note in stated.notes)
 
 
 @pytest.mark.parametrize("strength", [1.0, 0.15])

@@ -60,7 +60,7 @@ def raw_frame(dtype: str = "uint16", layout: Layout | None = None, **scene: Any)
 
 
 def quietly(*args: Any, **kwargs: Any) -> polsep.Result:
-    """`polsep.separate` under white light unless told, without its warnings, which stay in the report."""
+    """`polsep.separate` under white light unless stated, without its warnings, which stay in the report."""
     kwargs.setdefault("light_color", "white")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", polsep.PolsepWarning)
@@ -211,12 +211,12 @@ def test_unpolarized_light_is_reported() -> None:
 
 @pytest.mark.parametrize("method", ["joint", "color-affine"])
 def test_metals_are_reported(method: str) -> None:
-    """Highlights in the metal's own colour, and nothing else, are no white light on a coloured thing."""
+    """Highlights in the metal's own colour, and nothing else, are no white light on a coloured object."""
     generator = torch.Generator().manual_seed(2)
     light = interpolate(torch.rand(1, 1, 12, 12, generator=generator), size=(SIZE, SIZE))[0]
     gold = 0.1 + 0.9 * light * torch.tensor([1.0, 0.78, 0.34]).view(3, 1, 1)
     frame = expose(Stokes(gold, 0.6 * gold, 0.7 * gold), Layout(), IDEAL).data.numpy()
-    with pytest.warns(polsep.PolsepWarning, match="white highlights on coloured things were expected"):
+    with pytest.warns(polsep.PolsepWarning, match="white highlights on coloured objects were expected"):
         polsep.separate(frame, method=method, light_color="white")
 
 
@@ -228,7 +228,7 @@ def test_statistics_are_what_a_method_measures() -> None:
 
 
 @pytest.fixture
-def doubting(monkeypatch: pytest.MonkeyPatch) -> Joint:
+def expecting(monkeypatch: pytest.MonkeyPatch) -> Joint:
     """A random network that expects errors, installed as the method ``joint``."""
     torch.manual_seed(3)
     network = Joint(3, ResidualSize(4, (0, 1, 1))).eval()
@@ -246,11 +246,11 @@ def doubting(monkeypatch: pytest.MonkeyPatch) -> Joint:
 
 
 @pytest.mark.parametrize("full", [False, True])
-def test_expected_errors_reach_their_owner(doubting: Joint, full: bool) -> None:
+def test_expected_errors_reach_their_owner(expecting: Joint, full: bool) -> None:
     """The frame holds what the method expects, and the report their rms; other methods have neither."""
     raw = raw_frame("float32", exposure=0.5)
     out = quietly(raw, method="joint", full=full)
-    expected = run_joint(doubting, Mosaic(torch.from_numpy(raw), Layout(), 0.0, 1.0), full).expected_error
+    expected = run_joint(expecting, Mosaic(torch.from_numpy(raw), Layout(), 0.0, 1.0), full).expected_error
     assert expected is not None and out.error is not None
     assert out.error.shape == (*out.valid.shape, 2) and out.error.dtype == np.float32
     assert out.error.flags.c_contiguous and float(out.error.min()) > 0 and float(np.ptp(out.error)) > 0
@@ -264,9 +264,9 @@ def test_expected_errors_reach_their_owner(doubting: Joint, full: bool) -> None:
 
 
 @pytest.mark.parametrize("full", [False, True])
-def test_expected_errors_are_in_the_light(doubting: Joint, full: bool) -> None:
+def test_expected_errors_are_in_the_light(expecting: Joint, full: bool) -> None:
     """Under a said light, errors grow by the mean over its colours as images do; statistics stay of white light."""
-    del doubting
+    del expecting
     white = quietly(raw_frame("float32", exposure=0.5), method="joint", full=full)
     light = {"light": ODD_LIGHT, "exposure": 0.5}
     colored = quietly(raw_frame("float32", **light), method="joint", light_color=ODD_LIGHT, full=full)
@@ -599,8 +599,8 @@ def test_only_the_ratios_of_a_light_color_count(method: str) -> None:
 def test_the_light_color_may_be_an_array() -> None:
     """A NumPy array of three numbers is a light colour as a tuple is."""
     raw = raw_frame()
-    told = quietly(raw, method="analytic", light_color=ODD_LIGHT)
-    assert (told.specular == quietly(raw, method="analytic", light_color=np.array(ODD_LIGHT)).specular).all()
+    stated = quietly(raw, method="analytic", light_color=ODD_LIGHT)
+    assert (stated.specular == quietly(raw, method="analytic", light_color=np.array(ODD_LIGHT)).specular).all()
     with pytest.raises(ValueError, match="light colour of three positive numbers"):
         polsep.separate(raw, light_color=np.ones(4))  # type: ignore[arg-type]
 

@@ -77,15 +77,16 @@ def test_wrong_ranges_show(harm: Callable[[float, float], tuple[float, float]]) 
 
 
 @pytest.mark.parametrize("precision", ["f32", "i8"])
-def test_silent_blocks_are_left_out(precision: str) -> None:
+def test_inactive_blocks_are_left_out(precision: str) -> None:
     """A block whose first layer never exceeds zero adds the second layer's bias and nothing else."""
     arrays = dict(random_net(COLOR).weights().arrays)
     arrays["net.encoders.1.0.first.bias"] = np.full_like(arrays["net.encoders.1.0.first.bias"], -1e3)
-    silent = replace(random_net(COLOR).weights(), arrays=arrays)
-    ranges = measure_ranges(silent, [frame(COLOR)])
+    inactive = replace(random_net(COLOR).weights(), arrays=arrays)
+    ranges = measure_ranges(inactive, [frame(COLOR)])
     assert [name for name, bounds in ranges.items() if bounds == (0, 0)] == ["net.encoders.1.0.second"]
     others = {name: bounds for name, bounds in ranges.items() if bounds != (0, 0)}
-    assert rms(replace(silent, ranges=ranges), replace(silent, ranges=others), (precision,) * 2, COLOR, False) < 1e-6
+    given, left = replace(inactive, ranges=ranges), replace(inactive, ranges=others)
+    assert rms(given, left, (precision,) * 2, COLOR, False) < 1e-6
 
 
 def test_frames_are_needed() -> None:

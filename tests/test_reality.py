@@ -70,14 +70,14 @@ def test_units_bring_twins_together() -> None:
         torch.testing.assert_close(found.specular / found.unit, ideal.specular, rtol=1e-4, atol=1e-5)
 
 
-def test_what_is_told_is_true() -> None:
-    """The formula, told the light's colour, the black level or the room, loses nothing but noise."""
+def test_what_is_stated_is_true() -> None:
+    """The formula, given the light's colour, the black level or the room, loses nothing but noise."""
     ideal = score(ideal_frame(stage()), "analytic", True)
     for name in ("daylight balance", "black level 240", "room light 30 %, lamp-off frame"):
-        told = score(frame(name), "analytic", True)
-        assert ideal.diffuse - told.diffuse < 0.5
-        assert ideal.specular - told.specular < 0.5
-    assert frame("daylight balance").told == {"light_color": LAMPS["daylight"]}
+        stated = score(frame(name), "analytic", True)
+        assert ideal.diffuse - stated.diffuse < 0.5
+        assert ideal.specular - stated.specular < 0.5
+    assert frame("daylight balance").options == {"light_color": LAMPS["daylight"]}
 
 
 def test_rooms_are_diffuse_and_have_their_share() -> None:
@@ -85,7 +85,7 @@ def test_rooms_are_diffuse_and_have_their_share() -> None:
     lamp, room = light_stage(stage()), light_room(stage(), 0.3)
     assert float(room.specular.s0.abs().max()) == 0
     share = room.diffuse.s0[:, room.mask].mean() / lamp.diffuse.s0[:, lamp.mask].mean()
-    assert 0.3 < float(share) < 0.6  # its mirror image comes on top
+    assert 0.3 < float(share) < 0.6  # its specular reflection comes on top
     turned = light_room(replace(stage(), light=replace(stage().light, polarizer=1.0)), 0.3).diffuse
     scale = room.diffuse.s0.sum() / turned.s0.sum()
     torch.testing.assert_close(turned.s1 * scale, room.diffuse.s1, rtol=1e-4, atol=1e-6)
@@ -108,7 +108,7 @@ def test_mannequins_have_unpolarized_bodies() -> None:
 
 
 def test_traced_light_is_counted_as_behind_crossed_polarizers() -> None:
-    """Light along the lamp's mirror images is specular, unpolarized light and that across them is diffuse."""
+    """Light along the lamp's highlights is specular, unpolarized light and that across them is diffuse."""
     one, angle = torch.ones(1, 4, 4), math.radians(40)
     lit = Stokes(one, one * math.cos(2 * angle), one * math.sin(2 * angle))
     direct = Scene(Stokes(one, 0 * one, 0 * one), lit, one[0] > 0)

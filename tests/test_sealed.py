@@ -71,13 +71,13 @@ def test_lamps_are_farther_from_the_camera_than_others() -> None:
     assert 20 <= min(found) < 30 and LARGEST_ANGLE_DEG < max(found) <= 65
 
 
-def test_skins_are_images_mirrored_through_space() -> None:
+def test_textures_are_images_mirrored_through_space() -> None:
     """Along x an image of three pixels is passed to and fro; a step of depth moves it by half as much."""
     image = torch.tensor([[[0.0, 1.0, 2.0], [0.0, 1.0, 2.0]]])
-    skin = wrap(image, 2.0)
+    texture = wrap(image, 2.0)
 
     def at(x: float, z: float = 0.0) -> float:
-        return float(skin(torch.tensor([x, 0.0, z])[:, None, None]))
+        return float(texture(torch.tensor([x, 0.0, z])[:, None, None]))
 
     assert [at(x) for x in (0.0, 1.0, 2.0, 3.0, 4.0, -1.0)] == pytest.approx([0, 1, 2, 1, 0, 1], abs=2e-3)
     assert at(0.0, 2.0) == pytest.approx(1.0, abs=1e-3)

@@ -31,7 +31,7 @@ SIZE = 256
 
 
 def scene(channels: int) -> Stokes:
-    """Smooth polarized things of several colours on black."""
+    """Smooth polarized objects of several colours on black."""
     y, x = torch.meshgrid(torch.linspace(0, 1, SIZE), torch.linspace(0, 1, SIZE), indexing="ij")
     inside = ((y - 0.5) ** 2 + (x - 0.5) ** 2 < 0.18).float()
     s0 = torch.stack([inside * (0.25 + 0.5 * x + 0.4 * c * y) for c in range(channels)])
@@ -94,7 +94,7 @@ def test_scaled_codes_are_codes(layout: Layout, scale: float) -> None:
 
 @LAYOUTS
 def test_a_black_level_that_was_said_is_kept(layout: Layout) -> None:
-    """The right one passes without a word; one that is too small or too large is told but never changed."""
+    """The right one passes without a word; one that is too small or too large is reported but never changed."""
     right = replace(frame(layout, 240.0), black_level=240.0)
     assert check_black_level(right).warning is None
     for said, true in ((64.0, 240.0), (240.0, 0.0)):
@@ -110,9 +110,9 @@ def test_a_level_that_polsep_advised_is_not_doubted(layout: Layout) -> None:
     noisy = frame(layout, 240.0, replace(IMX250, read_noise=10.0))
     advised = check_black_level(noisy).level
     assert advised == pytest.approx(240, abs=1.5)
-    told = replace(noisy, black_level=advised)
-    assert np.mean(told.data.numpy() < advised - LEAST_EXCESS * (4095 - advised)) > BELOW
-    assert check_black_level(told).warning is None
+    stated = replace(noisy, black_level=advised)
+    assert np.mean(stated.data.numpy() < advised - LEAST_EXCESS * (4095 - advised)) > BELOW
+    assert check_black_level(stated).warning is None
     assert "say a lower" in (check_black_level(replace(noisy, black_level=260.0)).warning or "")
 
 

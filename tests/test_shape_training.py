@@ -113,4 +113,4 @@ def test_small_layers_learn_after_large_ones_were_rounded(tmp_path: Path) -> Non
             np.testing.assert_allclose(again[name], before[name], rtol=2e-3, atol=1e-6)
     assert sum(not np.array_equal(before[name], after[name]) for name in before.keys() - large) > 2
     with pytest.raises(ValueError, match="a part"):
-        replace(OPTIONS, part="doubt")
+        replace(OPTIONS, part="errors")

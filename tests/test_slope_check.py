@@ -24,7 +24,7 @@ Codes = NDArray[np.uint16]
 
 @pytest.fixture(scope="module")
 def crop() -> Codes:
-    """A part of the demo capture: round coloured things under one polarized lamp."""
+    """A part of the demo capture: round coloured objects under one polarized lamp."""
     return np.asarray(imagecodecs.png_decode(CAPTURE.read_bytes()))[512:1536, 600:1800]
 
 

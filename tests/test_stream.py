@@ -110,8 +110,8 @@ def test_raw_is_the_truth_behind_its_filters(monkeypatch: pytest.MonkeyPatch) ->
     assert abs(float(z.std()) - 1) < 0.05
 
 
-def test_real_frames_less_the_told_color_are_the_truth_behind_its_filters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As above under lamps of any colour that is told, in lit rooms, where all specular light has the lamp's colour."""
+def test_real_frames_less_the_stated_color_are_the_truth_behind_its_filters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As above under lamps of any stated colour, in lit rooms, where all specular light has the lamp's colour."""
     monkeypatch.setattr(stream, "random_sensor", lambda _: IMX250)
     monkeypatch.setattr(stream, "random_errors", lambda _: SensorErrors())
     monkeypatch.setattr(reality, "COLOR_ERROR_SHARES", (1.0, 0.0, 0.0, 0.0))
@@ -137,9 +137,9 @@ def test_a_thumbnail_is_of_the_whole_frame() -> None:
     torch.manual_seed(0)
     light, mask = torch.rand(18, 64, 64).half(), torch.ones(64, 64, dtype=torch.bool)
     light[3:9], light[12:] = 0, 0
-    told, common, ranks = torch.ones(3), torch.zeros(4), torch.linspace(LOWEST_QUANTILE, 1, QUANTILES)
+    color, common, ranks = torch.ones(3), torch.zeros(4), torch.linspace(LOWEST_QUANTILE, 1, QUANTILES)
     places = [torch.tensor([[k, k]]) for k in (8, 56)]
-    scenes = [PooledScene(light, told, common, False, False, mask, place, place, ranks, 0.5) for place in places]
+    scenes = [PooledScene(light, color, common, False, False, mask, place, place, ranks, 0.5) for place in places]
     one, other = (random_example(deque([scene]), 16, torch.Generator().manual_seed(1)) for scene in scenes)
     assert torch.equal(one.thumbnail, other.thumbnail)
     assert not torch.equal(one.raw, other.raw)
@@ -188,8 +188,8 @@ def test_some_crops_are_about_the_brightest_pixels() -> None:
     mask = torch.ones(size, size, dtype=torch.bool)
     light, bright = torch.zeros(18, size, size), torch.tensor([[40, 90]])
     light[9:12, 40, 90] = 1
-    told, common, ranks = torch.ones(3), torch.zeros(4), torch.ones(QUANTILES)
-    scene = PooledScene(light, told, common, False, False, mask, mask.nonzero(), bright, ranks, 0.5)
+    color, common, ranks = torch.ones(3), torch.zeros(4), torch.ones(QUANTILES)
+    scene = PooledScene(light, color, common, False, False, mask, mask.nonzero(), bright, ranks, 0.5)
     crops = [random_example(deque([scene]), crop, torch.Generator().manual_seed(k)) for k in range(draws)]
     about = sum(bool(drawn.specular.any()) for drawn in crops)
     expected = BRIGHT_SHARE + (1 - BRIGHT_SHARE) * (crop / size) ** 2

@@ -371,7 +371,7 @@ def test_the_noise_of_flat_light_is_known_to_percents(change: float, share: floa
 def test_the_noise_of_a_stream_is_the_mean_of_its_estimates() -> None:
     """Every frame tells for the first eight, every fourth from then on; the latest sixteen estimates count."""
     light = make_light().clamp(min=0.03)
-    state, told, gains = None, [], []
+    state, estimates, gains = None, [], []
     for number in range(24):
         frame = shoot(light, number)
         before = state
@@ -382,9 +382,9 @@ def test_the_noise_of_a_stream_is_the_mean_of_its_estimates() -> None:
             data = frame.data.float().numpy()
             found = estimate_noise(data, (before.mean, before.count), CODES, before.frames)
             assert found is not None
-            told.append(found.gain)
-        gains.append(float(np.mean(told)))
-        assert state.estimates == len(told)
+            estimates.append(found.gain)
+        gains.append(float(np.mean(estimates)))
+        assert state.estimates == len(estimates)
         assert state.noise.gain == pytest.approx(gains[-1], rel=1e-6)
 
 

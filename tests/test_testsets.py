@@ -330,8 +330,8 @@ def test_lights_are_near_the_camera(generator: torch.Generator) -> None:
     assert {light.polarizer < math.pi / 2 for light in lights} == {True, False}
 
 
-def test_a_quarter_of_the_skins_is_near_grey() -> None:
-    """Of 16 scenes in a row, four, and of all skins."""
+def test_a_quarter_of_the_textures_is_near_grey() -> None:
+    """Of 16 scenes in a row, four, and of all textures."""
     points = torch.rand(3, 200, 1, generator=torch.Generator().manual_seed(1)) - 0.5
     grey = []
     for scene in range(16):

@@ -1,4 +1,4 @@
-"""Things that stand: closed meshes on a foot, cameras that look at them as users do, frames that are mirrored alone."""
+"""Objects that stand: closed meshes on a foot, cameras that look at them as users do, frames mirrored alone."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_profiles_join_and_insides_stay_inside() -> None:
 
 
 def test_vessels_and_bodies_repeat() -> None:
-    """One seed is one thing; another seed is another one; half of the bodies are cut flat below."""
+    """One seed is one object; another seed is another one; half of the bodies are cut flat below."""
     for build in (random_vessel, random_blob):
         first, again, other = (build(seeded(seed)) for seed in (3, 3, 4))
         np.testing.assert_array_equal(first.vertices, again.vertices)
@@ -90,7 +90,7 @@ def test_vessels_and_bodies_repeat() -> None:
     assert 0 < sum(share > 0.02 for share in feet) < len(feet)
 
 
-def test_cameras_look_at_things_that_stand_as_users_do() -> None:
+def test_cameras_look_at_objects_that_stand_as_users_do() -> None:
     """Elevations are those that are said; a tenth look down."""
     vertices = random_vessel(seeded(1)).vertices
     generator, elevations = seeded(5), []
@@ -105,10 +105,10 @@ def test_cameras_look_at_things_that_stand_as_users_do() -> None:
 
 def planes_of(mesh: Mesh, camera: PinholeCamera, lamp: PointLight) -> Tensor:
     """Planes of an example without noise: the true s0, s1 and s2, and the surface."""
-    thing, materials = MeshScene(mesh), random_materials(mesh.slot_count, seeded(8))
+    shape, materials = MeshScene(mesh), random_materials(mesh.slot_count, seeded(8))
     materials = replace(materials, textures=None)
-    view = find_view(thing, camera, (96, 96), 2)
-    scene = shade_view(view, materials, lamp, find_lit(thing, view, lamp))
+    view = find_view(shape, camera, (96, 96), 2)
+    scene = shade_view(view, materials, lamp, find_lit(shape, view, lamp))
     total = scene.diffuse + scene.specular
     stokes = avg_pool2d(torch.cat([total.s0, total.s1, total.s2]), 2)
     planes = torch.zeros(COUNT, *stokes.shape[1:])
@@ -122,7 +122,7 @@ def mirrored(x: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 def test_a_mirrored_example_is_the_example_of_the_mirrored_scene() -> None:
-    """Thing, camera, lamp and polarizer mirrored at the plane x = 0 give the frame that `turn_example` gives."""
+    """Object, camera, lamp and polarizer mirrored at the plane x = 0 give the frame that `turn_example` gives."""
     mesh, flip = random_vessel(seeded(6)), np.array([-1.0, 1.0, 1.0])
     camera = PinholeCamera((3.0, 7.0, 9.0), (0.2, 0.1, 0.0), 40.0)
     lamp = PointLight((6.0, 9.0, 7.0), 120.0, 0.5)
@@ -138,7 +138,7 @@ def test_a_mirrored_example_is_the_example_of_the_mirrored_scene() -> None:
 
 
 def test_frames_of_things_that_stand_stay_upright(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are mirrored across alone, but for the share of held things; those of solids turn in eight ways."""
+    """They are mirrored across alone, but for the share of held objects; those of solids turn in eight ways."""
     monkeypatch.setattr(shape_task, "HELD_SHARE", 0.0)
     planes = torch.zeros(COUNT, 24, 24)
     planes[PLANES["mask"], 4:20, 4:20] = 1

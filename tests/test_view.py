@@ -164,9 +164,9 @@ def test_results_keep_their_name_and_their_lamp(sessions: Sessions, tmp_path: Pa
     sessions.open_upload("b", [(str(sent), sent.name)])
     found = sessions.find("b").separate(Settings())
     assert found.frame.report["source"] == "my_shot" and "light_color" not in found.frame.report
-    told = sessions.find("b").separate(parse_settings({"light": "1,2,0.5"}))
-    assert told.frame.report["light_color"] == [0.5, 1.0, 0.25] and "0.500, 1.000, 0.250 told" in light_panel(
-        told.frame, told.small
+    stated = sessions.find("b").separate(parse_settings({"light": "1,2,0.5"}))
+    assert stated.frame.report["light_color"] == [0.5, 1.0, 0.25] and "0.500, 1.000, 0.250 stated" in light_panel(
+        stated.frame, stated.small
     )
     page = sessions.find("c")
     page.begin_own(path)

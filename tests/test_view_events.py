@@ -145,15 +145,15 @@ def test_the_file_that_was_sent_last_is_shown(events: Events, held: Held, tmp_pa
         first = asyncio.create_task(collect(events.open_own(file(tmp_path, "slow"), VALUES, REQUEST)))
         await reached(held.begun)
         second = events.open_own(file(tmp_path, "next"), VALUES, REQUEST)
-        told = [await anext(second)]
+        shown = [await anext(second)]
         before = await asyncio.wait_for(first, 60)
         held.go_on.set()
-        return before, told + await collect(second)
+        return before, shown + await collect(second)
 
-    before, told = asyncio.run(act())
-    assert "Waiting, 1 before this one" in told[0]["progress"]
-    assert "<b>next</b>" in told[-1]["status"] and told[-1]["progress"] == ""
-    assert told[-1]["cancel"] == gr.update(visible=False)
+    before, shown = asyncio.run(act())
+    assert "Waiting, 1 before this one" in shown[0]["progress"]
+    assert "<b>next</b>" in shown[-1]["status"] and shown[-1]["progress"] == ""
+    assert shown[-1]["cancel"] == gr.update(visible=False)
     assert all("status" not in update for update in before)
 
 
@@ -164,16 +164,16 @@ def test_settings_changed_meanwhile_stay(events: Events, held: Held, tmp_path: P
         first = asyncio.create_task(collect(events.open_demo({**VALUES, "keep": True}, REQUEST)))
         await asyncio.wait_for(first, 60)
         slow = events.open_own(file(tmp_path, "slow"), VALUES, REQUEST)
-        told = [await asyncio.wait_for(anext(slow), 60) for _ in range(3)]
+        shown = [await asyncio.wait_for(anext(slow), 60) for _ in range(3)]
         rest = asyncio.create_task(collect(slow))
         await reached(held.begun)
         wrong = await collect(events.separate({**VALUES, "white": "40x"}, REQUEST))
-        return told + await asyncio.wait_for(rest, 60), wrong
+        return shown + await asyncio.wait_for(rest, 60), wrong
 
-    told, (wrong,) = asyncio.run(act())
-    assert "white" in told[0] and all("white" not in update for update in told[1:])
+    shown, (wrong,) = asyncio.run(act())
+    assert "white" in shown[0] and all("white" not in update for update in shown[1:])
     assert "expected a number as white level" in wrong["status"]
-    assert all("status" not in update for update in told)  # which would replace the message
+    assert all("status" not in update for update in shown)  # which would replace the message
     held.go_on.set()
 
 
@@ -187,11 +187,11 @@ def test_a_file_that_fails_ends_the_wait_for_the_one_before(
         first = asyncio.create_task(collect(events.open_own(file(tmp_path, "slow"), VALUES, REQUEST)))
         await reached(held.begun)
         claimed = {"path": str(sent), "orig_name": sent.name}
-        told = await collect(events.open_upload({**VALUES, "file": [claimed]}, REQUEST))
-        return await asyncio.wait_for(first, 60), told
+        shown = await collect(events.open_upload({**VALUES, "file": [claimed]}, REQUEST))
+        return await asyncio.wait_for(first, 60), shown
 
-    before, (told,) = asyncio.run(act())
-    assert "notes.txt: expected" in told["status"] and told["cancel"] == gr.update(visible=False)
+    before, (shown,) = asyncio.run(act())
+    assert "notes.txt: expected" in shown["status"] and shown["cancel"] == gr.update(visible=False)
     assert before[-1]["progress"] == "" and all("status" not in update for update in before)
     held.go_on.set()
     assert sessions.line.join("b", lambda ticket: "done").future.result(60) == "done"  # after the one before
@@ -202,10 +202,10 @@ def test_frames_without_colour_reset_the_controls_of_colour(events: Events, sess
     """Edits that are left out have a remark, and their controls stand where they start; others stay."""
     opened(sessions)
     sessions.find("a").edit(Recipe((Rougher(sigma=3.0), Metallic(amount=0.5))))
-    told = asyncio.run(collect(events.separate({**VALUES, **LEVELS, "layout": "mono"}, REQUEST)))[-1]
-    assert f"{Metallic.title} is left out" in told["status"] and isinstance(told["stage"], str)
+    shown = asyncio.run(collect(events.separate({**VALUES, **LEVELS, "layout": "mono"}, REQUEST)))[-1]
+    assert f"{Metallic.title} is left out" in shown["status"] and isinstance(shown["stage"], str)
     starts = {f"{c.edit.name}.{c.parameter.name}": c.start for c in list_controls()}
-    reset = {name: value for name, value in told.items() if name in starts}
+    reset = {name: value for name, value in shown.items() if name in starts}
     assert reset == {name: starts[name] for name in starts if name.startswith("metallic.")}
 
 
@@ -217,8 +217,8 @@ def test_no_numbers_of_another_frame_while_it_plays(events: Events, sessions: Se
     assert events.hover(REQUEST, at) == {"readout": PAUSE}
     assert asyncio.run(events.point(REQUEST, at))["readout"] == PAUSE
     page.toggle()
-    told = asyncio.run(collect(events.settle({**VALUES, **LEVELS}, REQUEST)))[-1]
-    assert told["index"]["value"] == 1
+    shown = asyncio.run(collect(events.settle({**VALUES, **LEVELS}, REQUEST)))[-1]
+    assert shown["index"]["value"] == 1
     assert "row 12, column 32" in events.hover(REQUEST, at)["readout"]
 
 
@@ -240,18 +240,18 @@ def test_the_compared_method_is_not_edited(events: Events, sessions: Sessions) -
     edited = {**VALUES, "left": "Edited", "right": "Edited"}
     assert names(asyncio.run(events.draw(edited, REQUEST)))[1] == "Edited · analytic, half"
     page.edit(Recipe((Metallic(amount=0.5),)))
-    told = asyncio.run(events.draw(edited, REQUEST))
-    assert names(told) == ("Edited · color-affine, half", "Input · analytic, half")
+    shown = asyncio.run(events.draw(edited, REQUEST))
+    assert names(shown) == ("Edited · color-affine, half", "Input · analytic, half")
     plain = asyncio.run(events.draw({**edited, "right": "Input"}, REQUEST))
-    assert told["stage"] == plain["stage"]
+    assert shown["stage"] == plain["stage"]
 
 
 def test_a_result_is_not_compared_with_itself(events: Events, sessions: Sessions, tmp_path: Path) -> None:
     """No method makes another separation of one, so no picture has a method's name, and the page says so."""
     path = write_separation(opened(sessions).frame, tmp_path, "shot", "exr")[0]
-    told = asyncio.run(collect(events.open_own(path, {**VALUES, "against": "analytic, half"}, REQUEST)))[-1]
-    assert names(told) == ("Input", "Diffuse")
-    assert told["against"] == SAME and "only raw frames are separated by other methods" in told["status"]
+    shown = asyncio.run(collect(events.open_own(path, {**VALUES, "against": "analytic, half"}, REQUEST)))[-1]
+    assert names(shown) == ("Input", "Diffuse")
+    assert shown["against"] == SAME and "only raw frames are separated by other methods" in shown["status"]
     assert "against" not in asyncio.run(collect(events.separate(VALUES, REQUEST)))[-1]
 
 
@@ -271,9 +271,9 @@ def test_a_later_picture_stays(events: Events, sessions: Sessions, monkeypatch: 
         monkeypatch.setattr(module, "light_panel", light_panel)
         return (await collect(events.separate({**VALUES, **LEVELS}, REQUEST)))[-1]
 
-    told = asyncio.run(act())
-    assert isinstance(drawn[0]["stage"], str) and told["stage"] == gr.skip()
-    assert "analytic" in told["status"] and told["progress"] == ""
+    shown = asyncio.run(act())
+    assert isinstance(drawn[0]["stage"], str) and shown["stage"] == gr.skip()
+    assert "analytic" in shown["status"] and shown["progress"] == ""
 
 
 def test_a_frame_that_was_closed_is_not_shown(
@@ -288,8 +288,8 @@ def test_a_frame_that_was_closed_is_not_shown(
         return real(*said)
 
     monkeypatch.setattr(module, "light_panel", light_panel)
-    told = asyncio.run(collect(events.separate({**VALUES, **LEVELS}, REQUEST)))[-1]
-    assert told == {"stage": gr.skip()}
+    shown = asyncio.run(collect(events.separate({**VALUES, **LEVELS}, REQUEST)))[-1]
+    assert shown == {"stage": gr.skip()}
 
 
 @pytest.mark.parametrize("action", ["undo", "a wrong file"])
@@ -354,5 +354,5 @@ def test_a_shape_of_a_frame_that_was_closed_is_not_shown(
     later = False
     assert asyncio.run(events.find_shape(REQUEST))["shape"] == "surface"
     later = True
-    told = asyncio.run(events.find_shape(REQUEST))
-    assert "surface" not in told.values() and set(told) <= {"shape", "status"}  # what the button may change
+    shown = asyncio.run(events.find_shape(REQUEST))
+    assert "surface" not in shown.values() and set(shown) <= {"shape", "status"}  # what the button may change

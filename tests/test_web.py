@@ -307,7 +307,7 @@ def test_settings_wait_for_a_frame(page: Any) -> None:
     page.press("#white", "Enter")
     assert page.locator("#notes li").count() == 0 and state_of(page) == ["asking", None]
     state_format(page, 320, 96)
-    assert page.evaluate("[polsep.report.white_level, polsep.report.light.source]") == [4000, "told"]
+    assert page.evaluate("[polsep.report.white_level, polsep.report.light.source]") == [4000, "stated"]
 
 
 @needs_packages

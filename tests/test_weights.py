@@ -45,7 +45,7 @@ def test_rounded_arrays_without_their_steps_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
-    """Whatever the order in which their metadata are told."""
+    """Whatever the order in which their metadata are given."""
     paths, metadata = [tmp_path / f"{k}.safetensors" for k in range(8)], {str(k): "é" * k for k in range(20)}
     for path in paths:
         write_weights(path, {"a": torch.ones(3), "b": torch.zeros(2, 2)}, metadata | {"method": "paper"})

@@ -36,7 +36,7 @@ def frames(colors: int) -> Iterator[Mosaic]:
             continue
         for name in DISTURBANCES:
             frame = reality.DISTURBANCES[name](stage)
-            color = (frame.told or {}).get("light_color", (1.0, 1.0, 1.0))
+            color = (frame.options or {}).get("light_color", (1.0, 1.0, 1.0))
             yield replace(as_mosaic(frame.raw, white_level=frame.white_level)[0], light_color=color)
 
 

@@ -1,6 +1,6 @@
 """``python -m tools.round_weights FILE...``: write large layers of weights in 8 bits (`polsep.io.store.rounding`).
 
-That halves the file. What is silent in a joint network becomes 0, also in a file that is rounded already.
+That halves the file. What is inactive in a joint network becomes 0, also in a file that is rounded already.
 ``--examples DIR`` rounds networks for shape so that what they say of the examples of `polsep train shape` there stays
 (`polsep.train.rounding`).
 """
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from polsep.io.store.rounding import coarsened, names_to_round, steps_of
 from polsep.io.store.weights import read_weights, write_weights
-from polsep.networks.ranges import silenced
+from polsep.networks.ranges import pruned
 
 #: Batches of 8 examples that are looked at.
 BATCHES = 8
@@ -32,7 +32,7 @@ def main(paths: tuple[Path, ...], examples: Path | None) -> None:
     for path in paths:
         arrays, metadata = read_weights(path)
         names, before, own = names_to_round(arrays, metadata), path.stat().st_size, metadata.pop("sha256")
-        arrays = silenced(arrays, json.loads(metadata.get("ranges", "{}")))
+        arrays = pruned(arrays, json.loads(metadata.get("ranges", "{}")))
         if "rounded_from" in metadata:
             write_weights(path, arrays, metadata, names)
             continue

@@ -1,9 +1,10 @@
 """The sealed set: scenes that no choice has seen, scored when a version is released and at no other time.
 
-Shapes are swept curves and superquadrics, skins are photographs and scanned maps that nothing else here uses, half of
-the scenes stand before a wall, and the lamp is 20 to 65 degrees from the camera. None of the other sets has any of it.
-`SEALED` is not to be looked at, scored or trained on between releases; `PRACTICE`, of the same make but with skins and
-seeds of its own, is for trying the command. Real crossed-polarizer photographs are not in it: all there are were used.
+Shapes are swept curves and superquadrics, textures are photographs and scanned maps that nothing else here uses, half
+of the scenes stand before a wall, and the lamp is 20 to 65 degrees from the camera. None of the other sets has any of
+it. `SEALED` is not to be looked at, scored or trained on between releases; `PRACTICE`, of the same make but with
+textures and seeds of its own, is for trying the command. Real crossed-polarizer photographs are not in it: all there
+are were used.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ SIDE, GRID = 512, (240, 120)
 ANGLES_DEG, DISTANCES = (20.0, 65.0), (1.0, 2.5)
 #: Roughness where no map says it, of the wall, and what a roughness map spans; specular strength; albedo.
 ROUGHNESSES, WALL_ROUGHNESS, MAPPED, STRENGTHS, ALBEDOS = (0.12, 0.6), 0.45, (0.15, 0.75), (0.4, 1.4), (0.02, 0.95)
-#: Widths of a skin's image in scene units, on the object and on the wall; half the wall's side and its place.
-SKIN_SIZES, WALL_SIZE, WALL = (0.8, 2.0), 5.0, (9.0, -1.3)
+#: Widths of a texture's image in scene units, on the object and on the wall; half the wall's side and its place.
+TEXTURE_SIZES, WALL_SIZE, WALL = (0.8, 2.0), 5.0, (9.0, -1.3)
 
 _PHOTOS = "svbrdf/deschaintre_examples/inputExamples"
 _GDQUEST = "svbrdf/gdquest/godot/Demos"
-#: Files of every skin: its colours, and its roughness if there is a map of it.
-SKINS = (
+#: Files of every texture: its colours, and its roughness if there is a map of it.
+TEXTURES = (
     (f"{_PHOTOS}/IMG_20180104_210434.png",),
     (
         "svbrdf/echartsgl/test/asset/leather/leather_albedo.jpg",
@@ -202,14 +203,14 @@ def wrap(image: Tensor, size: float) -> Field:
 
 
 def make_sealed(number: int, side: int, paths: list[Path], generator: torch.Generator) -> Scene:
-    """Scene ``number``, with the skin of ``paths``, or a random one without; every second one before a wall."""
+    """Scene ``number``, with the texture of ``paths``, or a random one without; every second one before a wall."""
     build, closed = SHAPES[number % len(SHAPES)]
     share = torch.rand(8, generator=generator, dtype=torch.float64).numpy()
     mesh = span_grid(build(GRID, share[:3]), closed)
     camera = look_at(mesh, 360 * share[3] - 180 if number % 2 else 40 * share[3] - 20, 10 + 30 * share[4])
     light = random_light_near(camera, generator, ANGLES_DEG, DISTANCES)
     roughness, strength, size = (
-        low + (high - low) * share[5 + k] for k, (low, high) in enumerate((ROUGHNESSES, STRENGTHS, SKIN_SIZES))
+        low + (high - low) * share[5 + k] for k, (low, high) in enumerate((ROUGHNESSES, STRENGTHS, TEXTURE_SIZES))
     )
     images = [
         torch.from_numpy(np.array(read_map(path, kind))) for path, kind in zip(paths, ("texture", "mask"), strict=False)
@@ -231,7 +232,7 @@ def make_sealed(number: int, side: int, paths: list[Path], generator: torch.Gene
 
 
 SEALED = tuple(
-    Recipe(f"sealed-{k:02d}", 52_000 + k, files, partial(make_sealed, k, SIDE)) for k, files in enumerate(SKINS)
+    Recipe(f"sealed-{k:02d}", 52_000 + k, files, partial(make_sealed, k, SIDE)) for k, files in enumerate(TEXTURES)
 )
 #: Of the same make, for trying the command: nothing of the sealed scenes is in it.
 PRACTICE = tuple(Recipe(f"practice-{k}", 51_000 + k, (), partial(make_sealed, k, 128)) for k in range(2))

@@ -1,4 +1,4 @@
-"""Set (b): photographed statues and scanned things with random albedo and roughness.
+"""Set (b): photographed statues and scanned objects with random albedo and roughness.
 
 Five DiLiGenT objects, each a surface spanned by its depth map that carries the map's normals, seen from where its own
 camera was; and the meshes of the data folder. Surfaces cast shadows, of the DiLiGenT objects the visible side only.
@@ -32,9 +32,9 @@ from polsep.render.sphere_tracing import GBuffer, PinholeCamera, PointLight, Sce
 
 #: Roughness of the paper's 3D scenes.
 ROUGHNESSES = (0.2, 0.5)
-#: Skins of scenes in turn: patches are half of them.
-SKINS = ("patches", "veins", "patches", "plain")
-#: One scene in so many is near-grey, each time of the next skin.
+#: Textures of scenes in turn: patches are half of them.
+TEXTURES = ("patches", "veins", "patches", "plain")
+#: One scene in so many is near-grey, each time of the next texture.
 GREY_EVERY = 4
 #: Saturation of near-grey scenes and of the others, and the largest channel of any colour.
 GREY_SATURATIONS, SATURATIONS, VALUES = (0.0, 0.08), (0.2, 1.0), (0.15, 0.95)
@@ -80,7 +80,7 @@ SCANS = {
 
 
 def make_statue(scene: int, paths: list[Path], generator: torch.Generator) -> Scene:
-    """A DiLiGenT object under a random light with a random skin."""
+    """A DiLiGenT object under a random light with a random texture."""
     mesh, viewpoint = read_statue(paths)
     camera = _look_from(mesh, viewpoint)
     back = tuple(STATUE_LIGHT_DISTANCE * x / math.hypot(*viewpoint) for x in viewpoint)
@@ -89,7 +89,7 @@ def make_statue(scene: int, paths: list[Path], generator: torch.Generator) -> Sc
 
 
 def make_scan(scene: int, pose: Pose, paths: list[Path], generator: torch.Generator) -> Scene:
-    """A scanned mesh in a fixed pose under a random light with a random skin."""
+    """A scanned mesh in a fixed pose under a random light with a random texture."""
     mesh, camera = read_scan(paths[0], pose)
     light = random_light_near(camera, generator)
     return _render(mesh, (camera, light), random_albedo(scene, generator), generator, SCAN_SIDE)
@@ -124,15 +124,15 @@ def _render(
 
 
 def random_albedo(scene: int, generator: torch.Generator) -> Field:
-    """Random colours in space, of the skin that is this scene's turn."""
-    skin, grey = SKINS[scene % len(SKINS)], scene % GREY_EVERY == scene // GREY_EVERY % GREY_EVERY
+    """Random colours in space, of the texture that is this scene's turn."""
+    texture, grey = TEXTURES[scene % len(TEXTURES)], scene % GREY_EVERY == scene // GREY_EVERY % GREY_EVERY
     hue, saturation, value = torch.rand(3, 5, generator=generator)
     colors = rgb_from_hsv(hue, _within(GREY_SATURATIONS if grey else SATURATIONS, saturation), _within(VALUES, value))
     palette: tuple[Vector, ...] = tuple((r, g, b) for r, g, b in colors.tolist())
     share = torch.rand(1, generator=generator)
-    if skin == "plain":
+    if texture == "plain":
         return plain(palette[0])
-    if skin == "veins":
+    if texture == "veins":
         return marble(palette[0], palette[1], _within(VEIN_SIZES, share).item())
     return cells(palette, _within(PATCH_SIZES, share).item(), generator)
 

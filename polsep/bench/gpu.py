@@ -1,6 +1,6 @@
 """Frames per second on a GPU, and what half precision changes.
 
-All see the demo capture, 2448x2048 colour, in its light, told. Rates:
+All see the demo capture, 2448x2048 colour, in its light, stated. Rates:
 
 * "raw frame in, images out": upload, separation, report, and images as NumPy arrays; two frames at once, so that the
   host works on one while the device has the other, as in `polsep video --device cuda`;

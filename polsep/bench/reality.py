@@ -1,8 +1,8 @@
 """The cost of a world unlike the ideal model: paired twins of `datasets.reality`, the same scene and noise.
 
-Loss: PSNR of the ideal twin, whose white lamp is told, less that of the disturbed frame, of images over its ``unit``.
-Both at half resolution by `polsep.separate` with its defaults, nothing told; "told" rows name what differs. Thresholds
-are chosen on the split "validation" (``--split``); the tables are of "test".
+Loss: PSNR of the ideal twin, whose white lamp is stated, less that of the disturbed frame, of images over its ``unit``.
+Both at half resolution by `polsep.separate` with its defaults, nothing stated; "told" rows state what differs.
+Thresholds are chosen on the split "validation" (``--split``); the tables are of "test".
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 ORDER = ("analytic", "color-affine", "paper", "joint-large", "joint", "joint-fast")
 #: Quality of JPEG files, and the loss against `analytic` that counts as worse than it [dB].
 JPEG_QUALITY, WORSE = 95, 1.0
-#: Ending of the rows that are told what differs.
-TOLD = ", told"
+#: Ending of the rows that state what differs.
+STATED = ", told"
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def find_kinds() -> tuple[Kind, ...]:
         flat = measure_flat(flats)
         corrections = corrections_for("analysers", flat)
         measured = measure_analysers((corrections.apply(frame) for frame in turned), flat)
-        return replace(reality.DISTURBANCES["bad sensor"](stage), told={"calibration": measured})
+        return replace(reality.DISTURBANCES["bad sensor"](stage), options={"calibration": measured})
 
     def build_corner(split: str, number: int, size: int) -> Stage:
         return corners.build_corner(split, number, size // 2)
@@ -120,7 +120,7 @@ def find_kinds() -> tuple[Kind, ...]:
 
 
 def bench_reality(options: RealityOptions | None = None, data: Path | None = None) -> Iterator[Row]:
-    """Loss of every method by what real lamps, rooms, surfaces and sensors differ in, nothing told and told.
+    """Loss of every method by what real lamps, rooms, surfaces and sensors differ in, stated or not.
 
     With ``data``, a folder with raw frames, also the mosaic's pattern in their outputs. Inter-reflections need the
     extra mitsuba. Raises ValueError without the extra render, and on names of rows or methods that there are not.
@@ -160,11 +160,11 @@ def _bench_kind(kind: Kind, methods: Sequence[str], options: RealityOptions) -> 
             if not bool(frame.mask.any()):  # one body, all of metal, has nothing beside it
                 continue
             before = _ideal_on(frame.mask, twin, {method: scores[-1] for method, scores in ideal.items()})
-            for told in _calls(name, frame):
-                scores = {method: score(frame, method, told) for method in wanted}
+            for stated in _calls(name, frame):
+                scores = {method: score(frame, method, stated) for method in wanted}
                 for method in wanted:
                     trial = Trial(number, before[method], scores[method], scores["analytic"])
-                    found.setdefault((name + TOLD * told, method), []).append(trial)
+                    found.setdefault((name + STATED * stated, method), []).append(trial)
     for method in methods:
         yield from _means("reality/ideal", f"{kind.name}, undisturbed", method, "PSNR", ideal[method])
     for (name, method), trials in found.items():
@@ -180,15 +180,15 @@ def _ideal_on(mask: Tensor, twin: Frame, scores: dict[str, Score]) -> dict[str, 
 
 
 def _calls(name: str, frame: Frame) -> tuple[bool, ...]:
-    """Calls of a row: with nothing told, or told, or both. The truth of a lamp alone needs its lamp-off frame."""
-    if frame.told is None or name == "white lamp":
+    """Calls of a row: with nothing stated, with all, or both. The truth of a lamp alone needs its lamp-off frame."""
+    if frame.options is None or name == "white lamp":
         return (False,)
-    return (True,) if "ambient" in frame.told else (False, True)
+    return (True,) if "ambient" in frame.options else (False, True)
 
 
 def _summarize(name: str, method: str, trials: list[Trial]) -> Iterator[Row]:
     """Rows of one disturbance and method."""
-    part = "told" if name.endswith(TOLD) else "loss"
+    part = "told" if name.endswith(STATED) else "loss"
     found = [trial.found for trial in trials]
     losses = [
         Score(a.diffuse - b.diffuse, a.specular - b.specular, b.warnings)
@@ -218,9 +218,9 @@ def _means(bench: str, case: str, method: str, metric: str, scores: list[Score])
         yield Row(bench, case, method, f"{output} {metric}", round(mean, 2), "dB")
 
 
-def score(frame: Frame, method: str, told: bool) -> Score:
-    """Return the scores of a method on a frame, whose differences are ``told`` or not."""
-    options = dict(frame.told or {}) if told else {}
+def score(frame: Frame, method: str, stated: bool) -> Score:
+    """Return the scores of a method on a frame, whose differences are ``stated`` or not."""
+    options = dict(frame.options or {}) if stated else {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PolsepWarning)
         out = separate(frame.raw, method, white_level=frame.white_level, **options)

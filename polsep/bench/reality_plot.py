@@ -23,7 +23,7 @@ SHOWN = (-3.0, 15.0)
 
 
 def draw_reality(rows: Sequence[Row], data: Path | None, folder: Path) -> Iterator[Path]:
-    """Write the plot of the losses with nothing told into ``folder``. Raises ValueError without the extra bench."""
+    """Write the plot of the losses with nothing stated into ``folder``. Raises ValueError without the extra bench."""
     del data
     try:
         from matplotlib import style

@@ -30,7 +30,7 @@ from polsep.sensor.falloff import Table, falloff_image
 HOT, HOT_DEVIATIONS = 0.01, 12.0
 #: Share of hot pixels above which they are a picture. Sensors have less than 1 %.
 MOST_HOT = 0.05
-#: Share of them in a block from which on they are a thing in the picture: those of sensors lie apart.
+#: Share of them in a block from which on they are an object in the picture: those of sensors lie apart.
 DENSE = 0.25
 #: Side of blocks whose means show light in one of several dark frames, and the least change that does, white = 1.
 BLOCK, LIGHT = 32, 0.01

@@ -65,7 +65,7 @@ def calibrate_files(
         merged.append(frame.merged)
         found = [note for note in frame.notes if not isinstance(note, Overexposed | BlackFrame)]
         for _ in first:  # the first frame shows the layout of all
-            found += _doubts(frame)
+            found += _warnings(frame)
         for note in found:
             notes.setdefault(note, f"{frame.stem}: {note}")
 
@@ -87,7 +87,7 @@ def _time_notes(times_s: Sequence[float]) -> tuple[str, ...]:
     return (f"the dark frames were exposed for {found}: use the exposure time of the frames to come",)
 
 
-def _doubts(frame: Frame) -> list[str]:
+def _warnings(frame: Frame) -> list[str]:
     """Warnings of a frame whose samples are encoded, or else of another layout."""
     assert isinstance(frame.data, Mosaic)  # as `read_mosaics` makes sure
     encoded = encoding_warning(frame.data)
@@ -143,7 +143,7 @@ def merge_files(
         recorded.append(frame.exposure)
         forgotten.extend([(path, frame)] if forgets_level(frame) else [])
         found = [text for text in frame.notes if not isinstance(text, Overexposed)]
-        notes.extend(f"{frame.stem}: {text}" for text in (*found, *_doubts(frame)))
+        notes.extend(f"{frame.stem}: {text}" for text in (*found, *_warnings(frame)))
 
     frames = list(read_mosaics(paths, read, note))
     if len(forgotten) == len(frames) > 0:  # a short exposure alone may be dark

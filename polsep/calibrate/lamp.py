@@ -1,8 +1,8 @@
 """Colour, polarization angle and degree of a lamp, from frames of an object or of a grey card under it.
 
-Mirrored light has the lamp's colour and polarization. On a shiny dark ball it is nearly all the light there is; on
+Specular light has the lamp's colour and polarization. On a shiny dark ball it is nearly all the light there is; on
 other objects the colour is that of `find_light`, while the degree of polarization is a lower bound. A grey card
-shows the colour without any mirrored light.
+shows the colour without any specular light.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ def measure_lamp(frames: Iterable[Mosaic], before: Calibration | None = None, ca
         if card:
             colors += _card_colors(mosaic)
         else:
-            polarizations.append(_mirrored_polarization(mosaic))
+            polarizations.append(_specular_polarization(mosaic))
             lights.append(find_light(mosaic))
     if first is None:
         raise ValueError("expected frames of the lamp's light, found none")
     color, error = _mean_color(np.array(colors)) if card else _found_color(lights)
     base = Calibration(first.layout, first.white_level) if before is None else before
     lamp = LampFacts(color, None, None) if base.lamp is None else base.lamp._replace(color=color)
-    details: dict[str, object] = {"from": "card" if card else "mirrored light", "color_error_deg": round(error, 3)}
+    details: dict[str, object] = {"from": "card" if card else "specular light", "color_error_deg": round(error, 3)}
     if polarizations:
         polarized = _mean_polarization(polarizations)
         sure = polarized.concentration >= ONE_ANGLE
@@ -80,7 +80,7 @@ def _found_color(lights: Sequence[Light]) -> tuple[tuple[float, float, float], f
         return (1.0, 1.0, 1.0), 0.0
     if not light.sure:
         raise ValueError(
-            f"expected mirrored light that shows the lamp's colour to {SURE_DEG} degrees, found {light.error_deg:.1f}: "
+            f"expected specular light that shows the lamp's colour to {SURE_DEG} degrees, found {light.error_deg:.1f}: "
             "show a shiny ball, or a grey card and say --card"
         )
     r, g, b = light.color
@@ -116,7 +116,7 @@ def _mean_polarization(found: Sequence[_Polarized]) -> _Polarized:
     )
 
 
-def _mirrored_polarization(mosaic: Mosaic) -> _Polarized:
+def _specular_polarization(mosaic: Mosaic) -> _Polarized:
     """The polarized light of a frame where it is purest."""
     stokes, determined = fit_stokes_unclipped(demosaic_bilinear_half(mosaic))
     s0, s1, s2 = (

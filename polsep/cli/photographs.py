@@ -94,8 +94,8 @@ def read_photo_options(options: Mapping[str, Any]) -> PhotoOptions:
     if options["angles"] is not None:
         angles = _numbers("angles", options["angles"])
     exposures = None if options["exposures"] is None else _numbers("exposures", options["exposures"])
-    told = {name: options[name] for name in ("extinction", "align", "encoding") if options[name] is not None}
-    return PhotoOptions(angles, exposures, full=options["full"], **told)
+    stated = {name: options[name] for name in ("extinction", "align", "encoding") if options[name] is not None}
+    return PhotoOptions(angles, exposures, full=options["full"], **stated)
 
 
 def _expand(files: tuple[str, ...], angles: tuple[float, ...] | None) -> list[str]:

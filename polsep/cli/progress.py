@@ -26,7 +26,7 @@ class Progress:
     def __init__(self, text: str, total: int | None, bar: Bar | None) -> None:
         self._text, self._total, self._done, self._before = text, total, 0, 0
         self._start_s, self._bar = time.monotonic(), bar
-        self.known = False  # whether the first state was told
+        self.known = False  # whether the first state was reported
         self._task = None if bar is None else bar.add_task(text, total=total, speed="")
 
     def update(self, done: int, total: int | None = None, text: str | None = None) -> None:

@@ -1,4 +1,4 @@
-"""The surface of a thing from one frame: shape."""
+"""The surface of an object from one frame: shape."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ from polsep.cli.progress import show_progress
     help="Direction toward the lamp: right, up, to the camera; auto: somewhere beside the camera.",
 )
 @click.option(
-    "--mask", type=FILE, metavar="FILE", help="Image that is white on the thing.  [default: where light falls]"
+    "--mask", type=FILE, metavar="FILE", help="Image that is white on the object.  [default: where light falls]"
 )
 @click.option(
     "--index",
     type=Number(float, 1.3, 2.5),
     default=1.5,
     metavar="N",
-    help="Refractive index of the thing: 1.33 water, 1.4 skin, 1.5 glass and most paints, 1.6 polycarbonate.",
+    help="Refractive index of the object: 1.33 water, 1.4 skin, 1.5 glass and most paints, 1.6 polycarbonate.",
 )
 @click.option(
     "--method",
@@ -74,9 +74,9 @@ from polsep.cli.progress import show_progress
 @WEIGHTS
 @OVERWRITE
 def shape(file: Path, **options: Any) -> None:
-    """Estimate normals, albedo, roughness, depth and a mesh of a thing from one frame under one polarized lamp.
+    """Estimate normals, albedo, roughness, depth and a mesh of an object from one frame under one polarized lamp.
 
-    FILE is a raw frame, as for 'polsep separate', or an EXR file that it wrote. The thing stands before a dark ground,
+    FILE is a raw frame, as for 'polsep separate', or an EXR file that it wrote. The object stands before a dark ground,
     or --mask says where it is. A network finds the surface in the separated images and in the polarization of the
     diffuse light, and says how far off it may be.
 

@@ -53,7 +53,7 @@ OWN |= {"part": (*_JOINT, "shape"), "side": ("shape",), "meshes": ("shape",), "c
     "--part",
     default="all",
     metavar="NAME",
-    help="Part to train: all; joint networks: details or doubt; shape: small, layers that are not rounded.",
+    help="Part to train: all; joint networks: details or errors; shape: small, layers that are not rounded.",
 )
 @click.option(
     "--input",

@@ -184,7 +184,7 @@ def _farthest(matrix: Doubles, shape: tuple[int, ...]) -> float:
 def residual_shift(reference: Floats, aligned: Floats) -> float:
     """Median shift [pixels] that blocks of an aligned picture still have; 0 where no block has details to tell.
 
-    It shows what one motion cannot undo: depth seen from two places, things that moved.
+    It shows what one motion cannot undo: depth seen from two places, objects that moved.
     """
     import cv2
 

@@ -1,7 +1,7 @@
 """Corners of coloured walls with objects in them, whose inter-reflections are traced by Mitsuba (extra ``mitsuba``).
 
 The truth is that behind crossed polarizers: of light that came over another surface first, what still oscillates along
-the lamp's mirror images counts as specular, and all the rest as diffuse, mirrored or not.
+the lamp's highlights counts as specular, and all the rest as diffuse, specular reflection or not.
 """
 
 from __future__ import annotations
@@ -73,11 +73,11 @@ def trace_indirect(stage: Stage) -> Scene:
 
 def add_traced(direct: Scene, indirect: Scene) -> Scene:
     """Return direct and indirect light together, with the truth of the module."""
-    angle, mirrored = 2 * specular_angle(direct), indirect.specular
-    along = (mirrored.s1 * angle.cos() + mirrored.s2 * angle.sin()).clamp(min=0)
-    along = torch.minimum(along, mirrored.s0.clamp(min=0))
+    angle, specular = 2 * specular_angle(direct), indirect.specular
+    along = (specular.s1 * angle.cos() + specular.s2 * angle.sin()).clamp(min=0)
+    along = torch.minimum(along, specular.s0.clamp(min=0))
     kept = Stokes(along, along * angle.cos(), along * angle.sin())
-    rest = mirrored + kept * -1.0
+    rest = specular + kept * -1.0
     return replace(direct, diffuse=direct.diffuse + indirect.diffuse + rest, specular=direct.specular + kept)
 
 

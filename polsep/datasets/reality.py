@@ -53,7 +53,7 @@ SAMPLES = 2
 CLIPPED, LEVEL = 0.001, 0.05
 #: Least specular over diffuse light of a stage, and most draws of one: without highlights methods hardly differ.
 LEAST_SPECULAR, MAX_DRAWS = 0.02, 20
-#: Directions of a room's light, least roughness of its mirror images, which blurs single directions, and how much
+#: Directions of a room's light, least roughness of its reflections, which blurs single directions, and how much
 #: brighter its bright side is than its mean.
 ROOM_LIGHTS, ROOM_ROUGHNESS, ROOM_CONTRAST = 16, 0.5, 0.8
 #: Range of a room light's red and blue over the lamp's, green = 1.
@@ -93,8 +93,8 @@ class Stage:
 class Frame:
     """A raw frame and its truth at half resolution: ``diffuse``, ``specular [3, h, w]``, ``mask [h, w]``.
 
-    ``unit [3, 1, 1]``: see the module. ``told``: options of `polsep.separate` that name what differs; None: there is
-    nothing to say.
+    ``unit [3, 1, 1]``: see the module. ``options``: of `polsep.separate`, stating what differs; None: there is
+    nothing to state.
     """
 
     raw: NDArray[Any]
@@ -103,7 +103,7 @@ class Frame:
     specular: Tensor
     mask: Tensor
     unit: Tensor
-    told: dict[str, Any] | None = None
+    options: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -185,25 +185,25 @@ def _light_around(stage: Stage) -> Scene:
 
 
 def expose_frame(
-    stage: Stage, scene: Scene, capture: Capture | None = None, told: dict[str, Any] | None = None
+    stage: Stage, scene: Scene, capture: Capture | None = None, options: dict[str, Any] | None = None
 ) -> Frame:
     """Return the frame that a sensor records of a scene, after its colour and exposure."""
     capture = capture or Capture()
     unit = capture.exposure * as_color(capture.color)
     lit = scale_light(scene, unit)
     mosaic = record(lit.diffuse + lit.specular, Layout(), capture.sensor, capture.errors, stage.seed)
-    return _as_frame(mosaic, lit, unit, told)
+    return _as_frame(mosaic, lit, unit, options)
 
 
-def _as_frame(mosaic: Mosaic, scene: Scene, unit: Tensor, told: dict[str, Any] | None) -> Frame:
+def _as_frame(mosaic: Mosaic, scene: Scene, unit: Tensor, options: dict[str, Any] | None) -> Frame:
     diffuse, specular, mask = half_resolution(scene)
     kind = np.uint8 if mosaic.white_level < 256 else np.uint16
-    return Frame(mosaic.data.numpy().astype(kind), mosaic.white_level, diffuse, specular, mask, unit, told)
+    return Frame(mosaic.data.numpy().astype(kind), mosaic.white_level, diffuse, specular, mask, unit, options)
 
 
 def ideal_frame(stage: Stage) -> Frame:
-    """Return the undisturbed twin; told: that the light is white."""
-    return expose_frame(stage, light_stage(stage), told={"light_color": (1.0, 1.0, 1.0)})
+    """Return the undisturbed twin; its options state that the light is white."""
+    return expose_frame(stage, light_stage(stage), options={"light_color": (1.0, 1.0, 1.0)})
 
 
 def _in_color(name: str) -> Callable[[Stage], Frame]:
@@ -230,10 +230,10 @@ def _less_dark_frame(share: float) -> Callable[[Stage], Frame]:
     return make
 
 
-def _by_sensor(told: dict[str, Any] | None = None, **errors: float) -> Callable[[Stage], Frame]:
+def _by_sensor(options: dict[str, Any] | None = None, **errors: float) -> Callable[[Stage], Frame]:
     def make(stage: Stage) -> Frame:
         found = SensorErrors(**errors, specimen=stage.seed % 1000)
-        return expose_frame(stage, light_stage(stage), Capture(errors=found), told)
+        return expose_frame(stage, light_stage(stage), Capture(errors=found), options)
 
     return make
 
@@ -322,7 +322,7 @@ def _usual_rig(stage: Stage) -> Frame:
 
 def ideal_mannequin(stage: Stage) -> Frame:
     """Return the undisturbed twin of `SHEENS`: white highlights and unpolarized diffuse light under a white lamp."""
-    return expose_frame(stage, _unpolarized(light_stage(stage)), told={"light_color": (1.0, 1.0, 1.0)})
+    return expose_frame(stage, _unpolarized(light_stage(stage)), options={"light_color": (1.0, 1.0, 1.0)})
 
 
 def _unpolarized(scene: Scene) -> Scene:

@@ -7,7 +7,7 @@ whose colours come in 2x2 blocks (`_intensity_mosaic`). Demosaicking has two hal
 1. s0 of all colours (`fill_colors`). Green first: along rows and columns, the interpolation of the other colour plus
    what the pixel's own colour differs from its interpolation, times the slope at which green follows that colour
    around (slope 1 is Hamilton and Adams 1997; textures of unlike colours need other slopes). What green then differs
-   from the pixel's colour is smoothed where it is no larger than the error of such an interpolation: on grey things,
+   from the pixel's colour is smoothed where it is no larger than the error of such an interpolation: on grey objects,
    that is everywhere. Then red and blue as local linear functions of green, with the residual interpolated (residual
    interpolation, Kiku et al. 2013).
 2. Polarization (`_residual_mosaic`). The guide is s0 of each pixel's own colour, from pixels around it; what the

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from polsep.geometry.frames import open_frame
 from polsep.geometry.integration import integrate_bilateral, integrate_smooth
+from polsep.geometry.object_mask import find_object_mask
 from polsep.geometry.photometric import Appearance, fit_robust, unexplained_share
 from polsep.geometry.polarization import Polarized, find_diffuse_polarization, normals_from_polarization
 from polsep.geometry.surface import Surface, draw_views, relight, span_surface
-from polsep.geometry.thing import find_lit
 from polsep.io.assets.maps import read_map
 from polsep.io.assets.shapes import ShapeFiles, encode_glb, encode_ply
 from polsep.io.raw.frames import ReadOptions
@@ -166,7 +166,7 @@ def find_object(views: Views) -> Mask:
     """Estimate the mask of an object before a dark background, from where light falls. Raises InputError."""
     brightest = views.images.mean(axis=-1).max(axis=0).astype(np.float32)
     try:
-        return find_lit(brightest, brightest)
+        return find_object_mask(brightest, brightest)
     except ValueError:
         raise InputError("expected light on an object, found black images") from None
 

@@ -1,7 +1,7 @@
 """The direction toward the lamp of one frame: by the shading of a surface, and among many by which explains most.
 
-A surface says which lamp would shade it so (`lamp_by_shading`), but a network that is not told the lamp draws surfaces
-for the lamp it guesses. So it looks once more for each of `LAMPS` (`search_lamp`). Under the true one it is surest,
+A surface says which lamp would shade it so (`lamp_by_shading`), but a network that is not given the lamp draws surfaces
+for the lamp it guesses. So it runs once more for each of `LAMPS` (`search_lamp`). Under the true one it is surest,
 its surface shows the picture that was seen, and its highlights are where they were seen (`misfit`).
 """
 
@@ -54,21 +54,21 @@ def lamp_by_shading(surface: Surface, seen: Seen) -> Vector:
     return _unit(vector) if vector[2] > 0 else (0.0, 0.0, 0.0)
 
 
-def search_lamp(look: Callable[[Seen], Surface], seen: Seen) -> Vector:
-    """The mean of `LAMPS` by how well the surface that ``look`` finds under each explains what is seen.
+def search_lamp(predict: Callable[[Seen], Surface], seen: Seen) -> Vector:
+    """The mean of `LAMPS` by how well the surface that ``predict`` finds under each explains what is seen.
 
-    They count less the farther they are from the lamp that shades the surface of an untold lamp.
+    They count less the farther they are from the lamp that shades the surface found without a lamp.
     """
-    shading = np.array(lamp_by_shading(look(seen), seen), np.float32)
+    shading = np.array(lamp_by_shading(predict(seen), seen), np.float32)
     away = np.degrees(np.arccos(np.clip(LAMPS @ shading, -1, 1))) / SHADING_DEG if shading.any() else 0 * LAMPS[:, 0]
     tried = away < REACH
-    cost = TRUST * np.array([misfit(look(seen_under(seen, lamp)), seen, lamp) for lamp in LAMPS[tried]])
+    cost = TRUST * np.array([misfit(predict(seen_under(seen, lamp)), seen, lamp) for lamp in LAMPS[tried]])
     cost += away[tried] ** 2 / 2
     return _unit(np.exp(cost.min() - cost) @ LAMPS[tried])
 
 
 def seen_under(seen: Seen, lamp: Vector | Floats) -> Seen:
-    """The same images, with the direction toward the lamp told."""
+    """The same images, with the direction toward the lamp given."""
     return seen._replace(light=np.array(lamp, np.float32)[:, None, None] + 0 * seen.light)
 
 
@@ -90,7 +90,7 @@ def misfit(surface: Surface, seen: Seen, lamp: Floats) -> float:
 
 
 def _logarithm(image: Floats, seen: Seen) -> Floats:
-    """The logarithm of an image's mean over colours, relative to the thing's level."""
+    """The logarithm of an image's mean over colours, relative to the object's level."""
     level = object_level(seen.image, seen.mask)[0]
     found: Floats = np.log(image.mean(axis=0).clip(0, None) / level + FLOOR)
     return found

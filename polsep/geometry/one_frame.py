@@ -1,9 +1,9 @@
-"""The surface behind one frame under one polarized lamp: normals, albedo, roughness, strength of its mirror images.
+"""The surface behind one frame under one polarized lamp: normals, albedo, roughness, specular strength.
 
-A network looks at the thing as a whole, in a square around its mask, and says how sure it is (`geometry.shape_maps`).
-It looks at the thing and at its mirror image, twice as fine as it was trained and coarser, when it has found the lamp
-(`ShapeEstimator.find`).
-It was trained on rendered frames that were separated as users' frames are. `polarization.choose_outward` is the same
+A network sees the object as a whole, in a square around its mask, and predicts its own errors
+(`geometry.shape_maps`). Its predictions for the object and its mirror image at three scales, twice as fine as it was
+trained and coarser, are averaged (test-time augmentation), once the lamp is found (`ShapeEstimator.find`). It was
+trained on rendered frames that were separated as users' frames are. `polarization.choose_outward` is the same
 task without training.
 """
 
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from polsep.compute.arguments import WrongType
 from polsep.compute.resizing import block_means, resize_area, resize_bilinear
 from polsep.geometry.lamp import search_lamp, seen_under
+from polsep.geometry.object_mask import find_object_mask
 from polsep.geometry.shape_maps import (
     INPUTS,
     Seen,
@@ -34,7 +35,6 @@ from polsep.geometry.shape_maps import (
     mirror_seen,
     mirror_surface,
 )
-from polsep.geometry.thing import find_lit
 from polsep.io.store.errors import as_path
 from polsep.io.store.weights import read_weights, shipped_weights
 from polsep.networks.graphs import core, require_own_threads, shape_model
@@ -46,18 +46,20 @@ from polsep.separation.report import SeparatedFrame, reported_light
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Side of the square around the thing [pixels]; over the longest side of the mask; sides of the blocks of pixels whose
+#: Side of the square around the object [pixels]; over the longest side of the mask; sides of the blocks of pixels whose
 #: means the network sees (training shows it squares of ``SIDE / 2``).
 SIDE, WIDER, SCALES = 384, 1.1, (1, 2, 3)
 #: Expected error of ln(roughness), and of ln(strength), from which on they count as unknown.
 UNKNOWN = 0.5
 #: Refractive indices of dielectrics, from water to diamond.
 INDICES = (1.3, 2.5)
-#: Share of the frame's border on the thing from which on the mask is probably wrong; expected error of normals
+#: Share of the frame's border on the object from which on the mask is probably wrong; expected error of normals
 #: [degrees], in the median, from which on they are called uncertain.
 FILLED, UNCERTAIN_DEG = 0.2, 15.0
 #: A note on a colour frame without the lamp's colour, as `read_separated` gives.
-UNTOLD = 'the lamp\'s colour is not told: taken for white, or set frame.report["light_color"] = [r, g, b] before'
+UNKNOWN_LIGHT = (
+    'the lamp\'s colour is not known: taken for white, or set frame.report["light_color"] = [r, g, b] before'
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +68,10 @@ class Shape:
 
     ``normals [h, w, 3]``: unit vectors, x right, y up, z to the camera. ``normal_error``: their expected deviation
     along each of two axes [rad]. ``albedo [h, w, C]``: relative, 1 where a surface that faces the lamp is as bright as
-    the thing in the mean. ``roughness``: GGX sqrt(alpha); ``specular``: strength of mirror images, 1 = a dielectric of
+    the object in the mean. ``roughness``: GGX sqrt(alpha); ``specular``: strength of reflections, 1 = a dielectric of
     index 1.5; ``roughness_error``, ``specular_error``: expected deviations of their logarithms, unknown from `UNKNOWN`
-    on. ``light [3]``: unit vector toward the lamp, told or found (`lamp.search_lamp`).
-    ``mask_told``: the mask was given, not found.
+    on. ``light [3]``: unit vector toward the lamp, given or found (`lamp.search_lamp`).
+    ``mask_given``: the mask was given, not found.
     """
 
     normals: Floats
@@ -81,27 +83,27 @@ class Shape:
     specular_error: Floats
     mask: Mask
     light: tuple[float, float, float]
-    mask_told: bool = False
+    mask_given: bool = False
 
     def __repr__(self) -> str:
         share, error = float(self.mask.mean()), float(np.degrees(np.median(self.normal_error[self.mask])))
         size = list(self.mask.shape)
-        return f"Shape(normals {size}, {share:.0%} on the thing, expected error {error:.1f} degrees in the median)"
+        return f"Shape(normals {size}, {share:.0%} on the object, expected error {error:.1f} degrees in the median)"
 
-    def doubts(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """Lines on what the network does not know, or what it was not made for."""
         inside = self.mask
         unknown = float((self.roughness_error[inside] >= UNKNOWN).mean())
         error = float(np.degrees(np.median(self.normal_error[inside])))
         border = float(np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]]).mean())
         notes = []
-        if border > FILLED and not self.mask_told:
+        if border > FILLED and not self.mask_given:
             notes.append(
-                f"one thing before a dark ground was expected, found light on {border:.0%} of the frame's border: say "
-                "where the thing is (mask)"
+                f"one object before a dark ground was expected, found light on {border:.0%} of the frame's border: say "
+                "where the object is (mask)"
             )
         if unknown > 0.5:
-            notes.append(f"the roughness of {unknown:.0%} of the thing is unknown: no highlight shows it")
+            notes.append(f"the roughness of {unknown:.0%} of the object is unknown: no highlight shows it")
         if error > UNCERTAIN_DEG:
             notes.append(f"normals are uncertain: {error:.0f} degrees are expected in the median")
         return notes
@@ -125,26 +127,26 @@ class ShapeEstimator:
     def find(self, seen: Seen) -> Surface:
         """The surface in images ``[C, SIDE, SIDE]``: the mean of what they and their means over `SCALES` say.
 
-        Small blocks show the detail, large ones the whole. Each says the mean of looks at the thing and at its mirror
-        image. Where the lamp is not told, it is found first (`find_lamp`).
+        Small blocks show the detail, large ones the whole; for each, predictions for the object and its mirror image
+        are averaged. Where the lamp is not given, it is found first (`find_lamp`).
         """
         seen = seen if np.any(seen.light) else seen_under(seen, self.find_lamp(seen))
         found = (self._find_mirrored(_means(seen, block)) for block in SCALES)
         return mean_surface(*(Surface(*(resize_bilinear(x, (SIDE, SIDE)) for x in surface)) for surface in found))
 
     def find_lamp(self, seen: Seen) -> tuple[float, float, float]:
-        """The unit vector toward the lamp, which is not told (`lamp.search_lamp`).
+        """The unit vector toward the lamp, which is not given (`lamp.search_lamp`).
 
-        By the coarsest of `SCALES` in which whole blocks are on the thing.
+        By the coarsest of `SCALES` in which whole blocks are on the object.
         """
         coarser = (_means(seen, block) for block in reversed(SCALES))
         return search_lamp(self._find_mirrored, next((means for means in coarser if means.mask.any()), seen))
 
     def _find_mirrored(self, seen: Seen) -> Surface:
-        return mean_surface(self.look(seen), mirror_surface(self.look(mirror_seen(seen))))
+        return mean_surface(self.predict(seen), mirror_surface(self.predict(mirror_seen(seen))))
 
-    def look(self, seen: Seen) -> Surface:
-        """The surface by one look of the network at images of ``SIDE`` over one of `SCALES`."""
+    def predict(self, seen: Seen) -> Surface:
+        """The surface by one run of the network on images of ``SIDE`` over one of `SCALES`."""
         require_own_threads()
         maps = np.ascontiguousarray(encode(seen, self.input), np.float32)[None]
         outputs = self._layers[maps.shape[-1]].create_infer_request().infer([maps])[0][0]
@@ -152,7 +154,7 @@ class ShapeEstimator:
 
 
 def _means(seen: Seen, block: int) -> Seen:
-    """Means over blocks of pixels; the mask is where all are of the thing."""
+    """Means over blocks of pixels; the mask is where all are of the object."""
     means = Seen(*(None if x is None else np.asarray(block_means(x, block), np.float32) for x in seen))
     return means._replace(mask=(means.mask > 0.99).astype(np.float32))
 
@@ -175,11 +177,11 @@ def shape(
     weights: str | Path | None = None,
     index: float = ETA,
 ) -> Shape:
-    """Find the surface of the thing in a frame that `polsep.separate` separated; its `doubts` are issued as warnings.
+    """Find the surface of the object in a frame that `polsep.separate` separated; issue its `warnings`.
 
-    ``mask [h, w]``: where the thing is; None: where light falls (`find_thing`). ``light``: x, y, z toward the lamp,
+    ``mask [h, w]``: where the object is; None: where light falls (`mask_of`). ``light``: x, y, z toward the lamp,
     x right, y up, z to the camera; None: not known, as beside the camera it need not be. ``index``: refractive index of
-    the thing, in `INDICES`. Raises ValueError on masks of another size or without pixels, on frames without
+    the object, in `INDICES`. Raises ValueError on masks of another size or without pixels, on frames without
     polarization, and on arguments of wrong types.
     """
     if not isinstance(frame, SeparatedFrame):
@@ -187,8 +189,8 @@ def shape(
     if not isinstance(index, Real):
         raise WrongType(f"expected a refractive index that is a number, found {index!r:.40}")
     found = find_shape(frame, mask, light, None if weights is None else as_path(weights), float(index))
-    untold = () if "light_color" in frame.report or frame.diffuse.shape[-1] == 1 else (UNTOLD,)
-    for note in (*untold, *found.doubts()):
+    remarks = () if "light_color" in frame.report or frame.diffuse.shape[-1] == 1 else (UNKNOWN_LIGHT,)
+    for note in (*remarks, *found.warnings()):
         warnings.warn(note, PolsepWarning, stacklevel=2)
     return found
 
@@ -203,7 +205,7 @@ def find_shape(
     """`shape` without warnings."""
     if not INDICES[0] <= index <= INDICES[1]:
         raise ValueError(f"expected a refractive index from {INDICES[0]} to {INDICES[1]}, found {index:g}")
-    chosen = find_thing(frame) if mask is None else _as_mask(mask)
+    chosen = mask_of(frame) if mask is None else _as_mask(mask)
     if chosen.shape != frame.dolp.shape or not chosen.any():
         raise ValueError(
             f"expected a mask of {list(frame.dolp.shape)} that holds pixels, found {list(chosen.shape)}, "
@@ -211,17 +213,17 @@ def find_shape(
         )
     if not frame.dolp[chosen].any():
         raise ValueError("expected a frame with its polarization, found DoLP 0 everywhere")
-    told = None if light is None else _as_told(light)
+    given = None if light is None else _as_direction(light)
     window = square_around(chosen)
     small = gather(images_of(frame, chosen), window, SIDE)
-    small[4:6] = polarized_as_usual(small[4:6], small[:3].mean(axis=0), small[3:4] * on_thing(small[7:8]), index)
-    on = on_thing(small[7:8]).astype(np.float32)
-    untold = Seen(small[:3], small[3:4], small[4:6], small[6:7], on, np.zeros((3, SIDE, SIDE), np.float32))
+    small[4:6] = polarized_as_usual(small[4:6], small[:3].mean(axis=0), small[3:4] * on_object(small[7:8]), index)
+    on = on_object(small[7:8]).astype(np.float32)
+    seen = Seen(small[:3], small[3:4], small[4:6], small[6:7], on, np.zeros((3, SIDE, SIDE), np.float32))
     estimator = load_estimator(weights)
     if estimator.input != "separated":
         raise ValueError(f"expected weights of a network that sees separated images, found one for {estimator.input!r}")
-    lamp = told or estimator.find_lamp(untold)
-    found = estimator.find(seen_under(untold, lamp))
+    lamp = given or estimator.find_lamp(seen)
+    found = estimator.find(seen_under(seen, lamp))
     planes = np.concatenate([np.asarray(x, np.float32) for x in found])
     wide = spread(planes, window, chosen.shape)
     normals = wide[:3] / np.maximum(np.linalg.norm(wide[:3], axis=0), 1e-6)
@@ -235,13 +237,13 @@ def find_shape(
         "specular_error": wide[10],
     }
     inside = {name: _outside_zero(x, chosen) for name, x in maps.items()}
-    return Shape(**inside, mask=chosen, light=lamp, mask_told=mask is not None)
+    return Shape(**inside, mask=chosen, light=lamp, mask_given=mask is not None)
 
 
 def polarized_as_usual(polarized: Floats, diffuse: Floats, specular: Floats, index: float) -> Floats:
     """The polarized light ``[2, h, w]`` that the same surface of index 1.5, for which the network is made, would have.
 
-    ``diffuse [h, w]`` and ``specular [1, h, w]`` light. What mirror images leave of the polarization (`encode`) is
+    ``diffuse [h, w]`` and ``specular [1, h, w]`` light. What specular light leaves of the polarization (`encode`) is
     diffuse light of one zenith angle: its DoLP there is exchanged (`fresnel.diffuse_dolp`), its AoLP stays.
     """
     if index == ETA:
@@ -266,7 +268,7 @@ def _as_mask(mask: object) -> Mask:
     return np.asarray(numbers != 0)
 
 
-def _as_told(light: Sequence[float]) -> tuple[float, float, float]:
+def _as_direction(light: Sequence[float]) -> tuple[float, float, float]:
     """A direction that was given, as a unit vector. Raises ValueError."""
     try:
         numbers = [float(x) for x in light]
@@ -274,7 +276,7 @@ def _as_told(light: Sequence[float]) -> tuple[float, float, float]:
         numbers = []
     length = float(np.linalg.norm(numbers)) if len(numbers) == 3 else 0.0
     if not 1e-6 < length < float("inf") or numbers[2] <= 0:
-        raise ValueError(f"expected a lamp's direction x, y, z in front of the thing (z > 0), found {light!r:.60}")
+        raise ValueError(f"expected a lamp's direction x, y, z in front of the object (z > 0), found {light!r:.60}")
     x, y, z = (number / length for number in numbers)
     return (x, y, z)
 
@@ -283,10 +285,10 @@ def _outside_zero(image: Floats, mask: Mask) -> Floats:
     return np.where(mask if image.ndim == 2 else mask[..., None], image, 0).astype(np.float32)
 
 
-def find_thing(frame: SeparatedFrame) -> Mask:
-    """The mask of a thing before a dark ground (`thing.find_lit`). Raises ValueError on a black frame."""
+def mask_of(frame: SeparatedFrame) -> Mask:
+    """The mask of an object before a dark ground (`find_object_mask`). Raises ValueError on a black frame."""
     diffuse = frame.diffuse.mean(axis=-1)
-    return find_lit(diffuse + frame.specular.mean(axis=-1), diffuse)
+    return find_object_mask(diffuse + frame.specular.mean(axis=-1), diffuse)
 
 
 def images_of(frame: SeparatedFrame, mask: Mask) -> Floats:
@@ -323,8 +325,8 @@ def gather(planes: Floats, window: tuple[int, int, int], side: int) -> Floats:
     return found
 
 
-def on_thing(share: Floats) -> Mask:
-    """Pixels that count as the thing's, by its share of each: more than half, or of thin things half the largest."""
+def on_object(share: Floats) -> Mask:
+    """Pixels that count as the object's, by its share of each: more than half, or of thin objects half the largest."""
     return share > min(0.5, float(share.max()) / 2)
 
 

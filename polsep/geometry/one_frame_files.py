@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.geometry.frames import open_frame
-from polsep.geometry.one_frame import SIDE, UNKNOWN, Shape, find_shape, gather, on_thing, square_around
+from polsep.geometry.one_frame import SIDE, UNKNOWN, Shape, find_shape, gather, on_object, square_around
 from polsep.geometry.shape_maps import Surface, relight
 from polsep.io.assets.maps import read_object
 from polsep.io.assets.relight_page import RelightMaps, encode_relight_page
@@ -44,16 +44,16 @@ LAMPS = {
 }
 #: Errors of normals [degrees] that are white in the preview.
 LARGEST_DEG = 30.0
-#: Colour around the thing in the preview.
+#: Colour around the object in the preview.
 GREY = 40
 
 
 @dataclass(frozen=True)
 class ShapeSettings:
     """Options of `polsep shape`: ``read`` and ``method`` of a raw frame; ``light_color``, of a separated one too, where
-    it goes before that of its report; ``lamp``, toward which a direction is told; a file of the ``mask``; format of the
+    it goes before that of its report; ``lamp``, the direction toward it; a file of the ``mask``; format of the
     ``mesh`` ("none": no depth and mesh), its ``integration``, a ``turntable``; ``weights`` instead of the shipped ones;
-    and the refractive ``index`` of the thing."""
+    and the refractive ``index`` of the object."""
 
     read: ReadOptions = field(default_factory=ReadOptions)
     method: str = "joint"
@@ -76,19 +76,19 @@ def find_shape_of(path: Path, settings: ShapeSettings) -> tuple[ShapeFiles, list
         files = shape_files(frame, found, settings, path.stem)
     except ValueError as error:
         raise input_error(path, error) from error
-    notes = [*notes, *found.doubts()]
+    notes = [*notes, *found.warnings()]
     return replace(files, facts={**files.facts, "warnings": notes}), notes
 
 
 def shape_files(frame: SeparatedFrame, found: Shape, settings: ShapeSettings, title: str) -> ShapeFiles:
-    """The files of a shape; depth and mesh, unless none is wanted, in a square of `MESH_SIDE` around the thing.
+    """The files of a shape; depth and mesh, unless none is wanted, in a square of `MESH_SIDE` around the object.
 
     ``title``: of the page that relights it.
     """
     facts: dict[str, Any] = {
         "light": [round(x, 4) for x in found.light],
-        "light_is": "found from the shading" if settings.lamp is None else "told",
-        "mask_is": "told" if found.mask_told else "found where light falls",
+        "light_is": "found from the shading" if settings.lamp is None else "given",
+        "mask_is": "given" if found.mask_given else "found where light falls",
         "index": settings.index,
         "method": frame.report.get("method", "separated before"),
         "median_normal_error_deg": round(float(np.degrees(np.median(found.normal_error[found.mask]))), 2),
@@ -126,11 +126,11 @@ def _page_maps(found: Shape) -> RelightMaps:
     surface, share = in_square(found, PAGE_SIDE)
     gain = 0.9 / max(float(np.percentile(found.albedo[found.mask], 99)), 1e-9)
     normals, colors = (np.moveaxis(x, 0, -1) for x in (surface.normal, surface.albedo * gain))
-    return RelightMaps(normals, colors, surface.roughness[0], surface.specular[0], on_thing(share))
+    return RelightMaps(normals, colors, surface.roughness[0], surface.specular[0], on_object(share))
 
 
 def _solid(found: Shape, integration: str) -> tuple[Mesh, NDArray[np.float64]]:
-    """Mesh and depth ``[h, w]`` of a shape. Needs the extra ``mesh``. Raises ValueError on too thin things."""
+    """Mesh and depth ``[h, w]`` of a shape. Needs the extra ``mesh``. Raises ValueError on too thin objects."""
     from polsep.geometry.files import INTEGRATIONS
     from polsep.geometry.photometric import Appearance
     from polsep.geometry.surface import span_surface
@@ -141,7 +141,7 @@ def _solid(found: Shape, integration: str) -> tuple[Mesh, NDArray[np.float64]]:
     corners = np.lib.stride_tricks.sliding_window_view(mask, (2, 2))
     if corners.sum(axis=(2, 3)).max() < 3:  # of four neighbours a triangle needs three
         least = math.ceil(3 * window[2] / side)
-        raise ValueError(f"expected a thing of {least} pixels across or more for a mesh, found less; say --mesh none")
+        raise ValueError(f"expected an object of {least} pixels across or more for a mesh, found less; say --mesh none")
     normals, albedo = (np.moveaxis(x, 0, -1).astype(np.float64) * mask[..., None] for x in surface[:2])
     depth = INTEGRATIONS[integration](normals, mask)
     gain = 1 / max(float(np.percentile(albedo[mask], 99.5)), 1e-9)
@@ -166,9 +166,9 @@ def _enlarged(depth: NDArray[np.float64], window: tuple[int, int, int], mask: Ma
 
 
 def in_square(found: Shape, side: int) -> tuple[Surface, Floats]:
-    """The surface ``[C, n, n]`` in the square around the thing, n at most ``side``, and its share of pixels ``[n, n]``.
+    """The surface ``[C, n, n]`` in the square around an object, n at most ``side``, and its share of pixels ``[n, n]``.
 
-    Maps are means over the thing alone, where pixels are merged.
+    Maps are means over the object alone, where pixels are merged.
     """
     window = square_around(found.mask)
     albedo = np.broadcast_to(found.albedo, (*found.mask.shape, 3))
@@ -182,9 +182,9 @@ def in_square(found: Shape, side: int) -> tuple[Surface, Floats]:
 
 
 def draw_panels(frame: SeparatedFrame, found: Shape) -> list[Sequence[Panel]]:
-    """Rows of pictures: the frame and its surface; the thing under other lamps."""
+    """Rows of pictures: the frame and its surface; the object under other lamps."""
     surface, share = in_square(found, CELL)
-    there, mask = on_thing(share), found.mask
+    there, mask = on_object(share), found.mask
     images = np.concatenate([frame.diffuse + frame.specular, frame.specular], axis=-1)
     small = gather(np.moveaxis(images, -1, 0), square_around(mask), len(share))
     seen, mirrored = (np.broadcast_to(x, (3, *share.shape)) for x in np.split(small, 2))

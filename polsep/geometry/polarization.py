@@ -31,7 +31,7 @@ REACH, ROUNDS = 1.0, 5
 #: Standard deviation of the estimate; measured on four test objects: 0.004 to 0.017 (docs/experiments.md).
 POLARIZATION_DEVIATION = 0.015
 #: Pixels (sigma) over which neighbours choose between a cue's normals, rounds of that, and the weight of pointing away
-#: from the thing's middle.
+#: from the object's middle.
 NEIGHBOURS, CHOICES, OUTWARD = 2.0, 40, 0.05
 #: Least standard deviation of a normal from polarization [rad].
 MIN_DEVIATION = 0.04
@@ -96,7 +96,7 @@ def normals_from_polarization(polarization: NDArray[np.complex128]) -> Cue:
 
 
 def choose_outward(cue: Cue, mask: Mask) -> Floats:
-    """The normals ``[H, W, 3]`` of a cue that point away from the thing's middle and agree with their neighbours.
+    """The normals ``[H, W, 3]`` of a cue that point away from the object's middle and agree with their neighbours.
 
     From the outline, where azimuths are known, inward: a classical way to solve what polarization leaves open. Source:
     Atkinson and Hancock 2006, Sec. IV, propagation from the boundary; here by rounds of weighted votes.

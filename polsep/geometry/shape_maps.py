@@ -5,7 +5,7 @@ the exposure: images are logarithms relative to the mean of the object. Polariza
 as (s1, s2), never as an angle. Three inputs exist, of the same frame:
 
 * "separated": diffuse and specular image; the polarization of their sum; that of the diffuse light alone, from which
-  the lamp's mirror images, which have one AoLP, are taken away; and, as Fresnel's equations say, the projected normal
+  the lamp's highlights, which have one AoLP, are subtracted; and, as Fresnel's equations say, the projected normal
   that it means, at twice its azimuth, since azimuths are known up to half a turn (Atkinson and Hancock 2006).
 * "stokes": s0, s1 and s2 of every colour as measured, and the projected normal that their polarization would mean.
 * "rgb": s0 alone, as an ordinary camera sees it.
@@ -60,7 +60,7 @@ class Seen(NamedTuple):
 
 class Surface(NamedTuple):
     """Maps of a surface: unit ``normal [3]``, x right, y up, z to the camera; relative ``albedo [3]``; ``roughness``
-    and ``specular [1]``, the strength of the mirror images of a dielectric; the deviations of ``normal_error`` [rad],
+    and ``specular [1]``, the strength of its reflections over a dielectric's; the deviations of ``normal_error`` [rad],
     and of the logarithms of the last two."""
 
     normal: Array
@@ -139,9 +139,9 @@ def encode(seen: Seen, name: str) -> Array:
         specular, polarized = seen.specular.clip(0, None) / level, seen.polarized / level
         lamp, sure = lamp_direction(polarized, specular * mask)
         left = (polarized - specular * lamp) / (grey + LEAST)
-        doubt = xp.log((seen.error / level) / (grey + LEAST) + 1e-3)
+        uncertainty = xp.log((seen.error / level) / (grey + LEAST) + 1e-3)
         parts += [xp.log(specular + FLOOR), _limited(polarized / (grey + specular + LEAST)), _limited(left)]
-        parts += [projected_normal(left), lamp * sure + 0 * grey, doubt]
+        parts += [projected_normal(left), lamp * sure + 0 * grey, uncertainty]
     elif name == "stokes":
         assert seen.polarized is not None
         polarized = seen.polarized / level

@@ -1,4 +1,4 @@
-"""The only room that touches files. It has four rooms; each imports only from those before it.
+"""The only subpackage that touches files. It has four of its own; each imports only from those before it.
 
 * `io.store`: atomic files, checks and codecs, and files that polsep keeps for itself: weights, checkpoints, rows.
 * `io.raw`: raw frames in. `io.raw.frames.read_frames` reads every format in its table `READERS`, and

@@ -20,7 +20,7 @@ from polsep.compute.arrays import to_numpy
 from polsep.compute.averages import weighted_median
 from polsep.compute.warm_up import make_ready
 from polsep.light.color import ColorFit, Doubles, axis_of, fit_color, planes_along, strongest
-from polsep.light.metals import MIN_MIRRORS, beside, is_metal, metal_share, only_mirrors
+from polsep.light.metals import MIN_SPECULAR_TILES, beside, is_metal, metal_share, only_specular
 from polsep.light.tiles import Tiles, tile_measurements, tile_mosaic
 from polsep.physics.stokes import Measurements, aolp_of
 from polsep.sensor.camera import Layout, Mosaic
@@ -72,7 +72,7 @@ class Light:
     ``error_deg``: mean angle by which such colours are off. ``sure``: whether the colour is found rather than assumed.
     ``aolp``: along which the frame is polarized most [rad, in [0, pi)], None where nothing shows it; that of specular
     light, but where much diffuse light is polarized (statistics of reports are of separated light). ``metal``: share of
-    the lit frame that mirrors the lamp in the colour of gold or copper. ``remarks``: what the frame's owner should know
+    the lit frame that reflects the lamp in the colour of gold or copper. ``remarks``: what the user should know
     of that, and of the levels of an array.
     """
 
@@ -141,20 +141,20 @@ def _light_of_tiles(tiles: Tiles, axis: NDArray[np.float64]) -> Light:
     from polsep.light.color_kernel import iterate_fast
 
     fit = fit_color(strongest(tiles), axis, iterate_fast)
-    mirrors = only_mirrors(tiles, axis)
-    bodies = tiles.select(~beside(tiles, mirrors))
-    if mirrors.sum() < MIN_MIRRORS or len(bodies.counts) < MIN_TILES:
+    specular = only_specular(tiles, axis)
+    bodies = tiles.select(~beside(tiles, specular))
+    if specular.sum() < MIN_SPECULAR_TILES or len(bodies.counts) < MIN_TILES:
         return _as_light(fit, tiles, aolp_of(*axis))
-    mirrored = iterate_fast(planes_along(strongest(tiles.select(mirrors)), axis))[0]
+    reflected = iterate_fast(planes_along(strongest(tiles.select(specular)), axis))[0]
     own_axis, _ = axis_of(strongest(bodies))
     own = fit_color(strongest(bodies), own_axis, iterate_fast)
-    if not is_metal(mirrored - own.x):
+    if not is_metal(reflected - own.x):
         return _as_light(fit, tiles, aolp_of(*axis))
     return replace(_as_light(own, bodies, aolp_of(*own_axis)), metal=metal_share(tiles, own_axis, own.x))
 
 
 def _remarks_on(light: Light, tiles: Tiles) -> Iterator[str]:
-    """Remarks for the owner of a frame: metals, and a colour that may be wrong."""
+    """Remarks for the user: metals, and a colour that may be wrong."""
     if light.metal >= LEAST_METAL:
         yield (
             f"highlights of the lamp's colour were expected, found those of gold or copper on {light.metal:.0%} of the "
@@ -170,7 +170,7 @@ def _remarks_on(light: Light, tiles: Tiles) -> Iterator[str]:
         color = ",".join(f"{c:.2f}" for c in light.color)
         yield (
             f"highlights that show the lamp's colour were expected, found too few; {color} is assumed: show a shiny "
-            "thing, or measure a grey card and say --light-color"
+            "object, or measure a grey card and say --light-color"
         )
 
 

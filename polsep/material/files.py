@@ -154,7 +154,7 @@ def white_lobes(frame: SeparatedFrame) -> tuple[Floats, Floats]:
 
 
 def flatness_notes(photographs: Photographs) -> list[str]:
-    """A line for each photograph with large parts that are nearly black, as behind or on the side of a thing that is
+    """A line for each photograph with large parts that are nearly black, as behind or on the side of an object that is
     not flat."""
     light = photographs.views.mean(dim=1, keepdim=True)
     parts = adaptive_avg_pool2d(light, FLAT_PARTS).flatten(1)

@@ -33,7 +33,7 @@ from polsep.networks.sizes import ResidualSize
 from polsep.networks.strips import cut_rows, margin_of
 from polsep.physics.stokes import wrap_aolp
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.orient import Orientation, orient, ways_of
+from polsep.sensor.orient import Orientation, orient, shifts_of
 from polsep.separation.images import FrameImages
 from polsep.separation.report import tally_again
 
@@ -98,8 +98,8 @@ def _make_engine(job: _Job) -> OpenVinoEngine:
 def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages:
     """A network's images of one frame ``[H, W]`` on the CPU, in its light.
 
-    Frames in other orientations than the network's are turned before and after, as in `run.run_joint`, and seen in
-    several ways where it averages them. Huge frames are cut into strips, all of one height, since an engine is for
+    Frames in other orientations than the network's are turned before and after, as in `run.run_joint`, and seen at
+    several shifts where it averages these. Huge frames are cut into strips, all of one height, since an engine is for
     one size. Raises ValueError on layouts that are not Sony's in any orientation, and RuntimeError as
     `require_own_threads`.
     """
@@ -111,8 +111,8 @@ def run_engine(network: JointWeights, mosaic: Mosaic, full: bool) -> FrameImages
     make_ready(images_kernel.warm_up)
     if full:
         make_ready(details_kernel.warm_up)
-    ways = ways_of(mosaic, wanted) if network.averages_ways else (orientation,)
-    return combine_images((_run_turned(network, mosaic, way, full) for way in ways), mosaic.light_color)
+    shifts = shifts_of(mosaic, wanted) if network.averages_shifts else (orientation,)
+    return combine_images((_run_turned(network, mosaic, shift, full) for shift in shifts), mosaic.light_color)
 
 
 def _halve(images: FrameImages, light: tuple[float, ...]) -> FrameImages:

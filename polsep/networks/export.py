@@ -1,11 +1,11 @@
 """The joint networks of a method as one exportable module from raw samples to images, for engines other than torch.
 
 A graph is what the method makes of a frame: levels, clip mask and colour of the light, demosaicking and closed form,
-layers in float32, all networks of the method weighed by their expected errors, frames seen in several ways by networks
-that average these: the twin of `run.run_joint` and, in float32, of `engines.run_engine`; then the mosaic's patterns are
-smoothed out where samples clip, and diffuse light under clipped highlights is filled. Around it, `pipeline.separate`
-repairs defects, finds black level and light, and moves what metals, bodies and weak polarizers leave in the diffuse
-image; graphs do none of that. `io.store.onnx` writes them.
+layers in float32, all networks of the method weighed by their expected errors, frames seen at several shifts by
+networks that average these: the twin of `run.run_joint` and, in float32, of `engines.run_engine`; then the mosaic's
+patterns are smoothed out where samples clip, and diffuse light under clipped highlights is filled. Around it,
+`pipeline.separate` repairs defects, finds black level and light, and moves what metals, bodies and weak polarizers
+leave in the diffuse image; graphs do none of that. `io.store.onnx` writes them.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from polsep.separation.clipped_pattern import shares_of, smooth_planes, taps_of,
 
 #: Names of the outputs, in order.
 OUTPUT_NAMES = ("diffuse", "specular", "error", "valid")
-#: Samples above and left of the frame in the ways in which it lies on periods (`orient.ways_of`), by its colours; by a
-#: cell, red and blue change places.
+#: Samples above and left of the frame at each of its shifts (`orient.shifts_of`), by its colours; by a cell, red and
+#: blue change places.
 SHIFTS = {1: tuple((top, left) for top in (2, 4) for left in (2, 4)), 3: ((4, 4), (2, 2))}
 
 
@@ -80,7 +80,7 @@ class ExportedNetwork(nn.Module):
         found, shares = [], []
         for network in self.members:
             assert isinstance(network, Joint)
-            found.append(combine(self._run_ways(network, samples, clipped)))
+            found.append(combine(self._run_shifted(network, samples, clipped)))
             shares.append(network.share)
         whole = combine(found, shares)
         assert whole.expected_error is not None
@@ -107,9 +107,9 @@ class ExportedNetwork(nn.Module):
         error, near = (repeat_pixels(x, self._scale) for x in (error, near))
         return [_separation(diffuse, specular.expand_as(diffuse), ~near[:, 0], error)]
 
-    def _run_ways(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:
-        """The same in all ways in which the network sees frames, as `run.run_joint` does: shifted, as one batch."""
-        if not network.averages_ways:
+    def _run_shifted(self, network: Joint, samples: Tensor, clipped: Tensor) -> list[Separation]:
+        """The same at all shifts at which the network sees frames, as `run.run_joint` does, as one batch."""
+        if not network.averages_shifts:
             return self._run(network, samples, clipped)
         frames, count, shifts = (samples, clipped), samples.shape[0], SHIFTS[self.colors]
         batch = [torch.cat([_shifted(_shifted(x, top, -2), left, -1) for top, left in shifts]) for x in frames]

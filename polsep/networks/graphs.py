@@ -5,7 +5,7 @@ Twins: the torch modules `joint.Joint` (its layers), `whole_frame.WholeFrame`, `
 
 Layers whose inputs have known ranges (`ranges`) can be rounded to 8 bits: inputs in 256 steps of one size, weights in
 255 steps of one size per output, as processors multiply them (Jacob et al. 2018, arXiv:1712.05877). Blocks whose
-second layer has the range (0, 0) only add its bias: training left them silent.
+second layer has the range (0, 0) only add its bias: training left them inactive.
 """
 
 from __future__ import annotations

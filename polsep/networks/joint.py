@@ -41,7 +41,7 @@ from polsep.networks.channels import (
     seen_maps,
 )
 from polsep.networks.details import Details
-from polsep.networks.joint_weights import DOUBT_HIDDEN, NAMES_IN_FILES, JointWeights
+from polsep.networks.joint_weights import NAMES_IN_FILES, VARIANCE_HIDDEN, JointWeights
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.taps import pool_outputs
 from polsep.networks.thumbnails import LIGHT
@@ -124,8 +124,8 @@ class Joint(nn.Module):
     ) -> None:
         super().__init__()
         self.colors, self.size, self.inputs, self.margin = colors, size, inputs, MARGIN
-        #: Frames are separated in all of `orient.ways_of` and combined; share among networks that are combined.
-        self.averages_ways, self.share = False, 1.0
+        #: Frames are separated at all of `orient.shifts_of` and combined; share among networks that are combined.
+        self.averages_shifts, self.share = False, 1.0
         #: Faster twin of `_guide_once`, which training on CPUs sets (`networks.guide`).
         self.guide: Callable[[Tensor, Layout], tuple[Tensor, Tensor]] | None = None
         self.layout = Layout.sony(colors)
@@ -140,7 +140,7 @@ class Joint(nn.Module):
         largest = torch.tensor(MAX_LOG_VARIANCE).repeat_interleave(4)
         self.register_buffer("max_log_variance", largest, persistent=False)
         self.log_variance = nn.Sequential(
-            nn.Conv2d(width, DOUBT_HIDDEN, 3, padding=1), nn.ReLU(), nn.Conv2d(DOUBT_HIDDEN, 8, 1)
+            nn.Conv2d(width, VARIANCE_HIDDEN, 3, padding=1), nn.ReLU(), nn.Conv2d(VARIANCE_HIDDEN, 8, 1)
         )
         self.details = Details(colors, width)
         self.whole_frame = WholeFrame(colors, size.widths) if sees_frame else None
@@ -153,15 +153,15 @@ class Joint(nn.Module):
         demosaicker: Demosaicker = "guided" if weights.demosaic is None else "linear"
         network = cls(weights.colors, weights.size, weights.inputs, demosaicker, weights.sees_frame)
         network.load_state_dict({name: torch.tensor(array) for name, array in weights.arrays.items()})
-        network.averages_ways, network.share = weights.averages_ways, weights.share
+        network.averages_shifts, network.share = weights.averages_shifts, weights.share
         for block in (part for part in network.modules() if isinstance(part, Block)):
-            block.silent = not bool(block.second.weight.any())
+            block.inactive = not bool(block.second.weight.any())
         return network.to(device, torch.float32).eval()
 
     def weights(self) -> JointWeights:
         """The twin of `of`: copies of what files of weights hold."""
         arrays = {name: tensor.float().cpu().numpy().copy() for name, tensor in self.state_dict().items()}
-        return JointWeights(self.colors, self.size, arrays, self.inputs, self.averages_ways, share=self.share)
+        return JointWeights(self.colors, self.size, arrays, self.inputs, self.averages_shifts, share=self.share)
 
     def forward(
         self, raw: Tensor, clipped: Tensor, thumbnail: Tensor | None = None

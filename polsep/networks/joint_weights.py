@@ -23,16 +23,16 @@ NAMES_IN_FILES = {
     "polarization": "pose",
     "log_variance": "doubt",
 }
-#: Channels between features and beliefs in details, and between features and variances.
-HIDDEN, DOUBT_HIDDEN = 32, 16
+#: Channels between features and shares of details, and between features and variances.
+HIDDEN, VARIANCE_HIDDEN = 32, 16
 
 
 @dataclass(frozen=True, eq=False)
 class JointWeights:
     """Sizes and ``arrays`` of a joint network, by their names in files; two are equal if they are one object.
 
-    ``colors``: 3, or 1 for mono frames. ``inputs``: the groups of `channels.GROUPS` that it sees. ``averages_ways``:
-    frames are separated in all of `orient.ways_of` and combined: with less noise, and of mono frames no pattern of a
+    ``colors``: 3, or 1 for mono frames. ``inputs``: the groups of `channels.GROUPS` that it sees. ``averages_shifts``:
+    frames are separated at all of `orient.shifts_of` and combined: with less noise, and of mono frames no pattern of a
     period is left. ``share``: factor on its weight among networks that are combined. ``ranges``: least and largest
     input of layers that may be rounded to 8 bits, by name, see `ranges`. Raises ValueError when arrays are missing or
     of other shapes.
@@ -42,7 +42,7 @@ class JointWeights:
     size: ResidualSize
     arrays: Arrays
     inputs: tuple[str, ...] = INPUTS
-    averages_ways: bool = False
+    averages_shifts: bool = False
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     share: float = 1.0
 
@@ -70,13 +70,13 @@ class JointWeights:
         return "whole_frame.light.bias" in self.arrays
 
 
-def joint_weights(arrays: Arrays, metadata: Mapping[str, str], averages_ways: bool = False) -> JointWeights:
+def joint_weights(arrays: Arrays, metadata: Mapping[str, str], averages_shifts: bool = False) -> JointWeights:
     """The network of a file's arrays and metadata. Raises KeyError, TypeError or ValueError when it is of another."""
     size = json.loads(metadata["size"])
     size = ResidualSize(size["width"], tuple(size["blocks"]), size.get("entry", 0))
     ranges = {name: (float(low), float(high)) for name, (low, high) in json.loads(metadata.get("ranges", "{}")).items()}
     inputs = tuple(json.loads(metadata["inputs"]))
-    return JointWeights(int(metadata["colors"]), size, arrays, inputs, averages_ways, ranges)
+    return JointWeights(int(metadata["colors"]), size, arrays, inputs, averages_shifts, ranges)
 
 
 def expected_shapes(weights: JointWeights) -> dict[str, tuple[int, ...]]:
@@ -85,7 +85,7 @@ def expected_shapes(weights: JointWeights) -> dict[str, tuple[int, ...]]:
     width = size.widths[0]
     outputs = {"last": 4 * (colors + 1), "pose": 4} | ({"trust": 4} if "split" in weights.inputs else {})
     layers = {name: (count, width, 1) for name, count in outputs.items()}
-    layers |= {"doubt.0": (DOUBT_HIDDEN, width, 3), "doubt.2": (8, DOUBT_HIDDEN, 1)}
+    layers |= {"doubt.0": (VARIANCE_HIDDEN, width, 3), "doubt.2": (8, VARIANCE_HIDDEN, 1)}
     layers |= {"details.belief.0": (HIDDEN, width + DETAIL_MAPS, 3), "details.belief.2": (2 * DETAIL_MAPS, HIDDEN, 1)}
     layers |= {"details.change": (DETAIL_MAPS * (colors + 1), width, 1)}
     layers |= _unet_layers(input_channels(colors, weights.inputs).total, size)

@@ -51,8 +51,8 @@ def measure_ranges(network: JointWeights, frames: Iterable[Mosaic]) -> dict[str,
     return {name: _widest(found) for name, found in bounds.items()}
 
 
-def silenced(arrays: Mapping[str, NDArray[Any]], ranges: Mapping[str, tuple[float, float]]) -> dict[str, NDArray[Any]]:
-    """A joint network's arrays with zeros for the weights of what its ``ranges`` say is silent; its images stay.
+def pruned(arrays: Mapping[str, NDArray[Any]], ranges: Mapping[str, tuple[float, float]]) -> dict[str, NDArray[Any]]:
+    """A joint network's arrays with zeros for the weights of what its ``ranges`` say is inactive; its images stay.
 
     That is a block whose second layer has the range (0, 0), or a level, and all deeper ones, if the layer that leads
     up from it has. Wheels compress zeros, and a training that starts from them draws new weights (`train.growth`).
@@ -60,12 +60,12 @@ def silenced(arrays: Mapping[str, NDArray[Any]], ranges: Mapping[str, tuple[floa
     found = dict(arrays)
     for layer, bounds in ranges.items():
         if bounds[0] == bounds[1] == 0:
-            silent = _silent_with(layer)
-            found |= {name: np.zeros_like(array) for name, array in arrays.items() if silent.match(name)}
+            inactive = _inactive_with(layer)
+            found |= {name: np.zeros_like(array) for name, array in arrays.items() if inactive.match(name)}
     return found
 
 
-def _silent_with(layer: str) -> re.Pattern[str]:
+def _inactive_with(layer: str) -> re.Pattern[str]:
     """Names of arrays that change nothing where a layer's input is 0; the layer's own bias is not among them."""
     part, level, *_ = layer.removeprefix("net.").split(".")
     if part != "ups":

@@ -30,7 +30,7 @@ from polsep.networks.joint import Joint, limit
 from polsep.networks.strips import LEAST_ERROR, cut_rows, margin_of
 from polsep.physics.stokes import Stokes, stokes_inverse
 from polsep.sensor.camera import Layout, Mosaic
-from polsep.sensor.orient import Orientation, orient, ways_of
+from polsep.sensor.orient import Orientation, orient, shifts_of
 from polsep.separation.analytic import Separation
 
 #: The type in which layers compute, by kind of device; elsewhere that of their weights.
@@ -48,14 +48,14 @@ def run_joint(network: Joint, mosaic: Mosaic, full: bool = False) -> Separation:
 
     The polarization is that of the network's linear filter, at half resolution. ``valid`` is False near cells of
     which all samples clip. ``expected_error``: see `Separation`. Raises ValueError on layouts that are not
-    Sony's in any orientation. In all of `ways_of`, where the network averages them.
+    Sony's in any orientation. At all of `shifts_of`, where the network averages them.
     """
     wanted = Layout.sony(mosaic.layout.channels)
     orientation = orient(mosaic, wanted)
     if not full and not orientation.keeps_cells:  # then the network's cells are not the frame's
         return _halve(run_joint(network, mosaic, full=True))
-    ways = ways_of(mosaic, wanted) if network.averages_ways else (orientation,)
-    return combine([_run_turned(network, mosaic, way, full) for way in ways])
+    shifts = shifts_of(mosaic, wanted) if network.averages_shifts else (orientation,)
+    return combine([_run_turned(network, mosaic, shift, full) for shift in shifts])
 
 
 def combine(separations: list[Separation], shares: Sequence[float] = ()) -> Separation:
@@ -74,11 +74,11 @@ def combine(separations: list[Separation], shares: Sequence[float] = ()) -> Sepa
     weights = weights / weights.sum(dim=0)
     diffuse, specular = weights[..., :1, :, :], weights[..., 1:, :, :]
     images = (torch.stack([getattr(s, name) for s in separations]) for name in ("diffuse", "specular"))
-    body, mirrored = ((w * x).sum(dim=0) for w, x in zip((diffuse, specular), images, strict=True))
+    body, reflected = ((w * x).sum(dim=0) for w, x in zip((diffuse, specular), images, strict=True))
     stokes = (torch.stack([getattr(s.stokes, name) for s in separations]).mean(dim=0) for name in ("s0", "s1", "s2"))
     valid = torch.stack([s.valid for s in separations]).all(dim=0)
     error = (weights * errors).sum(dim=0)
-    return replace(first, diffuse=body, specular=mirrored, valid=valid, stokes=Stokes(*stokes), expected_error=error)
+    return replace(first, diffuse=body, specular=reflected, valid=valid, stokes=Stokes(*stokes), expected_error=error)
 
 
 def _run_turned(network: Joint, mosaic: Mosaic, orientation: Orientation, full: bool) -> Separation:

@@ -67,12 +67,12 @@ class UNet(nn.Module):
 class Block(nn.Module):
     """Two 3x3 convolutions that add to their input; the second one starts at zero.
 
-    State: ``silent``, True where the second one's weights are 0 and will stay so; its bias alone is added.
+    State: ``inactive``, True where the second one's weights are 0 and will stay so; its bias alone is added.
     """
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.silent = False
+        self.inactive = False
         self.first = nn.Conv2d(width, width, 3, padding=1)
         self.second = nn.Conv2d(width, width, 3, padding=1)
         nn.init.kaiming_normal_(self.first.weight, nonlinearity="relu")
@@ -82,7 +82,7 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """``[N, C, h, w]`` of any size."""
-        if self.silent:
+        if self.inactive:
             assert self.second.bias is not None
             return x + self.second.bias.to(x)[:, None, None]
         change: Tensor = self.second(relu(self.first(x)))

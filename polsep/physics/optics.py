@@ -159,7 +159,7 @@ def _facets(g: Geometry, irradiance: Tensor, roughness: Tensor) -> tuple[Tensor,
 
 
 def _mirror(g: Geometry, polarizer: Tensor, shading: Tensor, f: Fresnel) -> Stokes:
-    """The mirrored light of facets with Fresnel coefficients ``f``."""
+    """The specular light of facets with Fresnel coefficients ``f``."""
     camera, light = _camera_and_light_beams(g)
     axis = _mirror_axis(g, camera)
     # The azimuth of h is that of the s axis turned by 90 degrees in either frame, hence the minus signs.

@@ -5,7 +5,7 @@ scene, whole frames or batches of crops. Numbers may be floats or tensors that b
 one number per crop is ``[B, 1, 1, 1]``, a colour ``[..., C, 1, 1]`` (`as_color`).
 
 Truth: after every function ``specular.s0`` is the light of the LAMPS mirrored at surfaces, and ``diffuse.s0`` all
-other light: also room light with its mirror images and unpolarized indirect light, as behind crossed polarizers. Light
+other light: also room light with its reflections and unpolarized indirect light, as behind crossed polarizers. Light
 inside a body that keeps the lamp's polarization counts as specular, as behind crossed polarizers too. The truth is
 what lies on the sensor: a lens changes it as it changes the light.
 
@@ -57,7 +57,7 @@ def scale_light(scene: Scene, gain: Number) -> Scene:
 
 
 def add_scenes(first: Scene, second: Scene) -> Scene:
-    """Return one set of surfaces under two lamps; both lamps' mirror images are specular. Masks must agree."""
+    """Return one set of surfaces under two lamps; both lamps' reflections are specular. Masks must agree."""
     return replace(first, diffuse=first.diffuse + second.diffuse, specular=first.specular + second.specular)
 
 
@@ -66,7 +66,7 @@ def depolarize_lamp(scene: Scene, degree: Number, crossed: Scene | None = None) 
 
     Exact with ``crossed``, the scene under the same lamp whose polarizer is turned by 90 degrees: a mixture of both.
     Without it s1 and s2 of the specular shrink and all else stays, which is exact at normal incidence. The whole
-    mirror image of the lamp stays specular.
+    reflection of the lamp stays specular.
     """
     if crossed is not None:
         return add_scenes(scale_light(scene, 0.5 + 0.5 * degree), scale_light(crossed, 0.5 - 0.5 * degree))
@@ -138,7 +138,7 @@ class IndirectLight:
 
 
 def add_indirect_light(scene: Scene, light: IndirectLight) -> Scene:
-    """Return the scene with coloured inter-reflections: diffuse, unpolarized mirror images, and few polarized ones."""
+    """Return the scene with coloured inter-reflections: diffuse, unpolarized specular, and some polarized specular."""
     base, inside = scene.diffuse.s0, scene.mask[..., None, :, :]
     mean = _mean_over(base, inside)
     falling = torch.ones_like(base) * light.places * light.color

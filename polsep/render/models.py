@@ -1,4 +1,4 @@
-"""Random things from triangle meshes, such as scans and models: stretched, turned, tilted, with patches of materials.
+"""Random objects from triangle meshes, such as scans and models: stretched, turned, tilted, with patches of materials.
 
 Normals are smooth but for creases. Neighbouring triangles of models are often wound against each other, so that sides
 are not told apart: normals face the camera when they are looked up (`render.raycast`).
@@ -28,7 +28,7 @@ STRETCH, TILT_DEG = 1.28, 10.0
 
 
 def random_model(meshes: Sequence[Mesh], generator: torch.Generator) -> Mesh:
-    """Return one of some meshes as another thing: other proportions, any turn about +y, a small tilt about x."""
+    """Return one of some meshes as another object: other proportions, any turn about +y, a small tilt about x."""
     draw = drawn_from(generator)
     mesh = meshes[int(draw_one(draw, (0, len(meshes))))]
     stretch = np.exp(draw(-math.log(STRETCH), math.log(STRETCH), 3))

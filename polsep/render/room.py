@@ -1,7 +1,7 @@
 """A room that is not dark: unpolarized light from many directions, rendered, on the surfaces of a scene.
 
-Light of a room is not polarized when it arrives, but when it leaves: its mirror images as Fresnel's equations reflect
-it, its diffuse light as they transmit it. Both follow the relief of surfaces as the lamp's do.
+Light of a room is not polarized when it arrives, but when it leaves: specular light as Fresnel's equations reflect
+it, diffuse light as they transmit it. Both follow the relief of surfaces as the lamp's do.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def even_directions(count: int) -> Tensor:
 
 
 def roughen(materials: Materials, least: float) -> Materials:
-    """Return the materials with at least this roughness, whose mirror images blur single lights."""
+    """Return the materials with at least this roughness, whose reflections blur single lights."""
     rough = replace(materials, roughness=materials.roughness.clamp(min=least))
     if materials.textures is None:
         return rough

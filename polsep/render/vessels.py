@@ -1,4 +1,4 @@
-"""Random things that stand: bowls, plates, cups, vases, bottles, cans, boxes and lids, +y up, as closed meshes.
+"""Random objects that stand: bowls, plates, cups, vases, bottles, cans, boxes and lids, +y up, as closed meshes.
 
 A vessel is a profile that is turned about +y: a flat foot, an outer wall, and either a lid, flat or domed, or a rim and
 an inside. Its cross section is round, oval, squared or fluted. Rings, waves and folds move its points. Some carry a few
@@ -49,7 +49,7 @@ SQUARED_SHARE, SQUARED, OVAL_SHARE, OVAL, FLUTED_SHARE, FLUTES = 0.25, (3.0, 14.
 RINGED_SHARE, RINGS, STEEPEST = 0.2, (2, 20), 0.6
 #: Shares of vessels with waves, whose heights are smaller than those of bodies, and with folds.
 WAVED_SHARE, HEIGHTS, FOLDED_SHARE = 0.4, (0.001, 0.02), 0.15
-#: Shares of vessels of one material, and of those that carry things; the number of these, and their semi-axes.
+#: Shares of vessels of one material, and of those that carry objects; the number of these, and their semi-axes.
 PLAIN_SHARE, LADEN_SHARE, LOADS, LOAD_AXES = 0.5, 0.3, (1, 7), (0.15, 0.6)
 #: Cells along a wall, a lid or an inside; along a rim or a foot; and around.
 ALONG, ACROSS, AROUND = 80, 16, 256
@@ -61,7 +61,7 @@ Section = Callable[[Floats], Floats]
 class Profile(NamedTuple):
     """Parts of a profile, each radii and heights ``[2, n]``: from the axis outward, downward, and along the foot back.
 
-    ``place``: radius and height of where things lie.
+    ``place``: radius and height of where objects lie.
     """
 
     parts: list[Floats]

@@ -17,7 +17,7 @@ from polsep.sensor.encoding import encoding_warning
 from polsep.sensor.layout_check import check_layout, phase_means
 from polsep.sensor.levels import overexposure_notes
 
-#: Share of pixels that are defects from which on the owner is warned.
+#: Share of pixels that are defects from which on the user is warned.
 MANY_DEFECTS = 5e-4
 
 

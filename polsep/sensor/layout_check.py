@@ -8,7 +8,7 @@ on one diagonal of the Bayer block.
 The identity does not show these: 0 and 90 swapped, 45 and 135 swapped, or the two pairs swapped obey it too, and so do
 red and blue. A mirrored, rotated or transposed MONO frame therefore looks in order. Of those only whole frames of known
 sensors are seen, which stand upright when they were transposed or turned. A transposed COLOUR frame, or one turned by
-180 degrees, has AoLP wrong by 90 degrees: that shows where things are round and coloured (`slope_check`).
+180 degrees, has AoLP wrong by 90 degrees: that shows where objects are round and coloured (`slope_check`).
 
 All statistics are means over blocks of 16x16 pixels, first-order corrected for the brightness gradient, without blocks
 that hold a clipped sample, in units of the mean brightness. The light's colour is left in: what is compared are the
@@ -46,7 +46,7 @@ MIN_RATIO = 2.0
 MIN_COLOR, MAX_MONO, EVEN = 0.03, 0.02, 0.007
 #: Differences are those of filters where blocks agree: with their neighbours, or all of them. Rendered and real mono
 #: frames, where texture makes the differences: up to 0.36 with neighbours, and 0.09 of all; colour frames 0.45 or more
-#: of either, but for grey things and small objects, which are not judged.
+#: of either, but for grey and small objects, which are not judged.
 MIN_AGREEMENT, MIN_COMMON, MAX_DISAGREEMENT, MAX_COMMON = 0.4, 0.25, 0.25, 0.1
 #: Fewest blocks whose disagreement says something, and how much more than at any other alignment cells must differ.
 MIN_BLOCKS, MIN_EXCESS = 60, 1.15

@@ -89,21 +89,21 @@ class Orientation:
         return Stokes(s0, -s1 if self.transposed else s1, -s2 if self.down != self.across else s2)
 
 
-def ways_of(mosaic: Mosaic, wanted: Layout) -> tuple[Orientation, ...]:
-    """The ways in which a mosaic's filters come into the ``wanted`` order, all of one size.
+def shifts_of(mosaic: Mosaic, wanted: Layout) -> tuple[Orientation, ...]:
+    """The shifts by whole cells that bring a mosaic's filters into the ``wanted`` order, all of one size.
 
-    Of colour frames two: by a cell of rows and of columns apart, where the filters are the same but for red and blue.
-    Of mono frames four (`shifts_of`).
+    Of colour frames two: a row and a column of cells apart, where the filters are the same but for red and blue.
+    Of mono frames four (`cell_shifts`).
     """
     first = orient(mosaic, wanted)
     if wanted.bayer is None:
-        return shifts_of(first)
-    shifts = {((way.top - first.top) % PERIOD, (way.left - first.left) % PERIOD): way for way in shifts_of(first)}
+        return cell_shifts(first)
+    shifts = {((s.top - first.top) % PERIOD, (s.left - first.left) % PERIOD): s for s in cell_shifts(first)}
     return shifts[0, 0], replace(shifts[2, 2], swapped=True)
 
 
-def shifts_of(orientation: Orientation) -> tuple[Orientation, ...]:
-    """The four ways in which a turned frame lies by whole cells on periods of 4 samples, all of one size.
+def cell_shifts(orientation: Orientation) -> tuple[Orientation, ...]:
+    """The four shifts by whole cells of a turned frame within periods of 4 samples, all of one size.
 
     Of mono frames, whose filters repeat every 2 samples, each is as good as the one that is given.
     """

@@ -1,4 +1,4 @@
-"""Check that light from inside a body is polarized along the slope of its shading, as it is on convex things.
+"""Check that light from inside a body is polarized along the slope of its shading, as it is on convex objects.
 
 Light that leaves a surface from inside is polarized in the plane that holds the normal and the view: its AoLP points
 where the surface tilts. There brightness falls or rises too, above all at outlines. Across all of a frame AoLP and the
@@ -31,8 +31,8 @@ SIZES = 3
 #: Blocks of less than this share of the mean brightness are background.
 BACKGROUND = 0.05
 #: DoLP that only specular light of a polarized lamp has, and the share of blocks that show it. Real frames under
-#: ordinary light, whose mirrored light is polarized across slopes too: up to 1 %; under one lamp 2.6 % and more.
-MIRRORED, MIN_MIRRORED = 0.3, 0.012
+#: ordinary light, whose specular light is polarized across slopes too: up to 1 %; under one lamp 2.6 % and more.
+SPECULAR, MIN_SPECULAR = 0.3, 0.012
 #: The mean agreement, from which on it is no accident of the scene, and over its spread, no chance. Clean frames of
 #: `python -m evaluation warned`, their crops and their quarters lie above -3.3.
 MIN_AGREEMENT, CERTAIN = 0.1, 3.5
@@ -41,7 +41,7 @@ MIN_AGREEMENT, CERTAIN = 0.1, 3.5
 def lies_across(mosaic: Mosaic) -> bool:
     """True if the polarization from inside lies across the slopes in the frame (the first of a batch), beyond doubt.
 
-    False where nothing can be judged: mono frames, light without a polarizer, grey, flat, black and small things.
+    False where nothing can be judged: mono frames, light without a polarizer, grey, flat, black and small objects.
     """
     top, left = mosaic.layout.origin
     frame = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0, top:, left:]
@@ -58,14 +58,14 @@ def lies_across(mosaic: Mosaic) -> bool:
         agreement, certainty = slope_agreement(*levels[number], layout, side << number)
         if agreement > -MIN_AGREEMENT or certainty > -CERTAIN:
             return False
-    return _mirrored_share(levels[0][0], layout) > MIN_MIRRORED
+    return _specular_share(levels[0][0], layout) > MIN_SPECULAR
 
 
-def _mirrored_share(phases: Floats, layout: Layout) -> float:
+def _specular_share(phases: Floats, layout: Layout) -> float:
     """Share of lit blocks whose light is more polarized than light from inside."""
     s0, p = _fit_colors(phases, layout)
     total, polarized = s0.mean(0), np.abs(p.mean(0))
-    return float((polarized > MIRRORED * total)[total > BACKGROUND * total.mean()].mean())
+    return float((polarized > SPECULAR * total)[total > BACKGROUND * total.mean()].mean())
 
 
 def _block_means(mosaic: Mosaic, frame: NDArray[np.generic], side: int, most: int) -> tuple[Floats, NDArray[np.bool_]]:
@@ -106,7 +106,7 @@ def slope_agreement(phases: Floats, usable: NDArray[np.bool_], layout: Layout, s
     steepness = np.hypot(down, right)
     toward = (right + 1j * down) ** 2 / np.maximum(steepness, 1e-12) ** 2  # conjugate: rows grow down, angles up
     weight = np.minimum(steepness / np.maximum(brightness, 0.1 * mean), 1)
-    kept = usable & (brightness > BACKGROUND * mean) & (polarized < MIRRORED * total) & (contrast > 0)
+    kept = usable & (brightness > BACKGROUND * mean) & (polarized < SPECULAR * total) & (contrast > 0)
     along = ((s0 * p).sum(0) * toward).real / np.maximum(contrast, 1e-9) * weight * kept
     whole, size, spread = float(along.sum()), float(np.abs(along).sum()), float(np.sqrt((along**2).sum()))
     return whole / max(size, 1e-12), whole / max(spread, 1e-12)

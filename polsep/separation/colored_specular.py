@@ -1,7 +1,7 @@
 """Specular light that does not have the lamp's colour: metals, tinted highlights, and what bodies keep polarized.
 
 Methods that assume white specular light leave its colour in the diffuse image. That part shows: it is
-polarized as mirror images are. The polarization along the lamp's is regressed on the diffuse image, both as deviations
+polarized as highlights are. The polarization along the lamp's is regressed on the diffuse image, both as deviations
 from their mean over colours. Diffuse light of dielectrics has slopes of at most 0.3, and that only at
 grazing angles; diffuse images of gold have 1 and more. There the whole polarized light becomes specular.
 
@@ -82,7 +82,7 @@ class Colored(NamedTuple):
 
     @property
     def remark(self) -> str | None:
-        """A line for the owner of the frame, or None."""
+        """A line for the user, or None."""
         if not self.unpolarized:
             return None
         return (
@@ -126,17 +126,17 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
         colored = found if _share(found) >= MIN_SHARE else None
     if not retained and not unpolarized and colored is None:
         return images, Colored()
-    body, mirrored, valid = (1 - retained) * diffuse, specular + retained * diffuse, images.valid
+    body, reflected, valid = (1 - retained) * diffuse, specular + retained * diffuse, images.valid
     if colored is not None:
         ratio = xp.minimum(periods.polarized.clip(0, None), periods.s0) / periods.total.clip(1e-4, None)
         part, ratio = (resize_bilinear(x, diffuse.shape[-2:]) for x in (colored, ratio.clip(0, MAX_GAIN)))
-        body, mirrored = (1 - part) * body, mirrored + part * (ratio * (diffuse + specular) - mirrored)
+        body, reflected = (1 - part) * body, reflected + part * (ratio * (diffuse + specular) - reflected)
         valid = valid & (part[0] < 0.5)
-    changed = [contiguous(xp.moveaxis(x, 0, -1)) for x in (body, mirrored)]
-    more = float(xp.sum(xp.mean((mirrored - before) / gain, axis=0), dtype=xp.float64))
+    changed = [contiguous(xp.moveaxis(x, 0, -1)) for x in (body, reflected)]
+    more = float(xp.sum(xp.mean((reflected - before) / gain, axis=0), dtype=xp.float64))
     tally = replace(tally, specular=tally.specular + more, valid=int(xp.sum(valid)))
     if colored is not None:  # all light of metals is what their polarization says, which changes the sum
-        gained = body + mirrored - diffuse - specular
+        gained = body + reflected - diffuse - specular
         tally = replace(tally, s0=tally.s0 + float(xp.sum(xp.mean(gained / gain, axis=0), dtype=xp.float64)))
     images = replace(images, diffuse=changed[0], specular=changed[1], valid=valid, tally=tally)
     return images, Colored(0.0 if colored is None else float(xp.mean(colored)), retained, unpolarized)

@@ -1,6 +1,6 @@
-"""The lamp's degree of polarization, from what its mirror images leave in the diffuse image.
+"""The lamp's degree of polarization, from what its highlights leave in the diffuse image.
 
-Methods take mirror images of the lamp for fully polarized. Behind an imperfect polarizer of degree p they find p of
+Methods take highlights of the lamp for fully polarized. Behind an imperfect polarizer of degree p they find p of
 them; (1 - p) / p of the specular image is left in the diffuse image, in white. In a place, the diffuse image less the
 body's colour is regressed on the specular image. The median of the places counts where it is clear: more than its
 standard error, and along white rather than beside it, where wrong colours of the lamp lead. Grey bodies show

@@ -242,7 +242,7 @@ def describe(sums: Tally, expects_errors: bool) -> dict[str, Any]:
         statistics["fit_residual"] = misfit
         if brightness > 1e-3 and misfit > MAX_RESIDUAL:
             remarks.append(
-                f"white highlights on coloured things were expected, found polarization of other colours (misfit "
+                f"white highlights on coloured objects were expected, found polarization of other colours (misfit "
                 f"{misfit:.2f} of the light): are there metals, or several lights?"
             )
     if sums.noise is not None:

@@ -5,7 +5,7 @@ body's colour (Ma et al. 2007). Crossed polarizers count it as specular. Methods
 white specular light leave it in the diffuse image.
 
 In a place, the polarization along the lamp's is regressed on the diffuse image, both as deviations from their mean over
-colours, so that white mirror images do not count. Slopes have two reasons. Transmitted light is polarized by Fresnel's
+colours, so that white highlights do not count. Slopes have two reasons. Transmitted light is polarized by Fresnel's
 equations, along and across the lamp's polarization, as the normals are, and hardly where surfaces face the camera: the
 densest slope of a frame is near 0. Retained light moves all slopes along the lamp's polarization, by its share. So the
 densest slope is that share, where it clearly lies along. The median must agree, since a frame of few planes has dense

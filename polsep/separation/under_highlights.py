@@ -116,7 +116,7 @@ def _contrast(holes: _Holes, mosaic: Mosaic, fill: Floats, gain: Floats) -> Floa
     """Polarized share of what holes ``[total]`` have beyond a fill, by the analysers of their cells.
 
     (most - least) / (most + least - fill) of samples under white light, in sums over a hole: unpolarized light of a
-    fill, which is s0, is half of it in each sample. Mirror images of the lamp have 0.7 to 1, less where all clip.
+    fill, which is s0, is half of it in each sample. Highlights of the lamp have 0.7 to 1, less where all clip.
     """
     (row, col), width = mosaic.layout.origin, mosaic.data.shape[1]
     cells = np.stack(np.divmod(holes.flat, holes.shape[1])) // holes.scale

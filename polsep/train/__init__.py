@@ -1,1 +1,1 @@
-"""Training: streamed examples, losses, one loop. The only room with optimizers. Needs the extra ``train``."""
+"""Training: streamed examples, losses, one loop. The only subpackage with optimizers. Needs the extra ``train``."""

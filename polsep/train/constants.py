@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from types import ModuleType
 
-#: Modules of this room that hold constants of examples.
+#: Modules of this subpackage that hold constants of examples.
 PLACES = ("variety", "reality", "stream")
 
 #: The name of a constant, and its number or numbers.

@@ -2,8 +2,8 @@
 
 A larger network has more residual blocks per level, whose last convolutions start at zero, or more channels, on which
 nothing that was there depends at first. It need not learn again what the small one knows (Chen et al. 2016, Net2Net,
-arXiv 1511.05641). Blocks and levels that an earlier training left silent, all 0 in the file (`networks.ranges`), begin
-again in the same way. A network for mono frames can begin as one for colour frames, of which every frame is grey.
+arXiv 1511.05641). Blocks and levels that an earlier training left inactive, all 0 in the file (`networks.ranges`),
+begin again in the same way. A network for mono frames can begin as one for colour frames, of which every frame is grey.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from polsep.networks.joint import Joint
 #: Parts that a smaller network may lack: they change nothing until they are trained.
 NEW_PARTS = re.compile(r"whole_frame\.|net\.(encoders|decoders)\.\d+\.\d+\.")
 #: Layers that begin again where they are 0: among zeros alone a gradient stays 0. What follows them is 0, too.
-WAKING = re.compile(r"net\.(downs|encoders|decoders)\.")
+RESTARTED = re.compile(r"net\.(downs|encoders|decoders)\.")
 
 
 def grow(tensors: dict[str, Tensor], network: Joint) -> dict[str, Tensor]:
     """Return the state of a network with the weights of a smaller one in it.
 
     What the smaller one lacks, and what is 0 in it, keeps its initial values, but old outputs do not depend on new
-    inputs, nor on a level that was silent. A network of one colour takes weights of three, see `for_one_color`, and
+    inputs, nor on a level that was inactive. A network of one colour takes weights of three, see `for_one_color`, and
     keeps its own linear filter. Raises ValueError on weights of a network that is not a part of this one.
     """
     state = {name: value.clone() for name, value in network.state_dict().items()}
@@ -41,7 +41,7 @@ def grow(tensors: dict[str, Tensor], network: Joint) -> dict[str, Tensor]:
     downs = [tensors[name].shape[0] for name in tensors if re.fullmatch(r"net\.downs\.\d+\.bias", name)]
     places = _moved((tensors["details.change.weight"].shape[1], *downs), network.size.widths)
     for name, old in tensors.items():
-        if old.any() or not WAKING.match(name):
+        if old.any() or not RESTARTED.match(name):
             state[name] = _embed(old, state[name], places.get(name))
     return state
 

@@ -66,7 +66,7 @@ ABLATIONS = {
     "paper-loss": Ablation(goal=Goal(paper_difference)),
 }
 #: Parts of a network that can be trained alone, by the prefix of their parameters' names.
-PARTS = {"all": "", "details": "details.", "doubt": "log_variance."}
+PARTS = {"all": "", "details": "details.", "errors": "log_variance."}
 #: Inputs and number of colours by variant.
 JOINT_VARIANTS = {"mosaic": (joint_inputs, 3), "mono": (joint_mono_inputs, 1)}
 

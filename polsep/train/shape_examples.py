@@ -1,6 +1,6 @@
-"""Training examples of shape from one frame: a raw frame of a random thing, separated, and the truth of its surface.
+"""Training examples of shape from one frame: a raw frame of a random object, separated, and the truth of its surface.
 
-A third of the things are unions of solids (`render.shapes`), a third smooth bodies (`render.blobs`), a third vessels
+A third of the objects are unions of solids (`render.shapes`), a third smooth bodies (`render.blobs`), a third vessels
 (`render.vessels`). Solids are seen from all sides; bodies and vessels stand, and cameras look at them as users do
 (`random_upright_camera`). Examples of the split `MESHES` show meshes of files (`render.models`), which stand, too.
 Lights, looks and disturbances are those of the separation's training (`variety`, `reality`). The lamp is mostly beside
@@ -80,19 +80,19 @@ COUNT = 35
 SIDE, SAMPLES = 384, 2
 #: Methods that separate frames, and their shares.
 METHODS, METHOD_SHARES = ("joint", "joint-fast", "color-affine"), (0.7, 0.2, 0.1)
-#: Share of lamps near the camera, largest angle of these and of the others, and distances in radii of the thing.
+#: Share of lamps near the camera, largest angle of these and of the others, and distances in radii of the object.
 NEAR_SHARE, NEAR_DEG, LARGEST_DEG, DISTANCES = 0.3, 20.0, 60.0, (3.0, 12.0)
 #: Shares of views that may be close-ups, of scenes with disturbances, and with another diffuse polarization.
 CLOSE_SHARE, REAL_SHARE, DEPOLARIZED_SHARE = 0.4, 0.6, 0.5
 #: Standard deviation of the lens's point spread in raw pixels.
 BLURS = (0.3, 1.0)
-#: Elevations of cameras about things that stand [degrees]; share of those that look down, and their elevations.
+#: Elevations of cameras about objects that stand [degrees]; share of those that look down, and their elevations.
 ELEVATIONS_DEG, DOWN_SHARE, DOWN_DEG = (-5.0, 70.0), 0.1, (70.0, 88.0)
-#: Kinds of things in turn; all but the first stand.
+#: Kinds of objects in turn; all but the first stand.
 KINDS = (random_mesh, random_blob, random_vessel)
 #: The split of training examples that show meshes of files, beside those of `render.views.SPLITS`.
 MESHES = "meshes"
-#: Most draws of a view that shows much of the thing lit.
+#: Most draws of a view that shows much of the object lit.
 MAX_DRAWS = 20
 
 
@@ -108,19 +108,19 @@ class Examples(NamedTuple):
     shown: str = ""
 
     def generator(self, number: int, view: int | None = None) -> torch.Generator:
-        """Return the generator of the thing of example ``number``, or of a view of it."""
+        """Return the generator of the object of example ``number``, or of a view of it."""
         split = "train" if self.split == MESHES else self.split
         return torch.Generator().manual_seed(scene_seed(split, self.seed, number, view))
 
-    def thing(self, number: int) -> MeshScene:
-        """Return random thing ``number``; but for meshes, the number says of which of `KINDS`."""
+    def shape(self, number: int) -> MeshScene:
+        """Return random object ``number``; but for meshes, the number says of which of `KINDS`."""
         generator = self.generator(number)
         if self.split == MESHES:
             return MeshScene(random_model(self.meshes, generator))
         return MeshScene(KINDS[number % len(KINDS)](generator))
 
     def stands(self, number: int) -> bool:
-        """Return True where the thing of example ``number`` stands, +y up, before an upright camera."""
+        """Return True where the object of example ``number`` stands, +y up, before an upright camera."""
         return self.split == MESHES or number % len(KINDS) != 0
 
     def path(self, folder: Path, number: int) -> Path:
@@ -130,7 +130,7 @@ class Examples(NamedTuple):
 
 
 def random_upright_camera(vertices: Floats, generator: torch.Generator) -> PinholeCamera:
-    """Return a camera that looks at a thing that stands: mostly from `ELEVATIONS_DEG`, sometimes straight down."""
+    """Return a camera that looks at an object that stands: mostly from `ELEVATIONS_DEG`, sometimes straight down."""
     turn, down, height = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
     low, high = DOWN_DEG if down < DOWN_SHARE else ELEVATIONS_DEG
     elevation = math.radians(low + (high - low) * height)
@@ -149,34 +149,34 @@ def random_lamp(camera: PinholeCamera, radius: float, generator: torch.Generator
     return PointLight((x, y, z), distance**2, math.pi * angle)
 
 
-def random_shape_shot(thing: MeshScene, upright: bool, generator: torch.Generator) -> Shot:
-    """Return a view of a thing under a lamp that reaches much of it. Raises ValueError where none of the draws does."""
+def random_shape_shot(shape: MeshScene, upright: bool, generator: torch.Generator) -> Shot:
+    """Return a view of a shape under a lamp that reaches much of it. Raises ValueError where none of the draws does."""
     draw_camera = random_upright_camera if upright else random_camera
     for _ in range(MAX_DRAWS):
-        camera = draw_camera(thing.mesh.vertices, generator)
-        lamp = random_lamp(camera, thing.size / 2, generator)
+        camera = draw_camera(shape.mesh.vertices, generator)
+        lamp = random_lamp(camera, shape.size / 2, generator)
         softness, close = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
         shot = Shot(camera, lamp, random_clip(generator), log_between(BLURS, softness))
-        if lit_share(thing, shot) >= MIN_LIT:
-            return vary_shot(thing, shot, generator) if close < CLOSE_SHARE else shot
-    raise ValueError(f"expected a view that shows {MIN_LIT:.0%} of the thing lit, found none in {MAX_DRAWS} draws")
+        if lit_share(shape, shot) >= MIN_LIT:
+            return vary_shot(shape, shot, generator) if close < CLOSE_SHARE else shot
+    raise ValueError(f"expected a view that shows {MIN_LIT:.0%} of the object lit, found none in {MAX_DRAWS} draws")
 
 
 def random_shape_example(examples: Examples, number: int, side: int = SIDE) -> Tensor:
     """Return planes ``[COUNT, side/2, side/2]`` (`PLANES`) of example ``number``; it depends on the arguments alone."""
-    thing, generator = examples.thing(number), examples.generator(number, 0)
-    shot = random_shape_shot(thing, examples.stands(number), generator)
-    view = vary_normals(find_view(thing, shot.camera, (side, side), SAMPLES), generator)
-    materials = random_materials(thing.mesh.slot_count, generator, thing.size)
+    shape, generator = examples.shape(number), examples.generator(number, 0)
+    shot = random_shape_shot(shape, examples.stands(number), generator)
+    view = vary_normals(find_view(shape, shot.camera, (side, side), SAMPLES), generator)
+    materials = random_materials(shape.mesh.slot_count, generator, shape.size)
     materials = vary_gloss(vary_colors(materials, generator), generator)
-    lit_view = LitView(view, materials, shot.light, find_lit(thing, view, shot.light))
+    lit_view = LitView(view, materials, shot.light, find_lit(shape, view, shot.light))
     scene = blur(shade_view(*lit_view), shot.blur)
     real, depolarized = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
     if depolarized < DEPOLARIZED_SHARE:
         scene = vary_polarization(scene, generator)
 
-    second = LitView(view, materials, random_lamp(shot.camera, thing.size / 2, generator), lit_view.lit)
-    relit = relit_of(thing, second, shot.blur)
+    second = LitView(view, materials, random_lamp(shot.camera, shape.size / 2, generator), lit_view.lit)
+    relit = relit_of(shape, second, shot.blur)
     found = disturb(scene, relit, generator) if real < REAL_SHARE else as_ideal(scene)
     return torch.cat([_photograph(found, shot.clip, generator), surface_planes(view, materials, shot)])
 
@@ -187,8 +187,8 @@ def _photograph(real: RealScene, clip: float, generator: torch.Generator) -> Ten
     exposed = expose_to_level(expose_to_clip(real.scene, clip, layout, sensor), MIN_LEVEL, layout, sensor)
     mosaic = capture(exposed, layout, sensor, generator).mosaic
     mosaic = replace(mosaic, data=mosaic.data.numpy().astype(np.float32))
-    told = real.told / real.told[1]
-    light = tuple(float(c) for c in told)
+    color = real.told / real.told[1]
+    light = tuple(float(c) for c in color)
     method = METHODS[int(torch.multinomial(torch.tensor(METHOD_SHARES), 1, generator=generator))]
     frame = separate_capture(mosaic, method, light)
     gain = np.array(light, np.float32)
@@ -198,9 +198,9 @@ def _photograph(real: RealScene, clip: float, generator: torch.Generator) -> Ten
     error = np.zeros((*strength.shape, 2), np.float32) if frame.error is None else frame.error / gain.mean()
     images = [stokes[0], stokes[1], stokes[2], diffuse, specular]
     images += [(strength * f(2 * frame.aolp))[..., None] for f in (np.cos, np.sin)] + [error]
-    true = [light.s0 / told[:, None, None] for light in (exposed.diffuse, exposed.specular)]
+    true = [light.s0 / color[:, None, None] for light in (exposed.diffuse, exposed.specular)]
     total = exposed.diffuse + exposed.specular
-    polarized = [(s / told[:, None, None]).mean(dim=0, keepdim=True) for s in (total.s1, total.s2)]
+    polarized = [(s / color[:, None, None]).mean(dim=0, keepdim=True) for s in (total.s1, total.s2)]
     truth = torch.cat([true[0], true[1].mean(dim=0, keepdim=True), *polarized])
     seen = torch.from_numpy(np.concatenate(images, axis=-1)).movedim(-1, 0)
     return torch.cat([seen, avg_pool2d(truth, 2)])

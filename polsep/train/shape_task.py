@@ -1,8 +1,8 @@
-"""Training of the network for shape, on examples from a folder: turned, mirrored, cut to the thing.
+"""Training of the network for shape, on examples from a folder: turned, mirrored, cut to the object.
 
-Frames of things that stand are mostly mirrored across alone, so that the network learns where down is: users' things
-stand, and a flat thing's normals are known but for the side to which it tips. `HELD_SHARE` of these frames and all of
-solids are turned in eight ways, so that a thing held at any angle still works.
+Frames of objects that stand are mostly mirrored across alone, so that the network learns where down is: users' objects
+stand, and a flat object's normals are known but for the side to which it tips. `HELD_SHARE` of these frames and all of
+solids are turned in eight ways, so that an object held at any angle still works.
 
 Batch number n depends on the options and n alone, so that a resumed training uses the same batches.
 """
@@ -35,12 +35,12 @@ TRAINED = (*INPUTS, "perfect")
 #: Parts that are trained: all layers, or small ones alone, which make up for it that large ones were rounded before
 #: (`io.store.rounding`).
 PARTS = ("all", "small")
-#: Share of frames whose lamp's direction is not told, and deviation of the others' [rad].
-UNTOLD, TOLD_ERROR = 0.3, 0.05
-#: Side of a cut over the longest side of the thing, in training; and in validation.
+#: Share of frames whose lamp's direction is not given, and deviation of the others' [rad].
+NOT_GIVEN, GIVEN_ERROR = 0.3, 0.05
+#: Side of a cut over the longest side of the object, in training; and in validation.
 CUTS, CUT = (1.04, 1.5), 1.1
-#: Share of frames of things that stand which are turned in eight ways, as frames of things held at any angle: with all
-#: of the solids, every second frame (a third and a quarter of two thirds).
+#: Share of frames of objects that stand which are turned in eight ways, as if held at any angle: with all of the
+#: solids, every second frame (a third and a quarter of two thirds).
 HELD_SHARE = 0.25
 #: Seed and number of validation's lamps.
 LAMP_SEED, VALIDATION_LAMPS = 31, 20
@@ -119,9 +119,9 @@ def truth_of(planes: Tensor) -> Surface:
 
 
 def cut_example(planes: Tensor, wider: float, side: int, place: tuple[float, float] = (0.5, 0.5)) -> Tensor:
-    """A square of ``wider`` times the longest side of the thing, resized to ``side``: ``[COUNT, side, side]``.
+    """A square of ``wider`` times the longest side of the object, resized to ``side``: ``[COUNT, side, side]``.
 
-    ``place``: of the thing in it, from 0 to 1 along rows and columns. Images that shrink are means over areas.
+    ``place``: of the object in it, from 0 to 1 along rows and columns. Images that shrink are means over areas.
     """
     mask = planes[PLANES["mask"]][0] > 0.5
     rows, cols = (torch.nonzero(mask.any(dim=axis))[:, 0] for axis in (1, 0))
@@ -165,13 +165,13 @@ def turn_example(planes: Tensor, across: bool, down: bool, transposed: bool) -> 
     return turned
 
 
-def tell_light(planes: Tensor, generator: torch.Generator) -> Tensor:
-    """An example whose lamp's direction is told with an error, or not at all."""
-    untold = float(torch.rand(1, generator=generator)) < UNTOLD
-    error = TOLD_ERROR * torch.randn(3, 1, 1, generator=generator)
-    told = planes.clone()
-    told[PLANES["light"]] = 0.0 if untold else normalize(planes[PLANES["light"]] + error, dim=0)
-    return told
+def give_light(planes: Tensor, generator: torch.Generator) -> Tensor:
+    """An example whose lamp's direction is given with an error, or not at all."""
+    unknown = float(torch.rand(1, generator=generator)) < NOT_GIVEN
+    error = GIVEN_ERROR * torch.randn(3, 1, 1, generator=generator)
+    given = planes.clone()
+    given[PLANES["light"]] = 0.0 if unknown else normalize(planes[PLANES["light"]] + error, dim=0)
+    return given
 
 
 def batches(options: ShapeOptions, paths: Sequence[Path], step: int, process: tuple[int, int]) -> Iterator[ShapeBatch]:
@@ -187,7 +187,7 @@ def batches(options: ShapeOptions, paths: Sequence[Path], step: int, process: tu
             examples, shown = find_example(paths[number])
             any_way = not examples.stands(shown) or draws[3] < HELD_SHARE
             down, transposed = (way and any_way for way in others)
-            found.append(tell_light(turn_example(planes, across, down, transposed), generator))
+            found.append(give_light(turn_example(planes, across, down, transposed), generator))
         yield ShapeBatch(torch.stack(found))
         step += 1
 

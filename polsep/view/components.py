@@ -15,7 +15,7 @@ from polsep.view.opening import UNSAID, OpenedFrame
 HINT = '<p class="ps-hint">Point at the picture to read a pixel, click to keep it.</p>'
 PAUSE = '<p class="ps-hint">Pause to read the numbers of this frame.</p>'
 NOTHING = '<p class="ps-hint">No frame yet.</p>'
-NO_SHAPE = '<p class="ps-hint">The surface of a thing before a dark ground, under a lamp that you move.</p>'
+NO_SHAPE = '<p class="ps-hint">The surface of an object before a dark ground, under a lamp that you move.</p>'
 #: Labels of the buttons that upload images.
 IMAGES = {"texture": "Texture", "normals": "Normals", "mask": "Mask for all edits"}
 #: Settings that describe a file, where nothing is said: another file begins with these.
@@ -33,7 +33,7 @@ Updates = dict[Any, Any]
 
 @dataclass(frozen=True)
 class Start:
-    """The first state of the page: values of its settings, and a ``file`` of the owner to open."""
+    """The first state of the page: values of its settings, and a ``file`` of the user to open."""
 
     settings: dict[str, Any]
     file: Any = None

@@ -118,7 +118,7 @@ class Events:
         session, parts = self._session(request), self.components
         try:
             said = {name: values[component] for name, component in parts.settings.items()}
-            demo = [source.path for source in session.sources] == [DEMO]  # by another sensor than the owner's
+            demo = [source.path for source in session.sources] == [DEMO]  # by another sensor than the user's
             settings = parse_settings(said if demo else self.start.corrections() | said)
             against = parse_against(values[parts.view["against"]], settings)
         except FAILURES as error:

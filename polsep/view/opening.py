@@ -143,7 +143,7 @@ def as_source(path: Path, stem: str) -> Source:
 
 
 def find_sources(path: Path) -> tuple[Source, ...]:
-    """The owner's own file, four of a template with ``{angle}``, or a folder: frames as `polsep video` writes them, or
+    """The user's own file, four of a template with ``{angle}``, or a folder: frames as `polsep video` writes them, or
     raw ones. Raises InputError.
     """
     path = path / RECORD if is_recording(path) else path
@@ -285,7 +285,7 @@ def _as_opened(read: SeparatedFrame, light_color: LightColor | str, stem: str) -
     report = read.report | {"source": stem, "warnings": list(read.report.get("warnings", ()))}
     if not is_to_be_found(light_color):
         color = stated_gains(light_color, read.diffuse.shape[-1])
-        report |= {"light_color": color, "light": {"source": "told", "color": color}}
+        report |= {"light_color": color, "light": {"source": "stated", "color": color}}
         report["warnings"] += color_notes(light_color, len(color))
     if not read.dolp.any():
         report["warnings"].append(LIGHT_ALONE)

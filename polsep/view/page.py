@@ -222,7 +222,7 @@ def _connect(page: Any, components: Components, events: Events) -> None:
 
 
 def _opening(events: Events, file: Any) -> Any:
-    """A function that opens the owner's file."""
+    """A function that opens the user's file."""
 
     async def answer(values: Any, request: gr.Request) -> Any:
         async for update in events.open_own(file, values, request):

@@ -352,7 +352,7 @@ def exposure_panel(frame: SeparatedFrame, found: Histogram | None) -> str:
 
 
 def shape_panel(frame: SeparatedFrame, stem: str) -> str:
-    """The surface of a frame's thing on a page of its own, and how sure it is. Raises ValueError."""
+    """The surface of a frame's object on a page of its own, and how sure it is. Raises ValueError."""
     from polsep.geometry.one_frame import find_shape
     from polsep.geometry.one_frame_files import page_of
 
@@ -360,10 +360,10 @@ def shape_panel(frame: SeparatedFrame, stem: str) -> str:
     error = float(np.degrees(np.median(surface.normal_error[surface.mask])))
     page, title = html.escape(page_of(surface, stem).decode(), quote=True), f"Relit {html.escape(stem)}"
     window = f'<iframe class="ps-relit" title="{title}" sandbox="allow-scripts" srcdoc="{page}"></iframe>'
-    doubts = surface.doubts()
+    notes = surface.warnings()
     if "light_color" not in frame.report:
-        doubts.append("the lamp's colour of this result is not known: taken for white, unless Light colour says it")
-    remarks = "".join(f'<div class="ps-remark">{html.escape(line)}</div>' for line in doubts)
+        notes.append("the lamp's colour of this result is not known: taken for white, unless Light colour says it")
+    remarks = "".join(f'<div class="ps-remark">{html.escape(line)}</div>' for line in notes)
     return f'{window}<p class="ps-hint">Expected error of normals {error:.0f}° in the median.</p>{remarks}'
 
 

@@ -88,7 +88,7 @@ class Session:
         return self._sources
 
     def begin_own(self, path: Path) -> None:
-        """Open the owner's file, or folder of separated frames. Raises InputError."""
+        """Open the user's file, or folder of separated frames. Raises InputError."""
         self.begin(find_sources(path))
 
     def forget(self) -> None:

@@ -73,9 +73,9 @@ function metallic({ diffuse, specular, height, width, valid }, seen, share, reta
       const part = read(share, 1, 0);
       if (part >= 0.5) valid[k] = 0;
       for (let channel = 0; channel < 3; channel++) {
-        const own = 3 * k + channel, d = diffuse[own], s = specular[own], mirrored = s + retained * d;
+        const own = 3 * k + channel, d = diffuse[own], s = specular[own], reflected = s + retained * d;
         diffuse[own] = (1 - part) * (1 - retained) * d;
-        specular[own] = mirrored + part * (read(ratio, 3, channel) * (d + s) - mirrored);
+        specular[own] = reflected + part * (read(ratio, 3, channel) * (d + s) - reflected);
       }
     }
 }

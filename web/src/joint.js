@@ -32,7 +32,7 @@ class Planes {
 /**
  * Images as `separateAnalytic` gives them, with `error` and `sums`, of a mosaic in a light.
  * `network`: {run(samples, rows, width, thumbnail), seesFrame, count of strips at once}; only one that sees the frame is
- * given a thumbnail. `progress(share)` is told after every strip.
+ * given a thumbnail. `progress(share)` is called after every strip.
  */
 export async function separateJoint(mosaic, light, network, progress) {
   const way = orient(mosaic.height, mosaic.width, mosaic.layout), { rows, cols } = turnedPlaces(way);

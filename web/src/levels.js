@@ -1,4 +1,4 @@
-// Levels of a raw frame, and what its owner should know of them: twin of polsep/sensor/levels.py.
+// Levels of a raw frame, and what the user should know of them: twin of polsep/sensor/levels.py.
 
 /** A sample within this share of white counts as clipped. */
 export const CLIP_MARGIN = 2 ** -10;

@@ -14,7 +14,7 @@ const GOOD = [1.25 * Math.exp(0.28), 0.126, 0.563], UNCERTAIN_DEG = 5.5, LEAST_M
 const WHITE_SHARE = 0.6, RAW_SHARE = 0.27, WARM_SHARE = 0.08, ANY_SHARE = 0.05, ANY_SPREAD = 0.5;
 const BODIES_SPREAD = 1, ASTRAY_SPREAD = 0.5, GOOD_SPREAD = 2.03, LIKELY_WHITE = 0.5, LIKELY_RIGHT = 0.5, GRID = [-1.5, 0.8, 47];
 const LARGEST_RATIO = 5;
-const GREENISH = -1.2, MIRROR = 1, MIN_MIRRORS = 3, METAL_DISTANCE = 0.28;
+const GREENISH = -1.2, PURE_SPECULAR = 1, MIN_SPECULAR_TILES = 3, METAL_DISTANCE = 0.28;
 const COPPER = [0.403, -0.17], GOLD = [0.246, -0.821];
 /** Two directions beside grey. */
 const BESIDE = [[1, -1, 0].map((v) => v / Math.SQRT2), [1, 1, -2].map((v) => v / Math.sqrt(6))];
@@ -38,13 +38,13 @@ const TOO_LITTLE = "a frame that shows the lamp's colour was expected, found one
 
 /** The light's colour, {color: [gain per channel], source, remarks}, green = 1: found in the frame unless it was said. */
 export function lightOf(said, mosaic) {
-  const mono = channelsOf(mosaic.layout) === 1, told = (color, remarks = []) => ({ color, source: "told", remarks });
-  if (said === "white") return told(mono ? [1] : [1, 1, 1]);
+  const mono = channelsOf(mosaic.layout) === 1, stated = (color, remarks = []) => ({ color, source: "stated", remarks });
+  if (said === "white") return stated(mono ? [1] : [1, 1, 1]);
   if (!Array.isArray(said)) return findLight(mosaic);
   if (said.length !== 3 || !said.every((gain) => gain > 1e-6 && gain < 1e6))
     throw new Error(`expected a light colour of three positive numbers, found ${said}`);
-  if (!mono) return told(said.map((gain) => gain / said[1]));
-  return told([1], new Set(said).size > 1 ? [IGNORED] : []);
+  if (!mono) return stated(said.map((gain) => gain / said[1]));
+  return stated([1], new Set(said).size > 1 ? [IGNORED] : []);
 }
 
 /** {color: [r, g, b], source, sure, error_deg, metal_fraction, remarks}, green = 1; of a mono mosaic the colour is [1]. */
@@ -65,14 +65,14 @@ const asReport = (light) =>
 
 /** The light of the bodies alone where they show that the frame holds coloured metal. */
 function lightOfTiles(tiles, axis) {
-  const fit = fitColor(strongest(tiles), axis), mirrors = onlyMirrors(tiles, axis);
-  const marked = new Set(tiles.filter((_, k) => mirrors[k]).map(({ row, col }) => `${row},${col}`));
+  const fit = fitColor(strongest(tiles), axis), specular = onlySpecular(tiles, axis);
+  const marked = new Set(tiles.filter((_, k) => specular[k]).map(({ row, col }) => `${row},${col}`));
   const touches = ({ row, col }) => [-1, 0, 1].some((i) => [-1, 0, 1].some((j) => marked.has(`${row + i},${col + j}`)));
   const bodies = tiles.filter((tile) => !touches(tile));
-  if (marked.size < MIN_MIRRORS || bodies.length < MIN_TILES) return asLight(fit, tiles);
-  const mirrored = iterate(planesAlong(strongest(tiles.filter((_, k) => mirrors[k])), axis)).x;
+  if (marked.size < MIN_SPECULAR_TILES || bodies.length < MIN_TILES) return asLight(fit, tiles);
+  const reflected = iterate(planesAlong(strongest(tiles.filter((_, k) => specular[k])), axis)).x;
   const ownAxis = axisOf(strongest(bodies)), own = fitColor(strongest(bodies), ownAxis);
-  if (!isMetal([mirrored[0] - own.x[0], mirrored[1] - own.x[1]])) return asLight(fit, tiles);
+  if (!isMetal([reflected[0] - own.x[0], reflected[1] - own.x[1]])) return asLight(fit, tiles);
   return { ...asLight(own, bodies), metal: metalShare(tiles, ownAxis, own.x) };
 }
 
@@ -86,7 +86,7 @@ function remarksOn(light, tiles) {
   const white = light.x[0] === 0 && light.x[1] === 0;
   if (light.error > UNCERTAIN_DEG && (!white || r * b < Math.exp(GREENISH) * g ** 2))
     remarks.push(`highlights that show the lamp's colour were expected, found too few; ${color.map((v) => v.toFixed(2))} is ` +
-      "assumed: show a shiny thing, or measure a grey card and say the lamp's colour");
+      "assumed: show a shiny object, or measure a grey card and say the lamp's colour");
   return remarks;
 }
 
@@ -302,8 +302,8 @@ function spreadDeg(x, covariance) {
 }
 
 /** Which tiles hold hardly any diffuse light. */
-const onlyMirrors = (tiles, axis) =>
-  planesAlong(tiles, axis).map(({ qq, dd }) => trace(qq) > MIRROR ** 2 * Math.max(trace(dd), 1e-9));
+const onlySpecular = (tiles, axis) =>
+  planesAlong(tiles, axis).map(({ qq, dd }) => trace(qq) > PURE_SPECULAR ** 2 * Math.max(trace(dd), 1e-9));
 
 /** True for colours, relative to the lamp's, of gold, copper and what lies between. */
 function isMetal([r, b]) {
@@ -314,10 +314,10 @@ function isMetal([r, b]) {
 
 /** Share of the lit points that are in tiles of coloured metal. */
 function metalShare(tiles, axis, lamp) {
-  const mirrors = onlyMirrors(tiles, axis), planes = planesAlong(tiles, axis);
+  const specular = onlySpecular(tiles, axis), planes = planesAlong(tiles, axis);
   const metal = planes.map(({ qq }, t) => {
     const [r, g, b] = [qq[0], qq[4], qq[8]].map((v) => Math.max(v, 1e-12));
-    return mirrors[t] && isMetal([0.5 * Math.log(r / g) - lamp[0], 0.5 * Math.log(b / g) - lamp[1]]);
+    return specular[t] && isMetal([0.5 * Math.log(r / g) - lamp[0], 0.5 * Math.log(b / g) - lamp[1]]);
   });
   return sum(tiles.map(({ count }, t) => (metal[t] ? count : 0))) / Math.max(sum(tiles.map(({ count }) => count)), 1);
 }

@@ -1,4 +1,4 @@
-// Polarization of separated images and what their owner should know: twin of polsep/separation/report.py.
+// Polarization of separated images and what the user should know: twin of polsep/separation/report.py.
 
 const MIN_CONCENTRATION = 0.34, MIN_CONCENTRATION_CLOSED = 0.29, MAX_RESIDUAL = 0.07, MAX_DOLP = 2;
 
@@ -39,7 +39,7 @@ export function tallyOf(images) {
   return { ...counts, ...sums };
 }
 
-/** Statistics of a frame and lines for its owner; `network`: of the method joint-fast. */
+/** Statistics of a frame and lines for the user; `network`: of the method joint-fast. */
 export function describe(sums, network, colors) {
   const angle = (0.5 * Math.atan2(sums.across, sums.along) + Math.PI) % Math.PI, warnings = [];
   const concentration = sums.power > 0 ? Math.hypot(sums.along, sums.across) / sums.power : 0;
@@ -48,7 +48,7 @@ export function describe(sums, network, colors) {
     warnings.push("polarized light of one angle was expected, found many (concentration " +
       `${concentration.toFixed(2)}): is the light polarized, and the only one?`);
   if (network && colors === 3 && brightness > 1e-3 && misfit > MAX_RESIDUAL)
-    warnings.push("white highlights on coloured things were expected, found polarization of other colours (misfit " +
+    warnings.push("white highlights on coloured objects were expected, found polarization of other colours (misfit " +
       `${misfit.toFixed(2)} of the light): are there metals, or several lights?`);
   const statistics = {
     clipped_fraction: sums.clipped / sums.frame,

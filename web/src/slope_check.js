@@ -5,7 +5,7 @@ import { filterAt, mirroredAcross, mirroredDown, specOf } from "./layout.js";
 import { CLIP_MARGIN } from "./levels.js";
 import { mean } from "./numbers.js";
 
-const BLOCK = 4, SIDE = 1024, SIZES = 3, BACKGROUND = 0.05, MIRRORED = 0.3, MIN_MIRRORED = 0.012, MIN_AGREEMENT = 0.1, CERTAIN = 3.5;
+const BLOCK = 4, SIDE = 1024, SIZES = 3, BACKGROUND = 0.05, SPECULAR = 0.3, MIN_SPECULAR = 0.012, MIN_AGREEMENT = 0.1, CERTAIN = 3.5;
 
 /** {text, layout} of a colour frame whose AoLP is 90 degrees off, beyond doubt; else null. */
 export function checkSlopes(mosaic) {
@@ -20,7 +20,7 @@ export function checkSlopes(mosaic) {
   }
   const { total, polarized } = fitColors(levels[0].means, own), average = mean(total);
   const lit = total.map((v, b) => [v, polarized[b]]).filter(([v]) => v > BACKGROUND * average);
-  if (!(lit.filter(([v, p]) => p > MIRRORED * v).length > MIN_MIRRORED * lit.length)) return null;
+  if (!(lit.filter(([v, p]) => p > SPECULAR * v).length > MIN_SPECULAR * lit.length)) return null;
   const turned = { ...layout, polarizer: layout.polarizer.map((angle) => (angle + 90) % 180) };
   const around = mirroredDown(mirroredAcross(layout, 4), 4);
   return {
@@ -80,7 +80,7 @@ function agreementOf({ means, usable, rows, cols }, layout, side) {
   const { s0, x, y, total, px, py, polarized } = fitColors(moved, layout);
   let whole = 0, size = 0, square = 0;
   for (let b = 0; b < count; b++) {
-    if (!usable[b] || !(brightness[b] > BACKGROUND * average) || !(polarized[b] < MIRRORED * total[b])) continue;
+    if (!usable[b] || !(brightness[b] > BACKGROUND * average) || !(polarized[b] < SPECULAR * total[b])) continue;
     let contrast = 0, re = 0, im = 0;
     for (let c = 0; c < 3; c++) {
       const d = s0[c][b] - total[b];

@@ -99,7 +99,7 @@ function stopwatch(steps) {
   };
 }
 
-/** The frame as a mosaic, put right where that is sure, with notes for its owner: {text, white, black, layout}. */
+/** The frame as a mosaic, put right where that is sure, with notes for the user: {text, white, black, layout}. */
 function prepare(settings) {
   const layout = parseLayout(settings.layout || frame.layout || "color"), notes = frame.notes.map((text) => ({ text }));
   const said = settings.white ?? frame.white, white = said ?? whiteOf(frame.data), black = settings.black || 0;

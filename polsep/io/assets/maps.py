@@ -70,7 +70,7 @@ def read_map(path: Path, kind: str) -> Floats:
 
 
 def read_object(path: Path, size: tuple[int, ...]) -> NDArray[np.bool_]:
-    """The mask ``[H, W]`` of a thing, in a file of that size, or of the raw frame's, which is twice that or larger by
+    """The mask ``[H, W]`` of an object, in a file of that size, or of the raw frame's, which is twice that or larger by
     what cuts cells: an odd last row or column, and with it the first one of a frame whose cells begin at the second.
 
     Raises InputError.

@@ -19,7 +19,7 @@ from polsep.io.store.image_codecs import encode_png
 
 Floats = NDArray[np.float32]
 
-#: Strength of mirror images that the gloss texture's green channel shows as 1.
+#: Specular strength that the gloss texture's green channel shows as 1.
 LARGEST_STRENGTH = 4.0
 
 

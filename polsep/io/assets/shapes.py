@@ -39,7 +39,7 @@ UNITS = {
     "normal_error": "expected deviation of the normals along each of two axes [degrees]",
     "roughness": "GGX sqrt(alpha); see roughness_error",
     "roughness_error": "expected deviation of ln(roughness); from 0.5 on it is unknown",
-    "specular": "strength of mirror images, 1 = a dielectric of index 1.5; see specular_error",
+    "specular": "strength of specular reflections, 1 = a dielectric of index 1.5; see specular_error",
     "specular_error": "expected deviation of ln(specular); from 0.5 on it is unknown",
 }
 

@@ -1,1 +1,1 @@
-"""Atomic files, checks and codecs for the other rooms, and files that polsep keeps for itself."""
+"""Atomic files, checks and codecs for the rest of `io`, and files that polsep keeps for itself."""

@@ -105,7 +105,7 @@ class Panel:
         )
 
     def _show(self, viewer: Any, layer: Any, found: OpenedFrame) -> None:
-        """Add the layers, instead of those of an earlier run, and say what the owner should know."""
+        """Add the layers, instead of those of an earlier run, and say what the user should know."""
         for data, shown, kind in frame_layers(found.frame, found.stem):
             if shown["name"] in viewer.layers:
                 viewer.layers.remove(shown["name"])

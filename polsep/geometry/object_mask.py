@@ -1,4 +1,4 @@
-"""The mask of a thing before a dark ground, where nobody told it: where light falls."""
+"""The mask of an object before a dark ground, where none was given: where light falls."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from polsep.separation.highlights_kernel import find_parts
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: The thing is where light exceeds this share of a level, its 99th percentile.
+#: The object is where light exceeds this share of a level, its 99th percentile.
 OBJECT_SHARE = 0.06
-#: A thing may be smaller than a hundredth of the frame: the level is at least this share of the diffuse light of this
+#: An object may be smaller than a hundredth of the frame: the level is at least this share of the diffuse light of this
 #: block, counted from the brightest one.
 SMALL_SHARE, SMALL_BLOCKS = 0.5, 4
-#: Side of blocks [pixels]: parts of the thing are near one that is mostly bright.
+#: Side of blocks [pixels]: parts of the object are near one that is mostly bright.
 BLOCK = 8
-#: Least share of the thing's blocks that a connected part has.
+#: Least share of the object's blocks that a connected part has.
 SMALLEST_PART = 0.01
 
 
-def find_lit(light: Floats, diffuse: Floats) -> Mask:
-    """The mask of a thing in an image of all its ``light [h, w]``, without specks and thin lines.
+def find_object_mask(light: Floats, diffuse: Floats) -> Mask:
+    """The mask of an object in an image of all its ``light [h, w]``, without specks and thin lines.
 
     ``diffuse [h, w]``: its diffuse light. Raises ValueError on a black frame.
     """
@@ -31,7 +31,7 @@ def find_lit(light: Floats, diffuse: Floats) -> Mask:
     level = max(np.percentile(light, 99), SMALL_SHARE * np.sort(blocks, axis=None)[-SMALL_BLOCKS:][0])
     bright: Mask = light > OBJECT_SHARE * level
     if not bright.any() or not light.any():
-        raise ValueError("expected light on a thing, found a black frame")
+        raise ValueError("expected light on an object, found a black frame")
     height, width = bright.shape
     solid = _large_parts(_cell_means(bright) > 0.5)
     around = np.pad(solid, 1)

@@ -61,13 +61,13 @@ _KINDS = {
         "material/relit",
     ),
     "shape": Kind(
-        "Normals, albedo, roughness and strength of mirror images of a thing, and their expected errors, from one "
+        "Normals, albedo, roughness and specular strength of an object, and their expected errors, from one "
         "separated frame.",
         "Unions of solids, smooth bodies and vessels with random textures, rendered as a model of Sony's IMX250 "
         "records them, and separated by this package (docs/shape.md), and 367 meshes from packages under free licences "
         "(evaluation/weights/shape/meshes.tsv). No photographs; some bones and asteroids are scans.",
-        "One dielectric thing under one polarized lamp within some 45 degrees of the camera; detail below a "
-        "hundredth of the thing is lost or faint (docs/shape.md).",
+        "One dielectric object under one polarized lamp within some 45 degrees of the camera; detail below a "
+        "hundredth of the object is lost or faint (docs/shape.md).",
         "shape",
         "shape/normals",
     ),

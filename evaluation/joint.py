@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 #: Methods whose images at full resolution would be of bilinear samples, as their networks' are at half.
 ENLARGED = ("paper",)
 #: Methods that separate mono frames with what the project ships, and the seed of these frames' noise.
-MONO, MONO_SEED = ("joint", "joint-fast", "color-affine", "analytic"), 2_000_000
+MONO, MONO_SEED = ("joint-large", "joint", "joint-fast", "color-affine", "analytic"), 2_000_000
 #: Groups of pixels in a reliability curve.
 BINS = 10
 

@@ -34,7 +34,6 @@ from polsep.separation.color_affine_kernel import ColorAffineOptions
 from polsep.separation.images import FrameImages
 from polsep.separation.report import images_of, in_light, tally_again, under_white_light
 from polsep.shipped import (
-    NAMES,
     accepts_mosaic,
     separate_paper,
     shipped_joint,
@@ -211,11 +210,10 @@ def _accepts_joint(name: str, capture: Capture) -> bool:
 
 
 def _joint(name: str, summary: str) -> Method:
-    colors = "colour or mono" if is_shipped(weights_name(name, Layout.sony(1))) else "colour"
     return Method(
         name,
         summary,
-        f"a raw mosaic in Sony's order, however turned, or co-sited images; {colors}; trained under white light",
+        "a raw mosaic in Sony's order, however turned, or co-sited images; colour or mono; trained under white light",
         "this project; after Dave et al. 2022 and the colour-affine closed form",
         partial(joint_reference, name),
         partial(run_joint, name),
@@ -263,10 +261,10 @@ _ALL = (
 METHODS = {m.name: m for m in _ALL if not m.reads_mosaic or is_shipped(weights_name(m.name, Layout()))}
 
 #: The meaning of `auto`: the first of these that is installed and accepts the capture.
-BEST = tuple(METHODS[name] for name in ("joint-large", "joint", "color-affine") if name in METHODS)
+BEST = tuple(METHODS[name] for name in ("joint-large", "color-affine") if name in METHODS)
 
 #: The meaning of `auto-fast`, for streams.
-FASTEST = tuple(METHODS[name] for name in ("joint-fast", "joint", "color-affine") if name in METHODS)
+FASTEST = tuple(METHODS[name] for name in ("joint-fast", "color-affine") if name in METHODS)
 
 #: Names that choose a method by the capture.
 _CHOICES = {"auto": BEST, "auto-fast": FASTEST}
@@ -275,7 +273,7 @@ _CHOICES = {"auto": BEST, "auto-fast": FASTEST}
 def find_method(name: str, capture: Capture) -> Method:
     """The method of that name, or the best one for a capture.
 
-    Raises ValueError, with the names there are, for any other, and where no weights for the capture's colours are.
+    Raises ValueError, with the names there are, for any other.
     """
     check_method(name)
     if name in _CHOICES:
@@ -285,9 +283,6 @@ def find_method(name: str, capture: Capture) -> Method:
         kind = "two crossed photographs" if is_pair(capture) else "these images"
         kind = "images that clip below white, of several exposures" if bounded_below_white(capture) else kind
         raise ValueError(f"expected a method for {kind} ({able}), found {name}")
-    if name in NAMES and isinstance(capture, Mosaic) and not is_shipped(weights_name(name, capture.layout)):
-        kind = "mono" if capture.layout.bayer is None else "colour"
-        raise ValueError(f"expected a method with weights for {kind} frames, as auto finds, found {name}")
     return METHODS[name]
 
 

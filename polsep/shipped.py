@@ -11,6 +11,7 @@ import threading
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 from polsep.compute.arrays import namespace
 from polsep.io.store.errors import one_line
@@ -26,11 +27,24 @@ from polsep.separation.analytic import Separation
 
 #: Methods of the joint network.
 NAMES = ("joint-large", "joint", "joint-fast")
-#: Networks of a method that weighs the images of several by their expected errors, and the share of each besides:
-#: `joint` was not trained on all that `joint-large` was, and expects too small errors where frames differ from its own.
-MEMBERS = {"joint-large": {"joint-large": 1.0, "joint": 0.4}}
-#: Methods for stills, whose networks average frames seen at several shifts, in colour; the same of mono frames.
-AVERAGED, AVERAGED_MONO = ("joint-large",), ("joint",)
+
+
+class Member(NamedTuple):
+    """One network of a method: the name of its weights, its share, and whether it averages frames at several shifts."""
+
+    weights: str
+    share: float = 1.0
+    averages_shifts: bool = False
+
+
+#: Networks of methods that weigh the images of several by their expected errors, or average shifts, by method and
+#: variant; others have one. Shares: `joint` was not trained on all that `joint-large` was, and expects too small errors
+#: where frames differ from its own; `joint-fast` has less accurate images (docs/experiments.md).
+MEMBERS = {
+    "joint-large-mosaic": (Member("joint-large-mosaic", 1.0, True), Member("joint-mosaic", 0.4, True)),
+    "joint-large-mono": (Member("joint-mono", 1.0, True), Member("joint-fast-mono", 0.5)),
+    "joint-mono": (Member("joint-mono", 1.0, True),),
+}
 #: The paper's networks, trained on noisy mosaics of colour cameras, and of those without colour filters.
 PAPER, PAPER_MONO = "paper-mosaic", "paper-mono"
 
@@ -50,18 +64,18 @@ def read_joint(path: Path, averages_shifts: bool = False) -> JointWeights:
 def shipped_joint(method: str, layout: Layout) -> list[JointWeights]:
     """All networks of a method for frames of a layout; always the same objects, since engines are kept by them."""
     with _LOADING:
-        members, averages = MEMBERS.get(method, {method: 1.0}), _averages(method, layout)
-        return [_read_shipped(weights_name(name, layout), averages, members[name]) for name in members]
+        return [_read_shipped(member) for member in _members(method, layout)]
 
 
-def _averages(method: str, layout: Layout) -> bool:
-    """True where a method's networks average frames of a layout seen at several shifts."""
-    return method in (AVERAGED_MONO if layout.bayer is None else AVERAGED)
+def _members(method: str, layout: Layout) -> tuple[Member, ...]:
+    name = f"{method}-{'mono' if layout.bayer is None else 'mosaic'}"
+    return MEMBERS.get(name, (Member(name),))
 
 
 @lru_cache(maxsize=16)
-def _read_shipped(name: str, averages_shifts: bool, share: float) -> JointWeights:
-    return replace(_read_weights(name), averages_shifts=averages_shifts, share=share)
+def _read_shipped(member: Member) -> JointWeights:
+    network = _read_weights(member.weights)
+    return replace(network, averages_shifts=member.averages_shifts, share=member.share)
 
 
 @lru_cache(maxsize=8)
@@ -79,7 +93,7 @@ def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[list[Joi
         raise ValueError(f"expected a method of {', '.join(NAMES)}, found {method!r}")
     if path is None:
         return shipped_joint(method, layout), read_weights(shipped_weights(weights_name(method, layout)))[1]
-    network, metadata = read_joint(path, _averages(method, layout)), read_weights(path)[1]
+    network, metadata = read_joint(path, _members(method, layout)[0].averages_shifts), read_weights(path)[1]
     if metadata["method"] != method:
         raise ValueError(f"expected weights of {method} in {path}, found those of {metadata['method']}")
     if network.colors != layout.channels:
@@ -88,8 +102,8 @@ def find_joint(method: str, layout: Layout, path: Path | None) -> tuple[list[Joi
 
 
 def weights_name(method: str, layout: Layout) -> str:
-    """The name of a method's weights for frames of a layout."""
-    return f"{method}-{'mono' if layout.bayer is None else 'mosaic'}"
+    """The name of the weights of a method's first network for frames of a layout."""
+    return _members(method, layout)[0].weights
 
 
 def accepts_mosaic(method: str, mosaic: Mosaic) -> bool:

@@ -155,7 +155,7 @@ def test_layers_are_of_the_precision_that_is_asked_for(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("full", [False, True])
-@pytest.mark.parametrize(("method", "layout"), [("joint-large", "color"), ("joint", "color"), ("joint", "mono")])
+@pytest.mark.parametrize(("method", "layout"), [("joint-large", "color"), ("joint", "color"), ("joint-large", "mono")])
 @pytest.mark.parametrize("crop", [clipped_crop, highlight_crop, real_crop])
 def test_graphs_are_the_whole_method(
     method: str, layout: str, full: bool, crop: Any, monkeypatch: pytest.MonkeyPatch

@@ -97,8 +97,7 @@ def test_frames_are_needed() -> None:
 @pytest.mark.parametrize("name", ["joint-large", "joint", "joint-fast"])
 def test_shipped_networks_have_ranges(name: str) -> None:
     for layout in (COLOR, MONO):
-        if layout == COLOR or "large" not in name:
-            assert all(network.ranges for network in shipped_joint(name, layout))
+        assert all(network.ranges for network in shipped_joint(name, layout))
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ class Member(NamedTuple):
 #: where frames differ from its own; `joint-fast` has less accurate images (docs/experiments.md).
 MEMBERS = {
     "joint-large-mosaic": (Member("joint-large-mosaic", 1.0, True), Member("joint-mosaic", 0.4, True)),
-    "joint-large-mono": (Member("joint-mono", 1.0, True), Member("joint-fast-mono", 0.5)),
+    "joint-large-mono": (Member("joint-mono", 1.0, True), Member("joint-fast-mono", 0.5, True)),
     "joint-mono": (Member("joint-mono", 1.0, True),),
 }
 #: The paper's networks, trained on noisy mosaics of colour cameras, and of those without colour filters.

@@ -190,6 +190,8 @@ def test_weights_of_users_are_those_of_the_method() -> None:
         (own,), _ = find_joint(method, layout, shipped_weights(f"{method}-mono"))
         (shipped,), _ = find_joint(method, layout, None)
         assert own.averages_shifts == shipped.averages_shifts == (method == "joint")
+    both, _ = find_joint("joint-large", Layout.parse("mono"), None)
+    assert len(both) == 2 and all(network.averages_shifts for network in both)  # else even light has a pattern
 
 
 def test_full_graphs_take_batches_of_any_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,7 +33,7 @@ from polsep.render.simulate import filter_light
 from polsep.sensor.camera import CLIP_MARGIN, IDEAL, IMX250, Layout, expose
 from polsep.train import command, loop
 from polsep.train import joint_task as module
-from polsep.train.command import JointOptions, train_weights
+from polsep.train.command import JointOptions, plan_run, train_weights
 from polsep.train.digest import digest_examples
 from polsep.train.growth import grow
 from polsep.train.inputs import JointInputs, joint_inputs, joint_mono_inputs
@@ -616,6 +616,20 @@ def test_filters_are_fitted_anew_only_when_asked(tmp_path: Path, shortened: None
             np.array_equal(value, expected if name == "demosaic" else before[name]) for name, value in found.items()
         )
         assert ("--refit" in metadata["command"]) == refit
+
+
+def test_a_mono_training_from_colour_weights_fits_its_own_filter(tmp_path: Path, shortened: None) -> None:
+    """Without `--refit` it would keep the bilinear filter that it begins with."""
+    run = Run(tmp_path / "color", "a test", STREAM, SCHEDULE, workers=0)
+    start = train_weights(JointOptions("joint-fast", size=TINY), run, lambda _: None)
+    mono = JointOptions("joint-fast", "mono", TINY)
+    on = replace(run, out=tmp_path / "mono", start=(start,), stream=replace(STREAM, size=256))
+    with pytest.raises(ValueError, match=f"expected --refit with weights for colour frames, found {start.name}"):
+        plan_run(on, mono)
+    planned = replace(plan_run(replace(on, refit=True), mono), stream=STREAM)
+    arrays, metadata = read_weights(train_weights(mono, planned, lambda _: None))
+    assert metadata["colors"] == "1"
+    assert not np.array_equal(arrays["demosaic"], bilinear_filter(MONO).half().float().numpy())
 
 
 def die_at(step: int) -> Callable[[dict[str, Any]], None]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from polsep.io.store.weights import write_weights
+from polsep.io.store.weights import read_weights, write_weights
 from polsep.networks.joint import Demosaicker
 from polsep.networks.rungs import RUNGS
 from polsep.networks.sizes import ResidualSize, Size
@@ -211,13 +211,18 @@ def choose_options(name: str, data: str, asked: dict[str, Any]) -> Options:
 def plan_run(run: Run, options: Options) -> Run:
     """Return the run with the description of its options and with their stream.
 
-    Raises ValueError as `check_run`, and on ``refit`` of a network without a linear filter.
+    Raises ValueError as `check_run`, on ``refit`` of a network without a linear filter, and on a mono network that
+    starts from weights for colour frames without it: their filter is not its own.
     """
     check_run(run)
     if run.refit and not (isinstance(options, JointOptions) and options.demosaicker == "linear"):
         raise ValueError(
             f"expected a network with a linear filter to refit, found {options.name} for {options.variant}"
         )
+    if isinstance(options, JointOptions) and options.variant == "mono" and not run.refit:
+        for path in run.start:
+            if read_weights(path)[1].get("colors") == "3":
+                raise ValueError(f"expected --refit with weights for colour frames, found {path.name} without")
     stream = replace(run.stream, seed=options.seed, crop=options.crop)
     return replace(run, what=json.dumps(asdict(options)), stream=stream)
 

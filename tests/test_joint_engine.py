@@ -23,6 +23,7 @@ from polsep.networks import engines, openvino_engine, strips
 from polsep.networks.channels import INPUTS, PERIOD
 from polsep.networks.engines import run_engine
 from polsep.networks.joint import Demosaicker, Joint
+from polsep.networks.joint_weights import scale_errors
 from polsep.networks.openvino_engine import OpenVinoEngine
 from polsep.networks.run import combine, run_joint
 from polsep.networks.sizes import ResidualSize
@@ -145,6 +146,17 @@ def test_cells_around_one_that_clips_as_a_whole_are_not_valid(cell: tuple[int, i
     assert np.array_equal(in_engine(net, mosaic).valid, wanted)
     data[2 * row, 2 * col] = 900
     assert in_engine(net, mosaic).valid.all()
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.spec)
+def test_scaled_expected_errors_change_no_image(layout: Layout) -> None:
+    weights, frame = WEIGHTS[layout.channels], random_frame(64, 96, layout)
+    scaled = Joint.of(replace(weights, arrays=scale_errors(weights.arrays, (0.5, 0.8))), torch.device("cpu"))
+    before, after = (in_engine(net, frame) for net in (NETS[layout.channels], scaled))
+    assert np.array_equal(before.diffuse, after.diffuse)
+    assert np.array_equal(before.specular, after.specular)
+    assert before.error is not None
+    np.testing.assert_allclose(after.error, before.error * np.float32((0.5, 0.8)), rtol=1e-5)
 
 
 def test_a_frame_without_clipped_samples_is_valid_everywhere() -> None:

@@ -79,6 +79,13 @@ def joint_weights(arrays: Arrays, metadata: Mapping[str, str], averages_shifts: 
     return JointWeights(int(metadata["colors"]), size, arrays, inputs, averages_shifts, ranges)
 
 
+def scale_errors(arrays: Arrays, factors: tuple[float, float]) -> Arrays:
+    """The arrays of a network that expects ``factors`` times the errors of diffuse and of specular; images stay."""
+    change = 2 * np.log(np.asarray(factors, np.float32)).repeat((PERIOD // 2) ** 2)  # of each pixel of a period
+    name = f"{NAMES_IN_FILES['log_variance']}.2.bias"
+    return {**arrays, name: arrays[name] + change}
+
+
 def expected_shapes(weights: JointWeights) -> dict[str, tuple[int, ...]]:
     """Shapes of all arrays of a network, by name; those of a filter or of `whole_frame` where it has any of them."""
     colors, size = weights.colors, weights.size

@@ -52,7 +52,8 @@ def curves(method: str) -> Iterator[tuple[str, list[float], list[float]]]:
         error, expected = (torch.cat(x, dim=-1) for x in zip(*parts, strict=True))
         whole = torch.ones(1, error.shape[-1], dtype=torch.bool)
         found = [reliability(error[k], expected[k, None], whole, GROUPS) for k in range(2)]
-        yield name, *((torch.log2(c.found / c.expected)).tolist() for c in found)
+        diffuse, specular = (torch.log2(curve.found / curve.expected).tolist() for curve in found)
+        yield name, diffuse, specular
 
 
 def _errors_of(frame: reality.Frame, method: str) -> tuple[torch.Tensor, torch.Tensor]:
@@ -79,16 +80,15 @@ def main(methods: tuple[str, ...]) -> None:
         for name, *both in curves(method):
             tenths.append(both)
             print(method, name, *(" ".join(f"{x:+.1f}" for x in tenth) for tenth in both), sep=" | ", flush=True)
-        medians = np.median(np.array(tenths), axis=(0, 2))
-        factors = tuple(float(f"{2.0**x:.3g}") for x in medians)
+        diffuse, specular = (float(f"{2.0**x:.3g}") for x in np.median(np.array(tenths), axis=(0, 2)))
         path = shipped_weights(f"{method}-mosaic")
         arrays, metadata = read_weights(path)
         before = json.loads(metadata.get("error_factors", "[1, 1]"))
         del metadata["sha256"]
-        total = json.dumps([float(f"{math.prod(pair):.3g}") for pair in zip(before, factors, strict=True)])
+        total = json.dumps([float(f"{math.prod(p):.3g}") for p in zip(before, (diffuse, specular), strict=True)])
         names = names_to_round(arrays, metadata) if "rounded_from" in metadata else ()
-        write_weights(path, scale_errors(arrays, factors), metadata | {"error_factors": total}, names)
-        print(f"{path}: expected errors times {factors[0]:g} and {factors[1]:g}, in all {total}")
+        write_weights(path, scale_errors(arrays, (diffuse, specular)), metadata | {"error_factors": total}, names)
+        print(f"{path}: expected errors times {diffuse:g} and {specular:g}, in all {total}")
 
 
 if __name__ == "__main__":

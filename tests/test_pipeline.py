@@ -445,6 +445,22 @@ def test_a_lamp_off_frame_of_codes_at_the_other_end_of_words_is_noted() -> None:
     assert not said(16 * codes, (16 * codes) // 3) and not said(16 * codes, 0 * room)
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_a_lamp_off_frame_of_floats_of_another_scale_is_noted(kind: type) -> None:
+    """Codes of 12 bits over 65535 beside such over 4095, or at the other end of words."""
+    codes, room = ((raw_frame(exposure=light) // 16).astype(kind) for light in (1.0, 0.1))
+
+    def said(frame: NDArray[Any], ambient: NDArray[Any], white: float = 1) -> str:
+        notes = quietly(frame, "analytic", ambient=ambient, white_level=white).report["warnings"]
+        return " ".join(note for note in notes if "are both of one unit?" in note)
+
+    for large, much in ((codes / 4095, room / 4095), (16 * codes / 65535, 16 * room / 65535)):
+        assert "16 times too little is subtracted" in said(large, room / 65535)
+        assert "16 times too much is subtracted" in said(codes / 65535, much, 4095 / 65535)
+        assert not said(large, much) and not said(large, 0 * room) and not said(large, room / 65535 + 1e-7 * codes)
+    assert not said(codes / 65535, room / 65535, 4095 / 65535)
+
+
 def test_lamp_off_frames_with_an_axis_of_colours_are_one_frame() -> None:
     """``[H, W, 1]`` and three equal channels are one frame, as beside the lamp; an axis before them holds several."""
     raw, room = raw_frame()[..., None], raw_frame(exposure=0.1)[..., None]

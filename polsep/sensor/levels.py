@@ -69,6 +69,10 @@ class ForgottenLevel(str):
     """
 
 
+class OtherUnit(str):
+    """A note on samples that are hardly in the unit of their white level."""
+
+
 class Overexposed(str):
     """A note on many clipped samples, which a merge of several exposures replaces."""
 
@@ -189,12 +193,14 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
         note = f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white"
         return (*notes, ForgottenLevel(note))
     if samples.dtype.kind == "f" and high <= 2 < white and high - black_level < MIN_USED * (white - black_level):
-        notes += (f"float values reach {high:g} of white level {white:g}: is white 1? Then leave out --white-level",)
+        found = f"float values reach {high:g} of white level {white:g}"
+        notes += (OtherUnit(f"{found}: is white 1? Then leave out --white-level"),)
     if np.float32(high) > np.float32(white):
         above = int(np.count_nonzero(samples > white))
         notes += (f"{above} samples exceed the white level {white:g} (largest {high:g}): they count as clipped",)
     if samples.dtype.kind == "u" and white > WHITE_LEVELS[samples.dtype.name]:
-        notes += (f"white level {white:g} is beyond {samples.dtype.name}: no sample can count as clipped",)
+        beyond = f"white level {white:g} is beyond {samples.dtype.name}"
+        notes += (OtherUnit(f"{beyond}: no sample can count as clipped"),)
     if white_level is None and samples.dtype != np.uint8:
         notes += _float_depth_notes(samples, high) if samples.dtype.kind == "f" else _depth_notes(samples, int(high))
     return notes

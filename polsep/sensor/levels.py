@@ -292,6 +292,7 @@ def _checked(array: NDArray[Any]) -> NDArray[Any]:
     """``array`` in native byte order, once its type, size and values are known to be acceptable."""
     if not isinstance(array, np.ndarray) or isinstance(array, np.ma.MaskedArray):  # masked samples have no value
         raise WrongType(f"expected a NumPy array, found {type(array).__name__}{_advice(array)}")
+    array = np.asarray(array)  # of a subclass, which may have operations of its own
     if array.dtype.name not in WHITE_LEVELS:
         raise ValueError(f"expected samples of uint8, uint16, float32 or float64, found {array.dtype}")
     if array.size == 0 or array.ndim < 2:
@@ -307,6 +308,12 @@ def _advice(found: Any) -> str:
         return ": say raw.numpy(force=True)"
     if isinstance(getattr(found, "data", None), Mosaic | Measurements):
         return ": say frame.data"
+    if hasattr(found, "__cuda_array_interface__"):
+        return ": copy it from the GPU, as cupy.asnumpy does"
+    if isinstance(found, list | memoryview) or (
+        hasattr(found, "__array_interface__") and not isinstance(found, np.ndarray | np.generic)
+    ):
+        return ": say numpy.array(raw, numpy.uint16), or the type that its samples have"
     return ": read files by polsep.read_frames" if isinstance(found, str | PathLike) else ""
 
 

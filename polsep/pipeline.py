@@ -31,6 +31,7 @@ from polsep.io.store.errors import as_path
 from polsep.light.find import Light, find_light
 from polsep.methods import Capture, Method, find_method
 from polsep.physics.stokes import Measurements
+from polsep.sensor.ambient import unit_remarks
 from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.checks import check_mosaic
@@ -172,8 +173,9 @@ def separate(
         if ambient is not None:
             four = isinstance(raw, np.ndarray) and raw.ndim == 3 and raw.shape[0] == 4
             kind = None if white_level is not None else getattr(raw, "dtype", None)
-            frames = [_as_ambient(dark, capture, kind) for dark in _ambient_frames(ambient, four)]
-            corrections = corrections.with_ambient(frames)
+            found = [_as_ambient(dark, capture, kind) for dark in _ambient_frames(ambient, four)]
+            said = unit_remarks(note for _, more in found for note in more)
+            corrections = replace(corrections.with_ambient(frame for frame, _ in found), ambient_remarks=said)
         capture, more = corrections.apply_noting(capture)
         notes += more
     elif measured is not None or ambient is not None:
@@ -207,21 +209,24 @@ def _as_capture(
     return as_measurements(raw, black_level, white_level)
 
 
-def _as_ambient(dark: NDArray[Any] | Mosaic, capture: Mosaic, kind: np.dtype[Any] | None) -> Mosaic:
+def _as_ambient(
+    dark: NDArray[Any] | Mosaic, capture: Mosaic, kind: np.dtype[Any] | None
+) -> tuple[Mosaic, tuple[str, ...]]:
     """A frame with the lamp off, of the layout and the levels of the frame with it, before both are corrected.
 
-    ``kind``: the type of its samples, where that says the white level. Raises ValueError on samples of other levels.
+    With notes on its samples. ``kind``: the type of the frame's samples, where that says the white level. Raises
+    ValueError on samples of other levels.
     """
     if isinstance(dark, Mosaic):
-        return dark
+        return dark, ()
     if isinstance(dark, np.ndarray) and not has_levels_of(dark, capture.white_level, kind):
         levels = f"white {capture.white_level:g}" if kind is None else f"{kind}, white {capture.white_level:g}"
         samples = f"{dark.dtype} up to {float(dark.max()):g}"
         raise ValueError(f"expected a lamp-off frame like the frame ({levels}), found {samples}")
-    found, _ = _as_capture(dark, capture.layout, capture.black_level, capture.white_level)
+    found, notes = _as_capture(dark, capture.layout, capture.black_level, capture.white_level)
     if not isinstance(found, Mosaic):
         raise ValueError(f"expected a raw frame with the lamp off, found shape {'x'.join(map(str, dark.shape))}")
-    return found
+    return found, notes
 
 
 def _ambient_frames(

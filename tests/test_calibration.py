@@ -769,6 +769,31 @@ def test_ambient_frames_of_another_exposure_time_are_named(tmp_path: Path) -> No
         said(10, 10, 20)
 
 
+@pytest.mark.parametrize("room", [np.uint8, np.float32])
+@pytest.mark.parametrize("black", [0, 64])
+def test_ambient_frames_of_another_type_are_said(room: type, black: int, tmp_path: Path) -> None:
+    """12 bits in words beside 8 bits, or floats of white 1: hardly anything is subtracted, or less than nothing."""
+    rng = np.random.default_rng(0)
+    lit, dark = (rng.uniform(100, most, SIZE) for most in (3000, 300))
+    np.save(tmp_path / "shot.npy", lit.astype(np.uint16))
+    np.save(tmp_path / "good.npy", dark.astype(np.uint16))
+    np.save(tmp_path / "room.npy", (dark / 16).astype(room) if room is np.uint8 else (dark / 4095).astype(room))
+    notes = []
+    for name in ("good.npy", "room.npy"):
+        read = with_corrections(ReadOptions(black_level=black, white_level=4095), None, [tmp_path / name])
+        (frame,) = read_frames(tmp_path / "shot.npy", read)
+        notes.append([note for note in frame.notes if "another unit" in note])
+    assert not notes[0] and len(notes[1]) == 1, notes
+    with warnings.catch_warnings(action="ignore"):
+        codes, samples = np.load(tmp_path / "shot.npy"), np.load(tmp_path / "room.npy")
+        if room is np.float32:
+            with pytest.raises(ValueError, match="expected a lamp-off frame like the frame"):
+                polsep.separate(codes, "analytic", None, black, 4095, ambient=samples)
+        else:
+            out = polsep.separate(codes, "analytic", None, black, 4095, ambient=samples)
+            assert [note for note in out.report["warnings"] if "another unit" in note] == notes[1]
+
+
 def test_paper_that_does_not_fill_the_frame_is_refused() -> None:
     """A border in half the light, and a corner in none: neither is a lens, nor are so many pixels dead."""
     sensor = BadSensor(MONO, dead=0)

@@ -313,6 +313,27 @@ def test_a_recording_is_a_camera_byte_for_byte(tmp_path: Path) -> None:
         assert [f.payload for f in found] == [i.payload for i in images]
 
 
+def test_a_recording_has_no_other_pixel_format(tmp_path: Path) -> None:
+    """Its bytes are sent as they are: another one that is asked for would change nothing."""
+    run(Scripted([image(1), EndOfFrames()]), CapturePlan(tmp_path / "a", None))
+    for path in (tmp_path / "a", tmp_path / "a" / RECORD):
+        assert len(frames_of(FolderSource(path, fast(pixel_format=PACKED)))[1]) == 1
+        with pytest.raises(InputError, match=f"expected the recording's own pixel format {PACKED}, found BayerRG8$"):
+            frames_of(FolderSource(path, fast(pixel_format="BayerRG8")))
+
+
+def test_a_recording_is_not_written_among_the_frames_that_are_played(tmp_path: Path) -> None:
+    """The folder would be that recording from then on, and its frames would be seen no more."""
+    (tmp_path / "shots").mkdir()
+    png(tmp_path / "shots" / "1.png", codes(0))
+    (tmp_path / "link").symlink_to(tmp_path / "shots")
+    for path in (tmp_path / "shots", tmp_path / "link", tmp_path / "shots" / "1.png"):
+        with pytest.raises(OutputError, match="expected a folder apart from that of the frames"):
+            run(FolderSource(path, fast()), CapturePlan(tmp_path / "shots", None))
+    assert [file.name for file in (tmp_path / "shots").iterdir()] == ["1.png"]
+    run(FolderSource(tmp_path / "shots", fast()), CapturePlan(tmp_path / "shots" / "take", None))
+
+
 def test_a_recording_that_is_played_keeps_its_layout(tmp_path: Path) -> None:
     """Its copy was read by the pixel format's name, and so was the live view."""
     layout, other = Layout(((0, 45), (135, 90))), Layout(bayer=None)

@@ -16,7 +16,11 @@ from test_cli import polsep as run_polsep  # noqa: F401
 
 import polsep
 from polsep.calibrate.exposures import merge_exposures
+from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.store.calibrations import write_calibration
+from polsep.io.store.errors import InputError
+from polsep.sensor.calibration import Calibration
 from polsep.sensor.camera import Layout, Mosaic
 
 SIZE = (128, 128)
@@ -196,3 +200,35 @@ def test_four_pages_are_four_frames(tmp_path: Path, run_polsep: Cli) -> None:  #
     assert done.status == 0 and done.out.startswith("4 frames, exposure times 1, 1")
     (frame,) = read_frames(tmp_path / "merged.tiff")
     assert frame.data.data.shape == SIZE
+
+
+def test_merged_frames_among_raw_ones(tmp_path: Path, run_polsep: Cli) -> None:  # noqa: F811
+    """Levels and the calibration of raw frames change nothing in a merged one, and a note says so; another calibration,
+    or one for a frame that was merged without, is a line."""
+    files, rig, other = [], tmp_path / "rig.json", tmp_path / "other.json"
+    for seed, time in enumerate((1, 4)):
+        files.append(tmp_path / f"shot{time}.tiff")
+        tifffile.imwrite(files[-1], expose(light(), time, seed).data.numpy().astype(np.uint16))
+    gains = tuple(tuple(1 + 0.02 * ((r + c) % 2) for c in range(4)) for r in range(4))
+    write_calibration(rig, Calibration(Layout(), WHITE, SIZE, BLACK, gains=gains), "0")
+    write_calibration(other, Calibration(Layout(), WHITE, SIZE, BLACK), "0")
+    plain, merged = tmp_path / "plain.tiff", tmp_path / "merged.tiff"
+    levels = ("--white-level", WHITE, "--black-level", BLACK)
+    assert run_polsep("merge", *files, *levels, "-o", plain).status == 0
+    assert run_polsep("merge", *files, "--calibration", rig, "-o", merged).status == 0
+    (wanted,) = read_frames(merged)
+    raw = ReadOptions(black_level=BLACK, white_level=WHITE)
+    for options in (raw, with_corrections(ReadOptions(), rig), with_corrections(raw, rig)):
+        (frame,) = read_frames(merged, options)
+        assert isinstance(frame.data, Mosaic) and isinstance(wanted.data, Mosaic)
+        np.testing.assert_array_equal(frame.data.data, wanted.data.data)
+        assert (frame.data.black_level, frame.data.white_level, frame.white_level) == (0, 1, 1)
+        said = ["levels stated are those of raw frames"] * (options.white_level is not None)
+        said += ["the merged frame is calibrated by rig.json already"] * (options.corrections is not None)
+        assert [any(note.startswith(start) for note in frame.notes) for start in said] == [True] * len(frame.notes)
+    for path, calibration, expected in (
+        (merged, other, "expected rig.json, by which the merged frame is calibrated already, found another"),
+        (plain, rig, "expected --calibration with 'polsep merge', found it with a frame that was merged without"),
+    ):
+        with pytest.raises(InputError, match=expected):
+            next(read_frames(path, with_corrections(ReadOptions(), calibration)))

@@ -10,7 +10,7 @@ import warnings
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -445,6 +445,22 @@ def test_a_lamp_off_frame_of_codes_at_the_other_end_of_words_is_noted() -> None:
     assert not said(16 * codes, (16 * codes) // 3) and not said(16 * codes, 0 * room)
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_a_lamp_off_frame_of_floats_of_another_scale_is_noted(kind: type) -> None:
+    """Codes of 12 bits over 65535 beside such over 4095, or at the other end of words."""
+    codes, room = ((raw_frame(exposure=light) // 16).astype(kind) for light in (1.0, 0.1))
+
+    def said(frame: NDArray[Any], ambient: NDArray[Any], white: float = 1) -> str:
+        notes = quietly(frame, "analytic", ambient=ambient, white_level=white).report["warnings"]
+        return " ".join(note for note in notes if "are both of one unit?" in note)
+
+    for large, much in ((codes / 4095, room / 4095), (16 * codes / 65535, 16 * room / 65535)):
+        assert "16 times too little is subtracted" in said(large, room / 65535)
+        assert "16 times too much is subtracted" in said(codes / 65535, much, 4095 / 65535)
+        assert not said(large, much) and not said(large, 0 * room) and not said(large, room / 65535 + 1e-7 * codes)
+    assert not said(codes / 65535, room / 65535, 4095 / 65535)
+
+
 def test_lamp_off_frames_with_an_axis_of_colours_are_one_frame() -> None:
     """``[H, W, 1]`` and three equal channels are one frame, as beside the lamp; an axis before them holds several."""
     raw, room = raw_frame()[..., None], raw_frame(exposure=0.1)[..., None]
@@ -498,6 +514,54 @@ def test_results_can_be_compared_and_collected() -> None:
     results = [quietly(frame, method="analytic") for _ in range(2)]
     for one, other in (results, [as_mosaic(frame)[0] for _ in range(2)], [lit_scene() for _ in range(2)]):
         assert one == one and one != other and other in [one, other] and len({one, other}) == 2
+
+
+def test_reports_hold_what_people_add(tmp_path: Path) -> None:
+    """Numbers and arrays of NumPy are written as JSON has them; what it has not is named, and nothing is written."""
+    out = quietly(raw_frame(), method="analytic")
+    out.report.update(celsius=np.float32(36.5), good=np.bool_(True), place=np.arange(3, dtype=np.uint8))
+    out.save(tmp_path / "shot.npz")
+    report = json.loads((tmp_path / "shot.json").read_text("utf-8"))["report"]
+    assert (report["celsius"], report["good"], report["place"]) == (36.5, True, [0, 1, 2])
+    out.report["camera"] = tmp_path
+    with pytest.raises(ValueError, match=r"^expected numbers, text, lists and mappings in a report, found PosixPath$"):
+        out.save(tmp_path / "other.npz")
+    assert not list(tmp_path.glob("other*"))
+
+
+class Stubborn(np.ndarray):
+    """An array that has no operations, as those with units refuse some."""
+
+    def __array_ufunc__(self, *arguments: Any, **options: Any) -> Any:
+        raise RuntimeError("no operations")
+
+
+def test_arrays_of_subclasses_are_arrays() -> None:
+    """Only their samples count."""
+    raw = raw_frame()
+    found, wanted = (quietly(frame, method="analytic") for frame in (raw.view(Stubborn), raw))
+    assert (found.diffuse == wanted.diffuse).all() and type(found.diffuse) is np.ndarray
+
+
+class OnDevice:
+    """As CuPy's arrays look."""
+
+    __cuda_array_interface__: ClassVar[dict[str, Any]] = {}
+
+
+@pytest.mark.parametrize(
+    ("raw", "advice"),
+    [
+        (OnDevice(), "found OnDevice: copy it from the GPU, as cupy.asnumpy does"),
+        ([[1, 2], [3, 4]], "found list: say numpy.array"),
+        (memoryview(b"ab"), "found memoryview: say numpy.array"),
+        (torch.zeros(4, 4), "found Tensor: say raw.numpy"),
+    ],
+)
+def test_what_is_no_array_gets_advice(raw: Any, advice: str) -> None:
+    """One line says how to make it one."""
+    with pytest.raises(TypeError, match=advice):
+        polsep.separate(raw)
 
 
 @pytest.mark.parametrize("name", ["shot.exr", "shot.npz", "shot.tif", "shot.png", "shot"])

@@ -730,6 +730,22 @@ def test_frames_of_joined_films_have_times_of_their_own(tmp_path: Path) -> None:
     assert times == [round(1000 * k / rate) for k in range(len(parts) * PART)]
 
 
+@pytest.mark.parametrize("kind", [LOSSLESS["ffv1", 1], LOSSLESS["ffvhuff", 1], WATCHABLE])
+@pytest.mark.parametrize("lengths", [(1,), (2,), (1, 1), (2, 1), (3, 3)])
+def test_joined_films_say_their_rate(kind: films.FilmKind, lengths: tuple[int, ...], tmp_path: Path) -> None:
+    """Also those of one or two frames, whose times don't show it."""
+    image = np.zeros((16, 16, 3), np.uint8) if kind is WATCHABLE else np.zeros((1, 16, 16), np.uint16)
+    parts, rate = [tmp_path / f"{k}{kind.suffix}" for k in range(len(lengths))], 12.5
+    for part, length in zip(parts, lengths, strict=True):
+        film = Film(part, kind, (16, 16), rate)
+        for _ in range(length):
+            film.write(image)
+        film.close()
+    join_films(parts, joined := tmp_path / f"film{kind.suffix}", kind, rate)
+    with av.open(str(joined)) as container:
+        assert container.streams.video[0].average_rate == Fraction(rate)
+
+
 def interrupt(*arguments: object) -> None:
     """Ctrl-C, in place of some function."""
     raise KeyboardInterrupt

@@ -157,6 +157,7 @@ def merge_files(
         "exposure_times": [float(f"{time:.6g}") for time in merged.times],
         "noise_gain": merged.noise.gain,
         "noise_floor": merged.noise.floor,
+        **(read.corrections.sources if read.corrections is not None else {}),
     }
     write_merged(output, merged.mosaic, facts)
     shortest, longest = min(merged.times), max(merged.times)

@@ -30,7 +30,8 @@ class FolderSource:
     """Frames of files as `read_pages` finds them, in natural order (2 before 10), or of a recording, byte for byte.
 
     Codes of 8 bits become BayerRG8, wider ones BayerRG10, 12 or 16 by the file's white level; the settings' pixel
-    format, which may be a packed one, overrides this. All frames must have one size. Files have no exposure to set.
+    format, which may be a packed one, overrides this. A recording has its own format alone. All frames must have one
+    size. Files have no exposure to set.
     """
 
     def __init__(self, path: Path, settings: CameraSettings, loop: bool = False) -> None:
@@ -58,7 +59,16 @@ class FolderSource:
         for _ in repeat(None) if self._loop else (None,):
             for path in self.files:
                 with naming(path):
-                    yield from _recorded(path) if path.name == RECORD else self._packed(path)
+                    yield from self._recorded(path) if path.name == RECORD else self._packed(path)
+
+    def _recorded(self, path: Path) -> Iterator[tuple[bytes, CameraInfo]]:
+        """Frames of a recording."""
+        header, asked = read_header(path), self._settings.pixel_format
+        if asked not in (None, header.pixel_format):
+            raise ValueError(f"expected the recording's own pixel format {header.pixel_format}, found {asked}")
+        info = CameraInfo(str(path), header.width, header.height, header.pixel_format, layout=header.layout)
+        for image in read_images(path):
+            yield image.payload, info
 
     def _packed(self, path: Path) -> Iterator[tuple[bytes, CameraInfo]]:
         for page in read_pages(path):
@@ -123,14 +133,6 @@ def _files_of(path: Path) -> list[Path]:
     if not files:
         raise CameraError(f"{path}: expected files of {', '.join(KINDS)} or a {RECORD}, found none")
     return files
-
-
-def _recorded(path: Path) -> Iterator[tuple[bytes, CameraInfo]]:
-    """Frames of a recording."""
-    header = read_header(path)
-    info = CameraInfo(str(path), header.width, header.height, header.pixel_format, layout=header.layout)
-    for image in read_images(path):
-        yield image.payload, info
 
 
 def _pixel_format(page: Page) -> str:

@@ -14,7 +14,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -109,6 +109,14 @@ class Status:
         )
 
 
+def _refuse_folder_of(files: Sequence[Path], output: Path) -> None:
+    """Raise OutputError where a recording would be written beside the frames of its source, and hide them."""
+    if output.resolve() in {file.parent.resolve() for file in files}:
+        raise OutputError(
+            f"expected a folder apart from that of the frames, found {output}: a recording would hide them"
+        )
+
+
 class Session:
     """The state that the threads of one run share; callers only use `run`, `stop` and `status`."""
 
@@ -119,8 +127,10 @@ class Session:
         """
         if plan.output is not None:
             read = [*plan.ambient, *([plan.calibration] if plan.calibration is not None else [])]
-            read += source.files if isinstance(source, FolderSource) else []
+            played = source.files if isinstance(source, FolderSource) else []
+            read += played
             refuse_inputs([plan.output / name for name in (RAW, INDEX, RECORD, PICTURE)], read)
+            _refuse_folder_of(played, plan.output)
             refuse_recording(plan.output, plan.overwrite)
         self._source, self._plan, self._limits, self._notify = source, plan, limits, notify
         picture = plan.output / PICTURE if plan.output is not None else None

@@ -6,7 +6,7 @@ ambient frame are: of one lamp. Those of a room lie elsewhere, or are polarized 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from polsep.compute.arrays import to_numpy
 from polsep.physics.stokes import stokes_inverse
 from polsep.sensor.camera import Layout, Mosaic, clip_level
-from polsep.sensor.levels import LIT
+from polsep.sensor.levels import CODE_ERROR, LIT, MOST_FLOAT, OtherUnit
 
 Floats = NDArray[np.float32]
 #: Part of a lit sample's light that ambient light leaves at least, and the share of lit samples with less from which on
@@ -37,7 +37,7 @@ WORDS = 65536
 
 
 class CodeScale(NamedTuple):
-    """The power of two of which all codes of a raw frame are multiples, 0 where unknown, and the largest code."""
+    """The power of two of which all codes of 16 bits are multiples, 0 where unknown, and the largest code."""
 
     step: int
     largest: float
@@ -47,14 +47,36 @@ UNKNOWN_SCALE = CodeScale(0, 0.0)
 
 
 def code_scale(mosaic: Mosaic) -> CodeScale:
-    """The scale of a raw frame, by every fifth sample of every fifth row; it is unknown of frames of one code."""
+    """The scale of a raw frame, by every fifth sample of every fifth row; it is unknown of frames of one code.
+
+    Floats of a white level of about 1 are codes of some bits over the largest of these.
+    """
     samples = to_numpy(mosaic.data)[..., ::5, ::5]
+    if mosaic.white_level <= MOST_FLOAT:
+        return _float_scale(samples.astype(np.float64))
     if not 0 <= samples.min() <= samples.max() < WORDS:
         return UNKNOWN_SCALE
     codes = samples.astype(np.int64)
     used, varies = (int(np.bitwise_or.reduce(c, axis=None)) for c in (codes, codes ^ codes.flat[0]))
     known = varies and (codes == samples).all()
     return CodeScale(used & -used if known else 0, float(samples.max()))
+
+
+def _float_scale(samples: NDArray[np.float64]) -> CodeScale:
+    for bits in (8, 10, 12, 14, 16):
+        codes = (2**bits - 1) * samples
+        whole = np.rint(codes).astype(np.int64)
+        if (np.abs(codes - whole) <= CODE_ERROR).all():
+            used, high = int(np.bitwise_or.reduce(whole, axis=None)), int(whole.max())
+            known = 0 <= whole.min() < high < WORDS
+            return CodeScale((used & -used) << 16 - bits, float(high << 16 - bits)) if known else UNKNOWN_SCALE
+    return UNKNOWN_SCALE
+
+
+def unit_remarks(notes: Iterable[str]) -> tuple[str, ...]:
+    """Remarks on an ambient frame of other samples than the frame's, of the notes on its levels, each once."""
+    found = dict.fromkeys(note for note in notes if isinstance(note, OtherUnit))
+    return tuple(f"the ambient frame may be in another unit than this one: {note}" for note in found)
 
 
 def scale_notes(frame: Mosaic, ambient: CodeScale) -> tuple[str, ...]:
@@ -64,6 +86,11 @@ def scale_notes(frame: Mosaic, ambient: CodeScale) -> tuple[str, ...]:
     if low.step != 1 or high.step < 4 or low.largest * high.step >= WORDS:
         return ()
     much = "little" if right == "the ambient frame" else "much"
+    if frame.white_level <= MOST_FLOAT:
+        return (
+            f"float samples of {left} are multiples of {high.step}/65535, those of {right} are not and reach "
+            f"{low.largest:g}/65535: are both of one unit? Else {high.step} times too {much} is subtracted",
+        )
     return (
         f"codes of {left} are multiples of {high.step}, those of {right} are not and reach {low.largest:g}: is only "
         f"one left-justified in 16 bits? Then {high.step} times too {much} is subtracted",
@@ -74,10 +101,14 @@ def ambient_notes(frame: Mosaic, less: Mosaic) -> tuple[str, ...]:
     """A note where the lamp was on in the ambient light that a frame had and that is gone in the frame ``less`` it.
 
     Most of the light is gone too (in every fifth sample of every fifth row, which are samples of all filters), or the
-    highlights that are left are those of the ambient light.
+    highlights that are left are those of the ambient light. Also a note where what is gone is no light at all.
     """
     black, white = float(frame.black_level), float(frame.white_level)
     was, left = (to_numpy(mosaic.data[..., ::5, ::5]) - black for mosaic in (frame, less))
+    if (was < left).all():
+        return (
+            "every sample of the ambient frame is below black: is it of another unit, or the black level too high?",
+        )
     lit = was > LIT * (white - black)
     gone = float(np.mean(left[lit] < LEAST_LEFT * was[lit])) if lit.any() else 0.0
     if gone >= MOST_GONE:

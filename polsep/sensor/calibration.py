@@ -129,10 +129,7 @@ class Calibration:
         return self.white_level if fits and (kind.kind != "u" or self.white_level > MOST_FLOAT) else None
 
     def black_level_of(self, array: NDArray[Any], stated: float, white_level: float | None) -> float:
-        """The measured black level in the unit of raw frames of a white level, None: of their type; else ``stated``.
-
-        So that a frame's exposure is judged by the light above it.
-        """
+        """The measured black level, above which exposures are judged, in the unit of raw frames; else ``stated``."""
         white = WHITE_LEVELS.get(array.dtype.name) if white_level is None else white_level
         return stated if self.black_level is None or white is None else self.black_level * white / self.white_level
 
@@ -366,8 +363,9 @@ def _check_match(mosaic: Mosaic, calibration: Calibration) -> None:
     if mosaic.data.ndim != 2:
         raise ValueError(f"expected one raw frame [H, W] to calibrate, found shape {tuple(mosaic.data.shape)}")
     if mosaic.layout != calibration.layout:
-        wanted, found = calibration.layout.spec, mosaic.layout.spec
-        raise ValueError(f"expected frames of layout {wanted}, as calibrated, found {found}")
+        raise ValueError(
+            f"expected frames of layout {calibration.layout.spec}, as calibrated, found {mosaic.layout.spec}"
+        )
     if calibration.size is not None and tuple(mosaic.data.shape) != calibration.size:
         wanted = f"{calibration.size[1]}x{calibration.size[0]}"
         raise ValueError(f"expected frames of {wanted}, as calibrated, found {_size(mosaic)}")
@@ -415,7 +413,7 @@ def _keep_clipped(samples: Floats, clipped: NDArray[np.bool_], levels: tuple[flo
 class Corrections:
     """Changes to every raw frame before anything else reads it; ``sources`` names their files in reports.
 
-    ``ambient_exposure_s`` (where files say it) and ``ambient_scale`` are of the ambient light's raw frames.
+    ``ambient_exposure_s`` (where files say it), ``ambient_scale`` and ``ambient_remarks`` are of its raw frames.
     """
 
     calibration: Calibration | None = None
@@ -423,6 +421,7 @@ class Corrections:
     sources: Mapping[str, Any] = field(default_factory=dict)
     ambient_exposure_s: float | None = None
     ambient_scale: CodeScale = UNKNOWN_SCALE
+    ambient_remarks: tuple[str, ...] = ()
 
     def with_ambient(self, frames: Iterable[Mosaic]) -> Corrections:
         """The same with the ambient light of raw frames, the mean of which, calibrated, is subtracted."""
@@ -447,4 +446,4 @@ class Corrections:
         if self.ambient is None:
             return calibrated, ()
         less = subtract_ambient(calibrated, self.ambient)
-        return less, scale_notes(mosaic, self.ambient_scale) + ambient_notes(calibrated, less)
+        return less, self.ambient_remarks + scale_notes(mosaic, self.ambient_scale) + ambient_notes(calibrated, less)

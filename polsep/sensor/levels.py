@@ -69,6 +69,10 @@ class ForgottenLevel(str):
     """
 
 
+class OtherUnit(str):
+    """A note on samples that are hardly in the unit of their white level."""
+
+
 class Overexposed(str):
     """A note on many clipped samples, which a merge of several exposures replaces."""
 
@@ -189,12 +193,14 @@ def level_notes(samples: NDArray[Any], black_level: float, white_level: float | 
         note = f"float values reach {high:g}, far above the white level 1: say --white-level N if N is white"
         return (*notes, ForgottenLevel(note))
     if samples.dtype.kind == "f" and high <= 2 < white and high - black_level < MIN_USED * (white - black_level):
-        notes += (f"float values reach {high:g} of white level {white:g}: is white 1? Then leave out --white-level",)
+        found = f"float values reach {high:g} of white level {white:g}"
+        notes += (OtherUnit(f"{found}: is white 1? Then leave out --white-level"),)
     if np.float32(high) > np.float32(white):
         above = int(np.count_nonzero(samples > white))
         notes += (f"{above} samples exceed the white level {white:g} (largest {high:g}): they count as clipped",)
     if samples.dtype.kind == "u" and white > WHITE_LEVELS[samples.dtype.name]:
-        notes += (f"white level {white:g} is beyond {samples.dtype.name}: no sample can count as clipped",)
+        beyond = f"white level {white:g} is beyond {samples.dtype.name}"
+        notes += (OtherUnit(f"{beyond}: no sample can count as clipped"),)
     if white_level is None and samples.dtype != np.uint8:
         notes += _float_depth_notes(samples, high) if samples.dtype.kind == "f" else _depth_notes(samples, int(high))
     return notes
@@ -286,6 +292,7 @@ def _checked(array: NDArray[Any]) -> NDArray[Any]:
     """``array`` in native byte order, once its type, size and values are known to be acceptable."""
     if not isinstance(array, np.ndarray) or isinstance(array, np.ma.MaskedArray):  # masked samples have no value
         raise WrongType(f"expected a NumPy array, found {type(array).__name__}{_advice(array)}")
+    array = np.asarray(array)  # of a subclass, which may have operations of its own
     if array.dtype.name not in WHITE_LEVELS:
         raise ValueError(f"expected samples of uint8, uint16, float32 or float64, found {array.dtype}")
     if array.size == 0 or array.ndim < 2:
@@ -301,6 +308,12 @@ def _advice(found: Any) -> str:
         return ": say raw.numpy(force=True)"
     if isinstance(getattr(found, "data", None), Mosaic | Measurements):
         return ": say frame.data"
+    if hasattr(found, "__cuda_array_interface__"):
+        return ": copy it from the GPU, as cupy.asnumpy does"
+    if isinstance(found, list | memoryview) or (
+        hasattr(found, "__array_interface__") and not isinstance(found, np.ndarray | np.generic)
+    ):
+        return ": say numpy.array(raw, numpy.uint16), or the type that its samples have"
     return ": read files by polsep.read_frames" if isinstance(found, str | PathLike) else ""
 
 

@@ -15,7 +15,7 @@ from polsep.io.raw.frames import Frame, ReadOptions, read_frames
 from polsep.io.raw.sequences import DamagedFrame, input_files, open_sequence
 from polsep.io.store.calibrations import read_calibration
 from polsep.io.store.errors import InputError, input_error
-from polsep.sensor.ambient import equally_exposed
+from polsep.sensor.ambient import equally_exposed, unit_remarks
 from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Mosaic
 
@@ -52,14 +52,20 @@ def _read_corrected(
         sources |= {"calibration": calibration.name, "calibration_sha256": digest}
     corrections = Corrections(measured, None, sources)
     if ambient:
-        times: list[float | None] = []
+        times, notes = list[float | None](), list[str]()
+
+        def look(_: Path, frame: Frame) -> None:
+            times.append(frame.exposure)
+            notes.extend(frame.notes)
+
         levels = measured and Calibration(measured.layout, measured.white_level, measured.size, measured.black_level)
         raw = replace(read, corrections=Corrections(levels))
-        corrections = corrections.with_ambient(read_mosaics(ambient, raw, lambda _, f: times.append(f.exposure)))
+        corrections = corrections.with_ambient(read_mosaics(ambient, raw, look))
         assert corrections.ambient is not None
         digest = hash_samples(corrections.ambient.data)
         sources |= {"ambient": [path.name for path in ambient], "ambient_sha256": digest}
-        corrections = replace(corrections, ambient_exposure_s=_one_time(ambient[0], times))
+        said = unit_remarks(notes)
+        corrections = replace(corrections, ambient_exposure_s=_one_time(ambient[0], times), ambient_remarks=said)
     return replace(read, corrections=corrections)
 
 

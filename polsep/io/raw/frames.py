@@ -27,7 +27,7 @@ from polsep.compute.arguments import WrongType
 from polsep.io.raw.extensions import LOSSLESS
 from polsep.io.raw.headerless import headerless_page, read_headerless, with_layout
 from polsep.io.raw.npy import read_npy, read_npz, stack_angles
-from polsep.io.raw.page import Page
+from polsep.io.raw.page import MergedFacts, Page
 from polsep.io.raw.pgm import read_pgm
 from polsep.io.raw.png import read_png
 from polsep.io.raw.recording import RECORD, read_recording
@@ -275,17 +275,36 @@ def output_stem(path: str | Path) -> str:
 
 def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
     """Codes to light, by the rules of the module, corrected; and notes."""
+    options, remarks = (options, ()) if page.merged is None else _left_for(page.merged, options)
     data, notes = _to_light(page, options)
     if page.merged is not None and isinstance(data, Mosaic):
-        if options.corrections is not None and options.corrections.calibration is not None:
-            raise ValueError("expected --calibration with 'polsep merge', found it with a frame that is merged already")
-        data = replace(data, **page.merged._asdict())
+        color, falloff, measured, _ = page.merged
+        data = replace(data, light_color=color, falloff=falloff, lamp_measured=measured)
+    notes = remarks + notes
     if options.corrections is None:
         return data, notes
     if isinstance(data, Measurements):
         raise ValueError("expected a raw mosaic to calibrate or to subtract room light from, found four angle images")
     data, more = options.corrections.apply_noting(data)
     return data, notes + more + exposure_notes(page.exposure, options.corrections.ambient_exposure_s)
+
+
+def _left_for(merged: MergedFacts, options: ReadOptions) -> tuple[ReadOptions, tuple[str, ...]]:
+    """Options for a frame of `polsep merge`, which has levels and is calibrated; and notes. Raises ValueError."""
+    notes = list[str]()
+    if options.black_level != 0 or options.white_level not in (1, None):
+        notes.append("levels stated are those of raw frames: a frame of 'polsep merge' has black 0 and white 1")
+        options = replace(options, black_level=0.0, white_level=1.0)
+    corrections = options.corrections
+    if corrections is None or corrections.calibration is None:
+        return options, tuple(notes)
+    if merged.calibration is None:
+        raise ValueError("expected --calibration with 'polsep merge', found it with a frame that was merged without")
+    name, digest = merged.calibration
+    if corrections.sources.get("calibration_sha256") != digest:
+        raise ValueError(f"expected {name}, by which the merged frame is calibrated already, found another calibration")
+    notes.append(f"the merged frame is calibrated by {name} already: this is not done again")
+    return replace(options, corrections=replace(corrections, calibration=None)), tuple(notes)
 
 
 def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
@@ -307,7 +326,7 @@ def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, 
 
 def _said_white_level(page: Page, options: ReadOptions) -> float | None:
     """The white level that the user says, or the file, or a calibration; None where nobody does."""
-    white = page.white_level if options.white_level is None else options.white_level
+    white = page.white_level if options.white_level is None or page.merged is not None else options.white_level
     if white is None and options.corrections is not None and options.corrections.calibration is not None:
         return options.corrections.calibration.white_level_of(page.array)
     return white

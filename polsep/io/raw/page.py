@@ -16,11 +16,15 @@ from polsep.sensor.camera import Layout
 
 
 class MergedFacts(NamedTuple):
-    """Properties of a frame of `polsep merge`, which nothing may correct again: fields of `Mosaic`."""
+    """Properties of a frame of `polsep merge`, which nothing may correct again: fields of `Mosaic`.
+
+    ``calibration``: name and hash of the file by which its exposures were calibrated, None where it names none.
+    """
 
     light_color: tuple[float, ...]
     falloff: tuple[tuple[float, ...], ...] | None
     lamp_measured: bool
+    calibration: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,9 @@ def _as_merged(facts: dict[str, Any]) -> MergedFacts:
         raise InputError(f"expected a light of one or three colours, found {len(color)}")
     require_gains("light colour", color)
     require_falloff(falloff)
-    return MergedFacts(color, falloff, facts.get("lamp_measured") is True)  # earlier files lack it
+    used = tuple(str(facts[name]) for name in ("calibration", "calibration_sha256") if name in facts)
+    known = (used[0], used[1]) if len(used) == 2 else None
+    return MergedFacts(color, falloff, facts.get("lamp_measured") is True, known)  # earlier files lack the last two
 
 
 def write_merged(path: Path, mosaic: Mosaic, facts: Mapping[str, Any]) -> None:

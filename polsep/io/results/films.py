@@ -184,7 +184,9 @@ def join_films(parts: Sequence[Path], path: Path, kind: FilmKind, rate: float) -
         for part in parts:
             with delayed_signals(), av.open(f"file:{part}") as source:  # a colon alone would end a protocol's name
                 template = source.streams.video[0]
-                stream = stream or output.add_stream_from_template(template)
+                if stream is None:
+                    stream = output.add_stream_from_template(template)
+                    stream.codec_context.framerate = per_second  # a template has none, and short films do not show it
                 for packet in source.demux(template):
                     if packet.size:  # every part counts its frames from 0, and rounds their times
                         packet.pts = packet.dts = round(frames / (per_second * packet.time_base))

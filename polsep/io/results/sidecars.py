@@ -71,9 +71,17 @@ def write_with_sidecar(
             "files": listed,
             **(report or {}),
         }
-        write_checked(folder / f"{stem}.json", (json.dumps(sidecar, indent=2, allow_nan=False) + "\n").encode())
+        text = json.dumps(sidecar, indent=2, allow_nan=False, default=_plain)
+        write_checked(folder / f"{stem}.json", (text + "\n").encode())
 
     write_set(targets, stem, write)
+
+
+def _plain(value: Any) -> Any:
+    """Numbers and arrays of NumPy, which people add to reports, as JSON has them. Raises OutputError on all else."""
+    if isinstance(value, np.generic | np.ndarray) and value.dtype.kind in "biufSU":
+        return value.tolist()
+    raise OutputError(f"expected numbers, text, lists and mappings in a report, found {type(value).__name__}")
 
 
 def read_report(path: Path) -> dict[str, Any]:

@@ -174,9 +174,7 @@ def _mirror(g: Geometry, polarizer: Tensor, shading: Tensor, f: Fresnel) -> Stok
 def mueller_rotator(angle: Tensor) -> Tensor:
     """C(t) ``[..., 4, 4]``: turns the frame of a Stokes vector by ``+angle`` [rad]. Source: Baek et al. 2018."""
     c, s, zero, one = torch.cos(2 * angle), torch.sin(2 * angle), torch.zeros_like(angle), torch.ones_like(angle)
-    return _matrix(
-        [[one, zero, zero, zero], [zero, c, s, zero], [zero, -s, c, zero], [zero, zero, zero, one]],
-    )
+    return _matrix([[one, zero, zero, zero], [zero, c, s, zero], [zero, -s, c, zero], [zero, zero, zero, one]])
 
 
 def mueller_polarizer(angle: Tensor, diattenuation: float = 1.0) -> Tensor:
@@ -184,7 +182,7 @@ def mueller_polarizer(angle: Tensor, diattenuation: float = 1.0) -> Tensor:
     d = torch.full_like(angle, diattenuation)
     zero, one, root = torch.zeros_like(angle), torch.ones_like(angle), torch.sqrt(1 - d * d)
     straight = 0.5 * _matrix(
-        [[one, d, zero, zero], [d, one, zero, zero], [zero, zero, root, zero], [zero, zero, zero, root]],
+        [[one, d, zero, zero], [d, one, zero, zero], [zero, zero, root, zero], [zero, zero, zero, root]]
     )
     return mueller_rotator(-angle) @ straight @ mueller_rotator(angle)
 

@@ -50,17 +50,8 @@ PART, WHITE = (slice(512, 1536), slice(612, 1836)), 4095.0
 PROMISED = 0.002
 
 
-def bench_agreement() -> Iterator[Row]:
+def bench_agreement(graphs: tuple[tuple[str, str, bool], ...] = GRAPHS) -> Iterator[Row]:
     """Largest differences of graphs and of the page, and seconds and memory of exports. Raises ValueError."""
-    yield from _bench(GRAPHS)
-
-
-def bench_agreement_quick() -> Iterator[Row]:
-    """One graph."""
-    yield from _bench(GRAPHS[:1])
-
-
-def _bench(graphs: tuple[tuple[str, str, bool], ...]) -> Iterator[Row]:
     before = os.environ.get("POLSEP_LAYERS")
     os.environ["POLSEP_LAYERS"] = "f32"
     try:

@@ -1,8 +1,7 @@
-"""The rooms of `polsep.io`: they import in one order, and a raw format is one reader and one line."""
+"""Raw formats of `polsep.io`: each is one reader and one line, and begins with any frame."""
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,18 +10,6 @@ import pytest
 
 from polsep.io.raw.frames import READERS, Reader, ReadOptions, read_frames
 from polsep.io.raw.page import Page
-
-IO = Path(__file__).resolve().parents[1] / "polsep" / "io"
-#: Each room imports from itself and from those before it.
-ROOMS = ("store", "raw", "results", "assets")
-
-
-@pytest.mark.parametrize("path", sorted(IO.glob("*/*.py")), ids=lambda path: f"{path.parent.name}/{path.name}")
-def test_rooms_import_in_one_order(path: Path) -> None:
-    nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-    names = [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
-    used = {name.split(".")[2] for name in names if name.startswith("polsep.io.")}
-    assert used <= set(ROOMS[: ROOMS.index(path.parent.name) + 1])
 
 
 def test_a_raw_format_is_one_reader_and_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,33 +7,15 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from test_optics import random_geometry, scalar
 from tolerances import assert_close
 from torch import Tensor
 
-from polsep.physics.optics import Geometry, diffuse_stokes, dot, normalize, specular_stokes
+from polsep.physics.optics import Geometry, diffuse_stokes, dot, specular_stokes
 from polsep.physics.stokes import Stokes
 
 DIRECTIONS = 400
 Lobe = Callable[..., Stokes]
-
-
-def scalar(value: float) -> Tensor:
-    return torch.full((1, 1, 1), value, dtype=torch.float64)
-
-
-def random_geometry(generator: torch.Generator) -> Geometry:
-    """Cameras and lights in front of random normals, and ups that have nothing to do with them."""
-
-    def directions() -> Tensor:
-        return normalize(torch.randn(3, DIRECTIONS, 1, generator=generator, dtype=torch.float64))
-
-    normal = directions()
-
-    def in_front() -> Tensor:
-        d = directions()
-        return normalize(d * torch.sign(dot(d, normal)) + 0.05 * normal)
-
-    return Geometry(normal, in_front(), in_front(), directions(), directions())
 
 
 def mueller(lobe: Lobe, g: Geometry, extra: Tensor) -> Tensor:
@@ -55,7 +37,7 @@ def test_exchanged_camera_and_light_transpose_the_matrix(lobe: Lobe, generator: 
 
     Source: van de Hulst 1957, Light Scattering by Small Particles, 5.22; de Hoop 1960.
     """
-    g = random_geometry(generator)
+    g = random_geometry(DIRECTIONS, generator)
     back = Geometry(g.normal, g.to_light, g.to_camera, g.light_up, g.camera_up)
     flip = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
     there, again = mueller(lobe, g, scalar(0.6)), mueller(lobe, back, scalar(0.6))
@@ -67,7 +49,7 @@ def test_exchanged_camera_and_light_transpose_the_matrix(lobe: Lobe, generator: 
 @pytest.mark.parametrize("lobe", [diffuse_stokes, specular_stokes])
 def test_no_light_is_polarized_beyond_its_power(lobe: Lobe, generator: torch.Generator) -> None:
     """Every linear state goes in, and what comes out has a DoLP of at most 1 and a power not below 0."""
-    matrix = mueller(lobe, random_geometry(generator), scalar(0.6))
+    matrix = mueller(lobe, random_geometry(DIRECTIONS, generator), scalar(0.6))
     angles = torch.linspace(0, 2 * math.pi, 13, dtype=torch.float64)
     for degree in (0.0, 0.5, 1.0):
         light = torch.stack([torch.ones_like(angles), degree * angles.cos(), degree * angles.sin()])

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 import imagecodecs
 import numpy as np
@@ -52,17 +53,10 @@ PROMISED = 0.002
 
 def bench_agreement(graphs: tuple[tuple[str, str, bool], ...] = GRAPHS) -> Iterator[Row]:
     """Largest differences of graphs and of the page, and seconds and memory of exports. Raises ValueError."""
-    before = os.environ.get("POLSEP_LAYERS")
-    os.environ["POLSEP_LAYERS"] = "f32"
-    try:
-        with TemporaryDirectory() as folder:
-            for method, layout, full in graphs:
-                yield from _compare_graph(method, layout, full, Path(folder) / "graph.onnx")
-            yield from _compare_page(Path(folder))
-    finally:
-        os.environ.pop("POLSEP_LAYERS")
-        if before is not None:
-            os.environ["POLSEP_LAYERS"] = before
+    with patch.dict(os.environ, POLSEP_LAYERS="f32"), TemporaryDirectory() as folder:
+        for method, layout, full in graphs:
+            yield from _compare_graph(method, layout, full, Path(folder) / "graph.onnx")
+        yield from _compare_page(Path(folder))
 
 
 def _compare_graph(method: str, layout: str, full: bool, path: Path) -> Iterator[Row]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from evaluation import InputFailure
 from evaluation.benches import BENCHES, MEASURES
 from evaluation.faults import faults
 from evaluation.house import house
@@ -24,12 +25,6 @@ OPTIONS = (
     click.Option(["--images"], type=DIR, metavar="DIR", help="Where pictures go.  [default: docs/images/NAME]"),
     RESULTS,
 )
-
-
-class InputFailure(click.ClickException):
-    """Something that cannot be measured here: one line, exit status 2."""
-
-    exit_code = 2
 
 
 def measure(data: Path | None, output: Path, quick: bool, images: Path | None) -> None:

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 import imagecodecs
 import numpy as np
@@ -50,28 +51,12 @@ PART, WHITE = (slice(512, 1536), slice(612, 1836)), 4095.0
 PROMISED = 0.002
 
 
-def bench_agreement() -> Iterator[Row]:
+def bench_agreement(graphs: tuple[tuple[str, str, bool], ...] = GRAPHS) -> Iterator[Row]:
     """Largest differences of graphs and of the page, and seconds and memory of exports. Raises ValueError."""
-    yield from _bench(GRAPHS)
-
-
-def bench_agreement_quick() -> Iterator[Row]:
-    """One graph."""
-    yield from _bench(GRAPHS[:1])
-
-
-def _bench(graphs: tuple[tuple[str, str, bool], ...]) -> Iterator[Row]:
-    before = os.environ.get("POLSEP_LAYERS")
-    os.environ["POLSEP_LAYERS"] = "f32"
-    try:
-        with TemporaryDirectory() as folder:
-            for method, layout, full in graphs:
-                yield from _compare_graph(method, layout, full, Path(folder) / "graph.onnx")
-            yield from _compare_page(Path(folder))
-    finally:
-        os.environ.pop("POLSEP_LAYERS")
-        if before is not None:
-            os.environ["POLSEP_LAYERS"] = before
+    with patch.dict(os.environ, POLSEP_LAYERS="f32"), TemporaryDirectory() as folder:
+        for method, layout, full in graphs:
+            yield from _compare_graph(method, layout, full, Path(folder) / "graph.onnx")
+        yield from _compare_page(Path(folder))
 
 
 def _compare_graph(method: str, layout: str, full: bool, path: Path) -> Iterator[Row]:

@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import polsep.bench
+from evaluation import dynamic, geometry, material, paper, video
 from evaluation.ablations import bench_ablations
-from evaluation.agreement import bench_agreement, bench_agreement_quick
+from evaluation.agreement import GRAPHS, bench_agreement
 from evaluation.appearance import bench_gallery, bench_gallery_real, draw_gallery, draw_gallery_real
 from evaluation.calibration import bench_calibration
-from evaluation.dynamic import bench_dynamic, bench_dynamic_quick
+from evaluation.dynamic import bench_dynamic
 from evaluation.gallery import REAL, draw_paper
-from evaluation.geometry import (
-    bench_geometry,
-    bench_geometry_quick,
-    bench_shape,
-    bench_shape_quick,
-    draw_geometry,
-    draw_shape,
-)
+from evaluation.geometry import bench_geometry, bench_shape, draw_geometry, draw_shape
 from evaluation.install import bench_install
 from evaluation.joint import bench_joint
-from evaluation.material import PUBLISHED, bench_material, bench_material_quick
+from evaluation.material import PUBLISHED, bench_material
 from evaluation.material_gallery import draw_material
-from evaluation.paper import bench_paper, bench_paper_quick
+from evaluation.paper import bench_paper, measure_paper
 from evaluation.rendering import bench_rendering
 from evaluation.repeats import bench_repeats
-from evaluation.sensors import bench_sensors, bench_sensors_quick
+from evaluation.sensors import bench_sensors
 from evaluation.sets import bench_sets
-from evaluation.video import bench_video, bench_video_quick
+from evaluation.video import bench_video
 from evaluation.viewing import bench_view
 from evaluation.warned import bench_warned, bench_warned_quick
-from evaluation.web import bench_web, bench_web_quick
+from evaluation.web import bench_web
 from polsep.bench import FORMULAS, SCENES, SEPARATION
 from polsep.bench.run import Bench
 
@@ -42,38 +38,42 @@ BENCHES: dict[str, Bench] = {
     "joint": Bench(bench_joint, data=SET_DATA, measures=SCENES),
     "ablations": Bench(bench_ablations, data=SET_DATA, measures=(*SCENES, "evaluation/weights/ablations")),
     "repeats": Bench(bench_repeats, data=SET_DATA, measures=(*SCENES, "polsep/train")),
-    "dynamic": Bench(bench_dynamic, bench_dynamic_quick, measures=(*SCENES, "polsep/video")),
+    "dynamic": Bench(bench_dynamic, partial(bench_dynamic, dynamic.QUICK), measures=(*SCENES, "polsep/video")),
     "calibration": Bench(bench_calibration, measures=SCENES),
     "sensors": Bench(
-        bench_sensors, bench_sensors_quick, measures=(*SCENES, "polsep/datasets/reality.py", "polsep/calibrate")
+        bench_sensors, partial(bench_sensors, 2), measures=(*SCENES, "polsep/datasets/reality.py", "polsep/calibrate")
     ),
     "material": Bench(
         bench_material,
-        bench_material_quick,
+        partial(bench_material, count=material.QUICK),
         draw_material,
         (PUBLISHED,),
         (*SEPARATION, "polsep/render", "polsep/material", "evaluation/weights/material"),
     ),
-    "video": Bench(bench_video, bench_video_quick, measures=(*SEPARATION, "polsep/compute", "polsep/video")),
+    "video": Bench(
+        bench_video,
+        partial(bench_video, video.SHORT, video.DISTINCT),
+        measures=(*SEPARATION, "polsep/compute", "polsep/video"),
+    ),
     "geometry": Bench(
         bench_geometry,
-        bench_geometry_quick,
+        partial(bench_geometry, names=geometry.QUICK),
         draw_geometry,
         ("diligent_normals", "meshes"),
         (*SEPARATION, "polsep/render", "polsep/geometry"),
     ),
     "shape": Bench(
         bench_shape,
-        bench_shape_quick,
+        partial(bench_shape, names=geometry.QUICK),
         draw_shape,
         ("diligent_normals", "meshes"),
         (*SCENES, "polsep/datasets/reality.py", "polsep/geometry", "evaluation/weights/shape"),
     ),
     "install": Bench(bench_install, measures=("polsep", "pyproject.toml", "constraints.txt")),
     "view": Bench(bench_view, measures=("polsep/view", "polsep/edit")),
-    "web": Bench(bench_web, bench_web_quick, measures=("web", "tools/web_models.py")),
+    "web": Bench(bench_web, partial(bench_web, (1,), 1), measures=("web", "tools/web_models.py")),
     "agreement": Bench(
-        bench_agreement, bench_agreement_quick, measures=(*SEPARATION, "polsep/io/store/onnx.py", "web")
+        bench_agreement, partial(bench_agreement, GRAPHS[:1]), measures=(*SEPARATION, "polsep/io/store/onnx.py", "web")
     ),
     "warned": Bench(
         bench_warned,
@@ -85,7 +85,13 @@ BENCHES: dict[str, Bench] = {
     "gallery_real": Bench(
         bench_gallery_real, draw=draw_gallery_real, data=tuple(name.format(angle=0) for name, _, _ in REAL)
     ),
-    "paper": Bench(bench_paper, bench_paper_quick, draw_paper, SET_DATA, (*SCENES, "evaluation/weights/ladder")),
+    "paper": Bench(
+        bench_paper,
+        partial(measure_paper, extent=paper.QUICK),
+        draw_paper,
+        SET_DATA,
+        (*SCENES, "evaluation/weights/ladder"),
+    ),
 }
 
 #: Paths that the numbers of every results file speak of; evaluation/peers writes what is not of a benchmark.

@@ -14,43 +14,11 @@ from collections.abc import Callable
 from evaluation.damage_fields import find_fields
 
 #: Whole numbers at which readers go wrong: around 0 and around the ends of types.
-NUMBERS = (
-    0,
-    1,
-    2,
-    3,
-    7,
-    255,
-    256,
-    32767,
-    32768,
-    65535,
-    65536,
-    2**24,
-    2**31 - 1,
-    2**31,
-    2**32 - 1,
-    2**40,
-    2**63,
-    2**64 - 1,
-)
+NUMBERS: tuple[int, ...] = (0, 1, 2, 3, 7, 255, 256, 32767, 32768, 65535, 65536, 2**24, 2**31 - 1, 2**31, 2**32 - 1)
+NUMBERS += (2**40, 2**63, 2**64 - 1)
 #: What stands for a number in damaged text.
-WORDS: tuple[str, ...] = (
-    "0",
-    "-1",
-    "1e999",
-    "-1e999",
-    "1e-300",
-    "NaN",
-    "Infinity",
-    "null",
-    "true",
-    '""',
-    "[]",
-    "{}",
-    "1" * 400,
-    "1e38",
-)
+WORDS: tuple[str, ...] = ("0", "-1", "1e999", "-1e999", "1e-300", "NaN", "Infinity", "null", "true", '""', "[]", "{}")
+WORDS += ("1" * 400, "1e38")
 WORDS += ("[" * 3000, '"' + "x" * 2000 + '"', str(2**31), str(2**63), "65536", "1048576", '"\\ud800\\u001b[2J"')
 _DIGITS = re.compile(rb"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 #: Bytes at the beginning of a file in which most headers lie.
@@ -151,17 +119,5 @@ def splice(data: bytes, other: bytes, draw: random.Random) -> bytes:
 
 
 Change = Callable[[bytes, bytes, random.Random], bytes]
-CHANGES: tuple[Change, ...] = (
-    flip_bits,
-    set_bytes,
-    set_number,
-    set_field,
-    set_field,
-    set_field,
-    set_text_number,
-    cut,
-    insert,
-    remove,
-    move,
-    splice,
-)
+CHANGES: tuple[Change, ...] = (flip_bits, set_bytes, set_number, *[set_field] * 3, set_text_number, cut, insert)
+CHANGES += (remove, move, splice)

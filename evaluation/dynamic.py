@@ -82,33 +82,20 @@ class Tally:
                 yield region, f"{output} flicker", "white", math.sqrt(sum(squares) / cells)
 
 
-def bench_dynamic() -> Iterator[Row]:
+def bench_dynamic(numbers: range | None = None) -> Iterator[Row]:
     """Flicker and PSNR on the dynamic selection set with and without the temporal filter, and what a frame of it takes.
 
-    Raises ValueError without the extra render, and on a frame that does not come out as recorded.
+    ``numbers``: of frames of each film, all by default. Raises ValueError without the extra render, and on a frame that
+    does not come out as recorded.
     """
-    yield from _bench(range(_load_films()[1]))
-
-
-def bench_dynamic_quick() -> Iterator[Row]:
-    """The same on ten frames of each film."""
-    yield from _bench(QUICK)
-
-
-def _bench(numbers: range) -> Iterator[Row]:
-    methods = [METHODS[name] for name in COMPARED if name in METHODS]
-    for film in _load_films()[0].values():
-        yield from score_film(film, numbers, methods)
-    yield from time_filter()
-
-
-def _load_films() -> tuple[dict[str, Film], int]:
-    """The films, and how many frames they have. Raises ValueError without what they need."""
     try:
         from evaluation.testsets import dynamic
     except ImportError as error:
         raise ValueError(f"expected the extra render, found no {error.name}") from None
-    return dynamic.FILMS, dynamic.FRAMES
+    methods = [METHODS[name] for name in COMPARED if name in METHODS]
+    for film in dynamic.FILMS.values():
+        yield from score_film(film, numbers or range(dynamic.FRAMES), methods)
+    yield from time_filter()
 
 
 def score_film(film: Film, numbers: range, methods: Sequence[Method]) -> Iterator[Row]:

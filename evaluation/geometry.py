@@ -16,14 +16,15 @@ QUICK = ("bear", "reading", "cow", "spot", "fish", "PowerDrill")
 SHOWN = ("spot", "fish")
 
 
-def bench_geometry(data: Path) -> Iterator[Row]:
+def bench_geometry(data: Path, names: Sequence[str] | None = None) -> Iterator[Row]:
     """Normals from six lights by input, and depth from true normals, on statues and scans. Raises ValueError."""
-    yield from _measure(data, None)
-
-
-def bench_geometry_quick(data: Path) -> Iterator[Row]:
-    """`bench_geometry` on six objects."""
-    yield from _measure(data, QUICK)
+    try:
+        from evaluation.shape_scores import measure_depth, measure_normals
+    except ImportError as error:
+        raise ValueError(f"expected the extra bench, found no {error.name}") from None
+    require_matplotlib()
+    yield from measure_depth(data)
+    yield from measure_normals(data, names)
 
 
 def draw_geometry(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
@@ -38,24 +39,14 @@ def draw_geometry(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Pat
         yield path
 
 
-def _measure(data: Path, names: Sequence[str] | None) -> Iterator[Row]:
+def bench_shape(data: Path, names: Sequence[str] | None = None) -> Iterator[Row]:
+    """Shape from one frame by what a network sees, on statues and scans, glossy and matte. Raises ValueError."""
     try:
-        from evaluation.shape_scores import measure_depth, measure_normals
+        from evaluation.one_frame import measure
     except ImportError as error:
         raise ValueError(f"expected the extra bench, found no {error.name}") from None
     require_matplotlib()
-    yield from measure_depth(data)
-    yield from measure_normals(data, names)
-
-
-def bench_shape(data: Path) -> Iterator[Row]:
-    """Shape from one frame by what a network sees, on statues and scans, glossy and matte. Raises ValueError."""
-    yield from _measure_shape(data, None)
-
-
-def bench_shape_quick(data: Path) -> Iterator[Row]:
-    """`bench_shape` on six objects."""
-    yield from _measure_shape(data, QUICK)
+    yield from measure(data, names)
 
 
 def draw_shape(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
@@ -71,12 +62,3 @@ def draw_shape(rows: Sequence[Row], data: Path, folder: Path) -> Iterator[Path]:
         if subject.name == SHOWN[0]:
             replace_bytes(page := folder / f"{subject.name}.html", relight_object(subject, number))
             yield page
-
-
-def _measure_shape(data: Path, names: Sequence[str] | None) -> Iterator[Row]:
-    try:
-        from evaluation.one_frame import measure
-    except ImportError as error:
-        raise ValueError(f"expected the extra bench, found no {error.name}") from None
-    require_matplotlib()
-    yield from measure(data, names)

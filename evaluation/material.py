@@ -53,20 +53,11 @@ MIN_DETAIL = 0.02
 MIN_SPECULAR = 0.01
 
 
-def bench_material(data: Path) -> Iterator[Row]:
+def bench_material(data: Path, count: int = PROCEDURAL) -> Iterator[Row]:
     """Errors of the maps of held-out materials and of their relit pictures, by input; single and several lights.
 
-    Raises ValueError without the extra bench.
+    ``count``: of procedural and of published materials. Raises ValueError without the extra bench.
     """
-    yield from _measure(data, PROCEDURAL)
-
-
-def bench_material_quick(data: Path) -> Iterator[Row]:
-    """The same of a few materials."""
-    yield from _measure(data, QUICK)
-
-
-def _measure(data: Path, count: int) -> Iterator[Row]:
     require_flip()
     estimators = load_estimators()
     sets = {"procedural": procedural_examples(count), "procedural, small frames": small_examples(count)}

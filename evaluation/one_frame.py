@@ -23,8 +23,8 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
-from evaluation.six_lights import ROWS_AT_ONCE, SEED, Subject, load_subjects
-from evaluation.testsets.casting import LENS_BLUR, SAMPLES, random_light_near
+from evaluation.six_lights import SEED, Subject, cast_bands, load_subjects, pool_band
+from evaluation.testsets.casting import LENS_BLUR, random_light_near
 from polsep.bench.rows import Row
 from polsep.datasets.reality import RIG
 from polsep.demosaic.measured_stokes import measured_stokes
@@ -36,7 +36,7 @@ from polsep.io.store.weights import shipped_weights
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
 from polsep.render.disturbances import LAMPS, add_scenes, as_color, depolarize_lamp, scale_light
-from polsep.render.raycast import Hits, find_hits, is_lit
+from polsep.render.raycast import Hits, is_lit
 from polsep.render.room import Around, as_room, even_directions, light_from_around
 from polsep.render.sensor_errors import record
 from polsep.render.simulate import blur, capture, expose_to_clip, half_resolution
@@ -47,8 +47,8 @@ from polsep.train.shape_losses import gained, random_lamps
 
 Floats = NDArray[np.float32]
 
-#: Strength of specular reflections of matte objects; share of samples that clip; raw pixels per side.
-MATTE, CLIPPED, RAW_SIDE = 0.05, 0.005, 512
+#: Strength of specular reflections of matte objects; share of samples that clip.
+MATTE, CLIPPED = 0.05, 0.005
 #: Of a usual rig: room light over the lamp's; its lights' number, distance in radii, and colour over the lamp's; the
 #: lamp's degree of polarization and raw colour.
 ROOM, ROOM_LIGHTS, ROOM_DISTANCE, ROOM_COLOR = 0.1, 6, 30.0, (1.15, 1.0, 0.85)
@@ -99,7 +99,7 @@ def photograph(subject: Subject, number: int, kind: Kind) -> Photograph:
     seed = SEED + 5000 + 2 * number + (kind.strength == MATTE)
     generator = torch.Generator().manual_seed(seed)
     lamp = _lamp(subject, generator)
-    hits = _find_hits(subject)
+    hits = list(cast_bands(subject))
     scene, planes = _render(subject, hits, lamp, kind.strength)
     exposed = expose_to_clip(blur(scene, LENS_BLUR), CLIPPED, Layout(), IMX250)
     if kind.rig:
@@ -150,17 +150,6 @@ def _lamp(subject: Subject, generator: torch.Generator) -> PointLight:
     return random_light_near(camera, generator, (0.0, LARGEST_DEG), DISTANCES)
 
 
-def _find_hits(subject: Subject) -> list[Hits]:
-    """Hits of all rays, in bands of `ROWS_AT_ONCE` rows."""
-    bands = []
-    for first in range(0, RAW_SIDE, ROWS_AT_ONCE):
-        rows = first + (torch.arange(ROWS_AT_ONCE * SAMPLES) + 0.5) / SAMPLES
-        cols = (torch.arange(RAW_SIDE * SAMPLES) + 0.5) / SAMPLES
-        points = tuple(g.flatten() for g in torch.meshgrid(rows, cols, indexing="ij"))
-        bands.append(find_hits(subject.mesh, subject.camera, (points[0], points[1]), (RAW_SIDE, RAW_SIDE)))
-    return bands
-
-
 def _render(subject: Subject, hits: list[Hits], lamp: PointLight, strength: float) -> tuple[Scene, torch.Tensor]:
     """The exact scene, and planes of mask, normals in the camera's frame, albedo, roughness and strength."""
     toward = torch.from_numpy(_axes(subject)).float()
@@ -172,9 +161,7 @@ def _render(subject: Subject, hits: list[Hits], lamp: PointLight, strength: floa
         diffuse, specular = shade(buffer, subject.camera, lamp, is_lit(subject.mesh, band, lamp))
         values = [one, (toward @ band.normal[..., 0])[..., None], albedo, subject.roughness * one, strength * one]
         values += [s for lobe in (diffuse, specular) for s in (lobe.s0, lobe.s1, lobe.s2)]
-        image = torch.zeros(sum(v.shape[0] for v in values), ROWS_AT_ONCE * RAW_SIDE * SAMPLES**2)
-        image[:, band.ray] = torch.cat(values)[..., 0]
-        bands.append(avg_pool2d(image.view(1, len(image), -1, RAW_SIDE * SAMPLES), SAMPLES)[0])
+        bands.append(pool_band(torch.cat(values), band))
     whole = torch.cat(bands, dim=1)
     lobes = [Stokes(*torch.split(whole[9 + 9 * k : 18 + 9 * k], 3)) for k in range(2)]
     return Scene(lobes[0], lobes[1], whole[0] == 1), whole[:9]

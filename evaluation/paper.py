@@ -50,13 +50,8 @@ def bench_paper(data: Path) -> Iterator[Row]:
     yield from measure_paper(data, Extent())
 
 
-def bench_paper_quick(data: Path) -> Iterator[Row]:
-    """`bench_paper` on `QUICK`, on those sets that ``data`` has."""
-    yield from measure_paper(data, QUICK)
-
-
 def measure_paper(data: Path, extent: Extent) -> Iterator[Row]:
-    """Rows of costs, tables and sweep, in this order, to the ``extent`` asked for."""
+    """Rows of costs, tables and sweep, in this order, to the ``extent`` asked for, of those sets that ``data`` has."""
     require_matplotlib()
     sets = {name: recipes[: extent.scenes.get(name)] for name, recipes in load_sets().items()}
     mosaic, co_sited = ladder_entries(MOSAIC), ladder_entries(CO_SITED)

@@ -6,6 +6,7 @@ A tiny triangle behind the camera and the light makes `polsep.render.raycast` ca
 from __future__ import annotations
 
 import time
+import timeit
 from collections.abc import Callable
 from functools import partial
 
@@ -47,12 +48,7 @@ def find_geometry(scene: MeshScene, camera: PinholeCamera, light: PointLight) ->
 
 def best_time(work: Callable[[], object]) -> float:
     """The least processor time of several calls [s]."""
-    times = []
-    for _ in range(ROUNDS):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return min(times)
+    return min(timeit.repeat(work, timer=time.process_time, number=1, repeat=ROUNDS))
 
 
 if __name__ == "__main__":

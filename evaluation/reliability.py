@@ -42,15 +42,8 @@ SECONDS, MEBIBYTES = 10.0, 2048.0
 ROOM = 6 << 30
 #: What can become of an input, and what can be wrong about it.
 OUTCOMES = ("refused", "accepted")
-FAULTS = (
-    "stray exceptions",
-    "bad messages",
-    "values not finite",
-    "lines of libraries",
-    "over time",
-    "over memory",
-    "crashes",
-)
+FAULTS: tuple[str, ...] = ("stray exceptions", "bad messages", "values not finite", "lines of libraries")
+FAULTS += ("over time", "over memory", "crashes")
 #: Inputs of each reader after which memory is measured anew from the start, as C libraries keep some.
 INPUTS = 2000
 

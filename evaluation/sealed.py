@@ -16,6 +16,7 @@ import click
 import torch
 
 import polsep
+from evaluation import InputFailure
 from evaluation.scoring import capture_noisy, find_missing
 from polsep.bench.history import ask_git
 from polsep.bench.rows import provenance, standard_error
@@ -94,14 +95,8 @@ def sealed(data: Path | None, quick: bool, output: Path) -> None:
     try:
         log = score_release(data, quick, output)
     except ValueError as error:
-        raise SealedFailure(str(error)) from None
+        raise InputFailure(str(error)) from None
     print(log)
-
-
-class SealedFailure(click.ClickException):
-    """Something that cannot be scored here: one line, exit status 2."""
-
-    exit_code = 2
 
 
 def score_release(data: Path | None, quick: bool, output: Path) -> Path:

@@ -45,17 +45,8 @@ LEVEL, LAMP = 0.6, LAMPS["daylight"]
 KNOWN = ("black level", "dark", "dark, flat", "dark, flat, analysers")
 
 
-def bench_sensors() -> Iterator[Row]:
+def bench_sensors(scenes: int = SCENES) -> Iterator[Row]:
     """Loss of methods before a bad sensor and a coloured lamp, by what of them is measured."""
-    yield from _bench(SCENES)
-
-
-def bench_sensors_quick() -> Iterator[Row]:
-    """Two scenes."""
-    yield from _bench(2)
-
-
-def _bench(scenes: int) -> Iterator[Row]:
     losses: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for number in range(scenes):
         stage = build_stage("test", number, SIDE)

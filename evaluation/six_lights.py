@@ -9,7 +9,7 @@ those of the selection set `statues`; shadows are cast. One exposure serves all 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,6 +44,8 @@ LIGHT_DISTANCE, LARGEST_TURN_DEG, LARGEST_GAIN = 8.0, 6.0, 0.1
 CLIPPED = 0.01
 #: Raw pixels per side; rows that are shaded together.
 SIDE, ROWS_AT_ONCE = 512, 64
+#: Rows and columns of rays of these.
+BAND = (ROWS_AT_ONCE * SAMPLES, SIDE * SAMPLES)
 #: Seed of the first object.
 SEED = 9000
 
@@ -136,16 +138,11 @@ def _light(way: Tensor, generator: torch.Generator) -> PointLight:
 def _render(subject: Subject, lights: list[PointLight]) -> tuple[list[Scene], Tensor, Tensor]:
     """Exact scenes behind the lens, and the normals ``[3, SIDE, SIDE]`` in the world's frame."""
     bands: list[list[Tensor]] = []
-    size = (ROWS_AT_ONCE * SAMPLES, SIDE * SAMPLES)
-    for first in range(0, SIDE, ROWS_AT_ONCE):
-        rows = first + (torch.arange(size[0]) + 0.5) / SAMPLES
-        cols = (torch.arange(size[1]) + 0.5) / SAMPLES
-        points = tuple(g.flatten() for g in torch.meshgrid(rows, cols, indexing="ij"))
-        hits = find_hits(subject.mesh, subject.camera, (points[0], points[1]), (SIDE, SIDE))
-        planes = [_pooled(torch.ones_like(hits.position[:1]), hits, size), _pooled(hits.normal, hits, size)]
+    for hits in cast_bands(subject):
+        planes = [pool_band(torch.ones_like(hits.position[:1]), hits), pool_band(hits.normal, hits)]
         for light in lights:
             lobes = shade(_cover(subject, hits), subject.camera, light, is_lit(subject.mesh, hits, light))
-            planes += [_pooled(s, hits, size) for lobe in lobes for s in (lobe.s0, lobe.s1, lobe.s2)]
+            planes += [pool_band(s, hits) for lobe in lobes for s in (lobe.s0, lobe.s1, lobe.s2)]
         bands.append(planes)
     covered, normals, *images = (torch.cat(planes, dim=1) for planes in zip(*bands, strict=True))
     mask = covered[0] == 1
@@ -155,16 +152,24 @@ def _render(subject: Subject, lights: list[PointLight]) -> tuple[list[Scene], Te
     return scenes, normals, mask
 
 
+def cast_bands(subject: Subject) -> Iterator[Hits]:
+    """Hits of all rays of a frame, in bands of `ROWS_AT_ONCE` rows."""
+    rows, cols = ((torch.arange(count) + 0.5) / SAMPLES for count in BAND)
+    for first in range(0, SIDE, ROWS_AT_ONCE):
+        points = tuple(g.flatten() for g in torch.meshgrid(first + rows, cols, indexing="ij"))
+        yield find_hits(subject.mesh, subject.camera, (points[0], points[1]), (SIDE, SIDE))
+
+
 def _cover(subject: Subject, hits: Hits) -> GBuffer:
     one = torch.ones_like(hits.position[:1])
     return GBuffer(hits.position, hits.normal, subject.albedo(hits.position), subject.roughness * one, one, one > 0)
 
 
-def _pooled(values: Tensor, hits: Hits, size: tuple[int, int]) -> Tensor:
+def pool_band(values: Tensor, hits: Hits) -> Tensor:
     """Values ``[C, M, 1]`` of hits as an image, the mean over each pixel's samples."""
-    image = torch.zeros(values.shape[0], size[0] * size[1])
+    image = torch.zeros(values.shape[0], BAND[0] * BAND[1])
     image[:, hits.ray] = values[..., 0]
-    return avg_pool2d(image.reshape(1, -1, *size), SAMPLES)[0]
+    return avg_pool2d(image.reshape(1, -1, *BAND), SAMPLES)[0]
 
 
 def _level(scene: Scene) -> float:

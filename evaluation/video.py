@@ -55,21 +55,11 @@ DUTIES = {
 }
 
 
-def bench_video() -> Iterator[Row]:
+def bench_video(long: int = LONG, short: int = SHORT) -> Iterator[Row]:
     """1000 frames of 2448x2048 by joint-fast, 60 by joint and in other formats: rates, processor time, memory.
 
     The recording is a headerless BayerRG12p stream in a folder for temporary files; 23 GB of it are needed.
     """
-    yield from measure_recordings(LONG, SHORT)
-
-
-def bench_video_quick() -> Iterator[Row]:
-    """The same with 60 frames at most."""
-    yield from measure_recordings(SHORT, DISTINCT)
-
-
-def measure_recordings(long: int, short: int) -> Iterator[Row]:
-    """Rows of a recording of ``long`` frames, and of its first ``short`` ones."""
     keep_memory()
     with TemporaryDirectory() as folder:
         path = Path(folder) / "run.raw"

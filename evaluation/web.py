@@ -59,17 +59,8 @@ class Memory:
             self.largest = max(self.largest, self.now())
 
 
-def bench_web() -> Iterator[Row]:
+def bench_web(cores: tuple[int, ...] = CORES, again: int = AGAIN) -> Iterator[Row]:
     """Seconds and memory of the browser page, by method and number of cores. Raises ValueError without its needs."""
-    yield from _bench(CORES, AGAIN)
-
-
-def bench_web_quick() -> Iterator[Row]:
-    """One core, two frames."""
-    yield from _bench((1,), 1)
-
-
-def _bench(cores: tuple[int, ...], again: int) -> Iterator[Row]:
     with TemporaryDirectory() as folder, served_page(Path(folder)) as (site, driver, address):
         size = sum(path.stat().st_size for path in site.iterdir())
         yield Row("web", "page", "all files", "size", size / 1e6, "MB")

@@ -33,12 +33,7 @@ from polsep.separation.color_affine import separate_color_affine
 from polsep.separation.color_affine_kernel import ColorAffineOptions
 from polsep.separation.images import FrameImages
 from polsep.separation.report import images_of, in_light, tally_again, under_white_light
-from polsep.shipped import (
-    accepts_mosaic,
-    separate_paper,
-    shipped_joint,
-    weights_name,
-)
+from polsep.shipped import accepts_mosaic, separate_paper, shipped_joint, weights_name
 
 #: A raw frame, or co-sited samples.
 Capture = Mosaic | Measurements

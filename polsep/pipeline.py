@@ -46,14 +46,7 @@ from polsep.sensor.levels import (
 )
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.images import FrameImages
-from polsep.separation.report import (
-    SeparatedFrame,
-    describe,
-    error_quantiles,
-    light_statistics,
-    on_host,
-    tally_again,
-)
+from polsep.separation.report import SeparatedFrame, describe, error_quantiles, light_statistics, on_host, tally_again
 from polsep.separation.under_highlights import fill_under_highlights
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The closed forms and the report give the same of NumPy arrays as of torch tensors, and run without torch."""
+"""The closed forms and the report give the same of NumPy arrays as of torch tensors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from test_kernels_color_affine import random_frame
-from test_without_torch import run
 from torch.nn import functional
 
 from polsep.compute.arrays import to_numpy
@@ -29,35 +28,6 @@ ROUNDING, SOLVED = 1e-6, 1e-4
 DEMOSAICKERS = (demosaic_bilinear_half, demosaic_guided_half, demosaic_guided)
 LIGHT = (0.6, 1.0, 0.8)
 MONO = Layout(bayer=None)
-
-#: A frame of noise, some of it clipped, separated by every closed form in an interpreter without torch.
-WITHOUT_TORCH = """
-warnings.simplefilter("error")
-import numpy as np
-from polsep.physics.stokes import Measurements
-from polsep.sensor.camera import Layout, Mosaic
-from polsep.separation.analytic import separate_analytic, separate_analytic_unclipped
-from polsep.separation.color_affine import separate_color_affine
-from polsep.separation.colored_specular import color_specular
-from polsep.separation.multi_capture import separate_ding2021, separate_extremes
-from polsep.separation.report import describe, images_of, in_light, under_white_light
-
-rng, light = np.random.default_rng(1), (0.6, 1.0, 0.8)
-for colors in (3, 1):
-    data = rng.random((4, colors, 40, 44), np.float32)
-    data[:, :, :8, :8] = 1
-    seen = under_white_light(Measurements(data, Layout().angles, data > 0.9), light[:colors])
-    separate_ding2021(seen, seen), separate_extremes(seen)
-    for separate in (separate_analytic, separate_analytic_unclipped, separate_color_affine):
-        white = separate(seen)
-        images = images_of(white, in_light(white, light[:colors]))
-        assert not images.valid.all() and describe(images.tally, False)["statistics"]["specular_fraction"] > 0
-        assert images.diffuse.dtype == np.float32 and np.isfinite(images.diffuse + images.specular).all()
-mosaic = Mosaic(rng.random((80, 88), np.float32), Layout(), 0.0, 1.0)
-data = rng.random((4, 3, 40, 44), np.float32)
-white = separate_analytic(Measurements(data, Layout().angles))
-color_specular(images_of(white, in_light(white, light)), mosaic, light)
-"""
 
 
 def as_numpy(seen: Measurements | None) -> Measurements | None:
@@ -144,8 +114,3 @@ def test_resizing_is_torchs(shape: tuple[int, int], generator: torch.Generator) 
         torch.testing.assert_close(found(x), expected, rtol=0, atol=ROUNDING)
         assert found(x.numpy()).dtype == np.float32
         np.testing.assert_allclose(found(x.numpy()), expected.numpy(), rtol=0, atol=ROUNDING)
-
-
-def test_closed_forms_run_without_torch() -> None:
-    done = run(WITHOUT_TORCH, "blocked")
-    assert done.returncode == 0, done.stderr

@@ -11,14 +11,7 @@ import pytest
 import torch
 
 from polsep.bench import frontend
-from polsep.bench.frontend import (
-    Case,
-    demosaic_case,
-    read_cases,
-    score_cases,
-    score_images,
-    score_stokes,
-)
+from polsep.bench.frontend import Case, demosaic_case, read_cases, score_cases, score_images, score_stokes
 from polsep.bench.peers import PEERS_VARIABLE, find_peers, run_json
 from polsep.bench.rows import Row, to_jsonl
 from polsep.demosaic.bilinear import mean_cells

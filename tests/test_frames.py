@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,9 @@ import tifffile
 import torch
 from numpy.typing import NDArray
 
-from polsep.io.raw.frames import Frame, ReadOptions, read_frames
+from polsep.io.raw.frames import READERS, Frame, Reader, ReadOptions, read_frames
 from polsep.io.raw.genicam import PIXEL_FORMATS, pack_frame
+from polsep.io.raw.page import Page
 from polsep.io.store.errors import InputError
 from polsep.physics.stokes import Measurements
 from polsep.sensor.camera import Layout, Mosaic, sample_mosaic
@@ -449,3 +450,39 @@ def test_orientation_is_noted_not_applied(tmp_path: Path) -> None:
     frame = only(tmp_path / "shot.tiff")
     assert_samples(mosaic_of(frame), codes)
     assert frame.notes == ("TIFF orientation 6 is not applied: pixels stay as stored",)
+
+
+def test_a_raw_format_is_one_reader_and_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader of a new format in `READERS` is all that `read_frames` needs."""
+
+    def read_text(path: Path, first: int) -> Iterator[Page]:
+        yield Page(np.loadtxt(path, dtype=np.uint16), white_level=4095)
+
+    monkeypatch.setitem(READERS, ".txt", Reader("text", read_text))
+    codes = np.arange(64).reshape(8, 8)
+    np.savetxt(tmp_path / "shot.txt", codes, fmt="%d")
+    (frame,) = read_frames(tmp_path / "shot.txt", ReadOptions(black_level=8))
+    assert (frame.stem, frame.data.white_level, frame.data.black_level) == ("shot", 4095, 8)
+    np.testing.assert_array_equal(frame.data.data, codes)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".tiff", ".raw"])
+def test_stacks_are_read_from_any_frame_on(tmp_path: Path, suffix: str) -> None:
+    """The frames from ``first`` on are those of a reading from the beginning."""
+    codes = np.random.default_rng(0).integers(0, 255, (5, 8, 8)).astype(np.uint8)
+    path = tmp_path / f"shots{suffix}"
+    if suffix == ".npy":
+        np.save(path, codes)
+    elif suffix == ".npz":
+        np.savez(path, raw=codes)
+    elif suffix == ".tiff":
+        tifffile.imwrite(path, codes, photometric="minisblack")
+    else:
+        path.write_bytes(codes.tobytes())
+    options = ReadOptions(size=(8, 8), pixel_format="Mono8") if suffix == ".raw" else None
+    for first in range(6):
+        frames = list(read_frames(path, options, first))
+        assert [(frame.index, frame.count) for frame in frames] == [(k, 5) for k in range(first, 5)]
+        assert [frame.stem for frame in frames] == [f"shots_{k:04d}" for k in range(first, 5)]
+        for frame in frames:
+            np.testing.assert_array_equal(frame.data.data, codes[frame.index])

@@ -39,11 +39,7 @@ def test_lucid_angles_lie_side_by_side_in_each_pixel() -> None:
 
 
 @settings(max_examples=12, deadline=None)
-@given(
-    width=st.integers(1, 9),
-    height=st.integers(1, 6),
-    seed=st.integers(0, 2**16),
-)
+@given(width=st.integers(1, 9), height=st.integers(1, 6), seed=st.integers(0, 2**16))
 @pytest.mark.parametrize("name", PIXEL_FORMATS)
 def test_round_trip(name: str, width: int, height: int, seed: int) -> None:
     fmt = PIXEL_FORMATS[name]

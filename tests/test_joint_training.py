@@ -21,6 +21,8 @@ pytest.importorskip("embreex")
 pytest.importorskip("lightning_fabric")
 pytest.importorskip("tensorboard")
 
+from test_training import die_at
+
 from polsep.io.store.weights import read_weights, write_weights
 from polsep.metrics import psnr
 from polsep.networks.channels import INPUTS
@@ -630,14 +632,6 @@ def test_a_mono_training_from_colour_weights_fits_its_own_filter(tmp_path: Path,
     arrays, metadata = read_weights(train_weights(mono, planned, lambda _: None))
     assert metadata["colors"] == "1"
     assert not np.array_equal(arrays["demosaic"], bilinear_filter(MONO).half().float().numpy())
-
-
-def die_at(step: int) -> Callable[[dict[str, Any]], None]:
-    def stop(line: dict[str, Any]) -> None:
-        if line["step"] == step:
-            raise KeyboardInterrupt
-
-    return stop
 
 
 def test_resumed_training_ends_with_the_same_bits(tmp_path: Path, shortened: None, monkeypatch: Any) -> None:

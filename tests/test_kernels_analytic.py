@@ -21,13 +21,7 @@ from polsep.compute.threads import get_threads, set_threads
 from polsep.demosaic.bilinear import demosaic_bilinear, demosaic_bilinear_half
 from polsep.demosaic.bilinear_kernel import clip_code
 from polsep.io.raw.genicam import pack_frame
-from polsep.kernels import (
-    AnalyticImages,
-    AnalyticOptions,
-    PackedFrame,
-    separate_analytic_full,
-    separate_analytic_half,
-)
+from polsep.kernels import AnalyticImages, AnalyticOptions, PackedFrame, separate_analytic_full, separate_analytic_half
 from polsep.methods import compose
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import BAYER_ORDERS, CLIP_MARGIN, Layout, Mosaic

@@ -21,13 +21,7 @@ from torch import Tensor
 
 from evaluation.material import novel_lights, score_failure, score_maps, score_relit
 from polsep.cli.app import main
-from polsep.io.assets.materials import (
-    encode_glb,
-    encode_materialx,
-    metallic_maps,
-    specular_scale,
-    texture_pixels,
-)
+from polsep.io.assets.materials import encode_glb, encode_materialx, metallic_maps, specular_scale, texture_pixels
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.exr import read_exr_layers
 from polsep.io.results.previews import srgb

@@ -9,15 +9,7 @@ import pytest
 import torch
 
 from polsep.material.heights import KINDS, random_place, random_relief
-from polsep.material.procedural import (
-    METAL_SHARE,
-    REFLECTANCES,
-    SLOPES,
-    TARNISH,
-    halve,
-    random_svbrdf,
-    rms_slope,
-)
+from polsep.material.procedural import METAL_SHARE, REFLECTANCES, SLOPES, TARNISH, halve, random_svbrdf, rms_slope
 from polsep.material.shots import (
     AROUND,
     FLASH,

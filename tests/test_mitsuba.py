@@ -13,14 +13,7 @@ from tolerances import MITSUBA, assert_within
 from torch import Tensor
 
 from polsep.physics.fresnel import ETA
-from polsep.physics.optics import (
-    Geometry,
-    beam_frame,
-    diffuse_stokes,
-    dot,
-    normalize,
-    specular_stokes,
-)
+from polsep.physics.optics import Geometry, beam_frame, diffuse_stokes, dot, normalize, specular_stokes
 
 mi = pytest.importorskip("mitsuba")
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tolerances import PRINTED, QUADRATURE, ROUNDING, assert_close, assert_finite, assert_same_angle, assert_within
 from torch import Tensor
 
-from polsep.physics.fresnel import ETA, diffuse_dolp, fresnel
+from polsep.physics.fresnel import ETA, Fresnel, diffuse_dolp, fresnel
 from polsep.physics.optics import (
     Beam,
     Geometry,
@@ -27,10 +27,6 @@ from polsep.physics.optics import (
     dot,
     double_angle,
     ggx_distribution,
-    mueller_diffuse,
-    mueller_polarizer,
-    mueller_reflection,
-    mueller_rotator,
     normalize,
     smith_shadowing,
     specular_stokes,
@@ -402,6 +398,30 @@ def azimuth(v: Tensor, beam: Beam) -> Tensor:
     return torch.atan2(dot(v, beam.y), dot(v, beam.x))[0, :, 0]
 
 
+def matrix_of(rows: list[list[Tensor]]) -> Tensor:
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def mueller_rotator(angle: Tensor) -> Tensor:
+    """C(t) ``[..., 4, 4]``: turns the frame of a Stokes vector by ``+angle`` [rad]. Source: Baek et al. 2018."""
+    c, s, zero, one = torch.cos(2 * angle), torch.sin(2 * angle), torch.zeros_like(angle), torch.ones_like(angle)
+    return matrix_of([[one, zero, zero, zero], [zero, c, s, zero], [zero, -s, c, zero], [zero, zero, zero, one]])
+
+
+def mueller_reflection(f: Fresnel) -> Tensor:
+    """Fresnel reflection ``[..., 4, 4]`` in the frame whose x axis is s (perpendicular to the plane of incidence)."""
+    plus, minus, cross, zero = f.r_plus, f.r_minus, f.r_cross, torch.zeros_like(f.r_plus)
+    linear = [[plus, minus, zero, zero], [minus, plus, zero, zero]]
+    return matrix_of([*linear, [zero, zero, cross, zero], [zero, zero, zero, cross]])
+
+
+def mueller_diffuse(out: Fresnel, into: Fresnel) -> Tensor:
+    """Transmission in, complete depolarization, transmission out: ``[..., 4, 4]`` in the s frames of both beams."""
+    zero = torch.zeros_like(out.t_plus)
+    rows = [[t * into.t_plus, t * into.t_minus, zero, zero] for t in (out.t_plus, out.t_minus)]
+    return matrix_of([*rows, [zero] * 4, [zero] * 4])
+
+
 def through_mueller(matrix: Tensor, g: Geometry, facet: Tensor, nu: Tensor) -> Tensor:
     """Stokes vectors [4, N] of polarized light of intensity 1 behind C(-(az_o + pi/2)) F C(az_i + pi/2)."""
     camera, light = beam_frame(g.to_camera, g.camera_up), beam_frame(-g.to_light, g.light_up)
@@ -630,39 +650,7 @@ def test_zero_vectors_stay_zero_with_finite_gradients() -> None:
         assert_finite(*torch.autograd.grad(unit_vector.sum(), v))
 
 
-# -------------------------------------------------------------------------------------------------------- polarizer
-
-
-@given(angle=st.floats(-4, 4), phi=st.floats(-4, 4))
-def test_ideal_polarizer(angle: float, phi: float) -> None:
-    """An ideal polarizer obeys Malus, sends out light along its axis, and twice is the same as once."""
-    matrix = mueller_polarizer(torch.tensor(angle, dtype=torch.float64))
-    light = torch.tensor([1, math.cos(2 * phi), math.sin(2 * phi), 0], dtype=torch.float64)
-    passed = math.cos(angle - phi) ** 2
-    axis = torch.tensor([1, math.cos(2 * angle), math.sin(2 * angle), 0], dtype=torch.float64)
-    assert_close(matrix @ light, passed * axis)
-    assert_close(matrix @ torch.tensor([1, 0, 0, 0], dtype=torch.float64), 0.5 * axis)
-    assert_close(matrix @ matrix, matrix)
-
-
-@given(angle=st.floats(-4, 4), ratio=st.floats(1, 1e6))
-def test_real_polarizer(angle: float, ratio: float) -> None:
-    """The diattenuation of an extinction ratio gives that ratio along and across, and half of natural light."""
-    d = (ratio - 1) / (ratio + 1)
-    matrix = mueller_polarizer(torch.tensor(angle, dtype=torch.float64), d)
-    through = [
-        (matrix @ torch.tensor([1, math.cos(2 * t), math.sin(2 * t), 0], dtype=torch.float64))[0].item()
-        for t in (angle, angle + math.pi / 2)
-    ]
-    assert through[0] == pytest.approx(ratio / (ratio + 1), rel=1e-12)
-    assert through[1] == pytest.approx(1 / (ratio + 1), rel=1e-8, abs=1e-15)
-    assert matrix[0, 0].item() == 0.5
-
-
-def test_no_polarizer_at_zero_diattenuation() -> None:
-    """With D = 0 every state passes at half its intensity."""
-    matrix = mueller_polarizer(torch.tensor(0.7, dtype=torch.float64), 0.0)
-    assert_close(matrix, 0.5 * torch.eye(4, dtype=torch.float64))
+# --------------------------------------------------------------------------------------------------------- rotators
 
 
 @given(a=st.floats(-4, 4), b=st.floats(-4, 4))
@@ -672,3 +660,48 @@ def test_rotators_add_angles(a: float, b: float) -> None:
     assert_close(second @ first, mueller_rotator(torch.tensor(a + b, dtype=torch.float64)))
     assert_close(mueller_rotator(torch.tensor(a + math.pi, dtype=torch.float64)), first)
     assert_close(first[1:3, 1:3] @ torch.tensor([math.cos(2 * a), math.sin(2 * a)], dtype=torch.float64), [1.0, 0.0])
+
+
+# ---------------------------------------------------------------------------------------- reciprocity of the matrix
+
+
+def mueller(lobe: Callable[..., Stokes], g: Geometry, extra: Tensor) -> Tensor:
+    """The matrix ``[3, 3, N]`` from linear light to linear light, per irradiance perpendicular to the surface.
+
+    Its columns come from light behind polarizers at 0, 45 and 90 degrees: (1, 1, 0), (1, 0, 1) and (1, -1, 0).
+    """
+    along, diagonal, across = (
+        torch.stack([s.s0, s.s1, s.s2])[:, 0, :, 0] / dot(g.normal, g.to_light)[0, :, 0]
+        for s in (lobe(g, scalar(t), scalar(1.0), extra) for t in (0.0, math.pi / 4, math.pi / 2))
+    )
+    unpolarized = (along + across) / 2
+    return torch.stack([unpolarized, (along - across) / 2, diagonal - unpolarized], dim=1)
+
+
+@pytest.mark.parametrize("lobe", [diffuse_stokes, specular_stokes])
+def test_exchanged_camera_and_light_transpose_the_matrix(
+    lobe: Callable[..., Stokes], generator: torch.Generator
+) -> None:
+    """M back = F M^T F: the x axis of a beam's frame turns round with the beam, so F = diag(1, 1, -1).
+
+    Source: van de Hulst 1957, Light Scattering by Small Particles, 5.22; de Hoop 1960.
+    """
+    g = random_geometry(400, generator)
+    back = Geometry(g.normal, g.to_light, g.to_camera, g.light_up, g.camera_up)
+    flip = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    there, again = mueller(lobe, g, scalar(0.6)), mueller(lobe, back, scalar(0.6))
+    expected = torch.einsum("ij,kjn,kl->iln", flip, there, flip)
+    assert float((there - there.transpose(0, 1)).abs().max()) > 1e-3
+    assert_close(again, expected, scale=float(there.abs().max()))
+
+
+@pytest.mark.parametrize("lobe", [diffuse_stokes, specular_stokes])
+def test_no_light_is_polarized_beyond_its_power(lobe: Callable[..., Stokes], generator: torch.Generator) -> None:
+    """Every linear state goes in, and what comes out has a DoLP of at most 1 and a power not below 0."""
+    matrix = mueller(lobe, random_geometry(400, generator), scalar(0.6))
+    angles = torch.linspace(0, 2 * math.pi, 13, dtype=torch.float64)
+    for degree in (0.0, 0.5, 1.0):
+        light = torch.stack([torch.ones_like(angles), degree * angles.cos(), degree * angles.sin()])
+        s0, s1, s2 = torch.einsum("ijn,jk->ikn", matrix, light)
+        assert float(s0.min()) >= -1e-12
+        assert bool((torch.hypot(s1, s2) <= s0 + 1e-12 * float(s0.max())).all())

@@ -6,14 +6,7 @@ import pytest
 import torch
 
 from polsep.physics.stokes import Stokes
-from polsep.render.sensor_errors import (
-    SensorErrors,
-    add_defects,
-    cross_talk,
-    encode_gamma,
-    record,
-    vary_gains,
-)
+from polsep.render.sensor_errors import SensorErrors, add_defects, cross_talk, encode_gamma, record, vary_gains
 from polsep.render.simulate import filter_light
 from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
 

@@ -23,6 +23,7 @@ from polsep.physics.stokes import (
     fit_stokes,
     flip_horizontal,
     flip_vertical,
+    intensity_behind,
     measure,
     transpose,
 )
@@ -32,6 +33,7 @@ from polsep.separation.analytic import Separation, light_polarizer_angle, separa
 from polsep.separation.closed_form import MAX_DIFFUSE_DOLP, white_specular
 from polsep.separation.color_affine import separate_color_affine
 from polsep.separation.images import Tally
+from polsep.separation.multi_capture import separate_debevec2000, separate_ding2021, separate_extremes
 from polsep.separation.report import dominant_angle, in_light, tally, under_white_light
 
 SONY = tuple(math.radians(t) for t in (0, 45, 90, 135))
@@ -473,3 +475,61 @@ def test_gradients_are_finite_where_there_is_light() -> None:
     found = separate_color_affine(Measurements(data, SONY))
     (found.diffuse.square().sum() + found.specular.sum()).backward()
     assert_finite(data.grad)
+
+
+# ---------------------------------------------------------------------------------------------- more than one capture
+
+
+def two_lobes(specular_angle: float, beta: float = 0.0, seed: int = 0) -> tuple[Stokes, torch.Tensor, torch.Tensor]:
+    """Diffuse light polarized by ``beta`` along 0 and specular light at an angle [rad]; with both s0."""
+    generator = torch.Generator().manual_seed(seed)
+    diffuse, specular = torch.rand(2, 3, 6, 7, generator=generator, dtype=torch.float64)
+    s1 = beta * diffuse + math.cos(2 * specular_angle) * specular
+    return Stokes(diffuse + specular, s1, math.sin(2 * specular_angle) * specular), diffuse, specular
+
+
+def test_debevec_is_exact_for_unpolarized_diffuse_light() -> None:
+    stokes, diffuse, specular = two_lobes(0.4)
+    found = separate_debevec2000(intensity_behind(stokes, 0.4), intensity_behind(stokes, 0.4 + math.pi / 2))
+    assert_close(found.diffuse, diffuse)
+    assert_close(found.specular, specular)
+    assert_close(found.stokes.s0, stokes.s0)
+
+
+@pytest.mark.parametrize("degrees", [5.0, 20.0])
+def test_debevec_loses_the_cosine_of_twice_the_error(degrees: float) -> None:
+    stokes, diffuse, specular = two_lobes(math.radians(degrees))
+    found = separate_debevec2000(intensity_behind(stokes, 0.0), intensity_behind(stokes, math.pi / 2))
+    assert_close(found.specular, specular * math.cos(2 * math.radians(degrees)))
+    assert_close(found.diffuse, diffuse + specular * (1 - math.cos(2 * math.radians(degrees))))
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.2])
+def test_ding_is_exact_for_polarized_diffuse_light(beta: float) -> None:
+    """Light turned by 90 degrees turns the sign of the specular polarization and leaves the diffuse as it is."""
+    first, diffuse, specular = two_lobes(0.3, beta)
+    second, _, _ = two_lobes(0.3 + math.pi / 2, beta)
+    found = separate_ding2021(measure(first, SONY), measure(second, SONY))
+    assert_close(found.diffuse, diffuse)
+    assert_close(found.specular, specular)
+
+
+def test_extremes_are_analytic_at_the_analysers_angles() -> None:
+    for angle in SONY:
+        seen = measure(two_lobes(angle)[0], SONY)
+        assert_close(separate_extremes(seen).specular, separate_analytic(seen).specular)
+    between = measure(two_lobes(math.radians(22.5))[0], SONY)
+    expected = separate_analytic(between).specular * math.cos(math.pi / 4)
+    assert_close(separate_extremes(between).specular, expected)
+
+
+def test_outputs_are_never_negative_and_clipping_is_flagged() -> None:
+    data = torch.rand(4, 3, 6, 7, generator=torch.Generator().manual_seed(2))
+    clipped = torch.zeros_like(data, dtype=torch.bool)
+    clipped[1, 2, 3, 4] = True
+    one, other = Measurements(data, SONY, clipped), Measurements(data.flip(0), SONY)
+    for found in (separate_ding2021(one, other), separate_extremes(one), separate_debevec2000(data[0], data[2])):
+        assert_finite(found.diffuse, found.specular)
+        assert float(torch.minimum(found.diffuse, found.specular).min()) >= 0
+    assert not bool(separate_ding2021(one, other).valid[3, 4])
+    assert int((~separate_extremes(one).valid).sum()) == 1

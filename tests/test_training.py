@@ -39,26 +39,14 @@ from polsep.networks.sizes import Size
 from polsep.physics.stokes import Stokes, measure
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.train import digest
-from polsep.train.command import (
-    Options,
-    TrainOptions,
-    choose_options,
-    describe_command,
-    plan_run,
-    train_weights,
-)
+from polsep.train.command import Options, TrainOptions, choose_options, describe_command, plan_run, train_weights
 from polsep.train.digest import digest_examples, find_sources
 from polsep.train.inputs import LadderInputs, co_sited_inputs, demosaic_lit, mono_inputs, mosaic_inputs
 from polsep.train.log import open_log, read_log
 from polsep.train.loop import Run, Schedule, Training, run_training, train
 from polsep.train.losses import FIRST_WEIGHT, first_specular_loss
 from polsep.train.stream import Examples, StreamOptions, stream_lane
-from polsep.train.tasks import (
-    FIRST_SHARE,
-    VARIANTS,
-    Task,
-    ladder_task,
-)
+from polsep.train.tasks import FIRST_SHARE, VARIANTS, Task, ladder_task
 from polsep.train.validation import score, score_averaged, score_references, validation_batches
 
 STREAM = StreamOptions(batch=2, crop=32, size=64, pool=2, uses=1)
@@ -490,11 +478,7 @@ def test_without_tensorboard_the_extra_is_named(
     ],
 )
 def test_bad_options_are_one_line_and_leave_nothing(
-    asked: list[str],
-    said: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    asked: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("a-file").touch()

@@ -611,7 +611,7 @@ def test_edits_are_shown_small_and_written_large(sessions: Sessions) -> None:
     found = opened(sessions)
     page = sessions.find("a")
     recipe = Recipe((Rougher(sigma=4.0), Metallic(amount=0.5)))
-    assert at_scale(recipe, 2).edits == (Rougher(sigma=2.0), Metallic(amount=0.5))
+    assert [at_scale(edit, 2) for edit in recipe.edits] == [Rougher(sigma=2.0), Metallic(amount=0.5)]
     page.edit(recipe)
     assert page.shown is not None and page.shown.edited is not None
     np.testing.assert_array_equal(page.shown.edited, edit_small(found.small, recipe))

@@ -39,8 +39,14 @@ for method in sys.argv[2].split(","):
 angles = np.random.default_rng(0).integers(100, 4096, (4, 32, 48, 3)).astype(np.uint16)
 from polsep.pipeline import separate_capture
 from polsep.sensor.levels import as_measurements
+from polsep.separation.analytic import separate_analytic_unclipped
+from polsep.separation.multi_capture import separate_ding2021, separate_extremes
+seen = as_measurements(angles, 0, 4095)[0]
+assert seen.clipped.any()
 for method in ("analytic", "color-affine", "paper"):
-    assert separate_capture(as_measurements(angles, 0, 4095)[0], method).diffuse.shape == (32, 48, 3)
+    assert separate_capture(seen, method).diffuse.shape == (32, 48, 3)
+for found in (separate_ding2021(seen, seen), separate_extremes(seen), separate_analytic_unclipped(seen)):
+    assert np.isfinite(found.diffuse + found.specular).all()
 slow = {"array_api_compat.numpy", "numpy.f2py"}  # a tenth of a second together, for nothing
 print(sorted(name for name in sys.modules if name.partition(".")[0] == "torch" or name in slow))
 """
@@ -60,7 +66,7 @@ def run(program: str, *words: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize("torch", ["blocked", "installed"])
 def test_every_method_separates(torch: str) -> None:
-    """Colour, mono and cropped mosaics at both resolutions, and co-sited samples; torch stays where it is."""
+    """Colour, mono and cropped mosaics at both resolutions, and co-sited samples, some of them clipped; torch stays."""
     done = run(SEPARATE, torch, ",".join(METHODS))
     assert done.stdout == "[]\n", done.stderr
 

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -75,7 +75,7 @@ def measure(device: str, capture: Mosaic, methods: tuple[str, ...] = MEASURED) -
             if name in NAMES:
                 yield from _precision_rows(method, task, case)
             if name in COMPILED:
-                with settings(run.State, "compiled", True):
+                with patch.object(run.State, "compiled", True):
                     for metric, rate in _rates(method, task):
                         if run.State.compiled:  # else that failed, which was said
                             yield Row("gpu", case, name, f"{metric}, compiled", rate, "frames/s")
@@ -119,7 +119,7 @@ def _precision_rows(method: Method, task: Task, case: str) -> Iterator[Row]:
     """Rows of layers in float32, and of what the images differ."""
     here = move_capture(task.frame, task.device)
     found = method.run(here, task.light, task.full)
-    with settings(run, "LAYERS", {}):
+    with patch.object(run, "LAYERS", {}):
         for metric, rate in _rates(method, task):
             yield Row("gpu", case, method.name, f"{metric}, float32", rate, "frames/s")
         exact = method.run(here, task.light, task.full)
@@ -127,17 +127,6 @@ def _precision_rows(method: Method, task: Task, case: str) -> Iterator[Row]:
         apart = to_numpy(getattr(found, name)).astype(np.float64) - to_numpy(getattr(exact, name))
         noise = max(float(np.mean(apart**2)), 1e-30)
         yield Row("gpu", case, method.name, f"{name} PSNR of float16 layers", -10 * np.log10(noise), "dB")
-
-
-@contextmanager
-def settings(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """Inside, an attribute of a module or class has another value."""
-    before = getattr(owner, name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        setattr(owner, name, before)
 
 
 def _wait(device: str) -> None:

@@ -12,15 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from polsep.capture.sources import (
-    CameraError,
-    CameraInfo,
-    CameraLost,
-    CameraSettings,
-    FrameIds,
-    Loss,
-    SoftwareTrigger,
-)
+from polsep.capture.sources import CameraError, CameraInfo, CameraLost, CameraSettings, FrameIds, Loss, SoftwareTrigger
 from polsep.io.raw.recording import RawImage
 
 #: Buffers that Aravis fills while Python is busy: 1.6 s at 10 frames per second.

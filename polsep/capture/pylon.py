@@ -15,15 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from polsep.capture.sources import (
-    CameraError,
-    CameraInfo,
-    CameraLost,
-    CameraSettings,
-    FrameIds,
-    Loss,
-    SoftwareTrigger,
-)
+from polsep.capture.sources import CameraError, CameraInfo, CameraLost, CameraSettings, FrameIds, Loss, SoftwareTrigger
 from polsep.io.raw.recording import RawImage
 
 #: Buffers that pylon fills while Python is busy.

@@ -199,8 +199,9 @@ def add_options(*options: Decorator) -> Decorator:
     return decorate
 
 
-#: How raw frames are read and corrected; whole frames of the light's colour too.
-READING = add_options(LAYOUT, BLACK_LEVEL, WHITE_LEVEL, CALIBRATION, AMBIENT)
+#: How raw frames are corrected, and how they are read too; whole frames of the light's colour too.
+CORRECTING = add_options(BLACK_LEVEL, WHITE_LEVEL, CALIBRATION, AMBIENT)
+READING = add_options(LAYOUT, CORRECTING)
 LIT_READING = add_options(READING, LIGHT_COLOR)
 
 
@@ -226,12 +227,12 @@ def print_note(line: str) -> None:
     print(f"polsep: {printable(line)}", file=sys.stderr)
 
 
-def print_results(notes: Iterable[str], written: Iterable[Path]) -> None:
-    """Print notes for the user, then the files that were written."""
+def print_results(notes: Iterable[str], results: Iterable[object]) -> None:
+    """Print notes for the user, then a line for each result, such as a file that was written."""
     for note in notes:
         print_note(note)
-    for path in written:
-        print(path)
+    for result in results:
+        print(result)
 
 
 def said_command(program: str) -> str:
@@ -259,6 +260,19 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if not (x and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise ValueError(f"expected {option} WIDTHxHEIGHT like 2448x2048, found {text!r}")
     return int(width), int(height)
+
+
+def parse_numbers(
+    text: str, expected: str, fits: Callable[[tuple[float, ...]], bool] = lambda _: True
+) -> tuple[float, ...]:
+    """Numbers from text with commas. Raises ValueError, which says what was ``expected``, also where they don't fit."""
+    try:
+        found = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        found = None
+    if found is None or not fits(found):
+        raise ValueError(f"expected {expected}, found {text!r:.40}")
+    return found
 
 
 def check_read_options(options: Mapping[str, Any]) -> None:

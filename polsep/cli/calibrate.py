@@ -22,7 +22,8 @@ from polsep.cli.app import (
     Number,
     add_options,
     app,
-    print_note,
+    parse_numbers,
+    print_results,
     read_options,
     require_paths,
 )
@@ -130,9 +131,7 @@ def _measure(
 
     with show_progress(f"measuring {kind}"):
         line, notes = calibrate_files(files, read_options(options), output, kind, measure)
-    for note in notes:
-        print_note(note)
-    print(line)
+    print_results(notes, [line])
 
 
 @app.command()
@@ -160,19 +159,9 @@ def merge(files: tuple[Path, ...], output: Path, times: str | None, overwrite: b
     polsep merge exposures/*.tiff --times 1,4,16 --calibration rig.json -o merged.tiff
     """
     require_paths(*files)
-    exposure_times = _parse_times(times)
+    exposure_times = None if times is None else list(parse_numbers(times, "--times T,T,... like 1,4,16"))
     from polsep.calibrate.files import merge_files
 
     with show_progress("merging"):
         line, notes = merge_files(files, read_options(options), output, exposure_times, overwrite)
-    for note in notes:
-        print_note(note)
-    print(line)
-
-
-def _parse_times(text: str | None) -> list[float] | None:
-    """Exposure times from ``T,T,...``; None for None."""
-    try:
-        return None if text is None else [float(time) for time in text.split(",")]
-    except ValueError:
-        raise ValueError(f"expected --times T,T,... like 1,4,16, found {text!r:.40}") from None
+    print_results(notes, [line])

@@ -7,18 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from polsep.cli.app import (
-    AMBIENT,
-    CALIBRATION,
-    COUNT,
-    DIR,
-    FINITE,
-    POSITIVE,
-    Number,
-    app,
-    chosen_layout,
-    print_note,
-)
+from polsep.cli.app import AMBIENT, CALIBRATION, COUNT, DIR, FINITE, POSITIVE, Number, app, chosen_layout, print_note
 
 if TYPE_CHECKING:
     from polsep.capture.session import Status

@@ -20,6 +20,7 @@ from polsep.cli.app import (
     RATE,
     app,
     is_given,
+    parse_numbers,
     print_note,
     require_paths,
 )
@@ -210,17 +211,9 @@ def _given_edits(options: dict[str, Any]) -> Iterator[tuple[Any, dict[str, Any]]
                 raise ValueError(f"expected --{name} beside --{flags[next(iter(values))]}, found none")
             continue
         if first.kind == "color":
-            values[first.name] = _parse_color(name, values[first.name])
+            wanted = f"--{name} R,G,B like 0.8,0.1,0.05"
+            values[first.name] = parse_numbers(values[first.name], wanted, lambda color: len(color) == 3)
         yield kind, values if options["mask"] is None else {**values, "mask": options["mask"]}
-
-
-def _parse_color(name: str, text: str) -> tuple[float, ...]:
-    """Three numbers from ``R,G,B``."""
-    try:
-        red, green, blue = map(float, text.split(","))
-    except ValueError:
-        raise ValueError(f"expected --{name} R,G,B like 0.8,0.1,0.05, found {text!r}") from None
-    return red, green, blue
 
 
 def _save_recipe(recipe: Recipe, folder: Path, path: Path, overwrite: bool) -> None:

@@ -11,9 +11,7 @@ import click
 
 import polsep
 from polsep.cli.app import (
-    AMBIENT,
-    BLACK_LEVEL,
-    CALIBRATION,
+    CORRECTING,
     DEVICE,
     DIR,
     FILE,
@@ -23,7 +21,6 @@ from polsep.cli.app import (
     SIZE,
     STOKES,
     WEIGHTS,
-    WHITE_LEVEL,
     Word,
     app,
     check_read_options,
@@ -50,10 +47,7 @@ if TYPE_CHECKING:
     "--method", default="auto", metavar="NAME", help="Method, see 'polsep methods'; auto is the best one installed."
 )
 @click.option("--layout", metavar="color|mono|SPEC", default="color", help="Filter layout of the sensor; see above.")
-@BLACK_LEVEL
-@WHITE_LEVEL
-@CALIBRATION
-@AMBIENT
+@CORRECTING
 @LIGHT_COLOR
 @click.option(
     "--format",

@@ -97,14 +97,7 @@ def geometry(files: tuple[Path, ...], **options: Any) -> None:
     beside = [file.with_suffix(".json") for file in files if is_separated(file)]  # reports are read, too
     refuse_inputs(targets, [*files, *beside, *filter(None, [options["mask"]]), *correcting_files(options)])
     refuse_existing(options["output"], targets, options["overwrite"])
-    from polsep.geometry.files import (
-        ShapeOptions,
-        Source,
-        find_object,
-        find_shape,
-        read_views,
-        shrink,
-    )
+    from polsep.geometry.files import ShapeOptions, Source, find_object, find_shape, read_views, shrink
 
     shape_options = ShapeOptions(options["mesh"], options["fov"], options["integration"], options["turntable"])
     with show_progress("finding the shape"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from polsep.cli.app import (
     Number,
     app,
     correcting_files,
+    parse_numbers,
     print_results,
     read_light,
     read_options,
@@ -66,7 +68,9 @@ def material(files: tuple[str, ...], **options: Any) -> None:
     """
     require_extra("torch")
     require_paths(*files, *filter(None, [options["weights"]]))
-    white, read = _parse_white(options["white"]), read_options(options)
+    wanted, text = "--white N or N,N,... above 0, like 0.8", options["white"]
+    white = () if text is None else parse_numbers(text, wanted, lambda levels: all(0 < x < math.inf for x in levels))
+    read = read_options(options)
     from polsep.methods import check_method
 
     check_method(options["method"])
@@ -90,16 +94,3 @@ def material(files: tuple[str, ...], **options: Any) -> None:
     with show_progress("estimating the material"):
         written, notes = estimate_files(files, settings, options["output"], options["name"], options["overwrite"])
     print_results(notes, written)
-
-
-def _parse_white(text: str | None) -> tuple[float, ...]:
-    """Levels from ``N`` or ``N,N,...``; none for None."""
-    if text is None:
-        return ()
-    try:
-        levels = tuple(float(level) for level in text.split(","))
-    except ValueError:
-        levels = ()
-    if not levels or not all(0 < level < float("inf") for level in levels):
-        raise ValueError(f"expected --white N or N,N,... above 0, like 0.8, found {text!r:.40}")
-    return levels

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from polsep.cli.app import Number, Word, add_options, require_extra, require_paths
+from polsep.cli.app import Number, Word, add_options, parse_numbers, require_extra, require_paths
 
 if TYPE_CHECKING:
     from polsep.photographs import PhotoOptions
@@ -115,10 +115,4 @@ def _numbers(name: str, text: str) -> tuple[float, ...] | None:
     """Numbers from text with commas; None of ``unknown``. Raises ValueError."""
     if name == "angles" and text == "unknown":
         return None
-    try:
-        found = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        found = (math.nan,)
-    if not all(map(math.isfinite, found)):
-        raise ValueError(f"expected --{name} as numbers like 0,60,120, found {text!r:.40}")
-    return found
+    return parse_numbers(text, f"--{name} as numbers like 0,60,120", lambda found: all(map(math.isfinite, found)))

@@ -22,6 +22,7 @@ from polsep.cli.app import (
     Word,
     app,
     correcting_files,
+    parse_numbers,
     print_results,
     read_light,
     read_options,
@@ -96,7 +97,9 @@ def shape(file: Path, **options: Any) -> None:
     if options["turntable"]:
         require_extra("video")
     require_paths(file, *filter(None, [options["mask"], options["weights"]]))
-    lamp, light = _parse_lamp(options["lamp"]), read_light(options)
+    wanted = "--light x,y,z with z > 0, like 0.3,0.5,0.8, or auto"
+    lamp = None if options["lamp"] == "auto" else parse_numbers(options["lamp"], wanted, _is_toward_camera)
+    light = read_light(options)
     from polsep.io.assets.shapes import shape_targets, write_shape
     from polsep.io.raw.frames import output_stem
     from polsep.io.results.separation_reader import is_separated
@@ -124,14 +127,6 @@ def shape(file: Path, **options: Any) -> None:
     print_results(notes, targets)
 
 
-def _parse_lamp(text: str) -> tuple[float, ...] | None:
-    """A direction of ``x,y,z``; None for auto. Raises ValueError."""
-    if text == "auto":
-        return None
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError:
-        x = y = z = 0.0
-    if not z > 0 or not all(abs(part) < 1e9 for part in (x, y, z)):
-        raise ValueError(f"expected --light x,y,z with z > 0, like 0.3,0.5,0.8, or auto, found {text!r:.40}")
-    return (x, y, z)
+def _is_toward_camera(way: tuple[float, ...]) -> bool:
+    """True for a direction (x, y, z) of which z is above 0."""
+    return len(way) == 3 and way[2] > 0 and all(abs(part) < 1e9 for part in way)

@@ -63,10 +63,7 @@ OWN |= {"part": (*_JOINT, "shape"), "side": ("shape",), "meshes": ("shape",), "c
     help="material: unseparated, separated, perfect; shape: separated, stokes, rgb, perfect.",
 )
 @click.option(
-    "--examples",
-    type=COUNT,
-    metavar="N",
-    help="material, shape: number of training examples.  [default: 768, 3200]",
+    "--examples", type=COUNT, metavar="N", help="material, shape: number of training examples.  [default: 768, 3200]"
 )
 @click.option("--side", type=COUNT, default=96, metavar="PX", help="shape: side of the images that the network sees.")
 @click.option(

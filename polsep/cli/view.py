@@ -45,11 +45,7 @@ from polsep.cli.app import (
 @SIZE
 @PIXEL_FORMAT
 @click.option(
-    "--upload-limit",
-    type=COUNT,
-    default=240,
-    metavar="MB",
-    help="Largest size of files that are uploaded together.",
+    "--upload-limit", type=COUNT, default=240, metavar="MB", help="Largest size of files that are uploaded together."
 )
 def view(file: Path | None, host: str, port: int | None, opens: bool, upload_limit: int, **options: Any) -> None:
     """Open raw frames and results in the browser: compare, inspect, edit, download.

@@ -16,14 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
-from polsep.physics.stokes import (
-    Measurements,
-    analyser_residual,
-    complete_pair,
-    fit_stokes,
-    is_pair,
-    stokes_inverse,
-)
+from polsep.physics.stokes import Measurements, analyser_residual, complete_pair, fit_stokes, is_pair, stokes_inverse
 from polsep.sensor.camera import Layout, Mosaic
 
 Floats = NDArray[np.float32]

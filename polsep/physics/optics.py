@@ -1,4 +1,4 @@
-"""Surfaces and filters in polarized light: Mueller matrices, Fresnel, GGX, the polarimetric BRDF.
+"""Surfaces in polarized light: Fresnel, GGX, the polarimetric BRDF.
 
 Conventions:
 
@@ -169,51 +169,3 @@ def _mirror(g: Geometry, polarizer: Tensor, shading: Tensor, f: Fresnel) -> Stok
     c, s = ci * cn + si * sn, si * cn - ci * sn
     a, b = f.r_plus * c - f.r_minus, f.r_cross * s
     return Stokes(shading * (f.r_plus - f.r_minus * c), shading * (a * co + b * so), shading * (a * so - b * co))
-
-
-def mueller_rotator(angle: Tensor) -> Tensor:
-    """C(t) ``[..., 4, 4]``: turns the frame of a Stokes vector by ``+angle`` [rad]. Source: Baek et al. 2018."""
-    c, s, zero, one = torch.cos(2 * angle), torch.sin(2 * angle), torch.zeros_like(angle), torch.ones_like(angle)
-    return _matrix(
-        [[one, zero, zero, zero], [zero, c, s, zero], [zero, -s, c, zero], [zero, zero, zero, one]],
-    )
-
-
-def mueller_polarizer(angle: Tensor, diattenuation: float = 1.0) -> Tensor:
-    """Linear polarizer at ``angle`` [rad]; half of unpolarized light passes, D = (ER-1)/(ER+1). Goldstein, 5.3."""
-    d = torch.full_like(angle, diattenuation)
-    zero, one, root = torch.zeros_like(angle), torch.ones_like(angle), torch.sqrt(1 - d * d)
-    straight = 0.5 * _matrix(
-        [[one, d, zero, zero], [d, one, zero, zero], [zero, zero, root, zero], [zero, zero, zero, root]],
-    )
-    return mueller_rotator(-angle) @ straight @ mueller_rotator(angle)
-
-
-def mueller_reflection(f: Fresnel) -> Tensor:
-    """Fresnel reflection ``[..., 4, 4]`` in the frame whose x axis is s (perpendicular to the plane of incidence)."""
-    zero = torch.zeros_like(f.r_plus)
-    return _matrix(
-        [
-            [f.r_plus, f.r_minus, zero, zero],
-            [f.r_minus, f.r_plus, zero, zero],
-            [zero, zero, f.r_cross, zero],
-            [zero, zero, zero, f.r_cross],
-        ]
-    )
-
-
-def mueller_diffuse(out: Fresnel, into: Fresnel) -> Tensor:
-    """Transmission in, complete depolarization, transmission out: ``[..., 4, 4]`` in the s frames of both beams."""
-    zero = torch.zeros_like(out.t_plus)
-    return _matrix(
-        [
-            [out.t_plus * into.t_plus, out.t_plus * into.t_minus, zero, zero],
-            [out.t_minus * into.t_plus, out.t_minus * into.t_minus, zero, zero],
-            [zero, zero, zero, zero],
-            [zero, zero, zero, zero],
-        ]
-    )
-
-
-def _matrix(rows: list[list[Tensor]]) -> Tensor:
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)

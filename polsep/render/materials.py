@@ -14,14 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from polsep.render.textures import (
-    CHECKER,
-    DOTS,
-    MAX_OCTAVES,
-    RINGS,
-    Textures,
-    pattern_weight,
-)
+from polsep.render.textures import CHECKER, DOTS, MAX_OCTAVES, RINGS, Textures, pattern_weight
 
 #: Shares of near-grey, dark and very glossy slots, drawn independently.
 GREY_SHARE, DARK_SHARE, GLOSSY_SHARE = 0.25, 0.15, 0.1

@@ -19,15 +19,7 @@ from polsep.networks.unet import count_parameters
 from polsep.train.constants import list_constants
 from polsep.train.digest import digest_examples
 from polsep.train.inputs import JointInputs, LadderInputs
-from polsep.train.joint_task import (
-    ABLATIONS,
-    DEMOSAICKERS,
-    JOINT_VARIANTS,
-    PARTS,
-    SIZES,
-    freeze_others,
-    joint_task,
-)
+from polsep.train.joint_task import ABLATIONS, DEMOSAICKERS, JOINT_VARIANTS, PARTS, SIZES, freeze_others, joint_task
 from polsep.train.log import curve_of, read_log, references_of
 from polsep.train.loop import Run, hash_starts, train
 from polsep.train.tasks import VARIANTS, Task, find, ladder_task

@@ -20,13 +20,7 @@ from polsep.material.network import MaterialNetwork, MaterialSize
 from polsep.material.shots import Example
 from polsep.material.svbrdf import INPUTS, unstack
 from polsep.train.loop import Training
-from polsep.train.material_losses import (
-    maps_loss,
-    material_loss,
-    random_configurations,
-    rendering_loss,
-    slopes_loss,
-)
+from polsep.train.material_losses import maps_loss, material_loss, random_configurations, rendering_loss, slopes_loss
 from polsep.train.tasks import batch_generator, find
 
 #: Seed and numbers of validation's configurations: random ones and mirror ones.

@@ -93,7 +93,8 @@ def edit_small(small: Small, recipe: Recipe, maps: Maps | None = None) -> Floats
 
     Raises EditError.
     """
-    return apply(SeparatedImages(small.diffuse, small.specular), at_scale(recipe, small.step), maps).combined
+    shown = Recipe(tuple(at_scale(edit, small.step) for edit in recipe.edits))
+    return apply(SeparatedImages(small.diffuse, small.specular), shown, maps).combined
 
 
 def keep_fitting(small: Small, recipe: Recipe, maps: Maps) -> tuple[Recipe, tuple[str, ...]]:
@@ -101,7 +102,7 @@ def keep_fitting(small: Small, recipe: Recipe, maps: Maps) -> tuple[Recipe, tupl
     kept, remarks, images = [], [], SeparatedImages(small.diffuse, small.specular)
     for edit in recipe.edits:
         try:
-            _at_scale(edit, small.step).change(images, maps)
+            at_scale(edit, small.step).change(images, maps)
         except EditError as error:
             remarks.append(f"{edit.title} is left out: {error}")
         else:
@@ -109,11 +110,7 @@ def keep_fitting(small: Small, recipe: Recipe, maps: Maps) -> tuple[Recipe, tupl
     return Recipe(tuple(kept)), tuple(remarks)
 
 
-def at_scale(recipe: Recipe, step: int) -> Recipe:
-    """The recipe for images whose pixels are ``step`` pixels of the frame wide."""
-    return Recipe(tuple(_at_scale(edit, step) for edit in recipe.edits))
-
-
-def _at_scale(edit: Edit, step: int) -> Edit:
+def at_scale(edit: Edit, step: int) -> Edit:
+    """The edit of images whose pixels are ``step`` pixels of the frame wide."""
     lengths = {p.name: getattr(edit, p.name) / step for p in edit.parameters() if p.unit == "px"}
     return replace(edit, **lengths)

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from polsep.edit import EditError
-from polsep.io.assets.maps import SUFFIXES, read_map
+from polsep.io.assets.maps import read_map
 from polsep.io.store.errors import InputError
 from polsep.io.store.header_checks import at_most
-from polsep.view.opening import MAX_SAMPLES, plain_name
+from polsep.view.opening import MAX_SAMPLES
 from polsep.view.pictures import Floats, shrink
 
 #: Kinds of images, in the order of the page.
@@ -36,11 +36,6 @@ class EditImage:
     size: tuple[int, int]
     step: int
     small: Floats
-
-
-def image_name(name: str) -> tuple[str, str]:
-    """Stem and extension of an image's name, safe in any path. Raises InputError for other files."""
-    return plain_name(name, SUFFIXES, "an image as PNG, JPEG, TIFF, NPY or EXR")
 
 
 def read_image(kind: str, name: str, path: Path, frame: tuple[int, int], step: int) -> EditImage:

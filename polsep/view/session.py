@@ -47,11 +47,11 @@ class Session:
     """The state of one page. Its methods may be called from several threads; only separating takes long, and what is
     shown stays usable meanwhile.
 
-    ``kept`` and ``downloads`` are its own folders: for its files, and for results to download. ``opened`` is the frame
-    whose numbers and files the page has, ``against`` another separation of it that the right picture shows, ``shown``
-    what the page sees: the opened frame, or one that is being played. ``mark``: row and column as shares. ``view``:
-    what the pictures show, as last said; ``turn``: number of pictures that were begun, of which the last one counts.
-    ``dropped``: edits that did not fit the opened frame.
+    ``kept`` and ``downloads`` are its own folders: for its files, and for results to download. ``sources``: the opened
+    files. ``opened`` is the frame whose numbers and files the page has, ``against`` another separation of it that the
+    right picture shows, ``shown`` what the page sees: the opened frame, or one that is being played. ``mark``: row and
+    column as shares. ``view``: what the pictures show, as last said; ``turn``: number of pictures that were begun, of
+    which the last one counts. ``dropped``: edits that did not fit the opened frame.
     """
 
     def __init__(self, kept: Path, downloads: Path, ahead: Prefetcher) -> None:
@@ -70,7 +70,7 @@ class Session:
         self.recipe, self.dropped = Recipe(), tuple[Edit, ...]()
         self.images: dict[str, EditImage] = {}
         self._ahead, self._reel = ahead, Reel()
-        self._sources: tuple[Source, ...] = ()
+        self.sources: tuple[Source, ...] = ()
         self._read: tuple[tuple[Source, ...], ReadOptions, int, Frame | SeparatedFrame] | None = None
         self._settings: Settings | None = None
         self._made: list[tuple[tuple[Source, ...], Settings, OpenedFrame]] = []
@@ -80,12 +80,7 @@ class Session:
         """Open other files and drop the state of the ones before."""
         with self.lock:
             self._forget()
-            self._sources = sources
-
-    @property
-    def sources(self) -> tuple[Source, ...]:
-        """The opened files."""
-        return self._sources
+            self.sources = sources
 
     def begin_own(self, path: Path) -> None:
         """Open the user's file, or folder of separated frames. Raises InputError."""
@@ -98,7 +93,7 @@ class Session:
 
     def _forget(self) -> None:
         self._drop_reel()
-        self._sources, self.place, self.playing = (), 0, False
+        self.sources, self.place, self.playing = (), 0, False
         self._read = self.opened = self.against = self.shown = self.mark = self._settings = None
         self.window = self.sharp = self._edited_frame_of = None
         self._made = []
@@ -115,7 +110,7 @@ class Session:
         Raises ValueError, in one line that names the file, and Superseded if the result is not ``wanted`` at the end.
         """
         with self.lock:
-            sources = self._sources
+            sources = self.sources
         if not sources:
             raise ValueError("expected an opened file, found none: choose one, or the demo capture")
         found = self._find(sources, settings)
@@ -125,7 +120,7 @@ class Session:
             other = found if against == settings else self._find(sources, against)
             made += [(sources, against, other)] if other is not found else []
         with self.lock:
-            if self._sources is not sources or not wanted():
+            if self.sources is not sources or not wanted():
                 raise Superseded
             self.dropped = ()
             if self.opened is not None and settings == self._settings:
@@ -152,7 +147,7 @@ class Session:
 
     def made(self, settings: Settings, sources: tuple[Source, ...] | None = None) -> OpenedFrame | None:
         """The frame of these files, or the opened ones, with these settings, if it was made before."""
-        files = self._sources if sources is None else sources
+        files = self.sources if sources is None else sources
         return next((found for of, made, found in self._made if of is files and made == settings), None)
 
     def _frame(self, sources: tuple[Source, ...], settings: Settings) -> Frame | SeparatedFrame:
@@ -231,7 +226,7 @@ class Session:
             if found is None or settings is None or found.count < 2:
                 raise ValueError("expected a sequence to play, found none")
             places = [(self.place + 1 + k) % found.count for k in range(min(AHEAD, found.count))]
-            sources = self._sources
+            sources = self.sources
             self._ahead.want(self._reel, places, lambda place: open_small(sources, replace(settings, index=place)))
             small = self._ahead.frame(self._reel, places[0])
             if small is None:

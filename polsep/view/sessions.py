@@ -7,6 +7,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 
+from polsep.io.assets.maps import SUFFIXES
 from polsep.io.raw.frames import output_stem
 from polsep.io.raw.sequences import natural_order
 from polsep.io.store.errors import InputError
@@ -20,7 +21,6 @@ from polsep.io.store.temporary import (
     remove_file,
     remove_folder,
 )
-from polsep.view.images import image_name
 from polsep.view.opening import Source, as_source, group_angles, plain_name
 from polsep.view.playback import Prefetcher
 from polsep.view.session import Session
@@ -105,7 +105,7 @@ class Sessions:
         The image before it stays until the new one is read.
         """
         path = find_upload(self.scratch, claimed, self.most_bytes)
-        said = image_name(name)
+        said = plain_name(name, SUFFIXES, "an image as PNG, JPEG, TIFF, NPY or EXR")
         session = self.find(key)
         folder = make_folder(session.kept, random_name())
         try:

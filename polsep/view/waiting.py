@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 
@@ -87,6 +87,3 @@ class Line:
         finally:
             with self._lock:
                 self._tickets.remove(ticket)
-
-
-__all__ = ["CancelledError", "Line", "Ticket"]

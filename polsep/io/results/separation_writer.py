@@ -30,13 +30,7 @@ from numpy.typing import NDArray
 from polsep import __version__
 from polsep.io.results.exr import LARGEST_HALF, as_planes, write_exr
 from polsep.io.results.previews import contact_sheet
-from polsep.io.results.sidecars import (
-    EncodedFile,
-    exr_notes,
-    require_finite,
-    require_stem,
-    write_with_sidecar,
-)
+from polsep.io.results.sidecars import EncodedFile, exr_notes, require_finite, require_stem, write_with_sidecar
 from polsep.io.store.atomic import OutputError, refuse_existing
 from polsep.io.store.image_codecs import encode_png, encode_png_quickly
 

@@ -26,14 +26,7 @@ from polsep.compute.arguments import WrongType
 from polsep.io.store.atomic import OutputError, replace_bytes, replace_text
 from polsep.io.store.errors import InputError, as_path, decoding, naming
 from polsep.io.store.header_checks import SAMPLES, limit
-from polsep.io.store.json_text import (
-    entry_of,
-    number_of,
-    numbers_of,
-    read_record,
-    section_of,
-    table_of,
-)
+from polsep.io.store.json_text import entry_of, number_of, numbers_of, read_record, section_of, table_of
 from polsep.sensor.calibration import Analyser, Calibration, LampFacts
 from polsep.sensor.camera import Layout
 

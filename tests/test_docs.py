@@ -139,7 +139,7 @@ def test_the_site_names_every_page() -> None:
     """The navigation of mkdocs.yml has every page of docs exactly once, and nothing else."""
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:\n")[2]
     named = re.findall(r"([\w/-]+\.md)$", navigation, re.MULTILINE)
-    assert sorted(named) == [page.relative_to(ROOT / "docs").as_posix() for page in DOCS]
+    assert sorted(named) == sorted(page.relative_to(ROOT / "docs").as_posix() for page in DOCS)
 
 
 def test_contributing_has_the_ranks_of_the_architecture() -> None:

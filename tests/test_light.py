@@ -16,6 +16,7 @@ from polsep.light.color import axis_of, iterate, planes_along
 from polsep.light.color_kernel import iterate_fast
 from polsep.light.find import (
     ANY_SHARE,
+    LED_SHARE,
     RAW_LAMPS,
     RAW_SHARE,
     SURE_DEG,
@@ -172,6 +173,13 @@ def test_the_likely_lamp_follows_the_evidence() -> None:
     assert np.hypot(*(found - tungsten)) < min(np.hypot(*tungsten), np.hypot(*(body - tungsten))) and error > 5
 
 
+@pytest.mark.parametrize("light", [(1.0, 0.6, 0.05), (1.0, 0.06, 0.02), (0.1, 1.0, 0.2)])
+def test_saturated_lamps_are_found(light: tuple[float, ...]) -> None:
+    """Amber, red and green LEDs: a fit of clear highlights counts more than that such lamps are rare."""
+    found = find_light(frame(light=light))
+    assert angle_between(found.color, light) < 1.5 and found.sure and found.remarks == ()
+
+
 def test_rare_lamps_are_found_with_less_certainty() -> None:
     """A bulb after a balance for daylight is off by less than is said, which is more than of a usual lamp."""
     rare = (1.6, 1.0, 0.45)
@@ -192,10 +200,11 @@ def test_light_of_one_channel_has_a_color(channel: int) -> None:
 
 
 def test_chances_of_lamps_add_up() -> None:
-    """Over the grid, but for lamps beyond it, the shares of lamps that are not white."""
+    """Over the grid, but for lamps beyond it, as most saturated ones are, the shares of lamps that are not white."""
     lamps, prior = _usual_lamps()
-    assert prior.sum() == pytest.approx(RAW_SHARE + WARM_SHARE + ANY_SHARE, abs=0.01)
-    assert prior.sum() + WHITE_SHARE == pytest.approx(1, abs=0.01)
+    usual = RAW_SHARE + WARM_SHARE + ANY_SHARE
+    assert usual - 0.01 < prior.sum() < usual + LED_SHARE
+    assert usual + LED_SHARE + WHITE_SHARE == pytest.approx(1, abs=1e-9)
     assert not (lamps[prior > prior.max() / 2] > RAW_LAMPS[:, 1] + 0.5).any()
 
 

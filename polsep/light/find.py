@@ -40,9 +40,10 @@ RAW_LAMPS = np.array([[-1.05, 0.13], [-1.35, 0.03]])
 #: Direction from cold to warm lamps after a white balance.
 WARM = np.array([0.524, -0.852])
 #: Chances of lamps before a frame is seen: white (balanced for the lamp); even among `RAW_LAMPS`, of soft edges; along
-#: `WARM` after another balance; any colour. Standard deviations of log-ratios along and beside `WARM`, of any colour.
-WHITE_SHARE, RAW_SHARE, WARM_SHARE, ANY_SHARE = 0.6, 0.27, 0.08, 0.05
-RAW_EDGE, WARM_SPREAD, ANY_SPREAD = 0.06, (0.5, 0.08), 0.5
+#: `WARM` after another balance; any colour; saturated, as coloured LEDs. Standard deviations of log-ratios along and
+#: beside `WARM`, of any colour, of saturated ones; log-ratio from which on a channel shows its noise, not the lamp.
+WHITE_SHARE, RAW_SHARE, WARM_SHARE, ANY_SHARE, LED_SHARE = 0.6, 0.27, 0.08, 0.03, 0.02
+RAW_EDGE, WARM_SPREAD, ANY_SPREAD, LED_SPREAD, LED_LIMIT = 0.06, (0.5, 0.08), 0.5, 1.5, 3.4
 #: Standard deviations of log-ratios: of the mean of a frame around its lamp, as bodies are coloured; of fits that went
 #: astray around the lamp; of the others, over their mean error [rad].
 BODIES_SPREAD, ASTRAY_SPREAD, GOOD_SPREAD = 1.0, 0.5, 2.03
@@ -284,7 +285,8 @@ def _prior_density(lamps: Doubles) -> Doubles:
     along, across = lamps @ WARM, lamps[:, 0] * WARM[1] - lamps[:, 1] * WARM[0]
     length, width = WARM_SPREAD
     warm = np.exp(-((along / length) ** 2 + (across / width) ** 2) / 2) / (2 * math.pi * length * width)
-    density: Doubles = RAW_SHARE * raw + WARM_SHARE * warm + ANY_SHARE * _normal(lamps, ANY_SPREAD)
+    led = (np.abs(lamps) < LED_LIMIT).all(axis=1) * _normal(lamps, LED_SPREAD)
+    density: Doubles = RAW_SHARE * raw + WARM_SHARE * warm + ANY_SHARE * _normal(lamps, ANY_SPREAD) + LED_SHARE * led
     return density
 
 

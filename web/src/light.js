@@ -11,7 +11,7 @@ const VOTE_ERROR = 0.0045, FREEDOM = 3.6, SPREAD = 0.5, STEPS = 15, LARGEST_STEP
 const SURE_DEG = 2.5, UNKNOWN_DEG = 20, ASTRAY = [[0.938, 0.02], [0.323, 0.1]], ASTRAY_LEAN = -0.674, ASTRAY_BIAS = 0.017;
 const RAW_LAMPS = [[-1.05, 0.13], [-1.35, 0.03]], RAW_EDGE = 0.06, WARM = [0.524, -0.852], WARM_SPREAD = [0.5, 0.08];
 const GOOD = [1.25 * Math.exp(0.28), 0.126, 0.563], UNCERTAIN_DEG = 5.5, LEAST_METAL = 0.02;
-const WHITE_SHARE = 0.6, RAW_SHARE = 0.27, WARM_SHARE = 0.08, ANY_SHARE = 0.05, ANY_SPREAD = 0.5;
+const WHITE_SHARE = 0.6, RAW_SHARE = 0.27, WARM_SHARE = 0.08, ANY_SHARE = 0.03, ANY_SPREAD = 0.5, LED_SHARE = 0.02, LED_SPREAD = 1.5, LED_LIMIT = 3.4;
 const BODIES_SPREAD = 1, ASTRAY_SPREAD = 0.5, GOOD_SPREAD = 2.03, LIKELY_WHITE = 0.5, LIKELY_RIGHT = 0.5, GRID = [-1.5, 0.8, 47];
 const LARGEST_RATIO = 5;
 const GREENISH = -1.2, PURE_SPECULAR = 1, MIN_SPECULAR_TILES = 3, METAL_DISTANCE = 0.28;
@@ -274,7 +274,8 @@ function priorDensity(x) {
   const raw = RAW_LAMPS.reduce((all, [least, most], k) => (all * (soft(x[k] - least) - soft(x[k] - most))) / 2 / (most - least), 1);
   const along = x[0] * WARM[0] + x[1] * WARM[1], across = x[0] * WARM[1] - x[1] * WARM[0];
   const warm = Math.exp(-((along / length) ** 2 + (across / width) ** 2) / 2) / (2 * Math.PI * length * width);
-  return RAW_SHARE * raw + WARM_SHARE * warm + ANY_SHARE * normal(x, [0, 0], ANY_SPREAD);
+  const led = x.every((v) => Math.abs(v) < LED_LIMIT) ? normal(x, [0, 0], LED_SPREAD) : 0;
+  return RAW_SHARE * raw + WARM_SHARE * warm + ANY_SHARE * normal(x, [0, 0], ANY_SPREAD) + LED_SHARE * led;
 }
 
 /** Mean angle [degrees] by which fits like this one are off that were not led astray; the chance that it was. */

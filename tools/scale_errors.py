@@ -1,11 +1,11 @@
 """``python -m tools.scale_errors METHOD...``: scale what the networks of colour methods expect of their errors.
 
 A network learns its expected errors while its images still improve, and images of several networks are better than
-each, so both expect too much. The factors are those that a median of validation frames asks for: rendered objects
-under disturbances of `datasets.reality` with the light stated, where nothing clips, in tenths of the pixels by their
-expected errors. They go into the last bias of the expected errors in ``polsep/weights/METHOD-mosaic.safetensors``; the
-images of that network stay. Run it for `joint` before `joint-large`, which combines both. (Guo et al. 2017, arXiv
-1706.04599, scale a classifier's logits in the same way.)
+each, so both expect too much. The factor is what the median over validation frames asks for: rendered objects under
+disturbances of `datasets.reality` with the light stated, where nothing clips, in tenths of the pixels by their expected
+errors. It is the same for all methods that are named, so networks that weigh each other's images by these errors go on
+to do so in the same way. It goes into the last bias of the expected errors in ``polsep/weights/METHOD-mosaic``; images
+of that network stay. (Guo et al. 2017, arXiv 1706.04599, scale a classifier's logits in the same way.)
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Iterator
 
 import click
 import numpy as np
@@ -44,16 +43,13 @@ DISTURBANCES = (
 GROUPS, NEAR = 10, 4
 
 
-def curves(method: str) -> Iterator[tuple[str, list[float], list[float]]]:
-    """Name of a disturbance, and log2(found / expected) of the tenths of both images' pixels, all frames together."""
-    stages = [reality.build_stage("validation", number, SIZE) for number in STAGES]
-    for name in DISTURBANCES:
-        parts = [_errors_of(reality.DISTURBANCES[name](stage), method) for stage in stages]
-        error, expected = (torch.cat(x, dim=-1) for x in zip(*parts, strict=True))
-        whole = torch.ones(1, error.shape[-1], dtype=torch.bool)
-        found = [reliability(error[k], expected[k, None], whole, GROUPS) for k in range(2)]
-        diffuse, specular = (torch.log2(curve.found / curve.expected).tolist() for curve in found)
-        yield name, diffuse, specular
+def log_ratios(stages: list[reality.Stage], disturbance: str, method: str) -> list[list[float]]:
+    """log2(found / expected) of the tenths of the pixels of all frames together, for diffuse and for specular."""
+    parts = [_errors_of(reality.DISTURBANCES[disturbance](stage), method) for stage in stages]
+    error, expected = (torch.cat(x, dim=-1) for x in zip(*parts, strict=True))
+    whole = torch.ones(1, error.shape[-1], dtype=torch.bool)
+    found = [reliability(error[k], expected[k, None], whole, GROUPS) for k in range(2)]
+    return [torch.log2(curve.found / curve.expected).tolist() for curve in found]
 
 
 def _errors_of(frame: reality.Frame, method: str) -> tuple[torch.Tensor, torch.Tensor]:
@@ -71,17 +67,17 @@ def _errors_of(frame: reality.Frame, method: str) -> tuple[torch.Tensor, torch.T
 
 
 @click.command()
-@click.argument("methods", nargs=-1, metavar="METHOD...")
+@click.argument("methods", nargs=-1, required=True, metavar="METHOD...")
 def main(methods: tuple[str, ...]) -> None:
     """Measure, scale and write."""
     warnings.simplefilter("ignore", PolsepWarning)
-    for method in methods:
-        tenths = []
-        for name, *both in curves(method):
-            tenths.append(both)
-            print(method, name, *(" ".join(f"{x:+.1f}" for x in tenth) for tenth in both), sep=" | ", flush=True)
-        diffuse, specular = (float(f"{2.0**x:.3g}") for x in np.median(np.array(tenths), axis=(0, 2)))
-        path = shipped_weights(f"{method}-mosaic")
+    stages, tenths = [reality.build_stage("validation", number, SIZE) for number in STAGES], []
+    for disturbance in DISTURBANCES:
+        for method in methods:
+            tenths.append(log_ratios(stages, disturbance, method))
+            print(disturbance, method, *(" ".join(f"{x:+.1f}" for x in t) for t in tenths[-1]), sep=" | ", flush=True)
+    diffuse, specular = (float(f"{2.0**x:.3g}") for x in np.median(np.array(tenths), axis=(0, 2)))
+    for path in (shipped_weights(f"{method}-mosaic") for method in methods):
         arrays, metadata = read_weights(path)
         before = json.loads(metadata.get("error_factors", "[1, 1]"))
         del metadata["sha256"]

@@ -90,6 +90,9 @@ def _facts(weights: Path, facts: dict[str, str]) -> Iterator[str]:
     yield f"| sha256 of the arrays | `{facts['sha256']}` |"
     if "rounded_from" in facts:
         yield f"| before large layers were rounded to 8 bits | `{facts['rounded_from']}` |"
+    if "error_factors" in facts:
+        factors = " and ".join(map(str, json.loads(facts["error_factors"])))
+        yield f"| expected errors of diffuse and of specular, after training times | {factors} |"
     yield "| licence | MIT, as polsep |"
 
 

@@ -7,7 +7,7 @@ import torch
 from tolerances import assert_close, assert_finite
 
 from polsep.networks.sizes import Size
-from polsep.networks.unet import UNet, count_parameters, pad_to_multiple
+from polsep.networks.unet import UNet, count_parameters, limit_above, pad_to_multiple
 
 SIZES = [Size(4, 2, 1), Size(4, 1, 2)]
 
@@ -68,3 +68,13 @@ def test_gradients_are_finite_and_reach_every_layer() -> None:
     assert all(g is not None for g in gradients)
     assert_finite(*(g for g in gradients if g is not None))
     assert all(float(g.abs().max()) > 0 for g in gradients if g is not None and g.ndim == 4)
+
+
+def test_values_above_a_limit_can_be_lowered_but_not_raised() -> None:
+    """An output above its limit follows a loss that is lower below it, and no other; values are the lesser of both."""
+    values, largest = torch.tensor([-1.0, 3.0, 3.0]).requires_grad_(), torch.tensor(2.0)
+    limited = limit_above(values, largest)
+    assert torch.equal(limited.detach(), torch.minimum(values.detach(), largest))
+    (limited * torch.tensor([-1.0, 1.0, -1.0])).sum().backward()
+    assert values.grad is not None
+    assert torch.equal(values.grad, torch.tensor([-1.0, 1.0, 0.0]))

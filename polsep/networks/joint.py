@@ -45,7 +45,7 @@ from polsep.networks.joint_weights import NAMES_IN_FILES, VARIANCE_HIDDEN, Joint
 from polsep.networks.sizes import ResidualSize
 from polsep.networks.taps import pool_outputs
 from polsep.networks.thumbnails import LIGHT
-from polsep.networks.unet import Block, ResidualUNet
+from polsep.networks.unet import Block, ResidualUNet, limit_above
 from polsep.networks.whole_frame import WholeFrame, make_thumbnail, split_modulation
 from polsep.physics.stokes import fit_stokes
 from polsep.sensor.camera import Layout, Mosaic
@@ -211,8 +211,8 @@ class Joint(nn.Module):
             changes = split_modulation(modulation, self.size.widths)
         features = self.net(closed.inputs, changes)
         log_variance = self.log_variance(features.detach()).float()
-        largest = self.max_log_variance.view(1, 8, 1, 1)
-        return total, closed, features, pixel_shuffle(torch.minimum(log_variance, largest), 2), light
+        limited = limit_above(log_variance, self.max_log_variance.view(1, 8, 1, 1))
+        return total, closed, features, pixel_shuffle(limited, 2), light
 
     def _correct(self, closed: ClosedForm, features: Tensor) -> Tensor:
         """Diffuse colours and specular at half resolution ``[N, C + 1, H/2, W/2]``."""

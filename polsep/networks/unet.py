@@ -152,3 +152,16 @@ def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:
 def count_parameters(module: nn.Module) -> int:
     """Number of trained parameters."""
     return sum(p.numel() for p in module.parameters())
+
+
+def limit_above(values: Tensor, largest: Tensor) -> Tensor:
+    """The lesser of both; what is above ``largest`` can still be lowered by a loss, but not raised.
+
+    With the gradient of `torch.minimum`, which is 0 there, an output that came above its limit somewhere stays.
+    """
+    if not values.requires_grad:
+        return torch.minimum(values, largest)
+    above = values > largest
+    limited = torch.where(above, largest + (values - values.detach()), values)
+    limited.register_hook(lambda gradient: gradient.masked_fill(above & (gradient < 0), 0))
+    return limited

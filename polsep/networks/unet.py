@@ -163,5 +163,7 @@ def limit_above(values: Tensor, largest: Tensor) -> Tensor:
         return torch.minimum(values, largest)
     above = values > largest
     limited = torch.where(above, largest + (values - values.detach()), values)
-    limited.register_hook(lambda gradient: gradient.masked_fill(above & (gradient < 0), 0))
+    limited.register_hook(  # type: ignore[no-untyped-call]
+        lambda gradient: gradient.masked_fill(above & (gradient < 0), 0)
+    )
     return limited

@@ -11,6 +11,7 @@ recorded + dropped. After a camera is lost, connecting is tried every second, an
 from __future__ import annotations
 
 import math
+import os
 import signal
 import threading
 import time
@@ -111,7 +112,7 @@ class Status:
 
 def _refuse_folder_of(files: Sequence[Path], output: Path) -> None:
     """Raise OutputError where a recording would be written beside the frames of its source, and hide them."""
-    if output.resolve() in {file.parent.resolve() for file in files}:
+    if os.path.realpath(output) in {os.path.realpath(file.parent) for file in files}:
         raise OutputError(
             f"expected a folder apart from that of the frames, found {output}: a recording would hide them"
         )

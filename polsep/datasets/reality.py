@@ -67,6 +67,8 @@ WORN = Sensor(10_500.0, 2.4, 12, (49 / 51, 79 / 81, 59 / 61))
 BAD = SensorErrors(angles_deg=1.5, gains=0.03, period_gains=0.02, cross_talk=0.02, defects=3e-4)
 FLATS, TURNS = 6, 8
 RIG = SensorErrors(angles_deg=1.0, gains=0.01, cross_talk=0.02)
+#: Raw colour of a saturated lamp, an amber LED.
+AMBER = (1.70, 1.0, 0.08)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,8 +208,7 @@ def ideal_frame(stage: Stage) -> Frame:
     return expose_frame(stage, light_stage(stage), options={"light_color": (1.0, 1.0, 1.0)})
 
 
-def _in_color(name: str) -> Callable[[Stage], Frame]:
-    color = LAMPS[name]
+def _in_color(color: tuple[float, float, float]) -> Callable[[Stage], Frame]:
     return lambda stage: expose_frame(stage, light_stage(stage), Capture(color), {"light_color": color})
 
 
@@ -362,8 +363,9 @@ def calibration_frames(stage: Stage) -> tuple[list[Mosaic], list[Mosaic]]:
 #: What can differ from the ideal twin, by name.
 DISTURBANCES: dict[str, Callable[[Stage], Frame]] = {
     "white lamp": ideal_frame,
-    "daylight balance": _in_color("daylight"),
-    "tungsten": _in_color("tungsten"),
+    "daylight balance": _in_color(LAMPS["daylight"]),
+    "tungsten": _in_color(LAMPS["tungsten"]),
+    "amber LED": _in_color(AMBER),
     "room light 10 %": _in_room(0.1),
     "room light 30 %": _in_room(0.3),
     "room light 30 %, lamp-off frame": _less_dark_frame(0.3),

@@ -69,7 +69,7 @@ def _before_bad_sensor(stage: Stage) -> dict[str, Frame]:
     scene = light_stage(stage)
     diffuse, specular, mask = half_resolution(scene)
     raw = sensor.expose(scene.diffuse + scene.specular, stage.seed).data.numpy().astype(np.uint16)
-    frame = Frame(raw, WORN.white_level, diffuse, specular, mask, torch.ones(3, 1, 1))
+    frame = Frame(raw, WORN.white_level, diffuse, specular, mask, torch.ones(3, 1, 1), Layout())
     dark = measure_dark(sensor.even(0.0, None) for _ in range(FRAMES))
     flat = measure_flat((_corrected("flat", dark, sensor.even(LEVEL, None)) for _ in range(FRAMES)), dark)
     turns = (math.pi * k / FRAMES for k in range(FRAMES))

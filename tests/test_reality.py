@@ -17,6 +17,7 @@ from polsep.bench.reality import Kind, RealityOptions, _bench_kind, bench_realit
 from polsep.datasets.corners import add_traced
 from polsep.datasets.reality import (
     DISTURBANCES,
+    MONO,
     Frame,
     Stage,
     build_mannequin,
@@ -29,6 +30,7 @@ from polsep.datasets.reality import (
 from polsep.physics.stokes import Stokes
 from polsep.render.disturbances import LAMPS, add_scenes, specular_angle
 from polsep.render.sphere_tracing import Scene
+from polsep.sensor.camera import Layout
 
 SIZE = 64
 
@@ -132,6 +134,22 @@ def test_bench_measures_losses() -> None:
         RealityOptions("train")
     with pytest.raises(ValueError, match=r"expected rows of white lamp; .*, found moon"):
         next(bench_reality(RealityOptions(rows=("moon",))))
+
+
+def test_mono_frames_hold_the_green_light() -> None:
+    """A mono frame has the truth of the colour frame's green, at its own exposure, and no colour to state."""
+    color, mono = (build_stage("train", 0, SIZE, Layout(bayer=bayer)) for bayer in ("RGGB", None))
+    for name in ("usual rig", "room light 30 %, lamp-off frame", "clipped 1 %"):
+        assert name in MONO
+        frame, wanted = (DISTURBANCES[name](stage) for stage in (mono, color))
+        assert frame.layout.channels == frame.diffuse.shape[0] == len(frame.unit) == 1
+        assert "light_color" not in (frame.options or {})
+        scale = frame.diffuse.sum() / wanted.diffuse[1].sum()
+        torch.testing.assert_close(frame.diffuse[0], scale * wanted.diffuse[1])
+        torch.testing.assert_close(frame.specular[0], scale * wanted.specular[1], rtol=1e-4, atol=1e-5)
+    clipped = DISTURBANCES["clipped 5 %"](mono)
+    lit = clipped.raw.reshape(SIZE // 2, 2, SIZE // 2, 2).swapaxes(1, 2)[clipped.mask.numpy()]
+    assert (lit >= clipped.white_level).mean() == pytest.approx(0.05, abs=0.01)
 
 
 def test_patterns_of_the_period_are_found() -> None:

@@ -31,6 +31,7 @@ from polsep.io.store.image_codecs import through_jpeg
 from polsep.methods import METHODS
 from polsep.metrics import psnr
 from polsep.pipeline import PolsepWarning, separate
+from polsep.sensor.camera import Layout
 
 if TYPE_CHECKING:
     from polsep.datasets.reality import Frame, Stage
@@ -62,13 +63,17 @@ class RealityOptions:
 
 
 class Kind(NamedTuple):
-    """Stages of one kind: what builds one, how many there are, their ideal twin, and the disturbances they show."""
+    """Stages of one kind: what builds one, how many there are, their ideal twin, and the disturbances they show.
+
+    ``table``: before the names of their tables of losses.
+    """
 
     name: str
     build: Callable[[str, int, int], Stage]
     stages: int
     ideal: Callable[[Stage], Frame]
     rows: Mapping[str, Callable[[Stage], Frame]]
+    table: str = ""
 
 
 class Score(NamedTuple):
@@ -110,12 +115,16 @@ def find_kinds() -> tuple[Kind, ...]:
     def build_corner(split: str, number: int, size: int) -> Stage:
         return corners.build_corner(split, number, size // 2)
 
+    def build_mono(split: str, number: int, size: int) -> Stage:
+        return reality.build_stage(split, number, size, Layout(bayer=None))
+
     objects = reality.DISTURBANCES | {f"8 bits, JPEG {JPEG_QUALITY}": compress, "bad sensor": calibrate}
     corner = {"inter-reflections": corners.corner_frame} if importlib.util.find_spec("mitsuba") else {}
     return (
         Kind("objects", reality.build_stage, 24, reality.ideal_frame, objects),
         Kind("mannequins", reality.build_mannequin, 8, reality.ideal_mannequin, reality.SHEENS),
         Kind("corners", build_corner, 3, reality.ideal_frame, corner),
+        Kind("mono objects", build_mono, 12, reality.ideal_frame, reality.MONO, "mono_"),
     )
 
 
@@ -169,7 +178,7 @@ def _bench_kind(kind: Kind, methods: Sequence[str], options: RealityOptions) -> 
         yield from _means("reality/ideal", f"{kind.name}, undisturbed", method, "PSNR", ideal[method])
     for (name, method), trials in found.items():
         if method in methods:
-            yield from _summarize(name, method, trials)
+            yield from _summarize(kind, name, method, trials)
 
 
 def _ideal_on(mask: Tensor, twin: Frame, scores: dict[str, Score]) -> dict[str, Score]:
@@ -186,9 +195,9 @@ def _calls(name: str, frame: Frame) -> tuple[bool, ...]:
     return (True,) if "ambient" in frame.options else (False, True)
 
 
-def _summarize(name: str, method: str, trials: list[Trial]) -> Iterator[Row]:
+def _summarize(kind: Kind, name: str, method: str, trials: list[Trial]) -> Iterator[Row]:
     """Rows of one disturbance and method."""
-    part = "told" if name.endswith(STATED) else "loss"
+    part = kind.table + ("told" if name.endswith(STATED) else "loss")
     found = [trial.found for trial in trials]
     losses = [
         Score(a.diffuse - b.diffuse, a.specular - b.specular, b.warnings)
@@ -201,9 +210,8 @@ def _summarize(name: str, method: str, trials: list[Trial]) -> Iterator[Row]:
         yield Row(f"reality/{part}_worst", name, method, f"{output} loss, worst scene", round(worst, 2), "dB")
     for trial, loss in zip(trials, losses, strict=True):
         for output in ("diffuse", "specular"):
-            yield Row(
-                "reality/scenes", f"{name}, scene {trial.number}", method, f"{output} loss", getattr(loss, output), "dB"
-            )
+            case = f"{kind.name}, {name}, scene {trial.number}"
+            yield Row("reality/scenes", case, method, f"{output} loss", getattr(loss, output), "dB")
     pairs = ((trial.found, trial.formula) for trial in trials)
     behind = [min(a.diffuse - b.diffuse, a.specular - b.specular) < -WORSE for a, b in pairs]
     if method != "analytic":
@@ -223,7 +231,7 @@ def score(frame: Frame, method: str, stated: bool) -> Score:
     options = dict(frame.options or {}) if stated else {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PolsepWarning)
-        out = separate(frame.raw, method, white_level=frame.white_level, **options)
+        out = separate(frame.raw, method, frame.layout, white_level=frame.white_level, **options)
 
     def compare(image: NDArray[np.float32], truth: Tensor) -> float:
         return psnr(torch.from_numpy(image).permute(2, 0, 1) / frame.unit, truth / frame.unit, frame.mask)

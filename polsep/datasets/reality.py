@@ -76,6 +76,7 @@ class Stage:
     """A view of surfaces with materials under a lamp, all that a frame needs but the disturbance.
 
     ``gain``: exposure of its ideal frame. ``softness``: of the lens. ``seed``: of its noise and of what it draws.
+    ``layout``: of the sensor; one without colour filters records the green light.
     """
 
     shape: MeshScene
@@ -85,6 +86,7 @@ class Stage:
     softness: float
     gain: float
     seed: int
+    layout: Layout = field(default_factory=Layout)
 
     def draw(self, use: int) -> torch.Generator:
         """Return a generator for one ``use`` of random numbers."""
@@ -93,9 +95,9 @@ class Stage:
 
 @dataclass(frozen=True)
 class Frame:
-    """A raw frame and its truth at half resolution: ``diffuse``, ``specular [3, h, w]``, ``mask [h, w]``.
+    """A raw frame and its truth at half resolution: ``diffuse``, ``specular [C, h, w]``, ``mask [h, w]``.
 
-    ``unit [3, 1, 1]``: see the module. ``options``: of `polsep.separate`, stating what differs; None: there is
+    ``unit [C, 1, 1]``: see the module. ``options``: of `polsep.separate`, stating what differs; None: there is
     nothing to state.
     """
 
@@ -105,6 +107,7 @@ class Frame:
     specular: Tensor
     mask: Tensor
     unit: Tensor
+    layout: Layout
     options: dict[str, Any] | None = None
 
 
@@ -118,15 +121,16 @@ class Capture:
     errors: SensorErrors = field(default_factory=SensorErrors)
 
 
-def build_stage(split: str, number: int, size: int) -> Stage:
-    """Return random textured surfaces, number ``number`` of a split."""
+def build_stage(split: str, number: int, size: int, layout: Layout | None = None) -> Stage:
+    """Return random textured surfaces, number ``number`` of a split, before a sensor in Sony's order or another one."""
     shape = seeded_shape(split, SEED, number)
     generator = torch.Generator().manual_seed(scene_seed(split, SEED, number, 0))
     for _ in range(MAX_DRAWS):
         shot = random_shot(shape, generator)
         materials = random_materials(shape.mesh.slot_count, generator, shape.size)
         view = find_view(shape, shot.camera, (size, size), SAMPLES)
-        stage = Stage(shape, view, materials, shot.light, shot.blur, 1.0, scene_seed(split, SEED, number, 1))
+        seed = scene_seed(split, SEED, number, 1)
+        stage = Stage(shape, view, materials, shot.light, shot.blur, 1.0, seed, layout or Layout())
         scene = light_stage(stage)
         if float(scene.specular.s0.mean()) > LEAST_SPECULAR * float(scene.diffuse.s0.mean()):
             break
@@ -144,8 +148,8 @@ def build_mannequin(split: str, number: int, size: int) -> Stage:
 
 def expose_stage(stage: Stage) -> Stage:
     """Return the stage with the gain of its ideal frame; that of ``stage`` must be 1."""
-    scene = light_stage(stage)
-    exposed = expose_to_level(expose_to_clip(scene, CLIPPED, Layout(), IMX250), LEVEL, Layout(), IMX250)
+    scene = as_recorded(light_stage(stage), stage.layout)
+    exposed = expose_to_level(expose_to_clip(scene, CLIPPED, stage.layout, IMX250), LEVEL, stage.layout, IMX250)
     return replace(stage, gain=float(exposed.diffuse.s0.double().sum() / scene.diffuse.s0.double().sum()))
 
 
@@ -154,6 +158,14 @@ def light_stage(stage: Stage, light: PointLight | None = None, materials: Materi
     light, materials = light or stage.light, materials or stage.materials
     scene = shade_view(stage.view, materials, light, find_lit(stage.shape, stage.view, light))
     return scale_light(blur(scene, stage.softness), stage.gain)
+
+
+def as_recorded(scene: Scene, layout: Layout) -> Scene:
+    """Return the colours of a scene that a sensor tells apart: all, or without filters the green light alone."""
+    if layout.channels > 1:
+        return scene
+    diffuse, specular = (light.map(lambda s: s[1:2]) for light in (scene.diffuse, scene.specular))
+    return replace(scene, diffuse=diffuse, specular=specular)
 
 
 def _turned(light: PointLight) -> PointLight:
@@ -189,18 +201,21 @@ def _light_around(stage: Stage) -> Scene:
 def expose_frame(
     stage: Stage, scene: Scene, capture: Capture | None = None, options: dict[str, Any] | None = None
 ) -> Frame:
-    """Return the frame that a sensor records of a scene, after its colour and exposure."""
+    """Return the frame that a sensor records of a scene, after its colour and exposure. ``options``: of the frame."""
     capture = capture or Capture()
     unit = capture.exposure * as_color(capture.color)
-    lit = scale_light(scene, unit)
-    mosaic = record(lit.diffuse + lit.specular, Layout(), capture.sensor, capture.errors, stage.seed)
+    lit = as_recorded(scale_light(scene, unit), stage.layout)
+    mosaic = record(lit.diffuse + lit.specular, stage.layout, capture.sensor, capture.errors, stage.seed)
+    if stage.layout.channels == 1:  # one colour of unknown light, which is not stated
+        unit, options = unit[1:2], {k: v for k, v in (options or {}).items() if k != "light_color"} or None
     return _as_frame(mosaic, lit, unit, options)
 
 
 def _as_frame(mosaic: Mosaic, scene: Scene, unit: Tensor, options: dict[str, Any] | None) -> Frame:
     diffuse, specular, mask = half_resolution(scene)
     kind = np.uint8 if mosaic.white_level < 256 else np.uint16
-    return Frame(mosaic.data.numpy().astype(kind), mosaic.white_level, diffuse, specular, mask, unit, options)
+    raw = mosaic.data.numpy().astype(kind)
+    return Frame(raw, mosaic.white_level, diffuse, specular, mask, unit, mosaic.layout, options)
 
 
 def ideal_frame(stage: Stage) -> Frame:
@@ -225,7 +240,7 @@ def _less_dark_frame(share: float) -> Callable[[Stage], Frame]:
         shorter = Capture(exposure=1 / (1 + share))
         dark = expose_frame(replace(stage, seed=stage.seed + 1), room, shorter)
         frame = expose_frame(stage, add_scenes(lamp, room), shorter, {"ambient": dark.raw})
-        diffuse, specular, _ = half_resolution(scale_light(lamp, shorter.exposure))
+        diffuse, specular, _ = half_resolution(scale_light(as_recorded(lamp, stage.layout), shorter.exposure))
         return replace(frame, diffuse=diffuse, specular=specular)
 
     return make
@@ -296,8 +311,9 @@ def _cells_of(stage: Stage, chosen: Tensor) -> Tensor:
 def _clipped(share: float) -> Callable[[Stage], Frame]:
     def make(stage: Stage) -> Frame:
         scene = light_stage(stage)
-        exposed = expose_to_clip(scene, share, Layout(), IMX250)
-        exposure = float(exposed.diffuse.s0.double().sum() / scene.diffuse.s0.double().sum())
+        recorded = as_recorded(scene, stage.layout)
+        exposed = expose_to_clip(recorded, share, stage.layout, IMX250)
+        exposure = float(exposed.diffuse.s0.double().sum() / recorded.diffuse.s0.double().sum())
         return expose_frame(stage, scene, Capture(exposure=exposure))
 
     return make
@@ -389,6 +405,28 @@ DISTURBANCES: dict[str, Callable[[Stage], Frame]] = {
     "8 bits, gamma": _with_gamma,
     "bad sensor": _bad_sensor,
     "usual rig": _usual_rig,
+}
+#: Those of mono frames, which have no colour to be wrong about.
+MONO: dict[str, Callable[[Stage], Frame]] = {
+    name: DISTURBANCES[name]
+    for name in (
+        "room light 10 %",
+        "room light 30 %",
+        "room light 30 %, lamp-off frame",
+        "defects 0.1 %",
+        "black level 240",
+        "retained 5 %",
+        "polarizer 0.9",
+        "polarizer 0.8",
+        "two lamps",
+        "metals",
+        "dielectrics beside metals",
+        "clipped 1 %",
+        "clipped 5 %",
+        "a tenth of the exposure",
+        "bad sensor",
+        "usual rig",
+    )
 }
 #: The same for stages of `build_mannequin`.
 SHEENS: dict[str, Callable[[Stage], Frame]] = {

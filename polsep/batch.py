@@ -18,7 +18,7 @@ from polsep.io.results.separation_writer import planned_outputs, write_separatio
 from polsep.io.store.atomic import OutputError, is_disk_full, refuse_existing, refuse_inputs, require_writable
 from polsep.io.store.errors import one_line
 from polsep.methods import find_method, release_memory
-from polsep.pipeline import LightColor, Result, separate_capture
+from polsep.pipeline import LightColor, Result, separate_capture, with_lamp_dolp
 from polsep.sensor.levels import BlackFrame, ForgottenLevel
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ class SeparateOptions:
     light_color: LightColor | str = "auto"
     device: str = "auto"
     full: bool = False
+    lamp_dolp: float | None = None
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,8 @@ def separate_photographs(
 def _separate_frame(path: str, frame: Frame, read: ReadOptions, options: SeparateOptions, stokes: bool) -> Result:
     """A frame's images with all that its file says, without its capture; ``stokes``: with Stokes images."""
     try:
-        separated = separate_capture(frame.data, options.method, options.light_color, options.device, options.full)
+        capture = with_lamp_dolp(frame.data, options.lamp_dolp)
+        separated = separate_capture(capture, options.method, options.light_color, options.device, options.full)
     except (ValueError, RuntimeError, MemoryError) as error:
         raise ValueError(f"{path}: {str(error) or 'out of memory'}") from error
     separated.report["source"] = Path(path).name

@@ -46,6 +46,7 @@ from polsep.sensor.levels import (
 )
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.images import FrameImages
+from polsep.separation.lamp_polarization import separate_by_known_lamp
 from polsep.separation.report import SeparatedFrame, describe, error_quantiles, light_statistics, on_host, tally_again
 from polsep.separation.under_highlights import fill_under_highlights
 
@@ -137,6 +138,7 @@ def separate(
     full: bool = False,
     calibration: Calibration | str | PathLike[str] | None = None,
     ambient: NDArray[Any] | Mosaic | Sequence[NDArray[Any] | Mosaic] | None = None,
+    lamp_dolp: float | None = None,
 ) -> Result:
     """Separate one raw mosaic ``[H, W]`` (uint8, uint16, float32) into diffuse and specular.
 
@@ -145,9 +147,11 @@ def separate(
     (1.0 for float): 12-bit codes in uint16 need 4095; moved to the left, to 65520, they need nothing.
     ``calibration``: a file of `polsep calibrate`, applied first. ``ambient``: a raw frame with the lamp off, or
     several, subtracted. ``light_color``: "auto" finds it in the frame (`find_light`), or "white", or camera RGB of the
-    light. ``raw`` may also be four angle images at 0, 45, 90, 135 degrees, ``[4, H, W]`` or ``[4, H, W, 3]``, which
-    keep their resolution, or what `read_frames` read. What the user should know is in ``report["warnings"]`` and
-    issued as `PolsepWarning`. Raises ValueError, with one line of what was expected and what was found, on other input;
+    light. ``lamp_dolp``: degree of polarization of the lamp where it is known, in twice the time; None: networks look
+    for it in colour frames, and it is 1 where nothing shows it. ``raw`` may also be four angle images at 0, 45, 90,
+    135 degrees, ``[4, H, W]`` or ``[4, H, W, 3]``, which keep their resolution, or what `read_frames` read. What the
+    user should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises ValueError, with one line of
+    what was expected and what was found, on other input;
     of wrong types it is also a TypeError.
     """
     require_flags(full=full)
@@ -173,6 +177,7 @@ def separate(
         notes += more
     elif measured is not None or ambient is not None:
         raise ValueError("expected a raw mosaic to calibrate or to subtract room light from, found four angle images")
+    capture = with_lamp_dolp(capture, lamp_dolp)
     frame = separate_capture(capture, method, light_color, device, bool(full))
     frame.report["warnings"] = [*notes, *frame.report["warnings"]]
     for note in frame.report["warnings"]:
@@ -254,20 +259,33 @@ def separate_capture(
     capture, device = checked.mosaic if checked else capture, find_device(device)
     light, facts, remarks = resolve_light(light_color, capture)  # before it moves: a device sends no raw frame back
     seen, capture = capture, move_capture(capture, device)
-    images, colored, filled = chosen.run(capture, light, full), Colored(), 0.0
+    colored, filled = Colored(), 0.0
     if isinstance(capture, Mosaic):
+        images = separate_by_known_lamp(lambda mosaic: chosen.run(mosaic, light, full), capture, light)
         if chosen.assumes_white:
             images, colored = color_specular(images, capture, light)
         images, filled = fill_under_highlights(images, capture, light)
+    else:
+        images = chosen.run(capture, light, full)
     frame = make_frame(images, chosen, capture, light, full)
     frame.report["light"] = facts
     frame.report.update(colored_specular=colored.share, retained_polarization=colored.retained)
-    frame.report.update(lamp_dolp=colored.lamp_dolp, filled_under_highlights=filled)
+    degree = getattr(capture, "lamp_dolp", None) or colored.lamp_dolp
+    frame.report.update(lamp_dolp=degree, filled_under_highlights=filled)
     frame.report["warnings"] = [*remarks, *([colored.remark] if colored.remark else []), *frame.report["warnings"]]
     if checked:
         frame.report.update(checked.report)
         frame.report["warnings"] = [*checked.warnings, *frame.report["warnings"]]
     return replace(frame, capture=seen)
+
+
+def with_lamp_dolp(capture: Capture, degree: float | None) -> Capture:
+    """The capture under a lamp of that degree of polarization. Raises ValueError where it is no mosaic."""
+    if degree is None:
+        return capture
+    if not isinstance(capture, Mosaic):
+        raise ValueError("expected a raw mosaic with the lamp's degree of polarization, found angle images")
+    return replace(capture, lamp_dolp=degree)
 
 
 def make_frame(

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from test_colored_specular import IDEAL, scene, separated
 from tolerances import assert_close
 from torch import Tensor
 
+from polsep.cli.app import app
 from polsep.compute.resizing import block_means
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.raw.sequences import open_sequence
-from polsep.pipeline import separate_capture
-from polsep.sensor.camera import Layout, expose
+from polsep.pipeline import separate, separate_capture
+from polsep.sensor.camera import MIN_LAMP_DOLP, Layout, Mosaic, expose
 from polsep.separation.colored_specular import Colored, color_specular
-from polsep.separation.lamp_polarization import MIN_PART, SIDE, find_unpolarized, measure_places
+from polsep.separation.lamp_polarization import MIN_PART, SIDE, find_unpolarized, less_unpolarized, measure_places
 from polsep.separation.places_kernel import measure_places_fast
 from polsep.video.first_frame import separate_first
 from polsep.video.recordings import VideoOptions
@@ -133,3 +137,84 @@ def test_the_kernel_measures_the_same_places(cell: int) -> None:
     for found, wanted in zip(measure_places_fast(diffuse, specular, gains, cell), expected, strict=True):
         assert found.shape == wanted.shape
         np.testing.assert_allclose(found, wanted, rtol=2e-6)
+
+
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("spec", ["color", "mono", "90,45,135,0/RGGB@1,0", "0,45,90,135/GBRG"])
+def test_a_stated_degree_separates_exactly(spec: str, full: bool) -> None:
+    """Even light of a lamp of degree p: the formula gives p S alone, and S where p is stated; samples in any unit."""
+    layout, degree, specular = Layout.parse(spec), 0.8, 0.4
+    body = torch.tensor([0.3, 0.5, 0.2][: layout.channels]).view(-1, 1, 1).expand(-1, SIZE + 1, SIZE)
+    white = torch.full_like(body, specular)
+    mosaic = expose(scene(body + (1 - degree) * white, degree * white), layout, replace(IDEAL, bits=None))
+    mosaic = replace(mosaic, data=600 + mosaic.data * 3000 / mosaic.white_level, black_level=600, white_level=3600)
+    assumed, stated = (
+        separate_capture(replace(mosaic, lamp_dolp=p), "analytic", "white", full=full) for p in (None, degree)
+    )
+    np.testing.assert_allclose(assumed.specular, degree * specular, atol=1e-4)
+    np.testing.assert_allclose(stated.specular, specular, atol=1e-4)
+    np.testing.assert_allclose(stated.diffuse, np.broadcast_to(body[:, 0, 0].numpy(), stated.diffuse.shape), atol=1e-4)
+    np.testing.assert_allclose(stated.dolp, assumed.dolp)
+    assert (assumed.report["lamp_dolp"], stated.report["lamp_dolp"]) == (1, degree)
+
+
+@pytest.mark.parametrize(("method", "saturation", "less"), [("joint-fast", 0.05, 0.7), ("color-affine", 1.0, 0.9)])
+def test_a_stated_degree_helps_where_none_is_found(method: str, saturation: float, less: float) -> None:
+    """Both images come nearer to the truth, in a coloured light: of networks, on grey bodies, which show no degree."""
+    body, mirrored = (x.repeat_interleave(4, dim=1).repeat_interleave(4, dim=2) for x in bodies(saturation))
+    white, degree, light = mirrored.expand_as(body), 0.8, (0.6, 1.0, 0.8)
+    gains = torch.tensor(light).view(3, 1, 1)
+    mosaic = expose(scene(gains * (body + (1 - degree) * white), gains * degree * white), Layout(), IDEAL)
+    truth = [block_means(gains * x, 2).movedim(0, -1).numpy() for x in (body, white)]
+    errors = []
+    for p in (None, degree):
+        found = separate_capture(replace(mosaic, lamp_dolp=p), method, light)
+        images = zip((found.diffuse, found.specular), truth, strict=True)
+        errors.append([float(np.sqrt(np.mean((image - wanted) ** 2))) for image, wanted in images])
+    assert errors[1][0] < less * errors[0][0] and errors[1][1] < less * errors[0][1]
+
+
+def test_unpolarized_light_is_subtracted_where_nothing_clips() -> None:
+    """Half of it from each sample, of its own colour; on arrays of either kind."""
+    mosaic = Mosaic(torch.full((9, 8), 0.5), Layout.parse("90,45,135,0/RGGB@1,0"), 0.0, 1.0)
+    mosaic.data[4, 4] = 1.0
+    part = np.full((4, 4, 3), [0.1, 0.2, 0.3], np.float32)
+    found = less_unpolarized(mosaic, part).data
+    layout = mosaic.layout
+    for y, x in ((0, 0), (1, 0), (2, 3), (7, 6), (8, 7)):
+        inside, channel = y >= 1, layout.filter_at(y, x).channel
+        assert float(found[y, x]) == pytest.approx(0.5 - inside * part[0, 0, channel] / 2)
+    assert float(found[4, 4]) == 1
+    same = less_unpolarized(replace(mosaic, data=mosaic.data.numpy()), part).data
+    np.testing.assert_array_equal(same, found.numpy())
+
+
+@pytest.mark.parametrize(
+    ("degree", "line"),
+    [
+        (0.2, "expected lamp_dolp from 0.3 to 1, found 0.2"),
+        (float("nan"), "expected lamp_dolp from 0.3 to 1, found nan"),
+        ("0.9", "expected lamp_dolp as a number, found '0.9'"),
+        (True, "expected lamp_dolp as a number, found True"),
+    ],
+)
+def test_other_degrees_are_one_line(degree: object, line: str) -> None:
+    with pytest.raises(ValueError, match=line):
+        separate(np.full((16, 16), 0.5, np.float32), "analytic", lamp_dolp=degree)
+    with pytest.raises(ValueError, match=r"expected a raw mosaic .* found angle images"):
+        separate(np.full((4, 16, 16), 0.5, np.float32), "analytic", lamp_dolp=0.9)
+
+
+def test_the_command_takes_the_degree(tmp_path: Path) -> None:
+    """It is in the report; the range is that of frames; photographs, whose lamp a filter sees, have no such option."""
+    np.save(tmp_path / "frame.npy", np.full((16, 16), 0.5, np.float32))
+    words = ["separate", str(tmp_path / "frame.npy"), "-o", str(tmp_path), "--method", "analytic", "--lamp-dolp"]
+    found = CliRunner().invoke(app, [*words, "0.9"])
+    assert found.exit_code == 0, found.output
+    assert json.loads((tmp_path / "frame.json").read_text())["report"]["lamp_dolp"] == 0.9
+    for degree in (MIN_LAMP_DOLP - 0.01, 1.01):
+        refused = CliRunner().invoke(app, [*words, str(degree)])
+        assert refused.exit_code == 2 and "--lamp-dolp" in refused.output
+    photographs = ["separate", "--parallel", "p.png", "--crossed", "c.png", "--lamp-dolp", "0.9"]
+    refused = CliRunner().invoke(app, photographs)
+    assert "expected photographs without --lamp-dolp" in str(refused.exception)

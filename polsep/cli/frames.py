@@ -21,6 +21,7 @@ from polsep.cli.app import (
     SIZE,
     STOKES,
     WEIGHTS,
+    Number,
     Word,
     app,
     check_read_options,
@@ -49,6 +50,12 @@ if TYPE_CHECKING:
 @click.option("--layout", metavar="color|mono|SPEC", default="color", help="Filter layout of the sensor; see above.")
 @CORRECTING
 @LIGHT_COLOR
+@click.option(
+    "--lamp-dolp",
+    type=Number(float, 0.3, 1),
+    metavar="P",
+    help="Degree of polarization of the lamp, where it is known; separates twice.  [default: found in the frame, or 1]",
+)
 @click.option(
     "--format",
     type=Word("exr", "npz", "tiff", "png"),
@@ -111,7 +118,7 @@ def separate(files: tuple[str, ...], **options: Any) -> None:
     check_method(options["method"])
     find_device(options["device"])
     light = read_light(options)
-    run = SeparateOptions(options["method"], light, options["device"], options["full"])
+    run = SeparateOptions(options["method"], light, options["device"], options["full"], options["lamp_dolp"])
     write = WriteOptions(
         options["output"], options["format"], options["overwrite"], options["stokes"], correcting_files(options)
     )

@@ -15,7 +15,15 @@ if TYPE_CHECKING:
     from polsep.photographs import PhotoOptions
 
 #: Options that say something of raw frames of polarization cameras alone, with the value that says nothing.
-_OF_FRAMES = {"layout": None, "calibration": None, "ambient": (), "size": None, "pixel_format": None, "pages": "auto"}
+_OF_FRAMES = {
+    "layout": None,
+    "calibration": None,
+    "ambient": (),
+    "lamp_dolp": None,
+    "size": None,
+    "pixel_format": None,
+    "pages": "auto",
+}
 _OF_PHOTOGRAPHS = {"exposures": None, "extinction": None, "align": None, "encoding": None}
 _FILE = click.Path(path_type=str)
 

@@ -177,6 +177,10 @@ def _with_polarizer(stage: Stage, degree: float) -> Scene:
     return depolarize_lamp(light_stage(stage), degree, light_stage(stage, _turned(stage.light)))
 
 
+def _through_polarizer(degree: float) -> Callable[[Stage], Frame]:
+    return lambda stage: expose_frame(stage, _with_polarizer(stage, degree), options={"lamp_dolp": degree})
+
+
 def light_room(stage: Stage, share: float) -> Scene:
     """Return the stage in unpolarized room light alone: all of it diffuse, polarized as Fresnel's equations have it.
 
@@ -332,9 +336,10 @@ def _in_8_bits(stage: Stage) -> Frame:
 
 def _usual_rig(stage: Stage) -> Frame:
     """IMX250, its usual errors, a polarizer of 0.98, 5 % room light, daylight before the sensor's filters."""
-    scene = add_scenes(_with_polarizer(stage, 0.98), light_room(stage, 0.05))
-    errors, color = replace(RIG, specimen=stage.seed % 1000), LAMPS["daylight"]
-    return expose_frame(stage, scene, Capture(color, errors=errors), {"light_color": color})
+    degree, color = 0.98, LAMPS["daylight"]
+    scene = add_scenes(_with_polarizer(stage, degree), light_room(stage, 0.05))
+    errors = replace(RIG, specimen=stage.seed % 1000)
+    return expose_frame(stage, scene, Capture(color, errors=errors), {"light_color": color, "lamp_dolp": degree})
 
 
 def ideal_mannequin(stage: Stage) -> Frame:
@@ -391,8 +396,8 @@ DISTURBANCES: dict[str, Callable[[Stage], Frame]] = {
     "black level 64": _by_sensor({"black_level": 64}, black=64 / 4095),
     "black level 240": _by_sensor({"black_level": 240}, black=240 / 4095),
     "retained 5 %": _changed(lambda scene: retain_polarization(scene, 0.05)),
-    "polarizer 0.9": lambda stage: expose_frame(stage, _with_polarizer(stage, 0.9)),
-    "polarizer 0.8": lambda stage: expose_frame(stage, _with_polarizer(stage, 0.8)),
+    "polarizer 0.9": _through_polarizer(0.9),
+    "polarizer 0.8": _through_polarizer(0.8),
     "two lamps": lambda stage: expose_frame(stage, scale_light(light_by_two(stage, 90), 0.5)),
     "metals": _metals(False),
     "dielectrics beside metals": _metals(True),

@@ -40,7 +40,8 @@ CLIP_MARGIN = 2.0**-10
 
 #: Pixels after which the filters of every sensor repeat, along both axes; those of mono ones after 2 already.
 PERIOD = 4
-
+#: Least degree of polarization of a lamp: of less, most of its specular light is unpolarized.
+MIN_LAMP_DOLP = 0.3
 #: Analysers that are closer than this [degrees] are one: no Stokes vector follows from their difference.
 MIN_APART_DEG = 0.1
 
@@ -237,6 +238,16 @@ def _require_gains(gains: object, channels: int) -> None:
         raise ValueError(f"expected a light_color of three positive numbers, found {gains!r:.80}")
 
 
+def _require_degree(degree: object) -> None:
+    """Raise ValueError unless the ``degree`` is None or one that a lamp may have; of no number it is a WrongType."""
+    if degree is None:
+        return
+    if isinstance(degree, bool) or not isinstance(degree, Real):
+        raise WrongType(f"expected lamp_dolp as a number, found {degree!r:.40}")
+    if not MIN_LAMP_DOLP <= float(degree) <= 1:
+        raise ValueError(f"expected lamp_dolp from {MIN_LAMP_DOLP:g} to 1, found {degree:g}")
+
+
 def clip_level(black_level: float, white_level: float) -> float:
     """The least sample that counts as clipped, in the unit of the samples; see `CLIP_MARGIN`."""
     return black_level + (1 - CLIP_MARGIN) * (white_level - black_level)
@@ -250,9 +261,10 @@ class Mosaic:
     count as clipped. ``light_color``: one gain per channel that `linear` divides out, so that what follows sees white
     light. ``falloff``: the smooth part of a calibrated sensor's flat frame (`falloff.falloff_image`), by which
     separated images are divided. ``less_ambient``: another frame was subtracted, and noise goes far below black.
-    ``lamp_measured``: ``light_color`` is that of a calibrated lamp, also where it is white.
-    Raises ValueError when white is not above black or the frame is smaller than one period; of samples that are no
-    whole numbers or floats, it is a `WrongType`.
+    ``lamp_measured``: ``light_color`` is that of a calibrated lamp, also where it is white. ``lamp_dolp``: degree of
+    polarization of the lamp where that is known.
+    Raises ValueError when white is not above black, the frame is smaller than one period or the degree is not from
+    `MIN_LAMP_DOLP` to 1; of samples that are no whole numbers or floats, it is a `WrongType`.
     """
 
     data: Array
@@ -263,6 +275,7 @@ class Mosaic:
     falloff: tuple[tuple[float, ...], ...] | None = None
     less_ambient: bool = False
     lamp_measured: bool = False
+    lamp_dolp: float | None = None
 
     __repr__ = short_repr
 
@@ -270,6 +283,7 @@ class Mosaic:
         _require_samples(self.data)
         check_frame(tuple(self.data.shape), self.layout, self.black_level, self.white_level)
         _require_gains(self.light_color, self.layout.channels)
+        _require_degree(self.lamp_dolp)
 
     @property
     def clip_level(self) -> float:

@@ -108,7 +108,9 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     white = replace(mosaic, data=data, layout=layout, light_color=light, falloff=None)
     diffuse, before = (xp.moveaxis(x, -1, 0) for x in (images.diffuse, images.specular))
     side = 2 if 2 * diffuse.shape[-1] <= data.shape[-1] else PERIOD
-    unpolarized, specular = find_unpolarized(_measure_places(images, light, side // 2), max(light)), before
+    unpolarized, specular = 0.0, before
+    if mosaic.lamp_dolp is None:
+        unpolarized = find_unpolarized(_measure_places(images, light, side // 2), max(light))
     if unpolarized:
         left = xp.minimum(unpolarized * before, diffuse)
         diffuse, specular = diffuse - left, before + left

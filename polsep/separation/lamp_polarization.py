@@ -1,7 +1,12 @@
-"""The lamp's degree of polarization, from what its highlights leave in the diffuse image.
+"""Lamps that are not fully polarized: separation where the degree is known, and the degree where it is not.
 
 Methods take highlights of the lamp for fully polarized. Behind an imperfect polarizer of degree p they find p of
-them; (1 - p) / p of the specular image is left in the diffuse image, in white. In a place, the diffuse image less the
+them; (1 - p) / p of the specular image is left in the diffuse image, in white.
+
+Where p is known (`Mosaic.lamp_dolp`), that part is subtracted from the samples and they are separated again: then they
+are those of a fully polarized lamp, whose specular light is p of the true one (`separate_by_known_lamp`).
+
+Where it is not, the frame may show it (`find_unpolarized`). In a place, the diffuse image less the
 body's colour is regressed on the specular image. The median of the places counts where it is clear: more than its
 standard error, and along white rather than beside it, where wrong colours of the lamp lead. Grey bodies show
 nothing, nor do bodies of one hue: there a wrong colour of the lamp may look white.
@@ -9,13 +14,18 @@ nothing, nor do bodies of one hue: there a wrong colour of the lamp may look whi
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.compute.arrays import Array, namespace, to_numpy_together
-from polsep.compute.resizing import block_means, blocks_of
+from polsep.compute.arrays import Array, as_floats, constant, namespace, of_kind, to_numpy_together
+from polsep.compute.resizing import block_means, blocks_of, resize_bilinear
+from polsep.sensor.camera import Mosaic
+from polsep.separation.images import FrameImages
+from polsep.separation.report import tally_again
 
 Floats = NDArray[np.float32]
 
@@ -45,6 +55,48 @@ class Places(NamedTuple):
     square: Floats
     product: Floats
     largest: Floats
+
+
+def separate_by_known_lamp(
+    run: Callable[[Mosaic], FrameImages], mosaic: Mosaic, light: tuple[float, ...]
+) -> FrameImages:
+    """Images of one frame ``[H, W]`` by a method, under a lamp of the degree of polarization ``mosaic.lamp_dolp``.
+
+    ``light``: camera RGB of the lamp. DoLP and AoLP are those of the frame as it is. Twice the method's time.
+    """
+    images, degree = run(mosaic), mosaic.lamp_dolp
+    if degree is None or degree == 1:
+        return images
+    xp = namespace(images.specular)
+    less = run(less_unpolarized(mosaic, (1 - degree) / degree * images.specular))
+    error = less.error
+    if error is not None:
+        error = error * constant([1.0, 1 / degree], error)
+    known = replace(less, specular=less.specular / degree, error=error, dolp=images.dolp, aolp=images.aolp)
+    return tally_again(replace(known, valid=xp.logical_and(images.valid, less.valid)), light)
+
+
+def less_unpolarized(mosaic: Mosaic, part: Array) -> Mosaic:
+    """One frame less unpolarized light ``part [h, w, C]`` of its unit, of which analysers pass half.
+
+    ``part`` has half or full resolution, without pixels that are no whole cell. Clipped samples stay.
+    """
+    data, layout = as_floats(mosaic.data), mosaic.layout
+    if isinstance(part, np.ndarray):
+        part = of_kind(part, data)
+    xp = namespace(data)
+    (row, col), (rows, cols) = layout.origin, (2 * n for n in layout.cells(tuple(data.shape)))
+    full = resize_bilinear(xp.moveaxis(part, -1, 0), (rows, cols)) * (
+        float(mosaic.white_level - mosaic.black_level) / 2
+    )
+    left = xp.zeros_like(data)
+    for y in range(layout.period):
+        for x in range(layout.period):
+            channel = layout.filter_at(row + y, col + x).channel
+            left[row + y : row + rows : layout.period, col + x : col + cols : layout.period] = full[
+                channel, y :: layout.period, x :: layout.period
+            ]
+    return replace(mosaic, data=xp.where(mosaic.clipped(), data, data - left))
 
 
 def measure_places(diffuse: Array, specular: Array) -> Places:

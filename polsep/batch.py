@@ -17,8 +17,9 @@ from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames, r
 from polsep.io.results.separation_writer import planned_outputs, write_separation
 from polsep.io.store.atomic import OutputError, is_disk_full, refuse_existing, refuse_inputs, require_writable
 from polsep.io.store.errors import one_line
+from polsep.light.light_color import LightColor
 from polsep.methods import find_method, release_memory
-from polsep.pipeline import LightColor, Result, separate_capture
+from polsep.pipeline import Result, separate_capture
 from polsep.sensor.levels import BlackFrame, ForgottenLevel
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import math
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -28,12 +28,12 @@ from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration
 from polsep.io.store.errors import as_path
-from polsep.light.find import Light, find_light
-from polsep.methods import Capture, Method, find_method
+from polsep.light.light_color import LightColor, resolve_light
+from polsep.methods import Method, find_method
 from polsep.physics.stokes import Measurements
 from polsep.sensor.ambient import unit_remarks
 from polsep.sensor.calibration import Calibration, Corrections
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Capture, Layout, Mosaic
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.falloff import Table, falloff_image
 from polsep.sensor.levels import (
@@ -52,12 +52,8 @@ from polsep.separation.under_highlights import fill_under_highlights
 if TYPE_CHECKING:
     from polsep.io.results.previews import Picture
 
-LightColor = Sequence[float]
 #: Formats by the endings of file names.
 _ENDINGS = {".exr": "exr", ".npz": "npz", ".tiff": "tiff", ".tif": "tiff", ".png": "png"}
-#: Words for the light's colour: found in the frame (two words for one thing), or white.
-FOUND_WORDS = ("auto", "estimate")
-LIGHT_WORDS = (*FOUND_WORDS, "white")
 
 
 def _calm_torch() -> None:
@@ -252,22 +248,24 @@ def separate_capture(
     chosen = find_method(method, capture)
     checked = check_mosaic(capture) if isinstance(capture, Mosaic) else None
     capture, device = checked.mosaic if checked else capture, find_device(device)
-    light, facts, remarks = resolve_light(light_color, capture)  # before it moves: a device sends no raw frame back
-    seen, capture = capture, move_capture(capture, device)
-    images, colored, filled = chosen.run(capture, light, full), Colored(), 0.0
-    if isinstance(capture, Mosaic):
+    light = resolve_light(light_color, capture)  # before it moves: a device sends no raw frame back
+    moved = move_capture(capture, device)
+    images, colored, filled = chosen.run(moved, light.gains, full), Colored(), 0.0
+    if isinstance(moved, Mosaic):
         if chosen.assumes_white:
-            images, colored = color_specular(images, capture, light)
-        images, filled = fill_under_highlights(images, capture, light)
-    frame = make_frame(images, chosen, capture, light, full)
-    frame.report["light"] = facts
-    frame.report.update(colored_specular=colored.share, retained_polarization=colored.retained)
-    frame.report.update(lamp_dolp=colored.lamp_dolp, filled_under_highlights=filled)
-    frame.report["warnings"] = [*remarks, *([colored.remark] if colored.remark else []), *frame.report["warnings"]]
-    if checked:
-        frame.report.update(checked.report)
-        frame.report["warnings"] = [*checked.warnings, *frame.report["warnings"]]
-    return replace(frame, capture=seen)
+            images, colored = color_specular(images, moved, light.gains)
+        images, filled = fill_under_highlights(images, moved, light.gains)
+    frame = make_frame(images, chosen, moved, light.gains, full)
+    facts: dict[str, Any] = {
+        "light": light.facts,
+        "colored_specular": colored.share,
+        "retained_polarization": colored.retained,
+        "lamp_dolp": colored.lamp_dolp,
+        "filled_under_highlights": filled,
+        **(checked.report if checked else {}),
+    }
+    warned = [*(checked.warnings if checked else ()), *light.remarks, *colored.remarks, *frame.report["warnings"]]
+    return replace(frame, report=frame.report | facts | {"warnings": warned}, capture=capture)
 
 
 def make_frame(
@@ -320,106 +318,3 @@ def move_capture(capture: Capture, device: str) -> Capture:
     """The capture with its arrays on a device: on the CPU as they are, on others as torch tensors."""
     moved = {name: to_device(value, device) for name, value in vars(capture).items() if is_array_api_obj(value)}
     return replace(capture, **moved)
-
-
-def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[SeparatedFrame, list[str]]:
-    """A frame that was separated before, with the report beside its file, and notes for the user, a line each.
-
-    ``light_color`` of the report is the one that is stated here, else the one beside the file; without either it is
-    left out and a note says so. Raises InputError on what cannot be read.
-    """
-    from polsep.io.results.separation_reader import read_separated
-    from polsep.io.results.sidecars import read_report
-
-    frame = replace(read_separated(path), report=read_report(path))
-    notes = list(frame.report.get("warnings", ()))
-    if not is_to_be_found(light_color):
-        frame.report["light_color"] = stated_gains(light_color, frame.diffuse.shape[-1])
-        notes += color_notes(light_color, frame.diffuse.shape[-1])
-    elif "light_color" not in frame.report and frame.diffuse.shape[-1] > 1:
-        notes.append(f"the lamp's colour is neither stated nor in {path.stem}.json beside the file: taken for white")
-    return frame, notes
-
-
-def stated_gains(light_color: LightColor | str, channels: int) -> list[float]:
-    """One gain per channel of a light whose colour is stated: three numbers or "white"; mono has one channel.
-
-    Green is 1, as in lights that are found: of a colour only the ratios count, in whatever unit it was measured.
-    """
-    if isinstance(light_color, str) or channels == 1:
-        return [1.0] * channels
-    color = [float(gain) for gain in light_color]
-    return [gain / color[1] for gain in color]
-
-
-def color_notes(light_color: LightColor | str, channels: int) -> tuple[str, ...]:
-    """A note where the colour that is stated of a light changes nothing: mono frames show none."""
-    ignored = channels == 1 and not isinstance(light_color, str) and len(set(light_color)) > 1
-    return ("the colour stated of the light changes nothing: mono frames show no colours",) * ignored
-
-
-def parse_light_color(text: str) -> LightColor | str:
-    """The light's colour as people write it: ``R,G,B``, ``white``, ``auto`` or ``estimate``. Raises ValueError."""
-    if text in LIGHT_WORDS:
-        return text
-    color = _as_color(text.split(","))
-    if color is None:
-        raise ValueError(
-            f'expected a light colour R,G,B like 1,0.9,0.7, all positive, "white" or "auto", found {text!r:.40}'
-        )
-    return color
-
-
-def _as_color(parts: Iterable[Any]) -> tuple[float, ...] | None:
-    """Three positive numbers of a light's colour; None of anything else. Raises TypeError on what are no parts."""
-    try:
-        color = tuple(float(part) for part in parts)
-    except ValueError:
-        return None
-    return color if len(color) == 3 and all(1e-6 < c < 1e6 for c in color) else None
-
-
-def light_of(capture: Capture) -> Light:
-    """`find_light` in a frame whose black level and defects were put right, as `separate_capture` does first."""
-    return find_light(check_mosaic(capture).mosaic if isinstance(capture, Mosaic) else capture)
-
-
-def is_calibrated(capture: Capture) -> bool:
-    """True if a calibration says the colour of the lamp, which mono frames have none of."""
-    if not isinstance(capture, Mosaic) or capture.layout.channels == 1:
-        return False
-    return capture.lamp_measured or any(gain != 1 for gain in capture.light_color)
-
-
-def is_to_be_found(light_color: LightColor | str) -> bool:
-    """True if a light's colour, of any type, is one of `FOUND_WORDS`."""
-    return isinstance(light_color, str) and light_color in FOUND_WORDS
-
-
-def resolve_light(
-    light_color: LightColor | str, capture: Capture
-) -> tuple[tuple[float, ...], dict[str, Any], tuple[str, ...]]:
-    """One gain per channel, green 1, the report's entry on the light, found in the frame or stated, and remarks on it.
-
-    "auto" takes what a calibration says, else what the frame shows. Raises ValueError on anything but three positive
-    numbers or one of `LIGHT_WORDS`.
-    """
-    channels = capture.layout.channels if isinstance(capture, Mosaic) else capture.data.shape[-3]
-    if isinstance(light_color, str) and light_color not in LIGHT_WORDS:
-        raise ValueError(f'expected a light colour of three numbers, "white" or "auto", found {light_color!r}')
-    if is_to_be_found(light_color) and not is_calibrated(capture):
-        found = find_light(capture)
-        return found.color if channels == 3 else (1.0,), {"source": "found", **found.describe()}, found.remarks
-    stated, source = light_color, "stated"
-    if isinstance(light_color, str):
-        stated = (1.0, 1.0, 1.0)
-        if isinstance(capture, Mosaic) and light_color != "white":
-            stated, source = capture.light_color, "calibrated"
-    try:
-        color = _as_color(stated)
-    except TypeError:
-        raise WrongType(f"expected a light colour of three positive numbers, found {light_color!r:.40}") from None
-    if color is None:
-        raise ValueError(f"expected a light colour of three positive numbers, found {light_color!r}")
-    gains = stated_gains(color, channels)
-    return tuple(gains), {"source": source, "color": gains}, color_notes(color, channels)

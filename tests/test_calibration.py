@@ -34,7 +34,7 @@ from polsep.io.raw.tiff import write_merged
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration, write_calibration
 from polsep.io.store.errors import InputError
-from polsep.pipeline import is_calibrated
+from polsep.light.light_color import is_calibrated
 from polsep.sensor.calibration import (
     Analyser,
     Calibration,

@@ -26,7 +26,7 @@ from polsep.io.store.errors import MOST, one_line, printable
 
 if TYPE_CHECKING:
     from polsep.io.raw.frames import ReadOptions
-    from polsep.pipeline import LightColor
+    from polsep.light.light_color import LightColor
     from polsep.sensor.camera import Layout
 
     _ParamType = click.ParamType[Any]
@@ -286,7 +286,7 @@ def check_read_options(options: Mapping[str, Any]) -> None:
 
 def read_light(options: Mapping[str, Any]) -> LightColor | str:
     """The colour of the light from the options of a command. Raises ValueError, which names the option."""
-    from polsep.pipeline import parse_light_color
+    from polsep.light.light_color import parse_light_color
 
     try:
         return parse_light_color(options["light_color"])

@@ -298,6 +298,10 @@ class Mosaic:
         return self._samples() >= 1 - CLIP_MARGIN
 
 
+#: A raw frame, or co-sited samples.
+Capture = Mosaic | Measurements
+
+
 @dataclass(frozen=True)
 class Sensor:
     """Properties of a pixel. Signals are fractions of ``full_well``, which maps to the white level.

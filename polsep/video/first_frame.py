@@ -18,7 +18,8 @@ from polsep.io.results.previews import exposure_of
 from polsep.io.results.sequences import PART
 from polsep.io.store.errors import InputError
 from polsep.light.find import Light, combine
-from polsep.pipeline import LightColor, is_calibrated, is_to_be_found, light_of, separate_capture
+from polsep.light.light_color import LightColor, find_light_after_checks, is_calibrated, is_to_be_found
+from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import find_lasting_defects
 from polsep.sensor.levels import BlackFrame
@@ -140,7 +141,7 @@ def _light_of(frames: Iterator[Frame], options: VideoOptions) -> tuple[LightColo
     captures = [frame.data for frame in frames]
     if not captures or any(is_calibrated(capture) for capture in captures):
         return options.light_color, None
-    found = combine([light_of(capture) for capture in captures])
+    found = combine([find_light_after_checks(capture) for capture in captures])
     if found.log_ratio is None:
         return options.light_color, None
     return found.color, found

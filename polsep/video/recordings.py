@@ -31,8 +31,9 @@ from polsep.io.raw.sequences import DamagedFrame, FrameSequence, input_files, op
 from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter, State
 from polsep.io.store.atomic import OutputError, refuse_inputs
 from polsep.io.store.errors import InputError
+from polsep.light.light_color import LightColor
 from polsep.methods import find_method
-from polsep.pipeline import LightColor, make_frame, move_capture
+from polsep.pipeline import make_frame, move_capture
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import repair
 from polsep.video.first_frame import FirstFrame, of_one_camera, separate_first

@@ -25,8 +25,9 @@ from polsep.io.results.sidecars import read_report
 from polsep.io.store.errors import InputError, input_error
 from polsep.io.store.header_checks import at_most
 from polsep.io.store.result_names import result_names
+from polsep.light.light_color import LightColor, color_notes, is_to_be_found, parse_light_color, stated_gains
 from polsep.methods import check_method
-from polsep.pipeline import LightColor, color_notes, is_to_be_found, parse_light_color, separate_capture, stated_gains
+from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.exposure import Histogram, exposure_flags, histogram
 from polsep.separation.report import SeparatedFrame

@@ -180,7 +180,7 @@ def _as_capture(
     raw: NDArray[Any] | Capture, layout: Layout | str | None, black_level: float, white_level: float | None
 ) -> tuple[Capture, tuple[str, ...]]:
     """A capture of anything that `separate` accepts, with notes for the user."""
-    if isinstance(raw, Mosaic | Measurements):
+    if isinstance(raw, Capture):
         if layout is not None or black_level != 0 or white_level is not None:
             raise ValueError(f"expected layout and levels with an array, found them with a {type(raw).__name__}")
         finite = namespace(raw.data).isfinite(raw.data)

@@ -23,7 +23,7 @@ from polsep.light.color import ColorFit, Doubles, axis_of, fit_color, planes_alo
 from polsep.light.metals import MIN_SPECULAR_TILES, beside, is_metal, metal_share, only_specular
 from polsep.light.tiles import Tiles, tile_measurements, tile_mosaic
 from polsep.physics.stokes import Measurements, aolp_of
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Capture, Layout
 from polsep.sensor.levels import as_mosaic
 
 #: Largest expected error of a colour that counts as found [degrees].
@@ -106,7 +106,7 @@ class Light:
 
 @np.errstate(under="ignore")  # also for callers to whom NumPy is to raise: small chances are 0
 def find_light(
-    raw: NDArray[Any] | Mosaic | Measurements,
+    raw: NDArray[Any] | Capture,
     layout: Layout | str | None = None,
     black_level: float = 0,
     white_level: float | None = None,
@@ -117,14 +117,14 @@ def find_light(
     frame shows little, ``sure`` is False and the colour is the likeliest of usual lamps. Deterministic. Raises
     ValueError on input that is not a mosaic.
     """
-    if isinstance(raw, Mosaic | Measurements):
+    if isinstance(raw, Capture):
         return _light_of(raw)
     mosaic, notes = as_mosaic(raw, layout, black_level, white_level)
     found = _light_of(mosaic)
     return replace(found, remarks=(*notes, *found.remarks))
 
 
-def _light_of(capture: Mosaic | Measurements) -> Light:
+def _light_of(capture: Capture) -> Light:
     """The light of a capture; see `find_light`."""
     tiles = find_tiles(capture)
     if len(tiles.counts) < MIN_TILES:
@@ -175,7 +175,7 @@ def _remarks_on(light: Light, tiles: Tiles) -> Iterator[str]:
         )
 
 
-def find_tiles(capture: Mosaic | Measurements) -> Tiles:
+def find_tiles(capture: Capture) -> Tiles:
     """Return the tiles of a capture, by the kernel where it reads the frame."""
     if isinstance(capture, Measurements):
         return tile_measurements(capture)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from polsep.compute import pages
 from polsep.compute.arguments import WrongType
 from polsep.physics.stokes import Measurements
-from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, clip_level
+from polsep.sensor.camera import CLIP_MARGIN, Capture, Layout, Mosaic, clip_level
 
 #: Accepted samples and the white level that their type implies.
 WHITE_LEVELS = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0, "float64": 1.0}
@@ -306,7 +306,7 @@ def _advice(found: Any) -> str:
     """Advice on a thing that is no array, where it is clear what to do."""
     if type(found).__module__.partition(".")[0] == "torch":
         return ": say raw.numpy(force=True)"
-    if isinstance(getattr(found, "data", None), Mosaic | Measurements):
+    if isinstance(getattr(found, "data", None), Capture):
         return ": say frame.data"
     if hasattr(found, "__cuda_array_interface__"):
         return ": copy it from the GPU, as cupy.asnumpy does"

@@ -38,7 +38,7 @@ from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
 from polsep.sensor.ambient import exposure_notes
 from polsep.sensor.calibration import Corrections
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Capture, Layout, Mosaic
 from polsep.sensor.levels import (
     WHITE_LEVELS,
     ForgottenLevel,
@@ -170,7 +170,7 @@ class Frame:
     """
 
     stem: str
-    data: Mosaic | Measurements
+    data: Capture
     notes: tuple[str, ...]
     index: int = 0
     count: int = 1
@@ -255,7 +255,7 @@ def refuse_forgotten(path: str | Path, frame: Frame) -> None:
         raise input_error(path, f"expected a white level, found that {note}, or --white-level {default:g} if not")
 
 
-def decode_frame(payload: bytes, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
+def decode_frame(payload: bytes, options: ReadOptions) -> tuple[Capture, tuple[str, ...]]:
     """One frame from the bytes a camera sent, and notes, exactly as `read_frames` reads it from a file of them.
 
     ``options`` say size and pixel format. Raises ValueError when they do not or the bytes do not fit them.
@@ -273,7 +273,7 @@ def output_stem(path: str | Path) -> str:
     return stem if _PLACEHOLDER not in stem else stem.replace(_PLACEHOLDER, "").strip("_-. ") or "angles"
 
 
-def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
+def _convert(page: Page, options: ReadOptions) -> tuple[Capture, tuple[str, ...]]:
     """Codes to light, by the rules of the module, corrected; and notes."""
     options, remarks = (options, ()) if page.merged is None else _left_for(page.merged, options)
     data, notes = _to_light(page, options)
@@ -307,7 +307,7 @@ def _left_for(merged: MergedFacts, options: ReadOptions) -> tuple[ReadOptions, t
     return replace(options, corrections=replace(corrections, calibration=None)), tuple(notes)
 
 
-def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
+def _to_light(page: Page, options: ReadOptions) -> tuple[Capture, tuple[str, ...]]:
     layout = page.layout if options.layout is None else options.layout
     white, array, black = _said_white_level(page, options), page.array, options.black_level
     if options.corrections is not None and options.corrections.calibration is not None:

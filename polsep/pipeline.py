@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,14 +35,7 @@ from polsep.sensor.calibration import Calibration, Corrections
 from polsep.sensor.camera import Capture, Layout, Mosaic
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.falloff import Table, falloff_image
-from polsep.sensor.levels import (
-    as_layout,
-    as_measurements,
-    as_mosaic,
-    has_levels_of,
-    interleave_planes,
-    require_plane_angles,
-)
+from polsep.sensor.levels import as_layout, as_mosaic, has_levels_of, planes_as_capture
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.images import FrameImages
 from polsep.separation.report import SeparatedFrame, describe, error_quantiles, light_statistics, on_host, tally_again
@@ -54,16 +46,6 @@ if TYPE_CHECKING:
 
 #: Formats by the endings of file names.
 _ENDINGS = {".exr": "exr", ".npz": "npz", ".tiff": "tiff", ".tif": "tiff", ".png": "png"}
-
-
-def _calm_torch() -> None:
-    """Hold torch to one thread in a forked child, where its other threads are missing and would be waited for."""
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_calm_torch)
 
 
 class PolsepWarning(UserWarning):
@@ -150,11 +132,10 @@ def separate(
     if not isinstance(calibration, Calibration | str | PathLike | None):
         raise WrongType(f"expected a calibration or its file, found {type(calibration).__name__}")
     measured = calibration if isinstance(calibration, Calibration | None) else read_calibration(Path(calibration))
-    if white_level is None and measured is not None and isinstance(raw, np.ndarray):
-        white_level = measured.white_level_of(raw)
     if measured is not None:
         measured.require_black_level(black_level, "black_level")
         if isinstance(raw, np.ndarray):
+            white_level = measured.white_level_of(raw) if white_level is None else white_level
             black_level = measured.black_level_of(raw, black_level, white_level)
     capture, notes = _as_capture(raw, layout, black_level, white_level)
     if isinstance(capture, Mosaic):
@@ -162,9 +143,7 @@ def separate(
         if ambient is not None:
             four = isinstance(raw, np.ndarray) and raw.ndim == 3 and raw.shape[0] == 4
             kind = None if white_level is not None else getattr(raw, "dtype", None)
-            found = [_as_ambient(dark, capture, kind) for dark in _ambient_frames(ambient, four)]
-            said = unit_remarks(note for _, more in found for note in more)
-            corrections = replace(corrections.with_ambient(frame for frame, _ in found), ambient_remarks=said)
+            corrections = _with_ambient(corrections, _ambient_frames(ambient, four), capture, kind)
         capture, more = corrections.apply_noting(capture)
         notes += more
     elif measured is not None or ambient is not None:
@@ -188,14 +167,21 @@ def _as_capture(
             raise ValueError(f"expected finite samples, found {int((~finite).sum())} that are not")
         return raw, ()
     four = isinstance(raw, np.ndarray) and raw.ndim in (3, 4) and raw.shape[0] == 4
-    if not four or (raw.ndim == 3 and raw.shape[2] in (1, 3)):
-        return as_mosaic(raw, layout, black_level, white_level)
-    layout = as_layout(layout)
-    if raw.ndim == 3 and layout is not None and layout.bayer is not None:
-        return as_mosaic(interleave_planes(raw, layout), layout, black_level, white_level)
-    if layout is not None:
-        require_plane_angles(layout)
-    return as_measurements(raw, black_level, white_level)
+    if four and not (raw.ndim == 3 and raw.shape[2] in (1, 3)):
+        return planes_as_capture(raw, as_layout(layout), black_level, white_level)
+    return as_mosaic(raw, layout, black_level, white_level)
+
+
+def _with_ambient(
+    corrections: Corrections,
+    frames: Sequence[NDArray[Any] | Mosaic],
+    capture: Mosaic,
+    kind: np.dtype[Any] | None,
+) -> Corrections:
+    """Corrections with the light of ``frames`` with the lamp off, and remarks on their samples; see `_as_ambient`."""
+    found = [_as_ambient(dark, capture, kind) for dark in frames]
+    remarks = unit_remarks(note for _, notes in found for note in notes)
+    return replace(corrections.with_ambient(mosaic for mosaic, _ in found), ambient_remarks=remarks)
 
 
 def _as_ambient(

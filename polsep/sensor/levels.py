@@ -155,6 +155,21 @@ def interleave_planes(planes: NDArray[Any], layout: Layout) -> NDArray[Any]:
     return mosaic
 
 
+def planes_as_capture(
+    planes: NDArray[Any], layout: Layout | None, black_level: float = 0.0, white_level: float | None = None
+) -> tuple[Capture, Notes]:
+    """Four angle planes as what they are: gray ones under a colour layout are samples of one mosaic, others co-sited.
+
+    ``planes``: ``[4, H, W]`` or ``[4, H, W, C]`` at `PLANE_ANGLES_DEG`. Raises ValueError as `as_mosaic` does, and on a
+    layout of other angles.
+    """
+    if planes.ndim == 3 and layout is not None and layout.bayer is not None:
+        return as_mosaic(interleave_planes(planes, layout), layout, black_level, white_level)
+    if layout is not None:
+        require_plane_angles(layout)
+    return as_measurements(planes, black_level, white_level)
+
+
 def require_plane_angles(layout: Layout) -> None:
     """Raise ValueError on a layout of other angles than those of four planes."""
     if sorted(angle % 180 for angle in layout.angles_deg) != [angle % 180 for angle in PLANE_ANGLES_DEG]:

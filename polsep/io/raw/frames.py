@@ -42,10 +42,9 @@ from polsep.sensor.camera import Capture, Layout, Mosaic
 from polsep.sensor.levels import (
     WHITE_LEVELS,
     ForgottenLevel,
-    as_measurements,
     as_mosaic,
     interleave_planes,
-    require_plane_angles,
+    planes_as_capture,
 )
 
 __all__ = [
@@ -316,12 +315,9 @@ def _to_light(page: Page, options: ReadOptions) -> tuple[Capture, tuple[str, ...
         return as_mosaic(array, layout, black, white)
     if array.ndim == 4 and array.shape[-1] == 1:
         array = array[..., 0]
-    if array.ndim == 3 and (page.sampled or (layout is not None and layout.bayer is not None)):
-        mosaic = interleave_planes(array, Layout() if layout is None else layout)
-        return as_mosaic(mosaic, layout, black, white)
-    if options.layout is not None:
-        require_plane_angles(options.layout)
-    return as_measurements(array, black, white)
+    if page.sampled and layout is not None:
+        return as_mosaic(interleave_planes(array, layout), layout, black, white)
+    return planes_as_capture(array, layout, black, white)
 
 
 def _said_white_level(page: Page, options: ReadOptions) -> float | None:

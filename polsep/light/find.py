@@ -23,7 +23,7 @@ from polsep.light.color import ColorFit, Doubles, axis_of, fit_color, planes_alo
 from polsep.light.metals import MIN_SPECULAR_TILES, beside, is_metal, metal_share, only_specular
 from polsep.light.tiles import Tiles, tile_measurements, tile_mosaic
 from polsep.physics.stokes import Measurements, aolp_of
-from polsep.sensor.camera import Capture, Layout
+from polsep.sensor.camera import Capture, Layout, first_frame
 from polsep.sensor.levels import as_mosaic
 
 #: Largest expected error of a colour that counts as found [degrees].
@@ -179,7 +179,7 @@ def find_tiles(capture: Capture) -> Tiles:
     """Return the tiles of a capture, by the kernel where it reads the frame."""
     if isinstance(capture, Measurements):
         return tile_measurements(capture)
-    array = to_numpy(capture.data.reshape(-1, *capture.data.shape[-2:])[0])
+    array = to_numpy(first_frame(capture))
     if min(array.shape) < 12:
         colors = capture.layout.channels
         moments = np.zeros((0, 1 + 3 * colors, 1 + 3 * colors))

@@ -2,7 +2,7 @@
 
 `find_light` measures tiles (`tiles`), fits the colour (`color`) and says how far off the fit is on average on frames
 like this one, by a formula fitted to rendered frames of known light (docs/experiments.md). `Light` holds the colour as
-log-ratios with a covariance, so that estimates of one lamp, from other frames or other means, combine by `combine`.
+log-ratios with their error, so that estimates of one lamp, from several frames, combine by `combine`.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _light_of(capture: Capture) -> Light:
     tiles = find_tiles(capture)
     if len(tiles.counts) < MIN_TILES:
         return unknown_light(tiles.colors)
-    axis, _ = axis_of(strongest(tiles))
+    axis = axis_of(strongest(tiles))
     if tiles.colors != 3:
         return Light(None, None, 0.0, True, aolp_of(*axis))
     make_ready(_warm_up)
@@ -147,7 +147,7 @@ def _light_of_tiles(tiles: Tiles, axis: NDArray[np.float64]) -> Light:
     if specular.sum() < MIN_SPECULAR_TILES or len(bodies.counts) < MIN_TILES:
         return _as_light(fit, tiles, aolp_of(*axis))
     reflected = iterate_fast(planes_along(strongest(tiles.select(specular)), axis))[0]
-    own_axis, _ = axis_of(strongest(bodies))
+    own_axis = axis_of(strongest(bodies))
     own = fit_color(strongest(bodies), own_axis, iterate_fast)
     if not is_metal(reflected - own.x):
         return _as_light(fit, tiles, aolp_of(*axis))

@@ -22,6 +22,7 @@ import click
 
 from polsep import __version__
 from polsep.compute.installed import is_installed
+from polsep.io.raw.extensions import PLACEHOLDER
 from polsep.io.store.errors import MOST, one_line, printable
 
 if TYPE_CHECKING:
@@ -386,7 +387,7 @@ def require_extra(extra: str, otherwise: str = "") -> None:
 def require_paths(*paths: str | Path) -> None:
     """Raise ValueError, which names the first path where nothing is. To call before heavy imports."""
     for path in paths:
-        if "{angle}" not in str(path) and not os.path.lexists(path):
+        if PLACEHOLDER not in str(path) and not os.path.lexists(path):
             raise ValueError(one_line(f"{path}: expected a file, found nothing at this path"))
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arguments import WrongType
-from polsep.io.raw.extensions import LOSSLESS
+from polsep.io.raw.extensions import ANGLES, LOSSLESS, PLACEHOLDER, template_files
 from polsep.io.raw.headerless import headerless_page, read_headerless, with_layout
 from polsep.io.raw.npy import read_npy, read_npz, stack_angles
 from polsep.io.raw.page import MergedFacts, Page
@@ -89,8 +89,6 @@ HEADERLESS = (".raw", ".bin")
 #: Extensions of files that a folder of frames may hold.
 FRAME_FILES = (*(suffix for suffix, reader in READERS.items() if reader.single), *HEADERLESS)
 _LOSSY = {".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".heic": "HEIC", ".mp4": "video"}
-_ANGLES = (0, 45, 90, 135)
-_PLACEHOLDER = "{angle}"
 #: Mean contradiction of four pages, relative to their mean differences, below which they are angle images.
 MOST_CONTRADICTION = 0.25
 
@@ -195,7 +193,7 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
         raise WrongType(f"expected ReadOptions, found {type(options).__name__}")
     path = as_path(path)
     options = ReadOptions() if options is None else options
-    if _PLACEHOLDER in str(path):
+    if PLACEHOLDER in str(path):
         pages: Iterator[Page] = iter([_read_template(str(path), options)])
     elif options.pages == "frames":
         pages = read_pages(path, options, first)
@@ -269,7 +267,7 @@ def output_stem(path: str | Path) -> str:
     if Path(path).name == RECORD:
         return Path(path).absolute().parent.name or "recording"
     stem = Path(path).stem
-    return stem if _PLACEHOLDER not in stem else stem.replace(_PLACEHOLDER, "").strip("_-. ") or "angles"
+    return stem if PLACEHOLDER not in stem else stem.replace(PLACEHOLDER, "").strip("_-. ") or "angles"
 
 
 def _convert(page: Page, options: ReadOptions) -> tuple[Capture, tuple[str, ...]]:
@@ -423,13 +421,13 @@ def _are_angles(images: list[NDArray[Any]]) -> bool:
 def _read_template(template: str, options: ReadOptions) -> Page:
     """The four images of a path with ``{angle}`` as one page of angles."""
     group: list[Page] = []
-    for path in (Path(template.replace(_PLACEHOLDER, str(angle))) for angle in _ANGLES):
+    for path in template_files(template):
         page = next(read_pages(path, options))
         if page.count != 1 or page.angles:
             raise input_error(path, f"expected one image of one angle, found {4 if page.angles else page.count}")
         group.append(page)
     with naming(template):
-        return _stacked(group, [f"{angle} deg" for angle in _ANGLES])
+        return _stacked(group, [f"{angle} deg" for angle in ANGLES])
 
 
 def _stacked(group: list[Page], names: list[str]) -> Page:

@@ -52,8 +52,8 @@ class Method:
 
     ``run(capture, light, full)``: the images of one frame in its light, by the fastest code that accepts it, at half or
     full resolution; co-sited measurements keep theirs. ``accepts``: whether it can separate a capture; others are a
-    ValueError. ``expects_errors``: its images come with expected errors. ``reads_mosaic``: it needs raw mosaics.
-    ``assumes_white``: its specular light is white, so that metals need `colored_specular`.
+    ValueError. ``expects_errors``: its images come with expected errors. ``reads_mosaic``: it does not demosaic first;
+    co-sited samples become a mosaic. ``assumes_white``: other specular light is moved by `colored_specular` afterwards.
     """
 
     name: str

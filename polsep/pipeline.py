@@ -31,9 +31,10 @@ from polsep.light.light_color import LightColor, resolve_light
 from polsep.methods import Method, find_method
 from polsep.physics.stokes import Measurements
 from polsep.sensor.ambient import unit_remarks
-from polsep.sensor.calibration import Calibration, Corrections
+from polsep.sensor.calibration import Calibration
 from polsep.sensor.camera import Capture, Layout, Mosaic
 from polsep.sensor.checks import check_mosaic
+from polsep.sensor.corrections import Corrections
 from polsep.sensor.falloff import Table, falloff_image
 from polsep.sensor.levels import as_layout, as_mosaic, has_levels_of, planes_as_capture
 from polsep.separation.colored_specular import Colored, color_specular

@@ -38,16 +38,14 @@ from polsep.light.light_color import is_calibrated
 from polsep.sensor.calibration import (
     Analyser,
     Calibration,
-    Corrections,
     LampFacts,
     correct_analysers,
     correct_analysers_reference,
     correct_mosaic,
-    mean_mosaic,
-    subtract_ambient,
     tile,
 )
 from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.corrections import Corrections, mean_mosaic, subtract_ambient
 from polsep.sensor.exposure import histogram
 from polsep.sensor.falloff import falloff_image
 

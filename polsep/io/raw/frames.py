@@ -37,8 +37,8 @@ from polsep.io.store.errors import InputError, as_path, input_error, naming, ref
 from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
 from polsep.sensor.ambient import exposure_notes
-from polsep.sensor.calibration import Corrections
 from polsep.sensor.camera import Capture, Layout, Mosaic
+from polsep.sensor.corrections import Corrections
 from polsep.sensor.levels import (
     WHITE_LEVELS,
     ForgottenLevel,

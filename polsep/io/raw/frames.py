@@ -33,7 +33,7 @@ from polsep.io.raw.png import read_png
 from polsep.io.raw.recording import RECORD, read_recording
 from polsep.io.raw.tiff import read_tiff
 from polsep.io.raw.videos import read_video
-from polsep.io.store.errors import InputError, as_path, input_error, naming, refuse_pipe
+from polsep.io.store.errors import as_path, input_error, naming, refuse_pipe
 from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
 from polsep.sensor.ambient import exposure_notes
@@ -46,19 +46,6 @@ from polsep.sensor.levels import (
     interleave_planes,
     planes_as_capture,
 )
-
-__all__ = [
-    "READERS",
-    "Frame",
-    "InputError",
-    "ReadOptions",
-    "decode_frame",
-    "forgets_level",
-    "output_stem",
-    "read_frames",
-    "read_pages",
-    "refuse_forgotten",
-]
 
 
 class Reader(NamedTuple):

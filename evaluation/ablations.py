@@ -19,9 +19,8 @@ from polsep.bench.rows import Row
 from polsep.in_torch import load_joint
 from polsep.io.store.rows import SPREAD
 from polsep.io.store.weights import read_weights
-from polsep.methods import Capture
 from polsep.networks.run import run_joint
-from polsep.sensor.camera import Mosaic
+from polsep.sensor.camera import Capture, Mosaic
 from polsep.separation.analytic import Separation
 
 #: Metrics of the table.

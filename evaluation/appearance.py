@@ -40,14 +40,13 @@ from polsep.edit.images import Maps
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.results.previews import exposure_of, toned
 from polsep.io.store.image_codecs import write_jpeg
-from polsep.methods import Capture
 from polsep.metrics import psnr
 from polsep.pipeline import separate_capture
 from polsep.render.materials import Materials
 from polsep.render.simulate import blur, expose_to_clip, half_resolution
 from polsep.render.sphere_tracing import PinholeCamera, PointLight, Scene, Vector, camera_axes
 from polsep.render.textures import CLOUDS, STRIPES, Textures
-from polsep.sensor.camera import IMX250, Layout, expose
+from polsep.sensor.camera import IMX250, Capture, Layout, expose
 from polsep.separation.report import SeparatedFrame
 
 if TYPE_CHECKING:

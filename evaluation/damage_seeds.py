@@ -39,8 +39,9 @@ from polsep.io.results.separation_reader import read_separated
 from polsep.io.store.calibrations import read_calibration, write_calibration
 from polsep.io.store.weights import digest_arrays, read_weights, write_weights
 from polsep.pipeline import separate_capture
-from polsep.sensor.calibration import Analyser, Calibration, Corrections, LampFacts
+from polsep.sensor.calibration import Analyser, Calibration, LampFacts
 from polsep.sensor.camera import Layout
+from polsep.sensor.corrections import Corrections
 from polsep.sensor.levels import as_mosaic
 
 Files = dict[str, bytes]

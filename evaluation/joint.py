@@ -21,9 +21,9 @@ from torch.nn.functional import interpolate
 from evaluation.scoring import Entry, Protocol, Truth, capture_noisy, score_sets
 from evaluation.sets import load_sets
 from polsep.bench.rows import Row
-from polsep.methods import METHODS, Capture
+from polsep.methods import METHODS
 from polsep.metrics import psnr, reliability
-from polsep.sensor.camera import IMX250, Layout, Mosaic, expose
+from polsep.sensor.camera import IMX250, Capture, Layout, Mosaic, expose
 from polsep.separation.analytic import Separation
 from polsep.shipped import NAMES
 

@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 
 from polsep.bench.rows import Row, with_spread
-from polsep.methods import METHODS, Capture
+from polsep.methods import METHODS
 from polsep.metrics import chroma, flip, highlights, psnr, psnr_unlimited, ssim, worst_mean
 from polsep.networks.paper import Refinement
+from polsep.sensor.camera import Capture
 from polsep.separation.analytic import Separation
 
 if TYPE_CHECKING:

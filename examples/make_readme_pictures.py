@@ -15,7 +15,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 import polsep
 from polsep.datasets.rendered import RenderOptions, default_workers, render_dataset
-from polsep.io.results.previews import contact_sheet, exposure_of, srgb
+from polsep.io.results.previews import contact_sheet, exposure_of
+from polsep.physics.srgb import srgb
 
 WIDTH, TITLE, GAP = 470, 30, 6
 

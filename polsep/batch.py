@@ -13,12 +13,14 @@ from os.path import realpath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from polsep.io.raw.extensions import template_files
 from polsep.io.raw.frames import Frame, ReadOptions, output_stem, read_frames, refuse_forgotten
 from polsep.io.results.separation_writer import planned_outputs, write_separation
 from polsep.io.store.atomic import OutputError, is_disk_full, refuse_existing, refuse_inputs, require_writable
 from polsep.io.store.errors import one_line
+from polsep.light.light_color import LightColor
 from polsep.methods import find_method, release_memory
-from polsep.pipeline import LightColor, Result, separate_capture, with_lamp_dolp
+from polsep.pipeline import Result, separate_capture, with_lamp_dolp
 from polsep.sensor.levels import BlackFrame, ForgottenLevel
 
 if TYPE_CHECKING:
@@ -81,15 +83,14 @@ def separate_files(
     """
     require_writable(write.directory)
     _refuse_equal_names(paths)
-    angles = ("0", "45", "90", "135")
-    claimed = {realpath(path.replace("{angle}", angle)): "is an input" for path in paths for angle in angles}
+    claimed = {realpath(file): "is an input" for path in paths for file in template_files(path)}
     claimed |= {realpath(path): "is an input" for path in write.kept}
     trusted: set[float | None] = set()  # white levels
     for path in paths:
-        left: int | None = None  # frames of the file
+        remaining: int | None = None  # frames of the file that are not written yet, None before the first is read
         try:
             for frame in read_frames(path, read):
-                left, level = frame.count - frame.index, frame.white_level
+                remaining, level = frame.count - frame.index, frame.white_level
                 if not any(isinstance(note, ForgottenLevel | BlackFrame) for note in frame.notes):
                     trusted.add(level)
                 if level not in trusted:
@@ -105,14 +106,14 @@ def separate_files(
                     release_memory()
                 outcome = _write_frame(path, stem, separated, write)
                 claimed |= {realpath(output): f"is of {path}" for output in outcome.written}
-                left -= 1
-                yield replace(outcome, last=left <= 0)
-            if left is None:
+                remaining -= 1
+                yield replace(outcome, last=remaining <= 0)
+            if remaining is None:
                 raise ValueError(f"{path}: expected frames, found none")
         except (ValueError, OSError, MemoryError, RuntimeError) as error:
             if is_disk_full(error):
                 raise
-            more = f"; {left - 1} frames behind it are left out" if left and left > 1 else ""
+            more = f"; {remaining - 1} frames behind it are left out" if remaining and remaining > 1 else ""
             yield Outcome(path, error=(one_line(error) or type(error).__name__) + more)
 
 

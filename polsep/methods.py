@@ -24,7 +24,7 @@ from polsep.demosaic.guided import demosaic_guided, demosaic_guided_half, is_lar
 from polsep.io.store.weights import is_shipped
 from polsep.networks.engines import ENGINES, combine_images, run_engine
 from polsep.physics.stokes import Measurements, behind_angles, bounded_below_white, fit_stokes, is_pair
-from polsep.sensor.camera import Layout, Mosaic, sample_fine_mosaic
+from polsep.sensor.camera import Capture, Layout, Mosaic, sample_fine_mosaic
 from polsep.separation import analytic_kernel, color_affine_kernel
 from polsep.separation.analytic import Separation, clipped_pixels, separate_analytic
 from polsep.separation.analytic_kernel import AnalyticOptions
@@ -35,10 +35,8 @@ from polsep.separation.images import FrameImages
 from polsep.separation.report import images_of, in_light, tally_again, under_white_light
 from polsep.shipped import accepts_mosaic, separate_paper, shipped_joint, weights_name
 
-#: A raw frame, or co-sited samples.
-Capture = Mosaic | Measurements
 #: One gain per channel.
-Light = tuple[float, ...]
+Gains = tuple[float, ...]
 
 
 class Reference(Protocol):
@@ -54,8 +52,8 @@ class Method:
 
     ``run(capture, light, full)``: the images of one frame in its light, by the fastest code that accepts it, at half or
     full resolution; co-sited measurements keep theirs. ``accepts``: whether it can separate a capture; others are a
-    ValueError. ``expects_errors``: its images come with expected errors. ``reads_mosaic``: it needs raw mosaics.
-    ``assumes_white``: its specular light is white, so that metals need `colored_specular`.
+    ValueError. ``expects_errors``: its images come with expected errors. ``reads_mosaic``: it does not demosaic first;
+    co-sited samples become a mosaic. ``assumes_white``: other specular light is moved by `colored_specular` afterwards.
     """
 
     name: str
@@ -63,7 +61,7 @@ class Method:
     needs: str
     source: str
     reference: Reference
-    run: Callable[[Capture, Light, bool], FrameImages]
+    run: Callable[[Capture, Gains, bool], FrameImages]
     accepts: Callable[[Capture], bool]
     expects_errors: bool = False
     reads_mosaic: bool = False
@@ -112,13 +110,13 @@ def joint_reference(name: str, capture: Capture, full: bool = False) -> Separati
     return separate_joint(name, capture, full)
 
 
-def run_reference(reference: Reference, capture: Capture, light: Light, full: bool) -> FrameImages:
+def run_reference(reference: Reference, capture: Capture, light: Gains, full: bool) -> FrameImages:
     """One frame by a method's reference, in its light."""
     separation = reference(under_white_light(capture, light), full)
     return images_of(separation, in_light(separation, light))
 
 
-def run_analytic(capture: Capture, light: Light, full: bool) -> FrameImages:
+def run_analytic(capture: Capture, light: Gains, full: bool) -> FrameImages:
     """`separate_analytic` of bilinear samples: compiled kernels for one frame, else the reference."""
     if not isinstance(capture, Mosaic) or not _is_plain(capture):
         return run_reference(analytic_reference, capture, light, full)
@@ -129,7 +127,7 @@ def run_analytic(capture: Capture, light: Light, full: bool) -> FrameImages:
     return separate(to_numpy(capture.data), capture.layout, *levels, options)
 
 
-def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
+def run_color_affine(capture: Capture, light: Gains, full: bool) -> FrameImages:
     """`separate_color_affine` of guided samples: compiled kernels for one colour frame, else the reference."""
     if (
         not isinstance(capture, Mosaic)
@@ -146,7 +144,7 @@ def run_color_affine(capture: Capture, light: Light, full: bool) -> FrameImages:
     return separate(to_numpy(capture.data), capture.layout, *levels, options)
 
 
-def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameImages:
+def run_joint(name: str, capture: Capture, light: Gains, full: bool) -> FrameImages:
     """The joint networks of that name: kernels and OpenVINO, on other devices torch."""
     if isinstance(capture, Measurements):
         return run_joint_co_sited(name, capture, light)
@@ -158,7 +156,7 @@ def run_joint(name: str, capture: Capture, light: Light, full: bool) -> FrameIma
     return run_reference(partial(joint_reference, name), capture, light, full)
 
 
-def run_joint_co_sited(name: str, samples: Measurements, light: Light) -> FrameImages:
+def run_joint_co_sited(name: str, samples: Measurements, light: Gains) -> FrameImages:
     """The joint networks on the mosaic that a sensor twice as fine would see of co-sited samples, at their resolution.
 
     Better than a mosaic of the samples themselves, which lacks three analysers and two colours in every pixel

@@ -29,8 +29,8 @@ from polsep.compute.registration import MOTIONS, Motion, find_motion, move_back,
 from polsep.compute.resizing import block_means
 from polsep.io.raw.frames import Frame, ReadOptions, output_stem, refuse_forgotten
 from polsep.io.raw.photographs import Photographs, read_photographs
-from polsep.io.results.previews import linear_from_srgb
 from polsep.io.store.errors import naming
+from polsep.physics.srgb import linear_from_srgb
 from polsep.physics.stokes import Measurements, contradictions, correct_extinction, stokes_inverse
 from polsep.physics.turned_analyser import find_angles, find_pair_exposure, gram
 from polsep.sensor.levels import as_measurements

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -28,22 +27,16 @@ from polsep.demosaic.measured_stokes import measured_stokes
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration
 from polsep.io.store.errors import as_path
-from polsep.light.find import Light, find_light
-from polsep.methods import Capture, Method, find_method
+from polsep.light.light_color import LightColor, resolve_light
+from polsep.methods import Method, find_method
 from polsep.physics.stokes import Measurements
 from polsep.sensor.ambient import unit_remarks
-from polsep.sensor.calibration import Calibration, Corrections
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.calibration import Calibration
+from polsep.sensor.camera import Capture, Layout, Mosaic
 from polsep.sensor.checks import check_mosaic
+from polsep.sensor.corrections import Corrections
 from polsep.sensor.falloff import Table, falloff_image
-from polsep.sensor.levels import (
-    as_layout,
-    as_measurements,
-    as_mosaic,
-    has_levels_of,
-    interleave_planes,
-    require_plane_angles,
-)
+from polsep.sensor.levels import as_layout, as_mosaic, has_levels_of, planes_as_capture
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.images import FrameImages
 from polsep.separation.lamp_polarization import separate_by_known_lamp
@@ -53,22 +46,8 @@ from polsep.separation.under_highlights import fill_under_highlights
 if TYPE_CHECKING:
     from polsep.io.results.previews import Picture
 
-LightColor = Sequence[float]
 #: Formats by the endings of file names.
 _ENDINGS = {".exr": "exr", ".npz": "npz", ".tiff": "tiff", ".tif": "tiff", ".png": "png"}
-#: Words for the light's colour: found in the frame (two words for one thing), or white.
-FOUND_WORDS = ("auto", "estimate")
-LIGHT_WORDS = (*FOUND_WORDS, "white")
-
-
-def _calm_torch() -> None:
-    """Hold torch to one thread in a forked child, where its other threads are missing and would be waited for."""
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_calm_torch)
 
 
 class PolsepWarning(UserWarning):
@@ -158,11 +137,10 @@ def separate(
     if not isinstance(calibration, Calibration | str | PathLike | None):
         raise WrongType(f"expected a calibration or its file, found {type(calibration).__name__}")
     measured = calibration if isinstance(calibration, Calibration | None) else read_calibration(Path(calibration))
-    if white_level is None and measured is not None and isinstance(raw, np.ndarray):
-        white_level = measured.white_level_of(raw)
     if measured is not None:
         measured.require_black_level(black_level, "black_level")
         if isinstance(raw, np.ndarray):
+            white_level = measured.white_level_of(raw) if white_level is None else white_level
             black_level = measured.black_level_of(raw, black_level, white_level)
     capture, notes = _as_capture(raw, layout, black_level, white_level)
     if isinstance(capture, Mosaic):
@@ -170,9 +148,7 @@ def separate(
         if ambient is not None:
             four = isinstance(raw, np.ndarray) and raw.ndim == 3 and raw.shape[0] == 4
             kind = None if white_level is not None else getattr(raw, "dtype", None)
-            found = [_as_ambient(dark, capture, kind) for dark in _ambient_frames(ambient, four)]
-            said = unit_remarks(note for _, more in found for note in more)
-            corrections = replace(corrections.with_ambient(frame for frame, _ in found), ambient_remarks=said)
+            corrections = _with_ambient(corrections, _ambient_frames(ambient, four), capture, kind)
         capture, more = corrections.apply_noting(capture)
         notes += more
     elif measured is not None or ambient is not None:
@@ -189,7 +165,7 @@ def _as_capture(
     raw: NDArray[Any] | Capture, layout: Layout | str | None, black_level: float, white_level: float | None
 ) -> tuple[Capture, tuple[str, ...]]:
     """A capture of anything that `separate` accepts, with notes for the user."""
-    if isinstance(raw, Mosaic | Measurements):
+    if isinstance(raw, Capture):
         if layout is not None or black_level != 0 or white_level is not None:
             raise ValueError(f"expected layout and levels with an array, found them with a {type(raw).__name__}")
         finite = namespace(raw.data).isfinite(raw.data)
@@ -197,14 +173,21 @@ def _as_capture(
             raise ValueError(f"expected finite samples, found {int((~finite).sum())} that are not")
         return raw, ()
     four = isinstance(raw, np.ndarray) and raw.ndim in (3, 4) and raw.shape[0] == 4
-    if not four or (raw.ndim == 3 and raw.shape[2] in (1, 3)):
-        return as_mosaic(raw, layout, black_level, white_level)
-    layout = as_layout(layout)
-    if raw.ndim == 3 and layout is not None and layout.bayer is not None:
-        return as_mosaic(interleave_planes(raw, layout), layout, black_level, white_level)
-    if layout is not None:
-        require_plane_angles(layout)
-    return as_measurements(raw, black_level, white_level)
+    if four and not (raw.ndim == 3 and raw.shape[2] in (1, 3)):
+        return planes_as_capture(raw, as_layout(layout), black_level, white_level)
+    return as_mosaic(raw, layout, black_level, white_level)
+
+
+def _with_ambient(
+    corrections: Corrections,
+    frames: Sequence[NDArray[Any] | Mosaic],
+    capture: Mosaic,
+    kind: np.dtype[Any] | None,
+) -> Corrections:
+    """Corrections with the light of ``frames`` with the lamp off, and remarks on their samples; see `_as_ambient`."""
+    found = [_as_ambient(dark, capture, kind) for dark in frames]
+    remarks = unit_remarks(note for _, notes in found for note in notes)
+    return replace(corrections.with_ambient(mosaic for mosaic, _ in found), ambient_remarks=remarks)
 
 
 def _as_ambient(
@@ -257,26 +240,28 @@ def separate_capture(
     chosen = find_method(method, capture)
     checked = check_mosaic(capture) if isinstance(capture, Mosaic) else None
     capture, device = checked.mosaic if checked else capture, find_device(device)
-    light, facts, remarks = resolve_light(light_color, capture)  # before it moves: a device sends no raw frame back
-    seen, capture = capture, move_capture(capture, device)
-    colored, filled = Colored(), 0.0
-    if isinstance(capture, Mosaic):
-        images = separate_by_known_lamp(lambda mosaic: chosen.run(mosaic, light, full), capture, light)
+    light = resolve_light(light_color, capture)  # before it moves: a device sends no raw frame back
+    moved = move_capture(capture, device)
+    degree, colored, filled = None, Colored(), 0.0
+    if isinstance(moved, Mosaic):
+        degree = moved.lamp_dolp
+        images = separate_by_known_lamp(lambda mosaic: chosen.run(mosaic, light.gains, full), moved, light.gains)
         if chosen.assumes_white:
-            images, colored = color_specular(images, capture, light)
-        images, filled = fill_under_highlights(images, capture, light)
+            images, colored = color_specular(images, moved, light.gains)
+        images, filled = fill_under_highlights(images, moved, light.gains)
     else:
-        images = chosen.run(capture, light, full)
-    frame = make_frame(images, chosen, capture, light, full)
-    frame.report["light"] = facts
-    frame.report.update(colored_specular=colored.share, retained_polarization=colored.retained)
-    degree = getattr(capture, "lamp_dolp", None) or colored.lamp_dolp
-    frame.report.update(lamp_dolp=degree, filled_under_highlights=filled)
-    frame.report["warnings"] = [*remarks, *([colored.remark] if colored.remark else []), *frame.report["warnings"]]
-    if checked:
-        frame.report.update(checked.report)
-        frame.report["warnings"] = [*checked.warnings, *frame.report["warnings"]]
-    return replace(frame, capture=seen)
+        images = chosen.run(moved, light.gains, full)
+    frame = make_frame(images, chosen, moved, light.gains, full)
+    facts: dict[str, Any] = {
+        "light": light.facts,
+        "colored_specular": colored.share,
+        "retained_polarization": colored.retained,
+        "lamp_dolp": degree or colored.lamp_dolp,
+        "filled_under_highlights": filled,
+        **(checked.report if checked else {}),
+    }
+    warned = [*(checked.warnings if checked else ()), *light.remarks, *colored.remarks, *frame.report["warnings"]]
+    return replace(frame, report=frame.report | facts | {"warnings": warned}, capture=capture)
 
 
 def with_lamp_dolp(capture: Capture, degree: float | None) -> Capture:
@@ -338,106 +323,3 @@ def move_capture(capture: Capture, device: str) -> Capture:
     """The capture with its arrays on a device: on the CPU as they are, on others as torch tensors."""
     moved = {name: to_device(value, device) for name, value in vars(capture).items() if is_array_api_obj(value)}
     return replace(capture, **moved)
-
-
-def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[SeparatedFrame, list[str]]:
-    """A frame that was separated before, with the report beside its file, and notes for the user, a line each.
-
-    ``light_color`` of the report is the one that is stated here, else the one beside the file; without either it is
-    left out and a note says so. Raises InputError on what cannot be read.
-    """
-    from polsep.io.results.separation_reader import read_separated
-    from polsep.io.results.sidecars import read_report
-
-    frame = replace(read_separated(path), report=read_report(path))
-    notes = list(frame.report.get("warnings", ()))
-    if not is_to_be_found(light_color):
-        frame.report["light_color"] = stated_gains(light_color, frame.diffuse.shape[-1])
-        notes += color_notes(light_color, frame.diffuse.shape[-1])
-    elif "light_color" not in frame.report and frame.diffuse.shape[-1] > 1:
-        notes.append(f"the lamp's colour is neither stated nor in {path.stem}.json beside the file: taken for white")
-    return frame, notes
-
-
-def stated_gains(light_color: LightColor | str, channels: int) -> list[float]:
-    """One gain per channel of a light whose colour is stated: three numbers or "white"; mono has one channel.
-
-    Green is 1, as in lights that are found: of a colour only the ratios count, in whatever unit it was measured.
-    """
-    if isinstance(light_color, str) or channels == 1:
-        return [1.0] * channels
-    color = [float(gain) for gain in light_color]
-    return [gain / color[1] for gain in color]
-
-
-def color_notes(light_color: LightColor | str, channels: int) -> tuple[str, ...]:
-    """A note where the colour that is stated of a light changes nothing: mono frames show none."""
-    ignored = channels == 1 and not isinstance(light_color, str) and len(set(light_color)) > 1
-    return ("the colour stated of the light changes nothing: mono frames show no colours",) * ignored
-
-
-def parse_light_color(text: str) -> LightColor | str:
-    """The light's colour as people write it: ``R,G,B``, ``white``, ``auto`` or ``estimate``. Raises ValueError."""
-    if text in LIGHT_WORDS:
-        return text
-    color = _as_color(text.split(","))
-    if color is None:
-        raise ValueError(
-            f'expected a light colour R,G,B like 1,0.9,0.7, all positive, "white" or "auto", found {text!r:.40}'
-        )
-    return color
-
-
-def _as_color(parts: Iterable[Any]) -> tuple[float, ...] | None:
-    """Three positive numbers of a light's colour; None of anything else. Raises TypeError on what are no parts."""
-    try:
-        color = tuple(float(part) for part in parts)
-    except ValueError:
-        return None
-    return color if len(color) == 3 and all(1e-6 < c < 1e6 for c in color) else None
-
-
-def light_of(capture: Capture) -> Light:
-    """`find_light` in a frame whose black level and defects were put right, as `separate_capture` does first."""
-    return find_light(check_mosaic(capture).mosaic if isinstance(capture, Mosaic) else capture)
-
-
-def is_calibrated(capture: Capture) -> bool:
-    """True if a calibration says the colour of the lamp, which mono frames have none of."""
-    if not isinstance(capture, Mosaic) or capture.layout.channels == 1:
-        return False
-    return capture.lamp_measured or any(gain != 1 for gain in capture.light_color)
-
-
-def is_to_be_found(light_color: LightColor | str) -> bool:
-    """True if a light's colour, of any type, is one of `FOUND_WORDS`."""
-    return isinstance(light_color, str) and light_color in FOUND_WORDS
-
-
-def resolve_light(
-    light_color: LightColor | str, capture: Capture
-) -> tuple[tuple[float, ...], dict[str, Any], tuple[str, ...]]:
-    """One gain per channel, green 1, the report's entry on the light, found in the frame or stated, and remarks on it.
-
-    "auto" takes what a calibration says, else what the frame shows. Raises ValueError on anything but three positive
-    numbers or one of `LIGHT_WORDS`.
-    """
-    channels = capture.layout.channels if isinstance(capture, Mosaic) else capture.data.shape[-3]
-    if isinstance(light_color, str) and light_color not in LIGHT_WORDS:
-        raise ValueError(f'expected a light colour of three numbers, "white" or "auto", found {light_color!r}')
-    if is_to_be_found(light_color) and not is_calibrated(capture):
-        found = find_light(capture)
-        return found.color if channels == 3 else (1.0,), {"source": "found", **found.describe()}, found.remarks
-    stated, source = light_color, "stated"
-    if isinstance(light_color, str):
-        stated = (1.0, 1.0, 1.0)
-        if isinstance(capture, Mosaic) and light_color != "white":
-            stated, source = capture.light_color, "calibrated"
-    try:
-        color = _as_color(stated)
-    except TypeError:
-        raise WrongType(f"expected a light colour of three positive numbers, found {light_color!r:.40}") from None
-    if color is None:
-        raise ValueError(f"expected a light colour of three positive numbers, found {light_color!r}")
-    gains = stated_gains(color, channels)
-    return tuple(gains), {"source": source, "color": gains}, color_notes(color, channels)

@@ -33,9 +33,9 @@ from polsep.physics.stokes import (
     rotate_quarter,
     transpose,
 )
-from polsep.sensor.calibration import mean_mosaic, subtract_ambient
 from polsep.sensor.camera import IDEAL, Layout, Mosaic, Sensor, expose, sample_mosaic
 from polsep.sensor.checks import check_mosaic
+from polsep.sensor.corrections import mean_mosaic, subtract_ambient
 from polsep.sensor.defects import find_defects, repair
 from polsep.sensor.orient import orient
 
@@ -56,7 +56,8 @@ from polsep.calibrate.lamp import measure_lamp
 from polsep.demosaic import bilinear, guided
 from polsep.light.find import find_light
 from polsep.physics.stokes import fit_stokes, fit_stokes_unclipped
-from polsep.sensor.calibration import correct_mosaic, mean_mosaic, subtract_ambient
+from polsep.sensor.calibration import correct_mosaic
+from polsep.sensor.corrections import mean_mosaic, subtract_ambient
 from polsep.sensor.camera import Layout
 from polsep.sensor.checks import check_mosaic
 from polsep.sensor.defects import find_defects

@@ -34,20 +34,18 @@ from polsep.io.raw.tiff import write_merged
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import read_calibration, write_calibration
 from polsep.io.store.errors import InputError
-from polsep.pipeline import is_calibrated
+from polsep.light.light_color import is_calibrated
 from polsep.sensor.calibration import (
     Analyser,
     Calibration,
-    Corrections,
     LampFacts,
     correct_analysers,
     correct_analysers_reference,
     correct_mosaic,
-    mean_mosaic,
-    subtract_ambient,
     tile,
 )
 from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.corrections import Corrections, mean_mosaic, subtract_ambient
 from polsep.sensor.exposure import histogram
 from polsep.sensor.falloff import falloff_image
 

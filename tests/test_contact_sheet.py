@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from polsep.io.results.dataset import GAP, GAP_LEVEL, SHEET_COLS, THUMBNAIL, contact_sheet
-from polsep.io.results.previews import srgb
+from polsep.physics.srgb import srgb
 
 RED, GREEN, BLUE = 0.25, 0.5, 1.5
 

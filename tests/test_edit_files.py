@@ -30,12 +30,12 @@ from polsep.edit.files import EditTarget, Work, edit_sequence, load_work, read_r
 from polsep.edit.recipe import recipe_as_text
 from polsep.io.assets.maps import read_map
 from polsep.io.results.exr import encode_exr, read_exr_layers
-from polsep.io.results.previews import linear_from_srgb, srgb
 from polsep.io.results.separation_reader import find_numbered, read_separated
 from polsep.io.results.separation_writer import write_separation
 from polsep.io.results.sequences import PART, Picture, SequenceKind, write_exr
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.errors import InputError
+from polsep.physics.srgb import linear_from_srgb, srgb
 from polsep.separation.report import SeparatedFrame
 
 Cli = Callable[..., Run]

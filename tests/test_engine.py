@@ -16,9 +16,10 @@ import torch
 
 from polsep.compute import jit, warm_up
 from polsep.compute.compiling import OPTIONS
+from polsep.light.light_color import resolve_light
 from polsep.methods import METHODS, run_reference
 from polsep.physics.stokes import Measurements
-from polsep.pipeline import SeparatedFrame, make_frame, resolve_light, separate_capture
+from polsep.pipeline import SeparatedFrame, make_frame, separate_capture
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.separation import analytic_kernel, color_affine_kernel
 from polsep.shipped import NAMES

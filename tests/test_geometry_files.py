@@ -30,10 +30,10 @@ from polsep.geometry.surface import Surface, draw_views, relight, span_surface
 from polsep.io.assets.shapes import encode_glb, encode_ply
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.previews import srgb
 from polsep.io.results.separation_reader import read_separated
 from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.image_codecs import encode_png
+from polsep.physics.srgb import srgb
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import IDEAL, Layout, expose
 from polsep.separation.report import SeparatedFrame

@@ -19,6 +19,7 @@ from torch.nn.functional import interpolate
 from polsep import pipeline
 from polsep.bench import gpu
 from polsep.compute.arrays import to_numpy_together
+from polsep.light import light_color
 from polsep.methods import METHODS
 from polsep.networks import run
 from polsep.networks.engines import ENGINES
@@ -136,13 +137,13 @@ def test_images_come_together(
 
 def test_the_light_is_found_before_the_frame_moves(monkeypatch: pytest.MonkeyPatch, generator: torch.Generator) -> None:
     """What is on the host anyway is never copied back."""
-    seen, find_light = [], pipeline.find_light
+    seen, find_light = [], light_color.find_light
 
     def find(capture: Mosaic) -> Any:
         seen.append(type(capture.data))
         return find_light(capture)
 
-    monkeypatch.setattr(pipeline, "find_light", find)
+    monkeypatch.setattr(light_color, "find_light", find)
     monkeypatch.setattr(pipeline, "find_device", lambda name: name)
     frame = textured(generator, 96)
     with pytest.raises(RuntimeError, match="meta"):  # where there are no numbers to look at

@@ -108,7 +108,7 @@ def test_light_that_is_left_moves_to_the_specular_image(side: int) -> None:
     mosaic = expose(scene(body + (1 - degree) * white, degree * white), Layout(), IDEAL)
     found, colored = color_specular(images, mosaic, (1.0, 1.0, 1.0))
     assert colored.lamp_dolp == pytest.approx(degree, abs=SLOPE) and colored.share == colored.retained == 0
-    assert colored.remark is not None and "found one of 80%" in colored.remark and Colored().remark is None
+    assert "found one of 80%" in colored.remarks[0] and not Colored().remarks
     assert_close(torch.from_numpy(found.diffuse + found.specular), torch.from_numpy(images.diffuse + images.specular))
     truth = white[:, ::side, ::side].movedim(0, -1)
     torch.testing.assert_close(torch.from_numpy(found.specular), truth, rtol=0, atol=SLOPE)

@@ -261,7 +261,7 @@ def test_votes_are_counted_as_by_the_twin(shape: tuple[int, int]) -> None:
     tall = Mosaic(mosaic.data.repeat(5, 1)[: shape[0], : shape[1]].contiguous(), mosaic.layout, 0.0, 4095.0)
     tiles, slow = find_tiles(tall), tile_mosaic(tall)
     assert np.array_equal(tiles.counts, slow.counts)
-    planes = planes_along(slow, axis_of(slow)[0])
+    planes = planes_along(slow, axis_of(slow))
     for one, other in zip(iterate_fast(planes), iterate(planes), strict=True):
         assert np.abs(one - other).max() < 1e-6 * max(1, np.abs(other).max())
 

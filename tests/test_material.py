@@ -24,7 +24,6 @@ from polsep.cli.app import main
 from polsep.io.assets.materials import encode_glb, encode_materialx, metallic_maps, specular_scale, texture_pixels
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.previews import srgb
 from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.weights import write_weights
 from polsep.material.estimate import load_estimator
@@ -34,6 +33,7 @@ from polsep.material.procedural import halve, random_svbrdf
 from polsep.material.shots import CAMERA, photograph, random_example, random_flash
 from polsep.material.svbrdf import CAMERA_HEIGHT, INPUTS, Svbrdf, plane_points, relight, unstack
 from polsep.physics.gltf import GLASS
+from polsep.physics.srgb import srgb
 from polsep.render.sphere_tracing import PointLight
 from polsep.separation.report import SeparatedFrame
 from polsep.train.material_losses import material_loss

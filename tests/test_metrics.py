@@ -13,8 +13,8 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from tolerances import SIGMAS, assert_close, assert_within
 from torch import Tensor
 
-from polsep.io.results.previews import srgb
 from polsep.metrics import chroma, flip, highlights, psnr, psnr_unlimited, reliability, require_flip, ssim, worst_mean
+from polsep.physics.srgb import srgb
 
 EVERYWHERE = torch.ones(40, 50, dtype=torch.bool)
 

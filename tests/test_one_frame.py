@@ -55,14 +55,15 @@ from polsep.geometry.shape_maps import (
 from polsep.io.assets.maps import read_object
 from polsep.io.raw.frames import Frame, ReadOptions
 from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.separation_reader import open_separated
 from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.errors import InputError
 from polsep.io.store.weights import write_weights
+from polsep.light.light_color import stated_gains
 from polsep.networks.shape import ShapeNetwork
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.fresnel import diffuse_dolp
 from polsep.physics.stokes import Stokes
-from polsep.pipeline import open_separated, stated_gains
 from polsep.render.blobs import random_blob
 from polsep.sensor.camera import IDEAL, Layout, Mosaic, expose
 from polsep.separation.report import SeparatedFrame

@@ -22,10 +22,10 @@ from polsep.compute.registration import MOTIONS, find_motion, move_back, residua
 from polsep.io.raw.frames import ReadOptions, read_frames
 from polsep.io.raw.photographs import MOST_FRAMES, read_photographs
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.previews import srgb
 from polsep.io.store.errors import InputError
 from polsep.methods import METHODS
 from polsep.photographs import PAIR, PAIR_DEG, PhotoOptions, read_measurements
+from polsep.physics.srgb import srgb
 from polsep.physics.stokes import Measurements, fit_stokes
 from polsep.sensor.camera import Mosaic
 

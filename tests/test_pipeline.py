@@ -23,15 +23,16 @@ from torch.nn.functional import interpolate
 import polsep
 from polsep.compute.devices import find_device
 from polsep.io.results.previews import contact_sheet
-from polsep.methods import BEST, FASTEST, METHODS, Capture, Method, find_method, run_reference
+from polsep.io.results.separation_reader import open_separated
+from polsep.methods import BEST, FASTEST, METHODS, Method, find_method, run_reference
 from polsep.networks.channels import MIN_BRIGHTNESS
 from polsep.networks.joint import Joint
 from polsep.networks.run import run_joint
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.stokes import Measurements, Stokes, measure
-from polsep.pipeline import PolsepWarning, open_separated, separate, separate_capture
+from polsep.pipeline import PolsepWarning, separate, separate_capture
 from polsep.sensor.calibration import Calibration
-from polsep.sensor.camera import IDEAL, IMX250, Layout, Mosaic, expose
+from polsep.sensor.camera import IDEAL, IMX250, Capture, Layout, Mosaic, expose
 from polsep.sensor.levels import as_mosaic
 from polsep.separation.analytic import Separation
 from polsep.shipped import NAMES
@@ -81,6 +82,7 @@ def test_signature_is_the_contract() -> None:
         "full": False,
         "calibration": None,
         "ambient": None,
+        "lamp_dolp": None,
     }
     assert list(parameters)[:5] == ["raw", "method", "layout", "black_level", "white_level"]
 

@@ -25,8 +25,8 @@ import pytest
 import polsep
 from polsep.io.assets.materials import metallic_maps
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.previews import srgb
 from polsep.io.store.samples import sample_folder
+from polsep.physics.srgb import srgb
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"

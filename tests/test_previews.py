@@ -20,8 +20,8 @@ from polsep.io.results.previews import (
     contact_sheet,
     dolp_map,
     exposure_of,
-    srgb,
 )
+from polsep.physics.srgb import srgb
 from polsep.separation.report import SeparatedFrame
 
 

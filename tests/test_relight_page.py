@@ -17,7 +17,7 @@ from test_geometry import cap
 
 from polsep.geometry.shape_maps import Surface, relight
 from polsep.io.assets.relight_page import LARGEST_STRENGTH, RelightMaps, encode_relight_page
-from polsep.io.results.previews import srgb
+from polsep.physics.srgb import srgb
 
 __all__ = ["browser"]
 

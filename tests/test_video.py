@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from test_cli import contents
 from torch.nn.functional import interpolate
 
-from polsep import cli, pipeline
+from polsep import cli
 from polsep.compute.threads import own_threads
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import Frame, ReadOptions, read_frames
@@ -44,6 +44,7 @@ from polsep.io.results.sequences import FILM_WHITE, PART, Picture, SequenceKind,
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.calibrations import write_calibration
 from polsep.io.store.errors import InputError
+from polsep.light import light_color
 from polsep.light.find import find_light
 from polsep.physics.stokes import Stokes
 from polsep.pipeline import separate_capture
@@ -885,7 +886,9 @@ def test_a_black_first_frame_says_nothing_of_levels(
     assert run(*plain) == 2
     assert "expected a white level" in capsys.readouterr().err and not list((tmp_path / "out").glob("*.exr"))
     lit = list[bool]()
-    monkeypatch.setattr(pipeline, "find_light", lambda capture: lit.append(capture.data.any()) or find_light(capture))
+    monkeypatch.setattr(
+        light_color, "find_light", lambda capture: lit.append(capture.data.any()) or find_light(capture)
+    )
     assert run(*plain, "--white-level", str(WHITE)) == 0
     assert lit and all(lit)  # nor of the lamp
     write_folder(tmp_path / "dark", images[:1].repeat(2, axis=0))
@@ -947,8 +950,8 @@ def test_the_lamp_of_a_film_is_found_in_frames_put_right(recording: Path, monkey
         seen.append(capture.black_level)
         return find_light(capture)
 
-    monkeypatch.setattr(pipeline, "check_mosaic", checked)
-    monkeypatch.setattr(pipeline, "find_light", found)
+    monkeypatch.setattr(light_color, "check_mosaic", checked)
+    monkeypatch.setattr(light_color, "find_light", found)
     first_frame.separate_first(open_sequence(recording, ReadOptions(white_level=WHITE)), video.VideoOptions("analytic"))
     assert seen and set(seen) == {7.0}
 

@@ -19,11 +19,11 @@ import torch
 from polsep.edit import EDITS, Metallic, Recipe, Rougher, Texture
 from polsep.edit import apply as apply_edits
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.previews import srgb
 from polsep.io.results.separation_reader import read_separated
 from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.errors import InputError
 from polsep.io.store.temporary import TemporaryFolders, find_upload, make_temporary_folders, remove_folder
+from polsep.physics.srgb import srgb
 from polsep.physics.stokes import Measurements
 from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout, Mosaic

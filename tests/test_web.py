@@ -18,11 +18,13 @@ import tifffile
 from chromium import WAIT_MS, browser, fresh_page
 
 import polsep
-from polsep.io.raw.frames import InputError, read_frames
+from polsep.io.raw.frames import read_frames
 from polsep.io.raw.genicam import pack_frame
 from polsep.io.results.exr import read_exr_layers
+from polsep.io.store.errors import InputError
 from polsep.light.find import find_light
-from polsep.pipeline import PolsepWarning, resolve_light
+from polsep.light.light_color import resolve_light
+from polsep.pipeline import PolsepWarning
 from polsep.sensor.black_level import check_black_level
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.defects import measure_noise

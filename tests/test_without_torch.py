@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from polsep.geometry.lights import NAMED
-from polsep.io.results.previews import srgb
 from polsep.io.results.separation_writer import write_separation
 from polsep.io.store.image_codecs import encode_png
 from polsep.methods import METHODS
+from polsep.physics.srgb import srgb
 from polsep.separation.report import SeparatedFrame
 
 #: Refuses to find torch, as where it is not installed, if it is told to.

@@ -11,7 +11,8 @@ from torch.nn.functional import interpolate
 
 from evaluation.testsets.cases import Case
 from polsep.demosaic.bilinear import demosaic_bilinear_half
-from polsep.io.results.previews import Pixels, aolp_wheel, dolp_map, exposure_of, srgb
+from polsep.io.results.previews import Pixels, aolp_wheel, dolp_map, exposure_of
+from polsep.physics.srgb import srgb_bytes
 from polsep.physics.stokes import Stokes, aolp, dolp, fit_stokes
 
 #: Pixels per side of one picture of the sheet.
@@ -40,7 +41,7 @@ def draw_row(case: Case) -> Pixels:
 
 def _toned(image: Tensor, gain: float) -> Pixels:
     linear: NDArray[np.float32] = _fit(image).permute(1, 2, 0).numpy()
-    return np.rint(255 * srgb(gain * linear)).astype(np.uint8)
+    return srgb_bytes(gain * linear)
 
 
 def _shrunk(stokes: Stokes) -> Stokes:

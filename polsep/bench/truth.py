@@ -17,7 +17,7 @@ from polsep.io.store.samples import DEMO, DEMO_WHITE
 from polsep.physics.stokes import Measurements, measure
 from polsep.render.distances import random_light, random_parts
 from polsep.render.sphere_tracing import PinholeCamera, Scene, render
-from polsep.sensor.camera import IMX250, Layout, Mosaic, add_noise, expose
+from polsep.sensor.camera import IMX250, Capture, Layout, Mosaic, add_noise, expose
 
 #: Seeds of the benchmark's scenes; nothing is ever tuned or trained on seeds from 2000 to 2999.
 SCENE_SEEDS = tuple(range(2000, 2008))
@@ -59,7 +59,7 @@ def render_scene(seed: int, saturation: float, size: tuple[int, int] = SCENE_SIZ
     return Scene(diffuse * gain, specular * gain, mask)
 
 
-Captures = Iterator[tuple[str, Measurements | Mosaic, Tensor, tuple[Tensor, Tensor]]]
+Captures = Iterator[tuple[str, Capture, Tensor, tuple[Tensor, Tensor]]]
 
 
 def captures(scene: Scene, seed: int) -> Captures:

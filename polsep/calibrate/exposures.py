@@ -21,13 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import of_kind, to_numpy
+from polsep.sensor.ambient import EQUAL
 from polsep.sensor.camera import CLIP_MARGIN, Mosaic
 from polsep.sensor.noise import Levels, Noise, estimate_noise
 
 Floats = NDArray[np.float32]
 
-#: Predicted samples above this share of white do not count; exposure times within this factor are equal.
-BRIGHTEST, EQUAL = 0.95, 1.02
+#: Predicted samples above this share of white do not count.
+BRIGHTEST = 0.95
 #: Samples that show the ratio of two exposures: of the longer one, in white. Fewest of them, and the largest ratio that
 #: they show: beyond, the shorter one has a few codes of 12 bits there, of which noise and the black level decide.
 RATIO_RANGE, MIN_SAMPLES, MOST_RATIO = (0.1, 0.9), 64, 300.0

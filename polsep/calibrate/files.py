@@ -20,8 +20,9 @@ from polsep.io.store.errors import input_error, refuse_repeated
 from polsep.physics.stokes import axis_deg
 from polsep.sensor.ambient import equally_exposed
 from polsep.sensor.black_level import check_black_level
-from polsep.sensor.calibration import Calibration, Corrections
+from polsep.sensor.calibration import Calibration
 from polsep.sensor.camera import Mosaic
+from polsep.sensor.corrections import Corrections
 from polsep.sensor.encoding import MAX_EXPONENT, encoding_warning
 from polsep.sensor.layout_check import check_layout
 from polsep.sensor.levels import BlackFrame, Overexposed

@@ -22,9 +22,9 @@ from polsep.io.results.previews import live_sheet
 from polsep.io.store.atomic import replace_bytes
 from polsep.io.store.image_codecs import encode_jpeg
 from polsep.light.find import UNKNOWN_DEG, Light, combine
-from polsep.methods import Capture
-from polsep.pipeline import LightColor, is_calibrated, light_of, separate_capture
-from polsep.sensor.camera import Layout
+from polsep.light.light_color import LightColor, find_light_after_checks, is_calibrated
+from polsep.pipeline import separate_capture
+from polsep.sensor.camera import Capture, Layout
 from polsep.separation.report import SeparatedFrame
 
 #: Frames that show the light's colour before it is fixed.
@@ -84,7 +84,7 @@ class LiveView:
         if is_calibrated(data):
             return "auto"
         if len(self._lights) < LIGHT_FRAMES:
-            found = light_of(data)
+            found = find_light_after_checks(data)
             if found.error_deg < UNKNOWN_DEG:
                 self._lights.append(found)
         if not self._lights or self._lights[0].log_ratio is None:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from polsep.io.results.charts import CHANNELS, histogram_svg, rose_shares, rose_svg
 from polsep.io.results.previews import exposure_of, toned
 from polsep.io.store.image_codecs import encode_jpeg
-from polsep.methods import Capture
-from polsep.sensor.camera import Mosaic
+from polsep.sensor.camera import Capture, Mosaic
 from polsep.sensor.exposure import BLACK, CLIPPED, edge_contrast, exposure_flags, histogram
 from polsep.separation.report import SeparatedFrame
 

@@ -22,11 +22,12 @@ import click
 
 from polsep import __version__
 from polsep.compute.installed import is_installed
+from polsep.io.raw.extensions import PLACEHOLDER
 from polsep.io.store.errors import MOST, one_line, printable
 
 if TYPE_CHECKING:
     from polsep.io.raw.frames import ReadOptions
-    from polsep.pipeline import LightColor
+    from polsep.light.light_color import LightColor
     from polsep.sensor.camera import Layout
 
     _ParamType = click.ParamType[Any]
@@ -286,7 +287,7 @@ def check_read_options(options: Mapping[str, Any]) -> None:
 
 def read_light(options: Mapping[str, Any]) -> LightColor | str:
     """The colour of the light from the options of a command. Raises ValueError, which names the option."""
-    from polsep.pipeline import parse_light_color
+    from polsep.light.light_color import parse_light_color
 
     try:
         return parse_light_color(options["light_color"])
@@ -386,7 +387,7 @@ def require_extra(extra: str, otherwise: str = "") -> None:
 def require_paths(*paths: str | Path) -> None:
     """Raise ValueError, which names the first path where nothing is. To call before heavy imports."""
     for path in paths:
-        if "{angle}" not in str(path) and not os.path.lexists(path):
+        if PLACEHOLDER not in str(path) and not os.path.lexists(path):
             raise ValueError(one_line(f"{path}: expected a file, found nothing at this path"))
 
 

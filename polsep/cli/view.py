@@ -21,6 +21,7 @@ from polsep.cli.app import (
     require_extra,
     require_paths,
 )
+from polsep.io.raw.extensions import template_files
 
 
 @app.command()
@@ -64,15 +65,14 @@ def view(file: Path | None, host: str, port: int | None, opens: bool, upload_lim
     """
     require_extra("view")
     if file is not None:
-        require_paths(file)
-    from polsep.view.opening import find_sources, four_angles, parse_settings, require_first
+        require_paths(*template_files(file))
+    from polsep.view.opening import find_sources, parse_settings, require_first
     from polsep.view.server import ViewOptions, serve
 
     names = {"black_level": "black", "white_level": "white", "light_color": "light"}
     settings = {names.get(name, name): value for name, value in options.items() if value not in (None, ())}
     read = parse_settings(settings).read
     if file is not None:
-        require_paths(*four_angles(file))
         require_first(find_sources(file), read)
     with serve(ViewOptions(host, port, file, settings, upload_limit)) as address:
         print(address, flush=True)

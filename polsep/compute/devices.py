@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
 from polsep.compute.arguments import WrongType
+
+
+def _use_one_thread() -> None:
+    """Hold torch to one thread in a forked child, where its other threads are missing and would be waited for."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_use_one_thread)
 
 
 def find_device(name: str) -> str:

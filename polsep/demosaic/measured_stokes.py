@@ -21,7 +21,7 @@ from polsep.demosaic.cells_kernel import Source, read_grid
 from polsep.demosaic.guided import is_large_enough
 from polsep.demosaic.guided_kernel import demosaic_rows, open_stream
 from polsep.physics.stokes import Measurements, complete_pair, fit_stokes, is_pair, stokes_inverse
-from polsep.sensor.camera import Mosaic
+from polsep.sensor.camera import Capture, Mosaic
 from polsep.sensor.unpack_kernel import as_samples
 
 Floats = NDArray[np.float32]
@@ -29,7 +29,7 @@ Floats = NDArray[np.float32]
 _STRETCHES = 4
 
 
-def measured_stokes(capture: Mosaic | Measurements, light: tuple[float, ...], full: bool = False) -> Floats:
+def measured_stokes(capture: Capture, light: tuple[float, ...], full: bool = False) -> Floats:
     """s0, s1, s2 of one frame ``[3, h, w, C]``, in the light whose colour has so many gains; 1.0 as in `Stokes`.
 
     Half resolution is that of images: means over 2x2 cells. Of s1 and s2 the signs are those of docs/conventions.md.

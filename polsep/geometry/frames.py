@@ -6,9 +6,10 @@ from itertools import islice
 from pathlib import Path
 
 from polsep.io.raw.frames import ReadOptions, read_frames, refuse_forgotten
-from polsep.io.results.separation_reader import is_separated
+from polsep.io.results.separation_reader import is_separated, open_separated
 from polsep.io.store.errors import input_error
-from polsep.pipeline import LightColor, open_separated, separate_capture
+from polsep.light.light_color import LightColor
+from polsep.pipeline import separate_capture
 from polsep.separation.report import SeparatedFrame
 
 

@@ -20,8 +20,8 @@ from polsep.io.assets.shapes import ShapeFiles
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
 from polsep.io.store.errors import input_error
+from polsep.light.light_color import LightColor
 from polsep.physics.fresnel import ETA
-from polsep.pipeline import LightColor
 from polsep.separation.report import SeparatedFrame
 
 if TYPE_CHECKING:

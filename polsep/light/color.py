@@ -83,20 +83,15 @@ class Planes(NamedTuple):
     across: Doubles
 
 
-def axis_of(tiles: Tiles) -> tuple[Doubles, float]:
-    """Unit vector of (s1, s2) along which light is polarized most, and how much more than across, in [0, 1].
-
-    The polarized part is positively correlated with s0 along it.
-    """
+def axis_of(tiles: Tiles) -> Doubles:
+    """Unit vector ``[2]`` of (s1, s2) along which light is polarized most; s0 grows with polarization along it."""
     blocks = tiles.moments[:, 1:, 1:].sum(0).reshape(3, tiles.colors, 3, tiles.colors)
     sums = np.einsum("icjc->ij", blocks)
     noise = 2 * float(tiles.noise.sum())
     along, across, mixed = sums[1, 1] - noise, sums[2, 2] - noise, sums[1, 2]
     angle = 0.5 * math.atan2(2 * mixed, along - across)
     axis = np.array([math.cos(angle), math.sin(angle)])
-    if sums[0, 1:] @ axis < 0:
-        axis = -axis
-    return axis, min(1.0, math.hypot(along - across, 2 * mixed) / max(along + across, 1e-12))
+    return -axis if sums[0, 1:] @ axis < 0 else axis
 
 
 def planes_along(tiles: Tiles, axis: Doubles) -> Planes:

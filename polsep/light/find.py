@@ -2,7 +2,7 @@
 
 `find_light` measures tiles (`tiles`), fits the colour (`color`) and says how far off the fit is on average on frames
 like this one, by a formula fitted to rendered frames of known light (docs/experiments.md). `Light` holds the colour as
-log-ratios with a covariance, so that estimates of one lamp, from other frames or other means, combine by `combine`.
+log-ratios with their error, so that estimates of one lamp, from several frames, combine by `combine`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from polsep.light.color import ColorFit, Doubles, axis_of, fit_color, planes_alo
 from polsep.light.metals import MIN_SPECULAR_TILES, beside, is_metal, metal_share, only_specular
 from polsep.light.tiles import Tiles, tile_measurements, tile_mosaic
 from polsep.physics.stokes import Measurements, aolp_of
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Capture, Layout, first_frame
 from polsep.sensor.levels import as_mosaic
 
 #: Largest expected error of a colour that counts as found [degrees].
@@ -106,7 +106,7 @@ class Light:
 
 @np.errstate(under="ignore")  # also for callers to whom NumPy is to raise: small chances are 0
 def find_light(
-    raw: NDArray[Any] | Mosaic | Measurements,
+    raw: NDArray[Any] | Capture,
     layout: Layout | str | None = None,
     black_level: float = 0,
     white_level: float | None = None,
@@ -117,19 +117,19 @@ def find_light(
     frame shows little, ``sure`` is False and the colour is the likeliest of usual lamps. Deterministic. Raises
     ValueError on input that is not a mosaic.
     """
-    if isinstance(raw, Mosaic | Measurements):
+    if isinstance(raw, Capture):
         return _light_of(raw)
     mosaic, notes = as_mosaic(raw, layout, black_level, white_level)
     found = _light_of(mosaic)
     return replace(found, remarks=(*notes, *found.remarks))
 
 
-def _light_of(capture: Mosaic | Measurements) -> Light:
+def _light_of(capture: Capture) -> Light:
     """The light of a capture; see `find_light`."""
     tiles = find_tiles(capture)
     if len(tiles.counts) < MIN_TILES:
         return unknown_light(tiles.colors)
-    axis, _ = axis_of(strongest(tiles))
+    axis = axis_of(strongest(tiles))
     if tiles.colors != 3:
         return Light(None, None, 0.0, True, aolp_of(*axis))
     make_ready(_warm_up)
@@ -147,7 +147,7 @@ def _light_of_tiles(tiles: Tiles, axis: NDArray[np.float64]) -> Light:
     if specular.sum() < MIN_SPECULAR_TILES or len(bodies.counts) < MIN_TILES:
         return _as_light(fit, tiles, aolp_of(*axis))
     reflected = iterate_fast(planes_along(strongest(tiles.select(specular)), axis))[0]
-    own_axis, _ = axis_of(strongest(bodies))
+    own_axis = axis_of(strongest(bodies))
     own = fit_color(strongest(bodies), own_axis, iterate_fast)
     if not is_metal(reflected - own.x):
         return _as_light(fit, tiles, aolp_of(*axis))
@@ -175,11 +175,11 @@ def _remarks_on(light: Light, tiles: Tiles) -> Iterator[str]:
         )
 
 
-def find_tiles(capture: Mosaic | Measurements) -> Tiles:
+def find_tiles(capture: Capture) -> Tiles:
     """Return the tiles of a capture, by the kernel where it reads the frame."""
     if isinstance(capture, Measurements):
         return tile_measurements(capture)
-    array = to_numpy(capture.data.reshape(-1, *capture.data.shape[-2:])[0])
+    array = to_numpy(first_frame(capture))
     if min(array.shape) < 12:
         colors = capture.layout.channels
         moments = np.zeros((0, 1 + 3 * colors, 1 + 3 * colors))

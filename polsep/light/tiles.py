@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
 from polsep.physics.stokes import Measurements, analyser_residual, complete_pair, fit_stokes, is_pair, stokes_inverse
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Layout, Mosaic, first_frame
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -69,8 +69,7 @@ def taps(offset: int) -> tuple[float, float, float]:
 
 def tile_mosaic(mosaic: Mosaic) -> Tiles:
     """Return the tiles of one frame, in its own light, in NumPy: the readable twin of `tiles_kernel`."""
-    data = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0]
-    data = to_numpy(data).astype(np.float32, copy=False)
+    data = to_numpy(first_frame(mosaic)).astype(np.float32, copy=False)
     samples = (data - np.float32(mosaic.black_level)) / np.float32(mosaic.white_level - mosaic.black_level)
     h, w = (n // 4 for n in samples.shape)
     samples, step = samples[: 4 * h, : 4 * w], point_step(h, w)

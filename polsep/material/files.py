@@ -15,12 +15,13 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate
 from polsep.io.assets.materials import MaterialFiles, material_targets, write_material
 from polsep.io.raw.frames import ReadOptions, output_stem, read_frames, refuse_forgotten
 from polsep.io.results.previews import Panel, Pixels, titled_sheet, toned
-from polsep.io.results.separation_reader import is_separated
+from polsep.io.results.separation_reader import is_separated, open_separated
 from polsep.io.store.atomic import refuse_existing, refuse_inputs
 from polsep.io.store.errors import InputError, input_error
+from polsep.light.light_color import LightColor
 from polsep.material.estimate import load_estimator
 from polsep.material.svbrdf import CAMERA_HEIGHT, MAP_SIZE, Svbrdf, plane_points, relight
-from polsep.pipeline import LightColor, open_separated, separate_capture
+from polsep.pipeline import separate_capture
 from polsep.separation.report import SeparatedFrame, reported_light
 
 Floats = NDArray[np.float32]

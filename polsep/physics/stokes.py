@@ -328,9 +328,8 @@ def correct_extinction(measurements: Measurements, extinction: float) -> Measure
     if math.isinf(extinction):
         return measurements
     whole = complete_pair(measurements) if is_pair(measurements) else measurements
-    half, loss = fit_stokes_unclipped(whole)[0].s0 / 2, (extinction + 1) / (extinction - 1)
-    half = half[..., None, :, :, :]
-    return replace(measurements, data=half + (measurements.data - half) * loss)
+    half = fit_stokes_unclipped(whole)[0].s0[..., None, :, :, :] / 2
+    return replace(measurements, data=half + (measurements.data - half) / diattenuation(extinction))
 
 
 def polarized_intensity(stokes: Stokes) -> Array:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from polsep.compute.arrays import to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.sensor import periods_kernel
-from polsep.sensor.camera import Mosaic
+from polsep.sensor.camera import Mosaic, first_frame
 from polsep.sensor.noise import BLOCK, LARGEST_WELL, MIN_SPAN, code_step
 from polsep.sensor.periods_kernel import measure_blocks
 
@@ -77,7 +77,7 @@ def _shows(mosaic: Mosaic, stated: float, rows: Floats) -> bool:
 
 def _some_rows(mosaic: Mosaic) -> Floats:
     """Rows of blocks, evenly spread over the first frame, about `BLOCKS` of them."""
-    x = to_numpy(mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0])
+    x = to_numpy(first_frame(mosaic))
     height, width = (n // BLOCK * BLOCK for n in x.shape)
     step = max(1, height * width // BLOCK**2 // BLOCKS)
     rows = x[:height].reshape(-1, BLOCK, x.shape[1])[::step, :, :width]

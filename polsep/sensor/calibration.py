@@ -18,7 +18,7 @@ Model of a sample without noise, t its analyser's angle and D = (ER - 1) / (ER +
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from numbers import Real
@@ -29,9 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arguments import WrongType
-from polsep.compute.arrays import as_floats, namespace, of_kind, to_numpy
+from polsep.compute.arrays import of_kind, to_numpy
 from polsep.physics.stokes import diattenuation
-from polsep.sensor.ambient import UNKNOWN_SCALE, CodeScale, ambient_notes, code_scale, scale_notes
 from polsep.sensor.camera import Layout, Mosaic, clip_level, require_layout
 from polsep.sensor.defects import MIN_SIZE, repair
 from polsep.sensor.falloff import Table
@@ -226,50 +225,6 @@ def _with_facts(mosaic: Mosaic, black: float, calibration: Calibration) -> Mosai
     return replace(mosaic, black_level=black, falloff=calibration.falloff)
 
 
-def subtract_ambient(mosaic: Mosaic, ambient: Mosaic) -> Mosaic:
-    """A frame less the light of the room: a frame, or the mean of several, of the same exposure with the lamp off.
-
-    A sample that is clipped in either counts as clipped. The noise of both adds up: the mean of n frames adds 1 / n of
-    its variance. Raises ValueError on another size, layout or levels.
-    """
-    for name in ("layout", "black_level", "white_level"):
-        wanted, found = getattr(mosaic, name), getattr(ambient, name)
-        if wanted != found:
-            wanted, found = (x.spec if isinstance(x, Layout) else f"{x:g}" for x in (wanted, found))
-            raise ValueError(f"expected an ambient frame with the frame's {name} {wanted}, found {found}")
-    if mosaic.data.shape[-2:] != ambient.data.shape[-2:]:
-        raise ValueError(f"expected an ambient frame of {_size(mosaic)} as the frame, found {_size(ambient)}")
-    other = replace(ambient, data=of_kind(to_numpy(ambient.data), mosaic.data))
-    black, white = float(mosaic.black_level), float(mosaic.white_level)
-    data = as_floats(mosaic.data)
-    data = data - namespace(data).astype(as_floats(other.data) - black, data.dtype, copy=False)
-    hidden = (mosaic.clipped() | other.clipped()) & (data < clip_level(black, white))
-    return replace(mosaic, data=namespace(data).where(hidden, white, data), less_ambient=True)
-
-
-def mean_mosaic(mosaics: Iterable[Mosaic]) -> Mosaic:
-    """The mean of frames of one exposure, one at a time; a sample is clipped where any frame's is.
-
-    Raises ValueError on none, and on mixed ones.
-    """
-    frames = iter(mosaics)
-    first = next(frames, None)
-    if first is None:
-        raise ValueError("expected at least one frame, found none")
-    xp = namespace(first.data)
-    total, clipped, count = xp.astype(first.data, xp.float64), first.clipped(), 1
-    for other in frames:
-        if (other.layout, other.black_level, other.white_level) != (first.layout, first.black_level, first.white_level):
-            raise ValueError("expected frames of one layout and of the same levels, found different ones")
-        if other.data.shape != first.data.shape:
-            raise ValueError(f"expected frames of one size, found {_size(first)} and {_size(other)}")
-        total, clipped, count = total + other.data, clipped | other.clipped(), count + 1
-    if count == 1:
-        return first
-    mean = xp.astype(total / count, xp.float32)
-    return replace(first, data=xp.where(clipped, mean.clip(float(first.white_level), None), mean))
-
-
 class Neighbours(NamedTuple):
     """For each row (or column): the nearest one, and the one on the other side, of the cell's other analyser.
 
@@ -367,12 +322,8 @@ def _check_match(mosaic: Mosaic, calibration: Calibration) -> None:
             f"expected frames of layout {calibration.layout.spec}, as calibrated, found {mosaic.layout.spec}"
         )
     if calibration.size is not None and tuple(mosaic.data.shape) != calibration.size:
-        wanted = f"{calibration.size[1]}x{calibration.size[0]}"
-        raise ValueError(f"expected frames of {wanted}, as calibrated, found {_size(mosaic)}")
-
-
-def _size(mosaic: Mosaic) -> str:
-    return f"{mosaic.data.shape[-1]}x{mosaic.data.shape[-2]}"
+        wanted, found = (f"{width}x{height}" for height, width in (calibration.size, mosaic.data.shape))
+        raise ValueError(f"expected frames of {wanted}, as calibrated, found {found}")
 
 
 @lru_cache(maxsize=4)  # frames of a stream are alike
@@ -407,43 +358,3 @@ def _keep_clipped(samples: Floats, clipped: NDArray[np.bool_], levels: tuple[flo
     """Corrected samples; those that were clipped and fell below the clip level are set to the white level."""
     samples[clipped & (samples < np.float32(clip_level(*levels)))] = levels[1]
     return samples
-
-
-@dataclass(frozen=True, eq=False)
-class Corrections:
-    """Changes to every raw frame before anything else reads it; ``sources`` names their files in reports.
-
-    ``ambient_exposure_s`` (where files say it), ``ambient_scale`` and ``ambient_remarks`` are of its raw frames.
-    """
-
-    calibration: Calibration | None = None
-    ambient: Mosaic | None = None
-    sources: Mapping[str, Any] = field(default_factory=dict)
-    ambient_exposure_s: float | None = None
-    ambient_scale: CodeScale = UNKNOWN_SCALE
-    ambient_remarks: tuple[str, ...] = ()
-
-    def with_ambient(self, frames: Iterable[Mosaic]) -> Corrections:
-        """The same with the ambient light of raw frames, the mean of which, calibrated, is subtracted."""
-        scales = list[CodeScale]()
-
-        def calibrated() -> Iterator[Mosaic]:
-            for frame in frames:
-                scales.append(code_scale(frame))
-                yield replace(self, ambient=None).apply(frame)
-
-        return replace(self, ambient=mean_mosaic(calibrated()), ambient_scale=min(scales))
-
-    def apply(self, mosaic: Mosaic) -> Mosaic:
-        """The frame calibrated and less the ambient light, which is of calibrated frames. Raises ValueError."""
-        if self.calibration is not None:
-            mosaic = correct_mosaic(mosaic, self.calibration)
-        return mosaic if self.ambient is None else subtract_ambient(mosaic, self.ambient)
-
-    def apply_noting(self, mosaic: Mosaic) -> tuple[Mosaic, tuple[str, ...]]:
-        """`apply`, and notes for the user. Raises ValueError."""
-        calibrated = replace(self, ambient=None).apply(mosaic)
-        if self.ambient is None:
-            return calibrated, ()
-        less = subtract_ambient(calibrated, self.ambient)
-        return less, self.ambient_remarks + scale_notes(mosaic, self.ambient_scale) + ambient_notes(calibrated, less)

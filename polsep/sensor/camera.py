@@ -312,6 +312,15 @@ class Mosaic:
         return self._samples() >= 1 - CLIP_MARGIN
 
 
+#: A raw frame, or co-sited samples.
+Capture = Mosaic | Measurements
+
+
+def first_frame(mosaic: Mosaic) -> Array:
+    """Samples ``[H, W]`` of the first frame of a batch, or of the only one."""
+    return mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0]
+
+
 @dataclass(frozen=True)
 class Sensor:
     """Properties of a pixel. Signals are fractions of ``full_well``, which maps to the white level.
@@ -361,19 +370,24 @@ def sample_mosaic(measurements: Measurements, layout: Layout) -> Array:
     The twin of every demosaicker. Channels beyond the layout's colours are ignored. Raises ValueError when the
     measurements lack an analyser of the layout.
     """
-    data = measurements.data
+    data, period, numbers = measurements.data, layout.period, _analyser_numbers(measurements, layout)
     out = namespace(data).empty((*data.shape[:-4], *data.shape[-2:]), dtype=data.dtype, device=device(data))
-    degrees = [round(math.degrees(t), 6) for t in measurements.angles]
-    for row in range(layout.period):
-        for col in range(layout.period):
-            filt = layout.filter_at(row, col)
-            if round(filt.angle_deg, 6) not in degrees:
-                raise ValueError(f"expected measurements at {layout.angles_deg} degrees, found {degrees}")
-            k = degrees.index(round(filt.angle_deg, 6))
-            out[..., row :: layout.period, col :: layout.period] = data[
-                ..., k, filt.channel, row :: layout.period, col :: layout.period
-            ]
+    for row in range(period):
+        for col in range(period):
+            angle, channel = layout.filter_at(row, col)
+            out[..., row::period, col::period] = data[..., numbers[angle], channel, row::period, col::period]
     return out
+
+
+def _analyser_numbers(measurements: Measurements, layout: Layout) -> dict[float, int]:
+    """The place of each analyser of a layout among those of measurements, by its angle [degrees].
+
+    Raises ValueError when the measurements lack one.
+    """
+    degrees = [round(math.degrees(t), 6) for t in measurements.angles]
+    if not {round(angle, 6) for angle in layout.angles_deg} <= set(degrees):
+        raise ValueError(f"expected measurements at {layout.angles_deg} degrees, found {degrees}")
+    return {angle: degrees.index(round(angle, 6)) for angle in layout.angles_deg}
 
 
 def sample_fine_mosaic(measurements: Measurements, layout: Layout) -> Mosaic:
@@ -389,11 +403,9 @@ def sample_fine_mosaic(measurements: Measurements, layout: Layout) -> Mosaic:
     for row in range(period):
         for col in range(period):
             filters.setdefault(layout.filter_at(row, col), []).append((row, col))
-    degrees = [round(math.degrees(t), 6) for t in measurements.angles]
+    numbers = _analyser_numbers(measurements, layout)
     for (angle, channel), places in filters.items():
-        if round(angle, 6) not in degrees:
-            raise ValueError(f"expected measurements at {layout.angles_deg} degrees, found {degrees}")
-        k = degrees.index(round(angle, 6))
+        k = numbers[angle]
         fine = resize_bilinear(data[..., k, channel, :, :], (height, width))
         if clipped is not None:
             mask = repeat_pixels(clipped[..., k, channel, :, :], 2)

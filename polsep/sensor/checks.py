@@ -46,11 +46,17 @@ def check_mosaic(mosaic: Mosaic) -> CheckedMosaic:
     understood = encoded is None and (black.warning is None or black.level is not None)
     layout = check_layout(mosaic, phases).warning if understood else None
     mosaic, count = remove_defects(mosaic)
-    share = count / math.prod(mosaic.data.shape)
-    many = (
+    lines = (*exposure, encoded, black.warning, layout, _defects_warning(count, math.prod(mosaic.data.shape)))
+    report = {"defects": count, "black_level": float(mosaic.black_level)}
+    return CheckedMosaic(mosaic, report, tuple(line for line in lines if line))
+
+
+def _defects_warning(count: int, pixels: int) -> str | None:
+    """A line on a frame of so many ``pixels`` of which many were defects, or None."""
+    share = count / pixels
+    if share < MANY_DEFECTS:
+        return None
+    return (
         f"{count} dead or hot pixels were repaired ({share:.2%}): a calibration of the dark finds them more surely, "
         "see 'polsep calibrate dark'"
     )
-    lines = (*exposure, encoded, black.warning, layout, many if share >= MANY_DEFECTS else None)
-    report = {"defects": count, "black_level": float(mosaic.black_level)}
-    return CheckedMosaic(mosaic, report, tuple(line for line in lines if line))

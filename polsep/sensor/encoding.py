@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from polsep.compute.arrays import to_numpy
 from polsep.sensor.black_level import smooth_blocks
-from polsep.sensor.camera import Mosaic
+from polsep.sensor.camera import Mosaic, first_frame
 from polsep.sensor.layout_check import crossed_pairs, phase_cells, phase_means
 from polsep.sensor.levels import saturates_early
 from polsep.sensor.noise import MIN_SPAN
@@ -115,7 +115,7 @@ def noise_exponent(mosaic: Mosaic) -> float | None:
 
 def block_ratio(mosaic: Mosaic) -> float | None:
     """Strength of the finest waves in blocks of 8x8 over that in blocks moved by 4; None for small frames."""
-    x = to_numpy(mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0]).astype(np.float32, copy=False)
+    x = to_numpy(first_frame(mosaic)).astype(np.float32, copy=False)
     if min(x.shape) < 8 * SIDE:
         return None
     number = np.arange(SIDE)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from polsep.compute.arrays import to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.sensor import periods_kernel
-from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic
+from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, first_frame
 from polsep.sensor.periods_kernel import sum_periods
 from polsep.sensor.slope_check import lies_across, turned_across
 
@@ -105,7 +105,7 @@ def crossed_pairs(layout: Layout) -> str | None:
 
 def _strips(mosaic: Mosaic) -> list[Floats]:
     """The first frame's samples; of a large one `STRIPS` of them: as reliable, in an eighth of the time."""
-    frame = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0]
+    frame = first_frame(mosaic)
     height = frame.shape[0]
     step = height // STRIPS // STRIP * STRIP
     tops, size = (range(0, STRIPS * step, step), STRIP) if height >= LARGE * STRIP else (range(1), height)
@@ -222,9 +222,13 @@ def check_layout(mosaic: Mosaic, phases: Floats | None = None) -> LayoutCheck:
         return LayoutCheck(_upright(mosaic) or (_across(mosaic) if color else None), pairs, color, layouts)
     likely, reason = next(iter(fits.items()))
     if _stands_upright(mosaic):
-        likely, reason = next(((turn, why) for turn, why in _turned(mosaic.layout) if turn in fits), (likely, reason))
+        whole = _turned(mosaic.layout)
     elif color and mosaic.layout == Layout() and mosaic.data.shape[:-3:-1] in SENSOR_SIZES:  # whole: no crop
-        likely, reason = next(((turn, why) for turn, why in _reversed(mosaic.layout) if turn in fits), (likely, reason))
+        whole = _reversed(mosaic.layout)
+    else:
+        whole = likely, reason
+    if whole[0] in fits:
+        likely, reason = whole
     option = f"--layout {'mono' if likely == Layout(bayer=None) else likely.spec} ({reason})"
     if color is False and mosaic.layout.bayer is not None:
         warning = f"the frame shows no colour pattern: unless all it shows is grey, say {option}"
@@ -262,16 +266,16 @@ def _across(mosaic: Mosaic) -> str | None:
     )
 
 
-def _turned(layout: Layout) -> list[tuple[Layout, str]]:
+def _turned(layout: Layout) -> tuple[Layout, str]:
     """The layout of frames turned by a right angle, which swap red and blue: the reason names the other one too."""
     left, right = layout.transposed().flipped_vertical(4), layout.transposed().flipped_horizontal(4)
-    return [(left, f"turned to the left; if to the right, {right.spec}")]
+    return left, f"turned to the left; if to the right, {right.spec}"
 
 
-def _reversed(layout: Layout) -> list[tuple[Layout, str]]:
+def _reversed(layout: Layout) -> tuple[Layout, str]:
     """The layout of mirrored whole frames, which differ in red and blue: the reason names the other one too."""
     left_right, top_bottom = layout.flipped_horizontal(4), layout.flipped_vertical(4)
-    return [(left_right, f"mirrored left-right; if top-bottom, {top_bottom.spec}")]
+    return left_right, f"mirrored left-right; if top-bottom, {top_bottom.spec}"
 
 
 def _find_color(phases: Floats, layout: Layout) -> tuple[bool | None, tuple[int, int], float]:
@@ -347,7 +351,7 @@ def _candidates(layout: Layout) -> tuple[tuple[Layout, str], ...]:
     bayer, swapped = (None, "mono read as colour") if layout.bayer else ("RGGB", "colour read as mono")
     for other in (Layout(layout.polarizer, bayer), *(Layout(order, bayer) for order in _ORDERS.values())):
         mistakes += [(other, swapped), *((crop, f"{swapped}, {reason}") for crop, reason in _cropped(other))]
-    return (*mistakes, *_turned(layout))
+    return (*mistakes, _turned(layout))
 
 
 def _cropped(layout: Layout) -> list[tuple[Layout, str]]:

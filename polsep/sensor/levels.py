@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from polsep.compute import pages
 from polsep.compute.arguments import WrongType
 from polsep.physics.stokes import Measurements
-from polsep.sensor.camera import CLIP_MARGIN, Layout, Mosaic, clip_level
+from polsep.sensor.camera import CLIP_MARGIN, Capture, Layout, Mosaic, clip_level
 
 #: Accepted samples and the white level that their type implies.
 WHITE_LEVELS = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0, "float64": 1.0}
@@ -153,6 +153,21 @@ def interleave_planes(planes: NDArray[Any], layout: Layout) -> NDArray[Any]:
         for col in (0, 1):
             mosaic[row::2, col::2] = planes[order.index(layout.filter_at(row, col).angle_deg % 180)]
     return mosaic
+
+
+def planes_as_capture(
+    planes: NDArray[Any], layout: Layout | None, black_level: float = 0.0, white_level: float | None = None
+) -> tuple[Capture, Notes]:
+    """Four angle planes as what they are: gray ones under a colour layout are samples of one mosaic, others co-sited.
+
+    ``planes``: ``[4, H, W]`` or ``[4, H, W, C]`` at `PLANE_ANGLES_DEG`. Raises ValueError as `as_mosaic` does, and on a
+    layout of other angles.
+    """
+    if planes.ndim == 3 and layout is not None and layout.bayer is not None:
+        return as_mosaic(interleave_planes(planes, layout), layout, black_level, white_level)
+    if layout is not None:
+        require_plane_angles(layout)
+    return as_measurements(planes, black_level, white_level)
 
 
 def require_plane_angles(layout: Layout) -> None:
@@ -306,7 +321,7 @@ def _advice(found: Any) -> str:
     """Advice on a thing that is no array, where it is clear what to do."""
     if type(found).__module__.partition(".")[0] == "torch":
         return ": say raw.numpy(force=True)"
-    if isinstance(getattr(found, "data", None), Mosaic | Measurements):
+    if isinstance(getattr(found, "data", None), Capture):
         return ": say frame.data"
     if hasattr(found, "__cuda_array_interface__"):
         return ": copy it from the GPU, as cupy.asnumpy does"

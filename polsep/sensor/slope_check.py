@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from polsep.compute.arrays import to_numpy
 from polsep.compute.warm_up import make_ready
 from polsep.sensor import periods_kernel
-from polsep.sensor.camera import CLIP_MARGIN, PERIOD, Filter, Layout, Mosaic
+from polsep.sensor.camera import CLIP_MARGIN, PERIOD, Filter, Layout, Mosaic, first_frame
 from polsep.sensor.periods_kernel import sum_periods
 
 Floats = NDArray[np.float32]
@@ -44,7 +44,7 @@ def lies_across(mosaic: Mosaic) -> bool:
     False where nothing can be judged: mono frames, light without a polarizer, grey, flat, black and small objects.
     """
     top, left = mosaic.layout.origin
-    frame = mosaic.data.reshape(-1, *mosaic.data.shape[-2:])[0, top:, left:]
+    frame = first_frame(mosaic)[top:, left:]
     side = BLOCK * -(-max(frame.shape) // SIDE)
     most = 1 << SIZES - 1
     if mosaic.layout.bayer is None or min(frame.shape) < 4 * most * side:

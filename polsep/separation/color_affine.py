@@ -24,6 +24,7 @@ Complex numbers are pairs ``[..., 2, h, w]``.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -275,27 +276,24 @@ def _fill(found: Separation, measurements: Measurements, offset: Array, determin
     on a bright matte surface. Where everything clips the specular is at least as bright as around. Of a colour without
     unclipped samples the diffuse follows from around and from what makes it clip.
     """
-    assert measurements.clipped is not None
-    assert found.diffuse_polarization is not None
+    a, before = found.diffuse_polarization, found.specular[..., :1, :, :]
+    assert a is not None and measurements.clipped is not None
     xp = namespace(offset)
     hole, known = ~found.valid[..., None, :, :], determined[..., None, :, :]
-    own = _unit(offset + found.diffuse_polarization * found.specular[..., :1, :, :])
-    nearby = interpolate_around(own * found.specular[..., :1, :, :], found.valid)
+    own = _unit(offset + a * before)
+    nearby = interpolate_around(own * before, found.valid)
     around = interpolate_around(found.diffuse, found.valid)
     phase, freedom = xp.where(known, own, _unit(nearby)), specular_freedom(nearby, around)
-    sums = _sum_unclipped(measurements, found.diffuse_polarization, phase, around)
+    sums = _sum_unclipped(measurements, a, phase, around)
     fitted = _fit_specular(sums, nearby, freedom)
-    lit = (found.diffuse_polarization, phase, _fit_diffuse(sums, fitted), fitted)
-    specular = xp.where(known, found.specular[..., :1, :, :], _raise_specular(measurements, lit, freedom))
-    diffuse = xp.maximum(_fit_diffuse(sums, specular), _least_diffuse(measurements, found, specular, phase))
+    lit = (a, phase, _fit_diffuse(sums, fitted), fitted)
+    specular = xp.where(known, before, _raise_specular(measurements, lit, freedom))
+    diffuse = xp.maximum(_fit_diffuse(sums, specular), _least_diffuse(measurements, a, phase, specular))
     core = xp.all(xp.all(measurements.clipped, axis=-4), axis=-3)
     if bool(xp.any(core)):
-        rim = interpolate_around(xp.where(hole, specular, found.specular[..., :1, :, :]), ~core)
+        rim = interpolate_around(xp.where(hole, specular, before), ~core)
         specular = xp.where(core[..., None, :, :], xp.maximum(specular, rim), specular)
-    p1, p2 = (
-        found.diffuse_polarization[..., i : i + 1, :, :] * diffuse + phase[..., i : i + 1, :, :] * specular
-        for i in (0, 1)
-    )
+    p1, p2 = (a[..., i : i + 1, :, :] * diffuse + phase[..., i : i + 1, :, :] * specular for i in (0, 1))
     seen = found.stokes
     stokes = [xp.where(hole, new, old) for new, old in ((diffuse + specular, seen.s0), (p1, seen.s1), (p2, seen.s2))]
     diffuse = xp.where(hole, diffuse, found.diffuse)
@@ -325,13 +323,11 @@ class _Sums(NamedTuple):
 
 def _sum_unclipped(measurements: Measurements, a: Array, phase: Array, around: Array) -> _Sums:
     """`_Sums` for given diffuse polarization, specular phase ``[..., 2, h, w]`` and diffuse light ``around``."""
-    assert measurements.clipped is not None
     xp = namespace(around)
     gg, gy = xp.full_like(around, PRIOR_WEIGHT), PRIOR_WEIGHT * around
     gp, pp, py = xp.zeros_like(around), xp.zeros_like(around), xp.zeros_like(around)
-    for k, t in enumerate(measurements.angles):
-        kept = ~measurements.clipped[..., k, :, :, :]
-        g, p, y = _transmitted(a, t) * kept, _transmitted(phase, t) * kept, 2 * measurements.data[..., k, :, :, :]
+    for g, p, y, clipped in _by_analyser(measurements, a, phase):
+        g, p = g * ~clipped, p * ~clipped
         gg, gp, pp, gy, py = gg + g * g, gp + g * p, pp + p * p, gy + g * y, py + p * y
     return _Sums(gg, gp, pp, gy, py)
 
@@ -355,12 +351,9 @@ def _raise_specular(measurements: Measurements, lit: tuple[Array, ...], freedom:
     Never more than the unclipped samples allow, except those nearly crossed with it. ``lit``: diffuse polarization,
     phase, tau_d and tau_s so far.
     """
-    assert measurements.clipped is not None
     xp, (a, phase, diffuse, specular) = namespace(freedom), lit
     raised, most = specular, xp.full_like(specular, math.inf)
-    for k, t in enumerate(measurements.angles):
-        g, p, clipped = _transmitted(a, t), _transmitted(phase, t), measurements.clipped[..., k, :, :, :]
-        y = 2 * measurements.data[..., k, :, :, :]
+    for g, p, y, clipped in _by_analyser(measurements, a, phase):
         missing = xp.max(clipped * (y - g * diffuse - p * specular).clip(0, None), axis=-3, keepdims=True)
         raised = xp.maximum(raised, specular + missing * p * freedom / (p * p * freedom + g * g))
         allowed = xp.where(clipped | (p <= 0.5), math.inf, y / p.clip(0.5, None))
@@ -368,17 +361,21 @@ def _raise_specular(measurements: Measurements, lit: tuple[Array, ...], freedom:
     return xp.minimum(raised, most.clip(0, None))
 
 
-def _least_diffuse(measurements: Measurements, found: Separation, specular: Array, phase: Array) -> Array:
+def _least_diffuse(measurements: Measurements, a: Array, phase: Array, specular: Array) -> Array:
     """The least tau_d ``[..., C, h, w]`` that makes every clipped sample clip for given tau_s; 0 where none does."""
-    assert measurements.clipped is not None
-    assert found.diffuse_polarization is not None
     xp = namespace(specular)
-    least = xp.zeros_like(found.diffuse)
-    for k, t in enumerate(measurements.angles):
-        needed = 2 * measurements.data[..., k, :, :, :] - _transmitted(phase, t) * specular
-        needed = needed / _transmitted(found.diffuse_polarization, t)
-        least = xp.maximum(least, measurements.clipped[..., k, :, :, :] * needed)
+    least = xp.zeros_like(measurements.data[..., 0, :, :, :])
+    for g, p, y, clipped in _by_analyser(measurements, a, phase):
+        least = xp.maximum(least, clipped * ((y - p * specular) / g))
     return least
+
+
+def _by_analyser(measurements: Measurements, a: Array, phase: Array) -> Iterator[tuple[Array, Array, Array, Array]]:
+    """g, p ``[..., 1, h, w]``, y ``[..., C, h, w]`` of y = 2 m = g tau_d + p tau_s by analyser, and what clipped."""
+    assert measurements.clipped is not None
+    for k, t in enumerate(measurements.angles):
+        data, clipped = (x[..., k, :, :, :] for x in (measurements.data, measurements.clipped))
+        yield _transmitted(a, t), _transmitted(phase, t), 2 * data, clipped
 
 
 def _transmitted(polarization: Array, angle: float) -> Array:

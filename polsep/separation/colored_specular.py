@@ -81,14 +81,14 @@ class Colored(NamedTuple):
         return 1 / (1 + self.unpolarized)
 
     @property
-    def remark(self) -> str | None:
-        """A line for the user, or None."""
+    def remarks(self) -> tuple[str, ...]:
+        """A line for the user where the lamp is not fully polarized."""
         if not self.unpolarized:
-            return None
+            return ()
         return (
             f"a fully polarized lamp was expected, found one of {self.lamp_dolp:.0%}: what its highlights leave in the "
             "diffuse image moves to the specular one, but not in films; a better polarizer before the lamp separates "
-            "more"
+            "more",
         )
 
 

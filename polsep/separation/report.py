@@ -15,8 +15,8 @@ from array_api_compat import is_array_api_obj
 from numpy.typing import NDArray
 
 from polsep.compute.arrays import Array, constant, contiguous, namespace, on_cpu, to_numpy, to_numpy_together
-from polsep.physics.stokes import MAX_DOLP, Measurements, Stokes, aolp, aolp_of, dolp
-from polsep.sensor.camera import Mosaic
+from polsep.physics.stokes import MAX_DOLP, Stokes, aolp, aolp_of, dolp
+from polsep.sensor.camera import Capture, Mosaic
 from polsep.separation.analytic import Separation, light_polarizer_angle
 from polsep.separation.images import FrameImages, Tally
 
@@ -137,7 +137,7 @@ def _total(image: Array) -> Array:
     return xp.sum(image, dtype=xp.float64)
 
 
-def under_white_light(capture: Mosaic | Measurements, light: tuple[float, ...]) -> Mosaic | Measurements:
+def under_white_light(capture: Capture, light: tuple[float, ...]) -> Capture:
     """The capture as it would be in white light: the light's colour divided out of every sample."""
     if isinstance(capture, Mosaic):
         return replace(capture, light_color=light)

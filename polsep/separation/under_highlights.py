@@ -31,7 +31,7 @@ from polsep.separation.highlights_kernel import find_parts, find_rings, solve_la
 from polsep.separation.images import FrameImages
 
 Floats = NDArray[np.float64]
-Places = NDArray[np.int64]
+Indices = NDArray[np.int64]
 
 #: Cells on each side of a clipped one that it may spoil, and cells around a hole that make its ring.
 SPOILED, RING = 1, 3
@@ -55,8 +55,8 @@ class _Holes(NamedTuple):
     ``flat [N]``: places of the pixels in the image, row by row; ``of [N]``: the hole of each, of ``total`` ones.
     """
 
-    flat: Places
-    of: Places
+    flat: Indices
+    of: Indices
     total: int
     shape: tuple[int, int]
     scale: int
@@ -131,7 +131,7 @@ def _contrast(holes: _Holes, mosaic: Mosaic, fill: Floats, gain: Floats) -> Floa
     return _sums(holes.of, most - least, holes.total) / np.maximum(_sums(holes.of, beyond, holes.total), 1e-9)
 
 
-def _clipped_cells(mosaic: Mosaic) -> Places:
+def _clipped_cells(mosaic: Mosaic) -> Indices:
     """Row and column ``[N, 2]`` of the 2x2 cells with a clipped sample."""
     width = mosaic.data.shape[1]
     level, data = mosaic.clip_level, mosaic.data.reshape(-1)
@@ -140,7 +140,7 @@ def _clipped_cells(mosaic: Mosaic) -> Places:
     return _distinct(places // 2, mosaic.layout.cells(mosaic.data.shape))
 
 
-def _find_holes(clipped: Places, shape: tuple[int, int], scale: int) -> _Holes:
+def _find_holes(clipped: Indices, shape: tuple[int, int], scale: int) -> _Holes:
     """Connected pixels, also over corners, of what clipped cells spoil in an image of that shape."""
     size = (shape[0] // scale, shape[1] // scale)
     cells = _distinct(_around(clipped, SPOILED), size)
@@ -172,7 +172,7 @@ def _fit_planes(holes: _Holes, diffuse: Array, gain: Floats) -> tuple[Floats, Fl
         np.stack([_sums(of, x, holes.total) for x in np.divmod(flat, width)], axis=1) / np.maximum(count, 1)[:, None]
     )
 
-    def shapes(flat: Places, of: Places) -> Floats:
+    def shapes(flat: Indices, of: Indices) -> Floats:
         offsets = np.stack(np.divmod(flat, width), axis=1) - center[of]
         return np.concatenate([np.ones((len(flat), 1)), offsets / reach], axis=1)
 
@@ -213,31 +213,31 @@ def _solve_laplace(holes: _Holes, diffuse: Array, gain: Floats, start: Floats) -
 _OUTSIDE, _BEYOND = -1, -2
 
 
-def _numbers(flat: Places, shape: tuple[int, int]) -> NDArray[np.int32]:
+def _numbers(flat: Indices, shape: tuple[int, int]) -> NDArray[np.int32]:
     """The number of each pixel of a hole, from 1 on, at its place in an image; elsewhere 0, in memory never touched."""
     number = np.zeros(shape[0] * shape[1], np.int32)
     number[flat] = np.arange(1, len(flat) + 1)
     return number
 
 
-def _neighbors(number: NDArray[np.int32], flat: Places, shape: tuple[int, int], step: tuple[int, int]) -> Places:
+def _neighbors(number: NDArray[np.int32], flat: Indices, shape: tuple[int, int], step: tuple[int, int]) -> Indices:
     """The numbers of the pixels one ``step`` (rows, columns) on; `_BEYOND` the image's border."""
     rows, cols = np.divmod(flat, shape[1])
     rows, cols = rows + step[0], cols + step[1]
     inside = (rows >= 0) & (rows < shape[0]) & (cols >= 0) & (cols < shape[1])
-    found: Places = np.where(inside, number[np.where(inside, rows * shape[1] + cols, 0)] - 1, _BEYOND)
+    found: Indices = np.where(inside, number[np.where(inside, rows * shape[1] + cols, 0)] - 1, _BEYOND)
     return found
 
 
-def _around(places: Places, reach: int) -> Places:
+def _around(places: Indices, reach: int) -> Indices:
     """All places ``[N, K, 2]`` up to ``reach`` rows and columns from some."""
     side = 2 * reach + 1
-    near: Places = places[:, None] + np.stack(np.divmod(np.arange(side**2), side), axis=1) - reach
+    near: Indices = places[:, None] + np.stack(np.divmod(np.arange(side**2), side), axis=1) - reach
     return near
 
 
-def _distinct(places: Places, shape: tuple[int, int]) -> Places:
-    """Places ``[..., 2]`` inside of an image of that shape, each once and in reading order."""
+def _distinct(places: Indices, shape: tuple[int, int]) -> Indices:
+    """Indices ``[..., 2]`` inside of an image of that shape, each once and in reading order."""
     rows, cols = places[..., 0], places[..., 1]
     inside = (rows >= 0) & (rows < shape[0]) & (cols >= 0) & (cols < shape[1])
     found = np.zeros(shape[0] * shape[1], np.bool_)
@@ -245,7 +245,7 @@ def _distinct(places: Places, shape: tuple[int, int]) -> Places:
     return np.stack(np.divmod(np.flatnonzero(found), shape[1]), axis=1)
 
 
-def _sums(of: Places, values: NDArray[Any], count: int) -> Floats:
+def _sums(of: Indices, values: NDArray[Any], count: int) -> Floats:
     """Sums of values by hole."""
     return np.bincount(of, values, count).astype(np.float64)
 
@@ -255,11 +255,11 @@ def _means(holes: _Holes, values: Floats) -> Floats:
     return _sums(holes.of, values, holes.total) / np.maximum(np.bincount(holes.of, minlength=holes.total), 1)
 
 
-def _take(image: Array, flat: Places) -> Array:
+def _take(image: Array, flat: Indices) -> Array:
     """Pixels of an image whose rows are joined, ``[N, ...]``."""
     return image[of_kind(flat, image)]
 
 
-def _put(image: Array, flat: Places, values: Floats) -> None:
+def _put(image: Array, flat: Indices, values: Floats) -> None:
     """The twin of `_take`: write pixels."""
     image[of_kind(flat, image)] = of_kind(values.astype(np.float32), image)

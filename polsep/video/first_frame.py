@@ -18,7 +18,8 @@ from polsep.io.results.previews import exposure_of
 from polsep.io.results.sequences import PART
 from polsep.io.store.errors import InputError
 from polsep.light.find import Light, combine
-from polsep.pipeline import LightColor, is_calibrated, is_to_be_found, light_of, separate_capture
+from polsep.light.light_color import LightColor, find_light_after_checks, is_calibrated, is_to_be_found
+from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import find_lasting_defects
 from polsep.sensor.levels import BlackFrame
@@ -79,21 +80,25 @@ def separate_first(recording: FrameSequence, options: VideoOptions) -> FirstFram
 
 def _separate_first(recording: FrameSequence, options: VideoOptions, frame: Frame) -> FirstFrame:
     refuse_forgotten(recording.stem, frame)
-    shape, camera = tuple(frame.data.data.shape), _camera_of(frame)
+    camera = _camera_of(frame)
     spread = islice(recording.begin(frame.index), 0, PART, LIGHT_STEP)
     light_color, found = _light_of(_intact(spread, camera, options), options)
     separated = separate_capture(frame.data, options.method, light_color, options.device)
-    gain = exposure_of(separated.diffuse + separated.specular)
-    light = tuple(float(c) for c in separated.report["light_color"])
-    size = (separated.diffuse.shape[0], separated.diffuse.shape[1], separated.diffuse.shape[2])
-    facts = separated.report["light"] if found is None else {"source": "found", **found.describe()}
+    height, width, colors = separated.diffuse.shape
     remarks = () if found is None else found.remarks
-    notes = (*recording.notes, *frame.notes, *remarks, *separated.report["warnings"])
-    defects = _defects_of(_intact(islice(recording.begin(0), DEFECT_FRAMES), camera, options))
-    black = separated.report.get("black_level")
-    digest = hash_samples(frame.data.data)
-    method = separated.report["method"]
-    return FirstFrame(method, light, gain, size, shape, notes, defects, facts, black, digest, camera)
+    return FirstFrame(
+        method=separated.report["method"],
+        light=tuple(float(c) for c in separated.report["light_color"]),
+        gain=exposure_of(separated.diffuse + separated.specular),
+        size=(height, width, colors),
+        shape=tuple(frame.data.data.shape),
+        warnings=(*recording.notes, *frame.notes, *remarks, *separated.report["warnings"]),
+        defects=_defects_of(_intact(islice(recording.begin(0), DEFECT_FRAMES), camera, options)),
+        facts=separated.report["light"] if found is None else {"source": "found", **found.describe()},
+        black_level=separated.report.get("black_level"),
+        sha256=hash_samples(frame.data.data),
+        camera=camera,
+    )
 
 
 def _ends_run(damaged: DamagedFrame, options: VideoOptions) -> bool:
@@ -140,7 +145,7 @@ def _light_of(frames: Iterator[Frame], options: VideoOptions) -> tuple[LightColo
     captures = [frame.data for frame in frames]
     if not captures or any(is_calibrated(capture) for capture in captures):
         return options.light_color, None
-    found = combine([light_of(capture) for capture in captures])
+    found = combine([find_light_after_checks(capture) for capture in captures])
     if found.log_ratio is None:
         return options.light_color, None
     return found.color, found

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.io.results.previews import srgb
 from polsep.io.results.sequences import Picture
+from polsep.physics.srgb import srgb_bytes
 from polsep.video.panels_kernel import STEPS, make_panels
 
 Floats = NDArray[np.float32]
@@ -16,7 +16,7 @@ Floats = NDArray[np.float32]
 #: Largest side of a panel.
 PANEL = 640
 #: The tone curve at equal steps of the square root of linear light.
-_TONES = np.rint(255 * srgb((np.arange(STEPS + 1) / STEPS) ** 2)).astype(np.uint8)
+_TONES = srgb_bytes((np.arange(STEPS + 1) / STEPS) ** 2)
 
 
 def draw_panels(diffuse: Floats, specular: Floats, gain: float) -> NDArray[np.uint8]:

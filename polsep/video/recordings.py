@@ -31,8 +31,9 @@ from polsep.io.raw.sequences import DamagedFrame, FrameSequence, input_files, op
 from polsep.io.results.sequences import Picture, SequenceKind, SequenceWriter, State
 from polsep.io.store.atomic import OutputError, refuse_inputs
 from polsep.io.store.errors import InputError
+from polsep.light.light_color import LightColor
 from polsep.methods import find_method
-from polsep.pipeline import LightColor, make_frame, move_capture
+from polsep.pipeline import make_frame, move_capture
 from polsep.sensor.camera import Mosaic
 from polsep.sensor.defects import repair
 from polsep.video.first_frame import FirstFrame, of_one_camera, separate_first
@@ -323,11 +324,13 @@ def _prepared(
     count = None if options.frames is None else max(options.frames - begin, 0)
     for frame in islice(recording.begin(begin), count):
         frame = of_one_camera(frame, first.camera)
-        if first.black_level is not None and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
-            frame = replace(frame, data=replace(frame.data, black_level=first.black_level))
-        if first.defects is not None and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
-            frame = replace(frame, data=repair(frame.data, first.defects))
-        if options.filter == "temporal" and isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
-            data, state = filter_frame(frame.data, state)
+        if isinstance(frame, Frame) and isinstance(frame.data, Mosaic):
+            data = frame.data
+            if first.black_level is not None:
+                data = replace(data, black_level=first.black_level)
+            if first.defects is not None:
+                data = repair(data, first.defects)
+            if options.filter == "temporal":
+                data, state = filter_frame(data, state)
             frame = replace(frame, data=data)
         yield frame, state

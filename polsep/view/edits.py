@@ -15,7 +15,7 @@ import numpy as np
 
 from polsep.edit import EDITS, Edit, EditError, Parameter, Recipe, SeparatedImages, apply, make_edit
 from polsep.edit.images import Maps
-from polsep.io.results.previews import linear_from_srgb, srgb
+from polsep.physics.srgb import linear_from_srgb, srgb
 from polsep.view.pictures import Floats, Small
 
 

@@ -16,17 +16,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from polsep.io.raw.corrections import with_corrections
+from polsep.io.raw.extensions import ANGLES, PLACEHOLDER, template_files
 from polsep.io.raw.frames import FRAME_FILES, HEADERLESS, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD, is_recording
 from polsep.io.raw.sequences import natural_order
-from polsep.io.raw.videos import count_frames, is_film
+from polsep.io.raw.videos import count_frames, is_lossless_film
 from polsep.io.results.separation_reader import find_numbered, is_separated, read_separated
 from polsep.io.results.sidecars import read_report
 from polsep.io.store.errors import InputError, input_error
 from polsep.io.store.header_checks import at_most
 from polsep.io.store.result_names import result_names
+from polsep.light.light_color import LightColor, color_notes, is_to_be_found, parse_light_color, stated_gains
 from polsep.methods import check_method
-from polsep.pipeline import LightColor, color_notes, is_to_be_found, parse_light_color, separate_capture, stated_gains
+from polsep.pipeline import separate_capture
 from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.exposure import Histogram, exposure_flags, histogram
 from polsep.separation.report import SeparatedFrame
@@ -51,9 +53,7 @@ OPTIONS = {
 _ADVICE = re.compile(rf"--({'|'.join(OPTIONS)}) (?!N\b)([\w][^\s;:)]*)")
 #: Remark on results of `polsep video` and `polsep edit`.
 LIGHT_ALONE = "the file holds diffuse and specular alone: DoLP and AoLP are shown as 0, and every pixel as valid"
-_PLACEHOLDER = "{angle}"
 _ANGLE = re.compile(r"(?<!\d)(?:0{1,3}|0?45|0?90|135)(?!\d)")
-_ANGLES = (0, 45, 90, 135)
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class Source:
 
 def as_source(path: Path, stem: str) -> Source:
     """A file, or a template of four angle images, as a source with a display name."""
-    return Source(path, stem, _PLACEHOLDER not in path.name and is_separated(path))
+    return Source(path, stem, PLACEHOLDER not in path.name and is_separated(path))
 
 
 def find_sources(path: Path) -> tuple[Source, ...]:
@@ -162,7 +162,7 @@ def find_sources(path: Path) -> tuple[Source, ...]:
         if not files:
             raise
         groups = group_angles([file.name for file in files])
-        if groups is None or not all(file.is_file() for name in groups for file in four_angles(path / name)):
+        if groups is None or not all(file.is_file() for name in groups for file in template_files(path / name)):
             return tuple(as_source(file, file.stem) for file in files)
         return tuple(as_source(path / template, output_stem(template)) for template in groups)
 
@@ -175,13 +175,6 @@ def require_first(sources: tuple[Source, ...], read: ReadOptions) -> None:
         read_source(sources, read, 0)
 
 
-def four_angles(path: Path) -> tuple[Path, ...]:
-    """The files of a path: four of a template with ``{angle}``, else the one."""
-    if _PLACEHOLDER not in path.name:
-        return (path,)
-    return tuple(path.with_name(path.name.replace(_PLACEHOLDER, str(angle))) for angle in _ANGLES)
-
-
 def group_angles(names: Sequence[str]) -> dict[str, tuple[int, ...]] | None:
     """Frames of four angle images: the places of 0, 45, 90 and 135 degrees in ``names``, by template.
 
@@ -190,9 +183,9 @@ def group_angles(names: Sequence[str]) -> dict[str, tuple[int, ...]] | None:
     found: dict[str, dict[int, int]] = {}
     for place, name in enumerate(names):
         for match in _ANGLE.finditer(name):
-            template = name[: match.start()] + _PLACEHOLDER + name[match.end() :]
+            template = name[: match.start()] + PLACEHOLDER + name[match.end() :]
             found.setdefault(template, {})[int(match[0])] = place
-    whole = {t: tuple(places[a] for a in _ANGLES) for t, places in found.items() if set(places) == set(_ANGLES)}
+    whole = {t: tuple(places[a] for a in ANGLES) for t, places in found.items() if set(places) == set(ANGLES)}
     used = sorted(place for places in whole.values() for place in places)
     return whole if used == list(range(len(names))) else None
 
@@ -255,7 +248,7 @@ def read_source(sources: tuple[Source, ...], read: ReadOptions, index: int) -> F
             raise ValueError(f"{source.path}: expected a frame number {index}, found none")
         if several and frame.count > 1:
             raise ValueError(f"{source.path}: expected one frame in each of several files, found {frame.count}")
-        if frame.count > 1 and not several and is_film(source.path):
+        if frame.count > 1 and not several and is_lossless_film(source.path):
             frame = replace(frame, count=count_frames(source.path, frame.count, index))
     return replace(frame, index=index, count=len(sources)) if several else frame
 
@@ -327,8 +320,8 @@ def _renamed(source: Source) -> Iterator[None]:
         yield
     except ValueError as error:
         said = str(error).replace(str(source.path), source.stem + source.path.suffix)
-        if _PLACEHOLDER in source.path.name:
-            for path, angle in zip(four_angles(source.path), _ANGLES, strict=True):
+        if PLACEHOLDER in source.path.name:
+            for path, angle in zip(template_files(source.path), ANGLES, strict=True):
                 said = said.replace(str(path), f"{source.stem} {angle}°{path.suffix}")
         raise InputError(said) from error
 

@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.results.charts import CHANNELS, histogram_svg, rose_shares, rose_svg
-from polsep.io.results.previews import aolp_legend, aolp_wheel, dolp_map, exposure_of, srgb
+from polsep.io.results.previews import aolp_legend, aolp_wheel, dolp_map, exposure_of
 from polsep.io.store.image_codecs import encode_jpeg_quickly, encode_png
+from polsep.physics.srgb import srgb, srgb_bytes
 from polsep.physics.stokes import wrap_aolp
 from polsep.sensor.exposure import BLACK, CLIPPED, Histogram
 from polsep.separation.report import SeparatedFrame
@@ -169,7 +170,7 @@ def shrink(image: Floats, step: int) -> Floats:
 @cache
 def _tones() -> Pixels:
     """8-bit sRGB codes of the squares of `_STEPS` even steps from 0 to 1: finer steps in the dark."""
-    return np.rint(255 * srgb((np.arange(_STEPS) / (_STEPS - 1)) ** 2)).astype(np.uint8)
+    return srgb_bytes((np.arange(_STEPS) / (_STEPS - 1)) ** 2)
 
 
 def tone(image: Floats, gain: float) -> Pixels:
@@ -334,9 +335,11 @@ def exposure_panel(frame: SeparatedFrame, found: Histogram | None) -> str:
     if frame.error is None:
         rows.append("This method does not say how far off it expects to be.")
     else:
-        levels = [np.quantile(frame.error[..., k], (0.5, 0.95)) for k in range(2)]
-        texts = [f"{name} {a:.2g} (95 % below {b:.2g})" for name, (a, b) in zip(("diffuse", "specular"), levels)]  # noqa: B905
-        rows.append(f"Expected error, median: {', '.join(texts)}; 1 is one measurement at the white level.")
+        levels = [np.quantile(error, (0.5, 0.95)) for error in np.moveaxis(frame.error, -1, 0)]
+        diffuse, specular = (f"{median:.2g} (95 % below {most:.2g})" for median, most in levels)
+        rows.append(
+            f"Expected error, median: diffuse {diffuse}, specular {specular}; 1 is one measurement at the white level."
+        )
     said = "".join(f"<p>{row}</p>" for row in rows)
     if found is None:
         return f'<div class="ps-note"><p>Results and angle images have no raw samples to count.</p>{said}</div>'

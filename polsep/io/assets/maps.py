@@ -21,9 +21,9 @@ from PIL import Image
 from polsep.io.raw.frames import read_pages
 from polsep.io.raw.photographs import orientation_of
 from polsep.io.results.exr import read_exr_layers
-from polsep.io.results.previews import linear_from_srgb
 from polsep.io.store.errors import InputError, decoding, input_error, naming
 from polsep.io.store.header_checks import require_signature, require_size
+from polsep.physics.srgb import linear_from_srgb
 
 Floats = NDArray[np.float32]
 

@@ -32,12 +32,12 @@ from trimesh.visual.material import PBRMaterial
 
 from polsep.io.raw.png import read_png
 from polsep.io.results.exr import encode_exr
-from polsep.io.results.previews import srgb
 from polsep.io.results.sidecars import EncodedFile, exr_notes, require_finite, require_stem, write_with_sidecar
 from polsep.io.store.atomic import refuse_existing
 from polsep.io.store.errors import naming
 from polsep.io.store.image_codecs import encode_png
 from polsep.physics.gltf import GLASS, metalness
+from polsep.physics.srgb import srgb
 
 Floats = NDArray[np.float32]
 Pixels = NDArray[np.uint8]

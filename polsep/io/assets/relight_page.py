@@ -14,8 +14,8 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
-from polsep.io.results.previews import srgb
 from polsep.io.store.image_codecs import encode_png
+from polsep.physics.srgb import srgb
 
 Floats = NDArray[np.float32]
 

@@ -22,10 +22,10 @@ from trimesh.exchange.ply import export_ply
 from trimesh.visual import ColorVisuals
 
 from polsep.io.results.exr import as_planes, encode_exr
-from polsep.io.results.previews import srgb
 from polsep.io.results.sidecars import exr_notes, require_finite, require_stem, write_with_sidecar
 from polsep.io.store.atomic import OutputError
 from polsep.io.store.image_codecs import encode_png
+from polsep.physics.srgb import srgb_bytes
 
 #: Mesh files by name; "none" writes no mesh.
 MESHES = ("glb", "ply", "none")
@@ -141,7 +141,7 @@ def encode_glb(
 def encode_ply(vertices: ArrayLike, normals: ArrayLike, colors: ArrayLike, faces: ArrayLike) -> bytes:
     """A binary little-endian PLY file of the same; colours become 8-bit sRGB, as viewers expect. Raises ValueError."""
     mesh, light = _mesh(vertices, normals, colors, faces)
-    mesh.visual = ColorVisuals(mesh, vertex_colors=np.rint(255 * srgb(light)).astype(np.uint8))
+    mesh.visual = ColorVisuals(mesh, vertex_colors=srgb_bytes(light))
     data: bytes = export_ply(mesh, vertex_normal=True)
     return data
 

@@ -16,12 +16,13 @@ from polsep.io.raw.sequences import DamagedFrame, input_files, open_sequence
 from polsep.io.store.calibrations import read_calibration
 from polsep.io.store.errors import InputError, input_error
 from polsep.sensor.ambient import equally_exposed, unit_remarks
-from polsep.sensor.calibration import Calibration, Corrections
+from polsep.sensor.calibration import Calibration
 from polsep.sensor.camera import Mosaic
+from polsep.sensor.corrections import Corrections
 
 #: Digits of hashes in reports, by which a run that is resumed knows its files again.
 DIGITS = 16
-#: Looks at a frame of a file before it is used.
+#: Called with a file and each frame of it, before that is used.
 Check = Callable[[Path, Frame], None]
 
 
@@ -54,13 +55,13 @@ def _read_corrected(
     if ambient:
         times, notes = list[float | None](), list[str]()
 
-        def look(_: Path, frame: Frame) -> None:
+        def keep_facts(_: Path, frame: Frame) -> None:
             times.append(frame.exposure)
             notes.extend(frame.notes)
 
         levels = measured and Calibration(measured.layout, measured.white_level, measured.size, measured.black_level)
         raw = replace(read, corrections=Corrections(levels))
-        corrections = corrections.with_ambient(read_mosaics(ambient, raw, look))
+        corrections = corrections.with_ambient(read_mosaics(ambient, raw, keep_facts))
         assert corrections.ambient is not None
         digest = hash_samples(corrections.ambient.data)
         sources |= {"ambient": [path.name for path in ambient], "ambient_sha256": digest}

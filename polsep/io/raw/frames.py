@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.compute.arguments import WrongType
-from polsep.io.raw.extensions import LOSSLESS
+from polsep.io.raw.extensions import ANGLES, LOSSLESS, PLACEHOLDER, template_files
 from polsep.io.raw.headerless import headerless_page, read_headerless, with_layout
 from polsep.io.raw.npy import read_npy, read_npz, stack_angles
 from polsep.io.raw.page import MergedFacts, Page
@@ -33,33 +33,19 @@ from polsep.io.raw.png import read_png
 from polsep.io.raw.recording import RECORD, read_recording
 from polsep.io.raw.tiff import read_tiff
 from polsep.io.raw.videos import read_video
-from polsep.io.store.errors import InputError, as_path, input_error, naming, refuse_pipe
+from polsep.io.store.errors import as_path, input_error, naming, refuse_pipe
 from polsep.io.store.header_checks import describe
 from polsep.physics.stokes import Measurements
 from polsep.sensor.ambient import exposure_notes
-from polsep.sensor.calibration import Corrections
-from polsep.sensor.camera import Layout, Mosaic
+from polsep.sensor.camera import Capture, Layout, Mosaic
+from polsep.sensor.corrections import Corrections
 from polsep.sensor.levels import (
     WHITE_LEVELS,
     ForgottenLevel,
-    as_measurements,
     as_mosaic,
     interleave_planes,
-    require_plane_angles,
+    planes_as_capture,
 )
-
-__all__ = [
-    "READERS",
-    "Frame",
-    "InputError",
-    "ReadOptions",
-    "decode_frame",
-    "forgets_level",
-    "output_stem",
-    "read_frames",
-    "read_pages",
-    "refuse_forgotten",
-]
 
 
 class Reader(NamedTuple):
@@ -90,8 +76,6 @@ HEADERLESS = (".raw", ".bin")
 #: Extensions of files that a folder of frames may hold.
 FRAME_FILES = (*(suffix for suffix, reader in READERS.items() if reader.single), *HEADERLESS)
 _LOSSY = {".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".heic": "HEIC", ".mp4": "video"}
-_ANGLES = (0, 45, 90, 135)
-_PLACEHOLDER = "{angle}"
 #: Mean contradiction of four pages, relative to their mean differences, below which they are angle images.
 MOST_CONTRADICTION = 0.25
 
@@ -170,7 +154,7 @@ class Frame:
     """
 
     stem: str
-    data: Mosaic | Measurements
+    data: Capture
     notes: tuple[str, ...]
     index: int = 0
     count: int = 1
@@ -196,7 +180,7 @@ def read_frames(path: str | Path, options: ReadOptions | None = None, first: int
         raise WrongType(f"expected ReadOptions, found {type(options).__name__}")
     path = as_path(path)
     options = ReadOptions() if options is None else options
-    if _PLACEHOLDER in str(path):
+    if PLACEHOLDER in str(path):
         pages: Iterator[Page] = iter([_read_template(str(path), options)])
     elif options.pages == "frames":
         pages = read_pages(path, options, first)
@@ -255,7 +239,7 @@ def refuse_forgotten(path: str | Path, frame: Frame) -> None:
         raise input_error(path, f"expected a white level, found that {note}, or --white-level {default:g} if not")
 
 
-def decode_frame(payload: bytes, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
+def decode_frame(payload: bytes, options: ReadOptions) -> tuple[Capture, tuple[str, ...]]:
     """One frame from the bytes a camera sent, and notes, exactly as `read_frames` reads it from a file of them.
 
     ``options`` say size and pixel format. Raises ValueError when they do not or the bytes do not fit them.
@@ -270,10 +254,10 @@ def output_stem(path: str | Path) -> str:
     if Path(path).name == RECORD:
         return Path(path).absolute().parent.name or "recording"
     stem = Path(path).stem
-    return stem if _PLACEHOLDER not in stem else stem.replace(_PLACEHOLDER, "").strip("_-. ") or "angles"
+    return stem if PLACEHOLDER not in stem else stem.replace(PLACEHOLDER, "").strip("_-. ") or "angles"
 
 
-def _convert(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
+def _convert(page: Page, options: ReadOptions) -> tuple[Capture, tuple[str, ...]]:
     """Codes to light, by the rules of the module, corrected; and notes."""
     options, remarks = (options, ()) if page.merged is None else _left_for(page.merged, options)
     data, notes = _to_light(page, options)
@@ -307,7 +291,7 @@ def _left_for(merged: MergedFacts, options: ReadOptions) -> tuple[ReadOptions, t
     return replace(options, corrections=replace(corrections, calibration=None)), tuple(notes)
 
 
-def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, tuple[str, ...]]:
+def _to_light(page: Page, options: ReadOptions) -> tuple[Capture, tuple[str, ...]]:
     layout = page.layout if options.layout is None else options.layout
     white, array, black = _said_white_level(page, options), page.array, options.black_level
     if options.corrections is not None and options.corrections.calibration is not None:
@@ -316,12 +300,9 @@ def _to_light(page: Page, options: ReadOptions) -> tuple[Mosaic | Measurements, 
         return as_mosaic(array, layout, black, white)
     if array.ndim == 4 and array.shape[-1] == 1:
         array = array[..., 0]
-    if array.ndim == 3 and (page.sampled or (layout is not None and layout.bayer is not None)):
-        mosaic = interleave_planes(array, Layout() if layout is None else layout)
-        return as_mosaic(mosaic, layout, black, white)
-    if options.layout is not None:
-        require_plane_angles(options.layout)
-    return as_measurements(array, black, white)
+    if page.sampled and layout is not None:
+        return as_mosaic(interleave_planes(array, layout), layout, black, white)
+    return planes_as_capture(array, layout, black, white)
 
 
 def _said_white_level(page: Page, options: ReadOptions) -> float | None:
@@ -427,13 +408,13 @@ def _are_angles(images: list[NDArray[Any]]) -> bool:
 def _read_template(template: str, options: ReadOptions) -> Page:
     """The four images of a path with ``{angle}`` as one page of angles."""
     group: list[Page] = []
-    for path in (Path(template.replace(_PLACEHOLDER, str(angle))) for angle in _ANGLES):
+    for path in template_files(template):
         page = next(read_pages(path, options))
         if page.count != 1 or page.angles:
             raise input_error(path, f"expected one image of one angle, found {4 if page.angles else page.count}")
         group.append(page)
     with naming(template):
-        return _stacked(group, [f"{angle} deg" for angle in _ANGLES])
+        return _stacked(group, [f"{angle} deg" for angle in ANGLES])
 
 
 def _stacked(group: list[Page], names: list[str]) -> Page:

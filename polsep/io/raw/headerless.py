@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from polsep.io.raw.genicam import Codes, PixelFormat, find_pixel_format, unpack_frame
 from polsep.io.raw.page import Page
 from polsep.io.store.header_checks import require_size
-from polsep.sensor.camera import Layout
+from polsep.sensor.camera import PERIOD, Layout
 
-#: Pixels after which filters repeat at the latest; rows of a frame in which its packing is checked, about, and how many
-#: times rougher codes of the wrong one are: 6 times and more.
-PERIOD, CHECKED_ROWS, ROUGHER = 4, 64, 3.0
+#: Rows of a frame in which its packing is checked, about, and how many times rougher codes must be to be of the wrong
+#: one: those are 6 times and more.
+CHECKED_ROWS, ROUGHER = 64, 3.0
 
 
 class AssumedLayout(str):

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from polsep.io.raw.frames import FRAME_FILES, Frame, ReadOptions, output_stem, read_frames
 from polsep.io.raw.recording import RECORD, gap_notes, is_recording, recorded_rate, recording_files
-from polsep.io.raw.videos import count_frames, cut_notes, find_timing, is_film
+from polsep.io.raw.videos import count_frames, cut_notes, find_timing, is_lossless_film
 from polsep.io.store.calibrations import holds_maps
 from polsep.io.store.errors import InputError, input_error, one_line
 from polsep.io.store.result_names import result_names
@@ -71,7 +71,7 @@ def open_sequence(path: Path, options: ReadOptions) -> FrameSequence:
         if isinstance(frame, Frame):
             begin = partial(_read_stack, path, options, frame.count)
             rate, notes = _times_of(path)
-            count = count_frames(path, frame.count, 0) if is_film(path) else frame.count
+            count = count_frames(path, frame.count, 0) if is_lossless_film(path) else frame.count
             return FrameSequence(output_stem(path), count, begin, notes, rate)
         unread = unread or frame.reason
     raise input_error(path, "expected frames, found none") if unread is None else InputError(unread)
@@ -81,7 +81,7 @@ def _times_of(path: Path) -> tuple[float | None, tuple[str, ...]]:
     """Frames per second of a file of many frames, if it says them, and notes on what is missing and on their times."""
     if path.name == RECORD:
         return recorded_rate(path), gap_notes(path)
-    if not is_film(path):
+    if not is_lossless_film(path):
         return None, ()
     rate, notes = find_timing(path)
     return rate, cut_notes(path) + notes

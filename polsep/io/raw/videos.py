@@ -42,8 +42,8 @@ FEWEST = 2
 mute("libav")
 
 
-def is_film(path: Path) -> bool:
-    """True for the names of films."""
+def is_lossless_film(path: Path) -> bool:
+    """True for the name of a film that may be lossless, by its extension; `extensions.is_film` knows all films."""
     return path.suffix.lower() in CONTAINERS
 
 

@@ -29,10 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polsep.io.results.exr import as_planes, encode_exr, read_exr_layers
-from polsep.io.results.previews import srgb
 from polsep.io.results.sidecars import require_same_settings
 from polsep.io.store.atomic import OutputError, replace_bytes, write_checked
 from polsep.io.store.image_codecs import encode_png
+from polsep.physics.srgb import srgb_bytes
 
 FORMATS = ("exr", "npz")
 #: RGB images of the truth; s1 and s2 are of the light on the sensor, whose s0 is diffuse + specular.
@@ -174,7 +174,7 @@ def _thumbnail(image: NDArray[Any]) -> NDArray[np.uint8]:
         counts = np.diff(edges, append=side)
         small = np.add.reduceat(np.add.reduceat(small, edges, axis=0), edges, axis=1)
         small /= counts[:, None, None] * counts[:, None]
-    return np.rint(255 * srgb(small / 2)).astype(np.uint8)
+    return srgb_bytes(small / 2)
 
 
 def _encode_exr(images: Images) -> bytes:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from polsep.physics.srgb import srgb, srgb_bytes
 from polsep.physics.stokes import wrap_aolp
 
 if TYPE_CHECKING:
@@ -63,21 +64,6 @@ class Panel(NamedTuple):
     title: str
     note: str
     pixels: Pixels
-
-
-def srgb(linear: ArrayLike) -> NDArray[np.float64]:
-    """Encode linear light with the sRGB transfer function; values are clipped to [0, 1] first. Any shape.
-
-    Source: IEC 61966-2-1:1999.
-    """
-    x = np.clip(np.asarray(linear, dtype=np.float64), 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
-
-
-def linear_from_srgb(display: ArrayLike) -> NDArray[np.float32]:
-    """Linear light of sRGB values in [0, 1]: the inverse of `srgb`. Source: IEC 61966-2-1:1999."""
-    x = np.asarray(display, dtype=np.float32)
-    return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def exposure_of(image: Values, percentile: float = 99.5) -> float:
@@ -278,7 +264,7 @@ def _to_bytes(display: Values) -> Pixels:
 
 def toned(image: Values, gain: float) -> Pixels:
     """A linear image ``[H, W, C]``, times ``gain``, as sRGB ``uint8 [H, W, 3]``."""
-    return _in_strips(lambda part: _to_bytes(np.broadcast_to(srgb(gain * part), (*part.shape[:2], 3))), image)
+    return _in_strips(lambda part: np.broadcast_to(srgb_bytes(gain * part), (*part.shape[:2], 3)), image)
 
 
 def _in_strips(draw: Callable[..., Pixels], *images: Values) -> Pixels:

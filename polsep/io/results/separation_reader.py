@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from polsep.io.raw.npy import read_arrays
 from polsep.io.results.exr import read_exr_layers
+from polsep.io.results.sidecars import read_report
 from polsep.io.store.errors import InputError, as_path, input_error, naming, refuse_pipe
+from polsep.light.light_color import LightColor, color_notes, is_to_be_found, stated_gains
 from polsep.separation.report import SeparatedFrame
 
 Floats = NDArray[np.float32]
@@ -66,6 +68,22 @@ def read_separated(path: str | Path) -> SeparatedFrame:
         refuse_pipe(path)
         images = _from_archive(path) if planes is None else _from_layers(planes)
         return _as_frame(images, path.name)
+
+
+def open_separated(path: Path, light_color: LightColor | str = "auto") -> tuple[SeparatedFrame, list[str]]:
+    """A frame that was separated before, with the report beside its file, and notes for the user, a line each.
+
+    ``light_color`` of the report is the one that is stated here, else the one beside the file; without either it is
+    left out and a note says so. Raises InputError on what cannot be read.
+    """
+    frame = replace(read_separated(path), report=read_report(path))
+    notes = list(frame.report.get("warnings", ()))
+    if not is_to_be_found(light_color):
+        frame.report["light_color"] = stated_gains(light_color, frame.diffuse.shape[-1])
+        notes += color_notes(light_color, frame.diffuse.shape[-1])
+    elif "light_color" not in frame.report and frame.diffuse.shape[-1] > 1:
+        notes.append(f"the lamp's colour is neither stated nor in {path.stem}.json beside the file: taken for white")
+    return frame, notes
 
 
 def is_separated(path: Path) -> bool:

@@ -186,21 +186,21 @@ def _from_record(record: dict[str, Any], maps: dict[str, NDArray[Any]]) -> Calib
     black_map, gain_map, older = (maps.get(name) for name in ("black_offset_codes", "gain_minus_1", "defective_pixels"))
     level = None if dark is None else number_of("black_level_codes", entry_of(dark, "black_level_codes"))
     found = Calibration(
-        _layout(entry_of(record, "layout")),
-        number_of("white_level_codes", entry_of(record, "white_level_codes")),
-        (_side(record, "height"), _side(record, "width")) if "height" in record or "width" in record else None,
-        level,
-        _unless_null(table_of, dark, "black_pattern_codes"),
-        None if black_map is None else black_map.astype(np.float32) + np.float32(level or 0),
-        _unless_null(number_of, dark, "read_noise_codes"),
-        None if flat is None else table_of("gains", entry_of(flat, "gains")),
-        None if gain_map is None else gain_map.astype(np.float32) + np.float32(1),
-        _unless_null(table_of, flat, "falloff_legendre"),
-        maps.get("dead_pixels", older),
-        None if analysers is None else _analysers(analysers),
-        None if light is None else _lamp(light),
-        {name: _details(section) for name, section in record.items() if isinstance(section, dict) and name != "maps"},
-        maps.get("hot_pixels", older),
+        layout=_layout(entry_of(record, "layout")),
+        white_level=number_of("white_level_codes", entry_of(record, "white_level_codes")),
+        size=(_side(record, "height"), _side(record, "width")) if "height" in record or "width" in record else None,
+        black_level=level,
+        black_pattern=_unless_null(table_of, dark, "black_pattern_codes"),
+        black_map=None if black_map is None else black_map.astype(np.float32) + np.float32(level or 0),
+        read_noise=_unless_null(number_of, dark, "read_noise_codes"),
+        gains=None if flat is None else table_of("gains", entry_of(flat, "gains")),
+        gain_map=None if gain_map is None else gain_map.astype(np.float32) + np.float32(1),
+        falloff=_unless_null(table_of, flat, "falloff_legendre"),
+        hot=maps.get("hot_pixels", older),
+        dead=maps.get("dead_pixels", older),
+        analysers=None if analysers is None else _analysers(analysers),
+        lamp=None if light is None else _lamp(light),
+        details={n: _details(part) for n, part in record.items() if isinstance(part, dict) and n != "maps"},
     )
     _require_parts(found)
     return found

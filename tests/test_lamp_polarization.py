@@ -19,7 +19,8 @@ from polsep.compute.resizing import block_means
 from polsep.io.raw.frames import ReadOptions
 from polsep.io.raw.sequences import open_sequence
 from polsep.pipeline import separate, separate_capture
-from polsep.sensor.camera import MIN_LAMP_DOLP, Layout, Mosaic, expose
+from polsep.sensor.camera import Layout, Mosaic, expose
+from polsep.sensor.mosaic_fields import MIN_LAMP_DOLP
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.lamp_polarization import MIN_PART, SIDE, find_unpolarized, less_unpolarized, measure_places
 from polsep.separation.places_kernel import measure_places_fast

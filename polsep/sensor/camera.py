@@ -22,12 +22,13 @@ from numbers import Real
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from array_api_compat import device, is_array_api_obj
+from array_api_compat import device
 
 from polsep.compute.arguments import WrongType, require_whole
 from polsep.compute.arrays import Array, as_floats, constant, namespace, short_repr
 from polsep.compute.resizing import repeat_pixels, resize_bilinear
 from polsep.physics.stokes import Measurements, Stokes, diattenuation
+from polsep.sensor.mosaic_fields import require_degree, require_gains, require_samples
 
 if TYPE_CHECKING:
     import torch
@@ -40,8 +41,7 @@ CLIP_MARGIN = 2.0**-10
 
 #: Pixels after which the filters of every sensor repeat, along both axes; those of mono ones after 2 already.
 PERIOD = 4
-#: Least degree of polarization of a lamp: of less, most of its specular light is unpolarized.
-MIN_LAMP_DOLP = 0.3
+
 #: Analysers that are closer than this [degrees] are one: no Stokes vector follows from their difference.
 MIN_APART_DEG = 0.1
 
@@ -220,34 +220,6 @@ def check_frame(shape: tuple[int, ...], layout: Layout, black_level: float, whit
         raise ValueError(f"expected a white level above the black level, found {white_level} and {black_level}")
 
 
-def _require_samples(data: Array) -> None:
-    """Raise WrongType unless ``data`` is an array of whole numbers or floats: others have no place on a sensor."""
-    if not is_array_api_obj(data) or isinstance(data, np.ma.MaskedArray):  # masked samples have no value
-        raise WrongType(f"expected samples as a NumPy array or a torch tensor, found {type(data).__name__}")
-    if not namespace(data).isdtype(data.dtype, ("integral", "real floating")):
-        raise WrongType(f"expected samples of whole numbers or floats, found {data.dtype}")
-
-
-def _require_gains(gains: object, channels: int) -> None:
-    """Raise ValueError unless ``gains`` are positive numbers, three or one per channel; of others it is a WrongType."""
-    try:
-        numbers = [float(gain) for gain in gains]  # type: ignore[attr-defined]
-    except (TypeError, ValueError):
-        raise WrongType(f"expected a light_color of positive numbers, found {gains!r:.40}") from None
-    if len(numbers) not in (3, channels) or not all(0 < gain < math.inf for gain in numbers):
-        raise ValueError(f"expected a light_color of three positive numbers, found {gains!r:.80}")
-
-
-def _require_degree(degree: object) -> None:
-    """Raise ValueError unless the ``degree`` is None or one that a lamp may have; of no number it is a WrongType."""
-    if degree is None:
-        return
-    if isinstance(degree, bool) or not isinstance(degree, Real):
-        raise WrongType(f"expected lamp_dolp as a number, found {degree!r:.40}")
-    if not MIN_LAMP_DOLP <= float(degree) <= 1:
-        raise ValueError(f"expected lamp_dolp from {MIN_LAMP_DOLP:g} to 1, found {degree:g}")
-
-
 def clip_level(black_level: float, white_level: float) -> float:
     """The least sample that counts as clipped, in the unit of the samples; see `CLIP_MARGIN`."""
     return black_level + (1 - CLIP_MARGIN) * (white_level - black_level)
@@ -264,7 +236,7 @@ class Mosaic:
     ``lamp_measured``: ``light_color`` is that of a calibrated lamp, also where it is white. ``lamp_dolp``: degree of
     polarization of the lamp where that is known.
     Raises ValueError when white is not above black, the frame is smaller than one period or the degree is not from
-    `MIN_LAMP_DOLP` to 1; of samples that are no whole numbers or floats, it is a `WrongType`.
+    `mosaic_fields.MIN_LAMP_DOLP` to 1; of samples that are no whole numbers or floats, it is a `WrongType`.
     """
 
     data: Array
@@ -280,10 +252,10 @@ class Mosaic:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        _require_samples(self.data)
+        require_samples(self.data)
         check_frame(tuple(self.data.shape), self.layout, self.black_level, self.white_level)
-        _require_gains(self.light_color, self.layout.channels)
-        _require_degree(self.lamp_dolp)
+        require_gains(self.light_color, self.layout.channels)
+        require_degree(self.lamp_dolp)
 
     @property
     def clip_level(self) -> float:

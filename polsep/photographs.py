@@ -34,6 +34,7 @@ from polsep.io.store.errors import naming
 from polsep.physics.stokes import Measurements, contradictions, correct_extinction, stokes_inverse
 from polsep.physics.turned_analyser import find_angles, find_pair_exposure, gram
 from polsep.sensor.levels import as_measurements
+from polsep.separation.report import PICTURE
 
 #: A pair of one colour pixel, to ask methods whether they take pairs.
 ANY_PAIR = Measurements(np.zeros((2, 3, 1, 1), np.float32), (0.0, math.pi / 2))
@@ -136,7 +137,7 @@ def read_measurements(
         "brightness": [round(float(mean), 5) for mean in means],
         "angles_deg": [round(math.degrees(t), 3) for t in angles],
         "angles": "found, up to a common roll and mirror" if options.angles_deg is None else "stated",
-        "frame": _FRAMES.get(options.angles_deg, "picture"),
+        "frame": _FRAMES.get(options.angles_deg, PICTURE),
         "exposures": [round(e, 5) for e in exposures],
         "exposures_source": source,
         "extinction": None if math.isinf(options.extinction) else options.extinction,

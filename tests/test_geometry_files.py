@@ -248,6 +248,16 @@ def test_files_that_do_not_fit_are_named(polsep: Cli, separated: list[Path], tmp
     assert not (tmp_path / "out").exists()
 
 
+def test_angles_that_nobody_knows_are_refused(polsep: Cli, separated: list[Path], tmp_path: Path) -> None:
+    """Files of photographs at unknown angles are named, as their AoLP counts from the first photograph."""
+    frame = read_separated(separated[2])
+    report = {"light_color": [1.0, 1.0, 1.0], "photographs": {"frame": "the first photograph"}}
+    turned = write_separation(replace(frame, report=report), tmp_path / "in", "turned")[0]
+    run = polsep(*separated[:5], turned, "-o", tmp_path / "out")
+    assert_refused(run, "turned.exr", "found them counted from the first photograph")
+    assert not (tmp_path / "out").exists()
+
+
 def ball() -> Any:
     """The surface of a sphere's cap."""
     normals, mask = cap(SIDE, 60)

@@ -28,8 +28,8 @@ from polsep.io.raw.videos import load_library
 from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
 from polsep.io.results.separation_reader import is_separated
-from polsep.io.store.errors import InputError, input_error, refuse_repeated
-from polsep.separation.report import SeparatedFrame, reported_light
+from polsep.io.store.errors import InputError, input_error, naming, refuse_repeated
+from polsep.separation.report import SeparatedFrame, reported_light, require_known_angles
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -128,6 +128,8 @@ def _read_frame(path: Path, source: Source) -> tuple[SeparatedFrame, list[str]]:
         return frame, notes
     if not frame.dolp.any():
         raise input_error(path, "expected a file of polsep separate with its polarization, found none in it")
+    with naming(path):
+        require_known_angles(frame)
     return frame, [note for note in notes if note not in frame.report.get("warnings", ())]
 
 

@@ -120,6 +120,15 @@ def test_edited_frames_can_be_edited(tmp_path: Path, polsep: Cli) -> None:
     assert (tmp_path / "b" / "shot.exr").read_bytes() == (tmp_path / "c" / "shot.exr").read_bytes()
 
 
+def test_archives_of_half_floats_are_read_as_exr_files_are(tmp_path: Path) -> None:
+    """Truth of `polsep render --format npz` has them."""
+    images = random_images()
+    halves = {name: getattr(images, name).astype(np.float16) for name in ("diffuse", "specular")}
+    np.savez(tmp_path / "view.npz", **halves)
+    found = read_separated(tmp_path / "view.npz")
+    assert found.diffuse.dtype == np.float32 and np.array_equal(found.specular, halves["specular"])
+
+
 def test_recipes_find_their_images_from_linked_folders(
     tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -441,6 +441,26 @@ def test_samples_that_are_not_flat_are_warned_of() -> None:
     assert note.startswith("ball.png: ") and "flat" in note
 
 
+def test_photographs_that_tell_less_are_said(
+    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Maps of more pixels than a photograph are remarked on; one photograph twice, or maps for it, are refused."""
+    path = grey_paper(tmp_path, "exr", {"light_color": [1, 1, 1]})
+    assert read_photographs([path], MaterialOptions(size=40)).notes == ()
+    (note,) = read_photographs([path], MaterialOptions(size=41)).notes
+    assert note.startswith(f"{path}: 41 pixels or more across") and "found 40" in note
+    asked = ["--weights", str(weights), "--size", "32"]
+    assert run(["material", path, path, "-o", str(tmp_path / "twice"), *asked], monkeypatch) == 2
+    assert "expected photographs under different lights" in capsys.readouterr().err
+    assert run(["material", path, "-o", str(tmp_path / "maps"), *asked], monkeypatch) == 0
+    maps = str(tmp_path / "maps" / "paper.exr")
+    for words in (["material", maps, *asked], ["edit", maps, "--rougher", "1"]):
+        capsys.readouterr()
+        assert run([*words, "-o", str(tmp_path / "out")], monkeypatch) == 2
+        assert "expected a separated frame, found maps of a material" in capsys.readouterr().err
+    assert not (tmp_path / "twice").exists() and not (tmp_path / "out").exists()
+
+
 def test_white_is_guessed_of_metal_too() -> None:
     """By the diffuse light of a dielectric, and by all light of what hardly has any; or as said."""
     views = torch.full((3, 6, 8, 8), 0.1)

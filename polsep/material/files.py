@@ -17,7 +17,7 @@ from polsep.io.raw.frames import ReadOptions, output_stem, read_frames, refuse_f
 from polsep.io.results.previews import Panel, Pixels, titled_sheet, toned
 from polsep.io.results.separation_reader import is_separated
 from polsep.io.store.atomic import refuse_existing, refuse_inputs
-from polsep.io.store.errors import InputError, input_error
+from polsep.io.store.errors import InputError, input_error, refuse_repeated
 from polsep.material.estimate import load_estimator
 from polsep.material.svbrdf import CAMERA_HEIGHT, MAP_SIZE, Svbrdf, plane_points, relight
 from polsep.pipeline import LightColor, open_separated, separate_capture
@@ -90,6 +90,7 @@ def estimate_files(
     name = output_stem(paths[0]) if name is None else name
     refuse_existing(directory, targets := material_targets(directory, name), overwrite)
     inputs = [Path(path) for path in paths]
+    refuse_repeated(inputs, "photographs under different lights")
     reports = [path.with_suffix(".json") for path in inputs if is_separated(path)]
     refuse_inputs(targets, [*inputs, *reports, *options.kept, *filter(None, [options.weights])])
     estimator = load_estimator(options.input, options.weights)
@@ -125,7 +126,7 @@ def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photogra
             views.append(view)
             sources.append(Path(path).name)
             lights.append(reported_light(frame))
-            notes += [f"{path}: {note}" for note in said]
+            notes += [f"{path}: {note}" for note in [*said, *_small_notes(frame, options.size)]]
     if not views:
         raise InputError("expected photographs of a material, found none")
     return Photographs(torch.stack(views), tuple(sources), tuple(notes), tuple(lights))
@@ -151,6 +152,13 @@ def white_lobes(frame: SeparatedFrame) -> tuple[Floats, Floats]:
     light = np.array(reported_light(frame), np.float32)
     gains = light / light.mean()
     return frame.diffuse / gains, frame.specular / gains
+
+
+def _small_notes(frame: SeparatedFrame, size: int) -> Iterator[str]:
+    """A line on a frame whose middle square has fewer pixels along a side than the maps, which then hold no more."""
+    side = min(frame.diffuse.shape[:2])
+    if side < size:
+        yield f"{size} pixels or more across the middle square were expected, found {side}: maps show no finer detail"
 
 
 def flatness_notes(photographs: Photographs) -> list[str]:

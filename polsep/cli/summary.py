@@ -26,10 +26,11 @@ def summary(report: dict[str, Any]) -> str:
 def _color(light: dict[str, Any]) -> str:
     """The light's colour and where it is from."""
     color = ",".join(f"{c:.2f}" for c in light["color"])
-    error = light.get("error_deg")
+    error, source = light.get("error_deg"), light["source"]
     if error is None:
-        return f"colour {color} ({light['source']})"
-    return f"colour {color} ({light['source']}, colour error {'below 0.1' if error < 0.1 else f'{error:.1f}'} deg)"
+        return f"colour {color} ({source})"
+    source = source if light.get("sure", True) else "assumed"
+    return f"colour {color} ({source}, colour error {'below 0.1' if error < 0.1 else f'{error:.1f}'} deg)"
 
 
 def _percent(share: float) -> str:

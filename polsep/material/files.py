@@ -32,6 +32,8 @@ USUAL_DIFFUSE = 0.25
 USUAL_METAL, MIRRORS = 0.14, 4.0
 #: Smallest and largest side of maps.
 MIN_SIZE, LARGEST_SIZE = 32, 1024
+#: Largest level of white, the most that s0 reaches before it clips: codes of the camera lie far beyond.
+LARGEST_WHITE = 2.0
 #: Parts along a side of the square, and the least light of one relative to the brightest that a flat sample shows.
 #: Random dielectrics: 95 % above 0.06; objects on black: 0.000, spheres that fill the square 0.02 to 0.04. Polished
 #: metal has dark corners, too.
@@ -62,8 +64,9 @@ class MaterialOptions:
     def __post_init__(self) -> None:
         if not MIN_SIZE <= self.size <= LARGEST_SIZE:
             raise ValueError(f"expected a size of {MIN_SIZE} to {LARGEST_SIZE} pixels, found {self.size}")
-        if not all(0 < level < float("inf") for level in self.white):
-            raise ValueError(f"expected levels of white above 0, found {', '.join(f'{x:g}' for x in self.white)}")
+        if not all(0 < level <= LARGEST_WHITE for level in self.white):
+            found = ", ".join(f"{level:g}" for level in self.white)
+            raise ValueError(f"expected levels of white above 0, at most {LARGEST_WHITE:g}, found {found}")
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,7 @@ def estimate_files(
     views = photographs.views / torch.tensor(white)[:, None, None, None]
     maps = estimator.estimate(views[:, :3] + views[:, 3:] if estimator.input == "unseparated" else views)
     notes = [*photographs.notes, *flatness_notes(photographs)]
+    notes += _whiter_notes(photographs, white)
     if not options.white:
         notes.append("the level of white paper is not known (--white): the diffuse map's brightness is a guess")
     sidecar = {
@@ -159,6 +163,14 @@ def _small_notes(frame: SeparatedFrame, size: int) -> Iterator[str]:
     side = min(frame.diffuse.shape[:2])
     if side < size:
         yield f"{size} pixels or more across the middle square were expected, found {side}: maps show no finer detail"
+
+
+def _whiter_notes(photographs: Photographs, white: tuple[float, ...]) -> Iterator[str]:
+    """A line on each photograph whose diffuse light is that of something whiter than the white paper."""
+    for source, view, level in zip(photographs.sources, photographs.views, white, strict=True):
+        share = float(view[:3].mean(dim=0).median()) / level
+        if share > 1:
+            yield f"{source}: a sample darker than white paper was expected, found one {share:.3g} times as bright"
 
 
 def flatness_notes(photographs: Photographs) -> list[str]:

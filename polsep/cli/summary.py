@@ -8,11 +8,11 @@ from typing import Any
 def summary(report: dict[str, Any]) -> str:
     """Method, clipping, the light, expected errors and the number of warnings, in one line."""
     from polsep.physics.stokes import axis_deg
-    from polsep.separation.report import PICTURE
+    from polsep.separation.report import PICTURE, angle_origin
 
     facts, light = report["statistics"], report.get("light", {})
     parts = [report["method"], f"{_percent(facts['clipped_fraction'])} clipped"]
-    known = report.get("photographs", {}).get("frame", PICTURE) == PICTURE  # else 0 deg lies nobody knows where
+    known = angle_origin(report) == PICTURE  # else 0 deg lies nobody knows where
     seen = [f"polarizer at {axis_deg(facts['light_polarizer_deg']):.0f} deg"] if known else []
     seen += [] if len(report["light_color"]) == 1 else [_color(light)]
     parts += [f"light: {', '.join(seen)}"] if seen else []

@@ -7,6 +7,7 @@ is before the light's colour is multiplied back, and polarization is that of all
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -72,15 +73,19 @@ def reported_light(frame: SeparatedFrame) -> tuple[float, ...]:
     return tuple(frame.report.get("light_color", (1.0,) * channels))[:channels]
 
 
+def angle_origin(report: Mapping[str, Any]) -> str:
+    """Where angles of polarization count from by a report: `PICTURE`, its right, or another place of photographs."""
+    facts = report.get("photographs")
+    return str(facts.get("frame", PICTURE)) if isinstance(facts, dict) else PICTURE
+
+
 def require_known_angles(frame: SeparatedFrame) -> None:
     """Raise ValueError where AoLP says nothing of the picture's directions by the report: of two photographs through a
     filter, which show s1 alone, and of photographs at unknown angles, which count from the first one."""
     advice = "photograph at three or more known angles (--angles)"
     if frame.report.get("layout") == PAIR_LAYOUT:
         raise ValueError(f"expected polarization in all directions, found that of {PAIR_LAYOUT}: {advice}")
-    facts = frame.report.get("photographs")
-    origin = facts.get("frame", PICTURE) if isinstance(facts, dict) else PICTURE
-    if origin != PICTURE:
+    if (origin := angle_origin(frame.report)) != PICTURE:
         raise ValueError(f"expected angles from the picture's right, found them counted from {origin}: {advice}")
 
 

@@ -74,7 +74,7 @@ def reported_light(frame: SeparatedFrame) -> tuple[float, ...]:
 
 
 def angle_origin(report: Mapping[str, Any]) -> str:
-    """Where angles of polarization count from by a report: `PICTURE`, its right, or another place of photographs."""
+    """The place that angles of polarization count from by a report: `PICTURE`, its right, or another of photographs."""
     facts = report.get("photographs")
     return str(facts.get("frame", PICTURE)) if isinstance(facts, dict) else PICTURE
 

@@ -34,6 +34,7 @@ from polsep.physics.srgb import linear_from_srgb
 from polsep.physics.stokes import Measurements, contradictions, correct_extinction, stokes_inverse
 from polsep.physics.turned_analyser import find_angles, find_pair_exposure, gram
 from polsep.sensor.levels import as_measurements
+from polsep.separation.report import PICTURE
 
 #: A pair of one colour pixel, to ask methods whether they take pairs.
 ANY_PAIR = Measurements(np.zeros((2, 3, 1, 1), np.float32), (0.0, math.pi / 2))
@@ -55,6 +56,9 @@ EQUAL = 0.12
 DARKER, LACKS = 0.97, 2.0
 #: Largest contradiction of four and more photographs, relative to their brightness, of which nobody is warned.
 MAX_CONTRADICTION = 0.03
+#: Largest noise of Stokes images relative to that of as many angles, evenly spaced, of which nobody is warned: a third
+#: angle 8 degrees beside another has it.
+MOST_NOISE = 4.0
 #: Largest error of angles that count as found [rad]; motion of a corner in pixels below which a photograph stays as it
 #: is; motion left after alignment of which to warn; and least share of the picture that all photographs show.
 MAX_ANGLE_ERROR, STILL, MAX_LEFT, LEAST_SHARED = math.radians(2), 0.1, 0.5, 0.5
@@ -136,7 +140,7 @@ def read_measurements(
         "brightness": [round(float(mean), 5) for mean in means],
         "angles_deg": [round(math.degrees(t), 3) for t in angles],
         "angles": "found, up to a common roll and mirror" if options.angles_deg is None else "stated",
-        "frame": _FRAMES.get(options.angles_deg, "picture"),
+        "frame": _FRAMES.get(options.angles_deg, PICTURE),
         "exposures": [round(e, 5) for e in exposures],
         "exposures_source": source,
         "extinction": None if math.isinf(options.extinction) else options.extinction,
@@ -298,8 +302,18 @@ def _remarks(facts: dict[str, Any], swapped: bool, options: PhotoOptions) -> Ite
             f"photographs that agree were expected, found {facts['contradiction']:.1%} of their light contradict: "
             "did exposure, lamp or an angle change, or are they not linear?"
         )
+    if options.angles_deg != PAIR and (noise := _relative_noise(facts["angles_deg"])) > MOST_NOISE:
+        said = ", ".join(f"{angle:g}" for angle in facts["angles_deg"])
+        yield f"angles all over half a turn were expected, found {said}: they multiply noise by {noise:.0f}"
     if max(facts["left_pixels"], default=0) > MAX_LEFT:
         yield (
             f"aligned photographs were expected, found them {max(facts['left_pixels']):.1f} pixels apart after "
             f"--align {options.align}: use a tripod, or try --align homography"
         )
+
+
+def _relative_noise(angles_deg: Sequence[float]) -> float:
+    """The noise of Stokes images from photographs at these angles over that from as many, evenly spaced."""
+    even = np.arange(len(angles_deg)) * math.pi / len(angles_deg)
+    found, least = (np.linalg.norm(stokes_inverse(list(angles))) for angles in (np.radians(angles_deg), even))
+    return float(found / least)

@@ -40,7 +40,15 @@ from polsep.sensor.levels import as_layout, as_mosaic, has_levels_of, planes_as_
 from polsep.separation.colored_specular import Colored, color_specular
 from polsep.separation.images import FrameImages
 from polsep.separation.lamp_polarization import separate_by_known_lamp
-from polsep.separation.report import SeparatedFrame, describe, error_quantiles, light_statistics, on_host, tally_again
+from polsep.separation.report import (
+    PAIR_LAYOUT,
+    SeparatedFrame,
+    describe,
+    error_quantiles,
+    light_statistics,
+    on_host,
+    tally_again,
+)
 from polsep.separation.under_highlights import fill_under_highlights
 
 if TYPE_CHECKING:
@@ -307,7 +315,7 @@ def without_falloff(images: FrameImages, falloff: Table, light: tuple[float, ...
 def _describe_angles(samples: Measurements) -> str:
     """Co-sited measurements in a few words."""
     number = len(samples.angles)
-    return "two crossed photographs" if number == 2 else f"{'four' if number == 4 else number} co-sited angle images"
+    return PAIR_LAYOUT if number == 2 else f"{'four' if number == 4 else number} co-sited angle images"
 
 
 def _is_finite(facts: Any) -> bool:

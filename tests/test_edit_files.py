@@ -120,6 +120,15 @@ def test_edited_frames_can_be_edited(tmp_path: Path, polsep: Cli) -> None:
     assert (tmp_path / "b" / "shot.exr").read_bytes() == (tmp_path / "c" / "shot.exr").read_bytes()
 
 
+def test_archives_of_half_floats_are_read_as_exr_files_are(tmp_path: Path) -> None:
+    """Truth of `polsep render --format npz` has them."""
+    images = random_images()
+    halves = {name: getattr(images, name).astype(np.float16) for name in ("diffuse", "specular")}
+    np.savez(tmp_path / "view.npz", **halves)
+    found = read_separated(tmp_path / "view.npz")
+    assert found.diffuse.dtype == np.float32 and np.array_equal(found.specular, halves["specular"])
+
+
 def test_recipes_find_their_images_from_linked_folders(
     tmp_path: Path, polsep: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -245,7 +254,7 @@ def test_bad_calls_leave_nothing(
     monkeypatch.chdir(tmp_path)
     separated(tmp_path)
     separated(tmp_path, "mono", colors=1)
-    png(tmp_path / "small.png", np.zeros((3, 3), np.uint8))
+    png(tmp_path / "small.png", np.full((3, 3), 255, np.uint8))
     (tmp_path / "a").mkdir()
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "shot.exr").write_bytes(b"mine")
@@ -299,6 +308,24 @@ def test_results_do_not_replace_what_made_them(
     before = contents(tmp_path)
     assert_refused(polsep(*args, "-o", "out", "--no-preview", *overwrite), words)
     assert contents(tmp_path) == before
+
+
+def test_light_beyond_floats_is_refused(tmp_path: Path, polsep: Cli) -> None:
+    """In a line, for whatever file; sharpening divided infinity by itself, with a warning of NumPy."""
+    images = np.full((4, 4, 3), 3e38, np.float32)
+    np.savez(tmp_path / "bright.npz", diffuse=images, specular=images)
+    for edit in (("--sharper", "2"), ("--metallic", "1")):
+        run = polsep(tmp_path / "bright.npz", "-o", tmp_path / "out", *edit)
+        assert run.status == 2 and run.out == ""
+        assert run.err.splitlines()[-1].endswith("expected light that 32-bit floats hold after the edits, found more")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_black_mask_is_refused(tmp_path: Path, polsep: Cli) -> None:
+    """It would edit nothing, without a word."""
+    mask = png(tmp_path / "mask.png", np.zeros((4, 4), np.uint8))
+    run = polsep(separated(tmp_path), "-o", tmp_path / "out", "--rougher", "2", "--mask", mask)
+    assert_refused(run, "mask.png: expected a mask that holds pixels, found none")
 
 
 def test_good_files_go_on_beside_bad_ones(tmp_path: Path, polsep: Cli) -> None:

@@ -249,6 +249,23 @@ def test_bad_requests_are_one_line_and_leave_nothing(
     assert not Path("x.onnx").exists()
 
 
+def test_outputs_are_onnx_files_apart_from_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before minutes of work, and so that no mistyped name costs a network."""
+    weights = tmp_path / "w.safetensors"
+    write_random(weights)
+    linked, before = tmp_path / "w.onnx", weights.read_bytes()
+    linked.symlink_to(weights)
+    for target, said in ((weights, "expected an output that ends in .onnx"), (linked, "is an input")):
+        asked = ["export", "joint", "--weights", str(weights), "-o", str(target), "--overwrite"]
+        monkeypatch.setattr(sys, "argv", ["polsep", *asked])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        assert stopped.value.code == 2 and said in capsys.readouterr().err
+    assert weights.read_bytes() == before and linked.is_symlink()
+
+
 def test_graphs_of_before_are_not_replaced_unasked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

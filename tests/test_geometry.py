@@ -303,7 +303,7 @@ def test_lights_are_named_or_given() -> None:
     """Names and vectors become unit vectors; anything else is said in one line."""
     found = parse_lights("front 0,3,4")
     assert np.allclose(found, np.array([[0, 0, 1.0], [0, 0.6, 0.8]]))
-    for text in ("behind", "1,2", "0,0,0", "1,nan,2"):
+    for text in ("behind", "1,2", "0,0,0", "1,nan,2", "0,0,-1 1,0,-0.2"):
         with pytest.raises(ValueError, match="expected"):
             parse_lights(text)
 

@@ -248,6 +248,16 @@ def test_files_that_do_not_fit_are_named(polsep: Cli, separated: list[Path], tmp
     assert not (tmp_path / "out").exists()
 
 
+def test_angles_that_nobody_knows_are_refused(polsep: Cli, separated: list[Path], tmp_path: Path) -> None:
+    """Files of photographs at unknown angles are named, as their AoLP counts from the first photograph."""
+    frame = read_separated(separated[2])
+    report = {"light_color": [1.0, 1.0, 1.0], "photographs": {"frame": "the first photograph"}}
+    turned = write_separation(replace(frame, report=report), tmp_path / "in", "turned")[0]
+    run = polsep(*separated[:5], turned, "-o", tmp_path / "out")
+    assert_refused(run, "turned.exr", "found them counted from the first photograph")
+    assert not (tmp_path / "out").exists()
+
+
 def ball() -> Any:
     """The surface of a sphere's cap."""
     normals, mask = cap(SIDE, 60)
@@ -314,6 +324,34 @@ def test_a_surface_is_centred_and_has_its_shape() -> None:
     assert np.abs(low + high).max() < 1e-9 and (high - low).max() == pytest.approx(1)
     center = surface.vertices - surface.normals * (0.5 / np.sin(np.radians(60)))
     assert np.linalg.norm(center - center.mean(axis=0), axis=1).max() < 0.03
+
+
+def test_the_extent_is_one_at_any_distance() -> None:
+    """Also where a pinhole's depth, which is exponential, is next to 0: else the mesh is a point."""
+    size, intrinsics = (6, 8), np.array([[10.0, 0, 3.5], [0, 10.0, 2.5], [0, 0, 1]])
+    facing = np.broadcast_to([0.0, 0, 1], (*size, 3))
+    appearance = Appearance(facing, np.ones((*size, 3)), np.ones(size, np.bool_))
+    surface = span_surface(appearance, np.full(size, 1e-30), intrinsics)
+    assert np.ptp(surface.vertices, axis=0).max() == pytest.approx(1)
+
+
+def test_a_mesh_that_no_side_shows_has_pictures() -> None:
+    """Black ones have a gain of 1."""
+    corner = np.zeros((3, 3))
+    surface = Surface(corner, np.broadcast_to([0.0, 0, 1], (3, 3)), np.ones((3, 3)), np.array([[0, 1, 2]]))
+    assert all((panel.pixels == files.GREY).all() for panel in files.draw_mesh(surface, 8))
+
+
+def test_distances_that_no_object_has_are_remarked_on() -> None:
+    """A far side many times as far as the near one tells of wrong lights, or of a wrong field of view."""
+    _, mask = cap(SIDE, 70)
+    views = files.Views(np.ones((3, SIDE, SIDE, 1)) * mask[..., None], None)
+    lights = np.array([[0.0, 0.0, 1.0], [0.9, 0.0, 0.44], [0.0, 0.9, 0.44]])
+    notes = [
+        files.find_shape(views, lights, mask, files.ShapeOptions("ply", fov, "smooth")).facts["warnings"]
+        for fov in (20.0, 119.0)
+    ]
+    assert notes[0] == [] and "times as far as its near one" in notes[1][0]
 
 
 def test_jumps_become_gaps() -> None:

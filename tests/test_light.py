@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import polsep
+from polsep.cli.summary import summary
 from polsep.light.color import axis_of, iterate, planes_along
 from polsep.light.color_kernel import iterate_fast
 from polsep.light.find import (
@@ -224,6 +225,13 @@ def test_frames_that_show_nothing_are_not_sure() -> None:
         found = find_light(raw)
         assert not found.sure and found.color == (1, 1, 1) and found.error_deg == UNKNOWN_DEG and found.aolp is None
         assert sum("white is assumed" in remark for remark in found.remarks) == 1
+
+
+def test_a_colour_that_nothing_shows_is_not_called_found() -> None:
+    """The line of the command line says so of black frames, under the warning that white is assumed."""
+    black, lit = (separate_capture(capture, "analytic") for capture in (frame(exposure=0.0), frame()))
+    assert "colour 1.00,1.00,1.00 (assumed, colour error" in summary(black.report)
+    assert "(found, colour error" in summary(lit.report)
 
 
 def test_mono_has_no_color() -> None:

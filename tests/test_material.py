@@ -314,8 +314,9 @@ def test_a_photograph_becomes_files(
     ("change", "said"),
     [
         (["--size", "3"], r"'--size': expected a whole number from 32 to 1024, found '3'"),
-        (["--white", "a"], r"expected --white N or N,N,... above 0, like 0.8, found 'a'"),
-        (["--white", "0"], r"expected --white N or N,N,... above 0, like 0.8, found '0'"),
+        (["--white", "a"], r"expected --white N or N,N,... above 0, at most 2, like 0.8, found 'a'"),
+        (["--white", "0"], r"expected --white N or N,N,... above 0, at most 2, like 0.8, found '0'"),
+        (["--white", "3200"], r"expected --white N or N,N,... above 0, at most 2, like 0.8, found '3200'"),
         (["--white", "1,1"], r"expected one level of white, or 1, one for each photograph, found 2"),
         (["--method", "magic"], r"expected a method of"),
         (["--weights", "nowhere.safetensors"], r"nowhere.safetensors: expected a file"),
@@ -439,6 +440,29 @@ def test_samples_that_are_not_flat_are_warned_of() -> None:
     views = torch.stack([light.expand(6, -1, -1) for light in (solid, paper)])
     (note,) = flatness_notes(Photographs(views, ("ball.png", "paper.png"), ()))
     assert note.startswith("ball.png: ") and "flat" in note
+
+
+def test_photographs_that_tell_less_are_said(
+    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Maps of more pixels than a photograph are remarked on; one photograph twice, or maps for it, are refused."""
+    path = grey_paper(tmp_path, "exr", {"light_color": [1, 1, 1]})
+    assert read_photographs([path], MaterialOptions(size=40)).notes == ()
+    (note,) = read_photographs([path], MaterialOptions(size=41)).notes
+    assert note.startswith(f"{path}: 41 pixels or more across") and "found 40" in note
+    asked = ["--weights", str(weights), "--size", "32"]
+    for white, brighter in (("0.31", False), ("0.1", True)):  # the diffuse light is 0.3
+        assert run(["material", path, "-o", str(tmp_path / white), "--white", white, *asked], monkeypatch) == 0
+        assert ("found one 3 times as bright" in capsys.readouterr().err) == brighter
+    assert run(["material", path, path, "-o", str(tmp_path / "twice"), *asked], monkeypatch) == 2
+    assert "expected photographs under different lights" in capsys.readouterr().err
+    assert run(["material", path, "-o", str(tmp_path / "maps"), *asked], monkeypatch) == 0
+    maps = str(tmp_path / "maps" / "paper.exr")
+    for words in (["material", maps, *asked], ["edit", maps, "--rougher", "1"]):
+        capsys.readouterr()
+        assert run([*words, "-o", str(tmp_path / "out")], monkeypatch) == 2
+        assert "expected a separated frame, found maps of a material" in capsys.readouterr().err
+    assert not (tmp_path / "twice").exists() and not (tmp_path / "out").exists()
 
 
 def test_white_is_guessed_of_metal_too() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
@@ -18,6 +19,7 @@ import polsep
 from polsep.calibrate.exposures import merge_exposures
 from polsep.io.raw.corrections import with_corrections
 from polsep.io.raw.frames import ReadOptions, read_frames
+from polsep.io.raw.tiff import write_merged
 from polsep.io.store.calibrations import write_calibration
 from polsep.io.store.errors import InputError
 from polsep.sensor.calibration import Calibration
@@ -232,3 +234,18 @@ def test_merged_frames_among_raw_ones(tmp_path: Path, run_polsep: Cli) -> None: 
     ):
         with pytest.raises(InputError, match=expected):
             next(read_frames(path, with_corrections(ReadOptions(), calibration)))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="file size limits are POSIX")
+def test_a_disk_that_is_full_is_named(tmp_path: Path) -> None:
+    """With the file, as of every output; "16384 requested and 3840 written" was all that was said."""
+    import resource
+
+    path, before = tmp_path / "merged.tiff", resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+    try:
+        with pytest.raises(OSError, match=r"File too large: .*merged\.tiff"):
+            write_merged(path, Mosaic(torch.rand(64, 64), Layout(), 0, 1), {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []

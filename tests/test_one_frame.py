@@ -403,6 +403,19 @@ def test_bad_arguments_are_refused() -> None:
         shape(frame, weights="nothing.safetensors")
 
 
+@pytest.mark.parametrize(
+    ("report", "said"),
+    [
+        ({"layout": "two crossed photographs"}, "expected polarization in all directions, found that of two crossed"),
+        ({"photographs": {"frame": "the first photograph"}}, "found them counted from the first photograph"),
+    ],
+)
+def test_angles_that_nobody_knows_are_refused(report: dict[str, object], said: str) -> None:
+    """Two photographs show s1 alone, and unknown angles turn all normals: both would give a wrong shape unsaid."""
+    with pytest.raises(ValueError, match=said):
+        shape(replace(sphere_frame(), report={"light_color": [1.0, 1.0, 1.0], **report}))
+
+
 def test_networks_of_other_inputs_are_refused(tmp_path: Path) -> None:
     """They would see images that they were not trained on; a file that changes is read again."""
     frame, path = sphere_frame(), tmp_path / "shape.safetensors"

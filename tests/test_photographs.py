@@ -361,6 +361,7 @@ def test_stacks_of_four_angles_are_read_as_such(tmp_path: Path, pages: str) -> N
         (["--angles", "0,60,120"], "Missing argument 'FILE...'"),
         (["--parallel", "p.tif", "--crossed", "./p.tif"], "p.tif: expected a photograph of each angle"),
         (["--angles", "0,60,120", "p.tif", "link.tif", "c.tif"], "link.tif: expected a photograph of each angle"),
+        (["--parallel", "p.tif", "--crossed", "copy.tif"], "copy.tif: expected a photograph of each angle"),
         (["--exposures", "1,2", "p.tif"], "expected --exposures with --parallel and --crossed"),
         (["--parallel", "p.tif", "--crossed", "c.tif", "--exposures", "1,0"], "expected positive exposures"),
         ([], "Missing argument 'FILE...'"),
@@ -375,6 +376,7 @@ def test_wrong_photographs_get_one_line(
     write_tiff(Path("small.tif"), photograph(90)[:, 1:])
     Path("cut.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     Path("link.tif").symlink_to("p.tif")
+    Path("copy.tif").write_bytes(Path("p.tif").read_bytes())
     av = pytest.importorskip("av")
     with av.open("film.mp4", "w") as container:
         stream = container.add_stream("mpeg4", rate=25)
@@ -384,6 +386,15 @@ def test_wrong_photographs_get_one_line(
     aligned = ["--align", "none"] if "--angles" in words or "--parallel" in words else []
     assert_refused(polsep("separate", *words, *aligned, "-o", "o"), said)
     assert not Path("o").exists()
+
+
+@pytest.mark.parametrize(("angles", "warned"), [((0.0, 30.0, 60.0), False), ((0.0, 1.0, 2.0), True)])
+def test_angles_that_lie_together_are_remarked_on(tmp_path: Path, angles: tuple[float, ...], warned: bool) -> None:
+    """Degrees that were mistyped, or a filter that was hardly turned, make noise of everything."""
+    paths = [str(write_tiff(tmp_path / f"{angle:g}.tif", photograph(angle))) for angle in angles]
+    frame, _ = read_measurements(paths, PhotoOptions(angles, align="none"))
+    assert [note for note in frame.notes if "half a turn were expected, found 0, 1, 2" in note] == [*frame.notes]
+    assert bool(frame.notes) == warned
 
 
 def test_an_extra_that_is_missing_is_named_before_any_work(

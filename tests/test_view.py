@@ -30,6 +30,7 @@ from polsep.sensor.camera import Layout, Mosaic
 from polsep.sensor.exposure import histogram
 from polsep.separation.report import SeparatedFrame
 from polsep.view import guard, opening
+from polsep.view.components import status_line
 from polsep.view.edits import at_scale, edit_small, list_controls, recipe_of
 from polsep.view.guard import Guard, host_name, names_address
 from polsep.view.opening import Settings, parse_settings, plain_name
@@ -503,6 +504,18 @@ def test_panels_hold_their_pictures_and_nothing_from_elsewhere(sessions: Session
         assert "http" not in panel and "file=" not in panel and "<script" not in panel
     assert panels[0].count("data:image/") == 3 and "ps-mark" in panels[0] and "<b>" not in panels[0]
     assert "does not say how far off" in panels[1]
+
+
+def test_angles_of_photographs_are_not_called_those_of_the_picture(sessions: Sessions) -> None:
+    """Where they count from the first photograph, no degrees of the lamp's polarizer are shown."""
+    found = opened(sessions)
+    assert "Polarizer of the light" in light_panel(found.frame, found.small)
+    assert "light polarizer about" in status_line(found)
+    report = {**found.frame.report, "photographs": {"frame": "the first photograph"}}
+    turned = replace(found, frame=replace(found.frame, report=report))
+    said = light_panel(turned.frame, found.small)
+    assert "from the first photograph, which" in said and "Polarizer of the light" not in said
+    assert "light polarizer about" not in status_line(turned)
 
 
 def test_the_histogram_counts_every_sample(sessions: Sessions) -> None:

@@ -205,10 +205,13 @@ def export(method: str, output: Path, weights: Path | None, **options: bool) -> 
     require_extra("export")
     if weights is not None:
         require_paths(weights)
-    from polsep.io.store.atomic import refuse_existing
+    if output.suffix.lower() != ".onnx":
+        raise ValueError(f"expected an output that ends in .onnx, found {output.name!r}")
+    from polsep.io.store.atomic import refuse_existing, refuse_inputs
     from polsep.sensor.camera import Layout
     from polsep.shipped import find_joint
 
+    refuse_inputs([output], [] if weights is None else [weights])
     refuse_existing(output.parent, [output], options["overwrite"])
     layout = Layout.sony(1 if options["mono"] else 3)
     networks, metadata = find_joint(method, layout, weights)

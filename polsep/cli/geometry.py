@@ -58,9 +58,9 @@ ORDER = "right front-right front front-left left above"
 def geometry(files: tuple[Path, ...], **options: Any) -> None:
     """Estimate normals, albedo, depth and a mesh of an object from frames under different lights.
 
-    FILE is a raw frame or an EXR file of 'polsep separate', one per light; the camera does not move. The diffuse images
-    show the shape without highlights, and their polarization resolves what shading leaves ambiguous. With --srgb,
-    photographs of any camera work too, less exactly.
+    FILE is a raw frame, or an EXR or NPZ file of 'polsep separate', one per light; the camera does not move. The
+    diffuse images show the shape without highlights, and their polarization resolves what shading leaves ambiguous.
+    With --srgb, photographs of any camera work too, less exactly.
 
     DIR/STEM.exr gets normal.X/Y/Z (x right, y up, z to the camera), albedo.R/G/B, depth.Z and mask.Y,
     DIR/STEM_normals.png normals for other programs, DIR/STEM.glb a mesh with colours, DIR/STEM.png is a preview.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -68,8 +67,8 @@ def material(files: tuple[str, ...], **options: Any) -> None:
     """
     require_extra("torch")
     require_paths(*files, *filter(None, [options["weights"]]))
-    wanted, text = "--white N or N,N,... above 0, like 0.8", options["white"]
-    white = () if text is None else parse_numbers(text, wanted, lambda levels: all(0 < x < math.inf for x in levels))
+    wanted, text = "--white N or N,N,... above 0, at most 2, like 0.8", options["white"]
+    white = () if text is None else parse_numbers(text, wanted, lambda levels: all(0 < x <= 2 for x in levels))
     read = read_options(options)
     from polsep.methods import check_method
 

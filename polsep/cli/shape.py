@@ -77,9 +77,9 @@ from polsep.cli.progress import show_progress
 def shape(file: Path, **options: Any) -> None:
     """Estimate normals, albedo, roughness, depth and a mesh of an object from one frame under one polarized lamp.
 
-    FILE is a raw frame, as for 'polsep separate', or an EXR file that it wrote. The object stands before a dark ground,
-    or --mask says where it is. A network finds the surface in the separated images and in the polarization of the
-    diffuse light, and says how far off it may be.
+    FILE is a raw frame, as for 'polsep separate', or an EXR or NPZ file that it wrote. The object stands before a dark
+    ground, or --mask says where it is. A network finds the surface in the separated images and in the polarization of
+    the diffuse light, and says how far off it may be.
 
     DIR/STEM.exr gets normal.X/Y/Z (x right, y up, z to the camera), albedo.R/G/B, roughness, specular, their expected
     errors, depth.Z and mask.Y; DIR/STEM_normals.png normals for other programs, DIR/STEM.glb a mesh with colours;

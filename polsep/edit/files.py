@@ -15,6 +15,8 @@ from os.path import realpath
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from polsep.compute.workers import map_ahead
 from polsep.edit.images import Maps, SeparatedImages
 from polsep.edit.parameters import EditError
@@ -84,6 +86,8 @@ def load_work(recipe: Recipe, folder: Path) -> Work:
     """Read the images that a recipe names, relative to ``folder``. Raises InputError."""
     paths = {name: folder / name for name in recipe.images()}
     maps = {name: read_map(paths[name], kind) for name, kind in recipe.images().items()}
+    for name in (name for name, kind in recipe.images().items() if kind == "mask" and not maps[name].any()):
+        raise input_error(paths[name], "expected a mask that holds pixels, found none: nothing would be edited")
     return Work(recipe, maps, {name: hash_map(path) for name, path in paths.items()})
 
 
@@ -150,9 +154,14 @@ def _edit(path: Path, work: Work) -> tuple[SeparatedImages, SeparatedImages]:
     frame = read_separated(path)
     before = SeparatedImages(frame.diffuse, frame.specular)
     try:
-        return before, apply(before, work.recipe, work.maps)
+        with np.errstate(over="ignore", invalid="ignore"):
+            after = apply(before, work.recipe, work.maps)
+            held = bool(np.isfinite(after.combined).all())
     except EditError as error:
         raise input_error(path, error) from error
+    if not held:
+        raise input_error(path, "expected light that 32-bit floats hold after the edits, found more")
+    return before, after
 
 
 def _exposure(before: SeparatedImages, after: SeparatedImages) -> float:

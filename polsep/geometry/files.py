@@ -28,8 +28,8 @@ from polsep.io.raw.videos import load_library
 from polsep.io.results.films import WATCHABLE, encode_film
 from polsep.io.results.previews import Panel, exposure_of, titled_sheet, toned
 from polsep.io.results.separation_reader import is_separated
-from polsep.io.store.errors import InputError, input_error, refuse_repeated
-from polsep.separation.report import SeparatedFrame, reported_light
+from polsep.io.store.errors import InputError, input_error, naming, refuse_repeated
+from polsep.separation.report import SeparatedFrame, reported_light, require_known_angles
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -45,6 +45,8 @@ INTEGRATIONS = {"bilateral": integrate_bilateral, "smooth": integrate_smooth}
 #: Largest `unexplained_share` of photographs without a remark: of statues rendered with weak highlights it is at most
 #: 0.17, with strong ones 0.23 to 0.32, of two objects under a flash 0.31 and 0.51 (docs/experiments.md).
 MOST_UNEXPLAINED = 0.2
+#: Largest distance of an object's far side over that of its near side without a remark: what is nearer fills the view.
+MOST_FARTHER = 10.0
 #: Colour around the object in previews.
 GREY = 40
 
@@ -128,6 +130,8 @@ def _read_frame(path: Path, source: Source) -> tuple[SeparatedFrame, list[str]]:
         return frame, notes
     if not frame.dolp.any():
         raise input_error(path, "expected a file of polsep separate with its polarization, found none in it")
+    with naming(path):
+        require_known_angles(frame)
     return frame, [note for note in notes if note not in frame.report.get("warnings", ())]
 
 
@@ -185,6 +189,8 @@ def find_shape(views: Views, directions: Floats, mask: Mask, options: ShapeOptio
     found = replace(found, albedo=found.albedo * level)
     intrinsics = None if options.fov_deg is None else intrinsics_of(options.fov_deg, mask.shape)
     depth = INTEGRATIONS[options.integration](found.normals, mask, intrinsics)
+    if intrinsics is not None:
+        notes += _notes_on_distances(depth[mask])
     gain = 1 / max(float(np.percentile(found.albedo[mask], 99.5)), 1e-30)
     shown = Appearance(found.normals, np.minimum(found.albedo * gain, 1), mask)
     surface = span_surface(shown, depth, intrinsics)
@@ -213,6 +219,17 @@ def _notes_on_photographs(unexplained: float) -> tuple[str, ...]:
         return ()
     seen = f"light of matte surfaces was expected, found {unexplained:.0%} of it that no normal explains"
     return (f"{seen} (highlights, clipped or uneven light): the mesh may be torn; --integration smooth keeps it whole",)
+
+
+def _notes_on_distances(depth: Floats) -> tuple[str, ...]:
+    """A note on distances from a pinhole that no object in its view has, or none."""
+    near, far = np.percentile(depth, (1, 99))
+    if far <= MOST_FARTHER * near:
+        return ()
+    times = f"{far / max(near, 1e-300):.3g}"
+    return (
+        f"an object was expected, found its far side {times} times as far as its near one: are lights and fov right?",
+    )
 
 
 def encode_mesh(surface: Surface, name: str, roughness: float = 1.0) -> bytes:
@@ -248,7 +265,7 @@ def draw_sheet(views: Views, shown: Appearance, surface: Surface) -> Pixels:
 def draw_mesh(surface: Surface, size: int) -> list[Panel]:
     """Pictures of a mesh from `VIEWS`, each ``size`` x ``size`` on grey, of one exposure."""
     meshes = np.stack(list(draw_views(surface, size, VIEWS)))
-    gain = exposure_of(meshes[meshes.sum(axis=-1) > 0])
+    gain = _exposure_of_mesh(meshes)
     sides = [f"{abs(azimuth):g} deg {'left' if azimuth < 0 else 'right'}" for azimuth, _ in VIEWS]
     return [Panel("Mesh", side, _on_grey(picture, gain)) for side, picture in zip(sides, meshes, strict=True)]
 
@@ -267,8 +284,14 @@ def draw_turntable(surface: Surface) -> Iterator[Pixels]:
     places = [(SWING[0] * math.sin(turn), SWING[1] * math.cos(turn)) for turn in turns]
     gain = None
     for picture in draw_views(surface, CELL, places):
-        gain = gain or exposure_of(picture[picture.sum(axis=-1) > 0])
+        gain = gain or _exposure_of_mesh(picture)
         yield _on_grey(picture, gain)
+
+
+def _exposure_of_mesh(pictures: Floats) -> float:
+    """The gain of pictures of a mesh by their pixels that show it; 1 where none does, as of a sliver."""
+    shown = pictures[pictures.sum(axis=-1) > 0]
+    return exposure_of(shown) if shown.size else 1.0
 
 
 def _on_grey(picture: Floats, gain: float) -> Pixels:

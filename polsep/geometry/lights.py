@@ -52,5 +52,9 @@ def parse_lights(text: str) -> Floats:
             raise ValueError(f"expected a light direction that points somewhere, found {word!r}")
         found.append((x, y, z))
     vectors = np.array(found, dtype=np.float64).reshape(-1, 3)
+    if len(vectors) and vectors[:, 2].max() < 0:
+        raise ValueError(
+            f"expected lights on the camera's side (z > 0 points to it), found all behind the object: {text}"
+        )
     unit: Floats = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     return unit

@@ -41,7 +41,7 @@ from polsep.networks.graphs import core, require_own_threads, shape_model
 from polsep.networks.sizes import ResidualSize
 from polsep.physics.fresnel import ETA, diffuse_dolp
 from polsep.pipeline import PolsepWarning
-from polsep.separation.report import SeparatedFrame, reported_light
+from polsep.separation.report import SeparatedFrame, reported_light, require_known_angles
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -213,6 +213,7 @@ def find_shape(
         )
     if not frame.dolp[chosen].any():
         raise ValueError("expected a frame with its polarization, found DoLP 0 everywhere")
+    require_known_angles(frame)
     given = None if light is None else _as_direction(light)
     window = square_around(chosen)
     small = gather(images_of(frame, chosen), window, SIDE)

@@ -62,7 +62,7 @@ def span_surface(appearance: Appearance, depth: Floats, intrinsics: Floats | Non
     kept, faces = np.unique(faces, return_inverse=True)
     vertices = points[mask][kept]
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    vertices = (vertices - (low + high) / 2) / max(float((high - low).max()), 1e-12)
+    vertices = (vertices - (low + high) / 2) / max(float((high - low).max()), float(np.finfo(np.float64).tiny))
     colors = np.broadcast_to(appearance.albedo, (*mask.shape, 3))[mask][kept]
     return Surface(vertices, appearance.normals[mask][kept], colors, faces.reshape(-1, 3))
 

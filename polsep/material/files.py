@@ -17,7 +17,7 @@ from polsep.io.raw.frames import ReadOptions, output_stem, read_frames, refuse_f
 from polsep.io.results.previews import Panel, Pixels, titled_sheet, toned
 from polsep.io.results.separation_reader import is_separated, open_separated
 from polsep.io.store.atomic import refuse_existing, refuse_inputs
-from polsep.io.store.errors import InputError, input_error
+from polsep.io.store.errors import InputError, input_error, refuse_repeated
 from polsep.light.light_color import LightColor
 from polsep.material.estimate import load_estimator
 from polsep.material.svbrdf import CAMERA_HEIGHT, MAP_SIZE, Svbrdf, plane_points, relight
@@ -33,6 +33,8 @@ USUAL_DIFFUSE = 0.25
 USUAL_METAL, MIRRORS = 0.14, 4.0
 #: Smallest and largest side of maps.
 MIN_SIZE, LARGEST_SIZE = 32, 1024
+#: Largest level of white, the most that s0 reaches before it clips: codes of the camera lie far beyond.
+LARGEST_WHITE = 2.0
 #: Parts along a side of the square, and the least light of one relative to the brightest that a flat sample shows.
 #: Random dielectrics: 95 % above 0.06; objects on black: 0.000, spheres that fill the square 0.02 to 0.04. Polished
 #: metal has dark corners, too.
@@ -63,8 +65,9 @@ class MaterialOptions:
     def __post_init__(self) -> None:
         if not MIN_SIZE <= self.size <= LARGEST_SIZE:
             raise ValueError(f"expected a size of {MIN_SIZE} to {LARGEST_SIZE} pixels, found {self.size}")
-        if not all(0 < level < float("inf") for level in self.white):
-            raise ValueError(f"expected levels of white above 0, found {', '.join(f'{x:g}' for x in self.white)}")
+        if not all(0 < level <= LARGEST_WHITE for level in self.white):
+            found = ", ".join(f"{level:g}" for level in self.white)
+            raise ValueError(f"expected levels of white above 0, at most {LARGEST_WHITE:g}, found {found}")
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ def estimate_files(
     name = output_stem(paths[0]) if name is None else name
     refuse_existing(directory, targets := material_targets(directory, name), overwrite)
     inputs = [Path(path) for path in paths]
+    refuse_repeated(inputs, "photographs under different lights")
     reports = [path.with_suffix(".json") for path in inputs if is_separated(path)]
     refuse_inputs(targets, [*inputs, *reports, *options.kept, *filter(None, [options.weights])])
     estimator = load_estimator(options.input, options.weights)
@@ -99,6 +103,7 @@ def estimate_files(
     views = photographs.views / torch.tensor(white)[:, None, None, None]
     maps = estimator.estimate(views[:, :3] + views[:, 3:] if estimator.input == "unseparated" else views)
     notes = [*photographs.notes, *flatness_notes(photographs)]
+    notes += _whiter_notes(photographs, white)
     if not options.white:
         notes.append("the level of white paper is not known (--white): the diffuse map's brightness is a guess")
     sidecar = {
@@ -126,7 +131,7 @@ def read_photographs(paths: Sequence[str], options: MaterialOptions) -> Photogra
             views.append(view)
             sources.append(Path(path).name)
             lights.append(reported_light(frame))
-            notes += [f"{path}: {note}" for note in said]
+            notes += [f"{path}: {note}" for note in [*said, *_small_notes(frame, options.size)]]
     if not views:
         raise InputError("expected photographs of a material, found none")
     return Photographs(torch.stack(views), tuple(sources), tuple(notes), tuple(lights))
@@ -152,6 +157,21 @@ def white_lobes(frame: SeparatedFrame) -> tuple[Floats, Floats]:
     light = np.array(reported_light(frame), np.float32)
     gains = light / light.mean()
     return frame.diffuse / gains, frame.specular / gains
+
+
+def _small_notes(frame: SeparatedFrame, size: int) -> Iterator[str]:
+    """A line on a frame whose middle square has fewer pixels along a side than the maps, which then hold no more."""
+    side = min(frame.diffuse.shape[:2])
+    if side < size:
+        yield f"{size} pixels or more across the middle square were expected, found {side}: maps show no finer detail"
+
+
+def _whiter_notes(photographs: Photographs, white: tuple[float, ...]) -> Iterator[str]:
+    """A line on each photograph whose diffuse light is that of something whiter than the white paper."""
+    for source, view, level in zip(photographs.sources, photographs.views, white, strict=True):
+        share = float(view[:3].mean(dim=0).median()) / level
+        if share > 1:
+            yield f"{source}: a sample darker than white paper was expected, found one {share:.3g} times as bright"
 
 
 def flatness_notes(photographs: Photographs) -> list[str]:

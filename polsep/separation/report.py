@@ -7,6 +7,7 @@ is before the light's colour is multiplied back, and polarization is that of all
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,6 +33,9 @@ MIN_CONCENTRATION_CLOSED = 0.29
 MAX_RESIDUAL = 0.07
 #: Pixels of which quantiles of expected errors are taken, at least.
 QUANTILE_SAMPLES = 50_000
+
+#: The layout of two photographs through a filter in a report, and where known angles of photographs count from.
+PAIR_LAYOUT, PICTURE = "two crossed photographs", "picture"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,6 +71,22 @@ def reported_light(frame: SeparatedFrame) -> tuple[float, ...]:
     """The lamp's colour by the report of a frame, a gain for each of its C channels; white where it says none."""
     channels = frame.diffuse.shape[-1]
     return tuple(frame.report.get("light_color", (1.0,) * channels))[:channels]
+
+
+def angle_origin(report: Mapping[str, Any]) -> str:
+    """The place that angles of polarization count from by a report: `PICTURE`, its right, or another of photographs."""
+    facts = report.get("photographs")
+    return str(facts.get("frame", PICTURE)) if isinstance(facts, dict) else PICTURE
+
+
+def require_known_angles(frame: SeparatedFrame) -> None:
+    """Raise ValueError where AoLP says nothing of the picture's directions by the report: of two photographs through a
+    filter, which show s1 alone, and of photographs at unknown angles, which count from the first one."""
+    advice = "photograph at three or more known angles (--angles)"
+    if frame.report.get("layout") == PAIR_LAYOUT:
+        raise ValueError(f"expected polarization in all directions, found that of {PAIR_LAYOUT}: {advice}")
+    if (origin := angle_origin(frame.report)) != PICTURE:
+        raise ValueError(f"expected angles from the picture's right, found them counted from {origin}: {advice}")
 
 
 def grey(stokes: Stokes) -> Stokes:

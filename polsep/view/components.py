@@ -9,6 +9,7 @@ from typing import Any
 
 from polsep.io.store import errors
 from polsep.physics.stokes import axis_deg
+from polsep.separation.report import PICTURE, angle_origin
 from polsep.view.edits import list_controls
 from polsep.view.opening import UNSAID, OpenedFrame
 
@@ -114,6 +115,7 @@ def status_line(found: OpenedFrame, more: Sequence[str] = ()) -> str:
     statistics = frame.report["statistics"]
     if "clipped_fraction" in statistics:
         texts.append(f"{statistics['clipped_fraction']:.2%} of the pixels clip")
+    if "clipped_fraction" in statistics and angle_origin(frame.report) == PICTURE:
         texts.append(f"light polarizer about {axis_deg(statistics['light_polarizer_deg']):.0f}°")
     texts.append(f"{found.seconds:.2f} s")
     name = html.escape(found.stem)

@@ -26,7 +26,7 @@ from polsep.io.store.image_codecs import encode_jpeg_quickly, encode_png
 from polsep.physics.srgb import srgb, srgb_bytes
 from polsep.physics.stokes import wrap_aolp
 from polsep.sensor.exposure import BLACK, CLIPPED, Histogram
-from polsep.separation.report import SeparatedFrame
+from polsep.separation.report import PICTURE, SeparatedFrame, angle_origin
 
 Floats = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
@@ -364,7 +364,7 @@ def shape_panel(frame: SeparatedFrame, stem: str) -> str:
     page, title = html.escape(page_of(surface, stem).decode(), quote=True), f"Relit {html.escape(stem)}"
     window = f'<iframe class="ps-relit" title="{title}" sandbox="allow-scripts" srcdoc="{page}"></iframe>'
     notes = surface.warnings()
-    if "light_color" not in frame.report:
+    if "light_color" not in frame.report and frame.diffuse.shape[-1] > 1:
         notes.append("the lamp's colour of this result is not known: taken for white, unless Light colour says it")
     remarks = "".join(f'<div class="ps-remark">{html.escape(line)}</div>' for line in notes)
     return f'{window}<p class="ps-hint">Expected error of normals {error:.0f}° in the median.</p>{remarks}'
@@ -374,8 +374,10 @@ def light_panel(frame: SeparatedFrame, small: Small) -> str:
     """The rose of the polarized light's angles, the angle of the light's polarizer, and the light's colour."""
     power = (small.diffuse + small.specular).mean(axis=-1) * small.dolp
     statistics = frame.report.get("statistics", {})
-    axes, rows = {}, ["Angles of all polarized light, from right toward up; the area is its share."]
-    if "specular_aolp_deg" in statistics:
+    origin = angle_origin(frame.report)
+    start = "right toward up" if origin == PICTURE else f"{html.escape(origin)}, which no degrees of the picture say"
+    axes, rows = {}, [f"Angles of all polarized light, from {start}; the area is its share."]
+    if "specular_aolp_deg" in statistics and origin == PICTURE:
         axes = {"ps-found": statistics["specular_aolp_deg"], "ps-lamp": statistics["light_polarizer_deg"]}
         rows.append(
             f'<b class="ps-found">Highlights</b> {axes["ps-found"]:.0f}°, concentration '

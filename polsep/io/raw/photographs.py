@@ -79,6 +79,8 @@ def read_photographs(paths: Sequence[Path], encoded: bool = False, full: bool = 
         pages += [(path.name if len(found) == 1 else f"{path.name} {page.index}", page) for page in found]
     names = tuple(name for name, _ in pages)
     levels = {page.white_level for _, page in pages}
+    if len(paths) > 1:
+        _refuse_copies(paths, [page.array for _, page in pages])
     if len(levels) != 1:
         raise ValueError(f"expected photographs of one bit depth, found white levels {sorted(map(str, levels))}")
     array = stack_angles({f"{k}: {name}": page.array for k, (name, page) in enumerate(pages)}, "photographs")
@@ -86,6 +88,16 @@ def read_photographs(paths: Sequence[Path], encoded: bool = False, full: bool = 
     notes = tuple(dict.fromkeys(note for _, page in pages for note in page.notes))
     exposures = said if len(said) == len(pages) else None
     return Photographs(array, names, levels.pop(), exposures, notes, first.exposure, first.captured)
+
+
+def _refuse_copies(paths: Sequence[Path], arrays: Sequence[NDArray[Any]]) -> None:
+    """Raise InputError on two files of the same samples, which no two photographs have: their noise differs."""
+    for k, path in enumerate(paths):
+        for other in range(k):
+            if np.array_equal(arrays[other], arrays[k]):
+                raise input_error(
+                    path, f"expected a photograph of each angle of the filter, found that of {paths[other]} again"
+                )
 
 
 def _read_pages(path: Path, encoded: bool, full: bool) -> list[Page]:

@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from polsep.compute.arrays import to_numpy
 from polsep.io.raw.page import MergedFacts, Page
 from polsep.io.raw.tiff_chunks import PICTURES, STREAMS, check_chunks
 from polsep.io.raw.tiff_directories import check_entries, find_pictures, walk_directories
-from polsep.io.store.atomic import atomic_path
+from polsep.io.store.atomic import replace_bytes
 from polsep.io.store.errors import InputError, decoding
 from polsep.io.store.header_checks import require_signature, require_size
 from polsep.io.store.json_text import parse_json
@@ -149,11 +150,9 @@ def write_merged(path: Path, mosaic: Mosaic, facts: Mapping[str, Any]) -> None:
         "lamp_measured": mosaic.lamp_measured,
         **facts,
     }
-    with atomic_path(path) as part:
-        data, description = to_numpy(mosaic.data), json.dumps(text, allow_nan=False)
-        tifffile.imwrite(
-            part, data, photometric="minisblack", metadata=None, software="polsep", description=description
-        )
+    data, description, file = to_numpy(mosaic.data), json.dumps(text, allow_nan=False), BytesIO()
+    tifffile.imwrite(file, data, photometric="minisblack", metadata=None, software="polsep", description=description)
+    replace_bytes(path, file.getbuffer())  # NumPy, writing a file itself, names neither it nor a disk that is full
 
 
 def _require_readable(page: tifffile.TiffPage, size: int) -> None:

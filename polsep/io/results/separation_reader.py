@@ -102,7 +102,11 @@ def holds_separated(path: Path) -> bool:
 
 
 def _from_layers(planes: Mapping[str, NDArray[Any]]) -> Images:
-    """Images from channels by their full names; other channels are ignored."""
+    """Images from channels by their full names; other channels are ignored, but for those of a material's maps."""
+    if {"diffuse.R", "normal.X", "roughness.Y"} <= set(planes) and not {"R", "Y"} & set(
+        planes
+    ):  # frames among passes have a total
+        raise InputError("expected a separated frame, found maps of a material: reflectances, not light")
     images = {}
     for layer in ("diffuse", "specular"):
         channels = next((c for c in ("RGB", "Y") if all(f"{layer}.{color}" in planes for color in c)), None)
@@ -125,8 +129,10 @@ def _from_archive(path: Path) -> Images:
     if not {"diffuse", "specular"} <= set(arrays):
         raise InputError(f"expected arrays diffuse and specular, found {', '.join(names[:8]) or 'none'}")
     for image in (arrays["diffuse"], arrays["specular"]):
-        if image.dtype != np.float32 or image.ndim != 3 or image.shape[2] not in (1, 3):
-            raise InputError(f"expected arrays float32 [h, w, 3 or 1], found {image.dtype} {list(image.shape)}")
+        if image.dtype not in (np.float32, np.float16) or image.ndim != 3 or image.shape[2] not in (1, 3):
+            raise InputError(
+                f"expected float32 or float16 arrays [h, w, 3 or 1], found {image.dtype} {list(image.shape)}"
+            )
     return {name: array.astype(np.float32, copy=False) for name, array in arrays.items()}
 
 

@@ -15,7 +15,7 @@ from polsep.compute.averages import weighted_median
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import Layout, expose
 from polsep.separation.colored_specular import Colored, color_specular
-from polsep.separation.retained_polarization import CAUTION, find_densest, find_retained
+from polsep.separation.retained_polarization import CAUTION, find_densest, find_missing, find_retained
 
 SIDE = 96
 
@@ -85,6 +85,17 @@ def test_retained_light_moves_to_the_specular_image() -> None:
         images, expose(Stokes(colors, a1 * colors, across), Layout(), IDEAL), (1.0, 1.0, 1.0)
     )
     assert clean is images and nothing == Colored()
+
+
+@pytest.mark.parametrize("taken", [0.0, 0.5, 1.0, 1.5])
+def test_no_more_moves_than_the_specular_image_lacks(taken: float) -> None:
+    """A method may find a part of retained light itself; together they have the polarized light, not more."""
+    colors, a1, a2 = ball(SIDE)
+    share, white = 0.06, 0.3
+    light = share * colors.mean(dim=0, keepdim=True)
+    along = (share * colors + white).numpy()
+    missing = find_missing(along, (taken * light + white).expand_as(colors).numpy(), colors.numpy())
+    assert missing == pytest.approx(max(1 - taken, 0) * share, abs=1e-6)
 
 
 def test_the_densest_point_is_where_most_values_lie() -> None:

@@ -38,7 +38,7 @@ from polsep.sensor.camera import PERIOD, Mosaic
 from polsep.separation import places_kernel
 from polsep.separation.images import FrameImages, Tally
 from polsep.separation.lamp_polarization import Places, find_unpolarized, measure_places
-from polsep.separation.retained_polarization import find_retained
+from polsep.separation.retained_polarization import find_missing, find_retained
 
 #: Slopes from which on, and up to which, diffuse light turns into specular light.
 SLOPES = (0.4, 0.7)
@@ -122,6 +122,8 @@ def color_specular(images: FrameImages, mosaic: Mosaic, light: tuple[float, ...]
     if min(data.shape) <= MANY:
         enough = Periods(*to_numpy_together(*_measure_periods(white, diffuse / gain, specular / gain, tally)))
     retained, colored = find_retained(enough.polarized, enough.across, enough.diffuse), None
+    degree = 1 / (1 + unpolarized) if mosaic.lamp_dolp is None else mosaic.lamp_dolp
+    retained = min(retained, find_missing(enough.polarized, degree * (enough.total - enough.diffuse), enough.diffuse))
     if _share(_part(some)) >= MIN_SHARE:
         periods = _measure_periods(white, diffuse / gain, specular / gain, tally)
         found = find_colored(periods)

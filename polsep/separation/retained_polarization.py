@@ -11,6 +11,9 @@ densest slope of a frame is near 0. Retained light moves all slopes along the la
 densest slope is that share, where it clearly lies along. The median must agree, since a frame of few planes has dense
 slopes anywhere; and a frame of one plane, all of whose slopes are alike, shows nothing. Nor does a frame of
 one hue, where highlights of a wrong colour look like it.
+
+Slopes are often too large, and a network's specular image may hold a part of retained light already. What may move is
+at most what the polarization along the lamp's has beyond the specular image, over the whole frame (`find_missing`).
 """
 
 from __future__ import annotations
@@ -28,8 +31,8 @@ MIN_CONTRAST, MIN_RELATIVE, MIN_BRIGHTNESS = 3e-4, 3e-3, 0.03
 #: Width of the density of slopes; largest slope that counts: metals have more.
 WIDTH, MAX_SLOPE = 0.02, 0.4
 #: Range of shares that are believed, the largest slope across, and the largest part of the places within `WIDTH`.
-#: Chosen on 128 validation stages of `datasets.reality` (docs/experiments.md).
-RETAINED, MAX_ACROSS, MAX_ALIKE = (0.04, 0.15), 0.03, 0.75
+#: Chosen on validation stages of `datasets.reality` (docs/experiments.md).
+RETAINED, MAX_ACROSS, MAX_ALIKE = (0.02, 0.15), 0.03, 0.75
 #: Taken off a share, which is found a little too high more often than too low.
 CAUTION = 0.005
 STEPS = 10
@@ -57,6 +60,15 @@ def find_retained(along: Floats, across: Floats, diffuse: Floats) -> float:
     if not RETAINED[0] < share < RETAINED[1] or abs(beside) > MAX_ACROSS or alike > MAX_ALIKE:
         return 0.0
     return share - CAUTION
+
+
+def find_missing(along: Floats, specular: Floats, diffuse: Floats) -> float:
+    """The light that ``along`` has beyond polarized ``specular`` light, over the diffuse light of a frame; at least 0.
+
+    All ``[3, h, w]``, in white light. Transmitted light, polarized along and across, adds up to little.
+    """
+    polarized, found, body = (float(image.mean(dtype=np.float64)) for image in (along, specular, diffuse))
+    return max(polarized - found, 0.0) / max(body, 1e-9)
 
 
 def find_densest(slopes: Floats, weight: Floats) -> tuple[tuple[float, float], float]:

@@ -90,7 +90,7 @@ def test_retained_light_moves_to_the_specular_image() -> None:
 @pytest.mark.parametrize("taken", [0.0, 0.5, 1.0, 1.5])
 def test_no_more_moves_than_the_specular_image_lacks(taken: float) -> None:
     """A method may find a part of retained light itself; together they have the polarized light, not more."""
-    colors, a1, a2 = ball(SIDE)
+    colors, _, _ = ball(SIDE)
     share, white = 0.06, 0.3
     light = share * colors.mean(dim=0, keepdim=True)
     along = (share * colors + white).numpy()

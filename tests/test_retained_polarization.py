@@ -15,7 +15,7 @@ from polsep.compute.averages import weighted_median
 from polsep.physics.stokes import Stokes
 from polsep.sensor.camera import Layout, expose
 from polsep.separation.colored_specular import Colored, color_specular
-from polsep.separation.retained_polarization import CAUTION, find_densest, find_missing, find_retained
+from polsep.separation.retained_polarization import CAUTION, MIN_SPECULAR, find_densest, find_missing, find_retained
 
 SIDE = 96
 
@@ -73,16 +73,18 @@ def test_retained_light_moves_to_the_specular_image() -> None:
     """From the raw frame: diffuse and specular keep their sum, and their ratio is that of the scene."""
     colors, a1, a2 = (x.repeat_interleave(4, dim=-1).repeat_interleave(4, dim=-2) for x in ball(SIDE))
     share, turn = 0.08, 2 * math.radians(25)
-    along, across = (a1 + share) * colors, a2 * colors
+    white = torch.full_like(colors, 0.02)
+    along, across = (a1 + share) * colors + white, a2 * colors
     s1, s2 = along * math.cos(turn) - across * math.sin(turn), along * math.sin(turn) + across * math.cos(turn)
-    images = separated(colors, torch.zeros_like(colors))
-    mosaic = expose(Stokes(colors, s1, s2), Layout(), IDEAL)
+    images = separated(colors, white)
+    mosaic = expose(Stokes(colors + white, s1, s2), Layout(), IDEAL)
     moved, found = color_specular(images, mosaic, (1.0, 1.0, 1.0))
     assert found.retained == pytest.approx(share - CAUTION, abs=0.01) and found.share == 0
-    assert_close(torch.from_numpy(moved.diffuse + moved.specular), torch.from_numpy(images.diffuse))
-    assert_close(torch.from_numpy(moved.specular), found.retained * torch.from_numpy(images.diffuse))
+    before = torch.from_numpy(images.diffuse), torch.from_numpy(images.specular)
+    assert_close(torch.from_numpy(moved.diffuse + moved.specular), before[0] + before[1])
+    assert_close(torch.from_numpy(moved.specular), before[1] + found.retained * before[0])
     clean, nothing = color_specular(
-        images, expose(Stokes(colors, a1 * colors, across), Layout(), IDEAL), (1.0, 1.0, 1.0)
+        images, expose(Stokes(colors + white, a1 * colors + white, across), Layout(), IDEAL), (1.0, 1.0, 1.0)
     )
     assert clean is images and nothing == Colored()
 
@@ -96,6 +98,13 @@ def test_no_more_moves_than_the_specular_image_lacks(taken: float) -> None:
     along = (share * colors + white).numpy()
     missing = find_missing(along, (taken * light + white).expand_as(colors).numpy(), colors.numpy())
     assert missing == pytest.approx(max(1 - taken, 0) * share, abs=1e-6)
+
+
+def test_nothing_moves_without_highlights() -> None:
+    """The lamp's polarization is that of highlights; of none, it is that of walls which lean one way."""
+    colors, _, _ = ball(SIDE)
+    dark = 0.5 * MIN_SPECULAR * colors
+    assert find_missing((0.05 * colors).numpy(), dark.numpy(), colors.numpy()) == 0
 
 
 def test_the_densest_point_is_where_most_values_lie() -> None:

@@ -33,6 +33,8 @@ WIDTH, MAX_SLOPE = 0.02, 0.4
 #: Range of shares that are believed, the largest slope across, and the largest part of the places within `WIDTH`.
 #: Chosen on validation stages of `datasets.reality` (docs/experiments.md).
 RETAINED, MAX_ACROSS, MAX_ALIKE = (0.02, 0.15), 0.03, 0.75
+#: Least specular light over the diffuse light of a frame, from which the lamp's polarization is known.
+MIN_SPECULAR = 0.01
 #: Taken off a share, which is found a little too high more often than too low.
 CAUTION = 0.005
 STEPS = 10
@@ -65,9 +67,12 @@ def find_retained(along: Floats, across: Floats, diffuse: Floats) -> float:
 def find_missing(along: Floats, specular: Floats, diffuse: Floats) -> float:
     """The light that ``along`` has beyond polarized ``specular`` light, over the diffuse light of a frame; at least 0.
 
-    All ``[3, h, w]``, in white light. Transmitted light, polarized along and across, adds up to little.
+    All ``[3, h, w]``, in white light. Transmitted light, polarized along and across, adds up to little. 0 where there
+    are hardly any highlights: then the lamp's polarization is not known, and ``along`` may be that of leaning walls.
     """
     polarized, found, body = (float(image.mean(dtype=np.float64)) for image in (along, specular, diffuse))
+    if found < MIN_SPECULAR * body:
+        return 0.0
     return max(polarized - found, 0.0) / max(body, 1e-9)
 
 

@@ -187,6 +187,6 @@ def test_a_recording_in_a_loop_takes_no_more_and_gives_the_same_bytes(tmp_path: 
     rows = list(soak.soak_rows("film", passes, 0, 1.0))
     assert json.dumps([vars(row) for row in rows], allow_nan=False)
     assert soak.find_growth(rows) == []
-    later = passes[0]._replace(memory=passes[0].memory + 1000, descriptors=99)
+    later = passes[0]._replace(memory=passes[0].memory + 1000, descriptors=passes[0].descriptors + 99)
     rows = list(soak.soak_rows("film", [passes[0]] * 20 + [later] * 20, 1, 1.0))
     assert soak.find_growth(rows) == ["memory", "descriptors", "bytes"]

@@ -138,8 +138,7 @@ def separate(
     for it in colour frames, and it is 1 where nothing shows it. ``raw`` may also be four angle images at 0, 45, 90,
     135 degrees, ``[4, H, W]`` or ``[4, H, W, 3]``, which keep their resolution, or what `read_frames` read. What the
     user should know is in ``report["warnings"]`` and issued as `PolsepWarning`. Raises ValueError, with one line of
-    what was expected and what was found, on other input;
-    of wrong types it is also a TypeError.
+    what was expected and what was found, on other input; of wrong types it is also a TypeError.
     """
     require_flags(full=full)
     if not isinstance(calibration, Calibration | str | PathLike | None):

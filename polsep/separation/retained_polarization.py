@@ -33,7 +33,8 @@ WIDTH, MAX_SLOPE = 0.02, 0.4
 #: Range of shares that are believed, the largest slope across, and the largest part of the places within `WIDTH`.
 #: Chosen on validation stages of `datasets.reality` (docs/experiments.md).
 RETAINED, MAX_ACROSS, MAX_ALIKE = (0.02, 0.15), 0.03, 0.75
-#: Least specular light over the diffuse light of a frame, from which the lamp's polarization is known.
+#: Least specular light over the diffuse light of a frame from which the lamp's polarization is known; chosen on one
+#: photograph of a selection set (docs/testsets.md).
 MIN_SPECULAR = 0.01
 #: Taken off a share, which is found a little too high more often than too low.
 CAUTION = 0.005

@@ -103,9 +103,8 @@ def holds_separated(path: Path) -> bool:
 
 def _from_layers(planes: Mapping[str, NDArray[Any]]) -> Images:
     """Images from channels by their full names; other channels are ignored, but for those of a material's maps."""
-    if {"diffuse.R", "normal.X", "roughness.Y"} <= set(planes) and not {"R", "Y"} & set(
-        planes
-    ):  # frames among passes have a total
+    names = set(planes)
+    if {"diffuse.R", "normal.X", "roughness.Y"} <= names and not {"R", "Y"} & names:  # frames among passes have a total
         raise InputError("expected a separated frame, found maps of a material: reflectances, not light")
     images = {}
     for layer in ("diffuse", "specular"):
